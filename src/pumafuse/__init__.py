@@ -1,0 +1,1 @@
+"""Kalman-filter fusion of a robot arm's commands with the readings of an external sensor."""

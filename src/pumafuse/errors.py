@@ -1,0 +1,44 @@
+"""What pumafuse raises and warns with: one line that says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class PumafuseError(Exception):
+    """Base of every error a user can cause; its text is one line fit for a screen."""
+
+
+class ConfigError(PumafuseError):
+    """A configuration file or value is wrong."""
+
+
+class RunError(PumafuseError):
+    """A recorded run, or a table of one, cannot be read as written."""
+
+
+class UnknownNameError(PumafuseError):
+    """A name that is not among the accepted ones.
+
+    Attributes:
+        name: The name as given.
+        accepted: The names that would have been accepted.
+    """
+
+    def __init__(self, where: str, kind: str, name: str, accepted: Iterable[str]) -> None:
+        self.name = name
+        self.accepted = tuple(accepted)
+        super().__init__(f"{where}: unknown {kind} '{name}'; {suggestion(name, self.accepted)}")
+
+
+class PumafuseWarning(UserWarning):
+    """Something in the data or the model that a user should know and that does not stop the work."""
+
+
+def suggestion(name: str, accepted: Iterable[str]) -> str:
+    """The accepted names in a sentence, the closest to ``name`` first when one is close."""
+    names = list(accepted)
+    close = difflib.get_close_matches(name, names, n=1)
+    listed = f"accepted: {', '.join(names)}" if names else "nothing is accepted here"
+    return f"did you mean '{close[0]}'? {listed}" if close else listed

@@ -1,0 +1,150 @@
+"""``fusion.toml``: the arm, how far it is trusted, and the sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from .. import toml
+from ..errors import ConfigError, PumafuseError, UnknownNameError
+from ..model.arm import ArmModel
+from ..model.plants import NotNegative, Positive
+
+_ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
+
+
+class Start(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is uncertain before the first command: only the offset, by ``offset_sd`` [m]."""
+
+    offset_sd: NotNegative = msgspec.field(name="offset_sd_mm", default=5e-3)
+
+
+class Process(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How one axis strays from its model; the two parts of each variance add up.
+
+    Attributes:
+        input_noise: Density of the white noise at the plant's input [m/√Hz].
+        drift: Density of the offset's random walk [m/√s].
+        maneuver_noise: More input noise per m/s of change in commanded speed [m/√Hz per m/s].
+        maneuver_drift: More drift per m/s of change in commanded speed [m/√s per m/s].
+    """
+
+    input_noise: NotNegative = msgspec.field(name="input_noise_mm_rtHz", default=0.03e-3)
+    drift: NotNegative = msgspec.field(name="drift_mm_rts", default=0.4e-3)
+    maneuver_noise: NotNegative = msgspec.field(name="maneuver_noise_mm_rtHz_per_m_s", default=0.0)
+    maneuver_drift: NotNegative = msgspec.field(name="maneuver_drift_mm_rts_per_m_s", default=0.0)
+
+
+class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """z = scale · p(stamp − latency) + bias + noise.
+
+    Attributes:
+        sd: Noise [m], one number or one for each axis.
+        latency: From the instant the reading is true of to its stamp [s].
+        latency_sd: How far the latency wanders [s].
+        scale: Of the position in the reading; −1 for a distance to a panel in front.
+        bias_sd: Prior uncertainty of a constant bias [m]; 0: no bias is estimated.
+        gate: A reading beyond this many standard deviations is rejected; 0: never.
+        gate_rows: One axis rejected rejects the row.
+    """
+
+    sd: Positive | Annotated[dict[str, Positive], msgspec.Meta(min_length=1)] = msgspec.field(name="sd_mm")
+    latency: float = msgspec.field(name="latency_ms", default=0.0)
+    latency_sd: NotNegative = msgspec.field(name="latency_sd_ms", default=0.0)
+    scale: float = 1.0
+    bias_sd: NotNegative = msgspec.field(name="bias_sd_mm", default=0.0)
+    gate: NotNegative = 5.0
+    gate_rows: bool = True
+
+    def sd_of(self, axis: str) -> float | None:
+        """The noise [m] on one axis; None where the sensor has none for it and so is not used on it."""
+        return self.sd.get(axis) if isinstance(self.sd, dict) else self.sd
+
+
+class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What ``fusion.toml`` holds, in SI units.
+
+    Attributes:
+        arm: The arm model.
+        start: What is uncertain before the first command.
+        process: How each axis strays from its model; every axis of the arm is there.
+        sensors: By name, in the order that decides between readings valid at the same instant.
+    """
+
+    arm: ArmModel
+    start: Start = Start()
+    process: dict[str, Process] = {}
+    sensors: dict[str, Sensor] = {}
+
+    def __post_init__(self) -> None:
+        _known_axes("process", self.process, self.arm)
+        for name, sensor in self.sensors.items():
+            if isinstance(sensor.sd, dict):
+                _known_axes(f"sensors.{name}.sd_mm", sensor.sd, self.arm)
+            if sensor.scale == 0.0:
+                raise ConfigError(f"sensors.{name}.scale: 0 would make the readings say nothing of the position")
+        complete = {axis: self.process.get(axis, Process()) for axis in self.arm.axes}
+        msgspec.structs.force_setattr(self, "process", complete)
+
+    @staticmethod
+    def load(path: str | Path) -> FusionConfig:
+        """Read ``fusion.toml`` and the arm it names.
+
+        Raises:
+            ConfigError: The file or its arm is not as declared; names file, key and the accepted names.
+        """
+        path = Path(path)
+        tree = toml.read(path)
+        if not isinstance(tree.get("arm"), str):
+            raise ConfigError(f"{path}: 'arm' is missing; give a file beside this one, or a preset, as in arm = 'arm.toml'")
+        arm = _load_arm(tree["arm"], path)
+        tree["arm"] = arm
+        if isinstance(tree.get("process"), dict):
+            tree["process"] = _per_axis(tree["process"], arm, str(path))
+        try:
+            return toml.struct(tree, FusionConfig, str(path))
+        except PumafuseError as error:
+            prefix = "" if str(error).startswith(str(path)) else f"{path}: "
+            raise ConfigError(f"{prefix}{error}") from None
+
+    def save(self, folder: Path) -> None:
+        """Write ``fusion.toml`` and the arm as ``arm.toml`` beside it."""
+        tree = toml.builtins(self)
+        tree["arm"] = _ARM_FILE
+        (folder / "fusion.toml").write_text(toml.text(tree), encoding="utf-8")
+        self.arm.save(folder / _ARM_FILE)
+
+    def sensor_names(self, chosen: Iterable[str] | None) -> tuple[str, ...]:
+        """The sensors to use, in the order of the file; all of them for None.
+
+        Raises:
+            UnknownNameError: A chosen name is not configured.
+        """
+        if chosen is None:
+            return tuple(self.sensors)
+        wanted = set(chosen)
+        for name in sorted(wanted - set(self.sensors)):
+            raise UnknownNameError("sensors", "sensor", name, self.sensors)
+        return tuple(name for name in self.sensors if name in wanted)
+
+
+def _load_arm(name: str, path: Path) -> ArmModel:
+    beside = path.parent / name
+    return ArmModel.load(beside if beside.exists() else name)
+
+
+def _per_axis(table: dict[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
+    """``[process]`` holds for every axis, ``[process.radial]`` overrides it for one."""
+    common = {key: value for key, value in table.items() if not isinstance(value, dict)}
+    own = {key: value for key, value in table.items() if isinstance(value, dict)}
+    _known_axes(f"{where}: process", own, arm)
+    return {axis: toml.struct({**common, **own.get(axis, {})}, Process, where, "process") for axis in arm.axes}
+
+
+def _known_axes(where: str, named: Mapping[str, object], arm: ArmModel) -> None:
+    for axis in named:
+        if axis not in arm.axes:
+            raise UnknownNameError(where, "axis", axis, arm.axes)

@@ -1,0 +1,128 @@
+"""The result of a fusion: estimates in the log's coordinates, what became of each reading, and what was noticed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from ..model.plants import FloatArray
+from .config import FusionConfig
+from .timeline import IntArray, Outcome
+from .track import AxisEstimate
+
+Mode = Literal["filtered", "as-live"]
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Every scalar of every sensor used, in the order of processing; arrays are (m,).
+
+    Attributes:
+        time: The instant the reading is true of [s since the first command], NaN without a stamp.
+        stamp: As logged [s since the first command], NaN without a stamp.
+        sensor: Index into ``sensors``.
+        axis: Index into ``axes``.
+        value: As logged [m].
+        innovation: One step ahead [m], NaN where the filter never met the scalar.
+        innovation_sd: What the filter expected of it [m].
+        outcome: An :class:`Outcome` each.
+        sensors: Sensor names.
+        axes: Axis names.
+    """
+
+    time: FloatArray
+    stamp: FloatArray
+    sensor: IntArray
+    axis: IntArray
+    value: FloatArray
+    innovation: FloatArray
+    innovation_sd: FloatArray
+    outcome: npt.NDArray[np.uint8]
+    sensors: tuple[str, ...]
+    axes: tuple[str, ...]
+
+    ARRAYS = ("time", "stamp", "sensor", "axis", "value", "innovation", "innovation_sd", "outcome")
+
+    @property
+    def nis(self) -> FloatArray:
+        """ν²/S, (m,)."""
+        return (self.innovation / self.innovation_sd) ** 2
+
+    def of(self, sensor: str, axis: str) -> Readings:
+        """The scalars of one sensor on one axis."""
+        return self.where((self.sensor == self.sensors.index(sensor)) & (self.axis == self.axes.index(axis)))
+
+    def where(self, mask: npt.NDArray[np.bool_]) -> Readings:
+        """The scalars that ``mask`` (m,) selects."""
+        return replace(self, **{name: getattr(self, name)[mask] for name in self.ARRAYS})
+
+    @staticmethod
+    def joined(parts: Sequence[Readings]) -> Readings:
+        """The scalars of several segments, one after the other."""
+        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in Readings.ARRAYS}
+        return replace(parts[0], **arrays)
+
+    def counts(self) -> dict[str, int]:
+        """How many scalars had each outcome, those that occur."""
+        found = np.bincount(self.outcome, minlength=len(Outcome))
+        return {outcome.word: int(found[outcome]) for outcome in Outcome if found[outcome]}
+
+
+@dataclass(frozen=True)
+class ReferenceTrack:
+    """The reference in the run's own time.
+
+    Attributes:
+        time: [s since the first command], ascending, (k,).
+        position: For each axis [m], NaN where it has none, (k,).
+        sd: Standard deviation of its own noise [m].
+        segment: As in :class:`Estimates`, (k,).
+    """
+
+    time: FloatArray
+    position: Mapping[str, FloatArray]
+    sd: float
+    segment: IntArray
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What :func:`pumafuse.fuse` returns. Arrays are (n,), one entry for each estimate.
+
+    Attributes:
+        run: The run's name.
+        time: [s since the run's first command].
+        axes: Estimates by axis; ``est["radial"]`` is the short way.
+        readings: What became of every scalar.
+        reference: The run's reference, where it has one.
+        origin: Stamp of the first command, int ns.
+        command: For each axis the commands as used: times [s] and u [m].
+        segment: 0, and one more after each time the log's clock was set back.
+        mode: Which readings an estimate knows: all valid by then (``filtered``), or those that had arrived (``as-live``).
+        engine: Which engine computed it.
+        config: The configuration as used.
+        speed: Highest commanded speed [m/s].
+        notes: Everything noticed, a sentence each.
+    """
+
+    run: str
+    time: FloatArray
+    axes: Mapping[str, AxisEstimate]
+    readings: Readings
+    reference: ReferenceTrack | None
+    origin: int
+    command: Mapping[str, tuple[FloatArray, FloatArray]]
+    segment: IntArray
+    mode: Mode
+    engine: str
+    config: FusionConfig
+    speed: float
+    notes: tuple[str, ...]
+
+    def __getitem__(self, axis: str) -> AxisEstimate:
+        """The estimates of one axis."""
+        return self.axes[axis]

@@ -1,0 +1,291 @@
+"""The total order of events: what acts on the plant when, and which reading is valid when.
+
+Time is int64 ns. At one instant commands come before readings, then sensors in the order of ``fusion.toml``, then stamp,
+position in the file and axis. The axes are independent but for row gates, so each axis meets its scalars in the order
+(time, sensor, stamp, position) whatever the others do.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import RunError, UnknownNameError
+from ..model.arm import ArmModel
+from ..model.drive import Drive, TimeArray, drive
+from ..model.plants import FloatArray
+from ..runs.clock import TOLERATED_STEP_BACK_NS, behind, regular_grid
+from ..runs.run import Run, Source
+from ..runs.tables import NO_STAMP
+from .config import FusionConfig, Sensor
+
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+class Outcome(enum.IntEnum):
+    """What became of a scalar."""
+
+    FUSED = 0
+    GATED = 1
+    REOPENED = 2
+    DUPLICATE = 3
+    BEFORE_START = 4
+    TOO_LATE = 5
+    INVALID = 6
+    UNKNOWN = 7
+
+    @property
+    def word(self) -> str:
+        """As files and screens have it."""
+        return self.name.lower()
+
+
+@dataclass(frozen=True)
+class AxisInput:
+    """What drives one axis.
+
+    Attributes:
+        name: The axis.
+        start: The level u₀ [m] that everything inside the filter is relative to.
+        given: When each command was given, int64 ns, (n,).
+        command: u [m] in the log's coordinates, (n,).
+        drive: The plant's input, by the time it is issued.
+        delay: Td, int ns.
+    """
+
+    name: str
+    start: float
+    given: TimeArray
+    command: FloatArray
+    drive: Drive
+    delay: int
+
+    @property
+    def acting(self) -> TimeArray:
+        """When each entry of the drive reaches the plant, int64 ns."""
+        return self.drive.time + self.delay
+
+
+@dataclass(frozen=True)
+class Scalars:
+    """The scalars of all readings in the order of processing; arrays are (m,).
+
+    Attributes:
+        valid: The instant each is true of, int64 ns (``NO_STAMP`` without a stamp).
+        stamp: As logged, int64 ns.
+        sensor: Index into ``sensors``.
+        axis: Index into the timeline's axes.
+        value: z [m] as logged.
+        row: Scalars of one row of one sensor share this number; it never falls.
+        outcome: What is known before filtering; ``Outcome.FUSED`` where the filter is to decide.
+        sensors: Sensor names, the configured ones first in their order.
+    """
+
+    valid: TimeArray
+    stamp: TimeArray
+    sensor: IntArray
+    axis: IntArray
+    value: FloatArray
+    row: IntArray
+    outcome: npt.NDArray[np.uint8]
+    sensors: tuple[str, ...]
+
+    @property
+    def candidates(self) -> IntArray:
+        """Indices of the scalars that the filter is to decide on."""
+        return np.flatnonzero(self.outcome == Outcome.FUSED)
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """One segment of a run, ready to be filtered.
+
+    Attributes:
+        origin: The first command, int ns: time 0 of the run.
+        commands: Stamps of the commands, ascending, int64 ns, (n,).
+        axes: What drives each axis.
+        scalars: The readings.
+        end: The last event that a filter meets, int ns.
+        speed: Highest commanded speed on any axis [m/s].
+        notes: Every anomaly once: how many, where first.
+    """
+
+    origin: int
+    commands: TimeArray
+    axes: tuple[AxisInput, ...]
+    scalars: Scalars
+    end: int
+    speed: float
+    notes: tuple[str, ...]
+
+
+def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) -> Timeline:
+    """Put a run's commands and readings into their total order.
+
+    Args:
+        run: One segment of a recorded run.
+        config: Arm and sensors.
+        sensors: Which of the configured sensors to use; all for None.
+
+    Raises:
+        PumafuseError: The run commands an axis that the arm has not, or a chosen sensor is not configured.
+    """
+    arm, notes = config.arm, list(run.notes)
+    for axis in run.axes:
+        if axis not in arm.axes:
+            raise UnknownNameError(f"{run.command.label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes)
+    stamp, command = _commands(run, arm.update_period, notes)
+    inputs: list[AxisInput] = []
+    for name in run.axes:
+        used = _actual_commands(stamp, command.values[name], arm.update_period)
+        given, values = stamp[used], command.values[name][used]
+        start = run.start.get(name, float(values[0]))
+        driven = drive(arm.axes[name], given, values, start, arm.update_period)
+        inputs.append(AxisInput(name, start, given, values, driven, round(arm.delay_of(name) * 1e9)))
+    commands = np.unique(np.concatenate([axis.given for axis in inputs]))
+    origin = int(commands[0])
+
+    named = tuple(name for name in config.sensor_names(sensors) if name in run.sensors)
+    others = tuple(name for name in run.sensors if name not in config.sensors) if sensors is None else ()
+    for name in config.sensor_names(sensors):
+        if name not in run.sensors:
+            notes.append(f"sensor '{name}' of the configuration has no readings in run '{run.name}'")
+    scalars = _scalars(run, config, named + others, origin, notes)
+    last = scalars.valid[scalars.candidates].max(initial=origin)
+    end = max(int(last), int(commands[-1]))
+    speed = max(axis.drive.speed for axis in inputs)
+    return Timeline(origin, commands, tuple(inputs), scalars, end, speed, tuple(notes))
+
+
+def output_times(timeline: Timeline, rate: float | None) -> TimeArray:
+    """When estimates are asked for: at each command, or on an even grid of ``rate`` [Hz] from the first command on."""
+    if rate is None:
+        return timeline.commands
+    count = int((timeline.end - timeline.origin) * 1e-9 * rate) + 1
+    return timeline.origin + np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
+
+
+def _commands(run: Run, period: float, notes: list[str]) -> tuple[TimeArray, Source]:
+    """The command rows that can be used, in order, with the times that they are taken to act from."""
+    source = run.command
+    missing = source.stamp == NO_STAMP
+    _tell(notes, source.label, missing, "no stamp: not used")
+    _tell(notes, source.label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
+    kept = source.where(~missing)
+    order = np.argsort(kept.stamp, kind="stable")
+    stamp = kept.stamp[order]
+    values = {axis: value[order] for axis, value in kept.values.items()}
+    _tell(notes, source.label, _said_before(source) & ~missing, "the stamp and values of an earlier row: duplicate")
+    for axis, value in values.items():
+        _tell(notes, source.label, ~np.isfinite(source.values[axis]) & ~missing, f"no finite {axis} command: not used")
+        value[~np.isfinite(value)] = np.nan
+    command = Source(stamp, values, source.label)
+    if run.clock == "regular":
+        distinct, place = np.unique(stamp, return_inverse=True)
+        grid, note = regular_grid(distinct, period, source.label)
+        stamp = grid[place]
+        notes.extend([] if note is None else [note])
+    return stamp, command
+
+
+def _actual_commands(stamp: TimeArray, value: FloatArray, period: float) -> IntArray:
+    """Indices of the rows that command one axis: with a value, the last of its stamp, and no repetition.
+
+    A repetition is the value of the row before it, said again within half a period: a log that fills its command
+    column down to the sensor's rate has one command where the value changes.
+    """
+    given = np.flatnonzero(np.isfinite(value))
+    given = given[np.concatenate((np.diff(stamp[given]) > 0, [True]))]
+    again = (np.diff(value[given]) == 0.0) & (np.diff(stamp[given]) < 0.5e9 * period)
+    return given[np.concatenate(([True], ~again))]
+
+
+def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int, notes: list[str]) -> Scalars:
+    columns: list[tuple[npt.NDArray[np.generic], ...]] = []
+    for index, name in enumerate(names):
+        source, sensor = run.sensors[name], config.sensors.get(name)
+        latency = 0 if sensor is None else round(sensor.latency * 1e9)
+        valid = np.where(source.stamp == NO_STAMP, NO_STAMP, source.stamp - latency)
+        rows = np.arange(len(valid))
+        outcomes = _row_outcomes(source, sensor, valid, origin)
+        told = set[Outcome]()
+        for number, axis in enumerate(run.axes):
+            if axis not in source.values:
+                continue
+            value, outcome = source.values[axis], outcomes.copy()
+            if sensor is not None and sensor.sd_of(axis) is None:
+                outcome[:] = Outcome.UNKNOWN
+            outcome[(outcome == Outcome.FUSED) & ~np.isfinite(value)] = Outcome.INVALID
+            columns.append((valid, source.stamp, np.full_like(rows, index), np.full_like(rows, number), value, rows, outcome))
+            _tell_outcomes(notes, f"{name} ({source.label})", axis, outcome, told)
+        _tell(notes, f"{name} ({source.label})", behind(source.stamp) > 0, "a stamp that steps back: sorted")
+    if not columns:
+        columns = [tuple(np.zeros(0, dtype) for dtype in ("i8", "i8", "i8", "i8", "f8", "i8", "u1"))]
+    valid, stamp, sensor_index, axis_index, value, rows, outcome = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+    order = np.lexsort((axis_index, rows, stamp, sensor_index, valid))
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = (np.diff(sensor_index[order]) != 0) | (np.diff(rows[order]) != 0)
+    return Scalars(
+        valid[order],
+        stamp[order],
+        sensor_index[order],
+        axis_index[order],
+        value[order],
+        np.cumsum(first) - 1,
+        outcome[order].astype(np.uint8),
+        names,
+    )
+
+
+def _row_outcomes(source: Source, sensor: Sensor | None, valid: TimeArray, origin: int) -> npt.NDArray[np.uint8]:
+    """What is known of each row whatever its axes say, the strongest reason last."""
+    outcome = np.full(len(valid), Outcome.FUSED, dtype=np.uint8)
+    outcome[valid < origin] = Outcome.BEFORE_START
+    outcome[behind(source.stamp) > TOLERATED_STEP_BACK_NS] = Outcome.TOO_LATE
+    outcome[_said_before(source)] = Outcome.DUPLICATE
+    outcome[source.stamp == NO_STAMP] = Outcome.INVALID
+    if sensor is None:
+        outcome[:] = Outcome.UNKNOWN
+    return outcome
+
+
+def _said_before(source: Source) -> BoolArray:
+    """Rows whose stamp and values all stood in an earlier row, (rows,)."""
+    keys = [source.stamp, *(np.ascontiguousarray(value).view(np.int64) for value in source.values.values())]
+    order = np.lexsort(keys)
+    again = np.all([np.diff(key[order]) == 0 for key in keys], axis=0)
+    found = np.zeros(len(order), dtype=bool)
+    found[order[1:][again]] = True
+    return found
+
+
+_REASONS: Mapping[Outcome, str] = {
+    Outcome.INVALID: "no stamp or no finite value: invalid",
+    Outcome.DUPLICATE: "the stamp and values of an earlier row: duplicate",
+    Outcome.BEFORE_START: "a time before the first command: before_start",
+    Outcome.TOO_LATE: "a stamp more than 1 s behind an earlier one: too_late",
+    Outcome.UNKNOWN: "no sensor in the configuration: unknown",
+}
+
+
+def _tell_outcomes(
+    notes: list[str], label: str, axis: str, outcome: npt.NDArray[np.uint8], told: set[Outcome]
+) -> None:
+    """Each reason once per sensor, for the first axis that meets it."""
+    for kind, reason in _REASONS.items():
+        if kind not in told and _tell(notes, label, outcome == kind, f"{reason} ({axis})" if kind is Outcome.INVALID else reason):
+            told.add(kind)
+
+
+def _tell(notes: list[str], label: str, rows: BoolArray, what: str) -> bool:
+    """Note how many rows have ``what``, and where the first is; True if any has."""
+    found = np.flatnonzero(rows)
+    if len(found):
+        plural = "row has" if len(found) == 1 else "rows have"
+        notes.append(f"{label}: {len(found)} {plural} {what} (first: row {found[0] + 1})")
+    return len(found) > 0

@@ -1,0 +1,174 @@
+"""The arm model: a plant, a gain and a delay for each axis, and ``arm.toml``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from .. import toml
+from ..errors import ConfigError, UnknownNameError
+from .plants import PLANTS, FloatArray, Interval, NotNegative, Positive
+
+CANONICAL_AXES = ("tangential", "radial", "vertical")
+
+
+class Gain(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Steady-state gain K = slope · speed + intercept, equation 11.
+
+    Attributes:
+        slope: a [s/m] (the paper's Table II prints m/s; K has no unit, so it is s/m).
+        intercept: b, the gain of an infinitely slow step.
+        slope_ci95: 95 % interval of a [s/m], where it was identified.
+        intercept_ci95: 95 % interval of b.
+    """
+
+    slope: float = msgspec.field(name="slope_s_m", default=0.0)
+    intercept: float = 1.0
+    slope_ci95: Interval | None = msgspec.field(name="slope_s_m_ci95", default=None)
+    intercept_ci95: Interval | None = None
+
+    def at(self, speed: FloatArray) -> FloatArray:
+        """K at ``speed`` [m/s]; the shape of ``speed``."""
+        return self.slope * speed + self.intercept
+
+
+class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How one axis answers to its commands.
+
+    Attributes:
+        plant: The plant, of unit gain.
+        gain: The gain against speed that acts on the command before it.
+        gain_recovery: Time constant [s] with which the arm's integral action takes the gain's error back; None: never.
+        delay: Dead time [s] of this axis where it differs from the arm's.
+    """
+
+    plant: PLANTS
+    gain: Gain = Gain()
+    gain_recovery: Positive | None = msgspec.field(name="gain_recovery_ms", default=None)
+    delay: NotNegative | None = msgspec.field(name="delay_ms", default=None)
+    delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
+
+
+class Validity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where the model was found to hold; beyond it pumafuse warns and goes on.
+
+    Attributes:
+        max_speed: Commanded speed [m/s].
+        max_radius: Distance from the base's vertical axis [m].
+    """
+
+    max_speed: Positive | None = msgspec.field(name="max_speed_m_s", default=None)
+    max_radius: Positive | None = msgspec.field(name="max_radius_mm", default=None)
+
+    def excess(self, speed: float, radius: float | None) -> list[str]:
+        """One sentence for each limit that the highest commanded ``speed`` [m/s] or ``radius`` [m] passes."""
+        found: list[str] = []
+        if self.max_speed is not None and speed > self.max_speed:
+            found.append(
+                f"commanded speed reaches {speed:.3g} m/s, {speed / self.max_speed:.2f} times the {self.max_speed:g} m/s"
+                " that the arm model is valid for"
+            )
+        if self.max_radius is not None and radius is not None and radius > self.max_radius:
+            beyond = (radius - self.max_radius) * 1e3
+            found.append(
+                f"commands reach {radius * 1e3:.1f} mm from the base axis, {beyond:.1f} mm beyond the"
+                f" {self.max_radius * 1e3:g} mm that the arm model is valid for"
+            )
+        return found
+
+
+class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A combined model: what ``arm.toml`` holds, in SI units.
+
+    Attributes:
+        name: For people.
+        update_period: T [s], the time between commands.
+        delay: Td [s], from the command to the plant's input.
+        axes: One model for each axis.
+        validity: Limits beyond which the model was not tried.
+        provenance: Where the numbers come from; kept as it is.
+    """
+
+    name: str
+    update_period: Positive = msgspec.field(name="update_period_ms")
+    delay: NotNegative = msgspec.field(name="delay_ms")
+    delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
+    validity: Validity = Validity()
+    axes: Annotated[dict[str, AxisModel], msgspec.Meta(min_length=1)]
+    provenance: dict[str, Any] = {}
+
+    @staticmethod
+    def load(source: str | Path) -> ArmModel:
+        """Read ``arm.toml``, or take a preset by its name.
+
+        Raises:
+            ConfigError: No such file or preset, or its content is not an arm; names the key and the accepted ones.
+        """
+        from .presets import PRESETS
+
+        if str(source) in PRESETS:
+            return PRESETS[str(source)]
+        path = Path(source)
+        if not path.exists():
+            raise ConfigError(f"{source}: no such arm file, and not a preset ({', '.join(PRESETS)})")
+        tree = toml.read(path)
+        axes = tree.get("axes")
+        if isinstance(axes, dict):
+            tree["axes"] = {name: _axis(table, f"{path}", f"axes.{name}") for name, table in axes.items()}  # pyright: ignore
+        return toml.struct(tree, ArmModel, str(path))
+
+    def save(self, path: str | Path) -> None:
+        """Write ``arm.toml``; reading it back gives the same model, to the last bit."""
+        Path(path).write_text(self.to_toml(), encoding="utf-8")
+
+    def to_toml(self) -> str:
+        """The text of ``arm.toml``."""
+        tree = toml.builtins(self)
+        tree["axes"] = {name: {**axis.pop("plant"), **axis} for name, axis in tree["axes"].items()}
+        return toml.text({key: value for key, value in tree.items() if value != {}})
+
+    def axis(self, name: str) -> AxisModel:
+        """The model of one axis.
+
+        Raises:
+            UnknownNameError: The arm has no axis of this name.
+        """
+        if name not in self.axes:
+            raise UnknownNameError(self.name, "axis", name, self.axes)
+        return self.axes[name]
+
+    def delay_of(self, axis: str) -> float:
+        """Td [s] of one axis: its own, or the arm's."""
+        own = self.axis(axis).delay
+        return self.delay if own is None else own
+
+
+def ordered_axes(names: set[str]) -> tuple[str, ...]:
+    """Axis names in the order tangential, radial, vertical, then any others by name."""
+    return tuple(sorted(names, key=lambda name: (_rank(name), name)))
+
+
+def commanded_speed(step: FloatArray, period: float) -> FloatArray:
+    """Speed [m/s] of each command: its step [m] over the update period [s] (the paper's "speed" of a step)."""
+    return np.abs(step) / period
+
+
+def _rank(name: str) -> int:
+    return CANONICAL_AXES.index(name) if name in CANONICAL_AXES else len(CANONICAL_AXES)
+
+
+def _axis(table: Any, where: str, path: str) -> AxisModel:
+    """An axis table: the plant's keys stand beside the axis's own in the file, apart from them in Python."""
+    if not isinstance(table, dict):
+        raise ConfigError(f"{where}: {path}: expected a table")
+    keys: dict[str, Any] = dict(table)  # pyright: ignore[reportUnknownArgumentType]
+    plants = {kind.__struct_config__.tag: kind for kind in PLANTS.__args__}
+    kind = plants.get(keys.pop("plant", None))
+    if kind is None:
+        raise UnknownNameError(f"{where}: {path}.plant", "plant", str(table.get("plant", "")), map(str, plants))  # pyright: ignore
+    own = {field.encode_name for field in msgspec.structs.fields(AxisModel)}
+    parameters = {key: keys.pop(key) for key in list(keys) if key not in own}
+    return toml.struct({**keys, "plant": toml.struct(parameters, kind, where, path)}, AxisModel, where, path)

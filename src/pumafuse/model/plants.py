@@ -1,0 +1,107 @@
+"""Plants: what the arm does to a command once gain and delay have had their say. All have unit gain.
+
+Equations 3 to 9 of "A Practical Dynamic Model of a Puma 560 Manipulator for Aircraft Maintenance", without the gain K.
+A new plant is a class here with a tag, :meth:`Plant.state_space` and :meth:`Plant.step_response`, added to ``PLANTS``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated, TypeAlias
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    import control
+
+FloatArray: TypeAlias = npt.NDArray[np.float64]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+Interval = tuple[float, float]
+
+
+class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid_unknown_fields=True):
+    """Base of the plants: ẋ = A x + B v, p = C x, with v and p in metres."""
+
+    def state_space(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A (n, n) [1/s], B (n, 1) and C (1, n); x in equilibrium under v = 0 is 0."""
+        raise NotImplementedError
+
+    def step_response(self, time: npt.ArrayLike) -> FloatArray:
+        """p [m] at ``time`` [s] after v stepped from 0 to 1 m; 0 before the step; the shape of ``time``."""
+        raise NotImplementedError
+
+    def transfer_function(self) -> control.TransferFunction:
+        """The plant as a `control` transfer function from v to p, without gain and delay."""
+        import control
+
+        return control.ss2tf(control.ss(*self.state_space(), 0.0))
+
+
+class FirstOrder(Plant, frozen=True, kw_only=True, tag="first-order", forbid_unknown_fields=True):
+    """H(s) = 1 / (τs + 1), equation 3.
+
+    Attributes:
+        time_constant: τ [s].
+        time_constant_ci95: Its 95 % interval [s], where it was identified.
+    """
+
+    time_constant: Positive = msgspec.field(name="time_constant_ms")
+    time_constant_ci95: Interval | None = msgspec.field(name="time_constant_ms_ci95", default=None)
+
+    def state_space(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """One state, the position [m]."""
+        rate = 1.0 / self.time_constant
+        return np.array([[-rate]]), np.array([[rate]]), np.array([[1.0]])
+
+    def step_response(self, time: npt.ArrayLike) -> FloatArray:
+        """Equation 4: 1 − e^(−t/τ)."""
+        t = np.maximum(np.asarray(time, dtype=np.float64), 0.0)
+        return -np.expm1(-t / self.time_constant)
+
+
+class SecondOrder(Plant, frozen=True, kw_only=True, tag="second-order", forbid_unknown_fields=True):
+    """H(s) = ω² / (s² + 2ζωs + ω²), equation 5.
+
+    Attributes:
+        natural_frequency: ω [rad/s].
+        damping: ζ; below 1 under-damped, above 1 over-damped.
+        natural_frequency_ci95: 95 % interval of ω [rad/s], where it was identified.
+        damping_ci95: 95 % interval of ζ.
+    """
+
+    natural_frequency: Positive = msgspec.field(name="natural_frequency_rad_s")
+    damping: Positive
+    natural_frequency_ci95: Interval | None = msgspec.field(name="natural_frequency_rad_s_ci95", default=None)
+    damping_ci95: Interval | None = None
+
+    def state_space(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Two states, the position [m] and its rate [m/s]."""
+        square = self.natural_frequency**2
+        A = np.array([[0.0, 1.0], [-square, -2.0 * self.damping * self.natural_frequency]])
+        return A, np.array([[0.0], [square]]), np.array([[1.0, 0.0]])
+
+    def step_response(self, time: npt.ArrayLike) -> FloatArray:
+        """Equations 6 and 9 and the ζ = 1 between them as one formula that joins them without cancellation.
+
+        With β² = ω²(ζ² − 1), c(t) = 1 − e^(−ζωt) [cosh βt + ζωt · sinh(βt)/(βt)]; for β² < 0 the hyperbolic functions
+        become circular ones, and at β = 0 both are 1 − e^(−ωt)(1 + ωt). Equations 6 and 9 divide by √|ζ² − 1| and
+        lose all digits near ζ = 1.
+        """
+        t = np.maximum(np.asarray(time, dtype=np.float64), 0.0)
+        decay = self.damping * self.natural_frequency
+        beta = self.natural_frequency * math.sqrt(abs((self.damping - 1.0) * (self.damping + 1.0)))
+        if self.damping < 1.0:
+            envelope = np.exp(-decay * t)
+            return 1.0 - envelope * (np.cos(beta * t) + decay * t * np.sinc(beta * t / np.pi))
+        # e^(−ζωt) cosh βt would overflow: the slow pole s2 (equation 8, as ω²/s1) is taken out of both terms.
+        slow = self.natural_frequency**2 / (decay + beta)
+        double = 2.0 * beta * t
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sinhc = np.where(double > 0.0, -np.expm1(-double) / double, 1.0)
+        return 1.0 - np.exp(-slow * t) * (0.5 * (1.0 + np.exp(-double)) + decay * t * sinhc)
+
+
+PLANTS: TypeAlias = FirstOrder | SecondOrder

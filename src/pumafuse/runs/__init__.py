@@ -1,0 +1,1 @@
+"""Recorded runs: what was commanded and what the sensors said, as it stands in the log."""

@@ -1,0 +1,90 @@
+"""``run.toml``: which file and which columns are the commands, the sensors and the reference of a recorded run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from .. import toml
+from ..errors import ConfigError
+from ..model.plants import NotNegative
+
+Columns = str | list[str]
+
+
+class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
+    """One table of a run: ``file``, ``time``, and the column (or columns to add up) of each axis."""
+
+    file: str
+    time: str
+    axes: dict[str, Columns]
+
+
+class CommandEntry(SourceEntry, frozen=True, kw_only=True):
+    """The commands: which also say where the arm rests before the first one, and whose clock stamped them."""
+
+    start: dict[str, float] = {}
+    clock: Literal["stamps", "regular"] = "stamps"
+
+
+class ReferenceEntry(SourceEntry, frozen=True, kw_only=True):
+    """A truth for scoring, with the standard deviation [m] of its own noise."""
+
+    sd: NotNegative = msgspec.field(name="sd_mm", default=0.0)
+
+
+class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What ``run.toml`` holds, in SI units."""
+
+    command: CommandEntry
+    name: str = ""
+    sensors: dict[str, SourceEntry] = {}
+    reference: ReferenceEntry | None = None
+
+
+def load(path: Path) -> Manifest:
+    """Read ``run.toml``.
+
+    Raises:
+        ConfigError: The file is no manifest; names the key and the accepted ones.
+    """
+    tree, where = toml.read(path), str(path)
+    parts = {
+        "command": _source(tree.get("command"), CommandEntry, where, "command"),
+        "sensors": {
+            name: _source(table, SourceEntry, where, f"sensors.{name}") for name, table in tree.get("sensors", {}).items()
+        },
+        "reference": _source(tree.get("reference"), ReferenceEntry, where, "reference"),
+    }
+    return toml.struct({**tree, **{key: part for key, part in parts.items() if part is not None}}, Manifest, where)
+
+
+def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> SourceEntry | None:
+    """A source's table: every key that is not the source's own is an axis."""
+    if table is None:
+        return None
+    if not isinstance(table, dict):
+        raise ConfigError(f"{where}: {path}: expected a table")
+    keys: dict[str, Any] = dict(table)  # pyright: ignore[reportUnknownArgumentType]
+    if isinstance(keys.get("start"), dict):
+        keys["start"] = {_axis_of(key, where): value for key, value in keys["start"].items()}
+    own = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes"}
+    axes = {key: keys.pop(key) for key in list(keys) if key not in own}
+    for axis, columns in axes.items():
+        if not isinstance(columns, str) and not (isinstance(columns, list) and columns):
+            raise ConfigError(f"{where}: {path}.{axis}: expected a column name or a list of them, as in {axis} = 'x_mm'")
+    if not axes:
+        raise ConfigError(f"{where}: [{path}] names no column for any axis, as in radial = 'y_mm'")
+    return toml.struct({**keys, "axes": axes}, kind, where, path)
+
+
+def _axis_of(key: str, where: str) -> str:
+    """``radial_mm`` → ``radial``; the number itself is already in metres."""
+    from ..units import LENGTHS, ending
+
+    unit = ending(key)
+    if unit not in LENGTHS:
+        raise ConfigError(f"{where}: command.start.{key} has no unit in its name, as in {key}_mm")
+    return key.removesuffix(unit)

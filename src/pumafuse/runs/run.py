@@ -1,0 +1,229 @@
+"""A recorded run: commands, readings and a reference as the log has them, in SI units and file order.
+
+Nothing is mended here: stamps that repeat, step back or are missing and values that are not finite stay where they are;
+the timeline gives each of them its outcome.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import RunError, UnknownNameError
+from ..model.arm import ordered_axes
+from ..model.drive import TimeArray
+from ..model.plants import FloatArray
+from . import manifest, tables
+from .tables import NO_STAMP
+
+Clock = Literal["stamps", "regular"]
+
+
+@dataclass(frozen=True)
+class Source:
+    """One stream of rows, in the order of the file.
+
+    Attributes:
+        stamp: When the logger stamped each row, int64 ns, ``NO_STAMP`` where it did not, (rows,).
+        values: For each axis the value [m], NaN where the row has none, (rows,).
+        label: What a person calls it: the file, or the column group of a single table.
+    """
+
+    stamp: TimeArray
+    values: Mapping[str, FloatArray]
+    label: str
+
+    def where(self, mask: npt.NDArray[np.bool_]) -> Source:
+        """The rows that ``mask`` (rows,) selects."""
+        return Source(self.stamp[mask], {axis: value[mask] for axis, value in self.values.items()}, self.label)
+
+
+@dataclass(frozen=True)
+class Reference(Source):
+    """A truth for scoring, never seen by a filter; ``sd`` [m] is the standard deviation of its own noise."""
+
+    sd: float = 0.0
+
+
+@dataclass(frozen=True)
+class Run:
+    """A recorded run.
+
+    Attributes:
+        name: For people and for result folders.
+        command: The commands u.
+        sensors: The readings by sensor.
+        reference: A truth, where there is one.
+        start: The level u₀ [m] of axes that do not rest at their first command before it.
+        clock: Whether the commands' stamps are believed (``stamps``) or fitted by a grid of T (``regular``).
+        notes: What was wrong with the files, a sentence each.
+    """
+
+    name: str
+    command: Source
+    sensors: Mapping[str, Source]
+    reference: Reference | None = None
+    start: Mapping[str, float] = field(default_factory=dict[str, float])
+    clock: Clock = "stamps"
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        sources = {f"sensor {name}": source for name, source in self.sensors.items()}
+        if self.reference is not None:
+            sources["the reference"] = self.reference
+        for name, source in sources.items():
+            _known_axes(f"run '{self.name}', {name}", source.values, self.axes)
+        _known_axes(f"run '{self.name}', start", self.start, self.axes)
+        stamped = self.command.stamp != NO_STAMP
+        for axis, command in self.command.values.items():
+            if not (np.isfinite(command) & stamped).any():
+                raise RunError(f"{self.command.label}: no command for axis '{axis}' has both a stamp and a value")
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The commanded axes, in the order tangential, radial, vertical, then others by name."""
+        return ordered_axes(set(self.command.values))
+
+    @staticmethod
+    def read(path: str | Path) -> Run:
+        """Read a folder with ``run.toml``, a ``run.toml`` itself, or one table with every source in its columns.
+
+        Raises:
+            PumafuseError: Nothing there, or not a recorded run; says what, where, and what is accepted.
+        """
+        path = Path(path)
+        if path.is_dir():
+            path = path / "run.toml"
+            if not path.exists():
+                raise RunError(f"{path.parent}: a folder without run.toml; write one, or give a single table")
+        if path.suffix == ".toml":
+            return _read_manifest(path)
+        return _read_single(path)
+
+    @staticmethod
+    def from_arrays(
+        time: npt.ArrayLike,
+        command: Mapping[str, npt.ArrayLike],
+        sensors: Mapping[str, tuple[npt.ArrayLike, Mapping[str, npt.ArrayLike]]] | None = None,
+        reference: tuple[npt.ArrayLike, Mapping[str, npt.ArrayLike]] | None = None,
+        *,
+        reference_sd: float = 0.0,
+        start: Mapping[str, float] | None = None,
+        clock: Clock = "stamps",
+        name: str = "run",
+    ) -> Run:
+        """A run from arrays in memory; they are copied.
+
+        Args:
+            time: Stamps of the commands, float seconds or int64 ns, (n,).
+            command: u [m] for each axis, (n,).
+            sensors: For each sensor its stamps (m,) and its values [m] for each axis, (m,).
+            reference: Stamps (k,) and true positions [m] for each axis, (k,).
+            reference_sd: Standard deviation of the reference's own noise [m].
+            start: Level [m] of each axis before its first command, where it is another.
+            clock: ``stamps`` or ``regular``.
+            name: For people.
+
+        Raises:
+            RunError: Lengths differ, or there is no command.
+        """
+        streams = {sensor: _from_arrays(sensor, *arrays) for sensor, arrays in (sensors or {}).items()}
+        truth = None
+        if reference is not None:
+            source = _from_arrays("reference", *reference)
+            truth = Reference(source.stamp, source.values, source.label, reference_sd)
+        return Run(name, _from_arrays("command", time, command), streams, truth, dict(start or {}), clock)
+
+
+def _known_axes(where: str, named: Mapping[str, object], axes: tuple[str, ...]) -> None:
+    for axis in named:
+        if axis not in axes:
+            raise UnknownNameError(where, "axis", axis, axes)
+
+
+def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.ArrayLike]) -> Source:
+    stamp = np.array(time)
+    if not np.issubdtype(stamp.dtype, np.integer):
+        seconds = stamp.astype(np.float64)
+        finite = np.isfinite(seconds)
+        stamp = np.full(seconds.shape, NO_STAMP)
+        stamp[finite] = np.rint(seconds[finite] * 1e9)
+    columns = {axis: np.array(value, dtype=np.float64) for axis, value in values.items()}
+    for axis, column in columns.items():
+        if stamp.ndim != 1 or column.shape != stamp.shape:
+            raise RunError(f"{label}: {axis} has shape {column.shape}, its stamps {stamp.shape}; one value a stamp is needed")
+    if not columns or not len(stamp):
+        raise RunError(f"{label}: no values")
+    return Source(stamp.astype(np.int64), columns, label)
+
+
+def _read_manifest(path: Path) -> Run:
+    listed = manifest.load(path)
+    notes: list[str] = []
+    loaded: dict[str, tables.Table] = {}
+
+    def source(entry: manifest.SourceEntry) -> Source:
+        if entry.file not in loaded:
+            loaded[entry.file] = tables.read(path.parent / entry.file)
+            notes.extend(loaded[entry.file].notes)
+        table = loaded[entry.file]
+        stamp, note = table.stamps(entry.time)
+        told = [note]
+        values: dict[str, FloatArray] = {}
+        for axis, columns in entry.axes.items():
+            parts = [table.numbers(column) for column in ([columns] if isinstance(columns, str) else columns)]
+            values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
+            told.extend(note for _, note in parts)
+        notes.extend(note for note in told if note is not None and note not in notes)
+        return Source(stamp, values, entry.file)
+
+    command = source(listed.command)
+    sensors = {name: source(entry) for name, entry in listed.sensors.items()}
+    reference = None
+    if listed.reference is not None:
+        truth = source(listed.reference)
+        reference = Reference(truth.stamp, truth.values, truth.label, listed.reference.sd)
+    name = listed.name or path.parent.resolve().name
+    return Run(name, command, sensors, reference, listed.command.start, listed.command.clock, tuple(notes))
+
+
+def _read_single(path: Path) -> Run:
+    """One table: ``time_s``, ``command.<axis>_mm``, ``<sensor>.<axis>_mm``, ``reference.<axis>_mm``."""
+    table = tables.read(path)
+    clocks = [name for name in table.columns if name.startswith("time_")]
+    if len(clocks) != 1:
+        raise RunError(f"{path}: a single table needs one time column, 'time_s'; it has: {', '.join(table.columns)}")
+    stamp, note = table.stamps(clocks[0])
+    notes = [*table.notes, *([note] if note else [])]
+    groups: dict[str, dict[str, FloatArray]] = {}
+    left: list[str] = []
+    for column in table.columns:
+        source, dot, rest = column.partition(".")
+        if not dot:
+            left.extend([column] if column != clocks[0] else [])
+            continue
+        values, note = table.numbers(column)
+        axis = rest[: rest.rindex("_")]
+        groups.setdefault(source, {})[axis] = values
+        notes.extend([note] if note else [])
+    if left:
+        notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
+    if "command" not in groups:
+        raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {', '.join(table.columns)}")
+
+    def source_of(name: str) -> Source:
+        present = ~np.all([np.isnan(value) for value in groups[name].values()], axis=0)
+        return Source(stamp, groups[name], name).where(present)
+
+    sensors = {name: source_of(name) for name in groups if name not in ("command", "reference")}
+    reference = None
+    if "reference" in groups:
+        truth = source_of("reference")
+        reference = Reference(truth.stamp, truth.values, truth.label)
+    name = path.name.split(".")[0]
+    return Run(name, source_of("command"), sensors, reference, notes=tuple(notes))

@@ -1,0 +1,102 @@
+"""TOML files as declared structs: the struct's fields are the schema, the units are in the names.
+
+A msgspec struct declares a file once: its field types are what is checked, its encoded names are the accepted keys.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from decimal import Decimal
+from pathlib import Path
+from typing import Any, TypeVar, get_origin
+
+import msgspec
+import tomli_w
+
+from .errors import ConfigError, suggestion
+from .units import from_si, to_si
+
+S = TypeVar("S", bound=msgspec.Struct)
+
+
+def read(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file with every number in SI.
+
+    Raises:
+        ConfigError: The file is absent, is not text, or is not TOML.
+    """
+    try:
+        return to_si(tomllib.loads(path.read_text(encoding="utf-8"), parse_float=Decimal))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: not a text file in UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def struct(tree: Any, kind: type[S], where: str, path: str = "") -> S:
+    """``tree`` (SI numbers) as a struct of ``kind``.
+
+    Args:
+        tree: What :func:`read` returned, or a table of it.
+        kind: The struct that declares the accepted keys.
+        where: The file, for the error's text.
+        path: The table's place in the file, such as ``axes.radial``.
+
+    Raises:
+        ConfigError: An unknown key, a missing one, a wrong type or a value out of range; names file, key and the
+            accepted names.
+    """
+    try:
+        return msgspec.convert(tree, kind)
+    except msgspec.ValidationError as error:
+        problem = next(_problems(tree, kind, path), f"{path}: {error}" if path else str(error))
+        raise ConfigError(f"{where}: {problem}") from None
+
+
+def text(tree: Mapping[str, Any]) -> str:
+    """SI tables as the text of a TOML file, in the units that the names tell."""
+    return tomli_w.dumps(from_si(tree))
+
+
+def builtins(value: msgspec.Struct) -> dict[str, Any]:
+    """A struct as plain tables with the file's key names; None is left out, as TOML has none."""
+    return _without_none(msgspec.to_builtins(value))
+
+
+def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: _without_none(value) if isinstance(value, dict) else value  # pyright: ignore[reportUnknownArgumentType]
+        for key, value in tree.items()
+        if value is not None
+    }
+
+
+def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
+    """What is wrong in ``tree``, deepest place first, each with its key."""
+    prefix = f"{path}." if path else ""
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and isinstance(tree, Mapping):
+        fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
+        tag = kind.__struct_config__.tag_field
+        for key, value in tree.items():  # pyright: ignore[reportUnknownVariableType]
+            if key in fields:
+                yield from _problems(value, fields[key].type, f"{prefix}{key}")
+            elif key != tag:
+                yield f"unknown key '{prefix}{key}'; {suggestion(str(key), fields)}"  # pyright: ignore
+        for key, field in fields.items():
+            if field.required and key not in tree:
+                yield f"'{prefix}{key}' is missing"
+    elif get_origin(kind) is dict and isinstance(tree, Mapping):
+        for key, value in tree.items():  # pyright: ignore[reportUnknownVariableType]
+            yield from _problems(value, kind.__args__[1], f"{prefix}{key}")
+    else:
+        try:
+            msgspec.convert(tree, kind)
+        except msgspec.ValidationError as error:
+            yield f"{path}: {str(error).split(' - at ')[0]}"

@@ -1,0 +1,103 @@
+"""The one place where units are converted: names carry the unit, Python carries SI.
+
+Every number in a file, a column or on a screen has its unit as the ending of its name (``latency_ms``, ``x_mm``).
+All of them are powers of ten of an SI unit, so conversion moves the decimal point of the shortest decimal that
+stands for the number: 60.45 ms is exactly the float 0.06045 s, and comes back as 60.45.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from decimal import Decimal
+from typing import Any
+
+from .errors import ConfigError
+
+# Name ending -> power of ten to SI. The longest ending wins, so `max_speed_m_s` is m/s and not seconds.
+EXPONENTS: Mapping[str, int] = {
+    "_m": 0,
+    "_mm": -3,
+    "_um": -6,
+    "_s": 0,
+    "_ms": -3,
+    "_us": -6,
+    "_ns": -9,
+    "_m_s": 0,
+    "_mm_s": -3,
+    "_rad_s": 0,
+    "_s_m": 0,
+    "_mm_rtHz": -3,
+    "_mm_rts": -3,
+    "_mm_rtHz_per_m_s": -3,
+    "_mm_rts_per_m_s": -3,
+}
+LENGTHS = ("_m", "_mm", "_um")
+TIMES = ("_s", "_ms", "_us", "_ns")
+INTERVAL = "_ci95"  # `time_constant_ms_ci95` is in ms
+
+
+def ending(name: str) -> str | None:
+    """The unit at the end of ``name``, its longest known one; None without a unit."""
+    stem = name.removesuffix(INTERVAL)
+    return max((unit for unit in EXPONENTS if stem.endswith(unit)), key=len, default=None)
+
+
+def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """A parsed TOML table with every number that has a unit in SI; the names stay as they are.
+
+    A unit holds for lists and for the entries of a sub-table: ``sd_mm = { radial = 0.05 }``.
+
+    Raises:
+        ConfigError: A number is not finite.
+    """
+    return {key: _scaled(value, _exponent(key, 0), key) for key, value in tree.items()}
+
+
+def from_si(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """The inverse of :func:`to_si`: SI numbers to the units that their names tell."""
+    return {key: _unscaled(value, _exponent(key, 0)) for key, value in tree.items()}
+
+
+def shifted(value: float | Decimal, exponent: int) -> float:
+    """``value`` × 10^exponent, exact in the shortest decimal form of ``value`` (no binary rounding in between)."""
+    decimal = value if isinstance(value, Decimal) else Decimal(repr(float(value)))
+    return float(decimal.scaleb(exponent))
+
+
+def _exponent(key: str, inherited: int) -> int:
+    unit = ending(key)
+    return inherited if unit is None else EXPONENTS[unit]
+
+
+def _scaled(value: Any, exponent: int, key: str) -> Any:
+    match value:
+        case bool() | str():
+            return value
+        case int() | float() | Decimal():
+            number = shifted(value, exponent) if exponent or not isinstance(value, int) else value
+            if not math.isfinite(number):
+                raise ConfigError(f"{key}: {value} is not a finite number")
+            return number
+        case list():
+            return [_scaled(item, exponent, key) for item in value]  # pyright: ignore[reportUnknownVariableType]
+        case Mapping():
+            return {k: _scaled(v, _exponent(k, exponent), k) for k, v in value.items()}  # pyright: ignore
+        case _:
+            return value
+
+
+def _unscaled(value: Any, exponent: int) -> Any:
+    match value:
+        case bool() | int() | str():
+            return value
+        case float():
+            decimal = Decimal(repr(value)).scaleb(-exponent)
+            plain = float(decimal)
+            return plain if Decimal(repr(plain)) == decimal else decimal  # the 17th digit would be lost in a float
+        case list() | tuple():
+            return [_unscaled(item, exponent) for item in value]  # pyright: ignore[reportUnknownVariableType]
+        case Mapping():
+            return {k: _unscaled(v, _exponent(k, exponent)) for k, v in value.items()}  # pyright: ignore
+        case _:
+            return value
