@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, TypeVar, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import msgspec
 import tomli_w
@@ -94,9 +94,10 @@ def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
                 yield f"'{prefix}{key}' is missing"
     elif get_origin(kind) is dict and isinstance(tree, Mapping):
         for key, value in tree.items():  # pyright: ignore[reportUnknownVariableType]
-            yield from _problems(value, kind.__args__[1], f"{prefix}{key}")
+            yield from _problems(value, get_args(kind)[1], f"{prefix}{key}")
     else:
+        leaf: Any = kind
         try:
-            msgspec.convert(tree, kind)
+            msgspec.convert(tree, leaf)
         except msgspec.ValidationError as error:
             yield f"{path}: {str(error).split(' - at ')[0]}"

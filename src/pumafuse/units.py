@@ -12,6 +12,9 @@ from collections.abc import Mapping
 from decimal import Decimal
 from typing import Any
 
+import numpy as np
+
+from .arrays import NO_STAMP, FloatArray, TimeArray
 from .errors import ConfigError
 
 # Name ending -> power of ten to SI. The longest ending wins, so `max_speed_m_s` is m/s and not seconds.
@@ -63,6 +66,18 @@ def shifted(value: float | Decimal, exponent: int) -> float:
     """``value`` × 10^exponent, exact in the shortest decimal form of ``value`` (no binary rounding in between)."""
     decimal = value if isinstance(value, Decimal) else Decimal(repr(float(value)))
     return float(decimal.scaleb(exponent))
+
+
+def seconds(stamp: TimeArray, origin: int = 0) -> FloatArray:
+    """Seconds since ``origin`` [ns] of int64 ns stamps; NaN for ``NO_STAMP``."""
+    since = np.asarray((stamp - origin) / 1e9, dtype=np.float64)
+    return np.where(stamp == NO_STAMP, np.nan, since)
+
+
+def nanoseconds(time: FloatArray) -> TimeArray:
+    """Int64 ns of seconds; ``NO_STAMP`` where they are not finite."""
+    finite = np.isfinite(time)
+    return np.where(finite, np.rint(np.where(finite, time, 0.0) * 1e9).astype(np.int64), NO_STAMP)
 
 
 def _exponent(key: str, inherited: int) -> int:

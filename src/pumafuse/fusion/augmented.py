@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
+from ..arrays import FloatArray, IntArray, TimeArray
 from ..model.discrete import transition
-from ..model.drive import TimeArray
-from ..model.plants import FloatArray, Plant
+from ..model.plants import Plant
 from .config import FusionConfig, Process, Sensor
-from .timeline import AxisInput, IntArray, Outcome, Timeline
+from .timeline import AxisInput, Outcome, Timeline
 from .track import Filtered, Track
 
 Progress = Callable[[float], None]
@@ -71,7 +71,7 @@ class AxisFilter:
         self._issues = kind == _ISSUE
         self._issued = values[np.maximum(np.cumsum(self._issues) - 1, 0)]
 
-        self._interval = np.diff(self.time) * 1e-9
+        self._interval = np.diff(self.time) / 1e9
         intervals, self._place = np.unique(self._interval, return_inverse=True)
         self._Phi, self._Gamma, self._Q = transition(plant, intervals)
 
@@ -155,7 +155,9 @@ class AxisFilter:
         """States of this filter as arrays."""
         index, mean, covariance = zip(*held, strict=True)
         at = np.array(index)
-        return Track(self.time[at], np.array(mean), np.array(covariance), self._input[at], self._noise[at], self._drift[at])
+        return Track(
+            self.time[at], np.array(mean), np.array(covariance), self._input[at], self._noise[at], self._drift[at]
+        )
 
     def _settle(self) -> None:
         # Rounding makes P drift from symmetry by an ulp a step, and that grows over a million steps.
@@ -185,13 +187,12 @@ class ReferenceEngine:
         self._sensors = config.sensors
         self._names = [axis.name for axis in timeline.axes]
         candidates = scalars.candidates
-        names = [scalars.sensors[index] for index in np.unique(scalars.sensor[candidates])]
         self._filters: list[AxisFilter] = []
         self._biases: list[tuple[str, ...]] = []
         for number, axis in enumerate(timeline.axes):
             mine = candidates[scalars.axis[candidates] == number]
-            heard = {scalars.sensors[index] for index in np.unique(scalars.sensor[mine])}
-            biases = [(name, self._sensors[name].bias_sd) for name in names if name in heard and self._sensors[name].bias_sd]
+            heard = [scalars.sensors[int(index)] for index in np.unique(scalars.sensor[mine])]
+            biases = [(name, self._sensors[name].bias_sd) for name in heard if self._sensors[name].bias_sd]
             self._biases.append(tuple(name for name, _ in biases))
             self._filters.append(
                 AxisFilter(
@@ -232,7 +233,9 @@ class ReferenceEngine:
         edges = np.searchsorted(arrival[queue], times, side="right")
         due = np.split(queue, edges)  # due[k]: the rows that arrive by times[k]; the last part comes after all of them
         arrived = np.zeros(len(self._rows), dtype=bool)
-        before = [self._checkpoint()]  # before[i]: as it was before row i; every row up to the last of them is dealt with
+        before = [
+            self._checkpoint()
+        ]  # before[i]: as it was before row i; every row up to the last of them is dealt with
         kept: list[list[Held]] = [[] for _ in self._filters]
         reach = 0
         for number, new in enumerate(due):
@@ -276,14 +279,15 @@ class ReferenceEngine:
         if any(beyond) and not reopens:
             self._streaks[key] = (count + 1, since)
         for scalar, outside, (axis, z, H, R, nu, S) in zip(scalars, beyond, met, strict=True):
+            spread = S
             if outside and reopens:
                 axis.widen_offset(nu**2)
-                _, S = axis.innovation(z, H, R)
+                spread = axis.innovation(z, H, R)[1]
                 self._streaks.pop(key, None)
             gated = any(beyond) and not reopens
             if not gated:
                 axis.fuse(z, H, R)
-            self._innovation[scalar], self._innovation_sd[scalar] = nu, np.sqrt(S)
+            self._innovation[scalar], self._innovation_sd[scalar] = nu, np.sqrt(spread)
             self._outcome[scalar] = Outcome.GATED if gated else Outcome.REOPENED if outside else Outcome.FUSED
 
     def _predicted(
@@ -303,7 +307,9 @@ class ReferenceEngine:
         scalars = self._scalars
         edges = np.flatnonzero(np.diff(scalars.row[candidates])) + 1
         return [
-            _Row(scalars.sensors[scalars.sensor[part[0]]], part, int(scalars.valid[part[0]]), int(scalars.stamp[part[0]]))
+            _Row(
+                scalars.sensors[scalars.sensor[part[0]]], part, int(scalars.valid[part[0]]), int(scalars.stamp[part[0]])
+            )
             for part in np.split(candidates, edges)
             if len(part)
         ]

@@ -99,7 +99,9 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         path = Path(path)
         tree = toml.read(path)
         if not isinstance(tree.get("arm"), str):
-            raise ConfigError(f"{path}: 'arm' is missing; give a file beside this one, or a preset, as in arm = 'arm.toml'")
+            raise ConfigError(
+                f"{path}: 'arm' is missing; give a file beside this one, or a preset, as in arm = 'arm.toml'"
+            )
         arm = _load_arm(tree["arm"], path)
         tree["arm"] = arm
         if isinstance(tree.get("process"), dict):
@@ -138,8 +140,8 @@ def _load_arm(name: str, path: Path) -> ArmModel:
 
 def _per_axis(table: dict[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
     """``[process]`` holds for every axis, ``[process.radial]`` overrides it for one."""
-    common = {key: value for key, value in table.items() if not isinstance(value, dict)}
-    own = {key: value for key, value in table.items() if isinstance(value, dict)}
+    own: dict[str, dict[str, Any]] = {key: value for key, value in table.items() if isinstance(value, dict)}
+    common = {key: value for key, value in table.items() if key not in own}
     _known_axes(f"{where}: process", own, arm)
     return {axis: toml.struct({**common, **own.get(axis, {})}, Process, where, "process") for axis in arm.axes}
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from ..model.plants import FloatArray
+from ..arrays import BoolArray, CodeArray, FloatArray, IntArray
 from .config import FusionConfig
-from .timeline import IntArray, Outcome
+from .timeline import Outcome
 from .track import AxisEstimate
 
 Mode = Literal["filtered", "as-live"]
@@ -41,7 +40,7 @@ class Readings:
     value: FloatArray
     innovation: FloatArray
     innovation_sd: FloatArray
-    outcome: npt.NDArray[np.uint8]
+    outcome: CodeArray
     sensors: tuple[str, ...]
     axes: tuple[str, ...]
 
@@ -56,7 +55,7 @@ class Readings:
         """The scalars of one sensor on one axis."""
         return self.where((self.sensor == self.sensors.index(sensor)) & (self.axis == self.axes.index(axis)))
 
-    def where(self, mask: npt.NDArray[np.bool_]) -> Readings:
+    def where(self, mask: BoolArray) -> Readings:
         """The scalars that ``mask`` (m,) selects."""
         return replace(self, **{name: getattr(self, name)[mask] for name in self.ARRAYS})
 
@@ -100,9 +99,9 @@ class Estimates:
         readings: What became of every scalar.
         reference: The run's reference, where it has one.
         origin: Stamp of the first command, int ns.
-        command: For each axis the commands as used: times [s] and u [m].
         segment: 0, and one more after each time the log's clock was set back.
-        mode: Which readings an estimate knows: all valid by then (``filtered``), or those that had arrived (``as-live``).
+        mode: Which readings an estimate knows: all that are valid by then (``filtered``), or only those that had
+            arrived (``as-live``).
         engine: Which engine computed it.
         config: The configuration as used.
         speed: Highest commanded speed [m/s].
@@ -115,7 +114,6 @@ class Estimates:
     readings: Readings
     reference: ReferenceTrack | None
     origin: int
-    command: Mapping[str, tuple[FloatArray, FloatArray]]
     segment: IntArray
     mode: Mode
     engine: str

@@ -9,12 +9,11 @@ from typing import Literal
 
 import numpy as np
 
+from ..arrays import NO_STAMP, TimeArray
 from ..errors import PumafuseWarning
-from ..model.drive import TimeArray
-from ..model.plants import FloatArray
 from ..runs.clock import segments
 from ..runs.run import Reference, Run
-from ..runs.tables import NO_STAMP
+from ..units import seconds
 from . import timeline as timelines
 from .config import FusionConfig
 from .estimates import Estimates, Mode, Readings, ReferenceTrack
@@ -99,12 +98,11 @@ def _fuse_segment(
     origin = timeline.origin
     return Estimates(
         run=run.name,
-        time=(times - origin) * 1e-9,
+        time=seconds(times, origin),
         axes=axes,
         readings=_readings(timeline, filtered),
-        reference=None if run.reference is None else _reference(run.reference, origin),
+        reference=None if run.reference is None else reference_track(run.reference, origin),
         origin=origin,
-        command={axis.name: ((axis.given - origin) * 1e-9, axis.command) for axis in timeline.axes},
         segment=np.zeros(len(times), dtype=np.int64),
         mode=mode,
         engine="filterpy",
@@ -117,8 +115,8 @@ def _fuse_segment(
 def _readings(timeline: Timeline, filtered: Filtered) -> Readings:
     scalars = timeline.scalars
     return Readings(
-        time=_seconds(scalars.valid, timeline.origin),
-        stamp=_seconds(scalars.stamp, timeline.origin),
+        time=seconds(scalars.valid, timeline.origin),
+        stamp=seconds(scalars.stamp, timeline.origin),
         sensor=scalars.sensor,
         axis=scalars.axis,
         value=scalars.value,
@@ -130,16 +128,14 @@ def _readings(timeline: Timeline, filtered: Filtered) -> Readings:
     )
 
 
-def _reference(reference: Reference, origin: int) -> ReferenceTrack:
+def reference_track(reference: Reference, origin: int) -> ReferenceTrack:
+    """A run's reference in order and in seconds since ``origin`` (int ns)."""
     order = np.argsort(reference.stamp, kind="stable")
     order = order[reference.stamp[order] != NO_STAMP]
     position = {axis: value[order] for axis, value in reference.values.items()}
-    time = (reference.stamp[order] - origin) * 1e-9
-    return ReferenceTrack(time, position, reference.sd, np.zeros(len(order), dtype=np.int64))
-
-
-def _seconds(stamp: TimeArray, origin: int) -> FloatArray:
-    return np.where(stamp == NO_STAMP, np.nan, (stamp - origin) * 1e-9)
+    return ReferenceTrack(
+        seconds(reference.stamp[order], origin), position, reference.sd, np.zeros(len(order), dtype=np.int64)
+    )
 
 
 def _joined(parts: Sequence[Estimates], said: Sequence[str]) -> Estimates:
@@ -147,26 +143,26 @@ def _joined(parts: Sequence[Estimates], said: Sequence[str]) -> Estimates:
     first = parts[0]
     if len(parts) == 1:
         return first
-    late = [(part.origin - first.origin) * 1e-9 for part in parts]
+    late = [(part.origin - first.origin) / 1e9 for part in parts]
     numbers = list(zip(parts, late, range(len(parts)), strict=True))
     axes = {
-        name: AxisEstimate(*(np.concatenate([getattr(part[name], field) for part in parts]) for field in AxisEstimate.FIELDS))
-        for name in first.axes
-    }
-    command = {
-        name: (
-            np.concatenate([part.command[name][0] + shift for part, shift, _ in numbers]),
-            np.concatenate([part.command[name][1] for part in parts]),
+        name: AxisEstimate(
+            *(np.concatenate([getattr(part[name], field) for part in parts]) for field in AxisEstimate.FIELDS)
         )
         for name in first.axes
     }
-    shifted = [replace(part.readings, time=part.readings.time + t, stamp=part.readings.stamp + t) for part, t, _ in numbers]
+    shifted = [
+        replace(part.readings, time=part.readings.time + t, stamp=part.readings.stamp + t) for part, t, _ in numbers
+    ]
     references = [(part.reference, shift, number) for part, shift, number in numbers if part.reference is not None]
     reference = None
     if references:
         reference = ReferenceTrack(
             np.concatenate([track.time + shift for track, shift, _ in references]),
-            {axis: np.concatenate([track.position[axis] for track, _, _ in references]) for axis in references[0][0].position},
+            {
+                axis: np.concatenate([track.position[axis] for track, _, _ in references])
+                for axis in references[0][0].position
+            },
             references[0][0].sd,
             np.concatenate([np.full(len(track.time), number) for track, _, number in references]),
         )
@@ -176,7 +172,6 @@ def _joined(parts: Sequence[Estimates], said: Sequence[str]) -> Estimates:
         axes=axes,
         readings=Readings.joined(shifted),
         reference=reference,
-        command=command,
         segment=np.concatenate([np.full(len(part.time), number) for part, _, number in numbers]),
         speed=max(part.speed for part in parts),
         notes=(*(note for part in parts for note in part.notes), *said),

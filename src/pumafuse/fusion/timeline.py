@@ -1,8 +1,8 @@
 """The total order of events: what acts on the plant when, and which reading is valid when.
 
 Time is int64 ns. At one instant commands come before readings, then sensors in the order of ``fusion.toml``, then stamp,
-position in the file and axis. The axes are independent but for row gates, so each axis meets its scalars in the order
-(time, sensor, stamp, position) whatever the others do.
+place in the file and axis. The axes are independent but for row gates, so rows are kept together and each axis still
+meets its scalars in the order (time, sensor, stamp, place in the file).
 """
 
 from __future__ import annotations
@@ -14,17 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import RunError, UnknownNameError
-from ..model.arm import ArmModel
-from ..model.drive import Drive, TimeArray, drive
-from ..model.plants import FloatArray
+from ..arrays import NO_STAMP, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
+from ..errors import UnknownNameError
+from ..model.drive import Drive, drive
 from ..runs.clock import TOLERATED_STEP_BACK_NS, behind, regular_grid
 from ..runs.run import Run, Source
-from ..runs.tables import NO_STAMP
 from .config import FusionConfig, Sensor
-
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 
 class Outcome(enum.IntEnum):
@@ -53,7 +48,6 @@ class AxisInput:
         name: The axis.
         start: The level u₀ [m] that everything inside the filter is relative to.
         given: When each command was given, int64 ns, (n,).
-        command: u [m] in the log's coordinates, (n,).
         drive: The plant's input, by the time it is issued.
         delay: Td, int ns.
     """
@@ -61,7 +55,6 @@ class AxisInput:
     name: str
     start: float
     given: TimeArray
-    command: FloatArray
     drive: Drive
     delay: int
 
@@ -92,7 +85,7 @@ class Scalars:
     axis: IntArray
     value: FloatArray
     row: IntArray
-    outcome: npt.NDArray[np.uint8]
+    outcome: CodeArray
     sensors: tuple[str, ...]
 
     @property
@@ -138,7 +131,9 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     arm, notes = config.arm, list(run.notes)
     for axis in run.axes:
         if axis not in arm.axes:
-            raise UnknownNameError(f"{run.command.label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes)
+            raise UnknownNameError(
+                f"{run.command.label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes
+            )
     stamp, command = _commands(run, arm.update_period, notes)
     inputs: list[AxisInput] = []
     for name in run.axes:
@@ -146,15 +141,14 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
         given, values = stamp[used], command.values[name][used]
         start = run.start.get(name, float(values[0]))
         driven = drive(arm.axes[name], given, values, start, arm.update_period)
-        inputs.append(AxisInput(name, start, given, values, driven, round(arm.delay_of(name) * 1e9)))
+        inputs.append(AxisInput(name, start, given, driven, round(arm.delay_of(name) * 1e9)))
     commands = np.unique(np.concatenate([axis.given for axis in inputs]))
     origin = int(commands[0])
 
     named = tuple(name for name in config.sensor_names(sensors) if name in run.sensors)
     others = tuple(name for name in run.sensors if name not in config.sensors) if sensors is None else ()
-    for name in config.sensor_names(sensors):
-        if name not in run.sensors:
-            notes.append(f"sensor '{name}' of the configuration has no readings in run '{run.name}'")
+    silent = [name for name in config.sensor_names(sensors) if name not in run.sensors]
+    notes.extend(f"sensor '{name}' of the configuration has no readings in this run" for name in silent)
     scalars = _scalars(run, config, named + others, origin, notes)
     last = scalars.valid[scalars.candidates].max(initial=origin)
     end = max(int(last), int(commands[-1]))
@@ -166,7 +160,7 @@ def output_times(timeline: Timeline, rate: float | None) -> TimeArray:
     """When estimates are asked for: at each command, or on an even grid of ``rate`` [Hz] from the first command on."""
     if rate is None:
         return timeline.commands
-    count = int((timeline.end - timeline.origin) * 1e-9 * rate) + 1
+    count = int((timeline.end - timeline.origin) / 1e9 * rate) + 1
     return timeline.origin + np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
 
 
@@ -221,12 +215,16 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
             if sensor is not None and sensor.sd_of(axis) is None:
                 outcome[:] = Outcome.UNKNOWN
             outcome[(outcome == Outcome.FUSED) & ~np.isfinite(value)] = Outcome.INVALID
-            columns.append((valid, source.stamp, np.full_like(rows, index), np.full_like(rows, number), value, rows, outcome))
+            columns.append(
+                (valid, source.stamp, np.full_like(rows, index), np.full_like(rows, number), value, rows, outcome)
+            )
             _tell_outcomes(notes, f"{name} ({source.label})", axis, outcome, told)
         _tell(notes, f"{name} ({source.label})", behind(source.stamp) > 0, "a stamp that steps back: sorted")
     if not columns:
         columns = [tuple(np.zeros(0, dtype) for dtype in ("i8", "i8", "i8", "i8", "f8", "i8", "u1"))]
-    valid, stamp, sensor_index, axis_index, value, rows, outcome = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+    valid, stamp, sensor_index, axis_index, value, rows, outcome = (
+        np.concatenate(parts) for parts in zip(*columns, strict=True)
+    )
     order = np.lexsort((axis_index, rows, stamp, sensor_index, valid))
     first = np.ones(len(order), dtype=bool)
     first[1:] = (np.diff(sensor_index[order]) != 0) | (np.diff(rows[order]) != 0)
@@ -242,7 +240,7 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
     )
 
 
-def _row_outcomes(source: Source, sensor: Sensor | None, valid: TimeArray, origin: int) -> npt.NDArray[np.uint8]:
+def _row_outcomes(source: Source, sensor: Sensor | None, valid: TimeArray, origin: int) -> CodeArray:
     """What is known of each row whatever its axes say, the strongest reason last."""
     outcome = np.full(len(valid), Outcome.FUSED, dtype=np.uint8)
     outcome[valid < origin] = Outcome.BEFORE_START
@@ -273,12 +271,12 @@ _REASONS: Mapping[Outcome, str] = {
 }
 
 
-def _tell_outcomes(
-    notes: list[str], label: str, axis: str, outcome: npt.NDArray[np.uint8], told: set[Outcome]
-) -> None:
+def _tell_outcomes(notes: list[str], label: str, axis: str, outcome: CodeArray, told: set[Outcome]) -> None:
     """Each reason once per sensor, for the first axis that meets it."""
     for kind, reason in _REASONS.items():
-        if kind not in told and _tell(notes, label, outcome == kind, f"{reason} ({axis})" if kind is Outcome.INVALID else reason):
+        if kind not in told and _tell(
+            notes, label, outcome == kind, f"{reason} ({axis})" if kind is Outcome.INVALID else reason
+        ):
             told.add(kind)
 
 

@@ -8,11 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import CodeArray, FloatArray, TimeArray
 from ..model.discrete import transition
-from ..model.drive import TimeArray
-from ..model.plants import FloatArray, Plant
+from ..model.plants import Plant
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Filtered:
     tracks: tuple[Track, ...]
     innovation: FloatArray
     innovation_sd: FloatArray
-    outcome: npt.NDArray[np.uint8]
+    outcome: CodeArray
     biases: tuple[tuple[str, ...], ...]
 
 
@@ -103,12 +102,12 @@ def estimate(held: Track, time: TimeArray, plant: Plant, start: float) -> AxisEs
     """
     A, B, C = plant.state_space()
     n = len(A)
-    interval, place = np.unique(time - held.time, return_inverse=True)
-    Phi, Gamma, Q = (part[place] for part in transition(plant, interval * 1e-9))
+    distinct, place = np.unique(time - held.time, return_inverse=True)
+    Phi, Gamma, Q = (part[place] for part in transition(plant, distinct / 1e9))
     x = (Phi @ held.mean[:, :n, None] + Gamma * held.input[:, None, None])[..., 0]
     Pxx = Phi @ held.covariance[:, :n, :n] @ Phi.swapaxes(1, 2) + Q * held.noise[:, None, None]
     Pxo = (Phi @ held.covariance[:, :n, n, None])[..., 0]
-    Poo = held.covariance[:, n, n] + held.drift * (time - held.time) * 1e-9
+    Poo = held.covariance[:, n, n] + held.drift * (time - held.time) / 1e9
     offset = held.mean[:, n]
     rate = (C @ A)[0]
     position_variance = np.einsum("i,kij,j->k", C[0], Pxx, C[0]) + 2.0 * Pxo @ C[0] + Poo

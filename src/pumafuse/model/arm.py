@@ -9,8 +9,9 @@ import msgspec
 import numpy as np
 
 from .. import toml
+from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError
-from .plants import PLANTS, FloatArray, Interval, NotNegative, Positive
+from .plants import PLANTS, Interval, NotNegative, Positive
 
 CANONICAL_AXES = ("tangential", "radial", "vertical")
 
@@ -68,8 +69,8 @@ class Validity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         found: list[str] = []
         if self.max_speed is not None and speed > self.max_speed:
             found.append(
-                f"commanded speed reaches {speed:.3g} m/s, {speed / self.max_speed:.2f} times the {self.max_speed:g} m/s"
-                " that the arm model is valid for"
+                f"commanded speed reaches {speed:.3g} m/s, {speed / self.max_speed:.2f} times the"
+                f" {self.max_speed:g} m/s that the arm model is valid for"
             )
         if self.max_radius is not None and radius is not None and radius > self.max_radius:
             beyond = (radius - self.max_radius) * 1e3

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ..arrays import FloatArray
 from .arm import AxisModel
-from .plants import FloatArray, Plant
+from .plants import Plant
 
 if TYPE_CHECKING:
     import control
@@ -108,7 +109,7 @@ class DiscreteModel:
         return control.ss(F, B, H, 0.0, self.period, inputs=["v"], outputs=["p"])
 
     def to_filterpy(self) -> KalmanFilter:
-        """A `filterpy` filter with F, B, H and Q set, at rest and certain of it (x = 0, P = 0); R is left to the user."""
+        """A `filterpy` filter with F, B, H and Q set, at rest and certain of it (x = 0, P = 0); R is the user's."""
         from filterpy.kalman import KalmanFilter
 
         kf = KalmanFilter(dim_x=len(self.F), dim_z=1, dim_u=1)

@@ -9,12 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import FloatArray, IntArray, TimeArray
 from .arm import AxisModel, commanded_speed
-from .plants import FloatArray
-
-TimeArray = npt.NDArray[np.int64]
 
 _NEGLIGIBLE = 1e-15  # m; below it a decaying gain error no longer changes any estimate
 
@@ -53,7 +50,7 @@ def drive(axis: AxisModel, time: TimeArray, command: FloatArray, start: float, p
     speed = commanded_speed(step, period)
     maneuver = np.abs(np.diff(step, prepend=0.0)) / period
     kick = (axis.gain.at(speed) - 1.0) * step
-    interval = np.diff(time) * 1e-9
+    interval = np.diff(time) / 1e9
     recovery = np.inf if axis.gain_recovery is None else axis.gain_recovery
     error = _decaying_sum(np.exp(-np.concatenate(([0.0], interval)) / recovery), kick)
     highest = float(speed.max(initial=0.0))
@@ -66,7 +63,7 @@ def drive(axis: AxisModel, time: TimeArray, command: FloatArray, start: float, p
     return Drive(time[source] + np.rint(tick * (period * 1e9)).astype(np.int64), value, maneuver[source], highest)
 
 
-def _grid_points(time: TimeArray, error: FloatArray, recovery: float, period: float) -> npt.NDArray[np.int64]:
+def _grid_points(time: TimeArray, error: FloatArray, recovery: float, period: float) -> IntArray:
     """How many grid points of T lie strictly inside each command's hold, as long as its error is worth decaying."""
     with np.errstate(divide="ignore"):
         worth = np.ceil(np.log(np.abs(error) / _NEGLIGIBLE) * (recovery / period))

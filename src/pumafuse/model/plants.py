@@ -13,10 +13,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from ..arrays import FloatArray
+
 if TYPE_CHECKING:
     import control
 
-FloatArray: TypeAlias = npt.NDArray[np.float64]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Interval = tuple[float, float]
@@ -30,7 +31,7 @@ class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid
         raise NotImplementedError
 
     def step_response(self, time: npt.ArrayLike) -> FloatArray:
-        """p [m] at ``time`` [s] after v stepped from 0 to 1 m; 0 before the step; the shape of ``time``."""
+        """P [m] at ``time`` [s] after v stepped from 0 to 1 m; 0 before the step; the shape of ``time``."""
         raise NotImplementedError
 
     def transfer_function(self) -> control.TransferFunction:

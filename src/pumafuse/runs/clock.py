@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import NO_STAMP, IntArray, TimeArray
 from ..errors import RunError
-from ..model.drive import TimeArray
 from .run import Reference, Run, Source
-from .tables import NO_STAMP
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
 _MOST_JUMPS = 100
@@ -42,8 +40,8 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
     for name, others in cut.items():
         if len(others) != len(cuts):
             raise RunError(
-                f"{run.command.label}: the commands' clock is set back {len(cuts)} times (first in row {cuts[0] + 1}), that"
-                f" of {name} {len(others)} times; cut the log there and fuse the parts one by one"
+                f"{run.command.label}: the commands' clock is set back {len(cuts)} times (first in row {cuts[0] + 1}),"
+                f" that of {name} {len(others)} times; cut the log there and fuse the parts one by one"
             )
     parts: list[Run] = []
     for index in range(len(cuts) + 1):
@@ -61,7 +59,8 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
         )
     lag = behind(run.command.stamp)
     said = [
-        f"{run.command.label}: the clock is set back by {lag[row] * 1e-9:.3f} s in row {row + 1}: new segment, filter restarted"
+        f"{run.command.label}: the clock is set back by {lag[row] / 1e9:.3f} s in row {row + 1}: new segment, filter"
+        " restarted"
         for row in cuts
     ]
     return parts, said
@@ -91,7 +90,7 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
         apart = (stamp[same[0] + 1] - stamp[same[0]]) * 1e-6
         raise RunError(
             f"{label}: clock = 'regular', but two commands are only {apart:.3f} ms apart, less than half the period of"
-            f" {period * 1e3:g} ms (stamp {stamp[same[0]] * 1e-9:.6f} s); use clock = 'stamps'"
+            f" {period * 1e3:g} ms (stamp {stamp[same[0]] / 1e9:.6f} s); use clock = 'stamps'"
         )
     since = (stamp - stamp[0]).astype(np.float64)
     note = None
@@ -124,11 +123,13 @@ def _jumps(source: Source) -> list[int]:
         first += int(back[0])
         found.append(int(stamped[first]))
         if len(found) > _MOST_JUMPS:
-            raise RunError(f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock")
+            raise RunError(
+                f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock"
+            )
 
 
 def _piece(source: Source, cuts: list[int], index: int) -> Source:
-    rows: npt.NDArray[np.int64] = np.arange(len(source.stamp))
+    rows: IntArray = np.arange(len(source.stamp))
     edges = [0, *cuts, len(rows)]
     part = source.where((rows >= edges[index]) & (rows < edges[index + 1]))
     return Reference(part.stamp, part.values, part.label, source.sd) if isinstance(source, Reference) else part

@@ -54,7 +54,8 @@ def load(path: Path) -> Manifest:
     parts = {
         "command": _source(tree.get("command"), CommandEntry, where, "command"),
         "sensors": {
-            name: _source(table, SourceEntry, where, f"sensors.{name}") for name, table in tree.get("sensors", {}).items()
+            name: _source(table, SourceEntry, where, f"sensors.{name}")
+            for name, table in tree.get("sensors", {}).items()
         },
         "reference": _source(tree.get("reference"), ReferenceEntry, where, "reference"),
     }
@@ -74,7 +75,9 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
     axes = {key: keys.pop(key) for key in list(keys) if key not in own}
     for axis, columns in axes.items():
         if not isinstance(columns, str) and not (isinstance(columns, list) and columns):
-            raise ConfigError(f"{where}: {path}.{axis}: expected a column name or a list of them, as in {axis} = 'x_mm'")
+            raise ConfigError(
+                f"{where}: {path}.{axis}: expected a column name or a list of them, as in {axis} = 'x_mm'"
+            )
     if not axes:
         raise ConfigError(f"{where}: [{path}] names no column for any axis, as in radial = 'y_mm'")
     return toml.struct({**keys, "axes": axes}, kind, where, path)

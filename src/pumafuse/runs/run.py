@@ -14,12 +14,11 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from ..arrays import NO_STAMP, BoolArray, FloatArray, TimeArray
 from ..errors import RunError, UnknownNameError
 from ..model.arm import ordered_axes
-from ..model.drive import TimeArray
-from ..model.plants import FloatArray
+from ..units import nanoseconds
 from . import manifest, tables
-from .tables import NO_STAMP
 
 Clock = Literal["stamps", "regular"]
 
@@ -38,7 +37,7 @@ class Source:
     values: Mapping[str, FloatArray]
     label: str
 
-    def where(self, mask: npt.NDArray[np.bool_]) -> Source:
+    def where(self, mask: BoolArray) -> Source:
         """The rows that ``mask`` (rows,) selects."""
         return Source(self.stamp[mask], {axis: value[mask] for axis, value in self.values.items()}, self.label)
 
@@ -149,14 +148,13 @@ def _known_axes(where: str, named: Mapping[str, object], axes: tuple[str, ...]) 
 def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.ArrayLike]) -> Source:
     stamp = np.array(time)
     if not np.issubdtype(stamp.dtype, np.integer):
-        seconds = stamp.astype(np.float64)
-        finite = np.isfinite(seconds)
-        stamp = np.full(seconds.shape, NO_STAMP)
-        stamp[finite] = np.rint(seconds[finite] * 1e9)
+        stamp = nanoseconds(stamp.astype(np.float64))
     columns = {axis: np.array(value, dtype=np.float64) for axis, value in values.items()}
     for axis, column in columns.items():
         if stamp.ndim != 1 or column.shape != stamp.shape:
-            raise RunError(f"{label}: {axis} has shape {column.shape}, its stamps {stamp.shape}; one value a stamp is needed")
+            raise RunError(
+                f"{label}: {axis} has shape {column.shape}, its stamps {stamp.shape}; one value a stamp is needed"
+            )
     if not columns or not len(stamp):
         raise RunError(f"{label}: no values")
     return Source(stamp.astype(np.int64), columns, label)

@@ -17,11 +17,9 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as papq
 
 from .. import units
+from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, UnknownNameError
-from ..model.drive import TimeArray
-from ..model.plants import FloatArray
 
-NO_STAMP = np.iinfo(np.int64).min  # a row without a readable stamp (numpy's NaT)
 _EPOCH_LIMIT_S = 9.2e9  # |stamp| that int64 ns can hold
 
 
@@ -77,7 +75,8 @@ class Table:
         if beyond.any():
             row = int(np.flatnonzero(beyond)[0])
             raise RunError(
-                f"{self.path}: column '{name}', row {row + 1}: a stamp beyond the year 2260; is its unit what its name says?"
+                f"{self.path}: column '{name}', row {row + 1}: a stamp beyond the year 2260; is its unit what its name"
+                " says?"
             )
         return ticks, note
 
@@ -162,6 +161,9 @@ def _read_csv(path: Path) -> tuple[pa.Table, list[str]]:
         torn.append(row)
         return "skip"
 
+    def skip(_: pacsv.InvalidRow) -> str:
+        return "skip"
+
     if path.stat().st_size == 0:
         raise RunError(f"{path}: the file is empty")
     parse = pacsv.ParseOptions(invalid_row_handler=leave_out)
@@ -174,7 +176,7 @@ def _read_csv(path: Path) -> tuple[pa.Table, list[str]]:
             raise
         # Types are guessed from the first block; text further down is met by reading every cell as text.
         torn.clear()
-        names = pacsv.open_csv(path, parse_options=pacsv.ParseOptions(invalid_row_handler=lambda _: "skip")).schema.names
+        names = pacsv.open_csv(path, parse_options=pacsv.ParseOptions(invalid_row_handler=skip)).schema.names
         blanks.column_types = dict.fromkeys(names, pa.string())
         table = pacsv.read_csv(path, read_options=serial, parse_options=parse, convert_options=blanks)
     if not torn:

@@ -1,0 +1,43 @@
+# Every target makes what it needs: a fresh machine with Python ≥ 3.11 is enough.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+
+.PHONY: help demo test test-long lint lock clean
+
+help:
+	@echo "make demo       fuse a recorded run, score it, draw it (into ./demo)"
+	@echo "make test       the tests, under 3 minutes"
+	@echo "make test-long  statistics and soak tests, under 30 minutes"
+	@echo "make lint       ruff and pyright"
+	@echo "make lock       write requirements.lock anew (needs uv)"
+	@echo "make clean      remove .venv and ./demo"
+
+$(READY): requirements.lock pyproject.toml
+	@echo "Setting up .venv from requirements.lock ..."
+	@$(PYTHON) -c 'import sys; sys.exit("pumafuse needs Python 3.11 or newer: make PYTHON=python3.12 ...") if sys.version_info < (3, 11) else None'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+demo: $(READY)
+	$(BIN)/pumafuse demo --output demo --force
+
+test: $(READY)
+	$(BIN)/python -m pytest -m "not long" -n 2
+
+test-long: $(READY)
+	$(BIN)/python -m pytest -m long -n 2
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+# Universal: one lock for every platform and Python. No index address goes into it.
+lock:
+	uv pip compile pyproject.toml --group dev --universal --generate-hashes --no-emit-index-url --no-header --quiet --output-file requirements.lock
+
+clean:
+	rm -rf .venv demo

@@ -1,0 +1,16 @@
+"""Names of the arrays that pumafuse passes around."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray: TypeAlias = npt.NDArray[np.float64]
+IntArray: TypeAlias = npt.NDArray[np.int64]
+BoolArray: TypeAlias = npt.NDArray[np.bool_]
+CodeArray: TypeAlias = npt.NDArray[np.uint8]
+TimeArray: TypeAlias = npt.NDArray[np.int64]  # absolute stamps, int64 ns
+
+NO_STAMP = -(2**63)  # in a TimeArray: a row without a readable stamp (numpy's NaT)

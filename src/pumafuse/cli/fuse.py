@@ -1,0 +1,118 @@
+"""`pumafuse fuse`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ..errors import PumafuseError
+from ..fusion import results
+from ..fusion.config import FusionConfig
+from ..fusion.estimates import Estimates
+from ..fusion.offline import Engine, fuse
+from ..fusion.summary import Summary
+from ..runs.run import Run
+from .tables import outcome_table, score_table
+
+
+def run(
+    runs: Sequence[Path],
+    config_path: Path,
+    output: Path,
+    *,
+    sensors: Sequence[str] | None,
+    rate: float | None,
+    as_live: bool,
+    rrd: bool,
+    engine: Engine,
+    force: bool,
+) -> None:
+    """Fuse each run into a result folder; a run that fails is told and the others go on.
+
+    Raises:
+        PumafuseError: The configuration is wrong, or at least one run failed.
+    """
+    config = FusionConfig.load(config_path)
+    config.sensor_names(sensors)
+    folders = _folders(runs, output)
+    if len(runs) == 1:
+        _one(runs[0], config, output, sensors, rate, as_live, rrd, engine, force)
+        return
+    failed = 0
+    for path, folder in zip(runs, folders, strict=True):
+        try:
+            _one(path, config, folder, sensors, rate, as_live, rrd, engine, force)
+        except PumafuseError as error:
+            failed += 1
+            print(f"pumafuse: {error}", file=sys.stderr)
+    if failed:
+        raise PumafuseError(f"{failed} of {len(runs)} runs failed (see above); the others are in {output}")
+
+
+def show(summary: Summary, folder: Path) -> None:
+    """Print what a person wants to know of a fusion."""
+    console = Console(highlight=False)
+    console.print(
+        f"[bold]{summary.run}[/bold]: {summary.estimates} estimates over {summary.duration_s:.1f} s, {summary.mode},"
+        f" arm {summary.arm}"
+    )
+    console.print(outcome_table(summary))
+    scores = {axis: part.score for axis, part in summary.axes.items() if part.score is not None}
+    if scores:
+        console.print(score_table([(summary.run, scores)]))
+    console.print(f"written to {folder}", soft_wrap=True)
+
+
+def _one(
+    path: Path,
+    config: FusionConfig,
+    folder: Path,
+    sensors: Sequence[str] | None,
+    rate: float | None,
+    as_live: bool,
+    rrd: bool,
+    engine: Engine,
+    force: bool,
+) -> None:
+    results.check_writable(folder, force)
+    recorded = Run.read(path)
+    with progress_of(recorded.name) as progress:
+        est = fuse(recorded, config, sensors=sensors, rate=rate, as_live=as_live, engine=engine, progress=progress)
+    summary = results.write(est, folder, force, (lambda new: to_recording(est, recorded, new)) if rrd else None)
+    show(summary, folder)
+
+
+def to_recording(est: Estimates, recorded: Run, folder: Path) -> None:
+    """Write ``fused.rrd`` into a result folder."""
+    from ..views.rerun import to_rerun
+
+    to_rerun(est, recorded, folder / "fused.rrd")
+
+
+def _folders(runs: Sequence[Path], output: Path) -> list[Path]:
+    """A folder for each run, named after its path; a number tells apart what has the same name."""
+    names: list[str] = []
+    for path in runs:
+        resolved = path.resolve()
+        name = resolved.parent.name if resolved.name == "run.toml" else resolved.name.split(".")[0]
+        taken = sum(name == other.rpartition("_")[0] or name == other for other in names)
+        names.append(f"{name}_{taken + 1}" if taken else name)
+    return [output / name for name in names]
+
+
+@contextmanager
+def progress_of(name: str) -> Generator[Callable[[float], None]]:
+    """A bar on stderr for runs that take long; nothing where stderr is no terminal."""
+    columns = (TextColumn(name), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task(name, total=1.0)
+
+        def move(done: float) -> None:
+            bar.update(task, completed=done)
+
+        yield move

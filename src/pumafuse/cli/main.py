@@ -1,0 +1,141 @@
+"""Parsing of the command line. Each command hands over to its own module, imported only when it runs."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from ..errors import PumafuseError, PumafuseWarning
+
+app = typer.Typer(
+    name="pumafuse",
+    help="Blend a robot arm's commands with the readings of an external sensor into the best estimate of its position.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace an earlier result.")]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"pumafuse {version('pumafuse')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(  # pyright: ignore[reportUnusedFunction]
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def fuse(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")],
+    config: Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")],
+    sensors: Annotated[
+        str | None, typer.Option(metavar="A,B", help="Which sensors to use; default: all configured.")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")
+    ] = None,
+    as_live: Annotated[bool, typer.Option("--as-live", help="Use only readings that had arrived by then.")] = False,
+    rrd: Annotated[bool, typer.Option("--rrd", help="Also write fused.rrd for the Rerun viewer.")] = False,
+    engine: Annotated[Literal["filterpy"], typer.Option(help="Which engine computes.")] = "filterpy",
+    force: Force = False,
+) -> None:
+    """Fuse recorded runs: estimates, what became of each reading, and a summary.
+
+    Several runs get a folder each inside DIR.
+    """
+    from . import fuse as command
+
+    command.run(
+        runs,
+        config,
+        output,
+        sensors=None if sensors is None else [name.strip() for name in sensors.split(",") if name.strip()],
+        rate=_positive(rate, "--rate"),
+        as_live=as_live,
+        rrd=rrd,
+        engine=engine,
+        force=force,
+    )
+
+
+@app.command()
+def compare(
+    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Result folders of `pumafuse fuse`.")],
+    reference: Annotated[
+        Path | None, typer.Option(metavar="FILE_OR_RUN", help="A truth from elsewhere; default: each folder's own.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Score results against a reference: RMSE, bias, 95 % coverage and mean NEES of each axis."""
+    from . import compare as command
+
+    command.run(folders, reference, json)
+
+
+@app.command()
+def discretize(
+    arm: Annotated[str, typer.Argument(metavar="ARM", help="An arm.toml, or the name of a preset.")],
+    axis: Annotated[str | None, typer.Option(metavar="NAME", help="One axis; default: all.")] = None,
+    period: Annotated[float | None, typer.Option(metavar="MS", help="Period; default: the arm's own.")] = None,
+    json: Json = False,
+) -> None:
+    """Show the exact delay-augmented model of an arm: F, B, H, Q, poles and step response."""
+    from . import discretize as command
+
+    command.run(arm, axis, _positive(period, "--period"), json)
+
+
+@app.command()
+def demo(
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")] = Path(
+        "demo"
+    ),
+    force: Force = False,
+) -> None:
+    """Fuse a recorded run that comes with pumafuse, score it against its reference, and draw it."""
+    from . import demo as command
+
+    command.run(output, force)
+
+
+def main() -> None:
+    """Run the command line: 0 done, 1 data or configuration is wrong, 2 usage, 3 a check asked for failed."""
+    warnings.showwarning = _one_line
+    warnings.simplefilter("always", PumafuseWarning)
+    try:
+        app()
+    except PumafuseError as error:
+        typer.echo(f"pumafuse: {error}", err=True)
+        sys.exit(1)
+    except BrokenPipeError:
+        sys.stderr.close()  # the reader of our output has gone, and Python would say so once more at exit
+        sys.exit(1)
+
+
+def _one_line(message: Warning | str, category: type[Warning], *_: object) -> None:
+    name = "warning" if issubclass(category, PumafuseWarning) else category.__name__
+    typer.echo(f"{name}: {message}", err=True)
+
+
+def _positive(value: float | None, name: str) -> float | None:
+    if value is not None and not 0.0 < value < float("inf"):
+        raise typer.BadParameter(f"must be a positive number, not {value}", param_hint=name)
+    return value

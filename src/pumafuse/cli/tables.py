@@ -1,0 +1,55 @@
+"""The tables that commands print."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rich import box
+from rich.table import Table
+
+from ..fusion.summary import ScoreSummary, Summary
+
+
+def outcome_table(summary: Summary) -> Table:
+    """Scalars by outcome, and innovations against what the filter expected, for each axis and sensor."""
+    table = Table(box=box.SIMPLE_HEAD)
+    words = sorted(
+        {word for axis in summary.axes.values() for sensor in axis.sensors.values() for word in sensor.outcomes}
+    )
+    words.sort(key=lambda word: word != "fused")
+    for heading in ("axis", "sensor"):
+        table.add_column(heading)
+    for heading in (*words, "innovation RMS [mm]", "expected [mm]", "NIS"):
+        table.add_column(heading, justify="right")
+    for axis, part in summary.axes.items():
+        for name, sensor in part.sensors.items():
+            counts = [str(sensor.outcomes.get(word, 0)) for word in words]
+            spread = [_mm(sensor.innovation_rms_mm), _mm(sensor.innovation_sd_mm)]
+            table.add_row(axis, name, *counts, *spread, "–" if sensor.nis_mean is None else f"{sensor.nis_mean:.2f}")
+    return table
+
+
+def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Table:
+    """Scores against the reference, for each result and axis."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("result", "axis"):
+        table.add_column(heading)
+    for heading in ("RMSE [mm]", "bias [mm]", "95 % cover", "NEES", "scored", "left out"):
+        table.add_column(heading, justify="right")
+    for name, scores in results:
+        for axis, score in scores.items():
+            table.add_row(
+                name,
+                axis,
+                _mm(score.rmse_mm),
+                f"{score.bias_mm:+.3f}",
+                f"{score.coverage:.1%}",
+                f"{score.nees_mean:.2f}",
+                str(score.rows),
+                str(score.left_out),
+            )
+    return table
+
+
+def _mm(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"

@@ -1,0 +1,239 @@
+"""Result folders: the tables that ``fuse`` leaves, and what ``compare`` reads of them. Files are in mm and s."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+
+from ..arrays import FloatArray, IntArray
+from ..errors import PumafuseError, RunError
+from ..runs import tables
+from ..runs.run import Run
+from ..runs.tables import Table
+from ..units import seconds
+from .estimates import Estimates, ReferenceTrack
+from .offline import reference_track
+from .score import Score, score
+from .summary import Summary, summarise
+from .timeline import Outcome
+
+ESTIMATES, READINGS, REFERENCE, SUMMARY = "estimates.parquet", "readings.parquet", "reference.parquet", "summary.json"
+_MM = 1e3
+_REFERENCE_PREFIX = "reference."
+
+
+class FolderError(PumafuseError):
+    """A result folder cannot be written or read."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a comparison needs of a result folder.
+
+    Attributes:
+        folder: Where it is.
+        summary: Its ``summary.json``.
+        time: [s since the first command], (n,).
+        segment: (n,).
+        position: For each axis [m], (n,).
+        position_sd: For each axis [m], (n,).
+        reference: What ``reference.parquet`` holds, if it is there.
+    """
+
+    folder: Path
+    summary: Summary
+    time: FloatArray
+    segment: IntArray
+    position: Mapping[str, FloatArray]
+    position_sd: Mapping[str, FloatArray]
+    reference: ReferenceTrack | None
+
+    def scores(self, reference: ReferenceTrack) -> dict[str, Score]:
+        """The score of each axis that the reference knows."""
+        found = {
+            axis: score(self.time, self.segment, position, self.position_sd[axis], reference, axis)
+            for axis, position in self.position.items()
+        }
+        return {axis: value for axis, value in found.items() if value is not None}
+
+
+def check_writable(folder: Path, force: bool) -> None:
+    """Refuse early what :func:`write` would refuse late.
+
+    Raises:
+        FolderError: The folder exists and is not to be replaced, or holds something else than results.
+    """
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise FolderError(f"{folder}: exists and is not a folder")
+    if not any(folder.iterdir()):
+        return
+    if not (folder / SUMMARY).exists():
+        raise FolderError(f"{folder}: exists and holds no results of pumafuse; choose another folder")
+    if not force:
+        raise FolderError(f"{folder}: exists; --force replaces it, or choose another folder")
+
+
+def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], None] | None = None) -> Summary:
+    """Write a result folder: complete, or not at all.
+
+    Args:
+        est: What to write.
+        folder: Where to; its parents are made.
+        force: Replace an earlier result.
+        extras: Writes more files into the folder before it takes its place.
+
+    Raises:
+        FolderError: See :func:`check_writable`, or the disk refuses.
+    """
+    check_writable(folder, force)
+    summary = summarise(est)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as place:
+            new = Path(place) / "new"
+            new.mkdir()
+            tables.write(_estimates_table(est), new / ESTIMATES)
+            tables.write(_readings_table(est), new / READINGS)
+            if est.reference is not None:
+                tables.write(_reference_table(est.reference), new / REFERENCE)
+            est.config.save(new)
+            (new / SUMMARY).write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
+            if extras is not None:
+                extras(new)
+            if folder.exists():
+                folder.replace(Path(place) / "old")
+            new.replace(folder)
+    except OSError as error:
+        raise FolderError(f"{folder}: cannot be written: {error.strerror}") from None
+    return summary
+
+
+def read(folder: Path) -> Result:
+    """Read a result folder.
+
+    Raises:
+        PumafuseError: It is none, or one of its files is damaged.
+    """
+    try:
+        summary = msgspec.json.decode((folder / SUMMARY).read_bytes(), type=Summary)
+    except (FileNotFoundError, NotADirectoryError):
+        raise FolderError(f"{folder}: no result folder of `pumafuse fuse` ({SUMMARY} is missing)") from None
+    except OSError as error:
+        raise FolderError(f"{folder / SUMMARY}: cannot be read: {error.strerror}") from None
+    except msgspec.MsgspecError as error:
+        raise FolderError(f"{folder / SUMMARY}: not a summary of pumafuse: {error}") from None
+    table = tables.read(folder / ESTIMATES)
+    path = folder / REFERENCE
+    return Result(
+        folder,
+        summary,
+        _seconds(table),
+        _segment(table),
+        {axis: table.numbers(f"{axis}.position_mm")[0] for axis in summary.axes},
+        {axis: table.numbers(f"{axis}.position_sd_mm")[0] for axis in summary.axes},
+        _own_reference(tables.read(path)) if path.exists() else None,
+    )
+
+
+def read_reference(path: Path, origin: int) -> ReferenceTrack:
+    """A reference from elsewhere, in the time of a result.
+
+    Args:
+        path: A recorded run with a reference; or a table with ``time_s`` (the log's clock) and ``reference.<axis>_mm``;
+            or one with ``time_s`` (since the first command) and ``<axis>.position_mm``, as in a result folder.
+        origin: Stamp of the result's first command, int ns.
+
+    Raises:
+        PumafuseError: It is none of these.
+    """
+    if path.is_dir() or path.suffix == ".toml":
+        run = Run.read(path)
+        if run.reference is None:
+            raise RunError(f"{path}: the run has no reference")
+        return reference_track(run.reference, origin)
+    table = tables.read(path)
+    logged = [name for name in table.columns if name.startswith(_REFERENCE_PREFIX)]
+    if not logged:
+        return _own_reference(table)
+    time = seconds(table.stamps("time_s")[0], origin)
+    position = {name[len(_REFERENCE_PREFIX) : name.rindex("_")]: table.numbers(name)[0] for name in logged}
+    return ReferenceTrack(time, position, 0.0, np.zeros(len(time), dtype=np.int64))
+
+
+def _estimates_table(est: Estimates) -> pa.Table:
+    columns: dict[str, FloatArray | IntArray] = {"time_s": est.time}
+    for name, axis in est.axes.items():
+        columns[f"{name}.position_mm"] = axis.position * _MM
+        columns[f"{name}.position_sd_mm"] = axis.position_sd * _MM
+        columns[f"{name}.velocity_mm_s"] = axis.velocity * _MM
+        columns[f"{name}.velocity_sd_mm_s"] = axis.velocity_sd * _MM
+        columns[f"{name}.offset_mm"] = axis.offset * _MM
+        columns[f"{name}.offset_sd_mm"] = axis.offset_sd * _MM
+    return pa.table({**columns, **_segment_column(est.segment)})
+
+
+def _readings_table(est: Estimates) -> pa.Table:
+    r = est.readings
+    return pa.table(
+        {
+            "time_s": _nullable(r.time),
+            "stamp_s": _nullable(r.stamp),
+            "sensor": pa.DictionaryArray.from_arrays(r.sensor.astype(np.int32), list(r.sensors)).cast(pa.string()),
+            "axis": pa.DictionaryArray.from_arrays(r.axis.astype(np.int32), list(r.axes)).cast(pa.string()),
+            "value_mm": _nullable(r.value * _MM),
+            "innovation_mm": _nullable(r.innovation * _MM),
+            "innovation_sd_mm": _nullable(r.innovation_sd * _MM),
+            "nis": _nullable(r.nis),
+            "outcome": pa.DictionaryArray.from_arrays(
+                r.outcome.astype(np.int32), [outcome.word for outcome in Outcome]
+            ).cast(pa.string()),
+        }
+    )
+
+
+def _reference_table(reference: ReferenceTrack) -> pa.Table:
+    columns: dict[str, pa.Array | FloatArray] = {"time_s": reference.time}
+    for axis, position in reference.position.items():
+        columns[f"{axis}.position_mm"] = _nullable(position * _MM)
+        columns[f"{axis}.position_sd_mm"] = np.full(len(position), reference.sd * _MM)
+    return pa.table({**columns, **_segment_column(reference.segment)})
+
+
+def _own_reference(table: Table) -> ReferenceTrack:
+    ending = ".position_mm"
+    axes = [name.removesuffix(ending) for name in table.columns if name.endswith(ending)]
+    if not axes:
+        raise RunError(
+            f"{table.path}: no column 'reference.<axis>_mm' or '<axis>{ending}'; it has: {', '.join(table.columns)}"
+        )
+    sd = f"{axes[0]}.position_sd_mm"
+    noise = float(table.numbers(sd)[0][0]) if sd in table.columns else 0.0
+    position = {axis: table.numbers(f"{axis}{ending}")[0] for axis in axes}
+    return ReferenceTrack(_seconds(table), position, noise, _segment(table))
+
+
+def _seconds(table: Table) -> FloatArray:
+    return seconds(table.stamps("time_s")[0])
+
+
+def _segment_column(segment: IntArray) -> dict[str, IntArray]:
+    """A column only where the log's clock was set back: most runs are one segment."""
+    return {"segment": segment} if segment.any() else {}
+
+
+def _segment(table: Table) -> IntArray:
+    if "segment" not in table.columns:
+        return np.zeros(table.rows, dtype=np.int64)
+    return table.columns["segment"].to_numpy().astype(np.int64)
+
+
+def _nullable(values: FloatArray) -> pa.Array:
+    return pa.array(values, from_pandas=True)

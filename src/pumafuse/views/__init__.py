@@ -1,0 +1,1 @@
+"""Pictures of a fusion: Rerun recordings and figures."""

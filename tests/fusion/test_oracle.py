@@ -1,0 +1,285 @@
+"""The filter against the conditional Gaussian of section 2 of the design, worked out without any filter."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+
+import mpmath
+import numpy as np
+import pytest
+from fusion_oracle import AxisOracle, Response, check_estimates, check_innovations, nanoseconds
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from pumafuse.errors import PumafuseWarning
+from pumafuse.fusion.augmented import AxisFilter
+from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
+from pumafuse.fusion.estimates import Estimates
+from pumafuse.fusion.offline import fuse
+from pumafuse.fusion.timeline import Outcome, build
+from pumafuse.model.arm import ArmModel, AxisModel, Gain
+from pumafuse.model.plants import FirstOrder, Plant, SecondOrder
+from pumafuse.runs.run import Run
+
+MS = 1_000_000  # ns
+T = 28 * MS
+UNDER, CRITICAL, OVER = (SecondOrder(natural_frequency=45.0, damping=damping) for damping in (0.4, 1.0, 1.8))
+LAG = FirstOrder(time_constant=0.0425)
+NOISE = Process(input_noise=0.3e-3, drift=0.8e-3, maneuver_noise=0.5e-3, maneuver_drift=5e-3)
+PAPER = Gain(slope=0.0818, intercept=0.933)
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A sensor and the instants it reads [ns since the first command], on ``axes`` (all for None)."""
+
+    sensor: Sensor
+    valid: np.ndarray
+    axes: tuple[str, ...] | None = None
+    missing: float = 0.0  # share of scalars that are NaN
+
+
+def sensor(sd: float = 0.05e-3, **kwargs: object) -> Sensor:
+    return Sensor(sd=sd, gate=0.0, **kwargs)
+
+
+def every(rate: float, count: int, first: int = 0) -> np.ndarray:
+    return first + np.rint(np.arange(count) * 1e9 / rate).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a run and its configuration are made of; the readings follow the commands with 1 mm of noise."""
+
+    axes: Mapping[str, AxisModel] = field(default_factory=lambda: {"radial": AxisModel(plant=LAG)})
+    delay: float = 0.06045
+    period: float = 0.028
+    times: np.ndarray = field(default_factory=lambda: np.arange(16) * T)
+    process: Process | Mapping[str, Process] = NOISE
+    offset_sd: float = 5e-3
+    heard: Mapping[str, Heard] = field(default_factory=lambda: {"tracker": Heard(sensor(latency=0.008), every(90, 36))})
+    start: Mapping[str, float] = field(default_factory=dict)
+    origin: int | float = 0  # stamp of the first command: int ns, or float seconds
+    rate: float | None = None
+    seed: int = 1
+
+    def made(self) -> tuple[Run, FusionConfig]:
+        rng = np.random.default_rng(self.seed)
+        level = 0.5 + 0.05 * np.arange(len(self.axes))
+        command = {axis: u + rng.uniform(-0.02, 0.02, len(self.times)) for axis, u in zip(self.axes, level, strict=True)}
+        process = self.process if isinstance(self.process, Mapping) else dict.fromkeys(self.axes, self.process)
+        config = FusionConfig(
+            arm=ArmModel(name="an arm", update_period=self.period, delay=self.delay, axes=dict(self.axes)),
+            start=Start(offset_sd=self.offset_sd),
+            process=dict(process),
+            sensors={name: heard.sensor for name, heard in self.heard.items()},
+        )
+        sensors = {name: self._readings(heard, command, rng) for name, heard in self.heard.items()}
+        shuffled = dict(reversed(sensors.items()))  # the order that counts is the configuration's
+        return Run.from_arrays(self._stamps(self.times), command, shuffled, start=self.start), config
+
+    def _stamps(self, ns: np.ndarray) -> np.ndarray:
+        return self.origin + (ns if isinstance(self.origin, int) else ns * 1e-9)
+
+    def _readings(
+        self, heard: Heard, command: Mapping[str, np.ndarray], rng: np.random.Generator
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        values: dict[str, np.ndarray] = {}
+        bias = rng.normal(0.0, heard.sensor.bias_sd)
+        for axis in heard.axes or command:
+            near = np.interp(heard.valid, self.times, command[axis]) + rng.normal(0.0, 1e-3, len(heard.valid))
+            values[axis] = heard.sensor.scale * near + bias
+            values[axis][rng.random(len(heard.valid)) < heard.missing] = np.nan
+        return self._stamps(heard.valid + round(heard.sensor.latency * 1e9)), values
+
+
+def anomalous(run: Run, config: FusionConfig) -> bool:
+    """Some scalar is not finite or valid before the first command: pumafuse has to say so."""
+    origin = run.command.stamp.min()
+    return any(
+        (source.stamp - round(config.sensors[name].latency * 1e9) < origin).any()
+        or not all(np.isfinite(value).all() for value in source.values.values())
+        for name, source in run.sensors.items()
+    )
+
+
+def told(run: Run, config: FusionConfig) -> AbstractContextManager[object]:
+    return pytest.warns(PumafuseWarning) if anomalous(run, config) else nullcontext()
+
+
+def check(case: Case, *, as_live: bool = False) -> Estimates:
+    """Everything :func:`fuse` says of a case agrees with the oracle."""
+    run, config = case.made()
+    with told(run, config):
+        estimates = fuse(run, config, rate=case.rate, as_live=as_live)
+    times = nanoseconds(estimates)
+    fused = estimates.readings.where(estimates.readings.outcome == Outcome.FUSED)
+    for number, axis in enumerate(estimates.axes):
+        oracle = AxisOracle(run, config, axis)
+        check_innovations(fused.where(fused.axis == number), oracle)
+        check_estimates(estimates[axis], oracle.as_live(times) if as_live else oracle.filtered(times))
+    return estimates
+
+
+# ---- the oracle itself ----------------------------------------------------------------------------------------------
+
+NEARLY = SecondOrder(natural_frequency=45.0, damping=1.0 + 1e-9)
+
+
+def companion(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    if isinstance(plant, FirstOrder):
+        return np.array([[-1.0 / plant.time_constant]]), np.array([1.0 / plant.time_constant]), np.array([1.0])
+    w, zeta = plant.natural_frequency, plant.damping
+    return np.array([[0.0, 1.0], [-w * w, -2.0 * zeta * w]]), np.array([0.0, w * w]), np.array([1.0, 0.0])
+
+
+@pytest.mark.parametrize("plant", [LAG, UNDER, CRITICAL, NEARLY, OVER])
+def test_the_oracles_responses_are_those_of_the_plants(plant: Plant) -> None:
+    """g = C e^(At) B, g' = C A e^(At) B and c = C A⁻¹ (e^(At) − 1) B, by matrix exponentials."""
+    A, B, C = companion(plant)
+    response = Response(AxisModel(plant=plant))
+    for t in (0.0, 1e-6, 3e-3, 0.02, 0.1, 1.0):
+        power = expm(A * t)
+        wanted = [C @ power @ B, C @ A @ power @ B, C @ np.linalg.solve(A, (power - np.eye(len(A))) @ B)]
+        got = [part(np.array([t]))[0] for part in (response.impulse, response.impulse_rate, response.step)]
+        np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("plant", [LAG, UNDER, CRITICAL, OVER])
+def test_the_oracle_settles_to_the_stationary_variances(plant: Plant) -> None:
+    """Without readings: ∫g² = 1/(2τ) or ω/(4ζ), ∫g'² = 1/(2τ³) or ω³/(4ζ), and an offset that walks."""
+    process = Process(input_noise=0.3e-3, drift=0.8e-3)
+    case = Case({"radial": AxisModel(plant=plant)}, times=np.array([0, 3000 * MS]), process=process, heard={})
+    belief = AxisOracle(*case.made(), "radial").filtered(case.times)
+    if isinstance(plant, FirstOrder):
+        position, velocity = 0.5 / plant.time_constant, 0.5 / plant.time_constant**3
+    else:
+        position = plant.natural_frequency / (4.0 * plant.damping)
+        velocity = position * plant.natural_frequency**2
+    walked = case.offset_sd**2 + process.drift**2 * 3.0
+    wanted = [process.input_noise**2 * position + walked, process.input_noise**2 * velocity, walked]
+    got = [getattr(belief, f"{name}_sd")[1] ** 2 for name in ("position", "velocity", "offset")]
+    np.testing.assert_allclose(got, wanted, rtol=1e-12)
+    assert [belief.position_sd[0], belief.velocity_sd[0], belief.offset_sd[0]] == [case.offset_sd, 0.0, case.offset_sd]
+
+
+def test_the_oracle_conditions_like_a_dense_solve() -> None:
+    """Mean and variance given three readings, as mpmath solves the 3 by 3 system from integrals of its own."""
+    heard = {"tracker": Heard(sensor(latency=0.0), np.array([10, 35, 61]) * MS)}
+    case = Case(delay=0.02, times=np.array([0, 28, 70]) * MS, heard=heard)
+    run, config = case.made()
+    belief = AxisOracle(run, config, "radial").filtered(np.array([65 * MS]))
+    u, z = run.command.values["radial"], run.sensors["tracker"].values["radial"]
+    tau, m = LAG.time_constant, [0.0, 0.0, abs(u[1] - u[0]) / 0.028]  # until 20 ms, 48 ms, then
+
+    def g(t: mpmath.mpf) -> mpmath.mpf:
+        return mpmath.exp(-t / tau) / tau
+
+    def q(part: int, plain: float, scaled: float) -> float:
+        return plain**2 + (scaled * m[part]) ** 2
+
+    def covariance(one: float, two: float) -> mpmath.mpf:
+        end, total = min(one, two), mpmath.mpf(config.start.offset_sd) ** 2
+        for part, (a, b) in enumerate([(0.0, 0.02), (0.02, 0.048), (0.048, 1.0)]):
+            if a < end:
+                span = [a, min(b, end)]
+                total += q(part, NOISE.input_noise, NOISE.maneuver_noise) * mpmath.quad(
+                    lambda s: g(one - s) * g(two - s), span
+                )
+                total += q(part, NOISE.drift, NOISE.maneuver_drift) * (span[1] - span[0])
+        return total
+
+    def mean(t: float) -> mpmath.mpf:
+        return u[0] + (u[1] - u[0]) * (1 - mpmath.exp(-(t - 0.048) / tau) if t > 0.048 else 0)
+
+    when, at = [0.010, 0.035, 0.061], 0.065
+    K = mpmath.matrix([[covariance(a, b) + (a == b) * mpmath.mpf(0.05e-3) ** 2 for b in when] for a in when])
+    cross = mpmath.matrix([covariance(at, b) for b in when])
+    gains = mpmath.lu_solve(K, cross)
+    wanted = mean(at) + sum(k * (value - mean(t)) for k, value, t in zip(gains, z, when, strict=True))
+    variance = covariance(at, at) - sum(k * c for k, c in zip(gains, cross, strict=True))
+    assert abs(belief.position[0] - wanted) < 1e-13
+    assert abs(belief.position_sd[0] ** 2 / variance - 1) < 1e-9
+
+
+# ---- the filter -----------------------------------------------------------------------------------------------------
+
+GRID = np.arange(16) * T
+IRREGULAR = np.cumsum([0, 28, 31, 20, 28, 3, 28, 400, 28, 28, 5, 28, 90, 28]) * MS
+TRACKER = Heard(sensor(latency=0.008), every(90, 36))
+VISION = Heard(sensor(0.4e-3, latency=0.090), every(25, 10, 7 * MS))
+SLOW = Heard(sensor(0.2e-3, latency=0.240), every(12.5, 5, 3 * MS))
+PANEL = Heard(sensor(0.3e-3, latency=0.004, scale=-1.0, bias_sd=1.0), every(40, 16, 2 * MS))
+AHEAD = Heard(sensor(0.3e-3, latency=-0.050), every(15, 6, 61 * MS))  # stamped before it is true
+THREE = {
+    "tangential": AxisModel(plant=SecondOrder(natural_frequency=53.9, damping=0.864), gain=Gain(slope=0.05, intercept=1.01)),
+    "radial": AxisModel(plant=LAG, gain=PAPER, gain_recovery=0.1, delay=0.0385),
+    "vertical": AxisModel(plant=FirstOrder(time_constant=0.0356), delay=0.0),
+}
+
+
+def one(plant: Plant, **kwargs: object) -> dict[str, AxisModel]:
+    return {"radial": AxisModel(plant=plant, **kwargs)}
+
+
+CASES = {
+    "first order": Case(),
+    "under-damped": Case(one(UNDER)),
+    "critical": Case(one(CRITICAL)),
+    "nearly critical": Case(one(NEARLY)),
+    "over-damped": Case(one(OVER)),
+    "no delay": Case(one(UNDER), delay=0.0),
+    "no delay, first order": Case(delay=0.0),
+    "a delay of less than a period": Case(one(UNDER), delay=0.0113),
+    "a delay of two periods exactly": Case(delay=0.056),
+    "a delay of many periods": Case(one(OVER), delay=0.2005),
+    "a delay beyond the run": Case(delay=2.0),
+    "irregular commands": Case(one(UNDER), times=IRREGULAR),
+    "irregular commands, recovering gain": Case(one(OVER, gain=PAPER, gain_recovery=0.1), times=IRREGULAR),
+    "gain": Case(one(LAG, gain=PAPER)),
+    "recovery": Case(one(UNDER, gain=PAPER, gain_recovery=0.1)),
+    "recovery of a period that is no whole ns": Case(one(LAG, gain=PAPER, gain_recovery=0.05), period=1.0 / 30.0, times=IRREGULAR),
+    "start elsewhere": Case(one(UNDER, gain=PAPER, gain_recovery=0.1), start={"radial": 0.46}),
+    "offset certain": Case(offset_sd=0.0),
+    "offset never": Case(one(CRITICAL), offset_sd=0.0, process=Process(input_noise=1e-3, drift=0.0)),
+    "no drift": Case(process=Process(input_noise=0.3e-3, drift=0.0)),
+    "nothing but offset": Case(one(UNDER), process=Process(input_noise=0.0, drift=0.0)),
+    "maneuver alone": Case(process=Process(input_noise=0.0, drift=0.0, maneuver_noise=1e-3, maneuver_drift=1e-2)),
+    "read as commands act": Case(delay=0.0565, heard={"tracker": Heard(sensor(latency=0.0033), GRID + 56_500_000)}),
+    "read as commands act, at once": Case(one(UNDER), delay=0.0, heard={"tracker": Heard(sensor(), GRID)}),
+    "two at the same instants": Case(heard={"vision": Heard(VISION.sensor, GRID), "tracker": Heard(TRACKER.sensor, GRID)}),
+    "rates and latencies": Case(one(UNDER), heard={"vision": VISION, "slow": SLOW, "ahead": AHEAD, "tracker": TRACKER}),
+    "panel": Case(one(UNDER), heard={"panel": PANEL, "tracker": Heard(sensor(latency=0.05), every(20, 8, 150 * MS))}),
+    "panel alone": Case(heard={"panel": PANEL}),
+    "two panels": Case(heard={"panel": PANEL, "other": Heard(PANEL.sensor, every(40, 16, 2 * MS))}),
+    "a factor": Case(heard={"tracker": Heard(sensor(scale=2.5), every(60, 20))}),
+    "without readings": Case(one(UNDER), heard={}),
+    "rows before the first command": Case(heard={"tracker": Heard(TRACKER.sensor, every(90, 20, -30 * MS))}),
+    "grid": Case(one(UNDER), rate=170.0),
+    "sparse grid": Case(rate=7.0, heard={"tracker": TRACKER, "vision": VISION}),
+    "nanosecond stamps": Case(origin=1_700_000_000_123_456_789, rate=100.0),
+    "absolute seconds": Case(one(UNDER), origin=1.7e9),
+    "negative stamps": Case(origin=-5_000_000_001),
+    "axes and missing values": Case(
+        THREE,
+        process={"tangential": NOISE, "radial": Process(input_noise=1e-3), "vertical": Process(drift=0.0)},
+        heard={
+            "vision": Heard(VISION.sensor, VISION.valid, missing=0.4),
+            "panel": Heard(PANEL.sensor, PANEL.valid, axes=("vertical",)),
+            "tracker": Heard(sensor({"radial": 0.05e-3, "tangential": 0.08e-3}), every(60, 12), axes=("radial", "tangential"), missing=0.2),
+        },
+        start={"vertical": 0.59},
+        rate=60.0,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("as_live", [False, True], ids=["filtered", "as-live"])
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
+def test_estimates_are_conditional_means(case: Case, as_live: bool) -> None:
+    """Every estimate, its error bar and every innovation is that of the joint Gaussian given the readings it may know."""
+    check(case, as_live=as_live)

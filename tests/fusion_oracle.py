@@ -1,0 +1,378 @@
+"""An oracle for the filter that shares nothing with it: one axis of a run as one joint Gaussian, conditioned once.
+
+Section 2 of the design says p(t) = ∫ g(t − s) (v(s − Td) + w(s)) ds + o(t) with g the plant's impulse response, so
+
+    mean       Σ Δv_k c(t − a_k), c the step response and a_k when the k-th change of v acts,
+    covariance ∫ q(s) g(t − s) g(t' − s) ds + var(o₀) + ∫ drift²(s) ds over what lies before both t and t'.
+
+Velocity has g' in the place of g. No state space and no recursion in time: closed-form responses, superposition,
+Gauss-Legendre quadrature. The priors are added and the readings conditioned on in 50-digit decimals, because a bias of
+1 m against noise of 0.05 mm leaves a double too few digits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, localcontext
+
+import numpy as np
+
+from pumafuse.fusion.config import FusionConfig
+from pumafuse.fusion.estimates import Estimates, Readings
+from pumafuse.model.arm import AxisModel
+from pumafuse.model.plants import FirstOrder
+from pumafuse.runs.run import Run
+
+DIGITS = 50
+FIELDS = ("position", "velocity", "offset")
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
+_decimal = np.frompyfunc(Decimal, 1, 1)
+
+
+def check_estimates(estimate: object, belief: Belief) -> None:
+    """An axis's estimates agree with the oracle: means to 1e-9 sd + 1e-12 m, variances to 1e-9."""
+    for field in FIELDS:
+        for name in (field, f"{field}_sd"):
+            assert np.isfinite(getattr(estimate, name)).all(), name
+        _check(field, getattr(estimate, field), getattr(belief, field), getattr(belief, f"{field}_sd"))
+        _check_sd(f"{field}_sd", getattr(estimate, f"{field}_sd"), getattr(belief, f"{field}_sd"))
+
+
+def check_innovations(readings: Readings, oracle: AxisOracle) -> None:
+    """Innovations of one axis's fused scalars agree with the oracle's, to the same tolerances."""
+    nu, sd = oracle.innovations()
+    assert readings.value.tolist() == [reading.value for reading in oracle.readings]
+    _check("innovation", readings.innovation, nu, sd)
+    _check_sd("innovation_sd", readings.innovation_sd, sd)
+
+
+def nanoseconds(estimates: Estimates) -> np.ndarray:
+    """When the estimates are for, int ns since the run's first command."""
+    return np.rint(estimates.time * 1e9).astype(np.int64)
+
+
+def _check(name: str, got: np.ndarray, wanted: np.ndarray, sd: np.ndarray) -> None:
+    np.testing.assert_array_less(np.abs(got - wanted) - 1e-9 * sd, 1e-12, err_msg=name)
+
+
+def _check_sd(name: str, got: np.ndarray, wanted: np.ndarray) -> None:
+    np.testing.assert_allclose(got**2, wanted**2, rtol=1e-9, atol=0.0, err_msg=name)
+
+
+class Response:
+    """What a plant of unit gain answers: c to a step, g = c' to an impulse, and g'; for t ≥ 0 [s].
+
+    With s̄ the mean of the two poles and ±δ what they differ from it, g = ω² e^(s̄t) sinh(δt)/δ: real, and the same
+    formula, whether δ is real, imaginary or 0.
+    """
+
+    def __init__(self, axis: AxisModel) -> None:
+        plant = axis.plant
+        self.first_order = isinstance(plant, FirstOrder)
+        if isinstance(plant, FirstOrder):
+            self.fastest = 1.0 / plant.time_constant
+        else:
+            zeta, self.omega = plant.damping, plant.natural_frequency
+            self.mean = -zeta * self.omega
+            self.delta = self.omega * np.sqrt(complex((zeta - 1.0) * (zeta + 1.0)))
+            self.fastest = abs(self.mean - self.delta)
+
+    def step(self, t: np.ndarray) -> np.ndarray:
+        """c(t)."""
+        if self.first_order:
+            return -np.expm1(-self.fastest * t)
+        cosh, sinhc = self._hyperbolic(t)
+        return 1.0 - cosh + self.mean * t * sinhc
+
+    def impulse(self, t: np.ndarray) -> np.ndarray:
+        """g(t) [1/s]."""
+        if self.first_order:
+            return self.fastest * np.exp(-self.fastest * t)
+        return self.omega**2 * t * self._hyperbolic(t)[1]
+
+    def impulse_rate(self, t: np.ndarray) -> np.ndarray:
+        """g'(t) [1/s²]."""
+        if self.first_order:
+            return -(self.fastest**2) * np.exp(-self.fastest * t)
+        cosh, sinhc = self._hyperbolic(t)
+        return self.omega**2 * (cosh + self.mean * t * sinhc)
+
+    def _hyperbolic(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """e^(s̄t) cosh δt and e^(s̄t) sinh(δt)/(δt), written so that nothing overflows."""
+        slow, twice = np.exp((self.mean + self.delta) * t), 2.0 * self.delta * t
+        some = np.where(twice == 0.0, 1.0, twice)
+        ratio = np.where(twice == 0.0, 1.0, -np.expm1(-some) / some)
+        return (slow * (1.0 + np.exp(-twice)) / 2.0).real, (slow * ratio).real
+
+
+@dataclass(frozen=True)
+class Entries:
+    """What the plant is fed on one axis, ns since the run's first command.
+
+    Attributes:
+        time: When each change of v acts.
+        change: How much v changes then [m].
+        acting: When each command acts.
+        maneuver: |u_n − 2u_(n−1) + u_(n−2)| / T [m/s] of each command.
+    """
+
+    time: np.ndarray
+    change: np.ndarray
+    acting: np.ndarray
+    maneuver: np.ndarray
+
+
+def entries(run: Run, config: FusionConfig, axis: str, end: int) -> Entries:
+    """Section 2's scalar recursion for the gain, up to ``end`` [ns]; commands as given, stamps believed."""
+    model, period = config.arm.axes[axis], config.arm.update_period
+    delay = round(config.arm.delay_of(axis) * 1e9)
+    kept = np.isfinite(run.command.values[axis])
+    given = [int(stamp) - int(run.command.stamp.min()) for stamp in run.command.stamp[kept]]
+    command = [float(u) for u in run.command.values[axis][kept]]
+    start = run.start.get(axis, command[0])
+    one, two, error, when = start, start, 0.0, given[0]  # u_(n-1), u_(n-2), e_(n-1), t_(n-1)
+    time, value, maneuver = list[int](), list[float](), list[float]()
+    for u, t, until in zip(command, given, [*given[1:], end], strict=True):
+        if model.gain_recovery is not None:
+            error *= math.exp(-(t - when) * 1e-9 / model.gain_recovery)
+        gain = model.gain.slope * abs(u - one) / period + model.gain.intercept
+        error += (gain - 1.0) * (u - one)
+        maneuver.append(abs(u - 2.0 * one + two) / period)
+        time.append(t)
+        value.append(u - start + error)
+        tick = 1
+        while model.gain_recovery is not None and (at := t + round(tick * period * 1e9)) < until:
+            time.append(at)
+            value.append(u - start + error * math.exp(-tick * period / model.gain_recovery))
+            tick += 1
+        one, two, when = u, one, t
+    return Entries(
+        np.array(time) + delay, np.diff(value, prepend=0.0), np.array(given) + delay, np.array(maneuver)
+    )
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One finite scalar, valid at or after the run's first command; ns since that command, SI."""
+
+    sensor: str
+    valid: int
+    stamp: int
+    value: float
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Things to know about the path, one a row: position·p(t) + velocity·ṗ(t) + offset·o(t); arrays are (rows,)."""
+
+    time: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    offset: np.ndarray
+
+    @staticmethod
+    def each(time: Sequence[int] | np.ndarray, position: object, velocity: object, offset: object) -> Rows:
+        """Rows at ``time``, weights given once or one by one."""
+        shape = np.shape(time)
+        weights = [np.broadcast_to(np.asarray(weight, float), shape) for weight in (position, velocity, offset)]
+        return Rows(np.asarray(time, dtype=np.int64), *weights)
+
+    def __add__(self, other: Rows) -> Rows:
+        return Rows(*(np.concatenate([getattr(rows, name) for rows in (self, other)]) for name in self.__annotations__))
+
+    @property
+    def level(self) -> np.ndarray:
+        """How much of a constant offset each row sees."""
+        return self.position + self.offset
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Means and standard deviations in the log's coordinates, SI; arrays are (times,)."""
+
+    position: np.ndarray
+    position_sd: np.ndarray
+    velocity: np.ndarray
+    velocity_sd: np.ndarray
+    offset: np.ndarray
+    offset_sd: np.ndarray
+
+
+class AxisOracle:
+    """One axis of a run, gates off.
+
+    Attributes:
+        readings: What there is to condition on, in the total order.
+    """
+
+    def __init__(
+        self, run: Run, config: FusionConfig, axis: str, *, leave_out: Collection[tuple[str, int]] = ()
+    ) -> None:
+        """Collect what ``run`` says of ``axis``.
+
+        Args:
+            run: Commands and readings.
+            config: Arm, noise and sensors.
+            axis: Which axis.
+            leave_out: Readings not to condition on: sensor and row.
+        """
+        self.run, self.config, self.axis = run, config, axis
+        self.process, self.response = config.process[axis], Response(config.arm.axes[axis])
+        first = run.command.values[axis][np.isfinite(run.command.values[axis])][0]
+        self.start = run.start.get(axis, float(first))
+        self.readings = self._collect(set(leave_out))
+
+    def innovations(self) -> tuple[np.ndarray, np.ndarray]:
+        """ν and √S of each reading, given all before it in the total order."""
+        with localcontext(prec=DIGITS):
+            L, w, _ = self._condition(self.readings, self._readings_as_rows(self.readings))
+            sd = np.diagonal(L)
+            return (sd * w).astype(float), sd.astype(float)
+
+    def filtered(self, times: np.ndarray) -> Belief:
+        """Given every reading valid at or before each of ``times`` [ns since the first command]."""
+        return self._believe(times, self.readings, [reading.valid for reading in self.readings])
+
+    def as_live(self, times: np.ndarray) -> Belief:
+        """Given every reading whose stamp and valid time are at or before each of ``times``."""
+        assert not any(self.config.sensors[reading.sensor].latency_sd for reading in self.readings)
+        arrived = sorted(self.readings, key=lambda reading: max(reading.stamp, reading.valid))
+        return self._believe(times, arrived, [max(reading.stamp, reading.valid) for reading in arrived])
+
+    def smoothed(self, times: np.ndarray) -> Belief:
+        """Given every reading there is."""
+        return self._believe(times, self.readings, [min(times)] * len(self.readings))
+
+    def _collect(self, leave_out: set[tuple[str, int]]) -> list[Reading]:
+        origin, found = int(self.run.command.stamp.min()), []
+        for rank, (name, sensor) in enumerate(self.config.sensors.items()):
+            source = self.run.sensors.get(name)
+            if source is None or self.axis not in source.values or sensor.sd_of(self.axis) is None:
+                continue
+            for row, value in enumerate(source.values[self.axis]):
+                stamp = int(source.stamp[row]) - origin
+                valid = stamp - round(sensor.latency * 1e9)
+                if np.isfinite(value) and valid >= 0 and (name, row) not in leave_out:
+                    found.append((valid, rank, stamp, row, Reading(name, valid, stamp, float(value))))
+        return [reading for *_, reading in sorted(found)]
+
+    def _believe(self, times: np.ndarray, order: Sequence[Reading], known_from: Sequence[int]) -> Belief:
+        """Given, for each of ``times``, the readings of ``order`` that are known by then: the first so many."""
+        count = np.searchsorted(known_from, times, side="right")
+        targets = (Rows.each(times, *weights) for weights in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+        rows = self._readings_as_rows(order)
+        for target in targets:
+            rows = rows + target
+        with localcontext(prec=DIGITS):
+            n = len(order)
+            L, w, joint = self._condition(order, rows)
+            C = _substituted(joint.cross[n:], L)
+            C[np.arange(n) >= np.tile(count, 3)[:, None]] = Decimal(0)
+            mean = joint.mean[n:] + C.dot(w) if n else joint.mean[n:]
+            variance = joint.variance[n:] - (C * C).sum(axis=1) if n else joint.variance[n:]
+            position, velocity, offset = mean.reshape(3, -1)
+            sd = [_root(part) for part in variance.reshape(3, -1)]
+            position = position + Decimal(self.start)
+        means = [part.astype(float) for part in (position, velocity, offset)]
+        return Belief(*(part for pair in zip(means, sd, strict=True) for part in pair))
+
+    def _condition(self, order: Sequence[Reading], rows: Rows) -> tuple[np.ndarray, np.ndarray, _Joint]:
+        """Cholesky factor of the readings' covariance and the whitened readings; the first of ``rows`` are theirs."""
+        n = len(order)
+        speeds = Rows.each([reading.valid for reading in order], 0, 1, 0)
+        joint = self._joint(order, rows + speeds)
+        L, w = np.full((n, n), Decimal(0)), np.full(n, Decimal(0))
+        for k, reading in enumerate(order):
+            sensor = self.config.sensors[reading.sensor]
+            scale, sd = Decimal(sensor.scale), Decimal(sensor.sd_of(self.axis))
+            here = [k, len(rows.time) + k]
+            L[k, :k], speed = _substituted(joint.cross[here, :k], L[:k, :k])
+            speed = joint.mean[here[1]] + _dot(speed, w[:k])
+            noise = sd**2 + (scale * speed * Decimal(sensor.latency_sd)) ** 2
+            L[k, k] = (joint.variance[k] + noise - _dot(L[k, :k], L[k, :k])).sqrt()
+            predicted = scale * Decimal(self.start) + joint.mean[k] + _dot(L[k, :k], w[:k])
+            w[k] = (Decimal(reading.value) - predicted) / L[k, k]
+        return L, w, joint.first(len(rows.time))
+
+    def _joint(self, order: Sequence[Reading], rows: Rows) -> _Joint:
+        """Mean and variance of ``rows`` and their covariance with the readings, which are the first rows, noise apart."""
+        n = len(order)
+        fed = entries(self.run, self.config, self.axis, int(rows.time.max(initial=0)) + 1)
+        mean = self._mean(rows, fed)
+        noise, drift, from_noise, from_drift = self._driven(rows, fed)
+        cross = (from_noise * noise) @ from_noise[:n].T + (from_drift * drift) @ from_drift[:n].T
+        variance = (from_noise**2) @ noise + (from_drift**2) @ drift
+        level, prior = _decimal(rows.level), Decimal(self.config.start.offset_sd) ** 2
+        exact_cross = _decimal(cross) + prior * np.multiply.outer(level, level[:n])
+        exact_variance = _decimal(variance) + prior * level * level
+        for k, one in enumerate(order):
+            bias = Decimal(self.config.sensors[one.sensor].bias_sd) ** 2
+            exact_variance[k] += bias
+            for j, other in enumerate(order):
+                if one.sensor == other.sensor:
+                    exact_cross[k, j] += bias
+        return _Joint(_decimal(mean), exact_variance, exact_cross)
+
+    def _mean(self, rows: Rows, fed: Entries) -> np.ndarray:
+        """Superposed step responses [m or m/s]; a change that acts at an instant is already seen there."""
+        lag = (rows.time[:, None] - fed.time) * 1e-9
+        seen, lag = lag >= 0.0, np.maximum(lag, 0.0)
+        position = np.where(seen, self.response.step(lag), 0.0) @ fed.change
+        velocity = np.where(seen, self.response.impulse(lag), 0.0) @ fed.change
+        return rows.position * position + rows.velocity * velocity
+
+    def _driven(self, rows: Rows, fed: Entries) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Quadrature weights times the two densities (nodes,), and what each row sees of them (rows, nodes)."""
+        end = int(rows.time.max(initial=1))
+        stride = max(1, int(1e9 / self.response.fastest))
+        edges = np.unique(np.concatenate(([0], rows.time, fed.acting, np.arange(0, end, stride))))
+        edges = edges[edges <= end] / 1e9
+        half, middle = np.diff(edges)[:, None] / 2.0, (edges[1:] + edges[:-1])[:, None] / 2.0
+        nodes, weights = (middle + half * _NODES).ravel(), (half * _WEIGHTS).ravel()
+        command = np.searchsorted(fed.acting / 1e9, middle[:, 0], side="right") - 1
+        m = np.repeat(np.where(command >= 0, fed.maneuver[command], 0.0), len(_NODES))
+        process = self.process
+        noise = weights * (process.input_noise**2 + (process.maneuver_noise * m) ** 2)
+        drift = weights * (process.drift**2 + (process.maneuver_drift * m) ** 2)
+        lag = rows.time[:, None] / 1e9 - nodes
+        past, lag = lag > 0.0, np.maximum(lag, 0.0)
+        weight = [np.asarray(part)[:, None] for part in (rows.position, rows.velocity, rows.level)]
+        seen = weight[0] * self.response.impulse(lag) + weight[1] * self.response.impulse_rate(lag)
+        return noise, drift, np.where(past, seen, 0.0), past * weight[2]
+
+    def _readings_as_rows(self, order: Sequence[Reading]) -> Rows:
+        scale = [self.config.sensors[reading.sensor].scale for reading in order]
+        return Rows.each([reading.valid for reading in order], scale, 0, 0)
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """Prior of some rows in decimals: mean (rows,), variance (rows,), covariance with the readings (rows, readings)."""
+
+    mean: np.ndarray
+    variance: np.ndarray
+    cross: np.ndarray
+
+    def first(self, count: int) -> _Joint:
+        return _Joint(self.mean[:count], self.variance[:count], self.cross[:count])
+
+
+def _substituted(K: np.ndarray, L: np.ndarray) -> np.ndarray:
+    """C with C Lᵀ = K, L lower triangular."""
+    C = K.copy()
+    for j in range(len(L)):
+        C[:, j] = (K[:, j] - C[:, :j].dot(L[j, :j]) if j else K[:, j]) / L[j, j]
+    return C
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> Decimal:
+    return sum(a * b, start=Decimal(0))
+
+
+def _root(variance: np.ndarray) -> np.ndarray:
+    """Standard deviations as floats; a variance that is negative beyond the quadrature's rounding is an error."""
+    assert all(value > Decimal("-1e-30") for value in variance)
+    return np.array([float(max(value, Decimal(0)).sqrt()) for value in variance])
