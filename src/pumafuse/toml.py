@@ -9,7 +9,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Any, TypeVar, cast, get_args, get_origin
 
 import msgspec
 import tomli_w
@@ -96,8 +96,7 @@ def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
         for key, value in tree.items():  # pyright: ignore[reportUnknownVariableType]
             yield from _problems(value, get_args(kind)[1], f"{prefix}{key}")
     else:
-        leaf: Any = kind
         try:
-            msgspec.convert(tree, leaf)
+            msgspec.convert(tree, cast(Any, kind))
         except msgspec.ValidationError as error:
             yield f"{path}: {str(error).split(' - at ')[0]}"

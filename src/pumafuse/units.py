@@ -37,6 +37,7 @@ EXPONENTS: Mapping[str, int] = {
 }
 LENGTHS = ("_m", "_mm", "_um")
 TIMES = ("_s", "_ms", "_us", "_ns")
+MM = 1e3  # mm in a metre, and ms in a second: SI arrays times this are what files and screens show
 INTERVAL = "_ci95"  # `time_constant_ms_ci95` is in ms
 
 

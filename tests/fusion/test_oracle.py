@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import mpmath
 import numpy as np
 import pytest
-from fusion_oracle import AxisOracle, Response, check_estimates, check_innovations, nanoseconds
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_discrete_are
 
+from fusion_oracle import AxisOracle, Response, check_estimates, check_innovations, nanoseconds
 from pumafuse.errors import PumafuseWarning
 from pumafuse.fusion.augmented import AxisFilter
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
-from pumafuse.fusion.timeline import Outcome, build
+from pumafuse.fusion.timeline import Outcome, Timeline, build
 from pumafuse.model.arm import ArmModel, AxisModel, Gain
 from pumafuse.model.plants import FirstOrder, Plant, SecondOrder
 from pumafuse.runs.run import Run
@@ -70,7 +69,9 @@ class Case:
     def made(self) -> tuple[Run, FusionConfig]:
         rng = np.random.default_rng(self.seed)
         level = 0.5 + 0.05 * np.arange(len(self.axes))
-        command = {axis: u + rng.uniform(-0.02, 0.02, len(self.times)) for axis, u in zip(self.axes, level, strict=True)}
+        command = {
+            axis: u + rng.uniform(-0.02, 0.02, len(self.times)) for axis, u in zip(self.axes, level, strict=True)
+        }
         process = self.process if isinstance(self.process, Mapping) else dict.fromkeys(self.axes, self.process)
         config = FusionConfig(
             arm=ArmModel(name="an arm", update_period=self.period, delay=self.delay, axes=dict(self.axes)),
@@ -117,6 +118,8 @@ def check(case: Case, *, as_live: bool = False) -> Estimates:
     with told(run, config):
         estimates = fuse(run, config, rate=case.rate, as_live=as_live)
     times = nanoseconds(estimates)
+    grid = case.times if case.rate is None else every(case.rate, len(times))
+    assert times.tolist() == grid.tolist()
     fused = estimates.readings.where(estimates.readings.outcome == Outcome.FUSED)
     for number, axis in enumerate(estimates.axes):
         oracle = AxisOracle(run, config, axis)
@@ -139,7 +142,7 @@ def companion(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("plant", [LAG, UNDER, CRITICAL, NEARLY, OVER])
 def test_the_oracles_responses_are_those_of_the_plants(plant: Plant) -> None:
-    """g = C e^(At) B, g' = C A e^(At) B and c = C A⁻¹ (e^(At) − 1) B, by matrix exponentials."""
+    """By matrix exponentials: g = C e^(At) B, g' = C A e^(At) B and c = C A⁻¹ (e^(At) − 1) B."""
     A, B, C = companion(plant)
     response = Response(AxisModel(plant=plant))
     for t in (0.0, 1e-6, 3e-3, 0.02, 0.1, 1.0):
@@ -216,7 +219,9 @@ SLOW = Heard(sensor(0.2e-3, latency=0.240), every(12.5, 5, 3 * MS))
 PANEL = Heard(sensor(0.3e-3, latency=0.004, scale=-1.0, bias_sd=1.0), every(40, 16, 2 * MS))
 AHEAD = Heard(sensor(0.3e-3, latency=-0.050), every(15, 6, 61 * MS))  # stamped before it is true
 THREE = {
-    "tangential": AxisModel(plant=SecondOrder(natural_frequency=53.9, damping=0.864), gain=Gain(slope=0.05, intercept=1.01)),
+    "tangential": AxisModel(
+        plant=SecondOrder(natural_frequency=53.9, damping=0.864), gain=Gain(slope=0.05, intercept=1.01)
+    ),
     "radial": AxisModel(plant=LAG, gain=PAPER, gain_recovery=0.1, delay=0.0385),
     "vertical": AxisModel(plant=FirstOrder(time_constant=0.0356), delay=0.0),
 }
@@ -242,7 +247,9 @@ CASES = {
     "irregular commands, recovering gain": Case(one(OVER, gain=PAPER, gain_recovery=0.1), times=IRREGULAR),
     "gain": Case(one(LAG, gain=PAPER)),
     "recovery": Case(one(UNDER, gain=PAPER, gain_recovery=0.1)),
-    "recovery of a period that is no whole ns": Case(one(LAG, gain=PAPER, gain_recovery=0.05), period=1.0 / 30.0, times=IRREGULAR),
+    "recovery in periods of no whole ns": Case(
+        one(LAG, gain=PAPER, gain_recovery=0.05), period=1.0 / 30.0, times=IRREGULAR
+    ),
     "start elsewhere": Case(one(UNDER, gain=PAPER, gain_recovery=0.1), start={"radial": 0.46}),
     "offset certain": Case(offset_sd=0.0),
     "offset never": Case(one(CRITICAL), offset_sd=0.0, process=Process(input_noise=1e-3, drift=0.0)),
@@ -251,7 +258,9 @@ CASES = {
     "maneuver alone": Case(process=Process(input_noise=0.0, drift=0.0, maneuver_noise=1e-3, maneuver_drift=1e-2)),
     "read as commands act": Case(delay=0.0565, heard={"tracker": Heard(sensor(latency=0.0033), GRID + 56_500_000)}),
     "read as commands act, at once": Case(one(UNDER), delay=0.0, heard={"tracker": Heard(sensor(), GRID)}),
-    "two at the same instants": Case(heard={"vision": Heard(VISION.sensor, GRID), "tracker": Heard(TRACKER.sensor, GRID)}),
+    "two at the same instants": Case(
+        heard={"vision": replace(VISION, valid=GRID), "tracker": replace(TRACKER, valid=GRID)}
+    ),
     "rates and latencies": Case(one(UNDER), heard={"vision": VISION, "slow": SLOW, "ahead": AHEAD, "tracker": TRACKER}),
     "panel": Case(one(UNDER), heard={"panel": PANEL, "tracker": Heard(sensor(latency=0.05), every(20, 8, 150 * MS))}),
     "panel alone": Case(heard={"panel": PANEL}),
@@ -270,7 +279,9 @@ CASES = {
         heard={
             "vision": Heard(VISION.sensor, VISION.valid, missing=0.4),
             "panel": Heard(PANEL.sensor, PANEL.valid, axes=("vertical",)),
-            "tracker": Heard(sensor({"radial": 0.05e-3, "tangential": 0.08e-3}), every(60, 12), axes=("radial", "tangential"), missing=0.2),
+            "tracker": Heard(
+                sensor({"radial": 0.05e-3, "tangential": 0.08e-3}), every(60, 12), ("radial", "tangential"), missing=0.2
+            ),
         },
         start={"vertical": 0.59},
         rate=60.0,
@@ -281,5 +292,220 @@ CASES = {
 @pytest.mark.parametrize("as_live", [False, True], ids=["filtered", "as-live"])
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 def test_estimates_are_conditional_means(case: Case, as_live: bool) -> None:
-    """Every estimate, its error bar and every innovation is that of the joint Gaussian given the readings it may know."""
+    """Every estimate, error bar and innovation is that of the joint Gaussian given the readings it may know."""
     check(case, as_live=as_live)
+
+
+@pytest.mark.parametrize(
+    "case", [Case(one(LAG)), Case(one(UNDER), times=IRREGULAR)], ids=["first order", "second order"]
+)
+def test_wandering_latency_counts_with_speed(case: Case) -> None:
+    """A reading's variance grows by (scale · predicted velocity · latency_sd)²."""
+    wanders = Heard(sensor(latency=0.02, latency_sd=0.004, scale=-1.5), every(70, 28))
+    check(replace(case, heard={"wandering": wanders, "vision": VISION}))
+
+
+def plants() -> st.SearchStrategy[Plant]:
+    first = st.builds(FirstOrder, time_constant=st.floats(0.008, 0.1))
+    damping = st.one_of(st.floats(0.1, 1.8), st.just(1.0))
+    return st.one_of(first, st.builds(SecondOrder, natural_frequency=st.floats(8.0, 70.0), damping=damping))
+
+
+def sensors(first: int) -> st.SearchStrategy[Heard]:
+    """A sensor of up to 13 readings; latencies, so the order of arrival, are anything."""
+    ms = st.integers(0, 300).map(lambda latency: latency * 1e-3)
+    read = st.builds(
+        sensor,
+        st.floats(0.02e-3, 1e-3),
+        latency=ms,
+        scale=st.sampled_from([1.0, -1.0, 0.3]),
+        bias_sd=st.sampled_from([0.0, 0.0, 1.0]),
+    )
+    valid = st.builds(
+        every, st.floats(8.0, 150.0), st.integers(3, 13), st.integers(0, 200).map(lambda t: t * MS + first)
+    )
+    return st.builds(Heard, read, valid, missing=st.sampled_from([0.0, 0.2]))
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> Case:
+    period = draw(st.sampled_from([28 * MS, 10 * MS, 4 * MS + 1]))
+    whole, fraction = draw(st.integers(0, 9)), draw(st.sampled_from([0, 1, period // 3, period - 1]))
+    gaps = draw(
+        st.lists(
+            st.sampled_from([period, period, 2 * period, period + 3 * MS, period // 2 + 1, 170 * MS]),
+            min_size=3,
+            max_size=24,
+        )
+    )
+    level = st.one_of(st.just(0.0), st.floats(1e-5, 2e-3))
+    process = st.builds(
+        Process, input_noise=level, drift=level, maneuver_noise=level, maneuver_drift=level.map(lambda d: 10 * d)
+    )
+    axis = AxisModel(
+        plant=draw(plants()),
+        gain=Gain(slope=draw(st.floats(0.0, 0.2)), intercept=draw(st.floats(0.9, 1.1))),
+        gain_recovery=draw(st.none() | st.floats(0.02, 0.3)),
+    )
+    names = draw(st.permutations(["tracker", "vision", "panel"]))[: draw(st.integers(1, 3))]
+    return Case(
+        {"radial": axis},
+        delay=(whole * period + fraction) * 1e-9,
+        period=period * 1e-9,
+        times=np.cumsum([0, *gaps]),
+        process=draw(process),
+        offset_sd=draw(st.sampled_from([0.0, 1e-3, 0.05])),
+        heard={name: draw(sensors(fraction)) for name in names},
+        start=draw(st.sampled_from([{}, {"radial": 0.512}])),
+        rate=draw(st.none() | st.floats(20.0, 60.0)),
+        seed=draw(st.integers(0, 2**32 - 1)),
+    )  # fmt: skip
+
+
+@settings(derandomize=True, deadline=None, max_examples=150)
+@given(cases(), st.booleans())
+def test_any_run_is_fused_like_the_conditional_gaussian(case: Case, as_live: bool) -> None:
+    """Random plants, delays, gains, noise and sensors: nothing deviates from the joint Gaussian."""
+    check(case, as_live=as_live)
+
+
+# ---- the gate -------------------------------------------------------------------------------------------------------
+
+OUTLIER = 13  # the row of the tracker that goes wrong
+
+
+def on_model(gate: float, gate_rows: bool = True) -> tuple[Run, FusionConfig]:
+    """Two axes whose readings are what the model expects, so that every innovation is 0."""
+    tracker = Heard(Sensor(sd=0.2e-3, latency=0.008, gate=gate, gate_rows=gate_rows), every(60, 20))
+    prompt = Heard(sensor(0.4e-3), VISION.valid)  # nothing arrives late, so the gate decides alike live
+    axes = {"radial": AxisModel(plant=LAG), "vertical": AxisModel(plant=UNDER)}
+    run, config = Case(axes, heard={"tracker": tracker, "prompt": prompt}).made()
+    for name, heard in {"tracker": tracker, "prompt": prompt}.items():
+        for axis, values in run.sensors[name].values.items():
+            silent = replace(run, sensors={})
+            values[:] = AxisOracle(silent, config, axis).filtered(heard.valid).position
+    return run, config
+
+
+def with_outlier(gate: float, sigmas: float, gate_rows: bool = True) -> tuple[Run, FusionConfig, float]:
+    """The tracker's row ``OUTLIER`` is off by ``sigmas`` √S on the radial axis; and that √S."""
+    run, config = on_model(gate, gate_rows)
+    oracle = AxisOracle(run, config, "radial")
+    nu, sd = oracle.innovations()
+    stamp = run.sensors["tracker"].stamp[OUTLIER] - run.command.stamp[0]
+    row = [(reading.sensor, reading.stamp) for reading in oracle.readings].index(("tracker", stamp))
+    assert np.abs(nu).max() < 1e-12
+    run.sensors["tracker"].values["radial"][OUTLIER] += sigmas * sd[row]
+    return run, config, sd[row]
+
+
+@pytest.mark.parametrize("as_live", [False, True], ids=["filtered", "as-live"])
+@pytest.mark.parametrize(
+    ("gate", "sigmas", "passes"),
+    [
+        (5.0, 0.999 * 5.0, True),
+        (5.0, -0.999 * 5.0, True),
+        (5.0, 1.001 * 5.0, False),
+        (5.0, -1.001 * 5.0, False),
+        (3.0, 1.001 * 3.0, False),
+        (5.0, 1e4, False),
+        (0.0, 1e4, True),
+    ],
+)
+def test_the_gate_rejects_beyond_so_many_sigma(gate: float, sigmas: float, passes: bool, as_live: bool) -> None:
+    """A reading beyond gate · √S leaves the estimates as if it had never been; one within is fused; gate 0 is none."""
+    run, config, sd = with_outlier(gate, sigmas)
+    estimates = fuse(run, config, as_live=as_live)
+    met = estimates.readings.of("tracker", "radial")
+    outcomes = [Outcome.FUSED] * len(met.value)
+    outcomes[OUTLIER] = Outcome.FUSED if passes else Outcome.GATED
+    assert met.outcome.tolist() == outcomes
+    assert met.innovation_sd[OUTLIER] == pytest.approx(sd, rel=1e-9)
+    assert met.innovation[OUTLIER] == pytest.approx(sigmas * sd, rel=1e-9)
+    oracle = AxisOracle(run, config, "radial", leave_out=() if passes else {("tracker", OUTLIER)})
+    times = nanoseconds(estimates)
+    check_estimates(estimates["radial"], oracle.as_live(times) if as_live else oracle.filtered(times))
+    radial = estimates.readings.where(estimates.readings.axis == estimates.readings.axes.index("radial"))
+    check_innovations(radial.where(radial.outcome == Outcome.FUSED), oracle)
+
+
+@pytest.mark.parametrize("gate_rows", [True, False])
+def test_a_gated_axis_gates_its_row_where_asked(gate_rows: bool) -> None:
+    """With gate_rows the other axis of the row is gated too and its estimates do without it; otherwise it is fused."""
+    run, config, _ = with_outlier(5.0, 7.0, gate_rows)
+    estimates = fuse(run, config)
+    outcome = {axis: estimates.readings.of("tracker", axis).outcome[OUTLIER] for axis in estimates.axes}
+    assert outcome == {"radial": Outcome.GATED, "vertical": Outcome.GATED if gate_rows else Outcome.FUSED}
+    assert np.count_nonzero(estimates.readings.outcome == Outcome.GATED) == 1 + gate_rows
+    for axis, gone in {"radial": True, "vertical": gate_rows}.items():
+        oracle = AxisOracle(run, config, axis, leave_out={("tracker", OUTLIER)} if gone else ())
+        check_estimates(estimates[axis], oracle.filtered(nanoseconds(estimates)))
+
+
+# ---- long runs ------------------------------------------------------------------------------------------------------
+
+
+def one_filter(case: Case) -> tuple[AxisFilter, Timeline, FusionConfig]:
+    """The filter of a case's only axis, at its start."""
+    run, config = case.made()
+    timeline = build(run, config)
+    (name,), (driven,) = config.arm.axes, timeline.axes
+    biases = [(sensor, heard.sensor.bias_sd) for sensor, heard in case.heard.items() if heard.sensor.bias_sd]
+    plant, process = config.arm.axes[name].plant, config.process[name]
+    valid = np.unique(timeline.scalars.valid)
+    return AxisFilter(plant, driven, process, case.offset_sd, biases, timeline.origin, valid), timeline, config
+
+
+def meet(axis: AxisFilter, sensor: Sensor, name: str, valid: int, z: float) -> None:
+    axis.advance(axis.latest(valid))
+    assert isinstance(sensor.sd, float)
+    axis.fuse(z, *axis.observation(name, sensor, sensor.sd))
+
+
+@pytest.mark.parametrize("plant", [LAG, UNDER])
+def test_the_covariance_settles_where_riccatis_equation_says(plant: Plant) -> None:
+    """One reading each period, forever: P before a reading solves the discrete algebraic Riccati equation."""
+    process = Process(input_noise=0.3e-3, drift=0.8e-3)
+    read = Heard(sensor(0.1e-3), np.arange(400) * T + 5 * MS)
+    axis, timeline, config = one_filter(
+        Case(one(plant), times=np.arange(401) * T, process=process, heard={"tracker": read})
+    )
+    for valid in timeline.scalars.valid:
+        meet(axis, config.sensors["tracker"], "tracker", int(valid), 0.0)
+    A, B, C = companion(plant)
+    n = len(A)
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    F, Q, H = np.eye(n + 1), np.zeros((n + 1, n + 1)), np.append(C, 1.0)[None]
+    F[:n, :n], Q[n, n] = expm(A * 0.028), process.drift**2 * 0.028
+    for node, weight in zip(nodes, weights, strict=True):
+        kick = expm(A * 0.014 * (1.0 + node)) @ B
+        Q[:n, :n] += 0.014 * weight * process.input_noise**2 * np.outer(kick, kick)
+    P = solve_discrete_are(F.T, H.T, Q, [[0.1e-3**2]])
+    gain = P @ H.T / (H @ P @ H.T + 0.1e-3**2)
+    np.testing.assert_allclose(axis.kf.P[: n + 1, : n + 1], P - gain @ H @ P, rtol=1e-8)
+
+
+@pytest.mark.long
+def test_a_million_steps_leave_the_covariance_symmetric_and_positive() -> None:
+    """P of plant, offset and a bias of 1 m stays symmetric to the last bit and positive; the register stays certain."""
+    count = 310_000
+    process = Process(input_noise=0.03e-3, drift=0.4e-3, maneuver_noise=0.5e-3, maneuver_drift=5e-3)
+    heard = {
+        "panel": Heard(sensor(0.3e-3, scale=-1.0, bias_sd=1.0), every(12.0, count // 3, 2 * MS)),
+        "tracker": Heard(sensor(0.05e-3, latency=0.008), every(36.0, count, 5 * MS)),
+    }
+    case = Case(one(UNDER), times=np.arange(count) * T, process=process, heard=heard)
+    axis, timeline, config = one_filter(case)
+    scalars, register = timeline.scalars, 4
+    assert len(axis.time) > 1_000_000
+    for number, (valid, of) in enumerate(zip(scalars.valid.tolist(), scalars.sensor.tolist(), strict=True)):
+        name = scalars.sensors[of]
+        meet(axis, config.sensors[name], name, valid, 0.0)
+        if number % 500 == 0:
+            P = axis.kf.P
+            assert (P == P.T).all()
+            assert not P[register:].any()
+            np.linalg.cholesky(
+                P[:register, :register] / np.sqrt(np.outer(P.diagonal(), P.diagonal())[:register, :register])
+            )
+            axis.held.clear()

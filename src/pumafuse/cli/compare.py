@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
-from rich.console import Console
 
 from ..errors import RunError
 from ..fusion import results
 from ..fusion.summary import ScoreSummary, score_summary
-from .tables import score_table
+from .tables import console, score_table
 
 
 class Compared(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,4 +44,4 @@ def run(folders: Sequence[Path], reference: Path | None, json: bool) -> None:
     if json:
         print(msgspec.json.format(msgspec.json.encode(compared), indent=2).decode())
     else:
-        Console(highlight=False).print(score_table([(entry.folder, entry.axes) for entry in compared]))
+        console().print(score_table([(entry.folder, entry.axes) for entry in compared]))

@@ -5,8 +5,6 @@ from __future__ import annotations
 from importlib.resources import as_file, files
 from pathlib import Path
 
-from rich.console import Console
-
 from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Estimates
@@ -14,6 +12,7 @@ from ..fusion.offline import fuse
 from ..runs.run import Run
 from ..views.figures import fused_figure
 from .fuse import progress_of, show, to_recording
+from .tables import console
 
 _SENSOR = "vision"  # alone: what a camera and a model can do together shows best without the laser tracker
 
@@ -25,8 +24,8 @@ def run(output: Path, force: bool) -> None:
         PumafuseError: The folder is in the way.
     """
     results.check_writable(output, force)
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(
+    out = console(soft_wrap=True)
+    out.print(
         "A 60 s scan of a panel by a PUMA 560: a command every 28 ms, a camera (0.5 mm noise, 45 ms late, dropouts and"
         " outliers),\nand a truth to score against that the filter never sees.\n"
     )
@@ -36,7 +35,7 @@ def run(output: Path, force: bool) -> None:
             est = fuse(recorded, config, sensors=[_SENSOR], rate=200.0, progress=progress)
         summary = results.write(est, output, force, lambda folder: _draw(est, recorded, folder))
         show(summary, output)
-        console.print(
+        out.print(
             f"\nWhat to open next:\n"
             f"  {output / 'fused.png'}   the run and its error, with error bars\n"
             f"  rerun {output / 'fused.rrd'}   the same in the Rerun viewer\n"

@@ -6,10 +6,11 @@ import math
 
 import msgspec
 import numpy as np
-from rich.console import Console
 
 from ..model.arm import ArmModel
 from ..model.discrete import DiscreteModel, discretize
+from ..units import shifted
+from .tables import console
 
 _LONGEST = 200  # ticks of step response that are shown at most
 
@@ -47,7 +48,7 @@ def run(source: str, axis: str | None, period_ms: float | None, json: bool) -> N
         PumafuseError: No such arm or axis.
     """
     arm = ArmModel.load(source)
-    period = arm.update_period if period_ms is None else period_ms / 1e3
+    period = arm.update_period if period_ms is None else shifted(period_ms, -3)
     models: dict[str, Discretized] = {}
     for name in arm.axes if axis is None else [axis]:
         # 1 m/√Hz and states in m give the same numbers as 1 mm/√Hz and states in mm.
@@ -66,8 +67,8 @@ def _shown(model: DiscreteModel) -> Discretized:
     settling = math.ceil(math.log(1e-3) / math.log(slowest)) if 0.0 < slowest < 1.0 else 1
     ticks = min(math.ceil(model.delay / model.period) + settling + 2, _LONGEST)
     return Discretized(
-        period_ms=model.period * 1e3,
-        delay_ms=model.delay * 1e3,
+        period_ms=shifted(model.period, 3),
+        delay_ms=shifted(model.delay, 3),
         states=list(model.states),
         F=model.F.tolist(),
         B=model.B.tolist(),
@@ -79,13 +80,13 @@ def _shown(model: DiscreteModel) -> Discretized:
 
 
 def _print(arm: str, axis: str, shown: Discretized) -> None:
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(f"[bold]{arm}, {axis}[/bold]: period {shown.period_ms:g} ms, delay {shown.delay_ms:g} ms")
-    console.print(f"states: {', '.join(shown.states)} (mm, mm/s)", markup=False)
+    out = console(soft_wrap=True)
+    out.print(f"[bold]{arm}, {axis}[/bold]: period {shown.period_ms:g} ms, delay {shown.delay_ms:g} ms")
+    out.print(f"states: {', '.join(shown.states)} (mm, mm/s)", markup=False)
     with np.printoptions(precision=6, suppress=False, linewidth=120):
         for letter, matrix in (("F", shown.F), ("B", shown.B), ("H", shown.H), ("Q", shown.Q)):
             unit = " [mm²] for input noise of 1 mm/√Hz" if letter == "Q" else ""
-            console.print(f"{letter}{unit} =\n{np.array(matrix)}", markup=False)
+            out.print(f"{letter}{unit} =\n{np.array(matrix)}", markup=False)
         poles = ", ".join(f"{re:.6g}" if im == 0.0 else f"{re:.6g}{im:+.6g}j" for re, im in shown.poles)
-        console.print(f"poles: {poles}", markup=False)
-        console.print(f"step response, p[0], p[1], …:\n{np.array(shown.step_response_mm)}\n", markup=False)
+        out.print(f"poles: {poles}", markup=False)
+        out.print(f"step response, p[0], p[1], …:\n{np.array(shown.step_response_mm)}\n", markup=False)

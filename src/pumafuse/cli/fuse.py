@@ -17,7 +17,7 @@ from ..fusion.estimates import Estimates
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
 from ..runs.run import Run
-from .tables import outcome_table, score_table
+from .tables import console, outcome_table, score_table
 
 
 def run(
@@ -56,16 +56,16 @@ def run(
 
 def show(summary: Summary, folder: Path) -> None:
     """Print what a person wants to know of a fusion."""
-    console = Console(highlight=False)
-    console.print(
+    out = console()
+    out.print(
         f"[bold]{summary.run}[/bold]: {summary.estimates} estimates over {summary.duration_s:.1f} s, {summary.mode},"
         f" arm {summary.arm}"
     )
-    console.print(outcome_table(summary))
+    out.print(outcome_table(summary))
     scores = {axis: part.score for axis, part in summary.axes.items() if part.score is not None}
     if scores:
-        console.print(score_table([(summary.run, scores)]))
-    console.print(f"written to {folder}", soft_wrap=True)
+        out.print(score_table([(summary.run, scores)]))
+    out.print(f"written to {folder}", soft_wrap=True)
 
 
 def _one(

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 
 from rich import box
+from rich.console import Console
 from rich.table import Table
 
 from ..fusion.summary import ScoreSummary, Summary
+
+
+def console(*, soft_wrap: bool = False) -> Console:
+    """Standard output for people; wide enough for our tables where it is no terminal."""
+    width = None if sys.stdout.isatty() else 120
+    return Console(highlight=False, soft_wrap=soft_wrap, width=width)
 
 
 def outcome_table(summary: Summary) -> Table:
@@ -32,8 +40,8 @@ def outcome_table(summary: Summary) -> Table:
 def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Table:
     """Scores against the reference, for each result and axis."""
     table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("result", "axis"):
-        table.add_column(heading)
+    table.add_column("result", overflow="fold")
+    table.add_column("axis")
     for heading in ("RMSE [mm]", "bias [mm]", "95 % cover", "NEES", "scored", "left out"):
         table.add_column(heading, justify="right")
     for name, scores in results:

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..units import MM
 from .config import Sensor
 from .estimates import Readings
 from .timeline import Outcome
-
-_MM = 1e3
 
 
 def log_likelihood(readings: Readings, sensors: Mapping[str, Sensor]) -> float:
@@ -21,7 +20,7 @@ def log_likelihood(readings: Readings, sensors: Mapping[str, Sensor]) -> float:
     """
     gate = np.array([sensors[name].gate if name in sensors else 0.0 for name in readings.sensors])
     met = readings.outcome <= Outcome.REOPENED
-    variance = (readings.innovation_sd[met] * _MM) ** 2
+    variance = (readings.innovation_sd[met] * MM) ** 2
     gated = readings.outcome[met] == Outcome.GATED
     square = np.where(gated, gate[readings.sensor[met]] ** 2, readings.nis[met])
     return float(-0.5 * np.sum(np.log(2.0 * np.pi * variance) + square))

@@ -16,7 +16,7 @@ from ..errors import PumafuseError, RunError
 from ..runs import tables
 from ..runs.run import Run
 from ..runs.tables import Table
-from ..units import seconds
+from ..units import MM, seconds
 from .estimates import Estimates, ReferenceTrack
 from .offline import reference_track
 from .score import Score, score
@@ -24,7 +24,6 @@ from .summary import Summary, summarise
 from .timeline import Outcome
 
 ESTIMATES, READINGS, REFERENCE, SUMMARY = "estimates.parquet", "readings.parquet", "reference.parquet", "summary.json"
-_MM = 1e3
 _REFERENCE_PREFIX = "reference."
 
 
@@ -171,12 +170,12 @@ def read_reference(path: Path, origin: int) -> ReferenceTrack:
 def _estimates_table(est: Estimates) -> pa.Table:
     columns: dict[str, FloatArray | IntArray] = {"time_s": est.time}
     for name, axis in est.axes.items():
-        columns[f"{name}.position_mm"] = axis.position * _MM
-        columns[f"{name}.position_sd_mm"] = axis.position_sd * _MM
-        columns[f"{name}.velocity_mm_s"] = axis.velocity * _MM
-        columns[f"{name}.velocity_sd_mm_s"] = axis.velocity_sd * _MM
-        columns[f"{name}.offset_mm"] = axis.offset * _MM
-        columns[f"{name}.offset_sd_mm"] = axis.offset_sd * _MM
+        columns[f"{name}.position_mm"] = axis.position * MM
+        columns[f"{name}.position_sd_mm"] = axis.position_sd * MM
+        columns[f"{name}.velocity_mm_s"] = axis.velocity * MM
+        columns[f"{name}.velocity_sd_mm_s"] = axis.velocity_sd * MM
+        columns[f"{name}.offset_mm"] = axis.offset * MM
+        columns[f"{name}.offset_sd_mm"] = axis.offset_sd * MM
     return pa.table({**columns, **_segment_column(est.segment)})
 
 
@@ -188,9 +187,9 @@ def _readings_table(est: Estimates) -> pa.Table:
             "stamp_s": _nullable(r.stamp),
             "sensor": pa.DictionaryArray.from_arrays(r.sensor.astype(np.int32), list(r.sensors)).cast(pa.string()),
             "axis": pa.DictionaryArray.from_arrays(r.axis.astype(np.int32), list(r.axes)).cast(pa.string()),
-            "value_mm": _nullable(r.value * _MM),
-            "innovation_mm": _nullable(r.innovation * _MM),
-            "innovation_sd_mm": _nullable(r.innovation_sd * _MM),
+            "value_mm": _nullable(r.value * MM),
+            "innovation_mm": _nullable(r.innovation * MM),
+            "innovation_sd_mm": _nullable(r.innovation_sd * MM),
             "nis": _nullable(r.nis),
             "outcome": pa.DictionaryArray.from_arrays(
                 r.outcome.astype(np.int32), [outcome.word for outcome in Outcome]
@@ -202,8 +201,8 @@ def _readings_table(est: Estimates) -> pa.Table:
 def _reference_table(reference: ReferenceTrack) -> pa.Table:
     columns: dict[str, pa.Array | FloatArray] = {"time_s": reference.time}
     for axis, position in reference.position.items():
-        columns[f"{axis}.position_mm"] = _nullable(position * _MM)
-        columns[f"{axis}.position_sd_mm"] = np.full(len(position), reference.sd * _MM)
+        columns[f"{axis}.position_mm"] = _nullable(position * MM)
+        columns[f"{axis}.position_sd_mm"] = np.full(len(position), reference.sd * MM)
     return pa.table({**columns, **_segment_column(reference.segment)})
 
 

@@ -7,12 +7,11 @@ from importlib.metadata import version
 import msgspec
 import numpy as np
 
+from ..units import MM
 from .consistency import log_likelihood
 from .estimates import Estimates, Readings
 from .score import Score, score
 from .timeline import Outcome
-
-_MM = 1e3
 
 
 class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -117,7 +116,7 @@ def summarise(est: Estimates) -> Summary:
         validity=ValiditySummary(
             max_speed_m_s=limits.max_speed,
             commanded_speed_m_s=est.speed,
-            max_radius_mm=None if limits.max_radius is None else limits.max_radius * _MM,
+            max_radius_mm=None if limits.max_radius is None else limits.max_radius * MM,
             commanded_radius_mm="not checked",
         ),
         notes=list(est.notes),
@@ -127,8 +126,8 @@ def summarise(est: Estimates) -> Summary:
 def score_summary(found: Score) -> ScoreSummary:
     """A score in mm."""
     return ScoreSummary(
-        rmse_mm=found.rmse * _MM,
-        bias_mm=found.bias * _MM,
+        rmse_mm=found.rmse * MM,
+        bias_mm=found.bias * MM,
         coverage=found.coverage,
         nees_mean=found.nees,
         rows=found.rows,
@@ -155,7 +154,7 @@ def _sensor_summary(readings: Readings) -> SensorSummary:
         return SensorSummary(outcomes=readings.counts(), innovation_rms_mm=None, innovation_sd_mm=None, nis_mean=None)
     return SensorSummary(
         outcomes=readings.counts(),
-        innovation_rms_mm=float(np.sqrt(np.mean(fused.innovation**2))) * _MM,
-        innovation_sd_mm=float(np.sqrt(np.mean(fused.innovation_sd**2))) * _MM,
+        innovation_rms_mm=float(np.sqrt(np.mean(fused.innovation**2))) * MM,
+        innovation_sd_mm=float(np.sqrt(np.mean(fused.innovation_sd**2))) * MM,
         nis_mean=float(np.mean(fused.nis)),
     )

@@ -1,8 +1,8 @@
 """The total order of events: what acts on the plant when, and which reading is valid when.
 
-Time is int64 ns. At one instant commands come before readings, then sensors in the order of ``fusion.toml``, then stamp,
-place in the file and axis. The axes are independent but for row gates, so rows are kept together and each axis still
-meets its scalars in the order (time, sensor, stamp, place in the file).
+Time is int64 ns. At one instant commands come before readings, then sensors in the order of ``fusion.toml``, then
+stamp, place in the file and axis. The axes are independent but for row gates, so rows are kept together and each axis
+still meets its scalars in the order (time, sensor, stamp, place in the file).
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ import numpy as np
 from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError
+from ..units import MM
 from .plants import PLANTS, Interval, NotNegative, Positive
 
 CANONICAL_AXES = ("tangential", "radial", "vertical")
@@ -73,10 +74,10 @@ class Validity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
                 f" {self.max_speed:g} m/s that the arm model is valid for"
             )
         if self.max_radius is not None and radius is not None and radius > self.max_radius:
-            beyond = (radius - self.max_radius) * 1e3
+            beyond = (radius - self.max_radius) * MM
             found.append(
-                f"commands reach {radius * 1e3:.1f} mm from the base axis, {beyond:.1f} mm beyond the"
-                f" {self.max_radius * 1e3:g} mm that the arm model is valid for"
+                f"commands reach {radius * MM:.1f} mm from the base axis, {beyond:.1f} mm beyond the"
+                f" {self.max_radius * MM:g} mm that the arm model is valid for"
             )
         return found
 

@@ -14,9 +14,8 @@ from ..fusion.estimates import Estimates, Readings
 from ..fusion.score import Z95, interpolated
 from ..fusion.timeline import Outcome
 from ..runs.run import Run
+from ..units import MM
 from . import style
-
-_MM = 1e3
 
 
 def fused_figure(est: Estimates, run: Run, path: Path) -> None:
@@ -48,33 +47,33 @@ def _path(axes: Axes, est: Estimates, run: Run, name: str) -> None:
     commanded = run.command.stamp != NO_STAMP
     time = (run.command.stamp[commanded] - est.origin) * 1e-9
     axes.step(
-        time, run.command.values[name][commanded] * _MM, where="post", color=style.COMMAND, lw=1.0, label="command"
+        time, run.command.values[name][commanded] * MM, where="post", color=style.COMMAND, lw=1.0, label="command"
     )
     for sensor, colour in style.sensor_colours(est.readings.sensors).items():
         scalars = _positions(est, est.readings.of(sensor, name), sensor)
         fused = scalars.outcome == Outcome.FUSED
-        axes.plot(scalars.time[fused], scalars.value[fused] * _MM, ".", ms=1.5, color=colour, label=sensor)
+        axes.plot(scalars.time[fused], scalars.value[fused] * MM, ".", ms=1.5, color=colour, label=sensor)
         rejected = scalars.outcome == Outcome.GATED
-        axes.plot(scalars.time[rejected], scalars.value[rejected] * _MM, "x", ms=4, color=style.REJECTED, label="gated")
-    axes.plot(est.time, est[name].position * _MM, color=style.ESTIMATE, lw=1.0, label="estimate")
-    low, high = np.nanmin(est[name].position) * _MM, np.nanmax(est[name].position) * _MM
+        axes.plot(scalars.time[rejected], scalars.value[rejected] * MM, "x", ms=4, color=style.REJECTED, label="gated")
+    axes.plot(est.time, est[name].position * MM, color=style.ESTIMATE, lw=1.0, label="estimate")
+    low, high = np.nanmin(est[name].position) * MM, np.nanmax(est[name].position) * MM
     margin = 0.1 * (high - low) + 1.0
     axes.set_ylim(low - margin, high + margin)
     axes.set_ylabel(f"{name} [mm]")
 
 
 def _error(axes: Axes, est: Estimates, name: str) -> None:
-    band = Z95 * est[name].position_sd * _MM
+    band = Z95 * est[name].position_sd * MM
     axes.fill_between(est.time, -band, band, color=style.ESTIMATE, alpha=0.25, lw=0, label="95 % interval")
     axes.axhline(0.0, color=style.COMMAND, lw=0.5)
     axes.set_ylabel("error [mm]" if est.reference is not None else "95 % interval [mm]")
     limit = 2.5 * float(np.quantile(band, 0.99))
     if est.reference is not None and name in est.reference.position:
         truth = interpolated(est.time, est.segment, est.reference, name)
-        error = (est[name].position - truth) * _MM
+        error = (est[name].position - truth) * MM
         for sensor, colour in style.sensor_colours(est.readings.sensors).items():
             scalars = _positions(est, est.readings.of(sensor, name), sensor)
-            raw = (scalars.value - _reference_at(est, scalars.time, name)) * _MM
+            raw = (scalars.value - _reference_at(est, scalars.time, name)) * MM
             axes.plot(scalars.time, raw, ".", ms=1.5, color=colour, alpha=0.6, label=f"{sensor}, latency removed")
         axes.plot(est.time, error, color=style.REFERENCE, lw=0.8, label="estimate")
         axes.set_title(f"{name}: RMS error {_rms(error):.3f} mm", fontsize=9, loc="left")

@@ -12,10 +12,9 @@ from ..arrays import FloatArray
 from ..fusion.estimates import Estimates
 from ..fusion.timeline import Outcome
 from ..runs.run import Run
-from ..units import seconds
+from ..units import MM, seconds
 from . import style
 
-_MM = 1e3
 _TIMELINE = "time"  # seconds since the run's first command
 
 
@@ -95,7 +94,7 @@ def _series(
     if not there.any():
         return
     rr.log(path, look, static=True, recording=stream)
-    columns = rr.Scalars.columns(scalars=value[there] * _MM)
+    columns = rr.Scalars.columns(scalars=value[there] * MM)
     rr.send_columns(path, [rr.TimeColumn(_TIMELINE, duration=time[there])], columns, recording=stream)
 
 

@@ -1,0 +1,271 @@
+"""`fusion.toml`: what it means, that it survives being saved, and one line for whatever is wrong in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pumafuse.errors import ConfigError, PumafuseError, UnknownNameError
+from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
+from pumafuse.model.arm import ArmModel
+
+PRESET = "puma560-internal"
+AXES = ("tangential", "radial", "vertical")
+ARM = f'arm = "{PRESET}"\n'
+TRACKER = "[sensors.tracker]\nsd_mm = 0.05\n"
+PROCESS_KEYS = "input_noise_mm_rtHz, drift_mm_rts, maneuver_noise_mm_rtHz_per_m_s, maneuver_drift_mm_rts_per_m_s"
+SENSOR_KEYS = "sd_mm, latency_ms, latency_sd_ms, scale, bias_sd_mm, gate, gate_rows"
+
+DESIGN = (
+    ARM
+    + """
+[start]
+offset_sd_mm = 3.0
+[process]
+input_noise_mm_rtHz = 0.05
+drift_mm_rts = 0.7
+[process.radial]
+drift_mm_rts = 0.9
+maneuver_noise_mm_rtHz_per_m_s = 0.2
+maneuver_drift_mm_rts_per_m_s = 20
+[sensors.tracker]
+sd_mm = { radial = 0.05, vertical = 0.08 }
+latency_ms = 8.0
+latency_sd_ms = 1.5
+gate = 4
+gate_rows = false
+[sensors.range]
+sd_mm = 0.3
+latency_ms = -4.1
+scale = -1.0
+bias_sd_mm = 1000
+"""
+)
+
+
+def load(folder: Path, text: str) -> FusionConfig:
+    (folder / "fusion.toml").write_text(text, encoding="utf-8")
+    return FusionConfig.load(folder / "fusion.toml")
+
+
+def refusal(call: Callable[[], object]) -> str:
+    with pytest.raises(PumafuseError) as caught:
+        call()
+    text = str(caught.value)
+    assert len(text.splitlines()) == 1, text
+    return text
+
+
+def test_every_key_arrives_in_si_units(tmp_path: Path) -> None:
+    """mm, ms and their densities become m and s with no rounding in between."""
+    config = load(tmp_path, DESIGN)
+    assert config.arm == ArmModel.load(PRESET)
+    assert config.start == Start(offset_sd=3e-3)
+    assert config.sensors == {
+        "tracker": Sensor(
+            sd={"radial": 5e-5, "vertical": 8e-5}, latency=8e-3, latency_sd=1.5e-3, gate=4.0, gate_rows=False
+        ),
+        "range": Sensor(sd=3e-4, latency=-4.1e-3, scale=-1.0, bias_sd=1.0),
+    }
+
+
+def test_an_axis_overrides_what_holds_for_all(tmp_path: Path) -> None:
+    """[process] is every axis's; [process.radial] replaces the keys it gives for that axis alone."""
+    process = load(tmp_path, DESIGN).process
+    common = Process(input_noise=5e-5, drift=7e-4)
+    own = Process(input_noise=5e-5, drift=9e-4, maneuver_noise=2e-4, maneuver_drift=20e-3)
+    assert process == {"tangential": common, "radial": own, "vertical": common}
+
+
+def test_defaults_are_those_of_the_design(tmp_path: Path) -> None:
+    """An arm and a sensor's noise are enough; the rest is as the design's example has it."""
+    config = load(tmp_path, ARM + TRACKER)
+    assert config.start == Start(offset_sd=5e-3)
+    assert config.process == dict.fromkeys(AXES, Process(input_noise=3e-5, drift=4e-4))
+    plain = Sensor(sd=5e-5, latency=0.0, latency_sd=0.0, scale=1.0, bias_sd=0.0, gate=5.0, gate_rows=True)
+    assert config.sensors == {"tracker": plain}
+
+
+def test_noise_is_one_number_or_one_for_each_axis(tmp_path: Path) -> None:
+    """A sensor without noise for an axis has none there: it is not used on that axis."""
+    sensors = load(tmp_path, DESIGN).sensors
+    assert [sensors["tracker"].sd_of(axis) for axis in AXES] == [None, 5e-5, 8e-5]
+    assert [sensors["range"].sd_of(axis) for axis in AXES] == [3e-4, 3e-4, 3e-4]
+
+
+def test_sensors_keep_the_order_of_the_file(tmp_path: Path) -> None:
+    """The order of the file decides between readings valid at one instant, also for a choice of sensors."""
+    names = ("zeta", "alpha", "mu")
+    config = load(tmp_path, ARM + "".join(f"[sensors.{name}]\nsd_mm = 1\n" for name in names))
+    assert config.sensor_names(None) == names
+    assert config.sensor_names(["mu", "zeta", "mu"]) == ("zeta", "mu")
+    assert config.sensor_names([]) == ()
+
+
+def test_a_sensor_that_is_not_configured_cannot_be_chosen(tmp_path: Path) -> None:
+    """Choosing an unknown sensor is refused with those that are configured."""
+    config = load(tmp_path, DESIGN)
+    with pytest.raises(UnknownNameError) as caught:
+        config.sensor_names(["tracker", "trakcer"])
+    assert (caught.value.name, caught.value.accepted) == ("trakcer", ("tracker", "range"))
+
+
+not_negative = st.floats(0.0, 1e6)
+positive = st.floats(1e-9, 1e6)
+processes = st.builds(
+    Process, input_noise=not_negative, drift=not_negative, maneuver_noise=not_negative, maneuver_drift=not_negative
+)
+sensors = st.builds(
+    Sensor,
+    sd=st.one_of(positive, st.dictionaries(st.sampled_from(AXES), positive, min_size=1)),
+    latency=st.floats(-1e3, 1e3),
+    latency_sd=not_negative,
+    scale=st.floats(-1e3, 1e3).filter(bool),
+    bias_sd=not_negative,
+    gate=not_negative,
+    gate_rows=st.booleans(),
+)
+configurations = st.builds(
+    FusionConfig,
+    arm=st.sampled_from([ArmModel.load(PRESET), ArmModel.load("puma560-external")]),
+    start=st.builds(Start, offset_sd=not_negative),
+    process=st.dictionaries(st.sampled_from(AXES), processes),
+    sensors=st.dictionaries(st.sampled_from(["tracker", "a b", "ä.β", '"', "0"]), sensors),
+)
+
+
+@settings(derandomize=True, deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(config=configurations)
+def test_what_is_saved_is_loaded_to_the_last_bit(tmp_path: Path, config: FusionConfig) -> None:
+    """Saved and loaded, any configuration is equal, its arm and the order of its sensors included."""
+    config.save(tmp_path)
+    again = FusionConfig.load(tmp_path / "fusion.toml")
+    assert again == config
+    assert list(again.sensors) == list(config.sensors)
+
+
+def test_a_saved_file_is_in_the_units_of_its_keys(tmp_path: Path) -> None:
+    """What is written reads like what was given: 0.05 mm and −4.1 ms, not 4.9999999999999996e-05."""
+    load(tmp_path, DESIGN).save(tmp_path)
+    lines = (tmp_path / "fusion.toml").read_text(encoding="utf-8").splitlines()
+    for line in ('arm = "arm.toml"', "offset_sd_mm = 3.0", "radial = 0.05", "latency_ms = -4.1", "bias_sd_mm = 1000.0"):
+        assert line in lines
+
+
+def test_an_arm_is_a_file_beside_or_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The arm's path counts from the file that names it, wherever one stands; a preset needs no file."""
+    (tmp_path / "arms").mkdir()
+    ArmModel.load("puma560-external").save(tmp_path / "arms" / "mine.toml")
+    monkeypatch.chdir(tmp_path / "arms")
+    assert load(tmp_path, 'arm = "arms/mine.toml"').arm == ArmModel.load("puma560-external")
+    assert load(tmp_path, f'arm = "{tmp_path}/arms/mine.toml"').arm == ArmModel.load("puma560-external")
+    for name in (PRESET, "puma560-external"):
+        assert load(tmp_path, f'arm = "{name}"').arm == ArmModel.load(name)
+
+
+def test_a_wrong_arm_file_is_refused_by_its_own_name(tmp_path: Path) -> None:
+    """What is wrong in the arm's file is told with that file and its key."""
+    (tmp_path / "mine.toml").write_text('name = "x"\nupdate_period_ms = 28\n', encoding="utf-8")
+    text = refusal(lambda: load(tmp_path, 'arm = "mine.toml"'))
+    assert "mine.toml" in text
+    assert "'delay_ms'" in text
+
+
+REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
+    # what the file says: what the one line must name
+    "no arm": ("", ("'arm'", "arm = 'arm.toml'")),
+    "arm is a number": ("arm = 3", ("'arm'",)),
+    "unknown key": (ARM + "sensor = 3", ("'sensor'", "did you mean 'sensors'", "arm, start, process, sensors")),
+    "start is a number": (ARM + "start = 3", ("start", "int")),
+    "start without unit": (ARM + "[start]\noffset_sd = 1", ("'start.offset_sd'", "offset_sd_mm")),
+    "start negative": (ARM + "[start]\noffset_sd_mm = -1", ("start.offset_sd_mm", ">= 0")),
+    "start infinite": (ARM + "[start]\noffset_sd_mm = inf", ("offset_sd_mm", "finite")),
+    "process is a number": (ARM + "process = 3", ("process", "int")),
+    "process of an unknown axis": (
+        ARM + "[process.radail]\ndrift_mm_rts = 1",
+        ("process", "'radail'", "did you mean 'radial'", "tangential, radial, vertical"),
+    ),
+    "process with an unknown key": (ARM + "[process]\nnoise = 1", ("'process.noise'", PROCESS_KEYS)),
+    "process without unit": (ARM + "[process]\ndrift = 1", ("'process.drift'", PROCESS_KEYS)),
+    "override with an unknown key": (ARM + "[process.radial]\ndrift = 1", ("drift'", PROCESS_KEYS)),
+    "drift negative": (ARM + "[process]\ndrift_mm_rts = -1", ("process.drift_mm_rts", ">= 0")),
+    "override negative": (ARM + "[process.radial]\ndrift_mm_rts = -1", ("drift_mm_rts", ">= 0")),
+    "drift nan": (ARM + "[process]\ndrift_mm_rts = nan", ("drift_mm_rts", "finite")),
+    "drift is a word": (ARM + '[process]\ndrift_mm_rts = "x"', ("process.drift_mm_rts", "float", "str")),
+    "sensors is a number": (ARM + "sensors = 3", ("sensors", "int")),
+    "sensors is a list": (ARM + "sensors = []", ("sensors", "array")),
+    "sensor is a number": (ARM + "[sensors]\ntracker = 3", ("sensors.tracker", "int")),
+    "sensor without sd": (ARM + "[sensors.tracker]", ("'sensors.tracker.sd_mm'", "missing")),
+    "sensor with an unknown key": (ARM + TRACKER + "noise = 1", ("'sensors.tracker.noise'", SENSOR_KEYS)),
+    "latency without unit": (
+        ARM + TRACKER + "latency = 8",
+        ("'sensors.tracker.latency'", "did you mean 'latency_ms'", SENSOR_KEYS),
+    ),
+    "sd negative": (ARM + TRACKER.replace("0.05", "-0.05"), ("sensors.tracker.sd_mm", "> 0")),
+    "sd zero": (ARM + TRACKER.replace("0.05", "0"), ("sensors.tracker.sd_mm", "> 0")),
+    "sd nan": (ARM + TRACKER.replace("0.05", "nan"), ("sd_mm", "finite")),
+    "sd is a word": (ARM + TRACKER.replace("0.05", '"x"'), ("sensors.tracker.sd_mm", "str")),
+    "sd of no axis": (ARM + TRACKER.replace("0.05", "{}"), ("sensors.tracker.sd_mm", ">= 1")),
+    "sd of an unknown axis": (
+        ARM + TRACKER.replace("0.05", "{ yaw = 1 }"),
+        ("sensors.tracker.sd_mm", "'yaw'", "tangential, radial, vertical"),
+    ),
+    "sd of an axis negative": (ARM + TRACKER.replace("0.05", "{ radial = -1 }"), ("sensors.tracker.sd_mm", "> 0")),
+    "scale zero": (ARM + TRACKER + "scale = 0", ("sensors.tracker.scale", "0")),
+    "scale minus zero": (ARM + TRACKER + "scale = -0.0", ("sensors.tracker.scale", "0")),
+    "scale nan": (ARM + TRACKER + "scale = nan", ("scale", "finite")),
+    "latency is yes": (ARM + TRACKER + "latency_ms = true", ("sensors.tracker.latency_ms", "bool")),
+    "latency infinite": (ARM + TRACKER + "latency_ms = -inf", ("latency_ms", "finite")),
+    "latency sd negative": (ARM + TRACKER + "latency_sd_ms = -1", ("sensors.tracker.latency_sd_ms", ">= 0")),
+    "bias sd negative": (ARM + TRACKER + "bias_sd_mm = -1", ("sensors.tracker.bias_sd_mm", ">= 0")),
+    "gate negative": (ARM + TRACKER + "gate = -1", ("sensors.tracker.gate", ">= 0")),
+    "gate_rows is a number": (ARM + TRACKER + "gate_rows = 1", ("sensors.tracker.gate_rows", "bool")),
+    "not TOML": ("arm puma", ("TOML",)),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
+    """Unknown keys, missing units, wrong types and values: one line with the file, the key and the accepted names."""
+    content, named = REFUSALS[case]
+    text = refusal(lambda: load(tmp_path, content))
+    assert text.startswith(f"{tmp_path / 'fusion.toml'}: ")
+    for words in named:
+        assert words in text
+
+
+@pytest.mark.parametrize("content", [None, b"\xff\xfe", b""], ids=["absent", "not UTF-8", "empty"])
+def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path, content: bytes | None) -> None:
+    """An absent file, bytes that are no text and an empty file are one line with the path."""
+    path = tmp_path / "fusion.toml"
+    if content is not None:
+        path.write_bytes(content)
+    assert str(path) in refusal(lambda: FusionConfig.load(path))
+
+
+def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
+    """A folder where the file is expected is refused in one line."""
+    assert str(tmp_path) in refusal(lambda: FusionConfig.load(tmp_path))
+
+
+def test_an_arm_that_is_nowhere_is_refused_with_the_presets(tmp_path: Path) -> None:
+    """A name that is neither a file beside nor a preset is refused, and the presets are listed."""
+    text = refusal(lambda: load(tmp_path, 'arm = "puma560"'))
+    for words in ("puma560", "puma560-internal", "puma560-external"):
+        assert words in text
+
+
+def test_a_configuration_made_in_python_is_checked_like_a_file() -> None:
+    """Axes that the arm has not, and a scale of 0, are refused without a file too."""
+    arm = ArmModel.load(PRESET)
+    with pytest.raises(UnknownNameError):
+        FusionConfig(arm=arm, process={"yaw": Process()})
+    with pytest.raises(UnknownNameError):
+        FusionConfig(arm=arm, sensors={"tracker": Sensor(sd={"yaw": 1e-3})})
+    with pytest.raises(ConfigError):
+        FusionConfig(arm=arm, sensors={"tracker": Sensor(sd=1e-3, scale=0.0)})
+    assert FusionConfig(arm=arm).process == dict.fromkeys(AXES, Process())

@@ -1,0 +1,309 @@
+"""The arm model: Table II, ``arm.toml`` out and in without loss, and what is refused and how."""
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pumafuse.errors import ConfigError, UnknownNameError
+from pumafuse.model.arm import ArmModel, AxisModel, Gain, Validity, commanded_speed, ordered_axes
+from pumafuse.model.plants import FirstOrder, SecondOrder
+
+TOP = "name, update_period_ms, delay_ms, delay_ms_ci95, validity, axes, provenance"
+GAIN = "slope_s_m, intercept, slope_s_m_ci95, intercept_ci95"
+
+ARM = """\
+name = "bench"
+update_period_ms = 28.0
+delay_ms = 60.45
+[validity]
+max_speed_m_s = 0.5
+max_radius_mm = 700.0
+[axes.tangential]
+plant = "second-order"
+natural_frequency_rad_s = 53.9
+damping = 0.864
+[axes.radial]
+plant = "first-order"
+time_constant_ms = 42.5
+gain = { slope_s_m = 0.0818, intercept = 0.933 }
+gain_recovery_ms = 100.0
+delay_ms = 38.5
+"""
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+positive = st.floats(min_value=0.0, exclude_min=True, allow_nan=False, allow_infinity=False)
+not_negative = st.just(0.0) | positive
+interval = st.none() | st.tuples(finite, finite)
+word = st.text(max_size=8)
+
+gains = st.builds(Gain, slope=finite, intercept=finite, slope_ci95=interval, intercept_ci95=interval)
+first_order = st.builds(FirstOrder, time_constant=positive, time_constant_ci95=interval)
+second_order = st.builds(
+    SecondOrder,
+    natural_frequency=positive,
+    damping=positive,
+    natural_frequency_ci95=interval,
+    damping_ci95=interval,
+)
+axis_models = st.builds(
+    AxisModel,
+    plant=first_order | second_order,
+    gain=gains,
+    gain_recovery=st.none() | positive,
+    delay=st.none() | not_negative,
+    delay_ci95=interval,
+)
+provenance = st.fixed_dictionaries(
+    {},
+    optional={
+        "source": word,
+        "trials": st.integers(-(2**63), 2**63 - 1),
+        "robust": st.booleans(),
+        "rms_error_mm": finite,
+        "levels_m_s": st.lists(finite, max_size=4),
+        "outliers": st.dictionaries(word, word | st.booleans() | st.lists(word, max_size=2), max_size=3),
+    },
+)
+axis_names = st.sampled_from(["tangential", "radial", "vertical"]) | word
+arms = st.builds(
+    ArmModel,
+    name=word,
+    update_period=positive,
+    delay=not_negative,
+    delay_ci95=interval,
+    validity=st.builds(Validity, max_speed=st.none() | positive, max_radius=st.none() | positive),
+    axes=st.dictionaries(
+        st.sampled_from(["tangential", "radial", "vertical"]) | word, axis_models, min_size=1, max_size=4
+    ),
+    provenance=provenance,
+)
+
+
+@pytest.fixture
+def load(tmp_path: Path):
+    """Load an arm from the text of a file."""
+
+    def from_text(text: str) -> ArmModel:
+        path = tmp_path / "arm.toml"
+        path.write_text(text, encoding="utf-8")
+        return ArmModel.load(path)
+
+    return from_text
+
+
+@settings(derandomize=True, deadline=None, max_examples=300)
+@given(arm=arms)
+def test_arm_toml_loses_nothing(tmp_path_factory: pytest.TempPathFactory, arm: ArmModel) -> None:
+    """Any arm, with any optional key and any finite numbers, comes back from its file to the last bit."""
+    path = tmp_path_factory.getbasetemp() / "arm.toml"
+    arm.save(path)
+    again = ArmModel.load(path)
+    assert again == arm
+    assert again.to_toml() == path.read_text(encoding="utf-8")
+
+
+@settings(derandomize=True, deadline=None, max_examples=200)
+@given(value=st.floats(1e-6, 1e6))
+def test_numbers_are_converted_without_rounding_twice(tmp_path_factory: pytest.TempPathFactory, value: float) -> None:
+    """What stands in a file in ms is the float nearest to its thousandth in seconds."""
+    path = tmp_path_factory.getbasetemp() / "units.toml"
+    path.write_text(ARM.replace("60.45", repr(value)), encoding="utf-8")
+    assert ArmModel.load(path).delay == float(Fraction(repr(value)) / 1000)
+
+
+def test_file_is_in_file_units_and_python_in_si(load) -> None:
+    """Each key of the file lands in its attribute, in SI; what is absent has its default."""
+    assert load(ARM) == ArmModel(
+        name="bench",
+        update_period=0.028,
+        delay=0.06045,
+        validity=Validity(max_speed=0.5, max_radius=0.7),
+        axes={
+            "tangential": AxisModel(plant=SecondOrder(natural_frequency=53.9, damping=0.864)),
+            "radial": AxisModel(
+                plant=FirstOrder(time_constant=0.0425),
+                gain=Gain(slope=0.0818, intercept=0.933),
+                gain_recovery=0.1,
+                delay=0.0385,
+            ),
+        },
+    )
+
+
+def test_whole_numbers_are_numbers(load) -> None:
+    """An integer in the file is converted like any other number."""
+    assert load(ARM.replace("28.0", "28").replace("100.0", "100")) == load(ARM)
+
+
+def test_intervals_are_in_the_unit_of_their_key(load) -> None:
+    """A key ending in _ci95 takes the unit before it."""
+    arm = load(
+        ARM.replace("60.45", "60.45\ndelay_ms_ci95 = [60.0, 61]")
+        .replace("42.5", "42.5\ntime_constant_ms_ci95 = [40.0, 45.0]")
+        .replace("0.864", "0.864\ndamping_ci95 = [0.8, 0.9]\nnatural_frequency_rad_s_ci95 = [50.0, 55.0]")
+    )
+    assert arm.delay_ci95 == (0.06, 0.061)
+    assert arm.axes["radial"].plant == FirstOrder(time_constant=0.0425, time_constant_ci95=(0.04, 0.045))
+    assert arm.axes["tangential"].plant == SecondOrder(
+        natural_frequency=53.9, damping=0.864, natural_frequency_ci95=(50.0, 55.0), damping_ci95=(0.8, 0.9)
+    )
+
+
+@pytest.mark.parametrize(("preset", "delay"), [("puma560-internal", 0.06045), ("puma560-external", 0.0385)])
+def test_presets_are_table_ii(preset: str, delay: float) -> None:
+    """A preset, taken by its name, is the paper's combined model, its gains recovering in 100 ms."""
+    arm = ArmModel.load(preset)
+    plants = {
+        "tangential": (SecondOrder(natural_frequency=53.9, damping=0.864), 0.0518, 1.010),
+        "radial": (FirstOrder(time_constant=0.0425), 0.0818, 0.933),
+        "vertical": (FirstOrder(time_constant=0.0356), 0.134, 0.941),
+    }
+    assert (arm.update_period, arm.delay) == (0.028, delay)
+    assert arm.validity == Validity(max_speed=0.5, max_radius=0.7)
+    assert list(arm.axes) == list(plants)
+    for name, (plant, slope, intercept) in plants.items():
+        gain = Gain(slope=slope, intercept=intercept)
+        assert arm.axes[name] == AxisModel(plant=plant, gain=gain, gain_recovery=0.1)
+
+
+def test_a_preset_can_be_saved_and_edited(tmp_path: Path) -> None:
+    """A preset written to a file is the same arm, and a path to it is taken as text too."""
+    preset = ArmModel.load("puma560-internal")
+    preset.save(tmp_path / "arm.toml")
+    assert ArmModel.load(str(tmp_path / "arm.toml")) == preset
+
+
+REFUSED = {
+    "unknown key": ("[validity]", "colour = 3\n[validity]", "'colour'", TOP),
+    "unknown table": ("[validity]", "[validty]", "'validty'; did you mean 'validity'", TOP),
+    "unknown key below": ("max_speed_m_s", "speed_m_s", "'validity.speed_m_s'", "max_speed_m_s, max_radius_mm"),
+    "unknown gain key": ("slope_s_m", "slope", "'axes.radial.gain.slope'; did you mean 'slope_s_m'", GAIN),
+    "missing unit": ("update_period_ms", "update_period", "'update_period'; did you mean 'update_period_ms'", TOP),
+    "missing unit below": ("max_radius_mm", "max_radius", "'validity.max_radius'", "max_speed_m_s, max_radius_mm"),
+    "missing unit of a plant": ("natural_frequency_rad_s", "natural_frequency", "'axes.tangential.natural_frequency'",
+                                "natural_frequency_rad_s"),
+    "unit of another kind": ("60.45", "60.45\ndelay_s = 0.06", "'delay_s'; did you mean 'delay_ms'", TOP),
+    "key of the other plant": ("0.864", "0.864\ntime_constant_ms = 3.0", "'axes.tangential.time_constant_ms'",
+                               "natural_frequency_rad_s, damping"),
+    "text for a number": ("28.0", '"28"', "update_period_ms", "float"),
+    "truth for a number": ("0.864", "true", "axes.tangential.damping", "float"),
+    "list for a number": ("42.5", "[42.5]", "axes.radial.time_constant_ms", "float"),
+    "number for a text": ('"bench"', "3", "name", "str"),
+    "number for a table": ("{ slope_s_m = 0.0818, intercept = 0.933 }", "0.9", "axes.radial.gain", "object"),
+    "number for an axis": ("[axes.tangential]", "[axes]\nvertical = 3\n[axes.tangential]", "axes.vertical", "table"),
+    "interval of one": ("60.45", "60.45\ndelay_ms_ci95 = [60.0]", "delay_ms_ci95", "length 2"),
+    "missing key": ("update_period_ms = 28.0", "", "'update_period_ms' is missing", ""),
+    "missing key of a plant": ("damping = 0.864", "", "'axes.tangential.damping' is missing", ""),
+    "infinite": ("60.45", "inf", "delay_ms", "not a finite number"),
+    "not a number": ("0.864", "nan", "damping", "not a finite number"),
+    "beyond a float": ("0.933", "1e400", "intercept", "not a finite number"),
+    "infinite limit of an interval": ("60.45", "60.45\ndelay_ms_ci95 = [60.0, inf]", "delay_ms_ci95", "not a finite"),
+    "zero": ("42.5", "0.0", "axes.radial.time_constant_ms", "> 0"),
+    "negative": ("60.45", "-1.0", "delay_ms", ">= 0"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "key", "accepted"), REFUSED.values(), ids=REFUSED.keys())
+def test_what_is_wrong_in_a_file_is_said_in_one_line(load, tmp_path: Path, old: str, new: str, key: str, accepted: str):
+    """A wrong file is refused with one line that names the file, the key and what would be accepted."""
+    assert old in ARM
+    with pytest.raises(ConfigError) as caught:
+        load(ARM.replace(old, new, 1))
+    said = str(caught.value)
+    assert said.startswith(f"{tmp_path / 'arm.toml'}: ")
+    assert key in said
+    assert accepted in said
+    assert len(said.splitlines()) == 1
+
+
+@pytest.mark.parametrize("axes", ["", "axes = {}", "axes = 3"])
+def test_an_arm_has_an_axis(load, axes: str) -> None:
+    """A file without an axis is refused, and the key is named."""
+    with pytest.raises(ConfigError, match="axes"):
+        load(f'name = "x"\nupdate_period_ms = 28.0\ndelay_ms = 0.0\n{axes}\n')
+
+
+@pytest.mark.parametrize("content", [b"name = ", b"\xff\xfe\x00", b'name = "a"\nname = "b"\n'])
+def test_what_is_not_toml_is_refused(tmp_path: Path, content: bytes) -> None:
+    """A file that is not TOML, or not text, is refused in one line with its name."""
+    path = tmp_path / "arm.toml"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError) as caught:
+        ArmModel.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_misspelled_preset_is_told_the_presets() -> None:
+    """A name that is neither a file nor a preset is refused with the presets' names."""
+    with pytest.raises(ConfigError, match=r"puma650-internal: .*puma560-internal, puma560-external"):
+        ArmModel.load("puma650-internal")
+
+
+def test_a_folder_is_not_an_arm(tmp_path: Path) -> None:
+    """A folder given as an arm is refused by name."""
+    with pytest.raises(ConfigError, match="cannot be read") as caught:
+        ArmModel.load(tmp_path)
+    assert str(tmp_path) in str(caught.value)
+
+
+def test_an_unknown_axis_is_told_the_axes(load) -> None:
+    """Asking for an axis that the arm does not have names the ones it has."""
+    with pytest.raises(
+        UnknownNameError, match="bench: unknown axis 'vertical'; accepted: tangential, radial"
+    ) as caught:
+        load(ARM).axis("vertical")
+    assert caught.value.accepted == ("tangential", "radial")
+
+
+def test_an_axis_may_override_the_delay(load) -> None:
+    """An axis's own delay wins over the arm's, also when it is zero."""
+    arm = load(ARM.replace("0.864", "0.864\ndelay_ms = 0"))
+    assert arm.delay_of("tangential") == 0.0
+    assert arm.delay_of("radial") == 0.0385
+    assert load(ARM).delay_of("tangential") == 0.06045
+
+
+def test_gain_is_equation_11() -> None:
+    """K = a·speed + b, speed being a step over the update period whichever way it goes."""
+    speed = commanded_speed(np.array([0.002, -0.019, 0.0]), 0.028)
+    np.testing.assert_allclose(speed, [0.0714286, 0.6785714, 0.0], atol=1e-7)
+    np.testing.assert_allclose(
+        Gain(slope=0.134, intercept=0.941).at(speed), [0.9505714, 1.0319286, 0.941], rtol=0.0, atol=1e-7
+    )
+
+
+def test_axes_come_in_the_papers_order() -> None:
+    """Tangential, radial, vertical, then any others by name."""
+    names = {"wrist", "vertical", "elbow", "radial", "tangential"}
+    assert ordered_axes(names) == ("tangential", "radial", "vertical", "elbow", "wrist")
+
+
+LIMITS = Validity(max_speed=0.5, max_radius=0.7)
+
+
+def test_validity_says_by_how_much() -> None:
+    """Each limit passed is one sentence with what was reached, the limit, and the excess."""
+    speed, radius = LIMITS.excess(0.68, 0.7321)
+    assert speed.startswith("commanded speed reaches 0.68 m/s, 1.36 times the 0.5 m/s")
+    assert radius.startswith("commands reach 732.1 mm from the base axis, 32.1 mm beyond the 700 mm")
+
+
+@pytest.mark.parametrize(
+    ("limits", "speed", "radius", "passed"),
+    [
+        (LIMITS, 0.5, 0.7, 0),
+        (LIMITS, 0.51, 0.7, 1),
+        (LIMITS, 0.5, 0.701, 1),
+        (LIMITS, 0.51, None, 1),
+        (Validity(max_speed=0.5), 0.1, 9.0, 0),
+        (Validity(), 9.0, 9.0, 0),
+    ],
+)
+def test_validity_counts_only_what_is_passed(limits: Validity, speed: float, radius: float | None, passed: int) -> None:
+    """At a limit is within it; a limit that is absent, or a radius that is not known, is not checked."""
+    assert len(limits.excess(speed, radius)) == passed

@@ -1,0 +1,220 @@
+"""Clocks that are set back cut a run; a controller's own ticks are found behind jittered stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pumafuse.arrays import NO_STAMP
+from pumafuse.errors import RunError
+from pumafuse.runs.clock import regular_grid, segments
+from pumafuse.runs.run import Reference, Run, Source
+
+SECOND = 1_000_000_000
+PERIOD = 0.028
+TICK = 28_000_000
+
+properties = settings(derandomize=True, deadline=None, max_examples=50)
+
+
+def source(stamp: Sequence[int], label: str) -> Source:
+    """A source whose values are the row numbers, so that a piece of it shows which rows it holds."""
+    return Source(np.array(stamp, dtype=np.int64), {"radial": np.arange(len(stamp), dtype=float)}, label)
+
+
+def recorded(command: Sequence[int], sensors: Mapping[str, Sequence[int]], truth: Sequence[int] | None = None) -> Run:
+    streams = {name: source(stamp, f"{name}.csv") for name, stamp in sensors.items()}
+    run = Run("run", source(command, "host.csv"), streams, start={"radial": 0.5}, notes=("torn",))
+    if truth is None:
+        return run
+    reference = source(truth, "truth.csv")
+    return replace(run, reference=Reference(reference.stamp, reference.values, reference.label, sd=1e-3))
+
+
+def rows(piece: Source | None) -> list[int]:
+    """Which rows of the original a piece holds."""
+    assert piece is not None
+    assert len(piece.stamp) == len(piece.values["radial"])
+    return piece.values["radial"].astype(int).tolist()
+
+
+def refusal(call: Callable[[], object]) -> str:
+    with pytest.raises(RunError) as caught:
+        call()
+    text = str(caught.value)
+    assert len(text.splitlines()) == 1, text
+    return text
+
+
+def cuts_by_hand(stamp: Sequence[int]) -> list[int]:
+    """Rows more than 1 s behind the latest stamp since the last cut, found one row at a time."""
+    cuts, latest = [], None
+    for row, value in enumerate(stamp):
+        if value == NO_STAMP:
+            continue
+        if latest is not None and latest - value > SECOND:
+            cuts.append(row)
+            latest = value
+        latest = value if latest is None else max(latest, value)
+    return cuts
+
+
+def pieces_by_hand(stamp: Sequence[int]) -> list[list[int]]:
+    edges = [0, *cuts_by_hand(stamp), len(stamp)]
+    return [list(range(*edge)) for edge in pairwise(edges)]
+
+
+def test_a_run_with_one_clock_is_one_segment() -> None:
+    """Without a jump the run itself comes back and nothing is said."""
+    run = recorded([0, TICK, 3600 * SECOND], {"tracker": [5, 4, 3]})
+    assert segments(run) == ([run], [])
+
+
+@pytest.mark.parametrize(("back", "count"), [(SECOND, 1), (SECOND + 1, 2)])
+def test_a_step_back_of_one_second_is_tolerated_and_a_nanosecond_more_is_a_jump(back: int, count: int) -> None:
+    """Up to 1 s rows are out of order; beyond it the clock was set back and a new segment begins."""
+    stamp = [10 * SECOND, 11 * SECOND, 11 * SECOND - back, 12 * SECOND]
+    parts, said = segments(recorded(stamp, {"tracker": stamp}))
+    assert len(parts) == count
+    assert len(said) == count - 1
+
+
+def test_a_slow_slide_back_adds_up_to_a_jump() -> None:
+    """What counts is how far a row is behind the latest stamp, not behind the row before it."""
+    stamp = [10 * SECOND, *(10 * SECOND - step * SECOND // 2 for step in (1, 2, 3)), 20 * SECOND]
+    parts, _ = segments(recorded(stamp, {}))
+    assert [rows(part.command) for part in parts] == [[0, 1, 2], [3, 4]]
+
+
+def test_a_jump_cuts_every_source_where_its_own_clock_jumps() -> None:
+    """Each source is cut at its own row; the start level and the file's notes belong to the first segment."""
+    late, early = 100 * SECOND, 50 * SECOND
+    command = [late, late + TICK, early, early + TICK]
+    run = recorded(command, {"tracker": [late, early, early + 1], "vision": [late, late + 1, early]}, [late, early])
+    (first, second), (said,) = segments(run)
+    assert [rows(part.command) for part in (first, second)] == [[0, 1], [2, 3]]
+    assert [rows(part.sensors["tracker"]) for part in (first, second)] == [[0], [1, 2]]
+    assert [rows(part.sensors["vision"]) for part in (first, second)] == [[0, 1], [2]]
+    assert [rows(part.reference) for part in (first, second)] == [[0], [1]]
+    assert [part.reference.sd for part in (first, second) if part.reference] == [1e-3, 1e-3]
+    assert (first.start, second.start) == ({"radial": 0.5}, {})
+    assert (first.notes, second.notes) == (("torn",), ())
+    for words in ("host.csv", "50.028 s", "row 3", "new segment"):
+        assert words in said
+
+
+@properties
+@given(st.lists(st.lists(st.integers(0, 3 * SECOND), min_size=1, max_size=8), min_size=1, max_size=6), st.data())
+def test_segments_hold_every_row_once_and_none_jumps(blocks: list[list[int]], data: st.DataObject) -> None:
+    """For any stamps the pieces are those of a walk from row to row, and together they are the whole log."""
+    stamp = [
+        data.draw(st.sampled_from((value, NO_STAMP))) if row else value for b in blocks for row, value in enumerate(b)
+    ]
+    parts, said = segments(recorded(stamp, {"tracker": stamp}, stamp))
+    wanted = pieces_by_hand(stamp)
+    assert [rows(part.command) for part in parts] == wanted
+    assert [rows(part.sensors["tracker"]) for part in parts] == wanted
+    assert [rows(part.reference) for part in parts] == wanted
+    assert len(said) == len(wanted) - 1
+
+
+@pytest.mark.parametrize("truth", [None, [9 * SECOND, 0]])
+def test_a_clock_that_is_set_back_for_the_commands_only_is_refused(truth: list[int] | None) -> None:
+    """If a sensor's clock did not jump with the commands', nothing tells which readings belong where."""
+    text = refusal(lambda: segments(recorded([9 * SECOND, 0, TICK], {"tracker": [9 * SECOND, 10 * SECOND]}, truth)))
+    for words in ("host.csv", "row 2", "tracker", "cut the log"):
+        assert words in text
+
+
+def test_a_clock_that_is_set_back_for_the_commands_and_not_the_reference_is_refused() -> None:
+    """A reference counts as a source: it must jump with the commands."""
+    text = refusal(lambda: segments(recorded([9 * SECOND, 0], {"tracker": [9 * SECOND, 0]}, [0, SECOND])))
+    assert "reference" in text
+
+
+def test_a_sensor_that_is_set_back_alone_cuts_nothing() -> None:
+    """A sensor whose clock jumps alone stays whole: the timeline calls its rows too late."""
+    run = recorded([0, TICK], {"tracker": [9 * SECOND, 0, SECOND]})
+    assert segments(run) == ([run], [])
+
+
+def test_stamps_that_are_no_clock_are_refused() -> None:
+    """Nonsense stamps would be a thousand segments: refused by the file's name instead."""
+    nonsense = np.random.default_rng(0).integers(0, 1000 * SECOND, 1000).tolist()
+    assert "host.csv" in refusal(lambda: segments(recorded(nonsense, {"tracker": nonsense})))
+
+
+def grid_of(ticks: np.ndarray, period_ns: float = TICK, origin: int = 1_700_000_000 * SECOND) -> np.ndarray:
+    return origin + np.rint(ticks * period_ns).astype(np.int64)
+
+
+@properties
+@given(st.sampled_from([PERIOD, 0.004, 1 / 30, 0.0281234567]), st.integers(200, 500), st.integers(0, 2**32 - 1))
+def test_the_grid_behind_jittered_stamps_is_even_to_a_nanosecond(period: float, count: int, seed: int) -> None:
+    """Stamps off by up to a fifth of a period, with commands missing, come back on ticks of exactly T."""
+    rng = np.random.default_rng(seed)
+    ticks = np.cumsum(rng.integers(1, 6, count))
+    jitter = rng.uniform(-0.2, 0.2, count) * period * SECOND
+    stamp = grid_of(ticks, period * SECOND) + np.rint(jitter).astype(np.int64)
+    got, note = regular_grid(stamp, period, "host")
+    assert note is None
+    np.testing.assert_allclose(got - got[0], (ticks - ticks[0]) * period * SECOND, rtol=0, atol=1.001)  # rounded twice
+    assert abs(float(np.median(stamp - got))) <= 1.0
+
+
+def test_the_grid_lies_where_the_ticks_were() -> None:
+    """With many commands the jitter averages out: the grid is within 4 standard errors of the true ticks."""
+    ticks = np.flatnonzero(np.random.default_rng(1).random(4000) < 0.8)
+    truth = grid_of(ticks)
+    sd = 1.5e6
+    stamp = truth + np.rint(np.random.default_rng(2).normal(0.0, sd, len(ticks))).astype(np.int64)
+    got, note = regular_grid(stamp, PERIOD, "host")
+    assert note is None
+    assert set(np.unique(np.diff(got) - np.diff(truth))) == {0}
+    assert abs(int(got[0] - truth[0])) < 4 * sd * np.sqrt(np.pi / 2 / len(ticks))  # of a median
+
+
+@pytest.mark.parametrize("ppm", [50.0, -50.0, 400.0])
+def test_a_drifting_clock_is_followed_and_told(ppm: float) -> None:
+    """50 ppm over an hour are 180 ms, six ticks: the grid stays on the true ticks, and the note tells the drift."""
+    ticks = np.flatnonzero(np.random.default_rng(3).random(130_000) < 0.9)
+    truth = grid_of(ticks, TICK * (1 + ppm * 1e-6))
+    jitter = np.random.default_rng(4).normal(0.0, 1e6, len(ticks))
+    got, note = regular_grid(truth + np.rint(jitter).astype(np.int64), PERIOD, "host")
+    assert np.abs(got - truth).max() < 4 * 1e6 * np.sqrt((4 + np.pi / 2) / len(ticks))  # slope and median together
+    assert note is not None
+    assert "host" in note
+    assert f"{ppm:+.1f} ppm" in note
+
+
+@pytest.mark.parametrize(("stamp", "wanted"), [([5], [5]), ([5, TICK + 1005], [505, TICK + 505])])
+def test_one_or_two_stamps_are_a_grid(stamp: list[int], wanted: list[int]) -> None:
+    """Stamps too few to fit a drift to keep T, and share the error."""
+    got, note = regular_grid(np.array(stamp), PERIOD, "host")
+    assert note is None
+    assert got.tolist() == wanted
+
+
+@pytest.mark.parametrize("period", [0.056, 0.030, 0.0281, 0.0279, 0.027, 0.0200])
+def test_a_wrong_period_is_refused(period: float) -> None:
+    """Stamps 28 ms apart do not fit another period: refused with both periods and what to do."""
+    ticks = np.arange(500)
+    jitter = np.random.default_rng(5).uniform(-1e6, 1e6, len(ticks))
+    text = refusal(lambda: regular_grid(grid_of(ticks) + np.rint(jitter).astype(np.int64), period, "host"))
+    assert text.startswith("host: ")
+    assert f"{period * 1e3:g} ms" in text
+    assert "clock = 'stamps'" in text
+
+
+def test_two_commands_in_one_tick_are_refused() -> None:
+    """A command between two ticks cannot be on a grid: refused, with where it is."""
+    stamp = np.array([0, TICK, TICK + TICK // 3, 2 * TICK])
+    text = refusal(lambda: regular_grid(stamp, PERIOD, "host"))
+    assert "9.333 ms" in text
+    assert "0.028" in text

@@ -1,0 +1,55 @@
+"""The rooms of the package and which way they import."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import pumafuse as pf
+
+SOURCE = Path(pf.__file__).parent
+ROOMS = ["model", "runs", "fusion", "views", "cli"]  # each imports itself and those before it
+GROUND = {"arrays", "errors", "units", "toml"}
+
+
+def imported_rooms(path: Path) -> set[str]:
+    """Rooms and ground-floor modules that a module imports, from its own relative imports."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            parts = (node.module or "").split(".")
+            if node.level == 2 or path.parent == SOURCE:
+                found |= {parts[0]} if parts[0] else {alias.name for alias in node.names}
+    return found
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_imports_run_one_way(room: str) -> None:
+    """No module imports a room that comes after its own."""
+    allowed = GROUND | set(ROOMS[: ROOMS.index(room) + 1])
+    for path in (SOURCE / room).glob("**/*.py"):
+        assert imported_rooms(path) <= allowed, path
+
+
+def test_every_room_is_known() -> None:
+    """A new room must take its place in the order above."""
+    assert {path.name for path in SOURCE.iterdir() if (path / "__init__.py").exists()} == set(ROOMS)
+
+
+def test_the_ground_floor_imports_no_room() -> None:
+    """What every room stands on stands on nothing but itself."""
+    for name in GROUND:
+        assert imported_rooms(SOURCE / f"{name}.py") <= GROUND
+
+
+def test_public_names_exist_and_are_lazy() -> None:
+    """Every public name resolves, and importing pumafuse alone imports no numpy."""
+    import subprocess
+    import sys
+
+    for name in pf.__all__:
+        assert getattr(pf, name) is not None
+    code = "import sys, pumafuse; sys.exit(bool({'numpy', 'pyarrow', 'msgspec'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = pf.nothing
