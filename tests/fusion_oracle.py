@@ -327,17 +327,19 @@ class AxisOracle:
         end = int(rows.time.max(initial=1))
         stride = max(1, int(1e9 / self.response.fastest))
         edges = np.unique(np.concatenate(([0], rows.time, fed.acting, np.arange(0, end, stride))))
-        edges = edges[edges <= end] / 1e9
-        half, middle = np.diff(edges)[:, None] / 2.0, (edges[1:] + edges[:-1])[:, None] / 2.0
-        nodes, weights = (middle + half * _NODES).ravel(), (half * _WEIGHTS).ravel()
-        command = np.searchsorted(fed.acting / 1e9, middle[:, 0], side="right") - 1
+        edges = edges[edges <= end]
+        first, last = edges[:-1], edges[1:]
+        half = (last - first)[:, None] / 2e9
+        weights, to_last = (half * _WEIGHTS).ravel(), (half * (1.0 - _NODES)).ravel()
+        command = np.searchsorted(fed.acting, first, side="right") - 1
         m = np.repeat(np.where(command >= 0, fed.maneuver[command], 0.0), len(_NODES))
         process = self.process
         noise = weights * (process.input_noise**2 + (process.maneuver_noise * m) ** 2)
         drift = weights * (process.drift**2 + (process.maneuver_drift * m) ** 2)
         instant, place = np.unique(rows.time, return_inverse=True)
-        lag = instant[:, None] / 1e9 - nodes
-        past, age = lag > 0.0, lag[lag > 0.0]
+        since_last = np.repeat(instant[:, None] - last, len(_NODES), axis=1)  # whole ns: no digits lost in short lags
+        past, lag = since_last >= 0, since_last / 1e9 + to_last
+        age = lag[past]
         impulse, rate = np.zeros(lag.shape), np.zeros(lag.shape)
         impulse[past], rate[past] = self.response.impulse(age), self.response.impulse_rate(age)
         seen = rows.position[:, None] * impulse[place] + rows.velocity[:, None] * rate[place]

@@ -9,6 +9,9 @@ from collections.abc import Iterable
 class PumafuseError(Exception):
     """Base of every error a user can cause; its text is one line fit for a screen."""
 
+    def __init__(self, text: str) -> None:
+        super().__init__(" ".join(text.splitlines()))  # a name in a file may hold a line break
+
 
 class ConfigError(PumafuseError):
     """A configuration file or value is wrong."""

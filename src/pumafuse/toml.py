@@ -5,6 +5,7 @@ A msgspec struct declares a file once: its field types are what is checked, its 
 
 from __future__ import annotations
 
+import datetime
 import tomllib
 from collections.abc import Iterator, Mapping
 from decimal import Decimal
@@ -14,7 +15,7 @@ from typing import Any, TypeVar, cast, get_args, get_origin
 import msgspec
 import tomli_w
 
-from .errors import ConfigError, suggestion
+from .errors import ConfigError, PumafuseError, suggestion
 from .units import from_si, to_si
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -36,6 +37,8 @@ def read(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: not a text file in UTF-8") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
+    except (ArithmeticError, ValueError, RecursionError):
+        raise ConfigError(f"{path}: not valid TOML: a number is out of range, or tables nest too deeply") from None
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
 
@@ -58,6 +61,8 @@ def struct(tree: Any, kind: type[S], where: str, path: str = "") -> S:
     except msgspec.ValidationError as error:
         problem = next(_problems(tree, kind, path), f"{path}: {error}" if path else str(error))
         raise ConfigError(f"{where}: {problem}") from None
+    except PumafuseError as error:  # a struct's own check
+        raise ConfigError(f"{where}: {error}") from None
 
 
 def text(tree: Mapping[str, Any]) -> str:
@@ -67,7 +72,8 @@ def text(tree: Mapping[str, Any]) -> str:
 
 def builtins(value: msgspec.Struct) -> dict[str, Any]:
     """A struct as plain tables with the file's key names; None is left out, as TOML has none."""
-    return _without_none(msgspec.to_builtins(value))
+    dates = (datetime.datetime, datetime.date, datetime.time)
+    return _without_none(msgspec.to_builtins(value, builtin_types=dates, enc_hook=float))  # numpy's numbers are floats
 
 
 def _without_none(tree: dict[str, Any]) -> dict[str, Any]:

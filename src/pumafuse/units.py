@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from decimal import Decimal
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -38,6 +38,7 @@ EXPONENTS: Mapping[str, int] = {
 LENGTHS = ("_m", "_mm", "_um")
 TIMES = ("_s", "_ms", "_us", "_ns")
 MM = 1e3  # mm in a metre, and ms in a second: SI arrays times this are what files and screens show
+PROVENANCE = "provenance"  # a table of this name is nobody's numbers but its author's
 INTERVAL = "_ci95"  # `time_constant_ms_ci95` is in ms
 
 
@@ -50,22 +51,37 @@ def ending(name: str) -> str | None:
 def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     """A parsed TOML table with every number that has a unit in SI; the names stay as they are.
 
-    A unit holds for lists and for the entries of a sub-table: ``sd_mm = { radial = 0.05 }``.
+    A unit holds for lists and for the entries of a sub-table: ``sd_mm = { radial = 0.05 }``. Provenance is kept as is.
 
     Raises:
-        ConfigError: A number is not finite.
+        ConfigError: A number outside an interval (``_ci95``) is not finite.
     """
-    return {key: _scaled(value, _exponent(key, 0), key) for key, value in tree.items()}
+    return _scaled(tree, 0, "")
 
 
 def from_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     """The inverse of :func:`to_si`: SI numbers to the units that their names tell."""
-    return {key: _unscaled(value, _exponent(key, 0)) for key, value in tree.items()}
+    return _unscaled(tree, 0)
+
+
+def refuse_unit(kind: str, name: str) -> None:
+    """Refuse the name of an axis or a sensor that ends like a unit.
+
+    Its table's numbers would be taken to have that unit, and ``<axis>_mm`` would have two.
+
+    Raises:
+        ConfigError: It does.
+    """
+    unit = ending(name)
+    if unit is not None:
+        raise ConfigError(
+            f"{kind} '{name}': a name must not end in a unit ({unit}); call it '{name.removesuffix(unit)}'"
+        )
 
 
 def shifted(value: float | Decimal, exponent: int) -> float:
     """``value`` × 10^exponent, exact in the shortest decimal form of ``value`` (no binary rounding in between)."""
-    decimal = value if isinstance(value, Decimal) else Decimal(repr(float(value)))
+    decimal = value if isinstance(value, Decimal) else Decimal(repr(value))
     return float(decimal.scaleb(exponent))
 
 
@@ -86,34 +102,61 @@ def _exponent(key: str, inherited: int) -> int:
     return inherited if unit is None else EXPONENTS[unit]
 
 
-def _scaled(value: Any, exponent: int, key: str) -> Any:
+def _scaled(value: Any, exponent: int, path: str) -> Any:
     match value:
         case bool() | str():
             return value
+        case int() if exponent == 0:
+            return value
         case int() | float() | Decimal():
-            number = shifted(value, exponent) if exponent or not isinstance(value, int) else value
-            if not math.isfinite(number):
-                raise ConfigError(f"{key}: {value} is not a finite number")
+            number = shifted(value, exponent)
+            if not math.isfinite(number) and not path.endswith(INTERVAL):
+                raise ConfigError(f"{path}: {str(value)[:24]} is not a finite number")
             return number
         case list():
-            return [_scaled(item, exponent, key) for item in value]  # pyright: ignore[reportUnknownVariableType]
+            return [_scaled(item, exponent, path) for item in cast(list[Any], value)]
         case Mapping():
-            return {k: _scaled(v, _exponent(k, exponent), k) for k, v in value.items()}  # pyright: ignore
+            table = cast(Mapping[str, Any], value)
+            return {key: _scaled_entry(key, item, exponent, path) for key, item in table.items()}
+        case _:
+            return value
+
+
+def _scaled_entry(key: str, value: Any, exponent: int, path: str) -> Any:
+    place = f"{path}.{key}" if path else key
+    return _plain(value) if key == PROVENANCE else _scaled(value, _exponent(key, exponent), place)
+
+
+def _plain(value: Any) -> Any:
+    """Provenance as it is, with floats for decimals."""
+    match value:
+        case Decimal():
+            return float(value)
+        case list():
+            return [_plain(item) for item in cast(list[Any], value)]
+        case Mapping():
+            return {key: _plain(item) for key, item in cast(Mapping[str, Any], value).items()}
         case _:
             return value
 
 
 def _unscaled(value: Any, exponent: int) -> Any:
     match value:
-        case bool() | int() | str():
+        case bool() | str():
             return value
-        case float():
-            decimal = Decimal(repr(value)).scaleb(-exponent)
+        case int() if exponent == 0:
+            return value
+        case int() | float():
+            decimal = Decimal(repr(float(value))).scaleb(-exponent)
             plain = float(decimal)
             return plain if Decimal(repr(plain)) == decimal else decimal  # the 17th digit would be lost in a float
         case list() | tuple():
-            return [_unscaled(item, exponent) for item in value]  # pyright: ignore[reportUnknownVariableType]
+            return [_unscaled(item, exponent) for item in cast(list[Any], value)]
         case Mapping():
-            return {k: _unscaled(v, _exponent(k, exponent)) for k, v in value.items()}  # pyright: ignore
+            table = cast(Mapping[str, Any], value)
+            return {
+                key: item if key == PROVENANCE else _unscaled(item, _exponent(key, exponent))
+                for key, item in table.items()
+            }
         case _:
             return value

@@ -1,5 +1,6 @@
 """The arm model: Table II, ``arm.toml`` out and in without loss, and what is refused and how."""
 
+import datetime
 from fractions import Fraction
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from pumafuse.errors import ConfigError, UnknownNameError
 from pumafuse.model.arm import ArmModel, AxisModel, Gain, Validity, commanded_speed, ordered_axes
 from pumafuse.model.plants import FirstOrder, SecondOrder
+from pumafuse.units import ending
 
 TOP = "name, update_period_ms, delay_ms, delay_ms_ci95, validity, axes, provenance"
 GAIN = "slope_s_m, intercept, slope_s_m_ci95, intercept_ci95"
@@ -68,7 +70,7 @@ provenance = st.fixed_dictionaries(
         "outliers": st.dictionaries(word, word | st.booleans() | st.lists(word, max_size=2), max_size=3),
     },
 )
-axis_names = st.sampled_from(["tangential", "radial", "vertical"]) | word
+axis_names = st.sampled_from(["tangential", "radial", "vertical"]) | word.filter(lambda name: ending(name) is None)
 arms = st.builds(
     ArmModel,
     name=word,
@@ -201,7 +203,16 @@ REFUSED = {
     "infinite": ("60.45", "inf", "delay_ms", "not a finite number"),
     "not a number": ("0.864", "nan", "damping", "not a finite number"),
     "beyond a float": ("0.933", "1e400", "intercept", "not a finite number"),
-    "infinite limit of an interval": ("60.45", "60.45\ndelay_ms_ci95 = [60.0, inf]", "delay_ms_ci95", "not a finite"),
+    "unknown plant": ('"first-order"', '"third-order"', "axes.radial.plant", "first-order, second-order"),
+    "plant of a wrong type": ('"first-order"', '["first-order"]', "axes.radial.plant", "first-order, second-order"),
+    "no plant": ('plant = "first-order"', "", "axes.radial.plant", "first-order, second-order"),
+    "misspelled axis key": ("42.5", "42.5\ngain_recovry_ms = 9.0", "axes.radial.gain_recovry_ms", "gain_recovery_ms"),
+    "axis key without unit": ("42.5", "42.5\ngain_recovery = 9.0", "axes.radial.gain_recovery", "gain_recovery_ms"),
+    "integer beyond a float": ("28.0", "1" + "0" * 400, "update_period_ms", "not a finite number"),
+    "exponent beyond decimal": ("28.0", "1e99999999999999999999", "number", "out of range"),
+    "key with a newline": ("42.5", '42.5\n"a\\nb" = 1', "axes.radial", ""),
+    "path of what is not finite": ("42.5", "inf", "axes.radial.time_constant_ms", "not a finite number"),
+    "axis named like a unit": ("axes.radial", "axes.rail_mm", "axis 'rail_mm'", "must not end in a unit"),
     "zero": ("42.5", "0.0", "axes.radial.time_constant_ms", "> 0"),
     "negative": ("60.45", "-1.0", "delay_ms", ">= 0"),
 }  # fmt: skip
@@ -307,3 +318,50 @@ def test_validity_says_by_how_much() -> None:
 def test_validity_counts_only_what_is_passed(limits: Validity, speed: float, radius: float | None, passed: int) -> None:
     """At a limit is within it; a limit that is absent, or a radius that is not known, is not checked."""
     assert len(limits.excess(speed, radius)) == passed
+
+
+def test_a_name_too_long_for_a_file_is_refused() -> None:
+    """A text that cannot be a path is a ConfigError, not an OSError."""
+    with pytest.raises(ConfigError):
+        ArmModel.load("x" * 300)
+
+
+def bench(**changed: object) -> ArmModel:
+    axes = {"radial": AxisModel(plant=FirstOrder(time_constant=0.04))}
+    return ArmModel(**{"name": "x", "update_period": 0.028, "delay": 0.06, "axes": axes, **changed})
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"update_period": 1},
+        {"axes": {"radial": AxisModel(plant=FirstOrder(time_constant=2))}},
+        {"update_period": np.float64(0.028)},
+        {"provenance": {"window_ms": 169}},
+        {"provenance": {"date": datetime.date(2024, 5, 1)}},
+    ],
+    ids=["whole seconds", "whole time constant", "numpy float", "whole number in provenance", "date in provenance"],
+)
+def test_numbers_of_any_kind_and_dates_come_back(tmp_path: Path, changed: dict[str, object]) -> None:
+    """Whole numbers, numpy numbers and dates come back as they were."""
+    bench(**changed).save(tmp_path / "arm.toml")
+    assert ArmModel.load(tmp_path / "arm.toml") == bench(**changed)
+
+
+def test_provenance_is_kept_as_it_is(tmp_path: Path) -> None:
+    """A provenance number is not converted: nothing reads it (ArmModel's docstring)."""
+    path = tmp_path / "arm.toml"
+    path.write_text(ARM + "[provenance]\nwindow_ms = 169.0\n")
+    assert ArmModel.load(path).provenance == {"window_ms": 169.0}
+
+
+def test_an_infinite_interval_comes_back(tmp_path: Path) -> None:
+    """An interval may be open: identification says so with inf."""
+    bench(delay_ci95=(0.05, np.inf)).save(tmp_path / "arm.toml")
+    assert ArmModel.load(tmp_path / "arm.toml").delay_ci95 == (0.05, np.inf)
+
+
+def test_a_preset_cannot_be_changed_for_others() -> None:
+    """What one caller does to a loaded preset's axes no other caller sees."""
+    ArmModel.load("puma560-internal").axes.clear()
+    assert ArmModel.load("puma560-internal").axes

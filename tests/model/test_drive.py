@@ -95,6 +95,7 @@ def test_drive_is_its_definition_on_a_long_scan(recovery: float | None, jitter_n
     command = 0.56 + 0.1 * np.sin(np.arange(3000) / 40.0) + rng.normal(0.0, 1e-3, 3000)
     model = axis(0.0518, 1.010, recovery)
     found = drive(model, time, command, 0.56, T)
+    assert (np.diff(found.time) > 0).all()
     assert_same_input(found, by_definition(model, time.tolist(), command.tolist(), 0.56, T_NS))
 
 
@@ -156,3 +157,12 @@ def test_no_commands_give_no_input() -> None:
     found = drive(axis(0.05, 1.1, 0.1), np.array([], dtype=np.int64), np.array([]), 0.56, T)
     assert len(found.time) == len(found.value) == len(found.maneuver) == 0
     assert found.speed == 0.0
+
+
+@pytest.mark.parametrize("period_ns", [15_700_000, 16_300_000, 33_100_000])
+def test_no_grid_point_falls_on_a_command(period_ns: int) -> None:
+    """Entries are strictly ascending: a grid point that would fall on the next command is that command."""
+    model = AxisModel(plant=FirstOrder(time_constant=0.04), gain=Gain(intercept=0.9), gain_recovery=0.1)
+    time = np.array([0, 1, 2, 5, 9]) * period_ns
+    found = drive(model, time, np.array([0.0, 0.01, 0.02, 0.01, 0.03]), 0.0, period_ns / 1e9)
+    assert (np.diff(found.time) > 0).all()

@@ -124,3 +124,11 @@ def coefficients(tf, omega: float) -> tuple[np.ndarray, np.ndarray]:
     """Numerator and denominator as polynomials in s/ω of degree 2, scaled to a denominator that ends in 1."""
     scale = omega ** np.array([2.0, 1.0, 0.0]) / tf.den[0][0][-1]
     return tuple(np.pad(poly, (3 - len(poly), 0)) * scale for poly in (tf.num[0][0], tf.den[0][0]))
+
+
+@pytest.mark.parametrize("damping", [0.864, 1 - 1e-9, 50.0])
+def test_transfer_function_has_the_coefficients_themselves(damping: float) -> None:
+    """No spurious power of s, and the denominator's numbers to the last digits."""
+    tf = SecondOrder(natural_frequency=53.9, damping=damping).transfer_function()
+    np.testing.assert_allclose(np.trim_zeros(tf.num[0][0], "f"), [53.9**2], rtol=1e-15)
+    np.testing.assert_allclose(tf.den[0][0], [1.0, 2 * damping * 53.9, 53.9**2], rtol=1e-15)

@@ -233,9 +233,7 @@ class ReferenceEngine:
         edges = np.searchsorted(arrival[queue], times, side="right")
         due = np.split(queue, edges)  # due[k]: the rows that arrive by times[k]; the last part comes after all of them
         arrived = np.zeros(len(self._rows), dtype=bool)
-        before = [
-            self._checkpoint()
-        ]  # before[i]: as it was before row i; every row up to the last of them is dealt with
+        before = [self._checkpoint()]  # before[i]: as it was before row i; the rows until the last are dealt with
         kept: list[list[Held]] = [[] for _ in self._filters]
         reach = 0
         for number, new in enumerate(due):

@@ -9,9 +9,10 @@ from typing import Annotated, Any
 import msgspec
 
 from .. import toml
-from ..errors import ConfigError, PumafuseError, UnknownNameError
+from ..errors import ConfigError, UnknownNameError
 from ..model.arm import ArmModel
 from ..model.plants import NotNegative, Positive
+from ..units import refuse_unit
 
 _ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
 
@@ -82,6 +83,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     def __post_init__(self) -> None:
         _known_axes("process", self.process, self.arm)
         for name, sensor in self.sensors.items():
+            refuse_unit("sensor", name)
             if isinstance(sensor.sd, dict):
                 _known_axes(f"sensors.{name}.sd_mm", sensor.sd, self.arm)
             if sensor.scale == 0.0:
@@ -106,11 +108,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         tree["arm"] = arm
         if isinstance(tree.get("process"), dict):
             tree["process"] = _per_axis(tree["process"], arm, str(path))
-        try:
-            return toml.struct(tree, FusionConfig, str(path))
-        except PumafuseError as error:
-            prefix = "" if str(error).startswith(str(path)) else f"{path}: "
-            raise ConfigError(f"{prefix}{error}") from None
+        return toml.struct(tree, FusionConfig, str(path))
 
     def save(self, folder: Path) -> None:
         """Write ``fusion.toml`` and the arm as ``arm.toml`` beside it."""

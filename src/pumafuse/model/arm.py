@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import msgspec
 import numpy as np
 
 from .. import toml
 from ..arrays import FloatArray
-from ..errors import ConfigError, UnknownNameError
-from ..units import MM
+from ..errors import ConfigError, UnknownNameError, suggestion
+from ..units import MM, refuse_unit
 from .plants import PLANTS, Interval, NotNegative, Positive
 
 CANONICAL_AXES = ("tangential", "radial", "vertical")
@@ -102,6 +103,10 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     axes: Annotated[dict[str, AxisModel], msgspec.Meta(min_length=1)]
     provenance: dict[str, Any] = {}
 
+    def __post_init__(self) -> None:
+        for name in self.axes:
+            refuse_unit("axis", name)
+
     @staticmethod
     def load(source: str | Path) -> ArmModel:
         """Read ``arm.toml``, or take a preset by its name.
@@ -111,10 +116,11 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """
         from .presets import PRESETS
 
-        if str(source) in PRESETS:
-            return PRESETS[str(source)]
+        preset = PRESETS.get(str(source))
+        if preset is not None:
+            return msgspec.structs.replace(preset, axes=dict(preset.axes))  # a caller may change its own
         path = Path(source)
-        if not path.exists():
+        if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises on a name that is too long
             raise ConfigError(f"{source}: no such arm file, and not a preset ({', '.join(PRESETS)})")
         tree = toml.read(path)
         axes = tree.get("axes")
@@ -167,10 +173,13 @@ def _axis(table: Any, where: str, path: str) -> AxisModel:
     if not isinstance(table, dict):
         raise ConfigError(f"{where}: {path}: expected a table")
     keys: dict[str, Any] = dict(table)  # pyright: ignore[reportUnknownArgumentType]
-    plants = {kind.__struct_config__.tag: kind for kind in PLANTS.__args__}
-    kind = plants.get(keys.pop("plant", None))
-    if kind is None:
-        raise UnknownNameError(f"{where}: {path}.plant", "plant", str(table.get("plant", "")), map(str, plants))  # pyright: ignore
-    own = {field.encode_name for field in msgspec.structs.fields(AxisModel)}
-    parameters = {key: keys.pop(key) for key in list(keys) if key not in own}
-    return toml.struct({**keys, "plant": toml.struct(parameters, kind, where, path)}, AxisModel, where, path)
+    plants = {str(kind.__struct_config__.tag): kind for kind in get_args(PLANTS)}
+    name = str(keys.pop("plant", "none"))
+    if name not in plants:
+        raise ConfigError(f"{where}: {path}.plant: unknown plant '{name}'; {suggestion(name, plants)}")
+    plant = [field.encode_name for field in msgspec.structs.fields(plants[name])]
+    accepted = dict.fromkeys(["plant", *plant, *(field.encode_name for field in msgspec.structs.fields(AxisModel))])
+    for key in keys.keys() - accepted.keys():
+        raise ConfigError(f"{where}: unknown key '{path}.{key}'; {suggestion(key, accepted)}")
+    parameters = {key: keys.pop(key) for key in plant if key in keys}
+    return toml.struct({**keys, "plant": toml.struct(parameters, plants[name], where, path)}, AxisModel, where, path)

@@ -40,8 +40,9 @@ def transition(plant: Plant, interval: npt.ArrayLike) -> Transition:
     """Exact transition of ``plant`` over each of ``interval`` [s] ≥ 0, of any shape.
 
     Both integrals come from matrix exponentials over h = interval / 2^k, short enough that nothing in them grows, and
-    are doubled k times: Γ(2h) = Φ Γ + Γ, Q(2h) = Φ Q Φᵀ + Q. Each doubling adds positive terms, so an interval of a
-    day is as exact as one of a microsecond.
+    are doubled k times: Γ(2h) = Φ Γ + Γ, Q(2h) = Φ Q Φᵀ + Q. Each doubling adds positive terms, so long intervals lose
+    nothing but to the plant's stiffness: relative errors are about 1e-16 times the ratio of its fastest to its slowest
+    pole (under 1e-9 up to ζ = 1000).
     """
     from scipy.linalg import expm
 

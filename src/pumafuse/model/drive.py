@@ -67,8 +67,9 @@ def _grid_points(time: TimeArray, error: FloatArray, recovery: float, period: fl
     """How many grid points of T lie strictly inside each command's hold, as long as its error is worth decaying."""
     with np.errstate(divide="ignore"):
         worth = np.ceil(np.log(np.abs(error) / _NEGLIGIBLE) * (recovery / period))
-    inside = np.full(len(time), np.inf)
-    inside[:-1] = np.ceil(np.diff(time) / (period * 1e9)) - 1.0
+    inside, hold, tick = np.full(len(time), np.inf), np.diff(time), period * 1e9
+    inside[:-1] = np.ceil(hold / tick) - 1.0
+    inside[:-1] -= np.rint(inside[:-1] * tick) >= hold  # a point that rounds onto the next command is not inside
     return np.maximum(np.minimum(inside, worth), 0.0).astype(np.int64)
 
 

@@ -1,7 +1,7 @@
 """Plants: what the arm does to a command once gain and delay have had their say. All have unit gain.
 
 Equations 3 to 9 of "A Practical Dynamic Model of a Puma 560 Manipulator for Aircraft Maintenance", without the gain K.
-A new plant is a class here with a tag, :meth:`Plant.state_space` and :meth:`Plant.step_response`, added to ``PLANTS``.
+A new plant is a class here with a tag and the three methods of :class:`Plant`, added to ``PLANTS``.
 """
 
 from __future__ import annotations
@@ -36,9 +36,7 @@ class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid
 
     def transfer_function(self) -> control.TransferFunction:
         """The plant as a `control` transfer function from v to p, without gain and delay."""
-        import control
-
-        return control.ss2tf(control.ss(*self.state_space(), 0.0))
+        raise NotImplementedError
 
 
 class FirstOrder(Plant, frozen=True, kw_only=True, tag="first-order", forbid_unknown_fields=True):
@@ -56,6 +54,12 @@ class FirstOrder(Plant, frozen=True, kw_only=True, tag="first-order", forbid_unk
         """One state, the position [m]."""
         rate = 1.0 / self.time_constant
         return np.array([[-rate]]), np.array([[rate]]), np.array([[1.0]])
+
+    def transfer_function(self) -> control.TransferFunction:
+        """Equation 3."""
+        import control
+
+        return control.tf([1.0], [self.time_constant, 1.0])
 
     def step_response(self, time: npt.ArrayLike) -> FloatArray:
         """Equation 4: 1 − e^(−t/τ)."""
@@ -83,6 +87,13 @@ class SecondOrder(Plant, frozen=True, kw_only=True, tag="second-order", forbid_u
         square = self.natural_frequency**2
         A = np.array([[0.0, 1.0], [-square, -2.0 * self.damping * self.natural_frequency]])
         return A, np.array([[0.0], [square]]), np.array([[1.0, 0.0]])
+
+    def transfer_function(self) -> control.TransferFunction:
+        """Equation 5."""
+        import control
+
+        square = self.natural_frequency**2
+        return control.tf([square], [1.0, 2.0 * self.damping * self.natural_frequency, square])
 
     def step_response(self, time: npt.ArrayLike) -> FloatArray:
         """Equations 6 and 9 and the ζ = 1 between them as one formula that joins them without cancellation.
