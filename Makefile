@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+# Matrices are small: threads of a BLAS would only wait for each other.
+export OPENBLAS_NUM_THREADS := 1
 
 .PHONY: help demo test test-long lint lock clean
 

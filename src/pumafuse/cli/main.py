@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from pathlib import Path
@@ -10,6 +11,9 @@ from typing import Annotated, Literal
 import typer
 
 from ..errors import PumafuseError, PumafuseWarning
+
+# Our matrices are 5 by 5: threads of a BLAS only wait for each other, ten times as long on a busy machine.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 app = typer.Typer(
     name="pumafuse",

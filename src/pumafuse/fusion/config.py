@@ -12,8 +12,10 @@ from .. import toml
 from ..errors import ConfigError, UnknownNameError
 from ..model.arm import ArmModel
 from ..model.plants import NotNegative, Positive
+from ..model.presets import PRESETS
 from ..units import refuse_unit
 
+_LONGEST_LATENCY = 3600.0  # s
 _ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
 
 
@@ -86,6 +88,8 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             refuse_unit("sensor", name)
             if isinstance(sensor.sd, dict):
                 _known_axes(f"sensors.{name}.sd_mm", sensor.sd, self.arm)
+            if abs(sensor.latency) > _LONGEST_LATENCY:
+                raise ConfigError(f"sensors.{name}.latency_ms: more than an hour; is it in ms?")
             if sensor.scale == 0.0:
                 raise ConfigError(f"sensors.{name}.scale: 0 would make the readings say nothing of the position")
         complete = {axis: self.process.get(axis, Process()) for axis in self.arm.axes}
@@ -133,7 +137,11 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 def _load_arm(name: str, path: Path) -> ArmModel:
     beside = path.parent / name
-    return ArmModel.load(beside if beside.exists() else name)
+    if name in PRESETS and not beside.exists():
+        return ArmModel.load(name)
+    if not beside.is_file():
+        raise ConfigError(f"{path}: arm = '{name}': no such file beside it, and not a preset ({', '.join(PRESETS)})")
+    return ArmModel.load(beside)
 
 
 def _per_axis(table: dict[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
@@ -141,7 +149,8 @@ def _per_axis(table: dict[str, Any], arm: ArmModel, where: str) -> dict[str, Any
     own: dict[str, dict[str, Any]] = {key: value for key, value in table.items() if isinstance(value, dict)}
     common = {key: value for key, value in table.items() if key not in own}
     _known_axes(f"{where}: process", own, arm)
-    return {axis: toml.struct({**common, **own.get(axis, {})}, Process, where, "process") for axis in arm.axes}
+    toml.struct(common, Process, where, "process")
+    return {axis: toml.struct({**common, **own.get(axis, {})}, Process, where, f"process.{axis}") for axis in arm.axes}
 
 
 def _known_axes(where: str, named: Mapping[str, object], arm: ArmModel) -> None:

@@ -15,11 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import NO_STAMP, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
-from ..errors import UnknownNameError
+from ..errors import RunError, UnknownNameError
 from ..model.drive import Drive, drive
 from ..runs.clock import TOLERATED_STEP_BACK_NS, behind, regular_grid
 from ..runs.run import Run, Source
 from .config import FusionConfig, Sensor
+
+_MOST_ESTIMATES = 100_000_000
 
 
 class Outcome(enum.IntEnum):
@@ -134,11 +136,19 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
             raise UnknownNameError(
                 f"{run.command.label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes
             )
-    stamp, command = _commands(run, arm.update_period, notes)
+    command = _sorted_commands(run.command, notes)
+    used = {name: _actual_commands(command.stamp, command.values[name], arm.update_period) for name in run.axes}
+    stamp = command.stamp
+    if run.clock == "regular":
+        rows = np.unique(np.concatenate(list(used.values())))
+        distinct, place = np.unique(stamp[rows], return_inverse=True)
+        grid, note = regular_grid(distinct, arm.update_period, run.command.label)
+        stamp = stamp.copy()
+        stamp[rows] = grid[place]
+        notes.extend([] if note is None else [note])
     inputs: list[AxisInput] = []
     for name in run.axes:
-        used = _actual_commands(stamp, command.values[name], arm.update_period)
-        given, values = stamp[used], command.values[name][used]
+        given, values = stamp[used[name]], command.values[name][used[name]]
         start = run.start.get(name, float(values[0]))
         driven = drive(arm.axes[name], given, values, start, arm.update_period)
         inputs.append(AxisInput(name, start, given, driven, round(arm.delay_of(name) * 1e9)))
@@ -160,31 +170,29 @@ def output_times(timeline: Timeline, rate: float | None) -> TimeArray:
     """When estimates are asked for: at each command, or on an even grid of ``rate`` [Hz] from the first command on."""
     if rate is None:
         return timeline.commands
-    count = int((timeline.end - timeline.origin) / 1e9 * rate) + 1
-    return timeline.origin + np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
+    span = timeline.end - timeline.origin
+    count = int(span / 1e9 * rate) + 2
+    if count > _MOST_ESTIMATES:
+        raise RunError(
+            f"{rate:g} estimates a second over {span / 86400e9:.1f} days are {count:.1e} estimates, more than"
+            f" {_MOST_ESTIMATES:.0e}: are all stamps on one clock, the first command's too?"
+        )
+    grid = np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
+    return timeline.origin + grid[grid <= span]
 
 
-def _commands(run: Run, period: float, notes: list[str]) -> tuple[TimeArray, Source]:
-    """The command rows that can be used, in order, with the times that they are taken to act from."""
-    source = run.command
+def _sorted_commands(source: Source, notes: list[str]) -> Source:
+    """The stamped command rows in order, NaN where an axis has no finite command."""
     missing = source.stamp == NO_STAMP
     _tell(notes, source.label, missing, "no stamp: not used")
     _tell(notes, source.label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
+    _tell(notes, source.label, _said_before(source) & ~missing, "the stamp and values of an earlier row: duplicate")
+    for axis, value in source.values.items():
+        _tell(notes, source.label, ~np.isfinite(value) & ~missing, f"no finite {axis} command: not used")
     kept = source.where(~missing)
     order = np.argsort(kept.stamp, kind="stable")
-    stamp = kept.stamp[order]
-    values = {axis: value[order] for axis, value in kept.values.items()}
-    _tell(notes, source.label, _said_before(source) & ~missing, "the stamp and values of an earlier row: duplicate")
-    for axis, value in values.items():
-        _tell(notes, source.label, ~np.isfinite(source.values[axis]) & ~missing, f"no finite {axis} command: not used")
-        value[~np.isfinite(value)] = np.nan
-    command = Source(stamp, values, source.label)
-    if run.clock == "regular":
-        distinct, place = np.unique(stamp, return_inverse=True)
-        grid, note = regular_grid(distinct, period, source.label)
-        stamp = grid[place]
-        notes.extend([] if note is None else [note])
-    return stamp, command
+    values = {axis: np.where(np.isfinite(value), value, np.nan)[order] for axis, value in kept.values.items()}
+    return Source(kept.stamp[order], values, source.label)
 
 
 def _actual_commands(stamp: TimeArray, value: FloatArray, period: float) -> IntArray:
@@ -203,23 +211,28 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
     columns: list[tuple[npt.NDArray[np.generic], ...]] = []
     for index, name in enumerate(names):
         source, sensor = run.sensors[name], config.sensors.get(name)
+        label = name if name == source.label else f"{name} ({source.label})"
         latency = 0 if sensor is None else round(sensor.latency * 1e9)
         valid = np.where(source.stamp == NO_STAMP, NO_STAMP, source.stamp - latency)
         rows = np.arange(len(valid))
         outcomes = _row_outcomes(source, sensor, valid, origin)
-        told = set[Outcome]()
+        _tell(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
+        for kind, reason in _REASONS.items():
+            _tell(notes, label, outcomes == kind, f"{reason}: {kind.word}")
         for number, axis in enumerate(run.axes):
             if axis not in source.values:
                 continue
             value, outcome = source.values[axis], outcomes.copy()
+            hollow = (outcome == Outcome.FUSED) & ~np.isfinite(value)
+            outcome[hollow] = Outcome.INVALID
             if sensor is not None and sensor.sd_of(axis) is None:
+                notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
                 outcome[:] = Outcome.UNKNOWN
-            outcome[(outcome == Outcome.FUSED) & ~np.isfinite(value)] = Outcome.INVALID
+            else:
+                _tell(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
             columns.append(
                 (valid, source.stamp, np.full_like(rows, index), np.full_like(rows, number), value, rows, outcome)
             )
-            _tell_outcomes(notes, f"{name} ({source.label})", axis, outcome, told)
-        _tell(notes, f"{name} ({source.label})", behind(source.stamp) > 0, "a stamp that steps back: sorted")
     if not columns:
         columns = [tuple(np.zeros(0, dtype) for dtype in ("i8", "i8", "i8", "i8", "f8", "i8", "u1"))]
     valid, stamp, sensor_index, axis_index, value, rows, outcome = (
@@ -263,21 +276,12 @@ def _said_before(source: Source) -> BoolArray:
 
 
 _REASONS: Mapping[Outcome, str] = {
-    Outcome.INVALID: "no stamp or no finite value: invalid",
-    Outcome.DUPLICATE: "the stamp and values of an earlier row: duplicate",
-    Outcome.BEFORE_START: "a time before the first command: before_start",
-    Outcome.TOO_LATE: "a stamp more than 1 s behind an earlier one: too_late",
-    Outcome.UNKNOWN: "no sensor in the configuration: unknown",
+    Outcome.INVALID: "no stamp",
+    Outcome.DUPLICATE: "the stamp and values of an earlier row",
+    Outcome.BEFORE_START: "a time before the first command",
+    Outcome.TOO_LATE: "a stamp more than 1 s behind an earlier one",
+    Outcome.UNKNOWN: "no sensor of this name in the configuration",
 }
-
-
-def _tell_outcomes(notes: list[str], label: str, axis: str, outcome: CodeArray, told: set[Outcome]) -> None:
-    """Each reason once per sensor, for the first axis that meets it."""
-    for kind, reason in _REASONS.items():
-        if kind not in told and _tell(
-            notes, label, outcome == kind, f"{reason} ({axis})" if kind is Outcome.INVALID else reason
-        ):
-            told.add(kind)
 
 
 def _tell(notes: list[str], label: str, rows: BoolArray, what: str) -> bool:

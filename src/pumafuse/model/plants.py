@@ -31,7 +31,7 @@ class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid
         raise NotImplementedError
 
     def step_response(self, time: npt.ArrayLike) -> FloatArray:
-        """P [m] at ``time`` [s] after v stepped from 0 to 1 m; 0 before the step; the shape of ``time``."""
+        """Position p [m] at ``time`` [s] after v stepped from 0 to 1 m; 0 before the step; the shape of ``time``."""
         raise NotImplementedError
 
     def transfer_function(self) -> control.TransferFunction:

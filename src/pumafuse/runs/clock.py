@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 
-from ..arrays import NO_STAMP, IntArray, TimeArray
+from ..arrays import NO_STAMP, FloatArray, IntArray, TimeArray
 from ..errors import RunError
-from .run import Reference, Run, Source
+from .run import Run, Source
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
 _MOST_JUMPS = 100
+_BLOCK = 64  # commands over which the two clocks' drift is small against T
+_MOST_DRIFT = 1e-3  # two quartz clocks differ by 1e-4 at the worst
+_MOST_ASTRAY = 0.05  # share of stamps that may be more than half a period off their tick
+
+S = TypeVar("S", bound=Source)
 
 
 def behind(stamp: TimeArray) -> TimeArray:
@@ -35,28 +41,23 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
     cuts = _jumps(run.command)
     if not cuts:
         return [run], []
-    streams = {**run.sensors, **({} if run.reference is None else {"reference": run.reference})}
-    cut = {name: _jumps(source) for name, source in streams.items()}
-    for name, others in cut.items():
-        if len(others) != len(cuts):
+    for source in (*run.sensors.values(), *([] if run.reference is None else [run.reference])):
+        if len(_jumps(source)) != len(cuts):
             raise RunError(
                 f"{run.command.label}: the commands' clock is set back {len(cuts)} times (first in row {cuts[0] + 1}),"
-                f" that of {name} {len(others)} times; cut the log there and fuse the parts one by one"
+                f" that of {source.label} {len(_jumps(source))} times; cut the log there and fuse the parts one by one"
             )
-    parts: list[Run] = []
-    for index in range(len(cuts) + 1):
-        pieces = {name: _piece(source, cut[name], index) for name, source in streams.items()}
-        reference = pieces.pop("reference", None)
-        parts.append(
-            replace(
-                run,
-                command=_piece(run.command, cuts, index),
-                sensors=pieces,
-                reference=reference if isinstance(reference, Reference) else None,
-                start=run.start if index == 0 else {},
-                notes=run.notes if index == 0 else (),
-            )
+    parts = [
+        replace(
+            run,
+            command=_piece(run.command, index),
+            sensors={name: _piece(source, index) for name, source in run.sensors.items()},
+            reference=None if run.reference is None else _piece(run.reference, index),
+            start=run.start if index == 0 else {},
+            notes=run.notes if index == 0 else (),
         )
+        for index in range(len(cuts) + 1)
+    ]
     lag = behind(run.command.stamp)
     said = [
         f"{run.command.label}: the clock is set back by {lag[row] / 1e9:.3f} s in row {row + 1}: new segment, filter"
@@ -73,7 +74,7 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
     more than 5 standard errors: then the two clocks drift apart, the slope is used and the drift told.
 
     Args:
-        stamp: Ascending stamps, int64 ns, (n,).
+        stamp: Strictly ascending stamps, int64 ns, (n,).
         period: T [s].
         label: The source, for messages.
 
@@ -81,35 +82,62 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
         The stamps on the grid, (n,), and a sentence on clock drift or None.
 
     Raises:
-        RunError: Two stamps fall on one tick, or the stamps' period is not T.
+        RunError: The stamps do not follow ticks of T.
     """
-    tick_ns = period * 1e9
-    ticks = np.concatenate(([0], np.cumsum(np.rint(np.diff(stamp) / tick_ns)))).astype(np.int64)
-    same = np.flatnonzero(np.diff(ticks) == 0)
-    if len(same):
-        apart = (stamp[same[0] + 1] - stamp[same[0]]) * 1e-6
-        raise RunError(
-            f"{label}: clock = 'regular', but two commands are only {apart:.3f} ms apart, less than half the period of"
-            f" {period * 1e3:g} ms (stamp {stamp[same[0]] / 1e9:.6f} s); use clock = 'stamps'"
-        )
+    tick = period * 1e9
     since = (stamp - stamp[0]).astype(np.float64)
-    note = None
-    if len(stamp) > 2:
-        centred = ticks - ticks.mean()
-        slope = float(centred @ since / (centred @ centred))
-        left = since - since.mean() - slope * centred
-        error = float(np.sqrt(left @ left / (len(stamp) - 2) / (centred @ centred)))
-        drift = slope / tick_ns - 1.0
-        if abs(drift) > 1e-3:
-            raise RunError(
-                f"{label}: clock = 'regular', but the commands come every {slope * 1e-6:.4f} ms, not every"
-                f" {period * 1e3:g} ms; check update_period_ms, or use clock = 'stamps'"
-            )
-        if abs(slope - tick_ns) > 5.0 * error and abs(slope - tick_ns) * ticks[-1] > 1.0:
-            tick_ns = slope
-            note = f"{label}: the log's clock runs {drift * 1e6:+.1f} ppm against the controller's; the grid follows it"
-    offset = float(np.median(since - ticks * tick_ns))
-    return stamp[0] + np.rint(ticks * tick_ns + offset).astype(np.int64), note
+    ticks = _ticks(since, tick)
+    slope, error = _line(ticks, since)
+    drift, note = slope / tick - 1.0, None
+    significant = len(stamp) >= _BLOCK and abs(drift) * tick > 5.0 * error and abs(drift) * tick * np.ptp(ticks) > 1.0
+    if significant and abs(drift) <= _MOST_DRIFT:
+        tick = slope
+        note = f"{label}: the log's clock runs {drift * 1e6:+.1f} ppm against the controller's; the grid follows it"
+    left = since - ticks * tick
+    offset = float(np.median(left))
+    astray = np.abs(left - offset) > 0.5 * tick
+    if (significant and abs(drift) > _MOST_DRIFT) or np.mean(astray) > _MOST_ASTRAY:
+        usual = float(np.median(np.diff(stamp))) / 1e6
+        raise RunError(
+            f"{label}: clock = 'regular', but the commands do not come on ticks of {period * 1e3:g} ms (their median"
+            f" interval is {usual:.4f} ms); check update_period_ms, or use clock = 'stamps'"
+        )
+    return stamp[0] + np.rint(ticks * tick + offset).astype(np.int64), note
+
+
+def _ticks(since: FloatArray, tick: float) -> IntArray:
+    """The number of the tick behind each stamp, strictly ascending, (n,).
+
+    Each stamp is rounded to the nearest tick of a phase that follows the clocks' slow drift, so that a late stamp moves
+    no other. The phase is the circular mean of the stamps over blocks, which no missing tick disturbs; over pauses it
+    is carried on with the drift seen between neighbouring blocks. Two stamps on one tick: the first one was late.
+    """
+    pauses = np.flatnonzero(np.diff(since) > _BLOCK * tick) + 1
+    edges = np.union1d(np.arange(0, len(since), _BLOCK), pauses)
+    size = np.diff(np.append(edges, len(since)))
+    turn = np.add.reduceat(np.exp(2j * np.pi * since / tick), edges)
+    phase = np.angle(turn) * tick / (2.0 * np.pi)
+    middle = np.add.reduceat(since, edges) / size
+    apart, moved = np.diff(middle), np.diff(phase)
+    moved -= np.rint(moved / tick) * tick
+    near = apart <= 2.0 * _BLOCK * tick
+    drift = float(np.median(moved[near] / apart[near])) if near.any() else 0.0
+    phase = np.unwrap(phase - drift * middle, period=tick) + drift * middle
+    block = np.repeat(np.arange(len(edges)), size)
+    nearest = np.rint((since - phase[block] - drift * (since - middle[block])) / tick).astype(np.int64)
+    order = np.arange(len(since))
+    return np.minimum.accumulate((nearest - order)[::-1])[::-1] + order
+
+
+def _line(ticks: IntArray, since: FloatArray) -> tuple[float, float]:
+    """Slope of the stamps over their ticks by least squares, and its standard error [ns]."""
+    if len(ticks) < 3:
+        return np.inf, np.inf
+    centred = ticks - ticks.mean()
+    weight = float(centred @ centred)
+    slope = float(centred @ since) / weight
+    left = since - since.mean() - slope * centred
+    return slope, float(np.sqrt(left @ left / (len(ticks) - 2) / weight))
 
 
 def _jumps(source: Source) -> list[int]:
@@ -128,8 +156,10 @@ def _jumps(source: Source) -> list[int]:
             )
 
 
-def _piece(source: Source, cuts: list[int], index: int) -> Source:
-    rows: IntArray = np.arange(len(source.stamp))
-    edges = [0, *cuts, len(rows)]
-    part = source.where((rows >= edges[index]) & (rows < edges[index + 1]))
-    return Reference(part.stamp, part.values, part.label, source.sd) if isinstance(source, Reference) else part
+def _piece(source: S, index: int) -> S:
+    """Segment ``index`` of a source: the rows between two of its jumps."""
+    edges = [0, *_jumps(source), len(source.stamp)]
+    rows = slice(edges[index], edges[index + 1])
+    return replace(
+        source, stamp=source.stamp[rows], values={axis: value[rows] for axis, value in source.values.items()}
+    )

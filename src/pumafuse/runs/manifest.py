@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import msgspec
 
@@ -51,11 +51,14 @@ def load(path: Path) -> Manifest:
         ConfigError: The file is no manifest; names the key and the accepted ones.
     """
     tree, where = toml.read(path), str(path)
+    sensors: Any = tree.get("sensors", {})
+    if not isinstance(sensors, dict):
+        raise ConfigError(f"{where}: sensors: expected a table for each sensor, as in [sensors.tracker]")
     parts = {
         "command": _source(tree.get("command"), CommandEntry, where, "command"),
         "sensors": {
             name: _source(table, SourceEntry, where, f"sensors.{name}")
-            for name, table in tree.get("sensors", {}).items()
+            for name, table in cast(dict[str, Any], sensors).items()
         },
         "reference": _source(tree.get("reference"), ReferenceEntry, where, "reference"),
     }

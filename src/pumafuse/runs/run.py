@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -78,6 +78,13 @@ class Run:
         for name, source in sources.items():
             _known_axes(f"run '{self.name}', {name}", source.values, self.axes)
         _known_axes(f"run '{self.name}', start", self.start, self.axes)
+        if self.clock not in get_args(Clock):
+            raise UnknownNameError(f"run '{self.name}'", "clock", self.clock, get_args(Clock))
+        for axis, level in self.start.items():
+            if not np.isfinite(level):
+                raise RunError(f"run '{self.name}': the start level of {axis} is not finite")
+        if self.reference is not None and not 0.0 <= self.reference.sd < np.inf:
+            raise RunError(f"run '{self.name}': the reference's sd must be finite and not negative")
         stamped = self.command.stamp != NO_STAMP
         for axis, command in self.command.values.items():
             if not (np.isfinite(command) & stamped).any():
@@ -146,10 +153,13 @@ def _known_axes(where: str, named: Mapping[str, object], axes: tuple[str, ...]) 
 
 
 def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.ArrayLike]) -> Source:
-    stamp = np.array(time)
-    if not np.issubdtype(stamp.dtype, np.integer):
-        stamp = nanoseconds(stamp.astype(np.float64))
-    columns = {axis: np.array(value, dtype=np.float64) for axis, value in values.items()}
+    try:
+        stamp = _stamps(np.array(time))
+        columns = {axis: np.array(value, dtype=np.float64) for axis, value in values.items()}
+    except (ValueError, TypeError, OverflowError) as error:
+        raise RunError(
+            f"{label}: stamps are int ns, float seconds or datetime64, values are numbers: {error}"
+        ) from None
     for axis, column in columns.items():
         if stamp.ndim != 1 or column.shape != stamp.shape:
             raise RunError(
@@ -157,7 +167,19 @@ def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.Array
             )
     if not columns or not len(stamp):
         raise RunError(f"{label}: no values")
-    return Source(stamp.astype(np.int64), columns, label)
+    return Source(stamp, columns, label)
+
+
+def _stamps(time: npt.NDArray[Any]) -> TimeArray:
+    """Int64 ns of datetime64, int ns or float seconds, all within reach."""
+    if time.dtype.kind == "M":
+        time = time.astype("M8[ns]").astype(np.int64)
+    whole = time.dtype.kind in "iu"
+    rough = time.astype(np.float64) * (1.0 if whole else 1e9)
+    missing = (time == NO_STAMP) if whole else ~np.isfinite(rough)
+    if (np.abs(rough[~missing]) >= tables.REACH_NS).any():
+        raise ValueError("a stamp beyond the year 2110")
+    return time.astype(np.int64) if whole else nanoseconds(rough / 1e9)
 
 
 def _read_manifest(path: Path) -> Run:
@@ -207,7 +229,9 @@ def _read_single(path: Path) -> Run:
             continue
         values, note = table.numbers(column)
         axis = rest[: rest.rindex("_")]
-        groups.setdefault(source, {})[axis] = values
+        if axis in groups.setdefault(source, {}):
+            raise RunError(f"{path}: two columns for {source}.{axis}; give one")
+        groups[source][axis] = values
         notes.extend([note] if note else [])
     if left:
         notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")

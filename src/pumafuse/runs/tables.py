@@ -7,6 +7,7 @@ told in one sentence each. Nothing here knows what a command or a sensor is.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from .. import units
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, UnknownNameError
 
-_EPOCH_LIMIT_S = 9.2e9  # |stamp| that int64 ns can hold
+REACH_NS = 4.6e18  # |stamp| whose differences int64 ns can hold: the years 1824 to 2115
 
 
 @dataclass(frozen=True)
@@ -43,42 +44,55 @@ class Table:
         """A length column in metres, NaN where a cell is empty or no number, and a note on cells that were text.
 
         Raises:
-            RunError: The column is absent or its name ends in no unit of length.
+            RunError: The column is absent, its name ends in no unit of length, or it holds something else than numbers.
         """
         exponent = self._exponent(name, units.LENGTHS, "_mm")
-        values, note = self._floats(name)
-        # Division by the exact power of ten rounds once: 1.1 mm and 0.0011 m are the same float.
-        return (values / 10.0**-exponent if exponent < 0 else values), note
+        column, note = self._numeric(name)
+        values = _to_numpy(column.cast(pa.float64(), safe=False))
+        return (values / 10.0**-exponent if exponent < 0 else values), note  # a quotient is rounded once
 
     def stamps(self, name: str) -> tuple[TimeArray, str | None]:
         """A time column in int64 ns, ``NO_STAMP`` where a cell is empty or no time, and a note on cells that were text.
 
+        Whole numbers are exact, also beside cells that are words.
+
         Raises:
-            RunError: The column is absent, its name ends in no unit of time, or its stamps do not fit int64 ns.
+            RunError: The column is absent, its name ends in no unit of time, or a stamp is beyond reach of int64 ns.
         """
         column = self._column(name)
         if pa.types.is_timestamp(column.type):
-            ticks = column.cast(pa.timestamp("ns")).cast(pa.int64())
-            return _filled(ticks), None
-        per_unit = 10 ** (9 + self._exponent(name, units.TIMES, "_s"))
-        if pa.types.is_integer(column.type):
-            ticks = _filled(column.cast(pa.int64()))
-            beyond = (ticks != NO_STAMP) & (np.abs(ticks) > _EPOCH_LIMIT_S * 1e9 / per_unit)
-            note = None
-            ticks = np.where(ticks == NO_STAMP, NO_STAMP, ticks * per_unit)
+            whole, note, per_unit = self._cast(name, column, pa.timestamp("ns")), None, 1
+            counted = _filled(whole.cast(pa.int64()))
+            values = np.where(counted == NO_STAMP, np.nan, counted.astype(np.float64))
         else:
-            values, note = self._floats(name)
-            beyond = np.abs(values) > _EPOCH_LIMIT_S * 1e9 / per_unit
-            with np.errstate(invalid="ignore"):
-                ticks = np.where(np.isfinite(values), np.rint(values * per_unit), NO_STAMP).astype(np.int64)
-            beyond &= np.isfinite(values)
-        if beyond.any():
-            row = int(np.flatnonzero(beyond)[0])
+            per_unit = 10 ** (9 + self._exponent(name, units.TIMES, "_s"))
+            column, note = self._numeric(name)
+            values = _to_numpy(column.cast(pa.float64(), safe=False))
+            counted = self._whole(name, column)
+        rough = values * per_unit
+        beyond = np.flatnonzero(np.isfinite(rough) & (np.abs(rough) >= REACH_NS))
+        if len(beyond):
             raise RunError(
-                f"{self.path}: column '{name}', row {row + 1}: a stamp beyond the year 2260; is its unit what its name"
-                " says?"
+                f"{self.path}: column '{name}', row {beyond[0] + 1}: a stamp beyond the year 2110; is its unit what its"
+                " name says?"
             )
-        return ticks, note
+        rounded = np.where(np.isfinite(rough), np.nan_to_num(np.rint(rough)), 0.0).astype(np.int64)
+        ticks = np.where(counted != NO_STAMP, counted * per_unit, rounded)
+        return np.where(np.isfinite(rough), ticks, NO_STAMP), note
+
+    def _whole(self, name: str, column: pa.ChunkedArray) -> TimeArray:
+        """The whole numbers of a column exactly, ``NO_STAMP`` for its other cells."""
+        if pa.types.is_string(column.type):
+            column = pc.if_else(pc.match_substring_regex(column, _WHOLE), column, pa.scalar(None, pa.string()))
+        elif not pa.types.is_integer(column.type):
+            return np.full(self.rows, NO_STAMP)
+        return _filled(self._cast(name, column, pa.int64()))
+
+    def _cast(self, name: str, column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
+        try:
+            return column.cast(kind)
+        except pa.ArrowInvalid as error:
+            raise RunError(f"{self.path}: column '{name}': {str(error).splitlines()[0]}") from None
 
     def _exponent(self, name: str, accepted: tuple[str, ...], example: str) -> int:
         self._column(name)
@@ -95,26 +109,34 @@ class Table:
             raise UnknownNameError(str(self.path), "column", name, self.columns)
         return self.columns[name]
 
-    def _floats(self, name: str) -> tuple[FloatArray, str | None]:
-        column = self._column(name)
-        if pa.types.is_string(column.type) or pa.types.is_large_string(column.type):
-            numeric = pc.match_substring_regex(pc.utf8_trim_whitespace(column), _NUMBER)
-            text = pc.and_(pc.is_valid(column), pc.invert(pc.or_(numeric, _is_blank(column))))
-            count = pc.sum(text).as_py() or 0
-            note = None
+    def _numeric(self, name: str) -> tuple[pa.ChunkedArray, str | None]:
+        """A column of numbers, or of texts that are numbers: cells of other text are null, and told."""
+        column, kind = self._column(name), self._column(name).type
+        if pa.types.is_dictionary(kind):
+            column = self._cast(name, column, kind.value_type)
+        if pa.types.is_large_string(column.type) or pa.types.is_string_view(column.type):
+            column = column.cast(pa.string())
+        if pa.types.is_string(column.type):
+            trimmed = pc.utf8_trim_whitespace(column)
+            numeric = pc.match_substring_regex(trimmed, _NUMBER)
+            blank = pc.is_in(trimmed, value_set=pa.array(sorted(_BLANK)))
+            words = pc.and_(pc.is_valid(column), pc.invert(pc.or_(numeric, blank)))
+            count, note = pc.sum(words).as_py() or 0, None
             if count:
-                row = pc.index(text, value=True).as_py()
+                row = pc.index(words, value=True).as_py()
+                cells = "1 cell" if count == 1 else f"{count} cells"
                 note = (
-                    f"{self.path.name}: {count} cells of column '{name}' hold no number, first"
-                    f" '{column[row].as_py()}' in row {row + 1}: taken as missing"
+                    f"{self.path.name}: {cells} of column '{name}' without a number, first"
+                    f" {column[row].as_py()[:40]!r} in row {row + 1}: taken as missing"
                 )
-            column = pc.if_else(numeric, pc.utf8_trim_whitespace(column), pa.scalar(None, pa.string()))
-            return _to_numpy(column.cast(pa.float64())), note
-        if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type) or pa.types.is_null(column.type)):
+            return pc.if_else(numeric, trimmed, pa.scalar(None, pa.string())), note
+        kinds = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
+        if not any(is_kind(column.type) for is_kind in kinds):
             raise RunError(f"{self.path}: column '{name}' holds {column.type}, not numbers")
-        return _to_numpy(column.cast(pa.float64())), None
+        return column, None
 
 
+_WHOLE = r"^[+-]?\d{1,19}$"
 _NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
 _BLANK = {"", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None"}
 
@@ -126,10 +148,8 @@ def read(path: Path) -> Table:
         RunError: The file is absent, empty, or neither CSV nor Parquet inside.
     """
     try:
-        if path.suffix == ".parquet":
-            table, notes = papq.read_table(path), ()
-        else:
-            table, notes = _read_csv(path)
+        table, notes = (papq.read_table(path), list[str]()) if path.suffix == ".parquet" else _read_csv(path)
+        names: list[str] = table.column_names
     except FileNotFoundError:
         raise RunError(f"{path}: no such file") from None
     except UnicodeDecodeError:
@@ -139,9 +159,10 @@ def read(path: Path) -> Table:
         raise RunError(f"{path}: not a table that can be read: {reason}") from None
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror or str(error).splitlines()[0]}") from None
+    except ValueError:  # a null character in the path
+        raise RunError(f"{path!r}: no such file") from None
     if table.num_rows == 0:
-        raise RunError(f"{path}: the table has no rows")
-    names = table.column_names
+        raise RunError("; ".join([f"{path}: the table has no rows", *notes]))
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
         raise RunError(f"{path}: two columns are named '{repeated}'")
@@ -155,41 +176,34 @@ def write(table: pa.Table, path: Path) -> None:
 
 def _read_csv(path: Path) -> tuple[pa.Table, list[str]]:
     """A CSV file; lines with the wrong number of cells (a torn last line) are left out and told."""
+    if path.stat().st_size == 0:
+        raise RunError(f"{path}: the file is empty")
     torn: list[pacsv.InvalidRow] = []
 
     def leave_out(row: pacsv.InvalidRow) -> str:
         torn.append(row)
         return "skip"
 
-    def skip(_: pacsv.InvalidRow) -> str:
-        return "skip"
-
-    if path.stat().st_size == 0:
-        raise RunError(f"{path}: the file is empty")
-    parse = pacsv.ParseOptions(invalid_row_handler=leave_out)
-    serial = pacsv.ReadOptions(use_threads=False)
-    blanks = pacsv.ConvertOptions(null_values=sorted(_BLANK), strings_can_be_null=True)
+    read = partial(
+        pacsv.read_csv,
+        path,
+        read_options=pacsv.ReadOptions(use_threads=False),
+        convert_options=pacsv.ConvertOptions(null_values=sorted(_BLANK), strings_can_be_null=True),
+    )
     try:
-        table = pacsv.read_csv(path, read_options=serial, parse_options=parse, convert_options=blanks)
+        return read(), []
     except pa.ArrowInvalid as error:
-        if "conversion error" not in str(error):
+        if " columns, got " not in str(error):
             raise
-        # Types are guessed from the first block; text further down is met by reading every cell as text.
-        torn.clear()
-        names = pacsv.open_csv(path, parse_options=pacsv.ParseOptions(invalid_row_handler=skip)).schema.names
-        blanks.column_types = dict.fromkeys(names, pa.string())
-        table = pacsv.read_csv(path, read_options=serial, parse_options=parse, convert_options=blanks)
-    if not torn:
-        return table, []
+    if path.suffix != ".gz":
+        path.read_text(encoding="utf-8")  # pyarrow cannot hand over a torn line that is not UTF-8
+    table = read(parse_options=pacsv.ParseOptions(invalid_row_handler=leave_out))
+    lines = "1 line" if len(torn) == 1 else f"{len(torn)} lines"
     where = "" if torn[0].number is None else f", first in line {torn[0].number}"
     return table, [
-        f"{path.name}: {len(torn)} lines with {torn[0].actual_columns} cells where the header has"
-        f" {torn[0].expected_columns}{where}: left out"
+        f"{path.name}: {lines} left out: {torn[0].actual_columns} cells where the header has"
+        f" {torn[0].expected_columns}{where}"
     ]
-
-
-def _is_blank(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    return pc.is_in(pc.utf8_trim_whitespace(column), value_set=pa.array(sorted(_BLANK)))
 
 
 def _filled(column: pa.ChunkedArray) -> TimeArray:
