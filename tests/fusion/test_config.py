@@ -122,7 +122,7 @@ processes = st.builds(
 sensors = st.builds(
     Sensor,
     sd=st.one_of(positive, st.dictionaries(st.sampled_from(AXES), positive, min_size=1)),
-    latency=st.floats(-1e3, 1e3),
+    latency=st.floats(-3600.0, 3600.0),
     latency_sd=not_negative,
     scale=st.floats(-1e3, 1e3).filter(bool),
     bias_sd=not_negative,
@@ -156,6 +156,21 @@ def test_a_saved_file_is_in_the_units_of_its_keys(tmp_path: Path) -> None:
         assert line in lines
 
 
+def test_whole_metres_and_seconds_are_saved_in_their_units(tmp_path: Path) -> None:
+    """An integer from Python is 1 m or 1 s, as 1.0 is, and saved as 1000 mm or ms."""
+    ranged = Sensor(sd=1, latency=1, latency_sd=1, bias_sd=1)
+    process = Process(input_noise=1, drift=2, maneuver_noise=3, maneuver_drift=4)
+    config = FusionConfig(
+        arm=ArmModel.load(PRESET),
+        start=Start(offset_sd=1),
+        process={"radial": process},
+        sensors={"range": ranged, "by axis": Sensor(sd={"radial": 1})},
+    )
+    config.save(tmp_path)
+    assert FusionConfig.load(tmp_path / "fusion.toml") == config
+    assert "latency_sd_ms = 1000.0" in (tmp_path / "fusion.toml").read_text(encoding="utf-8")
+
+
 def test_an_arm_is_a_file_beside_or_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The arm's path counts from the file that names it, wherever one stands; a preset needs no file."""
     (tmp_path / "arms").mkdir()
@@ -167,23 +182,40 @@ def test_an_arm_is_a_file_beside_or_a_preset(tmp_path: Path, monkeypatch: pytest
         assert load(tmp_path, f'arm = "{name}"').arm == ArmModel.load(name)
 
 
-def test_a_wrong_arm_file_is_refused_by_its_own_name(tmp_path: Path) -> None:
-    """What is wrong in the arm's file is told with that file and its key."""
-    (tmp_path / "mine.toml").write_text('name = "x"\nupdate_period_ms = 28\n', encoding="utf-8")
+def test_an_arm_is_not_taken_from_where_one_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A path counts from fusion.toml only: another arm.toml in the working folder is not the one that is meant."""
+    (tmp_path / "here").mkdir()
+    ArmModel.load("puma560-external").save(tmp_path / "here" / "arm.toml")
+    monkeypatch.chdir(tmp_path / "here")
+    assert "arm = 'arm.toml'" in refusal(lambda: load(tmp_path, 'arm = "arm.toml"'))
+
+
+AXIS = '[axes.rail_mm]\nplant = "first-order"\ntime_constant_ms = 40\n'
+
+
+@pytest.mark.parametrize(("content", "key"), [("", "'delay_ms'"), (f"delay_ms = 60\n{AXIS}", "'rail_mm'")])
+def test_a_wrong_arm_file_is_refused_by_its_own_name(tmp_path: Path, content: str, key: str) -> None:
+    """What is wrong in the arm's file, also an axis named like a unit, is told with that file and its key."""
+    (tmp_path / "mine.toml").write_text(f'name = "x"\nupdate_period_ms = 28\n{content}', encoding="utf-8")
     text = refusal(lambda: load(tmp_path, 'arm = "mine.toml"'))
-    assert "mine.toml" in text
-    assert "'delay_ms'" in text
+    assert text.startswith(f"{tmp_path / 'mine.toml'}: ")
+    assert key in text
 
 
 REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     # what the file says: what the one line must name
     "no arm": ("", ("'arm'", "arm = 'arm.toml'")),
     "arm is a number": ("arm = 3", ("'arm'",)),
-    "unknown key": (ARM + "sensor = 3", ("'sensor'", "did you mean 'sensors'", "arm, start, process, sensors")),
+    "arm is no file": ('arm = "nowhere.toml"', ("'nowhere.toml'", "puma560-internal, puma560-external")),
+    "arm is no preset": ('arm = "puma560"', ("'puma560'", "puma560-internal, puma560-external")),
+    "arm is a folder": ('arm = "."', ("'.'", "no such file")),
+    "arm is empty": ('arm = ""', ("''", "no such file")),
+    "arm with a null character": ('arm = "a\\u0000b"', ("arm = ", "no such file")),
+    "unknown key": (ARM + "sensor = 3", ("'sensor'", "did you mean 'sensors'", "arm, start, process")),
     "start is a number": (ARM + "start = 3", ("start", "int")),
     "start without unit": (ARM + "[start]\noffset_sd = 1", ("'start.offset_sd'", "offset_sd_mm")),
     "start negative": (ARM + "[start]\noffset_sd_mm = -1", ("start.offset_sd_mm", ">= 0")),
-    "start infinite": (ARM + "[start]\noffset_sd_mm = inf", ("offset_sd_mm", "finite")),
+    "start infinite": (ARM + "[start]\noffset_sd_mm = inf", ("start.offset_sd_mm", "finite")),
     "process is a number": (ARM + "process = 3", ("process", "int")),
     "process of an unknown axis": (
         ARM + "[process.radail]\ndrift_mm_rts = 1",
@@ -191,10 +223,11 @@ REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "process with an unknown key": (ARM + "[process]\nnoise = 1", ("'process.noise'", PROCESS_KEYS)),
     "process without unit": (ARM + "[process]\ndrift = 1", ("'process.drift'", PROCESS_KEYS)),
-    "override with an unknown key": (ARM + "[process.radial]\ndrift = 1", ("drift'", PROCESS_KEYS)),
+    "override with an unknown key": (ARM + "[process.radial]\ndrift = 1", ("'process.radial.drift'", PROCESS_KEYS)),
     "drift negative": (ARM + "[process]\ndrift_mm_rts = -1", ("process.drift_mm_rts", ">= 0")),
-    "override negative": (ARM + "[process.radial]\ndrift_mm_rts = -1", ("drift_mm_rts", ">= 0")),
-    "drift nan": (ARM + "[process]\ndrift_mm_rts = nan", ("drift_mm_rts", "finite")),
+    "override negative": (ARM + "[process.radial]\ndrift_mm_rts = -1", ("process.radial.drift_mm_rts", ">= 0")),
+    "drift nan": (ARM + "[process]\ndrift_mm_rts = nan", ("process.drift_mm_rts", "finite")),
+    "override nan": (ARM + "[process.radial]\ndrift_mm_rts = nan", ("process.radial.drift_mm_rts", "finite")),
     "drift is a word": (ARM + '[process]\ndrift_mm_rts = "x"', ("process.drift_mm_rts", "float", "str")),
     "sensors is a number": (ARM + "sensors = 3", ("sensors", "int")),
     "sensors is a list": (ARM + "sensors = []", ("sensors", "array")),
@@ -205,9 +238,12 @@ REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
         ARM + TRACKER + "latency = 8",
         ("'sensors.tracker.latency'", "did you mean 'latency_ms'", SENSOR_KEYS),
     ),
+    "sensor named like a length": (ARM + "[sensors.laser_mm]\nsd_mm = 1", ("'laser_mm'", "unit (_mm)", "'laser'")),
+    "sensor named like a time": (ARM + "[sensors.laser_s]\nsd_mm = 1", ("'laser_s'", "unit (_s)", "'laser'")),
+    "sensor named like a density": (ARM + "[sensors.a_mm_rts]\nsd_mm = 1", ("'a_mm_rts'", "unit (_mm_rts)", "'a'")),
     "sd negative": (ARM + TRACKER.replace("0.05", "-0.05"), ("sensors.tracker.sd_mm", "> 0")),
     "sd zero": (ARM + TRACKER.replace("0.05", "0"), ("sensors.tracker.sd_mm", "> 0")),
-    "sd nan": (ARM + TRACKER.replace("0.05", "nan"), ("sd_mm", "finite")),
+    "sd nan": (ARM + TRACKER.replace("0.05", "nan"), ("sensors.tracker.sd_mm", "finite")),
     "sd is a word": (ARM + TRACKER.replace("0.05", '"x"'), ("sensors.tracker.sd_mm", "str")),
     "sd of no axis": (ARM + TRACKER.replace("0.05", "{}"), ("sensors.tracker.sd_mm", ">= 1")),
     "sd of an unknown axis": (
@@ -217,9 +253,12 @@ REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "sd of an axis negative": (ARM + TRACKER.replace("0.05", "{ radial = -1 }"), ("sensors.tracker.sd_mm", "> 0")),
     "scale zero": (ARM + TRACKER + "scale = 0", ("sensors.tracker.scale", "0")),
     "scale minus zero": (ARM + TRACKER + "scale = -0.0", ("sensors.tracker.scale", "0")),
-    "scale nan": (ARM + TRACKER + "scale = nan", ("scale", "finite")),
+    "scale nan": (ARM + TRACKER + "scale = nan", ("sensors.tracker.scale", "finite")),
     "latency is yes": (ARM + TRACKER + "latency_ms = true", ("sensors.tracker.latency_ms", "bool")),
-    "latency infinite": (ARM + TRACKER + "latency_ms = -inf", ("latency_ms", "finite")),
+    "latency infinite": (ARM + TRACKER + "latency_ms = -inf", ("sensors.tracker.latency_ms", "finite")),
+    "latency beyond an hour": (ARM + TRACKER + "latency_ms = 3600001", ("sensors.tracker.latency_ms", "hour")),
+    "latency beyond minus an hour": (ARM + TRACKER + "latency_ms = -3600001", ("sensors.tracker.latency_ms", "hour")),
+    "latency beyond int64": (ARM + TRACKER + "latency_ms = 1e300", ("sensors.tracker.latency_ms", "hour")),
     "latency sd negative": (ARM + TRACKER + "latency_sd_ms = -1", ("sensors.tracker.latency_sd_ms", ">= 0")),
     "bias sd negative": (ARM + TRACKER + "bias_sd_mm = -1", ("sensors.tracker.bias_sd_mm", ">= 0")),
     "gate negative": (ARM + TRACKER + "gate = -1", ("sensors.tracker.gate", ">= 0")),
@@ -252,20 +291,21 @@ def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
     assert str(tmp_path) in refusal(lambda: FusionConfig.load(tmp_path))
 
 
-def test_an_arm_that_is_nowhere_is_refused_with_the_presets(tmp_path: Path) -> None:
-    """A name that is neither a file beside nor a preset is refused, and the presets are listed."""
-    text = refusal(lambda: load(tmp_path, 'arm = "puma560"'))
-    for words in ("puma560", "puma560-internal", "puma560-external"):
-        assert words in text
-
-
 def test_a_configuration_made_in_python_is_checked_like_a_file() -> None:
-    """Axes that the arm has not, and a scale of 0, are refused without a file too."""
+    """Axes that the arm has not, a scale of 0, a name like a unit, endless latency: refused without a file too."""
     arm = ArmModel.load(PRESET)
     with pytest.raises(UnknownNameError):
         FusionConfig(arm=arm, process={"yaw": Process()})
     with pytest.raises(UnknownNameError):
         FusionConfig(arm=arm, sensors={"tracker": Sensor(sd={"yaw": 1e-3})})
-    with pytest.raises(ConfigError):
-        FusionConfig(arm=arm, sensors={"tracker": Sensor(sd=1e-3, scale=0.0)})
+    for name, sensor in {
+        "tracker": Sensor(sd=1e-3, scale=0.0),
+        "laser_mm": Sensor(sd=1e-3),
+        "early": Sensor(sd=1e-3, latency=1e10),
+        "late": Sensor(sd=1e-3, latency=-1e297),
+    }.items():
+        with pytest.raises(ConfigError, match=name):
+            FusionConfig(arm=arm, sensors={name: sensor})
+    with pytest.raises(ConfigError, match="rail_mm"):
+        ArmModel(name="x", update_period=0.028, delay=0.0, axes={"rail_mm": arm.axes["radial"]})
     assert FusionConfig(arm=arm).process == dict.fromkeys(AXES, Process())

@@ -181,10 +181,13 @@ def test_the_order_of_the_configuration_decides_ties() -> None:
     assert timeline.scalars.sensors == ("b", "c", "a")
 
 
-def test_valid_times_are_exact_today() -> None:
-    """Stamps of 2023 in ns keep their last digit when the latency is taken off."""
-    timeline = build(recorded({"a": readings((5, 1.0))}), config(a=Sensor(sd=1e-4, latency=0.001_234_567)))
-    assert timeline.scalars.valid.tolist() == [ORIGIN + 5 * MS - 1_234_567]
+@pytest.mark.parametrize(
+    ("latency", "ns"), [(0.001_234_567, 1_234_567), (3600.0, 3600 * SECOND), (-3600, -3600 * SECOND)]
+)
+def test_valid_times_are_exact_today(latency: float, ns: int) -> None:
+    """Stamps of 2023 in ns keep their last digit when the latency, up to an hour, is taken off."""
+    timeline = build(recorded({"a": readings((5, 1.0))}), config(a=Sensor(sd=1e-4, latency=latency)))
+    assert timeline.scalars.valid.tolist() == [ORIGIN + 5 * MS - ns]
     assert timeline.scalars.stamp.tolist() == [ORIGIN + 5 * MS]
 
 
@@ -219,7 +222,7 @@ A = Sensor(sd=1e-4, latency=0.005)
 nan = math.nan
 
 OUTCOMES: dict[str, tuple[Rows, list[str], tuple[str, ...]]] = {
-    # rows as (ms, value), their outcomes in order of valid time, what the one note must say
+    # rows as (ms, value), their outcomes in order of valid time, what the one note of this outcome must say
     "duplicate": (
         readings((10, 1.0), (11, 2.0), (10, 1.0), (10, 3.0), (11, 2.0)),
         ["fused", "duplicate", "fused", "fused", "duplicate"],
@@ -236,9 +239,14 @@ OUTCOMES: dict[str, tuple[Rows, list[str], tuple[str, ...]]] = {
         ("2 rows", "row 2"),
     ),
     "invalid": (
-        readings((10, 1.0), (11, nan), (12, math.inf), (13, -math.inf), (nan, 1.0)),
-        ["invalid", "fused", "invalid", "invalid", "invalid"],
-        ("4 rows", "row 2"),
+        readings((10, 1.0), (11, nan), (12, math.inf), (13, -math.inf)),
+        ["fused", "invalid", "invalid", "invalid"],
+        ("3 rows", "row 2", "no finite radial value"),
+    ),
+    "no stamp": (
+        readings((10, 1.0), (nan, 1.0), (nan, nan)),
+        ["invalid", "invalid", "fused"],
+        ("2 rows", "row 2", "invalid"),
     ),
 }
 
@@ -250,7 +258,8 @@ def test_each_outcome_is_counted_and_told_once(outcome: str) -> None:
     timeline = build(recorded({"a": rows}), config(a=A))
     assert outcomes(timeline) == wanted
     note = one_note(timeline, outcome)
-    for word in ("a", *words):
+    assert note.startswith("a: ")
+    for word in words:
         assert word in note
 
 
@@ -290,6 +299,31 @@ def test_an_axis_without_noise_is_unknown_to_its_sensor() -> None:
     timeline = build(recorded({"a": rows}, ("radial", "vertical")), config(a=Sensor(sd={"vertical": 1e-4})))
     assert timeline.scalars.axis.tolist() == [0, 1, 0, 1]
     assert outcomes(timeline) == ["unknown", "fused", "unknown", "fused"]
+    (note,) = timeline.notes
+    for word in ("a: ", "sd_mm", "radial", "unknown"):
+        assert word in note
+    assert "vertical" not in note
+
+
+def test_rows_are_told_once_and_values_once_for_each_axis() -> None:
+    """What is wrong with a whole row is one note whatever its axes say; what is wrong with values is one an axis."""
+    stamp = [ORIGIN + 10 * MS, NO_STAMP, ORIGIN - SECOND, ORIGIN + 10 * MS, ORIGIN + 11 * MS, ORIGIN + 12 * MS]
+    columns = {"vertical": [3.0, nan, nan, 3.0, nan, math.inf], "radial": [1.0, nan, nan, 1.0, nan, 2.0]}
+    run = recorded({"stranger": (stamp, columns), "a": (stamp, columns)}, ("radial", "vertical"))
+    told = [
+        "stranger: 1 row has a stamp that steps back",
+        "stranger: 6 rows have no sensor of this name in the configuration: unknown (first: row 1)",
+        "a: 1 row has a stamp that steps back",
+        "a: 1 row has no stamp: invalid (first: row 2)",
+        "a: 1 row has the stamp and values of an earlier row: duplicate (first: row 4)",
+        "a: 1 row has a stamp more than 1 s behind an earlier one: too_late (first: row 3)",
+        "a: 1 row has no finite radial value: invalid (first: row 5)",
+        "a: 2 rows have no finite vertical value: invalid (first: row 5)",
+    ]
+    notes = build(run, config(a=Sensor(sd=1e-4))).notes
+    assert len(notes) == len(told)
+    for sentence in told:
+        assert sum(note.startswith(sentence) for note in notes) == 1, sentence
 
 
 def test_an_empty_axis_of_a_row_leaves_the_others_to_the_filter() -> None:
@@ -332,12 +366,14 @@ def test_an_axis_is_driven_by_its_own_commands_delay_and_start() -> None:
     assert timeline.origin == ORIGIN
 
 
-def test_a_column_filled_down_to_the_rate_of_the_log_is_one_command_per_change() -> None:
-    """At 1 kHz every row repeats the command in force: only the rows where it changes command the arm."""
-    stamp = ORIGIN + np.arange(0, 2000) * MS
-    value = 0.5 + np.floor(np.arange(2000) / 28) * 1e-3
+@pytest.mark.parametrize("clock", ["stamps", "regular"])
+@pytest.mark.parametrize("filled", [True, False])
+def test_a_column_at_the_rate_of_the_log_is_one_command_per_change(clock: Clock, filled: bool) -> None:
+    """At 1 kHz rows repeat the command in force or are empty: only those where it changes command the arm."""
+    row = np.arange(2000)
+    value = np.where(filled | (row % 28 == 0), 0.5 + np.floor(row / 28) * 1e-3, nan)
     wanted = [(ORIGIN + tick * TICK, round(0.5 + tick * 1e-3, 12)) for tick in range(2000 // 28 + 1)]
-    assert commanded(stamp.tolist(), value.tolist()) == wanted
+    assert commanded((ORIGIN + row * MS).tolist(), value.tolist(), clock) == wanted
 
 
 @pytest.mark.parametrize(("apart", "count"), [(14 * MS - 1, 1), (14 * MS, 2), (28 * MS, 2)])
@@ -491,3 +527,13 @@ def test_an_even_grid_has_every_point_up_to_the_end(rate: int, last: int, more: 
     got = output_times(timeline, float(rate))
     assert len(got) == len(wanted)
     assert np.abs(got - np.array(wanted)).max() <= 1
+
+
+@pytest.mark.parametrize("rate", [10, 50, 100, 200, 250, 1000])
+def test_a_run_that_ends_on_a_grid_point_has_that_point(rate: int) -> None:
+    """0.29 s at 100 Hz are 30 points, and so for every whole number of points."""
+    timeline = build(recorded(), config())
+    for count in range(2001):
+        end = ORIGIN + count * (SECOND // rate)
+        got = output_times(replace(timeline, end=end), float(rate))
+        assert (len(got), int(got[-1])) == (count + 1, end)

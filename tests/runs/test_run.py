@@ -150,6 +150,7 @@ MANIFEST_REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "file is a number": (COMMAND.replace('"host.csv"', "3"), ("run.toml", "command.file", "str")),
     "file is absent": (COMMAND.replace("host", "absent"), ("absent.csv", "no such file")),
     "file is the folder": (COMMAND.replace("host.csv", "."), ("cannot be read",)),
+    "file with a null character": (COMMAND.replace("host.csv", "a\\u0000b"), ("no such file",)),
     "time is a number": (COMMAND.replace('"t_ms"', "3"), ("run.toml", "command.time", "str")),
     "time is absent": (COMMAND.replace("t_ms", "t_s"), ("host.csv", "'t_s'", "did you mean 't_ms'", COLUMNS)),
     "time is a length": (COMMAND.replace("t_ms", "z_m"), ("host.csv", "'z_m'", "_s, _ms, _us, _ns")),
@@ -165,6 +166,10 @@ MANIFEST_REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "start is nan": (COMMAND + "start = { radial_mm = nan }", ("run.toml", "radial_mm", "finite")),
     "start of an unknown axis": (COMMAND + "start = { radail_mm = 1.0 }", ("'radail'", "did you mean 'radial'")),
     "clock is unknown": (COMMAND + 'clock = "exact"', ("run.toml", "command.clock", "'exact'")),
+    "sensors is a number": ("sensors = 3\n" + COMMAND, ("run.toml", "sensors", "table")),
+    "sensors is a word": ('sensors = "tracker"\n' + COMMAND, ("run.toml", "sensors", "table")),
+    "sensors is an empty list": ("sensors = []\n" + COMMAND, ("run.toml", "sensors", "table")),
+    "sensors is a list of tables": (COMMAND + "[[sensors]]\nradial = 1", ("run.toml", "sensors", "table")),
     "sensor is a number": (COMMAND + "[sensors]\ntracker = 3", ("run.toml", "sensors.tracker", "table")),
     "sensor is empty": (COMMAND + "[sensors.tracker]", ("run.toml", "[sensors.tracker]")),
     "sensor of an unknown axis": (COMMAND + SENSOR + 'radail = "y_mm"', ("tracker", "'radail'", "radial, vertical")),
@@ -177,6 +182,12 @@ MANIFEST_REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown key": ("commands = 3\n" + COMMAND, ("run.toml", "'commands'", "did you mean 'command'", "sensors")),
     "name is a number": ("name = 3\n" + COMMAND, ("run.toml", "name", "str")),
     "not TOML": ("command file host.csv", ("run.toml", "TOML")),
+    "huge integer": (f"x = {'9' * 400}\n{COMMAND}", ("run.toml", "'x'")),
+    "huge integer with unit": (f"x_mm = {'9' * 400}\n{COMMAND}", ("run.toml", "x_mm", "finite")),
+    "endless integer": (f"x = {'9' * 5000}\n{COMMAND}", ("run.toml", "out of range")),
+    "endless exponent": (f"x = 1e{'9' * 20}\n{COMMAND}", ("run.toml", "out of range")),
+    "endless exponent with unit": (f"x_mm = 1e{'9' * 20}\n{COMMAND}", ("run.toml", "out of range")),
+    "endless nesting": (f"x = {'[' * 5000}{']' * 5000}\n{COMMAND}", ("run.toml", "nest")),
 }
 
 
@@ -197,8 +208,8 @@ def test_a_manifest_that_is_no_text_is_refused(folder: Path) -> None:
 
 def test_a_path_without_a_run_is_refused(tmp_path: Path) -> None:
     """An absent file, and a folder without run.toml, are refused with what to do."""
-    assert "no such file" in refusal(lambda: Run.read(tmp_path / "absent"))
-    assert "no such file" in refusal(lambda: Run.read(tmp_path / "absent.toml"))
+    for name in ("absent", "absent.toml", "null\0character", "null\0character.csv"):
+        assert "no such file" in refusal(lambda name=name: Run.read(tmp_path / name))
     text = refusal(lambda: Run.read(tmp_path), RunError)
     assert str(tmp_path) in text
     assert "run.toml" in text
@@ -246,12 +257,14 @@ def test_columns_of_no_source_are_told(tmp_path: Path) -> None:
         ("time_x,command.radial_mm", ("time_x", "_s, _ms, _us, _ns")),
         ("time_s,tracker.radial_mm", ("command.<axis>_mm", "tracker.radial_mm")),
         ("time_s,command.radial", ("'command.radial'", "_m, _mm, _um")),
+        ("time_s,command.radial_mm,command.radial_m", ("two columns", "command.radial")),
+        ("time_s,command.radial_mm,tracker.radial_mm,tracker.radial_um", ("two columns", "tracker.radial")),
         ("time_s,command.radial_mm,tracker.vertical_mm", ("tracker", "'vertical'", "radial")),
         ("time_s,command.radial_mm,reference.vertical_mm", ("reference", "'vertical'", "radial")),
     ],
 )
 def test_a_wrong_single_table_is_refused_in_one_line(tmp_path: Path, header: str, named: tuple[str, ...]) -> None:
-    """A table without its time or commands, a unit, or with an axis that is not commanded: one line, with names."""
+    """A table without its time, commands or a unit, with an axis twice or not commanded: one line, with names."""
     row = ",".join(["1"] * len(header.split(",")))
     text = refusal(lambda: single(tmp_path, f"{header}\n{row}\n"))
     for words in named:
@@ -300,24 +313,54 @@ def test_stamps_of_arrays_are_seconds_or_whole_nanoseconds() -> None:
     assert run.command.stamp.tolist() == [100_000_000, NO_STAMP, 123_456_000_000_001, NO_STAMP]
 
 
-@pytest.mark.parametrize(
-    ("time", "command", "sensors"),
-    [
-        ([0.0, 1.0], {"radial": [1.0]}, None),
-        ([0.0], {"radial": [1.0, 2.0]}, None),
-        ([[0.0]], {"radial": [[1.0]]}, None),
-        ([0.0], {}, None),
-        ([], {"radial": []}, None),
-        ([np.nan], {"radial": [1.0]}, None),
-        ([0.0], {"radial": [np.nan]}, None),
-        ([0.0], {"radial": [1.0]}, {"tracker": ([0.0, 1.0], {"radial": [1.0]})}),
-        ([0.0], {"radial": [1.0]}, {"tracker": ([0.0], {})}),
-    ],
-)
-def test_arrays_that_do_not_fit_are_refused(time: Any, command: Any, sensors: Any) -> None:
-    """Lengths that differ, and sources that say nothing, are refused in one line that names the source."""
-    text = refusal(lambda: Run.from_arrays(time, command, sensors), RunError)
-    assert ("tracker" if sensors else "command") in text
+def test_stamps_of_arrays_may_be_dates() -> None:
+    """datetime64 of any unit is exact, from 1970 on and before it; NaT means no stamp."""
+    stamps = [1_700_000_000_123_456_789, NO_STAMP, -1]
+    run = Run.from_arrays(np.array(stamps).view("M8[ns]"), {"radial": np.zeros(3)})
+    assert run.command.stamp.tolist() == stamps
+    run = Run.from_arrays(np.array(["1970-01-02", "NaT"], "M8[D]"), {"radial": np.zeros(2)})
+    assert run.command.stamp.tolist() == [86_400_000_000_000, NO_STAMP]
+
+
+TRUTH_ROWS = ([0.0], {"radial": [0.0]})
+
+ARRAY_REFUSALS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    # what is given instead of two commands: what the one line must name
+    "too few values": ({"command": {"radial": [1.0]}}, ("command", "radial", "(1,)", "(2,)")),
+    "too many values": ({"command": {"radial": [1.0, 2.0, 3.0]}}, ("command", "radial", "(3,)", "(2,)")),
+    "two dimensions": ({"time": [[0.0]], "command": {"radial": [[1.0]]}}, ("command", "(1, 1)")),
+    "no axis": ({"command": {}}, ("command",)),
+    "no rows": ({"time": [], "command": {"radial": []}}, ("command",)),
+    "no stamps": ({"time": [np.nan, np.inf]}, ("command", "radial")),
+    "no values": ({"command": {"radial": [np.nan, np.nan]}}, ("command", "radial")),
+    "text for values": ({"command": {"radial": ["a", "b"]}}, ("command", "number")),
+    "text for stamps": ({"time": ["a", "b"]}, ("command", "stamp")),
+    "ragged stamps": ({"time": [[0.0], [1.0, 2.0]]}, ("command", "stamp")),
+    "seconds beyond reach": ({"time": [0.0, 4.6e9]}, ("command", "stamp")),
+    "nanoseconds as floats": ({"time": [1.7e18, 1.8e18]}, ("command", "stamp")),
+    "nanoseconds beyond reach": ({"time": [0, -4_600_000_000_000_000_000]}, ("command", "stamp")),
+    "stamps too far apart": ({"time": [9 * 10**18, -9 * 10**18]}, ("command", "stamp")),
+    "unsigned stamps beyond reach": ({"time": np.array([0, 2**63], np.uint64)}, ("command", "stamp")),
+    "stamps beyond any integer": ({"time": [0, 2**70]}, ("command", "stamp")),
+    "dates beyond reach": ({"time": np.array(["1970-01-01", "2200-01-01"], "M8[s]")}, ("command", "stamp")),
+    "sensor with too few values": ({"sensors": {"tracker": ([0.0, 1.0], {"radial": [1.0]})}}, ("tracker", "radial")),
+    "sensor without axis": ({"sensors": {"tracker": ([0.0], {})}}, ("tracker",)),
+    "sensor beyond reach": ({"sensors": {"tracker": ([5e9], {"radial": [1.0]})}}, ("tracker", "stamp")),
+    "reference beyond reach": ({"reference": ([5e9], {"radial": [1.0]})}, ("reference", "stamp")),
+    "reference with negative sd": ({"reference": TRUTH_ROWS, "reference_sd": -1.0}, ("reference", "sd")),
+    "reference with sd nan": ({"reference": TRUTH_ROWS, "reference_sd": np.nan}, ("reference", "sd")),
+    "start nan": ({"start": {"radial": np.nan}}, ("start", "radial", "finite")),
+    "clock is unknown": ({"clock": "regulr"}, ("clock", "'regulr'", "did you mean 'regular'", "stamps")),
+}
+
+
+@pytest.mark.parametrize("case", ARRAY_REFUSALS)
+def test_arrays_that_do_not_fit_are_refused(case: str) -> None:
+    """Lengths that differ, sources that say nothing and stamps beyond reach: one line that names the source."""
+    more, named = ARRAY_REFUSALS[case]
+    text = refusal(lambda: Run.from_arrays(**{"time": [0.0, 1.0], "command": {"radial": [0.0, 1.0]}, **more}))
+    for words in named:
+        assert words in text
 
 
 @pytest.mark.parametrize("place", ["sensor", "reference", "start"])

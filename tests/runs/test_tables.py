@@ -24,6 +24,7 @@ from pumafuse.runs.tables import Table
 LENGTHS = {"_m": 0, "_mm": 3, "_um": 6}
 TIMES = {"_s": 9, "_ms": 6, "_us": 3, "_ns": 0}
 EPOCH_NS = 1_700_000_000_123_456_789  # int64 ns of today: float64 there has a grid of 256 ns
+LAST_S = 4_599_999_999  # the last whole second within reach
 FIRST_BLOCK = 1 << 20  # pyarrow guesses types from blocks of this size
 
 properties = settings(
@@ -65,12 +66,21 @@ def test_lengths_are_the_exact_quotient_by_their_unit(tmp_path: Path, unit: str,
     assert note is None
 
 
+@properties
+@given(st.lists(st.integers(-(2**63), 2**64), min_size=1, max_size=20))
+def test_whole_lengths_of_any_size_are_numbers(tmp_path: Path, values: list[int]) -> None:
+    """Integers beyond 2^53, and beyond int64, are lengths to a float's precision."""
+    got, note = column(tmp_path, "x_mm", [str(value) for value in values]).numbers("x_mm")
+    np.testing.assert_allclose(got, [value / 1000 for value in values], rtol=4e-16, atol=0)  # rounded twice
+    assert note is None
+
+
 @pytest.mark.parametrize("unit", TIMES)
 @properties
 @given(st.data())
 def test_whole_stamps_are_exact_in_every_unit(tmp_path: Path, unit: str, data: st.DataObject) -> None:
-    """Integer stamps come out in ns without a rounding, wherever in int64 they lie."""
-    limit = 9_200_000_000 * 10 ** (9 - TIMES[unit])
+    """Integer stamps come out in ns without a rounding, wherever within reach they lie."""
+    limit = LAST_S * 10 ** (9 - TIMES[unit])
     stamps = data.draw(st.lists(st.integers(-limit, limit), min_size=1, max_size=20))
     got, _ = column(tmp_path, f"t{unit}", [str(stamp) for stamp in stamps]).stamps(f"t{unit}")
     assert got.tolist() == [stamp * 10 ** TIMES[unit] for stamp in stamps]
@@ -85,12 +95,12 @@ def test_decimal_stamps_of_a_run_are_exact(tmp_path: Path, unit: str, stamps: li
     assert column(tmp_path, f"t{unit}", [*cells, "0.5"]).stamps(f"t{unit}")[0].tolist()[:-1] == stamps
 
 
-def test_epoch_stamps_in_nanoseconds_stay_exact_beside_empty_cells(tmp_path: Path) -> None:
-    """int64 ns of today keep their last digit in a column with gaps."""
-    cells = [str(EPOCH_NS), "", str(EPOCH_NS + 1), "NaN", str(EPOCH_NS + 2)]
-    got, note = column(tmp_path, "t_ns", cells).stamps("t_ns")
-    assert got.tolist() == [EPOCH_NS, NO_STAMP, EPOCH_NS + 1, NO_STAMP, EPOCH_NS + 2]
-    assert note is None
+@pytest.mark.parametrize("bad", ["", "NaN", " ", "word"])
+def test_epoch_stamps_in_nanoseconds_stay_exact_beside_a_bad_cell(tmp_path: Path, bad: str) -> None:
+    """int64 ns of today keep their last digit in a column with gaps or words."""
+    got, note = column(tmp_path, "t_ns", [str(EPOCH_NS), bad, str(EPOCH_NS + 1), str(-EPOCH_NS)]).stamps("t_ns")
+    assert got.tolist() == [EPOCH_NS, NO_STAMP, EPOCH_NS + 1, -EPOCH_NS]
+    assert (note is not None) == (bad == "word")
 
 
 @pytest.mark.parametrize("zone", ["", "Z"])
@@ -139,6 +149,15 @@ def test_words_are_missing_and_told_once(tmp_path: Path, cell: str) -> None:
     assert "x_mm" in note
     assert f"'{cell.strip(chr(34))}'" in note
     assert "row 2" in note
+
+
+@pytest.mark.parametrize("cell", ["word" * 1000, '"2\n' + "2,3\n" * 1000 + '"'], ids=["long", "quote never closed"])
+def test_a_note_on_a_cell_is_one_short_line(tmp_path: Path, cell: str) -> None:
+    """However much text a cell holds, the note on it is fit for a screen."""
+    _, note = column(tmp_path, "x_mm", ["1", cell]).numbers("x_mm")
+    assert note is not None
+    assert len(note.splitlines()) == 1
+    assert len(note) < 300
 
 
 @pytest.mark.parametrize(
@@ -265,12 +284,20 @@ UNREADABLE: dict[str, tuple[str, bytes | None, str]] = {
     "CSV called gzip": ("log.csv.gz", b"t_s,x_mm\n0,1\n", "cannot be read"),
     "gzip cut short": ("log.csv.gz", gzip.compress(b"t_s,x_mm\n" + b"0,1\n" * 1000)[:-20], "cannot be read"),
     "gzip of nothing": ("log.csv.gz", gzip.compress(b""), "Empty CSV"),
+    "gzip called CSV": ("log.csv", gzip.compress(b"t_s,x_mm\n0,1\n"), "UTF-8"),
+    "UTF-16": ("log.csv", "t_s,x_mm\n0,1\n".encode("utf-16"), "UTF-8"),
+    "header in Latin-1": ("log.csv", "t_s,höhe_mm\n0,1\n".encode("latin-1"), "UTF-8"),
+    "torn line in Latin-1": ("log.csv", "t_s,x_mm,y_mm\n0,1,2\n1,hö\n2,3,4\n".encode("latin-1"), "UTF-8"),
+    "torn line beside Latin-1": ("log.csv", "t_s,x_mm,y_mm\n0,1,ö\n1,2\n2,3,4\n".encode("latin-1"), "UTF-8"),
+    "decimal commas": ("log.csv", b"t_s;x_mm\n0,5;1,5\n0,6;1,5\n", "2 lines left out: 3 cells where the header has 1"),
 }
 
 
 @pytest.mark.parametrize("case", UNREADABLE)
-def test_a_file_that_is_no_table_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
-    """What cannot be read is a one-line error with the file's path and the reason, never another exception."""
+def test_a_file_that_is_no_table_is_refused_in_one_line(
+    tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """What cannot be read is a one-line error with the file's path and the reason, and nothing is printed."""
     name, content, reason = UNREADABLE[case]
     path = tmp_path / name
     if content is not None:
@@ -278,6 +305,13 @@ def test_a_file_that_is_no_table_is_refused_in_one_line(tmp_path: Path, case: st
     text = refusal(lambda: tables.read(path))
     assert text.startswith(f"{path}: ")
     assert reason in text
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["a\0b", "a\0b.csv", "a\0b.csv.gz", "a\0b.parquet"])
+def test_a_name_with_a_null_character_is_no_file(tmp_path: Path, name: str) -> None:
+    """A name that no file can have is refused in one line with the path."""
+    assert str(tmp_path) in refusal(lambda: tables.read(tmp_path / name))
 
 
 @pytest.mark.parametrize("name", ["folder", "folder.csv", "folder.parquet"])
@@ -330,21 +364,47 @@ def test_a_parquet_column_of_another_kind_is_refused(tmp_path: Path, kind: pa.Da
         assert "not numbers" in refusal(call)
 
 
-@pytest.mark.parametrize(("name", "last"), [("t_s", 9_200_000_000), ("t_ms", 9_200_000_000_000)])
+@pytest.mark.parametrize("unit", ["_s", "_ms", "_us"])
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("ending", ["", ".0", "\nword"])
-def test_a_stamp_that_int64_cannot_hold_is_refused_and_the_last_that_fits_is_not(
-    tmp_path: Path, name: str, last: int, sign: int, ending: str
+def test_a_stamp_beyond_reach_is_refused_and_the_last_within_is_not(
+    tmp_path: Path, unit: str, sign: int, ending: str
 ) -> None:
-    """Stamps in ms under a name in s would overflow: refused with the row, where the one before still fits."""
+    """Stamps below 4.6e18 ns, whose differences int64 can hold, are read; a second later they are refused by row."""
+    name = f"t{unit}"
 
-    def stamps(value: int) -> list[int]:
-        return column(tmp_path, name, ["0", *f"{sign * value}{ending}".split()]).stamps(name)[0].tolist()
+    def stamps(second: int) -> list[int]:
+        cell = f"{sign * second * 10 ** (9 - TIMES[unit])}{ending}"
+        return column(tmp_path, name, ["0", *cell.split()]).stamps(name)[0].tolist()
 
-    assert stamps(last)[1] == sign * last * 10 ** TIMES[name[1:]]
-    text = refusal(lambda: stamps(last + 10**6))
-    assert name in text
+    assert stamps(LAST_S)[1] == sign * LAST_S * 10**9
+    text = refusal(lambda: stamps(LAST_S + 1))
+    assert f"'{name}'" in text
     assert "row 2" in text
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [
+        ["9000000000000000000", "-9000000000000000000"],
+        ["9223372036854775807"],
+        ["9223372036854775808"],
+        ["9999999999999999999", "word"],
+        ["1e300"],
+        ["2200-01-01T00:00:00"],
+        ["1800-01-01T00:00:00"],
+        ["9999-01-01T00:00:00"],
+    ],
+)
+def test_stamps_too_far_from_1970_are_refused_in_one_line(tmp_path: Path, cells: list[str]) -> None:
+    """Counts and dates that int64 ns cannot hold, or not the difference of, are refused by their column."""
+    assert "'t_ns'" in refusal(lambda: column(tmp_path, "t_ns", cells).stamps("t_ns"))
+
+
+@pytest.mark.parametrize("value", [2**64 - 1, 2**63, LAST_S * 10**9 + 10**9])
+def test_an_unsigned_stamp_beyond_reach_is_refused(tmp_path: Path, value: int) -> None:
+    """An unsigned column of Parquet does not wrap round to 1969."""
+    assert "'t_ns'" in refusal(lambda: written(tmp_path, t_ns=pa.array([value], pa.uint64())).stamps("t_ns"))
 
 
 def test_only_pumafuse_errors_come_out_of_a_mangled_file(tmp_path: Path) -> None:
