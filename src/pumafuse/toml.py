@@ -84,6 +84,12 @@ def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def _tagged(kind: Any) -> dict[str, type[msgspec.Struct]]:
+    """The structs of a union by their tags."""
+    structs = [part for part in get_args(kind) if isinstance(part, type) and issubclass(part, msgspec.Struct)]
+    return {str(part.__struct_config__.tag): part for part in structs if part.__struct_config__.tag is not None}
+
+
 def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
     """What is wrong in ``tree``, deepest place first, each with its key."""
     prefix = f"{path}." if path else ""
@@ -98,6 +104,13 @@ def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
         for key, field in fields.items():
             if field.required and key not in tree:
                 yield f"'{prefix}{key}' is missing"
+    elif isinstance(tree, Mapping) and (tagged := _tagged(kind)):
+        tag = next(iter(tagged.values())).__struct_config__.tag_field or ""
+        name = str(tree.get(tag, "none"))  # pyright: ignore[reportUnknownArgumentType]
+        if name in tagged:
+            yield from _problems(tree, tagged[name], path)
+        else:
+            yield f"{path}.{tag}: unknown {tag} '{name}'; {suggestion(name, tagged)}"
     elif get_origin(kind) is dict and isinstance(tree, Mapping):
         for key, value in tree.items():  # pyright: ignore[reportUnknownVariableType]
             yield from _problems(value, get_args(kind)[1], f"{prefix}{key}")

@@ -38,7 +38,7 @@ EXPONENTS: Mapping[str, int] = {
 LENGTHS = ("_m", "_mm", "_um")
 TIMES = ("_s", "_ms", "_us", "_ns")
 MM = 1e3  # mm in a metre, and ms in a second: SI arrays times this are what files and screens show
-PROVENANCE = "provenance"  # a table of this name is nobody's numbers but its author's
+PROVENANCE = "provenance"  # a file's table of this name is nobody's numbers but its author's
 INTERVAL = "_ci95"  # `time_constant_ms_ci95` is in ms
 
 
@@ -61,7 +61,7 @@ def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def from_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     """The inverse of :func:`to_si`: SI numbers to the units that their names tell."""
-    return _unscaled(tree, 0)
+    return {key: value if key == PROVENANCE else _unscaled(value, _exponent(key, 0)) for key, value in tree.items()}
 
 
 def refuse_unit(kind: str, name: str) -> None:
@@ -74,9 +74,7 @@ def refuse_unit(kind: str, name: str) -> None:
     """
     unit = ending(name)
     if unit is not None:
-        raise ConfigError(
-            f"{kind} '{name}': a name must not end in a unit ({unit}); call it '{name.removesuffix(unit)}'"
-        )
+        raise ConfigError(f"{kind} '{name}': a name must not end in a unit ({unit})")
 
 
 def shifted(value: float | Decimal, exponent: int) -> float:
@@ -124,7 +122,7 @@ def _scaled(value: Any, exponent: int, path: str) -> Any:
 
 def _scaled_entry(key: str, value: Any, exponent: int, path: str) -> Any:
     place = f"{path}.{key}" if path else key
-    return _plain(value) if key == PROVENANCE else _scaled(value, _exponent(key, exponent), place)
+    return _plain(value) if place == PROVENANCE else _scaled(value, _exponent(key, exponent), place)
 
 
 def _plain(value: Any) -> Any:
@@ -154,9 +152,6 @@ def _unscaled(value: Any, exponent: int) -> Any:
             return [_unscaled(item, exponent) for item in cast(list[Any], value)]
         case Mapping():
             table = cast(Mapping[str, Any], value)
-            return {
-                key: item if key == PROVENANCE else _unscaled(item, _exponent(key, exponent))
-                for key, item in table.items()
-            }
+            return {key: _unscaled(item, _exponent(key, exponent)) for key, item in table.items()}
         case _:
             return value

@@ -55,8 +55,9 @@ def test_the_demo_leaves_everything_it_promises(demo: Path) -> None:
     """Tables, the configuration as used, a picture and a recording that rerun accepts."""
     names = {path.name for path in demo.iterdir()}
     tables = {"estimates.parquet", "readings.parquet", "reference.parquet"}
-    assert names == tables | {"summary.json", "fusion.toml", "arm.toml", "fused.png", "fused.rrd"}
-    assert (demo / "fused.png").read_bytes().startswith(b"\x89PNG")
+    figures = {"fused.png", "error.png", "validation.png"}
+    assert names == tables | figures | {"summary.json", "fusion.toml", "arm.toml", "fused.rrd"}
+    assert all((demo / name).read_bytes().startswith(b"\x89PNG") for name in figures)
     rerun = Path(sys.executable).parent / "rerun"
     assert subprocess.run([str(rerun), "rrd", "verify", str(demo / "fused.rrd")], check=False).returncode == 0
 

@@ -243,7 +243,7 @@ def test_a_late_stamp_moves_no_other_command(first: int) -> None:
     stamp[first] += 15_000_000
     stamp[first + 1] += 3_000_000
     got, note = regular_grid(stamp, PERIOD, "host")
-    assert note is None
+    assert note == "host: 1 commands stamped more than half a period late are set back to their ticks"
     np.testing.assert_allclose(got - truth, 0, atol=1)
 
 
@@ -253,7 +253,8 @@ def test_stamps_that_are_only_ever_late_have_a_grid(mean: float) -> None:
     truth = grid_of(np.arange(4000))
     late = np.random.default_rng(0).exponential(mean, len(truth)).astype(np.int64)
     got, note = regular_grid(np.maximum.accumulate(truth + late), PERIOD, "host")
-    assert note is None
+    assert note is not None
+    assert "ppm" not in note
     np.testing.assert_array_equal(np.diff(got), TICK)
 
 
@@ -284,3 +285,12 @@ def test_two_commands_in_one_tick_are_refused() -> None:
     assert text.startswith("host: ")
     for words in ("ticks of 28 ms", "median interval is 18.6667 ms", "clock = 'stamps'"):
         assert words in text
+
+
+@pytest.mark.parametrize("place", [50, 100, 190, 3900])
+def test_a_command_between_two_ticks_is_refused(place: int) -> None:
+    """Two commands on one tick are no regular clock; no other command is moved to make room for them."""
+    truth = grid_of(np.arange(4000))
+    stamp = np.sort(np.append(truth, truth[place] + TICK // 2))
+    with pytest.raises(RunError, match="do not come on ticks"):
+        regular_grid(stamp, PERIOD, "host")

@@ -11,6 +11,9 @@ class KalmanFilter:
     F: _Floats
     H: _Floats
     B: _Floats | None
+    K: _Floats
+    y: _Floats
+    S: _Floats
     def __init__(self, dim_x: int, dim_z: int, dim_u: int = ...) -> None: ...
     def predict(
         self, u: _Floats | None = ..., B: _Floats | None = ..., F: _Floats | None = ..., Q: _Floats | None = ...

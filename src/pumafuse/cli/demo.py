@@ -7,11 +7,9 @@ from pathlib import Path
 
 from ..fusion import results
 from ..fusion.config import FusionConfig
-from ..fusion.estimates import Estimates
 from ..fusion.offline import fuse
 from ..runs.run import Run
-from ..views.figures import fused_figure
-from .fuse import progress_of, show, to_recording
+from .fuse import draw, progress_of, record, show
 from .tables import console
 
 _SENSOR = "vision"  # alone: what a camera and a model can do together shows best without the laser tracker
@@ -33,11 +31,18 @@ def run(output: Path, force: bool) -> None:
         recorded, config = Run.read(data / "scan1"), FusionConfig.load(data / "fusion.toml")
         with progress_of(recorded.name) as progress:
             est = fuse(recorded, config, sensors=[_SENSOR], rate=200.0, progress=progress)
-        summary = results.write(est, output, force, lambda folder: _draw(est, recorded, folder))
+
+        def extras(folder: Path) -> None:
+            draw(est, recorded, folder)
+            record(est, recorded, folder)
+
+        summary = results.write(est, output, force, extras)
         show(summary, output)
         out.print(
             f"\nWhat to open next:\n"
-            f"  {output / 'fused.png'}   the run and its error, with error bars\n"
+            f"  {output / 'fused.png'}   the run: command, readings, estimate with its band\n"
+            f"  {output / 'error.png'}   its error against the truth, and the error bars\n"
+            f"  {output / 'validation.png'}   is the filter as good as it says?\n"
             f"  rerun {output / 'fused.rrd'}   the same in the Rerun viewer\n"
             f"  {output / 'summary.json'}   every number of it\n"
             f"The same with the laser tracker as well:\n"
@@ -45,8 +50,3 @@ def run(output: Path, force: bool) -> None:
             f" -o with-tracker\n"
             f"  pumafuse compare {output} with-tracker"
         )
-
-
-def _draw(est: Estimates, recorded: Run, folder: Path) -> None:
-    fused_figure(est, recorded, folder / "fused.png")
-    to_recording(est, recorded, folder)

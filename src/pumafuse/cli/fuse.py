@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
@@ -20,38 +21,42 @@ from ..runs.run import Run
 from .tables import console, outcome_table, score_table
 
 
-def run(
-    runs: Sequence[Path],
-    config_path: Path,
-    output: Path,
-    *,
-    sensors: Sequence[str] | None,
-    rate: float | None,
-    as_live: bool,
-    rrd: bool,
-    engine: Engine,
-    force: bool,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What the command line asks of a fusion; see ``pumafuse fuse --help``."""
+
+    config: Path
+    output: Path
+    sensors: Sequence[str] | None
+    rate: float | None
+    smooth: bool
+    as_live: bool
+    rrd: bool
+    figures: bool
+    engine: Engine
+    force: bool
+
+
+def run(runs: Sequence[Path], options: Options) -> None:
     """Fuse each run into a result folder; a run that fails is told and the others go on.
 
     Raises:
         PumafuseError: The configuration is wrong, or at least one run failed.
     """
-    config = FusionConfig.load(config_path)
-    config.sensor_names(sensors)
-    folders = _folders(runs, output)
+    config = FusionConfig.load(options.config)
+    config.sensor_names(options.sensors)
     if len(runs) == 1:
-        _one(runs[0], config, output, sensors, rate, as_live, rrd, engine, force)
+        _one(runs[0], options.output, config, options)
         return
     failed = 0
-    for path, folder in zip(runs, folders, strict=True):
+    for path, folder in zip(runs, _folders(runs, options.output), strict=True):
         try:
-            _one(path, config, folder, sensors, rate, as_live, rrd, engine, force)
+            _one(path, folder, config, options)
         except PumafuseError as error:
             failed += 1
             print(f"pumafuse: {error}", file=sys.stderr)
     if failed:
-        raise PumafuseError(f"{failed} of {len(runs)} runs failed (see above); the others are in {output}")
+        raise PumafuseError(f"{failed} of {len(runs)} runs failed (see above); the others are in {options.output}")
 
 
 def show(summary: Summary, folder: Path) -> None:
@@ -61,37 +66,53 @@ def show(summary: Summary, folder: Path) -> None:
         f"[bold]{summary.run}[/bold]: {summary.estimates} estimates over {summary.duration_s:.1f} s, {summary.mode},"
         f" arm {summary.arm}"
     )
-    out.print(outcome_table(summary))
+    if any(axis.sensors for axis in summary.axes.values()):
+        out.print(outcome_table(summary))
     scores = {axis: part.score for axis, part in summary.axes.items() if part.score is not None}
     if scores:
         out.print(score_table([(summary.run, scores)]))
     out.print(f"written to {folder}", soft_wrap=True)
 
 
-def _one(
-    path: Path,
-    config: FusionConfig,
-    folder: Path,
-    sensors: Sequence[str] | None,
-    rate: float | None,
-    as_live: bool,
-    rrd: bool,
-    engine: Engine,
-    force: bool,
-) -> None:
-    results.check_writable(folder, force)
-    recorded = Run.read(path)
-    with progress_of(recorded.name) as progress:
-        est = fuse(recorded, config, sensors=sensors, rate=rate, as_live=as_live, engine=engine, progress=progress)
-    summary = results.write(est, folder, force, (lambda new: to_recording(est, recorded, new)) if rrd else None)
-    show(summary, folder)
+def draw(est: Estimates, recorded: Run, folder: Path) -> None:
+    """Write the figures into a result folder."""
+    from ..views.figures import error_figure, fused_figure, validation_figure
+
+    fused_figure(est, recorded, folder / "fused.png")
+    validation_figure(est, folder / "validation.png")
+    if est.reference is not None:
+        error_figure(est, folder / "error.png")
 
 
-def to_recording(est: Estimates, recorded: Run, folder: Path) -> None:
+def record(est: Estimates, recorded: Run, folder: Path) -> None:
     """Write ``fused.rrd`` into a result folder."""
     from ..views.rerun import to_rerun
 
     to_rerun(est, recorded, folder / "fused.rrd")
+
+
+def _one(path: Path, folder: Path, config: FusionConfig, options: Options) -> None:
+    results.check_writable(folder, options.force)
+    recorded = Run.read(path)
+    with progress_of(recorded.name) as progress:
+        est = fuse(
+            recorded,
+            config,
+            sensors=options.sensors,
+            rate=options.rate,
+            smooth=options.smooth,
+            as_live=options.as_live,
+            engine=options.engine,
+            progress=progress,
+        )
+
+    def extras(new: Path) -> None:
+        if options.rrd:
+            record(est, recorded, new)
+        if options.figures:
+            draw(est, recorded, new)
+
+    show(results.write(est, folder, options.force, extras), folder)
 
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:

@@ -56,8 +56,12 @@ def fuse(
     rate: Annotated[
         float | None, typer.Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")
     ] = None,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Use later readings too: the best there is, afterwards.")
+    ] = False,
     as_live: Annotated[bool, typer.Option("--as-live", help="Use only readings that had arrived by then.")] = False,
     rrd: Annotated[bool, typer.Option("--rrd", help="Also write fused.rrd for the Rerun viewer.")] = False,
+    figures: Annotated[bool, typer.Option("--figures", help="Also draw the run and its validation.")] = False,
     engine: Annotated[Literal["filterpy"], typer.Option(help="Which engine computes.")] = "filterpy",
     force: Force = False,
 ) -> None:
@@ -67,17 +71,21 @@ def fuse(
     """
     from . import fuse as command
 
-    command.run(
-        runs,
-        config,
-        output,
+    if smooth and as_live:
+        raise typer.BadParameter("choose one of --smooth and --as-live")
+    options = command.Options(
+        config=config,
+        output=output,
         sensors=None if sensors is None else [name.strip() for name in sensors.split(",") if name.strip()],
         rate=_positive(rate, "--rate"),
+        smooth=smooth,
         as_live=as_live,
         rrd=rrd,
+        figures=figures,
         engine=engine,
         force=force,
     )
+    command.run(runs, options)
 
 
 @app.command()

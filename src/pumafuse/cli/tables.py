@@ -9,6 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from ..fusion.score import Z95
 from ..fusion.summary import ScoreSummary, Summary
 
 
@@ -21,19 +22,22 @@ def console(*, soft_wrap: bool = False) -> Console:
 def outcome_table(summary: Summary) -> Table:
     """Scalars by outcome, and innovations against what the filter expected, for each axis and sensor."""
     table = Table(box=box.SIMPLE_HEAD)
+    biased = any(sensor.bias_mm is not None for axis in summary.axes.values() for sensor in axis.sensors.values())
     words = sorted(
         {word for axis in summary.axes.values() for sensor in axis.sensors.values() for word in sensor.outcomes}
     )
     words.sort(key=lambda word: word != "fused")
     for heading in ("axis", "sensor"):
         table.add_column(heading)
-    for heading in (*words, "innovation RMS [mm]", "expected [mm]", "NIS"):
+    for heading in (*words, "innovation, mm", "expected, mm", *(["bias, mm"] if biased else [])):
         table.add_column(heading, justify="right")
+    table.add_column("verdict", overflow="fold")
     for axis, part in summary.axes.items():
         for name, sensor in part.sensors.items():
             counts = [str(sensor.outcomes.get(word, 0)) for word in words]
             spread = [_mm(sensor.innovation_rms_mm), _mm(sensor.innovation_sd_mm)]
-            table.add_row(axis, name, *counts, *spread, "–" if sensor.nis_mean is None else f"{sensor.nis_mean:.2f}")
+            bias = [_interval(sensor.bias_mm, sensor.bias_sd_mm)] if biased else []
+            table.add_row(axis, name, *counts, *spread, *bias, sensor.verdict)
     return table
 
 
@@ -42,7 +46,7 @@ def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Ta
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column("result", overflow="fold")
     table.add_column("axis")
-    for heading in ("RMSE [mm]", "bias [mm]", "95 % cover", "NEES", "scored", "left out"):
+    for heading in ("RMSE, mm", "bias, mm", "95 % cover", "NEES", "scored", "left out"):
         table.add_column(heading, justify="right")
     for name, scores in results:
         for axis, score in scores.items():
@@ -57,6 +61,11 @@ def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Ta
                 str(score.left_out),
             )
     return table
+
+
+def _interval(value: float | None, sd: float | None) -> str:
+    """A value with its 95 % interval."""
+    return "–" if value is None or sd is None else f"{value:.3f} ± {Z95 * sd:.3f}"
 
 
 def _mm(value: float | None) -> str:

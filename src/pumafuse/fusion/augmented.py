@@ -21,15 +21,18 @@ from ..model.discrete import transition
 from ..model.plants import Plant
 from .config import FusionConfig, Process, Sensor
 from .timeline import AxisInput, Outcome, Timeline
-from .track import Filtered, Track
+from .track import Filtered, Track, Updates
 
 Progress = Callable[[float], None]
 
 REOPEN_AFTER = 10  # rejections in a row of one sensor …
 REOPEN_SPAN_NS = 500_000_000  # … the first of them at least 0.5 s ago
 
-# A state that holds until the next: instant, mean (s,) and covariance (s, s) of plant, offset and biases.
-Held = tuple[int, FloatArray, FloatArray]
+# H, K (s,), ν and S of an update.
+Update = tuple[FloatArray, FloatArray, float, float]
+# A state that holds until the next: instant, mean (s,) and covariance (s, s) of plant, offset and biases, and the
+# update that made it, if one did.
+Held = tuple[int, FloatArray, FloatArray, Update | None]
 
 _ACT, _ISSUE, _READ = 0, 1, 2  # at one instant commands come before readings
 _AxisPoint = tuple[int, FloatArray, FloatArray, int]
@@ -129,7 +132,8 @@ class AxisFilter:
     def fuse(self, z: float, H: FloatArray, R: float) -> None:
         """Joseph-form update with one scalar."""
         self.kf.update(np.array([[z]]), R=np.array([[R]]), H=H)
-        self._settle()
+        kept = self._register
+        self._settle((H[0, :kept], self.kf.K[:kept, 0], float(self.kf.y[0, 0]), float(self.kf.S[0, 0])))
 
     def widen_offset(self, variance: float) -> None:
         """Add to the offset's variance [m²]."""
@@ -153,20 +157,35 @@ class AxisFilter:
 
     def track(self, held: Sequence[Held]) -> Track:
         """States of this filter as arrays."""
-        index, mean, covariance = zip(*held, strict=True)
+        index, mean, covariance, updates = zip(*held, strict=True)
         at = np.array(index)
+        made = [(entry, *update) for entry, update in enumerate(updates) if update is not None]
+        entry, H, K, nu, S = zip(*made, strict=True) if made else ((), (), (), (), ())
+        size = self._register
         return Track(
-            self.time[at], np.array(mean), np.array(covariance), self._input[at], self._noise[at], self._drift[at]
+            self.time[at],
+            np.array(mean),
+            np.array(covariance),
+            self._input[at],
+            self._noise[at],
+            self._drift[at],
+            Updates(
+                np.array(entry, dtype=np.int64),
+                np.array(H, dtype=np.float64).reshape(-1, size),
+                np.array(K, dtype=np.float64).reshape(-1, size),
+                np.array(nu, dtype=np.float64),
+                np.array(S, dtype=np.float64),
+            ),
         )
 
-    def _settle(self) -> None:
+    def _settle(self, update: Update | None = None) -> None:
         # Rounding makes P drift from symmetry by an ulp a step, and that grows over a million steps.
         self.kf.P = 0.5 * (self.kf.P + self.kf.P.T)
-        self._hold()
+        self._hold(update)
 
-    def _hold(self) -> None:
+    def _hold(self, update: Update | None = None) -> None:
         kept = self._register
-        self._held.append((self.index, self.kf.x[:kept, 0].copy(), self.kf.P[:kept, :kept].copy()))
+        self._held.append((self.index, self.kf.x[:kept, 0].copy(), self.kf.P[:kept, :kept].copy(), update))
 
 
 @dataclass(frozen=True)
@@ -297,7 +316,7 @@ class ReferenceEngine:
         axis.advance(axis.latest(row.valid))
         sd = sensor.sd_of(self._names[number])
         assert sd is not None  # a scalar without one is `unknown` and never gets here
-        H, R = axis.observation(row.sensor, sensor, sd)
+        H, R = axis.observation(row.sensor, sensor, sd * float(self._scalars.spread[scalar]))
         z = float(self._scalars.value[scalar]) - sensor.scale * self._starts[number]
         return axis, z, H, R, *axis.innovation(z, H, R)
 

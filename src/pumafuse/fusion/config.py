@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,6 +15,7 @@ from ..errors import ConfigError, UnknownNameError
 from ..model.arm import ArmModel
 from ..model.plants import NotNegative, Positive
 from ..model.presets import PRESETS
+from ..runs.frames import Frame
 from ..units import refuse_unit
 
 _LONGEST_LATENCY = 3600.0  # s
@@ -74,18 +77,23 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         arm: The arm model.
         start: What is uncertain before the first command.
         process: How each axis strays from its model; every axis of the arm is there.
+        frame: For streams and runs in x, y, z that bring no frame of their own.
         sensors: By name, in the order that decides between readings valid at the same instant.
     """
 
     arm: ArmModel
     start: Start = Start()
     process: dict[str, Process] = {}
+    frame: Frame | None = None
     sensors: dict[str, Sensor] = {}
 
     def __post_init__(self) -> None:
         _known_axes("process", self.process, self.arm)
         for name, sensor in self.sensors.items():
             refuse_unit("sensor", name)
+            toml.struct(toml.builtins(sensor), Sensor, "configuration", f"sensors.{name}")  # made in Python: unchecked
+            if not math.isfinite(sensor.scale + sensor.latency + sensor.gate + sensor.bias_sd + sensor.latency_sd):
+                raise ConfigError(f"sensors.{name}: scale, latency, gate and sds must be finite")
             if isinstance(sensor.sd, dict):
                 _known_axes(f"sensors.{name}.sd_mm", sensor.sd, self.arm)
             if abs(sensor.latency) > _LONGEST_LATENCY:
@@ -137,9 +145,10 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 def _load_arm(name: str, path: Path) -> ArmModel:
     beside = path.parent / name
-    if name in PRESETS and not beside.exists():
+    there = os.path.isfile(beside)  # noqa: PTH113 - Path.is_file raises on a name that is too long
+    if name in PRESETS and not there:
         return ArmModel.load(name)
-    if not beside.is_file():
+    if not there:
         raise ConfigError(f"{path}: arm = '{name}': no such file beside it, and not a preset ({', '.join(PRESETS)})")
     return ArmModel.load(beside)
 

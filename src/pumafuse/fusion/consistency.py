@@ -1,15 +1,53 @@
-"""Is the filter as good as it says? Innovations against their predicted spread."""
+"""Is the filter as good as it says? Innovations and errors against their predicted spread, with a verdict in words.
+
+NIS ν²/S averages 1 where the filter's S is right; its mean over n scalars lies in a chi-square band. Innovations of a
+right filter are white in the order of reading: Ljung-Box over their autocorrelation tells. Gated scalars are left out.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
+from ..arrays import FloatArray
 from ..units import MM
 from .config import Sensor
-from .estimates import Readings
+from .estimates import Estimates, Readings
+from .score import Z95
 from .timeline import Outcome
+
+LAGS = 20
+_FEW = 30  # scalars below which nothing is said
+_FROZEN = 10  # equal values in a row of a sensor with noise
+_NOTABLE = 0.1  # mean lag-1 correlation below which whiteness is beside the point, however significant
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """One sensor's fused scalars on one axis.
+
+    Attributes:
+        count: How many, n.
+        nis: Mean ν²/S.
+        nis_band: Where that mean lies in 95 % of cases for a right filter.
+        correlation: Autocorrelation of the normalised innovations at lags 1 to 20, (lags,).
+        whiteness: Ljung-Box p-value over those lags; small: the innovations are not white.
+        verdict: In words, with the likely cause and the key to change.
+    """
+
+    count: int
+    nis: float
+    nis_band: tuple[float, float]
+    correlation: FloatArray
+    whiteness: float
+    verdict: str
+
+    @property
+    def correlation_band(self) -> float:
+        """Autocorrelations of white noise lie within ± this in 95 % of cases."""
+        return Z95 / float(np.sqrt(self.count))
 
 
 def log_likelihood(readings: Readings, sensors: Mapping[str, Sensor]) -> float:
@@ -24,3 +62,128 @@ def log_likelihood(readings: Readings, sensors: Mapping[str, Sensor]) -> float:
     gated = readings.outcome[met] == Outcome.GATED
     square = np.where(gated, gate[readings.sensor[met]] ** 2, readings.nis[met])
     return float(-0.5 * np.sum(np.log(2.0 * np.pi * variance) + square))
+
+
+def chi_square_band(count: int) -> tuple[float, float]:
+    """Where the mean of ``count`` squares of standard normal variables lies in 95 % of cases."""
+    from scipy.special import chdtri
+
+    return float(chdtri(count, 0.975)) / count, float(chdtri(count, 0.025)) / count
+
+
+def ljung_box(values: FloatArray, lags: int = LAGS) -> tuple[FloatArray, float]:
+    """Autocorrelations at lags 1 … ``lags`` and the Ljung-Box p-value that all are zero.
+
+    Ljung & Box, "On a measure of lack of fit in time series models", Biometrika 65, 1978.
+    """
+    from scipy.special import chdtrc
+
+    centred, count = values - values.mean(), len(values)
+    lags = min(lags, count - 1)
+    power = float(centred @ centred)
+    if power == 0.0 or lags < 1:
+        return np.zeros(max(lags, 0)), 1.0
+    correlation = np.array([centred[lag:] @ centred[:-lag] for lag in range(1, lags + 1)]) / power
+    statistic = count * (count + 2) * float(np.sum(correlation**2 / (count - np.arange(1, lags + 1))))
+    return correlation, float(chdtrc(lags, statistic))
+
+
+def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
+    """How one sensor's scalars on one axis fit what the filter expected; None where none were fused."""
+    readings = est.readings.of(sensor, axis)
+    fused = readings.where(readings.outcome == Outcome.FUSED)
+    count = len(fused.value)
+    if not count:
+        return None
+    correlation, whiteness = ljung_box(fused.innovation / fused.innovation_sd)
+    nis, band = float(np.mean(fused.nis)), chi_square_band(count)
+    verdict = _verdict(est, axis, fused, nis, band, correlation, whiteness)
+    return Consistency(count, nis, band, correlation, whiteness, verdict)
+
+
+def troubles(est: Estimates) -> list[str]:
+    """What went wrong with whole sensors, a sentence each: gates that reopened, readings that all failed, clocks."""
+    found: list[str] = []
+    for name in est.readings.sensors:
+        mine = est.readings.where(est.readings.sensor == est.readings.sensors.index(name))
+        total, counts = len(mine.outcome), mine.counts()
+        if not total:
+            continue
+        if counts.get(Outcome.REOPENED.word, 0):
+            found.append(
+                f"{name}: its gate reopened {counts[Outcome.REOPENED.word]} times after half a second of rejections: it"
+                " contradicts the others or the model; if it is off by a constant, give it bias_sd_mm"
+            )
+        if counts.get(Outcome.BEFORE_START.word, 0) > 0.5 * total:
+            found.append(f"{name}: most readings lie before the first command: are both stamped by one clock?")
+        last = float(np.nanmax(mine.time, initial=-np.inf))
+        if last > est.last_command + 3600.0:
+            found.append(
+                f"{name}: readings go on for {(last - est.last_command) / 3600.0:.1f} hours after the last command: are"
+                " both stamped by one clock?"
+            )
+        if counts.get(Outcome.GATED.word, 0) > 0.1 * total:
+            share = counts[Outcome.GATED.word] / total
+            found.append(
+                f"{name}: {share:.0%} of its scalars were gated: sd_mm, latency_ms or the process noise too small"
+            )
+        found.extend(_frozen(est, name))
+    return found
+
+
+def _frozen(est: Estimates, sensor: str) -> list[str]:
+    """A sensor that repeats a value to the last digit while others would scatter."""
+    found: list[str] = []
+    for axis in est.readings.axes:
+        values = est.readings.of(sensor, axis).value
+        values = values[np.isfinite(values)]
+        if len(values) < _FROZEN or len(np.unique(values)) < 0.1 * len(values):
+            continue  # coarse steps repeat without being frozen
+        edges = np.flatnonzero(np.concatenate(([True], np.diff(values) != 0.0, [True])))
+        longest = int(np.diff(edges).max())
+        if longest >= _FROZEN:
+            found.append(f"{sensor}: {longest} {axis} readings in a row have the same value: it froze")
+    return found
+
+
+def _verdict(
+    est: Estimates,
+    axis: str,
+    fused: Readings,
+    nis: float,
+    band: tuple[float, float],
+    correlation: FloatArray,
+    whiteness: float,
+) -> str:
+    if len(fused.value) < _FEW:
+        return f"too few readings ({len(fused.value)}) to tell"
+    said = f"NIS {nis:.2f}, expected {band[0]:.2f} to {band[1]:.2f}"
+    coloured = whiteness < 0.01 and abs(float(correlation[0])) > _NOTABLE
+    late = _lateness(est, axis, fused)
+    moving = late is not None and coloured
+    if nis > band[1]:
+        if moving and late is not None:
+            way = "small" if late > 0.0 else "large"
+            return f"{said}: errors follow the speed: latency_ms too {way} by {abs(late) * MM:.0f} ms or more"
+        if coloured:
+            return f"{said}, one innovation like the next: the process noise too small, or sd_mm"
+        return f"{said}: sd_mm or latency_sd_ms too small"
+    if nis < band[0]:
+        return f"{said}: sd_mm or the process noise too large" + (", innovations not white" if coloured else "")
+    if coloured:
+        return f"{said}: consistent in size, but one innovation is like the next (lag 1: {correlation[0]:+.2f})"
+    return f"{said}: consistent"
+
+
+def _lateness(est: Estimates, axis: str, fused: Readings) -> float | None:
+    """How much later than ``latency_ms`` says the readings are [s], where their innovations follow the velocity.
+
+    The filter takes most of a latency's error into its offset, so this is a lower bound and only its sign is sure.
+    """
+    sensor = est.config.sensors[fused.sensors[int(fused.sensor[0])]]
+    velocity = sensor.scale * np.interp(fused.time, est.time, est[axis].velocity)
+    power = float(velocity @ velocity)
+    if power == 0.0:
+        return None
+    share = float(fused.innovation @ velocity) / np.sqrt(power * float(fused.innovation @ fused.innovation))
+    return -float(fused.innovation @ velocity) / power if abs(share) > 0.3 else None

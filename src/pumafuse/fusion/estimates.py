@@ -13,7 +13,7 @@ from .config import FusionConfig
 from .timeline import Outcome
 from .track import AxisEstimate
 
-Mode = Literal["filtered", "as-live"]
+Mode = Literal["filtered", "as-live", "smoothed"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,10 @@ class Readings:
         """The scalars that ``mask`` (m,) selects."""
         return replace(self, **{name: getattr(self, name)[mask] for name in self.ARRAYS})
 
+    def as_position(self, scale: float, bias: float) -> Readings:
+        """The scalars with their values turned into positions [m]: (z − bias) / scale."""
+        return replace(self, value=(self.value - bias) / scale)
+
     @staticmethod
     def joined(parts: Sequence[Readings]) -> Readings:
         """The scalars of several segments, one after the other."""
@@ -69,6 +73,14 @@ class Readings:
         """How many scalars had each outcome, those that occur."""
         found = np.bincount(self.outcome, minlength=len(Outcome))
         return {outcome.word: int(found[outcome]) for outcome in Outcome if found[outcome]}
+
+
+@dataclass(frozen=True)
+class Bias:
+    """A sensor's constant bias on one axis [m], in the log's coordinates, and its standard deviation [m]."""
+
+    value: float
+    sd: float
 
 
 @dataclass(frozen=True)
@@ -96,29 +108,37 @@ class Estimates:
         run: The run's name.
         time: [s since the run's first command].
         axes: Estimates by axis; ``est["radial"]`` is the short way.
+        cartesian: With a frame, the estimates in the log's ``x``, ``y`` and ``z`` [m].
         readings: What became of every scalar.
+        biases: By sensor and axis, as all readings together know them.
         reference: The run's reference, where it has one.
         origin: Stamp of the first command, int ns.
+        last_command: When the last command was given [s since the first].
         segment: 0, and one more after each time the log's clock was set back.
         mode: Which readings an estimate knows: all that are valid by then (``filtered``), or only those that had
-            arrived (``as-live``).
+            arrived (``as-live``), or all of the run (``smoothed``).
         engine: Which engine computed it.
         config: The configuration as used.
         speed: Highest commanded speed [m/s].
+        radius: Farthest that commands are from the base's axis [m]; None without a cylindrical frame.
         notes: Everything noticed, a sentence each.
     """
 
     run: str
     time: FloatArray
     axes: Mapping[str, AxisEstimate]
+    cartesian: Mapping[str, FloatArray] | None
     readings: Readings
+    biases: Mapping[str, Mapping[str, Bias]]
     reference: ReferenceTrack | None
     origin: int
+    last_command: float
     segment: IntArray
     mode: Mode
     engine: str
     config: FusionConfig
     speed: float
+    radius: float | None
     notes: tuple[str, ...]
 
     def __getitem__(self, axis: str) -> AxisEstimate:

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from ..arrays import NO_STAMP, TimeArray
+from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import PumafuseWarning
+from ..runs.axes import in_axes
 from ..runs.clock import segments
+from ..runs.frames import Cylindrical, Placed
 from ..runs.run import Reference, Run
 from ..units import seconds
 from . import timeline as timelines
 from .config import FusionConfig
-from .estimates import Estimates, Mode, Readings, ReferenceTrack
+from .consistency import troubles
+from .estimates import Bias, Estimates, Mode, Readings, ReferenceTrack
+from .smoother import adjoints, adjoints_at
 from .timeline import Timeline
 from .track import AxisEstimate, Filtered, estimate
 
@@ -29,6 +33,7 @@ def fuse(
     *,
     sensors: Iterable[str] | None = None,
     rate: float | None = None,
+    smooth: bool = False,
     as_live: bool = False,
     engine: Engine = "filterpy",
     progress: Callable[[float], None] | None = None,
@@ -40,6 +45,7 @@ def fuse(
         config: Arm, noise and sensors.
         sensors: Which of the configured sensors to use; all of them for None.
         rate: Estimates on an even grid [Hz] from the first command on; one for each command for None.
+        smooth: An estimate knows every reading of the run, later ones too.
         as_live: An estimate knows only the readings that had arrived by then, as a live user would have had.
         engine: ``filterpy``, the reference engine.
         progress: Called now and then with the share done, 0 to 1.
@@ -52,23 +58,27 @@ def fuse(
 
     Raises:
         PumafuseError: Run and configuration do not fit together.
-        ValueError: ``rate`` is not positive, or there is no such engine.
+        ValueError: ``rate`` is not positive, there is no such engine, or ``smooth`` and ``as_live`` are both asked for.
     """
     if rate is not None and not 0.0 < rate < np.inf:
         raise ValueError(f"rate must be positive and finite, got {rate}")
     if engine != "filterpy":
         raise ValueError(f"no engine '{engine}'; there is: filterpy")
+    if smooth and as_live:
+        raise ValueError("smooth uses every reading and as_live only those that had arrived; choose one")
+    mode: Mode = "smoothed" if smooth else "as-live" if as_live else "filtered"
     chosen = None if sensors is None else tuple(sensors)
-    parts, said = segments(run)
+    logged, said = segments(run)
     fused: list[Estimates] = []
-    for number, part in enumerate(parts):
-        built = timelines.build(part, config, chosen)
+    for number, part in enumerate(logged):
+        placed_run, placed = in_axes(part, config.frame)
+        built = timelines.build(placed_run, config, chosen)
         times = timelines.output_times(built, rate)
-        share = None if progress is None else _share(progress, number, len(parts))
-        fused.append(_fuse_segment(part, built, times, config, as_live, share))
+        share = None if progress is None else _share(progress, number, len(logged))
+        fused.append(_fuse_segment(placed_run, placed, built, times, config, mode, share))
     joined = _joined(fused, said)
-    excess = config.arm.validity.excess(joined.speed, None)
-    joined = replace(joined, notes=(*joined.notes, *excess))
+    excess = config.arm.validity.excess(joined.speed, joined.radius)
+    joined = replace(joined, notes=(*joined.notes, *excess, *troubles(joined)))
     for note in joined.notes:
         warnings.warn(f"run '{run.name}': {note}", PumafuseWarning, stacklevel=2)
     return joined
@@ -80,36 +90,69 @@ def _share(progress: Callable[[float], None], number: int, count: int) -> Callab
 
 def _fuse_segment(
     run: Run,
+    placed: Placed | None,
     timeline: Timeline,
     times: TimeArray,
     config: FusionConfig,
-    as_live: bool,
+    mode: Mode,
     progress: Callable[[float], None] | None,
 ) -> Estimates:
     from .augmented import ReferenceEngine
 
     engine = ReferenceEngine(timeline, config)
-    filtered = engine.filter_as_live(times, progress) if as_live else engine.filter(progress)
+    filtered = engine.filter_as_live(times, progress) if mode == "as-live" else engine.filter(progress)
     axes: dict[str, AxisEstimate] = {}
     for axis, track in zip(timeline.axes, filtered.tracks, strict=True):
-        held = track if as_live else track.at(times)
-        axes[axis.name] = estimate(held, times, config.arm.axes[axis.name].plant, axis.start)
-    mode: Mode = "as-live" if as_live else "filtered"
+        plant = config.arm.axes[axis.name].plant
+        entry = np.arange(len(times)) if mode == "as-live" else track.holding(times)
+        adjoint = adjoints_at(track, adjoints(track, plant), times, plant) if mode == "smoothed" else None
+        axes[axis.name] = estimate(track, entry, times, plant, axis.start, adjoint)
     origin = timeline.origin
     return Estimates(
         run=run.name,
         time=seconds(times, origin),
         axes=axes,
+        cartesian=None if placed is None else _cartesian(placed, axes),
         readings=_readings(timeline, filtered),
+        biases=_biases(timeline, filtered),
         reference=None if run.reference is None else reference_track(run.reference, origin),
         origin=origin,
+        last_command=(int(timeline.commands[-1]) - origin) / 1e9,
         segment=np.zeros(len(times), dtype=np.int64),
         mode=mode,
         engine="filterpy",
         config=config,
         speed=timeline.speed,
+        radius=_highest_radius(run, placed),
         notes=timeline.notes,
     )
+
+
+def _cartesian(placed: Placed, axes: Mapping[str, AxisEstimate]) -> dict[str, FloatArray]:
+    """Estimates in the log's x, y and z [m], those that the axes give."""
+    found: dict[str, FloatArray] = {}
+    if "tangential" in axes and "radial" in axes:
+        found["x"], found["y"] = placed.to_log(axes["tangential"].position, axes["radial"].position)
+    if "vertical" in axes:
+        found["z"] = axes["vertical"].position.copy()
+    return found
+
+
+def _biases(timeline: Timeline, filtered: Filtered) -> dict[str, dict[str, Bias]]:
+    """Each sensor's bias on each axis, as all readings together know it."""
+    found: dict[str, dict[str, Bias]] = {}
+    for axis, track, names in zip(timeline.axes, filtered.tracks, filtered.biases, strict=True):
+        for number, name in enumerate(names, track.mean.shape[1] - len(names)):
+            sd = float(np.sqrt(track.covariance[-1, number, number]))
+            found.setdefault(name, {})[axis.name] = Bias(float(track.mean[-1, number]), sd)
+    return found
+
+
+def _highest_radius(run: Run, placed: Placed | None) -> float | None:
+    """The commands' greatest distance from the base's axis [m]; None where no cylindrical frame says where that is."""
+    if placed is None or not isinstance(placed.frame, Cylindrical) or "radial" not in run.command.values:
+        return None
+    return float(np.nanmax(run.command.values["radial"]))
 
 
 def _readings(timeline: Timeline, filtered: Filtered) -> Readings:
@@ -151,6 +194,10 @@ def _joined(parts: Sequence[Estimates], said: Sequence[str]) -> Estimates:
         )
         for name in first.axes
     }
+    cartesian = {
+        name: np.concatenate([part.cartesian[name] for part in parts if part.cartesian is not None])
+        for name in first.cartesian or ()
+    }
     shifted = [
         replace(part.readings, time=part.readings.time + t, stamp=part.readings.stamp + t) for part, t, _ in numbers
     ]
@@ -170,9 +217,13 @@ def _joined(parts: Sequence[Estimates], said: Sequence[str]) -> Estimates:
         first,
         time=np.concatenate([part.time + shift for part, shift, _ in numbers]),
         axes=axes,
+        cartesian=None if first.cartesian is None else cartesian,
         readings=Readings.joined(shifted),
+        biases=parts[-1].biases,
         reference=reference,
+        last_command=max(part.last_command + shift for part, shift, _ in numbers),
         segment=np.concatenate([np.full(len(part.time), number) for part, _, number in numbers]),
         speed=max(part.speed for part in parts),
+        radius=max((part.radius for part in parts if part.radius is not None), default=None),
         notes=(*(note for part in parts for note in part.notes), *said),
     )

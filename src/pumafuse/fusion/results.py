@@ -176,6 +176,7 @@ def _estimates_table(est: Estimates) -> pa.Table:
         columns[f"{name}.velocity_sd_mm_s"] = axis.velocity_sd * MM
         columns[f"{name}.offset_mm"] = axis.offset * MM
         columns[f"{name}.offset_sd_mm"] = axis.offset_sd * MM
+    columns |= {f"{name}_mm": position * MM for name, position in (est.cartesian or {}).items()}
     return pa.table({**columns, **_segment_column(est.segment)})
 
 

@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 
 from ..units import MM
-from .consistency import log_likelihood
-from .estimates import Estimates, Readings
+from .consistency import chi_square_band, consistency, log_likelihood
+from .estimates import Estimates
 from .score import Score, score
 from .timeline import Outcome
 
@@ -22,12 +22,26 @@ class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):
         innovation_rms_mm: Root mean square of the fused scalars' innovations; null without any.
         innovation_sd_mm: Root mean square of what the filter expected of them.
         nis_mean: Mean ν²/S of the fused scalars; 1 for a consistent filter.
+        nis_band: Where that mean lies in 95 % of cases for a consistent filter.
+        correlation: Autocorrelation of the innovations at lags 1, 2, …
+        correlation_band: White innovations' autocorrelations lie within ± this in 95 % of cases.
+        whiteness_p: Ljung-Box p-value; small: the innovations are not white.
+        verdict: In words, with the likely cause and the key to change.
+        bias_mm: The estimated bias in the log's coordinates; null where none is estimated.
+        bias_sd_mm: Its standard deviation.
     """
 
     outcomes: dict[str, int]
-    innovation_rms_mm: float | None
-    innovation_sd_mm: float | None
-    nis_mean: float | None
+    innovation_rms_mm: float | None = None
+    innovation_sd_mm: float | None = None
+    nis_mean: float | None = None
+    nis_band: tuple[float, float] | None = None
+    correlation: list[float] = []
+    correlation_band: float | None = None
+    whiteness_p: float | None = None
+    verdict: str = "nothing fused"
+    bias_mm: float | None = None
+    bias_sd_mm: float | None = None
 
 
 class ScoreSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -51,11 +65,20 @@ class ScoreSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AxisSummary(msgspec.Struct, frozen=True, kw_only=True):
-    """One axis: its sensors, the log-likelihood of its scalars (positions in mm), and its score; null without one."""
+    """One axis.
+
+    Attributes:
+        sensors: By name, those with scalars on this axis.
+        log_likelihood: Of its scalars, with positions in mm.
+        score: Against the reference; null without one.
+        nees_band: Where the mean NEES lies in 95 % of cases for a consistent filter that knows as many independent
+            errors as scalars; null without scalars.
+    """
 
     sensors: dict[str, SensorSummary]
     log_likelihood: float
     score: ScoreSummary | None
+    nees_band: tuple[float, float] | None
 
 
 class ValiditySummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -117,7 +140,7 @@ def summarise(est: Estimates) -> Summary:
             max_speed_m_s=limits.max_speed,
             commanded_speed_m_s=est.speed,
             max_radius_mm=None if limits.max_radius is None else limits.max_radius * MM,
-            commanded_radius_mm="not checked",
+            commanded_radius_mm="not checked" if est.radius is None else est.radius * MM,
         ),
         notes=list(est.notes),
     )
@@ -137,24 +160,35 @@ def score_summary(found: Score) -> ScoreSummary:
 
 def _axis_summary(est: Estimates, axis: str) -> AxisSummary:
     mine = est.readings.where(est.readings.axis == est.readings.axes.index(axis))
-    sensors = {name: _sensor_summary(mine.of(name, axis)) for name in mine.sensors}
+    sensors = {name: _sensor_summary(est, name, axis) for name in mine.sensors if len(mine.of(name, axis).value)}
     found = None
     if est.reference is not None:
         found = score(est.time, est.segment, est[axis].position, est[axis].position_sd, est.reference, axis)
+    fused = int(np.sum(mine.outcome == Outcome.FUSED))
     return AxisSummary(
-        sensors={name: summary for name, summary in sensors.items() if summary.outcomes},
+        sensors=sensors,
         log_likelihood=log_likelihood(mine, est.config.sensors),
         score=None if found is None else score_summary(found),
+        nees_band=chi_square_band(fused) if fused else None,
     )
 
 
-def _sensor_summary(readings: Readings) -> SensorSummary:
+def _sensor_summary(est: Estimates, sensor: str, axis: str) -> SensorSummary:
+    readings, found = est.readings.of(sensor, axis), consistency(est, sensor, axis)
+    if found is None:
+        return SensorSummary(outcomes=readings.counts())
     fused = readings.where(readings.outcome == Outcome.FUSED)
-    if not len(fused.value):
-        return SensorSummary(outcomes=readings.counts(), innovation_rms_mm=None, innovation_sd_mm=None, nis_mean=None)
+    bias = est.biases.get(sensor, {}).get(axis)
     return SensorSummary(
         outcomes=readings.counts(),
         innovation_rms_mm=float(np.sqrt(np.mean(fused.innovation**2))) * MM,
         innovation_sd_mm=float(np.sqrt(np.mean(fused.innovation_sd**2))) * MM,
-        nis_mean=float(np.mean(fused.nis)),
+        nis_mean=found.nis,
+        nis_band=found.nis_band,
+        correlation=found.correlation.tolist(),
+        correlation_band=found.correlation_band,
+        whiteness_p=found.whiteness,
+        verdict=found.verdict,
+        bias_mm=None if bias is None else bias.value * MM,
+        bias_sd_mm=None if bias is None else bias.sd * MM,
     )

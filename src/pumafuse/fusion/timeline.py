@@ -18,6 +18,7 @@ from ..arrays import NO_STAMP, BoolArray, CodeArray, FloatArray, IntArray, TimeA
 from ..errors import RunError, UnknownNameError
 from ..model.drive import Drive, drive
 from ..runs.clock import TOLERATED_STEP_BACK_NS, behind, regular_grid
+from ..runs.frames import CARTESIAN
 from ..runs.run import Run, Source
 from .config import FusionConfig, Sensor
 
@@ -77,6 +78,7 @@ class Scalars:
         axis: Index into the timeline's axes.
         value: z [m] as logged.
         row: Scalars of one row of one sensor share this number; it never falls.
+        spread: By what a frame scales the noise of each.
         outcome: What is known before filtering; ``Outcome.FUSED`` where the filter is to decide.
         sensors: Sensor names, the configured ones first in their order.
     """
@@ -87,6 +89,7 @@ class Scalars:
     axis: IntArray
     value: FloatArray
     row: IntArray
+    spread: FloatArray
     outcome: CodeArray
     sensors: tuple[str, ...]
 
@@ -132,6 +135,8 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     """
     arm, notes = config.arm, list(run.notes)
     for axis in run.axes:
+        if axis in CARTESIAN and axis not in arm.axes:
+            raise RunError(f"{run.command.label}: commands are in x, y, z; give a [frame] in run.toml or fusion.toml")
         if axis not in arm.axes:
             raise UnknownNameError(
                 f"{run.command.label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes
@@ -189,7 +194,7 @@ def _sorted_commands(source: Source, notes: list[str]) -> Source:
     _tell(notes, source.label, _said_before(source) & ~missing, "the stamp and values of an earlier row: duplicate")
     for axis, value in source.values.items():
         _tell(notes, source.label, ~np.isfinite(value) & ~missing, f"no finite {axis} command: not used")
-    kept = source.where(~missing)
+    kept = source.rows(~missing)
     order = np.argsort(kept.stamp, kind="stable")
     values = {axis: np.where(np.isfinite(value), value, np.nan)[order] for axis, value in kept.values.items()}
     return Source(kept.stamp[order], values, source.label)
@@ -231,11 +236,20 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
             else:
                 _tell(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
             columns.append(
-                (valid, source.stamp, np.full_like(rows, index), np.full_like(rows, number), value, rows, outcome)
+                (
+                    valid,
+                    source.stamp,
+                    np.full_like(rows, index),
+                    np.full_like(rows, number),
+                    value,
+                    rows,
+                    source.spread.get(axis, np.ones(len(rows))),
+                    outcome,
+                )
             )
     if not columns:
-        columns = [tuple(np.zeros(0, dtype) for dtype in ("i8", "i8", "i8", "i8", "f8", "i8", "u1"))]
-    valid, stamp, sensor_index, axis_index, value, rows, outcome = (
+        columns = [tuple(np.zeros(0, dtype) for dtype in ("i8", "i8", "i8", "i8", "f8", "i8", "f8", "u1"))]
+    valid, stamp, sensor_index, axis_index, value, rows, spread, outcome = (
         np.concatenate(parts) for parts in zip(*columns, strict=True)
     )
     order = np.lexsort((axis_index, rows, stamp, sensor_index, valid))
@@ -248,6 +262,7 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
         axis_index[order],
         value[order],
         np.cumsum(first) - 1,
+        spread[order],
         outcome[order].astype(np.uint8),
         names,
     )

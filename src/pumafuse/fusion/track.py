@@ -9,9 +9,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import CodeArray, FloatArray, TimeArray
+from ..arrays import CodeArray, FloatArray, IntArray, TimeArray
 from ..model.discrete import transition
 from ..model.plants import Plant
+
+
+@dataclass(frozen=True)
+class Updates:
+    """The updates among the entries of a track, for the smoother.
+
+    Attributes:
+        entry: Which entry each update made, ascending, (u,).
+        H: Its observation row, (u, s).
+        K: Its Kalman gain, (u, s).
+        nu: Its innovation [m], (u,).
+        S: The innovation's variance [m²], (u,).
+    """
+
+    entry: IntArray
+    H: FloatArray
+    K: FloatArray
+    nu: FloatArray
+    S: FloatArray
 
 
 @dataclass(frozen=True)
@@ -27,6 +46,7 @@ class Track:
         input: v acting from then on [m], (k,).
         noise: Its input noise density squared, two-sided [m²·s], (k,).
         drift: Density squared of the offset's random walk [m²/s], (k,).
+        updates: Which entries are updates, and what they were.
     """
 
     time: TimeArray
@@ -35,18 +55,24 @@ class Track:
     input: FloatArray
     noise: FloatArray
     drift: FloatArray
+    updates: Updates
 
-    def at(self, time: TimeArray) -> Track:
-        """The state that holds at each of ``time`` (the last event at or before it)."""
-        index = np.maximum(np.searchsorted(self.time, time, side="right") - 1, 0)
-        return Track(
-            self.time[index],
-            self.mean[index],
-            self.covariance[index],
-            self.input[index],
-            self.noise[index],
-            self.drift[index],
-        )
+    def holding(self, time: TimeArray) -> IntArray:
+        """The entry that holds at each of ``time``: the last one at or before it."""
+        return np.maximum(np.searchsorted(self.time, time, side="right") - 1, 0)
+
+
+@dataclass(frozen=True)
+class Adjoint:
+    """What all later readings say of a state: smoothed mean = x − P λ, covariance = P − P Λ P.
+
+    Attributes:
+        mean: λ, (k, s).
+        covariance: Λ, (k, s, s).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -91,32 +117,56 @@ class AxisEstimate:
     FIELDS = ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd")
 
 
-def estimate(held: Track, time: TimeArray, plant: Plant, start: float) -> AxisEstimate:
-    """Predict from each held state to its ``time``, (n,).
+def estimate(
+    track: Track, entry: IntArray, time: TimeArray, plant: Plant, start: float, adjoint: Adjoint | None = None
+) -> AxisEstimate:
+    """Predict from a held state to each ``time``, (n,), and smooth it where an adjoint is given.
 
     Args:
-        held: The state to predict from, one for each time.
-        time: Int64 ns, none before its held state.
+        track: The states.
+        entry: Which of them to predict from, one for each time.
+        time: Int64 ns, none before its state.
         plant: The plant of the axis.
         start: The level u₀ [m] that the states are relative to.
+        adjoint: What later readings say of the state at each time.
     """
     A, B, C = plant.state_space()
-    n = len(A)
-    distinct, place = np.unique(time - held.time, return_inverse=True)
-    Phi, Gamma, Q = (part[place] for part in transition(plant, distinct / 1e9))
-    x = (Phi @ held.mean[:, :n, None] + Gamma * held.input[:, None, None])[..., 0]
-    Pxx = Phi @ held.covariance[:, :n, :n] @ Phi.swapaxes(1, 2) + Q * held.noise[:, None, None]
-    Pxo = (Phi @ held.covariance[:, :n, n, None])[..., 0]
-    Poo = held.covariance[:, n, n] + held.drift * (time - held.time) / 1e9
-    offset = held.mean[:, n]
-    rate = (C @ A)[0]
-    position_variance = np.einsum("i,kij,j->k", C[0], Pxx, C[0]) + 2.0 * Pxo @ C[0] + Poo
-    velocity_variance = np.einsum("i,kij,j->k", rate, Pxx, rate)
+    n, size = len(A), track.mean.shape[1]
+    interval, place = np.unique(time - track.time[entry], return_inverse=True)
+    F, Gamma, Q1 = extended(plant, interval, size)
+    v, q = track.input[entry], track.noise[entry]
+    x = np.einsum("kij,kj->ki", F[place], track.mean[entry])
+    x[:, :n] += Gamma[place] * v[:, None]
+    P = F[place] @ track.covariance[entry] @ F[place].swapaxes(1, 2)
+    P[:, :n, :n] += Q1[place] * q[:, None, None]
+    P[:, n, n] += track.drift[entry] * (interval[place] / 1e9)
+    if adjoint is not None:
+        x -= np.einsum("kij,kj->ki", P, adjoint.mean)
+        np.subtract(P, P @ adjoint.covariance @ P, out=P)
+    position, velocity, offset = np.zeros((3, size))
+    position[:n], position[n], velocity[:n], offset[n] = C[0], 1.0, (C @ A)[0], 1.0
     return AxisEstimate(
-        position=start + x @ C[0] + offset,
-        position_sd=np.sqrt(np.maximum(position_variance, 0.0)),
-        velocity=x @ rate + (C @ B).item() * held.input,
-        velocity_sd=np.sqrt(np.maximum(velocity_variance, 0.0)),
-        offset=offset.copy(),
-        offset_sd=np.sqrt(np.maximum(Poo, 0.0)),
+        position=start + x @ position,
+        position_sd=_sd(P, position),
+        velocity=x @ velocity + (C @ B).item() * v,
+        velocity_sd=_sd(P, velocity),
+        offset=x @ offset,
+        offset_sd=_sd(P, offset),
     )
+
+
+def extended(plant: Plant, interval: TimeArray, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Transitions of plant, offset and biases over each of ``interval`` [int ns], (k,).
+
+    Returns:
+        F (k, s, s) with the constant states' ones, Γ (k, n) and Q of the plant for unit input noise (k, n, n).
+    """
+    Phi, Gamma, Q = transition(plant, interval / 1e9)
+    n = Phi.shape[-1]
+    F = np.tile(np.eye(size), (len(interval), 1, 1))
+    F[:, :n, :n] = Phi
+    return F, Gamma[..., 0], Q
+
+
+def _sd(P: FloatArray, row: FloatArray) -> FloatArray:
+    return np.sqrt(np.maximum(np.einsum("i,kij,j->k", row, P, row), 0.0))

@@ -10,6 +10,7 @@ import msgspec
 from .. import toml
 from ..errors import ConfigError
 from ..model.plants import NotNegative
+from .frames import Frame
 
 Columns = str | list[str]
 
@@ -42,6 +43,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     name: str = ""
     sensors: dict[str, SourceEntry] = {}
     reference: ReferenceEntry | None = None
+    frame: Frame | None = None
 
 
 def load(path: Path) -> Manifest:

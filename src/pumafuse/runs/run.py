@@ -6,21 +6,24 @@ the timeline gives each of them its outcome.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import os
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import NO_STAMP, BoolArray, FloatArray, TimeArray
 from ..errors import RunError, UnknownNameError
-from ..model.arm import ordered_axes
+from ..model.arm import CANONICAL_AXES, ordered_axes
 from ..units import nanoseconds
 from . import manifest, tables
+from .frames import CARTESIAN, Frame
 
 Clock = Literal["stamps", "regular"]
+S = TypeVar("S", bound="Source")
 
 
 @dataclass(frozen=True)
@@ -31,15 +34,19 @@ class Source:
         stamp: When the logger stamped each row, int64 ns, ``NO_STAMP`` where it did not, (rows,).
         values: For each axis the value [m], NaN where the row has none, (rows,).
         label: What a person calls it: the file, or the column group of a single table.
+        spread: For an axis that a frame has made, by what the noise of each row is scaled, (rows,).
     """
 
     stamp: TimeArray
     values: Mapping[str, FloatArray]
     label: str
+    spread: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
 
-    def where(self, mask: BoolArray) -> Source:
-        """The rows that ``mask`` (rows,) selects."""
-        return Source(self.stamp[mask], {axis: value[mask] for axis, value in self.values.items()}, self.label)
+    def rows(self: S, chosen: BoolArray | slice) -> S:
+        """The chosen rows."""
+        values = {axis: value[chosen] for axis, value in self.values.items()}
+        spread = {axis: value[chosen] for axis, value in self.spread.items()}
+        return replace(self, stamp=self.stamp[chosen], values=values, spread=spread)
 
 
 @dataclass(frozen=True)
@@ -60,6 +67,7 @@ class Run:
         reference: A truth, where there is one.
         start: The level u₀ [m] of axes that do not rest at their first command before it.
         clock: Whether the commands' stamps are believed (``stamps``) or fitted by a grid of T (``regular``).
+        frame: Where the log's x, y, z are in the arm's axes, for sources that give them.
         notes: What was wrong with the files, a sentence each.
     """
 
@@ -69,17 +77,21 @@ class Run:
     reference: Reference | None = None
     start: Mapping[str, float] = field(default_factory=dict[str, float])
     clock: Clock = "stamps"
+    frame: Frame | None = None
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         sources = {f"sensor {name}": source for name, source in self.sensors.items()}
         if self.reference is not None:
             sources["the reference"] = self.reference
+        named = {axis for source in sources.values() for axis in source.values} | set(self.axes)
+        framed = self.frame is not None or not named.isdisjoint(CARTESIAN)
+        accepted = dict.fromkeys((*self.axes, *CARTESIAN, *CANONICAL_AXES)) if framed else self.axes
         for name, source in sources.items():
-            _known_axes(f"run '{self.name}', {name}", source.values, self.axes)
-        _known_axes(f"run '{self.name}', start", self.start, self.axes)
+            _known_axes(f"run '{self.name}', {name}", source.values, accepted)
+        _known_axes(f"run '{self.name}', start", self.start, accepted)
         if self.clock not in get_args(Clock):
-            raise UnknownNameError(f"run '{self.name}'", "clock", self.clock, get_args(Clock))
+            raise UnknownNameError(f"run '{self.name}'", "clock", str(self.clock), get_args(Clock))
         for axis, level in self.start.items():
             if not np.isfinite(level):
                 raise RunError(f"run '{self.name}': the start level of {axis} is not finite")
@@ -103,7 +115,7 @@ class Run:
             PumafuseError: Nothing there, or not a recorded run; says what, where, and what is accepted.
         """
         path = Path(path)
-        if path.is_dir():
+        if os.path.isdir(path):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
             path = path / "run.toml"
             if not path.exists():
                 raise RunError(f"{path.parent}: a folder without run.toml; write one, or give a single table")
@@ -121,6 +133,7 @@ class Run:
         reference_sd: float = 0.0,
         start: Mapping[str, float] | None = None,
         clock: Clock = "stamps",
+        frame: Frame | None = None,
         name: str = "run",
     ) -> Run:
         """A run from arrays in memory; they are copied.
@@ -133,6 +146,7 @@ class Run:
             reference_sd: Standard deviation of the reference's own noise [m].
             start: Level [m] of each axis before its first command, where it is another.
             clock: ``stamps`` or ``regular``.
+            frame: For sources in x, y, z.
             name: For people.
 
         Raises:
@@ -142,11 +156,11 @@ class Run:
         truth = None
         if reference is not None:
             source = _from_arrays("reference", *reference)
-            truth = Reference(source.stamp, source.values, source.label, reference_sd)
-        return Run(name, _from_arrays("command", time, command), streams, truth, dict(start or {}), clock)
+            truth = _as_reference(source, reference_sd)
+        return Run(name, _from_arrays("command", time, command), streams, truth, dict(start or {}), clock, frame)
 
 
-def _known_axes(where: str, named: Mapping[str, object], axes: tuple[str, ...]) -> None:
+def _known_axes(where: str, named: Mapping[str, object], axes: Collection[str]) -> None:
     for axis in named:
         if axis not in axes:
             raise UnknownNameError(where, "axis", axis, axes)
@@ -173,13 +187,22 @@ def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.Array
 def _stamps(time: npt.NDArray[Any]) -> TimeArray:
     """Int64 ns of datetime64, int ns or float seconds, all within reach."""
     if time.dtype.kind == "M":
+        rough_s = time.astype("M8[s]").astype(np.float64)
+        if (np.abs(rough_s[~np.isnat(time)]) >= tables.REACH_NS / 1e9).any():
+            raise ValueError("a stamp beyond the year 2110")
         time = time.astype("M8[ns]").astype(np.int64)
+    if time.dtype.kind not in "iuf":
+        raise TypeError(f"got {time.dtype}")
     whole = time.dtype.kind in "iu"
     rough = time.astype(np.float64) * (1.0 if whole else 1e9)
     missing = (time == NO_STAMP) if whole else ~np.isfinite(rough)
     if (np.abs(rough[~missing]) >= tables.REACH_NS).any():
         raise ValueError("a stamp beyond the year 2110")
     return time.astype(np.int64) if whole else nanoseconds(rough / 1e9)
+
+
+def _as_reference(source: Source, sd: float) -> Reference:
+    return Reference(source.stamp, source.values, source.label, sd=sd)
 
 
 def _read_manifest(path: Path) -> Run:
@@ -206,10 +229,11 @@ def _read_manifest(path: Path) -> Run:
     sensors = {name: source(entry) for name, entry in listed.sensors.items()}
     reference = None
     if listed.reference is not None:
-        truth = source(listed.reference)
-        reference = Reference(truth.stamp, truth.values, truth.label, listed.reference.sd)
+        reference = _as_reference(source(listed.reference), listed.reference.sd)
     name = listed.name or path.parent.resolve().name
-    return Run(name, command, sensors, reference, listed.command.start, listed.command.clock, tuple(notes))
+    return Run(
+        name, command, sensors, reference, listed.command.start, listed.command.clock, listed.frame, tuple(notes)
+    )
 
 
 def _read_single(path: Path) -> Run:
@@ -240,12 +264,11 @@ def _read_single(path: Path) -> Run:
 
     def source_of(name: str) -> Source:
         present = ~np.all([np.isnan(value) for value in groups[name].values()], axis=0)
-        return Source(stamp, groups[name], name).where(present)
+        return Source(stamp, groups[name], name).rows(present)
 
     sensors = {name: source_of(name) for name in groups if name not in ("command", "reference")}
     reference = None
     if "reference" in groups:
-        truth = source_of("reference")
-        reference = Reference(truth.stamp, truth.values, truth.label)
+        reference = _as_reference(source_of("reference"), 0.0)
     name = path.name.split(".")[0]
     return Run(name, source_of("command"), sensors, reference, notes=tuple(notes))

@@ -131,6 +131,8 @@ class Table:
                 )
             return pc.if_else(numeric, trimmed, pa.scalar(None, pa.string())), note
         kinds = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
+        if pa.types.is_binary(column.type):
+            raise RunError(f"{self.path}: column '{name}': its text is not UTF-8")
         if not any(is_kind(column.type) for is_kind in kinds):
             raise RunError(f"{self.path}: column '{name}' holds {column.type}, not numbers")
         return column, None
@@ -160,7 +162,7 @@ def read(path: Path) -> Table:
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror or str(error).splitlines()[0]}") from None
     except ValueError:  # a null character in the path
-        raise RunError(f"{path!r}: no such file") from None
+        raise RunError(f"{str(path)!r}: no such file") from None
     if table.num_rows == 0:
         raise RunError("; ".join([f"{path}: the table has no rows", *notes]))
     repeated = next((name for name in names if names.count(name) > 1), None)
@@ -195,8 +197,7 @@ def _read_csv(path: Path) -> tuple[pa.Table, list[str]]:
     except pa.ArrowInvalid as error:
         if " columns, got " not in str(error):
             raise
-    if path.suffix != ".gz":
-        path.read_text(encoding="utf-8")  # pyarrow cannot hand over a torn line that is not UTF-8
+    pa.input_stream(str(path)).read().decode("utf-8")  # pyarrow cannot hand over a torn line that is not UTF-8
     table = read(parse_options=pacsv.ParseOptions(invalid_row_handler=leave_out))
     lines = "1 line" if len(torn) == 1 else f"{len(torn)} lines"
     where = "" if torn[0].number is None else f", first in line {torn[0].number}"

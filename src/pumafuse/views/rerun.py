@@ -1,25 +1,38 @@
-"""Rerun recordings: the one bridge to rerun-sdk."""
+"""Rerun recordings: the one bridge to rerun-sdk.
+
+Entities: ``<axis>/command``, ``/reference``, ``/estimate`` with ``/upper`` and ``/lower`` at ±2σ, ``/<sensor>`` and
+``/<sensor>/rejected``; ``innovation/<axis>/<sensor>`` with its ±2σ band; ``path/command`` and ``path/estimate`` in 3D.
+All against seconds since the run's first command, positions in mm.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from ..arrays import FloatArray
-from ..fusion.estimates import Estimates
+from ..fusion.estimates import Estimates, Readings
 from ..fusion.timeline import Outcome
+from ..model.arm import CANONICAL_AXES
+from ..runs.axes import in_axes
+from ..runs.frames import CARTESIAN
 from ..runs.run import Run
 from ..units import MM, seconds
 from . import style
 
-_TIMELINE = "time"  # seconds since the run's first command
+Marker = Literal["Circle", "Cross"]
+
+_TIMELINE = "time"
+_OPENING_S = 4.0
+_PATH_POINTS = 20_000  # a 3D path needs no more, whatever the rate of the estimates
 
 
 def to_rerun(est: Estimates, run: Run, sink: str | Path | rr.RecordingStream) -> None:
-    """Write a fusion as a Rerun recording, positions in mm against seconds since the first command.
+    """Write a fusion as a Rerun recording.
 
     Args:
         est: The estimates.
@@ -35,36 +48,69 @@ def to_rerun(est: Estimates, run: Run, sink: str | Path | rr.RecordingStream) ->
 
 
 def _send(est: Estimates, run: Run, stream: rr.RecordingStream) -> None:
+    stream.send_recording_name(f"{est.run}, {est.mode}")
     colours = style.sensor_colours(est.readings.sensors)
-    command_time = seconds(run.command.stamp, est.origin)
+    command = in_axes(run, est.config.frame)[0].command
+    time = seconds(command.stamp, est.origin)
     for name, axis in est.axes.items():
-        _line(stream, f"{name}/command", command_time, run.command.values[name], style.COMMAND, step=True)
+        _line(stream, f"{name}/command", time, command.values[name], style.COMMAND, step=True)
         if est.reference is not None and name in est.reference.position:
-            _line(stream, f"{name}/reference", est.reference.time, est.reference.position[name], style.REFERENCE)
+            _line(stream, f"{name}/reference", est.reference.time, est.reference.position[name], style.REFERENCE_3D)
         for sensor in est.readings.sensors:
-            scalars = est.readings.of(sensor, name)
-            rejected = (scalars.outcome != Outcome.FUSED) & (scalars.outcome != Outcome.REOPENED)
-            _points(stream, f"{name}/{sensor}", scalars.time[~rejected], scalars.value[~rejected], colours[sensor])
-            _points(
-                stream, f"{name}/{sensor}/rejected", scalars.time[rejected], scalars.value[rejected], style.REJECTED
-            )
-        _line(
-            stream,
-            f"{name}/estimate/upper",
-            est.time,
-            axis.position + 2.0 * axis.position_sd,
-            style.ESTIMATE,
-            width=0.5,
-        )
-        _line(
-            stream,
-            f"{name}/estimate/lower",
-            est.time,
-            axis.position - 2.0 * axis.position_sd,
-            style.ESTIMATE,
-            width=0.5,
-        )
+            _sensor(stream, est, sensor, name, colours[sensor])
+        half = 2.0 * axis.position_sd
+        _band(stream, f"{name}/estimate", est.time, axis.position + half, axis.position - half)
         _line(stream, f"{name}/estimate", est.time, axis.position, style.ESTIMATE)
+    _paths(stream, est, run)
+
+
+def _sensor(stream: rr.RecordingStream, est: Estimates, sensor: str, axis: str, colour: str) -> None:
+    readings = est.readings.of(sensor, axis)
+    if sensor not in est.config.sensors or not len(readings.value):
+        return
+    bias = est.biases.get(sensor, {}).get(axis)
+    seen = readings.as_position(est.config.sensors[sensor].scale, 0.0 if bias is None else bias.value)
+    fused = (seen.outcome == Outcome.FUSED) | (seen.outcome == Outcome.REOPENED)
+    _points(stream, f"{axis}/{sensor}", seen.time[fused], seen.value[fused], colour)
+    _points(stream, f"{axis}/{sensor}/rejected", seen.time[~fused], seen.value[~fused], style.REJECTED, marker="Cross")
+    _innovations(stream, f"innovation/{axis}/{sensor}", readings.where(np.isfinite(readings.innovation)), colour)
+
+
+def _innovations(stream: rr.RecordingStream, path: str, met: Readings, colour: str) -> None:
+    _points(stream, path, met.time, met.innovation, colour)
+    _band(stream, path, met.time, 2.0 * met.innovation_sd, -2.0 * met.innovation_sd)
+
+
+def _paths(stream: rr.RecordingStream, est: Estimates, run: Run) -> None:
+    """Command and estimate in space: the log's x, y, z with a frame, else tangential, radial, vertical."""
+    if est.cartesian is not None:
+        command, estimated, names = run.command.values, est.cartesian, CARTESIAN
+    else:
+        command, names = run.command.values, CANONICAL_AXES
+        estimated = {name: axis.position for name, axis in est.axes.items()}
+    if not all(name in command and name in estimated for name in names):
+        return
+    _strip(stream, "path/command", [command[name] for name in names], style.COMMAND, 0.3)
+    _strip(stream, "path/estimate", [estimated[name] for name in names], style.ESTIMATE, 0.6)
+    every = max(1, len(est.time) // _PATH_POINTS)
+    position = np.column_stack([estimated[name] for name in names])[::every] * MM
+    look = rr.Points3D.from_fields(colors=[style.rgb(style.REJECTED)], radii=[2.5])
+    rr.log("path/tool", look, static=True, recording=stream)
+    columns = rr.Points3D.columns(positions=position)
+    rr.send_columns("path/tool", [rr.TimeColumn(_TIMELINE, duration=est.time[::every])], columns, recording=stream)
+
+
+def _strip(stream: rr.RecordingStream, path: str, coordinates: list[FloatArray], colour: str, radius: float) -> None:
+    points = np.column_stack(coordinates) * MM
+    points = points[np.isfinite(points).all(axis=1)]
+    points = points[:: max(1, len(points) // _PATH_POINTS)]
+    line = rr.LineStrips3D([points], colors=[style.rgb(colour)], radii=[radius])
+    rr.log(path, line, static=True, recording=stream)
+
+
+def _band(stream: rr.RecordingStream, path: str, time: FloatArray, upper: FloatArray, lower: FloatArray) -> None:
+    _line(stream, f"{path}/upper", time, upper, style.BAND, width=0.7, label="+2σ")
+    _line(stream, f"{path}/lower", time, lower, style.BAND, width=0.7, label="−2σ")
 
 
 def _line(
@@ -76,14 +122,19 @@ def _line(
     *,
     width: float = 1.5,
     step: bool = False,
+    label: str | None = None,
 ) -> None:
+    label = path.rpartition("/")[2] if label is None else label
     mode = "StepAfter" if step else "Linear"
-    look = rr.SeriesLines(colors=[style.rgb(colour)], widths=width, names=path, interpolation_mode=mode)
+    look = rr.SeriesLines(colors=[style.rgb(colour)], widths=[width], names=label, interpolation_mode=mode)
     _series(stream, path, look, time, value)
 
 
-def _points(stream: rr.RecordingStream, path: str, time: FloatArray, value: FloatArray, colour: str) -> None:
-    look = rr.SeriesPoints(colors=[style.rgb(colour)], marker_sizes=2.0, names=path)
+def _points(
+    stream: rr.RecordingStream, path: str, time: FloatArray, value: FloatArray, colour: str, marker: Marker = "Circle"
+) -> None:
+    size, label = (3.0, "rejected") if marker == "Cross" else (1.2, path.rpartition("/")[2])
+    look = rr.SeriesPoints(colors=[style.rgb(colour)], marker_sizes=[size], names=label, markers=[marker])
     _series(stream, path, look, time, value)
 
 
@@ -99,5 +150,44 @@ def _series(
 
 
 def _blueprint(est: Estimates) -> rrb.Blueprint:
-    plots = [rrb.TimeSeriesView(origin=f"/{name}", name=f"{name} [mm]") for name in est.axes]
-    return rrb.Blueprint(rrb.Vertical(*plots), collapse_panels=True)
+    """Opens on the busiest seconds: positions on the left; the path and all innovations on the right."""
+    start, end = style.busiest(est, _OPENING_S)
+    bounds = [rrb.TimeRangeBoundary.absolute(seconds=edge) for edge in (start, end)]
+    legend = rrb.PlotLegend(rrb.Corner2D.RightTop)
+    positions = [
+        rrb.TimeSeriesView(
+            origin=f"/{name}",
+            name=f"{name} [mm]",
+            plot_legend=legend,
+            axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(*bounds)),
+            axis_y=rrb.ScalarAxis(range=_span(axis.position[(est.time >= start) & (est.time <= end)])),
+        )
+        for name, axis in est.axes.items()
+    ]
+    innovations = [
+        rrb.TimeSeriesView(
+            origin=f"/innovation/{name}",
+            name=f"{name}: innovations and ±2σ [mm]",
+            plot_legend=legend,
+            axis_y=rrb.ScalarAxis(range=_innovation_span(est, name)),
+        )
+        for name in est.axes
+    ]
+    path = rrb.Spatial3DView(origin="/path", name="path [mm]")
+    left, right = rrb.Vertical(*positions), rrb.Vertical(path, rrb.Tabs(*innovations))
+    return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[3, 2]), collapse_panels=True)
+
+
+def _span(position: FloatArray) -> tuple[float, float]:
+    """A plot's limits [mm] about some positions [m]."""
+    low, high = float(position.min()) * MM, float(position.max()) * MM
+    margin = 0.2 * (high - low) + 0.5
+    return low - margin, high + margin
+
+
+def _innovation_span(est: Estimates, axis: str) -> tuple[float, float]:
+    """Limits [mm] that show the band and leave the far outliers out."""
+    mine = est.readings.where(est.readings.axis == est.readings.axes.index(axis))
+    known = mine.innovation_sd[np.isfinite(mine.innovation_sd)]
+    limit = 6.0 * float(np.median(known)) * MM if len(known) else 1.0
+    return -limit, limit

@@ -1,0 +1,104 @@
+"""Cartesian logs as the arm's cylindrical axes, and back.
+
+``cylindrical``: radial = r, tangential = R0·(θ − θ0), vertical = z about the base's vertical axis, with R0 and θ0 from
+the start level. ``rotated``: a fixed rotation about z, for small motions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import msgspec
+import numpy as np
+
+from ..arrays import FloatArray
+
+CARTESIAN = ("x", "y", "z")
+Direction = Literal["counterclockwise", "clockwise"]
+
+
+class _Kind(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", forbid_unknown_fields=True):
+    pass
+
+
+class Cylindrical(_Kind, frozen=True, kw_only=True, tag="cylindrical"):
+    """Cylindrical axes about the arm's base.
+
+    Attributes:
+        base: The base's vertical axis in the log's x and y [m].
+        positive: Direction of +tangential seen from above.
+    """
+
+    base: tuple[float, float] = msgspec.field(name="base_mm", default=(0.0, 0.0))
+    positive: Direction = "counterclockwise"
+
+
+class Rotated(_Kind, frozen=True, kw_only=True, tag="rotated"):
+    """Axes at a fixed angle in the log's x and y.
+
+    Attributes:
+        azimuth: Direction of +radial, counterclockwise from x [degrees, as in the file].
+        positive: Direction of +tangential seen from above: to the left of +radial, or to its right.
+    """
+
+    azimuth: float = msgspec.field(name="azimuth_deg")
+    positive: Direction = "counterclockwise"
+
+
+Frame: TypeAlias = Cylindrical | Rotated
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A frame in its place: with R0 and θ0 of a run's start.
+
+    Attributes:
+        frame: The frame.
+        radius: R0 [m]; 1 in a rotated frame, where it has no meaning.
+        angle: θ0, or the azimuth [rad].
+    """
+
+    frame: Frame
+    radius: float
+    angle: float
+
+    @property
+    def _sign(self) -> float:
+        return 1.0 if self.frame.positive == "counterclockwise" else -1.0
+
+    def to_axes(self, x: FloatArray, y: FloatArray, near: FloatArray | None = None) -> tuple[FloatArray, ...]:
+        """Tangential and radial [m] of positions in the log's x and y [m], and how the noise of each is scaled.
+
+        Args:
+            x: (n,).
+            y: (n,).
+            near: Tangential positions [m] near by, (n,), which say how often the arm has gone round; None: the
+                positions follow one another, each less than half a turn from the last.
+
+        Returns:
+            Tangential (n,), radial (n,), and R0/r (n,), by which the noise of a tangential reading is larger.
+        """
+        if isinstance(self.frame, Rotated):
+            along = x * np.cos(self.angle) + y * np.sin(self.angle)
+            across = y * np.cos(self.angle) - x * np.sin(self.angle)
+            return self._sign * across, along, np.ones_like(x)
+        dx, dy = x - self.frame.base[0], y - self.frame.base[1]
+        r, turn = np.hypot(dx, dy), np.arctan2(dy, dx) - self.angle
+        if near is None:
+            known = np.isfinite(turn)
+            turn[known] = np.unwrap(np.concatenate(([0.0], turn[known])))[1:]
+        else:
+            about = self._sign * near / self.radius
+            turn = about + np.remainder(turn - about + np.pi, 2.0 * np.pi) - np.pi
+        with np.errstate(divide="ignore"):
+            return self._sign * self.radius * turn, r, self.radius / r
+
+    def to_log(self, tangential: FloatArray, radial: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The log's x and y [m] of axis positions [m]; the inverse of :meth:`to_axes`."""
+        if isinstance(self.frame, Rotated):
+            across = self._sign * tangential
+            cos, sin = np.cos(self.angle), np.sin(self.angle)
+            return radial * cos - across * sin, radial * sin + across * cos
+        theta = self.angle + self._sign * tangential / self.radius
+        return self.frame.base[0] + radial * np.cos(theta), self.frame.base[1] + radial * np.sin(theta)
