@@ -243,7 +243,7 @@ def test_a_late_stamp_moves_no_other_command(first: int) -> None:
     stamp[first] += 15_000_000
     stamp[first + 1] += 3_000_000
     got, note = regular_grid(stamp, PERIOD, "host")
-    assert note == "host: 1 commands stamped more than half a period late are set back to their ticks"
+    assert note == "host: 1 commands are stamped more than half a period late: set back to their ticks"
     np.testing.assert_allclose(got - truth, 0, atol=1)
 
 
