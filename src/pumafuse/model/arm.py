@@ -14,6 +14,7 @@ from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError, suggestion
 from ..units import MM, refuse_unit
 from .plants import PLANTS, Interval, NotNegative, Positive
+from .presets import PRESETS
 
 CANONICAL_AXES = ("tangential", "radial", "vertical")
 
@@ -114,19 +115,17 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         Raises:
             ConfigError: No such file or preset, or its content is not an arm; names the key and the accepted ones.
         """
-        from .presets import PRESETS
-
-        preset = PRESETS.get(str(source))
+        where, preset = str(source), PRESETS.get(str(source))
         if preset is not None:
-            return msgspec.structs.replace(preset, axes=dict(preset.axes))  # a caller may change its own
-        path = Path(source)
-        if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises on a name that is too long
+            tree = toml.parse(preset, where)
+        elif os.path.exists(source):  # noqa: PTH110 - Path.exists raises on a name that is too long
+            tree = toml.read(Path(source))
+        else:
             raise ConfigError(f"{source}: no such arm file, and not a preset ({', '.join(PRESETS)})")
-        tree = toml.read(path)
         axes = tree.get("axes")
         if isinstance(axes, dict):
-            tree["axes"] = {name: _axis(table, f"{path}", f"axes.{name}") for name, table in axes.items()}  # pyright: ignore
-        return toml.struct(tree, ArmModel, str(path))
+            tree["axes"] = {name: _axis(table, where, f"axes.{name}") for name, table in axes.items()}  # pyright: ignore
+        return toml.struct(tree, ArmModel, where)
 
     def save(self, path: str | Path) -> None:
         """Write ``arm.toml``; reading it back gives the same model, to the last bit."""
