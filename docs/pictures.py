@@ -48,9 +48,11 @@ def rows(est, axis):
     """Positions on the even grid by each method."""
     seen = est.readings.of("vision", axis)
     good = seen.where(seen.outcome == pf.Outcome.FUSED)
-    best = minimize_scalar(
-        lambda log: -constant_velocity(seen.time, seen.value, np.exp(log), est.time)[1], bounds=(-6.0, 3.0), method="bounded"
-    )
+
+    def misfit(log_density):
+        return -constant_velocity(seen.time, seen.value, np.exp(log_density), est.time)[1]
+
+    best = minimize_scalar(misfit, bounds=(-6.0, 3.0), method="bounded")
     held = np.maximum(np.searchsorted(good.time, est.time, side="right") - 1, 0)
     return {
         "last camera reading held": good.value[held],
