@@ -230,7 +230,6 @@ class ReferenceEngine:
         self._innovation = np.full(len(scalars.value), np.nan)
         self._innovation_sd = np.full(len(scalars.value), np.nan)
         self._outcome = scalars.outcome.copy()
-        self._end = timeline.end
 
     def filter(self, progress: Progress | None = None) -> Filtered:
         """Every reading at its valid time, whenever it arrived."""
@@ -239,7 +238,7 @@ class ReferenceEngine:
             if progress is not None and number % 1000 == 0:
                 progress(number / len(self._rows))
         for axis in self._filters:
-            axis.advance(axis.latest(self._end))
+            axis.advance(len(axis.time) - 1)
         return self._filtered(tuple(axis.track(axis.held) for axis in self._filters))
 
     def filter_as_live(self, times: TimeArray, progress: Progress | None = None) -> Filtered:

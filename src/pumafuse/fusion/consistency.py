@@ -16,7 +16,7 @@ from ..units import MM
 from .config import Sensor
 from .estimates import Estimates, Readings
 from .score import Z95
-from .timeline import Outcome
+from .timeline import LONGEST_TAIL_NS, Outcome
 
 LAGS = 20
 _FEW = 30  # scalars below which nothing is said
@@ -117,7 +117,7 @@ def troubles(est: Estimates) -> list[str]:
         if counts.get(Outcome.BEFORE_START.word, 0) > 0.5 * total:
             found.append(f"{name}: most readings lie before the first command: are both stamped by one clock?")
         last = float(np.nanmax(mine.time, initial=-np.inf))
-        if last > est.last_command + 3600.0:
+        if last > est.last_command + LONGEST_TAIL_NS / 1e9:
             found.append(
                 f"{name}: readings go on for {(last - est.last_command) / 3600.0:.1f} hours after the last command: are"
                 " both stamped by one clock?"

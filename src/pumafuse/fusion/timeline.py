@@ -22,6 +22,7 @@ from ..runs.frames import CARTESIAN
 from ..runs.run import Run, Source
 from .config import FusionConfig, Sensor
 
+LONGEST_TAIL_NS = 3_600_000_000_000  # readings this long after the last command no longer belong to the run
 _MOST_ESTIMATES = 100_000_000
 
 
@@ -108,7 +109,8 @@ class Timeline:
         commands: Stamps of the commands, ascending, int64 ns, (n,).
         axes: What drives each axis.
         scalars: The readings.
-        end: The last event that a filter meets, int ns.
+        end: Where an even grid of estimates ends, int ns: with the last command or reading. Readings an hour after the
+            last command are on another clock.
         speed: Highest commanded speed on any axis [m/s].
         notes: Every anomaly once: how many, where first.
     """
@@ -165,8 +167,8 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     silent = [name for name in config.sensor_names(sensors) if name not in run.sensors]
     notes.extend(f"sensor '{name}' of the configuration has no readings in this run" for name in silent)
     scalars = _scalars(run, config, named + others, origin, notes)
-    last = scalars.valid[scalars.candidates].max(initial=origin)
-    end = max(int(last), int(commands[-1]))
+    valid = scalars.valid[scalars.candidates]
+    end = int(valid[valid <= commands[-1] + LONGEST_TAIL_NS].max(initial=commands[-1]))
     speed = max(axis.drive.speed for axis in inputs)
     return Timeline(origin, commands, tuple(inputs), scalars, end, speed, tuple(notes))
 
