@@ -157,6 +157,7 @@ class Reading:
     """One finite scalar, valid at or after the run's first command; ns since that command, SI."""
 
     sensor: str
+    row: int
     valid: int
     stamp: int
     value: float
@@ -204,10 +205,17 @@ class AxisOracle:
 
     Attributes:
         readings: What there is to condition on, in the total order.
+        jumps: Readings just before which the offset jumps by N(0, variance [m²]): what a gate that reopens adds.
     """
 
     def __init__(
-        self, run: Run, config: FusionConfig, axis: str, *, leave_out: Collection[tuple[str, int]] = ()
+        self,
+        run: Run,
+        config: FusionConfig,
+        axis: str,
+        *,
+        leave_out: Collection[tuple[str, int]] = (),
+        reopened: Collection[tuple[str, int]] = (),
     ) -> None:
         """Collect what ``run`` says of ``axis``.
 
@@ -216,12 +224,17 @@ class AxisOracle:
             config: Arm, noise and sensors.
             axis: Which axis.
             leave_out: Readings not to condition on: sensor and row.
+            reopened: Readings that reopened the gate: each adds its ν² to the offset's variance before it is fused.
         """
         self.run, self.config, self.axis = run, config, axis
         self.process, self.response = config.process[axis], Response(config.arm.axes[axis])
         first = run.command.values[axis][np.isfinite(run.command.values[axis])][0]
         self.start = run.start.get(axis, float(first))
         self.readings = self._collect(set(leave_out))
+        self.jumps = dict[int, float]()
+        for k, reading in enumerate(self.readings):
+            if (reading.sensor, reading.row) in reopened:
+                self.jumps[k] = float(self.innovations()[0][k] ** 2)
 
     def innovations(self) -> tuple[np.ndarray, np.ndarray]:
         """ν and √S of each reading, given all before it in the total order."""
@@ -230,6 +243,25 @@ class AxisOracle:
             sd = np.diagonal(L)
             return (sd * w).astype(float), sd.astype(float)
 
+    def undisturbed(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Position [m] and velocity [m/s] at ``times`` [ns since the first command] without noise and offset."""
+        fed = entries(self.run, self.config, self.axis, int(max(times)) + 1)
+        position, velocity = (self._mean(Rows.each(times, *weights), fed) for weights in ((1, 0, 0), (0, 1, 0)))
+        return self.start + position, velocity
+
+    def biases(self) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation [m] of each read sensor's bias, given every reading there is."""
+        found = dict[str, tuple[float, float]]()
+        with localcontext(prec=DIGITS):
+            L, w, _ = self._condition(self.readings, self._readings_as_rows(self.readings))
+            for name in {reading.sensor for reading in self.readings}:
+                prior = Decimal(self.config.sensors[name].bias_sd) ** 2
+                shares = [[prior * (reading.sensor == name) for reading in self.readings]]
+                C = _substituted(np.array(shares), L)[0]
+                if prior:
+                    found[name] = float(_dot(C, w)), float((prior - _dot(C, C)).sqrt())
+        return found
+
     def filtered(self, times: np.ndarray) -> Belief:
         """Given every reading valid at or before each of ``times`` [ns since the first command]."""
         return self._believe(times, self.readings, [reading.valid for reading in self.readings])
@@ -237,6 +269,7 @@ class AxisOracle:
     def as_live(self, times: np.ndarray) -> Belief:
         """Given every reading whose stamp and valid time are at or before each of ``times``."""
         assert not any(self.config.sensors[reading.sensor].latency_sd for reading in self.readings)
+        assert not self.jumps
         arrived = sorted(self.readings, key=lambda reading: max(reading.stamp, reading.valid))
         return self._believe(times, arrived, [max(reading.stamp, reading.valid) for reading in arrived])
 
@@ -254,7 +287,7 @@ class AxisOracle:
                 stamp = int(source.stamp[row]) - origin
                 valid = stamp - round(sensor.latency * 1e9)
                 if np.isfinite(value) and valid >= 0 and (name, row) not in leave_out:
-                    found.append((valid, rank, stamp, row, Reading(name, valid, stamp, float(value))))
+                    found.append((valid, rank, stamp, row, Reading(name, row, valid, stamp, float(value))))
         return [reading for *_, reading in sorted(found)]
 
     def _believe(self, times: np.ndarray, order: Sequence[Reading], known_from: Sequence[int]) -> Belief:
@@ -312,6 +345,11 @@ class AxisOracle:
             for j, other in enumerate(order):
                 if one.sensor == other.sensor:
                     exact_cross[k, j] += bias
+        for k, variance in self.jumps.items():
+            after = np.where(np.arange(len(level)) < n, np.arange(len(level)) >= k, rows.time >= order[k].valid)
+            jumped = level * after
+            exact_cross += Decimal(variance) * np.multiply.outer(jumped, jumped[:n])
+            exact_variance += Decimal(variance) * jumped * jumped
         return _Joint(_decimal(mean), exact_variance, exact_cross)
 
     def _mean(self, rows: Rows, fed: Entries) -> np.ndarray:

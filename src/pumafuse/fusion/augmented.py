@@ -28,8 +28,8 @@ Progress = Callable[[float], None]
 REOPEN_AFTER = 10  # rejections in a row of one sensor …
 REOPEN_SPAN_NS = 500_000_000  # … the first of them at least 0.5 s ago
 
-# H, K (s,), ν and S of an update.
-Update = tuple[FloatArray, FloatArray, float, float]
+# H, K (s,), ν and R of an update, and by how much the offset's variance was widened before it.
+Update = tuple[FloatArray, FloatArray, float, float, float]
 # A state that holds until the next: instant, mean (s,) and covariance (s, s) of plant, offset and biases, and the
 # update that made it, if one did.
 Held = tuple[int, FloatArray, FloatArray, Update | None]
@@ -129,17 +129,15 @@ class AxisFilter:
         """ν = z − H x and S = H P Hᵀ + R."""
         return z - (H @ self.kf.x).item(), (H @ self.kf.P @ H.T).item() + R
 
-    def fuse(self, z: float, H: FloatArray, R: float) -> None:
-        """Joseph-form update with one scalar."""
+    def fuse(self, z: float, H: FloatArray, R: float, widened: float = 0.0) -> None:
+        """Joseph-form update with one scalar, after the offset's variance was ``widened`` [m²]."""
+        if widened:
+            P = self.kf.P.copy()
+            P[self._n, self._n] += widened
+            self.kf.P = P
         self.kf.update(np.array([[z]]), R=np.array([[R]]), H=H)
         kept = self._register
-        self._settle((H[0, :kept], self.kf.K[:kept, 0], float(self.kf.y[0, 0]), float(self.kf.S[0, 0])))
-
-    def widen_offset(self, variance: float) -> None:
-        """Add to the offset's variance [m²]."""
-        P = self.kf.P.copy()
-        P[self._n, self._n] += variance
-        self.kf.P = P
+        self._settle((H[0, :kept], self.kf.K[:kept, 0], float(self.kf.y[0, 0]), R, widened))
 
     def checkpoint(self) -> _AxisPoint:
         """What :meth:`restore` needs to come back to this state."""
@@ -160,7 +158,7 @@ class AxisFilter:
         index, mean, covariance, updates = zip(*held, strict=True)
         at = np.array(index)
         made = [(entry, *update) for entry, update in enumerate(updates) if update is not None]
-        entry, H, K, nu, S = zip(*made, strict=True) if made else ((), (), (), (), ())
+        entry, H, K, nu, R, widened = zip(*made, strict=True) if made else ((), (), (), (), (), ())
         size = self._register
         return Track(
             self.time[at],
@@ -174,7 +172,8 @@ class AxisFilter:
                 np.array(H, dtype=np.float64).reshape(-1, size),
                 np.array(K, dtype=np.float64).reshape(-1, size),
                 np.array(nu, dtype=np.float64),
-                np.array(S, dtype=np.float64),
+                np.array(R, dtype=np.float64),
+                np.array(widened, dtype=np.float64),
             ),
         )
 
@@ -295,14 +294,12 @@ class ReferenceEngine:
         if any(beyond) and not reopens:
             self._streaks[key] = (count + 1, since)
         for scalar, outside, (axis, z, H, R, nu, S) in zip(scalars, beyond, met, strict=True):
-            spread = S
-            if outside and reopens:
-                axis.widen_offset(nu**2)
-                spread = axis.innovation(z, H, R)[1]
+            gated, widened = any(beyond) and not reopens, nu**2 if outside and reopens else 0.0
+            if widened:
                 self._streaks.pop(key, None)
-            gated = any(beyond) and not reopens
             if not gated:
-                axis.fuse(z, H, R)
+                axis.fuse(z, H, R, widened)
+            spread = S if gated else float(axis.kf.S[0, 0])
             self._innovation[scalar], self._innovation_sd[scalar] = nu, np.sqrt(spread)
             self._outcome[scalar] = Outcome.GATED if gated else Outcome.REOPENED if outside else Outcome.FUSED
 
@@ -339,4 +336,5 @@ class ReferenceEngine:
         self._streaks = point[1].copy()
 
     def _filtered(self, tracks: tuple[Track, ...]) -> Filtered:
-        return Filtered(tracks, self._innovation, self._innovation_sd, self._outcome, tuple(self._biases))
+        final = tuple(axis.held[-1][1:3] for axis in self._filters)
+        return Filtered(tracks, self._innovation, self._innovation_sd, self._outcome, tuple(self._biases), final)

@@ -110,7 +110,7 @@ class Estimates:
         axes: Estimates by axis; ``est["radial"]`` is the short way.
         cartesian: With a frame, the estimates in the log's ``x``, ``y`` and ``z`` [m].
         readings: What became of every scalar.
-        biases: By sensor and axis, as all readings together know them.
+        biases: By sensor and axis, as all readings together know them (of the last segment, if the clock jumped).
         reference: The run's reference, where it has one.
         origin: Stamp of the first command, int ns.
         last_command: When the last command was given [s since the first].

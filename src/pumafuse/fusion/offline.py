@@ -20,7 +20,7 @@ from . import timeline as timelines
 from .config import FusionConfig
 from .consistency import troubles
 from .estimates import Bias, Estimates, Mode, Readings, ReferenceTrack
-from .smoother import adjoints, adjoints_at
+from .smoother import hindsight, hindsight_at
 from .timeline import Timeline
 from .track import AxisEstimate, Filtered, estimate
 
@@ -105,8 +105,8 @@ def _fuse_segment(
     for axis, track in zip(timeline.axes, filtered.tracks, strict=True):
         plant = config.arm.axes[axis.name].plant
         entry = np.arange(len(times)) if mode == "as-live" else track.holding(times)
-        adjoint = adjoints_at(track, adjoints(track, plant), times, plant) if mode == "smoothed" else None
-        axes[axis.name] = estimate(track, entry, times, plant, axis.start, adjoint)
+        later = hindsight_at(track, hindsight(track, plant), entry, times, plant) if mode == "smoothed" else None
+        axes[axis.name] = estimate(track, entry, times, plant, axis.start, later)
     origin = timeline.origin
     return Estimates(
         run=run.name,
@@ -141,10 +141,10 @@ def _cartesian(placed: Placed, axes: Mapping[str, AxisEstimate]) -> dict[str, Fl
 def _biases(timeline: Timeline, filtered: Filtered) -> dict[str, dict[str, Bias]]:
     """Each sensor's bias on each axis, as all readings together know it."""
     found: dict[str, dict[str, Bias]] = {}
-    for axis, track, names in zip(timeline.axes, filtered.tracks, filtered.biases, strict=True):
-        for number, name in enumerate(names, track.mean.shape[1] - len(names)):
-            sd = float(np.sqrt(track.covariance[-1, number, number]))
-            found.setdefault(name, {})[axis.name] = Bias(float(track.mean[-1, number]), sd)
+    for axis, (mean, covariance), names in zip(timeline.axes, filtered.final, filtered.biases, strict=True):
+        for number, name in enumerate(names, len(mean) - len(names)):
+            sd = float(np.sqrt(covariance[number, number]))
+            found.setdefault(name, {})[axis.name] = Bias(float(mean[number]), sd)
     return found
 
 

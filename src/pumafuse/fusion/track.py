@@ -6,6 +6,7 @@ An estimate is a side prediction from the last event before it, so asking never 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,14 +24,16 @@ class Updates:
         H: Its observation row, (u, s).
         K: Its Kalman gain, (u, s).
         nu: Its innovation [m], (u,).
-        S: The innovation's variance [m²], (u,).
+        R: Its reading's variance [m²], (u,).
+        widened: By how much a reopened gate widened the offset's variance just before [m²], (u,).
     """
 
     entry: IntArray
     H: FloatArray
     K: FloatArray
     nu: FloatArray
-    S: FloatArray
+    R: FloatArray
+    widened: FloatArray
 
 
 @dataclass(frozen=True)
@@ -63,16 +66,16 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Adjoint:
-    """What all later readings say of a state: smoothed mean = x − P λ, covariance = P − P Λ P.
+class Hindsight:
+    """What all later readings say of states, as information on the deviation from the filter's mean.
 
     Attributes:
-        mean: λ, (k, s).
-        covariance: Λ, (k, s, s).
+        eta: η, (k, s).
+        N: Its matrix, (k, s, s).
     """
 
-    mean: FloatArray
-    covariance: FloatArray
+    eta: FloatArray
+    N: FloatArray
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,7 @@ class Filtered:
         innovation_sd: √S [m], likewise.
         outcome: What became of each scalar, (m,).
         biases: For each axis the names of the sensors whose bias is in its state, in order.
+        final: For each axis mean (s,) and covariance (s, s) after every reading.
     """
 
     tracks: tuple[Track, ...]
@@ -92,6 +96,7 @@ class Filtered:
     innovation_sd: FloatArray
     outcome: CodeArray
     biases: tuple[tuple[str, ...], ...]
+    final: tuple[tuple[FloatArray, FloatArray], ...]
 
 
 @dataclass(frozen=True)
@@ -117,10 +122,43 @@ class AxisEstimate:
     FIELDS = ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd")
 
 
+class Moves(NamedTuple):
+    """Transitions of plant, offset and biases over some intervals, (k, …).
+
+    Attributes:
+        F: (k, s, s), with the constant states' ones.
+        Gamma: (k, n).
+        Q: Of the plant for unit input noise, (k, n, n).
+    """
+
+    F: FloatArray
+    Gamma: FloatArray
+    Q: FloatArray
+
+
+def transitions(plant: Plant, interval: IntArray, size: int) -> tuple[Moves, IntArray]:
+    """Transitions over the distinct ones of ``interval`` [int ns], and which of them each interval is."""
+    distinct, place = np.unique(interval, return_inverse=True)
+    Phi, Gamma, Q = transition(plant, distinct / 1e9)
+    n = Phi.shape[-1]
+    F = np.tile(np.eye(size), (len(distinct), 1, 1))
+    F[:, :n, :n] = Phi
+    return Moves(F, Gamma[..., 0], Q), place
+
+
+def process_noise(track: Track, entry: IntArray, moves: Moves, place: IntArray, interval: IntArray) -> FloatArray:
+    """Covariance that each interval [int ns] after its ``entry`` adds to the state, (k, s, s)."""
+    size, n = moves.F.shape[-1], moves.Q.shape[-1]
+    Q = np.zeros((len(entry), size, size))
+    Q[:, :n, :n] = moves.Q[place] * track.noise[entry][:, None, None]
+    Q[:, n, n] = track.drift[entry] * (interval / 1e9)
+    return Q
+
+
 def estimate(
-    track: Track, entry: IntArray, time: TimeArray, plant: Plant, start: float, adjoint: Adjoint | None = None
+    track: Track, entry: IntArray, time: TimeArray, plant: Plant, start: float, hindsight: Hindsight | None = None
 ) -> AxisEstimate:
-    """Predict from a held state to each ``time``, (n,), and smooth it where an adjoint is given.
+    """Predict from a held state to each ``time``, (n,), and smooth it where hindsight is given.
 
     Args:
         track: The states.
@@ -128,21 +166,21 @@ def estimate(
         time: Int64 ns, none before its state.
         plant: The plant of the axis.
         start: The level u₀ [m] that the states are relative to.
-        adjoint: What later readings say of the state at each time.
+        hindsight: What later readings say of the state at each time.
     """
     A, B, C = plant.state_space()
     n, size = len(A), track.mean.shape[1]
-    interval, place = np.unique(time - track.time[entry], return_inverse=True)
-    F, Gamma, Q1 = extended(plant, interval, size)
-    v, q = track.input[entry], track.noise[entry]
-    x = np.einsum("kij,kj->ki", F[place], track.mean[entry])
-    x[:, :n] += Gamma[place] * v[:, None]
-    P = F[place] @ track.covariance[entry] @ F[place].swapaxes(1, 2)
-    P[:, :n, :n] += Q1[place] * q[:, None, None]
-    P[:, n, n] += track.drift[entry] * (interval[place] / 1e9)
-    if adjoint is not None:
-        x -= np.einsum("kij,kj->ki", P, adjoint.mean)
-        np.subtract(P, P @ adjoint.covariance @ P, out=P)
+    interval, v = time - track.time[entry], track.input[entry]
+    moves, place = transitions(plant, interval, size)
+    F = moves.F[place]
+    x = np.einsum("kij,kj->ki", F, track.mean[entry])
+    x[:, :n] += moves.Gamma[place] * v[:, None]
+    P = F @ track.covariance[entry] @ F.swapaxes(1, 2) + process_noise(track, entry, moves, place, interval)
+    if hindsight is not None:
+        told = np.concatenate((P, P @ hindsight.eta[..., None]), axis=-1)
+        smoothed = np.linalg.solve(np.eye(size) + P @ hindsight.N, told)
+        np.copyto(P, 0.5 * (smoothed[..., :size] + smoothed[..., :size].swapaxes(1, 2)))
+        x += smoothed[..., size]
     position, velocity, offset = np.zeros((3, size))
     position[:n], position[n], velocity[:n], offset[n] = C[0], 1.0, (C @ A)[0], 1.0
     return AxisEstimate(
@@ -153,19 +191,6 @@ def estimate(
         offset=x @ offset,
         offset_sd=_sd(P, offset),
     )
-
-
-def extended(plant: Plant, interval: TimeArray, size: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Transitions of plant, offset and biases over each of ``interval`` [int ns], (k,).
-
-    Returns:
-        F (k, s, s) with the constant states' ones, Γ (k, n) and Q of the plant for unit input noise (k, n, n).
-    """
-    Phi, Gamma, Q = transition(plant, interval / 1e9)
-    n = Phi.shape[-1]
-    F = np.tile(np.eye(size), (len(interval), 1, 1))
-    F[:, :n, :n] = Phi
-    return F, Gamma[..., 0], Q
 
 
 def _sd(P: FloatArray, row: FloatArray) -> FloatArray:

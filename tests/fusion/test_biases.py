@@ -1,0 +1,172 @@
+"""Constant biases of sensors, and latencies that wander."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from scipy.stats import chi2
+
+import pumafuse as pf
+from fusion.test_oracle import CASES, LAG, MS, PANEL, TRACKER, UNDER, Case, Heard, cases, every, one, sensor, told
+from fusion_oracle import AxisOracle
+from pumafuse.errors import PumafuseWarning
+from pumafuse.fusion.config import FusionConfig, Process
+from pumafuse.fusion.offline import fuse
+from pumafuse.model.arm import AxisModel
+from pumafuse.runs.run import Run
+
+# ---- biases ---------------------------------------------------------------------------------------------------------
+
+
+def check(case: Case, *, smooth: bool = False) -> None:
+    """The biases are those of the joint Gaussian: means to 1e-9 sd + 1e-12 m, variances to 1e-9."""
+    run, config = case.made()
+    with told(run, config):
+        estimates = fuse(run, config, rate=case.rate, smooth=smooth)
+    wanted = {axis: AxisOracle(run, config, axis).biases() for axis in estimates.axes}
+    named = {(name, axis) for axis, found in wanted.items() for name in found}
+    assert {(name, axis) for name, of in estimates.biases.items() for axis in of} == named
+    for name, axis in named:
+        bias, (mean, sd) = estimates.biases[name][axis], wanted[axis][name]
+        assert abs(bias.value - mean) < 1e-9 * sd + 1e-12
+        assert bias.sd**2 == pytest.approx(sd**2, rel=1e-9)
+
+
+BIASED = {name: case for name, case in CASES.items() if any(ear.sensor.bias_sd for ear in case.heard.values())} | {
+    "two axes": Case(
+        {"radial": AxisModel(plant=LAG), "vertical": AxisModel(plant=UNDER)}, heard={"panel": PANEL, "tracker": TRACKER}
+    ),
+    "a panel that sees one axis": Case(
+        {"radial": AxisModel(plant=LAG), "vertical": AxisModel(plant=UNDER)},
+        heard={"panel": replace(PANEL, axes=("vertical",)), "tracker": TRACKER},
+    ),
+    "a panel read once": Case(heard={"tracker": TRACKER, "panel": replace(PANEL, valid=np.array([250 * MS]))}),
+    "every scale": Case(
+        heard={
+            str(scale): Heard(sensor(0.3e-3, scale=scale, bias_sd=bias_sd), every(30, 9, 40 * MS))
+            for scale, bias_sd in ((1.0, 0.0), (-1.0, 0.5), (2.5, 1e-3), (-0.2, 0.02))
+        },
+        start={"radial": 0.51},
+    ),
+}
+
+
+@pytest.mark.parametrize("smooth", [False, True], ids=["filtered", "smoothed"])
+@pytest.mark.parametrize("case", BIASED.values(), ids=BIASED.keys())
+def test_biases_are_conditional_means(case: Case, smooth: bool) -> None:
+    """Each sensor that may have one has its bias on each axis it reads, given all readings; smoothed or not."""
+    check(case, smooth=smooth)
+
+
+@settings(derandomize=True, deadline=None, max_examples=60)
+@given(cases())
+def test_any_bias_is_estimated_like_the_conditional_gaussian(case: Case) -> None:
+    """Random plants, noise and sensors, most with a bias: nothing deviates from the joint Gaussian."""
+    heard = {
+        name: replace(ear, sensor=msgspec.structs.replace(ear.sensor, bias_sd=bias_sd, sd=max(ear.sensor.sd, 0.2e-3)))
+        for (name, ear), bias_sd in zip(case.heard.items(), (1.0, 0.05, 0.0), strict=False)
+    }
+    check(replace(case, heard=heard))
+
+
+@pytest.mark.parametrize("level", [-2.0, 0.0, 0.56, 3.0])
+@pytest.mark.parametrize("start", [None, 5e-3])
+def test_a_bias_is_in_the_coordinates_of_the_log(level: float, start: float | None) -> None:
+    """Readings 600.4 mm − p have a bias of 600.4 mm wherever the arm starts, be it said or the first command."""
+    case = Case(heard={"panel": PANEL, "tracker": TRACKER}, start={} if start is None else {"radial": 0.5 + start})
+    run, config = case.made()
+    shift = level - 0.5
+    for name, bias in (("panel", 0.6004), ("tracker", 0.0)):
+        of, values = config.sensors[name], run.sensors[name].values["radial"]
+        values[:] = of.scale * (AxisOracle(run, config, "radial").undisturbed(case.heard[name].valid)[0] + shift) + bias
+    run.command.values["radial"][:] += shift
+    moved = replace(run, start={axis: u + shift for axis, u in run.start.items()})
+    bias = fuse(moved, config).biases["panel"]["radial"]
+    assert abs(bias.value - 0.6004) < 2.0 * bias.sd**2 / 1.0**2  # all that the prior of 0 ± 1 m takes from it, twice
+    assert bias.sd < 0.5e-3
+
+
+def test_a_bias_that_cannot_be_told_from_the_offset_stays_as_uncertain() -> None:
+    """A panel alone: their sum is known to its noise, neither is better known than the other's prior."""
+    case = Case(heard={"panel": PANEL}, process=Process(input_noise=0.0, drift=0.0))
+    estimates = fuse(*case.made())
+    bias = estimates.biases["panel"]["radial"]
+    together = (1.0**-2 + case.offset_sd**-2) ** -0.5  # bias given bias − offset = 0
+    assert bias.sd == pytest.approx(together, rel=1e-3)
+    assert estimates["radial"].offset_sd[-1] == pytest.approx(together, rel=1e-3)
+
+
+def test_the_scans_range_finder_tells_its_bias() -> None:
+    """Camera and range finder: radial RMSE within 0.15 mm, and the bias within 0.1 mm of the 600.4 mm it was given."""
+    data = Path(pf.__file__).parent / "data"
+    run, config = pf.Run.read(data / "scan1"), pf.FusionConfig.load(data / "fusion.toml")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PumafuseWarning)  # the scan's own faults are told elsewhere
+        estimates = pf.fuse(run, config, sensors=["vision", "range"])
+    radial = estimates["radial"]
+    assert estimates.reference is not None
+    found = pf.score(
+        estimates.time, estimates.segment, radial.position, radial.position_sd, estimates.reference, "radial"
+    )
+    assert found is not None
+    assert found.rmse <= 0.15e-3
+    assert list(estimates.biases) == ["range"]
+    assert abs(estimates.biases["range"]["radial"].value - 0.6004) <= 0.1e-3
+
+
+# ---- latencies that wander ------------------------------------------------------------------------------------------
+
+SCALE, JITTER, DRIFT = -1.5, 0.004, 0.3e-3
+
+
+def moving(heard: Heard, process: Process, seed: int = 1) -> tuple[Run, FusionConfig]:
+    """Three seconds of swinging to and fro by 60 mm at up to 0.11 m/s, commands every 10 ms."""
+    times = np.arange(300) * 10 * MS
+    case = Case(
+        one(UNDER), times=times, period=0.01, process=process, offset_sd=1e-3, heard={"tracker": heard}, seed=seed
+    )
+    run, config = case.made()
+    run.command.values["radial"][:] = 0.5 + 0.03 * np.sin(2.0 * np.pi * 0.6e-9 * times)
+    return run, config
+
+
+@pytest.mark.parametrize("at", [75, 300, 1234, 2400, 2990])
+def test_a_readings_variance_grows_with_the_square_of_the_speed(at: int) -> None:
+    """S of a first reading is that of a sure latency and (scale · predicted velocity · latency_sd)²."""
+    spread = []
+    for latency_sd in (0.0, JITTER):
+        of = sensor(0.1e-3, latency=0.02, scale=SCALE, latency_sd=latency_sd)
+        run, config = moving(Heard(of, np.array([at * MS])), Process(input_noise=0.2e-3, drift=0.5e-3))
+        spread.append(fuse(run, config).readings.innovation_sd.item() ** 2)
+    speed = AxisOracle(run, config, "radial").undisturbed(np.array([at * MS]))[1].item()
+    assert spread[1] - spread[0] == pytest.approx((SCALE * speed * JITTER) ** 2, rel=1e-9, abs=1e-18)
+    assert abs(speed) > 1e-3
+
+
+def jittering_nis(latency_sd: float, seed: int) -> np.ndarray:
+    """NIS of 150 readings whose latency really wanders, of an arm whose offset really walks."""
+    rng, valid = np.random.default_rng(seed), every(50, 150)
+    of = sensor(0.1e-3, latency=0.02, scale=SCALE, latency_sd=latency_sd)
+    run, config = moving(Heard(of, valid), Process(input_noise=0.0, drift=DRIFT))
+    actual = np.maximum(valid + np.rint(rng.normal(0.0, JITTER * 1e9, len(valid))).astype(np.int64), 0)
+    order = np.argsort(actual)
+    offset = np.empty(len(valid))
+    step = np.sqrt(np.diff(actual[order], prepend=0) * 1e-9) * DRIFT
+    offset[order] = rng.normal(0.0, config.start.offset_sd) + np.cumsum(step * rng.normal(size=len(valid)))
+    position = AxisOracle(run, config, "radial").undisturbed(actual)[0] + offset
+    run.sensors["tracker"].values["radial"][:] = SCALE * position + rng.normal(0.0, 0.1e-3, len(valid))
+    return fuse(run, config).readings.nis
+
+
+def test_readings_whose_latency_wanders_are_consistent_where_latency_sd_says_so() -> None:
+    """Mean NIS over many runs is 1 within the 99.9 % band of χ²; without latency_sd the errors look far too large."""
+    told_of, untold = (np.concatenate([jittering_nis(sd, seed) for seed in range(25)]) for sd in (JITTER, 0.0))
+    low, high = chi2.ppf([0.0005, 0.9995], len(told_of)) / len(told_of)
+    assert low < told_of.mean() < high
+    assert untold.mean() > 3.0

@@ -1,0 +1,265 @@
+"""Consistency: the statistics against scipy and by hand, the verdicts on data made exactly by the model.
+
+The simulation draws from section 2's model itself: a first-order plant with white noise at its input, an offset on a
+random walk, readings with white noise and a latency. A filter told the truth must then be right; one told a lie must
+say which.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import pumafuse as pf
+from pumafuse.fusion.consistency import (
+    LAGS,
+    Consistency,
+    chi_square_band,
+    consistency,
+    ljung_box,
+    log_likelihood,
+)
+
+PERIOD, DELAY, TAU = 28_000_000, 60_450_000, 0.0425  # ns, ns, s
+FIRST = 40_000_000  # ns, of the first reading
+SEEDS = 120
+
+
+@dataclass(frozen=True)
+class World:
+    """What the simulation does and, field by field replaced, what the filter is told. SI units."""
+
+    input_noise: float = 0.05e-3
+    drift: float = 0.3e-3
+    offset_sd: float = 2e-3
+    sd: float = 0.5e-3
+    latency: float = 0.020
+    gate: float = 0.0
+
+    def config(self, run: pf.Run) -> pf.FusionConfig:
+        plant = pf.AxisModel(plant=pf.FirstOrder(time_constant=TAU))
+        process = pf.Process(input_noise=self.input_noise, drift=self.drift)
+        return pf.FusionConfig(
+            arm=pf.ArmModel(
+                name="simulated", update_period=PERIOD / 1e9, delay=DELAY / 1e9, axes=dict.fromkeys(run.axes, plant)
+            ),
+            start=pf.Start(offset_sd=self.offset_sd),
+            process=dict.fromkeys(run.axes, process),
+            sensors={"camera": pf.Sensor(sd=self.sd, latency=self.latency, gate=self.gate, gate_rows=False)},
+        )
+
+
+def simulated(world: World, command: np.ndarray, every: float, count: int, axes: int, seed: int) -> pf.Run:
+    """A run of ``axes`` independent axes with the same commands [m], and a camera read ``count`` times."""
+    rng = np.random.default_rng(seed)
+    valid = FIRST + np.rint(every * 1e9 * np.arange(count)).astype(np.int64)
+    given = PERIOD * np.arange(len(command))
+    change = dict(zip((given + DELAY).tolist(), command - command[0], strict=True))
+    reading = set(valid.tolist())
+    x, o = np.zeros(axes), world.offset_sd * rng.standard_normal(axes)
+    v, now, z = 0.0, 0, list[np.ndarray]()
+    for instant in sorted(reading | {time for time in change if time <= valid[-1]}):
+        dt = (instant - now) / 1e9
+        decay = math.exp(-dt / TAU)
+        spread = world.input_noise * math.sqrt((1.0 - decay**2) / (2.0 * TAU))
+        x = decay * x + (1.0 - decay) * v + spread * rng.standard_normal(axes)
+        o = o + world.drift * math.sqrt(dt) * rng.standard_normal(axes)
+        now, v = instant, change.get(instant, v)
+        if instant in reading:
+            z.append(command[0] + x + o + world.sd * rng.standard_normal(axes))
+    names = [f"axis{number}" for number in range(axes)]
+    stamps = valid + round(world.latency * 1e9)
+    return pf.Run.from_arrays(
+        given,
+        dict.fromkeys(names, command),
+        {"camera": (stamps, dict(zip(names, np.array(z).T, strict=True)))},
+    )
+
+
+def swing(duration: float, period: float = 2.0) -> np.ndarray:
+    """Commands to and fro over 100 mm."""
+    time = np.arange(0.0, duration, PERIOD / 1e9)
+    return 0.05 * (1.0 - np.cos(2.0 * np.pi * time / period))
+
+
+def judged(run: pf.Run, told: World) -> Mapping[str, Consistency]:
+    """What the filter says of itself on each axis, when told this."""
+    est = pf.fuse(run, told.config(run))
+    return {axis: consistency(est, "camera", axis) for axis in run.axes}
+
+
+@pytest.mark.parametrize("count", [1, 2, 30, 1689, 100_000])
+def test_the_band_is_that_of_chi_square(count: int) -> None:
+    """95 % of the mean of n squared normals lies in it, the rest equally on both sides."""
+    low, high = chi_square_band(count)
+    assert (low, high) == pytest.approx(tuple(stats.chi2.ppf([0.025, 0.975], count) / count), rel=1e-9)
+
+
+def test_ljung_box_by_hand() -> None:
+    """1 … 5: r1 = 4/10, r2 = −1/10, Q = 5·7·(r1²/4 + r2²/3), and chi-square of 2 exceeds it with e^(−Q/2)."""
+    correlation, p = ljung_box(np.arange(1.0, 6.0), 2)
+    assert correlation == pytest.approx([0.4, -0.1])
+    statistic = 35 * (Fraction(4, 10) ** 2 / 4 + Fraction(1, 10) ** 2 / 3)
+    assert p == pytest.approx(math.exp(-float(statistic) / 2.0))
+
+
+@pytest.mark.parametrize(("count", "lags"), [(500, 20), (40, 20), (15, 20), (2, 20), (100, 1)])
+def test_ljung_box_against_loops(count: int, lags: int) -> None:
+    """Autocorrelations and Q summed term by term; a series shorter than the lags has one lag less than values."""
+    values = np.random.default_rng(count).standard_normal(count).cumsum() + 3.0
+    centred = [value - sum(values) / count for value in values]
+    power = sum(c * c for c in centred)
+    wanted = [
+        sum(centred[i] * centred[i + lag] for i in range(count - lag)) / power
+        for lag in range(1, min(lags, count - 1) + 1)
+    ]
+    statistic = count * (count + 2) * sum(r * r / (count - lag) for lag, r in enumerate(wanted, 1))
+    correlation, p = ljung_box(values, lags)
+    assert correlation == pytest.approx(wanted, abs=1e-12)
+    assert p == pytest.approx(stats.chi2.sf(statistic, len(wanted)), rel=1e-6, abs=1e-300)
+
+
+@pytest.mark.parametrize("values", [[0.3], [0.3, 0.3, 0.3]])
+def test_ljung_box_of_what_does_not_vary_accuses_nobody(values: list[float]) -> None:
+    """One value, or equal ones, cannot be told from white: p = 1 and no correlation."""
+    correlation, p = ljung_box(np.array(values))
+    assert not correlation.any()
+    assert p == 1.0
+
+
+def test_log_likelihood_is_the_joint_density_of_the_readings() -> None:
+    """Gates off, it is the log density of all readings in mm as one dense Gaussian: offset walk plus noise."""
+    world = World(input_noise=0.0)
+    run = simulated(world, np.zeros(30), 0.02, 40, 2, 1)
+    est = pf.fuse(run, world.config(run))
+    time = FIRST / 1e9 + 0.02 * np.arange(40)
+    covariance = world.offset_sd**2 + world.drift**2 * np.minimum.outer(time, time) + world.sd**2 * np.eye(40)
+    density = stats.multivariate_normal(np.zeros(40), covariance * 1e6)
+    wanted = sum(density.logpdf(run.sensors["camera"].values[axis] * 1e3) for axis in run.axes)
+    assert log_likelihood(est.readings, est.config.sensors) == pytest.approx(wanted, rel=1e-9)
+
+
+def outlying(world: World, rows: range) -> tuple[pf.Run, np.ndarray]:
+    """A run of one axis with a 50 mm blunder in every one of ``rows``, and which rows are good."""
+    run = simulated(world, swing(6.0), 0.02, 250, 1, 2)
+    run.sensors["camera"].values["axis0"][rows] += 0.05
+    good = np.ones(250, dtype=bool)
+    good[rows] = False
+    return run, good
+
+
+def test_gated_scalars_leave_the_counts() -> None:
+    """With blunders gated, count, NIS, correlation and verdict are those of the run without these rows."""
+    world = World(gate=6.0)
+    run, good = outlying(world, range(10, 250, 20))
+    told = judged(run, world)["axis0"]
+    clean = replace(run, sensors={"camera": run.sensors["camera"].rows(good)})
+    wanted = judged(clean, world)["axis0"]
+    assert told.count == wanted.count == good.sum()
+    assert (told.nis, told.whiteness) == pytest.approx((wanted.nis, wanted.whiteness), rel=1e-9)
+    assert told.correlation == pytest.approx(wanted.correlation, abs=1e-9)
+    assert told.verdict == wanted.verdict
+
+
+def test_a_gated_scalar_costs_as_much_as_one_at_the_gate() -> None:
+    """−½(ln 2πS + gate²) for each gated scalar, −½(ln 2πS + ν²/S) for each other: normal densities in mm."""
+    world = World(gate=6.0)
+    run, good = outlying(world, range(10, 250, 20))
+    est = pf.fuse(run, world.config(run))
+    met, sd = est.readings, est.readings.innovation_sd * 1e3
+    at = np.where(good, met.innovation * 1e3, 6.0 * sd)
+    assert log_likelihood(met, est.config.sensors) == pytest.approx(stats.norm.logpdf(at, 0.0, sd).sum(), rel=1e-9)
+
+
+def test_what_is_judged_are_the_normalised_innovations() -> None:
+    """NIS is the mean of (ν/√S)², and the correlations are those of ν/√S with its sign."""
+    world = World()
+    run = simulated(world, swing(3.0), 0.02, 100, 1, 6)
+    est = pf.fuse(run, world.config(run))
+    found = consistency(est, "camera", "axis0")
+    normalised = est.readings.innovation / est.readings.innovation_sd
+    assert found.nis == pytest.approx(np.mean(normalised**2))
+    centred = normalised - normalised.mean()
+    assert found.correlation[:2] == pytest.approx(
+        [centred[lag:] @ centred[:-lag] / (centred @ centred) for lag in (1, 2)]
+    )
+
+
+@pytest.fixture(scope="module")
+def matched() -> Mapping[str, Consistency]:
+    """What a filter that is told the truth says of itself, once for each of 120 seeds."""
+    world = World()
+    return judged(simulated(world, swing(5.0), 0.015, 300, SEEDS, 3), world)
+
+
+def test_the_nis_of_a_right_filter_lies_in_its_band(matched: Mapping[str, Consistency]) -> None:
+    """In 95 % of the seeds, and its mean over all of them is 1 within 3 standard errors."""
+    inside = sum(found.nis_band[0] <= found.nis <= found.nis_band[1] for found in matched.values())
+    assert stats.binom.cdf(inside, SEEDS, 0.95) > 0.005
+    assert stats.binom.sf(inside - 1, SEEDS, 0.95) > 0.005
+    counts = {found.count for found in matched.values()}
+    assert counts == {300}
+    assert np.mean([found.nis for found in matched.values()]) == pytest.approx(1.0, abs=3 * math.sqrt(2 / 300 / SEEDS))
+
+
+def test_the_innovations_of_a_right_filter_are_white(matched: Mapping[str, Consistency]) -> None:
+    """Ljung-Box p > 0.01 in 99 % of the seeds and p evenly spread; 95 % of the correlations lie in their band."""
+    p = np.array([found.whiteness for found in matched.values()])
+    assert stats.binom.sf(int((p <= 0.01).sum()) - 1, SEEDS, 0.01) > 0.005
+    assert stats.kstest(p, "uniform").pvalue > 0.005
+    within = [np.abs(found.correlation) <= found.correlation_band for found in matched.values()]
+    assert np.mean(within) == pytest.approx(0.95, abs=0.015)
+    assert all(len(found.correlation) == LAGS for found in matched.values())
+
+
+def test_a_right_filter_is_called_consistent(matched: Mapping[str, Consistency]) -> None:
+    """In at least nine seeds of ten; nobody is told of latency or colour who has none."""
+    verdicts = [found.verdict for found in matched.values()]
+    assert sum(verdict.endswith(": consistent") for verdict in verdicts) >= 0.9 * SEEDS
+    assert not any("latency_ms" in verdict for verdict in verdicts)
+
+
+@pytest.fixture(scope="module")
+def moving() -> pf.Run:
+    """Six axes on the move, seen at 30 Hz for 18 s."""
+    return simulated(World(), swing(19.0), 0.033, 540, 6, 4)
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        (World(sd=1.0e-3), ": sd_mm or the process noise too large"),
+        (World(latency=-0.010), "latency_ms too small by"),
+        (World(latency=0.050), "latency_ms too large by"),
+        (World(input_noise=0.0, drift=0.0), "the process noise too small"),
+        (World(input_noise=0.05e-5, drift=0.3e-5), "the process noise too small"),
+        (World(input_noise=1e-3, drift=6e-3), "the process noise too large"),
+    ],
+)
+def test_verdicts_name_the_key_that_is_wrong(moving: pf.Run, told: World, said: str) -> None:
+    """Double the noise, 30 ms too early and too late, no process noise or far too much: on every axis."""
+    for axis, found in judged(moving, told).items():
+        assert said in found.verdict, (axis, found.verdict)
+
+
+@pytest.mark.parametrize(("count", "told"), [(29, True), (30, False)])
+def test_few_readings_are_not_judged(count: int, told: bool) -> None:
+    """Below 30 the verdict is that there are too few, and how many."""
+    world = World()
+    found = judged(simulated(world, swing(2.0), 0.033, count, 1, 5), world)["axis0"]
+    assert (found.verdict == f"too few readings ({count}) to tell") == told
+    assert found.count == count
+
+
+def test_nothing_fused_is_nothing_judged() -> None:
+    """Only values that are not finite: no numbers, and no division by nothing."""
+    run = pf.Run.from_arrays([0.0, 0.028], {"axis0": [0.0, 0.0]}, {"camera": ([0.03, 0.04], {"axis0": [np.nan] * 2})})
+    with pytest.warns(pf.PumafuseWarning, match="invalid"):
+        est = pf.fuse(run, World().config(run))
+    assert consistency(est, "camera", "axis0") is None

@@ -1,0 +1,185 @@
+"""Fusion of logs in x, y, z: the shipped scan written in them, circles, and the way back to x, y, z."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import pumafuse as pf
+from pumafuse.fusion import results
+from pumafuse.fusion.summary import summarise
+from pumafuse.runs.frames import Cylindrical, Rotated
+
+DATA = Path(pf.__file__).parent / "data"
+CARTESIAN = {"tangential": "x", "radial": "y", "vertical": "z"}
+ROTATED = 'kind = "rotated"\nazimuth_deg = 90.0\npositive = "clockwise"\n'
+CYLINDRICAL = 'kind = "cylindrical"\npositive = "clockwise"\n'
+
+
+def scan_in_xyz(folder: Path, frame: str) -> pf.Run:
+    """The shipped scan with a manifest that names x, y and z; the range sensor still names the axis it looks along."""
+    text = (DATA / "scan1" / "run.toml").read_text()
+    for axis, letter in CARTESIAN.items():
+        for column in (f'["nominal_{letter}_mm"', f'"{letter}_mm"'):
+            text = text.replace(f"{axis} = {column}", f"{letter} = {column}")
+    assert text.count("\nx = ") == text.count("\ny = ") == text.count("\nz = ") == 4
+    assert 'radial = "range_mm"' in text
+    text = text.replace('file = "', f'file = "{(DATA / "scan1").as_posix()}/')
+    (folder / "run.toml").write_text(f"{text}\n[frame]\n{frame}")
+    return pf.Run.read(folder)
+
+
+@pytest.fixture(scope="module")
+def config() -> pf.FusionConfig:
+    return pf.FusionConfig.load(DATA / "fusion.toml")
+
+
+@pytest.fixture(scope="module")
+def by_axes(config: pf.FusionConfig) -> pf.Estimates:
+    """The scan as shipped, x taken for tangential and y for radial."""
+    return pf.fuse(pf.Run.read(DATA / "scan1"), config, sensors=["vision", "range"])
+
+
+@pytest.fixture(scope="module")
+def cylindrical(config: pf.FusionConfig, tmp_path_factory: pytest.TempPathFactory) -> pf.Estimates:
+    """The scan about its base; the range sensor looks along y, which is no axis then."""
+    return pf.fuse(scan_in_xyz(tmp_path_factory.mktemp("scan"), CYLINDRICAL), config, sensors=["vision"])
+
+
+def rmse(est: pf.Estimates, estimate: np.ndarray, truth: np.ndarray) -> float:
+    """Root mean square error [mm] at the estimates' times against a dense truth."""
+    time = est.reference.time
+    inside = (est.time >= time[0]) & (est.time <= time[-1])
+    return 1e3 * float(np.sqrt(np.mean((estimate - np.interp(est.time, time, truth))[inside] ** 2)))
+
+
+def test_the_scan_in_a_rotated_frame_is_the_scan(
+    config: pf.FusionConfig, by_axes: pf.Estimates, tmp_path: Path
+) -> None:
+    """At azimuth 90°, clockwise, every estimate and outcome is that of the axes, and x, y, z are the axes."""
+    est = pf.fuse(scan_in_xyz(tmp_path, ROTATED), config, sensors=["vision", "range"])
+    assert by_axes.cartesian is None
+    assert est.readings.outcome.tolist() == by_axes.readings.outcome.tolist()
+    for axis, letter in CARTESIAN.items():
+        for field in pf.AxisEstimate.FIELDS:
+            np.testing.assert_allclose(
+                getattr(est[axis], field), getattr(by_axes[axis], field), rtol=0, atol=1e-9, err_msg=field
+            )
+        np.testing.assert_allclose(est.cartesian[letter], est[axis].position, rtol=0, atol=1e-15)
+    assert summarise(est).validity.commanded_radius_mm == "not checked"
+
+
+def test_the_scan_in_a_cylindrical_frame_is_fused_as_well(
+    config: pf.FusionConfig, cylindrical: pf.Estimates, by_axes: pf.Estimates
+) -> None:
+    """With the camera alone the error in x, y and z is within 10 % of the axis-wise fusion's."""
+    axis_wise = pf.fuse(pf.Run.read(DATA / "scan1"), config, sensors=["vision"])
+    truth = by_axes.reference.position
+    for axis, letter in CARTESIAN.items():
+        wanted = rmse(axis_wise, axis_wise[axis].position, truth[axis])
+        assert rmse(cylindrical, cylindrical.cartesian[letter], truth[axis]) == pytest.approx(wanted, rel=0.1), letter
+
+
+def test_a_framed_reference_scores_the_axes(cylindrical: pf.Estimates, by_axes: pf.Estimates) -> None:
+    """The reference turns with the run: its radius and arc are those of its x and y, and every axis is scored."""
+    x, y = (by_axes.reference.position[axis] for axis in ("tangential", "radial"))
+    radius, azimuth = np.hypot(-150.0, 560.0) / 1e3, np.arctan2(560.0, -150.0)
+    found = cylindrical.reference.position
+    np.testing.assert_allclose(found["radial"], np.hypot(x, y), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found["tangential"], radius * (azimuth - np.arctan2(y, x)), rtol=0, atol=1e-12)
+    scores = {axis: summary.score for axis, summary in summarise(cylindrical).axes.items()}
+    assert scores["tangential"].rmse_mm < 0.4
+    assert scores["radial"].rmse_mm < 0.25
+    assert min(score.coverage for score in scores.values()) > 0.9
+
+
+def test_the_result_folder_holds_x_y_z(cylindrical: pf.Estimates, tmp_path: Path) -> None:
+    """estimates.parquet ends in x_mm, y_mm, z_mm, which are the axes laid out about the base by plain trigonometry."""
+    results.write(cylindrical, tmp_path / "out", force=False)
+    table = pq.read_table(tmp_path / "out" / "estimates.parquet")
+    assert table.column_names[-3:] == ["x_mm", "y_mm", "z_mm"]
+    column = {name: table[name].to_numpy() for name in table.column_names}
+    turn = np.arctan2(560.0, -150.0) - column["tangential.position_mm"] / np.hypot(150.0, 560.0)
+    np.testing.assert_allclose(column["x_mm"], column["radial.position_mm"] * np.cos(turn), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(column["y_mm"], column["radial.position_mm"] * np.sin(turn), rtol=0, atol=1e-9)
+    assert column["z_mm"].tolist() == column["vertical.position_mm"].tolist()
+
+
+def circle(radius: float, count: int = 100) -> pf.Run:
+    """Commands round a base at (0.1, −0.2) by 1.5 rad, at a height that rises."""
+    angle = np.linspace(0.5, 2.0, count)
+    values = {"x": 0.1 + radius * np.cos(angle), "y": -0.2 + radius * np.sin(angle), "z": np.linspace(0.0, 0.1, count)}
+    return pf.Run.from_arrays(0.028 * np.arange(count), values)
+
+
+def about_the_base(positive: str = "counterclockwise") -> pf.FusionConfig:
+    return pf.FusionConfig(
+        arm=pf.ArmModel.load("puma560-internal"), frame=Cylindrical(base=(0.1, -0.2), positive=positive)
+    )
+
+
+@pytest.mark.parametrize("positive", ["counterclockwise", "clockwise"])
+def test_a_commanded_circle_stays_a_circle(positive: str) -> None:
+    """Its lag lies along the circle, not across it: the tool trails the command at the command's own radius."""
+    run = circle(0.4)
+    est = pf.fuse(run, about_the_base(positive))
+    dx, dy = est.cartesian["x"] - 0.1, est.cartesian["y"] + 0.2
+    np.testing.assert_allclose(np.hypot(dx, dy), 0.4, rtol=0, atol=1e-12)
+    behind = np.linspace(0.5, 2.0, 100) - np.arctan2(dy, dx)
+    rate = 1.5 / 99 / 0.028
+    assert behind[0] == pytest.approx(0.0, abs=1e-12)
+    assert 0.06045 * rate < behind[50] < 0.15 * rate
+
+
+@pytest.mark.parametrize("how", [{"smooth": True}, {"as_live": True}, {"rate": 50.0}])
+def test_every_kind_of_estimate_has_its_x_y_z(how: dict[str, bool | float]) -> None:
+    """Smoothed, as live or on a grid: x, y and z lie at radius and height of the axes, one for each estimate."""
+    run = circle(0.4)
+    est = pf.fuse(run, about_the_base(), **how)
+    assert all(len(est.cartesian[letter]) == len(est.time) for letter in "xyz")
+    radius = np.hypot(est.cartesian["x"] - 0.1, est.cartesian["y"] + 0.2)
+    np.testing.assert_allclose(radius, est["radial"].position, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(est.cartesian["z"], est["vertical"].position)
+
+
+def test_commands_beyond_the_arm_s_radius_are_told_once(recwarn: pytest.WarningsRecorder) -> None:
+    """720 mm from the base where the model holds to 700: one sentence that says both and the 20 mm between."""
+    est = pf.fuse(circle(0.72), about_the_base())
+    said = [str(warning.message) for warning in recwarn]
+    assert said == [
+        "run 'run': commands reach 720.0 mm from the base axis, 20.0 mm beyond the 700 mm that the arm model is valid"
+        " for"
+    ]
+    validity = summarise(est).validity
+    assert (validity.max_radius_mm, validity.commanded_radius_mm) == pytest.approx((700.0, 720.0))
+
+
+@pytest.mark.parametrize(("reach", "said"), [(0.701, ["701.0 mm"]), (0.699, [])])
+def test_the_radius_is_the_largest_of_the_run_and_not_that_of_its_start(
+    reach: float, said: list[str], recwarn: pytest.WarningsRecorder
+) -> None:
+    """A stroke outward from 500 to 701 mm is told although it starts well inside; up to 699 mm nothing is."""
+    values = {"x": 0.1 + np.linspace(0.5, reach, 60), "y": np.full(60, -0.2), "z": np.zeros(60)}
+    est = pf.fuse(pf.Run.from_arrays(0.028 * np.arange(60), values), about_the_base())
+    assert est.radius == pytest.approx(reach)
+    assert [str(warning.message).split(" reach ")[1][:8] for warning in recwarn] == said
+
+
+def test_a_run_that_names_axes_has_no_radius_to_check() -> None:
+    """Without a frame radial may be counted from anywhere: 'not checked', however large."""
+    run = pf.Run.from_arrays(0.028 * np.arange(2), {"radial": [0.9, 0.9]})
+    est = pf.fuse(run, pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal")))
+    assert summarise(est).validity.commanded_radius_mm == "not checked"
+
+
+@pytest.mark.parametrize(
+    "frame", [Cylindrical(base=(0.1, -0.2), positive="clockwise"), Rotated(azimuth=33.3, positive="clockwise"), None]
+)
+def test_the_configuration_as_used_keeps_the_frame(frame: Cylindrical | Rotated | None, tmp_path: Path) -> None:
+    """fusion.toml of a result folder is read back with the frame that it had, to the last bit."""
+    config = pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal"), frame=frame)
+    config.save(tmp_path)
+    assert pf.FusionConfig.load(tmp_path / "fusion.toml").frame == frame
