@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, TypeVar, cast, get_args, get_origin
+from typing import Any, Literal, TypeVar, cast, get_args, get_origin
 
 import msgspec
 import tomli_w
@@ -124,6 +124,9 @@ def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
             yield from _problems(tree, tagged[name], path)
         else:
             yield f"{path}.{tag}: unknown {tag} '{name}'; {suggestion(name, tagged)}"
+    elif get_origin(kind) is Literal and tree not in get_args(kind):
+        given = str(cast(Any, tree))
+        yield f"{path}: unknown value '{given}'; {suggestion(given, get_args(kind))}"
     elif get_origin(kind) is dict and isinstance(tree, Mapping):
         for key, value in tree.items():  # pyright: ignore[reportUnknownVariableType]
             yield from _problems(value, get_args(kind)[1], f"{prefix}{key}")

@@ -133,7 +133,9 @@ def test_an_existing_folder_is_replaced_only_with_force(demo: Path) -> None:
 def test_force_never_replaces_a_folder_that_holds_something_else(tmp_path: Path) -> None:
     """A folder of somebody's files is not a result."""
     (tmp_path / "thesis.tex").write_text("…")
-    assert "holds no results" in refused("fuse", SCAN, "-c", FUSION, "-o", tmp_path, "--force")
+    assert "holds 'thesis.tex'" in refused("fuse", SCAN, "-c", FUSION, "-o", tmp_path, "--force")
+    (tmp_path / "summary.json").write_text("{}")
+    assert "holds 'thesis.tex'" in refused("fuse", SCAN, "-c", FUSION, "-o", tmp_path, "--force")
     assert (tmp_path / "thesis.tex").exists()
 
 
@@ -230,3 +232,40 @@ def test_a_real_servo_is_followed_between_rare_readings(name: str, limit: float,
     )
     pumafuse("fuse", servo(name), "-c", tmp_path / "fusion.toml", "-o", tmp_path / "out", "--rate", 200)
     assert scores([tmp_path / "out"])[0]["tip"]["rmse_mm"] <= limit
+
+
+def test_a_result_that_cannot_be_swapped_in_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the last rename fails, what stood there before stands there still."""
+    from pumafuse.fusion import results
+
+    new, old = tmp_path / "new", tmp_path / "result"
+    for folder in (new, old):
+        folder.mkdir()
+        (folder / "summary.json").write_text(folder.name)
+    rename = Path.replace
+
+    def broken(self: Path, target: Path) -> Path:
+        if self == new:
+            raise OSError("disk gone")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "replace", broken)
+    with pytest.raises(OSError, match="disk gone"):
+        results._swap(new, old, tmp_path / "aside")
+    assert (old / "summary.json").read_text() == "result"
+
+
+def test_folders_of_runs_that_share_a_name_do_not_meet(tmp_path: Path) -> None:
+    """`a/scan`, `b/scan` and `scan_2` get a folder each, and dots in a folder's name stay."""
+    from pumafuse.cli.fuse import _folders
+
+    runs = [tmp_path / name for name in ("scan_2", "a/scan", "b/scan", "scan_0.5mm", "scan_0.8mm")]
+    for run in runs:
+        run.mkdir(parents=True)
+    assert [folder.name for folder in _folders(runs, tmp_path)] == [
+        "scan_2",
+        "scan",
+        "scan_3",
+        "scan_0.5mm",
+        "scan_0.8mm",
+    ]

@@ -235,8 +235,8 @@ def moving() -> pf.Run:
     ("told", "said"),
     [
         (World(sd=1.0e-3), ": sd_mm or the process noise too large"),
-        (World(latency=-0.010), "latency_ms too small by"),
-        (World(latency=0.050), "latency_ms too large by"),
+        (World(latency=-0.010), "latency_ms is wrong"),
+        (World(latency=0.050), "latency_ms is wrong"),
         (World(input_noise=0.0, drift=0.0), "the process noise too small"),
         (World(input_noise=0.05e-5, drift=0.3e-5), "the process noise too small"),
         (World(input_noise=1e-3, drift=6e-3), "the process noise too large"),
@@ -263,3 +263,13 @@ def test_nothing_fused_is_nothing_judged() -> None:
     with pytest.warns(pf.PumafuseWarning, match="invalid"):
         est = pf.fuse(run, World().config(run))
     assert consistency(est, "camera", "axis0") is None
+
+
+def test_half_the_noise_blames_sd_first():
+    """Each innovation pulls against the last: that is sd_mm, and not the process noise."""
+    world = World(sd=0.3e-3, drift=0.5e-3)
+    run = simulated(world, swing(11.0), 0.01, 1000, 6, 3)
+    for found in judged(run, replace(world, sd=0.15e-3)).values():
+        assert found.correlation[0] < 0.0
+        assert "the process noise too small" not in found.verdict
+        assert "sd_mm" in found.verdict

@@ -9,6 +9,7 @@ import msgspec
 
 from ..errors import RunError
 from ..fusion import results
+from ..fusion.config import FusionConfig
 from ..fusion.summary import ScoreSummary, score_summary
 from .tables import console, score_table
 
@@ -31,7 +32,10 @@ def run(folders: Sequence[Path], reference: Path | None, json: bool) -> None:
     compared: list[Compared] = []
     for folder in folders:
         result = results.read(folder)
-        truth = result.reference if reference is None else results.read_reference(reference, result.summary.origin_ns)
+        truth = result.reference
+        if reference is not None:
+            frame = FusionConfig.load(folder / "fusion.toml").frame
+            truth = results.read_reference(reference, result.summary.origin_ns, frame)
         if truth is None:
             raise RunError(f"{folder}: the run had no reference; give one with --reference")
         scores = {axis: score_summary(score) for axis, score in result.scores(truth).items()}

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import PumafuseError
@@ -63,15 +64,15 @@ def show(summary: Summary, folder: Path) -> None:
     """Print what a person wants to know of a fusion."""
     out = console()
     out.print(
-        f"[bold]{summary.run}[/bold]: {summary.estimates} estimates over {summary.duration_s:.1f} s, {summary.mode},"
-        f" arm {summary.arm}"
+        f"[bold]{escape(summary.run)}[/bold]: {summary.estimates} estimates over {summary.duration_s:.1f} s,"
+        f" {summary.mode}, arm {escape(summary.arm)}"
     )
     if any(axis.sensors for axis in summary.axes.values()):
         out.print(outcome_table(summary))
     scores = {axis: part.score for axis, part in summary.axes.items() if part.score is not None}
     if scores:
         out.print(score_table([(summary.run, scores)]))
-    out.print(f"written to {folder}", soft_wrap=True)
+    out.print(f"written to {folder}", soft_wrap=True, markup=False)
 
 
 def draw(est: Estimates, recorded: Run, folder: Path) -> None:
@@ -120,10 +121,19 @@ def _folders(runs: Sequence[Path], output: Path) -> list[Path]:
     names: list[str] = []
     for path in runs:
         resolved = path.resolve()
-        name = resolved.parent.name if resolved.name == "run.toml" else resolved.name.split(".")[0]
-        taken = sum(name == other.rpartition("_")[0] or name == other for other in names)
-        names.append(f"{name}_{taken + 1}" if taken else name)
+        plain = resolved.parent.name if resolved.name == "run.toml" else resolved.name
+        plain = plain if resolved.is_dir() else _without_endings(plain)
+        name, number = plain or "run", 2
+        while name in names:
+            name, number = f"{plain}_{number}", number + 1
+        names.append(name)
     return [output / name for name in names]
+
+
+def _without_endings(name: str) -> str:
+    for ending in (".gz", ".csv", ".parquet"):
+        name = name.removesuffix(ending)
+    return name
 
 
 @contextmanager

@@ -76,7 +76,7 @@ def fuse(
     options = command.Options(
         config=config,
         output=output,
-        sensors=None if sensors is None else [name.strip() for name in sensors.split(",") if name.strip()],
+        sensors=None if sensors is None else _names(sensors),
         rate=_positive(rate, "--rate"),
         smooth=smooth,
         as_live=as_live,
@@ -145,6 +145,13 @@ def main() -> None:
 def _one_line(message: Warning | str, category: type[Warning], *_: object) -> None:
     name = "warning" if issubclass(category, PumafuseWarning) else category.__name__
     typer.echo(f"{name}: {message}", err=True)
+
+
+def _names(listed: str) -> list[str]:
+    names = [name.strip() for name in listed.split(",") if name.strip()]
+    if not names:
+        raise typer.BadParameter("names no sensor", param_hint="--sensors")
+    return names
 
 
 def _positive(value: float | None, name: str) -> float | None:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from ..fusion.score import Z95
@@ -37,7 +38,7 @@ def outcome_table(summary: Summary) -> Table:
             counts = [str(sensor.outcomes.get(word, 0)) for word in words]
             spread = [_mm(sensor.innovation_rms_mm), _mm(sensor.innovation_sd_mm)]
             bias = [_interval(sensor.bias_mm, sensor.bias_sd_mm)] if biased else []
-            table.add_row(axis, name, *counts, *spread, *bias, sensor.verdict)
+            table.add_row(escape(axis), escape(name), *counts, *spread, *bias, sensor.verdict)
     return table
 
 
@@ -51,12 +52,12 @@ def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Ta
     for name, scores in results:
         for axis, score in scores.items():
             table.add_row(
-                name,
-                axis,
+                escape(name),
+                escape(axis),
                 _mm(score.rmse_mm),
                 f"{score.bias_mm:+.3f}",
                 f"{score.coverage:.1%}",
-                f"{score.nees_mean:.2f}",
+                "–" if score.nees_mean is None else f"{score.nees_mean:.2f}",
                 str(score.rows),
                 str(score.left_out),
             )

@@ -109,9 +109,10 @@ def troubles(est: Estimates) -> list[str]:
         total, counts = len(mine.outcome), mine.counts()
         if not total:
             continue
-        if counts.get(Outcome.REOPENED.word, 0):
+        reopened = len(np.unique(mine.time[mine.outcome == Outcome.REOPENED]))
+        if reopened:
             found.append(
-                f"{name}: its gate reopened {counts[Outcome.REOPENED.word]} times after half a second of rejections: it"
+                f"{name}: its gate reopened {reopened} times after half a second of rejections: it"
                 " contradicts the others or the model; if it is off by a constant, give it bias_sd_mm"
             )
         if counts.get(Outcome.BEFORE_START.word, 0) > 0.5 * total:
@@ -122,6 +123,8 @@ def troubles(est: Estimates) -> list[str]:
                 f"{name}: readings go on for {(last - est.last_command) / 3600.0:.1f} hours after the last command: are"
                 " both stamped by one clock?"
             )
+        elif float(np.mean(mine.time > est.last_command + 1.0)) > 0.5:
+            found.append(f"{name}: most readings lie after the last command: are both stamped by one clock?")
         if counts.get(Outcome.GATED.word, 0) > 0.1 * total:
             share = counts[Outcome.GATED.word] / total
             found.append(
@@ -137,12 +140,12 @@ def _frozen(est: Estimates, sensor: str) -> list[str]:
     for axis in est.readings.axes:
         values = est.readings.of(sensor, axis).value
         values = values[np.isfinite(values)]
-        if len(values) < _FROZEN or len(np.unique(values)) < 0.1 * len(values):
-            continue  # coarse steps repeat without being frozen
+        if len(values) < _FROZEN:
+            continue
         edges = np.flatnonzero(np.concatenate(([True], np.diff(values) != 0.0, [True])))
-        longest = int(np.diff(edges).max())
-        if longest >= _FROZEN:
-            found.append(f"{sensor}: {longest} {axis} readings in a row have the same value: it froze")
+        repeats = np.diff(edges)
+        if repeats.max() >= _FROZEN * float(np.median(repeats)):  # coarse steps repeat without being frozen
+            found.append(f"{sensor}: {repeats.max()} {axis} readings in a row have the same value: it froze")
     return found
 
 
@@ -158,32 +161,33 @@ def _verdict(
     if len(fused.value) < _FEW:
         return f"too few readings ({len(fused.value)}) to tell"
     said = f"NIS {nis:.2f}, expected {band[0]:.2f} to {band[1]:.2f}"
-    coloured = whiteness < 0.01 and abs(float(correlation[0])) > _NOTABLE
-    late = _lateness(est, axis, fused)
-    moving = late is not None and coloured
+    first = float(correlation[0])
+    coloured = whiteness < 0.01 and abs(first) > _NOTABLE
     if nis > band[1]:
-        if moving and late is not None:
-            way = "small" if late > 0.0 else "large"
-            return f"{said}: errors follow the speed: latency_ms too {way} by {abs(late) * MM:.0f} ms or more"
+        if coloured and _follows_velocity(est, axis, fused):
+            return f"{said}, innovations follow the velocity: latency_ms is wrong"
+        if coloured and first > 0.0:
+            return f"{said}, one innovation like the next: the process noise too small, or latency_ms wrong"
         if coloured:
-            return f"{said}, one innovation like the next: the process noise too small, or sd_mm"
-        return f"{said}: sd_mm or latency_sd_ms too small"
+            return f"{said}, one innovation against the next: sd_mm too small"
+        return f"{said}: sd_mm or the process noise too small"
     if nis < band[0]:
-        return f"{said}: sd_mm or the process noise too large" + (", innovations not white" if coloured else "")
+        if coloured and first < 0.0:
+            return f"{said}, one innovation against the next: the process noise too large"
+        return f"{said}: sd_mm or the process noise too large"
     if coloured:
-        return f"{said}: consistent in size, but one innovation is like the next (lag 1: {correlation[0]:+.2f})"
+        return f"{said}: consistent in size, but not white (lag 1: {first:+.2f})"
     return f"{said}: consistent"
 
 
-def _lateness(est: Estimates, axis: str, fused: Readings) -> float | None:
-    """How much later than ``latency_ms`` says the readings are [s], where their innovations follow the velocity.
+def _follows_velocity(est: Estimates, axis: str, fused: Readings) -> bool:
+    """Whether innovations go with the velocity, as those of a reading with the wrong valid time do.
 
-    The filter takes most of a latency's error into its offset, so this is a lower bound and only its sign is sure.
+    Which way the latency is wrong they do not tell: the offset takes up most of the error, and what is left of an
+    accurate sensor's follows the acceleration.
     """
-    sensor = est.config.sensors[fused.sensors[int(fused.sensor[0])]]
-    velocity = sensor.scale * np.interp(fused.time, est.time, est[axis].velocity)
-    power = float(velocity @ velocity)
-    if power == 0.0:
-        return None
-    share = float(fused.innovation @ velocity) / np.sqrt(power * float(fused.innovation @ fused.innovation))
-    return -float(fused.innovation @ velocity) / power if abs(share) > 0.3 else None
+    inside = (fused.time >= est.time[0]) & (fused.time <= est.time[-1])
+    innovation = fused.innovation[inside]
+    velocity = np.interp(fused.time[inside], est.time, est[axis].velocity)
+    power = float(velocity @ velocity) * float(innovation @ innovation)
+    return power > 0.0 and abs(float(innovation @ velocity)) > 0.3 * float(np.sqrt(power))

@@ -90,13 +90,13 @@ class ReferenceTrack:
     Attributes:
         time: [s since the first command], ascending, (k,).
         position: For each axis [m], NaN where it has none, (k,).
-        sd: Standard deviation of its own noise [m].
+        sd: Standard deviation of its own noise on each axis [m], (k,).
         segment: As in :class:`Estimates`, (k,).
     """
 
     time: FloatArray
     position: Mapping[str, FloatArray]
-    sd: float
+    sd: Mapping[str, FloatArray]
     segment: IntArray
 
 

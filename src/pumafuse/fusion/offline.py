@@ -12,7 +12,7 @@ import numpy as np
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import PumafuseWarning
 from ..runs.axes import in_axes
-from ..runs.clock import segments
+from ..runs.clock import TOLERATED_STEP_BACK_NS, behind, segments
 from ..runs.frames import Cylindrical, Placed
 from ..runs.run import Reference, Run
 from ..units import seconds
@@ -20,6 +20,7 @@ from . import timeline as timelines
 from .config import FusionConfig
 from .consistency import troubles
 from .estimates import Bias, Estimates, Mode, Readings, ReferenceTrack
+from .score import interpolated
 from .smoother import hindsight, hindsight_at
 from .timeline import Timeline
 from .track import AxisEstimate, Filtered, estimate
@@ -68,20 +69,35 @@ def fuse(
         raise ValueError("smooth uses every reading and as_live only those that had arrived; choose one")
     mode: Mode = "smoothed" if smooth else "as-live" if as_live else "filtered"
     chosen = None if sensors is None else tuple(sensors)
-    logged, said = segments(run)
+    in_place, placed = in_axes(run, config.frame)
+    logged, said = segments(in_place)
     fused: list[Estimates] = []
     for number, part in enumerate(logged):
-        placed_run, placed = in_axes(part, config.frame)
-        built = timelines.build(placed_run, config, chosen)
+        built = timelines.build(part, config, chosen)
         times = timelines.output_times(built, rate)
         share = None if progress is None else _share(progress, number, len(logged))
-        fused.append(_fuse_segment(placed_run, placed, built, times, config, mode, share))
+        fused.append(_fuse_segment(part, placed, built, times, config, mode, share))
     joined = _joined(fused, said)
     excess = config.arm.validity.excess(joined.speed, joined.radius)
-    joined = replace(joined, notes=(*joined.notes, *excess, *troubles(joined)))
+    joined = replace(joined, notes=(*joined.notes, *_reference_notes(joined, logged), *excess, *troubles(joined)))
     for note in joined.notes:
         warnings.warn(f"run '{run.name}': {note}", PumafuseWarning, stacklevel=2)
     return joined
+
+
+def _reference_notes(est: Estimates, parts: Sequence[Run]) -> list[str]:
+    """What is wrong with the reference: rows behind a jump of its clock, or nothing near any estimate."""
+    if est.reference is None:
+        return []
+    sources = [part.reference for part in parts if part.reference is not None]
+    late = sum(int(np.sum(behind(source.stamp) > TOLERATED_STEP_BACK_NS)) for source in sources)
+    found = (
+        [f"{sources[0].label}: {late} rows are stamped more than 1 s behind an earlier one: not used"] if late else []
+    )
+    known = [name for name in est.axes if name in est.reference.position]
+    if not any(np.isfinite(interpolated(est.time, est.segment, est.reference, name)).any() for name in known):
+        found.append("the reference covers no estimate: are both stamped by one clock?")
+    return found
 
 
 def _share(progress: Callable[[float], None], number: int, count: int) -> Callable[[float], None]:
@@ -152,7 +168,8 @@ def _highest_radius(run: Run, placed: Placed | None) -> float | None:
     """The commands' greatest distance from the base's axis [m]; None where no cylindrical frame says where that is."""
     if placed is None or not isinstance(placed.frame, Cylindrical) or "radial" not in run.command.values:
         return None
-    return float(np.nanmax(run.command.values["radial"]))
+    radial = run.command.values["radial"]
+    return float(np.max(radial[np.isfinite(radial)]))
 
 
 def _readings(timeline: Timeline, filtered: Filtered) -> Readings:
@@ -172,12 +189,23 @@ def _readings(timeline: Timeline, filtered: Filtered) -> Readings:
 
 
 def reference_track(reference: Reference, origin: int) -> ReferenceTrack:
-    """A run's reference in order and in seconds since ``origin`` (int ns)."""
-    order = np.argsort(reference.stamp, kind="stable")
-    order = order[reference.stamp[order] != NO_STAMP]
-    position = {axis: value[order] for axis, value in reference.values.items()}
+    """A run's reference in order and in seconds since ``origin`` (int ns), without what lies behind a jump back."""
+    usable = (reference.stamp != NO_STAMP) & (behind(reference.stamp) <= TOLERATED_STEP_BACK_NS)
+    kept = reference.rows(usable)
+    order = np.argsort(kept.stamp, kind="stable")
+    position = {axis: value[order] for axis, value in kept.values.items()}
+    sd = {axis: reference.sd * kept.spread.get(axis, np.ones(len(order)))[order] for axis in position}
+    return ReferenceTrack(seconds(kept.stamp[order], origin), position, sd, np.zeros(len(order), dtype=np.int64))
+
+
+def joined_references(parts: Sequence[tuple[ReferenceTrack, float, int]]) -> ReferenceTrack:
+    """The references of several segments, each with what is added to its time [s] and its segment's number."""
+    first = parts[0][0]
     return ReferenceTrack(
-        seconds(reference.stamp[order], origin), position, reference.sd, np.zeros(len(order), dtype=np.int64)
+        np.concatenate([track.time + shift for track, shift, _ in parts]),
+        {axis: np.concatenate([track.position[axis] for track, _, _ in parts]) for axis in first.position},
+        {axis: np.concatenate([track.sd[axis] for track, _, _ in parts]) for axis in first.position},
+        np.concatenate([np.full(len(track.time), number) for track, _, number in parts]),
     )
 
 
@@ -202,17 +230,7 @@ def _joined(parts: Sequence[Estimates], said: Sequence[str]) -> Estimates:
         replace(part.readings, time=part.readings.time + t, stamp=part.readings.stamp + t) for part, t, _ in numbers
     ]
     references = [(part.reference, shift, number) for part, shift, number in numbers if part.reference is not None]
-    reference = None
-    if references:
-        reference = ReferenceTrack(
-            np.concatenate([track.time + shift for track, shift, _ in references]),
-            {
-                axis: np.concatenate([track.position[axis] for track, _, _ in references])
-                for axis in references[0][0].position
-            },
-            references[0][0].sd,
-            np.concatenate([np.full(len(track.time), number) for track, _, number in references]),
-        )
+    reference = joined_references(references) if references else None
     return replace(
         first,
         time=np.concatenate([part.time + shift for part, shift, _ in numbers]),

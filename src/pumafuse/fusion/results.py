@@ -14,16 +14,23 @@ import pyarrow as pa
 from ..arrays import FloatArray, IntArray
 from ..errors import PumafuseError, RunError
 from ..runs import tables
+from ..runs.axes import in_axes
+from ..runs.clock import segments
+from ..runs.frames import Frame
 from ..runs.run import Run
 from ..runs.tables import Table
 from ..units import MM, seconds
 from .estimates import Estimates, ReferenceTrack
-from .offline import reference_track
+from .offline import joined_references, reference_track
 from .score import Score, score
 from .summary import Summary, summarise
 from .timeline import Outcome
 
 ESTIMATES, READINGS, REFERENCE, SUMMARY = "estimates.parquet", "readings.parquet", "reference.parquet", "summary.json"
+OURS = frozenset(
+    {ESTIMATES, READINGS, REFERENCE, SUMMARY, "fusion.toml", "arm.toml"}
+    | {"fused.rrd", "fused.png", "error.png", "validation.png"}
+)  # a folder with anything else in it is never replaced
 _REFERENCE_PREFIX = "reference."
 
 
@@ -74,8 +81,10 @@ def check_writable(folder: Path, force: bool) -> None:
         raise FolderError(f"{folder}: exists and is not a folder")
     if not any(folder.iterdir()):
         return
-    if not (folder / SUMMARY).exists():
-        raise FolderError(f"{folder}: exists and holds no results of pumafuse; choose another folder")
+    strange = sorted(path.name for path in folder.iterdir() if path.name not in OURS or not path.is_file())
+    if strange or not (folder / SUMMARY).exists():
+        what = f"holds '{strange[0]}'" if strange else "holds no results of pumafuse"
+        raise FolderError(f"{folder}: exists and {what}, which is not ours to replace; choose another folder")
     if not force:
         raise FolderError(f"{folder}: exists; --force replaces it, or choose another folder")
 
@@ -92,6 +101,7 @@ def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], No
     Raises:
         FolderError: See :func:`check_writable`, or the disk refuses.
     """
+    folder = folder.resolve()  # a link stays a link, its target is replaced
     check_writable(folder, force)
     summary = summarise(est)
     try:
@@ -107,12 +117,22 @@ def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], No
             (new / SUMMARY).write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
             if extras is not None:
                 extras(new)
-            if folder.exists():
-                folder.replace(Path(place) / "old")
-            new.replace(folder)
+            _swap(new, folder, Path(place) / "old")
     except OSError as error:
         raise FolderError(f"{folder}: cannot be written: {error.strerror}") from None
     return summary
+
+
+def _swap(new: Path, folder: Path, aside: Path) -> None:
+    """Put ``new`` in the folder's place; if that fails the old one is back where it was."""
+    if folder.exists():
+        folder.replace(aside)
+    try:
+        new.replace(folder)
+    except BaseException:
+        if aside.exists():
+            aside.replace(folder)
+        raise
 
 
 def read(folder: Path) -> Result:
@@ -142,29 +162,32 @@ def read(folder: Path) -> Result:
     )
 
 
-def read_reference(path: Path, origin: int) -> ReferenceTrack:
+def read_reference(path: Path, origin: int, frame: Frame | None = None) -> ReferenceTrack:
     """A reference from elsewhere, in the time of a result.
 
     Args:
         path: A recorded run with a reference; or a table with ``time_s`` (the log's clock) and ``reference.<axis>_mm``;
             or one with ``time_s`` (since the first command) and ``<axis>.position_mm``, as in a result folder.
         origin: Stamp of the result's first command, int ns.
+        frame: For a run in x, y, z that brings no frame of its own.
 
     Raises:
         PumafuseError: It is none of these.
     """
     if path.is_dir() or path.suffix == ".toml":
-        run = Run.read(path)
-        if run.reference is None:
+        run, _ = in_axes(Run.read(path), frame)
+        tracks = [reference_track(part.reference, origin) for part in segments(run)[0] if part.reference is not None]
+        if not tracks:
             raise RunError(f"{path}: the run has no reference")
-        return reference_track(run.reference, origin)
+        return joined_references(list(zip(tracks, [0.0] * len(tracks), range(len(tracks)), strict=True)))
     table = tables.read(path)
     logged = [name for name in table.columns if name.startswith(_REFERENCE_PREFIX)]
     if not logged:
         return _own_reference(table)
     time = seconds(table.stamps("time_s")[0], origin)
     position = {name[len(_REFERENCE_PREFIX) : name.rindex("_")]: table.numbers(name)[0] for name in logged}
-    return ReferenceTrack(time, position, 0.0, np.zeros(len(time), dtype=np.int64))
+    exact = {axis: np.zeros(len(time)) for axis in position}
+    return ReferenceTrack(time, position, exact, np.zeros(len(time), dtype=np.int64))
 
 
 def _estimates_table(est: Estimates) -> pa.Table:
@@ -203,7 +226,7 @@ def _reference_table(reference: ReferenceTrack) -> pa.Table:
     columns: dict[str, pa.Array | FloatArray] = {"time_s": reference.time}
     for axis, position in reference.position.items():
         columns[f"{axis}.position_mm"] = _nullable(position * MM)
-        columns[f"{axis}.position_sd_mm"] = np.full(len(position), reference.sd * MM)
+        columns[f"{axis}.position_sd_mm"] = reference.sd[axis] * MM
     return pa.table({**columns, **_segment_column(reference.segment)})
 
 
@@ -214,8 +237,12 @@ def _own_reference(table: Table) -> ReferenceTrack:
         raise RunError(
             f"{table.path}: no column 'reference.<axis>_mm' or '<axis>{ending}'; it has: {', '.join(table.columns)}"
         )
-    sd = f"{axes[0]}.position_sd_mm"
-    noise = float(table.numbers(sd)[0][0]) if sd in table.columns else 0.0
+    noise = {
+        axis: table.numbers(f"{axis}.position_sd_mm")[0]
+        if f"{axis}.position_sd_mm" in table.columns
+        else np.zeros(table.rows)
+        for axis in axes
+    }
     position = {axis: table.numbers(f"{axis}{ending}")[0] for axis in axes}
     return ReferenceTrack(_seconds(table), position, noise, _segment(table))
 

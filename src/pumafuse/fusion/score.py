@@ -53,11 +53,12 @@ def score(
     if axis not in reference.position:
         return None
     truth = interpolated(time, segment, reference, axis)
+    noise = np.interp(time, reference.time, reference.sd[axis]) if len(reference.time) else np.zeros(len(time))
     scored = np.isfinite(truth)
     if not scored.any():
         return None
     error = (position - truth)[scored]
-    variance = sd[scored] ** 2 + reference.sd**2
+    variance = sd[scored] ** 2 + noise[scored] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         nees = error**2 / variance
     return Score(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from importlib.metadata import version
 
 import msgspec
@@ -51,7 +52,7 @@ class ScoreSummary(msgspec.Struct, frozen=True, kw_only=True):
         rmse_mm: Root mean square error.
         bias_mm: Mean of estimate − reference.
         coverage: Share of errors within 1.96 standard deviations.
-        nees_mean: Mean of error²/variance; 1 for a consistent filter.
+        nees_mean: Mean of error²/variance; 1 for a consistent filter; null where a variance is 0.
         rows: Estimates scored.
         left_out: Estimates with no reference near enough.
     """
@@ -59,7 +60,7 @@ class ScoreSummary(msgspec.Struct, frozen=True, kw_only=True):
     rmse_mm: float
     bias_mm: float
     coverage: float
-    nees_mean: float
+    nees_mean: float | None
     rows: int
     left_out: int
 
@@ -152,7 +153,7 @@ def score_summary(found: Score) -> ScoreSummary:
         rmse_mm=found.rmse * MM,
         bias_mm=found.bias * MM,
         coverage=found.coverage,
-        nees_mean=found.nees,
+        nees_mean=found.nees if math.isfinite(found.nees) else None,
         rows=found.rows,
         left_out=found.left_out,
     )

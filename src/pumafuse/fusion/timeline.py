@@ -23,6 +23,7 @@ from ..runs.run import Run, Source
 from .config import FusionConfig, Sensor
 
 LONGEST_TAIL_NS = 3_600_000_000_000  # readings this long after the last command no longer belong to the run
+_FARTHEST = 1e6  # m
 _MOST_ESTIMATES = 100_000_000
 
 
@@ -143,6 +144,11 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
             raise UnknownNameError(
                 f"{run.command.label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes
             )
+    for name, source in run.sensors.items():
+        if any(axis in CARTESIAN and axis not in run.axes for axis in source.values):
+            raise RunError(
+                f"sensor '{name}' is in x, y, z, the commands are not; give a [frame], and them in x, y, z too"
+            )
     command = _sorted_commands(run.command, notes)
     used = {name: _actual_commands(command.stamp, command.values[name], arm.update_period) for name in run.axes}
     stamp = command.stamp
@@ -195,10 +201,10 @@ def _sorted_commands(source: Source, notes: list[str]) -> Source:
     _tell(notes, source.label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
     _tell(notes, source.label, _said_before(source) & ~missing, "the stamp and values of an earlier row: duplicate")
     for axis, value in source.values.items():
-        _tell(notes, source.label, ~np.isfinite(value) & ~missing, f"no finite {axis} command: not used")
+        _tell(notes, source.label, ~_plausible(value) & ~missing, f"no finite {axis} command: not used")
     kept = source.rows(~missing)
     order = np.argsort(kept.stamp, kind="stable")
-    values = {axis: np.where(np.isfinite(value), value, np.nan)[order] for axis, value in kept.values.items()}
+    values = {axis: np.where(_plausible(value), value, np.nan)[order] for axis, value in kept.values.items()}
     return Source(kept.stamp[order], values, source.label)
 
 
@@ -230,7 +236,7 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
             if axis not in source.values:
                 continue
             value, outcome = source.values[axis], outcomes.copy()
-            hollow = (outcome == Outcome.FUSED) & ~np.isfinite(value)
+            hollow = (outcome == Outcome.FUSED) & ~_plausible(value)
             outcome[hollow] = Outcome.INVALID
             if sensor is not None and sensor.sd_of(axis) is None:
                 notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
@@ -268,6 +274,11 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
         outcome[order].astype(np.uint8),
         names,
     )
+
+
+def _plausible(value: FloatArray) -> BoolArray:
+    """Finite and no sentinel such as 3.4e38: within a thousand kilometres."""
+    return np.abs(value) < _FARTHEST
 
 
 def _row_outcomes(source: Source, sensor: Sensor | None, valid: TimeArray, origin: int) -> CodeArray:

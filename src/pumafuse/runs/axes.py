@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray
 from ..errors import RunError
+from .clock import TOLERATED_STEP_BACK_NS, behind
 from .frames import CARTESIAN, Frame, Placed, Rotated
 from .run import Run, Source
 
@@ -29,8 +30,11 @@ def in_axes(run: Run, frame: Frame | None) -> tuple[Run, Placed | None]:
         RunError: A source gives x without y, or names an axis both ways; or the start is not known in x and y.
     """
     frame = frame if run.frame is None else run.frame
-    if frame is None:
+    named = {name for source in (run.command, *run.sensors.values()) for name in source.values}
+    if frame is None or named.isdisjoint(CARTESIAN):
         return run, None
+    if ("x" in run.start) != ("y" in run.start):
+        raise RunError(f"run '{run.name}': start gives one of x and y; a frame needs both")
     placed = _placed(run, frame)
     command = _converted(run.command, placed, None)
     start = {axis: level for axis, level in run.start.items() if axis not in CARTESIAN}
@@ -59,7 +63,9 @@ def _placed(run: Run, frame: Frame) -> Placed:
         usable = np.flatnonzero(np.isfinite(x_all) & np.isfinite(y_all) & (run.command.stamp != NO_STAMP))
         if not len(usable):
             raise RunError(f"{run.command.label}: no command has both x and y")
-        first = usable[np.argmin(run.command.stamp[usable])]
+        jumps = np.flatnonzero(behind(run.command.stamp) > TOLERATED_STEP_BACK_NS)
+        segment = usable[usable < jumps[0]] if len(jumps) and usable[0] < jumps[0] else usable
+        first = segment[np.argmin(run.command.stamp[segment])]
         x, y = float(x_all[first]), float(y_all[first])
     else:
         raise RunError(
@@ -82,7 +88,7 @@ def _converted(source: S, placed: Placed, command: Source | None) -> S:
     spread = dict(source.spread)
     found: dict[str, FloatArray] = {}
     if "x" in given:
-        near = None if command is None else _commanded(command, source)
+        near = None if command is None or isinstance(placed.frame, Rotated) else _commanded(command, source)
         found["tangential"], found["radial"], spread["tangential"] = placed.to_axes(
             source.values["x"], source.values["y"], near
         )

@@ -79,20 +79,22 @@ class Placed:
         Returns:
             Tangential (n,), radial (n,), and R0/r (n,), by which the noise of a tangential reading is larger.
         """
+        x, y = np.where(np.isfinite(x + y), (x, y), np.nan)
         if isinstance(self.frame, Rotated):
             along = x * np.cos(self.angle) + y * np.sin(self.angle)
             across = y * np.cos(self.angle) - x * np.sin(self.angle)
             return self._sign * across, along, np.ones_like(x)
         dx, dy = x - self.frame.base[0], y - self.frame.base[1]
-        r, turn = np.hypot(dx, dy), np.arctan2(dy, dx) - self.angle
+        r = np.hypot(dx, dy)
+        r[r == 0.0] = np.nan  # on the base's axis there is no angle: what some sensors send when they are lost
+        turn = np.where(np.isnan(r), np.nan, np.arctan2(dy, dx) - self.angle)
         if near is None:
             known = np.isfinite(turn)
             turn[known] = np.unwrap(np.concatenate(([0.0], turn[known])))[1:]
         else:
             about = self._sign * near / self.radius
             turn = about + np.remainder(turn - about + np.pi, 2.0 * np.pi) - np.pi
-        with np.errstate(divide="ignore"):
-            return self._sign * self.radius * turn, r, self.radius / r
+        return self._sign * self.radius * turn, r, np.where(np.isnan(r), 1.0, self.radius / r)
 
     def to_log(self, tangential: FloatArray, radial: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The log's x and y [m] of axis positions [m]; the inverse of :meth:`to_axes`."""

@@ -58,10 +58,17 @@ def error_figure(est: Estimates, path: Path) -> None:
     """
     if est.reference is None:
         raise ValueError("the run has no reference")
-    known = [name for name in est.axes if name in est.reference.position]
+    truth = {
+        name: interpolated(est.time, est.segment, est.reference, name)
+        for name in est.axes
+        if name in est.reference.position
+    }
+    known = [name for name, values in truth.items() if np.isfinite(values).any()]
+    if not known:
+        return
     with _sheet(est, path, len(known), 1) as grid:
         for (axes,), name in zip(grid, known, strict=True):
-            error = est[name].position - interpolated(est.time, est.segment, est.reference, name)
+            error = est[name].position - truth[name]
             for sensor, colour in style.sensor_colours(est.readings.sensors).items():
                 scalars = _positions(est, sensor, name)
                 first = np.zeros(len(scalars.time), dtype=np.int64)  # the first segment's will do for a picture
@@ -73,7 +80,7 @@ def error_figure(est: Estimates, path: Path) -> None:
             rms = float(np.sqrt(np.nanmean(error**2))) * MM
             axes.set_title(f"{name}: RMS error {rms:.3f} mm", loc="left", fontsize=9)
             axes.set_ylabel("error [mm]")
-            limit = 1.3 * float(np.nanmax(np.abs(error))) * MM
+            limit = max(1.3 * float(np.nanmax(np.abs(error))) * MM, 1e-6)
             axes.set_ylim(-limit, limit)
         grid[0][0].legend(loc="upper right", ncols=3, frameon=False)
 
@@ -103,7 +110,14 @@ def validation_figure(est: Estimates, path: Path) -> None:
             series.set_title(f"{axis}, {sensor}. {found.verdict}", loc="left", fontsize=9)
             series.set_ylabel("innovation / sd")
             at = np.linspace(-4.5, 4.5, 91)
-            spread.hist(normalised, bins=45, range=(-4.5, 4.5), density=True, color=colours[sensor], alpha=0.6)
+            spread.hist(
+                np.clip(normalised, -4.5, 4.5),
+                bins=45,
+                range=(-4.5, 4.5),
+                density=True,
+                color=colours[sensor],
+                alpha=0.6,
+            )
             spread.plot(at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), color=style.REFERENCE, lw=1.0)
             lags = np.arange(1, len(found.correlation) + 1)
             correlation.bar(lags, found.correlation, color=colours[sensor], width=0.6)

@@ -88,9 +88,10 @@ def _paths(stream: rr.RecordingStream, est: Estimates, run: Run) -> None:
     else:
         command, names = run.command.values, CANONICAL_AXES
         estimated = {name: axis.position for name, axis in est.axes.items()}
-    if not all(name in command and name in estimated for name in names):
+    if not all(name in estimated for name in names):
         return
-    _strip(stream, "path/command", [command[name] for name in names], style.COMMAND, 0.3)
+    if all(name in command for name in names):
+        _strip(stream, "path/command", [command[name] for name in names], style.COMMAND, 0.3)
     _strip(stream, "path/estimate", [estimated[name] for name in names], style.ESTIMATE, 0.6)
     every = max(1, len(est.time) // _PATH_POINTS)
     position = np.column_stack([estimated[name] for name in names])[::every] * MM

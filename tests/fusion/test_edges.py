@@ -1,0 +1,228 @@
+"""Logs at the edge of sense: infinities, frames, clocks, references that fit nothing. Each is told, none breaks."""
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.fusion import results
+from pumafuse.fusion.consistency import consistency
+from pumafuse.runs.axes import in_axes
+from pumafuse.runs.frames import Cylindrical, Rotated
+from pumafuse.views.figures import error_figure, validation_figure
+
+DATA = Path(pf.__file__).parent / "data"
+ARM = pf.ArmModel.load("puma560-internal")
+
+
+def quiet(*args, **kwargs):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        return pf.fuse(*args, **kwargs)
+
+
+def config(**sensor):
+    return pf.FusionConfig(arm=ARM, sensors={"camera": pf.Sensor(sd=1e-3, **sensor)})
+
+
+def arc(frame=None, **spoil):
+    """0.2 rad at 0.5 m; spoil: values of row 50 of the camera."""
+    time, angle = 10 + 0.028 * np.arange(60), np.linspace(0, 0.2, 60)
+    seen = 10 + 0.01 * np.arange(1, 150)
+    camera = {"x": 0.5 * np.cos(np.interp(seen, time, angle)), "y": 0.5 * np.sin(np.interp(seen, time, angle))}
+    for axis, value in spoil.items():
+        camera[axis][50] = value
+    return pf.Run.from_arrays(
+        time,
+        {"x": 0.5 * np.cos(angle), "y": 0.5 * np.sin(angle)},
+        {"camera": (seen, camera)},
+        frame=frame or Cylindrical(),
+    )
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_infinite_x_or_y_is_invalid(axis):
+    """Infinite x or y is invalid."""
+    est = quiet(arc(**{axis: np.inf}), config(gate=0.0))
+    assert est.readings.of("camera", "tangential").outcome[50] == pf.Outcome.INVALID
+
+
+@pytest.mark.parametrize("sensor", [{"gate": 0.0}, {"gate_rows": False}])
+def test_a_reading_on_the_base_axis_does_not_poison_the_filter(sensor):
+    """A reading on the base axis does not poison the filter."""
+    est = quiet(arc(x=0.0, y=0.0), config(**sensor))
+    assert np.isfinite(est["tangential"].position).all()
+
+
+def test_a_gated_reading_on_the_base_axis_leaves_a_readable_folder(tmp_path):
+    """A gated reading on the base axis leaves a readable folder."""
+    results.write(quiet(arc(x=0.0, y=0.0), config()), tmp_path / "out", False)
+    results.read(tmp_path / "out")
+
+
+def test_an_infinite_command_is_no_radius():
+    """An infinite command is no radius."""
+    run = arc()
+    run.command.values["x"][20] = np.inf
+    assert quiet(run, config()).radius == pytest.approx(0.5)
+
+
+def test_infinite_values_raise_no_numpy_warning():
+    """Infinite values raise no numpy warning."""
+    quiet(arc(frame=Rotated(azimuth=0.0), x=np.inf), config())
+
+
+@pytest.mark.parametrize("start", [{"x": 0.5}, {"y": 0.5}])
+def test_half_a_start_level_is_refused(start):
+    """Half a start level is refused."""
+    with pytest.raises(pf.RunError, match="start"):
+        in_axes(replace(arc(), start=start), None)
+
+
+def test_a_frame_in_fusion_toml_does_not_refuse_runs_that_name_axes():
+    """A frame in fusion toml does not refuse runs that name axes."""
+    run = pf.Run.from_arrays([0.0, 0.028], {"radial": [0.5, 0.5]})
+    est = quiet(run, pf.FusionConfig(arm=ARM, frame=Cylindrical()))
+    assert est["radial"].position[0] == 0.5
+
+
+def test_a_sensor_in_x_y_without_a_frame_is_not_dropped_silently():
+    """A sensor in x y without a frame is not dropped silently."""
+    run = pf.Run.from_arrays([0.0, 0.028], {"radial": [0.5, 0.5]}, {"camera": ([0.01], {"x": [0.5], "y": [0.0]})})
+    try:
+        est = quiet(run, config())
+    except pf.RunError as error:
+        assert "[frame]" in str(error)
+    else:
+        assert est.notes
+
+
+def test_compare_takes_the_reference_of_a_framed_run(tmp_path):
+    """Compare takes the reference of a framed run."""
+    (tmp_path / "log.csv").write_text(
+        "time_s,command.x_mm,command.y_mm,reference.x_mm,reference.y_mm\n"
+        "0,100,500,100,500\n0.028,100,500,100,500\n0.056,100,500,100,500\n"
+    )
+    columns = '{0} = "{1}.{0}_mm"\n'
+    part = "".join(columns.format(axis, "{0}") for axis in "xy")
+    (tmp_path / "run.toml").write_text(
+        '[command]\nfile = "log.csv"\ntime = "time_s"\n'
+        + part.format("command")
+        + '[reference]\nfile = "log.csv"\ntime = "time_s"\n'
+        + part.format("reference")
+        + '[frame]\nkind = "cylindrical"\n'
+    )
+    results.write(quiet(pf.Run.read(tmp_path), pf.FusionConfig(arm=ARM)), tmp_path / "out", False)
+    result = results.read(tmp_path / "out")
+    assert set(result.scores(result.reference)) == {"tangential", "radial"}
+    truth = results.read_reference(tmp_path / "run.toml", result.summary.origin_ns)
+    assert set(result.scores(truth)) == {"tangential", "radial"}
+
+
+def test_a_second_segment_keeps_the_frame_of_the_run():
+    """R0 and θ0 are the run's: a clock that is set back moves nothing."""
+    n = 60
+    time = np.concatenate([10 + 0.028 * np.arange(n), 5 + 0.028 * np.arange(n)])
+    angle = np.concatenate([np.linspace(0, 0.2, n), np.full(n, 0.2)])
+    run = pf.Run.from_arrays(time, {"x": 0.5 * np.cos(angle), "y": 0.5 * np.sin(angle)}, frame=Cylindrical())
+    est = quiet(run, pf.FusionConfig(arm=ARM))
+    assert est["tangential"].position[-1] == pytest.approx(0.1)
+
+
+def test_a_latency_too_large_is_not_called_too_small():
+    """A latency too large is not called too small."""
+    import msgspec
+
+    scan, conf = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
+    tracker = msgspec.structs.replace(conf.sensors["tracker"], latency=0.038, gate=0.0)  # 8 ms is right
+    est = quiet(scan, msgspec.structs.replace(conf, sensors={"tracker": tracker}))
+    for axis in est.axes:
+        assert "latency_ms too small" not in consistency(est, "tracker", axis).verdict, axis
+
+
+def test_a_sensor_frozen_for_most_of_the_run_is_told():
+    """A sensor frozen for most of the run is told."""
+    scan, conf = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
+    tracker = scan.sensors["tracker"]
+    frozen = tracker.stamp - scan.command.stamp.min() > 5_000_000_000
+    values = {axis: np.where(frozen, value[frozen.argmax()], value) for axis, value in tracker.values.items()}
+    est = quiet(replace(scan, sensors={"tracker": replace(tracker, values=values)}), conf, sensors=["tracker"])
+    assert any("froze" in note for note in est.notes)
+
+
+def test_reopenings_are_counted_as_often_as_the_gate_reopened():
+    """Reopenings are counted as often as the gate reopened."""
+    scan, conf = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
+    tracker = scan.sensors["tracker"]
+    off = replace(tracker, values={axis: value + 0.05 for axis, value in tracker.values.items()})
+    est = quiet(replace(scan, sensors={**scan.sensors, "tracker": off}), conf, sensors=["tracker", "vision"])
+    mine = est.readings.where(est.readings.sensor == est.readings.sensors.index("tracker"))
+    rows = len(np.unique(mine.stamp[mine.outcome == pf.Outcome.REOPENED]))
+    assert any(f"tracker: its gate reopened {rows} times" in note for note in est.notes), est.notes
+
+
+def test_readings_only_after_the_run_are_told():
+    """Readings only after the run are told."""
+    scan, conf = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
+    tracker = scan.sensors["tracker"]
+    late = replace(tracker, stamp=tracker.stamp + 70_000_000_000)
+    est = quiet(replace(scan, sensors={**scan.sensors, "tracker": late}), conf, sensors=["tracker", "vision"])
+    assert any("after the last command" in note for note in est.notes), est.notes
+
+
+def small(shift=0.0, spoil=0.0):
+    time = 10 + 0.028 * np.arange(60)
+    seen = 10 + 0.01 * np.arange(1, 100)
+    sight = 0.5 + spoil * np.where(np.arange(99) % 2, 1.0, -1.0)
+    return pf.Run.from_arrays(
+        time,
+        {"radial": np.full(60, 0.5)},
+        {"camera": (seen, {"radial": sight})},
+        (seen + shift, {"radial": np.full(99, 0.5)}),
+    )
+
+
+def test_a_reference_that_covers_nothing_makes_no_traceback(tmp_path):
+    """A reference that covers nothing makes no traceback."""
+    error_figure(quiet(small(shift=1000.0), config()), tmp_path / "error.png")
+
+
+def test_innovations_all_beyond_the_histogram_make_no_warning(tmp_path):
+    """Innovations all beyond the histogram make no warning."""
+    validation_figure(quiet(small(spoil=1.0), config(gate=0.0)), tmp_path / "validation.png")
+
+
+def test_no_variance_leaves_a_readable_folder(tmp_path):
+    """No variance leaves a readable folder."""
+    run = replace(small(), sensors={}, reference=replace(small().reference, values={"radial": np.full(99, 0.5001)}))
+    sure = {"radial": pf.Process(input_noise=0.0, drift=0.0)}
+    est = quiet(run, pf.FusionConfig(arm=ARM, start=pf.Start(offset_sd=0.0), process=sure))
+    results.write(est, tmp_path / "out", False)
+    results.read(tmp_path / "out")
+
+
+def test_a_wrong_direction_is_told_the_accepted_ones(tmp_path):
+    """A wrong direction is told the accepted ones."""
+    (tmp_path / "fusion.toml").write_text('arm = "puma560-internal"\n[frame]\nkind = "cylindrical"\npositive = "cw"\n')
+    with pytest.raises(pf.ConfigError, match="counterclockwise, clockwise"):
+        pf.FusionConfig.load(tmp_path / "fusion.toml")
+
+
+def test_a_reference_s_own_noise_scales_like_a_reading_s():
+    """Scoring: the tangential variance of a reference at r is (sd R0/r)²."""
+    time = 0.028 * np.arange(60)
+    x = np.linspace(0.5, 0.25, 60)
+    run = pf.Run.from_arrays(
+        time,
+        {"x": x, "y": np.zeros(60)},
+        None,
+        (time, {"x": x, "y": np.zeros(60)}),
+        reference_sd=1e-3,
+        frame=Cylindrical(),
+    )
+    est = quiet(run, pf.FusionConfig(arm=ARM))
+    np.testing.assert_allclose(est.reference.sd["tangential"], 1e-3 * 0.5 / x)
+    np.testing.assert_allclose(est.reference.sd["radial"], 1e-3)
