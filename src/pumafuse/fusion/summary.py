@@ -20,7 +20,8 @@ class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         outcomes: How many scalars met each outcome, those that occur.
-        innovation_rms_mm: Root mean square of the fused scalars' innovations; null without any.
+        innovation_rms_mm: Root mean square of the fused scalars' innovations; null without any. Of a sensor with a
+            bias the first is left out.
         innovation_sd_mm: Root mean square of what the filter expected of them.
         nis_mean: Mean ν²/S of the fused scalars; 1 for a consistent filter.
         nis_band: Where that mean lies in 95 % of cases for a consistent filter.
@@ -180,10 +181,11 @@ def _sensor_summary(est: Estimates, sensor: str, axis: str) -> SensorSummary:
         return SensorSummary(outcomes=readings.counts())
     fused = readings.where(readings.outcome == Outcome.FUSED)
     bias = est.biases.get(sensor, {}).get(axis)
+    learnt = 0 if bias is None or len(fused.value) == 1 else 1  # the first reading of a biased sensor tells its bias
     return SensorSummary(
         outcomes=readings.counts(),
-        innovation_rms_mm=float(np.sqrt(np.mean(fused.innovation**2))) * MM,
-        innovation_sd_mm=float(np.sqrt(np.mean(fused.innovation_sd**2))) * MM,
+        innovation_rms_mm=float(np.sqrt(np.mean(fused.innovation[learnt:] ** 2))) * MM,
+        innovation_sd_mm=float(np.sqrt(np.mean(fused.innovation_sd[learnt:] ** 2))) * MM,
         nis_mean=found.nis,
         nis_band=found.nis_band,
         correlation=found.correlation.tolist(),

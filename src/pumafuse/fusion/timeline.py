@@ -24,7 +24,7 @@ from .config import FusionConfig, Sensor
 
 LONGEST_TAIL_NS = 3_600_000_000_000  # readings this long after the last command no longer belong to the run
 _FARTHEST = 1e6  # m
-_MOST_ESTIMATES = 100_000_000
+_MOST_ESTIMATES = 10_000_000
 
 
 class Outcome(enum.IntEnum):
@@ -188,7 +188,7 @@ def output_times(timeline: Timeline, rate: float | None) -> TimeArray:
     if count > _MOST_ESTIMATES:
         raise RunError(
             f"{rate:g} estimates a second over {span / 86400e9:.1f} days are {count:.1e} estimates, more than"
-            f" {_MOST_ESTIMATES:.0e}: are all stamps on one clock, the first command's too?"
+            f" {_MOST_ESTIMATES:.0e}: a lower --rate? Or are not all stamps on one clock?"
         )
     grid = np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
     return timeline.origin + grid[grid <= span]
