@@ -90,7 +90,7 @@ def test_smoothed_estimates_know_every_reading(case: Case) -> None:
 
 
 def tame(case: Case) -> Case:
-    """Priors of at most 30 times a reading's noise."""
+    """Priors of at most 30 times a reading's noise; beyond, rounding of a velocity's mean can pass 1e-12 m/s."""
     heard = {
         name: replace(ear, sensor=msgspec.structs.replace(
             ear.sensor, sd=max(ear.sensor.sd, 0.3e-3), bias_sd=min(ear.sensor.bias_sd, 9e-3)))
@@ -284,3 +284,14 @@ def test_smoothed_error_bars_on_the_scan_are_right(scan: tuple[Run, FusionConfig
     )  # fmt: skip
     assert found is not None
     assert 0.90 <= found.coverage <= 0.99
+
+
+def test_error_bars_hold_with_a_prior_as_wide_as_a_metre() -> None:
+    """An offset and a panel's bias unknown to 1 m, beside a tracker of 0.05 mm: the smoothed error bars are right."""
+    case = EVERY["a panel before the tracker"]
+    heard = {**case.heard, "tracker": replace(LATE, sensor=msgspec.structs.replace(LATE.sensor, sd=5e-5, bias_sd=0.0))}
+    estimates, run, config = smoothed(replace(case, heard=heard, offset_sd=1.0))
+    expected = AxisOracle(run, config, "radial").smoothed(nanoseconds(estimates))
+    for field in ("position", "offset"):
+        found = getattr(estimates["radial"], f"{field}_sd")
+        np.testing.assert_allclose(found, getattr(expected, f"{field}_sd"), rtol=1e-7)
