@@ -141,8 +141,8 @@ def test_before_anything_acts_the_arm_rests_and_only_the_offset_is_learnt() -> N
     resting = slice(0, 20)
     assert not radial.velocity[resting].any()
     assert not radial.velocity_sd[resting].any()
-    np.testing.assert_allclose(radial.position[resting], 0.507 + radial.offset[resting], rtol=1e-14)
-    np.testing.assert_allclose(radial.position_sd[resting], radial.offset_sd[resting], rtol=1e-14)
+    np.testing.assert_allclose(radial.position[resting], 0.507 + radial.offset[resting], rtol=1e-15)
+    np.testing.assert_allclose(radial.position_sd[resting], radial.offset_sd[resting], rtol=1e-15)
     assert (radial.offset_sd[resting] < 0.25 * case.offset_sd).all()
     assert radial.velocity_sd[21:].all()
 

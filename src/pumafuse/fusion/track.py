@@ -177,8 +177,9 @@ def estimate(
     x[:, :n] += moves.Gamma[place] * v[:, None]
     P = F @ track.covariance[entry] @ F.swapaxes(1, 2) + process_noise(track, entry, moves, place, interval)
     if hindsight is not None:
-        told = np.concatenate((P, P @ hindsight.eta[..., None]), axis=-1)
-        smoothed = np.linalg.solve(np.eye(size) + P @ hindsight.N, told)
+        # From the left P keeps the zero rows of states that are known exactly, whatever the solver's pivots.
+        told = np.concatenate((np.broadcast_to(np.eye(size), P.shape), hindsight.eta[..., None]), axis=-1)
+        smoothed = P @ np.linalg.solve(np.eye(size) + hindsight.N @ P, told)
         np.copyto(P, 0.5 * (smoothed[..., :size] + smoothed[..., :size].swapaxes(1, 2)))
         x += smoothed[..., size]
     position, velocity, offset = np.zeros((3, size))
