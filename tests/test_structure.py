@@ -8,8 +8,8 @@ import pytest
 import pumafuse as pf
 
 SOURCE = Path(pf.__file__).parent
-ROOMS = ["model", "runs", "fusion", "views", "cli"]  # each imports itself and those before it
-GROUND = {"arrays", "errors", "units", "toml"}
+ROOMS = ["model", "runs", "fusion", "simulate", "views", "cli"]  # each imports itself and those before it
+GROUND = {"arrays", "errors", "units", "toml", "folders"}
 
 
 def imported_rooms(path: Path) -> set[str]:

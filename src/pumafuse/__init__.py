@@ -3,7 +3,9 @@
 The public names, imported only when used.
 """
 
+import sys
 from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
     from .model.discrete import DiscreteModel, discretize
     from .model.plants import FirstOrder, SecondOrder
     from .runs.run import Run
+    from .simulate.scenario import Scenario
+    from .simulate.simulate import Simulated, simulate
     from .views.rerun import to_rerun
 
 _HOME = {
@@ -37,15 +41,18 @@ _HOME = {
     "Readings": "fusion.estimates",
     "Run": "runs.run",
     "RunError": "errors",
+    "Scenario": "simulate.scenario",
     "Score": "fusion.score",
     "SecondOrder": "model.plants",
     "Sensor": "fusion.config",
+    "Simulated": "simulate.simulate",
     "Start": "fusion.config",
     "UnknownNameError": "errors",
     "Validity": "model.arm",
     "discretize": "model.discrete",
     "fuse": "fusion.offline",
     "score": "fusion.score",
+    "simulate": "simulate.simulate",
     "to_rerun": "views.rerun",
 }
 
@@ -66,17 +73,31 @@ __all__ = [
     "Readings",
     "Run",
     "RunError",
+    "Scenario",
     "Score",
     "SecondOrder",
     "Sensor",
+    "Simulated",
     "Start",
     "UnknownNameError",
     "Validity",
     "discretize",
     "fuse",
     "score",
+    "simulate",
     "to_rerun",
 ]
+
+
+class _Package(ModuleType):
+    """Keeps a room from hiding the function of its name: importing `pumafuse.simulate` would make `pf.simulate` it."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name not in _HOME or not isinstance(value, ModuleType):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> object:

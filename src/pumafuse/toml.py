@@ -116,7 +116,7 @@ def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
                 yield f"unknown key '{prefix}{key}'; {suggestion(str(key), fields)}"  # pyright: ignore
         for key, field in fields.items():
             if field.required and key not in tree:
-                yield f"'{prefix}{key}' is missing"
+                yield f"'{prefix}{key}' is missing; accepted: {', '.join(fields)}"
     elif isinstance(tree, Mapping) and (tagged := _tagged(kind)):
         tag = next(iter(tagged.values())).__struct_config__.tag_field or ""
         name = str(tree.get(tag, "none"))  # pyright: ignore[reportUnknownArgumentType]

@@ -236,7 +236,7 @@ def test_a_real_servo_is_followed_between_rare_readings(name: str, limit: float,
 
 def test_a_result_that_cannot_be_swapped_in_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """If the last rename fails, what stood there before stands there still."""
-    from pumafuse.fusion import results
+    from pumafuse import folders
 
     new, old = tmp_path / "new", tmp_path / "result"
     for folder in (new, old):
@@ -251,7 +251,7 @@ def test_a_result_that_cannot_be_swapped_in_leaves_the_old_one(tmp_path: Path, m
 
     monkeypatch.setattr(Path, "replace", broken)
     with pytest.raises(OSError, match="disk gone"):
-        results._swap(new, old, tmp_path / "aside")
+        folders._swap(new, old, tmp_path / "aside")
     assert (old / "summary.json").read_text() == "result"
 
 

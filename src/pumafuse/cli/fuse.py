@@ -6,20 +6,21 @@ import sys
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ..errors import PumafuseError
 from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Estimates
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
 from ..runs.run import Run
-from .tables import console, outcome_table, score_table
+from .many import each, tell
+from .tables import console, outcome_table, runs_table, score_table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,17 +48,19 @@ def run(runs: Sequence[Path], options: Options) -> None:
     config = FusionConfig.load(options.config)
     config.sensor_names(options.sensors)
     if len(runs) == 1:
-        _one(runs[0], options.output, config, options)
+        results.check_writable(options.output, options.force)
+        recorded = Run.read(runs[0])
+        with progress_of(recorded.name) as progress:
+            summary = _one(recorded, options.output, config, options, progress)
+        show(summary, options.output)
         return
-    failed = 0
-    for path, folder in zip(runs, _folders(runs, options.output), strict=True):
-        try:
-            _one(path, folder, config, options)
-        except PumafuseError as error:
-            failed += 1
-            print(f"pumafuse: {error}", file=sys.stderr)
-    if failed:
-        raise PumafuseError(f"{failed} of {len(runs)} runs failed (see above); the others are in {options.output}")
+    places = zip(runs, _folders(runs, options.output), strict=True)
+    jobs = {str(path): partial(_read_and_fuse, path, folder, config, options) for path, folder in places}
+    done, failed = each("fusing", jobs)
+    if done:
+        console().print(runs_table(list(done.values())))
+        console(soft_wrap=True).print(f"written to {options.output}", markup=False)
+    tell(failed, len(jobs), str(options.output))
 
 
 def show(summary: Summary, folder: Path) -> None:
@@ -92,20 +95,28 @@ def record(est: Estimates, recorded: Run, folder: Path) -> None:
     to_rerun(est, recorded, folder / "fused.rrd")
 
 
-def _one(path: Path, folder: Path, config: FusionConfig, options: Options) -> None:
+def _read_and_fuse(path: Path, folder: Path, config: FusionConfig, options: Options) -> Summary:
     results.check_writable(folder, options.force)
-    recorded = Run.read(path)
-    with progress_of(recorded.name) as progress:
-        est = fuse(
-            recorded,
-            config,
-            sensors=options.sensors,
-            rate=options.rate,
-            smooth=options.smooth,
-            as_live=options.as_live,
-            engine=options.engine,
-            progress=progress,
-        )
+    return _one(Run.read(path), folder, config, options)
+
+
+def _one(
+    recorded: Run,
+    folder: Path,
+    config: FusionConfig,
+    options: Options,
+    progress: Callable[[float], None] | None = None,
+) -> Summary:
+    est = fuse(
+        recorded,
+        config,
+        sensors=options.sensors,
+        rate=options.rate,
+        smooth=options.smooth,
+        as_live=options.as_live,
+        engine=options.engine,
+        progress=progress,
+    )
 
     def extras(new: Path) -> None:
         if options.rrd:
@@ -113,7 +124,7 @@ def _one(path: Path, folder: Path, config: FusionConfig, options: Options) -> No
         if options.figures:
             draw(est, recorded, new)
 
-    show(results.write(est, folder, options.force, extras), folder)
+    return results.write(est, folder, options.force, extras)
 
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:

@@ -116,6 +116,21 @@ def discretize(
 
 
 @app.command()
+def simulate(
+    scenario: Annotated[Path, typer.Argument(metavar="SCENARIO.TOML", help="What happens, and what the filter knows.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the recorded run goes.")],
+    runs: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="N runs with seeds in a row, in DIR/seed-K.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Make a recorded run with its reference from a scenario, and the configuration of a filter for it."""
+    from . import simulate as command
+
+    command.run(scenario, output, runs, force)
+
+
+@app.command()
 def demo(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")] = Path(
         "demo"

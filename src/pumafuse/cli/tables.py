@@ -13,6 +13,8 @@ from rich.table import Table
 from ..fusion.score import Z95
 from ..fusion.summary import ScoreSummary, Summary
 
+_FEW_RUNS = 20  # that get lines of their own
+
 
 def console(*, soft_wrap: bool = False) -> Console:
     """Standard output for people; wide enough for our tables where it is no terminal."""
@@ -62,6 +64,47 @@ def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Ta
                 str(score.left_out),
             )
     return table
+
+
+def runs_table(summaries: Sequence[Summary]) -> Table:
+    """Many runs: a line for each run and axis of a few, and for each axis all of them together."""
+    table = Table(box=box.SIMPLE_HEAD)
+    table.add_column("run", overflow="fold")
+    table.add_column("axis")
+    for heading in ("RMSE, mm", "worst, mm", "95 % cover", "NEES", "NIS", "fused", "gated", "notes"):
+        table.add_column(heading, justify="right")
+    if len(summaries) <= _FEW_RUNS:
+        for summary in summaries:
+            for axis in summary.axes:
+                table.add_row(escape(summary.run), escape(axis), *_pooled([summary], axis))
+        table.add_section()
+    for axis in dict.fromkeys(axis for summary in summaries for axis in summary.axes):
+        having = [summary for summary in summaries if axis in summary.axes]
+        table.add_row(f"all {len(having)}", escape(axis), *_pooled(having, axis))
+    return table
+
+
+def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
+    """One axis over several runs: each estimate and each scalar counts once."""
+    parts = [summary.axes[axis] for summary in summaries]
+    scores = [part.score for part in parts if part.score is not None]
+    sensors = [sensor for part in parts for sensor in part.sensors.values()]
+    nis = [(sensor.nis_mean, sensor.outcomes.get("fused", 0)) for sensor in sensors if sensor.nis_mean is not None]
+    fused, gated = (sum(sensor.outcomes.get(word, 0) for sensor in sensors) for word in ("fused", "gated"))
+    rows = sum(score.rows for score in scores)
+    cells = ["–"] * 4
+    if rows:
+        square = sum(score.rmse_mm**2 * score.rows for score in scores) / rows
+        cover = sum(score.coverage * score.rows for score in scores) / rows
+        nees = [(score.nees_mean, score.rows) for score in scores if score.nees_mean is not None]
+        cells = [_mm(square**0.5), _mm(max(score.rmse_mm for score in scores)), f"{cover:.1%}", _mean(nees)]
+    notes = sum(len(summary.notes) for summary in summaries)
+    return [*cells, _mean(nis), str(fused), str(gated), str(notes)]
+
+
+def _mean(weighted: Sequence[tuple[float, int]]) -> str:
+    total = sum(weight for _, weight in weighted)
+    return f"{sum(value * weight for value, weight in weighted) / total:.2f}" if total else "–"
 
 
 def _interval(value: float | None, sd: float | None) -> str:

@@ -111,16 +111,11 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             ConfigError: The file or its arm is not as declared; names file, key and the accepted names.
         """
         path = Path(path)
-        tree = toml.read(path)
-        if not isinstance(tree.get("arm"), str):
-            raise ConfigError(
-                f"{path}: 'arm' is missing; give a file beside this one, or a preset, as in arm = 'arm.toml'"
-            )
-        arm = _load_arm(tree["arm"], path)
-        tree["arm"] = arm
+        tree, where = toml.read(path), str(path)
+        tree["arm"] = load_arm(tree, path)
         if isinstance(tree.get("process"), dict):
-            tree["process"] = _per_axis(tree["process"], arm, str(path))
-        return toml.struct(tree, FusionConfig, str(path))
+            tree["process"] = by_axis(tree["process"], Process, tree["arm"], where, "process")
+        return toml.struct(tree, FusionConfig, where)
 
     def save(self, folder: Path) -> None:
         """Write ``fusion.toml`` and the arm as ``arm.toml`` beside it."""
@@ -143,7 +138,15 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         return tuple(name for name in self.sensors if name in wanted)
 
 
-def _load_arm(name: str, path: Path) -> ArmModel:
+def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
+    """The arm that the file ``path`` with the tables ``tree`` names: a file beside it, or a preset.
+
+    Raises:
+        ConfigError: It names none, or the arm is not as declared.
+    """
+    name = tree.get("arm")
+    if not isinstance(name, str):
+        raise ConfigError(f"{path}: 'arm' is missing; give a file beside this one, or a preset, as in arm = 'arm.toml'")
     beside = path.parent / name
     there = os.path.isfile(beside)  # noqa: PTH113 - Path.is_file raises on a name that is too long
     if name in PRESETS and not there:
@@ -153,13 +156,29 @@ def _load_arm(name: str, path: Path) -> ArmModel:
     return ArmModel.load(beside)
 
 
-def _per_axis(table: dict[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
-    """``[process]`` holds for every axis, ``[process.radial]`` overrides it for one."""
-    own: dict[str, dict[str, Any]] = {key: value for key, value in table.items() if isinstance(value, dict)}
+def by_axis(
+    table: Mapping[str, Any], kind: type[msgspec.Struct], arm: ArmModel, where: str, path: str
+) -> dict[str, dict[str, Any]]:
+    """A table for each axis of the arm: ``[process]`` holds for every axis, ``[process.radial]`` overrides it for one.
+
+    Args:
+        table: The table with the tables in it, in SI.
+        kind: The struct that declares the keys of both.
+        arm: Its axes are the accepted names.
+        where: The file, for the error's text.
+        path: The table's place in the file.
+
+    Raises:
+        ConfigError: A table names no axis, or a key is not declared.
+    """
+    keys = {field.encode_name for field in msgspec.structs.fields(kind)}
+    own: dict[str, dict[str, Any]] = {
+        key: value for key, value in table.items() if isinstance(value, dict) and key not in keys
+    }
     common = {key: value for key, value in table.items() if key not in own}
-    _known_axes(f"{where}: process", own, arm)
-    toml.struct(common, Process, where, "process")
-    return {axis: toml.struct({**common, **own.get(axis, {})}, Process, where, f"process.{axis}") for axis in arm.axes}
+    _known_axes(f"{where}: {path}", own, arm)
+    toml.struct(common, kind, where, path)
+    return {axis: {**common, **own.get(axis, {})} for axis in arm.axes}
 
 
 def _known_axes(where: str, named: Mapping[str, object], arm: ArmModel) -> None:

@@ -21,6 +21,7 @@ from .timeline import LONGEST_TAIL_NS, Outcome
 LAGS = 20
 _FEW = 30  # scalars below which nothing is said
 _FROZEN = 10  # equal values in a row of a sensor with noise
+_NEVER = 1e-6  # expected number below which something does not happen by chance
 _NOTABLE = 0.1  # mean lag-1 correlation below which whiteness is beside the point, however significant
 
 
@@ -135,7 +136,11 @@ def troubles(est: Estimates) -> list[str]:
 
 
 def _frozen(est: Estimates, sensor: str) -> list[str]:
-    """A sensor that repeats a value to the last digit while others would scatter."""
+    """A sensor that repeats a value to the last digit while others would scatter.
+
+    Coarse steps repeat by themselves: with a share p of repeats elsewhere, L equal values in a row come up n p^(L−1)
+    times in n readings.
+    """
     found: list[str] = []
     for axis in est.readings.axes:
         values = est.readings.of(sensor, axis).value
@@ -143,9 +148,10 @@ def _frozen(est: Estimates, sensor: str) -> list[str]:
         if len(values) < _FROZEN:
             continue
         edges = np.flatnonzero(np.concatenate(([True], np.diff(values) != 0.0, [True])))
-        repeats = np.diff(edges)
-        if repeats.max() >= _FROZEN * float(np.median(repeats)):  # coarse steps repeat without being frozen
-            found.append(f"{sensor}: {repeats.max()} {axis} readings in a row have the same value: it froze")
+        longest = int(np.diff(edges).max())
+        elsewhere = (len(values) - (len(edges) - 1) - (longest - 1)) / max(len(values) - longest, 1)
+        if longest >= _FROZEN and len(values) * elsewhere ** (longest - 1) < _NEVER:
+            found.append(f"{sensor}: {longest} {axis} readings in a row have the same value: it froze")
     return found
 
 

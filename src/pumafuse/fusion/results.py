@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,8 +10,10 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 
+from .. import folders
 from ..arrays import FloatArray, IntArray
-from ..errors import PumafuseError, RunError
+from ..errors import RunError
+from ..folders import FolderError
 from ..runs import tables
 from ..runs.axes import in_axes
 from ..runs.clock import segments
@@ -32,10 +33,6 @@ OURS = frozenset(
     | {"fused.rrd", "fused.png", "error.png", "validation.png"}
 )  # a folder with anything else in it is never replaced
 _REFERENCE_PREFIX = "reference."
-
-
-class FolderError(PumafuseError):
-    """A result folder cannot be written or read."""
 
 
 @dataclass(frozen=True)
@@ -75,18 +72,7 @@ def check_writable(folder: Path, force: bool) -> None:
     Raises:
         FolderError: The folder exists and is not to be replaced, or holds something else than results.
     """
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise FolderError(f"{folder}: exists and is not a folder")
-    if not any(folder.iterdir()):
-        return
-    strange = sorted(path.name for path in folder.iterdir() if path.name not in OURS or not path.is_file())
-    if strange or not (folder / SUMMARY).exists():
-        what = f"holds '{strange[0]}'" if strange else "holds no results of pumafuse"
-        raise FolderError(f"{folder}: exists and {what}, which is not ours to replace; choose another folder")
-    if not force:
-        raise FolderError(f"{folder}: exists; --force replaces it, or choose another folder")
+    folders.check_writable(folder, force, SUMMARY, OURS.__contains__)
 
 
 def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], None] | None = None) -> Summary:
@@ -101,38 +87,18 @@ def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], No
     Raises:
         FolderError: See :func:`check_writable`, or the disk refuses.
     """
-    folder = folder.resolve()  # a link stays a link, its target is replaced
     check_writable(folder, force)
     summary = summarise(est)
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as place:
-            new = Path(place) / "new"
-            new.mkdir()
-            tables.write(_estimates_table(est), new / ESTIMATES)
-            tables.write(_readings_table(est), new / READINGS)
-            if est.reference is not None:
-                tables.write(_reference_table(est.reference), new / REFERENCE)
-            est.config.save(new)
-            (new / SUMMARY).write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
-            if extras is not None:
-                extras(new)
-            _swap(new, folder, Path(place) / "old")
-    except OSError as error:
-        raise FolderError(f"{folder}: cannot be written: {error.strerror}") from None
+    with folders.replacing(folder) as new:
+        tables.write(_estimates_table(est), new / ESTIMATES)
+        tables.write(_readings_table(est), new / READINGS)
+        if est.reference is not None:
+            tables.write(_reference_table(est.reference), new / REFERENCE)
+        est.config.save(new)
+        (new / SUMMARY).write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
+        if extras is not None:
+            extras(new)
     return summary
-
-
-def _swap(new: Path, folder: Path, aside: Path) -> None:
-    """Put ``new`` in the folder's place; if that fails the old one is back where it was."""
-    if folder.exists():
-        folder.replace(aside)
-    try:
-        new.replace(folder)
-    except BaseException:
-        if aside.exists():
-            aside.replace(folder)
-        raise
 
 
 def read(folder: Path) -> Result:

@@ -21,7 +21,7 @@ class Score:
         rmse: Root mean square error [m].
         bias: Mean of estimate − reference [m].
         coverage: Share of errors within 1.96 standard deviations.
-        nees: Mean of error² / variance; 1 for a consistent filter.
+        nees: Mean of error² / variance; 1 for a consistent filter. Estimates known exactly and right do not count.
         rows: Estimates scored.
         left_out: Estimates with no reference near enough.
     """
@@ -59,13 +59,14 @@ def score(
         return None
     error = (position - truth)[scored]
     variance = sd[scored] ** 2 + noise[scored] ** 2
-    with np.errstate(divide="ignore", invalid="ignore"):
-        nees = error**2 / variance
+    telling = (variance > 0.0) | (error != 0.0)  # what is known exactly and is right says nothing of the error bars
+    with np.errstate(divide="ignore"):
+        nees = error[telling] ** 2 / variance[telling]
     return Score(
         rmse=float(np.sqrt(np.mean(error**2))),
         bias=float(np.mean(error)),
         coverage=float(np.mean(np.abs(error) <= Z95 * np.sqrt(variance))),
-        nees=float(np.mean(nees)),
+        nees=float(np.mean(nees)) if len(nees) else 1.0,
         rows=int(scored.sum()),
         left_out=int((~scored).sum()),
     )

@@ -10,6 +10,7 @@ import msgspec
 from .. import toml
 from ..errors import ConfigError
 from ..model.plants import NotNegative
+from ..units import LENGTHS, ending
 from .frames import Frame
 
 Columns = str | list[str]
@@ -75,7 +76,7 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
         raise ConfigError(f"{where}: {path}: expected a table")
     keys: dict[str, Any] = dict(table)  # pyright: ignore[reportUnknownArgumentType]
     if isinstance(keys.get("start"), dict):
-        keys["start"] = {_axis_of(key, where): value for key, value in keys["start"].items()}
+        keys["start"] = {axis_of(key, where, f"{path}.start"): value for key, value in keys["start"].items()}
     own = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes"}
     axes = {key: keys.pop(key) for key in list(keys) if key not in own}
     for axis, columns in axes.items():
@@ -88,11 +89,13 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
     return toml.struct({**keys, "axes": axes}, kind, where, path)
 
 
-def _axis_of(key: str, where: str) -> str:
-    """``radial_mm`` → ``radial``; the number itself is already in metres."""
-    from ..units import LENGTHS, ending
+def axis_of(key: str, where: str, path: str) -> str:
+    """``radial_mm`` → ``radial``; the number itself is already in metres.
 
+    Raises:
+        ConfigError: The key ends in no unit of length.
+    """
     unit = ending(key)
     if unit not in LENGTHS:
-        raise ConfigError(f"{where}: command.start.{key} has no unit in its name, as in {key}_mm")
+        raise ConfigError(f"{where}: {path}.{key} has no unit in its name, as in {key}_mm")
     return key.removesuffix(unit)

@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import NO_STAMP, BoolArray, FloatArray, TimeArray
+from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
 from ..model.arm import CANONICAL_AXES, ordered_axes
 from ..units import nanoseconds
@@ -42,8 +42,8 @@ class Source:
     label: str
     spread: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
 
-    def rows(self: S, chosen: BoolArray | slice) -> S:
-        """The chosen rows."""
+    def rows(self: S, chosen: BoolArray | IntArray | slice) -> S:
+        """The chosen rows, in the order in which they are chosen."""
         values = {axis: value[chosen] for axis, value in self.values.items()}
         spread = {axis: value[chosen] for axis, value in self.spread.items()}
         return replace(self, stamp=self.stamp[chosen], values=values, spread=spread)

@@ -172,8 +172,11 @@ def read(path: Path) -> Table:
 
 
 def write(table: pa.Table, path: Path) -> None:
-    """Write a Parquet table."""
-    papq.write_table(table, path, compression="zstd")
+    """Write a table, as CSV or Parquet by the ending of its name."""
+    if path.suffix == ".csv":
+        pacsv.write_csv(table, path, pacsv.WriteOptions(quoting_style="needed"))
+    else:
+        papq.write_table(table, path, compression="zstd")
 
 
 def _read_csv(path: Path) -> tuple[pa.Table, list[str]]:

@@ -1,0 +1,76 @@
+"""The same job on many runs, over all cores: one bar, failures at the end, finished work kept.
+
+joblib spreads the jobs; ``joblib.parallel_config`` around :func:`each` sends them to another backend, such as dask.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Mapping
+from typing import TypeVar, cast
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ..errors import PumafuseError, PumafuseWarning
+
+R = TypeVar("R")
+
+
+class SomeFailedError(PumafuseError):
+    """Some of many jobs failed; the others are done."""
+
+
+def each(what: str, jobs: Mapping[str, Callable[[], R]]) -> tuple[dict[str, R], dict[str, str]]:
+    """Do every job, several at a time.
+
+    Args:
+        what: For the bar.
+        jobs: By name; each can be pickled and leaves its work on disk when done.
+
+    Returns:
+        What each job returned, and what was wrong with those that failed, both in the order given.
+
+    Raises:
+        SomeFailedError: Interrupted; says how many were done.
+    """
+    from joblib import Parallel, delayed
+
+    results: dict[str, R] = {}
+    failed: dict[str, str] = {}
+    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task(what, total=len(jobs))
+        parallel = Parallel(n_jobs=-1, return_as="generator_unordered", batch_size=1)
+        for name, result, problem in parallel(delayed(_guarded)(name, job) for name, job in jobs.items()):
+            if problem is None:
+                results[name] = cast(R, result)
+            else:
+                failed[name] = problem
+            bar.advance(task)
+    return {name: results[name] for name in jobs if name in results}, {n: failed[n] for n in jobs if n in failed}
+
+
+def tell(failed: Mapping[str, str], count: int, where: str) -> None:
+    """Say what failed.
+
+    Raises:
+        SomeFailedError: Something did.
+    """
+    for name, problem in failed.items():
+        print(f"pumafuse: {name}: {problem}", file=sys.stderr)
+    if failed:
+        raise SomeFailedError(f"{len(failed)} of {count} runs failed (see above); the others are in {where}")
+
+
+def _guarded(name: str, job: Callable[[], R]) -> tuple[str, R | None, str | None]:
+    """A job's result, or its error in one line: one bad run must not cost the others."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PumafuseWarning)  # they are among the notes of each run's summary
+        try:
+            return name, job(), None
+        except PumafuseError as error:
+            return name, None, str(error)
+        except Exception as error:
+            return name, None, f"unexpected {type(error).__name__}: {error}"

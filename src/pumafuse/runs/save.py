@@ -1,0 +1,47 @@
+"""A recorded run as a folder: a CSV file for each source, and ``run.toml``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from .. import toml
+from ..units import MM, seconds
+from . import tables
+from .run import Run, Source
+
+
+def save(run: Run, folder: Path) -> None:
+    """Write a run that :meth:`Run.read` reads back: stamps to the ns within 26 days of 0, lengths to the nm.
+
+    Args:
+        run: What to write; its notes stay behind.
+        folder: An existing folder.
+    """
+    manifest: dict[str, Any] = {"name": run.name, "command": _entry(run.command, "commands.csv", folder)}
+    if run.start:
+        manifest["command"]["start"] = {f"{axis}_mm": level for axis, level in run.start.items()}
+    if run.clock != "stamps":
+        manifest["command"]["clock"] = run.clock
+    if run.sensors:
+        manifest["sensors"] = {name: _entry(source, f"{name}.csv", folder) for name, source in run.sensors.items()}
+    if run.reference is not None:
+        manifest["reference"] = _entry(run.reference, "truth.csv", folder)
+        if run.reference.sd:
+            manifest["reference"]["sd_mm"] = run.reference.sd
+    if run.frame is not None:
+        manifest["frame"] = toml.builtins(run.frame)
+    (folder / "run.toml").write_text(toml.text(manifest), encoding="utf-8")
+
+
+def _entry(source: Source, file: str, folder: Path) -> dict[str, Any]:
+    """Write one source; returns its table of ``run.toml``."""
+    columns = {
+        f"{axis}_mm": pa.array(np.round(value * MM, 6), from_pandas=True) for axis, value in source.values.items()
+    }
+    stamp = pa.array(seconds(source.stamp), from_pandas=True)
+    tables.write(pa.table({"time_s": stamp, **columns}), folder / file)
+    return {"file": file, "time": "time_s", **{axis: f"{axis}_mm" for axis in source.values}}

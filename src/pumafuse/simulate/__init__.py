@@ -1,0 +1,1 @@
+"""Recorded runs on demand, with the truth in them."""

@@ -1,0 +1,247 @@
+"""From a scenario and a seed to a recorded run with its truth: :func:`simulate`."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from .. import folders
+from ..arrays import FloatArray, IntArray, TimeArray
+from ..fusion.config import FusionConfig, Process
+from ..model.arm import ordered_axes
+from ..runs import save, tables
+from ..runs.frames import Cylindrical, Placed, Rotated
+from ..runs.run import Reference, Run, Source
+from ..units import MM
+from . import sensing
+from .motion import Motion, move
+from .scenario import Scenario
+from .trajectory import Steps
+
+TRIALS, SAMPLES = "trials.csv", "samples.csv"
+_BEFORE = 0.05  # s of rest that a trial's samples begin with
+_OURS = frozenset({"run.toml", "fusion.toml", "arm.toml", TRIALS, SAMPLES})
+
+
+@dataclass(frozen=True)
+class Trials:
+    """A campaign of step trials; arrays are (trials,) and (samples,).
+
+    Attributes:
+        axis: Which axis is stepped.
+        step: By how much, signed [m].
+        speed: Of the step: its size over T [m/s].
+        trial: Of each sample, its trial's number.
+        time: Of each sample since its step's command [s].
+        position: Of each sample [m], as the scope has it.
+    """
+
+    axis: tuple[str, ...]
+    step: FloatArray
+    speed: FloatArray
+    trial: IntArray
+    time: FloatArray
+    position: FloatArray
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What :func:`simulate` returns.
+
+    Attributes:
+        run: The recorded run; its reference is the truth.
+        config: What the filter is to believe.
+        trials: The step trials of a campaign.
+    """
+
+    run: Run
+    config: FusionConfig
+    trials: Trials | None
+
+
+def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
+    """Let the true arm of a scenario follow its trajectory under the eyes of its sensors.
+
+    The same scenario and seed give the same numbers. Every axis and sensor draws from a stream of its own: another
+    sensor changes no other reading.
+
+    Args:
+        scenario: What happens.
+        seed: Instead of the scenario's own.
+
+    Raises:
+        PumafuseError: The trajectory's file cannot be read, or it is too long.
+    """
+    seed = scenario.seed if seed is None else seed
+    tick, told = _commands(scenario, seed)
+    period = scenario.arm.update_period
+    end = int(tick[-1]) + round(period * 1e9)
+    axes, log = tuple(told), _Log(scenario, tuple(told))
+    parts = scenario.reference.rows_per_command
+    rows = np.rint(np.arange(len(tick) * parts) * (period * 1e9 / parts)).astype(np.int64)
+    valid = {
+        name: sensing.valid_times(sensor, end, _stream(seed, "rate", name)) for name, sensor in scenario.sensors.items()
+    }
+    moved = _motions(scenario, seed, tick, told, np.unique(np.concatenate([rows, *valid.values()])))
+
+    sensors: dict[str, Source] = {}
+    for name, sensor in scenario.sensors.items():
+        seen = axes if sensor.axes is None else ordered_axes(set(sensor.axes) & set(axes))
+        true = log.positions({axis: moved[axis].at(valid[name]) for axis in seen}, in_axes=sensor.axes is not None)
+        sensors[name] = _rounded(sensing.measure(sensor, name, valid[name], true, _stream(seed, "sensor", name)))
+    noise = _stream(seed, "reference")
+    reference = {
+        axis: true + scenario.reference.sd * noise.standard_normal(len(rows))
+        for axis, true in log.positions({axis: motion.at(rows) for axis, motion in moved.items()}).items()
+    }
+    truth = _rounded(Source(rows, reference, "reference"))
+    jitter = scenario.command.stamp_jitter * _stream(seed, "stamps").standard_normal(len(tick))
+    stamp = np.maximum.accumulate(tick + np.rint(jitter * 1e9).astype(np.int64))
+    start = {axis: value[0] for axis, value in log.positions({axis: np.zeros(1) for axis in axes}).items()}
+    run = Run(
+        name=f"{scenario.name}, seed {seed}",
+        command=_rounded(Source(stamp, log.positions(told), "command")),
+        sensors=sensors,
+        reference=Reference(truth.stamp, truth.values, truth.label, sd=scenario.reference.sd),
+        start={axis: float(_nanometres(level)) for axis, level in start.items()},
+        clock=scenario.command.clock,
+        frame=scenario.frame,
+    )
+    return Simulated(run, scenario.config, _trials(scenario, tick, told, sensors))
+
+
+def check_writable(folder: Path, force: bool) -> None:
+    """Refuse early what :func:`write` would refuse late.
+
+    Raises:
+        FolderError: The folder exists and is not to be replaced, or holds something else than a simulated run.
+    """
+    folders.check_writable(folder, force, "run.toml", lambda name: name in _OURS or name.endswith(".csv"))
+
+
+def write(simulated: Simulated, folder: Path, force: bool) -> None:
+    """Write a simulated run as a recorded run, with ``fusion.toml`` and ``arm.toml`` for a filter, and its step trials.
+
+    Raises:
+        FolderError: See :func:`check_writable`, or the disk refuses.
+    """
+    check_writable(folder, force)
+    with folders.replacing(folder) as new:
+        save.save(simulated.run, new)
+        simulated.config.save(new)
+        if simulated.trials is not None:
+            _write_trials(simulated.trials, new)
+
+
+class _Log:
+    """In which coordinates the log is: the axes, or x, y, z."""
+
+    def __init__(self, scenario: Scenario, axes: tuple[str, ...]) -> None:
+        self._level = {axis: scenario.start.level.get(axis, 0.0) for axis in axes}
+        self._placed: Placed | None = None
+        if isinstance(scenario.frame, Cylindrical):
+            azimuth = float(np.deg2rad(scenario.start_azimuth))
+            self._placed = Placed(scenario.frame, self._level["radial"], azimuth)
+        elif isinstance(scenario.frame, Rotated):
+            self._placed = Placed(scenario.frame, 1.0, float(np.deg2rad(scenario.frame.azimuth)))
+
+    def positions(self, moved: Mapping[str, FloatArray], *, in_axes: bool = False) -> dict[str, FloatArray]:
+        """What is ``moved`` [m] from the start level as the log has it; ``in_axes``: as a source that names axes."""
+        along = {axis: value + self._level[axis] for axis, value in moved.items()}
+        if self._placed is None or in_axes:
+            return along
+        x, y = self._placed.to_log(along["tangential"], along["radial"])
+        return {"x": x, "y": y} | ({"z": along["vertical"]} if "vertical" in along else {})
+
+
+def _stream(seed: int, *purpose: str) -> np.random.Generator:
+    """Random numbers for one purpose, the same whatever else is drawn."""
+    return np.random.default_rng([seed, *(zlib.crc32(word.encode()) for word in purpose)])
+
+
+def _commands(scenario: Scenario, seed: int) -> tuple[TimeArray, dict[str, FloatArray]]:
+    """The ticks [int64 ns] and, for each commanded axis in order, u relative to its start level [m]."""
+    period = scenario.arm.update_period
+    offsets = scenario.trajectory.offsets(period, _stream(seed, "trajectory"))
+    count = len(next(iter(offsets.values())))
+    named = set(offsets) if scenario.frame is None else set(scenario.arm.axes)  # x and y need both their axes
+    told = {axis: offsets.get(axis, np.zeros(count)) for axis in ordered_axes(named)}
+    return np.rint(np.arange(count) * (period * 1e9)).astype(np.int64), told
+
+
+def _motions(
+    scenario: Scenario, seed: int, tick: TimeArray, told: Mapping[str, FloatArray], wanted: TimeArray
+) -> dict[str, Motion]:
+    true_axes = scenario.true_axes
+    return {
+        axis: move(
+            true_axes[axis],
+            scenario.process.get(axis, Process()),
+            scenario.start.offset_sd,
+            tick,
+            command,
+            scenario.arm.update_period,
+            wanted,
+            _stream(seed, "axis", axis),
+        )
+        for axis, command in told.items()
+    }
+
+
+def _nanometres(value: FloatArray) -> FloatArray:
+    """Lengths [m] rounded as files have them, so that a run is the same in memory and read back."""
+    return np.round(value * MM, 6) / MM
+
+
+def _rounded(source: Source) -> Source:
+    return replace(source, values={axis: _nanometres(value) for axis, value in source.values.items()})
+
+
+def _trials(
+    scenario: Scenario, tick: TimeArray, told: Mapping[str, FloatArray], sensors: Mapping[str, Source]
+) -> Trials | None:
+    """The trials of a step campaign, cut from its run; None for another trajectory."""
+    campaign = scenario.trajectory
+    if not isinstance(campaign, Steps):
+        return None
+    scope, period = sensors[campaign.scope], scenario.arm.update_period
+    valid = scope.stamp / 1e9 - scenario.sensors[campaign.scope].latency
+    axis_of, step, samples = list[str](), list[float](), list[tuple[int, FloatArray, FloatArray]]()
+    for number in range(1, len(tick) // campaign.ticks_between(period)):
+        at = number * campaign.ticks_between(period)
+        axis = next(axis for axis, command in told.items() if command[at] != command[at - 1])
+        since = valid - tick[at] / 1e9
+        kept = (since >= -_BEFORE) & (since <= campaign.window)
+        axis_of.append(axis)
+        step.append(float(told[axis][at] - told[axis][at - 1]))
+        samples.append((number, since[kept], scope.values[axis][kept]))
+    return Trials(
+        tuple(axis_of),
+        np.array(step),
+        np.abs(step) / period,
+        np.concatenate([np.full(len(time), number) for number, time, _ in samples]),
+        np.concatenate([time for _, time, _ in samples]),
+        np.concatenate([position for _, _, position in samples]),
+    )
+
+
+def _write_trials(trials: Trials, folder: Path) -> None:
+    listed = {
+        "trial": np.arange(1, len(trials.axis) + 1),
+        "axis": list(trials.axis),
+        "step_mm": np.round(trials.step * MM, 6),
+        "speed_m_s": np.round(trials.speed, 6),
+        "direction": ["up" if step > 0.0 else "down" for step in trials.step.tolist()],
+    }
+    sampled = {
+        "trial": trials.trial,
+        "time_s": np.round(trials.time, 9),
+        "position_mm": np.round(trials.position * MM, 6),
+    }
+    tables.write(pa.table(listed), folder / TRIALS)
+    tables.write(pa.table(sampled), folder / SAMPLES)
