@@ -33,7 +33,7 @@ def each(what: str, jobs: Mapping[str, Callable[[], R]]) -> tuple[dict[str, R], 
         What each job returned, and what was wrong with those that failed, both in the order given.
 
     Raises:
-        SomeFailedError: Interrupted; says how many were done.
+        KeyboardInterrupt: As it came, after saying how many are done.
     """
     from joblib import Parallel, delayed
 
@@ -43,12 +43,16 @@ def each(what: str, jobs: Mapping[str, Callable[[], R]]) -> tuple[dict[str, R], 
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task(what, total=len(jobs))
         parallel = Parallel(n_jobs=-1, return_as="generator_unordered", batch_size=1)
-        for name, result, problem in parallel(delayed(_guarded)(name, job) for name, job in jobs.items()):
-            if problem is None:
-                results[name] = cast(R, result)
-            else:
-                failed[name] = problem
-            bar.advance(task)
+        try:
+            for name, result, problem in parallel(delayed(_guarded)(name, job) for name, job in jobs.items()):
+                if problem is None:
+                    results[name] = cast(R, result)
+                else:
+                    failed[name] = problem
+                bar.advance(task)
+        except KeyboardInterrupt:
+            print(f"interrupted: {len(results)} of {len(jobs)} runs are done and kept", file=sys.stderr)
+            raise
     return {name: results[name] for name in jobs if name in results}, {n: failed[n] for n in jobs if n in failed}
 
 
