@@ -9,7 +9,7 @@ import pumafuse as pf
 
 SOURCE = Path(pf.__file__).parent
 ROOMS = ["model", "runs", "fusion", "simulate", "views", "cli"]  # each imports itself and those before it
-GROUND = {"arrays", "errors", "units", "toml", "folders"}
+GROUND = {"arrays", "errors", "units", "toml", "folders", "compiled"}
 
 
 def imported_rooms(path: Path) -> set[str]:

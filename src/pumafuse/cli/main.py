@@ -62,7 +62,9 @@ def fuse(
     as_live: Annotated[bool, typer.Option("--as-live", help="Use only readings that had arrived by then.")] = False,
     rrd: Annotated[bool, typer.Option("--rrd", help="Also write fused.rrd for the Rerun viewer.")] = False,
     figures: Annotated[bool, typer.Option("--figures", help="Also draw the run and its validation.")] = False,
-    engine: Annotated[Literal["filterpy"], typer.Option(help="Which engine computes.")] = "filterpy",
+    engine: Annotated[
+        Literal["compiled", "filterpy"], typer.Option(help="Which engine computes; filterpy is the slow reference.")
+    ] = "compiled",
     force: Force = False,
 ) -> None:
     """Fuse recorded runs: estimates, what became of each reading, and a summary.

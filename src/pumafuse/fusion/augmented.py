@@ -20,13 +20,12 @@ from ..arrays import FloatArray, IntArray, TimeArray
 from ..model.discrete import transition
 from ..model.plants import Plant
 from .config import FusionConfig, Process, Sensor
-from .timeline import AxisInput, Outcome, Timeline
-from .track import Filtered, Track, Updates
+from .estimates import Mode
+from .smoother import hindsight, hindsight_at
+from .timeline import REOPEN_AFTER, REOPEN_SPAN_NS, AxisInput, Outcome, Timeline
+from .track import AxisEstimate, Bias, Filtered, Fused, Track, Updates, estimate
 
 Progress = Callable[[float], None]
-
-REOPEN_AFTER = 10  # rejections in a row of one sensor …
-REOPEN_SPAN_NS = 500_000_000  # … the first of them at least 0.5 s ago
 
 # H, K (s,), ν and R of an update, and by how much the offset's variance was widened before it.
 Update = tuple[FloatArray, FloatArray, float, float, float]
@@ -338,3 +337,23 @@ class ReferenceEngine:
     def _filtered(self, tracks: tuple[Track, ...]) -> Filtered:
         final = tuple(axis.held[-1][1:3] for axis in self._filters)
         return Filtered(tracks, self._innovation, self._innovation_sd, self._outcome, tuple(self._biases), final)
+
+
+def fuse_reference(
+    timeline: Timeline, config: FusionConfig, times: TimeArray, mode: Mode, progress: Progress | None = None
+) -> Fused:
+    """Filter or smooth one timeline by the reference engine, with estimates at ``times`` (int64 ns)."""
+    engine = ReferenceEngine(timeline, config)
+    filtered = engine.filter_as_live(times, progress) if mode == "as-live" else engine.filter(progress)
+    axes: dict[str, AxisEstimate] = {}
+    biases: dict[str, dict[str, Bias]] = {}
+    for number, (axis, track) in enumerate(zip(timeline.axes, filtered.tracks, strict=True)):
+        plant = config.arm.axes[axis.name].plant
+        entry = np.arange(len(times)) if mode == "as-live" else track.holding(times)
+        later = hindsight_at(track, hindsight(track, plant), entry, times, plant) if mode == "smoothed" else None
+        axes[axis.name] = estimate(track, entry, times, plant, axis.start, later)
+        (mean, covariance), names = filtered.final[number], filtered.biases[number]
+        for place, name in enumerate(names, len(mean) - len(names)):
+            sd = float(np.sqrt(covariance[place, place]))
+            biases.setdefault(name, {})[axis.name] = Bias(float(mean[place]), sd)
+    return Fused(axes, filtered.innovation, filtered.innovation_sd, filtered.outcome, biases)

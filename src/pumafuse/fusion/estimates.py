@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import BoolArray, CodeArray, FloatArray, IntArray
 from .config import FusionConfig
 from .timeline import Outcome
-from .track import AxisEstimate
+from .track import AxisEstimate, Bias
 
 Mode = Literal["filtered", "as-live", "smoothed"]
 
@@ -73,14 +73,6 @@ class Readings:
         """How many scalars had each outcome, those that occur."""
         found = np.bincount(self.outcome, minlength=len(Outcome))
         return {outcome.word: int(found[outcome]) for outcome in Outcome if found[outcome]}
-
-
-@dataclass(frozen=True)
-class Bias:
-    """A sensor's constant bias on one axis [m], in the log's coordinates, and its standard deviation [m]."""
-
-    value: float
-    sd: float
 
 
 @dataclass(frozen=True)

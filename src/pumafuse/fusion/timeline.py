@@ -23,6 +23,8 @@ from ..runs.run import Run, Source
 from .config import FusionConfig, Sensor
 
 LONGEST_TAIL_NS = 3_600_000_000_000  # readings this long after the last command no longer belong to the run
+REOPEN_AFTER = 10  # rejections in a row of one sensor …
+REOPEN_SPAN_NS = 500_000_000  # … the first of them at least 0.5 s ago
 _FARTHEST = 1e6  # m
 _MOST_ESTIMATES = 10_000_000
 

@@ -122,6 +122,33 @@ class AxisEstimate:
     FIELDS = ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd")
 
 
+@dataclass(frozen=True)
+class Bias:
+    """A sensor's constant bias on one axis [m], in the log's coordinates, and its standard deviation [m]."""
+
+    value: float
+    sd: float
+
+
+@dataclass(frozen=True)
+class Fused:
+    """What an engine makes of one timeline.
+
+    Attributes:
+        axes: Estimates by axis.
+        innovation: ν [m] of each scalar, NaN where the filter never met it, (m,).
+        innovation_sd: √S [m], likewise.
+        outcome: What became of each scalar, (m,).
+        biases: By sensor and axis, as all readings together know it.
+    """
+
+    axes: dict[str, AxisEstimate]
+    innovation: FloatArray
+    innovation_sd: FloatArray
+    outcome: CodeArray
+    biases: dict[str, dict[str, Bias]]
+
+
 class Moves(NamedTuple):
     """Transitions of plant, offset and biases over some intervals, (k, …).
 

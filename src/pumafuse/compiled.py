@@ -1,0 +1,41 @@
+"""How kernels are compiled: by numba, kept on disk, without fast-math, and with a word to who waits the first time."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    P = ParamSpec("P")
+    R = TypeVar("R")
+
+    def compiled(function: Callable[P, R]) -> Callable[P, R]:
+        """A function compiled to machine code; called from Python or from another one."""
+        ...
+
+else:
+    import numba
+
+    # A division by zero gives an infinity, as in numpy; the GIL is free for other threads.
+    compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+_PATIENCE = 1.5  # s; what is on disk loads in less
+
+
+@contextmanager
+def maybe_compiling() -> Generator[None]:
+    """Say on stderr that kernels are being compiled when the block takes that long before it is through."""
+    timer = threading.Timer(
+        _PATIENCE, print, ("compiling the filter, once for this machine (about 20 s) ...",), {"file": sys.stderr}
+    )
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

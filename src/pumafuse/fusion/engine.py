@@ -1,0 +1,187 @@
+"""From a timeline to the compiled kernels' arrays and back."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..arrays import FloatArray, IntArray, TimeArray
+from ..compiled import maybe_compiling
+from ..model import closed
+from ..model.plants import FirstOrder
+from . import kernels
+from .config import FusionConfig
+from .estimates import Mode
+from .timeline import AxisInput, Timeline
+from .track import AxisEstimate, Bias, Fused
+
+
+def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mode: Mode) -> Fused:
+    """Filter or smooth one timeline, with estimates at ``times`` (int64 ns, ascending, none before the origin)."""
+    scalars, candidates = timeline.scalars, timeline.scalars.candidates
+    sensors, biases = _sensors(timeline, config)
+    axes = _axes(timeline, config, [len(names) for names in biases])
+    rows = _rows(timeline, config)
+    count, width = len(timeline.axes), int(axes.states.max())
+    state = _start(axes, timeline, config, biases, width)
+    met = kernels.Met(*(np.full(len(candidates), np.nan) for _ in range(2)), np.zeros(len(candidates), dtype=np.uint8))
+    outputs = kernels.Outputs(*(np.empty((count, len(times))) for _ in kernels.Outputs._fields))
+    smooth = mode == "smoothed"
+    kept = len(times) if smooth else 0
+    held = kernels.Held(np.empty((count, kept, width)), np.empty((count, kept, width, width)), np.empty((count, kept)))
+    log = _log(axes, rows, width) if smooth else _log(axes, None, width)
+    with maybe_compiling():
+        if mode == "as-live":
+            arrival = np.maximum(scalars.stamp[candidates[rows.first[:-1]]], rows.valid)
+            queue = np.argsort(arrival, kind="stable")
+            back = int((np.maximum.accumulate(queue) - queue).max(initial=0)) + 2
+            places = kernels.State(*(np.empty((back, *part.shape), part.dtype) for part in state))
+            kernels.filter_as_live(
+                axes, sensors, rows, arrival, queue, state, places, times, met, log, held, outputs
+            )
+        else:
+            kernels.filter_run(axes, sensors, rows, state, times, met, log, held, outputs)
+        if smooth:
+            sensor_of = np.repeat(rows.sensor, np.diff(rows.first))
+            kernels.smooth_run(axes, sensors, rows, log, met, sensor_of, timeline.origin, times, held, outputs)
+    outcome = scalars.outcome.copy()
+    outcome[candidates] = met.outcome
+    return Fused(
+        {axis.name: _estimate(axis, outputs, number) for number, axis in enumerate(timeline.axes)},
+        _spread(met.innovation, candidates, len(scalars.value)),
+        _spread(met.innovation_sd, candidates, len(scalars.value)),
+        outcome,
+        _known_biases(timeline, axes, state, biases),
+    )
+
+
+def _biases_on(timeline: Timeline, config: FusionConfig) -> list[list[str]]:
+    """For each axis the sensors whose bias is in its state: those heard on it, in their order."""
+    scalars, candidates = timeline.scalars, timeline.scalars.candidates
+    heard = np.zeros((len(scalars.sensors), len(timeline.axes)), dtype=np.bool_)
+    heard[scalars.sensor[candidates], scalars.axis[candidates]] = True
+    biased = [name in config.sensors and config.sensors[name].bias_sd > 0.0 for name in scalars.sensors]
+    return [
+        [name for index, name in enumerate(scalars.sensors) if biased[index] and heard[index, axis]]
+        for axis in range(len(timeline.axes))
+    ]
+
+
+def _sensors(timeline: Timeline, config: FusionConfig) -> tuple[kernels.Sensors, list[list[str]]]:
+    names, biases = timeline.scalars.sensors, _biases_on(timeline, config)
+    known = [config.sensors.get(name) for name in names]
+    bias = np.full((len(names), len(timeline.axes)), -1)
+    for number, axis in enumerate(timeline.axes):
+        first = _order(config, axis) + 1
+        for place, name in enumerate(biases[number]):
+            bias[names.index(name), number] = first + place
+    return kernels.Sensors(
+        np.array([1.0 if sensor is None else sensor.scale for sensor in known]),
+        np.array([0.0 if sensor is None else sensor.latency_sd for sensor in known]),
+        np.array([0.0 if sensor is None else sensor.gate for sensor in known]),
+        np.array([sensor is None or sensor.gate_rows for sensor in known], dtype=np.bool_),
+        bias,
+    ), biases
+
+
+def _order(config: FusionConfig, axis: AxisInput) -> int:
+    return 1 if isinstance(config.arm.axes[axis.name].plant, FirstOrder) else 2
+
+
+def _axes(timeline: Timeline, config: FusionConfig, biases: list[int]) -> kernels.Axes:
+    driven = [(axis, config.process[axis.name]) for axis in timeline.axes]
+    order = np.array([_order(config, axis) for axis, _ in driven])
+    noise = [p.input_noise**2 + (p.maneuver_noise * axis.drive.maneuver) ** 2 for axis, p in driven]
+    drift = [p.drift**2 + (p.maneuver_drift * axis.drive.maneuver) ** 2 for axis, p in driven]
+    return kernels.Axes(
+        order=order,
+        constants=np.array([closed.constants(config.arm.axes[axis.name].plant) for axis, _ in driven]),
+        states=order + 1 + np.array(biases),
+        first=np.cumsum([0, *(len(axis.drive.time) for axis, _ in driven)]),
+        acting=np.concatenate([axis.acting for axis, _ in driven]),
+        value=np.concatenate([axis.drive.value for axis, _ in driven]),
+        noise=np.concatenate(noise),
+        drift=np.concatenate(drift),
+        resting=np.array([[p.input_noise**2, p.drift**2] for _, p in driven]),
+    )
+
+
+def _rows(timeline: Timeline, config: FusionConfig) -> kernels.Rows:
+    scalars, candidates = timeline.scalars, timeline.scalars.candidates
+    sensor, axis, row = scalars.sensor[candidates], scalars.axis[candidates], scalars.row[candidates]
+    begins = np.flatnonzero(np.diff(row, prepend=-1))
+    known = [config.sensors.get(name) for name in scalars.sensors]
+    sds = [[(s and s.sd_of(axis.name)) or np.nan for axis in timeline.axes] for s in known]
+    scale = np.array([1.0 if s is None else s.scale for s in known])
+    start = np.array([axis.start for axis in timeline.axes])
+    return kernels.Rows(
+        valid=scalars.valid[candidates[begins]],
+        sensor=sensor[begins],
+        first=np.append(begins, len(candidates)),
+        axis=axis,
+        value=scalars.value[candidates] - scale[sensor] * start[axis],
+        sd=np.array(sds).reshape(len(known), len(start))[sensor, axis] * scalars.spread[candidates],
+    )
+
+
+def _start(
+    axes: kernels.Axes, timeline: Timeline, config: FusionConfig, biases: list[list[str]], width: int
+) -> kernels.State:
+    """At rest at the start level, certain of all but the offset and the biases."""
+    count, sensors = len(axes.order), len(timeline.scalars.sensors)
+    P = np.zeros((count, width, width))
+    for number, names in enumerate(biases):
+        offset = axes.order[number]
+        P[number, offset, offset] = config.start.offset_sd**2
+        for place, name in enumerate(names, offset + 1):
+            P[number, place, place] = config.sensors[name].bias_sd ** 2
+    return kernels.State(
+        x=np.zeros((count, width)),
+        P=P,
+        clock=np.full(count, timeline.origin),
+        entry=np.full(count, -1),
+        rejected=np.zeros((sensors, count + 1), dtype=np.int64),
+        since=np.zeros((sensors, count + 1), dtype=np.int64),
+        work=np.zeros((4 + width, width)),
+    )
+
+
+def _log(axes: kernels.Axes, rows: kernels.Rows | None, width: int) -> kernels.Log:
+    """Room for what happens to each axis: an interval for each command, and an interval and an update for each scalar."""
+    count = len(axes.order)
+    room = np.zeros(count, dtype=np.int64)
+    if rows is not None:
+        room = np.diff(axes.first) + 2 * np.bincount(rows.axis, minlength=count)
+    size = int(room.sum())
+    return kernels.Log(
+        np.concatenate(([0], np.cumsum(room))),
+        np.zeros(count, dtype=np.int64),
+        np.empty(size, dtype=np.int64),
+        np.empty(size, dtype=np.int64),
+        np.empty(size),
+        np.empty(size),
+        np.empty((size, width)),
+    )
+
+
+def _estimate(axis: AxisInput, outputs: kernels.Outputs, number: int) -> AxisEstimate:
+    parts = {name: getattr(outputs, name)[number] for name in AxisEstimate.FIELDS}
+    parts["position"] += axis.start
+    return AxisEstimate(**parts)
+
+
+def _known_biases(
+    timeline: Timeline, axes: kernels.Axes, state: kernels.State, biases: list[list[str]]
+) -> dict[str, dict[str, Bias]]:
+    found: dict[str, dict[str, Bias]] = {}
+    for number, axis in enumerate(timeline.axes):
+        for place, name in enumerate(biases[number], int(axes.order[number]) + 1):
+            sd = float(np.sqrt(max(state.P[number, place, place], 0.0)))
+            found.setdefault(name, {})[axis.name] = Bias(float(state.x[number, place]), sd)
+    return found
+
+
+def _spread(values: FloatArray, candidates: IntArray, size: int) -> FloatArray:
+    """Values of the candidates among all scalars, NaN for the others."""
+    found = np.full(size, np.nan)
+    found[candidates] = values
+    return found

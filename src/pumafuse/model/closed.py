@@ -1,0 +1,133 @@
+"""Transitions of first- and second-order plants in closed form, for any interval, compiled.
+
+Over an interval t the response g of the free plant (g″ = −2σ g′ − ω² g, g(0) = 0, g′(0) = 1) gives
+
+    Φ = [ g′ + 2σ g, g; −ω² g, g′ ],   Q11 = ω⁴ ∫ g², Q12 = ½ ω⁴ g², Q22 = ω² Q11 + 2σ Q12 + ω⁴ g g′
+
+for unit noise on the input. While the fastest pole turns by less than half a radian, g and ∫ g² come from their Taylor
+series: closed forms would lose all digits of Q11 ~ t³. Beyond it from exponentials, in the form that does not cancel.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..compiled import compiled
+from .plants import PLANTS, FirstOrder
+
+_TERMS = 16  # of each series: the next would be below 1e-16 of the sum
+_SHORT = 0.5  # rad; fastest pole × interval up to which the series are used
+_HEAD = 6  # constants before the series
+_APART = 0.3  # rad; below it exponentials of the two poles cancel
+
+SIZE = _HEAD + 3 * _TERMS
+
+
+def constants(plant: PLANTS) -> FloatArray:
+    """What the kernels need to know of a plant, (c,): for first order its rate, for second order ω, σ, β², r, series."""
+    found = np.zeros(SIZE)
+    if isinstance(plant, FirstOrder):
+        found[0] = 1.0 / plant.time_constant
+        return found
+    omega = plant.natural_frequency
+    sigma = plant.damping * omega
+    square = (plant.damping - 1.0) * (plant.damping + 1.0) * omega**2
+    fastest = sigma + math.sqrt(square) if square > 0.0 else omega
+    found[:4] = omega, sigma, square, fastest
+    s, w = sigma / fastest, (omega / fastest) ** 2  # in the time u = r t, where no coefficient overflows
+    g = np.zeros(_TERMS + 2)
+    g[1] = 1.0
+    for k in range(_TERMS):
+        g[k + 2] = -(2.0 * s * (k + 1) * g[k + 1] + w * g[k]) / ((k + 1) * (k + 2))
+    # y = g² obeys y‴ = −6σ y″ − (8σ² + 4ω²) y′ − 8σω² y
+    y = np.zeros(_TERMS + 3)
+    y[2] = 1.0
+    for k in range(_TERMS):
+        y[k + 3] = -(
+            6.0 * s * (k + 1) * (k + 2) * y[k + 2] + (8.0 * s * s + 4.0 * w) * (k + 1) * y[k + 1] + 8.0 * s * w * y[k]
+        ) / ((k + 1) * (k + 2) * (k + 3))
+    order = np.arange(_TERMS)
+    found[_HEAD : _HEAD + _TERMS] = g[1 : _TERMS + 1]  # g / u
+    found[_HEAD + _TERMS : _HEAD + 2 * _TERMS] = g[1 : _TERMS + 1] * (order + 1)  # g′
+    found[_HEAD + 2 * _TERMS :] = y[2 : _TERMS + 2] / (order + 3)  # ∫ g² / u³
+    return found
+
+
+@compiled
+def advance_first(constants: FloatArray, dt: float) -> tuple[float, float]:
+    """Φ − 1 and Q of a first-order plant over ``dt`` [s]."""
+    rate = constants[0]
+    lost = math.expm1(-rate * dt)
+    return lost, -0.5 * rate * lost * (2.0 + lost)
+
+
+@compiled
+def advance_second(constants: FloatArray, dt: float) -> tuple[float, float, float, float, float, float, float]:
+    """Φ11, Φ12, Φ21, Φ22, Q11, Q12, Q22 of a second-order plant over ``dt`` [s]."""
+    omega, sigma, square, fastest = constants[0], constants[1], constants[2], constants[3]
+    u = fastest * dt
+    if u <= _SHORT:
+        g, rate, power = _series(constants, u)
+        g, power = g / fastest, power / (fastest * fastest * fastest)
+    else:
+        g, rate, power = _exponentials(omega, sigma, square, dt)
+    w2 = omega * omega
+    h, h_rate = w2 * g, w2 * rate
+    q11, q12 = w2 * w2 * power, 0.5 * h * h
+    return rate + 2.0 * sigma * g, g, -h, rate, q11, q12, w2 * q11 + 2.0 * sigma * q12 + h * h_rate
+
+
+@compiled
+def _series(constants: FloatArray, u: float) -> tuple[float, float, float]:
+    """g, g′ and ∫ g² in the time u."""
+    g, rate, power = 0.0, 0.0, 0.0
+    for k in range(_TERMS - 1, -1, -1):
+        g = g * u + constants[_HEAD + k]
+        rate = rate * u + constants[_HEAD + _TERMS + k]
+        power = power * u + constants[_HEAD + 2 * _TERMS + k]
+    return g * u, rate, power * u * u * u
+
+
+@compiled
+def _exponentials(omega: float, sigma: float, square: float, t: float) -> tuple[float, float, float]:
+    """g, g′ and ∫ g² over an interval that is long against the fastest pole."""
+    beta = math.sqrt(abs(square))
+    if square < 0.0:
+        decay = math.exp(-sigma * t)
+        sine, cosine = math.sin(beta * t), math.cos(beta * t)
+        g = decay * sine / beta
+        rate = decay * cosine - sigma * g
+        if beta * t > _APART:
+            twice = decay * decay
+            straight = -math.expm1(-2.0 * sigma * t) / (2.0 * sigma)
+            turning = (
+                2.0 * sigma * (1.0 - twice * (cosine - sine) * (cosine + sine)) + 4.0 * beta * twice * sine * cosine
+            ) / (4.0 * omega * omega)
+            return g, rate, (straight - turning) / (2.0 * beta * beta)
+        return g, rate, _energy(omega, sigma, g, rate)
+    slow, fast = omega * omega / (sigma + beta), sigma + beta
+    lasting = math.exp(-slow * t)
+    if beta * t > _APART:
+        brief = math.exp(-fast * t)
+        g = (lasting - brief) / (2.0 * beta)
+        rate = (fast * brief - slow * lasting) / (2.0 * beta)
+        power = (
+            -math.expm1(-2.0 * slow * t) / (2.0 * slow)
+            + math.expm1(-2.0 * sigma * t) / sigma
+            - math.expm1(-2.0 * fast * t) / (2.0 * fast)
+        ) / (4.0 * beta * beta)
+        return g, rate, power
+    g = lasting * t if beta == 0.0 else -lasting * math.expm1(-2.0 * beta * t) / (2.0 * beta)
+    rate = 0.5 * lasting * (1.0 + math.exp(-2.0 * beta * t)) - sigma * g
+    return g, rate, _energy(omega, sigma, g, rate)
+
+
+@compiled
+def _energy(omega: float, sigma: float, g: float, rate: float) -> float:
+    """∫ g² of poles that lie together, from the balance of energy: 4σ ∫ g′² = 1 − g′² − ω² g², ω² ∫ g² = ∫ g′² − …."""
+    w2 = omega * omega
+    moving = (1.0 - rate * rate - w2 * g * g) / (4.0 * sigma)  # ∫ g′²
+    return (moving - sigma * g * g - g * rate) / w2
