@@ -1,14 +1,15 @@
 """The true arm's motion against integrators and quadratures that share nothing with it.
 
 Deterministic responses are compared with an adaptive Runge-Kutta method run from one change of the input to the next,
-to 1e-8 of the largest command. Noise is compared with its covariance ∫ q(s) g(t − s) g(t' − s) ds, g(t) = C e^(At) B, by
-Gauss-Legendre quadrature, over independent seeds: the covariance's own Cholesky factor turns all positions into standard
-normal numbers, whose mean square must lie in the 99.9 % chi-square band and whose sample covariance within five standard
-deviations of the identity, entry by entry.
+to 1e-8 of the largest command. Noise is compared with its covariance ∫ q(s) g(t − s) g(t' − s) ds, where
+g(t) = C e^(At) B, by Gauss-Legendre quadrature, over independent seeds: the covariance's own Cholesky factor turns all
+positions into standard normal numbers, whose mean square must lie in the 99.9 % chi-square band and whose sample
+covariance within five standard deviations of the identity, entry by entry.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -179,9 +180,7 @@ def exact(axis: TrueAxis, v: Sequence[float], acting: Floats, wanted: Floats) ->
 
 
 @settings(max_examples=30, deadline=None, derandomize=True)
-@given(
-    st.floats(5.0, 300.0), st.floats(0.05, 5.0), st.one_of(st.none(), st.floats(0.002, 0.2)), st.floats(0.0, 0.2)
-)
+@given(st.floats(5.0, 300.0), st.floats(0.05, 5.0), st.one_of(st.none(), st.floats(0.002, 0.2)), st.floats(0.0, 0.2))
 def test_any_linear_axis_follows_its_differential_equation(w: float, z: float, lag: float | None, delay: float) -> None:
     """Natural frequency, damping, extra lag and delay of any size agree with matrix exponentials to 1e-8."""
     command = random_walk(40)
@@ -192,7 +191,7 @@ def test_any_linear_axis_follows_its_differential_equation(w: float, z: float, l
 
 
 def gained(command: Floats, gain: Callable[[float], float], recovery: float | None) -> list[float]:
-    """v = u + e, one command after the other, from the words of the design."""
+    """V = u + e, one command after the other, from the words of the design."""
     v, e, before = [], 0.0, 0.0
     for u in command.tolist():
         if recovery is not None:
@@ -205,7 +204,7 @@ def gained(command: Floats, gain: Callable[[float], float], recovery: float | No
 
 @pytest.mark.parametrize("recovery", [None, 0.1, 0.005])
 def test_the_gain_acts_on_each_step_and_its_error_recovers(recovery: float | None) -> None:
-    """v is the command and an error of (K(speed) − 1) of each step, which decays by e^(−T/recovery) a tick, or never."""
+    """Each step adds (K(speed) − 1) times itself to an error that decays by e^(−T/recovery) a tick, or never."""
     command = random_walk(40)
     axis = true_axis(FIRST, delay=0.0604, gain=Gain(slope=0.134, intercept=0.941), gain_recovery=recovery)
     check_linear(axis, gained(command, lambda speed: 0.134 * speed + 0.941, recovery), command)
@@ -312,8 +311,8 @@ def test_slow_drift_is_a_sine_on_the_position() -> None:
 def test_each_command_has_a_delay_of_its_own() -> None:
     """From the rise after each of 300 steps comes its delay, exactly; their mean and spread are those asked for.
 
-    Mean within four standard errors, variance in the 99.9 % chi-square band of 300 delays. With the recovered delays the
-    whole motion agrees with superposed step responses to 1e-8.
+    Mean within four standard errors, variance in the 99.9 % chi-square band of 300 delays. With the recovered delays
+    the whole motion agrees with superposed step responses to 1e-8.
     """
     tau, jitter, delay, hold, steps = 0.010, 0.004, 0.050, 12, 300
     axis = true_axis(FirstOrder(time_constant=tau), delay=delay, delay_jitter=jitter)
@@ -375,16 +374,14 @@ def test_asking_for_more_instants_changes_no_noise(process: Process) -> None:
     assert together == pytest.approx(alone, abs=1e-9)
 
 
-def covariance(
-    axis: TrueAxis, q: Sequence[float], changes: Sequence[float], wanted: Floats
-) -> Floats:
+def covariance(axis: TrueAxis, q: Sequence[float], changes: Sequence[float], wanted: Floats) -> Floats:
     """∫ q(s) g(t − s) g(t' − s) ds by quadrature over pieces of constant q, 24 nodes on each millisecond or less."""
     A, B, C = state_space(axis)
     node, weight = np.polynomial.legendre.leggauss(24)
     edges = np.unique(np.concatenate(([0.0], changes, wanted, np.arange(0.0, float(wanted[-1]), 0.02))))
     edges = edges[edges <= wanted[-1]]
     found = np.zeros((len(wanted), len(wanted)))
-    for start, end in zip(edges[:-1], edges[1:], strict=True):
+    for start, end in itertools.pairwise(edges):
         density = q[int(np.searchsorted(changes, start, side="right"))]
         at = start + 0.5 * (node + 1.0) * (end - start)
         g = np.array([[C @ expm(A * (t - s)) @ B if t >= end else 0.0 for s in at] for t in wanted])
@@ -437,7 +434,7 @@ def test_the_start_offset_alone_is_one_number_for_the_whole_run() -> None:
 
 @pytest.mark.parametrize("plant", [FIRST, WEAK], ids=["first", "weak"])
 def test_noise_grows_with_the_maneuver_of_the_command_that_acts(plant: FirstOrder | SecondOrder) -> None:
-    """q = input² + (maneuver_noise · m)² and likewise the drift, m = |u_n − 2u_(n−1) + u_(n−2)| / T, one delay late."""
+    """Q = input² + (maneuver_noise · m)² and likewise the drift, m = |u_n − 2u_(n−1) + u_(n−2)| / T, one delay late."""
     delay, at = 0.0405, np.array([0.035, 0.05, 0.09, 0.16, 0.3])
     process = Process(input_noise=0.0002, drift=0.0003, maneuver_noise=0.0005, maneuver_drift=0.0008)
     axis = true_axis(plant, delay=delay)

@@ -44,7 +44,10 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
         WHOLE + "[filter.sensors.eye]\nlatency = 0.1\n",
         ("sensors.eye.latency", "latency_ms"),
     ),
-    "unknown table of the filter": (WHOLE + "[filter.sensor.eye]\nsd_mm = 1.0\n", ("'sensor'", "did you mean 'sensors'?")),
+    "unknown table of the filter": (
+        WHOLE + "[filter.sensor.eye]\nsd_mm = 1.0\n",
+        ("'sensor'", "did you mean 'sensors'?"),
+    ),
     "arm of the filter": (WHOLE + '[filter]\narm = "puma560-external"\n', ("filter", "arm")),
     "negative sd": (WHOLE.replace("0.5", "-0.5"), ("sensors.eye.sd_mm",)),
     "zero sd": (WHOLE.replace("0.5", "0.0"), ("sensors.eye.sd_mm",)),
@@ -62,7 +65,8 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
     "axis of a raster": (
         HEAD
         + ARM
-        + '[trajectory]\nkind = "raster"\nalong = "x"\nwidth_mm = 1.0\nheight_mm = 1.0\npitch_mm = 1.0\nspeed_m_s = 1.0\n',
+        + '[trajectory]\nkind = "raster"\nalong = "x"\nwidth_mm = 1.0\nheight_mm = 1.0\n'
+        + "pitch_mm = 1.0\nspeed_m_s = 1.0\n",
         ("'x'", *AXES),
     ),
     "raster along and across one axis": (
@@ -74,7 +78,10 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "axis of the true arm": (WHOLE + "[true_arm.radail]\nstiction_mm = 0.1\n", ("true_arm", "did you mean 'radial'?")),
     "axis of the process": (WHOLE + "[process.radail]\ndrift_mm_rts = 0.1\n", ("process", "did you mean 'radial'?")),
-    "axis of the start level": (WHOLE + "[start]\nlevel = { radail_mm = 1.0 }\n", ("'radail'", "did you mean 'radial'?")),
+    "axis of the start level": (
+        WHOLE + "[start]\nlevel = { radail_mm = 1.0 }\n",
+        ("'radail'", "did you mean 'radial'?"),
+    ),
     "start level without unit": (WHOLE + "[start]\nlevel = { radial = 1.0 }\n", ("start.level.radial", "radial_mm")),
     "axis of a sensor": (WHOLE + 'axes = ["up"]\n', ("sensors.eye.axes", "'up'", *AXES)),
     "axis of a sensor's sd": (WHOLE.replace("0.5", "{ up = 0.5 }"), ("sensors.eye.sd_mm", "'up'", *AXES)),

@@ -136,7 +136,7 @@ def test_white_noise_finds_the_model_right(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_an_arm_that_is_not_as_modelled(tmp_path: Path) -> None:
-    """mismatched-arm: process noise keeps the estimate below the tracker's 0.1 mm, and the verdicts say what is amiss."""
+    """mismatched-arm: process noise keeps the estimate below the tracker's 0.1 mm; a verdict says what is amiss."""
     worked = Worked("mismatched-arm", tmp_path)
     worked.check("tangential", (0.05, 0.1), (0.7, 0.94))
     worked.check("radial", (0.03, 0.09), (0.8, 0.98))

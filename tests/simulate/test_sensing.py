@@ -85,7 +85,7 @@ def test_latency_wanders_from_row_to_row_and_stamps_stay_in_order() -> None:
 
 
 def test_scale_bias_and_quantisation_act_in_this_order() -> None:
-    """z = scale · p + bias, rounded to whole steps."""
+    """Z = scale · p + bias, rounded to whole steps."""
     found = measured(sensor(scale=-1.5, bias={"a": 0.3}, quantisation=0.00025))
     for axis, bias in (("a", 0.3), ("b", 0.0)):
         exact = -1.5 * path(even())[axis] + bias
@@ -136,7 +136,7 @@ def test_bursts_lose_rows_together() -> None:
 
 
 def test_outliers_have_their_share_size_and_either_sign() -> None:
-    """A wild row is wild on every axis, uniformly between from and to, up as often as down; other rows are untouched."""
+    """A wild row is wild on every axis, uniformly between from and to, up as often as down; others are untouched."""
     found = measured(sensor(outliers=Outliers(share=0.05, smallest=0.005, largest=0.020)))
     wrong = {axis: found.values[axis] - true for axis, true in path(even()).items()}
     wild = np.abs(wrong["a"]) > 1e-9
@@ -145,7 +145,7 @@ def test_outliers_have_their_share_size_and_either_sign() -> None:
     count = int(wild.sum())
     for axis in "ab":
         size = np.abs(wrong[axis][wild])
-        assert 0.005 - 1e-10 <= size.min() and size.max() <= 0.020 + 1e-10
+        assert size.min() >= 0.005 - 1e-10 and size.max() <= 0.020 + 1e-10
         within(float(size.mean()), 0.0125, 0.015 / 12**0.5 / count**0.5)
         within(float(np.mean(wrong[axis][wild] > 0.0)), 0.5, 0.5 / count**0.5)
 
@@ -160,7 +160,7 @@ def test_outages_lose_exactly_their_rows() -> None:
 
 
 def test_a_sensors_clock_is_off_and_drifts() -> None:
-    """stamp = (t + latency) · (1 + drift) + offset, to the nanosecond."""
+    """Stamp = (t + latency) · (1 + drift) + offset, to the nanosecond."""
     found = measured(sensor(latency=0.01, clock_offset=-0.25, clock_drift=50.0))
     expected = (even() / 1e9 + 0.01) * (1.0 + 50e-6) - 0.25
     assert np.abs(found.stamp - expected * 1e9).max() <= 1.0
@@ -172,7 +172,7 @@ def test_rows_come_at_their_rate(jitter: float) -> None:
     end, phases = 200 * SECOND, []
     for seed in range(100):
         valid = valid_times(sensor(rate=30.0, rate_jitter=jitter), end, np.random.default_rng(seed))
-        assert 0 <= valid[0] and valid[-1] <= end and abs(len(valid) - 6000) <= 1
+        assert valid[0] >= 0 and valid[-1] <= end and abs(len(valid) - 6000) <= 1
         assert (np.diff(valid) > 0).all()
         grid = valid / 1e9 * 30.0
         off = (grid - np.arange(len(grid)) - grid[0]) / 30.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from pathlib import Path
 
@@ -31,7 +32,7 @@ def on_raster(x: float, y: float, width: float, height: float, pitch: float) -> 
 
 
 def test_a_raster_goes_to_and_fro_at_constant_speed() -> None:
-    """Every command is on the lines, and within one tick of each corner, in order, at the instant that the speed says."""
+    """Every command is on the lines, and within one tick of each corner in turn when the speed says so."""
     width, height, pitch, speed = 0.300, 0.060, 0.020, 0.06
     found = Raster(width=width, height=height, pitch=pitch, speed=speed).offsets(PERIOD, rng())
     x, y = found["tangential"], found["vertical"]
@@ -77,7 +78,9 @@ def campaign(**different: object) -> Steps:
 def test_a_campaign_has_every_combination_as_often_as_asked() -> None:
     """Each axis and size both up and down, and a step down follows its step up at once."""
     plan = campaign().plan(rng())
-    assert Counter(plan) == {(axis, sign * size): 3 for axis in "ab" for size in (0.002, 0.004, 0.008) for sign in (1, -1)}
+    assert Counter(plan) == {
+        (axis, sign * size): 3 for axis in "ab" for size in (0.002, 0.004, 0.008) for sign in (1, -1)
+    }
     for up, down in zip(plan[::2], plan[1::2], strict=True):
         assert up[1] > 0.0 and down == (up[0], -up[1])
 
@@ -140,7 +143,7 @@ def test_a_sweep_has_the_frequency_it_says(start: float, end: float) -> None:
     rises = np.flatnonzero((found[:-1] <= 0.0) & (found[1:] > 0.0))
     crossing = time[rises] - found[rises] * step / (found[rises + 1] - found[rises])
     # Between two rising zeros the phase grows by one turn: the mean of the frequency over that time is 1/Δ.
-    for a, b in zip(crossing[:-1], crossing[1:], strict=True):
+    for a, b in itertools.pairwise(crossing):
         at = np.linspace(a, b, 400)
         assert np.trapezoid(start * (end / start) ** (at / 10.0), at) == pytest.approx(1.0, rel=1e-3)
 

@@ -35,14 +35,16 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
             queue = np.argsort(arrival, kind="stable")
             back = int((np.maximum.accumulate(queue) - queue).max(initial=0)) + 2
             places = kernels.State(*(np.empty((back, *part.shape), part.dtype) for part in state))
+            arrived = np.zeros(len(rows.valid), dtype=np.bool_)
             kernels.filter_as_live(
-                axes, sensors, rows, arrival, queue, state, places, times, met, log, held, outputs
+                axes, sensors, rows, arrival, queue, arrived, state, places, times, met, log, held, outputs
             )
         else:
             kernels.filter_run(axes, sensors, rows, state, times, met, log, held, outputs)
         if smooth:
             sensor_of = np.repeat(rows.sensor, np.diff(rows.first))
-            kernels.smooth_run(axes, sensors, rows, log, met, sensor_of, timeline.origin, times, held, outputs)
+            room = (np.empty((2, width)), np.empty((2, width, width)), np.empty((4, width)), np.empty((width, width)))
+            kernels.smooth_run(axes, sensors, sensor_of, met, log, timeline.origin, times, held, *room, outputs)
     outcome = scalars.outcome.copy()
     outcome[candidates] = met.outcome
     return Fused(
@@ -128,20 +130,20 @@ def _start(
 ) -> kernels.State:
     """At rest at the start level, certain of all but the offset and the biases."""
     count, sensors = len(axes.order), len(timeline.scalars.sensors)
-    P = np.zeros((count, width, width))
+    P = np.zeros((count + 1, width, width))
     for number, names in enumerate(biases):
         offset = axes.order[number]
         P[number, offset, offset] = config.start.offset_sd**2
         for place, name in enumerate(names, offset + 1):
             P[number, place, place] = config.sensors[name].bias_sd ** 2
     return kernels.State(
-        x=np.zeros((count, width)),
+        x=np.zeros((count + 1, width)),
         P=P,
         clock=np.full(count, timeline.origin),
         entry=np.full(count, -1),
         rejected=np.zeros((sensors, count + 1), dtype=np.int64),
         since=np.zeros((sensors, count + 1), dtype=np.int64),
-        work=np.zeros((4 + width, width)),
+        work=np.zeros((4, width)),
     )
 
 

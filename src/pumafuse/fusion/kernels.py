@@ -12,14 +12,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from ..arrays import BoolArray, CodeArray, FloatArray, IntArray, TimeArray
 from ..compiled import compiled
 from ..model.closed import advance_first, advance_second
 from .timeline import REOPEN_AFTER, REOPEN_SPAN_NS, Outcome
 
 _FUSED, _GATED, _REOPENED = int(Outcome.FUSED), int(Outcome.GATED), int(Outcome.REOPENED)
+_NOTHING = 1e-15  # of a pivot, below which it is rounding
 
 
 class Axes(NamedTuple):
@@ -90,13 +89,13 @@ class State(NamedTuple):
     """All that changes; a copy is a checkpoint.
 
     Attributes:
-        x: Mean, (A, s).
-        P: Covariance, (A, s, s).
+        x: Mean, (A + 1, s); the last is room for a prediction aside.
+        P: Covariance, (A + 1, s, s).
         clock: The instant each axis stands at, int64 ns, (A,).
         entry: The entry of the drive that acts, −1 before the first, counted from the axis's own first, (A,).
         rejected: Rejections in a row, of each sensor's rows (first column) or scalars by axis, (S, A + 1).
         since: When the first of them was valid, int64 ns, (S, A + 1).
-        work: Room to compute in: H, K and H P of an update, then a mean and a covariance, (4 + s, s).
+        work: Room for an update's vectors: H, K, P Hᵀ and (I − K H) P Hᵀ, (4, s).
     """
 
     x: FloatArray
@@ -179,39 +178,37 @@ class Held(NamedTuple):
 
 
 @compiled
-def step(
-    order: int, constants: FloatArray, states: int, x: FloatArray, P: FloatArray, ns: int, v: float, q: float, d: float
-) -> None:
-    """Predict over ``ns`` with the input held: x⁺ = v + Φ (x − v), P⁺ = Φ P Φᵀ + q Q, offset variance + d Δ."""
-    if ns <= 0:
-        return
-    dt = ns / 1e9
-    if order == 1:
-        lost, q11 = advance_first(constants, dt)  # lost = Φ − 1
+def step(axes: Axes, axis: int, x: FloatArray, P: FloatArray, at: int, ns: int, entry: int) -> None:
+    """Predict x[at] and P[at] of an axis over ``ns`` with an entry of its drive held.
+
+    x⁺ = v + Φ (x − v), P⁺ = Φ P Φᵀ + q Q, and the offset's variance grows by d Δ.
+    """
+    v, q, d = acting_now(axes, axis, entry)
+    dt, states = ns / 1e9, axes.states[axis]
+    if axes.order[axis] == 1:
+        lost, q11 = advance_first(axes.constants, axis, dt)  # lost = Φ − 1
         kept = 1.0 + lost
-        x[0] += lost * (x[0] - v)
+        x[at, 0] += lost * (x[at, 0] - v)
         for j in range(1, states):
-            P[0, j] *= kept
-            P[j, 0] = P[0, j]
-        P[0, 0] = kept * kept * P[0, 0] + q * q11
-        P[1, 1] += d * dt
+            P[at, 0, j] *= kept
+            P[at, j, 0] = P[at, 0, j]
+        P[at, 0, 0] = kept * kept * P[at, 0, 0] + q * q11
+        P[at, 1, 1] += d * dt
         return
-    f11, f12, f21, f22, q11, q12, q22 = advance_second(constants, dt)
-    gap, rate = x[0] - v, x[1]
-    x[0] = v + (f11 * gap + f12 * rate)
-    x[1] = f21 * gap + f22 * rate
-    a, b, c = P[0, 0], P[0, 1], P[1, 1]
+    f11, f12, f21, f22, q11, q12, q22 = advance_second(axes.constants, axis, dt)
+    gap, rate = x[at, 0] - v, x[at, 1]
+    x[at, 0] = v + (f11 * gap + f12 * rate)
+    x[at, 1] = f21 * gap + f22 * rate
+    a, b, c = P[at, 0, 0], P[at, 0, 1], P[at, 1, 1]
     u, w = f11 * a + f12 * b, f11 * b + f12 * c
-    P[0, 0] = u * f11 + w * f12 + q * q11
-    P[0, 1] = u * f21 + w * f22 + q * q12
-    P[1, 0] = P[0, 1]
-    P[1, 1] = (f21 * a + f22 * b) * f21 + (f21 * b + f22 * c) * f22 + q * q22
+    P[at, 0, 0] = u * f11 + w * f12 + q * q11
+    P[at, 0, 1] = P[at, 1, 0] = u * f21 + w * f22 + q * q12
+    P[at, 1, 1] = (f21 * a + f22 * b) * f21 + (f21 * b + f22 * c) * f22 + q * q22
     for j in range(2, states):
-        a, b = P[0, j], P[1, j]
-        P[0, j] = f11 * a + f12 * b
-        P[1, j] = f21 * a + f22 * b
-        P[j, 0], P[j, 1] = P[0, j], P[1, j]
-    P[2, 2] += d * dt
+        a, b = P[at, 0, j], P[at, 1, j]
+        P[at, 0, j] = P[at, j, 0] = f11 * a + f12 * b
+        P[at, 1, j] = P[at, j, 1] = f21 * a + f22 * b
+    P[at, 2, 2] += d * dt
 
 
 @compiled
@@ -231,11 +228,11 @@ def advance(axes: Axes, state: State, log: Log, axis: int, time: int) -> None:
         acts = following < end and axes.acting[following] <= time
         until = axes.acting[following] if acts else time
         if until > state.clock[axis]:
-            v, q, d = acting_now(axes, axis, state.entry[axis])
-            ns = until - state.clock[axis]
-            step(axes.order[axis], axes.constants[axis], axes.states[axis], state.x[axis], state.P[axis], ns, v, q, d)
+            step(axes, axis, state.x, state.P, axis, until - state.clock[axis], state.entry[axis])
             state.clock[axis] = until
-            write_log(log, axis, until, -1, q, d, state.work[1])
+            if log.first[axis] < log.first[axis + 1]:
+                _, q, d = acting_now(axes, axis, state.entry[axis])
+                write_log(log, axis, until, -1, q, d, state.work)
         if not acts:
             return
         state.entry[axis] += 1
@@ -243,60 +240,58 @@ def advance(axes: Axes, state: State, log: Log, axis: int, time: int) -> None:
 
 
 @compiled
-def write_log(
-    log: Log, axis: int, time: int, scalar: int, noise: float, drift: float, gain: FloatArray
-) -> None:
-    """Keep an entry, where entries are kept."""
+def write_log(log: Log, axis: int, time: int, scalar: int, noise: float, drift: float, work: FloatArray) -> None:
+    """Keep an entry, where entries are kept; an update's gain is in ``work[1]``."""
     at = log.first[axis] + log.count[axis]
     if at < log.first[axis + 1]:
         log.time[at], log.scalar[at], log.noise[at], log.drift[at] = time, scalar, noise, drift
         if scalar >= 0:
-            log.gain[at] = gain
+            for i in range(log.gain.shape[1]):
+                log.gain[at, i] = work[1, i]
         log.count[axis] += 1
 
 
 @compiled
-def velocity(order: int, constants: FloatArray, x: FloatArray, v: float) -> float:
+def velocity(axes: Axes, axis: int, x: FloatArray, at: int, v: float) -> float:
     """C(A x + B v) [m/s]: the model's drift."""
-    return x[1] if order == 2 else constants[0] * (v - x[0])
+    return x[at, 1] if axes.order[axis] == 2 else axes.constants[axis, 0] * (v - x[at, 0])
 
 
 @compiled
-def observation(axes: Axes, sensors: Sensors, axis: int, sensor: int, row: FloatArray) -> None:
-    """H of a sensor on an axis, into ``row`` (s,)."""
-    row[:] = 0.0
-    row[0] = row[axes.order[axis]] = sensors.scale[sensor]
+def observation(axes: Axes, sensors: Sensors, axis: int, sensor: int, work: FloatArray) -> None:
+    """H of a sensor on an axis, into ``work[0]``."""
+    for i in range(axes.states[axis]):
+        work[0, i] = 0.0
+    work[0, 0] = work[0, axes.order[axis]] = sensors.scale[sensor]
     if sensors.bias[sensor, axis] >= 0:
-        row[sensors.bias[sensor, axis]] = 1.0
+        work[0, sensors.bias[sensor, axis]] = 1.0
 
 
 @compiled
-def joseph(P: FloatArray, states: int, row: FloatArray, R: float, gain: FloatArray, left: FloatArray) -> None:
-    """P⁺ = (I − K H) P (I − K H)ᵀ + K R Kᵀ with K = P Hᵀ / (H P Hᵀ + R), which is left in ``gain``.
+def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> None:
+    """P⁺ = (I − K H) P (I − K H)ᵀ + K R Kᵀ with H in ``work[0]`` and K = P Hᵀ / (H P Hᵀ + R), left in ``work[1]``.
 
-    The smoother uses it for its dual, too: information that passes through noise of unit variance along ``row``.
+    The smoother uses it for its dual, too: information that passes through noise of unit variance along H.
     """
     spread = R
     for i in range(states):
-        left[i] = 0.0
+        across = 0.0
         for j in range(states):
-            left[i] += P[i, j] * row[j]
-        spread += row[i] * left[i]
+            across += P[at, i, j] * work[0, j]
+        work[2, i] = across
+        spread += work[0, i] * across
     for i in range(states):
-        gain[i] = left[i] / spread
-    for i in range(states):  # W = (I − K H) P
+        work[1, i] = work[2, i] / spread
+    for i in range(states):  # W = (I − K H) P and W Hᵀ
+        across = 0.0
         for j in range(states):
-            P[i, j] -= gain[i] * left[j]
-    for i in range(states):  # W Hᵀ
-        left[i] = 0.0
-        for j in range(states):
-            left[i] += P[i, j] * row[j]
+            P[at, i, j] -= work[1, i] * work[2, j]
+            across += P[at, i, j] * work[0, j]
+        work[3, i] = across
     for i in range(states):  # W − W Hᵀ Kᵀ + K R Kᵀ
-        P[i, i] += gain[i] * R * gain[i] - left[i] * gain[i]
-        for j in range(i):
-            both = 0.5 * (P[i, j] - left[i] * gain[j] + P[j, i] - left[j] * gain[i]) + gain[i] * R * gain[j]
-            P[i, j] = both
-            P[j, i] = both
+        for j in range(i + 1):
+            left = P[at, i, j] - work[3, i] * work[1, j] + P[at, j, i] - work[3, j] * work[1, i]
+            P[at, i, j] = P[at, j, i] = 0.5 * left + work[1, i] * R * work[1, j]
 
 
 @compiled
@@ -305,39 +300,47 @@ def predicted(
 ) -> tuple[float, float, float]:
     """ν = z − H x, S = H P Hᵀ + R and R of a scalar here and now; R grows with speed where latency wanders."""
     axis = rows.axis[scalar]
-    x, P, row, states = state.x[axis], state.P[axis], state.work[0], axes.states[axis]
-    observation(axes, sensors, axis, sensor, row)
+    observation(axes, sensors, axis, sensor, state.work)
     R = rows.sd[scalar] ** 2
     if sensors.latency_sd[sensor] > 0.0:
         v, _, _ = acting_now(axes, axis, state.entry[axis])
-        speed = velocity(axes.order[axis], axes.constants[axis], x, v)
-        R += (sensors.scale[sensor] * speed * sensors.latency_sd[sensor]) ** 2
+        R += (sensors.scale[sensor] * velocity(axes, axis, state.x, axis, v) * sensors.latency_sd[sensor]) ** 2
     nu, S = rows.value[scalar], R
-    for i in range(states):
-        nu -= row[i] * x[i]
-        for j in range(states):
-            S += row[i] * P[i, j] * row[j]
+    for i in range(axes.states[axis]):
+        nu -= state.work[0, i] * state.x[axis, i]
+        for j in range(axes.states[axis]):
+            S += state.work[0, i] * state.P[axis, i, j] * state.work[0, j]
     return nu, S, R
 
 
 @compiled
 def meet(axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log: Log, row: int) -> None:
     """Gate a row and fuse what passes: whole rows or scalar by scalar, as the sensor says."""
+    first, end = rows.first[row], rows.first[row + 1]
     if sensors.rows[rows.sensor[row]]:
-        meet_together(axes, sensors, rows, state, met, log, row, rows.first[row], rows.first[row + 1], 0)
+        meet_together(axes, sensors, rows, state, met, log, row, first, end, 0)
     else:
-        for scalar in range(rows.first[row], rows.first[row + 1]):
+        for scalar in range(first, end):
             meet_together(axes, sensors, rows, state, met, log, row, scalar, scalar + 1, rows.axis[scalar] + 1)
 
 
 @compiled
 def meet_together(
-    axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log: Log, row: int, begin: int, end: int, part: int
+    axes: Axes,
+    sensors: Sensors,
+    rows: Rows,
+    state: State,
+    met: Met,
+    log: Log,
+    row: int,
+    first: int,
+    end: int,
+    part: int,
 ) -> None:
     """Scalars of one row that pass the gate together or not at all."""
     sensor, valid = rows.sensor[row], rows.valid[row]
     gate, any_beyond = sensors.gate[sensor], False
-    for scalar in range(begin, end):
+    for scalar in range(first, end):
         advance(axes, state, log, rows.axis[scalar], valid)
         nu, S, _ = predicted(axes, sensors, rows, state, scalar, sensor)
         met.innovation[scalar], met.innovation_sd[scalar] = nu, math.sqrt(S)
@@ -347,63 +350,71 @@ def meet_together(
     long_enough = valid - state.since[sensor, part] >= REOPEN_SPAN_NS
     reopens = any_beyond and state.rejected[sensor, part] >= REOPEN_AFTER and long_enough
     state.rejected[sensor, part] = state.rejected[sensor, part] + 1 if any_beyond and not reopens else 0
-    for scalar in range(begin, end):
+    for scalar in range(first, end):
         if any_beyond and not reopens:
             met.outcome[scalar] = _GATED
-            continue
-        axis = rows.axis[scalar]
-        nu, S, R = predicted(axes, sensors, rows, state, scalar, sensor)
-        widened = nu * nu if abs(nu) > gate * math.sqrt(S) and reopens else 0.0
-        P, o = state.P[axis], axes.order[axis]
-        if widened > 0.0:
-            P[o, o] += widened
-            _, S, _ = predicted(axes, sensors, rows, state, scalar, sensor)
-            met.innovation_sd[scalar] = math.sqrt(S)
-        joseph(P, axes.states[axis], state.work[0], R, state.work[1], state.work[2])
-        for i in range(axes.states[axis]):
-            state.x[axis, i] += state.work[1, i] * nu
-        met.outcome[scalar] = _REOPENED if widened > 0.0 else _FUSED
-        write_log(log, axis, valid, scalar, R, widened, state.work[1])
+        else:
+            fuse(axes, sensors, rows, state, met, log, row, scalar, gate if reopens else math.inf)
 
 
 @compiled
-def spread_of(P: FloatArray, first: int, second: int) -> float:
-    """Standard deviation of the sum of two states."""
-    return math.sqrt(max(P[first, first] + 2.0 * P[first, second] + P[second, second], 0.0))
+def fuse(
+    axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log: Log, row: int, scalar: int, gate: float
+) -> None:
+    """Update with one scalar; one beyond the ``gate``, which reopens, widens the offset by ν² first."""
+    sensor, axis = rows.sensor[row], rows.axis[scalar]
+    nu, S, R = predicted(axes, sensors, rows, state, scalar, sensor)
+    widened = nu * nu if abs(nu) > gate * math.sqrt(S) else 0.0
+    if widened > 0.0:
+        state.P[axis, axes.order[axis], axes.order[axis]] += widened
+        _, S, _ = predicted(axes, sensors, rows, state, scalar, sensor)
+        met.innovation_sd[scalar] = math.sqrt(S)
+    joseph(state.P, axis, axes.states[axis], R, state.work)
+    for i in range(axes.states[axis]):
+        state.x[axis, i] += state.work[1, i] * nu
+    met.outcome[scalar] = _REOPENED if widened > 0.0 else _FUSED
+    write_log(log, axis, rows.valid[row], scalar, R, widened, state.work)
 
 
 @compiled
 def write_output(
-    order: int, constants: FloatArray, x: FloatArray, P: FloatArray, v: float, outputs: Outputs, axis: int, at: int
+    axes: Axes, axis: int, x: FloatArray, P: FloatArray, at: int, v: float, outputs: Outputs, n: int
 ) -> None:
-    """The estimate that a state is."""
-    outputs.position[axis, at] = x[0] + x[order]
-    outputs.position_sd[axis, at] = spread_of(P, 0, order)
-    outputs.velocity[axis, at] = velocity(order, constants, x, v)
-    own = math.sqrt(max(P[order - 1, order - 1], 0.0))
-    outputs.velocity_sd[axis, at] = own if order == 2 else own * constants[0]
-    outputs.offset[axis, at] = x[order]
-    outputs.offset_sd[axis, at] = math.sqrt(max(P[order, order], 0.0))
+    """The estimate that a state is, as output ``n``."""
+    o = axes.order[axis]
+    outputs.position[axis, n] = x[at, 0] + x[at, o]
+    outputs.position_sd[axis, n] = math.sqrt(max(P[at, 0, 0] + 2.0 * P[at, 0, o] + P[at, o, o], 0.0))
+    outputs.velocity[axis, n] = velocity(axes, axis, x, at, v)
+    own = math.sqrt(max(P[at, o - 1, o - 1], 0.0))
+    outputs.velocity_sd[axis, n] = own if o == 2 else own * axes.constants[axis, 0]
+    outputs.offset[axis, n] = x[at, o]
+    outputs.offset_sd[axis, n] = math.sqrt(max(P[at, o, o], 0.0))
 
 
 @compiled
-def estimate(axes: Axes, state: State, log: Log, time: int, held: Held, outputs: Outputs, at: int) -> None:
+def estimate(axes: Axes, state: State, log: Log, time: int, held: Held, outputs: Outputs, n: int) -> None:
     """Predict every axis to ``time`` [ns] beside the state, which itself goes on over what acts until then."""
-    x, P = state.work[3], state.work[4:]
+    aside = len(axes.order)
     for axis in range(len(axes.order)):
         following, end = axes.first[axis] + state.entry[axis] + 1, axes.first[axis + 1]
         while following < end and axes.acting[following] <= time:
             following += 1
         if following - 1 >= axes.first[axis]:
             advance(axes, state, log, axis, axes.acting[following - 1])
-        v, q, d = acting_now(axes, axis, state.entry[axis])
-        order, constants, states = axes.order[axis], axes.constants[axis], axes.states[axis]
-        x[:], P[:] = state.x[axis], state.P[axis]
-        step(order, constants, states, x, P, time - state.clock[axis], v, q, d)
+        for i in range(axes.states[axis]):
+            state.x[aside, i] = state.x[axis, i]
+            for j in range(axes.states[axis]):
+                state.P[aside, i, j] = state.P[axis, i, j]
+        step(axes, axis, state.x, state.P, aside, time - state.clock[axis], state.entry[axis])
+        v, _, _ = acting_now(axes, axis, state.entry[axis])
         if held.x.shape[1]:
-            held.x[axis, at], held.P[axis, at], held.input[axis, at] = x, P, v
+            held.input[axis, n] = v
+            for i in range(axes.states[axis]):
+                held.x[axis, n, i] = state.x[aside, i]
+                for j in range(axes.states[axis]):
+                    held.P[axis, n, i, j] = state.P[aside, i, j]
         else:
-            write_output(order, constants, x, P, v, outputs, axis, at)
+            write_output(axes, axis, state.x, state.P, aside, v, outputs, n)
 
 
 @compiled
@@ -432,18 +443,32 @@ def filter_run(
 
 @compiled
 def keep(state: State, kept: State, place: int) -> None:
-    """Copy a state into place ``place`` of many."""
-    kept.x[place], kept.P[place] = state.x, state.P
-    kept.clock[place], kept.entry[place] = state.clock, state.entry
-    kept.rejected[place], kept.since[place] = state.rejected, state.since
+    """Copy a state to ``place`` among many."""
+    for axis in range(len(state.clock)):
+        kept.clock[place, axis], kept.entry[place, axis] = state.clock[axis], state.entry[axis]
+        for i in range(state.x.shape[1]):
+            kept.x[place, axis, i] = state.x[axis, i]
+            for j in range(state.x.shape[1]):
+                kept.P[place, axis, i, j] = state.P[axis, i, j]
+    for sensor in range(state.since.shape[0]):
+        for part in range(state.since.shape[1]):
+            kept.rejected[place, sensor, part] = state.rejected[sensor, part]
+            kept.since[place, sensor, part] = state.since[sensor, part]
 
 
 @compiled
 def go_back(state: State, kept: State, place: int) -> None:
     """Undo everything since :func:`keep`."""
-    state.x[:], state.P[:] = kept.x[place], kept.P[place]
-    state.clock[:], state.entry[:] = kept.clock[place], kept.entry[place]
-    state.rejected[:], state.since[:] = kept.rejected[place], kept.since[place]
+    for axis in range(len(state.clock)):
+        state.clock[axis], state.entry[axis] = kept.clock[place, axis], kept.entry[place, axis]
+        for i in range(state.x.shape[1]):
+            state.x[axis, i] = kept.x[place, axis, i]
+            for j in range(state.x.shape[1]):
+                state.P[axis, i, j] = kept.P[place, axis, i, j]
+    for sensor in range(state.since.shape[0]):
+        for part in range(state.since.shape[1]):
+            state.rejected[sensor, part] = kept.rejected[place, sensor, part]
+            state.since[sensor, part] = kept.since[place, sensor, part]
 
 
 @compiled
@@ -453,6 +478,7 @@ def filter_as_live(
     rows: Rows,
     arrival: TimeArray,
     queue: IntArray,
+    arrived: BoolArray,
     state: State,
     kept: State,
     times: TimeArray,
@@ -463,14 +489,14 @@ def filter_as_live(
 ) -> None:
     """At each of ``times`` only the rows that had arrived: late ones make the filter go back and replay.
 
-    ``queue`` lists the rows by ``arrival``; ``kept`` has as many places as rows may have to be taken back, and two.
+    ``queue`` lists the rows by ``arrival``, ``arrived`` is all false; ``kept`` has two places more than rows may have
+    to be taken back.
     """
-    arrived = np.zeros(len(rows.valid), dtype=np.bool_)
     due, done, reach = 0, 0, 0  # rows before `done` are dealt with: fused, or not here yet
     places = len(kept.clock)
-    for at in range(len(times) + 1):
+    for n in range(len(times) + 1):
         earliest = done
-        while due < len(queue) and (at == len(times) or arrival[queue[due]] <= times[at]):
+        while due < len(queue) and (n == len(times) or arrival[queue[due]] <= times[n]):
             row = queue[due]
             arrived[row] = True
             earliest, reach = min(earliest, row), max(reach, row + 1)
@@ -482,157 +508,197 @@ def filter_as_live(
             if arrived[row]:
                 meet(axes, sensors, rows, state, met, log, row)
         done = reach
-        if at < len(times):
-            keep(state, kept, done % places)  # estimates let the state go on, rows still to come may be before that
-            estimate(axes, state, log, times[at], held, outputs, at)
+        if n < len(times):
+            keep(state, kept, done % places)  # the state goes on with estimates, rows still to come may be before that
+            estimate(axes, state, log, times[n], held, outputs, n)
             go_back(state, kept, done % places)
 
 
 @compiled
 def carry_back(
-    order: int, constants: FloatArray, states: int, eta: FloatArray, N: FloatArray, ns: int, q: float, d: float,
+    axes: Axes,
+    axis: int,
+    states: int,
+    eta: FloatArray,
+    N: FloatArray,
+    at: int,
+    ns: int,
+    q: float,
+    d: float,
     work: FloatArray,
 ) -> None:
-    """η and N over an interval, backward: through its noise, one independent part at a time, then by Fᵀ."""
+    """η[at] and N[at] over an interval, backward: through its noise, one independent part at a time, then by Fᵀ."""
     dt = ns / 1e9
-    if order == 1:
-        lost, q11 = advance_first(constants, dt)
-        pass_noise(eta, N, states, 0, math.sqrt(q * q11), 0.0, work)
-        pass_noise(eta, N, states, 1, math.sqrt(d * dt), 0.0, work)
+    if axes.order[axis] == 1:
+        lost, q11 = advance_first(axes.constants, axis, dt)
+        pass_noise(eta, N, at, states, 0, math.sqrt(q * q11), 0.0, work)
+        pass_noise(eta, N, at, states, 1, math.sqrt(d * dt), 0.0, work)
         kept = 1.0 + lost
-        eta[0] *= kept
+        eta[at, 0] *= kept
         for j in range(1, states):
-            N[0, j] *= kept
-            N[j, 0] = N[0, j]
-        N[0, 0] *= kept * kept
+            N[at, 0, j] *= kept
+            N[at, j, 0] = N[at, 0, j]
+        N[at, 0, 0] *= kept * kept
         return
-    f11, f12, f21, f22, q11, q12, q22 = advance_second(constants, dt)
+    f11, f12, f21, f22, q11, q12, q22 = advance_second(axes.constants, axis, dt)
     first = math.sqrt(q * q11)
     both = q * q12 / first if first > 0.0 else 0.0
-    pass_noise(eta, N, states, 0, first, both, work)
-    pass_noise(eta, N, states, 1, math.sqrt(max(q * q22 - both * both, 0.0)), 0.0, work)
-    pass_noise(eta, N, states, 2, math.sqrt(d * dt), 0.0, work)
-    eta[0], eta[1] = f11 * eta[0] + f21 * eta[1], f12 * eta[0] + f22 * eta[1]
-    a, b, c = N[0, 0], N[0, 1], N[1, 1]
+    pass_noise(eta, N, at, states, 0, first, both, work)
+    pass_noise(eta, N, at, states, 1, math.sqrt(max(q * q22 - both * both, 0.0)), 0.0, work)
+    pass_noise(eta, N, at, states, 2, math.sqrt(d * dt), 0.0, work)
+    a, b = eta[at, 0], eta[at, 1]
+    eta[at, 0], eta[at, 1] = f11 * a + f21 * b, f12 * a + f22 * b
+    a, b, c = N[at, 0, 0], N[at, 0, 1], N[at, 1, 1]
     u, w = f11 * a + f21 * b, f11 * b + f21 * c
-    N[0, 0] = u * f11 + w * f21
-    N[0, 1] = u * f12 + w * f22
-    N[1, 0] = N[0, 1]
-    N[1, 1] = (f12 * a + f22 * b) * f12 + (f12 * b + f22 * c) * f22
+    N[at, 0, 0] = u * f11 + w * f21
+    N[at, 0, 1] = N[at, 1, 0] = u * f12 + w * f22
+    N[at, 1, 1] = (f12 * a + f22 * b) * f12 + (f12 * b + f22 * c) * f22
     for j in range(2, states):
-        a, b = N[0, j], N[1, j]
-        N[0, j] = f11 * a + f21 * b
-        N[1, j] = f12 * a + f22 * b
-        N[j, 0], N[j, 1] = N[0, j], N[1, j]
+        a, b = N[at, 0, j], N[at, 1, j]
+        N[at, 0, j] = N[at, j, 0] = f11 * a + f21 * b
+        N[at, 1, j] = N[at, j, 1] = f12 * a + f22 * b
 
 
 @compiled
 def pass_noise(
-    eta: FloatArray, N: FloatArray, states: int, at: int, first: float, second: float, work: FloatArray
+    eta: FloatArray, N: FloatArray, at: int, states: int, enters: int, first: float, second: float, work: FloatArray
 ) -> None:
-    """η and N through noise of unit variance that enters state ``at`` by ``first`` and the next one by ``second``."""
+    """η[at] and N[at] through unit noise that enters state ``enters`` by ``first`` and the next one by ``second``."""
     if first == 0.0 and second == 0.0:
         return
-    row, gain = work[0], work[1]
-    row[:] = 0.0
-    row[at] = first
-    if second != 0.0:
-        row[at + 1] = second
-    joseph(N, states, row, 1.0, gain, work[2])
-    told = row[at] * eta[at] + second * eta[at + 1] if second != 0.0 else row[at] * eta[at]
     for i in range(states):
-        eta[i] -= gain[i] * told
+        work[0, i] = 0.0
+    work[0, enters] = first
+    told = first * eta[at, enters]
+    if second != 0.0:
+        work[0, enters + 1] = second
+        told += second * eta[at, enters + 1]
+    joseph(N, at, states, 1.0, work)
+    for i in range(states):
+        eta[at, i] -= work[1, i] * told
 
 
 @compiled
-def smoothed(x: FloatArray, P: FloatArray, states: int, eta: FloatArray, N: FloatArray, work: FloatArray) -> None:
-    """P_s = (I + P N)⁻¹ P and x_s = x + P_s η in place: N = L Lᵀ is met column by column, as readings of unit noise."""
-    L = work[4 : 4 + len(x)]
+def root(N: FloatArray, at: int, states: int, L: FloatArray) -> None:
+    """N[at] = L Lᵀ, L (s, s) lower triangular with a column of zeros where N says nothing more."""
     for j in range(states):
-        pivot = N[j, j]
+        pivot = N[at, j, j]
         for k in range(j):
             pivot -= L[j, k] * L[j, k]
         for i in range(states):
             L[i, j] = 0.0
-        if pivot <= 1e-15 * N[j, j]:  # nothing is said beyond the columns before
+        if pivot <= _NOTHING * N[at, j, j]:
             continue
         L[j, j] = math.sqrt(pivot)
         for i in range(j + 1, states):
-            rest = N[i, j]
+            rest = N[at, i, j]
             for k in range(j):
                 rest -= L[i, k] * L[j, k]
             L[i, j] = rest / L[j, j]
-    for j in range(states):
+
+
+@compiled
+def smooth_output(
+    axes: Axes,
+    axis: int,
+    n: int,
+    held: Held,
+    eta: FloatArray,
+    N: FloatArray,
+    at: int,
+    work: FloatArray,
+    L: FloatArray,
+    outputs: Outputs,
+) -> None:
+    """P_s = (I + P N)⁻¹ P and x_s = x + P_s η: the columns of N = L Lᵀ are met as readings with unit noise."""
+    x, P, states = held.x[axis], held.P[axis], axes.states[axis]
+    root(N, at, states, L)
+    for k in range(states):
         for i in range(states):
-            work[0, i] = L[i, j]
-        joseph(P, states, work[0], 1.0, work[1], work[2])
+            work[0, i] = L[i, k]
+        joseph(P, n, states, 1.0, work)
     for i in range(states):
         for j in range(states):
-            x[i] += P[i, j] * eta[j]
+            x[n, i] += P[n, i, j] * eta[at, j]
+    write_output(axes, axis, x, P, n, held.input[axis, n], outputs, n)
 
 
 @compiled
 def smooth_run(
     axes: Axes,
     sensors: Sensors,
-    rows: Rows,
-    log: Log,
-    met: Met,
     sensor_of: IntArray,
+    met: Met,
+    log: Log,
     origin: int,
     times: TimeArray,
     held: Held,
+    eta: FloatArray,
+    N: FloatArray,
+    work: FloatArray,
+    L: FloatArray,
     outputs: Outputs,
 ) -> None:
     """Estimates that know every reading: the filter's, with what all later ones say, carried backward as η and N.
 
-    Over an update η ← η + N K ν + Hᵀ ν / R and N ← N + Hᵀ H / R; ``sensor_of`` is the sensor of each scalar.
+    Over an update η ← η + N K ν + Hᵀ ν / R and N ← N + Hᵀ H / R. ``sensor_of`` is the sensor of each scalar; η (2, s),
+    N (2, s, s), ``work`` (4, s) and L (s, s) are room to compute in.
     """
-    width = held.x.shape[2]
-    eta, N, row = np.zeros(width), np.zeros((width, width)), np.zeros(width)
-    part_eta, part_N, work = np.zeros(width), np.zeros((width, width)), np.zeros((4 + width, width))
     for axis in range(len(axes.order)):
-        order, constants, states = axes.order[axis], axes.constants[axis], axes.states[axis]
-        eta[:], N[:], at = 0.0, 0.0, len(times) - 1
-        for entry in range(log.first[axis] + log.count[axis] - 1, log.first[axis] - 2, -1):
-            before_all = entry < log.first[axis]
-            until = origin if before_all else log.time[entry]
-            while at >= 0 and times[at] >= until:
-                smooth_output(axes, axis, at, held, eta, N, work, outputs)
-                at -= 1
-            if before_all:
+        states, n = axes.states[axis], len(times) - 1
+        for i in range(states):
+            eta[0, i] = 0.0
+            for j in range(states):
+                N[0, i, j] = 0.0
+        entry = log.first[axis] + log.count[axis] - 1
+        while True:
+            first = entry < log.first[axis]
+            until = origin if first else log.time[entry]
+            while n >= 0 and times[n] >= until:
+                smooth_output(axes, axis, n, held, eta, N, 0, work, L, outputs)
+                n -= 1
+            if first:
                 break
-            scalar = log.scalar[entry]
-            if scalar < 0:
+            if log.scalar[entry] < 0:
                 start = log.time[entry - 1] if entry > log.first[axis] else origin
-                while at >= 0 and times[at] > start:
-                    part_eta[:], part_N[:] = eta, N
-                    rest = until - times[at]
-                    carry_back(
-                        order, constants, states, part_eta, part_N, rest, log.noise[entry], log.drift[entry], work
-                    )
-                    smooth_output(axes, axis, at, held, part_eta, part_N, work, outputs)
-                    at -= 1
-                carry_back(order, constants, states, eta, N, until - start, log.noise[entry], log.drift[entry], work)
-                continue
-            observation(axes, sensors, axis, sensor_of[scalar], row)
-            nu, R, gain = met.innovation[scalar], log.noise[entry], log.gain[entry]
-            for i in range(states):
-                for j in range(states):
-                    eta[i] += N[i, j] * gain[j] * nu
-                eta[i] += row[i] * nu / R
-            for i in range(states):
-                for j in range(states):
-                    N[i, j] += row[i] * row[j] / R
-            if log.drift[entry] > 0.0:  # a gate that reopened let the offset move
-                pass_noise(eta, N, states, order, math.sqrt(log.drift[entry]), 0.0, work)
+                q, d = log.noise[entry], log.drift[entry]
+                while n >= 0 and times[n] > start:
+                    for i in range(states):
+                        eta[1, i] = eta[0, i]
+                        for j in range(states):
+                            N[1, i, j] = N[0, i, j]
+                    carry_back(axes, axis, states, eta, N, 1, until - times[n], q, d, work)
+                    smooth_output(axes, axis, n, held, eta, N, 1, work, L, outputs)
+                    n -= 1
+                carry_back(axes, axis, states, eta, N, 0, until - start, q, d, work)
+            else:
+                take_back(axes, sensors, axis, sensor_of[log.scalar[entry]], met, log, entry, eta, N, work)
+            entry -= 1
 
 
 @compiled
-def smooth_output(
-    axes: Axes, axis: int, at: int, held: Held, eta: FloatArray, N: FloatArray, work: FloatArray, outputs: Outputs
+def take_back(
+    axes: Axes,
+    sensors: Sensors,
+    axis: int,
+    sensor: int,
+    met: Met,
+    log: Log,
+    entry: int,
+    eta: FloatArray,
+    N: FloatArray,
+    work: FloatArray,
 ) -> None:
-    """One smoothed estimate."""
-    x, P = held.x[axis, at], held.P[axis, at]
-    smoothed(x, P, axes.states[axis], eta, N, work)
-    write_output(axes.order[axis], axes.constants[axis], x, P, held.input[axis, at], outputs, axis, at)
+    """η[0] and N[0] over an update, backward."""
+    states = axes.states[axis]
+    observation(axes, sensors, axis, sensor, work)
+    nu, R = met.innovation[log.scalar[entry]], log.noise[entry]
+    for i in range(states):
+        for j in range(states):
+            eta[0, i] += N[0, i, j] * log.gain[entry, j] * nu
+        eta[0, i] += work[0, i] * nu / R
+    for i in range(states):
+        for j in range(states):
+            N[0, i, j] += work[0, i] * work[0, j] / R
+    if log.drift[entry] > 0.0:  # a gate that reopened let the offset move
+        pass_noise(eta, N, 0, states, axes.order[axis], math.sqrt(log.drift[entry]), 0.0, work)

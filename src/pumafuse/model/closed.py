@@ -57,20 +57,22 @@ def constants(plant: PLANTS) -> FloatArray:
 
 
 @compiled
-def advance_first(constants: FloatArray, dt: float) -> tuple[float, float]:
-    """Φ − 1 and Q of a first-order plant over ``dt`` [s]."""
-    rate = constants[0]
+def advance_first(constants: FloatArray, axis: int, dt: float) -> tuple[float, float]:
+    """Φ − 1 and Q of a first-order plant over ``dt`` [s]; its constants are in row ``axis``."""
+    rate = constants[axis, 0]
     lost = math.expm1(-rate * dt)
     return lost, -0.5 * rate * lost * (2.0 + lost)
 
 
 @compiled
-def advance_second(constants: FloatArray, dt: float) -> tuple[float, float, float, float, float, float, float]:
-    """Φ11, Φ12, Φ21, Φ22, Q11, Q12, Q22 of a second-order plant over ``dt`` [s]."""
-    omega, sigma, square, fastest = constants[0], constants[1], constants[2], constants[3]
+def advance_second(
+    constants: FloatArray, axis: int, dt: float
+) -> tuple[float, float, float, float, float, float, float]:
+    """Φ11, Φ12, Φ21, Φ22, Q11, Q12, Q22 of a second-order plant over ``dt`` [s]; its constants are in row ``axis``."""
+    omega, sigma, square, fastest = constants[axis, 0], constants[axis, 1], constants[axis, 2], constants[axis, 3]
     u = fastest * dt
     if u <= _SHORT:
-        g, rate, power = _series(constants, u)
+        g, rate, power = _series(constants, axis, u)
         g, power = g / fastest, power / (fastest * fastest * fastest)
     else:
         g, rate, power = _exponentials(omega, sigma, square, dt)
@@ -81,13 +83,13 @@ def advance_second(constants: FloatArray, dt: float) -> tuple[float, float, floa
 
 
 @compiled
-def _series(constants: FloatArray, u: float) -> tuple[float, float, float]:
+def _series(constants: FloatArray, axis: int, u: float) -> tuple[float, float, float]:
     """g, g′ and ∫ g² in the time u."""
     g, rate, power = 0.0, 0.0, 0.0
     for k in range(_TERMS - 1, -1, -1):
-        g = g * u + constants[_HEAD + k]
-        rate = rate * u + constants[_HEAD + _TERMS + k]
-        power = power * u + constants[_HEAD + 2 * _TERMS + k]
+        g = g * u + constants[axis, _HEAD + k]
+        rate = rate * u + constants[axis, _HEAD + _TERMS + k]
+        power = power * u + constants[axis, _HEAD + 2 * _TERMS + k]
     return g * u, rate, power * u * u * u
 
 

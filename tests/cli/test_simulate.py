@@ -1,0 +1,350 @@
+"""`pumafuse simulate` and many runs at a time: real executable, real files, real signals."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+import pumafuse as pf
+from pumafuse import folders
+from pumafuse.cli import many
+from pumafuse.simulate import simulate as simulation
+
+EXECUTABLE = Path(sys.executable).parent / "pumafuse"
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+SCENARIO = """
+name = "short"
+teaches = "Nothing much."
+seed = 3
+arm = "puma560-internal"
+[trajectory]
+kind = "white-noise"
+axes = ["radial", "vertical"]
+amplitude_mm = 5.0
+duration_s = 2.0
+[sensors.eye]
+rate_hz = 30.0
+sd_mm = 0.5
+"""
+FILES = {"run.toml", "fusion.toml", "arm.toml", "commands.csv", "eye.csv", "truth.csv"}
+RESULT = {"estimates.parquet", "readings.parquet", "reference.parquet", "summary.json", "fusion.toml", "arm.toml"}
+
+
+def pumafuse(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
+    words = [str(EXECUTABLE), *map(str, arguments)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    path = tmp_path / "short.toml"
+    path.write_text(SCENARIO)
+    return path
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_a_run_is_written_whole_and_the_next_command_works(scenario: Path, tmp_path: Path) -> None:
+    """What it teaches, what is in it, where it is; and the line that comes next can be typed as it stands."""
+    said = pumafuse("simulate", scenario, "-o", tmp_path / "run").stdout.splitlines()
+    assert said[0] == "short: Nothing much."
+    assert (
+        said[1] == f"1 run: 73 commands, {len(pf.Run.read(tmp_path / 'run').sensors['eye'].stamp)} rows of readings,"
+        f" written to {tmp_path / 'run'}"
+    )
+    assert names(tmp_path / "run") == FILES
+    words = said[2].removeprefix("next: ").split()
+    assert words[:2] == ["pumafuse", "fuse"]
+    pumafuse(*words[1:-1], tmp_path / "result")
+    assert names(tmp_path / "result") == RESULT
+
+
+def test_the_executable_gives_the_bytes_that_python_gives(scenario: Path, tmp_path: Path) -> None:
+    """And `--runs` those of single runs with the seeds in a row, on however many cores."""
+    pumafuse("simulate", scenario, "-o", tmp_path / "one")
+    said = pumafuse("simulate", scenario, "-o", tmp_path / "many", "--runs", 3).stdout
+    assert "3 runs: 219 commands" in said and f"next: pumafuse fuse {tmp_path / 'many' / 'seed-*'} -c " in said
+    assert names(tmp_path / "many") == {"seed-3", "seed-4", "seed-5"}
+    for seed in (3, 4, 5):
+        simulation.write(pf.simulate(pf.Scenario.load(scenario), seed), tmp_path / f"python-{seed}", force=False)
+        assert digests(tmp_path / "many" / f"seed-{seed}") == digests(tmp_path / f"python-{seed}")
+    assert digests(tmp_path / "one") == digests(tmp_path / "python-3")
+    assert digests(tmp_path / "one") != digests(tmp_path / "python-4")
+
+
+def test_many_runs_are_fused_into_one_table(scenario: Path, tmp_path: Path) -> None:
+    """A line for each run and axis, then one for each axis over all of them; a result folder for each run."""
+    pumafuse("simulate", scenario, "-o", tmp_path / "runs", "--runs", 4)
+    runs = sorted((tmp_path / "runs").iterdir())
+    config = tmp_path / "runs" / "seed-3" / "fusion.toml"
+    table = pumafuse("fuse", *runs, "-c", config, "-o", tmp_path / "out").stdout.splitlines()
+    own = [line.split() for line in table if line.strip().startswith("short, seed")]
+    assert [(line[2], line[3]) for line in own] == [(s, a) for s in "3456" for a in ("radial", "vertical")]
+    pooled = [line.split() for line in table if line.strip().startswith("all 4")]
+    assert [line[2] for line in pooled] == ["radial", "vertical"]
+    assert names(tmp_path / "out") == {run.name for run in runs}
+    assert all(names(folder) == RESULT for folder in (tmp_path / "out").iterdir())
+    for axis, number in (("radial", 0), ("vertical", 1)):
+        squares = [float(line[4]) ** 2 for line in own if line[3] == axis]
+        assert float(pooled[number][3]) == pytest.approx((sum(squares) / 4) ** 0.5, abs=0.001)
+        assert float(pooled[number][4]) == pytest.approx(max(squares) ** 0.5, abs=0.001)
+
+
+def test_one_run_that_fails_stops_no_other(scenario: Path, tmp_path: Path) -> None:
+    """It is named at the end, one line for it and one in all, and the exit code is 1."""
+    out = tmp_path / "many"
+    out.mkdir()
+    (out / "seed-4").write_text("in the way")
+    done = pumafuse("simulate", scenario, "-o", out, "--runs", 3, code=1)
+    assert done.stderr.splitlines() == [
+        f"pumafuse: seed-4: {out / 'seed-4'}: exists and is not a folder",
+        f"pumafuse: 1 of 3 runs failed (see above); the others are in {out}",
+    ]
+    assert "2 runs: 146 commands" in done.stdout
+    assert names(out / "seed-3") == names(out / "seed-5") == FILES
+    assert (out / "seed-4").read_text() == "in the way"
+
+
+def test_fusing_goes_on_past_a_run_that_cannot_be_read(scenario: Path, tmp_path: Path) -> None:
+    """Torn tables, strange folders and missing runs are listed in the order given."""
+    runs = tmp_path / "runs"
+    pumafuse("simulate", scenario, "-o", runs, "--runs", 3)
+    (runs / "seed-4" / "eye.csv").write_text("time_s,radial_mm\n")
+    arguments = [runs / "none", runs / "seed-3", runs / "seed-4", runs / "seed-5"]
+    done = pumafuse("fuse", *arguments, "-c", runs / "seed-3" / "fusion.toml", "-o", tmp_path / "out", code=1)
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("warning: ")]
+    assert [line.split(": ")[1] for line in lines[:2]] == [str(runs / "none"), str(runs / "seed-4")]
+    assert lines[2:] == [f"pumafuse: 2 of 4 runs failed (see above); the others are in {tmp_path / 'out'}"]
+    assert names(tmp_path / "out") == {"seed-3", "seed-5"}
+    assert "all 2" in done.stdout
+
+
+def test_when_every_run_fails_nothing_is_promised(scenario: Path, tmp_path: Path) -> None:
+    """No table and no next step, only what was wrong."""
+    done = pumafuse("fuse", tmp_path / "a", tmp_path / "b", "-c", SCENARIOS / "none.toml", "-o", tmp_path / "o", code=1)
+    assert done.stdout == ""
+    out = tmp_path / "many"
+    out.mkdir()
+    for seed in (3, 4):
+        (out / f"seed-{seed}").write_text("in the way")
+    done = pumafuse("simulate", scenario, "-o", out, "--runs", 2, code=1)
+    assert done.stdout.splitlines() == ["short: Nothing much."]
+    assert len(done.stderr.splitlines()) == 3
+
+
+def _square(number: int) -> int:
+    return number**2
+
+
+def _refused() -> int:
+    raise pf.ConfigError("not\nso")
+
+
+def _broken() -> int:
+    raise ValueError("several\nlines\nof it")
+
+
+def test_jobs_are_done_and_reported_in_the_order_given(capsys: pytest.CaptureFixture[str]) -> None:
+    """Whichever is ready first; a refusal and an unexpected exception are one line each, the rest is done."""
+    jobs: dict[str, Callable[[], int]] = {f"job-{n}": partial(_square, n) for n in range(6)}
+    jobs = {"bad": _refused, **jobs, "worse": _broken}
+    done, failed = many.each("testing", jobs)
+    assert done == {f"job-{n}": n**2 for n in range(6)} and list(done) == [f"job-{n}" for n in range(6)]
+    assert list(failed) == ["bad", "worse"]
+    assert failed["bad"] == "not so"
+    assert "ValueError" in failed["worse"]
+    with pytest.raises(many.SomeFailedError, match="2 of 8 runs failed"):
+        many.tell(failed, 8, "here")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2 and lines[0] == "pumafuse: bad: not so"
+    assert lines[1].startswith("pumafuse: worse: ") and "several" in lines[1] and "of it" in lines[1]
+
+
+def test_nothing_is_told_when_nothing_failed(capsys: pytest.CaptureFixture[str]) -> None:
+    """And nothing raised."""
+    many.tell({}, 3, "here")
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.long
+def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
+    """As when memory runs out: the command says so and ends, it does not hang and shows no traceback."""
+    script = tmp_path / "dies.py"
+    script.write_text(
+        "import os, sys\nfrom pumafuse.cli import many, main\n"
+        "def die():\n    os._exit(9)\n"
+        "def app():\n    many.tell(many.each('x', {'a': die, 'b': die})[1], 2, 'here')\n"
+        "if __name__ == '__main__':\n    main.app = app\n    main.main()\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+
+
+def interrupted(words: list[str], out: Path, finished: int, group: bool) -> tuple[int, str]:
+    """Start a command, interrupt it once it has ``finished`` some folders, and wait: exit code and stderr."""
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    give_up = time.monotonic() + 100.0
+    while process.poll() is None and time.monotonic() < give_up:
+        if out.exists() and len([path for path in out.iterdir() if not path.name.startswith(".")]) >= finished:
+            break
+        time.sleep(0.01)
+    assert process.poll() is None, process.communicate()
+    if group:
+        os.killpg(process.pid, signal.SIGINT)  # Ctrl-C reaches every process of the terminal
+    else:
+        os.kill(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=100)
+    return process.returncode, said
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("group", [True, False], ids=["terminal", "one"])
+def test_an_interrupted_simulation_keeps_whole_runs_and_nothing_else(group: bool, tmp_path: Path) -> None:
+    """Exit code 130, a line that says how many are done; every folder with a run's name is whole.
+
+    A worker that is killed while it writes may leave a hidden folder behind.
+    """
+    out = tmp_path / "out"
+    words = [str(EXECUTABLE), "simulate", str(SCENARIOS / "step-campaign.toml"), "-o", str(out), "--runs", "300"]
+    code, said = interrupted(words, out, 3, group)
+    assert code == 130
+    assert len(said.splitlines()) <= 2, said
+    assert "interrupted: " in said and "of 300 runs" in said
+    time.sleep(1.0)  # what is still running would still write
+    left = sorted(path.name for path in out.iterdir() if not path.name.startswith(".seed-"))
+    assert 3 <= len(left) < 300
+    assert all(name.startswith("seed-") for name in left)
+    for name in left:
+        assert names(out / name) == (FILES - {"eye.csv"}) | {"scope.csv", "trials.csv", "samples.csv"}
+        assert pf.Run.read(out / name).name.endswith(f"seed {name.removeprefix('seed-')}")
+
+
+@pytest.mark.long
+def test_an_interrupted_fusion_keeps_whole_results_and_nothing_else(scenario: Path, tmp_path: Path) -> None:
+    """As a simulation does."""
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    scenario.write_text(SCENARIO.replace("30.0\nsd", "500.0\nsd").replace("= 2.0\n[", "= 20.0\n["))
+    pumafuse("simulate", scenario, "-o", runs, "--runs", 60)
+    paths = sorted(map(str, runs.iterdir()))
+    config = str(runs / "seed-3" / "fusion.toml")
+    words = [str(EXECUTABLE), "fuse", *paths, "-c", config, "-o", str(out), "--engine", "filterpy"]
+    code, said = interrupted(words, out, 2, group=True)
+    assert code == 130
+    assert "Traceback" not in said and "interrupted: " in said
+    time.sleep(1.0)
+    left = sorted(path.name for path in out.iterdir() if not path.name.startswith(".seed-"))
+    assert 2 <= len(left) < 60
+    assert all(name.startswith("seed-") for name in left)
+    assert all(names(out / name) == RESULT for name in left)
+
+
+def ours(name: str) -> bool:
+    return name in ("run.toml", "a.csv")
+
+
+def test_a_folder_is_writable_when_it_is_absent_or_empty(tmp_path: Path) -> None:
+    """Neither needs --force."""
+    (tmp_path / "empty").mkdir()
+    for name in ("absent", "empty", "deep/er"):
+        folders.check_writable(tmp_path / name, False, "run.toml", ours)
+
+
+def test_a_folder_of_ours_needs_force(tmp_path: Path) -> None:
+    """And with it is replaced."""
+    (tmp_path / "run.toml").write_text("")
+    (tmp_path / "a.csv").write_text("")
+    with pytest.raises(folders.FolderError, match="exists; --force replaces it"):
+        folders.check_writable(tmp_path, False, "run.toml", ours)
+    folders.check_writable(tmp_path, True, "run.toml", ours)
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_strange_folders_are_never_ours(force: bool, tmp_path: Path) -> None:
+    """A file in the place, something else in it, a folder in it, or our kind of file without the marker."""
+
+    def refused(path: Path) -> str:
+        with pytest.raises(folders.FolderError) as error:
+            folders.check_writable(path, force, "run.toml", ours)
+        return str(error.value)
+
+    (tmp_path / "file").write_text("")
+    assert "is not a folder" in refused(tmp_path / "file")
+    for name, entries in {
+        "strange": ["run.toml", "b.txt"],
+        "unmarked": ["a.csv"],
+        "hidden": ["run.toml", ".git"],
+    }.items():
+        (tmp_path / name).mkdir()
+        for entry in entries:
+            (tmp_path / name / entry).write_text("")
+    assert "holds 'b.txt'" in refused(tmp_path / "strange")
+    assert "holds no output of pumafuse" in refused(tmp_path / "unmarked")
+    assert "holds '.git'" in refused(tmp_path / "hidden")
+    (tmp_path / "nested" / "a.csv").mkdir(parents=True)
+    (tmp_path / "nested" / "run.toml").write_text("")
+    assert "holds 'a.csv'" in refused(tmp_path / "nested")
+
+
+def test_an_output_that_fails_half_way_leaves_the_old_one_and_no_trace(tmp_path: Path) -> None:
+    """Whatever goes wrong while it is written."""
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.toml").write_text("old")
+
+    def half() -> None:
+        with folders.replacing(tmp_path / "run") as new:
+            (new / "run.toml").write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        half()
+    assert names(tmp_path) == {"run"} and (tmp_path / "run" / "run.toml").read_text() == "old"
+    with folders.replacing(tmp_path / "run") as new:
+        (new / "run.toml").write_text("new")
+    assert names(tmp_path) == {"run"} and (tmp_path / "run" / "run.toml").read_text() == "new"
+
+
+def test_a_simulated_run_is_replaced_only_with_force(scenario: Path, tmp_path: Path) -> None:
+    """And what was there is untouched when it is refused."""
+    run = tmp_path / "run"
+    pumafuse("simulate", scenario, "-o", run)
+    before = digests(run)
+    scenario.write_text(SCENARIO.replace("seed = 3", "seed = 4"))
+    assert "--force" in pumafuse("simulate", scenario, "-o", run, code=1).stderr
+    assert digests(run) == before
+    pumafuse("simulate", scenario, "-o", run, "--force")
+    assert digests(run) != before and names(run) == FILES
+
+
+def test_a_run_that_was_recorded_is_not_replaced_even_with_force(scenario: Path, tmp_path: Path) -> None:
+    """A folder with run.toml and tables of its own is somebody's measurement, not our output."""
+    recorded = tmp_path / "measured"
+    recorded.mkdir()
+    (recorded / "run.toml").write_text('[command]\nfile = "host.csv"\ntime = "t_s"\nradial = "u_mm"\n')
+    (recorded / "host.csv").write_text("t_s,u_mm\n0.0,1.0\n")
+    pumafuse("simulate", scenario, "-o", recorded, "--force", code=1)
+    assert names(recorded) == {"run.toml", "host.csv"}
+
+
+@pytest.mark.parametrize("arguments", [("--runs", "0"), ("--runs", "-1"), ("--runs", "two"), ()])
+def test_wrong_usage_exits_with_2(arguments: tuple[str, ...], scenario: Path) -> None:
+    """Impossible numbers of runs, and no output folder."""
+    pumafuse("simulate", scenario, *(("-o", "out", *arguments) if arguments else ()), code=2)
