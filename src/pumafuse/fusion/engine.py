@@ -148,7 +148,7 @@ def _start(
 
 
 def _log(axes: kernels.Axes, rows: kernels.Rows | None, width: int) -> kernels.Log:
-    """Room for what happens to each axis: an interval for each command, and an interval and an update for each scalar."""
+    """Room for what happens to each axis: an interval for each command, an interval and an update for each scalar."""
     count = len(axes.order)
     room = np.zeros(count, dtype=np.int64)
     if rows is not None:

@@ -7,6 +7,9 @@ in arrays that change in place: a copy of them is a checkpoint. No fast-math: th
 State of an axis: the plant's n states (position [m], and its rate [m/s] for a second-order plant), the offset, biases.
 """
 
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportReturnType=false
+# (an element of an array is a plain number here: numba compiles it, numpy's types do not know)
+
 from __future__ import annotations
 
 import math
@@ -213,7 +216,7 @@ def step(axes: Axes, axis: int, x: FloatArray, P: FloatArray, at: int, ns: int, 
 
 @compiled
 def acting_now(axes: Axes, axis: int, entry: int) -> tuple[float, float, float]:
-    """v [m], q [m²·s] and d [m²/s] of an entry of the drive; at rest before the first."""
+    """The v [m], q [m²·s] and d [m²/s] of an entry of the drive; at rest before the first."""
     if entry < 0:
         return 0.0, axes.resting[axis, 0], axes.resting[axis, 1]
     at = axes.first[axis] + entry
@@ -579,22 +582,32 @@ def pass_noise(
 
 
 @compiled
-def root(N: FloatArray, at: int, states: int, L: FloatArray) -> None:
-    """N[at] = L Lᵀ, L (s, s) lower triangular with a column of zeros where N says nothing more."""
-    for j in range(states):
-        pivot = N[at, j, j]
-        for k in range(j):
-            pivot -= L[j, k] * L[j, k]
+def root(N: FloatArray, at: int, states: int, L: FloatArray, left: FloatArray) -> None:
+    """N[at] = L Lᵀ by columns of L (s, s), the state with the largest share of its own information left first.
+
+    N says nothing of some states, or of their differences: in another order a pivot of rounding would be divided by.
+    ``left`` (s,) is room for what is left of the diagonal.
+    """
+    for i in range(states):
+        left[i] = N[at, i, i]
+        for k in range(states):
+            L[i, k] = 0.0
+    for k in range(states):
+        pivot, most = -1, _NOTHING
         for i in range(states):
-            L[i, j] = 0.0
-        if pivot <= _NOTHING * N[at, j, j]:
-            continue
-        L[j, j] = math.sqrt(pivot)
-        for i in range(j + 1, states):
-            rest = N[at, i, j]
-            for k in range(j):
-                rest -= L[i, k] * L[j, k]
-            L[i, j] = rest / L[j, j]
+            if left[i] > most * N[at, i, i]:
+                pivot, most = i, left[i] / N[at, i, i]
+        if pivot < 0:
+            return
+        L[pivot, k] = math.sqrt(left[pivot])
+        left[pivot] = 0.0
+        for i in range(states):
+            if left[i] > 0.0:
+                rest = N[at, i, pivot]
+                for m in range(k):
+                    rest -= L[i, m] * L[pivot, m]
+                L[i, k] = rest / L[pivot, k]
+                left[i] -= L[i, k] * L[i, k]
 
 
 @compiled
@@ -612,7 +625,7 @@ def smooth_output(
 ) -> None:
     """P_s = (I + P N)⁻¹ P and x_s = x + P_s η: the columns of N = L Lᵀ are met as readings with unit noise."""
     x, P, states = held.x[axis], held.P[axis], axes.states[axis]
-    root(N, at, states, L)
+    root(N, at, states, L, work[3])
     for k in range(states):
         for i in range(states):
             work[0, i] = L[i, k]

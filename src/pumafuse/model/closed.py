@@ -27,7 +27,7 @@ SIZE = _HEAD + 3 * _TERMS
 
 
 def constants(plant: PLANTS) -> FloatArray:
-    """What the kernels need to know of a plant, (c,): for first order its rate, for second order ω, σ, β², r, series."""
+    """What the kernels need to know of a plant, (c,): of first order its rate; of second order ω, σ, β², r, series."""
     found = np.zeros(SIZE)
     if isinstance(plant, FirstOrder):
         found[0] = 1.0 / plant.time_constant
