@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..units import MM
 from .config import Sensor
-from .estimates import Estimates, Readings
+from .estimates import Estimates, Readings, outcome_counts
 from .score import Z95
 from .timeline import LONGEST_TAIL_NS, Outcome
 
@@ -105,12 +105,14 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
 def troubles(est: Estimates) -> list[str]:
     """What went wrong with whole sensors, a sentence each: gates that reopened, readings that all failed, clocks."""
     found: list[str] = []
-    for name in est.readings.sensors:
-        mine = est.readings.where(est.readings.sensor == est.readings.sensors.index(name))
-        total, counts = len(mine.outcome), mine.counts()
+    readings = est.readings
+    for name in readings.sensors:
+        mine = readings.sensor == readings.sensors.index(name)
+        time, outcome = readings.time[mine], readings.outcome[mine]
+        total, counts = len(outcome), outcome_counts(outcome)
         if not total:
             continue
-        reopened = len(np.unique(mine.time[mine.outcome == Outcome.REOPENED]))
+        reopened = len(np.unique(time[outcome == Outcome.REOPENED]))
         if reopened:
             found.append(
                 f"{name}: its gate reopened {reopened} times after half a second of rejections: it"
@@ -118,13 +120,13 @@ def troubles(est: Estimates) -> list[str]:
             )
         if counts.get(Outcome.BEFORE_START.word, 0) > 0.5 * total:
             found.append(f"{name}: most readings lie before the first command: are both stamped by one clock?")
-        last = float(np.nanmax(mine.time, initial=-np.inf))
+        last = float(np.nanmax(time, initial=-np.inf))
         if last > est.last_command + LONGEST_TAIL_NS / 1e9:
             found.append(
                 f"{name}: readings go on for {(last - est.last_command) / 3600.0:.1f} hours after the last command: are"
                 " both stamped by one clock?"
             )
-        elif float(np.mean(mine.time > est.last_command + 1.0)) > 0.5:
+        elif float(np.mean(time > est.last_command + 1.0)) > 0.5:
             found.append(f"{name}: most readings lie after the last command: are both stamped by one clock?")
         if counts.get(Outcome.GATED.word, 0) > 0.1 * total:
             share = counts[Outcome.GATED.word] / total
@@ -143,7 +145,7 @@ def _frozen(est: Estimates, sensor: str) -> list[str]:
     """
     found: list[str] = []
     for axis in est.readings.axes:
-        values = est.readings.of(sensor, axis).value
+        values = est.readings.values_of(sensor, axis)
         values = values[np.isfinite(values)]
         if len(values) < _FROZEN:
             continue

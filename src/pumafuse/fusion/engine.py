@@ -9,7 +9,7 @@ from ..compiled import maybe_compiling
 from ..model import closed
 from ..model.plants import FirstOrder
 from . import kernels
-from .config import FusionConfig
+from .config import FusionConfig, Sensor
 from .estimates import Mode
 from .timeline import AxisInput, Timeline
 from .track import AxisEstimate, Bias, Fused
@@ -23,7 +23,7 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
     rows = _rows(timeline, config)
     count, width = len(timeline.axes), int(axes.states.max())
     state = _start(axes, timeline, config, biases, width)
-    met = kernels.Met(*(np.full(len(candidates), np.nan) for _ in range(2)), np.zeros(len(candidates), dtype=np.uint8))
+    met = kernels.Met(np.empty(len(candidates)), np.empty(len(candidates)), np.empty(len(candidates), dtype=np.uint8))
     outputs = kernels.Outputs(*(np.empty((count, len(times))) for _ in kernels.Outputs._fields))
     smooth = mode == "smoothed"
     kept = len(times) if smooth else 0
@@ -34,7 +34,7 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
             arrival = np.maximum(scalars.stamp[candidates[rows.first[:-1]]], rows.valid)
             queue = np.argsort(arrival, kind="stable")
             back = int((np.maximum.accumulate(queue) - queue).max(initial=0)) + 2
-            places = kernels.State(*(np.empty((back, *part.shape), part.dtype) for part in state))
+            places = _places(state, back)
             arrived = np.zeros(len(rows.valid), dtype=np.bool_)
             kernels.filter_as_live(
                 axes, sensors, rows, arrival, queue, arrived, state, places, times, met, log, held, outputs
@@ -58,9 +58,9 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
 
 def _biases_on(timeline: Timeline, config: FusionConfig) -> list[list[str]]:
     """For each axis the sensors whose bias is in its state: those heard on it, in their order."""
-    scalars, candidates = timeline.scalars, timeline.scalars.candidates
-    heard = np.zeros((len(scalars.sensors), len(timeline.axes)), dtype=np.bool_)
-    heard[scalars.sensor[candidates], scalars.axis[candidates]] = True
+    scalars, chosen, count = timeline.scalars, _chosen(timeline), len(timeline.axes)
+    both = scalars.sensor[chosen] * count + scalars.axis[chosen]
+    heard = np.bincount(both, minlength=len(scalars.sensors) * count).reshape(-1, count) > 0
     biased = [name in config.sensors and config.sensors[name].bias_sd > 0.0 for name in scalars.sensors]
     return [
         [name for index, name in enumerate(scalars.sensors) if biased[index] and heard[index, axis]]
@@ -108,21 +108,27 @@ def _axes(timeline: Timeline, config: FusionConfig, biases: list[int]) -> kernel
 
 
 def _rows(timeline: Timeline, config: FusionConfig) -> kernels.Rows:
-    scalars, candidates = timeline.scalars, timeline.scalars.candidates
-    sensor, axis, row = scalars.sensor[candidates], scalars.axis[candidates], scalars.row[candidates]
+    scalars, chosen = timeline.scalars, _chosen(timeline)
+    sensor, axis, row = scalars.sensor[chosen], scalars.axis[chosen], scalars.row[chosen]
     begins = np.flatnonzero(np.diff(row, prepend=-1))
     known = [config.sensors.get(name) for name in scalars.sensors]
-    sds = [[(s and s.sd_of(axis.name)) or np.nan for axis in timeline.axes] for s in known]
-    scale = np.array([1.0 if s is None else s.scale for s in known])
-    start = np.array([axis.start for axis in timeline.axes])
+    sds = np.array([[_noise(s, axis.name) for axis in timeline.axes] for s in known]).ravel()
+    levels = np.array([[(1.0 if s is None else s.scale) * axis.start for axis in timeline.axes] for s in known]).ravel()
+    both = sensor * len(timeline.axes) + axis
     return kernels.Rows(
-        valid=scalars.valid[candidates[begins]],
+        valid=scalars.valid[chosen][begins],
         sensor=sensor[begins],
-        first=np.append(begins, len(candidates)),
+        first=np.append(begins, len(row)),
         axis=axis,
-        value=scalars.value[candidates] - scale[sensor] * start[axis],
-        sd=np.array(sds).reshape(len(known), len(start))[sensor, axis] * scalars.spread[candidates],
+        value=scalars.value[chosen] - levels[both],
+        sd=sds[both] * scalars.spread[chosen],
     )
+
+
+def _chosen(timeline: Timeline) -> slice | IntArray:
+    """The candidates among all scalars; a slice where they are all of them, which copies nothing."""
+    candidates = timeline.scalars.candidates
+    return slice(None) if len(candidates) == len(timeline.scalars.value) else candidates
 
 
 def _start(
@@ -144,6 +150,19 @@ def _start(
         rejected=np.zeros((sensors, count + 1), dtype=np.int64),
         since=np.zeros((sensors, count + 1), dtype=np.int64),
         work=np.zeros((4, width)),
+    )
+
+
+def _places(state: kernels.State, count: int) -> kernels.State:
+    """Room for ``count`` checkpoints."""
+    return kernels.State(
+        x=np.empty((count, *state.x.shape)),
+        P=np.empty((count, *state.P.shape)),
+        clock=np.empty((count, *state.clock.shape), dtype=np.int64),
+        entry=np.empty((count, *state.entry.shape), dtype=np.int64),
+        rejected=np.empty((count, *state.rejected.shape), dtype=np.int64),
+        since=np.empty((count, *state.since.shape), dtype=np.int64),
+        work=state.work,
     )
 
 
@@ -182,8 +201,15 @@ def _known_biases(
     return found
 
 
+def _noise(sensor: Sensor | None, axis: str) -> float:
+    sd = None if sensor is None else sensor.sd_of(axis)
+    return np.nan if sd is None else sd
+
+
 def _spread(values: FloatArray, candidates: IntArray, size: int) -> FloatArray:
     """Values of the candidates among all scalars, NaN for the others."""
+    if len(values) == size:
+        return values
     found = np.full(size, np.nan)
     found[candidates] = values
     return found

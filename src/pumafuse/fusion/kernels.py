@@ -7,7 +7,7 @@ in arrays that change in place: a copy of them is a checkpoint. No fast-math: th
 State of an axis: the plant's n states (position [m], and its rate [m/s] for a second-order plant), the offset, biases.
 """
 
-# pyright: reportArgumentType=false, reportAssignmentType=false, reportReturnType=false
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportReturnType=false, reportConstantRedefinition=false
 # (an element of an array is a plain number here: numba compiles it, numpy's types do not know)
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ class Log(NamedTuple):
 
     Attributes:
         first: Where each axis's entries begin, (A + 1,); all 0 where nothing is to be kept.
-        count: How many each axis has, (A,).
+        used: How many each axis has, (A,).
         time: The instant after each, int64 ns, (k,).
         scalar: Which scalar's update it was, −1 for an interval, (k,).
         noise: Input noise density squared of an interval [m²·s], R of an update [m²], (k,).
@@ -158,7 +158,7 @@ class Log(NamedTuple):
     """
 
     first: IntArray
-    count: IntArray
+    used: IntArray
     time: TimeArray
     scalar: IntArray
     noise: FloatArray
@@ -245,13 +245,13 @@ def advance(axes: Axes, state: State, log: Log, axis: int, time: int) -> None:
 @compiled
 def write_log(log: Log, axis: int, time: int, scalar: int, noise: float, drift: float, work: FloatArray) -> None:
     """Keep an entry, where entries are kept; an update's gain is in ``work[1]``."""
-    at = log.first[axis] + log.count[axis]
+    at = log.first[axis] + log.used[axis]
     if at < log.first[axis + 1]:
         log.time[at], log.scalar[at], log.noise[at], log.drift[at] = time, scalar, noise, drift
         if scalar >= 0:
             for i in range(log.gain.shape[1]):
                 log.gain[at, i] = work[1, i]
-        log.count[axis] += 1
+        log.used[axis] += 1
 
 
 @compiled
@@ -303,17 +303,17 @@ def predicted(
 ) -> tuple[float, float, float]:
     """ν = z − H x, S = H P Hᵀ + R and R of a scalar here and now; R grows with speed where latency wanders."""
     axis = rows.axis[scalar]
-    observation(axes, sensors, axis, sensor, state.work)
-    R = rows.sd[scalar] ** 2
+    x, P, o, scale, bias = state.x, state.P, axes.order[axis], sensors.scale[sensor], sensors.bias[sensor, axis]
+    R = rows.sd[scalar] * rows.sd[scalar]
     if sensors.latency_sd[sensor] > 0.0:
         v, _, _ = acting_now(axes, axis, state.entry[axis])
-        R += (sensors.scale[sensor] * velocity(axes, axis, state.x, axis, v) * sensors.latency_sd[sensor]) ** 2
-    nu, S = rows.value[scalar], R
-    for i in range(axes.states[axis]):
-        nu -= state.work[0, i] * state.x[axis, i]
-        for j in range(axes.states[axis]):
-            S += state.work[0, i] * state.P[axis, i, j] * state.work[0, j]
-    return nu, S, R
+        R += (scale * velocity(axes, axis, x, axis, v) * sensors.latency_sd[sensor]) ** 2
+    nu = rows.value[scalar] - scale * (x[axis, 0] + x[axis, o])
+    S = scale * scale * (P[axis, 0, 0] + 2.0 * P[axis, 0, o] + P[axis, o, o])
+    if bias >= 0:
+        nu -= x[axis, bias]
+        S += 2.0 * scale * (P[axis, 0, bias] + P[axis, o, bias]) + P[axis, bias, bias]
+    return nu, S + R, R
 
 
 @compiled
@@ -346,8 +346,9 @@ def meet_together(
     for scalar in range(first, end):
         advance(axes, state, log, rows.axis[scalar], valid)
         nu, S, _ = predicted(axes, sensors, rows, state, scalar, sensor)
-        met.innovation[scalar], met.innovation_sd[scalar] = nu, math.sqrt(S)
-        any_beyond |= gate > 0.0 and abs(nu) > gate * math.sqrt(S)
+        sd = math.sqrt(S)
+        met.innovation[scalar], met.innovation_sd[scalar] = nu, sd
+        any_beyond |= gate > 0.0 and abs(nu) > gate * sd
     if state.rejected[sensor, part] == 0:
         state.since[sensor, part] = valid
     long_enough = valid - state.since[sensor, part] >= REOPEN_SPAN_NS
@@ -372,6 +373,7 @@ def fuse(
         state.P[axis, axes.order[axis], axes.order[axis]] += widened
         _, S, _ = predicted(axes, sensors, rows, state, scalar, sensor)
         met.innovation_sd[scalar] = math.sqrt(S)
+    observation(axes, sensors, axis, sensor, state.work)
     joseph(state.P, axis, axes.states[axis], R, state.work)
     for i in range(axes.states[axis]):
         state.x[axis, i] += state.work[1, i] * nu
@@ -663,7 +665,7 @@ def smooth_run(
             eta[0, i] = 0.0
             for j in range(states):
                 N[0, i, j] = 0.0
-        entry = log.first[axis] + log.count[axis] - 1
+        entry = log.first[axis] + log.used[axis] - 1
         while True:
             first = entry < log.first[axis]
             until = origin if first else log.time[entry]

@@ -8,8 +8,10 @@ still meets its scalars in the order (time, sensor, stamp, place in the file).
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +28,7 @@ LONGEST_TAIL_NS = 3_600_000_000_000  # readings this long after the last command
 REOPEN_AFTER = 10  # rejections in a row of one sensor …
 REOPEN_SPAN_NS = 500_000_000  # … the first of them at least 0.5 s ago
 _FARTHEST = 1e6  # m
+T = TypeVar("T", bound=np.generic)
 _MOST_ESTIMATES = 10_000_000
 
 
@@ -97,7 +100,7 @@ class Scalars:
     outcome: CodeArray
     sensors: tuple[str, ...]
 
-    @property
+    @cached_property
     def candidates(self) -> IntArray:
         """Indices of the scalars that the filter is to decide on."""
         return np.flatnonzero(self.outcome == Outcome.FUSED)
@@ -167,7 +170,8 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
         start = run.start.get(name, float(values[0]))
         driven = drive(arm.axes[name], given, values, start, arm.update_period)
         inputs.append(AxisInput(name, start, given, driven, round(arm.delay_of(name) * 1e9)))
-    commands = np.unique(np.concatenate([axis.given for axis in inputs]))
+    same = all(np.array_equal(axis.given, inputs[0].given) for axis in inputs)
+    commands = inputs[0].given if same else np.unique(np.concatenate([axis.given for axis in inputs]))
     origin = int(commands[0])
 
     named = tuple(name for name in config.sensor_names(sensors) if name in run.sensors)
@@ -223,58 +227,79 @@ def _actual_commands(stamp: TimeArray, value: FloatArray, period: float) -> IntA
 
 
 def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int, notes: list[str]) -> Scalars:
-    columns: list[tuple[npt.NDArray[np.generic], ...]] = []
-    for index, name in enumerate(names):
-        source, sensor = run.sensors[name], config.sensors.get(name)
-        label = name if name == source.label else f"{name} ({source.label})"
-        latency = 0 if sensor is None else round(sensor.latency * 1e9)
-        valid = np.where(source.stamp == NO_STAMP, NO_STAMP, source.stamp - latency)
-        rows = np.arange(len(valid))
-        outcomes = _row_outcomes(source, sensor, valid, origin)
-        _tell(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
-        for kind, reason in _REASONS.items():
-            _tell(notes, label, outcomes == kind, f"{reason}: {kind.word}")
-        for number, axis in enumerate(run.axes):
-            if axis not in source.values:
-                continue
-            value, outcome = source.values[axis], outcomes.copy()
-            hollow = (outcome == Outcome.FUSED) & ~_plausible(value)
-            outcome[hollow] = Outcome.INVALID
-            if sensor is not None and sensor.sd_of(axis) is None:
-                notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
-                outcome[:] = Outcome.UNKNOWN
-            else:
-                _tell(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
-            columns.append(
-                (
-                    valid,
-                    source.stamp,
-                    np.full_like(rows, index),
-                    np.full_like(rows, number),
-                    value,
-                    rows,
-                    source.spread.get(axis, np.ones(len(rows))),
-                    outcome,
-                )
-            )
-    if not columns:
-        columns = [tuple(np.zeros(0, dtype) for dtype in ("i8", "i8", "i8", "i8", "f8", "i8", "f8", "u1"))]
-    valid, stamp, sensor_index, axis_index, value, rows, spread, outcome = (
-        np.concatenate(parts) for parts in zip(*columns, strict=True)
-    )
-    order = np.lexsort((axis_index, rows, stamp, sensor_index, valid))
-    first = np.ones(len(order), dtype=bool)
-    first[1:] = (np.diff(sensor_index[order]) != 0) | (np.diff(rows[order]) != 0)
+    heard = [_heard(run, config, name, origin, notes) for name in names]
+    valid = np.concatenate([np.zeros(0, dtype=np.int64), *(part.valid for part in heard)])
+    stamp = np.concatenate([np.zeros(0, dtype=np.int64), *(part.stamp for part in heard)])
+    sensor = np.repeat(np.arange(len(names)), [len(part.valid) for part in heard])
+    # Each sensor's rows are in order, and the sensors in theirs: a stable sort by valid time keeps both.
+    order = np.argsort(valid, kind="stable")
+    width = np.array([len(part.axes) for part in heard], dtype=np.int64)
+    source = np.cumsum(width[sensor]) - width[sensor]  # where each row's scalars begin in the sensors' own order
+    width, source = width[sensor][order], source[order]
+    first = np.cumsum(width) - width
+    gather = np.repeat(source - first, width) + np.arange(int(width.sum()))
+    row = np.repeat(np.arange(len(order)), width)
+    at = order[row]
+
+    def of_scalars(parts: Sequence[npt.NDArray[T]], dtype: type[T]) -> npt.NDArray[T]:
+        return np.concatenate([np.zeros(0, dtype), *(part.ravel() for part in parts)])[gather]
+
     return Scalars(
-        valid[order],
-        stamp[order],
-        sensor_index[order],
-        axis_index[order],
-        value[order],
-        np.cumsum(first) - 1,
-        spread[order],
-        outcome[order].astype(np.uint8),
+        valid[at],
+        stamp[at],
+        sensor[at],
+        of_scalars([np.tile(part.axes, len(part.valid)) for part in heard], np.int64),
+        of_scalars([part.value for part in heard], np.float64),
+        row,
+        of_scalars([part.spread for part in heard], np.float64),
+        of_scalars([part.outcome for part in heard], np.uint8),
         names,
+    )
+
+
+class _Heard(NamedTuple):
+    """One sensor's rows in order; of its k axes: their numbers (k,), and value, spread and outcome (rows, k)."""
+
+    valid: TimeArray
+    stamp: TimeArray
+    axes: IntArray
+    value: FloatArray
+    spread: FloatArray
+    outcome: CodeArray
+
+
+def _heard(run: Run, config: FusionConfig, name: str, origin: int, notes: list[str]) -> _Heard:
+    source, sensor = run.sensors[name], config.sensors.get(name)
+    label = name if name == source.label else f"{name} ({source.label})"
+    latency = 0 if sensor is None else round(sensor.latency * 1e9)
+    valid = np.where(source.stamp == NO_STAMP, NO_STAMP, source.stamp - latency)
+    outcomes = _row_outcomes(source, sensor, valid, origin)
+    _tell(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
+    for kind, reason in _REASONS.items():
+        _tell(notes, label, outcomes == kind, f"{reason}: {kind.word}")
+    axes = [(number, axis) for number, axis in enumerate(run.axes) if axis in source.values]
+    value = np.empty((len(valid), len(axes)))
+    spread = np.ones((len(valid), len(axes)))
+    outcome = np.repeat(outcomes[:, None], len(axes), axis=1)
+    for place, (_, axis) in enumerate(axes):
+        value[:, place] = source.values[axis]
+        if axis in source.spread:
+            spread[:, place] = source.spread[axis]
+        if sensor is not None and sensor.sd_of(axis) is None:
+            notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
+            outcome[:, place] = Outcome.UNKNOWN
+            continue
+        hollow = (outcomes == Outcome.FUSED) & ~_plausible(value[:, place])
+        outcome[hollow, place] = Outcome.INVALID
+        _tell(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
+    heard = _Heard(
+        valid, source.stamp, np.array([number for number, _ in axes], dtype=np.int64), value, spread, outcome
+    )
+    if (np.diff(valid) >= 0).all():
+        return heard
+    order = np.argsort(valid, kind="stable")
+    return heard._replace(
+        valid=valid[order], stamp=source.stamp[order], value=value[order], spread=spread[order], outcome=outcome[order]
     )
 
 
@@ -297,10 +322,12 @@ def _row_outcomes(source: Source, sensor: Sensor | None, valid: TimeArray, origi
 
 def _said_before(source: Source) -> BoolArray:
     """Rows whose stamp and values all stood in an earlier row, (rows,)."""
+    found = np.zeros(len(source.stamp), dtype=bool)
+    if (np.diff(source.stamp) > 0).all():
+        return found
     keys = [source.stamp, *(np.ascontiguousarray(value).view(np.int64) for value in source.values.values())]
     order = np.lexsort(keys)
     again = np.all([np.diff(key[order]) == 0 for key in keys], axis=0)
-    found = np.zeros(len(order), dtype=bool)
     found[order[1:][again]] = True
     return found
 

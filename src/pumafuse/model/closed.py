@@ -19,6 +19,7 @@ from ..compiled import compiled
 from .plants import PLANTS, FirstOrder
 
 _TERMS = 16  # of each series: the next would be below 1e-16 of the sum
+_TINY, _FEW = 0.1, 10  # rad, terms: enough for most intervals between readings
 _SHORT = 0.5  # rad; fastest pole × interval up to which the series are used
 _HEAD = 6  # constants before the series
 _APART = 0.3  # rad; below it exponentials of the two poles cancel
@@ -86,7 +87,7 @@ def advance_second(
 def _series(constants: FloatArray, axis: int, u: float) -> tuple[float, float, float]:
     """g, g′ and ∫ g² in the time u."""
     g, rate, power = 0.0, 0.0, 0.0
-    for k in range(_TERMS - 1, -1, -1):
+    for k in range((_FEW if u <= _TINY else _TERMS) - 1, -1, -1):
         g = g * u + constants[axis, _HEAD + k]
         rate = rate * u + constants[axis, _HEAD + _TERMS + k]
         power = power * u + constants[axis, _HEAD + 2 * _TERMS + k]
