@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import glob
+import shutil
 import tempfile
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -57,6 +59,13 @@ def replacing(folder: Path) -> Generator[Path]:
             _swap(new, folder, Path(place) / "old")
     except OSError as error:
         raise FolderError(f"{folder}: cannot be written: {error.strerror}") from None
+
+
+def sweep(folders: Iterable[Path]) -> None:
+    """Remove what killed processes left beside the folders that they were writing."""
+    for folder in folders:
+        for left in folder.parent.glob(f".{glob.escape(folder.name)}.*"):
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _swap(new: Path, folder: Path, aside: Path) -> None:

@@ -103,6 +103,13 @@ def _tagged(kind: Any) -> dict[str, type[msgspec.Struct]]:
     return {str(part.__struct_config__.tag): part for part in structs if part.__struct_config__.tag is not None}
 
 
+def _words(kind: Any) -> tuple[str, ...]:
+    """The words that a Literal, alone or in a union without plain text, accepts."""
+    parts = (kind,) if get_origin(kind) is Literal else get_args(kind)
+    words = [word for part in parts if get_origin(part) is Literal for word in get_args(part)]
+    return () if str in parts else tuple(words)
+
+
 def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
     """What is wrong in ``tree``, deepest place first, each with its key."""
     prefix = f"{path}." if path else ""
@@ -124,9 +131,8 @@ def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
             yield from _problems(tree, tagged[name], path)
         else:
             yield f"{path}.{tag}: unknown {tag} '{name}'; {suggestion(name, tagged)}"
-    elif get_origin(kind) is Literal and tree not in get_args(kind):
-        given = str(cast(Any, tree))
-        yield f"{path}: unknown value '{given}'; {suggestion(given, get_args(kind))}"
+    elif isinstance(tree, str) and (words := _words(kind)) and tree not in words:
+        yield f"{path}: unknown value '{tree}'; {suggestion(tree, words)}"
     elif get_origin(kind) is dict and isinstance(tree, Mapping):
         for key, value in tree.items():  # pyright: ignore[reportUnknownVariableType]
             yield from _problems(value, get_args(kind)[1], f"{prefix}{key}")

@@ -54,9 +54,12 @@ def run(runs: Sequence[Path], options: Options) -> None:
             summary = _one(recorded, options.output, config, options, progress)
         show(summary, options.output)
         return
-    places = zip(runs, _folders(runs, options.output), strict=True)
-    jobs = {str(path): partial(_read_and_fuse, path, folder, config, options) for path, folder in places}
-    done, failed = each("fusing", jobs)
+    places = _folders(runs, options.output)
+    jobs = {
+        str(path): partial(_read_and_fuse, path, folder, config, options)
+        for path, folder in zip(runs, places, strict=True)
+    }
+    done, failed = each("fusing", jobs, places)
     if done:
         console().print(runs_table(list(done.values())))
         console(soft_wrap=True).print(f"written to {options.output}", markup=False)

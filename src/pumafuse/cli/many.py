@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import TypeVar, cast
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import PumafuseError, PumafuseWarning
+from ..folders import sweep
 
 R = TypeVar("R")
 
@@ -22,20 +24,23 @@ class SomeFailedError(PumafuseError):
     """Some of many jobs failed; the others are done."""
 
 
-def each(what: str, jobs: Mapping[str, Callable[[], R]]) -> tuple[dict[str, R], dict[str, str]]:
+def each(what: str, jobs: Mapping[str, Callable[[], R]], places: Iterable[Path]) -> tuple[dict[str, R], dict[str, str]]:
     """Do every job, several at a time.
 
     Args:
         what: For the bar.
         jobs: By name; each can be pickled and leaves its work on disk when done.
+        places: The folders that the jobs write; nothing half written is left beside them.
 
     Returns:
         What each job returned, and what was wrong with those that failed, both in the order given.
 
     Raises:
         KeyboardInterrupt: As it came, after saying how many are done.
+        SomeFailedError: A worker process died.
     """
     from joblib import Parallel, delayed
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     results: dict[str, R] = {}
     failed: dict[str, str] = {}
@@ -52,7 +57,13 @@ def each(what: str, jobs: Mapping[str, Callable[[], R]]) -> tuple[dict[str, R], 
                 bar.advance(task)
         except KeyboardInterrupt:
             print(f"interrupted: {len(results)} of {len(jobs)} runs are done and kept", file=sys.stderr)
+            sweep(places)
             raise
+        except TerminatedWorkerError:
+            sweep(places)
+            raise SomeFailedError(
+                f"a worker process died (out of memory?): {len(results)} of {len(jobs)} runs are done and kept"
+            ) from None
     return {name: results[name] for name in jobs if name in results}, {n: failed[n] for n in jobs if n in failed}
 
 
@@ -77,4 +88,4 @@ def _guarded(name: str, job: Callable[[], R]) -> tuple[str, R | None, str | None
         except PumafuseError as error:
             return name, None, str(error)
         except Exception as error:
-            return name, None, f"unexpected {type(error).__name__}: {error}"
+            return name, None, " ".join(f"unexpected {type(error).__name__}: {error}".split())

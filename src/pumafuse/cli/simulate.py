@@ -26,7 +26,7 @@ def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
     else:
         seeds = range(scenario.seed, scenario.seed + runs)
         jobs = {f"seed-{seed}": partial(_one, scenario, seed, output / f"seed-{seed}", force) for seed in seeds}
-        done, failed = each("simulating", jobs)
+        done, failed = each("simulating", jobs, [output / name for name in jobs])
         made, runs_in = list(done.values()), str(output / "seed-*")
     if made:
         commands, readings, trials = (sum(counts) for counts in zip(*made, strict=True))

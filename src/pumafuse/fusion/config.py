@@ -19,7 +19,7 @@ from ..runs.frames import Frame
 from ..units import refuse_unit
 
 _LONGEST_LATENCY = 3600.0  # s
-_ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
+ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
 
 
 class Start(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -120,9 +120,9 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     def save(self, folder: Path) -> None:
         """Write ``fusion.toml`` and the arm as ``arm.toml`` beside it."""
         tree = toml.builtins(self)
-        tree["arm"] = _ARM_FILE
+        tree["arm"] = ARM_FILE
         (folder / "fusion.toml").write_text(toml.text(tree), encoding="utf-8")
-        self.arm.save(folder / _ARM_FILE)
+        self.arm.save(folder / ARM_FILE)
 
     def sensor_names(self, chosen: Iterable[str] | None) -> tuple[str, ...]:
         """The sensors to use, in the order of the file; all of them for None.

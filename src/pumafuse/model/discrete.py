@@ -92,6 +92,11 @@ class DiscreteModel:
         """Eigenvalues of F, (m,)."""
         return np.linalg.eigvals(self.F).astype(np.complex128)
 
+    @property
+    def split(self) -> tuple[int, float]:
+        """The delay in whole ticks, and what is left of it [s]."""
+        return split_delay(self.delay, self.period)
+
     def step_response(self, ticks: int) -> FloatArray:
         """p[0] … p[ticks-1] [m] after v stepped to 1 m at tick 0, (ticks,)."""
         x = np.zeros((len(self.F), 1))

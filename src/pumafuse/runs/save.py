@@ -9,9 +9,12 @@ import numpy as np
 import pyarrow as pa
 
 from .. import toml
+from ..errors import RunError
 from ..units import MM, seconds
 from . import tables
 from .run import Run, Source
+
+_TAKEN = ("commands", "truth", "trials", "samples")
 
 
 def save(run: Run, folder: Path) -> None:
@@ -20,7 +23,12 @@ def save(run: Run, folder: Path) -> None:
     Args:
         run: What to write; its notes stay behind.
         folder: An existing folder.
+
+    Raises:
+        RunError: See :func:`check_name`.
     """
+    for name in run.sensors:
+        check_name(name)
     manifest: dict[str, Any] = {"name": run.name, "command": _entry(run.command, "commands.csv", folder)}
     if run.start:
         manifest["command"]["start"] = {f"{axis}_mm": level for axis, level in run.start.items()}
@@ -35,6 +43,19 @@ def save(run: Run, folder: Path) -> None:
     if run.frame is not None:
         manifest["frame"] = toml.builtins(run.frame)
     (folder / "run.toml").write_text(toml.text(manifest), encoding="utf-8")
+
+
+def check_name(sensor: str) -> None:
+    """Refuse a sensor whose name makes no file of its own.
+
+    Raises:
+        RunError: It has characters of a path, or is the name of another table.
+    """
+    if sensor in _TAKEN or Path(sensor).name != sensor or sensor.startswith(".") or not sensor.isprintable():
+        raise RunError(
+            f"sensor '{sensor}': its rows go into a file of its name, which must not be a path or one of"
+            f" {', '.join(_TAKEN)}"
+        )
 
 
 def _entry(source: Source, file: str, folder: Path) -> dict[str, Any]:

@@ -164,7 +164,9 @@ def read(path: Path) -> Table:
     except ValueError:  # a null character in the path
         raise RunError(f"{str(path)!r}: no such file") from None
     if table.num_rows == 0:
-        raise RunError("; ".join([f"{path}: the table has no rows", *notes]))
+        if notes or path.is_dir():  # every line was left out: not the kind of table that it should be
+            raise RunError("; ".join([f"{path}: the table has no rows", *notes]))
+        notes = [f"{path.name}: the table has no rows"]
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
         raise RunError(f"{path}: two columns are named '{repeated}'")

@@ -16,12 +16,13 @@ import numpy.typing as npt
 from ..arrays import FloatArray, TimeArray
 from ..fusion.config import Process
 from ..model.plants import FirstOrder
-from .scenario import TrueAxis
+from .scenario import LATTICE, TrueAxis
 
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
-_APART = 1e-5  # equal poles are set this far apart, relatively: it changes the response by its square
-_NODES = 6  # of the noise integral: exact to 1e-12 while |p|Δ ≤ 1
+_APART = {2: 1e-5, 3: 1e-4}  # equal poles are set this far apart, relatively: it changes the response by its square
+_NODES = 3  # of the noise integral: exact to 1e-10 while |p|Δ ≤ 0.1
+_TURN = 0.1
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Motion:
     """Where the tool truly was on one axis.
 
     Attributes:
-        time: Int64 ns, ascending, (k,).
+        time: Int64 ns, ascending, (k,); among them the lattice.
         position: [m] relative to the start level, (k,).
     """
 
@@ -37,7 +38,7 @@ class Motion:
     position: FloatArray
 
     def at(self, time: TimeArray) -> FloatArray:
-        """Positions [m] at instants that were asked for when the motion was made, (n,)."""
+        """Positions [m] at instants of the lattice, (n,)."""
         return self.position[np.searchsorted(self.time, time)]
 
 
@@ -48,7 +49,6 @@ def move(
     issued: TimeArray,
     command: FloatArray,
     period: float,
-    wanted: TimeArray,
     rng: np.random.Generator,
 ) -> Motion:
     """Move one axis through its commands.
@@ -60,18 +60,16 @@ def move(
         issued: When each command is given, on the ticks of T, int64 ns, (n,).
         command: Relative to the start level [m], (n,).
         period: T [s].
-        wanted: Instants whose position is wanted, int64 ns, (k,).
         rng: Draws everything random of this axis.
 
     Returns:
-        The motion, exact at ``wanted``.
+        The motion, exact on the lattice, until one period after the last command.
     """
     noises = rng.spawn(4)  # so that one kind of noise changes no other
     acting = issued + np.rint(_delays(axis, len(issued), noises[0]) * 1e9).astype(np.int64)
     acting = np.maximum.accumulate(acting)  # commands do not overtake one another
     poles, residues = _modes(axis)
-    last = max(int(wanted[-1]), int(acting[-1]))
-    time = _events(acting, wanted, last, float(np.abs(poles).max()))
+    time = _events(acting, lattice(len(issued), period), float(np.abs(poles).max()))
     interval = np.diff(time) / 1e9
     entry = np.searchsorted(acting, time[:-1], side="right") - 1  # −1: the arm still rests
     resting = entry < 0
@@ -116,6 +114,11 @@ def _stick(v: FloatArray, stiction: float) -> FloatArray:
     return found
 
 
+def lattice(ticks: int, period: float) -> TimeArray:
+    """The instants of ``ticks`` periods of T [s] at which readings and reference rows may be, int64 ns."""
+    return np.rint(np.arange(ticks * LATTICE + 1) * (period * 1e9 / LATTICE)).astype(np.int64)
+
+
 def _modes(axis: TrueAxis) -> tuple[ComplexArray, ComplexArray]:
     """Poles p_i [rad/s] and residues r_i of the plant, and of the extra pole in series with it."""
     plant = axis.plant
@@ -124,25 +127,34 @@ def _modes(axis: TrueAxis) -> tuple[ComplexArray, ComplexArray]:
     else:
         middle = -plant.damping * plant.natural_frequency
         half = plant.natural_frequency * np.sqrt(complex(plant.damping**2 - 1.0))
-        # The fast pole as ω² over the slow one would be exact too; the sum loses digits only beyond ζ = 1e8.
         poles = [middle - half, plant.natural_frequency**2 / (middle - half)]
     if axis.extra_pole is not None:
         poles.append(complex(-1.0 / axis.extra_pole))
-    apart = np.array(poles)
-    for number in range(1, len(apart)):
-        while np.any(np.abs(apart[:number] - apart[number]) < _APART * np.abs(apart[number])):
-            apart[number] *= 1.0 + 2.0 * _APART
+    apart = _set_apart(np.array(poles))
     differences = apart[:, None] - apart[None, :]
     np.fill_diagonal(differences, 1.0)
     return apart, np.prod(-apart) / np.prod(differences, axis=1)
 
 
-def _events(acting: TimeArray, wanted: TimeArray, last: int, fastest: float) -> TimeArray:
-    """Where something changes or is wanted, and as many instants between as the noise integral needs."""
-    longest = max(int(1e9 / fastest), 1)
-    start = min(int(acting[0]), int(wanted[0]), 0)
-    between = np.arange(start, last, longest)
-    return np.unique(np.concatenate((acting, wanted, between)))
+def _set_apart(poles: ComplexArray) -> ComplexArray:
+    """Poles that (nearly) coincide, spread evenly about their mean, so that each is a mode of its own."""
+    found = poles.copy()
+    for pole in poles:
+        together = np.abs(poles - pole) < max(_APART.values()) * np.abs(pole)
+        count = int(together.sum())
+        nearest = np.abs(poles[together][:, None] - poles[together][None, :])[np.triu_indices(count, 1)]
+        if count > 1 and nearest.min() < _APART[count] * np.abs(pole):
+            spread = (np.arange(count) - 0.5 * (count - 1)) * (2.0 * _APART[count])
+            found[together] = poles[together].mean() * (1.0 + spread)
+    return found
+
+
+def _events(acting: TimeArray, lattice: TimeArray, fastest: float) -> TimeArray:
+    """Where something changes or may be looked at, and as many instants between as the noise integral needs."""
+    longest = max(int(_TURN * 1e9 / fastest), 1)
+    acting = acting[acting <= lattice[-1]]
+    finer = np.arange(0, lattice[-1] if longest < lattice[1] else 0, longest, dtype=np.int64)
+    return np.unique(np.concatenate((acting, lattice, finer)))
 
 
 def _response(
@@ -155,13 +167,18 @@ def _response(
 ) -> FloatArray:
     """The plant's position after each interval [m], from rest, (intervals,)."""
     node, weight = np.polynomial.legendre.leggauss(_NODES)
-    age = 0.5 * (node + 1.0) * interval[:, None]
-    white = rng.standard_normal(age.shape) * np.sqrt(0.5 * weight * interval[:, None]) * density[:, None]
+    white = rng.standard_normal((len(interval), _NODES)) * np.sqrt(0.5 * weight)
+    white *= (np.sqrt(interval) * density)[:, None]
+    distinct, place = np.unique(interval, return_inverse=True)
     position = np.zeros(len(interval))
     for pole, residue in zip(poles, residues, strict=True):
-        noise = np.sum(np.exp(pole * age) * white, axis=1)
-        forced = np.expm1(pole * interval) / pole * v
-        position += (residue * _sum_of_decays(np.exp(pole * interval), forced + noise)).real
+        if pole.imag < 0.0:
+            continue  # its conjugate stands for both
+        share = residue if pole.imag == 0.0 else 2.0 * residue
+        aged = np.exp(pole * 0.5 * (node + 1.0) * distinct[:, None])[place]
+        forced = (np.expm1(pole * distinct) / pole)[place] * v
+        kick = np.einsum("ij,ij->i", aged, white) + forced
+        position += (share * _sum_of_decays(np.exp(pole * distinct)[place], kick)).real
     return position
 
 

@@ -12,14 +12,18 @@ import numpy as np
 
 from .. import toml
 from ..arrays import FloatArray
-from ..errors import ConfigError, UnknownNameError
-from ..fusion.config import FusionConfig, Process, Start, by_axis, load_arm
+from ..errors import ConfigError, PumafuseError, UnknownNameError
+from ..fusion.config import FusionConfig, Process, by_axis, load_arm
 from ..model.arm import ArmModel, AxisModel, Gain
 from ..model.plants import PLANTS, FirstOrder, NotNegative, Positive, SecondOrder
+from ..runs import save
 from ..runs.frames import CARTESIAN, Frame
 from ..runs.manifest import axis_of
 from ..runs.run import Clock
 from .trajectory import TRAJECTORIES, PathFromFile, Steps
+
+_OVERRIDES = ("start", "process", "sensors")
+LATTICE = 60  # instants in each period: all that is random is drawn on them, so that it is the same whoever looks
 
 Share: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1)]
 PerAxis: TypeAlias = float | dict[str, float]
@@ -228,17 +232,19 @@ class Truth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         sd: Noise of its own [m].
     """
 
-    rows_per_command: Annotated[int, msgspec.Meta(gt=0)] = 5
+    rows_per_command: Annotated[int, msgspec.Meta(gt=0, le=LATTICE)] = 5
     sd: NotNegative = msgspec.field(name="sd_mm", default=0.0)
 
 
-class TrueStart(Start, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class TrueStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where the arm rests before the first command.
 
     Attributes:
+        offset_sd: Of the offset there, drawn for each run and axis [m].
         level: By axis [m]; 0 where absent.
     """
 
+    offset_sd: NotNegative = msgspec.field(name="offset_sd_mm", default=0.0)
     level: dict[str, float] = msgspec.field(default_factory=dict[str, float])
 
 
@@ -268,7 +274,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     arm: ArmModel
     true_arm: dict[str, TrueArm] = {}
     trajectory: TRAJECTORIES
-    start: TrueStart = TrueStart(offset_sd=0.0)
+    start: TrueStart = TrueStart()
     process: dict[str, Process] = {}
     command: CommandLog = CommandLog()
     reference: Truth = Truth()
@@ -280,10 +286,14 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def __post_init__(self) -> None:
         for name in (*self.trajectory.named, *self.start.level):
             self.arm.axis(name)
-        if isinstance(self.trajectory, Steps) and self.trajectory.scope not in self.sensors:
-            raise UnknownNameError("trajectory.scope", "sensor", self.trajectory.scope, self.sensors)
         for name, sensor in self.sensors.items():
+            save.check_name(name)
             self._check(f"sensors.{name}", sensor)
+        if isinstance(self.trajectory, Steps):
+            self._check_steps(self.trajectory)
+        for key in self.filter:
+            if key not in _OVERRIDES:
+                raise UnknownNameError("filter", "table", key, _OVERRIDES)
         if self.frame is not None:
             if not {"tangential", "radial"} <= set(self.arm.axes):
                 raise ConfigError("frame: an arm in x, y, z needs the axes tangential and radial")
@@ -304,11 +314,29 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
                     raise UnknownNameError(f"{where}.{key}", "axis", name, logged)
         if logged is CARTESIAN and isinstance(sensor.sd, dict):
             raise ConfigError(f"{where}.sd_mm: one number for a sensor in x, y, z")
+        seen = set(self.trajectory.named) if sensor.axes is None else set(sensor.axes) & set(self.trajectory.named)
+        for axis in sorted(seen - set(sensor.sd)) if isinstance(sensor.sd, dict) else []:
+            raise ConfigError(f"{where}.sd_mm: no entry for '{axis}', which it measures")
+        fastest = LATTICE / self.arm.update_period
+        if sensor.rate > fastest:
+            raise ConfigError(
+                f"{where}.rate_hz: at most {fastest:g} on this arm ({LATTICE} rows a command), got {sensor.rate:g}"
+            )
         if sensor.outliers is not None and sensor.outliers.largest < sensor.outliers.smallest:
             raise ConfigError(f"{where}.outliers: to_mm is smaller than from_mm")
         for start, end in sensor.outages:
             if end <= start:
                 raise ConfigError(f"{where}.outages_s: [{start:g}, {end:g}] ends before it begins")
+
+    def _check_steps(self, campaign: Steps) -> None:
+        if campaign.scope not in self.sensors:
+            raise UnknownNameError("trajectory.scope", "sensor", campaign.scope, self.sensors)
+        seen = self.sensors[campaign.scope].axes
+        if self.frame is not None and seen is None:
+            raise ConfigError(f"sensors.{campaign.scope}.axes: name the axes of a scope where the log is in x, y, z")
+        for axis in campaign.axes:
+            if seen is not None and axis not in seen:
+                raise ConfigError(f"sensors.{campaign.scope}.axes: the scope does not see '{axis}', which is stepped")
 
     @property
     def true_axes(self) -> dict[str, TrueAxis]:
@@ -337,6 +365,13 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
                     raise UnknownNameError("filter.sensors", "sensor", name, self.sensors)
         return toml.struct({**_merged(tree, override), "arm": self.arm}, FusionConfig, "filter")
 
+    def to_toml(self, seed: int, arm: str) -> str:
+        """The text of a ``scenario.toml`` with this ``seed``, and its arm in the file ``arm``."""
+        tree = toml.builtins(self)
+        tree["arm"], tree["seed"] = arm, seed
+        tree["start"]["level"] = {f"{axis}_mm": level for axis, level in self.start.level.items()}
+        return toml.text(tree)
+
     @staticmethod
     def load(path: str | Path) -> Scenario:
         """Read ``scenario.toml`` and the arm it names.
@@ -359,6 +394,10 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         if isinstance(trajectory, PathFromFile):
             beside = msgspec.structs.replace(trajectory, file=str(path.parent / trajectory.file))
             scenario = msgspec.structs.replace(scenario, trajectory=beside)
+        try:
+            scenario.trajectory.offsets(scenario.arm.update_period, np.random.default_rng(scenario.seed))
+        except PumafuseError as error:
+            raise ConfigError(f"{where}: {error}") from None
         return scenario
 
 

@@ -9,13 +9,14 @@ from ..runs.run import Source
 from .scenario import PerAxis, TrueSensor
 
 
-def valid_times(sensor: TrueSensor, end: int, rng: np.random.Generator) -> TimeArray:
-    """The instants from 0 to ``end`` [int ns] at which the sensor measures, int64 ns, ascending, (rows,)."""
-    count = int(end / 1e9 * sensor.rate) + 1
+def valid_times(sensor: TrueSensor, lattice: TimeArray, rng: np.random.Generator) -> TimeArray:
+    """The instants of the lattice (int64 ns, even) at which the sensor measures, ascending, (rows,)."""
+    end = lattice[-1] / 1e9
+    count = int(end * sensor.rate) + 1
     jitter = sensor.rate_jitter * rng.standard_normal(count)
     instant = (rng.random() + np.arange(count)) / sensor.rate + jitter
-    valid = np.unique(np.rint(instant * 1e9).astype(np.int64))
-    return valid[(valid >= 0) & (valid <= end)]
+    nearest = np.unique(np.rint(instant * ((len(lattice) - 1) / end)).astype(np.int64))
+    return lattice[nearest[(nearest >= 0) & (nearest < len(lattice))]]
 
 
 def measure(

@@ -12,20 +12,21 @@ import pyarrow as pa
 
 from .. import folders
 from ..arrays import FloatArray, IntArray, TimeArray
-from ..fusion.config import FusionConfig, Process
+from ..fusion.config import ARM_FILE, FusionConfig, Process
 from ..model.arm import ordered_axes
 from ..runs import save, tables
 from ..runs.frames import Cylindrical, Placed, Rotated
 from ..runs.run import Reference, Run, Source
 from ..units import MM
 from . import sensing
-from .motion import Motion, move
-from .scenario import Scenario
+from .motion import Motion, lattice, move
+from .scenario import LATTICE, Scenario
 from .trajectory import Steps
 
 TRIALS, SAMPLES = "trials.csv", "samples.csv"
 _BEFORE = 0.05  # s of rest that a trial's samples begin with
-_OURS = frozenset({"run.toml", "fusion.toml", "arm.toml", TRIALS, SAMPLES})
+SCENARIO = "scenario.toml"
+_OURS = frozenset({SCENARIO, "run.toml", "fusion.toml", "arm.toml"})
 
 
 @dataclass(frozen=True)
@@ -54,11 +55,15 @@ class Simulated:
     """What :func:`simulate` returns.
 
     Attributes:
+        scenario: What was simulated.
+        seed: With which seed.
         run: The recorded run; its reference is the truth.
         config: What the filter is to believe.
         trials: The step trials of a campaign.
     """
 
+    scenario: Scenario
+    seed: int
     run: Run
     config: FusionConfig
     trials: Trials | None
@@ -80,20 +85,19 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
     seed = scenario.seed if seed is None else seed
     tick, told = _commands(scenario, seed)
     period = scenario.arm.update_period
-    end = int(tick[-1]) + round(period * 1e9)
+    instants = lattice(len(tick), period)
     axes, log = tuple(told), _Log(scenario, tuple(told))
-    parts = scenario.reference.rows_per_command
-    rows = np.rint(np.arange(len(tick) * parts) * (period * 1e9 / parts)).astype(np.int64)
-    valid = {
-        name: sensing.valid_times(sensor, end, _stream(seed, "rate", name)) for name, sensor in scenario.sensors.items()
-    }
-    moved = _motions(scenario, seed, tick, told, np.unique(np.concatenate([rows, *valid.values()])))
+    moved = _motions(scenario, seed, tick, told)
 
     sensors: dict[str, Source] = {}
     for name, sensor in scenario.sensors.items():
         seen = axes if sensor.axes is None else ordered_axes(set(sensor.axes) & set(axes))
-        true = log.positions({axis: moved[axis].at(valid[name]) for axis in seen}, in_axes=sensor.axes is not None)
-        sensors[name] = _rounded(sensing.measure(sensor, name, valid[name], true, _stream(seed, "sensor", name)))
+        if seen:
+            valid = sensing.valid_times(sensor, instants, _stream(seed, "rate", name))
+            true = log.positions({axis: moved[axis].at(valid) for axis in seen}, in_axes=sensor.axes is not None)
+            sensors[name] = _rounded(sensing.measure(sensor, name, valid, true, _stream(seed, "sensor", name)))
+    parts = scenario.reference.rows_per_command
+    rows = instants[np.rint(np.arange(len(tick) * parts) * (LATTICE / parts)).astype(np.int64)]
     noise = _stream(seed, "reference")
     reference = {
         axis: true + scenario.reference.sd * noise.standard_normal(len(rows))
@@ -112,7 +116,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
         clock=scenario.command.clock,
         frame=scenario.frame,
     )
-    return Simulated(run, scenario.config, _trials(scenario, tick, told, sensors))
+    return Simulated(scenario, seed, run, scenario.config, _trials(scenario, tick, told, sensors))
 
 
 def check_writable(folder: Path, force: bool) -> None:
@@ -121,11 +125,13 @@ def check_writable(folder: Path, force: bool) -> None:
     Raises:
         FolderError: The folder exists and is not to be replaced, or holds something else than a simulated run.
     """
-    folders.check_writable(folder, force, "run.toml", lambda name: name in _OURS or name.endswith(".csv"))
+    folders.check_writable(folder, force, SCENARIO, lambda name: name in _OURS or name.endswith(".csv"))
 
 
 def write(simulated: Simulated, folder: Path, force: bool) -> None:
     """Write a simulated run as a recorded run, with ``fusion.toml`` and ``arm.toml`` for a filter, and its step trials.
+
+    ``scenario.toml`` in the folder makes the same run again (but for a path from a file, which is not copied).
 
     Raises:
         FolderError: See :func:`check_writable`, or the disk refuses.
@@ -134,6 +140,8 @@ def write(simulated: Simulated, folder: Path, force: bool) -> None:
     with folders.replacing(folder) as new:
         save.save(simulated.run, new)
         simulated.config.save(new)
+        text = simulated.scenario.to_toml(simulated.seed, ARM_FILE)
+        (new / SCENARIO).write_text(text, encoding="utf-8")
         if simulated.trials is not None:
             _write_trials(simulated.trials, new)
 
@@ -174,9 +182,7 @@ def _commands(scenario: Scenario, seed: int) -> tuple[TimeArray, dict[str, Float
     return np.rint(np.arange(count) * (period * 1e9)).astype(np.int64), told
 
 
-def _motions(
-    scenario: Scenario, seed: int, tick: TimeArray, told: Mapping[str, FloatArray], wanted: TimeArray
-) -> dict[str, Motion]:
+def _motions(scenario: Scenario, seed: int, tick: TimeArray, told: Mapping[str, FloatArray]) -> dict[str, Motion]:
     true_axes = scenario.true_axes
     return {
         axis: move(
@@ -186,7 +192,6 @@ def _motions(
             tick,
             command,
             scenario.arm.update_period,
-            wanted,
             _stream(seed, "axis", axis),
         )
         for axis, command in told.items()

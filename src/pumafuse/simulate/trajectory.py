@@ -14,6 +14,8 @@ from ..model.plants import NotNegative, Positive
 from ..runs import tables
 from ..units import seconds
 
+_MOST_TICKS = 200_000  # 93 minutes at 28 ms; a gigabyte of work
+
 Offsets: TypeAlias = dict[str, FloatArray]
 Names: TypeAlias = Annotated[list[str], msgspec.Meta(min_length=1)]
 Count: TypeAlias = Annotated[int, msgspec.Meta(gt=0)]
@@ -51,6 +53,10 @@ class Raster(Trajectory, frozen=True, kw_only=True, tag="raster"):
     pitch: Positive = msgspec.field(name="pitch_mm")
     speed: Positive = msgspec.field(name="speed_m_s")
 
+    def __post_init__(self) -> None:
+        if self.along == self.across:
+            raise ConfigError(f"trajectory: along and across are both '{self.along}'")
+
     @property
     def named(self) -> tuple[str, ...]:
         """Along and across."""
@@ -58,7 +64,7 @@ class Raster(Trajectory, frozen=True, kw_only=True, tag="raster"):
 
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """The corner points, joined at constant speed."""
-        lines = int(self.height / self.pitch) + 1
+        lines = int(self.height / self.pitch + 1e-9) + 1
         line = np.repeat(np.arange(lines), 2)
         side = np.tile([0.0, 1.0, 1.0, 0.0], lines // 2 + 1)[: 2 * lines]
         corners = {self.along: side * self.width, self.across: line * self.pitch}
@@ -91,6 +97,10 @@ class Steps(Trajectory, frozen=True, kw_only=True, tag="steps"):
     window: Positive = msgspec.field(name="window_s", default=0.33)
     scope: str
 
+    def __post_init__(self) -> None:
+        if self.window > self.rest:
+            raise ConfigError("trajectory: window_s is longer than rest_s: a trial would see the next step")
+
     @property
     def named(self) -> tuple[str, ...]:
         """The stepped axes."""
@@ -106,6 +116,7 @@ class Steps(Trajectory, frozen=True, kw_only=True, tag="steps"):
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """The sum of the steps so far."""
         plan, pause = self.plan(rng), self.ticks_between(period)
+        ticks((len(plan) + 1) * pause * period, period)
         found = {axis: np.zeros((len(plan) + 1) * pause) for axis in self.axes}
         for number, (axis, step) in enumerate(plan, 1):
             found[axis][number * pause :] += step
@@ -228,5 +239,11 @@ TRAJECTORIES: TypeAlias = Raster | Steps | WhiteNoise | SineSweep | Hold | PathF
 
 
 def ticks(duration: float, period: float) -> IntArray:
-    """Numbers of the ticks from 0 to ``duration`` [s], the last at or after it."""
+    """Numbers of the ticks from 0 to ``duration`` [s], the last at or after it.
+
+    Raises:
+        ConfigError: There are too many to simulate at a time.
+    """
+    if not duration / period < _MOST_TICKS:
+        raise ConfigError(f"trajectory: {duration / period:.3g} commands; at most {_MOST_TICKS} in one run")
     return np.arange(int(np.ceil(duration / period - 1e-9)) + 1)
