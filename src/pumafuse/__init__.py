@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from .fusion.estimates import Estimates, Readings
     from .fusion.offline import fuse
     from .fusion.score import Score, score
+    from .fusion.ticks import TickEstimates, filter_ticks, smooth_ticks, tick_likelihood
     from .fusion.timeline import Outcome
     from .fusion.track import AxisEstimate
     from .model.arm import ArmModel, AxisModel, Gain, Validity
@@ -47,12 +48,16 @@ _HOME = {
     "Sensor": "fusion.config",
     "Simulated": "simulate.simulate",
     "Start": "fusion.config",
+    "TickEstimates": "fusion.ticks",
     "UnknownNameError": "errors",
     "Validity": "model.arm",
     "discretize": "model.discrete",
+    "filter_ticks": "fusion.ticks",
     "fuse": "fusion.offline",
     "score": "fusion.score",
     "simulate": "simulate.simulate",
+    "smooth_ticks": "fusion.ticks",
+    "tick_likelihood": "fusion.ticks",
     "to_rerun": "views.rerun",
 }
 
@@ -79,12 +84,16 @@ __all__ = [
     "Sensor",
     "Simulated",
     "Start",
+    "TickEstimates",
     "UnknownNameError",
     "Validity",
     "discretize",
+    "filter_ticks",
     "fuse",
     "score",
     "simulate",
+    "smooth_ticks",
+    "tick_likelihood",
     "to_rerun",
 ]
 

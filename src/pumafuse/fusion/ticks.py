@@ -8,10 +8,11 @@ The state is the plant's position and rate, and the offset: v[n−1], v[n−2], 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -27,10 +28,8 @@ class TickEstimates:
     """Estimates at the ticks, relative to the level at which the arm rested; shapes follow the readings.
 
     Attributes:
-        position: p[n] [m], with every reading up to n; with all readings where smoothed.
+        position: p[n] [m], with every reading up to n; with all of them where smoothed.
         position_sd: Its standard deviation [m].
-        velocity: The plant's rate [m/s] (of a first-order plant 0: its rate is no state).
-        velocity_sd: Its standard deviation [m/s].
         innovation: z[n] less its prediction [m], NaN where missing.
         innovation_sd: Its predicted standard deviation [m].
         log_likelihood: Of each run's readings (in metres), one number a run.
@@ -38,8 +37,6 @@ class TickEstimates:
 
     position: FloatArray
     position_sd: FloatArray
-    velocity: FloatArray
-    velocity_sd: FloatArray
     innovation: FloatArray
     innovation_sd: FloatArray
     log_likelihood: FloatArray
@@ -66,19 +63,32 @@ def filter_ticks(
         ValueError: Shapes do not fit, or the models are of several delays.
     """
     many = _Many.of(model, command, readings, sd, offset_sd)
-    outputs = [np.empty((many.runs, many.steps)) for _ in range(6)]
-    likelihood = np.zeros(many.runs)
-    if many.runs == 1:
-        with maybe_compiling():
-            kernels.filter_one(many.models[0], many.delay, many.command[0], many.readings[0], likelihood, *outputs)
-    else:
-        many.share(
-            lambda first, end, room: kernels.filter_many(
-                many.models, many.delay, many.command, many.readings, first, end, room, likelihood, *outputs
-            )
-        )
-    shaped = [part[0] for part in outputs] if np.ndim(readings) == 1 and many.runs == 1 else outputs
-    return TickEstimates(*shaped, log_likelihood=likelihood)
+    outputs = _room(many.runs, many.steps)
+    likelihood = many.filter(outputs)
+    if np.ndim(readings) == 1 and many.runs == 1:
+        return TickEstimates(*(part[0] for part in outputs), log_likelihood=likelihood)
+    return TickEstimates(*outputs, log_likelihood=likelihood)
+
+
+def smooth_ticks(
+    model: DiscreteModel, command: npt.ArrayLike, readings: npt.ArrayLike, sd: float, *, offset_sd: float = 0.0
+) -> TickEstimates:
+    """One run as :func:`filter_ticks` has it, with positions that know every reading of the run.
+
+    The error bars are good to 1e-16 × offset_sd² relative to their own square: with an offset prior of a metre beside
+    readings of 0.05 mm, use :func:`pumafuse.fuse`.
+
+    Raises:
+        ValueError: As :func:`filter_ticks`.
+    """
+    many = _Many.of(model, command, readings, sd, offset_sd)
+    if many.runs != 1:
+        raise ValueError("smooth_ticks takes one run at a time")
+    outputs, before = _room(1, many.steps), np.empty((many.steps, 4))
+    likelihood = many.filter(outputs, before)
+    with maybe_compiling():
+        kernels.smooth_one(many.models[0], outputs[2], before, *outputs[:2])
+    return TickEstimates(*(part[0] for part in outputs), log_likelihood=likelihood)
 
 
 def tick_likelihood(
@@ -91,14 +101,15 @@ def tick_likelihood(
 ) -> FloatArray:
     """Only the log-likelihood of :func:`filter_ticks`, for each run or parameter set, (runs,)."""
     many = _Many.of(model, command, readings, sd, offset_sd)
-    likelihood = np.zeros(many.runs)
-    nothing = [np.empty((many.runs, 0)) for _ in range(6)]
-    many.share(
-        lambda first, end, room: kernels.filter_many(
-            many.models, many.delay, many.command, many.readings, first, end, room, likelihood, *nothing
-        )
-    )
-    return likelihood
+    return many.filter(_room(many.runs, 0))
+
+
+_Outputs: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+def _room(runs: int, steps: int) -> _Outputs:
+    shape = (runs, steps)
+    return np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape)
 
 
 @dataclass(frozen=True)
@@ -107,12 +118,14 @@ class _Many:
 
     Attributes:
         models: The numbers of each, (runs, NUMBERS).
+        prior: Variance of the offset at the start [m²]; None where there is none, ever.
         delay: Whole ticks of delay.
         command: (1 or runs, steps).
         readings: (1 or runs, steps).
     """
 
     models: FloatArray
+    prior: float | None
     delay: int
     command: FloatArray
     readings: FloatArray
@@ -149,17 +162,35 @@ class _Many:
             raise ValueError("sd must be positive, offset_sd not negative, both finite")
         numbers = np.empty((runs, kernels.NUMBERS))
         numbers[:] = [_numbers(one) for one in models]
-        numbers[:, 12], numbers[:, 13] = noise**2, offset_sd**2
-        return _Many(numbers, models[0].split[0], u, z)
+        numbers[:, 12] = noise**2
+        prior = offset_sd**2 if numbers[:, 11].any() or offset_sd else None
+        return _Many(numbers, prior, models[0].split[0], u, z)
 
-    def share(self, work: Callable[[int, int, FloatArray], None]) -> None:
-        """Do ``work`` on a share of the runs, in whole groups of lanes, on each core."""
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        groups = -(-self.runs // kernels.LANES)
-        edges = [groups * part // cores * kernels.LANES for part in range(cores)] + [self.runs]
-        shares = [(first, end, np.empty(kernels.ROOM)) for first, end in pairwise(edges) if first < end]
-        with maybe_compiling(), ThreadPoolExecutor(len(shares)) as pool:
-            list(pool.map(work, *zip(*shares, strict=True)))
+    def filter(self, outputs: _Outputs, before: FloatArray | None = None) -> FloatArray:
+        """Fill the outputs; returns the log-likelihood of each run. Each core has its share of the runs."""
+        likelihood = np.zeros(self.runs)
+        with maybe_compiling():
+            if self.runs == 1:
+                before = np.empty((0, 4)) if before is None else before
+                one = (self.models[0], self.prior, self.delay, self.command[0], self.readings[0], likelihood)
+                kernels.filter_one(*one, *outputs, before)
+                return likelihood
+            cores, groups = usable_cores(), -(-self.runs // kernels.LANES)
+            edges = [groups * part // cores * kernels.LANES for part in range(cores)] + [self.runs]
+            shares = [(first, end) for first, end in pairwise(edges) if first < end]
+            many = (self.models, self.prior, self.delay, self.command, self.readings, likelihood)
+
+            def work(share: tuple[int, int]) -> None:
+                kernels.filter_many(*many, *outputs, *share, np.empty(kernels.ROOM))
+
+            with ThreadPoolExecutor(len(shares)) as pool:
+                list(pool.map(work, shares))
+        return likelihood
+
+
+def usable_cores() -> int:
+    """Of this process, where the system says; else all."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _numbers(model: DiscreteModel) -> FloatArray:
