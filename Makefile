@@ -5,13 +5,14 @@ READY := .venv/.ready
 # Matrices are small: threads of a BLAS would only wait for each other.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help demo test test-long lint lock clean
+.PHONY: help demo test test-long lint bench lock clean
 
 help:
 	@echo "make demo       fuse a recorded run, score it, draw it (into ./demo)"
 	@echo "make test       the tests, under 3 minutes"
 	@echo "make test-long  statistics and soak tests, under 30 minutes"
 	@echo "make lint       ruff and pyright"
+	@echo "make bench      pumafuse against its peers (into .venv-bench; some minutes)"
 	@echo "make lock       write requirements.lock anew (needs uv)"
 	@echo "make clean      remove .venv and ./demo"
 
@@ -42,4 +43,4 @@ lock:
 	uv pip compile pyproject.toml --group dev --universal --generate-hashes --no-emit-index-url --no-header --quiet --output-file requirements.lock
 
 clean:
-	rm -rf .venv demo
+	rm -rf .venv .venv-bench demo

@@ -10,6 +10,7 @@ import numpy.typing as npt
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
+IndexArray: TypeAlias = npt.NDArray[np.int16]  # which of a few sensors or axes
 CodeArray: TypeAlias = npt.NDArray[np.uint8]
 TimeArray: TypeAlias = npt.NDArray[np.int64]  # absolute stamps, int64 ns
 

@@ -29,11 +29,14 @@ _PATIENCE = 1.5  # s; what is on disk loads in less
 
 
 @contextmanager
-def maybe_compiling() -> Generator[None]:
-    """Say on stderr that kernels are being compiled when the block takes that long before it is through."""
-    timer = threading.Timer(
-        _PATIENCE, print, ("compiling the filter, once for this machine (about 20 s) ...",), {"file": sys.stderr}
-    )
+def maybe_compiling(*kernels: object) -> Generator[None]:
+    """Say on stderr that the kernels are being compiled, when one of them still is after more than a moment."""
+
+    def tell() -> None:
+        if any(not getattr(kernel, "signatures", True) for kernel in kernels):
+            print("compiling the filter, once for this machine (about 20 s) ...", file=sys.stderr)
+
+    timer = threading.Timer(_PATIENCE, tell)
     timer.daemon = True
     timer.start()
     try:

@@ -29,7 +29,11 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
     kept = len(times) if smooth else 0
     held = kernels.Held(np.empty((count, kept, width)), np.empty((count, kept, width, width)), np.empty((count, kept)))
     log = _log(axes, rows, width) if smooth else _log(axes, None, width)
-    with maybe_compiling():
+    used = (
+        kernels.filter_as_live if mode == "as-live" else kernels.filter_run,
+        *([kernels.smooth_run] if smooth else []),
+    )
+    with maybe_compiling(*used):
         if mode == "as-live":
             arrival = np.maximum(scalars.stamp[candidates[rows.first[:-1]]], rows.valid)
             queue = np.argsort(arrival, kind="stable")

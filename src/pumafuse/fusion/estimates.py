@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import BoolArray, CodeArray, FloatArray, IntArray
+from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
 from .config import FusionConfig
 from .timeline import Outcome
 from .track import AxisEstimate, Bias
@@ -41,8 +41,8 @@ class Readings:
 
     time: FloatArray
     stamp: FloatArray
-    sensor: IntArray
-    axis: IntArray
+    sensor: IndexArray
+    axis: IndexArray
     value: FloatArray
     innovation: FloatArray
     innovation_sd: FloatArray

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ..arrays import BoolArray, CodeArray, FloatArray, IntArray, TimeArray
+from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
 from ..compiled import compiled
 from ..model.closed import advance_first, advance_second
 from .timeline import REOPEN_AFTER, REOPEN_SPAN_NS, Outcome
@@ -81,9 +81,9 @@ class Rows(NamedTuple):
     """
 
     valid: TimeArray
-    sensor: IntArray
+    sensor: IndexArray
     first: IntArray
-    axis: IntArray
+    axis: IndexArray
     value: FloatArray
     sd: FloatArray
 
@@ -642,7 +642,7 @@ def smooth_output(
 def smooth_run(
     axes: Axes,
     sensors: Sensors,
-    sensor_of: IntArray,
+    sensor_of: IndexArray,
     met: Met,
     log: Log,
     origin: int,

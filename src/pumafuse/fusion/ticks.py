@@ -86,7 +86,7 @@ def smooth_ticks(
         raise ValueError("smooth_ticks takes one run at a time")
     outputs, before = _room(1, many.steps), np.empty((many.steps, 4))
     likelihood = many.filter(outputs, before)
-    with maybe_compiling():
+    with maybe_compiling(kernels.smooth_one):
         kernels.smooth_one(many.models[0], outputs[2], before, *outputs[:2])
     return TickEstimates(*(part[0] for part in outputs), log_likelihood=likelihood)
 
@@ -169,7 +169,7 @@ class _Many:
     def filter(self, outputs: _Outputs, before: FloatArray | None = None) -> FloatArray:
         """Fill the outputs; returns the log-likelihood of each run. Each core has its share of the runs."""
         likelihood = np.zeros(self.runs)
-        with maybe_compiling():
+        with maybe_compiling(kernels.filter_one if self.runs == 1 else kernels.filter_many):
             if self.runs == 1:
                 before = np.empty((0, 4)) if before is None else before
                 one = (self.models[0], self.prior, self.delay, self.command[0], self.readings[0], likelihood)

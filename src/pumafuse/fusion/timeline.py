@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import NO_STAMP, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
+from ..arrays import NO_STAMP, BoolArray, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
 from ..model.drive import Drive, drive
 from ..runs.clock import TOLERATED_STEP_BACK_NS, behind, regular_grid
@@ -92,8 +92,8 @@ class Scalars:
 
     valid: TimeArray
     stamp: TimeArray
-    sensor: IntArray
-    axis: IntArray
+    sensor: IndexArray
+    axis: IndexArray
     value: FloatArray
     row: IntArray
     spread: FloatArray
@@ -230,7 +230,7 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
     heard = [_heard(run, config, name, origin, notes) for name in names]
     valid = np.concatenate([np.zeros(0, dtype=np.int64), *(part.valid for part in heard)])
     stamp = np.concatenate([np.zeros(0, dtype=np.int64), *(part.stamp for part in heard)])
-    sensor = np.repeat(np.arange(len(names)), [len(part.valid) for part in heard])
+    sensor = np.repeat(np.arange(len(names), dtype=np.int16), [len(part.valid) for part in heard])
     # Each sensor's rows are in order, and the sensors in theirs: a stable sort by valid time keeps both.
     order = np.argsort(valid, kind="stable")
     width = np.array([len(part.axes) for part in heard], dtype=np.int64)
@@ -248,7 +248,7 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
         valid[at],
         stamp[at],
         sensor[at],
-        of_scalars([np.tile(part.axes, len(part.valid)) for part in heard], np.int64),
+        of_scalars([np.tile(part.axes, len(part.valid)) for part in heard], np.int16),
         of_scalars([part.value for part in heard], np.float64),
         row,
         of_scalars([part.spread for part in heard], np.float64),
@@ -262,7 +262,7 @@ class _Heard(NamedTuple):
 
     valid: TimeArray
     stamp: TimeArray
-    axes: IntArray
+    axes: IndexArray
     value: FloatArray
     spread: FloatArray
     outcome: CodeArray
@@ -293,7 +293,7 @@ def _heard(run: Run, config: FusionConfig, name: str, origin: int, notes: list[s
         outcome[hollow, place] = Outcome.INVALID
         _tell(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
     heard = _Heard(
-        valid, source.stamp, np.array([number for number, _ in axes], dtype=np.int64), value, spread, outcome
+        valid, source.stamp, np.array([number for number, _ in axes], dtype=np.int16), value, spread, outcome
     )
     if (np.diff(valid) >= 0).all():
         return heard
