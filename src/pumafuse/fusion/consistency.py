@@ -21,6 +21,7 @@ from .timeline import LONGEST_TAIL_NS, Outcome
 LAGS = 20
 _FEW = 30  # scalars below which nothing is said
 _FROZEN = 10  # equal values in a row of a sensor with noise
+_WIDEST = 1e6  # prior over noise up to which error bars are held to
 _NEVER = 1e-6  # expected number below which something does not happen by chance
 _NOTABLE = 0.1  # mean lag-1 correlation below which whiteness is beside the point, however significant
 
@@ -104,7 +105,7 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
 
 def troubles(est: Estimates) -> list[str]:
     """What went wrong with whole sensors, a sentence each: gates that reopened, readings that all failed, clocks."""
-    found: list[str] = []
+    found = _too_wide(est)
     readings = est.readings
     for name in readings.sensors:
         mine = readings.sensor == readings.sensors.index(name)
@@ -134,6 +135,22 @@ def troubles(est: Estimates) -> list[str]:
                 f"{name}: {share:.0%} of its scalars were gated: sd_mm, latency_ms or the process noise too small"
             )
         found.extend(_frozen(est, name))
+    return found
+
+
+def _too_wide(est: Estimates) -> list[str]:
+    """Priors so much wider than a sensor's noise that double precision blurs the error bars."""
+    found: list[str] = []
+    for name in est.readings.sensors:
+        sensor = est.config.sensors.get(name)
+        sds = [] if sensor is None else [sd for axis in est.axes if (sd := sensor.sd_of(axis)) is not None]
+        if sensor is not None and sds:
+            ratio = max(est.config.start.offset_sd, sensor.bias_sd) / min(sds)
+            if ratio > _WIDEST:
+                found.append(
+                    f"{name}: its prior (offset_sd_mm, bias_sd_mm) is {ratio:.1e} times its noise: more than double"
+                    " precision resolves; a narrower prior says the same"
+                )
     return found
 
 

@@ -47,7 +47,12 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
             kernels.filter_run(axes, sensors, rows, state, times, met, log, held, outputs)
         if smooth:
             sensor_of = np.repeat(rows.sensor, np.diff(rows.first))
-            room = (np.empty((2, width)), np.empty((2, width, width)), np.empty((4, width)), np.empty((width, width)))
+            room = (
+                np.empty((2, width)),
+                np.empty((2, width, width)),
+                np.empty((4, width)),
+                np.empty((width + 1, width)),
+            )
             kernels.smooth_run(axes, sensors, sensor_of, met, log, timeline.origin, times, held, *room, outputs)
     outcome = scalars.outcome.copy()
     outcome[candidates] = met.outcome

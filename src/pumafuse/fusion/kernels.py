@@ -22,6 +22,7 @@ from .timeline import REOPEN_AFTER, REOPEN_SPAN_NS, Outcome
 
 _FUSED, _GATED, _REOPENED = int(Outcome.FUSED), int(Outcome.GATED), int(Outcome.REOPENED)
 _NOTHING = 1e-15  # of a pivot, below which it is rounding
+_ROUNDING = 1e-15  # of the variances that S is made of: S cannot be known to be smaller
 
 
 class Axes(NamedTuple):
@@ -276,13 +277,15 @@ def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> N
 
     The smoother uses it for its dual, too: information that passes through noise of unit variance along H.
     """
-    spread = R
+    spread, seen = R, 0.0
     for i in range(states):
+        seen += work[0, i] * work[0, i] * P[at, i, i]
         across = 0.0
         for j in range(states):
             across += P[at, i, j] * work[0, j]
         work[2, i] = across
         spread += work[0, i] * across
+    spread = max(spread, R, _ROUNDING * seen)
     for i in range(states):
         work[1, i] = work[2, i] / spread
     for i in range(states):  # W = (I − K H) P and W Hᵀ
@@ -313,7 +316,8 @@ def predicted(
     if bias >= 0:
         nu -= x[axis, bias]
         S += 2.0 * scale * (P[axis, 0, bias] + P[axis, o, bias]) + P[axis, bias, bias]
-    return nu, S + R, R
+    seen = scale * scale * (P[axis, 0, 0] + P[axis, o, o]) + (P[axis, bias, bias] if bias >= 0 else 0.0)
+    return nu, max(S + R, R, _ROUNDING * seen), R
 
 
 @compiled
@@ -584,15 +588,16 @@ def pass_noise(
 
 
 @compiled
-def root(N: FloatArray, at: int, states: int, L: FloatArray, left: FloatArray) -> None:
-    """N[at] = L Lᵀ by columns of L (s, s), the state with the largest share of its own information left first.
+def root(N: FloatArray, eta: FloatArray, at: int, states: int, L: FloatArray, left: FloatArray) -> None:
+    """N[at] = L Lᵀ and η[at] = L y: as columns, readings with unit noise; y is the last row of L (s + 1, s).
 
-    N says nothing of some states, or of their differences: in another order a pivot of rounding would be divided by.
-    ``left`` (s,) is room for what is left of the diagonal.
+    The state with the largest share of its own information left comes first: N says nothing of some states, or of
+    their differences, and in another order a pivot of rounding would be divided by. ``left`` (s,) is room for what is
+    left of the diagonal.
     """
-    for i in range(states):
-        left[i] = N[at, i, i]
-        for k in range(states):
+    for k in range(states):
+        left[k] = N[at, k, k]
+        for i in range(states + 1):
             L[i, k] = 0.0
     for k in range(states):
         pivot, most = -1, _NOTHING
@@ -603,6 +608,10 @@ def root(N: FloatArray, at: int, states: int, L: FloatArray, left: FloatArray) -
             return
         L[pivot, k] = math.sqrt(left[pivot])
         left[pivot] = 0.0
+        rest = eta[at, pivot]
+        for m in range(k):
+            rest -= L[states, m] * L[pivot, m]
+        L[states, k] = rest / L[pivot, k]
         for i in range(states):
             if left[i] > 0.0:
                 rest = N[at, i, pivot]
@@ -625,16 +634,19 @@ def smooth_output(
     L: FloatArray,
     outputs: Outputs,
 ) -> None:
-    """P_s = (I + P N)⁻¹ P and x_s = x + P_s η: the columns of N = L Lᵀ are met as readings with unit noise."""
+    """P_s = (I + P N)⁻¹ P and x_s = x + P_s η, reading by reading: at once, wide priors would cancel in P_s η."""
     x, P, states = held.x[axis], held.P[axis], axes.states[axis]
-    root(N, at, states, L, work[3])
+    root(N, eta, at, states, L, work[3])
     for k in range(states):
+        nu = L[states, k]
         for i in range(states):
             work[0, i] = L[i, k]
         joseph(P, n, states, 1.0, work)
-    for i in range(states):
-        for j in range(states):
-            x[n, i] += P[n, i, j] * eta[at, j]
+        for i in range(states):
+            x[n, i] += work[1, i] * nu
+        for m in range(k + 1, states):
+            for i in range(states):
+                L[states, m] -= L[i, m] * work[1, i] * nu
     write_output(axes, axis, x, P, n, held.input[axis, n], outputs, n)
 
 
@@ -657,7 +669,7 @@ def smooth_run(
     """Estimates that know every reading: the filter's, with what all later ones say, carried backward as η and N.
 
     Over an update η ← η + N K ν + Hᵀ ν / R and N ← N + Hᵀ H / R. ``sensor_of`` is the sensor of each scalar; η (2, s),
-    N (2, s, s), ``work`` (4, s) and L (s, s) are room to compute in.
+    N (2, s, s), ``work`` (4, s) and L (s + 1, s) are room to compute in.
     """
     for axis in range(len(axes.order)):
         states, n = axes.states[axis], len(times) - 1

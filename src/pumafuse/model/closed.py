@@ -22,7 +22,7 @@ _TERMS = 16  # of each series: the next would be below 1e-16 of the sum
 _TINY, _FEW = 0.1, 10  # rad, terms: enough for most intervals between readings
 _SHORT = 0.5  # rad; fastest pole × interval up to which the series are used
 _HEAD = 6  # constants before the series
-_APART = 0.3  # rad; below it exponentials of the two poles cancel
+_APART = 0.5  # difference of the poles over their sum, below which exponentials of the two cancel
 
 SIZE = _HEAD + 3 * _TERMS
 
@@ -103,7 +103,7 @@ def _exponentials(omega: float, sigma: float, square: float, t: float) -> tuple[
         sine, cosine = math.sin(beta * t), math.cos(beta * t)
         g = decay * sine / beta
         rate = decay * cosine - sigma * g
-        if beta * t > _APART:
+        if beta > _APART * sigma:
             twice = decay * decay
             straight = -math.expm1(-2.0 * sigma * t) / (2.0 * sigma)
             turning = (
@@ -113,7 +113,7 @@ def _exponentials(omega: float, sigma: float, square: float, t: float) -> tuple[
         return g, rate, _energy(omega, sigma, g, rate)
     slow, fast = omega * omega / (sigma + beta), sigma + beta
     lasting = math.exp(-slow * t)
-    if beta * t > _APART:
+    if beta > _APART * sigma:
         brief = math.exp(-fast * t)
         g = (lasting - brief) / (2.0 * beta)
         rate = (fast * brief - slow * lasting) / (2.0 * beta)

@@ -1,0 +1,367 @@
+"""Numbers at the edge of what a configuration may say: estimates stay numbers, error bars are never less than nothing.
+
+Every run goes through all three modes of the compiled engine, twice, with another run in between.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pumafuse as pf
+from pumafuse.fusion.estimates import Estimates
+from pumafuse.fusion.timeline import Outcome
+from pumafuse.model.plants import Plant
+from pumafuse.runs.run import Run
+
+MS = 1_000_000  # ns
+DAY = 86_400_000 * MS
+T = 28 * MS
+MODES = {"filtered": {}, "smoothed": {"smooth": True}, "as-live": {"as_live": True}}
+FIELDS = ("position", "velocity", "offset")
+
+PLANTS = {
+    "lag": pf.FirstOrder(time_constant=0.04),
+    "under-damped": pf.SecondOrder(natural_frequency=53.9, damping=0.4),
+    "critical": pf.SecondOrder(natural_frequency=53.9, damping=1.0),
+    "over-damped": pf.SecondOrder(natural_frequency=53.9, damping=20.0),
+    "lag of 1 µs": pf.FirstOrder(time_constant=1e-6),
+    "lag of 1000 s": pf.FirstOrder(time_constant=1e3),
+    "fast": pf.SecondOrder(natural_frequency=1e4, damping=0.7),
+    "fast, hardly damped": pf.SecondOrder(natural_frequency=1e4, damping=1e-6),
+    "fast, stuck": pf.SecondOrder(natural_frequency=1e4, damping=1e4),
+    "slow": pf.SecondOrder(natural_frequency=1e-3, damping=0.7),
+    "slow, hardly damped": pf.SecondOrder(natural_frequency=1e-3, damping=1e-6),
+    "slow, stuck": pf.SecondOrder(natural_frequency=1e-3, damping=1e4),
+}
+PROCESSES = {
+    "ordinary": pf.Process(input_noise=0.03e-3, drift=0.4e-3),
+    "none": pf.Process(input_noise=0.0, drift=0.0),
+    "huge": pf.Process(input_noise=1e3, drift=1e3),
+    "huge input noise": pf.Process(input_noise=1e3, drift=0.0),
+    "huge drift": pf.Process(input_noise=0.0, drift=1e3),
+    "huge with maneuvers": pf.Process(input_noise=0.0, drift=0.0, maneuver_noise=1e3, maneuver_drift=1e3),
+}
+
+
+def ear(sd: float = 0.05e-3, **kwargs: object) -> pf.Sensor:
+    return pf.Sensor(sd=sd, gate=0.0, **kwargs)
+
+
+def grid(count: int, step: int = 10 * MS, first: int = 0) -> np.ndarray:
+    return first + step * np.arange(count)
+
+
+@dataclass(frozen=True)
+class Edge:
+    """A run of one axis near 0.5 m: commands at ``commands`` [ns], each sensor's rows at ``heard``."""
+
+    plant: Plant = PLANTS["under-damped"]
+    process: pf.Process = PROCESSES["ordinary"]
+    offset_sd: float = 5e-3
+    delay: float = 0.06
+    commands: np.ndarray = field(default_factory=lambda: grid(12, T))
+    sensors: Mapping[str, pf.Sensor] = field(default_factory=lambda: {"tracker": ear(latency=0.008)})
+    heard: np.ndarray | Mapping[str, np.ndarray] = field(default_factory=lambda: grid(40, first=3 * MS))
+    values: Mapping[int, float] = field(default_factory=dict)  # by row: instead of the true one
+
+    def made(self) -> tuple[Run, pf.FusionConfig]:
+        rng = np.random.default_rng(5)
+        command = 0.5 + rng.normal(0.0, 2e-3, len(self.commands))
+        heard = self.heard if isinstance(self.heard, Mapping) else dict.fromkeys(self.sensors, self.heard)
+        streams = {}
+        for name, known in self.sensors.items():
+            valid = heard[name]
+            near = known.scale * np.interp(valid, self.commands, command) + rng.normal(0.0, 1e-3, len(valid))
+            for row, value in self.values.items():
+                near[row] = value
+            if len(valid):
+                streams[name] = valid + round(known.latency * 1e9), {"radial": near}
+        config = pf.FusionConfig(
+            arm=pf.ArmModel(
+                name="an arm", update_period=0.028, delay=self.delay, axes={"radial": pf.AxisModel(plant=self.plant)}
+            ),
+            start=pf.Start(offset_sd=self.offset_sd),
+            process={"radial": self.process},
+            sensors=dict(self.sensors),
+        )
+        return Run.from_arrays(self.commands, {"radial": command}, streams), config
+
+
+def fused(edge: Edge, mode: str, rate: float | None = None) -> Estimates:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)  # much of it is worth a warning; numpy's stay errors
+        return pf.fuse(*edge.made(), rate=rate, **MODES[mode])
+
+
+def parts(estimates: Estimates) -> dict[str, np.ndarray]:
+    """Everything that is computed."""
+    found = {f"{axis} {name}": getattr(of, name) for axis, of in estimates.axes.items() for name in of.FIELDS}
+    found |= {name: getattr(estimates.readings, name) for name in ("innovation", "innovation_sd", "outcome")}
+    return found | {
+        f"bias of {name}": np.array([bias.value, bias.sd])
+        for name, of in estimates.biases.items()
+        for bias in of.values()
+    }
+
+
+BETWEEN = Edge(PLANTS["lag"], sensors={"other": pf.Sensor(sd=3e-4, bias_sd=0.2, gate=1.0), "tracker": ear(1e-3)})
+
+
+def check(edge: Edge, rate: float | None = None) -> dict[str, Estimates]:
+    """All modes: finite estimates, error bars not negative, and the same bits again after another run."""
+    found = {mode: fused(edge, mode, rate) for mode in MODES}
+    for mode, estimates in found.items():
+        assert len(estimates.time)
+        readings = estimates.readings
+        for axis in estimates.axes:
+            for name in FIELDS:
+                mean, sd = getattr(estimates[axis], name), getattr(estimates[axis], f"{name}_sd")
+                assert np.isfinite(mean).all(), (mode, name)
+                assert np.isfinite(sd).all(), (mode, name)
+                assert (sd >= 0.0).all(), (mode, name)
+        met = readings.outcome <= Outcome.REOPENED
+        assert np.isfinite(readings.innovation[met]).all(), mode
+        assert np.isfinite(readings.innovation_sd[met]).all(), mode
+        assert (readings.innovation_sd[met] > 0.0).all(), mode
+        assert np.isnan(readings.innovation[~met]).all(), mode
+        for of in estimates.biases.values():
+            for bias in of.values():
+                assert np.isfinite(bias.value)
+                assert 0.0 <= bias.sd < np.inf
+        fused(BETWEEN, mode, 33.0)
+        again = parts(fused(edge, mode, rate))
+        for name, one in parts(estimates).items():
+            assert one.tobytes() == again[name].tobytes(), (mode, name)
+    return found
+
+
+# ---- each extreme beside every plant --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("process", PROCESSES.values(), ids=PROCESSES.keys())
+@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
+def test_any_process_noise_moves_any_plant(plant: Plant, process: pf.Process) -> None:
+    """From none to a kilometre, on poles from nanohertz to 100 MHz."""
+    check(Edge(plant, process), 170.0)
+
+
+@pytest.mark.parametrize("offset_sd", [0.0, 1e3])
+@pytest.mark.parametrize("sd", [1e-9, 1e-6, 1.0, 1e3])
+@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
+def test_any_noise_meets_any_prior(plant: Plant, sd: float, offset_sd: float) -> None:
+    """Sensors of a nanometre and of a kilometre, offsets known exactly and not at all; a wide one is learnt."""
+    found = check(Edge(plant, offset_sd=offset_sd, sensors={"tracker": ear(sd, latency=0.008)}), 170.0)
+    for estimates in found.values():
+        assert estimates["radial"].position_sd[-1] < max(10.0 * sd, 0.1)
+
+
+@pytest.mark.parametrize("offset_sd", [0.0, 1e3])
+def test_without_noise_an_offset_is_a_mean(offset_sd: float) -> None:
+    """A certain one keeps every error bar at 0, whatever is read; an unknown one is a mean of the readings so far."""
+    for mode, estimates in check(Edge(process=PROCESSES["none"], offset_sd=offset_sd), 170.0).items():
+        radial = estimates["radial"]
+        assert not radial.velocity_sd.any()
+        if offset_sd == 0.0:
+            assert not radial.position_sd.any()
+            assert not radial.offset.any()
+        else:
+            readings, live = estimates.readings, mode == "as-live"
+            known = (readings.stamp if live else readings.time) <= (
+                np.inf if mode == "smoothed" else estimates.time[-1]
+            )
+            assert radial.position_sd[-1] == pytest.approx(0.05e-3 / np.sqrt(known.sum()), rel=1e-6)
+
+
+GAPS = {
+    "between readings": Edge(heard=np.concatenate([grid(20), grid(20, first=DAY)])),
+    "between commands": Edge(commands=np.concatenate([grid(6, T), grid(6, T, DAY)])),
+    "between both": Edge(
+        commands=np.concatenate([grid(6, T), grid(6, T, DAY)]), heard=np.concatenate([grid(20), grid(20, first=DAY)])
+    ),
+    "before the first reading": Edge(commands=np.array([0, DAY]), heard=grid(20, first=DAY + 5 * MS)),
+    "after the last one": Edge(commands=np.array([0, DAY]), heard=grid(20)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("process", [PROCESSES["ordinary"], PROCESSES["huge"], PROCESSES["none"]], ids=str)
+@pytest.mark.parametrize("gap", GAPS.values(), ids=GAPS.keys())
+@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
+def test_a_day_may_pass(plant: Plant, gap: Edge, process: pf.Process) -> None:
+    """A day without a reading or a command is one step for every plant."""
+    check(replace(gap, plant=plant, process=process))
+
+
+@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
+def test_a_day_of_rest_forgets_the_plant_and_widens_the_offset(plant: Plant) -> None:
+    """After it the error bars are what noise alone makes of them: stationary for the plant, a walk for the offset."""
+    edge = Edge(plant, commands=np.array([0, DAY]), heard=grid(20))
+    if isinstance(plant, pf.FirstOrder):
+        slowest, stationary = 1.0 / plant.time_constant, 0.5 / plant.time_constant
+    else:
+        omega, zeta = plant.natural_frequency, plant.damping
+        slowest = omega / (zeta + np.sqrt(zeta**2 - 1.0)) if zeta > 1.0 else zeta * omega
+        stationary = omega / (4.0 * zeta)
+    radial = check(edge)["filtered"]["radial"]
+    walked = radial.offset_sd[-1] ** 2
+    assert walked == pytest.approx(0.4e-3**2 * 86_400.0, rel=1e-4)
+    if slowest * 86_400.0 > 20.0:
+        assert radial.position_sd[-1] ** 2 - walked == pytest.approx(0.03e-3**2 * stationary, rel=1e-3)
+
+
+@pytest.mark.parametrize("sd", [1e-9, 1e-3])
+@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
+def test_readings_may_be_a_nanosecond_apart(plant: Plant, sd: float) -> None:
+    """Forty in 40 ns, while a command comes to act, and estimates in between."""
+    edge = Edge(plant, sensors={"tracker": ear(sd)}, heard=grid(40, 1, 60 * MS - 20), delay=0.06)
+    check(edge)
+    check(replace(edge, commands=np.concatenate([grid(3, T), grid(30, 1, 90 * MS)]), heard=grid(40, 1, 150 * MS - 5)))
+
+
+@pytest.mark.parametrize("gate", [0.0, 5.0])
+@pytest.mark.parametrize("bias_sd", [0.0, 1e-3])
+def test_a_hundred_sensors_may_read_at_one_instant(bias_sd: float, gate: float) -> None:
+    """Each is met in its turn; without biases they are one reading of a tenth of their noise."""
+    known = {
+        f"s{number}": pf.Sensor(sd=1e-3, bias_sd=bias_sd if number < 20 else 0.0, gate=gate) for number in range(100)
+    }
+    edge = Edge(offset_sd=1.0, process=PROCESSES["none"], sensors=known, heard=grid(3, 50 * MS, 50 * MS))
+    last = check(edge)["filtered"]["radial"].position_sd[-1]
+    assert last >= 1e-3 / np.sqrt(300) * 0.999
+    if not bias_sd and not gate:
+        assert last == pytest.approx(1e-3 / np.sqrt(300), rel=1e-6)
+
+
+@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
+def test_eight_biases_on_one_axis(plant: Plant) -> None:
+    """Eight sensors, each with a bias of a metre, an offset of a kilometre: their mean stays unknown, as it is."""
+    known = {
+        f"s{number}": ear(1e-4, bias_sd=1.0, scale=-1.0 if number % 2 else 2.0, latency=0.01 * number)
+        for number in range(8)
+    }
+    heard = {name: grid(20, 15 * MS, number * MS) for number, name in enumerate(known)}
+    for estimates in check(Edge(plant, offset_sd=1e3, sensors=known, heard=heard), 90.0).values():
+        assert set(estimates.biases) == set(known)
+        assert estimates["radial"].position_sd[-1] > 0.1
+
+
+@pytest.mark.parametrize("delay", [0.0, 1e-9, 10.0])
+@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
+def test_any_delay(plant: Plant, delay: float) -> None:
+    """None, a nanosecond, and ten seconds with everything in flight."""
+    check(Edge(plant, delay=delay), 170.0)
+
+
+@pytest.mark.parametrize("rate", [None, 100.0])
+@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
+def test_one_command_is_a_run(plant: Plant, rate: float | None) -> None:
+    """With readings and without."""
+    check(Edge(plant, commands=np.zeros(1, dtype=np.int64)), rate)
+    check(Edge(plant, commands=np.zeros(1, dtype=np.int64), sensors={}), rate)
+
+
+def test_no_readings_is_a_run() -> None:
+    """No sensor at all, a sensor that never speaks, and one that speaks only before the first command."""
+    plain = check(Edge(sensors={}))
+    early = Edge(heard=grid(10, first=-2000 * MS))
+    for mode, estimates in check(early).items():
+        assert set(estimates.readings.outcome) == {Outcome.BEFORE_START}
+        for name, values in parts(plain[mode]).items():
+            if name.startswith("radial"):
+                np.testing.assert_array_equal(parts(estimates)[name], values)
+    check(Edge(heard=grid(0)))
+
+
+# ---- readings that are no readings ----------------------------------------------------------------------------------
+
+SENTINELS = [np.nan, np.inf, -np.inf, 1e300, -1e300, 3.4e38, 1e6, -1.8e308]
+
+
+@pytest.mark.parametrize("gate", [0.0, 5.0])
+@pytest.mark.parametrize("value", SENTINELS)
+def test_a_value_that_is_none_leaves_no_trace(value: float, gate: float) -> None:
+    """NaN, infinities and sentinels are invalid, and the estimates are those without the row, bit for bit."""
+    known = {"tracker": pf.Sensor(sd=1e-3, latency=0.008, gate=gate), "other": pf.Sensor(sd=1e-3, gate=gate)}
+    heard = grid(40, first=3 * MS)
+    spoilt = Edge(sensors=known, heard=heard, values={0: value, 7: value, 8: value, 39: value})
+    wanted = replace(spoilt, values={0: np.nan, 7: np.nan, 8: np.nan, 39: np.nan})
+    for mode, estimates in check(spoilt, 170.0).items():
+        assert (estimates.readings.outcome == Outcome.INVALID).sum() == 8
+        without = parts(fused(wanted, mode, 170.0))
+        for name, values in parts(estimates).items():
+            assert values.tobytes() == without[name].tobytes(), (mode, name)
+
+
+@pytest.mark.parametrize("gate", [0.0, 5.0])
+@pytest.mark.parametrize("value", [9.99e5, -9.99e5, 1e-300, -0.0])
+@pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
+def test_a_value_of_a_thousand_kilometres_is_survived(plant: Plant, value: float, gate: float) -> None:
+    """Fused or gated, what is no sentinel spoils nothing but its own estimate."""
+    known = {"tracker": pf.Sensor(sd=1e-3, gate=gate, latency_sd=0.005)}
+    check(Edge(plant, sensors=known, values={5: value, 20: value}), 170.0)
+
+
+def test_a_sensor_that_is_never_right_reopens_its_gate_and_nothing_breaks() -> None:
+    """A thousand kilometres off, again and again: the offset follows each time the gate reopens."""
+    off = {row: 9.9e5 * (-1.0) ** (row // 70) for row in range(300)}
+    edge = Edge(
+        commands=grid(120, T), sensors={"tracker": pf.Sensor(sd=1e-6, gate=3.0)}, heard=grid(300), values=off
+    )  # fmt: skip
+    for estimates in check(edge, 170.0).values():
+        assert (estimates.readings.outcome == Outcome.REOPENED).sum() >= 3
+        assert np.abs(estimates["radial"].offset).max() > 9e5
+
+
+# ---- all together ---------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def edges(draw: st.DrawFn) -> tuple[Edge, float | None]:
+    known = {
+        f"s{number}": pf.Sensor(
+            sd=draw(st.sampled_from([1e-9, 1e-6, 1e-3, 1.0, 1e3])),
+            latency=draw(st.sampled_from([0.0, 0.008, 1.0, -0.5])),
+            latency_sd=draw(st.sampled_from([0.0, 1e-3, 10.0])),
+            scale=draw(st.sampled_from([1.0, -1.0, 1e-6, 1e6])),
+            bias_sd=draw(st.sampled_from([0.0, 1e-9, 1.0, 1e3])),
+            gate=draw(st.sampled_from([0.0, 1e-3, 5.0, 1e6])),
+            gate_rows=draw(st.booleans()),
+        )
+        for number in range(draw(st.integers(0, 8)))
+    }
+    steps = st.sampled_from([1, 1000, MS, 10 * MS, 1000 * MS, 3_600_000 * MS])
+    heard = {
+        name: np.cumsum([draw(st.sampled_from([-MS, 0, 60 * MS])), *draw(st.lists(steps, max_size=12))])
+        for name in known
+    }
+    edge = Edge(
+        plant=draw(st.sampled_from(list(PLANTS.values()))),
+        process=draw(st.sampled_from(list(PROCESSES.values()))),
+        offset_sd=draw(st.sampled_from([0.0, 1e-9, 5e-3, 1e3])),
+        delay=draw(st.sampled_from([0.0, 1e-9, 0.028, 0.06, 10.0])),
+        commands=np.cumsum([0, *draw(st.lists(steps, max_size=10))]),
+        sensors=known,
+        heard=heard,
+    )
+    return edge, draw(st.sampled_from([None, None, 1e-3]))
+
+
+@settings(derandomize=True, deadline=None, max_examples=60)
+@given(edges())
+def test_extremes_may_meet(made: tuple[Edge, float | None]) -> None:
+    """Any of them together: estimates stay numbers, and the same bits come again."""
+    check(*made)
+
+
+@pytest.mark.long
+@settings(derandomize=True, deadline=None, max_examples=1500)
+@given(edges())
+def test_extremes_may_meet_in_any_way(made: tuple[Edge, float | None]) -> None:
+    """As above, many more."""
+    check(*made)

@@ -1,0 +1,236 @@
+"""Closed-form transitions against integrals of exponentials worked out with 160 digits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import product
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import assume, example, given, settings
+from hypothesis import strategies as st
+from mpmath import mpf
+
+from pumafuse.model import closed
+from pumafuse.model.plants import FirstOrder, SecondOrder
+
+DIGITS = 160  # close poles over a nanosecond cancel a hundred of them
+TINY = mpf(1e-290)  # below it numbers are subnormal somewhere on the way
+
+
+@dataclass(frozen=True)
+class Step:
+    """A transition with position, and rate over ω, as its states: all entries of Φ then are of order 1.
+
+    Attributes:
+        Phi: (2, 2).
+        Q: For unit noise on the input, (2, 2).
+    """
+
+    Phi: mpmath.matrix
+    Q: mpmath.matrix
+
+
+def wanted(omega: float, zeta: float, t: float) -> Step:
+    """From the two poles, or the double one: g is a sum of exponentials, and so is what there is to integrate."""
+    with mpmath.workdps(DIGITS):
+        w, z, t = mpf(omega), mpf(zeta), mpf(t)
+        s = z * w
+        if z == 1:
+            e, ee = mpmath.exp(-w * t), mpmath.exp(-2 * w * t)
+            g, rate = t * e, (1 - w * t) * e
+            zeroth, first = (1 - ee) / (2 * w), (1 - ee * (1 + 2 * w * t)) / (4 * w**2)
+            second = (1 - ee * (1 + 2 * w * t + 2 * (w * t) ** 2)) / (4 * w**3)  # ∫ t^n e^(−2ωt)
+            gg, rr = second, zeroth - 2 * w * first + w**2 * second
+        else:
+            b = w * mpmath.sqrt(mpmath.mpc((z - 1) * (z + 1)))
+            p, m = -s + b, -s - b
+            one, two, both = (mpmath.expm1(r * t) / r for r in (2 * p, 2 * m, p + m))
+            g = ((mpmath.exp(p * t) - mpmath.exp(m * t)) / (p - m)).real
+            rate = ((p * mpmath.exp(p * t) - m * mpmath.exp(m * t)) / (p - m)).real
+            gg = ((one + two - 2 * both) / (p - m) ** 2).real
+            rr = ((p**2 * one + m**2 * two - 2 * p * m * both) / (p - m) ** 2).real
+        Phi = mpmath.matrix([[rate + 2 * s * g, w * g], [-w * g, rate]])
+        Q = mpmath.matrix([[w**4 * gg, w**3 * g**2 / 2], [w**3 * g**2 / 2, w**2 * rr]])
+        return Step(Phi, Q)
+
+
+def found(omega: float, zeta: float, t: float) -> Step:
+    """What the package says, brought to the same states."""
+    plant = closed.constants(SecondOrder(natural_frequency=omega, damping=zeta))
+    values = closed.advance_second(np.stack([np.full_like(plant, np.nan), plant]), 1, t)
+    assert all(map(math.isfinite, values))
+    f11, f12, f21, f22, q11, q12, q22 = map(mpf, values)
+    with mpmath.workdps(DIGITS):
+        w = mpf(omega)
+        Q = mpmath.matrix([[q11, q12 / w], [q12 / w, q22 / w**2]])
+        return Step(mpmath.matrix([[f11, f12 * w], [f21 / w, f22]]), Q)
+
+
+def check(got: Step, right: Step, phi: float, q: float) -> None:
+    """Entries of Φ to ``phi``, of Q to ``q`` of √(Qii Qjj)."""
+    with mpmath.workdps(DIGITS):
+        for i, j in product(range(2), repeat=2):
+            assert abs(got.Phi[i, j] - right.Phi[i, j]) <= phi, f"Φ{i + 1}{j + 1}"
+        if right.Q[0, 0] > TINY and right.Q[1, 1] > TINY:
+            for i, j in product(range(2), repeat=2):
+                off, scale = abs(got.Q[i, j] - right.Q[i, j]), mpmath.sqrt(right.Q[i, i] * right.Q[j, j])
+                assert off <= q * scale, f"Q{i + 1}{j + 1}: {mpmath.nstr(off / scale, 3)}"
+
+
+def blurred(omega: float, zeta: float, t: float) -> float:
+    """By how much a relative change of ω alone turns Φ: the oscillation's phase, as far as it has not died away."""
+    return 1.0 + omega * t * math.exp(-min(zeta * omega * t, 700.0)) * (zeta < 1.0)
+
+
+# ---- the oracle -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("zeta", [0.3, 1.0 - 1e-9, 1.0, 1.0 + 1e-4, 4.0])
+@pytest.mark.parametrize("turn", [1e-3, 0.7, 5.0])
+def test_the_oracle_is_the_matrix_exponential_and_its_integral(zeta: float, turn: float) -> None:
+    """Φ and Q stand in the exponential of [−A, B Bᵀ; 0, Aᵀ] t (Van Loan), summed as a power series, to 30 digits."""
+    omega = 20.0
+    got = wanted(omega, zeta, turn / omega)
+    with mpmath.workdps(60):
+        w, t = mpf(omega), mpf(turn / omega)
+        A = w * mpmath.matrix([[0, 1], [-1, -2 * mpf(zeta)]])
+        block = mpmath.zeros(4)
+        block[:2, :2], block[2:, 2:], block[1, 3] = -A, A.T, w**2
+        power = mpmath.expm(block * t)
+        Phi = power[2:, 2:].T
+        assert mpmath.norm(got.Phi - Phi) < mpf("1e-30")
+        assert mpmath.norm(got.Q - Phi * power[:2, 2:]) < mpf("1e-30") * mpmath.norm(got.Q)
+
+
+# ---- second order ---------------------------------------------------------------------------------------------------
+
+CRITICAL = [1.0, 1.0 + 2**-52, 1.0 - 2**-53, 1.0 + 1e-12, 1.0 - 1e-12, 1.0 + 1e-9, 1.0 - 1e-9, 1.0 + 1e-4, 1.0 - 1e-4]
+DAMPINGS = [*CRITICAL, 1e-6, 1e-3, 0.1, 0.6, 0.864, 0.95, 0.99, 1.01, 1.05, 1.2, 2.0, 10.0, 1e3, 1e4]
+
+
+def powers(low: float, high: float) -> st.SearchStrategy[float]:
+    return st.floats(low, high).map(lambda exponent: 10.0**exponent)
+
+
+dampings = st.one_of(
+    st.sampled_from(DAMPINGS),
+    powers(-6.0, 4.0),
+    st.builds(lambda sign, by: 1.0 + sign * by, st.sampled_from([-1.0, 1.0]), powers(-15.0, -0.3)),
+)
+
+
+def fastest(omega: float, zeta: float) -> float:
+    return omega * (zeta + math.sqrt(zeta * zeta - 1.0)) if zeta > 1.0 else omega
+
+
+@st.composite
+def transitions(draw: st.DrawFn) -> tuple[float, float, float]:
+    """ω, ζ and an interval: anything, or near what the fastest pole, the slower one, or their difference turns in."""
+    omega, zeta = draw(powers(-3.0, 6.0)), draw(dampings)
+    apart = omega * math.sqrt(abs((zeta - 1.0) * (zeta + 1.0))) or omega
+    near = draw(st.sampled_from([None, fastest(omega, zeta), omega, omega**2 / fastest(omega, zeta), apart]))
+    t = draw(powers(-9.0, 5.0)) if near is None else draw(powers(-1.5, 1.5)) / near
+    return omega, zeta, min(max(t, 1e-9), 1e5)
+
+
+@settings(derandomize=True, deadline=None, max_examples=1500)
+@given(transitions())
+@example((9997.97309637579, 0.999999999998836, 147.78737883089568))
+@example((29562.580357190545, 1.0 - 2**-53, 1e5))
+@example((0.07393011252651258, 1e4, 0.00033815720290611775))
+def test_any_transition_is_that_of_the_plant(made: tuple[float, float, float]) -> None:
+    """Φ to 2e-15 (times the phase, for an oscillation that lasts) and Q to 1e-13, with digits left where Q ~ t³."""
+    check(found(*made), wanted(*made), 2e-15 * blurred(*made), 1e-13)
+
+
+@pytest.mark.parametrize("zeta", DAMPINGS)
+@pytest.mark.parametrize("omega", [1e-3, 1.0, 53.9, 1e6])
+def test_a_transition_over_any_interval(omega: float, zeta: float) -> None:
+    """From 1 ns to 1e5 s, densely where the plant answers: the same digits everywhere."""
+    for t in {*(10.0 ** np.arange(-9.0, 6.0)), *(10.0 ** np.arange(-2.0, 2.01, 0.1) / fastest(omega, zeta))}:
+        if 1e-9 <= t <= 1e5:
+            made = omega, zeta, float(t)
+            check(found(*made), wanted(*made), 2e-15 * blurred(*made), 1e-13)
+
+
+@settings(derandomize=True, deadline=None, max_examples=1000)
+@given(transitions())
+def test_process_noise_is_a_covariance(made: tuple[float, float, float]) -> None:
+    """Q11 and Q22 are never negative, and no correlation is beyond 1 by more than an ulp or two."""
+    Q = found(*made).Q
+    assert Q[0, 0] >= 0
+    assert Q[1, 1] >= 0
+    if Q[0, 0] > TINY and Q[1, 1] > TINY:
+        assert Q[0, 1] ** 2 <= Q[0, 0] * Q[1, 1] * (1 + 4e-16)
+
+
+@settings(derandomize=True, deadline=None, max_examples=500)
+@given(transitions())
+def test_two_steps_are_one_of_twice_the_length(made: tuple[float, float, float]) -> None:
+    """Φ(2t) = Φ(t)² and Q(2t) = Φ(t) Q(t) Φ(t)ᵀ + Q(t)."""
+    omega, zeta, t = made
+    once, twice = found(*made), found(omega, zeta, 2.0 * t)
+    with mpmath.workdps(DIGITS):
+        composed = Step(once.Phi * once.Phi, once.Phi * once.Q * once.Phi.T + once.Q)
+    blur = blurred(*made) + blurred(omega, zeta, 2.0 * t)
+    check(composed, twice, 1e-14 * blur, 1e-13 + 1e-14 * blur)
+
+
+@pytest.mark.parametrize("turn", [closed._TINY, closed._SHORT])
+@pytest.mark.parametrize("zeta", DAMPINGS)
+def test_nothing_jumps_where_one_form_takes_over_from_another(zeta: float, turn: float) -> None:
+    """On either side of the intervals where series end, and are lengthened, a transition is the same to 1e-13."""
+    omega = 53.9
+    middle = turn / fastest(omega, zeta)
+    below, above = (found(omega, zeta, middle * (1.0 + by)) for by in (-1e-15, 1e-15))
+    check(below, above, 4e-15, 1e-13)
+    check(below, wanted(omega, zeta, middle * (1.0 - 1e-15)), 2e-15, 1e-13)
+
+
+@pytest.mark.parametrize("turn", [1e-3, 0.2, 0.49, 0.51, 1.0, 3.0, 30.0, 1e4, 1e9])
+@pytest.mark.parametrize("by", [0.0, 2**-52, 1e-14, 1e-12])
+def test_nothing_jumps_at_critical_damping(turn: float, by: float) -> None:
+    """ζ a hair below 1, at 1 and a hair above it are one plant: the hair, and 1e-13."""
+    below, above = (found(53.9, 1.0 + sign * by, turn / 53.9) for sign in (-1.0, 1.0))
+    check(below, above, 4e-15 + 4.0 * by, 1e-13 + 20.0 * by)
+
+
+def test_nothing_happens_in_no_time() -> None:
+    """Over an interval of 0 every plant stands still, exactly."""
+    for zeta in DAMPINGS:
+        plant = closed.constants(SecondOrder(natural_frequency=53.9, damping=zeta))
+        assert closed.advance_second(plant[None], 0, 0.0) == (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    assert closed.advance_first(closed.constants(FirstOrder(time_constant=0.04))[None], 0, 0.0) == (0.0, 0.0)
+
+
+# ---- first order ----------------------------------------------------------------------------------------------------
+
+
+def lag(tau: float, t: float) -> tuple[float, float]:
+    plant = closed.constants(FirstOrder(time_constant=tau))
+    return closed.advance_first(np.stack([np.full_like(plant, np.nan), plant]), 1, t)
+
+
+@settings(derandomize=True, deadline=None, max_examples=1000)
+@given(powers(-6.0, 3.0), powers(-9.0, 5.0))
+def test_any_lag_is_that_of_the_plant(tau: float, t: float) -> None:
+    """Φ − 1 = e^(−t/τ) − 1 and Q = (1 − e^(−2t/τ)) / 2τ, each to 2e-15 of itself."""
+    lost, q = lag(tau, t)
+    with mpmath.workdps(DIGITS):
+        turned = mpf(t) / mpf(tau)
+        assert abs(mpf(lost) / mpmath.expm1(-turned) - 1) < 2e-15
+        assert abs(mpf(q) / (-mpmath.expm1(-2 * turned) / (2 * mpf(tau))) - 1) < 2e-15
+
+
+@settings(derandomize=True, deadline=None, max_examples=300)
+@given(powers(-6.0, 3.0), powers(-9.0, 4.6))
+def test_two_lags_are_one_of_twice_the_length(tau: float, t: float) -> None:
+    """Φ(2t) = Φ(t)² and Q(2t) = Φ(t)² Q(t) + Q(t)."""
+    (lost, q), (lost_twice, q_twice) = lag(tau, t), lag(tau, 2.0 * t)
+    assume(q_twice > 1e-290)
+    kept = 1 + mpf(lost)
+    assert abs(kept**2 - (1 + mpf(lost_twice))) < 4e-16
+    assert abs((kept**2 * q + q) / mpf(q_twice) - 1) < 4e-15
