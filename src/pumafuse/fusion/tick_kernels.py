@@ -80,7 +80,7 @@ def filter_one(
         else:
             h0, h1, h2, mean = a + d, b + e, d + f, x + offset
             S = h0 + h2 + R
-        nu = readings[n] - mean
+        nu = readings[n] - mean if abs(readings[n]) < math.inf else math.nan
         if wanted:
             innovation[0, n], innovation_sd[0, n] = nu, math.sqrt(S)
         if len(before):
@@ -105,7 +105,8 @@ def filter_one(
             if prior is None:
                 position[0, n], position_sd[0, n] = x, math.sqrt(a)
             else:
-                position[0, n], position_sd[0, n] = x + offset, math.sqrt(max(a + 2.0 * d + f, 0.0))
+                spread = (h0 + h2) * (R / S if nu == nu else 1.0)  # H P Hᵀ after the reading: a + 2 d + f would cancel
+                position[0, n], position_sd[0, n] = x + offset, math.sqrt(spread)
         earlier, recent = recent, command[n - delay] if n >= delay else 0.0
         x, rate = (
             f11 * x + f12 * rate + g01 * recent + g11 * earlier,
@@ -126,28 +127,33 @@ def smooth_one(
 ) -> None:
     """Modified Bryson-Frazier, backward: λ and Λ say what later innovations ask of the prediction at each step.
 
-    Bierman, "Fixed interval smoothing with discrete measurements", Int. J. Control 18(1), 1973. It inverts nothing; its
-    variance is a difference, good to 1e-16 of the filter's.
+    Bierman, "Fixed interval smoothing with discrete measurements", Int. J. Control 18(1), 1973. It inverts nothing;
+    each estimate is corrected after its own reading, where a wide prior is gone.
     """
     f11, f12, f21, f22, R = model[0], model[1], model[2], model[3], model[12]
     l0, l1, l2 = 0.0, 0.0, 0.0
     a, b, c, d, e, f = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for n in range(len(before) - 1, -1, -1):
         h0, h1, h2 = before[n, 1], before[n, 2], before[n, 3]
-        nu = innovation[0, n]
-        if nu == nu:
-            weight = 1.0 / (h0 + h2 + R)
+        nu, weight = innovation[0, n], 1.0 / (h0 + h2 + R)
+        there = abs(nu) < math.inf
+        kept = R * weight if there else 1.0  # P Hᵀ after the reading is P Hᵀ R / S
+        g0, g1, g2 = h0 * kept, h1 * kept, h2 * kept
+        told = g0 * (a * g0 + b * g1 + d * g2) + g1 * (b * g0 + c * g1 + e * g2) + g2 * (d * g0 + e * g1 + f * g2)
+        position_sd[0, n] = math.sqrt(max((h0 + h2) * kept - told, 0.0))
+        position[0, n] = before[n, 0] - (g0 * l0 + g1 * l1 + g2 * l2)
+        if there:
+            position[0, n] += (h0 + h2) * weight * nu
+            # Λ ← Mᵀ Λ M + Hᵀ H / S with M = I − K H, whose 1 − K are written as what is left of S
             k0, k1, k2 = h0 * weight, h1 * weight, h2 * weight
-            # Λ ← (I − K H)ᵀ Λ (I − K H) + Hᵀ H / S with H = (1, 0, 1): m = Λ K changes the rows and columns of H
-            m0, m1, m2 = a * k0 + b * k1 + d * k2, b * k0 + c * k1 + e * k2, d * k0 + e * k1 + f * k2
-            more = k0 * m0 + k1 * m1 + k2 * m2 + weight
-            asked = k0 * l0 + k1 * l1 + k2 * l2 + nu * weight
-            a, d, f = a - 2.0 * m0 + more, d - m0 - m2 + more, f - 2.0 * m2 + more
-            b, e = b - m1, e - m1
-            l0, l2 = l0 - asked, l2 - asked
-        position[0, n] = before[n, 0] - (h0 * l0 + h1 * l1 + h2 * l2)
-        told = h0 * (a * h0 + b * h1 + d * h2) + h1 * (b * h0 + c * h1 + e * h2) + h2 * (d * h0 + e * h1 + f * h2)
-        position_sd[0, n] = math.sqrt(max(h0 + h2 - told, 0.0))
+            m0, m2 = (h2 + R) * weight, (h0 + R) * weight
+            u0, u1, u2 = a * m0 - b * k1 - d * k2, b * m0 - c * k1 - e * k2, d * m0 - e * k1 - f * k2
+            w0, w1, w2 = d * m2 - a * k0 - b * k1, e * m2 - b * k0 - c * k1, f * m2 - d * k0 - e * k1
+            a = m0 * u0 - k1 * u1 - k2 * u2 + weight
+            d = m0 * w0 - k1 * w1 - k2 * w2 + weight
+            f = m2 * w2 - k0 * w0 - k1 * w1 + weight
+            b, e = u1, w1
+            l0, l2 = m0 * l0 - k1 * l1 - k2 * l2 - nu * weight, m2 * l2 - k0 * l0 - k1 * l1 - nu * weight
         l0, l1 = f11 * l0 + f21 * l1, f12 * l0 + f22 * l1
         u, w = f11 * a + f21 * b, f11 * b + f21 * c
         y, z = f12 * a + f22 * b, f12 * b + f22 * c
@@ -224,11 +230,12 @@ def update_lanes(room: FloatArray, k: int, prior: float | None) -> None:
         R = room[(_MODEL + 12) * LANES + lane]
         S = a + R if prior is None else (a + d) + (d + f) + R
         nu = room[(_TILE + k) * LANES + lane] - (x if prior is None else x + offset)
-        there = nu == nu
+        there = abs(nu) < math.inf
+        nu = nu if there else math.nan
         weight = 1.0 / S if there else 0.0
+        kept = R * weight if there else 1.0  # 1 − K
         told = nu * weight if there else 0.0
         if prior is None:
-            kept = R * weight if there else 1.0  # 1 − K
             mean, spread = x + a * told, a * kept
             room[lane] = mean
             room[LANES + lane] = rate + b * told
@@ -236,6 +243,7 @@ def update_lanes(room: FloatArray, k: int, prior: float | None) -> None:
             room[4 * LANES + lane] = b * kept
             room[5 * LANES + lane] = c - b * b * weight
         else:
+            spread = ((a + d) + (d + f)) * kept
             x, offset = x + (a + d) * told, offset + (d + f) * told
             room[lane] = x
             room[LANES + lane] = rate + (b + e) * told
@@ -247,7 +255,7 @@ def update_lanes(room: FloatArray, k: int, prior: float | None) -> None:
             room[6 * LANES + lane] = d
             room[7 * LANES + lane] = e
             room[8 * LANES + lane] = f
-            mean, spread = x + offset, max(a + 2.0 * d + f, 0.0)
+            mean = x + offset
         room[10 * LANES + lane] += nu * told + _LOG_2PI if there else 0.0
         room[11 * LANES + lane] *= S if there else 1.0
         room[(_TILE + 2 * TILE + k) * LANES + lane] = mean

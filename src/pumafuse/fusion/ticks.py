@@ -55,7 +55,7 @@ def filter_ticks(
     Args:
         model: From :func:`pumafuse.discretize`, for all runs or one for each; of one delay and period.
         command: v [m] relative to the level at rest, (steps,) for all runs or (runs, steps).
-        readings: z [m] likewise, NaN where missing, (steps,) for one run or (runs, steps).
+        readings: z [m] likewise, (steps,) for one run or (runs, steps); what is not finite is missing.
         sd: Noise of the readings [m], one for all or one for each run.
         offset_sd: Prior standard deviation of the offset [m].
 
@@ -65,18 +65,13 @@ def filter_ticks(
     many = _Many.of(model, command, readings, sd, offset_sd)
     outputs = _room(many.runs, many.steps)
     likelihood = many.filter(outputs)
-    if np.ndim(readings) == 1 and many.runs == 1:
-        return TickEstimates(*(part[0] for part in outputs), log_likelihood=likelihood)
-    return TickEstimates(*outputs, log_likelihood=likelihood)
+    return _shaped(outputs, likelihood, readings)
 
 
 def smooth_ticks(
     model: DiscreteModel, command: npt.ArrayLike, readings: npt.ArrayLike, sd: float, *, offset_sd: float = 0.0
 ) -> TickEstimates:
     """One run as :func:`filter_ticks` has it, with positions that know every reading of the run.
-
-    The error bars are good to 1e-16 × offset_sd² relative to their own square: with an offset prior of a metre beside
-    readings of 0.05 mm, use :func:`pumafuse.fuse`.
 
     Raises:
         ValueError: As :func:`filter_ticks`.
@@ -88,7 +83,7 @@ def smooth_ticks(
     likelihood = many.filter(outputs, before)
     with maybe_compiling(kernels.smooth_one):
         kernels.smooth_one(many.models[0], outputs[2], before, *outputs[:2])
-    return TickEstimates(*(part[0] for part in outputs), log_likelihood=likelihood)
+    return _shaped(outputs, likelihood, readings)
 
 
 def tick_likelihood(
@@ -104,7 +99,14 @@ def tick_likelihood(
     return many.filter(_room(many.runs, 0))
 
 
+_LEAST, _MOST = 1e-15, 1e15  # m; squares and products of eight of them fit
 _Outputs: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+def _shaped(outputs: _Outputs, likelihood: FloatArray, readings: npt.ArrayLike) -> TickEstimates:
+    """One run given as (steps,) comes back as (steps,)."""
+    flat = np.ndim(readings) == 1 and len(likelihood) == 1
+    return TickEstimates(*(part[0] if flat else part for part in outputs), log_likelihood=likelihood)
 
 
 def _room(runs: int, steps: int) -> _Outputs:
@@ -154,12 +156,20 @@ class _Many:
         for name, count in (("models", len(models)), ("commands", len(u)), ("readings", len(z)), ("sd", len(noise))):
             if count not in (1, runs):
                 raise ValueError(f"{name} are for {count} runs, others for {runs}; give one for all, or one each")
+        if u.ndim != 2 or z.ndim != 2:
+            raise ValueError("commands and readings are (steps,) or (runs, steps)")
+        if not np.isfinite(u).all():
+            raise ValueError("a command that is not a finite number")
         if u.shape[1] != z.shape[1]:
             raise ValueError(f"{u.shape[1]} commands and {z.shape[1]} readings a run; give one of each for a tick")
         if len({(one.delay, one.period) for one in models}) > 1:
             raise ValueError("the models are of several delays or periods; give one at a time")
-        if not ((noise > 0.0) & np.isfinite(noise)).all() or not 0.0 <= offset_sd < np.inf:
-            raise ValueError("sd must be positive, offset_sd not negative, both finite")
+        if noise.ndim != 1 or not ((noise >= _LEAST) & (noise <= _MOST)).all() or not 0.0 <= offset_sd <= _MOST:
+            raise ValueError(
+                f"sd must be one number, or one for each run, of {_LEAST:g} to {_MOST:g} m; offset_sd too, or 0"
+            )
+        if any("position" not in one.states for one in models):
+            raise ValueError("the tight path knows plants of first and second order")
         numbers = np.empty((runs, kernels.NUMBERS))
         numbers[:] = [_numbers(one) for one in models]
         numbers[:, 12] = noise**2
