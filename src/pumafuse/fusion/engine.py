@@ -8,7 +8,7 @@ from ..arrays import FloatArray, IntArray, TimeArray
 from ..compiled import maybe_compiling
 from ..model import closed
 from ..model.plants import FirstOrder
-from . import kernels
+from . import kernels, smoother_kernels
 from .config import FusionConfig, Sensor
 from .estimates import Mode
 from .timeline import AxisInput, Timeline
@@ -31,7 +31,7 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
     log = _log(axes, rows, width) if smooth else _log(axes, None, width)
     used = (
         kernels.filter_as_live if mode == "as-live" else kernels.filter_run,
-        *([kernels.smooth_run] if smooth else []),
+        *([smoother_kernels.smooth_run] if smooth else []),
     )
     with maybe_compiling(*used):
         if mode == "as-live":
@@ -53,7 +53,9 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
                 np.empty((4, width)),
                 np.empty((width + 1, width)),
             )
-            kernels.smooth_run(axes, sensors, sensor_of, met, log, timeline.origin, times, held, *room, outputs)
+            smoother_kernels.smooth_run(
+                axes, sensors, sensor_of, met, log, timeline.origin, times, held, *room, outputs
+            )
     outcome = scalars.outcome.copy()
     outcome[candidates] = met.outcome
     return Fused(
