@@ -16,13 +16,13 @@ class FolderError(PumafuseError):
     """An output folder cannot be written or read."""
 
 
-def check_writable(folder: Path, force: bool, marker: str, ours: Callable[[str], bool]) -> None:
+def check_writable(folder: Path, force: bool, markers: Iterable[str], ours: Callable[[str], bool]) -> None:
     """Refuse early what :func:`replacing` would refuse late.
 
     Args:
         folder: Where the output is to go.
         force: Whether an earlier output may be replaced.
-        marker: The file that every folder of this kind has.
+        markers: Files that every folder of this kind has.
         ours: Whether a file of this name may be in it; with any other it is never replaced.
 
     Raises:
@@ -35,7 +35,7 @@ def check_writable(folder: Path, force: bool, marker: str, ours: Callable[[str],
     if not any(folder.iterdir()):
         return
     strange = sorted(path.name for path in folder.iterdir() if not ours(path.name) or not path.is_file())
-    if strange or not (folder / marker).exists():
+    if strange or not all((folder / marker).exists() for marker in markers):
         what = f"holds '{strange[0]}'" if strange else "holds no output of pumafuse"
         raise FolderError(f"{folder}: exists and {what}, which is not ours to replace; choose another folder")
     if not force:

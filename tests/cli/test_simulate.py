@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -35,7 +36,7 @@ duration_s = 2.0
 rate_hz = 30.0
 sd_mm = 0.5
 """
-FILES = {"run.toml", "fusion.toml", "arm.toml", "commands.csv", "eye.csv", "truth.csv"}
+FILES = {"scenario.toml", "run.toml", "fusion.toml", "arm.toml", "commands.csv", "eye.csv", "truth.csv"}
 RESULT = {"estimates.parquet", "readings.parquet", "reference.parquet", "summary.json", "fusion.toml", "arm.toml"}
 
 
@@ -162,15 +163,15 @@ def _broken() -> int:
     raise ValueError("several\nlines\nof it")
 
 
-def test_jobs_are_done_and_reported_in_the_order_given(capsys: pytest.CaptureFixture[str]) -> None:
+def test_jobs_are_done_and_reported_in_the_order_given(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Whichever is ready first; a refusal and an unexpected exception are one line each, the rest is done."""
     jobs: dict[str, Callable[[], int]] = {f"job-{n}": partial(_square, n) for n in range(6)}
     jobs = {"bad": _refused, **jobs, "worse": _broken}
-    done, failed = many.each("testing", jobs)
+    done, failed = many.each("testing", jobs, [tmp_path / name for name in jobs])
     assert done == {f"job-{n}": n**2 for n in range(6)} and list(done) == [f"job-{n}" for n in range(6)]
     assert list(failed) == ["bad", "worse"]
     assert failed["bad"] == "not so"
-    assert "ValueError" in failed["worse"]
+    assert failed["worse"] == "unexpected ValueError: several lines of it"
     with pytest.raises(many.SomeFailedError, match="2 of 8 runs failed"):
         many.tell(failed, 8, "here")
     lines = capsys.readouterr().err.splitlines()
@@ -185,18 +186,27 @@ def test_nothing_is_told_when_nothing_failed(capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.long
-def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
-    """As when memory runs out: the command says so and ends, it does not hang and shows no traceback."""
-    script = tmp_path / "dies.py"
+@pytest.mark.parametrize("death", ["os._exit(9)", "os.kill(os.getpid(), signal.SIGKILL)"])
+def test_a_worker_that_dies_is_one_line(death: str, tmp_path: Path) -> None:
+    """As when memory runs out: the command says so and ends; what was half written is swept, what is whole is kept."""
+    script, out = tmp_path / "dies.py", tmp_path / "out"
     script.write_text(
-        "import os, sys\nfrom pumafuse.cli import many, main\n"
-        "def die():\n    os._exit(9)\n"
-        "def app():\n    many.tell(many.each('x', {'a': die, 'b': die})[1], 2, 'here')\n"
+        "import os, signal, sys, time\nfrom functools import partial\nfrom pathlib import Path\n"
+        "from pumafuse import folders\nfrom pumafuse.cli import many, main\n"
+        f"out = Path({str(out)!r})\n"
+        "def whole():\n    with folders.replacing(out / 'a') as new:\n        (new / 'x').write_text('')\n"
+        "def die():\n    while not (out / 'a').exists():\n        time.sleep(0.01)\n"
+        f"    with folders.replacing(out / 'b'):\n        {death}\n"
+        "def app():\n    jobs = {'a': whole, 'b': die}\n"
+        "    many.tell(many.each('x', jobs, [out / name for name in jobs])[1], 2, 'here')\n"
         "if __name__ == '__main__':\n    main.app = app\n    main.main()\n"
     )
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1
-    assert "Traceback" not in done.stderr
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("pumafuse: a worker process died"), done.stderr
+    assert "of 2 runs are done and kept" in lines[0]
+    assert names(out) == {"a"} and names(out / "a") == {"x"}
 
 
 def interrupted(words: list[str], out: Path, finished: int, group: bool) -> tuple[int, str]:
@@ -219,10 +229,7 @@ def interrupted(words: list[str], out: Path, finished: int, group: bool) -> tupl
 @pytest.mark.long
 @pytest.mark.parametrize("group", [True, False], ids=["terminal", "one"])
 def test_an_interrupted_simulation_keeps_whole_runs_and_nothing_else(group: bool, tmp_path: Path) -> None:
-    """Exit code 130, a line that says how many are done; every folder with a run's name is whole.
-
-    A worker that is killed while it writes may leave a hidden folder behind.
-    """
+    """Exit code 130, a line that says how many are done; every folder is a whole run, and nothing hidden is left."""
     out = tmp_path / "out"
     words = [str(EXECUTABLE), "simulate", str(SCENARIOS / "step-campaign.toml"), "-o", str(out), "--runs", "300"]
     code, said = interrupted(words, out, 3, group)
@@ -230,7 +237,7 @@ def test_an_interrupted_simulation_keeps_whole_runs_and_nothing_else(group: bool
     assert len(said.splitlines()) <= 2, said
     assert "interrupted: " in said and "of 300 runs" in said
     time.sleep(1.0)  # what is still running would still write
-    left = sorted(path.name for path in out.iterdir() if not path.name.startswith(".seed-"))
+    left = sorted(path.name for path in out.iterdir())
     assert 3 <= len(left) < 300
     assert all(name.startswith("seed-") for name in left)
     for name in left:
@@ -251,7 +258,7 @@ def test_an_interrupted_fusion_keeps_whole_results_and_nothing_else(scenario: Pa
     assert code == 130
     assert "Traceback" not in said and "interrupted: " in said
     time.sleep(1.0)
-    left = sorted(path.name for path in out.iterdir() if not path.name.startswith(".seed-"))
+    left = sorted(path.name for path in out.iterdir())
     assert 2 <= len(left) < 60
     assert all(name.startswith("seed-") for name in left)
     assert all(names(out / name) == RESULT for name in left)
@@ -265,7 +272,7 @@ def test_a_folder_is_writable_when_it_is_absent_or_empty(tmp_path: Path) -> None
     """Neither needs --force."""
     (tmp_path / "empty").mkdir()
     for name in ("absent", "empty", "deep/er"):
-        folders.check_writable(tmp_path / name, False, "run.toml", ours)
+        folders.check_writable(tmp_path / name, False, ["run.toml"], ours)
 
 
 def test_a_folder_of_ours_needs_force(tmp_path: Path) -> None:
@@ -273,8 +280,8 @@ def test_a_folder_of_ours_needs_force(tmp_path: Path) -> None:
     (tmp_path / "run.toml").write_text("")
     (tmp_path / "a.csv").write_text("")
     with pytest.raises(folders.FolderError, match="exists; --force replaces it"):
-        folders.check_writable(tmp_path, False, "run.toml", ours)
-    folders.check_writable(tmp_path, True, "run.toml", ours)
+        folders.check_writable(tmp_path, False, ["run.toml"], ours)
+    folders.check_writable(tmp_path, True, ["run.toml"], ours)
 
 
 @pytest.mark.parametrize("force", [False, True])
@@ -283,7 +290,7 @@ def test_strange_folders_are_never_ours(force: bool, tmp_path: Path) -> None:
 
     def refused(path: Path) -> str:
         with pytest.raises(folders.FolderError) as error:
-            folders.check_writable(path, force, "run.toml", ours)
+            folders.check_writable(path, force, ["run.toml"], ours)
         return str(error.value)
 
     (tmp_path / "file").write_text("")
@@ -334,14 +341,67 @@ def test_a_simulated_run_is_replaced_only_with_force(scenario: Path, tmp_path: P
     assert digests(run) != before and names(run) == FILES
 
 
-def test_a_run_that_was_recorded_is_not_replaced_even_with_force(scenario: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("more", [(), ("fusion.toml", "arm.toml")])
+@pytest.mark.parametrize("runs", [(), ("--runs", 1)])
+def test_a_run_that_was_recorded_is_not_replaced_even_with_force(
+    more: tuple[str, ...], runs: tuple[object, ...], scenario: Path, tmp_path: Path
+) -> None:
     """A folder with run.toml and tables of its own is somebody's measurement, not our output."""
-    recorded = tmp_path / "measured"
-    recorded.mkdir()
+    recorded = tmp_path / "measured" / "seed-3" if runs else tmp_path / "measured"
+    recorded.mkdir(parents=True)
     (recorded / "run.toml").write_text('[command]\nfile = "host.csv"\ntime = "t_s"\nradial = "u_mm"\n')
     (recorded / "host.csv").write_text("t_s,u_mm\n0.0,1.0\n")
-    pumafuse("simulate", scenario, "-o", recorded, "--force", code=1)
-    assert names(recorded) == {"run.toml", "host.csv"}
+    for name in more:
+        (recorded / name).write_text("")
+    before = digests(recorded)
+    done = pumafuse("simulate", scenario, "-o", tmp_path / "measured", "--force", *runs, code=1)
+    assert "holds no output of pumafuse, which is not ours to replace" in done.stderr
+    assert digests(recorded) == before
+    assert names(tmp_path / "measured") == ({"seed-3"} if runs else set(before))
+
+
+def test_a_folder_with_a_scenario_of_ones_own_is_not_replaced_even_with_force(tmp_path: Path) -> None:
+    """A hand-written scenario.toml and the path beside it are nobody's output."""
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    path = '[trajectory]\nkind = "path"\nfile = "path.csv"\naxes = ["radial"]\n'
+    (mine / "scenario.toml").write_text('name = "mine"\narm = "puma560-internal"\n' + path)
+    (mine / "path.csv").write_text("time_s,radial_mm\n0.0,1.0\n1.0,2.0\n")
+    before = digests(mine)
+    pumafuse("simulate", mine / "scenario.toml", "-o", mine, "--force", code=1)
+    assert digests(mine) == before
+
+
+def test_a_written_run_is_simulated_anew_from_its_own_scenario(scenario: Path, tmp_path: Path) -> None:
+    """By the executable, from another folder and of a seed that is not the scenario's own: the same bytes."""
+    pumafuse("simulate", scenario, "-o", tmp_path / "many", "--runs", 2)
+    pumafuse("simulate", tmp_path / "many" / "seed-4" / "scenario.toml", "-o", tmp_path / "again")
+    assert digests(tmp_path / "again") == digests(tmp_path / "many" / "seed-4")
+
+
+@pytest.mark.parametrize("file", ["eye.csv", "truth.csv"])
+def test_a_table_without_rows_is_a_note_and_the_run_is_fused(file: str, scenario: Path, tmp_path: Path) -> None:
+    """A sensor that was silent, a reference that was never recorded: exit code 0, and the summary says so."""
+    run, result = tmp_path / "run", tmp_path / "result"
+    pumafuse("simulate", scenario, "-o", run)
+    (run / file).write_text((run / file).read_text().splitlines()[0] + "\n")
+    done = pumafuse("fuse", run, "-c", run / "fusion.toml", "-o", result)
+    note = f"{file}: the table has no rows"
+    assert note in done.stderr
+    summary = json.loads((result / "summary.json").read_text())
+    assert note in summary["notes"]
+    for axis in ("radial", "vertical"):
+        assert (summary["axes"][axis]["score"] is None) == (file == "truth.csv")
+
+
+def test_commands_without_rows_are_refused_in_one_line(scenario: Path, tmp_path: Path) -> None:
+    """Named by their file: there is no run without them."""
+    run = tmp_path / "run"
+    pumafuse("simulate", scenario, "-o", run)
+    (run / "commands.csv").write_text((run / "commands.csv").read_text().splitlines()[0] + "\n")
+    done = pumafuse("fuse", run, "-c", run / "fusion.toml", "-o", tmp_path / "result", code=1)
+    assert len(done.stderr.splitlines()) == 1 and "commands.csv" in done.stderr
+    assert not (tmp_path / "result").exists()
 
 
 @pytest.mark.parametrize("arguments", [("--runs", "0"), ("--runs", "-1"), ("--runs", "two"), ()])

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from pumafuse import Run
 from pumafuse.arrays import NO_STAMP
+from pumafuse.errors import RunError
 from pumafuse.runs.frames import Cylindrical, Rotated
 from pumafuse.runs.run import Source
 from pumafuse.runs.save import save
@@ -116,7 +117,7 @@ def test_a_run_in_x_y_z_comes_back() -> None:
         same(run.sensors[name], again.sensors[name])
 
 
-@pytest.mark.parametrize("name", ["commands", "truth", "run", "../eye", "a/b", "fusion", "two words"])
+@pytest.mark.parametrize("name", ["run", "fusion", "two words", "scenario", "arm", "Ä", "a.b", "_eye-2"])
 def test_no_sensors_name_can_spoil_another_file(name: str) -> None:
     """Whatever a sensor is called, commands and reference are read back, and nothing is written outside the folder."""
     run = plain(
@@ -133,6 +134,22 @@ def test_no_sensors_name_can_spoil_another_file(name: str) -> None:
     same(run.sensors[name], again.sensors[name])
     assert run.reference is not None and again.reference is not None
     same(run.reference, again.reference)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["commands", "truth", "trials", "samples", "../eye", "a/b", "/tmp/eye", "", ".", "..", ".eye", "a\0b", "a\nb"],
+)
+def test_a_sensor_whose_file_would_be_another_is_refused_before_anything_is_written(name: str) -> None:
+    """In one line that names it."""
+    run = plain(sensors={"eye": ([0.01], {"radial": [0.7]}), name: ([0.01], {"radial": [0.7]})})
+    with TemporaryDirectory() as outer:
+        folder = Path(outer) / "run"
+        folder.mkdir()
+        with pytest.raises(RunError, match="its rows go into a file of its name") as refused:
+            save(run, folder)
+        assert list(folder.iterdir()) == [] and [path.name for path in Path(outer).iterdir()] == ["run"]
+    assert len(str(refused.value).splitlines()) == 1
 
 
 def test_saving_changes_nothing_in_the_run() -> None:

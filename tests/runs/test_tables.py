@@ -273,7 +273,6 @@ UNREADABLE: dict[str, tuple[str, bytes | None, str]] = {
     "absent Parquet": ("log.parquet", None, "no such file"),
     "empty": ("log.csv", b"", "empty"),
     "one newline": ("log.csv", b"\n", "Empty CSV"),
-    "header only": ("log.csv", b"t_s,x_mm\n", "no rows"),
     "header, no newline": ("log.csv", b"t_s,x_mm", "Empty CSV"),
     "column twice": ("log.csv", b"t_s,x_mm,x_mm\n0,1,2\n", "two columns are named 'x_mm'"),
     "columns without names": ("log.csv", b",\n0,1\n", "two columns"),
@@ -306,6 +305,22 @@ def test_a_file_that_is_no_table_is_refused_in_one_line(
     assert text.startswith(f"{path}: ")
     assert reason in text
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.csv.gz", "log.parquet"])
+def test_a_header_without_rows_is_a_table_of_no_rows(tmp_path: Path, name: str) -> None:
+    """Its columns are read as nothing, and a note says so with the file's name."""
+    text, path = b"t_s,x_mm\n", tmp_path / name
+    if name.endswith(".parquet"):
+        papq.write_table(pa.table({"t_s": pa.array([], pa.float64()), "x_mm": pa.array([], pa.float64())}), path)
+    else:
+        path.write_bytes(gzip.compress(text) if name.endswith(".gz") else text)
+    table = tables.read(path)
+    assert table.rows == 0
+    assert table.notes == (f"{name}: the table has no rows",)
+    stamp, values = table.stamps("t_s")[0], table.numbers("x_mm")[0]
+    assert (stamp.shape, stamp.dtype) == ((0,), np.int64)
+    assert (values.shape, values.dtype) == ((0,), np.float64)
 
 
 @pytest.mark.parametrize("name", ["a\0b", "a\0b.csv", "a\0b.csv.gz", "a\0b.parquet"])

@@ -1,10 +1,11 @@
 """The true arm's motion against integrators and quadratures that share nothing with it.
 
 Deterministic responses are compared with an adaptive Runge-Kutta method run from one change of the input to the next,
-to 1e-8 of the largest command. Noise is compared with its covariance ∫ q(s) g(t − s) g(t' − s) ds, where
-g(t) = C e^(At) B, by Gauss-Legendre quadrature, over independent seeds: the covariance's own Cholesky factor turns all
-positions into standard normal numbers, whose mean square must lie in the 99.9 % chi-square band and whose sample
-covariance within five standard deviations of the identity, entry by entry.
+at every instant of the motion, to 1e-9 of the largest command. Noise is compared with its covariance
+∫ q(s) g(t − s) g(t' − s) ds, where g(t) = C e^(At) B, by Gauss-Legendre quadrature: once exactly, for the motion is
+linear in the numbers it draws, and each in its turn is drawn as 1; and over independent seeds: the covariance's own
+Cholesky factor turns all positions into standard normal numbers, whose mean square must lie in the 99.9 % chi-square
+band and whose sample covariance within five standard deviations of the identity, entry by entry.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from scipy.stats import chi2
 from pumafuse.fusion.config import Process
 from pumafuse.model.arm import Gain
 from pumafuse.model.plants import FirstOrder, SecondOrder
-from pumafuse.simulate.motion import Motion, move
-from pumafuse.simulate.scenario import GainCurve, TrueAxis
+from pumafuse.simulate.motion import Motion, lattice, move
+from pumafuse.simulate.scenario import LATTICE, GainCurve, TrueAxis
 
 Floats = NDArray[np.float64]
 PERIOD = 0.028
@@ -65,6 +66,24 @@ def ns(seconds: Any) -> NDArray[np.int64]:
     return np.rint(np.asarray(seconds, dtype=np.float64) * 1e9).astype(np.int64)
 
 
+def near(seconds: Any) -> NDArray[np.int64]:
+    """The instants of the lattice nearest to ``seconds``."""
+    number = np.rint(np.asarray(seconds, dtype=np.float64) / (PERIOD / LATTICE))
+    return np.unique(np.rint(number * (PERIOD * 1e9 / LATTICE)).astype(np.int64))
+
+
+def motion(
+    axis: TrueAxis,
+    command: Sequence[float] | Floats,
+    process: Process = QUIET,
+    offset_sd: float = 0.0,
+    rng: Any = 0,
+) -> Motion:
+    told = np.asarray(command, dtype=np.float64)
+    chance = np.random.default_rng(rng) if isinstance(rng, int) else rng
+    return move(axis, process, offset_sd, ticks(len(told)), told, PERIOD, chance)
+
+
 def moved(
     axis: TrueAxis,
     command: Sequence[float] | Floats,
@@ -73,8 +92,8 @@ def moved(
     offset_sd: float = 0.0,
     seed: int = 0,
 ) -> Floats:
-    told = np.asarray(command, dtype=np.float64)
-    found = move(axis, process, offset_sd, ticks(len(told)), told, PERIOD, wanted, np.random.default_rng(seed))
+    found = motion(axis, command, process, offset_sd, seed)
+    assert np.isin(wanted, found.time).all()
     return found.at(wanted)
 
 
@@ -121,21 +140,19 @@ def random_walk(count: int, size: float = 0.004, seed: int = 5) -> Floats:
     return np.cumsum(steps)
 
 
-WANTED = np.unique(np.concatenate((ticks(41), ns(np.random.default_rng(8).uniform(0.0, 1.12, 150)))))
-
-
-def check_linear(axis: TrueAxis, v: Sequence[float], command: Floats, rel: float = 1e-8) -> None:
-    """The motion is the plant's answer to ``v``, one delay late."""
+def check_linear(axis: TrueAxis, v: Sequence[float], command: Floats, rel: float = 1e-9) -> None:
+    """The motion is the plant's answer to ``v``, one delay late, at every one of its instants."""
     acting = ticks(len(v)) / 1e9 + round(axis.delay * 1e9) / 1e9
-    expected = integrated(axis, v, acting, WANTED / 1e9)
+    found = motion(axis, command)
+    expected = integrated(axis, v, acting, found.time / 1e9)
     assert np.abs(expected).max() > 0.5 * np.abs(command).max()  # something moves
-    assert np.abs(moved(axis, command, WANTED) - expected).max() <= rel * np.abs(command).max()
+    assert np.abs(found.position - expected).max() <= rel * np.abs(command).max()
 
 
 @PLANTS
 @pytest.mark.parametrize("delay", [0.0, 0.028, 0.06045])
 def test_a_plant_answers_its_commands_one_delay_late(plant: FirstOrder | SecondOrder, delay: float) -> None:
-    """First- and second-order plants, ζ = 0.2, 1 and 3, agree with the integrator to 1e-8 of the largest command."""
+    """First- and second-order plants, ζ = 0.2, 1 and 3, agree with the integrator to 1e-9 of the largest command."""
     command = random_walk(40)
     check_linear(true_axis(plant, delay=delay), command.tolist(), command)
 
@@ -154,15 +171,9 @@ def test_a_plant_answers_its_commands_one_delay_late(plant: FirstOrder | SecondO
     ids=["first", "weak", "strong", "equal", "equal-to-slow-pole", "nearly-equal", "close"],
 )
 def test_an_extra_lag_is_in_series_with_the_plant(plant: FirstOrder | SecondOrder, lag: float) -> None:
-    """Also a lag equal or nearly equal to one of the plant's own agrees with the integrator to 1e-8."""
+    """Also a lag equal or nearly equal to one of the plant's own agrees with the integrator to 1e-9."""
     command = random_walk(40)
     check_linear(true_axis(plant, delay=0.01, extra_pole=lag), command.tolist(), command)
-
-
-def test_three_equal_poles_are_a_limit_and_not_a_cliff() -> None:
-    """A critically damped plant behind an equal lag, the worst case of partial fractions, agrees to 1e-6."""
-    command = random_walk(40)
-    check_linear(true_axis(CRITICAL, extra_pole=1.0 / 53.9), command.tolist(), command, rel=1e-6)
 
 
 def exact(axis: TrueAxis, v: Sequence[float], acting: Floats, wanted: Floats) -> Floats:
@@ -182,12 +193,41 @@ def exact(axis: TrueAxis, v: Sequence[float], acting: Floats, wanted: Floats) ->
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(st.floats(5.0, 300.0), st.floats(0.05, 5.0), st.one_of(st.none(), st.floats(0.002, 0.2)), st.floats(0.0, 0.2))
 def test_any_linear_axis_follows_its_differential_equation(w: float, z: float, lag: float | None, delay: float) -> None:
-    """Natural frequency, damping, extra lag and delay of any size agree with matrix exponentials to 1e-8."""
-    command = random_walk(40)
+    """Natural frequency, damping, extra lag and delay of any size agree with matrix exponentials to 1e-9."""
+    command = random_walk(25)
     axis = true_axis(SecondOrder(natural_frequency=w, damping=z), extra_pole=lag, delay=delay)
     acting = ticks(len(command)) / 1e9 + round(delay * 1e9) / 1e9
-    difference = moved(axis, command, WANTED) - exact(axis, command.tolist(), acting, WANTED / 1e9)
-    assert np.abs(difference).max() <= 1e-8 * np.abs(command).max()
+    found = motion(axis, command)
+    some = slice(None, None, 17)
+    difference = found.position[some] - exact(axis, command.tolist(), acting, found.time[some] / 1e9)
+    assert np.abs(difference).max() <= 1e-9 * np.abs(command).max()
+
+
+NEAR_CRITICAL = [
+    1.0 + sign * 10.0**-power for power in (6, 8, 8.5, 9, 9.5, 10, 10.5, 11, 12, 14, 15.5) for sign in (-1, 1)
+]
+
+
+@pytest.mark.parametrize("damping", [1.0, *NEAR_CRITICAL], ids=lambda damping: f"{damping - 1.0:.1e}")
+@pytest.mark.parametrize(("lag", "rel"), [(None, 5e-10), (1.0 / 53.9, 1e-7)], ids=["two", "three"])
+def test_poles_that_come_together_are_a_limit_and_not_a_cliff(lag: float | None, rel: float, damping: float) -> None:
+    """Around critical damping, from either side, two poles agree with matrix exponentials to 5e-10, three to 1e-7."""
+    command = random_walk(25)
+    axis = true_axis(SecondOrder(natural_frequency=53.9, damping=damping), extra_pole=lag)
+    found = motion(axis, command)
+    some = slice(None, None, 17)
+    difference = found.position[some] - exact(axis, command.tolist(), ticks(25) / 1e9, found.time[some] / 1e9)
+    assert np.abs(difference).max() <= rel * np.abs(command).max()
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-7, 3e-6, 0.99e-5, 1.01e-5, 1e-4, -2e-6])
+def test_a_lag_as_slow_as_the_plant_is_a_limit_too(apart: float) -> None:
+    """To 5e-10, on both sides of where poles are set apart."""
+    command = random_walk(25)
+    axis = true_axis(FIRST, extra_pole=FIRST.time_constant * (1.0 + apart))
+    found = motion(axis, command)
+    difference = found.position - exact(axis, command.tolist(), ticks(25) / 1e9, found.time / 1e9)
+    assert np.abs(difference).max() <= 5e-10 * np.abs(command).max()
 
 
 def gained(command: Floats, gain: Callable[[float], float], recovery: float | None) -> list[float]:
@@ -233,7 +273,7 @@ def test_a_gain_curve_is_linear_between_its_points_and_level_outside() -> None:
 def test_one_step_without_recovery_ends_at_gain_times_step() -> None:
     """The paper's K · u."""
     axis = true_axis(FIRST, gain=Gain(slope=0.0818, intercept=0.933))
-    end = moved(axis, np.full(80, 0.008), ns([2.2]))[0]
+    end = moved(axis, np.full(80, 0.008), near([2.2]))[0]
     assert end == pytest.approx((0.0818 * 0.008 / PERIOD + 0.933) * 0.008, rel=1e-12)
 
 
@@ -270,39 +310,42 @@ def play(position: Floats, width: float) -> Floats:
 
 @pytest.mark.parametrize("width", [0.0001, 0.002, 0.02])
 def test_backlash_is_the_play_operator(width: float) -> None:
-    """On a fine grid the tool is where a plain loop over the instants pushes it, to 1e-9 of the largest command."""
-    command, fine = random_walk(40), ns(np.arange(0.0, 1.2, 0.0001))
-    plain, loose = true_axis(WEAK, delay=0.03), true_axis(WEAK, delay=0.03, backlash=width)
-    found, expected = moved(loose, command, fine), play(moved(plain, command, fine), width)
-    assert np.abs(found - expected).max() <= 1e-9 * np.abs(command).max()
+    """The tool is where a plain loop over the motion's instants pushes it, to 1e-12 of the largest command."""
+    command = random_walk(40)
+    plain, loose = (motion(true_axis(WEAK, delay=0.03, backlash=gap), command) for gap in (0.0, width))
+    assert (plain.time == loose.time).all()
+    assert np.abs(loose.position - play(plain.position, width)).max() <= 1e-12 * np.abs(command).max()
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_backlash_holds_under_noise(seed: int) -> None:
-    """Noise of the plant goes through the play as commands do: the same seed without play, played, is the same.
-
-    To 0.02 mm, what the noise can do between two instants of the loop.
-    """
+    """Noise of the plant goes through the play as commands do: the same seed without play, played, is the same."""
     process = Process(input_noise=0.0005, drift=0.0)
-    command, fine = random_walk(30, seed=seed), ns(np.arange(0.0, 1.0, 0.00005))
-    bare, loose = true_axis(FIRST), true_axis(FIRST, backlash=0.0006)
-    expected = play(moved(bare, command, fine, process, seed=seed), 0.0006)
-    assert np.abs(moved(loose, command, fine, process, seed=seed) - expected).max() <= 0.00002
+    command = random_walk(30, seed=seed)
+    bare, loose = (motion(true_axis(FIRST, backlash=gap), command, process, rng=seed) for gap in (0.0, 0.0006))
+    assert np.abs(loose.position - play(bare.position, 0.0006)).max() <= 1e-12 * np.abs(command).max()
 
 
-def test_backlash_knows_the_turning_points_between_the_instants_asked_for() -> None:
-    """A tool that overshoots between two instants stays where the overshoot pushed it, to 0.1 % of the play."""
-    width = 0.010  # so wide that the swing back does not reach the other edge
-    axis, command = true_axis(WEAK, backlash=width), np.full(80, 0.010)
-    sparse = ns([0.4, 1.0, 2.2])
-    fine = np.union1d(sparse, ns(np.arange(0.0, 2.24, 0.0001)))
-    expected = play(moved(true_axis(WEAK), command, fine), width)[np.searchsorted(fine, sparse)]
-    assert np.abs(moved(axis, command, sparse) - expected).max() <= 0.001 * width
+@pytest.mark.parametrize("width", [0.002, 0.010])
+def test_backlash_knows_the_turning_points_between_its_instants(width: float) -> None:
+    """An overshoot pushes the tool as far as it would if the play were worked out every 0.04 ms.
+
+    To what the tip of a parabola of the largest acceleration, ω² of the step, rises within half a step of the lattice.
+    """
+    axis, command = true_axis(WEAK, backlash=width), np.full(22, 0.010)
+    found = motion(axis, command)
+    fine = np.union1d(found.time / 1e9, np.arange(0.0, found.time[-1] / 1e9, 0.00004))
+    expected = play(exact(axis, command.tolist(), ticks(22) / 1e9, fine), width)[
+        np.searchsorted(fine, found.time / 1e9)
+    ]
+    tip = 0.5 * WEAK.natural_frequency**2 * 0.010 * (0.5 * PERIOD / LATTICE) ** 2
+    assert tip < 0.001 * 0.010
+    assert np.abs(found.position - expected).max() <= tip
 
 
 def test_slow_drift_is_a_sine_on_the_position() -> None:
     """A sin(2πt/P) from the first command on, whatever the plant does."""
-    command, wanted = random_walk(40), ns(np.linspace(0.0, 1.1, 60))
+    command, wanted = random_walk(40), lattice(40, PERIOD)
     still, drifting = true_axis(FIRST), true_axis(FIRST, slow_drift=0.0007, slow_drift_period=0.9)
     difference = moved(drifting, command, wanted) - moved(still, command, wanted)
     assert difference == pytest.approx(0.0007 * np.sin(2.0 * np.pi * wanted / 1e9 / 0.9), abs=1e-14)
@@ -319,8 +362,8 @@ def test_each_command_has_a_delay_of_its_own() -> None:
     sign = np.where(np.arange(steps) % 2 == 0, 0.01, -0.01)
     command = np.cumsum(np.kron(sign, np.eye(hold)[0]))
     issued = np.arange(steps) * hold * PERIOD
-    look = issued + delay + 5.0 * jitter
-    wanted = np.unique(np.concatenate((ns(look), ns(np.linspace(0.0, steps * hold * PERIOD, 2000)))))
+    look = near(issued + delay + 5.0 * jitter) / 1e9
+    wanted = np.union1d(near(look), lattice(len(command), PERIOD)[::107])
     position = moved(axis, command, wanted, seed=4)
     known: list[float] = []
     for start, at, step in zip(issued, look, sign, strict=True):
@@ -341,37 +384,26 @@ def test_each_command_has_a_delay_of_its_own() -> None:
 def test_commands_with_jittering_delays_do_not_overtake_one_another(seed: int) -> None:
     """Even where the jitter is far beyond T the last command is where the arm ends, and a ramp never goes back."""
     axis = true_axis(FIRST, delay=0.05, delay_jitter=0.2)
-    command = np.arange(1, 61) * 0.001
-    position = moved(axis, command, ns(np.linspace(0.0, 5.0, 400)), seed=seed)
+    command = np.minimum(np.arange(1, 181), 60) * 0.001
+    position = motion(axis, command, rng=seed).position
     assert np.diff(position).min() >= -1e-15
     assert position[-1] == pytest.approx(0.060, rel=1e-9)
 
 
 def test_the_arm_rests_until_its_first_command_acts() -> None:
-    """Exactly, for instants before the delay is over."""
-    assert not moved(true_axis(WEAK, delay=0.06), [0.01, 0.02], ns([0.0, 0.03, 0.0599])).any()
+    """Exactly, and moves at the very next instant."""
+    found = motion(true_axis(WEAK, delay=0.06), [0.01] * 4)
+    acts = found.time <= 60_000_000
+    assert not found.position[acts].any() and found.position[~acts].all()
 
 
-@pytest.mark.parametrize("asked", [0.0001, 0.0031])
-def test_asking_for_more_instants_changes_no_position(asked: float) -> None:
-    """Of an axis without noise, to 1e-9 of the largest command."""
-    axis = true_axis(WEAK, delay=0.02, gain=Gain(intercept=0.97), gain_recovery=0.1, extra_pole=0.01, stiction=0.001)
-    command, few = random_walk(40), ns([0.1, 0.31, 0.77, 1.1])
-    more = np.union1d(few, ns(np.arange(0.0, 1.2, asked)))
-    difference = moved(axis, command, few) - moved(axis, command, more)[np.searchsorted(more, few)]
-    assert np.abs(difference).max() <= 1e-9 * np.abs(command).max()
-
-
-@pytest.mark.parametrize(
-    "process", [Process(input_noise=0.001, drift=0.0), Process(input_noise=0.0, drift=0.001)], ids=["input", "drift"]
-)
-def test_asking_for_more_instants_changes_no_noise(process: Process) -> None:
-    """The same seed strays the same way, whoever looks: another sensor cannot move the arm."""
-    command, few = random_walk(40), ns([0.1, 0.31, 0.77, 1.1])
-    more = np.union1d(few, ns(np.arange(0.0, 1.2, 0.0031)))
-    alone = moved(true_axis(FIRST), command, few, process, seed=3)
-    together = moved(true_axis(FIRST), command, more, process, seed=3)[np.searchsorted(more, few)]
-    assert together == pytest.approx(alone, abs=1e-9)
+@pytest.mark.parametrize("fastest", [None, 0.0004])
+def test_a_motion_is_known_on_the_whole_lattice(fastest: float | None) -> None:
+    """60 even instants a period, to the ns, from the first command to a period after the last, however fast the arm."""
+    axis, asked = true_axis(WEAK, delay=0.0123, extra_pole=fastest), lattice(7, PERIOD)
+    assert len(asked) == 7 * 60 + 1 and (asked[0], asked[-1]) == (0, 196_000_000)
+    assert np.abs(asked - np.linspace(0.0, 196e6, 421)).max() <= 0.5
+    assert np.isin(asked, motion(axis, np.zeros(7)).time).all()
 
 
 def covariance(axis: TrueAxis, q: Sequence[float], changes: Sequence[float], wanted: Floats) -> Floats:
@@ -400,42 +432,105 @@ def check_normal(samples: Floats, expected: Floats) -> None:
     assert (np.abs(white.T @ white / count - np.eye(size)) < 5.0 * entry_sd).all()
 
 
+class OneDraw:
+    """A generator, and all that spawn from it, whose every number is 0 but for one, which is 1."""
+
+    def __init__(self, chosen: int) -> None:
+        self.left = chosen
+
+    def spawn(self, count: int) -> list[OneDraw]:
+        return [self] * count
+
+    def standard_normal(self, size: Any = None) -> Any:
+        drawn = np.zeros(1 if size is None else size)
+        if 0 <= self.left < drawn.size:
+            drawn.flat[self.left] = 1.0
+        self.left -= drawn.size
+        return drawn if size is not None else float(drawn[0])
+
+
+def drawn_covariance(
+    axis: TrueAxis, command: Sequence[float], wanted: NDArray[np.int64], process: Process, offset_sd: float = 0.0
+) -> Floats:
+    """L Lᵀ, the motion being its mean + L times the numbers it draws."""
+    counter = OneDraw(-1)
+    mean = motion(axis, command, process, offset_sd, counter).at(wanted)
+    columns = [
+        motion(axis, command, process, offset_sd, OneDraw(number)).at(wanted) - mean
+        for number in range(-1 - counter.left)
+    ]
+    L = np.array(columns).T
+    return L @ L.T
+
+
+FEW = near([0.0052, 0.0131, 0.0135, 0.04, 0.055])
+RISING = [0.014, 0.056]  # changes of speed by 0.5 and 1.0 m/s
+
+
+@PLANTS
+@pytest.mark.parametrize("lag", [None, 0.02, 0.0021])
+def test_noise_has_exactly_the_covariance_of_its_impulse_response(
+    plant: FirstOrder | SecondOrder, lag: float | None
+) -> None:
+    """Q = input² + (maneuver_noise · m)² of the command that acts: to 1e-10 of the variance, 4e-9 for equal poles."""
+    process = Process(input_noise=4.0, drift=0.0, maneuver_noise=7.0)  # so large that the mean costs no digits
+    delay, axis = 0.0061, true_axis(plant, extra_pole=lag, delay=0.0061)
+    q = [4.0**2, *(4.0**2 + (7.0 * m) ** 2 for m in (0.5, 1.0))]
+    expected = covariance(axis, q, [delay, delay + PERIOD], FEW / 1e9)
+    found = drawn_covariance(axis, RISING, FEW, process)
+    assert np.abs(found - expected).max() <= (4e-9 if plant is CRITICAL else 1e-10) * expected.max()
+
+
+def test_the_offset_has_exactly_the_covariance_of_its_walk() -> None:
+    """offset_sd² + ∫ drift² + (maneuver_drift · m)² up to the earlier of two instants, to 1e-12."""
+    process = Process(input_noise=0.0, drift=0.0003, maneuver_drift=0.0008)
+    delay, at = 0.0061, FEW / 1e9
+    parts = [(0.0, delay, 0.0), (delay, delay + PERIOD, 0.5), (delay + PERIOD, 9.0, 1.0)]
+    walked = sum((0.0003**2 + (0.0008 * m) ** 2) * np.clip(at - start, 0.0, end - start) for start, end, m in parts)
+    found = drawn_covariance(true_axis(WEAK, delay=delay), RISING, FEW, process, 0.002)
+    assert found == pytest.approx(0.002**2 + np.minimum.outer(walked, walked), rel=1e-12)
+
+
 SEEDS = 3000
-NOISY_AT = np.array([0.0123, 0.03, 0.0301, 0.07, 0.2, 0.55])
+NOISY_AT = near([0.0123, 0.03, 0.0305, 0.07, 0.2, 0.55])
 
 
+@pytest.mark.long
 @PLANTS
 @pytest.mark.parametrize("lag", [None, 0.02])
 def test_input_noise_has_the_covariance_of_its_impulse_response(
     plant: FirstOrder | SecondOrder, lag: float | None
 ) -> None:
-    """Also between instants a tenth of a millisecond apart, and with an extra lag, which filters it too."""
+    """Over seeds; also between neighbours on the lattice, and with an extra lag, which filters it too."""
     axis, at = true_axis(plant, extra_pole=lag, delay=0.02), NOISY_AT if lag is None else NOISY_AT[[0, 1, 3, 4, 5]]
     process = Process(input_noise=0.0004, drift=0.0)
-    samples = np.array([moved(axis, np.zeros(20), ns(at), process, seed=seed) for seed in range(SEEDS)])
-    check_normal(samples, covariance(axis, [0.0004**2], [], at))
+    samples = np.array([moved(axis, np.zeros(20), at, process, seed=seed) for seed in range(SEEDS)])
+    check_normal(samples, covariance(axis, [0.0004**2], [], at / 1e9))
 
 
+@pytest.mark.long
 def test_the_offset_starts_uncertain_and_walks() -> None:
     """Its covariance is offset_sd² + drift² · min(t, t')."""
-    at, process = np.array([0.0, 0.004, 0.1, 0.5]), Process(input_noise=0.0, drift=0.0007)
+    wanted, process = near([0.0, 0.004, 0.1, 0.5]), Process(input_noise=0.0, drift=0.0007)
     axis = true_axis(WEAK, delay=0.03)
-    samples = np.array([moved(axis, np.zeros(20), ns(at), process, 0.002, seed) for seed in range(SEEDS)])
-    check_normal(samples, 0.002**2 + 0.0007**2 * np.minimum.outer(at, at))
+    samples = np.array([moved(axis, np.zeros(20), wanted, process, 0.002, seed) for seed in range(SEEDS)])
+    check_normal(samples, 0.002**2 + 0.0007**2 * np.minimum.outer(wanted, wanted) / 1e9)
 
 
 def test_the_start_offset_alone_is_one_number_for_the_whole_run() -> None:
     """Drawn anew for each seed."""
-    wanted = ns([0.0, 0.2, 0.9])
-    found = np.array([moved(true_axis(FIRST), np.zeros(20), wanted, QUIET, 0.002, seed) for seed in range(SEEDS)])
+    wanted = near([0.0, 0.04, 0.084])
+    found = np.array([motion(true_axis(FIRST), np.zeros(3), QUIET, 0.002, seed).at(wanted) for seed in range(SEEDS)])
     assert (found == found[:, :1]).all()
     check_normal(found[:, :1], np.array([[0.002**2]]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("plant", [FIRST, WEAK], ids=["first", "weak"])
 def test_noise_grows_with_the_maneuver_of_the_command_that_acts(plant: FirstOrder | SecondOrder) -> None:
     """Q = input² + (maneuver_noise · m)² and likewise the drift, m = |u_n − 2u_(n−1) + u_(n−2)| / T, one delay late."""
-    delay, at = 0.0405, np.array([0.035, 0.05, 0.09, 0.16, 0.3])
+    delay, wanted = 0.0405, near([0.035, 0.05, 0.09, 0.16, 0.3])
+    at = wanted / 1e9
     process = Process(input_noise=0.0002, drift=0.0003, maneuver_noise=0.0005, maneuver_drift=0.0008)
     axis = true_axis(plant, delay=delay)
     u = [0.014, 0.014, 0.028, 0.070, 0.112, 0.112, *[0.112] * 6]
@@ -452,14 +547,14 @@ def test_noise_grows_with_the_maneuver_of_the_command_that_acts(plant: FirstOrde
             for t in at
         ]
     )
-    mean = moved(axis, u, ns(at))
-    samples = np.array([moved(axis, u, ns(at), process, seed=seed) for seed in range(SEEDS)]) - mean
+    mean = moved(axis, u, wanted)
+    samples = np.array([moved(axis, u, wanted, process, seed=seed) for seed in range(SEEDS)]) - mean
     check_normal(samples, covariance(axis, q, changes, at) + np.minimum.outer(walked, walked))
 
 
 def test_kinds_of_noise_draw_from_streams_of_their_own() -> None:
     """The offset is the same with and without input noise and jitter: what one adds, another does not change."""
-    command, wanted = np.zeros(20), ns(np.linspace(0.0, 0.5, 30))
+    command, wanted = np.zeros(20), lattice(20, PERIOD)
 
     def found(process: Process, offset_sd: float, jitter: float) -> Floats:
         return moved(true_axis(FIRST, delay_jitter=jitter), command, wanted, process, offset_sd, seed=9)

@@ -91,7 +91,6 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
         HEAD + ARM + HOLD + SENSOR.replace("0.5", "{ x = 0.5 }") + LEVEL + FRAME,
         ("sensors.eye.sd_mm", "one number"),
     ),
-    "axes of a sensor of an axis that is not commanded": (WHOLE + 'axes = ["vertical"]\n', ("sensors.eye", "vertical")),
     "sensor of the filter": (WHOLE + "[filter.sensors.ear]\nsd_mm = 1.0\n", ("filter.sensors", "'ear'", "eye")),
     "axis of the filter": (WHOLE + "[filter.process.radail]\ndrift_mm_rts = 1.0\n", ("did you mean 'radial'?",)),
     "wrong type in the filter": (WHOLE + "[filter]\nprocess = 3\n", ("process",)),
@@ -135,26 +134,80 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "sensor that would overwrite the truth": (HEAD + ARM + HOLD + SENSOR.replace("eye", "truth"), ("truth",)),
     "sensor outside the folder": (HEAD + ARM + HOLD + SENSOR.replace("eye", '"../eye"'), ("../eye",)),
-    "longer than memory": (WHOLE.replace("0.2", "1e15"), ("long",)),
+    "longer than memory": (WHOLE.replace("0.2", "1e15"), ("trajectory", "at most 200000", "commands")),
+    "one command too many": (WHOLE.replace("0.2", "5600.0"), ("2e+05 commands", "at most 200000")),
+    "campaign without end": (
+        HEAD + ARM + STEPS + 'scope = "eye"\nrest_s = 1e9\n' + SENSOR,
+        ("trajectory", "at most 200000"),
+    ),
+    "window longer than the rest": (
+        HEAD + ARM + STEPS + 'scope = "eye"\nrest_s = 0.3\nwindow_s = 0.31\n' + SENSOR,
+        ("window_s", "rest_s"),
+    ),
+    "sensor faster than the lattice": (
+        WHOLE.replace("30.0", "2143.0"),
+        ("sensors.eye.rate_hz", "at most 2142.86", "2143"),
+    ),
+    "more rows of the truth than the lattice has": (
+        WHOLE + "[reference]\nrows_per_command = 61\n",
+        ("reference.rows_per_command", "60"),
+    ),
+    "path without a file": (
+        WHOLE.replace('"hold"', '"path"').replace("duration_s = 0.2", 'file = "none.csv"'),
+        ("none.csv", "no such file"),
+    ),
+    "sensor that would overwrite the trials": (HEAD + ARM + HOLD + SENSOR.replace("eye", "trials"), ("trials",)),
+    "sensor that would overwrite the samples": (HEAD + ARM + HOLD + SENSOR.replace("eye", "samples"), ("samples",)),
 }
+
+
+def check(said: str, path: Path, expected: tuple[str, ...]) -> None:
+    assert len(said.splitlines()) == 1, said
+    assert path.name in said
+    for words in expected:
+        assert words in said
 
 
 @pytest.mark.parametrize("case", WRONG)
 def test_a_wrong_scenario_is_refused_in_one_line(case: str, tmp_path: Path) -> None:
-    """File, key and the accepted names; exit code 1, no traceback, and no folder is left behind."""
+    """File, key and the accepted names."""
+    text, expected = WRONG[case]
+    with pytest.raises((pf.ConfigError, pf.UnknownNameError)) as refused:
+        load(tmp_path, text)
+    check(str(refused.value), tmp_path / "scenario.toml", expected)
+
+
+@pytest.mark.parametrize("case", ["unknown key", "sensor outside the folder", "longer than memory", "not TOML"])
+def test_the_executable_refuses_a_wrong_scenario_and_writes_nothing(case: str, tmp_path: Path) -> None:
+    """The same line, exit code 1, no traceback, and no folder is left behind."""
     text, expected = WRONG[case]
     path = tmp_path / "scenario.toml"
     path.write_text(text)
     words = [str(EXECUTABLE), "simulate", str(path), "-o", str(tmp_path / "out")]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    assert "Traceback" not in done.stderr
-    assert done.returncode == 1, done.stderr
-    lines = done.stderr.splitlines()
-    assert len(lines) == 1, lines
-    assert lines[0].startswith("pumafuse: ") and "scenario.toml" in lines[0]
-    for words_of in expected:
-        assert words_of in lines[0]
+    assert (done.returncode, done.stdout) == (1, ""), done.stderr
+    assert done.stderr.startswith("pumafuse: ")
+    check(done.stderr, path, expected)
     assert [entry.name for entry in tmp_path.iterdir()] == ["scenario.toml"]
+
+
+def test_limits_are_themselves_allowed(tmp_path: Path) -> None:
+    """60 rows a period of a sensor and of the truth, a window as long as the rest, the sd of the axes that move."""
+    whole = WHOLE.replace("30.0", "2142.857142857142") + "[reference]\nrows_per_command = 60\n"
+    assert load(tmp_path, whole).reference.rows_per_command == 60
+    steps = (
+        HEAD
+        + ARM
+        + STEPS
+        + 'scope = "eye"\nrest_s = 0.3\nwindow_s = 0.3\n'
+        + SENSOR
+        + 'axes = ["tangential", "radial"]\n'
+    )
+    assert load(tmp_path, steps + LEVEL + FRAME).sensors["eye"].axes == ["tangential", "radial"]
+    assert (
+        load(tmp_path, WHOLE.replace("0.5", "{ radial = 0.5, tangential = 0.4 }")).config.sensors["eye"].sd_of("radial")
+        == 5e-4
+    )
 
 
 def test_a_whole_scenario_is_accepted(tmp_path: Path) -> None:

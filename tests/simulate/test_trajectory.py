@@ -113,6 +113,13 @@ def test_steps_are_one_command_each_after_a_rest() -> None:
     assert len(found["a"]) == (len(plan) + 1) * pause  # the last trial has its rest too
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_white_noise_begins_where_the_arm_rests(seed: int) -> None:
+    """The first command of every axis is the start level."""
+    found = WhiteNoise(axes=["a", "b"], amplitude=0.008, duration=1.0).offsets(PERIOD, rng(seed))
+    assert (found["a"][0], found["b"][0]) == (0.0, 0.0)
+
+
 def test_white_noise_has_two_levels_and_changes_with_probability_one_half() -> None:
     """Switches are binomial(n, ½) within their 99.9 % interval, and neighbours' are uncorrelated within 4/√n."""
     noise = WhiteNoise(axes=["a", "b"], amplitude=0.008, duration=140.0)

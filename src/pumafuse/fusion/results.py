@@ -72,7 +72,7 @@ def check_writable(folder: Path, force: bool) -> None:
     Raises:
         FolderError: The folder exists and is not to be replaced, or holds something else than results.
     """
-    folders.check_writable(folder, force, SUMMARY, OURS.__contains__)
+    folders.check_writable(folder, force, [SUMMARY], OURS.__contains__)
 
 
 def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], None] | None = None) -> Summary:

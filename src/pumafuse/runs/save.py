@@ -51,7 +51,13 @@ def check_name(sensor: str) -> None:
     Raises:
         RunError: It has characters of a path, or is the name of another table.
     """
-    if sensor in _TAKEN or Path(sensor).name != sensor or sensor.startswith(".") or not sensor.isprintable():
+    if (
+        not sensor
+        or sensor in _TAKEN
+        or Path(sensor).name != sensor
+        or sensor.startswith(".")
+        or not sensor.isprintable()
+    ):
         raise RunError(
             f"sensor '{sensor}': its rows go into a file of its name, which must not be a path or one of"
             f" {', '.join(_TAKEN)}"

@@ -126,8 +126,9 @@ def _modes(axis: TrueAxis) -> tuple[ComplexArray, ComplexArray]:
         poles = [complex(-1.0 / plant.time_constant)]
     else:
         middle = -plant.damping * plant.natural_frequency
-        half = plant.natural_frequency * np.sqrt(complex(plant.damping**2 - 1.0))
-        poles = [middle - half, plant.natural_frequency**2 / (middle - half)]
+        half = plant.natural_frequency * np.sqrt(complex((plant.damping - 1.0) * (plant.damping + 1.0)))
+        far = middle - half
+        poles = [far, far.conjugate() if half.imag else plant.natural_frequency**2 / far]
     if axis.extra_pole is not None:
         poles.append(complex(-1.0 / axis.extra_pole))
     apart = _set_apart(np.array(poles))
@@ -145,7 +146,7 @@ def _set_apart(poles: ComplexArray) -> ComplexArray:
         nearest = np.abs(poles[together][:, None] - poles[together][None, :])[np.triu_indices(count, 1)]
         if count > 1 and nearest.min() < _APART[count] * np.abs(pole):
             spread = (np.arange(count) - 0.5 * (count - 1)) * (2.0 * _APART[count])
-            found[together] = poles[together].mean() * (1.0 + spread)
+            found[together] = poles[together].mean().real * (1.0 + spread)
     return found
 
 

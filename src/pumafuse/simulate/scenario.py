@@ -370,7 +370,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         tree = toml.builtins(self)
         tree["arm"], tree["seed"] = arm, seed
         tree["start"]["level"] = {f"{axis}_mm": level for axis, level in self.start.level.items()}
-        return toml.text(tree)
+        return toml.text({key: value for key, value in tree.items() if value != {}})
 
     @staticmethod
     def load(path: str | Path) -> Scenario:
@@ -378,6 +378,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
         Raises:
             ConfigError: The file or its arm is not as declared; names file, key and the accepted names.
+            UnknownNameError: A table is of an axis that the arm does not have.
         """
         path = Path(path)
         tree, where = toml.read(path), str(path)

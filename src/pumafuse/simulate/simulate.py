@@ -125,7 +125,7 @@ def check_writable(folder: Path, force: bool) -> None:
     Raises:
         FolderError: The folder exists and is not to be replaced, or holds something else than a simulated run.
     """
-    folders.check_writable(folder, force, SCENARIO, lambda name: name in _OURS or name.endswith(".csv"))
+    folders.check_writable(folder, force, _OURS, lambda name: name in _OURS or name.endswith(".csv"))
 
 
 def write(simulated: Simulated, folder: Path, force: bool) -> None:
