@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-import threading
-from collections.abc import Generator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 if TYPE_CHECKING:
@@ -19,27 +15,27 @@ if TYPE_CHECKING:
         ...
 
 else:
+    import sys
+
     import numba
+    from numba.core import event
 
     # Kernels own no arrays, so nothing in them is counted (`_nrt`), and all calls between them vanish (`forceinline`):
     # together that is a factor of twenty. A division by zero gives an infinity, as in numpy.
     compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, _nrt=False)
 
-_PATIENCE = 1.5  # s; what is on disk loads in less
+    class _Announcer(event.Listener):
+        """Says once in a process that kernels are compiled; those found on disk are no event."""
 
+        said = False
 
-@contextmanager
-def maybe_compiling(*kernels: object) -> Generator[None]:
-    """Say on stderr that the kernels are being compiled, when one of them still is after more than a moment."""
+        def on_start(self, event: event.Event) -> None:
+            ours = event.data["dispatcher"].py_func.__module__.startswith(__package__)
+            if ours and not self.said:
+                self.said = True
+                print("compiling the filter, once for this machine (up to 40 s) ...", file=sys.stderr, flush=True)
 
-    def tell() -> None:
-        if any(not getattr(kernel, "signatures", True) for kernel in kernels):
-            print("compiling the filter, once for this machine (about 20 s) ...", file=sys.stderr)
+        def on_end(self, event: event.Event) -> None:
+            """Nothing to say."""
 
-    timer = threading.Timer(_PATIENCE, tell)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
+    event.register("numba:compile", _Announcer())

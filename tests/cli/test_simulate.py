@@ -211,7 +211,9 @@ def test_a_worker_that_dies_is_one_line(death: str, tmp_path: Path) -> None:
 
 def interrupted(words: list[str], out: Path, finished: int, group: bool) -> tuple[int, str]:
     """Start a command, interrupt it once it has ``finished`` some folders, and wait: exit code and stderr."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what ignores it hands that on
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    signal.signal(signal.SIGINT, before)
     give_up = time.monotonic() + 100.0
     while process.poll() is None and time.monotonic() < give_up:
         if out.exists() and len([path for path in out.iterdir() if not path.name.startswith(".")]) >= finished:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import FloatArray, IntArray, TimeArray
-from ..compiled import maybe_compiling
 from ..model import closed
 from ..model.plants import FirstOrder
 from . import kernels, smoother_kernels
@@ -29,33 +28,26 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
     kept = len(times) if smooth else 0
     held = kernels.Held(np.empty((count, kept, width)), np.empty((count, kept, width, width)), np.empty((count, kept)))
     log = _log(axes, rows, width) if smooth else _log(axes, None, width)
-    used = (
-        kernels.filter_as_live if mode == "as-live" else kernels.filter_run,
-        *([smoother_kernels.smooth_run] if smooth else []),
-    )
-    with maybe_compiling(*used):
-        if mode == "as-live":
-            arrival = np.maximum(scalars.stamp[candidates[rows.first[:-1]]], rows.valid)
-            queue = np.argsort(arrival, kind="stable")
-            back = int((np.maximum.accumulate(queue) - queue).max(initial=0)) + 2
-            places = _places(state, back)
-            arrived = np.zeros(len(rows.valid), dtype=np.bool_)
-            kernels.filter_as_live(
-                axes, sensors, rows, arrival, queue, arrived, state, places, times, met, log, held, outputs
-            )
-        else:
-            kernels.filter_run(axes, sensors, rows, state, times, met, log, held, outputs)
-        if smooth:
-            sensor_of = np.repeat(rows.sensor, np.diff(rows.first))
-            room = (
-                np.empty((2, width)),
-                np.empty((2, width, width)),
-                np.empty((4, width)),
-                np.empty((width + 1, width)),
-            )
-            smoother_kernels.smooth_run(
-                axes, sensors, sensor_of, met, log, timeline.origin, times, held, *room, outputs
-            )
+    if mode == "as-live":
+        arrival = np.maximum(scalars.stamp[candidates[rows.first[:-1]]], rows.valid)
+        queue = np.argsort(arrival, kind="stable")
+        back = int((np.maximum.accumulate(queue) - queue).max(initial=0)) + 2
+        places = _places(state, back)
+        arrived = np.zeros(len(rows.valid), dtype=np.bool_)
+        kernels.filter_as_live(
+            axes, sensors, rows, arrival, queue, arrived, state, places, times, met, log, held, outputs
+        )
+    else:
+        kernels.filter_run(axes, sensors, rows, state, times, met, log, held, outputs)
+    if smooth:
+        sensor_of = np.repeat(rows.sensor, np.diff(rows.first))
+        room = (
+            np.empty((2, width)),
+            np.empty((2, width, width)),
+            np.empty((4, width)),
+            np.empty((width + 1, width)),
+        )
+        smoother_kernels.smooth_run(axes, sensors, sensor_of, met, log, timeline.origin, times, held, *room, outputs)
     outcome = scalars.outcome.copy()
     outcome[candidates] = met.outcome
     return Fused(

@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import FloatArray
-from ..compiled import maybe_compiling
 from ..model.discrete import DiscreteModel
 from . import tick_kernels as kernels
 
@@ -81,8 +80,7 @@ def smooth_ticks(
         raise ValueError("smooth_ticks takes one run at a time")
     outputs, before = _room(1, many.steps), np.empty((many.steps, 4))
     likelihood = many.filter(outputs, before)
-    with maybe_compiling(kernels.smooth_one):
-        kernels.smooth_one(many.models[0], outputs[2], before, *outputs[:2])
+    kernels.smooth_one(many.models[0], outputs[2], before, *outputs[:2])
     return _shaped(outputs, likelihood, readings)
 
 
@@ -179,22 +177,21 @@ class _Many:
     def filter(self, outputs: _Outputs, before: FloatArray | None = None) -> FloatArray:
         """Fill the outputs; returns the log-likelihood of each run. Each core has its share of the runs."""
         likelihood = np.zeros(self.runs)
-        with maybe_compiling(kernels.filter_one if self.runs == 1 else kernels.filter_many):
-            if self.runs == 1:
-                before = np.empty((0, 4)) if before is None else before
-                one = (self.models[0], self.prior, self.delay, self.command[0], self.readings[0], likelihood)
-                kernels.filter_one(*one, *outputs, before)
-                return likelihood
-            cores, groups = usable_cores(), -(-self.runs // kernels.LANES)
-            edges = [groups * part // cores * kernels.LANES for part in range(cores)] + [self.runs]
-            shares = [(first, end) for first, end in pairwise(edges) if first < end]
-            many = (self.models, self.prior, self.delay, self.command, self.readings, likelihood)
+        if self.runs == 1:
+            before = np.empty((0, 4)) if before is None else before
+            one = (self.models[0], self.prior, self.delay, self.command[0], self.readings[0], likelihood)
+            kernels.filter_one(*one, *outputs, before)
+            return likelihood
+        cores, groups = usable_cores(), -(-self.runs // kernels.LANES)
+        edges = [groups * part // cores * kernels.LANES for part in range(cores)] + [self.runs]
+        shares = [(first, end) for first, end in pairwise(edges) if first < end]
+        many = (self.models, self.prior, self.delay, self.command, self.readings, likelihood)
 
-            def work(share: tuple[int, int]) -> None:
-                kernels.filter_many(*many, *outputs, *share, np.empty(kernels.ROOM))
+        def work(share: tuple[int, int]) -> None:
+            kernels.filter_many(*many, *outputs, *share, np.empty(kernels.ROOM))
 
-            with ThreadPoolExecutor(len(shares)) as pool:
-                list(pool.map(work, shares))
+        with ThreadPoolExecutor(len(shares)) as pool:
+            list(pool.map(work, shares))
         return likelihood
 
 
