@@ -33,7 +33,7 @@ else:
             ours = event.data["dispatcher"].py_func.__module__.startswith(__package__)
             if ours and not self.said:
                 self.said = True
-                print("compiling the filter, once for this machine (up to 40 s) ...", file=sys.stderr, flush=True)
+                print("compiling the filter for this machine, only this once (some 10 s) ...", file=sys.stderr, flush=True)
 
         def on_end(self, event: event.Event) -> None:
             """Nothing to say."""

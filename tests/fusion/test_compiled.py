@@ -1,0 +1,30 @@
+"""What compiling tells the user."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CODE = """
+import numpy as np, pumafuse as pf
+model = pf.discretize(pf.FirstOrder(time_constant=0.02), 0.028, 0.0, input_noise=1e-4)
+print(pf.filter_ticks(model, np.zeros(3), np.ones(3), 1.0).log_likelihood)
+"""
+
+
+@pytest.mark.long
+def test_the_first_use_says_once_that_it_compiles_and_the_next_loads(tmp_path: Path) -> None:
+    """On stderr, when nothing is on disk yet; the second process finds it there, is silent, and has the same result."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    words = [sys.executable, "-c", CODE]
+    first, second = (
+        subprocess.run(words, env=environment, capture_output=True, text=True, check=True, timeout=200)
+        for _ in range(2)
+    )
+    assert first.stderr.splitlines() == ["compiling the filter for this machine, only this once (some 10 s) ..."]
+    assert second.stderr == ""
+    assert first.stdout == second.stdout
