@@ -22,6 +22,7 @@ else:
 
     # Kernels own no arrays, so nothing in them is counted (`_nrt`), and all calls between them vanish (`forceinline`):
     # together that is a factor of twenty. A division by zero gives an infinity, as in numpy.
+    # A product and a sum stay two roundings: contracted to one, variances of extreme priors fall below 0.
     compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, _nrt=False)
 
     class _Announcer(event.Listener):
@@ -33,7 +34,9 @@ else:
             ours = event.data["dispatcher"].py_func.__module__.startswith(__package__)
             if ours and not self.said:
                 self.said = True
-                print("compiling the filter for this machine, only this once (some 10 s) ...", file=sys.stderr, flush=True)
+                print(
+                    "compiling the filter for this machine, only this once (some 10 s) ...", file=sys.stderr, flush=True
+                )
 
         def on_end(self, event: event.Event) -> None:
             """Nothing to say."""

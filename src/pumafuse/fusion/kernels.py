@@ -271,6 +271,32 @@ def observation(axes: Axes, sensors: Sensors, axis: int, sensor: int, work: Floa
 
 
 @compiled
+def joseph_three(
+    a: float, b: float, c: float, d: float, e: float, f: float, h0: float, h1: float, h2: float, R: float, S: float
+) -> tuple[float, float, float, float, float, float]:
+    """(I − K H) P (I − K H)ᵀ + K R Kᵀ with P = [a b d; b c e; d e f]; S is infinite without a reading.
+
+    A quotient is exactly 1 where a prior is all there is to S; a product with 1/S would leave a variance below 0.
+    """
+    s0, s1, s2 = a * h0 + b * h1 + d * h2, b * h0 + c * h1 + e * h2, d * h0 + e * h1 + f * h2
+    k0, k1, k2 = s0 / S, s1 / S, s2 / S
+    w00, w01, w02 = a - k0 * s0, b - k0 * s1, d - k0 * s2
+    w10, w11, w12 = b - k1 * s0, c - k1 * s1, e - k1 * s2
+    w20, w21, w22 = d - k2 * s0, e - k2 * s1, f - k2 * s2
+    r0 = w00 * h0 + w01 * h1 + w02 * h2 - R * k0
+    r1 = w10 * h0 + w11 * h1 + w12 * h2 - R * k1
+    r2 = w20 * h0 + w21 * h1 + w22 * h2 - R * k2
+    return (
+        w00 - r0 * k0,
+        0.5 * (w01 - r0 * k1 + w10 - r1 * k0),
+        w11 - r1 * k1,
+        0.5 * (w02 - r0 * k2 + w20 - r2 * k0),
+        0.5 * (w12 - r1 * k2 + w21 - r2 * k1),
+        w22 - r2 * k2,
+    )
+
+
+@compiled
 def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> None:
     """P⁺ = (I − K H) P (I − K H)ᵀ + K R Kᵀ with H in ``work[0]`` and K = P Hᵀ / (H P Hᵀ + R), left in ``work[1]``.
 
@@ -287,6 +313,13 @@ def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> N
     spread = max(spread, R, _ROUNDING * seen)
     for i in range(states):
         work[1, i] = work[2, i] / spread
+    if states == 3:  # what most axes have, in registers
+        P[at, 0, 0], P[at, 0, 1], P[at, 1, 1], P[at, 0, 2], P[at, 1, 2], P[at, 2, 2] = joseph_three(
+            P[at, 0, 0], P[at, 0, 1], P[at, 1, 1], P[at, 0, 2], P[at, 1, 2], P[at, 2, 2],
+            work[0, 0], work[0, 1], work[0, 2], R, spread,
+        )  # fmt: skip
+        P[at, 1, 0], P[at, 2, 0], P[at, 2, 1] = P[at, 0, 1], P[at, 0, 2], P[at, 1, 2]
+        return
     for i in range(states):  # W = (I − K H) P and W Hᵀ
         across = 0.0
         for j in range(states):
@@ -300,23 +333,28 @@ def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> N
 
 
 @compiled
-def predicted(
-    axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: int, sensor: int
-) -> tuple[float, float, float]:
-    """ν = z − H x, S = H P Hᵀ + R and R of a scalar here and now; R grows with speed where latency wanders."""
-    axis = rows.axis[scalar]
-    x, P, o, scale, bias = state.x, state.P, axes.order[axis], sensors.scale[sensor], sensors.bias[sensor, axis]
-    R = rows.sd[scalar] * rows.sd[scalar]
+def noise(axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: int, sensor: int) -> float:
+    """R of a scalar here and now [m²]; it grows with speed where latency wanders."""
+    axis, R = rows.axis[scalar], rows.sd[scalar] * rows.sd[scalar]
     if sensors.latency_sd[sensor] > 0.0:
         v, _, _ = acting_now(axes, axis, state.entry[axis])
-        R += (scale * velocity(axes, axis, x, axis, v) * sensors.latency_sd[sensor]) ** 2
+        speed = velocity(axes, axis, state.x, axis, v)
+        R += (sensors.scale[sensor] * speed * sensors.latency_sd[sensor]) ** 2
+    return R
+
+
+@compiled
+def predicted(axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: int, sensor: int) -> tuple[float, float]:
+    """ν = z − H x and S = H P Hᵀ + R of a scalar here and now."""
+    axis, R = rows.axis[scalar], noise(axes, sensors, rows, state, scalar, sensor)
+    x, P, o, scale, bias = state.x, state.P, axes.order[axis], sensors.scale[sensor], sensors.bias[sensor, axis]
     nu = rows.value[scalar] - scale * (x[axis, 0] + x[axis, o])
     S = scale * scale * (P[axis, 0, 0] + 2.0 * P[axis, 0, o] + P[axis, o, o])
     if bias >= 0:
         nu -= x[axis, bias]
         S += 2.0 * scale * (P[axis, 0, bias] + P[axis, o, bias]) + P[axis, bias, bias]
     seen = scale * scale * (P[axis, 0, 0] + P[axis, o, o]) + (P[axis, bias, bias] if bias >= 0 else 0.0)
-    return nu, max(S + R, R, _ROUNDING * seen), R
+    return nu, max(S + R, R, _ROUNDING * seen)
 
 
 @compiled
@@ -348,7 +386,7 @@ def meet_together(
     gate, any_beyond = sensors.gate[sensor], False
     for scalar in range(first, end):
         advance(axes, state, log, rows.axis[scalar], valid)
-        nu, S, _ = predicted(axes, sensors, rows, state, scalar, sensor)
+        nu, S = predicted(axes, sensors, rows, state, scalar, sensor)
         sd = math.sqrt(S)
         met.innovation[scalar], met.innovation_sd[scalar] = nu, sd
         any_beyond |= gate > 0.0 and abs(nu) > gate * sd
@@ -370,11 +408,12 @@ def fuse(
 ) -> None:
     """Update with one scalar; one beyond the ``gate``, which reopens, widens the offset by ν² first."""
     sensor, axis = rows.sensor[row], rows.axis[scalar]
-    nu, S, R = predicted(axes, sensors, rows, state, scalar, sensor)
-    widened = nu * nu if abs(nu) > gate * math.sqrt(S) else 0.0
+    nu = met.innovation[scalar]
+    R = noise(axes, sensors, rows, state, scalar, sensor)
+    widened = nu * nu if abs(nu) > gate * met.innovation_sd[scalar] else 0.0
     if widened > 0.0:
         state.P[axis, axes.order[axis], axes.order[axis]] += widened
-        _, S, _ = predicted(axes, sensors, rows, state, scalar, sensor)
+        _, S = predicted(axes, sensors, rows, state, scalar, sensor)
         met.innovation_sd[scalar] = math.sqrt(S)
     observation(axes, sensors, axis, sensor, state.work)
     joseph(state.P, axis, axes.states[axis], R, state.work)

@@ -12,6 +12,7 @@ import math
 
 from ..arrays import FloatArray
 from ..compiled import compiled
+from .kernels import joseph_three
 
 NUMBERS = 13
 LANES = 16  # runs side by side: two vectors of the widest instructions, so that one hides the other's latency
@@ -20,30 +21,6 @@ _MODEL = 13  # quantities of a lane before the numbers of its model
 _TILE = _MODEL + NUMBERS  # … and before its tile
 ROOM = LANES * (_TILE + 6 * TILE)
 _LOG_2PI = math.log(2.0 * math.pi)
-
-
-@compiled
-def joseph_three(
-    a: float, b: float, c: float, d: float, e: float, f: float, R: float, weight: float
-) -> tuple[float, float, float, float, float, float]:
-    """(I − K H) P (I − K H)ᵀ + K R Kᵀ with H = (1, 0, 1) and P = [a b d; b c e; d e f].
-
-    ``weight`` is 1/S, or 0 where there is no reading.
-    """
-    h0, h1, h2 = a + d, b + e, d + f
-    k0, k1, k2 = h0 * weight, h1 * weight, h2 * weight
-    w00, w01, w02 = a - k0 * h0, b - k0 * h1, d - k0 * h2
-    w10, w11, w12 = b - k1 * h0, c - k1 * h1, e - k1 * h2
-    w20, w21, w22 = d - k2 * h0, e - k2 * h1, f - k2 * h2
-    r0, r1, r2 = w00 + w02 - R * k0, w10 + w12 - R * k1, w20 + w22 - R * k2
-    return (
-        w00 - r0 * k0,
-        0.5 * (w01 - r0 * k1 + w10 - r1 * k0),
-        w11 - r1 * k1,
-        0.5 * (w02 - r0 * k2 + w20 - r2 * k0),
-        0.5 * (w12 - r1 * k2 + w21 - r2 * k1),
-        w22 - r2 * k2,
-    )
 
 
 @compiled
@@ -63,8 +40,8 @@ def filter_one(
     """One run, everything in registers.
 
     ``prior`` is the offset's variance at the start; None: there is no offset, and the kernel is compiled without one.
-    Outputs are (1, steps), and ``before`` (steps, 4) gets the predicted position and P Hᵀ of each step for the
-    smoother; with no columns or rows they are not wanted.
+    Outputs are (1, steps); with no columns they are not wanted. ``before`` (steps, 4) gets the predicted position and
+    P Hᵀ of each step for the smoother, which then fills the first two outputs; with no rows it is not wanted.
     """
     f11, f12, f21, f22, g01, g02, g11, g12 = (
         model[0], model[1], model[2], model[3], model[4], model[5], model[6], model[7]
@@ -81,49 +58,55 @@ def filter_one(
             h0, h1, h2, mean = a + d, b + e, d + f, x + offset
             S = h0 + h2 + R
         nu = readings[n] - mean if abs(readings[n]) < math.inf else math.nan
-        if wanted:
-            innovation[0, n], innovation_sd[0, n] = nu, math.sqrt(S)
-        if len(before):
-            before[n, 0], before[n, 1], before[n, 2], before[n, 3] = mean, h0, h1, h2
-        if nu == nu:
-            weight = 1.0 / S
-            x += h0 * weight * nu
-            rate += h1 * weight * nu
-            if prior is None:
-                kept = R * weight  # 1 − K
-                a, b, c = a * kept, b * kept, c - b * b * weight
-            else:
-                offset += h2 * weight * nu
-                a, b, c, d, e, f = joseph_three(a, b, c, d, e, f, R, weight)
+        there, weight = nu == nu, 1.0 / S
+        told, kept = (nu * weight, R * weight) if there else (0.0, 1.0)
+        if there:
             product *= S
-            total += nu * nu * weight + _LOG_2PI
+            total += nu * told + _LOG_2PI
             since += 1
             if since == TILE:
                 total += math.log(product)
                 product, since = 1.0, 0
         if wanted:
-            if prior is None:
-                position[0, n], position_sd[0, n] = x, math.sqrt(a)
-            else:
-                spread = (h0 + h2) * (R / S if nu == nu else 1.0)  # H P Hᵀ after the reading: a + 2 d + f would cancel
-                position[0, n], position_sd[0, n] = x + offset, math.sqrt(spread)
+            innovation[0, n], innovation_sd[0, n] = nu, math.sqrt(S)
+        if len(before):
+            before[n, 0], before[n, 1], before[n, 2], before[n, 3] = mean, h0, h1, h2
+        elif wanted:  # H P Hᵀ after the reading is as written: a + 2 d + f would cancel
+            position[0, n], position_sd[0, n] = mean + (h0 + h2) * told, math.sqrt((h0 + h2) * kept)
         earlier, recent = recent, command[n - delay] if n >= delay else 0.0
         x, rate = (
-            f11 * x + f12 * rate + g01 * recent + g11 * earlier,
-            f21 * x + f22 * rate + g02 * recent + g12 * earlier,
+            f11 * x + f12 * rate + g01 * recent + g11 * earlier + (f11 * h0 + f12 * h1) * told,
+            f21 * x + f22 * rate + g02 * recent + g12 * earlier + (f21 * h0 + f22 * h1) * told,
         )
-        u, w = f11 * a + f12 * b, f11 * b + f12 * c
-        y, z = f21 * a + f22 * b, f21 * b + f22 * c
-        a, b, c = u * f11 + w * f12 + q11, u * f21 + w * f22 + q12, y * f21 + z * f22 + q22
-        if prior is not None:
-            d, e = f11 * d + f12 * e, f21 * d + f22 * e
-            f += qo
+        if prior is None:
+            # Φ P Φᵀ + Q with P = [a R, b R; b R, c S − b²] / S: one product alone waits for the division
+            over, noise, square = (weight, R, b * b) if there else (1.0, 1.0, 0.0)
+            a, b, c = (
+                f12 * f12 * c + q11 + (f11 * (f11 * a + 2.0 * f12 * b) * noise - f12 * f12 * square) * over,
+                f12 * f22 * c
+                + q12
+                + ((f11 * f21 * a + (f11 * f22 + f12 * f21) * b) * noise - f12 * f22 * square) * over,
+                f22 * f22 * c + q22 + (f21 * (f21 * a + 2.0 * f22 * b) * noise - f22 * f22 * square) * over,
+            )
+        else:
+            if there:
+                offset += h2 * told
+                a, b, c, d, e, f = joseph_three(a, b, c, d, e, f, 1.0, 0.0, 1.0, R, S)
+            u, w = f11 * a + f12 * b, f11 * b + f12 * c
+            y, z = f21 * a + f22 * b, f21 * b + f22 * c
+            a, b, c = u * f11 + w * f12 + q11, u * f21 + w * f22 + q12, y * f21 + z * f22 + q22
+            d, e, f = f11 * d + f12 * e, f21 * d + f22 * e, f + qo
     likelihood[0] = -0.5 * (total + math.log(product))
 
 
 @compiled
 def smooth_one(
-    model: FloatArray, innovation: FloatArray, before: FloatArray, position: FloatArray, position_sd: FloatArray
+    model: FloatArray,
+    prior: float | None,
+    innovation: FloatArray,
+    before: FloatArray,
+    position: FloatArray,
+    position_sd: FloatArray,
 ) -> None:
     """Modified Bryson-Frazier, backward: λ and Λ say what later innovations ask of the prediction at each step.
 
@@ -134,31 +117,41 @@ def smooth_one(
     l0, l1, l2 = 0.0, 0.0, 0.0
     a, b, c, d, e, f = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for n in range(len(before) - 1, -1, -1):
-        h0, h1, h2 = before[n, 1], before[n, 2], before[n, 3]
-        nu, weight = innovation[0, n], 1.0 / (h0 + h2 + R)
-        there = abs(nu) < math.inf
-        kept = R * weight if there else 1.0  # P Hᵀ after the reading is P Hᵀ R / S
+        h0, h1, h2 = before[n, 1], before[n, 2], 0.0 if prior is None else before[n, 3]
+        weight = 1.0 / (h0 + h2 + R)
+        if abs(innovation[0, n]) < math.inf:
+            told, kept = innovation[0, n] * weight, R * weight  # P Hᵀ after the reading is P Hᵀ R / S
+        else:
+            told, kept, weight = 0.0, 1.0, 0.0
         g0, g1, g2 = h0 * kept, h1 * kept, h2 * kept
-        told = g0 * (a * g0 + b * g1 + d * g2) + g1 * (b * g0 + c * g1 + e * g2) + g2 * (d * g0 + e * g1 + f * g2)
-        position_sd[0, n] = math.sqrt(max((h0 + h2) * kept - told, 0.0))
-        position[0, n] = before[n, 0] - (g0 * l0 + g1 * l1 + g2 * l2)
-        if there:
-            position[0, n] += (h0 + h2) * weight * nu
-            # Λ ← Mᵀ Λ M + Hᵀ H / S with M = I − K H, whose 1 − K are written as what is left of S
-            k0, k1, k2 = h0 * weight, h1 * weight, h2 * weight
-            m0, m2 = (h2 + R) * weight, (h0 + R) * weight
-            u0, u1, u2 = a * m0 - b * k1 - d * k2, b * m0 - c * k1 - e * k2, d * m0 - e * k1 - f * k2
-            w0, w1, w2 = d * m2 - a * k0 - b * k1, e * m2 - b * k0 - c * k1, f * m2 - d * k0 - e * k1
-            a = m0 * u0 - k1 * u1 - k2 * u2 + weight
-            d = m0 * w0 - k1 * w1 - k2 * w2 + weight
-            f = m2 * w2 - k0 * w0 - k1 * w1 + weight
-            b, e = u1, w1
-            l0, l2 = m0 * l0 - k1 * l1 - k2 * l2 - nu * weight, m2 * l2 - k0 * l0 - k1 * l1 - nu * weight
-        l0, l1 = f11 * l0 + f21 * l1, f12 * l0 + f22 * l1
-        u, w = f11 * a + f21 * b, f11 * b + f21 * c
-        y, z = f12 * a + f22 * b, f12 * b + f22 * c
-        a, b, c = u * f11 + w * f21, u * f12 + w * f22, y * f12 + z * f22
-        d, e = f11 * d + f21 * e, f12 * d + f22 * e
+        mean = before[n, 0] + (h0 + h2) * told - (g0 * l0 + g1 * l1)
+        spread = (h0 + h2) * kept - (g0 * (a * g0 + b * g1) + g1 * (b * g0 + c * g1))
+        if prior is not None:
+            mean -= g2 * l2
+            spread -= g2 * (2.0 * (d * g0 + e * g1) + f * g2)
+        position[0, n], position_sd[0, n] = mean, math.sqrt(max(spread, 0.0))
+        # Λ ← Aᵀ Λ A + (H F)ᵀ H F / S with A = (I − K H) F, whose 1 − K are written as what is left of S
+        k0, k1, k2 = h0 * weight, h1 * weight, h2 * weight
+        m0 = kept if prior is None else kept + k2
+        A00, A01, A10, A11 = m0 * f11, m0 * f12, f21 - k1 * f11, f22 - k1 * f12
+        u0, u1, w0, w1 = a * A00 + b * A10, b * A00 + c * A10, a * A01 + b * A11, b * A01 + c * A11
+        if prior is None:
+            l0, l1 = A00 * l0 + A10 * l1 - f11 * told, A01 * l0 + A11 * l1 - f12 * told
+            a, b, c = A00 * u0 + A10 * u1, A00 * w0 + A10 * w1, A01 * w0 + A11 * w1
+        else:
+            A20, A21, m2 = -k2 * f11, -k2 * f12, kept + k0
+            l0, l1, l2 = (
+                A00 * l0 + A10 * l1 + A20 * l2 - f11 * told,
+                A01 * l0 + A11 * l1 + A21 * l2 - f12 * told,
+                m2 * l2 - k0 * l0 - k1 * l1 - told,
+            )
+            u0, u1, u2 = u0 + d * A20, u1 + e * A20, d * A00 + e * A10 + f * A20
+            w0, w1, w2 = w0 + d * A21, w1 + e * A21, d * A01 + e * A11 + f * A21
+            y0, y1, y2 = d * m2 - a * k0 - b * k1, e * m2 - b * k0 - c * k1, f * m2 - d * k0 - e * k1
+            a, b, c = A00 * u0 + A10 * u1 + A20 * u2, A00 * w0 + A10 * w1 + A20 * w2, A01 * w0 + A11 * w1 + A21 * w2
+            d, e = A00 * y0 + A10 * y1 + A20 * y2 + f11 * weight, A01 * y0 + A11 * y1 + A21 * y2 + f12 * weight
+            f = m2 * y2 - k0 * y0 - k1 * y1 + weight
+        a, b, c = a + f11 * f11 * weight, b + f11 * f12 * weight, c + f12 * f12 * weight
 
 
 @compiled
@@ -203,8 +196,9 @@ def filter_many(
                     room[(_TILE + k) * LANES + lane] = readings[heard, n]
                     room[(_TILE + TILE + k) * LANES + lane] = command[told, n - delay] if n >= delay else 0.0
             for k in range(length):
-                update_lanes(room, k, prior)
-                predict_lanes(room, k, prior)
+                step = k & (TILE - 1)  # k itself, but seen not to be negative, without which no loop is a vector's
+                update_lanes(room, step, prior)
+                predict_lanes(room, step, prior)
             for lane in range(LANES):
                 room[12 * LANES + lane] += math.log(room[11 * LANES + lane])
                 room[11 * LANES + lane] = 1.0
@@ -248,7 +242,7 @@ def update_lanes(room: FloatArray, k: int, prior: float | None) -> None:
             room[lane] = x
             room[LANES + lane] = rate + (b + e) * told
             room[2 * LANES + lane] = offset
-            a, b, c, d, e, f = joseph_three(a, b, c, d, e, f, R, weight)
+            a, b, c, d, e, f = joseph_three(a, b, c, d, e, f, 1.0, 0.0, 1.0, R, S if there else math.inf)
             room[3 * LANES + lane] = a
             room[4 * LANES + lane] = b
             room[5 * LANES + lane] = c
