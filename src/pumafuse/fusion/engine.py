@@ -118,13 +118,15 @@ def _rows(timeline: Timeline, config: FusionConfig) -> kernels.Rows:
     sds = np.array([[_noise(s, axis.name) for axis in timeline.axes] for s in known]).ravel()
     levels = np.array([[(1.0 if s is None else s.scale) * axis.start for axis in timeline.axes] for s in known]).ravel()
     both = sensor * len(timeline.axes) + axis
+    sd = sds[both]
+    sd *= scalars.spread[chosen]
     return kernels.Rows(
         valid=scalars.valid[chosen][begins],
         sensor=sensor[begins],
         first=np.append(begins, len(row)),
         axis=axis,
         value=scalars.value[chosen] - levels[both],
-        sd=sds[both] * scalars.spread[chosen],
+        sd=sd,
     )
 
 

@@ -244,6 +244,10 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
     def of_scalars(parts: Sequence[npt.NDArray[T]], dtype: type[T]) -> npt.NDArray[T]:
         return np.concatenate([np.zeros(0, dtype), *(part.ravel() for part in parts)])[gather]
 
+    if any(run.sensors[name].spread for name in names):
+        spread = of_scalars([part.spread for part in heard], np.float64)
+    else:
+        spread = np.broadcast_to(1.0, len(at))
     return Scalars(
         valid[at],
         stamp[at],
@@ -251,7 +255,7 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
         of_scalars([np.tile(part.axes, len(part.valid)) for part in heard], np.int16),
         of_scalars([part.value for part in heard], np.float64),
         row,
-        of_scalars([part.spread for part in heard], np.float64),
+        spread,
         of_scalars([part.outcome for part in heard], np.uint8),
         names,
     )
@@ -279,7 +283,7 @@ def _heard(run: Run, config: FusionConfig, name: str, origin: int, notes: list[s
         _tell(notes, label, outcomes == kind, f"{reason}: {kind.word}")
     axes = [(number, axis) for number, axis in enumerate(run.axes) if axis in source.values]
     value = np.empty((len(valid), len(axes)))
-    spread = np.ones((len(valid), len(axes)))
+    spread = np.ones((len(valid), len(axes))) if source.spread else np.broadcast_to(1.0, (len(valid), len(axes)))
     outcome = np.repeat(outcomes[:, None], len(axes), axis=1)
     for place, (_, axis) in enumerate(axes):
         value[:, place] = source.values[axis]
