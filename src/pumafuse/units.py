@@ -86,7 +86,8 @@ def shifted(value: float | Decimal, exponent: int) -> float:
 def seconds(stamp: TimeArray, origin: int = 0) -> FloatArray:
     """Seconds since ``origin`` [ns] of int64 ns stamps; NaN for ``NO_STAMP``."""
     since = np.asarray((stamp - origin) / 1e9, dtype=np.float64)
-    return np.where(stamp == NO_STAMP, np.nan, since)
+    since[stamp == NO_STAMP] = np.nan
+    return since
 
 
 def nanoseconds(time: FloatArray) -> TimeArray:

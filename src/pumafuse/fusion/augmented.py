@@ -311,7 +311,9 @@ class ReferenceEngine:
         axis.advance(axis.latest(row.valid))
         sd = sensor.sd_of(self._names[number])
         assert sd is not None  # a scalar without one is `unknown` and never gets here
-        H, R = axis.observation(row.sensor, sensor, sd * float(self._scalars.spread[scalar]))
+        H, R = axis.observation(
+            row.sensor, sensor, sd if (spread := self._scalars.spread) is None else sd * float(spread[scalar])
+        )
         z = float(self._scalars.value[scalar]) - sensor.scale * self._starts[number]
         return axis, z, H, R, *axis.innovation(z, H, R)
 

@@ -134,7 +134,10 @@ def troubles(est: Estimates) -> list[str]:
             found.append(
                 f"{name}: {share:.0%} of its scalars were gated: sd_mm, latency_ms or the process noise too small"
             )
-        found.extend(_frozen(est, name))
+        axis, value = readings.axis[mine], readings.value[mine]
+        for number, label in enumerate(readings.axes):
+            if frozen := _frozen(value[axis == number]):
+                found.append(f"{name}: {frozen} {label} readings in a row have the same value: it froze")
     return found
 
 
@@ -154,24 +157,20 @@ def _too_wide(est: Estimates) -> list[str]:
     return found
 
 
-def _frozen(est: Estimates, sensor: str) -> list[str]:
-    """A sensor that repeats a value to the last digit while others would scatter.
+def _frozen(values: FloatArray) -> int:
+    """How often in a row a sensor repeated a value to the last digit while others would scatter; 0 if it did not.
 
     Coarse steps repeat by themselves: with a share p of repeats elsewhere, L equal values in a row come up n p^(L−1)
     times in n readings.
     """
-    found: list[str] = []
-    for axis in est.readings.axes:
-        values = est.readings.values_of(sensor, axis)
-        values = values[np.isfinite(values)]
-        if len(values) < _FROZEN:
-            continue
-        edges = np.flatnonzero(np.concatenate(([True], np.diff(values) != 0.0, [True])))
-        longest = int(np.diff(edges).max())
-        elsewhere = (len(values) - (len(edges) - 1) - (longest - 1)) / max(len(values) - longest, 1)
-        if longest >= _FROZEN and len(values) * elsewhere ** (longest - 1) < _NEVER:
-            found.append(f"{sensor}: {longest} {axis} readings in a row have the same value: it froze")
-    return found
+    values = values[np.isfinite(values)]
+    changes = np.diff(values) != 0.0
+    if len(values) - 1 - np.count_nonzero(changes) < _FROZEN - 1:
+        return 0
+    edges = np.flatnonzero(np.concatenate(([True], changes, [True])))
+    longest = int(np.diff(edges).max())
+    elsewhere = (len(values) - (len(edges) - 1) - (longest - 1)) / max(len(values) - longest, 1)
+    return longest if longest >= _FROZEN and len(values) * elsewhere ** (longest - 1) < _NEVER else 0
 
 
 def _verdict(

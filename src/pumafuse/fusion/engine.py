@@ -19,7 +19,7 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
     scalars, candidates = timeline.scalars, timeline.scalars.candidates
     sensors, biases = _sensors(timeline, config)
     axes = _axes(timeline, config, [len(names) for names in biases])
-    rows = _rows(timeline, config)
+    rows = _rows(timeline)
     count, width = len(timeline.axes), int(axes.states.max())
     state = _start(axes, timeline, config, biases, width)
     met = kernels.Met(np.empty(len(candidates)), np.empty(len(candidates)), np.empty(len(candidates), dtype=np.uint8))
@@ -79,8 +79,12 @@ def _sensors(timeline: Timeline, config: FusionConfig) -> tuple[kernels.Sensors,
         first = _order(config, axis) + 1
         for place, name in enumerate(biases[number]):
             bias[names.index(name), number] = first + place
+    scale = np.array([1.0 if sensor is None else sensor.scale for sensor in known])
+    table = (len(names), len(timeline.axes))
     return kernels.Sensors(
-        np.array([1.0 if sensor is None else sensor.scale for sensor in known]),
+        scale,
+        scale[:, None] * np.array([axis.start for axis in timeline.axes]),
+        np.array([[_noise(sensor, axis.name) for axis in timeline.axes] for sensor in known]).reshape(table),
         np.array([0.0 if sensor is None else sensor.latency_sd for sensor in known]),
         np.array([0.0 if sensor is None else sensor.gate for sensor in known]),
         np.array([sensor is None or sensor.gate_rows for sensor in known], dtype=np.bool_),
@@ -110,23 +114,17 @@ def _axes(timeline: Timeline, config: FusionConfig, biases: list[int]) -> kernel
     )
 
 
-def _rows(timeline: Timeline, config: FusionConfig) -> kernels.Rows:
+def _rows(timeline: Timeline) -> kernels.Rows:
     scalars, chosen = timeline.scalars, _chosen(timeline)
     sensor, axis, row = scalars.sensor[chosen], scalars.axis[chosen], scalars.row[chosen]
     begins = np.flatnonzero(np.diff(row, prepend=-1))
-    known = [config.sensors.get(name) for name in scalars.sensors]
-    sds = np.array([[_noise(s, axis.name) for axis in timeline.axes] for s in known]).ravel()
-    levels = np.array([[(1.0 if s is None else s.scale) * axis.start for axis in timeline.axes] for s in known]).ravel()
-    both = sensor * len(timeline.axes) + axis
-    sd = sds[both]
-    sd *= scalars.spread[chosen]
     return kernels.Rows(
         valid=scalars.valid[chosen][begins],
         sensor=sensor[begins],
         first=np.append(begins, len(row)),
         axis=axis,
-        value=scalars.value[chosen] - levels[both],
-        sd=sd,
+        value=scalars.value[chosen],
+        spread=np.empty(0) if scalars.spread is None else scalars.spread[chosen],
     )
 
 

@@ -18,8 +18,8 @@ Mode = Literal["filtered", "as-live", "smoothed"]
 
 def outcome_counts(outcomes: CodeArray) -> dict[str, int]:
     """How many scalars had each outcome, those that occur."""
-    found = np.bincount(outcomes, minlength=len(Outcome))
-    return {outcome.word: int(found[outcome]) for outcome in Outcome if found[outcome]}
+    found = {outcome.word: int(np.count_nonzero(outcomes == outcome)) for outcome in Outcome}
+    return {word: count for word, count in found.items() if count}
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,7 @@ class Readings:
 
     def of(self, sensor: str, axis: str) -> Readings:
         """The scalars of one sensor on one axis."""
-        return self.where(self._are(sensor, axis))
-
-    def values_of(self, sensor: str, axis: str) -> FloatArray:
-        """The values [m] of one sensor on one axis as logged."""
-        return self.value[self._are(sensor, axis)]
-
-    def _are(self, sensor: str, axis: str) -> BoolArray:
-        return (self.sensor == self.sensors.index(sensor)) & (self.axis == self.axes.index(axis))
+        return self.where((self.sensor == self.sensors.index(sensor)) & (self.axis == self.axes.index(axis)))
 
     def where(self, mask: BoolArray) -> Readings:
         """The scalars that ``mask`` (m,) selects."""

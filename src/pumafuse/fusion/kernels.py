@@ -55,6 +55,8 @@ class Sensors(NamedTuple):
 
     Attributes:
         scale: Of the position in the reading, (S,).
+        level: scale · u₀ of each axis [m], (S, A).
+        sd: Noise on each axis [m], (S, A).
         latency_sd: How far the latency wanders [s], (S,).
         gate: In standard deviations, 0 for none, (S,).
         rows: Whether one axis gated gates the row, (S,).
@@ -62,6 +64,8 @@ class Sensors(NamedTuple):
     """
 
     scale: FloatArray
+    level: FloatArray
+    sd: FloatArray
     latency_sd: FloatArray
     gate: FloatArray
     rows: BoolArray
@@ -76,8 +80,8 @@ class Rows(NamedTuple):
         sensor: (R,).
         first: Where each row's scalars begin, and where the last one's end, (R + 1,).
         axis: Of each scalar, (m,).
-        value: z − scale · u₀ [m], (m,).
-        sd: Noise [m], (m,).
+        value: z [m] as logged, (m,).
+        spread: By what the noise of each is scaled, (m,); (0,) where it is by nothing.
     """
 
     valid: TimeArray
@@ -85,7 +89,7 @@ class Rows(NamedTuple):
     first: IntArray
     axis: IndexArray
     value: FloatArray
-    sd: FloatArray
+    spread: FloatArray
 
 
 class State(NamedTuple):
@@ -335,7 +339,9 @@ def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> N
 @compiled
 def noise(axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: int, sensor: int) -> float:
     """R of a scalar here and now [m²]; it grows with speed where latency wanders."""
-    axis, R = rows.axis[scalar], rows.sd[scalar] * rows.sd[scalar]
+    axis = rows.axis[scalar]
+    sd = sensors.sd[sensor, axis] * (rows.spread[scalar] if len(rows.spread) else 1.0)
+    R = sd * sd
     if sensors.latency_sd[sensor] > 0.0:
         v, _, _ = acting_now(axes, axis, state.entry[axis])
         speed = velocity(axes, axis, state.x, axis, v)
@@ -348,7 +354,7 @@ def predicted(axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: in
     """ν = z − H x and S = H P Hᵀ + R of a scalar here and now."""
     axis, R = rows.axis[scalar], noise(axes, sensors, rows, state, scalar, sensor)
     x, P, o, scale, bias = state.x, state.P, axes.order[axis], sensors.scale[sensor], sensors.bias[sensor, axis]
-    nu = rows.value[scalar] - scale * (x[axis, 0] + x[axis, o])
+    nu = rows.value[scalar] - sensors.level[sensor, axis] - scale * (x[axis, 0] + x[axis, o])
     S = scale * scale * (P[axis, 0, 0] + 2.0 * P[axis, 0, o] + P[axis, o, o])
     if bias >= 0:
         nu -= x[axis, bias]

@@ -8,13 +8,12 @@ still meets its scalars in the order (time, sensor, stamp, place in the file).
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from ..arrays import NO_STAMP, BoolArray, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
@@ -85,7 +84,7 @@ class Scalars:
         axis: Index into the timeline's axes.
         value: z [m] as logged.
         row: Scalars of one row of one sensor share this number; it never falls.
-        spread: By what a frame scales the noise of each.
+        spread: By what a frame scales the noise of each; None without one.
         outcome: What is known before filtering; ``Outcome.FUSED`` where the filter is to decide.
         sensors: Sensor names, the configured ones first in their order.
     """
@@ -96,7 +95,7 @@ class Scalars:
     axis: IndexArray
     value: FloatArray
     row: IntArray
-    spread: FloatArray
+    spread: FloatArray | None
     outcome: CodeArray
     sensors: tuple[str, ...]
 
@@ -233,42 +232,42 @@ def _scalars(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int
     sensor = np.repeat(np.arange(len(names), dtype=np.int16), [len(part.valid) for part in heard])
     # Each sensor's rows are in order, and the sensors in theirs: a stable sort by valid time keeps both.
     order = np.argsort(valid, kind="stable")
-    width = np.array([len(part.axes) for part in heard], dtype=np.int64)
-    source = np.cumsum(width[sensor]) - width[sensor]  # where each row's scalars begin in the sensors' own order
-    width, source = width[sensor][order], source[order]
-    first = np.cumsum(width) - width
-    gather = np.repeat(source - first, width) + np.arange(int(width.sum()))
-    row = np.repeat(np.arange(len(order)), width)
-    at = order[row]
-
-    def of_scalars(parts: Sequence[npt.NDArray[T]], dtype: type[T]) -> npt.NDArray[T]:
-        return np.concatenate([np.zeros(0, dtype), *(part.ravel() for part in parts)])[gather]
-
-    if any(run.sensors[name].spread for name in names):
-        spread = of_scalars([part.spread for part in heard], np.float64)
-    else:
-        spread = np.broadcast_to(1.0, len(at))
+    width = np.array([len(part.axes) for part in heard], dtype=np.int64)[sensor[order]]
+    count = int(width.sum())
+    first = np.empty(len(order), dtype=np.int64)  # where each row's scalars begin
+    first[order] = np.cumsum(width) - width
+    axis, value, outcome = np.empty(count, np.int16), np.empty(count), np.empty(count, np.uint8)
+    spread = np.ones(count) if any(run.sensors[name].spread for name in names) else None
+    begin = 0
+    for part in heard:
+        at = first[begin : begin + len(part.valid)]
+        begin += len(part.valid)
+        for place, number in enumerate(part.axes):
+            here = at + place
+            axis[here], value[here], outcome[here] = number, part.value[place], part.outcome[place]
+            if spread is not None and part.spread is not None:
+                spread[here] = part.spread[place]
     return Scalars(
-        valid[at],
-        stamp[at],
-        sensor[at],
-        of_scalars([np.tile(part.axes, len(part.valid)) for part in heard], np.int16),
-        of_scalars([part.value for part in heard], np.float64),
-        row,
+        np.repeat(valid[order], width),
+        np.repeat(stamp[order], width),
+        np.repeat(sensor[order], width),
+        axis,
+        value,
+        np.repeat(np.arange(len(order)), width),
         spread,
-        of_scalars([part.outcome for part in heard], np.uint8),
+        outcome,
         names,
     )
 
 
 class _Heard(NamedTuple):
-    """One sensor's rows in order; of its k axes: their numbers (k,), and value, spread and outcome (rows, k)."""
+    """One sensor's rows in order; of its k axes: their numbers (k,), and value, spread and outcome (k, rows)."""
 
     valid: TimeArray
     stamp: TimeArray
     axes: IndexArray
     value: FloatArray
-    spread: FloatArray
+    spread: FloatArray | None
     outcome: CodeArray
 
 
@@ -282,19 +281,20 @@ def _heard(run: Run, config: FusionConfig, name: str, origin: int, notes: list[s
     for kind, reason in _REASONS.items():
         _tell(notes, label, outcomes == kind, f"{reason}: {kind.word}")
     axes = [(number, axis) for number, axis in enumerate(run.axes) if axis in source.values]
-    value = np.empty((len(valid), len(axes)))
-    spread = np.ones((len(valid), len(axes))) if source.spread else np.broadcast_to(1.0, (len(valid), len(axes)))
-    outcome = np.repeat(outcomes[:, None], len(axes), axis=1)
+    shape = (len(axes), len(valid))
+    value = np.empty(shape)
+    spread = np.ones(shape) if source.spread else None
+    outcome = np.repeat(outcomes[None], len(axes), axis=0)
     for place, (_, axis) in enumerate(axes):
-        value[:, place] = source.values[axis]
-        if axis in source.spread:
-            spread[:, place] = source.spread[axis]
+        value[place] = source.values[axis]
+        if spread is not None and axis in source.spread:
+            spread[place] = source.spread[axis]
         if sensor is not None and sensor.sd_of(axis) is None:
             notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
-            outcome[:, place] = Outcome.UNKNOWN
+            outcome[place] = Outcome.UNKNOWN
             continue
-        hollow = (outcomes == Outcome.FUSED) & ~_plausible(value[:, place])
-        outcome[hollow, place] = Outcome.INVALID
+        hollow = (outcomes == Outcome.FUSED) & ~_plausible(value[place])
+        outcome[place, hollow] = Outcome.INVALID
         _tell(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
     heard = _Heard(
         valid, source.stamp, np.array([number for number, _ in axes], dtype=np.int16), value, spread, outcome
@@ -303,7 +303,11 @@ def _heard(run: Run, config: FusionConfig, name: str, origin: int, notes: list[s
         return heard
     order = np.argsort(valid, kind="stable")
     return heard._replace(
-        valid=valid[order], stamp=source.stamp[order], value=value[order], spread=spread[order], outcome=outcome[order]
+        valid=valid[order],
+        stamp=source.stamp[order],
+        value=value[:, order],
+        spread=None if spread is None else spread[:, order],
+        outcome=outcome[:, order],
     )
 
 
