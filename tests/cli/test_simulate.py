@@ -374,6 +374,31 @@ def test_a_folder_with_a_scenario_of_ones_own_is_not_replaced_even_with_force(tm
     assert digests(mine) == before
 
 
+def test_a_file_put_into_a_simulated_run_is_not_lost_even_with_force(scenario: Path, tmp_path: Path) -> None:
+    """A table of the user's own among ours: only what run.toml names is ours to replace."""
+    run = tmp_path / "run"
+    pumafuse("simulate", scenario, "-o", run)
+    (run / "mine.csv").write_text("time_s,note\n0.0,1\n")
+    before = digests(run)
+    assert "'mine.csv'" in pumafuse("simulate", scenario, "-o", run, "--force", code=1).stderr
+    assert digests(run) == before
+
+
+def test_a_run_along_a_path_is_simulated_anew_where_it_lies(scenario: Path, tmp_path: Path) -> None:
+    """Its table goes with it: the same bytes, also in its own place."""
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "way.csv").write_text("time_s,radial_mm\n0.0,0.0\n1.0,20.0\n2.0,5.0\n")
+    path = '[trajectory]\nkind = "path"\nfile = "there/way.csv"\naxes = ["radial"]\n'
+    along = scenario.with_name("along.toml")
+    along.write_text(SCENARIO[: SCENARIO.index("[trajectory]")] + path + SCENARIO[SCENARIO.index("[sensors.eye]") :])
+    pumafuse("simulate", along, "-o", tmp_path / "one")
+    before = digests(tmp_path / "one")
+    assert "path.csv" in before
+    pumafuse("simulate", tmp_path / "one" / "scenario.toml", "-o", tmp_path / "two")
+    pumafuse("simulate", tmp_path / "one" / "scenario.toml", "-o", tmp_path / "one", "--force")
+    assert digests(tmp_path / "two") == before == digests(tmp_path / "one")
+
+
 def test_a_written_run_is_simulated_anew_from_its_own_scenario(scenario: Path, tmp_path: Path) -> None:
     """By the executable, from another folder and of a seed that is not the scenario's own: the same bytes."""
     pumafuse("simulate", scenario, "-o", tmp_path / "many", "--runs", 2)

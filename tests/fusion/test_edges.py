@@ -226,3 +226,11 @@ def test_a_reference_s_own_noise_scales_like_a_reading_s():
     est = quiet(run, pf.FusionConfig(arm=ARM))
     np.testing.assert_allclose(est.reference.sd["tangential"], 1e-3 * 0.5 / x)
     np.testing.assert_allclose(est.reference.sd["radial"], 1e-3)
+
+
+def test_an_axis_that_was_not_fused_is_named_with_those_that_were():
+    """Asking the estimates for another axis is one line that lists them."""
+    est = quiet(pf.Run.from_arrays([0.0, 0.028], {"radial": [0.5, 0.5]}, name="short"), config())
+    with pytest.raises(pf.UnknownNameError, match=r"run 'short'.*'nothing'.*radial") as refused:
+        est["nothing"]
+    assert len(str(refused.value).splitlines()) == 1

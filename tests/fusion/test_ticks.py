@@ -529,6 +529,15 @@ def test_an_infinite_reading_is_not_fused(value: float, drift: float | None, run
         np.testing.assert_array_equal(*(one.position for one in smoothed))
 
 
+def test_a_masked_reading_is_missing() -> None:
+    """What lies under the mask is nothing that was measured."""
+    model, command, readings, sd = Case(Axis(UNDER), 20, runs=3, missing=0.3).asked()
+    masked = np.ma.masked_array(np.nan_to_num(readings, nan=7.0), mask=np.isnan(readings))
+    wanted, got = (pf.filter_ticks(model, command, one, sd) for one in (readings, masked))
+    np.testing.assert_array_equal(got.position, wanted.position)
+    np.testing.assert_array_equal(got.log_likelihood, wanted.log_likelihood)
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("function", [pf.filter_ticks, pf.smooth_ticks, pf.tick_likelihood])
 def test_a_command_that_is_no_number_is_refused(function: Callable[..., object], value: float) -> None:

@@ -56,7 +56,7 @@ axis_models = st.builds(
     plant=first_order | second_order,
     gain=gains,
     gain_recovery=st.none() | positive,
-    delay=st.none() | not_negative,
+    delay=st.none() | st.floats(0.0, 1e6),
     delay_ci95=interval,
 )
 provenance = st.fixed_dictionaries(
@@ -75,7 +75,7 @@ arms = st.builds(
     ArmModel,
     name=word,
     update_period=positive,
-    delay=not_negative,
+    delay=st.floats(0.0, 1e6),
     delay_ci95=interval,
     validity=st.builds(Validity, max_speed=st.none() | positive, max_radius=st.none() | positive),
     axes=st.dictionaries(

@@ -134,8 +134,9 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "sensor that would overwrite the truth": (HEAD + ARM + HOLD + SENSOR.replace("eye", "truth"), ("truth",)),
     "sensor outside the folder": (HEAD + ARM + HOLD + SENSOR.replace("eye", '"../eye"'), ("../eye",)),
-    "longer than memory": (WHOLE.replace("0.2", "1e15"), ("trajectory", "at most 200000", "commands")),
-    "one command too many": (WHOLE.replace("0.2", "5600.0"), ("2e+05 commands", "at most 200000")),
+    "longer than memory": (WHOLE.replace("0.2", "1e8"), ("trajectory", "at most 200000", "commands")),
+    "longer than time": (WHOLE.replace("0.2", "1e15"), ("trajectory.duration_s", "nothing can be simulated")),
+    "one command too many": (WHOLE.replace("0.2", "5600.0"), ("200001 commands", "at most 200000")),
     "campaign without end": (
         HEAD + ARM + STEPS + 'scope = "eye"\nrest_s = 1e9\n' + SENSOR,
         ("trajectory", "at most 200000"),
@@ -155,6 +156,25 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
     "path without a file": (
         WHOLE.replace('"hold"', '"path"').replace("duration_s = 0.2", 'file = "none.csv"'),
         ("none.csv", "no such file"),
+    ),
+    "a million replicates": (
+        HEAD + ARM + STEPS + 'scope = "eye"\nreplicates = 1000000\n' + SENSOR,
+        ("trajectory.replicates", "10000"),
+    ),
+    "a raster of a billion lines": (
+        HEAD
+        + ARM
+        + '[trajectory]\nkind = "raster"\nwidth_mm = 100.0\nheight_mm = 1e6\npitch_mm = 1e-3\nspeed_m_s = 0.1\n'
+        + SENSOR,
+        ("trajectory", "at most 200000"),
+    ),
+    "a billion bursts": (WHOLE + "bursts = { per_minute = 1e9, length_s = 1.0 }\n", ("sensors.eye.bursts", "6000")),
+    "noise of a galaxy": (WHOLE + "[process]\ninput_noise_mm_rtHz = 1e160\n", ("process.input_noise_mm_rtHz", "size")),
+    "a sine of nothing": (WHOLE.replace("30.0", "1e-300"), ("sensors.eye.rate_hz", "size")),
+    "level twice": (WHOLE + LEVEL.replace("500.0", "500.0, radial_m = 0.1"), ("start.level", "twice")),
+    "damping that is missing": (
+        WHOLE + "[true_arm.radial]\nplant = 'second-order'\nnatural_frequency_rad_s = 40.0\n",
+        ("true_arm.radial, a second-order plant", "'damping' is missing"),
     ),
     "sensor that would overwrite the trials": (HEAD + ARM + HOLD + SENSOR.replace("eye", "trials"), ("trials",)),
     "sensor that would overwrite the samples": (HEAD + ARM + HOLD + SENSOR.replace("eye", "samples"), ("samples",)),
@@ -339,3 +359,44 @@ def _plain(config: pf.FusionConfig) -> dict[str, Any]:
         "process": {axis: msgspec.structs.asdict(process) for axis, process in config.process.items()},
         "sensors": {name: msgspec.structs.asdict(sensor) for name, sensor in config.sensors.items()},
     }
+
+
+PATH = '[trajectory]\nkind = "path"\nfile = "path.csv"\naxes = ["radial"]\n'
+
+
+@pytest.mark.parametrize(
+    ("rows", "reason"),
+    [
+        ("", "the table has no rows"),
+        ("0,0\n1,5\n2,50,9\n3,5\n", "1 line left out"),
+        ("0,0\n1,5\n1,6\n", "time_s must ascend"),
+        ("0,0\n1,\n2,6\n", "radial_mm has a cell without a number"),
+    ],
+)
+def test_a_path_with_a_hole_is_refused(rows: str, reason: str, tmp_path: Path) -> None:
+    """What would be interpolated over is another path than the one that was meant."""
+    (tmp_path / "path.csv").write_text("time_s,radial_mm\n" + rows)
+    with pytest.raises(pf.ConfigError, match=reason) as refused:
+        load(tmp_path, HEAD + ARM + PATH + SENSOR)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("axis", ["file", "time", "start", "clock"])
+def test_an_axis_that_run_toml_could_not_tell_is_refused(axis: str, tmp_path: Path) -> None:
+    """Before anything is simulated."""
+    arm = f'name = "a"\nupdate_period_ms = 28.0\ndelay_ms = 60.0\n[axes.{axis}]\nplant = "first-order"\n'
+    (tmp_path / "arm.toml").write_text(arm + "time_constant_ms = 40.0\n")
+    hold = f'[trajectory]\nkind = "hold"\naxes = ["{axis}"]\nduration_s = 1.0\n'
+    with pytest.raises(pf.ConfigError, match=f"axis '{axis}': run.toml uses this word itself"):
+        load(tmp_path, HEAD + 'arm = "arm.toml"\n' + hold + SENSOR)
+
+
+def test_what_cannot_be_followed_is_refused_when_it_is_simulated(tmp_path: Path) -> None:
+    """Commands across the base's axis, where cylindrical coordinates fold; a lag of nothing, which needs all memory."""
+    sweep = '[trajectory]\nkind = "sine-sweep"\naxes = ["radial"]\namplitude_mm = 600.0\nfrom_hz = 0.1\nto_hz = 0.2\n'
+    crossing = load(tmp_path, HEAD + ARM + sweep + "duration_s = 20.0\n" + SENSOR + LEVEL + FRAME)
+    with pytest.raises(pf.ConfigError, match="cross the base's axis"):
+        pf.simulate(crossing)
+    stiff = load(tmp_path, WHOLE + "[true_arm]\nextra_pole_ms = 1e-8\n")
+    with pytest.raises(pf.ConfigError, match=r"too short to follow over 0 s: at least [0-9.e-]+ ms"):
+        pf.simulate(stiff)

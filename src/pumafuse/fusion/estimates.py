@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
+from ..errors import UnknownNameError
 from .config import FusionConfig
 from .timeline import Outcome
 from .track import AxisEstimate, Bias
@@ -139,5 +140,11 @@ class Estimates:
     notes: tuple[str, ...]
 
     def __getitem__(self, axis: str) -> AxisEstimate:
-        """The estimates of one axis."""
+        """The estimates of one axis.
+
+        Raises:
+            UnknownNameError: The run has no such axis.
+        """
+        if axis not in self.axes:
+            raise UnknownNameError(f"run '{self.run}'", "axis", str(axis), self.axes)
         return self.axes[axis]

@@ -49,12 +49,15 @@ def filter_ticks(
     *,
     offset_sd: float = 0.0,
 ) -> TickEstimates:
-    """Filter runs whose readings are all at ticks, as :func:`pumafuse.fuse` would, faster.
+    """Filter runs whose readings are all at ticks, as :func:`pumafuse.fuse` would with this plant and noise, faster.
+
+    There is no gain here (``command`` is v, what the gain makes of u) and no gate, and the prior of the offset is 0
+    unless it is given (that of :class:`pumafuse.Start` is 5 mm).
 
     Args:
         model: From :func:`pumafuse.discretize`, for all runs or one for each; of one delay and period.
         command: v [m] relative to the level at rest, (steps,) for all runs or (runs, steps).
-        readings: z [m] likewise, (steps,) for one run or (runs, steps); what is not finite is missing.
+        readings: z [m] likewise, (steps,) for one run or (runs, steps); what is not finite, or masked, is missing.
         sd: Noise of the readings [m], one for all or one for each run.
         offset_sd: Prior standard deviation of the offset [m].
 
@@ -148,8 +151,7 @@ class _Many:
         offset_sd: float,
     ) -> _Many:
         models = [model] if isinstance(model, DiscreteModel) else list(model)
-        u = np.atleast_2d(np.ascontiguousarray(command, dtype=np.float64))
-        z = np.atleast_2d(np.ascontiguousarray(readings, dtype=np.float64))
+        u, z = _in_rows(command), _in_rows(readings)
         noise = np.atleast_1d(np.asarray(sd, dtype=np.float64))
         runs = max(len(models), len(u), len(z), len(noise))
         for name, count in (("models", len(models)), ("commands", len(u)), ("readings", len(z)), ("sd", len(noise))):
@@ -194,6 +196,12 @@ class _Many:
         with ThreadPoolExecutor(len(shares)) as pool:
             list(pool.map(work, shares))
         return likelihood
+
+
+def _in_rows(values: npt.ArrayLike) -> FloatArray:
+    """(runs, steps), NaN where a masked array is masked."""
+    masked = np.ma.asarray(values, dtype=np.float64)
+    return np.atleast_2d(np.ascontiguousarray(masked.filled(np.nan)))
 
 
 def usable_cores() -> int:

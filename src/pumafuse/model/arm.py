@@ -13,7 +13,7 @@ from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError, suggestion
 from ..units import MM, refuse_unit
-from .plants import PLANTS, Interval, NotNegative, Positive
+from .plants import PLANTS, Delay, Interval, Positive
 from .presets import PRESETS
 
 CANONICAL_AXES = ("tangential", "radial", "vertical")
@@ -52,7 +52,7 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     plant: PLANTS
     gain: Gain = Gain()
     gain_recovery: Positive | None = msgspec.field(name="gain_recovery_ms", default=None)
-    delay: NotNegative | None = msgspec.field(name="delay_ms", default=None)
+    delay: Delay | None = msgspec.field(name="delay_ms", default=None)
     delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
 
 
@@ -98,7 +98,7 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     name: str
     update_period: Positive = msgspec.field(name="update_period_ms")
-    delay: NotNegative = msgspec.field(name="delay_ms")
+    delay: Delay = msgspec.field(name="delay_ms")
     delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
     validity: Validity = Validity()
     axes: Annotated[dict[str, AxisModel], msgspec.Meta(min_length=1)]

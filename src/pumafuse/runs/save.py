@@ -14,7 +14,8 @@ from ..units import MM, seconds
 from . import tables
 from .run import Run, Source
 
-_TAKEN = ("commands", "truth", "trials", "samples")
+_KEYS = ("file", "time", "start", "clock")  # of run.toml, beside which an axis is a key
+_TAKEN = ("commands", "truth", "trials", "samples", "path")
 
 
 def save(run: Run, folder: Path) -> None:
@@ -25,10 +26,12 @@ def save(run: Run, folder: Path) -> None:
         folder: An existing folder.
 
     Raises:
-        RunError: See :func:`check_name`.
+        RunError: See :func:`check_name` and :func:`check_axis`.
     """
     for name in run.sensors:
         check_name(name)
+    for axis in run.axes:
+        check_axis(axis)
     manifest: dict[str, Any] = {"name": run.name, "command": _entry(run.command, "commands.csv", folder)}
     if run.start:
         manifest["command"]["start"] = {f"{axis}_mm": level for axis, level in run.start.items()}
@@ -62,6 +65,16 @@ def check_name(sensor: str) -> None:
             f"sensor '{sensor}': its rows go into a file of its name, which must not be a path or one of"
             f" {', '.join(_TAKEN)}"
         )
+
+
+def check_axis(axis: str) -> None:
+    """Refuse an axis whose name run.toml needs for something else.
+
+    Raises:
+        RunError: It is a key of its own.
+    """
+    if axis in _KEYS:
+        raise RunError(f"axis '{axis}': run.toml uses this word itself; no axis can be called {', '.join(_KEYS)}")
 
 
 def _entry(source: Source, file: str, folder: Path) -> dict[str, Any]:

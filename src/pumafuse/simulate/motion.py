@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import FloatArray, TimeArray
+from ..errors import ConfigError
 from ..fusion.config import Process
 from ..model.plants import FirstOrder
 from .scenario import LATTICE, TrueAxis
@@ -23,6 +24,7 @@ ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 _APART = {2: 1e-5, 3: 1e-4}  # equal poles are set this far apart, relatively: it changes the response by its square
 _NODES = 3  # of the noise integral: exact to 1e-10 while |p|Δ ≤ 0.1
 _TURN = 0.1
+_MOST_EVENTS = 20_000_000  # 2 GB of work
 
 
 @dataclass(frozen=True)
@@ -154,6 +156,12 @@ def _events(acting: TimeArray, lattice: TimeArray, fastest: float) -> TimeArray:
     """Where something changes or may be looked at, and as many instants between as the noise integral needs."""
     longest = max(int(_TURN * 1e9 / fastest), 1)
     acting = acting[acting <= lattice[-1]]
+    if lattice[-1] / longest > _MOST_EVENTS:
+        shortest = lattice[-1] / 1e6 / _MOST_EVENTS / _TURN
+        raise ConfigError(
+            f"a lag or time constant of {1e3 / fastest:.3g} ms is too short to follow over {lattice[-1] / 1e9:.0f} s:"
+            f" at least {shortest:.2g} ms"
+        )
     finer = np.arange(0, lattice[-1] if longest < lattice[1] else 0, longest, dtype=np.int64)
     return np.unique(np.concatenate((acting, lattice, finer)))
 

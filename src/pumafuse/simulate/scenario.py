@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeAlias, cast
 import msgspec
 import numpy as np
 
-from .. import toml
+from .. import toml, units
 from ..arrays import FloatArray
 from ..errors import ConfigError, PumafuseError, UnknownNameError
 from ..fusion.config import FusionConfig, Process, by_axis, load_arm
@@ -23,6 +23,7 @@ from ..runs.run import Clock
 from .trajectory import TRAJECTORIES, PathFromFile, Steps
 
 _OVERRIDES = ("start", "process", "sensors")
+_LEAST, _FARTHEST, _LONGEST = 1e-12, 1e5, 4e9  # SI; 100 km, 127 years
 LATTICE = 60  # instants in each period: all that is random is drawn on them, so that it is the same whoever looks
 
 Share: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1)]
@@ -75,15 +76,15 @@ class TrueArm(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     slow_drift: NotNegative = msgspec.field(name="slow_drift_mm", default=0.0)
     slow_drift_period: Positive = msgspec.field(name="slow_drift_period_s", default=600.0)
 
-    def over(self, believed: AxisModel, delay: float) -> TrueAxis:
-        """The true axis: this over the believed one, whose Td is ``delay`` [s].
+    def over(self, believed: AxisModel, delay: float, where: str) -> TrueAxis:
+        """The true axis: this over the believed one, whose Td is ``delay`` [s]; errors call it ``where``.
 
         Raises:
             ConfigError: A parameter of the other plant is given, or one of a new plant is missing.
         """
         recovery = believed.gain_recovery if self.gain_recovery is None else self.gain_recovery
         return TrueAxis(
-            plant=self._plant(believed.plant),
+            plant=self._plant(believed.plant, where),
             gain=believed.gain if self.gain is None else self.gain,
             gain_curve=self.gain_curve,
             gain_recovery=None if recovery == "never" else recovery,
@@ -96,7 +97,7 @@ class TrueArm(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             slow_drift_period=self.slow_drift_period,
         )
 
-    def _plant(self, believed: PLANTS) -> PLANTS:
+    def _plant(self, believed: PLANTS, where: str) -> PLANTS:
         kind = self.plant or believed.__struct_config__.tag
         parameters = {
             "time_constant_ms": self.time_constant,
@@ -107,7 +108,7 @@ class TrueArm(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         chosen = FirstOrder if kind == "first-order" else SecondOrder
         kept = toml.builtins(believed) if believed.__struct_config__.tag == kind else {}
         tree = {key: value for key, value in {**kept, **given}.items() if key != "plant"}
-        return toml.struct(tree, chosen, "true_arm", f"a {kind} plant")
+        return toml.struct(tree, chosen, f"{where}, a {kind} plant")
 
 
 class TrueAxis(msgspec.Struct, frozen=True, kw_only=True):
@@ -140,7 +141,7 @@ class Bursts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         length: How long each lasts [s].
     """
 
-    per_minute: Positive
+    per_minute: Annotated[float, msgspec.Meta(gt=0, le=6000)]
     length: Positive = msgspec.field(name="length_s")
 
 
@@ -286,6 +287,8 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def __post_init__(self) -> None:
         for name in (*self.trajectory.named, *self.start.level):
             self.arm.axis(name)
+        for name in self.arm.axes:
+            save.check_axis(name)
         for name, sensor in self.sensors.items():
             save.check_name(name)
             self._check(f"sensors.{name}", sensor)
@@ -343,7 +346,8 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """The true arm, whole."""
         delay = self.arm.delay_of
         return {
-            name: self.true_arm.get(name, TrueArm()).over(axis, delay(name)) for name, axis in self.arm.axes.items()
+            name: self.true_arm.get(name, TrueArm()).over(axis, delay(name), f"true_arm.{name}")
+            for name, axis in self.arm.axes.items()
         }
 
     @property
@@ -382,6 +386,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """
         path = Path(path)
         tree, where = toml.read(path), str(path)
+        _check_sizes({key: value for key, value in tree.items() if key != "seed"}, where)
         tree["arm"] = load_arm(tree, path)
         for key, kind in (("true_arm", TrueArm), ("process", Process)):
             if isinstance(tree.get(key), dict):
@@ -390,6 +395,8 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         if isinstance(start, dict) and isinstance(levels := cast(dict[str, Any], start).get("level"), dict):
             named = cast(dict[str, Any], levels)
             start["level"] = {axis_of(key, where, "start.level"): level for key, level in named.items()}
+            if len(start["level"]) < len(named):
+                raise ConfigError(f"{where}: start.level gives an axis twice")
         scenario = toml.struct(tree, Scenario, where)
         trajectory = scenario.trajectory
         if isinstance(trajectory, PathFromFile):
@@ -400,6 +407,18 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         except PumafuseError as error:
             raise ConfigError(f"{where}: {error}") from None
         return scenario
+
+
+def _check_sizes(tree: Mapping[str, Any], where: str, path: str = "", inherited: str | None = None) -> None:
+    """Refuse numbers (SI) with which nothing could be computed."""
+    for key, value in tree.items():
+        unit = units.ending(key) or inherited
+        most = _FARTHEST if unit in units.LENGTHS else _LONGEST
+        if isinstance(value, Mapping):
+            _check_sizes(cast(Mapping[str, Any], value), where, f"{path}{key}.", unit)
+        for number in cast(list[Any], value if isinstance(value, list) else [value]):
+            if isinstance(number, float | int) and number and not _LEAST <= abs(number) <= most:
+                raise ConfigError(f"{where}: {path}{key}: a size with which nothing can be simulated")
 
 
 def _merged(tree: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import shutil
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 
-from .. import folders
+from .. import folders, toml
 from ..arrays import FloatArray, IntArray, TimeArray
+from ..errors import ConfigError
 from ..fusion.config import ARM_FILE, FusionConfig, Process
 from ..model.arm import ordered_axes
 from ..runs import save, tables
@@ -21,12 +24,14 @@ from ..units import MM
 from . import sensing
 from .motion import Motion, lattice, move
 from .scenario import LATTICE, Scenario
-from .trajectory import Steps
+from .trajectory import PathFromFile, Steps
 
 TRIALS, SAMPLES = "trials.csv", "samples.csv"
 _BEFORE = 0.05  # s of rest that a trial's samples begin with
 SCENARIO = "scenario.toml"
-_OURS = frozenset({SCENARIO, "run.toml", "fusion.toml", "arm.toml"})
+MANIFEST = "run.toml"
+_OURS = frozenset({SCENARIO, MANIFEST, "fusion.toml", ARM_FILE})
+_PATHS = ("path.csv", "path.csv.gz", "path.parquet")
 
 
 @dataclass(frozen=True)
@@ -125,13 +130,13 @@ def check_writable(folder: Path, force: bool) -> None:
     Raises:
         FolderError: The folder exists and is not to be replaced, or holds something else than a simulated run.
     """
-    folders.check_writable(folder, force, _OURS, lambda name: name in _OURS or name.endswith(".csv"))
+    folders.check_writable(folder, force, _OURS, lambda name: name in _files_of(folder))
 
 
 def write(simulated: Simulated, folder: Path, force: bool) -> None:
     """Write a simulated run as a recorded run, with ``fusion.toml`` and ``arm.toml`` for a filter, and its step trials.
 
-    ``scenario.toml`` in the folder makes the same run again (but for a path from a file, which is not copied).
+    ``scenario.toml`` in the folder makes the same run again; a path from a file is beside it.
 
     Raises:
         FolderError: See :func:`check_writable`, or the disk refuses.
@@ -140,10 +145,32 @@ def write(simulated: Simulated, folder: Path, force: bool) -> None:
     with folders.replacing(folder) as new:
         save.save(simulated.run, new)
         simulated.config.save(new)
-        text = simulated.scenario.to_toml(simulated.seed, ARM_FILE)
-        (new / SCENARIO).write_text(text, encoding="utf-8")
+        scenario = _with_path(simulated.scenario, new)
+        (new / SCENARIO).write_text(scenario.to_toml(simulated.seed, ARM_FILE), encoding="utf-8")
         if simulated.trials is not None:
             _write_trials(simulated.trials, new)
+
+
+def _with_path(scenario: Scenario, folder: Path) -> Scenario:
+    """The scenario with its path's table, if it has one, copied into ``folder``."""
+    trajectory = scenario.trajectory
+    if not isinstance(trajectory, PathFromFile):
+        return scenario
+    endings = (name for name in _PATHS if trajectory.file.endswith(name.removeprefix("path")))
+    name = next(endings, _PATHS[0])
+    shutil.copyfile(trajectory.file, folder / name)
+    return msgspec.structs.replace(scenario, trajectory=msgspec.structs.replace(trajectory, file=name))
+
+
+def _files_of(folder: Path) -> set[str]:
+    """What a simulated run in ``folder`` can consist of, by its own run.toml."""
+    try:
+        manifest = toml.read(folder / MANIFEST)
+    except ConfigError:
+        return set(_OURS)
+    sensors = manifest.get("sensors")
+    sources = [manifest.get("command"), manifest.get("reference"), *(sensors.values() if sensors else ())]
+    return {*_OURS, TRIALS, SAMPLES, *_PATHS, *(str(source["file"]) for source in sources if source)}
 
 
 class _Log:
@@ -179,6 +206,8 @@ def _commands(scenario: Scenario, seed: int) -> tuple[TimeArray, dict[str, Float
     count = len(next(iter(offsets.values())))
     named = set(offsets) if scenario.frame is None else set(scenario.arm.axes)  # x and y need both their axes
     told = {axis: offsets.get(axis, np.zeros(count)) for axis in ordered_axes(named)}
+    if isinstance(scenario.frame, Cylindrical) and (told["radial"] + scenario.start.level["radial"] <= 0.0).any():
+        raise ConfigError("trajectory: the commands cross the base's axis, beyond which radial has no meaning")
     return np.rint(np.arange(count) * (period * 1e9)).astype(np.int64), told
 
 

@@ -18,7 +18,7 @@ _MOST_TICKS = 200_000  # 93 minutes at 28 ms; a gigabyte of work
 
 Offsets: TypeAlias = dict[str, FloatArray]
 Names: TypeAlias = Annotated[list[str], msgspec.Meta(min_length=1)]
-Count: TypeAlias = Annotated[int, msgspec.Meta(gt=0)]
+Count: TypeAlias = Annotated[int, msgspec.Meta(gt=0, le=10_000)]
 
 
 class Trajectory(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", forbid_unknown_fields=True):
@@ -64,6 +64,7 @@ class Raster(Trajectory, frozen=True, kw_only=True, tag="raster"):
 
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """The corner points, joined at constant speed."""
+        ticks((self.height / self.pitch + 1.0) * self.width / self.speed, period)  # before it is laid out
         lines = int(self.height / self.pitch + 1e-9) + 1
         line = np.repeat(np.arange(lines), 2)
         side = np.tile([0.0, 1.0, 1.0, 0.0], lines // 2 + 1)[: 2 * lines]
@@ -222,6 +223,8 @@ class PathFromFile(Trajectory, frozen=True, kw_only=True, tag="path"):
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """The path on the ticks."""
         table = tables.read(Path(self.file))
+        if table.notes:  # a row that is left out is a path of its own
+            raise ConfigError("; ".join(table.notes))
         time = seconds(table.stamps("time_s")[0])
         if not np.isfinite(time).all() or (np.diff(time) <= 0.0).any():
             raise ConfigError(f"{self.file}: time_s must ascend from row to row")
@@ -245,5 +248,5 @@ def ticks(duration: float, period: float) -> IntArray:
         ConfigError: There are too many to simulate at a time.
     """
     if not duration / period < _MOST_TICKS:
-        raise ConfigError(f"trajectory: {duration / period:.3g} commands; at most {_MOST_TICKS} in one run")
+        raise ConfigError(f"trajectory: {duration / period + 1.0:.6g} commands; at most {_MOST_TICKS} in one run")
     return np.arange(int(np.ceil(duration / period - 1e-9)) + 1)
