@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from .fusion.ticks import TickEstimates, filter_ticks, smooth_ticks, tick_likelihood
     from .fusion.timeline import Outcome
     from .fusion.track import AxisEstimate
+    from .identify.identify import Identification, identify
+    from .identify.trials import StepTrials, TrialsError
+    from .identify.verify import AxisVerification, verify
     from .model.arm import ArmModel, AxisModel, Gain, Validity
     from .model.discrete import DiscreteModel, discretize
     from .model.plants import FirstOrder, SecondOrder
@@ -29,12 +32,14 @@ _HOME = {
     "ArmModel": "model.arm",
     "AxisEstimate": "fusion.track",
     "AxisModel": "model.arm",
+    "AxisVerification": "identify.verify",
     "ConfigError": "errors",
     "DiscreteModel": "model.discrete",
     "Estimates": "fusion.estimates",
     "FirstOrder": "model.plants",
     "FusionConfig": "fusion.config",
     "Gain": "model.arm",
+    "Identification": "identify.identify",
     "Outcome": "fusion.timeline",
     "Process": "fusion.config",
     "PumafuseError": "errors",
@@ -48,29 +53,35 @@ _HOME = {
     "Sensor": "fusion.config",
     "Simulated": "simulate.simulate",
     "Start": "fusion.config",
+    "StepTrials": "identify.trials",
     "TickEstimates": "fusion.ticks",
+    "TrialsError": "identify.trials",
     "UnknownNameError": "errors",
     "Validity": "model.arm",
     "discretize": "model.discrete",
     "filter_ticks": "fusion.ticks",
     "fuse": "fusion.offline",
+    "identify": "identify.identify",
     "score": "fusion.score",
     "simulate": "simulate.simulate",
     "smooth_ticks": "fusion.ticks",
     "tick_likelihood": "fusion.ticks",
     "to_rerun": "views.rerun",
+    "verify": "identify.verify",
 }
 
 __all__ = [
     "ArmModel",
     "AxisEstimate",
     "AxisModel",
+    "AxisVerification",
     "ConfigError",
     "DiscreteModel",
     "Estimates",
     "FirstOrder",
     "FusionConfig",
     "Gain",
+    "Identification",
     "Outcome",
     "Process",
     "PumafuseError",
@@ -84,17 +95,21 @@ __all__ = [
     "Sensor",
     "Simulated",
     "Start",
+    "StepTrials",
     "TickEstimates",
+    "TrialsError",
     "UnknownNameError",
     "Validity",
     "discretize",
     "filter_ticks",
     "fuse",
+    "identify",
     "score",
     "simulate",
     "smooth_ticks",
     "tick_likelihood",
     "to_rerun",
+    "verify",
 ]
 
 

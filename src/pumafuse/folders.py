@@ -61,6 +61,24 @@ def replacing(folder: Path) -> Generator[Path]:
         raise FolderError(f"{folder}: cannot be written: {error.strerror}") from None
 
 
+def write_file(path: Path, text: str) -> None:
+    """Write a file whole or not at all; what was there before stays until then.
+
+    Raises:
+        FolderError: The disk refuses.
+    """
+    path = path.resolve()
+    new = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        new.write_text(text, encoding="utf-8")
+        new.replace(path)
+    except OSError as error:
+        raise FolderError(f"{path}: cannot be written: {error.strerror}") from None
+    finally:
+        new.unlink(missing_ok=True)
+
+
 def sweep(folders: Iterable[Path]) -> None:
     """Remove what killed processes left beside the folders that they were writing."""
     for folder in folders:

@@ -6,7 +6,7 @@ import os
 import sys
 import warnings
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, overload
 
 import typer
 
@@ -133,6 +133,68 @@ def simulate(
 
 
 @app.command()
+def identify(
+    trials: Annotated[Path, typer.Argument(metavar="TRIALS", help="Folder with trials.csv and samples.csv.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="ARM.TOML", help="Where the model goes.")],
+    period: Annotated[
+        float | None, typer.Option(metavar="MS", help="Update period; default: step over speed, where trials agree.")
+    ] = None,
+    samples: Annotated[
+        int | None, typer.Option(metavar="N", min=8, help="Use only N samples from each step on; default: all.")
+    ] = None,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="Read delay and gain off each trial, as published, instead of fitting.")
+    ] = False,
+    tolerance: Annotated[
+        float, typer.Option(metavar="MM", help="RMS beyond which the model is not called valid.")
+    ] = 1.0,
+    report: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Also write tables and figures as one HTML page.")
+    ] = None,
+    json: Json = False,
+    force: Force = False,
+) -> None:
+    """Make a model of an arm from step trials: order, gain, delay and plant of each axis, with intervals."""
+    from . import identify as command
+
+    options = command.Options(
+        output=output,
+        period=_si(_positive(period, "--period")),
+        samples=samples,
+        paper=paper,
+        tolerance=_si(_positive(tolerance, "--tolerance")),
+        report=report,
+        json=json,
+        force=force,
+    )
+    command.run(trials, options)
+
+
+@app.command()
+def verify(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")],
+    arm: Annotated[str, typer.Option("--arm", metavar="ARM", help="An arm.toml, or the name of a preset.")],
+    sensors: Annotated[
+        str | None, typer.Option(metavar="A,B", help="Compare with these; default: the reference, else every sensor.")
+    ] = None,
+    start: Annotated[
+        list[str] | None,
+        typer.Option(metavar="AXIS=MM", help="Level before the first command; default: the run's, else chosen by RMS."),
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Also write table and figures as one HTML page.")
+    ] = None,
+    json: Json = False,
+    force: Force = False,
+) -> None:
+    """Check a model on runs that it was not made from, beside the best that a linear model could do there."""
+    from . import verify as command
+
+    levels = dict(_level(text) for text in start or ())
+    command.run(runs, arm, None if sensors is None else _names(sensors), levels, report, json, force)
+
+
+@app.command()
 def demo(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")] = Path(
         "demo"
@@ -171,6 +233,28 @@ def _names(listed: str) -> list[str]:
     return names
 
 
+def _level(text: str) -> tuple[str, float]:
+    """``radial=560`` as an axis and its level [m]."""
+    axis, _, level = text.partition("=")
+    try:
+        return axis.strip(), float(level) * 1e-3
+    except ValueError:
+        raise typer.BadParameter(f"expected AXIS=MM, not '{text}'", param_hint="--start") from None
+
+
+@overload
+def _si(value: float) -> float: ...
+@overload
+def _si(value: None) -> None: ...
+def _si(value: float | None) -> float | None:
+    """Milliseconds or millimetres of the command line in s or m."""
+    return None if value is None else value * 1e-3
+
+
+@overload
+def _positive(value: float, name: str) -> float: ...
+@overload
+def _positive(value: float | None, name: str) -> float | None: ...
 def _positive(value: float | None, name: str) -> float | None:
     if value is not None and not 0.0 < value < float("inf"):
         raise typer.BadParameter(f"must be a positive number, not {value}", param_hint=name)

@@ -57,6 +57,7 @@ class AxisInput:
         name: The axis.
         start: The level u₀ [m] that everything inside the filter is relative to.
         given: When each command was given, int64 ns, (n,).
+        command: u as logged [m], (n,).
         drive: The plant's input, by the time it is issued.
         delay: Td, int ns.
     """
@@ -64,6 +65,7 @@ class AxisInput:
     name: str
     start: float
     given: TimeArray
+    command: FloatArray
     drive: Drive
     delay: int
 
@@ -168,7 +170,7 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
         given, values = stamp[used[name]], command.values[name][used[name]]
         start = run.start.get(name, float(values[0]))
         driven = drive(arm.axes[name], given, values, start, arm.update_period)
-        inputs.append(AxisInput(name, start, given, driven, round(arm.delay_of(name) * 1e9)))
+        inputs.append(AxisInput(name, start, given, values, driven, round(arm.delay_of(name) * 1e9)))
     same = all(np.array_equal(axis.given, inputs[0].given) for axis in inputs)
     commands = inputs[0].given if same else np.unique(np.concatenate([axis.given for axis in inputs]))
     origin = int(commands[0])

@@ -51,6 +51,26 @@ class Table:
         values = _to_numpy(column.cast(pa.float64(), safe=False))
         return (values / 10.0**-exponent if exponent < 0 else values), note  # a quotient is rounded once
 
+    def plain(self, name: str) -> tuple[FloatArray, str | None]:
+        """A column of numbers as they stand, with the cells and the note of :meth:`numbers`.
+
+        Raises:
+            RunError: The column is absent or holds something else than numbers.
+        """
+        column, note = self._numeric(name)
+        return _to_numpy(column.cast(pa.float64(), safe=False)), note
+
+    def texts(self, name: str) -> list[str]:
+        """A column as it is written, trimmed, empty where a cell is; whole numbers without a point.
+
+        Raises:
+            RunError: The column is absent or has no text.
+        """
+        column = self._column(name)
+        if pa.types.is_floating(column.type) and pc.all(pc.equal(column, pc.round(column))).as_py():
+            column = column.cast(pa.int64())
+        return [(cell or "").strip() for cell in self._cast(name, column, pa.string()).to_pylist()]
+
     def stamps(self, name: str) -> tuple[TimeArray, str | None]:
         """A time column in int64 ns, ``NO_STAMP`` where a cell is empty or no time, and a note on cells that were text.
 

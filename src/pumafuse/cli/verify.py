@@ -1,0 +1,90 @@
+"""`pumafuse verify`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+
+from .. import units
+from ..identify.verify import AxisVerification, verify
+from ..model.arm import ArmModel
+from ..model.plants import FirstOrder
+from ..runs.run import Run
+from ..units import MM
+from .tables import console
+
+
+def run(
+    paths: Sequence[Path],
+    arm: str,
+    sensors: list[str] | None,
+    start: Mapping[str, float],
+    report: Path | None,
+    json: bool,
+    force: bool,
+) -> None:
+    """Compare a model with runs that it was not made from.
+
+    Raises:
+        PumafuseError: The arm or a run cannot be read, or they do not fit together.
+    """
+    if report is not None:
+        from ..views import report as reports
+
+        reports.check_writable(report, force)
+    model = ArmModel.load(arm)
+    found = [one for path in paths for one in verify(Run.read(path), model, sensors=sensors, start=start)]
+    if report is not None:
+        from ..views import report as reports
+
+        reports.write_verification(found, model, report, force)
+    verified = [verification for verification, _ in found]
+    if json:
+        tree = [units.from_si(msgspec.to_builtins(one, enc_hook=float)) for one in verified]
+        print(msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode())
+    else:
+        _show(verified, report)
+
+
+def _show(verified: Sequence[AxisVerification], report: Path | None) -> None:
+    out = console()
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("run", "axis", "source"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("signal, mm", "RMS, mm", "of signal", "fit", "no recovery", "recovery", "floor, mm"):
+        table.add_column(heading, justify="right")
+    table.add_column("verdict", overflow="fold")
+    for one in verified:
+        table.add_row(
+            escape(one.run),
+            escape(one.axis),
+            escape(one.source),
+            f"{one.amplitude * MM:.4g}",
+            f"{one.model.rms * MM:.3f}",
+            f"{one.model.percent:.1f} %",
+            f"{one.model.fit:.1f} %",
+            f"{one.without_recovery.rms * MM:.3f}",
+            f"{one.with_recovery.rms * MM:.3f}",
+            f"{one.floor.fit.rms * MM:.3f}",
+            one.verdict,
+        )
+    out.print(table)
+    for one in verified:
+        floor, plant = one.floor, one.floor.plant
+        shape = (
+            f"τ {plant.time_constant * MM:.1f} ms"
+            if isinstance(plant, FirstOrder)
+            else f"ω {plant.natural_frequency:.1f} rad/s, ζ {plant.damping:.2f}"
+        )
+        out.print(
+            f"{one.run}, {one.axis}: start level {one.start * MM:g} mm ({one.start_from}); gain recovery tried with"
+            f" {one.recovery * MM:g} ms; the floor is K {floor.gain:.3f}, Td {floor.delay * MM:.1f} ms, {shape}",
+            markup=False,
+        )
+    if report is not None:
+        out.print(f"written to {report}", markup=False, soft_wrap=True)

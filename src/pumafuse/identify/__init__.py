@@ -1,0 +1,1 @@
+"""From step trials to a model of the arm."""

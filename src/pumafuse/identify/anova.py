@@ -1,0 +1,276 @@
+"""Do a model's coefficients depend on what was varied? The paper's Table I, and what it needs beside it.
+
+The i-ratio is F of a one-way analysis of variance over its 95 % point: above 1 the means differ. It assumes equal
+variances and looks at one factor alone; so Welch's test, which does not assume them, and an analysis with all factors
+at once, which an unbalanced design needs, stand beside it.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+
+from ..arrays import BoolArray, FloatArray
+from .trials import Trial
+
+_COUNTERS = frozenset({"replicate", "repetition", "repeat", "rep", "run", "observation"})  # columns that only count
+_MOST_LEVELS = 12  # a numeric factor with more is cut into quarters
+_OUTLYING = 8.0  # robust standard deviations from the median
+_LEAST_SD = 0.005  # of the median: a coefficient that is closer than this times `_OUTLYING` is no outlier
+_FEWEST = 5  # values among which one can be outlying
+
+
+class Level(msgspec.Struct, frozen=True, kw_only=True):
+    """A coefficient at one level of a factor, in the coefficient's unit; sd is null of a single trial."""
+
+    level: str
+    trials: int
+    mean: float
+    sd: float | None
+
+
+class Dependence(msgspec.Struct, frozen=True, kw_only=True):
+    """Whether one coefficient depends on one factor.
+
+    Attributes:
+        coefficient: With its unit.
+        factor: What was varied.
+        levels: The coefficient at each level.
+        i_ratio: F over the 95 % point of its distribution; above 1 is dependent. Null where it cannot be computed.
+        p: Of that F.
+        welch_p: Of Welch's test, which does not assume equal variances.
+        adjusted_p: Of the factor beside all the others; null where the others already tell its level.
+        verdict: In words.
+    """
+
+    coefficient: str
+    factor: str
+    levels: list[Level]
+    i_ratio: float | None
+    p: float | None
+    welch_p: float | None
+    adjusted_p: float | None
+    verdict: str
+
+
+class Scatter(msgspec.Struct, frozen=True, kw_only=True):
+    """How one coefficient scatters on one axis, in its unit.
+
+    Attributes:
+        coefficient: With its unit.
+        axis: Of the trials.
+        median: Over the trials.
+        normal_p: Of a Shapiro-Wilk test; small: not normally distributed, means and i-ratios are to be read with care.
+        outlying: Trials further from the median than eight robust standard deviations.
+        replicate_sd: Between trials of the same settings; null where none were repeated.
+        own_sd: What the noise within a trial lets expect (median over the trials).
+    """
+
+    coefficient: str
+    axis: str
+    median: float
+    normal_p: float | None
+    outlying: list[str]
+    replicate_sd: float | None
+    own_sd: float
+
+
+def factors_of(trials: Sequence[Trial], period: float) -> dict[str, list[str]]:
+    """The level of each trial for every factor that varies and is no mere counter.
+
+    Args:
+        trials: All that are analysed together.
+        period: T [s], for a speed that is not recorded.
+    """
+    columns: dict[str, list[str]] = {
+        "axis": [trial.axis for trial in trials],
+        "speed_m_s": speed_levels(trials, period),
+    }
+    columns["sense"] = ["+" if trial.step > 0.0 else "-" for trial in trials]
+    for name in trials[0].factors:
+        if name not in _COUNTERS:
+            columns[name] = _levels([trial.factors[name] for trial in trials])
+    return {name: levels for name, levels in columns.items() if 1 < len(set(levels)) <= max(len(trials) // 2, 2)}
+
+
+def speed_levels(trials: Sequence[Trial], period: float) -> list[str]:
+    """Each trial's speed [m/s] to two digits."""
+    return [f"{trial.speed_at(period):.2g}" for trial in trials]
+
+
+def numbers(cells: Sequence[str]) -> list[float] | None:
+    """Levels as numbers; None where one is none."""
+    try:
+        found = [float(cell) for cell in cells]
+    except ValueError:
+        return None
+    return found if np.isfinite(found).all() else None
+
+
+def ordered(levels: set[str]) -> list[str]:
+    """Levels by number where they are numbers, else by name."""
+    return sorted(levels) if numbers(list(levels)) is None else sorted(levels, key=float)
+
+
+def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Sequence[str]]) -> list[Dependence]:
+    """Analyse every coefficient against every factor.
+
+    Args:
+        coefficients: By name, each (trials,).
+        factors: By name, the level of each trial.
+    """
+    return [
+        _dependence(coefficient, values, factor, factors)
+        for coefficient, values in coefficients.items()
+        for factor in factors
+    ]
+
+
+def scatter(coefficient: str, trials: Sequence[Trial], values: FloatArray, sd: FloatArray) -> Scatter:
+    """How a coefficient scatters among the trials of one axis.
+
+    Args:
+        coefficient: Its name.
+        trials: The trials.
+        values: The coefficient of each, (n,).
+        sd: Its standard deviation by the noise within the trial, (n,).
+    """
+    from scipy.stats import shapiro
+
+    normal = None
+    if len(values) >= 3 and np.ptp(values) > 0.0:
+        normal = float(shapiro(values).pvalue)
+    return Scatter(
+        coefficient=coefficient,
+        axis=trials[0].axis,
+        median=float(np.median(values)),
+        normal_p=normal,
+        outlying=[trial.name for trial, far in zip(trials, outlying(values, sd), strict=True) if far],
+        replicate_sd=_replicate_sd(trials, values),
+        own_sd=float(np.median(sd)),
+    )
+
+
+def outlying(values: FloatArray, sd: FloatArray) -> BoolArray:
+    """Which values are further than eight robust standard deviations (1.4826 MAD) from the median, (n,).
+
+    Args:
+        values: One of each trial, (n,).
+        sd: What the noise within each trial lets expect; it widens the limit, (n,).
+    """
+    from scipy.stats import median_abs_deviation
+
+    if len(values) < _FEWEST:
+        return np.zeros(len(values), dtype=bool)
+    middle = float(np.median(values))
+    scatter = max(float(median_abs_deviation(values, scale="normal")), _LEAST_SD * abs(middle))
+    return np.abs(values - middle) > _OUTLYING * np.hypot(scatter, sd)
+
+
+def _levels(cells: Sequence[str]) -> list[str]:
+    """A factor's levels; a numeric one with many is cut into quarters."""
+    values = numbers(cells)
+    if values is None or len(set(cells)) <= _MOST_LEVELS:
+        return list(cells)
+    quarter = np.searchsorted(np.quantile(values, [0.25, 0.5, 0.75]), values)
+    middles = {part: f"{np.median(np.array(values)[quarter == part]):.4g}" for part in set(quarter.tolist())}
+    return [middles[part] for part in quarter.tolist()]
+
+
+def _replicate_sd(trials: Sequence[Trial], values: FloatArray) -> float | None:
+    """Pooled over groups of trials whose step and factors are the same."""
+    groups: defaultdict[tuple[object, ...], list[float]] = defaultdict(list)
+    for trial, value in zip(trials, values.tolist(), strict=True):
+        settings = tuple(sorted((name, cell) for name, cell in trial.factors.items() if name not in _COUNTERS))
+        groups[(trial.step, settings)].append(value)
+    squares = sum(float(np.var(group)) * len(group) for group in groups.values())
+    freedom = len(values) - len(groups)
+    return float(np.sqrt(squares / freedom)) if freedom else None
+
+
+def levels_of(values: FloatArray, cells: Sequence[str]) -> list[Level]:
+    """Mean and scatter of (n,) values at each level that ``cells`` (n,) names."""
+    named = np.array(cells)
+    groups = {level: values[named == level] for level in ordered(set(cells))}
+    return [
+        Level(
+            level=level,
+            trials=len(group),
+            mean=float(group.mean()),
+            sd=float(group.std(ddof=1)) if len(group) > 1 else None,
+        )
+        for level, group in groups.items()
+    ]
+
+
+def welch(groups: Sequence[FloatArray]) -> float | None:
+    """P of the hypothesis that groups have one mean, whatever their variances; None where it cannot be told."""
+    from statsmodels.stats.oneway import anova_oneway
+
+    usable = [group for group in groups if len(group) > 1 and np.ptp(group) > 0.0]
+    return float(anova_oneway(usable, use_var="unequal").pvalue) if len(usable) > 1 else None
+
+
+def _dependence(coefficient: str, values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> Dependence:
+    cells = np.array(factors[factor])
+    groups = [values[cells == level] for level in ordered(set(factors[factor]))]
+    ratio, p = _one_way(groups)
+    by_welch, adjusted = welch(groups), _adjusted(values, factor, factors)
+    return Dependence(
+        coefficient=coefficient,
+        factor=factor,
+        levels=levels_of(values, factors[factor]),
+        i_ratio=ratio,
+        p=p,
+        welch_p=by_welch,
+        adjusted_p=adjusted,
+        verdict=_verdict(ratio, by_welch, adjusted, alone=len(factors) == 1),
+    )
+
+
+def _one_way(groups: Sequence[FloatArray]) -> tuple[float | None, float | None]:
+    from scipy.stats import f, f_oneway
+
+    between, within = len(groups) - 1, sum(len(group) for group in groups) - len(groups)
+    if within < 1 or not any(np.ptp(group) > 0.0 for group in groups):
+        return None, None
+    found = f_oneway(*groups)
+    return float(found.statistic / f.ppf(0.95, between, within)), float(found.pvalue)
+
+
+def _adjusted(values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> float | None:
+    """P of one factor in a model with all of them (main effects)."""
+    from statsmodels.regression.linear_model import OLS
+
+    rest = _design(len(values), [cells for name, cells in factors.items() if name != factor])
+    whole = np.column_stack((rest, _design(len(values), [factors[factor]])[:, 1:]))
+    full, reduced = OLS(values, whole).fit(), OLS(values, rest).fit()
+    if full.df_resid < 1 or full.df_model == reduced.df_model or full.ssr <= 1e-24 * float(values @ values):
+        return None
+    return float(full.compare_f_test(reduced)[1])
+
+
+def _design(rows: int, factors: Sequence[Sequence[str]]) -> FloatArray:
+    """A one, and for each factor a column for each level but its first, (rows, k)."""
+    columns = [np.ones(rows)]
+    for cells in factors:
+        columns.extend(np.array(cells) == level for level in ordered(set(cells))[1:])
+    return np.column_stack(columns).astype(np.float64)
+
+
+def _verdict(ratio: float | None, welch: float | None, adjusted: float | None, alone: bool) -> str:
+    if ratio is None:
+        return "cannot be told: nothing was repeated"
+    said = "dependent" if ratio > 1.0 else "independent"
+    if welch is not None and (welch < 0.05) != (ratio > 1.0):
+        said += ", but Welch's test " + ("says it is" if welch < 0.05 else "does not confirm it")
+    if alone:
+        return said
+    if adjusted is None:
+        return said + "; cannot be told from the other factors"
+    if (adjusted < 0.05) != (ratio > 1.0):
+        said += "; beside the other factors " + ("dependent" if adjusted < 0.05 else "independent")
+    return said

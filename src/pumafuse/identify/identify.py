@@ -1,0 +1,362 @@
+"""A campaign of step trials as a model of the arm: every trial fitted, all combined, the model judged against them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+
+from .. import units
+from ..arrays import FloatArray
+from ..model.arm import ArmModel, Validity
+from ..model.plants import FirstOrder, Interval, SecondOrder
+from . import anova
+from .combine import Combination, CombinedAxis, Fitted, combine, combined_rms, usual_gain
+from .estimate import common
+from .fit import StepFit, fit_steps, flags
+from .paper import fit_as_published, onset
+from .trials import StepTrials, Trial, TrialsError
+
+TOLERANCE = 1e-3  # m, the paper's
+_BATCH = 100  # trials a job
+_DIGITS = 6
+
+
+class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
+    """One trial's fit of one order; plant parameters of the other order are null, as are infinite ends of intervals.
+
+    Attributes:
+        gain: K.
+        gain_ci95: Its 95 % interval.
+        delay: Td [s].
+        delay_ci95: Its interval.
+        time_constant: τ [s].
+        time_constant_ci95: Its interval.
+        natural_frequency: ω [rad/s].
+        natural_frequency_ci95: Its interval.
+        damping: ζ.
+        damping_ci95: Its interval.
+        rms: Of what is left, eq. 10 [m].
+        rms_percent: Of the step.
+        flags: What to know before trusting it.
+    """
+
+    gain: float
+    gain_ci95: Interval
+    delay: float = msgspec.field(name="delay_ms")
+    delay_ci95: Interval = msgspec.field(name="delay_ms_ci95")
+    time_constant: float | None = msgspec.field(name="time_constant_ms", default=None)
+    time_constant_ci95: Interval | None = msgspec.field(name="time_constant_ms_ci95", default=None)
+    natural_frequency: float | None = msgspec.field(name="natural_frequency_rad_s", default=None)
+    natural_frequency_ci95: Interval | None = msgspec.field(name="natural_frequency_rad_s_ci95", default=None)
+    damping: float | None = None
+    damping_ci95: Interval | None = None
+    rms: float = msgspec.field(name="rms_mm")
+    rms_percent: float
+    flags: list[str]
+
+
+class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
+    """One trial.
+
+    Attributes:
+        trial: Its name.
+        axis: Which was stepped.
+        step: By how much [m].
+        speed: [m/s].
+        factors: What else was varied.
+        onset: When the arm was first seen to move [s]; null: never.
+        first: First-order fit.
+        second: Second-order fit.
+        combined_rms: Of what the combined model leaves [m]; null without one.
+        left_out: Why it is not in the combined model; null when it is.
+    """
+
+    trial: str
+    axis: str
+    step: float = msgspec.field(name="step_mm")
+    speed: float = msgspec.field(name="speed_m_s")
+    factors: Mapping[str, str]
+    onset: float | None = msgspec.field(name="onset_ms")
+    first: OrderFit
+    second: OrderFit
+    combined_rms: float | None = msgspec.field(name="combined_rms_mm")
+    left_out: str | None
+
+
+class Performance(msgspec.Struct, frozen=True, kw_only=True):
+    """How well the combined model fits by one factor; levels hold RMS in mm.
+
+    Attributes:
+        factor: What was varied.
+        levels: RMS [mm] of the trials at each level.
+        limit: Where the mean RMS passes the tolerance, in the factor's unit; null where it does not.
+        verdict: In words.
+    """
+
+    factor: str
+    levels: list[anova.Level]
+    limit: float | None
+    verdict: str
+
+
+class Identification(msgspec.Struct, frozen=True, kw_only=True):
+    """What a campaign tells.
+
+    Attributes:
+        arm: The combined model.
+        method: ``fitted``, or ``published`` with the paper's own readings.
+        samples: How many from the step on were used; null: all.
+        tolerance: RMS up to which the model is called valid [m].
+        trials: Every usable trial.
+        axes: The combined model of each axis, with how it came about.
+        one_delay: Whether one delay does for all axes, in words.
+        dependences: The paper's Table I.
+        scatter: Normality, outlying trials and replicates of each coefficient.
+        performance: The paper's Fig. 7.
+        notes: What was left out or repaired, a sentence each.
+    """
+
+    arm: ArmModel
+    method: str
+    samples: int | None
+    tolerance: float = msgspec.field(name="tolerance_mm")
+    trials: list[TrialResult]
+    axes: dict[str, CombinedAxis]
+    one_delay: str
+    dependences: list[anova.Dependence]
+    scatter: list[anova.Scatter]
+    performance: list[Performance]
+    notes: list[str]
+
+    def to_json(self) -> str:
+        """All of it, in the units that the names tell."""
+        tree = units.from_si(msgspec.to_builtins(self, enc_hook=float))
+        return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode()
+
+
+def identify(
+    trials: StepTrials,
+    *,
+    period: float | None = None,
+    samples: int | None = None,
+    paper: bool = False,
+    tolerance: float = TOLERANCE,
+    name: str = "identified arm",
+) -> Identification:
+    """Identify an arm from step trials.
+
+    Args:
+        trials: From :meth:`StepTrials.read`.
+        period: T [s]; None: step over speed, where all trials agree on it.
+        samples: Use only so many from each step on, as the paper's 30; None: all.
+        paper: Read delay and gain off each trial, as the paper does, instead of fitting them.
+        tolerance: RMS [m] beyond which the model is not called valid.
+        name: Of the arm.
+
+    Raises:
+        TrialsError: The period is not known, or no axis has trials enough for a model.
+    """
+    period = trials.period(period)
+    fitted = _fitted(trials.trials, samples, paper)
+    notes, combined = list(trials.notes), dict[str, Combination]()
+    for axis in trials.axes:
+        found = combine([one for one in fitted if one.trial.axis == axis], period, samples, paper)
+        if isinstance(found, str):
+            notes.append(f"{axis}: no model: {found}")
+        else:
+            combined[axis] = found
+    if not combined:
+        raise TrialsError("; ".join(["no axis has trials enough for a model", *notes]))
+    arm, one_delay = _arm(combined, period, name)
+    rms = {
+        one.trial.name: combined_rms(one.trial, arm.axes[one.trial.axis], arm.delay_of(one.trial.axis), period, samples)
+        for one in fitted
+        if one.trial.axis in combined
+    }
+    usual = {axis: usual_gain([one for one in fitted if one.trial.axis == axis]) for axis in trials.axes}
+    left_out = {trial: why for found in combined.values() for trial, why in found.axis.left_out.items()}
+    used = [one for one in fitted if one.trial.name in rms and one.trial.name not in left_out]
+    factors = anova.factors_of([one.trial for one in used], period)
+    performance = _performances(factors, np.array([rms[one.trial.name] for one in used]) * units.MM, tolerance)
+    limited = _valid(performance, used, period)
+    provenance = {
+        "made_by": f"pumafuse identify {version('pumafuse')}",
+        "trials": {axis: found.axis.trials for axis, found in combined.items()},
+        "left_out": left_out,
+        "order": {axis: found.axis.choice.why for axis, found in combined.items()},
+        "delay": one_delay,
+        "delay_spread_ms": {axis: round(found.axis.delay_spread * units.MM, 2) for axis, found in combined.items()},
+        "gain": {axis: found.axis.gain_words for axis, found in combined.items()},
+        "validity": {one.factor: one.verdict for one in performance},
+        "samples": "all" if samples is None else samples,
+        "method": "delay and gain read off each trial (--paper)" if paper else "all parameters fitted",
+    }
+    arm = _rounded(msgspec.structs.replace(arm, validity=limited, provenance=provenance))
+    return Identification(
+        arm=arm,
+        method="published" if paper else "fitted",
+        samples=samples,
+        tolerance=tolerance,
+        trials=[_result(one, period, usual[one.trial.axis], rms, left_out) for one in fitted],
+        axes={axis: found.axis for axis, found in combined.items()},
+        one_delay=one_delay,
+        dependences=anova.dependences(_coefficients(used), factors) if factors else [],
+        scatter=_scatters(fitted),
+        performance=performance,
+        notes=notes,
+    )
+
+
+def _fitted(trials: Sequence[Trial], samples: int | None, paper: bool) -> list[Fitted]:
+    """Every trial with its fits, over all cores where there are many."""
+    from joblib import Parallel, delayed
+
+    batches = [trials[first : first + _BATCH] for first in range(0, len(trials), _BATCH)]
+    fit = _published if paper else fit_steps
+    parallel = Parallel(n_jobs=-1 if len(batches) > 1 else 1, return_as="generator")
+    fits = [pair for batch in parallel(delayed(fit)(batch, samples) for batch in batches) for pair in batch]
+    return [Fitted(trial, *pair, onset(trial)) for trial, pair in zip(trials, fits, strict=True)]
+
+
+def _published(trials: Sequence[Trial], samples: int | None) -> list[tuple[StepFit, StepFit]]:
+    return [fit_as_published(trial, samples) for trial in trials]
+
+
+def _arm(combined: Mapping[str, Combination], period: float, name: str) -> tuple[ArmModel, str]:
+    """The arm with one delay, or one for each axis where the data ask for it, and which in words."""
+    delays = [found.common.delay for found in combined.values()]
+    every = common(np.concatenate(delays), np.concatenate([found.common.delay_sd for found in combined.values()]))
+    p = anova.welch(delays) if len(delays) > 1 else None
+    apart = p is not None and p < 0.05
+    if len(delays) == 1:
+        words = "one axis, one delay"
+    elif p is None:
+        words = "one delay: whether axes differ cannot be told"
+    elif apart:
+        words = f"a delay for each axis: they differ (Welch's test, p {'< 0.001' if p < 1e-3 else f'= {p:.2g}'})"
+    else:
+        words = f"one delay: the axes do not differ (Welch's test, p = {p:.2g})"
+    own = {axis: found.axis.model for axis, found in combined.items()}
+    axes = (
+        own if apart else {axis: msgspec.structs.replace(one, delay=None, delay_ci95=None) for axis, one in own.items()}
+    )
+    return ArmModel(name=name, update_period=period, delay=every.value, delay_ci95=every.ci95, axes=axes), words
+
+
+def _rounded(arm: ArmModel) -> ArmModel:
+    """The arm in six digits: more would only look exact."""
+
+    def rounded(value: Any) -> Any:
+        match value:
+            case float():
+                return float(f"{value:.{_DIGITS}g}")
+            case dict():
+                return {key: rounded(item) for key, item in cast(dict[str, Any], value).items()}
+            case list() | tuple():
+                return [rounded(item) for item in cast(list[Any], value)]
+            case _:
+                return value
+
+    return msgspec.convert(rounded(msgspec.to_builtins(arm)), ArmModel)
+
+
+def _performances(factors: Mapping[str, Sequence[str]], rms: FloatArray, tolerance: float) -> list[Performance]:
+    """RMS [mm] by each factor."""
+    found: list[Performance] = []
+    for factor, cells in factors.items():
+        levels = anova.levels_of(rms, cells)
+        limit, verdict = _limit(levels, tolerance * units.MM)
+        found.append(Performance(factor=factor, levels=levels, limit=limit, verdict=verdict))
+    return found
+
+
+def _limit(levels: Sequence[anova.Level], tolerance: float) -> tuple[float | None, str]:
+    """Where the mean RMS passes the tolerance, and in words. RMS and tolerance in mm."""
+    within = [level.mean <= tolerance for level in levels]
+    if all(within):
+        return None, f"within {tolerance:g} mm at every level tried"
+    if not any(within):
+        return None, f"beyond {tolerance:g} mm at every level tried"
+    first = within.index(False)
+    numbers = anova.numbers([level.level for level in levels])
+    if numbers is None or not first or any(within[first:]):
+        good = ", ".join(level.level for level, fine in zip(levels, within, strict=True) if fine)
+        return None, f"within {tolerance:g} mm at {good} only"
+    low, high = levels[first - 1].mean, levels[first].mean
+    limit = numbers[first - 1] + (tolerance - low) / (high - low) * (numbers[first] - numbers[first - 1])
+    between = f"between the levels {levels[first - 1].level} and {levels[first].level}"
+    return limit, f"within {tolerance:g} mm up to {limit:.3g} ({between})"
+
+
+def _valid(performance: Sequence[Performance], used: Sequence[Fitted], period: float) -> Validity:
+    """Limits that fuse can check: speed, and distance from the base where a factor is called so."""
+    limits = {one.factor: one.limit for one in performance}
+    fastest = max(one.trial.speed_at(period) for one in used)
+    radius = limits.get("radius_mm")
+    return Validity(
+        max_speed=limits.get("speed_m_s") or fastest, max_radius=None if radius is None else radius / units.MM
+    )
+
+
+def _coefficients(used: Sequence[Fitted]) -> dict[str, FloatArray]:
+    """The paper's three, of first-order fits, in the units that their names tell."""
+    return {
+        "delay_ms": np.array([one.first.shape.delay for one in used]) * units.MM,
+        "gain": np.array([one.first.gain for one in used]),
+        "time_constant_ms": np.array([one.first.shape.q for one in used]) * units.MM,
+    }
+
+
+_PLACES = {"delay_ms": (0, units.MM), "gain": (2, 1.0), "time_constant_ms": (1, units.MM)}  # in a covariance; unit
+
+
+def _scatters(fitted: Sequence[Fitted]) -> list[anova.Scatter]:
+    found: list[anova.Scatter] = []
+    for axis in dict.fromkeys(one.trial.axis for one in fitted):
+        on_axis = [one for one in fitted if one.trial.axis == axis]
+        for coefficient, values in _coefficients(on_axis).items():
+            place, unit = _PLACES[coefficient]
+            sd = np.sqrt([one.first.covariance[place, place] for one in on_axis]) * unit
+            found.append(anova.scatter(coefficient, [one.trial for one in on_axis], values, sd))
+    return found
+
+
+def _result(
+    one: Fitted, period: float, usual: float, rms: Mapping[str, float], left_out: Mapping[str, str]
+) -> TrialResult:
+    trial = one.trial
+    return TrialResult(
+        trial=trial.name,
+        axis=trial.axis,
+        step=trial.step,
+        speed=trial.speed_at(period),
+        factors=trial.factors,
+        onset=one.onset if np.isfinite(one.onset) else None,
+        first=_order_fit(one.first, trial, usual),
+        second=_order_fit(one.second, trial, usual),
+        combined_rms=rms.get(trial.name),
+        left_out=left_out.get(trial.name),
+    )
+
+
+def _order_fit(fit: StepFit, trial: Trial, usual: float) -> OrderFit:
+    plant = fit.plant
+    return OrderFit(
+        gain=fit.gain,
+        gain_ci95=fit.gain_ci95,
+        delay=fit.shape.delay,
+        delay_ci95=fit.delay_ci95,
+        time_constant=plant.time_constant if isinstance(plant, FirstOrder) else None,
+        time_constant_ci95=fit.q_ci95 if fit.order == 1 else None,
+        natural_frequency=plant.natural_frequency if isinstance(plant, SecondOrder) else None,
+        natural_frequency_ci95=fit.natural_frequency_ci95 if fit.order == 2 else None,
+        damping=plant.damping if isinstance(plant, SecondOrder) else None,
+        damping_ci95=fit.damping_ci95 if fit.order == 2 else None,
+        rms=fit.rms,
+        rms_percent=100.0 * fit.rms / abs(trial.step),
+        flags=flags(fit, usual),
+    )

@@ -1,0 +1,330 @@
+"""Does a model hold on a run it was not made from? The paper's white-noise verification, Table III and Figs. 8 and 9.
+
+The model is driven by the run's commands alone and compared with what was measured, both without their means, as in the
+paper. Beside it stands the floor: the best linear model of the same order, refitted on this very run; no model of that
+kind can do better, so what is left is noise, friction and everything else that is not linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from .. import units
+from ..arrays import FloatArray, TimeArray
+from ..errors import RunError
+from ..fusion import timeline as timelines
+from ..fusion.config import FusionConfig, Sensor
+from ..fusion.timeline import AxisInput
+from ..model.arm import ArmModel, AxisModel, Gain
+from ..model.drive import drive
+from ..model.plants import PLANTS, FirstOrder, SecondOrder
+from ..model.respond import respond
+from ..runs.axes import in_axes
+from ..runs.clock import segments
+from ..runs.run import Run
+from .rows import Order
+
+RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
+REFERENCE = "reference"
+_FEWEST = 20  # readings
+_MOST_LEVELS = 8  # of a run whose start level is looked for among them
+
+
+class Fit(msgspec.Struct, frozen=True, kw_only=True):
+    """How well a simulated position fits the measured one.
+
+    Attributes:
+        rms: Of the difference, without its mean [m].
+        percent: Of the amplitude of the commands.
+        fit: 100 (1 − ‖difference‖ / ‖measured‖), both without their means.
+    """
+
+    rms: float = msgspec.field(name="rms_mm")
+    percent: float = msgspec.field(name="percent_of_signal")
+    fit: float = msgspec.field(name="fit_percent")
+
+
+class Floor(msgspec.Struct, frozen=True, kw_only=True):
+    """The best linear model of the order, refitted on the run.
+
+    Attributes:
+        fit: How well it fits.
+        delay: Td [s].
+        gain: K.
+        plant: Of unit gain.
+    """
+
+    fit: Fit
+    delay: float = msgspec.field(name="delay_ms")
+    gain: float
+    plant: PLANTS
+
+
+class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
+    """One axis of a run against one source.
+
+    Attributes:
+        run: Its name.
+        axis: The axis.
+        source: The sensor, or ``reference``.
+        readings: How many were compared.
+        amplitude: From the lowest to the highest command [m].
+        start: Level at which the arm was taken to rest before the first command [m].
+        start_from: How that was known, in words.
+        model: The model as it is.
+        without_recovery: With a gain that never recovers.
+        with_recovery: With a gain that recovers.
+        recovery: Its time constant [s].
+        floor: The best that a linear model of this order can do on this run.
+        verdict: In words.
+    """
+
+    run: str
+    axis: str
+    source: str
+    readings: int
+    amplitude: float = msgspec.field(name="amplitude_mm")
+    start: float = msgspec.field(name="start_mm")
+    start_from: str
+    model: Fit
+    without_recovery: Fit
+    with_recovery: Fit
+    recovery: float = msgspec.field(name="recovery_ms")
+    floor: Floor
+    verdict: str
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What was compared, without means, for a picture. Arrays (n,).
+
+    Attributes:
+        time: [s] since the first command.
+        measured: [m].
+        modelled: [m].
+    """
+
+    time: FloatArray
+    measured: FloatArray
+    modelled: FloatArray
+
+
+def verify(
+    run: Run, arm: ArmModel, *, sensors: Iterable[str] | None = None, start: Mapping[str, float] | None = None
+) -> list[tuple[AxisVerification, Trace]]:
+    """Simulate a run's commands and compare with what was measured.
+
+    Args:
+        run: With readings or a reference that are true at their stamps.
+        arm: The model.
+        sensors: Which sensors, or ``reference``; None: the reference where there is one, else every sensor.
+        start: Level [m] before the first command by axis; where it is not known from here or the run, it is chosen
+            among the run's levels by RMS.
+
+    Returns:
+        For each axis and source the verdict, and the traces it was made of.
+
+    Raises:
+        PumafuseError: The run has no such sensor, commands an axis that the arm has not, or nothing to compare with.
+    """
+    chosen, known = _with_reference(run, None if sensors is None else tuple(sensors)), dict(start or {})
+    in_place, _ = in_axes(chosen, None)
+    part = segments(in_place)[0][0]
+    part = replace(part, start={**part.start, **known})
+    config = FusionConfig(arm=arm, sensors={name: Sensor(sd=units.MM**-1) for name in part.sensors})
+    timeline = timelines.build(part, config)
+    scalars, found = timeline.scalars, list[tuple[AxisVerification, Trace]]()
+    for number, driven in enumerate(timeline.axes):
+        for index, source in enumerate(scalars.sensors):
+            here = scalars.candidates[
+                (scalars.axis[scalars.candidates] == number) & (scalars.sensor[scalars.candidates] == index)
+            ]
+            if len(here) >= _FEWEST:
+                given = driven.name in part.start
+                measured = _Measured(run.name, source, scalars.valid[here], scalars.value[here])
+                found.append(_verified(measured, driven, arm, given))
+    if not found:
+        raise RunError(
+            f"run '{run.name}': no source has {_FEWEST} readings of a commanded axis after the first command"
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Readings of one axis: when [ns] and where [m], (n,)."""
+
+    run: str
+    source: str
+    time: TimeArray
+    position: FloatArray
+
+    def fit(self, modelled: FloatArray, amplitude: float) -> Fit:
+        left = self.position - modelled
+        rms, signal = float(np.std(left)), float(np.std(self.position))
+        return Fit(
+            rms=rms,
+            percent=100.0 * rms / amplitude if amplitude > 0.0 else np.inf,
+            fit=100.0 * (1.0 - rms / signal) if signal > 0.0 else -np.inf,
+        )
+
+
+def _with_reference(run: Run, sensors: Sequence[str] | None) -> Run:
+    """The run with only the sources that it is verified against, as sensors."""
+    sources = dict(run.sensors)
+    if run.reference is not None:
+        sources[REFERENCE] = run.reference
+    if sensors is None:
+        sensors = (REFERENCE,) if run.reference is not None else tuple(sources)
+    if strange := [name for name in sensors if name not in sources]:
+        raise RunError(f"run '{run.name}' has no sensor '{strange[0]}'; it has {', '.join(sources) or 'none'}")
+    return replace(run, sensors={name: sources[name] for name in sensors}, reference=None)
+
+
+def _verified(measured: _Measured, driven: AxisInput, arm: ArmModel, given: bool) -> tuple[AxisVerification, Trace]:
+    model, delay = arm.axes[driven.name], arm.delay_of(driven.name)
+    command = _Commands(driven.given, driven.command, arm.update_period)
+    recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
+    start, words = _start(measured, command, driven.start, model, delay, given)
+
+    def simulated(axis: AxisModel) -> FloatArray:
+        return command.moved(axis, delay, start, measured.time)
+
+    fits = {
+        key: measured.fit(simulated(msgspec.structs.replace(model, gain_recovery=value)), command.amplitude)
+        for key, value in (("as it is", model.gain_recovery), ("never", None), ("recovering", recovery))
+    }
+    floor = _floor(measured, command, model, delay, start)
+    modelled = simulated(model)
+    trace = Trace(
+        units.seconds(measured.time, int(command.time[0])),
+        measured.position - measured.position.mean(),
+        modelled - modelled.mean(),
+    )
+    verification = AxisVerification(
+        run=measured.run,
+        axis=driven.name,
+        source=measured.source,
+        readings=len(measured.time),
+        amplitude=command.amplitude,
+        start=start,
+        start_from=words,
+        model=fits["as it is"],
+        without_recovery=fits["never"],
+        with_recovery=fits["recovering"],
+        recovery=recovery,
+        floor=floor,
+        verdict=_verdict(fits["as it is"], floor.fit),
+    )
+    return verification, trace
+
+
+@dataclass(frozen=True)
+class _Commands:
+    """Commands of one axis: when [ns] and u [m], (k,); the update period [s]."""
+
+    time: TimeArray
+    value: FloatArray
+    period: float
+
+    @property
+    def amplitude(self) -> float:
+        return float(np.ptp(self.value))
+
+    def moved(self, axis: AxisModel, delay: float, start: float, time: TimeArray) -> FloatArray:
+        """Where the axis is at ``time`` [ns], relative to ``start`` [m], (n,)."""
+        driven = drive(axis, self.time, self.value, start, self.period)
+        return respond(axis.plant, driven.time + round(delay * 1e9), driven.value, time)
+
+
+def _start(
+    measured: _Measured, command: _Commands, first: float, model: AxisModel, delay: float, given: bool
+) -> tuple[float, str]:
+    """Where the arm rested before the first command [m], and how that is known."""
+    if given:
+        return first, "given"
+    levels = np.unique(command.value)
+    if len(levels) > _MOST_LEVELS:
+        return first, "the first command"
+    rms = [np.std(measured.position - command.moved(model, delay, level, measured.time)) for level in levels.tolist()]
+    return float(levels[np.argmin(rms)]), f"chosen among the run's {len(levels)} levels by RMS"
+
+
+def _floor(measured: _Measured, command: _Commands, model: AxisModel, delay: float, start: float) -> Floor:
+    """The best gain, delay and plant of the model's order on this run; gain and bias are linear."""
+    from scipy.optimize import least_squares
+
+    order: Order = 1 if isinstance(model.plant, FirstOrder) else 2
+    z = measured.position - measured.position.mean()
+    first = _coordinates(delay, model.plant)
+    unit = Gain()
+
+    def basis(x: FloatArray) -> FloatArray:
+        axis = AxisModel(plant=_plant_at(x), gain=unit)
+        c = command.moved(axis, float(x[0]) ** 2, start, measured.time)
+        return c - c.mean()
+
+    def left(x: FloatArray) -> FloatArray:
+        c = basis(x)
+        power = float(c @ c)
+        return z - (float(c @ z) / power) * c if power > 0.0 else z
+
+    best = min(
+        (
+            least_squares(left, first + shift, x_scale="jac", xtol=1e-10, ftol=1e-12, gtol=1e-12, max_nfev=300)
+            for shift in _shifts(first, order)
+        ),
+        key=lambda found: found.cost,
+    )
+    c = basis(best.x)
+    power = float(c @ c)
+    gain = float(c @ z) / power if power > 0.0 else 0.0
+    return Floor(
+        fit=measured.fit(gain * c, command.amplitude),
+        delay=float(best.x[0]) ** 2,
+        gain=gain,
+        plant=_plant_at(best.x),
+    )
+
+
+def _coordinates(delay: float, plant: PLANTS) -> FloatArray:
+    """√Td and log τ, or log 2ζ/ω and log 1/ω: free of bounds."""
+    if isinstance(plant, FirstOrder):
+        return np.array([np.sqrt(delay), np.log(plant.time_constant)])
+    q = 2.0 * plant.damping / plant.natural_frequency
+    return np.array([np.sqrt(delay), np.log(q), -np.log(plant.natural_frequency)])
+
+
+def _plant_at(x: FloatArray) -> PLANTS:
+    q = float(np.exp(np.clip(x[1], -12.0, 6.0)))
+    if len(x) == 2:
+        return FirstOrder(time_constant=q)
+    omega = float(np.exp(-np.clip(x[2], -12.0, 6.0)))
+    return SecondOrder(natural_frequency=omega, damping=0.5 * q * omega)
+
+
+def _shifts(first: FloatArray, order: Order) -> list[FloatArray]:
+    """Where else to begin: other delays, faster and slower plants."""
+    shifts = [np.zeros(len(first))]
+    for delay in (-0.25, 0.25):
+        for slow in (-0.5, 0.5):
+            shift = np.zeros(len(first))
+            shift[0] = delay * max(float(first[0]), 0.1)
+            shift[1:] = slow if order == 1 else [slow, 0.5 * slow]
+            shifts.append(shift)
+    return shifts
+
+
+def _verdict(model: Fit, floor: Fit) -> str:
+    if floor.fit < 50.0:
+        return "no linear model of this order fits: look at the log"
+    ratio = model.rms / floor.rms if floor.rms > 0.0 else np.inf
+    if ratio < 1.2:
+        return "the model is as good as any of its order"
+    if ratio < 2.0:
+        return f"{ratio:.1f} times the floor: the model holds, a refit would help"
+    return f"{ratio:.1f} times the floor: the model does not hold on this run"
