@@ -14,11 +14,11 @@ from rich.table import Table
 from ..errors import PumafuseWarning
 from ..folders import FolderError, write_file
 from ..identify.anova import Dependence, Scatter
-from ..identify.estimate import Estimate
 from ..identify.identify import Identification, identify
 from ..identify.trials import StepTrials
-from ..model.plants import FirstOrder, Interval
+from ..model.plants import FirstOrder
 from ..units import MM
+from ..views import words
 from .tables import console
 
 
@@ -99,33 +99,22 @@ def _models(found: Identification) -> Table:
     for heading in ("trials", "plant", "K at speed s [m/s]", "Td, ms", "onset, ms", "lag, ms", "RMS, mm"):
         table.add_column(heading, justify="right")
     for axis, one in found.axes.items():
-        plant, gain = one.model.plant, one.model.gain
-        shape = (
-            f"τ {_with(plant.time_constant, plant.time_constant_ci95, MM)} ms"
-            if isinstance(plant, FirstOrder)
-            else f"ω {_with(plant.natural_frequency, plant.natural_frequency_ci95)} rad/s\n"
-            f"ζ {_with(plant.damping, plant.damping_ci95)}"
-        )
-        line = f"{_with(gain.intercept, gain.intercept_ci95)}"
-        if gain.slope:
-            line += f"\n+ {_with(gain.slope, gain.slope_ci95)} s"
-        rms = [
-            t.combined_rms for t in found.trials if t.axis == axis and t.left_out is None and t.combined_rms is not None
-        ]
-        delays = one.delays
+        delays, plant = one.delays, one.model.plant
+        used = [trial.combined_rms for trial in found.trials if trial.axis == axis and trial.left_out is None]
+        rms = [value for value in used if value is not None]
         table.add_row(
             escape(axis),
             str(one.trials),
-            shape,
-            line,
-            _ms(delays.fitted),
-            _ms(delays.onset),
-            _ms(delays.lag),
+            words.plant(plant).replace(", ", "\n"),
+            words.gain(one.model.gain).replace(" + ", "\n+ "),
+            words.milliseconds(delays.fitted),
+            words.milliseconds(delays.onset),
+            words.milliseconds(delays.lag),
             f"{MM * float(np.sqrt(np.mean(np.square(rms)))):.3f}",
         )
         if isinstance(plant, FirstOrder):
-            averages = f"trials' mean {_ms(one.time_constant_mean)}, robust {_ms(one.time_constant_robust)} ms"
-            table.add_row("", "", averages, "", "", "", "", "")
+            averages = (words.milliseconds(one.time_constant_mean), words.milliseconds(one.time_constant_robust))
+            table.add_row("", "", f"trials' mean {averages[0]},\nrobust {averages[1]} ms", "", "", "", "", "")
     return table
 
 
@@ -138,19 +127,14 @@ def _dependences(rows: list[Dependence]) -> Table:
         table.add_column(heading, justify="right")
     table.add_column("verdict", overflow="fold")
     for row in rows:
-        levels = "\n".join(
-            f"{level.level}: {level.mean:.4g}"
-            + ("" if level.sd is None else f" ± {level.sd:.2g}")
-            + f" ({level.trials})"
-            for level in row.levels
-        )
+        levels = "\n".join(words.level(level) for level in row.levels)
         table.add_row(
             row.coefficient,
             escape(row.factor),
             escape(levels),
             "–" if row.i_ratio is None else f"{row.i_ratio:.2f}",
-            _p(row.welch_p),
-            _p(row.adjusted_p),
+            words.p_value(row.welch_p),
+            words.p_value(row.adjusted_p),
             row.verdict,
         )
     return table
@@ -170,26 +154,9 @@ def _scatter(rows: list[Scatter]) -> Table:
             row.coefficient,
             escape(row.axis),
             f"{row.median:.4g}",
-            _p(row.normal_p),
+            words.p_value(row.normal_p),
             replicates,
             f"{row.own_sd:.2g}",
             named,
         )
     return table
-
-
-def _p(value: float | None) -> str:
-    return "–" if value is None else "< 0.001" if value < 1e-3 else f"{value:.3f}"
-
-
-def _ms(estimate: Estimate) -> str:
-    return _with(estimate.value, estimate.ci95, MM)
-
-
-def _with(value: float, interval: Interval | None, unit: float = 1.0) -> str:
-    """A number with half its interval, in as many digits as the interval is worth."""
-    if interval is None or not np.isfinite(interval).all():
-        return f"{value * unit:.4g}"
-    half = 0.5 * (interval[1] - interval[0]) * unit
-    digits = max(1 - int(np.floor(np.log10(half))), 0) if half > 0.0 else 3
-    return f"{value * unit:.{min(digits, 6)}f} ± {half:.{min(digits, 6)}f}"

@@ -13,9 +13,9 @@ from rich.table import Table
 from .. import units
 from ..identify.verify import AxisVerification, verify
 from ..model.arm import ArmModel
-from ..model.plants import FirstOrder
 from ..runs.run import Run
 from ..units import MM
+from ..views import words
 from .tables import console
 
 
@@ -58,32 +58,20 @@ def _show(verified: Sequence[AxisVerification], report: Path | None) -> None:
         table.add_column(heading, overflow="fold")
     for heading in ("signal, mm", "RMS, mm", "of signal", "fit", "no recovery", "recovery", "floor, mm"):
         table.add_column(heading, justify="right")
-    table.add_column("verdict", overflow="fold")
     for one in verified:
         table.add_row(
             escape(one.run),
             escape(one.axis),
             escape(one.source),
-            f"{one.amplitude * MM:.4g}",
-            f"{one.model.rms * MM:.3f}",
-            f"{one.model.percent:.1f} %",
-            f"{one.model.fit:.1f} %",
-            f"{one.without_recovery.rms * MM:.3f}",
-            f"{one.with_recovery.rms * MM:.3f}",
-            f"{one.floor.fit.rms * MM:.3f}",
-            one.verdict,
+            *words.verification(one),
         )
     out.print(table)
     for one in verified:
-        floor, plant = one.floor, one.floor.plant
-        shape = (
-            f"τ {plant.time_constant * MM:.1f} ms"
-            if isinstance(plant, FirstOrder)
-            else f"ω {plant.natural_frequency:.1f} rad/s, ζ {plant.damping:.2f}"
-        )
+        floor = one.floor
+        refitted = f"K {floor.gain:.3f}, Td {floor.delay * MM:.1f} ms, {words.plant(floor.plant)}"
         out.print(
-            f"{one.run}, {one.axis}: start level {one.start * MM:g} mm ({one.start_from}); gain recovery tried with"
-            f" {one.recovery * MM:g} ms; the floor is K {floor.gain:.3f}, Td {floor.delay * MM:.1f} ms, {shape}",
+            f"{one.run}, {one.axis}: {one.verdict}; start level {one.start * MM:g} mm ({one.start_from}); gain recovery tried with"
+            f" {one.recovery * MM:g} ms; the floor is {refitted}",
             markup=False,
         )
     if report is not None:

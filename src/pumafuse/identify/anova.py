@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray
+from ..model.arm import ordered_axes
 from .trials import Trial
 
 _COUNTERS = frozenset({"replicate", "repetition", "repeat", "rep", "run", "observation"})  # columns that only count
@@ -111,8 +112,8 @@ def numbers(cells: Sequence[str]) -> list[float] | None:
 
 
 def ordered(levels: set[str]) -> list[str]:
-    """Levels by number where they are numbers, else by name."""
-    return sorted(levels) if numbers(list(levels)) is None else sorted(levels, key=float)
+    """Levels by number where they are numbers, else by name, axes in their own order."""
+    return list(ordered_axes(levels)) if numbers(list(levels)) is None else sorted(levels, key=float)
 
 
 def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Sequence[str]]) -> list[Dependence]:

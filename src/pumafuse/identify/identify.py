@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import units
 from ..arrays import FloatArray
-from ..model.arm import ArmModel, Validity
+from ..model.arm import ArmModel, Validity, ordered_axes
 from ..model.plants import FirstOrder, Interval, SecondOrder
 from . import anova
 from .combine import Combination, CombinedAxis, Fitted, combine, combined_rms, usual_gain
@@ -71,6 +71,8 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
         onset: When the arm was first seen to move [s]; null: never.
         first: First-order fit.
         second: Second-order fit.
+        common_delay: Td under the plant that its axis's trials have in common [s]; null when left out.
+        common_gain: K under it.
         combined_rms: Of what the combined model leaves [m]; null without one.
         left_out: Why it is not in the combined model; null when it is.
     """
@@ -83,6 +85,8 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     onset: float | None = msgspec.field(name="onset_ms")
     first: OrderFit
     second: OrderFit
+    common_delay: float | None = msgspec.field(name="common_delay_ms")
+    common_gain: float | None
     combined_rms: float | None = msgspec.field(name="combined_rms_mm")
     left_out: str | None
 
@@ -180,6 +184,15 @@ def identify(
     usual = {axis: usual_gain([one for one in fitted if one.trial.axis == axis]) for axis in trials.axes}
     left_out = {trial: why for found in combined.values() for trial, why in found.axis.left_out.items()}
     used = [one for one in fitted if one.trial.name in rms and one.trial.name not in left_out]
+    own = {
+        one.trial.name: pair
+        for axis, found in combined.items()
+        for one, pair in zip(
+            [one for one in used if one.trial.axis == axis],
+            zip(found.common.delay.tolist(), found.common.gain.tolist(), strict=True),
+            strict=True,
+        )
+    }
     factors = anova.factors_of([one.trial for one in used], period)
     performance = _performances(factors, np.array([rms[one.trial.name] for one in used]) * units.MM, tolerance)
     limited = _valid(performance, used, period)
@@ -201,7 +214,7 @@ def identify(
         method="published" if paper else "fitted",
         samples=samples,
         tolerance=tolerance,
-        trials=[_result(one, period, usual[one.trial.axis], rms, left_out) for one in fitted],
+        trials=[_result(one, period, usual[one.trial.axis], own, rms, left_out) for one in fitted],
         axes={axis: found.axis for axis, found in combined.items()},
         one_delay=one_delay,
         dependences=anova.dependences(_coefficients(used), factors) if factors else [],
@@ -316,7 +329,7 @@ _PLACES = {"delay_ms": (0, units.MM), "gain": (2, 1.0), "time_constant_ms": (1, 
 
 def _scatters(fitted: Sequence[Fitted]) -> list[anova.Scatter]:
     found: list[anova.Scatter] = []
-    for axis in dict.fromkeys(one.trial.axis for one in fitted):
+    for axis in ordered_axes({one.trial.axis for one in fitted}):
         on_axis = [one for one in fitted if one.trial.axis == axis]
         for coefficient, values in _coefficients(on_axis).items():
             place, unit = _PLACES[coefficient]
@@ -326,9 +339,15 @@ def _scatters(fitted: Sequence[Fitted]) -> list[anova.Scatter]:
 
 
 def _result(
-    one: Fitted, period: float, usual: float, rms: Mapping[str, float], left_out: Mapping[str, str]
+    one: Fitted,
+    period: float,
+    usual: float,
+    own: Mapping[str, tuple[float, float]],
+    rms: Mapping[str, float],
+    left_out: Mapping[str, str],
 ) -> TrialResult:
     trial = one.trial
+    delay, gain = own.get(trial.name, (None, None))
     return TrialResult(
         trial=trial.name,
         axis=trial.axis,
@@ -338,6 +357,8 @@ def _result(
         onset=one.onset if np.isfinite(one.onset) else None,
         first=_order_fit(one.first, trial, usual),
         second=_order_fit(one.second, trial, usual),
+        common_delay=delay,
+        common_gain=gain,
         combined_rms=rms.get(trial.name),
         left_out=left_out.get(trial.name),
     )

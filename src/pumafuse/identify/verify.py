@@ -32,6 +32,8 @@ RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
 REFERENCE = "reference"
 _FEWEST = 20  # readings
 _MOST_LEVELS = 8  # of a run whose start level is looked for among them
+_AS_GOOD = 1.2  # times the floor
+_HOLDS = 50.0  # % fit
 
 
 class Fit(msgspec.Struct, frozen=True, kw_only=True):
@@ -218,7 +220,7 @@ def _verified(measured: _Measured, driven: AxisInput, arm: ArmModel, given: bool
         with_recovery=fits["recovering"],
         recovery=recovery,
         floor=floor,
-        verdict=_verdict(fits["as it is"], floor.fit),
+        verdict=_verdict(fits["as it is"], model, delay, floor),
     )
     return verification, trace
 
@@ -291,12 +293,16 @@ def _floor(measured: _Measured, command: _Commands, model: AxisModel, delay: flo
     )
 
 
+def lag(plant: PLANTS) -> float:
+    """How far a plant is behind its input at constant velocity [s]: τ, or 2ζ/ω."""
+    return plant.time_constant if isinstance(plant, FirstOrder) else 2.0 * plant.damping / plant.natural_frequency
+
+
 def _coordinates(delay: float, plant: PLANTS) -> FloatArray:
     """√Td and log τ, or log 2ζ/ω and log 1/ω: free of bounds."""
     if isinstance(plant, FirstOrder):
         return np.array([np.sqrt(delay), np.log(plant.time_constant)])
-    q = 2.0 * plant.damping / plant.natural_frequency
-    return np.array([np.sqrt(delay), np.log(q), -np.log(plant.natural_frequency)])
+    return np.array([np.sqrt(delay), np.log(lag(plant)), -np.log(plant.natural_frequency)])
 
 
 def _plant_at(x: FloatArray) -> PLANTS:
@@ -319,12 +325,16 @@ def _shifts(first: FloatArray, order: Order) -> list[FloatArray]:
     return shifts
 
 
-def _verdict(model: Fit, floor: Fit) -> str:
-    if floor.fit < 50.0:
+def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor) -> str:
+    """How near the model is to the best of its order, and where the two differ."""
+    if floor.fit.fit < _HOLDS:
         return "no linear model of this order fits: look at the log"
-    ratio = model.rms / floor.rms if floor.rms > 0.0 else np.inf
-    if ratio < 1.2:
-        return "the model is as good as any of its order"
-    if ratio < 2.0:
-        return f"{ratio:.1f} times the floor: the model holds, a refit would help"
-    return f"{ratio:.1f} times the floor: the model does not hold on this run"
+    ratio = model.rms / floor.fit.rms if floor.fit.rms > 0.0 else 1.0 if model.rms == 0.0 else np.inf
+    if ratio < _AS_GOOD:
+        return "as good as any model of its order"
+    later = (floor.delay + lag(floor.plant)) - (delay + lag(axis.plant))
+    differ = f"here the arm answers {abs(later) * units.MM:.1f} ms {'later' if later > 0.0 else 'sooner'}"
+    held = "holds" if model.fit >= _HOLDS else "does not hold"
+    return (
+        f"{held}, with {ratio:.1f} times the error of the best model of its order: {differ}, with gain {floor.gain:.2f}"
+    )

@@ -1,0 +1,241 @@
+"""Figures of an identification and of its verification, as SVG text for a page."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FormatStrFormatter, MaxNLocator, NullLocator
+
+from ..identify.anova import Level, factors_of, levels_of, numbers
+from ..identify.identify import Identification, TrialResult
+from ..identify.rows import Rows, window
+from ..identify.trials import StepTrials, Trial
+from ..identify.verify import AxisVerification, Trace
+from ..units import MM
+from . import style
+
+_SECONDS = 1.2  # of a white-noise run that is shown in detail
+_GRID = 40  # points each way of a contour plot
+_SPREAD = 4.0  # how far it goes from ω and ζ, as a factor
+
+
+class Sheet:
+    """Axes to draw on; ``svg`` is the picture when the drawing is done."""
+
+    def __init__(self, axes: list[Axes]) -> None:
+        self.axes = axes
+        self.svg = ""
+
+
+def responses(found: Identification, trials: StepTrials) -> str:
+    """Every trial over its own gain, from its own delay on, beside the combined plant."""
+    measured = {trial.name: trial for trial in trials.trials}
+    with _sheet(len(found.axes)) as sheet:
+        for axes, (axis, combined) in zip(sheet.axes, found.axes.items(), strict=True):
+            plant = combined.model.plant
+            longest = 0.0
+            for one in found.trials:
+                if one.axis != axis or one.common_delay is None or not one.common_gain:
+                    continue
+                time, position = window(measured[one.trial], found.samples)
+                t, height = time - one.common_delay, one.common_gain * one.step
+                zero = float(np.mean(position - height * plant.step_response(t)))
+                axes.plot(t * MM, (position - zero) / height, color=style.BAND, lw=0.6, alpha=0.7)
+                longest = max(longest, float(t[-1]))
+            t = np.linspace(-0.02, longest, 400)
+            axes.plot(t * MM, plant.step_response(t), color=style.REFERENCE, lw=1.4)
+            axes.set_title(axis, loc="left")
+            axes.set_xlabel("time since the trial's own delay [ms]")
+            axes.set_ylim(-0.15, 1.3)
+        sheet.axes[0].set_ylabel("share of the final value")
+    return sheet.svg
+
+
+def delays(found: Identification) -> str:
+    """Td of each trial in the order of the campaign."""
+    with _sheet(len(found.axes)) as sheet:
+        for axes, (axis, combined) in zip(sheet.axes, found.axes.items(), strict=True):
+            values = [one.common_delay for one in found.trials if one.axis == axis and one.common_delay is not None]
+            axes.plot(np.arange(1, len(values) + 1), np.array(values) * MM, ".", color=style.ESTIMATE, ms=4)
+            fitted = combined.delays.fitted
+            axes.axhline(fitted.value * MM, color=style.REFERENCE, lw=1.0)
+            axes.axhspan(fitted.ci95[0] * MM, fitted.ci95[1] * MM, color=style.ESTIMATE, alpha=0.2, lw=0)
+            axes.set_title(axis, loc="left")
+            axes.set_xlabel("trial, in the order of the list")
+        sheet.axes[0].set_ylabel("delay [ms]")
+    return sheet.svg
+
+
+def gains(found: Identification) -> str:
+    """K of each trial against speed, with the line."""
+    with _sheet(len(found.axes)) as sheet:
+        for axes, (axis, combined) in zip(sheet.axes, found.axes.items(), strict=True):
+            used = [one for one in found.trials if one.axis == axis]
+            pairs = [(one.speed, one.common_gain) for one in used if one.common_gain is not None]
+            speed, gain = np.array(pairs).T
+            axes.plot(speed, gain, ".", color=style.ESTIMATE, ms=4)
+            at = np.linspace(0.0, 1.05 * float(speed.max()), 50)
+            axes.plot(at, combined.model.gain.at(at), color=style.REFERENCE, lw=1.0)
+            axes.set_title(axis, loc="left")
+            axes.set_xlabel("speed [m/s]")
+        sheet.axes[0].set_ylabel("gain K")
+    return sheet.svg
+
+
+def histograms(found: Identification) -> str:
+    """Delay, gain and τ of first-order fits (the paper's Fig. 5)."""
+    used = [one for one in found.trials if one.left_out is None]
+    columns = {
+        "delay [ms]": [one.first.delay * MM for one in used],
+        "gain": [one.first.gain for one in used],
+        "time constant [ms]": [(one.first.time_constant or 0.0) * MM for one in used],
+    }
+    with _sheet(3) as sheet:
+        for axes, (name, values) in zip(sheet.axes, columns.items(), strict=True):
+            axes.hist(values, bins="auto", color=style.BAND, edgecolor="white")
+            axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+            axes.set_xlabel(name)
+        sheet.axes[0].set_ylabel("trials")
+    return sheet.svg
+
+
+def fits_by_factor(found: Identification, trials: StepTrials) -> str:
+    """RMS of both orders by each factor, with two standard deviations (the paper's Fig. 6)."""
+    used = [one for one in found.trials if one.left_out is None]
+    names = {one.trial for one in used}
+    factors = factors_of([trial for trial in trials.trials if trial.name in names], found.arm.update_period)
+    if not factors:
+        return ""
+    rms = {
+        order: np.array([(one.first if order == "first order" else one.second).rms for one in used]) * MM
+        for order in ("first order", "second order")
+    }
+    with _sheet(len(factors)) as sheet:
+        for axes, (factor, cells) in zip(sheet.axes, factors.items(), strict=True):
+            for number, (order, values) in enumerate(rms.items()):
+                colour = (style.COMMAND, style.ESTIMATE)[number]
+                _levels(axes, levels_of(values, cells), colour, order, 0.15 * (2 * number - 1))
+            axes.set_xlabel(factor)
+            axes.set_ylim(bottom=0.0)
+        sheet.axes[0].set_ylabel("RMS of each trial's own fit [mm]")
+        sheet.axes[0].legend(frameon=False)
+    return sheet.svg
+
+
+def performance(found: Identification) -> str:
+    """RMS of the combined model by each factor (the paper's Fig. 7)."""
+    if not found.performance:
+        return ""
+    with _sheet(len(found.performance)) as sheet:
+        for axes, one in zip(sheet.axes, found.performance, strict=True):
+            _levels(axes, one.levels, style.ESTIMATE, "combined model", 0.0)
+            top = max(level.mean + 2.0 * (level.sd or 0.0) for level in one.levels)
+            if found.tolerance * MM < 3.0 * top:
+                axes.axhline(found.tolerance * MM, color=style.REJECTED, lw=0.8, ls="--")
+            axes.set_xlabel(one.factor)
+            axes.set_ylim(bottom=0.0)
+        sheet.axes[0].set_ylabel("RMS of the combined model [mm]")
+    return sheet.svg
+
+
+def valleys(found: Identification, trials: StepTrials) -> tuple[str, list[str]]:
+    """RMS over ω and ζ of one trial of each axis (the paper's Fig. 4), and which trials those are.
+
+    The trial is the one whose ω is known worst, so that a long flat valley shows where there is any.
+    """
+    measured = {trial.name: trial for trial in trials.trials}
+    chosen = [
+        _flattest([one for one in found.trials if one.axis == axis and one.left_out is None]) for axis in found.axes
+    ]
+    with _sheet(len(chosen)) as sheet:
+        for axes, one in zip(sheet.axes, chosen, strict=True):
+            _valley(axes, one, measured[one.trial], found.samples)
+        sheet.axes[0].set_ylabel("damping ζ")
+    return sheet.svg, [one.trial for one in chosen]
+
+
+def verification(verified: AxisVerification, trace: Trace) -> str:
+    """Measured and modelled position, without means: the first second in detail (the paper's Figs. 8 and 9)."""
+    with _sheet(1, width=9.0) as sheet:
+        axes = sheet.axes[0]
+        shown = trace.time <= trace.time[0] + _SECONDS
+        axes.plot(trace.time[shown], trace.measured[shown] * MM, color=style.REFERENCE, lw=1.0, label="measured")
+        axes.plot(trace.time[shown], trace.modelled[shown] * MM, "--", color=style.ESTIMATE, lw=1.2, label="model")
+        axes.set_title(f"{verified.run}: {verified.axis}, {verified.source}", loc="left")
+        axes.set_xlabel("time since the first command [s]")
+        axes.set_ylabel("position without its mean [mm]")
+        axes.legend(frameon=False, ncols=2, loc="upper right")
+    return sheet.svg
+
+
+def _flattest(trials: Sequence[TrialResult]) -> TrialResult:
+    def openness(one: TrialResult) -> float:
+        low, high = one.second.natural_frequency_ci95 or (1.0, np.inf)
+        return high / max(low, 1e-9)
+
+    return max(trials, key=openness)
+
+
+def _valley(axes: Axes, one: TrialResult, trial: Trial, samples: int | None) -> None:
+    fit = one.second
+    omega, zeta = fit.natural_frequency or 1.0, fit.damping or 1.0
+    omega, zeta = (omega, zeta) if zeta < 5.0 else (omega * 5.0 / zeta, 5.0)  # the valley runs off to infinity
+    across = np.geomspace(omega / _SPREAD, omega * _SPREAD, _GRID)
+    up = np.geomspace(zeta / _SPREAD, zeta * _SPREAD, _GRID)
+    w, z = (grid.ravel() for grid in np.meshgrid(across, up))
+    q, p = 2.0 * z / w, w**-2.0
+    # the delay follows so that the area over the response stays: what a trial tells best
+    delay = np.maximum(fit.delay + 2.0 * zeta / omega - q, 0.0)
+    rows = Rows.of([trial], [1.0], samples).taken(np.zeros(len(w), dtype=np.int64))
+    rms = np.sqrt(rows.point(np.stack((delay, q, p), axis=1)).cost / rows.count) * MM
+    levels = np.geomspace(float(rms.min()) * 1.02, float(rms.max()), 12)
+    axes.contour(across, up, rms.reshape(_GRID, _GRID), levels=levels, colors=style.ESTIMATE, linewidths=0.7)
+    axes.plot(fit.natural_frequency or omega, fit.damping or zeta, "x", color=style.REJECTED)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    for side, ends in ((axes.xaxis, across), (axes.yaxis, up)):
+        marks = float(f"{ends[0]:.1g}") * 2.0 ** np.arange(0, 6)
+        side.set_major_locator(FixedLocator(marks.tolist()))
+        side.set_major_formatter(FormatStrFormatter("%.3g"))
+        side.set_minor_locator(NullLocator())
+    axes.set_xlim(across[0], across[-1])
+    axes.set_ylim(up[0], up[-1])
+    axes.set_title(f"{one.axis}, trial {one.trial}", loc="left")
+    axes.set_xlabel("natural frequency ω [rad/s]")
+
+
+def _levels(axes: Axes, levels: Sequence[Level], colour: str, label: str, aside: float) -> None:
+    """Means with bars of two standard deviations, one for each level."""
+    at = np.arange(len(levels)) + aside
+    means = [level.mean for level in levels]
+    bars = [2.0 * (level.sd or 0.0) for level in levels]
+    axes.errorbar(at, means, bars, fmt="o", ms=4, capsize=3, color=colour, lw=1.0, label=label)
+    axes.set_xticks(np.arange(len(levels)), [level.level for level in levels])
+    if numbers([level.level for level in levels]) is None:
+        axes.tick_params(axis="x", rotation=20)
+
+
+@contextmanager
+def _sheet(columns: int, width: float | None = None) -> Generator[Sheet]:
+    """A row of axes, drawn to SVG when done."""
+    with matplotlib.rc_context(
+        {
+            "font.size": 9,
+            "axes.titlesize": 9,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "svg.hashsalt": "pumafuse",  # the same data give the same page
+        }
+    ):
+        figure = Figure(figsize=(width or 3.6 * columns, 2.9), layout="constrained")
+        sheet = Sheet(figure.subplots(1, columns, squeeze=False)[0].tolist())
+        yield sheet
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None})
+        sheet.svg = text.getvalue()[text.getvalue().index("<svg") :]

@@ -1,0 +1,64 @@
+"""Numbers with their intervals as tables and pages have them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..identify.anova import Level
+from ..identify.estimate import Estimate
+from ..identify.verify import AxisVerification
+from ..model.arm import Gain
+from ..model.plants import PLANTS, FirstOrder, Interval
+from ..units import MM
+
+
+def with_interval(value: float, interval: Interval | None, unit: float = 1.0) -> str:
+    """A number times ``unit`` with half its interval, in as many digits as the interval is worth."""
+    if interval is None or not np.isfinite(interval).all():
+        return f"{value * unit:.4g}"
+    half = 0.5 * (interval[1] - interval[0]) * unit
+    digits = min(max(1 - int(np.floor(np.log10(half))), 0), 6) if half > 0.0 else 3
+    return f"{value * unit:.{digits}f} ± {half:.{digits}f}"
+
+
+def milliseconds(estimate: Estimate) -> str:
+    """An estimate in seconds, shown in milliseconds."""
+    return with_interval(estimate.value, estimate.ci95, MM)
+
+
+def p_value(value: float | None) -> str:
+    """A p-value."""
+    return "–" if value is None else "< 0.001" if value < 1e-3 else f"{value:.3f}"
+
+
+def level(found: Level) -> str:
+    """A level of a factor with mean and standard deviation of the trials there."""
+    spread = "" if found.sd is None else f" ± {found.sd:.2g}"
+    return f"{found.level}: {found.mean:.4g}{spread} ({found.trials})"
+
+
+def plant(found: PLANTS) -> str:
+    """A plant's parameters."""
+    if isinstance(found, FirstOrder):
+        return f"τ {with_interval(found.time_constant, found.time_constant_ci95, MM)} ms"
+    omega = with_interval(found.natural_frequency, found.natural_frequency_ci95)
+    return f"ω {omega} rad/s, ζ {with_interval(found.damping, found.damping_ci95)}"
+
+
+def gain(found: Gain) -> str:
+    """K against speed s."""
+    line = with_interval(found.intercept, found.intercept_ci95)
+    return f"{line} + ({with_interval(found.slope, found.slope_ci95)}) s" if found.slope else line
+
+
+def verification(one: AxisVerification) -> list[str]:
+    """Signal, RMS, its share of the signal, fit, without and with recovery, and the floor."""
+    return [
+        f"{one.amplitude * MM:.4g}",
+        f"{one.model.rms * MM:.3f}",
+        f"{one.model.percent:.1f} %",
+        f"{one.model.fit:.1f} %",
+        f"{one.without_recovery.rms * MM:.3f}",
+        f"{one.with_recovery.rms * MM:.3f}",
+        f"{one.floor.fit.rms * MM:.3f}",
+    ]
