@@ -133,6 +133,50 @@ def simulate(
 
 
 @app.command()
+def plan(
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the sequences go.")],
+    axes: Annotated[str, typer.Option(metavar="A,B", help="Axes to step.")] = "tangential,radial,vertical",
+    speeds: Annotated[
+        str, typer.Option(metavar="M_S,...", help="Speeds of the steps; a step is its speed times the period.")
+    ] = "0.071,0.14,0.28,0.68",
+    positions: Annotated[
+        Path | None, typer.Option(metavar="TABLE", help="Where to step: a row a position, a column a coordinate.")
+    ] = None,
+    replicates: Annotated[int, typer.Option(metavar="N", min=1, help="How often each combination is tried.")] = 2,
+    period: Annotated[float, typer.Option(metavar="MS", help="Update period.")] = 28.0,
+    hold: Annotated[float, typer.Option(metavar="S", help="How long a step is held.")] = 0.5,
+    rest: Annotated[float, typer.Option(metavar="S", help="How long the arm rests before and after it.")] = 0.5,
+    noise: Annotated[
+        str, typer.Option(metavar="MM,...", help="Amplitudes of the white noise; empty: none.")
+    ] = "4,8,14",
+    noise_duration: Annotated[float, typer.Option(metavar="S", help="Of each white-noise sequence.")] = 4.2,
+    arm: Annotated[
+        str | None, typer.Option(metavar="ARM", help="What is known of the arm, to check the plan: arm.toml or preset.")
+    ] = None,
+    max_speed: Annotated[
+        float | None, typer.Option(metavar="M_S", help="The arm's limit; default: the arm's validity.")
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the order and of the noise.")] = 1,
+    force: Force = False,
+) -> None:
+    """Lay out a step campaign and white noise to send to an arm, tick by tick."""
+    from . import plan as command
+
+    design = command.Design(
+        axes=tuple(_names(axes, "--axes")),
+        speeds=_numbers(speeds, "--speeds"),
+        period=_si(_positive(period, "--period")),
+        replicates=replicates,
+        hold=_positive(hold, "--hold"),
+        rest=_positive(rest, "--rest"),
+        amplitudes=tuple(_si(amplitude) for amplitude in _numbers(noise, "--noise")),
+        noise_duration=_positive(noise_duration, "--noise-duration"),
+        seed=seed,
+    )
+    command.run(output, design, positions, arm, _positive(max_speed, "--max-speed"), force)
+
+
+@app.command()
 def identify(
     trials: Annotated[Path, typer.Argument(metavar="TRIALS", help="Folder with trials.csv and samples.csv.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="ARM.TOML", help="Where the model goes.")],
@@ -226,11 +270,18 @@ def _one_line(message: Warning | str, category: type[Warning], *_: object) -> No
     typer.echo(f"{name}: {message}", err=True)
 
 
-def _names(listed: str) -> list[str]:
+def _names(listed: str, option: str = "--sensors") -> list[str]:
     names = [name.strip() for name in listed.split(",") if name.strip()]
     if not names:
-        raise typer.BadParameter("names no sensor", param_hint="--sensors")
+        raise typer.BadParameter("names nothing", param_hint=option)
     return names
+
+
+def _numbers(listed: str, option: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(number) for number in listed.split(",") if number.strip())
+    except ValueError:
+        raise typer.BadParameter(f"expected numbers with commas between, not '{listed}'", param_hint=option) from None
 
 
 def _level(text: str) -> tuple[str, float]:

@@ -70,8 +70,8 @@ def _show(verified: Sequence[AxisVerification], report: Path | None) -> None:
         floor = one.floor
         refitted = f"K {floor.gain:.3f}, Td {floor.delay * MM:.1f} ms, {words.plant(floor.plant)}"
         out.print(
-            f"{one.run}, {one.axis}: {one.verdict}; start level {one.start * MM:g} mm ({one.start_from}); gain recovery tried with"
-            f" {one.recovery * MM:g} ms; the floor is {refitted}",
+            f"{one.run}, {one.axis}: {one.verdict}; start level {one.start * MM:g} mm ({one.start_from}); gain recovery"
+            f" tried with {one.recovery * MM:g} ms; the floor is {refitted}",
             markup=False,
         )
     if report is not None:

@@ -90,10 +90,12 @@ def factors_of(trials: Sequence[Trial], period: float) -> dict[str, list[str]]:
         "axis": [trial.axis for trial in trials],
         "speed_m_s": speed_levels(trials, period),
     }
-    columns["sense"] = ["+" if trial.step > 0.0 else "-" for trial in trials]
     for name in trials[0].factors:
         if name not in _COUNTERS:
             columns[name] = _levels([trial.factors[name] for trial in trials])
+    sense = ["+" if trial.step > 0.0 else "-" for trial in trials]
+    if not any(len(set(zip(cells, sense, strict=True))) == len(set(cells)) == 2 for cells in columns.values()):
+        columns["sense"] = sense
     return {name: levels for name, levels in columns.items() if 1 < len(set(levels)) <= max(len(trials) // 2, 2)}
 
 

@@ -18,6 +18,7 @@ from .combine import Combination, CombinedAxis, Fitted, combine, combined_rms, u
 from .estimate import common
 from .fit import StepFit, fit_steps, flags
 from .paper import fit_as_published, onset
+from .rows import window
 from .trials import StepTrials, Trial, TrialsError
 
 TOLERANCE = 1e-3  # m, the paper's
@@ -41,6 +42,7 @@ class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
         damping_ci95: Its interval.
         rms: Of what is left, eq. 10 [m].
         rms_percent: Of the step.
+        fit_percent: 100 (1 − ‖what is left‖ / ‖position without its mean‖).
         flags: What to know before trusting it.
     """
 
@@ -56,6 +58,7 @@ class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
     damping_ci95: Interval | None = None
     rms: float = msgspec.field(name="rms_mm")
     rms_percent: float
+    fit_percent: float
     flags: list[str]
 
 
@@ -214,7 +217,7 @@ def identify(
         method="published" if paper else "fitted",
         samples=samples,
         tolerance=tolerance,
-        trials=[_result(one, period, usual[one.trial.axis], own, rms, left_out) for one in fitted],
+        trials=[_result(one, period, samples, usual[one.trial.axis], own, rms, left_out) for one in fitted],
         axes={axis: found.axis for axis, found in combined.items()},
         one_delay=one_delay,
         dependences=anova.dependences(_coefficients(used), factors) if factors else [],
@@ -341,6 +344,7 @@ def _scatters(fitted: Sequence[Fitted]) -> list[anova.Scatter]:
 def _result(
     one: Fitted,
     period: float,
+    samples: int | None,
     usual: float,
     own: Mapping[str, tuple[float, float]],
     rms: Mapping[str, float],
@@ -355,8 +359,8 @@ def _result(
         speed=trial.speed_at(period),
         factors=trial.factors,
         onset=one.onset if np.isfinite(one.onset) else None,
-        first=_order_fit(one.first, trial, usual),
-        second=_order_fit(one.second, trial, usual),
+        first=_order_fit(one.first, trial, usual, samples),
+        second=_order_fit(one.second, trial, usual, samples),
         common_delay=delay,
         common_gain=gain,
         combined_rms=rms.get(trial.name),
@@ -364,7 +368,8 @@ def _result(
     )
 
 
-def _order_fit(fit: StepFit, trial: Trial, usual: float) -> OrderFit:
+def _order_fit(fit: StepFit, trial: Trial, usual: float, samples: int | None) -> OrderFit:
+    moved = float(np.std(window(trial, samples)[1]))
     plant = fit.plant
     return OrderFit(
         gain=fit.gain,
@@ -379,5 +384,6 @@ def _order_fit(fit: StepFit, trial: Trial, usual: float) -> OrderFit:
         damping_ci95=fit.damping_ci95 if fit.order == 2 else None,
         rms=fit.rms,
         rms_percent=100.0 * fit.rms / abs(trial.step),
+        fit_percent=100.0 * (1.0 - fit.rms / moved) if moved > 0.0 else 0.0,
         flags=flags(fit, usual),
     )

@@ -293,16 +293,11 @@ def _floor(measured: _Measured, command: _Commands, model: AxisModel, delay: flo
     )
 
 
-def lag(plant: PLANTS) -> float:
-    """How far a plant is behind its input at constant velocity [s]: τ, or 2ζ/ω."""
-    return plant.time_constant if isinstance(plant, FirstOrder) else 2.0 * plant.damping / plant.natural_frequency
-
-
 def _coordinates(delay: float, plant: PLANTS) -> FloatArray:
     """√Td and log τ, or log 2ζ/ω and log 1/ω: free of bounds."""
     if isinstance(plant, FirstOrder):
         return np.array([np.sqrt(delay), np.log(plant.time_constant)])
-    return np.array([np.sqrt(delay), np.log(lag(plant)), -np.log(plant.natural_frequency)])
+    return np.array([np.sqrt(delay), np.log(plant.lag), -np.log(plant.natural_frequency)])
 
 
 def _plant_at(x: FloatArray) -> PLANTS:
@@ -332,7 +327,7 @@ def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor) -> str:
     ratio = model.rms / floor.fit.rms if floor.fit.rms > 0.0 else 1.0 if model.rms == 0.0 else np.inf
     if ratio < _AS_GOOD:
         return "as good as any model of its order"
-    later = (floor.delay + lag(floor.plant)) - (delay + lag(axis.plant))
+    later = (floor.delay + floor.plant.lag) - (delay + axis.plant.lag)
     differ = f"here the arm answers {abs(later) * units.MM:.1f} ms {'later' if later > 0.0 else 'sooner'}"
     held = "holds" if model.fit >= _HOLDS else "does not hold"
     return (

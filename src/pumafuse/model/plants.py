@@ -1,7 +1,7 @@
 """Plants: what the arm does to a command once gain and delay have had their say. All have unit gain.
 
 Equations 3 to 9 of "A Practical Dynamic Model of a Puma 560 Manipulator for Aircraft Maintenance", without the gain K.
-A new plant is a class here with a tag and the three methods of :class:`Plant`, added to ``PLANTS``.
+A new plant is a class here with a tag and the methods of :class:`Plant`, added to ``PLANTS``.
 """
 
 from __future__ import annotations
@@ -39,6 +39,11 @@ class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid
         """The plant as a `control` transfer function from v to p, without gain and delay."""
         raise NotImplementedError
 
+    @property
+    def lag(self) -> float:
+        """How far the plant is behind an input of constant velocity [s]."""
+        raise NotImplementedError
+
 
 class FirstOrder(Plant, frozen=True, kw_only=True, tag="first-order", forbid_unknown_fields=True):
     """H(s) = 1 / (τs + 1), equation 3.
@@ -61,6 +66,11 @@ class FirstOrder(Plant, frozen=True, kw_only=True, tag="first-order", forbid_unk
         import control
 
         return control.tf([1.0], [self.time_constant, 1.0])
+
+    @property
+    def lag(self) -> float:
+        """τ."""
+        return self.time_constant
 
     def step_response(self, time: npt.ArrayLike) -> FloatArray:
         """Equation 4: 1 − e^(−t/τ)."""
@@ -95,6 +105,11 @@ class SecondOrder(Plant, frozen=True, kw_only=True, tag="second-order", forbid_u
 
         square = self.natural_frequency**2
         return control.tf([square], [1.0, 2.0 * self.damping * self.natural_frequency, square])
+
+    @property
+    def lag(self) -> float:
+        """2ζ/ω."""
+        return 2.0 * self.damping / self.natural_frequency
 
     def step_response(self, time: npt.ArrayLike) -> FloatArray:
         """Equations 6 and 9 and the ζ = 1 between them as one formula that joins them without cancellation.
