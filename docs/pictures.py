@@ -1,4 +1,4 @@
-"""The pictures and the numbers of the README, made anew from the shipped scan: ``python docs/pictures.py``.
+"""The pictures and the numbers of the README, made anew from the shipped data: ``python docs/pictures.py``.
 
 Sets side by side, with the camera alone: its raw readings, the readings interpolated, a constant-velocity Kalman filter
 tuned by maximum likelihood, and pumafuse. All have the camera's latency removed; errors are against the truth.
@@ -16,7 +16,7 @@ from scipy.optimize import minimize_scalar
 
 import pumafuse as pf
 from pumafuse.fusion.score import interpolated
-from pumafuse.views import style
+from pumafuse.views import step_figures, style
 
 HERE = Path(__file__).parent
 DATA = Path(pf.__file__).parent / "data"
@@ -93,6 +93,10 @@ def main() -> None:
     for axes in (bars, trace):
         axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(HERE / "images" / "comparison.png", dpi=110)
+
+    trials = pf.StepTrials.read(DATA / "steps")
+    picture = step_figures.responses(pf.identify(trials), trials)
+    (HERE / "images" / "steps.svg").write_text(picture, encoding="utf-8")
 
 
 if __name__ == "__main__":

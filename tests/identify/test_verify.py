@@ -185,7 +185,7 @@ def check_floor(order: int, seed: int, delays: tuple[float, float]) -> None:
     assert found.floor.fit.rms <= found.model.rms * (1.0 + 1e-9)
     assert found.floor.fit.rms <= np.std(noise(seed)) * (1.0 + 1e-9)
     np.testing.assert_allclose([found.floor.delay, found.floor.gain], [DELAY, TRUE_GAIN], rtol=0.01)
-    np.testing.assert_allclose(msgspec.structs.astuple(found.floor.plant)[: order], numbers_of(true), rtol=0.03)
+    np.testing.assert_allclose(msgspec.structs.astuple(found.floor.plant)[:order], numbers_of(true), rtol=0.03)
 
 
 def numbers_of(plant: PLANTS) -> list[float]:
@@ -200,21 +200,43 @@ def test_the_floor_is_found_from_a_wrong_arm(order: int, seed: int) -> None:
 
 
 def test_the_verdict_tells_how_far_above_the_floor() -> None:
-    """A slightly wrong arm wants a refit, a wrong one does not hold, and noise alone is no arm's answer."""
+    """How many times, by how many milliseconds the arm answers later or sooner; and where no arm's answer is seen."""
     run = run_of(moved(arm()) + noise())
-    for tau, begins in (
-        (0.0425, "as good as any"),
-        (0.0450, "1."),
-        (0.0850, ""),
+    for tau, begins, word in (
+        (0.0465, "holds, with ", "sooner"),
+        (0.0385, "holds, with ", "later"),
+        (0.3000, "does not hold, with ", "sooner"),
     ):
         found = only(run, arm(pf.FirstOrder(time_constant=tau)))
-        assert found.verdict.startswith(begins), found.verdict
-    ratio = found.model.rms / found.floor.fit.rms
-    assert ratio > 10.0
-    assert found.verdict.startswith(f"{ratio:.1f} times")
+        ratio, plant = found.model.rms / found.floor.fit.rms, found.floor.plant
+        assert ratio > 1.5
+        assert isinstance(plant, pf.FirstOrder)
+        apart = abs(DELAY + tau - found.floor.delay - plant.time_constant)
+        assert apart == pytest.approx(abs(tau - FIRST.time_constant), abs=2e-4)
+        assert found.verdict.startswith(f"{begins}{ratio:.1f} times the error"), found.verdict
+        assert found.verdict.endswith(f"answers {1e3 * apart:.1f} ms {word}, with gain 0.93"), found.verdict
     still = only(run_of(LOW + noise()), arm())
     assert still.floor.fit.fit < 5.0
     assert still.verdict == "no linear model of this order fits: look at the log"
+
+
+SENTENCE = "the floor's search is local and its gain does not recover; reported"
+
+
+@pytest.mark.xfail(strict=True, reason=SENTENCE)
+@pytest.mark.parametrize("seed", [11, 29, 32])
+def test_the_floor_is_found_from_an_arm_that_has_no_delay(seed: int) -> None:
+    """A second-order arm that is given as 1 to 10 ms late, where the truth is 60 ms: the plant must not run away."""
+    check_floor(2, seed, (0.0, 0.03))
+
+
+@pytest.mark.xfail(strict=True, reason=SENTENCE)
+@pytest.mark.parametrize("held", [1, 5])
+def test_the_floor_is_not_above_an_arm_whose_gain_recovers(held: int) -> None:
+    """The presets' gains do: a floor above the model is none."""
+    known, command = arm(recovery=0.1), BINARY[: TICKS // held]
+    found = only(run_of(moved(known, command, held=held) + noise(), command, held), known)
+    assert found.floor.fit.rms <= found.model.rms * (1.0 + 1e-9)
 
 
 # ---- the start level ------------------------------------------------------------------------------------------------
@@ -367,8 +389,9 @@ LIMITS = {"preset": (0.66e-3, 0.28e-3, 0.31e-3), "identified": (1.02e-3, 0.40e-3
 
 @pytest.mark.skipif(not SHARED.exists(), reason="the recorded white-noise runs are not beside the project")
 def test_recorded_white_noise_is_met_as_well_as_promised() -> None:
-    """At 8 mm, tangential, radial, vertical: the preset at most 0.66, 0.28, 0.31 mm RMS, an arm from 86 trials at most
-    1.02, 0.40, 0.35 mm; that arm states no recovery and both agree on the floor within 1 % where the order is one.
+    """The preset and an arm from 86 trials at 8 mm, tangential, radial, vertical: RMS within LIMITS.
+
+    That arm states no recovery, and where both are of one order they find the same floor.
     """
     recorded = SHARED / "puma-virtual"
     trials = pf.StepTrials.read(recorded / "steps")

@@ -21,7 +21,7 @@ from ..errors import ConfigError
 from ..model.arm import ArmModel, commanded_speed, ordered_axes
 from ..runs import tables
 from ..simulate.trajectory import WhiteNoise, ticks
-from ..units import MM
+from ..units import MM, refuse_unit
 
 TRIALS, STEPS = "trials.csv", "steps.csv"
 _NOISE = "white-noise-"
@@ -61,6 +61,10 @@ class Design:
     def __post_init__(self) -> None:
         if not self.axes or len(set(self.axes)) < len(self.axes):
             raise ConfigError("plan: at least one axis, and each once")
+        for axis in self.axes:
+            refuse_unit("axis", axis)
+        if not self.speeds:
+            raise ConfigError("plan: at least one speed")
         for name, numbers in (("speeds", self.speeds), ("amplitudes", self.amplitudes)):
             if any(not 0.0 < number < np.inf for number in numbers) or len(set(numbers)) < len(numbers):
                 raise ConfigError(f"plan: {name} must be positive, and each once")
@@ -181,8 +185,7 @@ def _offsets(design: Design, trial: PlannedTrial, axis: str) -> FloatArray:
 
 
 def _clock(tick: IntArray, period: float) -> dict[str, IntArray | FloatArray]:
-    time: FloatArray = np.round(tick * period, 9)
-    return {"tick": tick, "time_s": time}
+    return {"tick": tick, "time_s": np.asarray(np.round(tick * period, 9), dtype=np.float64)}
 
 
 def _columns(offsets: Mapping[str, FloatArray]) -> dict[str, FloatArray]:

@@ -34,6 +34,7 @@ _FEWEST = 20  # readings
 _MOST_LEVELS = 8  # of a run whose start level is looked for among them
 _AS_GOOD = 1.2  # times the floor
 _HOLDS = 50.0  # % fit
+_BETTER = 0.8  # share of the error that is worth a word
 
 
 class Fit(msgspec.Struct, frozen=True, kw_only=True):
@@ -220,7 +221,8 @@ def _verified(measured: _Measured, driven: AxisInput, arm: ArmModel, given: bool
         with_recovery=fits["recovering"],
         recovery=recovery,
         floor=floor,
-        verdict=_verdict(fits["as it is"], model, delay, floor),
+        verdict=_verdict(fits["as it is"], model, delay, floor)
+        + _recovers(fits["as it is"], fits["recovering"], recovery),
     )
     return verification, trace
 
@@ -333,3 +335,9 @@ def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor) -> str:
     return (
         f"{held}, with {ratio:.1f} times the error of the best model of its order: {differ}, with gain {floor.gain:.2f}"
     )
+
+
+def _recovers(model: Fit, recovering: Fit, recovery: float) -> str:
+    if recovering.rms > _BETTER * model.rms:
+        return ""
+    return f"; with gain_recovery_ms = {recovery * units.MM:g} {recovering.rms * units.MM:.3g} mm are left"
