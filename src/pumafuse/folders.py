@@ -6,7 +6,7 @@ import glob
 import shutil
 import tempfile
 from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .errors import PumafuseError
@@ -76,7 +76,8 @@ def write_file(path: Path, text: str) -> None:
     except OSError as error:
         raise FolderError(f"{path}: cannot be written: {error.strerror}") from None
     finally:
-        new.unlink(missing_ok=True)
+        with suppress(OSError):
+            new.unlink()
 
 
 def sweep(folders: Iterable[Path]) -> None:

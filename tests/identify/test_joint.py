@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -86,8 +87,10 @@ def test_the_order_of_the_trials_does_not_matter(order: int) -> None:
     place = np.random.default_rng(1).permutation(len(trials))
     one, other = joined(trials, order), joined([trials[k] for k in place], order)
     np.testing.assert_allclose([other.q, other.p, other.cost], [one.q, one.p, one.cost], rtol=1e-5)
-    for name in ("delay", "gain", "rms", "delay_sd", "gain_sd", "delay_slope", "gain_slope", "influence", "expected"):
-        got, expected = getattr(other, name), getattr(one, name)[place]
+    names = ("delay", "gain", "rms", "gain_sd", "delay_slope", "gain_slope")
+    parts = ("parts.delay_sd", "parts.influence", "parts.expected")
+    for name in (*names, *parts):
+        got, expected = attrgetter(name)(other), attrgetter(name)(one)[place]
         np.testing.assert_allclose(got, expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max(), err_msg=name)
 
 
@@ -99,7 +102,7 @@ def test_a_trial_with_less_noise_weighs_more() -> None:
         (odd,), _, _ = campaign((0.05, 0.0), quiet, 6, n=1)
         found = joined([*trials, odd], 1)
         taus.append(found.q)
-        sds.append(found.delay_sd[-1])
+        sds.append(found.parts.delay_sd[-1])
     assert 0.038 < taus[0] < taus[1] - 5e-4 < taus[2] - 2e-3 < 0.05
     np.testing.assert_allclose(np.array(sds) / sds[0], [1.0, 0.25, 0.0625], rtol=0.25)
 
@@ -112,7 +115,9 @@ def test_large_steps_do_not_rule() -> None:
     one, other = joined(trials, 1), joined([*trials[:-1], larger], 1)
     assert other.q == pytest.approx(one.q, rel=1e-6)
     np.testing.assert_allclose(other.delay, one.delay, rtol=1e-6)
-    np.testing.assert_allclose(other.influence, one.influence, rtol=0.0, atol=1e-5 * np.abs(one.influence).max())
+    np.testing.assert_allclose(
+        other.parts.influence, one.parts.influence, rtol=0.0, atol=1e-5 * np.abs(one.parts.influence).max()
+    )
 
 
 # ---- errors ---------------------------------------------------------------------------------------------------------
@@ -144,9 +149,12 @@ def test_influence_is_what_a_trials_weight_does(order: int, plant: tuple[float, 
     noise = np.array([pair[order - 1].rms for pair in fit_steps(trials)])
     parts = n * np.sqrt(n / (n - 1)) * parts_by_refits(trials, found, order, noise)
     np.testing.assert_allclose(
-        found.influence[:, :order] / np.abs(parts).max(axis=0), parts / np.abs(parts).max(axis=0), rtol=0.0, atol=0.08
+        found.parts.influence[:, :order] / np.abs(parts).max(axis=0),
+        parts / np.abs(parts).max(axis=0),
+        rtol=0.0,
+        atol=0.08,
     )
-    assert order == 2 or not found.influence[:, 1].any()
+    assert order == 2 or not found.parts.influence[:, 1].any()
 
 
 def test_influence_tells_what_leaving_a_trial_out_does() -> None:
@@ -160,7 +168,7 @@ def test_influence_tells_what_leaving_a_trial_out_does() -> None:
         rest = [k for k in range(n) if k != place]
         other = fit_together([trials[k] for k in rest], [fits[k][1] for k in rest], 2, None)
         moved.append([other.q - found.q, other.p - found.p])
-    expected = -found.influence * np.sqrt(1.0 - 1.0 / n) / (n - 1)
+    expected = -found.parts.influence * np.sqrt(1.0 - 1.0 / n) / (n - 1)
     scale = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(np.array(moved) / scale, expected / scale, rtol=0.0, atol=0.15)
 
@@ -194,7 +202,7 @@ def test_sds_of_delays_and_gains_are_those_of_regression(order: int, plant: tupl
         slope = -height * (shifted[2] - shifted[1]) / 2e-7
         J = np.column_stack((slope, trial.step * shifted[0], np.ones(len(TIMES))))
         sd = pair[order - 1].rms * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
-        assert found.delay_sd[place] == pytest.approx(sd[0], rel=1e-4)
+        assert found.parts.delay_sd[place] == pytest.approx(sd[0], rel=1e-4)
         assert found.gain_sd[place] == pytest.approx(sd[1], rel=1e-4)
 
 
@@ -203,9 +211,9 @@ def test_half_a_width_is_students_where_trials_are_alike() -> None:
     n = 10
     trials, _, _ = campaign(FIRST, 0.01, 11, jitter=0.0, n=n)
     found = joined(trials, 1)
-    spread = float(np.sqrt(np.sum(found.influence[:, 0] ** 2)) / n)
-    assert found.half_width([1.0, 0.0]) == pytest.approx(stats.t.ppf(0.975, n - 1) * spread, rel=0.02)
-    assert found.half_width([-3.0, 0.0]) == pytest.approx(3.0 * found.half_width([1.0, 0.0]), rel=1e-12)
+    spread = float(np.sqrt(np.sum(found.parts.influence[:, 0] ** 2)) / n)
+    assert found.parts.half_width([1.0, 0.0]) == pytest.approx(stats.t.ppf(0.975, n - 1) * spread, rel=0.02)
+    assert found.parts.half_width([-3.0, 0.0]) == pytest.approx(3.0 * found.parts.half_width([1.0, 0.0]), rel=1e-12)
 
 
 def test_a_first_order_arm_is_rarely_told_to_be_of_second_order() -> None:
@@ -234,7 +242,7 @@ def test_half_widths_hold(order: int, plant: tuple[float, float]) -> None:
     found = [joined(campaign(plant, noise, seed)[0], order) for seed in range(100)]
     slopes = [[1.0, 0.0], [0.0, 1.0]][:order]
     values = np.array([[one.q, one.p][:order] for one in found])
-    halves = np.array([[one.half_width(slope) for slope in slopes] for one in found])
+    halves = np.array([[one.parts.half_width(slope) for slope in slopes] for one in found])
     inside = np.mean(np.abs(values - plant[:order]) <= halves, axis=0)
     assert (inside >= 0.87).all(), inside
     ratio = np.sqrt(np.mean((halves / stats.t.ppf(0.975, 7)) ** 2, axis=0)) / values.std(axis=0)

@@ -138,8 +138,9 @@ def test_a_response_that_comes_after_the_last_sample_has_no_height() -> None:
     np.testing.assert_allclose(found.cost, scatter, rtol=1e-12)
     slopes, heights = rows.slopes(found, 2)
     assert not slopes.any() and not heights.any()
-    equations = rows.equations(slopes, found.left)
-    assert not any(part.any() for part in equations)
+    equations = rows.equations(found, slopes)
+    assert not any(part.any() for part in equations[:-1])
+    assert (equations.delay_sd == np.inf).all()
 
 
 @pytest.mark.parametrize(("order", "plant"), PLANTS)
@@ -201,7 +202,7 @@ def test_equations_are_the_dense_ones_with_all_that_is_a_trials_own_eliminated(
     rows = Rows.of(trials, WEIGHTS, None)
     at = rows.point(shapes(plant))
     slopes, _ = rows.slopes(at, order)
-    found = rows.equations(slopes, at.left)
+    found = rows.equations(at, slopes)
     x = unpacked(trials, plant, DELAYS, order)
     J, left = dense_jacobian(trials, x, order), dense(trials, x, order)
     scale = np.linalg.norm(J, axis=0)
@@ -313,7 +314,7 @@ def test_padding_changes_no_number(order: int, plant: tuple[float, float]) -> No
     assert rows.time.shape == (4, max(LENGTHS)) and rows.count.tolist() == list(LENGTHS)
     at = rows.point(shapes(plant))
     slopes, heights = rows.slopes(at, order)
-    equations = rows.equations(slopes, at.left)
+    equations = rows.equations(at, slopes)
     cost = rows.each(shapes(plant), order).cost
     for row, trial in enumerate(trials):
         alone = Rows.of([trial], WEIGHTS[row : row + 1], None)
@@ -325,7 +326,7 @@ def test_padding_changes_no_number(order: int, plant: tuple[float, float]) -> No
         np.testing.assert_allclose(slopes[:, row, : LENGTHS[row]], own[:, 0], rtol=0.0, atol=1e-9 * np.abs(own).max())
         assert not slopes[:, row, LENGTHS[row] :].any()
         np.testing.assert_allclose(heights[:, row], height[:, 0], rtol=1e-9)
-        for whole, part in zip(equations, alone.equations(own, one.left), strict=True):
+        for whole, part in zip(equations, alone.equations(one, own), strict=True):
             np.testing.assert_allclose(whole[row], part[0], rtol=1e-7)
         assert cost[row] == pytest.approx(alone.each(shapes(plant)[row : row + 1], order).cost[0], rel=KINKS)
 

@@ -37,7 +37,7 @@ def superposed(plant: PLANTS, acting: TimeArray, value: FloatArray, time: TimeAr
     return plant.step_response(since) @ np.diff(value, prepend=0.0)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(PLANT, st.integers(0, 10**6), st.integers(0, 40), st.integers(0, 60))
 def test_inputs_superpose(plant: PLANTS, seed: int, commands: int, times: int) -> None:
     """Any inputs at irregular times, asked for at any times, also the same instant twice, in stamps of a real clock."""

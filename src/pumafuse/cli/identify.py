@@ -42,6 +42,8 @@ def run(folder: Path, options: Options) -> None:
     Raises:
         PumafuseError: The trials cannot be used, or what is to be written is in the way.
     """
+    if options.output.is_dir():
+        raise FolderError(f"{options.output}: is a folder; give the name of a file")
     if options.output.exists() and not options.force:
         raise FolderError(f"{options.output}: exists; --force replaces it")
     if options.report is not None:

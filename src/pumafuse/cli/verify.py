@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from .. import units
+from ..errors import PumafuseWarning
 from ..identify.verify import AxisVerification, verify
 from ..model.arm import ArmModel
 from ..runs.run import Run
@@ -44,6 +46,9 @@ def run(
 
         reports.write_verification(found, model, report, force)
     verified = [verification for verification, _ in found]
+    for one in verified:
+        for note in one.notes:
+            warnings.warn(f"run '{one.run}': {note}", PumafuseWarning, stacklevel=1)
     if json:
         tree = [units.from_si(msgspec.to_builtins(one, enc_hook=float)) for one in verified]
         print(msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode())

@@ -115,7 +115,11 @@ def numbers(cells: Sequence[str]) -> list[float] | None:
 
 def ordered(levels: set[str]) -> list[str]:
     """Levels by number where they are numbers, else by name, axes in their own order."""
-    return list(ordered_axes(levels)) if numbers(list(levels)) is None else sorted(levels, key=float)
+    return (
+        list(ordered_axes(levels))
+        if numbers(list(levels)) is None
+        else sorted(levels, key=lambda level: (float(level), level))
+    )
 
 
 def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Sequence[str]]) -> list[Dependence]:
@@ -246,14 +250,21 @@ def _one_way(groups: Sequence[FloatArray]) -> tuple[float | None, float | None]:
 
 def _adjusted(values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> float | None:
     """P of one factor in a model with all of them (main effects)."""
-    from statsmodels.regression.linear_model import OLS
+    from scipy.stats import f as fisher
 
     rest = _design(len(values), [cells for name, cells in factors.items() if name != factor])
     whole = np.column_stack((rest, _design(len(values), [factors[factor]])[:, 1:]))
-    full, reduced = OLS(values, whole).fit(), OLS(values, rest).fit()
-    if full.df_resid < 1 or full.df_model == reduced.df_model or full.ssr <= 1e-24 * float(values @ values):
+    (left, columns), (left_by_rest, columns_of_rest) = (_least_squares(values, design) for design in (whole, rest))
+    more, freedom = columns - columns_of_rest, len(values) - columns
+    if not more or freedom < 1 or left <= 1e-24 * float(values @ values):
         return None
-    return float(full.compare_f_test(reduced)[1])
+    return float(fisher.sf((left_by_rest - left) / more / (left / freedom), more, freedom))
+
+
+def _least_squares(values: FloatArray, design: FloatArray) -> tuple[float, int]:
+    """What is left, squared and summed, and how many columns are independent (confounded factors are not)."""
+    solution, _, rank, _ = np.linalg.lstsq(design, values, rcond=None)
+    return float(np.sum((values - design @ solution) ** 2)), int(rank)
 
 
 def _design(rows: int, factors: Sequence[Sequence[str]]) -> FloatArray:
@@ -266,7 +277,7 @@ def _design(rows: int, factors: Sequence[Sequence[str]]) -> FloatArray:
 
 def _verdict(ratio: float | None, welch: float | None, adjusted: float | None, alone: bool) -> str:
     if ratio is None:
-        return "cannot be told: nothing was repeated"
+        return "cannot be told: no scatter within any level"
     said = "dependent" if ratio > 1.0 else "independent"
     if welch is not None and (welch < 0.05) != (ratio > 1.0):
         said += ", but Welch's test " + ("says it is" if welch < 0.05 else "does not confirm it")

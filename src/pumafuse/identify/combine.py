@@ -203,35 +203,33 @@ def _fitted_together(used: Sequence[Fitted], samples: int | None) -> Common:
     trials, own = [one.trial for one in used], [one.second for one in used]
     joints: dict[Order, JointFit] = {order: fit_together(trials, own, order, samples) for order in _ORDERS}
     second = joints[2]
-    # where p is held at 0 the trials' parts in its error do not sum to 0: their mean is how far it would have gone on
-    centre, half = second.p + float(second.influence[:, 1].mean()), second.half_width([0.0, 1.0])
     choice = choose(
         squares={order: joint.cost for order, joint in joints.items()},
         parameters={order: 3 * len(used) + order for order in joints},
         samples=int(second.count.sum()),
         rms={order: float(np.sqrt(np.average(joint.rms**2, weights=joint.count))) for order, joint in joints.items()},
-        inverse_square=Estimate(value=second.p, ci95=(centre - half, centre + half)),
+        inverse_square=second.inverse_square,
     )
     best = joints[choice.order]
     return Common(
         choice=choice,
         plant=_plant(best, choice.order),
-        lag=best.q + best.influence[:, 0],
+        lag=best.q + best.parts.influence[:, 0],
         # what an error of the plant does to every trial's delay and gain belongs to the trials that cause it
-        delay=best.delay + best.influence @ best.delay_slope.mean(axis=0),
-        delay_sd=best.delay_sd,
-        gain=best.gain + best.influence @ best.gain_slope.mean(axis=0),
+        delay=best.delay + best.parts.influence @ best.delay_slope.mean(axis=0),
+        delay_sd=best.parts.delay_sd,
+        gain=best.gain + best.parts.influence @ best.gain_slope.mean(axis=0),
         gain_sd=best.gain_sd,
     )
 
 
 def _plant(best: JointFit, order: Order) -> PLANTS:
     if order == 1:
-        half = best.half_width([1.0, 0.0])
+        half = best.parts.half_width([1.0, 0.0])
         return FirstOrder(time_constant=best.q, time_constant_ci95=(best.q - half, best.q + half))
     # log ω and log ζ, whose errors are nearer to normal
-    omega_half = best.half_width([0.0, -0.5 / best.p])
-    zeta_half = best.half_width([1.0 / best.q, -0.5 / best.p])
+    omega_half = best.parts.half_width([0.0, -0.5 / best.p])
+    zeta_half = best.parts.half_width([1.0 / best.q, -0.5 / best.p])
     return _second_order(best.q, best.p, omega_half, zeta_half)
 
 

@@ -34,11 +34,12 @@ def mean(values: FloatArray) -> Estimate:
 
 def robust(values: FloatArray) -> Estimate:
     """Huber's mean, to which an outlying value adds no more than one at its bound."""
+    from scipy.stats import median_abs_deviation
     from statsmodels.robust.robust_linear_model import RLM
 
-    if len(values) < 3 or not np.ptp(values) > 0.0:
+    if len(values) < 3 or not median_abs_deviation(values, scale="normal") > 0.0:
         return mean(values)
-    found = RLM(values, np.ones(len(values))).fit()
+    found = RLM(values, np.ones(len(values))).fit(maxiter=500)
     low, high = mean(values).ci95
     half = 0.5 * (high - low) * float(found.bse[0] * np.sqrt(len(values)) / values.std(ddof=1))
     middle = float(found.params[0])
@@ -73,7 +74,7 @@ def regression(values: FloatArray, sd: FloatArray, design: FloatArray) -> Regres
     from scipy.optimize import brentq
     from statsmodels.regression.linear_model import WLS
 
-    floor = 1e-9 * float(np.abs(values).max()) + 1e-300
+    floor = 1e-9 * float(np.abs(values).max()) + 1e-150
 
     def fitted(between: float) -> RegressionResults:
         return WLS(values, design, weights=1.0 / (sd**2 + between**2 + floor**2)).fit()

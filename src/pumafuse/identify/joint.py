@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from ..arrays import FloatArray
+from .estimate import Estimate
 from .fit import StepFit
 from .rows import Order, Point, Rows
 from .trials import Trial
@@ -20,6 +21,38 @@ from .trials import Trial
 _STARTS = (0.0, 0.05, 0.15, 0.25, 0.4, 1.0)  # p/q² to begin with
 _NOISELESS = 1e-6  # of the step: less noise than this is none
 _RESOLVED = 1e-9  # of the information in 1/ω², what must be left when delay and q have had their share
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Each trial's part in q and p; of first order what belongs to p is 0.
+
+    Attributes:
+        influence: n times each trial's part in the errors of q and p, which are their mean; corrected for its leverage,
+            (n, 2).
+        expected: What its noise lets expect of each trial's influence, (n, 2, 2).
+        information: Of each trial in q (and p), whatever its delay does, (n, k, k).
+        coupling: −∂Td/∂(q, p), (n, k).
+        delay_sd: Of each Td by the trial's noise [s], infinite where it tells nothing, (n,).
+    """
+
+    influence: FloatArray
+    expected: FloatArray
+    information: FloatArray
+    coupling: FloatArray
+    delay_sd: FloatArray
+
+    def half_width(self, slope: Sequence[float]) -> float:
+        """Half the 95 % interval of a quantity that follows q and p with ``slope`` (2,).
+
+        Clustered by trial, with a t distribution of as many degrees of freedom as trials have a say (Bell & McCaffrey,
+        Survey Methodology 28, 2002): a few large steps may outweigh the others.
+        """
+        c, n = np.asarray(slope), len(self.influence)
+        variance = float(np.sum((self.influence @ c) ** 2)) / n**2
+        shares = np.einsum("i,nij,j->n", c, self.expected, c)
+        freedom = max(float(shares.sum() ** 2 / np.sum(shares**2)) * (n - 1) / n, 1.0) if shares.any() else 1.0
+        return float(stdtrit(freedom, 0.975) * np.sqrt(variance))
 
 
 @dataclass(frozen=True)
@@ -34,12 +67,11 @@ class JointFit:
         rms: Of what is left of each trial [m].
         count: Samples of each.
         cost: Sum of squares of what is left, each trial's over its own noise.
-        influence: n times each trial's part in the errors of q and p, their mean; corrected for its leverage.
-        expected: What its noise lets expect of each trial's influence, (n, 2, 2).
+        parts: Each trial's in q and p.
+        inverse_square: p with an interval that tells whether it may be 0.
         delay_slope: ∂Td/∂(q, p).
         gain_slope: ∂K/∂(q, p).
-        delay_sd: Of each Td by the trial's noise [s].
-        gain_sd: Of each K likewise.
+        gain_sd: Of each K by the trial's noise.
     """
 
     q: float
@@ -49,24 +81,11 @@ class JointFit:
     rms: FloatArray
     count: FloatArray
     cost: float
-    influence: FloatArray
-    expected: FloatArray
+    parts: Parts
+    inverse_square: Estimate
     delay_slope: FloatArray
     gain_slope: FloatArray
-    delay_sd: FloatArray
     gain_sd: FloatArray
-
-    def half_width(self, slope: Sequence[float]) -> float:
-        """Half the 95 % interval of a quantity that follows q and p with ``slope`` (2,).
-
-        Clustered by trial, with a t distribution of as many degrees of freedom as trials have a say (Bell & McCaffrey,
-        Survey Methodology 28, 2002): a few large steps may outweigh the others.
-        """
-        c, n = np.asarray(slope), len(self.delay)
-        variance = float(np.sum((self.influence @ c) ** 2)) / n**2
-        shares = np.einsum("i,nij,j->n", c, self.expected, c)
-        freedom = max(float(shares.sum() ** 2 / np.sum(shares**2)) * (n - 1) / n, 1.0) if shares.any() else 1.0
-        return float(stdtrit(freedom, 0.975) * np.sqrt(variance))
 
 
 def fit_together(trials: Sequence[Trial], own: Sequence[StepFit], order: Order, samples: int | None) -> JointFit:
@@ -94,45 +113,60 @@ def fit_together(trials: Sequence[Trial], own: Sequence[StepFit], order: Order, 
 
 
 def _result(rows: Rows, at: Point, order: Order, step: FloatArray, noise: FloatArray) -> JointFit:
+    n, p = len(step), at.shape[:, 2]
     slopes, amplitude_slopes = rows.slopes(at, order)
-    equations = rows.equations(slopes, at.left)
-    if order == 2 and not _resolved(equations.information.sum(axis=0), float(np.sum(slopes[-1] ** 2))):
-        # a second pole much faster than the sampling is like a delay: what is known of 1/ω² is how large it can be
-        reach = float(np.median(rows.spacing)) / float(at.shape[0, 1])
-        slopes, amplitude_slopes = rows.slopes(at, order, reach)
-        equations = rows.equations(slopes, at.left)
-    n = len(step)
-    influence, delay_slope, gain_slope = (np.zeros((n, 2)) for _ in range(3))
-    expected = np.zeros((n, 2, 2))
-    corrected = n * _corrected(equations.information)
-    influence[:, :order] = np.einsum("ijk,ik->ij", corrected, equations.score)
-    expected[:, :order, :order] = corrected @ equations.information @ corrected.swapaxes(1, 2)
-    own = np.sum(slopes[0] ** 2, axis=1)
-    delay_sd = 1.0 / np.sqrt(np.where(own > 0.0, own, np.nan))
-    power = np.sum(at.unit**2, axis=1)
-    gain_sd = np.hypot(1.0 / np.sqrt(power), amplitude_slopes[0] * delay_sd) / np.abs(step)
-    delay_slope[:, :order] = -equations.coupling
-    gain_slope[:, :order] = (amplitude_slopes[1:] - equations.coupling.T * amplitude_slopes[0]).T / step[:, None]
+    parts = _parts(rows, at, slopes)
+    square = Estimate(value=0.0, ci95=(0.0, 0.0))
+    if order == 2:
+        told = parts
+        if not _resolved(parts, slopes):
+            # a pole much faster than the sampling is like a delay: it is only known how slow it can be
+            slopes, amplitude_slopes = rows.slopes(at, order, (p, np.median(rows.spacing) * at.shape[:, 1]))
+            told = parts = _parts(rows, at, slopes)
+        elif p[0] > 0.0:
+            # whether p may be 0 is asked of the whole way there: the response bends on it
+            way = rows.slopes(at, order, (p, np.zeros(n)))[0]
+            to_zero = _parts(rows, at, way)
+            told = to_zero if not _resolved(to_zero, way) or to_zero.half_width([0.0, 1.0]) >= p[0] else parts
+        half = told.half_width([0.0, 1.0])
+        # where p is held at 0 the trials' parts do not sum to 0: their mean is how far it would have gone on
+        centre = float(p[0]) + (float(told.influence[:, 1].mean()) if p[0] == 0.0 else 0.0)
+        square = Estimate(value=float(p[0]), ci95=(centre - half, centre + half))
+    delay_slope, gain_slope = np.zeros((n, 2)), np.zeros((n, 2))
+    delay_slope[:, :order] = -parts.coupling
+    gain_slope[:, :order] = (amplitude_slopes[1:] - parts.coupling.T * amplitude_slopes[0]).T / step[:, None]
+    told = np.isfinite(parts.delay_sd)
+    by_delay = np.where(told, amplitude_slopes[0] * np.where(told, parts.delay_sd, 0.0), np.inf)
     return JointFit(
         q=float(at.shape[0, 1]),
-        p=float(at.shape[0, 2]),
+        p=float(p[0]),
         delay=at.shape[:, 0],
         gain=at.amplitude / step,
         rms=np.sqrt(at.cost / rows.count) * noise,
         count=rows.count,
         cost=float(at.cost.sum()),
-        influence=influence,
-        expected=expected,
+        parts=parts,
+        inverse_square=square,
         delay_slope=delay_slope,
         gain_slope=gain_slope,
-        delay_sd=delay_sd,
-        gain_sd=gain_sd,
+        gain_sd=np.hypot(1.0 / np.sqrt(np.sum(at.unit**2, axis=1)), by_delay) / np.abs(step),
     )
+
+
+def _parts(rows: Rows, at: Point, slopes: FloatArray) -> Parts:
+    n, k = len(at.shape), len(slopes) - 1
+    found = rows.equations(at, slopes)
+    corrected = n * _corrected(found.information)
+    influence, expected = np.zeros((n, 2)), np.zeros((n, 2, 2))
+    influence[:, :k] = np.einsum("ijk,ik->ij", corrected, found.score)
+    expected[:, :k, :k] = corrected @ found.information @ corrected.swapaxes(1, 2)
+    return Parts(influence, expected, found.information, found.coupling, found.delay_sd)
 
 
 def _corrected(information: FloatArray) -> FloatArray:
     """H^(−1/2) (I − h)^(−1/2) H^(−1/2) of each trial's information, h its share of H (HC2), (n, k, k)."""
-    scale = 1.0 / np.sqrt(np.einsum("nii->i", information))
+    diagonal = np.einsum("nii->i", information)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, np.inf))
     scaled = information * np.outer(scale, scale)
     value, vector = np.linalg.eigh(scaled.sum(axis=0))
     root = vector / np.sqrt(np.maximum(value, 1e-14)) @ vector.T
@@ -141,7 +175,10 @@ def _corrected(information: FloatArray) -> FloatArray:
     return root @ inverse_root @ root * np.outer(scale, scale)
 
 
-def _resolved(information: FloatArray, bare: float) -> bool:
+def _resolved(parts: Parts, slopes: FloatArray) -> bool:
     """Whether anything of the information in 1/ω² is left when delay and q have had their share."""
+    information = parts.information.sum(axis=0)
+    if not information[0, 0] > 0.0:
+        return False
     left = information[1, 1] - information[0, 1] ** 2 / information[0, 0]
-    return bool(left > _RESOLVED * bare)
+    return bool(left > _RESOLVED * float(np.sum(slopes[-1] ** 2)))

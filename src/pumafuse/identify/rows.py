@@ -23,7 +23,9 @@ Order = Literal[1, 2]
 _ITERATIONS = 200
 _CONVERGED = 1e-13  # relative fall of the sum of squares
 _HOPELESS = 1e12  # damping at which no step helps
+_REACH = 1e-5  # of q: how far apart responses are for a slope
 _RIDGE = 1e-12  # of the diagonal, where a parameter tells nothing
+_TOLD = 1e-12  # of what a delay could tell, below which it tells nothing
 
 
 class Point(NamedTuple):
@@ -48,12 +50,14 @@ class Equations(NamedTuple):
         coupling: −∂delay/∂(q, p), (R, k).
         information: (R, k, k).
         score: (R, k).
+        delay_sd: Of each delay under a given plant, for noise of 1; infinite where it tells nothing, (R,).
     """
 
     shift: FloatArray
     coupling: FloatArray
     information: FloatArray
     score: FloatArray
+    delay_sd: FloatArray
 
 
 @dataclass(frozen=True)
@@ -115,18 +119,24 @@ class Rows:
         mean = np.sum(np.where(self.weight > 0.0, values, 0.0), axis=1) / self.count
         return self.weight * (values - mean[:, None])
 
-    def slopes(self, at: Point, order: Order, reach: float = 1e-5) -> tuple[FloatArray, FloatArray]:
+    def slopes(
+        self, at: Point, order: Order, chord: tuple[FloatArray, FloatArray] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """∂/∂(delay, q, p) of the fitted response, (k, R, m), and how the amplitude follows each, (k, R).
 
-        By differences over ``reach`` · q, the one in p on one side where p is near 0.
+        Args:
+            at: Where.
+            order: 1 without p.
+            chord: From how far below p to how far above its slope is taken, (R,) each; None: as good as there, on one
+                side where p is 0.
         """
-        size = reach * at.shape[:, 1]
+        size = _REACH * at.shape[:, 1]
         high = [self._response(at.shape, size, 0.0, 0.0), self._response(at.shape, 0.0, size, 0.0)]
         low = [self._response(at.shape, -size, 0.0, 0.0), self._response(at.shape, 0.0, -size, 0.0)]
         width = [2.0 * size, 2.0 * size]
         if order == 2:
-            above = size * at.shape[:, 1]
-            below = np.minimum(above, at.shape[:, 2])
+            near = size * at.shape[:, 1]
+            below, above = (np.minimum(near, at.shape[:, 2]), near) if chord is None else chord
             high.append(self._response(at.shape, 0.0, 0.0, above))
             low.append(self._response(at.shape, 0.0, 0.0, -below))
             width.append(above + below)
@@ -136,14 +146,28 @@ class Rows:
         share = np.einsum("kij,ij->ki", raw, at.unit) / np.where(power > 0.0, power, np.inf)
         return raw - share[:, :, None] * at.unit, -share
 
-    def equations(self, slopes: FloatArray, left: FloatArray) -> Equations:
-        """What q and p should do, whatever the delays do about it."""
+    def equations(self, at: Point, slopes: FloatArray, damping: float = 0.0) -> Equations:
+        """What q and p should do, whatever the delays do about it.
+
+        A delay takes no part where it tells nothing, or where its bound 0 holds it back.
+
+        Args:
+            at: Where.
+            slopes: There, from :meth:`slopes`.
+            damping: Of the delays' own steps.
+        """
         own = np.einsum("ij,ij->i", slopes[0], slopes[0])
-        own = np.where(own > 0.0, own, np.inf)
-        pull = np.einsum("ij,ij->i", slopes[0], left) / own
-        coupling = np.einsum("ij,kij->ik", slopes[0], slopes[1:]) / own[:, None]
-        free = slopes[1:] - coupling.T[:, :, None] * slopes[0]
-        return Equations(pull, coupling, np.einsum("kij,lij->ikl", free, free), np.einsum("kij,ij->ik", free, left))
+        pull = np.einsum("ij,ij->i", slopes[0], at.left)
+        height = np.einsum("ij,ij->i", at.unit, at.unit) * (at.amplitude / at.shape[:, 1]) ** 2
+        told = own > _TOLD * height
+        delay_sd = np.where(told, 1.0 / np.sqrt(np.where(told, own, 1.0)), np.inf)
+        held = (at.shape[:, 0] <= 0.0) & (pull <= 0.0)
+        own = np.where(held | ~told, np.inf, own * (1.0 + damping))
+        cross = np.einsum("ij,kij->ik", slopes[0], slopes[1:])
+        coupling = cross / own[:, None]
+        information = np.einsum("kij,lij->ikl", slopes[1:], slopes[1:]) - cross[:, :, None] * coupling[:, None, :]
+        score = np.einsum("kij,ij->ik", slopes[1:], at.left) - coupling * pull[:, None]
+        return Equations(pull / own, coupling, information, score, delay_sd)
 
     def each(self, shape: FloatArray, order: Order) -> Point:
         """From a shape for each row to the nearest minimum of that row."""
@@ -178,13 +202,13 @@ class Rows:
         at, damping = self.point(_shapes(delay, q, p)), 1e-3
         for _ in range(_ITERATIONS):
             slopes, _ = self.slopes(at, order)
-            shift, coupling, information, score = self.equations(slopes, at.left)
-            H, g = information.sum(axis=0)[None], score.sum(axis=0)[None]
             cost = float(at.cost.sum())
             while True:
+                found = self.equations(at, slopes, damping)
+                H, g = found.information.sum(axis=0)[None], found.score.sum(axis=0)[None]
                 plant = _stepped(at.shape[:1, 1:], H, g, np.array([damping]))
                 plant = np.clip(plant, [[0.2 * at.shape[0, 1], 0.0]], np.inf)
-                delays = at.shape[:, 0] + shift - coupling @ (plant - at.shape[:1, 1:])[0, :order]
+                delays = at.shape[:, 0] + found.shift - found.coupling @ (plant - at.shape[:1, 1:])[0, :order]
                 new = self.point(_shapes(np.maximum(delays, 0.0), *plant[0].tolist()))
                 fallen = cost - float(new.cost.sum())
                 if fallen >= 0.0 or damping > _HOPELESS:

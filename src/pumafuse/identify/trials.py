@@ -116,6 +116,9 @@ class StepTrials:
             notes.append(f"{sampled.path.name}: {len(strange)} trials are not listed, first '{strange[0]}': left out")
         trials: list[Trial] = []
         for row, name in enumerate(names):
+            if not name:
+                notes.append(f"{listed.path.name}: row {row + 1} names no trial: left out")
+                continue
             time, position = samples.get(name, (np.zeros(0), np.zeros(0)))
             found = np.isfinite(time) & np.isfinite(position)
             reason = _unusable(known[name], axes[row], float(step[row]), time[found])

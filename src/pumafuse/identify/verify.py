@@ -7,7 +7,7 @@ kind can do better, so what is left is noise, friction and everything else that 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -19,21 +19,24 @@ from ..errors import RunError
 from ..fusion import timeline as timelines
 from ..fusion.config import FusionConfig, Sensor
 from ..fusion.timeline import AxisInput
-from ..model.arm import ArmModel, AxisModel, Gain
+from ..model.arm import ArmModel, AxisModel, Gain, commanded_speed
 from ..model.drive import drive
 from ..model.plants import PLANTS, FirstOrder, SecondOrder
 from ..model.respond import respond
 from ..runs.axes import in_axes
 from ..runs.clock import segments
 from ..runs.run import Run
-from .rows import Order
 
 RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
 REFERENCE = "reference"
 _FEWEST = 20  # readings
 _MOST_LEVELS = 8  # of a run whose start level is looked for among them
 _AS_GOOD = 1.2  # times the floor
+_OUTLYING = 8.0  # robust standard deviations
 _HOLDS = 50.0  # % fit
+_DELAYS, _LATEST = 13, 9.0  # of the floor's first grid: how many, up to how many periods
+_LAGS, _RATIOS = 5, (0.05, 0.25, 0.8)  # of 2ζ/ω; of 1/ω² over its square
+_STARTS = 3
 _BETTER = 0.8  # share of the error that is worth a word
 
 
@@ -57,7 +60,7 @@ class Floor(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         fit: How well it fits.
         delay: Td [s].
-        gain: K.
+        gain: K, at the commands' mean speed.
         plant: Of unit gain.
     """
 
@@ -83,7 +86,9 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
         with_recovery: With a gain that recovers.
         recovery: Its time constant [s].
         floor: The best that a linear model of this order can do on this run.
+        outlying: Readings further than eight robust standard deviations from the model.
         verdict: In words.
+        notes: What was wrong with the run, a sentence each; with the first axis and source of each part of it.
     """
 
     run: str
@@ -98,7 +103,9 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
     with_recovery: Fit
     recovery: float = msgspec.field(name="recovery_ms")
     floor: Floor
+    outlying: int
     verdict: str
+    notes: list[str]
 
 
 @dataclass(frozen=True)
@@ -134,26 +141,33 @@ def verify(
     Raises:
         PumafuseError: The run has no such sensor, commands an axis that the arm has not, or nothing to compare with.
     """
-    chosen, known = _with_reference(run, None if sensors is None else tuple(sensors)), dict(start or {})
-    in_place, _ = in_axes(chosen, None)
-    part = segments(in_place)[0][0]
-    part = replace(part, start={**part.start, **known})
-    config = FusionConfig(arm=arm, sensors={name: Sensor(sd=units.MM**-1) for name in part.sensors})
-    timeline = timelines.build(part, config)
-    scalars, found = timeline.scalars, list[tuple[AxisVerification, Trace]]()
-    for number, driven in enumerate(timeline.axes):
-        for index, source in enumerate(scalars.sensors):
-            here = scalars.candidates[
-                (scalars.axis[scalars.candidates] == number) & (scalars.sensor[scalars.candidates] == index)
-            ]
-            if len(here) >= _FEWEST:
-                given = driven.name in part.start
-                measured = _Measured(run.name, source, scalars.valid[here], scalars.value[here])
-                found.append(_verified(measured, driven, arm, given))
+    chosen = _with_reference(run, None if sensors is None else tuple(sensors))
+    config = FusionConfig(arm=arm, sensors={name: Sensor(sd=1e-3) for name in chosen.sensors})
+    parts, said = segments(in_axes(chosen, None)[0])
+    found: list[tuple[AxisVerification, Trace]] = []
+    for number, part in enumerate(parts, 1):
+        name = run.name if len(parts) == 1 else f"{run.name}, part {number}"
+        part = replace(part, name=name, start={**part.start, **(start or {})})
+        found.extend(_part(part, config, said if number == 1 else ()))
     if not found:
         raise RunError(
             f"run '{run.name}': no source has {_FEWEST} readings of a commanded axis after the first command"
         )
+    return found
+
+
+def _part(run: Run, config: FusionConfig, said: Sequence[str]) -> list[tuple[AxisVerification, Trace]]:
+    """Every axis and source of one segment of a run."""
+    timeline = timelines.build(run, config)
+    scalars, found = timeline.scalars, list[tuple[AxisVerification, Trace]]()
+    axis, sensor = scalars.axis[scalars.candidates], scalars.sensor[scalars.candidates]
+    for number, driven in enumerate(timeline.axes):
+        for index, source in enumerate(scalars.sensors):
+            here = scalars.candidates[(axis == number) & (sensor == index)]
+            if len(here) >= _FEWEST and np.ptp(driven.command) > 0.0:
+                measured = _Measured(run.name, source, scalars.valid[here], scalars.value[here])
+                notes = [*said, *timeline.notes] if not found else []
+                found.append(_verified(measured, driven, config.arm, driven.name in run.start, notes))
     return found
 
 
@@ -188,7 +202,9 @@ def _with_reference(run: Run, sensors: Sequence[str] | None) -> Run:
     return replace(run, sensors={name: sources[name] for name in sensors}, reference=None)
 
 
-def _verified(measured: _Measured, driven: AxisInput, arm: ArmModel, given: bool) -> tuple[AxisVerification, Trace]:
+def _verified(
+    measured: _Measured, driven: AxisInput, arm: ArmModel, given: bool, notes: list[str]
+) -> tuple[AxisVerification, Trace]:
     model, delay = arm.axes[driven.name], arm.delay_of(driven.name)
     command = _Commands(driven.given, driven.command, arm.update_period)
     recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
@@ -208,6 +224,10 @@ def _verified(measured: _Measured, driven: AxisInput, arm: ArmModel, given: bool
         measured.position - measured.position.mean(),
         modelled - modelled.mean(),
     )
+    from scipy.stats import median_abs_deviation
+
+    left = trace.measured - trace.modelled
+    outlying = int(np.sum(np.abs(left) > _OUTLYING * max(float(median_abs_deviation(left, scale="normal")), 1e-9)))
     verification = AxisVerification(
         run=measured.run,
         axis=driven.name,
@@ -221,8 +241,10 @@ def _verified(measured: _Measured, driven: AxisInput, arm: ArmModel, given: bool
         with_recovery=fits["recovering"],
         recovery=recovery,
         floor=floor,
-        verdict=_verdict(fits["as it is"], model, delay, floor)
+        outlying=outlying,
+        verdict=_verdict(fits["as it is"], model, delay, floor, outlying)
         + _recovers(fits["as it is"], fits["recovering"], recovery),
+        notes=notes,
     )
     return verification, trace
 
@@ -237,7 +259,13 @@ class _Commands:
 
     @property
     def amplitude(self) -> float:
+        """From the lowest to the highest [m]."""
         return float(np.ptp(self.value))
+
+    @property
+    def speeds(self) -> FloatArray:
+        """Of the commands that move [m/s]."""
+        return commanded_speed(np.diff(self.value)[np.diff(self.value) != 0.0], self.period)
 
     def moved(self, axis: AxisModel, delay: float, start: float, time: TimeArray) -> FloatArray:
         """Where the axis is at ``time`` [ns], relative to ``start`` [m], (n,)."""
@@ -262,37 +290,63 @@ def _floor(measured: _Measured, command: _Commands, model: AxisModel, delay: flo
     """The best gain, delay and plant of the model's order on this run; gain and bias are linear."""
     from scipy.optimize import least_squares
 
-    order: Order = 1 if isinstance(model.plant, FirstOrder) else 2
     z = measured.position - measured.position.mean()
-    first = _coordinates(delay, model.plant)
-    unit = Gain()
+    columns = _gain_columns(command, model)
 
     def basis(x: FloatArray) -> FloatArray:
-        axis = AxisModel(plant=_plant_at(x), gain=unit)
-        c = command.moved(axis, float(x[0]) ** 2, start, measured.time)
-        return c - c.mean()
+        moved = [command.moved(_with(axis, _plant_at(x)), float(x[0]) ** 2, start, measured.time) for axis in columns]
+        independent = np.stack([moved[0], *(column - moved[0] for column in moved[1:])], axis=1)
+        return independent - independent.mean(axis=0)
+
+    def shares(design: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.lstsq(design, z, rcond=None)[0], dtype=np.float64)
 
     def left(x: FloatArray) -> FloatArray:
-        c = basis(x)
-        power = float(c @ c)
-        return z - (float(c @ z) / power) * c if power > 0.0 else z
+        design = basis(x)
+        return z - design @ shares(design)
 
+    starts = [_coordinates(delay, model.plant), *_starts(left, command.period, model.plant)]
     best = min(
-        (
-            least_squares(left, first + shift, x_scale="jac", xtol=1e-10, ftol=1e-12, gtol=1e-12, max_nfev=300)
-            for shift in _shifts(first, order)
-        ),
+        (least_squares(left, x, x_scale="jac", xtol=1e-10, ftol=1e-12, gtol=1e-12, max_nfev=300) for x in starts),
         key=lambda found: found.cost,
     )
-    c = basis(best.x)
-    power = float(c @ c)
-    gain = float(c @ z) / power if power > 0.0 else 0.0
+    design = basis(best.x)
+    share = shares(design)
+    speed = np.array(command.speeds.mean())
     return Floor(
-        fit=measured.fit(gain * c, command.amplitude),
+        fit=measured.fit(design @ share, command.amplitude),
         delay=float(best.x[0]) ** 2,
-        gain=gain,
+        gain=float(share[0] + sum(share[k] * (columns[k].gain.at(speed) - 1.0) for k in range(1, len(columns)))),
         plant=_plant_at(best.x),
     )
+
+
+def _gain_columns(command: _Commands, model: AxisModel) -> list[AxisModel]:
+    """Axes whose responses span those of all gains: K = 1; another K where it recovers; K that rises with speed."""
+    gains = [Gain()]
+    if model.gain_recovery is not None:
+        gains.append(Gain(intercept=2.0))
+    if np.ptp(command.speeds) > 1e-6 * command.speeds.max():
+        gains.append(Gain(slope=1.0))
+    return [msgspec.structs.replace(model, gain=gain) for gain in gains]
+
+
+def _with(axis: AxisModel, plant: PLANTS) -> AxisModel:
+    return msgspec.structs.replace(axis, plant=plant)
+
+
+def _starts(left: Callable[[FloatArray], FloatArray], period: float, plant: PLANTS) -> list[FloatArray]:
+    """The best cells of a grid of delays and plants, of different delays."""
+    ratios = (None,) if isinstance(plant, FirstOrder) else _RATIOS
+    found: list[tuple[float, FloatArray]] = []
+    for delay in np.linspace(0.0, _LATEST * period, _DELAYS).tolist():
+        cells = [
+            np.array([np.sqrt(delay), np.log(q), *([] if ratio is None else [0.5 * np.log(ratio * q * q)])])
+            for q in np.geomspace(0.2 * period, 10.0 * period, _LAGS).tolist()
+            for ratio in ratios
+        ]
+        found.append(min(((float(np.sum(left(x) ** 2)), x) for x in cells), key=lambda one: one[0]))
+    return [x for _, x in sorted(found, key=lambda one: one[0])[:_STARTS]]
 
 
 def _coordinates(delay: float, plant: PLANTS) -> FloatArray:
@@ -310,22 +364,11 @@ def _plant_at(x: FloatArray) -> PLANTS:
     return SecondOrder(natural_frequency=omega, damping=0.5 * q * omega)
 
 
-def _shifts(first: FloatArray, order: Order) -> list[FloatArray]:
-    """Where else to begin: other delays, faster and slower plants."""
-    shifts = [np.zeros(len(first))]
-    for delay in (-0.25, 0.25):
-        for slow in (-0.5, 0.5):
-            shift = np.zeros(len(first))
-            shift[0] = delay * max(float(first[0]), 0.1)
-            shift[1:] = slow if order == 1 else [slow, 0.5 * slow]
-            shifts.append(shift)
-    return shifts
-
-
-def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor) -> str:
+def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor, outlying: int) -> str:
     """How near the model is to the best of its order, and where the two differ."""
-    if floor.fit.fit < _HOLDS:
-        return "no linear model of this order fits: look at the log"
+    if max(floor.fit.fit, model.fit) < _HOLDS:
+        outliers = f" ({outlying} outlying readings)" if outlying else ""
+        return f"no linear model of this order fits: look at the log{outliers}"
     ratio = model.rms / floor.fit.rms if floor.fit.rms > 0.0 else 1.0 if model.rms == 0.0 else np.inf
     if ratio < _AS_GOOD:
         return "as good as any model of its order"

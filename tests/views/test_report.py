@@ -1,0 +1,145 @@
+"""Pages stand alone, hold every table and figure with its sentence, and cannot be broken by what users name things."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.folders import FolderError
+from pumafuse.identify.trials import Trial
+from pumafuse.views import report
+
+DATA = Path(pf.__file__).parent / "data"
+TIMES = np.arange(50) * 0.006
+
+
+def trials(names: str = "t", axis: str = "tip", speeds: int = 4) -> pf.StepTrials:
+    rng = np.random.default_rng(3)
+    made = []
+    for number in range(4 * speeds):
+        step = 0.002 * (1 + number % speeds)
+        c = 1.0 - np.exp(-np.maximum(TIMES - 0.05 - 0.002 * rng.standard_normal(), 0.0) / 0.03)
+        position = step * c + 2e-5 * rng.standard_normal(len(TIMES))
+        made.append(Trial(f"{names}{number}", axis, step, step / 0.02, {"tool": "ab"[number % 2]}, TIMES, position))
+    return pf.StepTrials(tuple(made), ())
+
+
+def page_of(folder: Path, of: pf.StepTrials) -> str:
+    report.write_identification(pf.identify(of), of, folder, False)
+    return (folder / "report.html").read_text(encoding="utf-8")
+
+
+class Outline(HTMLParser):
+    """Headings, the sentences and pictures below each, and whether every tag is closed."""
+
+    VOID = frozenset({"meta", "br"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.headings: list[str] = []
+        self.sentences: dict[str, str] = {}
+        self.pictures: list[str] = []
+        self.says = False
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in self.VOID:
+            self.open.append(tag)
+        if tag in {"h1", "h2"}:
+            self.headings.append("")
+        if tag == "svg":
+            self.pictures.append(self.headings[-1])
+        self.says = self.says or ("class", "says") in attrs
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+        self.says = self.says and tag != "p"
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        pass
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] in {"h1", "h2"}:
+            self.headings[-1] += data
+        if self.says and self.headings:
+            self.sentences[self.headings[-1]] = self.sentences.get(self.headings[-1], "") + data
+
+
+def outline(text: str) -> Outline:
+    found = Outline()
+    found.feed(text)
+    assert found.open == []
+    return found
+
+
+def test_the_page_of_the_recorded_campaign_has_the_papers_tables_and_figures(tmp_path: Path) -> None:
+    """Tables I and II, Figs. 4 to 7, each figure under a sentence; nothing is loaded from elsewhere."""
+    of = pf.StepTrials.read(DATA / "steps")
+    text = page_of(tmp_path, of)
+    found = outline(text)
+    for mark in ("Table I)", "Table II)", "Fig. 4", "Fig. 5", "Fig. 6", "Fig. 7"):
+        (heading,) = [heading for heading in found.headings if mark in heading]
+        assert heading in found.pictures or "Table" in heading
+        if "Table II)" not in heading:
+            assert len(found.sentences[heading]) > 40, heading
+    assert not re.search(r"""(src|href)=["'](?!#)""", text.replace('xlink:href="#', ""))
+    assert "<script" not in text and "@import" not in text and "url(http" not in text
+    for trial in of.trials:
+        assert f"<td>{trial.name}</td>" in text
+    assert "stiction" in text
+
+
+def test_the_same_trials_give_the_same_page(tmp_path: Path) -> None:
+    """To the byte: a report can be kept under version control."""
+    assert page_of(tmp_path / "a", trials()) == page_of(tmp_path / "b", trials())
+
+
+def test_names_are_text_and_nothing_else(tmp_path: Path) -> None:
+    """Trials, axes and factors named like markup are shown as they are written."""
+    text = page_of(tmp_path, trials("<b>&</b>", axis="<i>tip$x$"))
+    assert "&lt;b&gt;&amp;&lt;/b&gt;0" in text
+    assert "<b>" not in text and "<i>" not in text
+    outline(text)
+
+
+@pytest.mark.parametrize("speeds", [1, 2])
+def test_a_small_campaign_has_a_page_too(speeds: int, tmp_path: Path) -> None:
+    """One speed, no factor that varies but a tool; or none at all."""
+    of = trials(speeds=speeds)
+    outline(page_of(tmp_path / "one", of))
+    bare = pf.StepTrials(tuple(replace(trial, factors={}) for trial in of.trials), ())
+    text = page_of(tmp_path / "two", bare)
+    if speeds == 1:
+        assert "Table I)" not in text
+        assert "one speed only" in text
+
+
+def test_a_verification_has_its_table_and_a_figure_for_each_run(tmp_path: Path) -> None:
+    """Table III, and measured beside modelled with the start level that was taken."""
+    arm = pf.ArmModel.load("puma560-internal")
+    runs = [pf.Run.read(DATA / "white-noise" / f"{axis}_8mm_r1") for axis in ("radial", "vertical")]
+    report.write_verification([one for run in runs for one in pf.verify(run, arm)], arm, tmp_path, False)
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    found = outline(text)
+    assert any("Table III" in heading for heading in found.headings)
+    assert len(found.pictures) == 2
+    assert text.count("chosen among the run&#39;s 2 levels by RMS") == 2
+
+
+def test_a_report_is_replaced_only_when_asked_and_never_with_what_is_not_ours(tmp_path: Path) -> None:
+    """Without --force nothing is touched; a folder that holds anything else never is."""
+    of, folder = trials(), tmp_path / "report"
+    found = pf.identify(of)
+    report.write_identification(found, of, folder, False)
+    with pytest.raises(FolderError, match="--force replaces it"):
+        report.write_identification(found, of, folder, False)
+    report.write_identification(found, of, folder, True)
+    (folder / "mine.txt").write_text("mine")
+    with pytest.raises(FolderError, match=r"holds 'mine\.txt'"):
+        report.write_identification(found, of, folder, True)
