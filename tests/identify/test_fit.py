@@ -100,7 +100,7 @@ def finest(of: Trial, order: int) -> float:
     return best
 
 
-@pytest.mark.parametrize("noise", [0.05e-3, 0.5e-3, 5e-3])
+@pytest.mark.parametrize("noise", [0.05e-3, pytest.param(0.5e-3, marks=pytest.mark.long), 5e-3])
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize(("q", "p"), [SLOW, SWINGING])
 def test_a_fit_is_never_worse_than_a_fine_grid(q: float, p: float, order: int, noise: float) -> None:
@@ -110,12 +110,11 @@ def test_a_fit_is_never_worse_than_a_fine_grid(q: float, p: float, order: int, n
         assert fit_step(noisy, order).squares <= finest(noisy, order) * (1.0 + 1e-9)
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.05e-3, 1e-3])
+@pytest.mark.parametrize("noise", [0.05e-3, 1e-3])
 def test_second_order_never_fits_worse_than_first(noise: float) -> None:
     """First order is its p = 0."""
-    for seed in range(10):
-        noisy = trial(*SLOW, noise, seed)
-        assert fit_step(noisy, 2).squares <= fit_step(noisy, 1).squares * (1.0 + 1e-12)
+    for first, second in fit_steps([trial(*SLOW, noise, seed) for seed in range(10)]):
+        assert second.squares <= first.squares * (1.0 + 1e-12)
 
 
 def test_only_the_first_samples_are_used_when_so_many_are_asked_for() -> None:

@@ -216,6 +216,7 @@ def test_half_a_width_is_students_where_trials_are_alike() -> None:
     assert found.parts.half_width([-3.0, 0.0]) == pytest.approx(3.0 * found.parts.half_width([1.0, 0.0]), rel=1e-12)
 
 
+@pytest.mark.long
 def test_a_first_order_arm_is_rarely_told_to_be_of_second_order() -> None:
     """In 10 of 12 campaigns the interval of 1/ω² by trials holds 0 and τ lies in its own."""
     held = 0

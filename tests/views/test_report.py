@@ -134,12 +134,11 @@ def test_a_verification_has_its_table_and_a_figure_for_each_run(tmp_path: Path) 
 
 def test_a_report_is_replaced_only_when_asked_and_never_with_what_is_not_ours(tmp_path: Path) -> None:
     """Without --force nothing is touched; a folder that holds anything else never is."""
-    of, folder = trials(), tmp_path / "report"
-    found = pf.identify(of)
-    report.write_identification(found, of, folder, False)
+    report.check_writable(tmp_path / "new", False)
+    (tmp_path / "report.html").write_text("earlier")
     with pytest.raises(FolderError, match="--force replaces it"):
-        report.write_identification(found, of, folder, False)
-    report.write_identification(found, of, folder, True)
-    (folder / "mine.txt").write_text("mine")
+        report.check_writable(tmp_path, False)
+    report.check_writable(tmp_path, True)
+    (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(FolderError, match=r"holds 'mine\.txt'"):
-        report.write_identification(found, of, folder, True)
+        report.check_writable(tmp_path, True)

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 from ..arrays import FloatArray
 from .estimate import Estimate
@@ -48,6 +47,8 @@ class Parts:
         Clustered by trial, with a t distribution of as many degrees of freedom as trials have a say (Bell & McCaffrey,
         Survey Methodology 28, 2002): a few large steps may outweigh the others.
         """
+        from scipy.special import stdtrit
+
         c, n = np.asarray(slope), len(self.influence)
         variance = float(np.sum((self.influence @ c) ** 2)) / n**2
         shares = np.einsum("i,nij,j->n", c, self.expected, c)

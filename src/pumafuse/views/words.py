@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..identify.anova import Level
 from ..identify.estimate import Estimate
-from ..identify.verify import AxisVerification
 from ..model.arm import Gain
 from ..model.plants import PLANTS, FirstOrder, Interval
 from ..units import MM
+
+if TYPE_CHECKING:
+    from ..identify.verify import AxisVerification
 
 
 def with_interval(value: float, interval: Interval | None, unit: float = 1.0) -> str:
