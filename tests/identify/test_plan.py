@@ -25,7 +25,11 @@ def design(**changes: Any) -> Design:
         "period": 0.028,
         "positions": POSITIONS,
         "replicates": 3,
+        "hold": 0.5,
+        "rest": 0.5,
         "amplitudes": (0.004, 0.008),
+        "noise_duration": 4.0,
+        "seed": 1,
     }
     return Design(**{**made, **changes})
 

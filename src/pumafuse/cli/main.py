@@ -135,7 +135,9 @@ def simulate(
 @app.command()
 def plan(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the sequences go.")],
-    axes: Annotated[str, typer.Option(metavar="A,B", help="Axes to step.")] = "tangential,radial,vertical",
+    axes: Annotated[
+        str | None, typer.Option(metavar="A,B", help="Axes to step; default: the arm's, or the paper's three.")
+    ] = None,
     speeds: Annotated[
         str, typer.Option(metavar="M_S,...", help="Speeds of the steps; a step is its speed times the period.")
     ] = "0.071,0.14,0.28,0.68",
@@ -143,7 +145,9 @@ def plan(
         Path | None, typer.Option(metavar="TABLE", help="Where to step: a row a position, a column a coordinate.")
     ] = None,
     replicates: Annotated[int, typer.Option(metavar="N", min=1, help="How often each combination is tried.")] = 2,
-    period: Annotated[float, typer.Option(metavar="MS", help="Update period.")] = 28.0,
+    period: Annotated[
+        float | None, typer.Option(metavar="MS", help="Update period; default: the arm's, or 28.")
+    ] = None,
     hold: Annotated[float, typer.Option(metavar="S", help="How long a step is held.")] = 0.5,
     rest: Annotated[float, typer.Option(metavar="S", help="How long the arm rests before and after it.")] = 0.5,
     noise: Annotated[
@@ -162,18 +166,19 @@ def plan(
     """Lay out a step campaign and white noise to send to an arm, tick by tick."""
     from . import plan as command
 
-    design = command.Design(
-        axes=tuple(_names(axes, "--axes")),
+    wanted = command.Wanted(
+        axes=None if axes is None else _names(axes, "--axes"),
         speeds=_numbers(speeds, "--speeds"),
-        period=_si(_positive(period, "--period")),
+        positions=positions,
         replicates=replicates,
+        period=_si(_positive(period, "--period")),
         hold=_positive(hold, "--hold"),
         rest=_positive(rest, "--rest"),
         amplitudes=tuple(_si(amplitude) for amplitude in _numbers(noise, "--noise")),
         noise_duration=_positive(noise_duration, "--noise-duration"),
         seed=seed,
     )
-    command.run(output, design, positions, arm, _positive(max_speed, "--max-speed"), force)
+    command.run(output, wanted, arm, _positive(max_speed, "--max-speed"), force)
 
 
 @app.command()

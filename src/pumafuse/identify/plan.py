@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 import pyarrow as pa
@@ -50,13 +49,13 @@ class Design:
     axes: tuple[str, ...]
     speeds: tuple[float, ...]
     period: float
-    positions: tuple[Mapping[str, str], ...] = (MappingProxyType[str, str]({}),)
-    replicates: int = 2
-    hold: float = 0.5
-    rest: float = 0.5
-    amplitudes: tuple[float, ...] = ()
-    noise_duration: float = 4.0
-    seed: int = 1
+    positions: tuple[Mapping[str, str], ...]
+    replicates: int
+    hold: float
+    rest: float
+    amplitudes: tuple[float, ...]
+    noise_duration: float
+    seed: int
 
     def __post_init__(self) -> None:
         if not self.axes or len(set(self.axes)) < len(self.axes):
