@@ -101,9 +101,8 @@ def fit_together(trials: Sequence[Trial], own: Sequence[StepFit], order: Order, 
     step = np.array([trial.step for trial in trials])
     noise = np.maximum([fit.rms for fit in own], _NOISELESS * np.abs(step))
     rows = Rows.of(trials, (1.0 / noise).tolist(), samples)
-    lag = np.array(
-        [fit.shape.delay + fit.shape.q for fit in own]
-    )  # what a trial tells best: the area over its response
+    # what a trial tells best is the area over its response
+    lag = np.array([fit.shape.delay + fit.shape.q for fit in own])
     middle = float(np.median([fit.shape.q for fit in own]))
     found: list[Point] = []
     for ratio in _STARTS[: 1 if order == 1 else None]:
@@ -117,22 +116,10 @@ def _result(rows: Rows, at: Point, order: Order, step: FloatArray, noise: FloatA
     n, p = len(step), at.shape[:, 2]
     slopes, amplitude_slopes = rows.slopes(at, order)
     parts = _parts(rows, at, slopes)
-    square = Estimate(value=0.0, ci95=(0.0, 0.0))
-    if order == 2:
-        told = parts
-        if not _resolved(parts, slopes):
-            # a pole much faster than the sampling is like a delay: it is only known how slow it can be
-            slopes, amplitude_slopes = rows.slopes(at, order, (p, np.median(rows.spacing) * at.shape[:, 1]))
-            told = parts = _parts(rows, at, slopes)
-        elif p[0] > 0.0:
-            # whether p may be 0 is asked of the whole way there: the response bends on it
-            way = rows.slopes(at, order, (p, np.zeros(n)))[0]
-            to_zero = _parts(rows, at, way)
-            told = to_zero if not _resolved(to_zero, way) or to_zero.half_width([0.0, 1.0]) >= p[0] else parts
-        half = told.half_width([0.0, 1.0])
-        # where p is held at 0 the trials' parts do not sum to 0: their mean is how far it would have gone on
-        centre = float(p[0]) + (float(told.influence[:, 1].mean()) if p[0] == 0.0 else 0.0)
-        square = Estimate(value=float(p[0]), ci95=(centre - half, centre + half))
+    if order == 2 and not _resolved(parts, slopes):
+        # a pole much faster than the sampling is like a delay: it is only known how slow it can be
+        slopes, amplitude_slopes = rows.slopes(at, order, (p, np.median(rows.spacing) * at.shape[:, 1]))
+        parts = _parts(rows, at, slopes)
     delay_slope, gain_slope = np.zeros((n, 2)), np.zeros((n, 2))
     delay_slope[:, :order] = -parts.coupling
     gain_slope[:, :order] = (amplitude_slopes[1:] - parts.coupling.T * amplitude_slopes[0]).T / step[:, None]
@@ -147,11 +134,26 @@ def _result(rows: Rows, at: Point, order: Order, step: FloatArray, noise: FloatA
         count=rows.count,
         cost=float(at.cost.sum()),
         parts=parts,
-        inverse_square=square,
+        inverse_square=_inverse_square(rows, at, parts),
         delay_slope=delay_slope,
         gain_slope=gain_slope,
         gain_sd=np.hypot(1.0 / np.sqrt(np.sum(at.unit**2, axis=1)), by_delay) / np.abs(step),
     )
+
+
+def _inverse_square(rows: Rows, at: Point, parts: Parts) -> Estimate:
+    """1/ω² with an interval that holds 0 unless the trials agree that it is more; 0 of first order."""
+    p = float(at.shape[0, 2])
+    if p == 0.0:
+        # held at 0, the trials' parts do not sum to 0: their mean is how far it would have gone on
+        centre, half = float(parts.influence[:, 1].mean()), parts.half_width([0.0, 1.0])
+        return Estimate(value=p, ci95=(centre - half, centre + half))
+    # whether it may be 0 is asked of the whole way there: the response bends on it
+    way = rows.slopes(at, 2, (at.shape[:, 2], np.zeros(len(at.shape))))[0]
+    to_zero = _parts(rows, at, way)
+    far = not _resolved(to_zero, way) or to_zero.half_width([0.0, 1.0]) >= p
+    half = max((to_zero if far else parts).half_width([0.0, 1.0]), p if far else 0.0)
+    return Estimate(value=p, ci95=(p - half, p + half))
 
 
 def _parts(rows: Rows, at: Point, slopes: FloatArray) -> Parts:

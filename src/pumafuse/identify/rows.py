@@ -229,7 +229,7 @@ class Rows:
     def _response(
         self, shape: FloatArray, later: FloatArray | float, q: FloatArray | float, p: FloatArray | float
     ) -> FloatArray:
-        """C at every sample, of a shape and changes to it, (R, m)."""
+        """The unit response at every sample, of a shape and changes to it, (R, m)."""
         delay, slow, square = shape[:, 0] + later, shape[:, 1] + q, shape[:, 2] + p
         return unit_response(self.time - delay[:, None], slow[:, None], square[:, None])
 
