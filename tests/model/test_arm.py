@@ -78,9 +78,7 @@ arms = st.builds(
     delay=st.floats(0.0, 1e6),
     delay_ci95=interval,
     validity=st.builds(Validity, max_speed=st.none() | positive, max_radius=st.none() | positive),
-    axes=st.dictionaries(
-        st.sampled_from(["tangential", "radial", "vertical"]) | word, axis_models, min_size=1, max_size=4
-    ),
+    axes=st.dictionaries(axis_names, axis_models, min_size=1, max_size=4),
     provenance=provenance,
 )
 

@@ -7,6 +7,7 @@ at once, which an unbalanced design needs, stand beside it.
 
 from __future__ import annotations
 
+import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
@@ -250,21 +251,16 @@ def _one_way(groups: Sequence[FloatArray]) -> tuple[float | None, float | None]:
 
 def _adjusted(values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> float | None:
     """P of one factor in a model with all of them (main effects)."""
-    from scipy.stats import f as fisher
+    from statsmodels.regression.linear_model import OLS
 
     rest = _design(len(values), [cells for name, cells in factors.items() if name != factor])
     whole = np.column_stack((rest, _design(len(values), [factors[factor]])[:, 1:]))
-    (left, columns), (left_by_rest, columns_of_rest) = (_least_squares(values, design) for design in (whole, rest))
-    more, freedom = columns - columns_of_rest, len(values) - columns
-    if not more or freedom < 1 or left <= 1e-24 * float(values @ values):
+    with warnings.catch_warnings():  # of columns that depend on one another: confounded factors, told by the rank
+        warnings.simplefilter("ignore")
+        full, reduced = OLS(values, whole).fit(), OLS(values, rest).fit()
+    if full.df_resid < 1 or full.df_resid == reduced.df_resid or full.ssr <= 1e-24 * float(values @ values):
         return None
-    return float(fisher.sf((left_by_rest - left) / more / (left / freedom), more, freedom))
-
-
-def _least_squares(values: FloatArray, design: FloatArray) -> tuple[float, int]:
-    """What is left, squared and summed, and how many columns are independent (confounded factors are not)."""
-    solution, _, rank, _ = np.linalg.lstsq(design, values, rcond=None)
-    return float(np.sum((values - design @ solution) ** 2)), int(rank)
+    return float(full.compare_f_test(reduced)[1])
 
 
 def _design(rows: int, factors: Sequence[Sequence[str]]) -> FloatArray:

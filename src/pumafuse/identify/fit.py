@@ -16,7 +16,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..model.plants import PLANTS, FirstOrder, Interval, SecondOrder
-from .response import unit_response
+from ..model.response import unit_response
 from .rows import Order, Rows, window
 from .trials import Trial
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..arrays import FloatArray
+from ..model.response import unit_response
 from .fit import Shape, StepFit, inverse, reached, sensitivity
-from .response import unit_response
 from .rows import Order, window
 from .trials import Trial
 

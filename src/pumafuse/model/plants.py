@@ -6,7 +6,6 @@ A new plant is a class here with a tag and the methods of :class:`Plant`, added 
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import msgspec
@@ -14,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import FloatArray
+from .response import unit_response
 
 if TYPE_CHECKING:
     import control
@@ -112,24 +112,8 @@ class SecondOrder(Plant, frozen=True, kw_only=True, tag="second-order", forbid_u
         return 2.0 * self.damping / self.natural_frequency
 
     def step_response(self, time: npt.ArrayLike) -> FloatArray:
-        """Equations 6 and 9 and the ζ = 1 between them as one formula that joins them without cancellation.
-
-        With β² = ω²(ζ² − 1), c(t) = 1 − e^(−ζωt) [cosh βt + ζωt · sinh(βt)/(βt)]; for β² < 0 the hyperbolic functions
-        become circular ones, and at β = 0 both are 1 − e^(−ωt)(1 + ωt). Equations 6 and 9 divide by √|ζ² − 1| and
-        lose all digits near ζ = 1.
-        """
-        t = np.maximum(np.asarray(time, dtype=np.float64), 0.0)
-        decay = self.damping * self.natural_frequency
-        beta = self.natural_frequency * math.sqrt(abs((self.damping - 1.0) * (self.damping + 1.0)))
-        if self.damping < 1.0:
-            envelope = np.exp(-decay * t)
-            return 1.0 - envelope * (np.cos(beta * t) + decay * t * np.sinc(beta * t / np.pi))
-        # e^(−ζωt) cosh βt would overflow: the slow pole s2 (equation 8, as ω²/s1) is taken out of both terms.
-        slow = self.natural_frequency**2 / (decay + beta)
-        double = 2.0 * beta * t
-        with np.errstate(invalid="ignore", divide="ignore"):
-            sinhc = np.where(double > 0.0, -np.expm1(-double) / double, 1.0)
-        return 1.0 - np.exp(-slow * t) * (0.5 * (1.0 + np.exp(-double)) + decay * t * sinhc)
+        """Equations 6 and 9 and the ζ = 1 between them, see :func:`pumafuse.model.response.unit_response`."""
+        return unit_response(np.asarray(time, dtype=np.float64), self.lag, self.natural_frequency**-2)
 
 
 PLANTS: TypeAlias = FirstOrder | SecondOrder
