@@ -20,7 +20,7 @@ from .anova import ordered, outlying, speed_levels
 from .choice import OrderChoice, choose
 from .estimate import Estimate, common, mean, regression, robust
 from .fit import StepFit, flags
-from .joint import JointFit, fit_together
+from .joint import JointFit, fit_together, inverse_square
 from .paper import minimised, sensitivities
 from .rows import Order, window
 from .trials import Trial
@@ -208,7 +208,7 @@ def _fitted_together(used: Sequence[Fitted], samples: int | None) -> Common:
         parameters={order: 3 * len(used) + order for order in joints},
         samples=int(second.count.sum()),
         rms={order: float(np.sqrt(np.average(joint.rms**2, weights=joint.count))) for order, joint in joints.items()},
-        inverse_square=second.inverse_square,
+        inverse_square=inverse_square(joints[1], second),
     )
     best = joints[choice.order]
     return Common(

@@ -21,14 +21,19 @@ class Estimate(msgspec.Struct, frozen=True, kw_only=True):
     ci95: Interval
 
 
-def mean(values: FloatArray) -> Estimate:
-    """The mean of independent values with its t-interval; an open one of a single value."""
+def t_quantile(freedom: float) -> float:
+    """Half the 95 % interval of Student's t."""
     from scipy.special import stdtrit
 
-    middle = float(values.mean()) if len(values) else np.nan
+    return float(stdtrit(freedom, 0.975))
+
+
+def mean(values: FloatArray) -> Estimate:
+    """The mean of independent values with its t-interval; an open one of a single value."""
+    middle = float(values.mean())
     if len(values) < 2:
         return Estimate(value=middle, ci95=(-np.inf, np.inf))
-    half = float(stdtrit(len(values) - 1, 0.975) * values.std(ddof=1) / np.sqrt(len(values)))
+    half = t_quantile(len(values) - 1) * float(values.std(ddof=1)) / np.sqrt(len(values))
     return Estimate(value=middle, ci95=(middle - half, middle + half))
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..model.plants import PLANTS, FirstOrder, Interval, SecondOrder
 from ..model.response import unit_response
+from .estimate import t_quantile
 from .rows import Order, Rows, window
 from .trials import Trial
 
@@ -251,4 +252,4 @@ def inverse(jacobian: FloatArray) -> FloatArray:
 def _quantile(fit: StepFit) -> float:
     from scipy.special import stdtrit
 
-    return float(stdtrit(max(fit.samples - fit.parameters, 1), 0.975))
+    return t_quantile(max(fit.samples - fit.parameters, 1))

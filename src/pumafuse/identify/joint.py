@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import FloatArray
-from .estimate import Estimate
+from .estimate import Estimate, t_quantile
 from .fit import StepFit
 from .rows import Order, Point, Rows
 from .trials import Trial
@@ -47,13 +47,11 @@ class Parts:
         Clustered by trial, with a t distribution of as many degrees of freedom as trials have a say (Bell & McCaffrey,
         Survey Methodology 28, 2002): a few large steps may outweigh the others.
         """
-        from scipy.special import stdtrit
-
         c, n = np.asarray(slope), len(self.influence)
         variance = float(np.sum((self.influence @ c) ** 2)) / n**2
         shares = np.einsum("i,nij,j->n", c, self.expected, c)
         freedom = max(float(shares.sum() ** 2 / np.sum(shares**2)) * (n - 1) / n, 1.0) if shares.any() else 1.0
-        return float(stdtrit(freedom, 0.975) * np.sqrt(variance))
+        return float(t_quantile(freedom) * np.sqrt(variance))
 
 
 @dataclass(frozen=True)
@@ -68,8 +66,8 @@ class JointFit:
         rms: Of what is left of each trial [m].
         count: Samples of each.
         cost: Sum of squares of what is left, each trial's over its own noise.
+        left: What is left of each trial, over its noise, (n, m).
         parts: Each trial's in q and p.
-        inverse_square: p with an interval that tells whether it may be 0.
         delay_slope: ∂Td/∂(q, p).
         gain_slope: ∂K/∂(q, p).
         gain_sd: Of each K by the trial's noise.
@@ -82,8 +80,8 @@ class JointFit:
     rms: FloatArray
     count: FloatArray
     cost: float
+    left: FloatArray
     parts: Parts
-    inverse_square: Estimate
     delay_slope: FloatArray
     gain_slope: FloatArray
     gain_sd: FloatArray
@@ -134,25 +132,35 @@ def _result(rows: Rows, at: Point, order: Order, step: FloatArray, noise: FloatA
         count=rows.count,
         cost=float(at.cost.sum()),
         parts=parts,
-        inverse_square=_inverse_square(rows, at, parts),
+        left=at.left,
         delay_slope=delay_slope,
         gain_slope=gain_slope,
         gain_sd=np.hypot(1.0 / np.sqrt(np.sum(at.unit**2, axis=1)), by_delay) / np.abs(step),
     )
 
 
-def _inverse_square(rows: Rows, at: Point, parts: Parts) -> Estimate:
-    """1/ω² with an interval that holds 0 unless the trials agree that it is more; 0 of first order."""
-    p = float(at.shape[0, 2])
+def inverse_square(first: JointFit, second: JointFit) -> Estimate:
+    """1/ω² with an interval that holds 0 unless the trials agree that second order fits them better.
+
+    Whether it may be 0 is asked of the way between the two fits, refitted at both ends: p/p̂ is 1 at one and 0 at the
+    other, and a trial's part in it is how far its residuals there want to go back. A slope at p̂ would not do: the
+    response bends on the way, and near 0 it is flat.
+    """
+    n, p = len(second.delay), second.p
+    half = second.parts.half_width([0.0, 1.0])
     if p == 0.0:
         # held at 0, the trials' parts do not sum to 0: their mean is how far it would have gone on
-        centre, half = float(parts.influence[:, 1].mean()), parts.half_width([0.0, 1.0])
-        return Estimate(value=p, ci95=(centre - half, centre + half))
-    # whether it may be 0 is asked of the whole way there: the response bends on it
-    way = rows.slopes(at, 2, (at.shape[:, 2], np.zeros(len(at.shape))))[0]
-    to_zero = _parts(rows, at, way)
-    far = not _resolved(to_zero, way) or to_zero.half_width([0.0, 1.0]) >= p
-    half = max((to_zero if far else parts).half_width([0.0, 1.0]), p if far else 0.0)
+        centre = float(second.parts.influence[:, 1].mean())
+        return Estimate(value=p, ci95=(min(centre - half, p), max(centre + half, p)))
+    way = first.left - second.left
+    weight = np.einsum("ij,ij->i", way, way)
+    share = weight / max(float(weight.sum()), 1e-300)
+    parts = np.einsum("ij,ij->i", second.left, way) / max(float(weight.sum()), 1e-300)
+    corrected = parts / np.sqrt(np.maximum(1.0 - share, 1e-3))
+    freedom = max((n - 1) / n / float(np.sum(share**2)), 1.0) if weight.any() else 1.0
+    across = t_quantile(freedom) * float(np.sqrt(np.sum(corrected**2)))  # of p/p̂
+    may_be_zero = not weight.any() or across >= 1.0 + float(parts.sum())
+    half = max(half, p * across, p) if may_be_zero else min(half, p * max(across, 0.5))
     return Estimate(value=p, ci95=(p - half, p + half))
 
 
