@@ -412,3 +412,22 @@ def test_recorded_white_noise_is_met_as_well_as_promised() -> None:
         floors = {name: one.floor for name, one in found.items()}
         if isinstance(floors["preset"].plant, type(floors["identified"].plant)):
             assert 0.95 < floors["preset"].fit.rms / floors["identified"].fit.rms < 1.0 + 1e-6
+
+
+def test_readings_that_jump_are_left_out_and_counted_and_a_wrong_model_is_not_spared() -> None:
+    """2 % of the readings 20 mm away change nothing; a second of a stuck arm stays in the error."""
+    rng = np.random.default_rng(12)
+    known = arm(FIRST)
+    clean = moved(known) + noise()
+    far = rng.random(len(clean)) < 0.02
+    far[1:] &= ~far[:-1]
+    spiked = clean + 0.02 * far * rng.choice([-1.0, 1.0], len(clean))
+    expected, found = only(run_of(clean), known), only(run_of(spiked), known)
+    assert expected.outlying == 0
+    assert found.outlying == int(far.sum())
+    assert found.model.rms == pytest.approx(expected.model.rms, rel=0.03)
+    stuck = clean.copy()
+    stuck[500:750] = stuck[500]
+    held = only(run_of(stuck), known)
+    assert held.outlying < 10
+    assert held.model.rms > 0.9 * float(np.std(stuck - moved(known)))

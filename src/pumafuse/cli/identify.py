@@ -61,15 +61,16 @@ def run(folder: Path, options: Options) -> None:
     )
     for note in found.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=1)
+    shown = found.to_json() if options.json else None
     write_file(options.output, found.arm.to_toml())
     if options.report is not None:
         from ..views import report
 
         report.write_identification(found, trials, options.report, options.force)
-    if options.json:
-        print(found.to_json())
-    else:
+    if shown is None:
         _show(found, options)
+    else:
+        print(shown)
 
 
 def _show(found: Identification, options: Options) -> None:

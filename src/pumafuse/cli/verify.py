@@ -73,10 +73,11 @@ def _show(verified: Sequence[AxisVerification], report: Path | None) -> None:
     out.print(table)
     for one in verified:
         floor = one.floor
+        left_out = f"; {one.outlying} outlying readings left out" if one.outlying else ""
         refitted = f"K {floor.gain:.3f}, Td {floor.delay * MM:.1f} ms, {words.plant(floor.plant)}"
         out.print(
             f"{one.run}, {one.axis}: {one.verdict}; start level {one.start * MM:g} mm ({one.start_from}); gain recovery"
-            f" tried with {one.recovery * MM:g} ms; the floor is {refitted}",
+            f" tried with {one.recovery * MM:g} ms; the floor is {refitted}{left_out}",
             markup=False,
         )
     if report is not None:

@@ -64,8 +64,8 @@ def choose(
     agreed = inverse_square.ci95[0] > 0.0
     wanted = p < 0.05 and gain is not None and gain > 0.0
     said = (
-        f"first order leaves {1e3 * rms[1]:.3g} mm, second {1e3 * rms[2]:.3g} (F({more}, {freedom}) = {F:.3g},"
-        f" p {'< 0.001' if p < 1e-3 else f'= {p:.2g}'}; "
+        f"first order leaves {1e3 * rms[1]:.3g} mm, second {1e3 * rms[2]:.3g} (each trial weighed by its noise:"
+        f" F({more}, {freedom}) = {F:.3g}, p {'< 0.001' if p < 1e-3 else f'= {p:.2g}'}; "
         + (
             "too few samples for AICc"
             if gain is None

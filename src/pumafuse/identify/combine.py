@@ -19,7 +19,7 @@ from ..model.plants import PLANTS, FirstOrder, SecondOrder
 from .anova import ordered, outlying, speed_levels
 from .choice import OrderChoice, choose
 from .estimate import Estimate, common, mean, regression, robust
-from .fit import StepFit, flags
+from .fit import HARDLY_MOVED, TOO_FEW, StepFit, flags
 from .joint import JointFit, fit_together, inverse_square
 from .paper import minimised, sensitivities
 from .rows import Order, window
@@ -50,12 +50,12 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
     """Three answers to "how late is it?" [s].
 
     Attributes:
-        onset: When the arm is first seen to move: above 3 standard deviations and 2 % of the step.
+        onset: When the arm is first seen to move: above 3 standard deviations and 2 % of the step; null: never.
         fitted: Td of the model.
         lag: Behind the held command at constant velocity: Td + τ, or Td + 2ζ/ω.
     """
 
-    onset: Estimate = msgspec.field(name="onset_ms")
+    onset: Estimate | None = msgspec.field(name="onset_ms")
     fitted: Estimate = msgspec.field(name="fitted_ms")
     lag: Estimate = msgspec.field(name="lag_ms")
 
@@ -133,15 +133,20 @@ def combine(fitted: Sequence[Fitted], period: float, samples: int | None, paper:
     Returns:
         The model, or why there is none.
     """
-    left_out = _still(fitted) if paper else {**_outlying(fitted), **_still(fitted)}
+    if usual_gain(fitted) == 0.0 or not any(np.isfinite(one.onset) for one in fitted):
+        return "the arm is never seen to move"
+    left_out = _unseen(fitted, samples) if paper else _outlying(fitted)
+    left_out |= _still(fitted)
     used = [one for one in fitted if one.trial.name not in left_out]
     if len(used) < _FEWEST:
-        return f"{len(used)} usable trials, at least {_FEWEST} are needed"
+        why = "; ".join(f"trial '{name}' {reason}" for name, reason in list(left_out.items())[:3])
+        return f"{len(used)} usable trials, at least {_FEWEST} are needed" + (f" ({why})" if why else "")
     found = _published(used, samples) if paper else _fitted_together(used, samples)
     speed = np.array([one.trial.speed_at(period) for one in used])
     line, lack, words = _gain_line(speed, found, speed_levels([one.trial for one in used], period))
     delay = common(found.delay, found.delay_sd)
     tau = np.array([one.first.shape.q for one in used])
+    seen = [one.onset for one in used if np.isfinite(one.onset)]
     axis = CombinedAxis(
         trials=len(used),
         left_out=left_out,
@@ -150,7 +155,7 @@ def combine(fitted: Sequence[Fitted], period: float, samples: int | None, paper:
         time_constant_mean=mean(tau),
         time_constant_robust=robust(tau),
         delays=Delays(
-            onset=mean(np.array([one.onset for one in used if np.isfinite(one.onset)])),
+            onset=mean(np.array(seen)) if seen else None,
             fitted=delay,
             lag=common(found.delay + found.lag, found.delay_sd),
         ),
@@ -173,7 +178,19 @@ def _still(fitted: Sequence[Fitted]) -> dict[str, str]:
     """Trials in which the arm hardly moved."""
     usual = usual_gain(fitted)
     return {
-        one.trial.name: flag for one in fitted for flag in flags(one.first, usual) if flag.startswith("hardly moved")
+        one.trial.name: flag
+        for one in fitted
+        for flag in flags(one.first, usual)
+        if flag.startswith((HARDLY_MOVED, TOO_FEW))
+    }
+
+
+def _unseen(fitted: Sequence[Fitted], samples: int | None) -> dict[str, str]:
+    """Trials whose window ends before the arm is seen to move."""
+    return {
+        one.trial.name: "not seen to move within the window"
+        for one in fitted
+        if not one.onset < window(one.trial, samples)[0][-1]
     }
 
 

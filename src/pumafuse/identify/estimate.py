@@ -30,10 +30,10 @@ def t_quantile(freedom: float) -> float:
 
 def mean(values: FloatArray) -> Estimate:
     """The mean of independent values with its t-interval; an open one of a single value."""
-    middle = float(values.mean())
+    middle = float(values.mean()) if len(values) else np.nan
     if len(values) < 2:
         return Estimate(value=middle, ci95=(-np.inf, np.inf))
-    half = t_quantile(len(values) - 1) * float(values.std(ddof=1)) / np.sqrt(len(values))
+    half = t_quantile(len(values) - 1) * float(values.std(ddof=1) / np.sqrt(len(values)))
     return Estimate(value=middle, ci95=(middle - half, middle + half))
 
 

@@ -21,9 +21,13 @@ from .estimate import t_quantile
 from .rows import Order, Rows, window
 from .trials import Trial
 
+HARDLY_MOVED = "hardly moved (stiction?)"
+TOO_FEW = "too few samples tell anything: the gain may be 0"
+
 _STARTS = 4  # cells of the grid to go on from
 _RATIOS = (0.0, 0.08, 0.16, 0.25, 0.4, 0.8, 2.0)  # p/q² = 1/(4ζ²): ζ from ∞ to 0.35
 _SLOWNESSES = 14  # values of q on the grid
+_MOST_DELAYS, _MOST_SAMPLES = 200, 300  # on the grid
 _FINE = 8  # instants between samples at which the grid's responses are known
 _SETTLED = 0.98  # share of the final value that a settled response has reached at the end
 _MOVES = 0.5  # share of what is usual below which an arm has hardly moved
@@ -156,8 +160,10 @@ def flags(fit: StepFit, usual: float = 1.0) -> list[str]:
     """
     found: list[str] = []
     moved = fit.gain * fit.reached
-    if moved / usual < _MOVES or fit.gain_ci95[0] <= 0.0 < fit.gain_ci95[1]:
-        found.append(f"hardly moved (stiction?): {max(moved, 0.0):.0%} of the step")
+    if usual == 0.0 or moved / usual < _MOVES:
+        found.append(f"{HARDLY_MOVED}: {max(moved, 0.0):.0%} of the step")
+    elif not fit.gain_ci95[1] - fit.gain_ci95[0] < 2.0 * abs(fit.gain):
+        found.append(TOO_FEW)
     if fit.reached < _SETTLED:
         found.append(f"not settled: {fit.reached:.0%} reached")
     if fit.order == 2 and fit.p_ci95[0] <= 0.0:
@@ -183,7 +189,8 @@ def _searched(rows: Rows, order: Order, more: list[FloatArray]) -> FloatArray:
 
 def _starts(rows: Rows, row: int, order: Order) -> FloatArray:
     """The best cells of the grid for one row, of different delays, (starts, 3)."""
-    inside = rows.weight[row] > 0.0
+    inside = np.flatnonzero(rows.weight[row] > 0.0)
+    inside = inside[:: len(inside) // _MOST_SAMPLES + 1]
     shapes, unit = _grid(rows.time[row, inside].tobytes(), order)
     left = rows.position[row, inside]
     explained = ((unit @ (left - left.mean())) ** 2).reshape(shapes.shape[:2])
@@ -196,13 +203,14 @@ def _starts(rows: Rows, row: int, order: Order) -> FloatArray:
 def _grid(time: bytes, order: Order) -> tuple[FloatArray, FloatArray]:
     """Shapes by delay (d, g, 3), and their centred responses, each of unit length, (d·g, n)."""
     t = np.frombuffer(time)
-    spacing, span = float(np.median(np.diff(t))), float(t[-1])
+    span = float(t[-1])
+    spacing = max(float(np.mean(np.diff(t))), span / _MOST_DELAYS)
     delays = np.arange(0.0, 0.8 * span, 0.75 * spacing)
     slowness, ratio = np.meshgrid(np.geomspace(0.5 * spacing, span, _SLOWNESSES), _RATIOS[: 1 if order == 1 else None])
     q, p = slowness.ravel(), (ratio * slowness**2).ravel()
     # a delay is a shift: one fine response of each plant serves all
     fine = spacing / _FINE
-    table = unit_response(np.arange(0.0, span - min(float(t[0]), 0.0) + fine, fine), q[:, None], p[:, None])
+    table = unit_response(np.arange(0.0, span + 2.0 * fine, fine), q[:, None], p[:, None])
     place = np.maximum(np.rint((t - delays[:, None]) / fine).astype(np.int64), 0)
     c = np.ascontiguousarray(table[:, place].swapaxes(0, 1)).reshape(-1, len(t))
     c -= c.mean(axis=1, keepdims=True)
@@ -250,6 +258,4 @@ def inverse(jacobian: FloatArray) -> FloatArray:
 
 
 def _quantile(fit: StepFit) -> float:
-    from scipy.special import stdtrit
-
     return t_quantile(max(fit.samples - fit.parameters, 1))

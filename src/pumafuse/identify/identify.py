@@ -176,6 +176,8 @@ def identify(
             notes.append(f"{axis}: no model: {found}")
         else:
             combined[axis] = found
+            if usual_gain([one for one in fitted if one.trial.axis == axis]) < 0.0:
+                notes.append(f"{axis}: the arm moves against its commands; is a sign wrong?")
     if not combined:
         raise TrialsError("; ".join(["no axis has trials enough for a model", *notes]))
     arm, one_delay = _arm(combined, period, name)

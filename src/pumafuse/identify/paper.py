@@ -32,7 +32,7 @@ def rest(trial: Trial) -> tuple[float, float]:
 def onset(trial: Trial) -> float:
     """When the arm first is further from rest than 3 standard deviations and 2 % of the step [s]; NaN: never."""
     level, sd = rest(trial)
-    away = (trial.position - level) * np.sign(trial.step)
+    away = np.abs(trial.position - level)
     moved = (away > max(_SIGMAS * sd, _SHARE * abs(trial.step))) & (trial.time >= 0.0)
     return float(trial.time[np.argmax(moved)]) if moved.any() else np.nan
 

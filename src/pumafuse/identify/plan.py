@@ -25,7 +25,9 @@ from ..units import MM, refuse_unit
 TRIALS, STEPS = "trials.csv", "steps.csv"
 _NOISE = "white-noise-"
 _SETTLED = 0.98  # share of the final value
-_MOST_TRIALS = 100_000
+_MOST_TRIALS, _MOST_ROWS = 100_000, 5_000_000
+_LEAST, _MOST = 1e-6, 10.0  # m, that a step can be
+_TAKEN = frozenset({"trial", "axis", "step_mm", "speed_m_s", "replicate", "tick", "time_s"})
 
 
 @dataclass(frozen=True)
@@ -62,15 +64,23 @@ class Design:
             raise ConfigError("plan: at least one axis, and each once")
         for axis in self.axes:
             refuse_unit("axis", axis)
+            if axis in _TAKEN or not axis.replace("_", "").replace("-", "").replace(" ", "").isalnum():
+                raise ConfigError(f"plan: an axis cannot be called '{axis}'")
         if not self.speeds:
             raise ConfigError("plan: at least one speed")
-        for name, numbers in (("speeds", self.speeds), ("amplitudes", self.amplitudes)):
-            if any(not 0.0 < number < np.inf for number in numbers) or len(set(numbers)) < len(numbers):
-                raise ConfigError(f"plan: {name} must be positive, and each once")
-        if len(self.positions) * len(self.axes) * len(self.speeds) * self.replicates > _MOST_TRIALS:
-            raise ConfigError(f"plan: more than {_MOST_TRIALS} trials")
-        for duration in (self.hold + 2.0 * self.rest, self.noise_duration):
-            ticks(duration, self.period)
+        sizes = {"speeds": [speed * self.period for speed in self.speeds], "amplitudes": list(self.amplitudes)}
+        for name, lengths in sizes.items():
+            if any(not _LEAST <= length <= _MOST for length in lengths):
+                raise ConfigError(f"plan: {name} must make steps of {_LEAST * MM:g} mm to {_MOST:g} m")
+            if len({_written(length) for length in lengths}) < len(lengths):
+                raise ConfigError(f"plan: two {name} make the same step")
+        if taken := sorted(_TAKEN & set(self.positions[0])):
+            raise ConfigError(f"plan: positions cannot have a column '{taken[0]}': trials.csv needs it itself")
+        count = len(self.positions) * len(self.axes) * len(self.speeds) * self.replicates
+        rows = count * (self.hold + 2.0 * self.rest) / self.period
+        if count > _MOST_TRIALS or not rows <= _MOST_ROWS:
+            raise ConfigError(f"plan: {count} trials of {rows:.3g} ticks; at most {_MOST_TRIALS} of {_MOST_ROWS:g}")
+        ticks(self.noise_duration + 2.0 * self.rest, self.period)
 
 
 @dataclass(frozen=True)
@@ -163,9 +173,14 @@ def write(planned: Plan, folder: Path, force: bool) -> None:
         first = {"trial": number, **_clock(np.tile(np.arange(len(shape)), len(planned.trials)), design.period)}
         tables.write(pa.table({**first, **_columns(steps)}), new / STEPS)
         for (axis, amplitude), sequence in planned.noise.items():
-            file = new / f"{_NOISE}{axis}-{amplitude * MM:g}mm.csv"
+            file = new / f"{_NOISE}{axis}-{_written(amplitude)}mm.csv"
             clock = _clock(np.arange(len(sequence)), design.period)
             tables.write(pa.table({**clock, **_columns({axis: sequence})}), file)
+
+
+def _written(length: float) -> str:
+    """In mm, to the nanometre, as files have it."""
+    return f"{round(length * MM, 6):.10g}"
 
 
 def _ticks(duration: float, period: float) -> int:

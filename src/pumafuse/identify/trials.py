@@ -18,6 +18,9 @@ from ..units import ending, seconds
 _FEWEST = 8  # samples from the step on: a second-order fit with delay, gain and zero has five unknowns
 _AGREE = 0.03  # how far step over speed may differ between trials and still be one update period
 _PERIODS = (0.001, 0.2)  # s, that an update period can be
+_GIVEN = (1e-4, 10.0)  # s, that one can be given
+_LATEST, _FARTHEST = 3600.0, 1e6  # s and m that a sample can be away from its command and from 0
+_STEPS = (1e-9, 1e3)  # m, that a step can be
 
 
 class TrialsError(PumafuseError):
@@ -79,6 +82,8 @@ class StepTrials:
             TrialsError: The trials do not agree, or on no period of 1 to 200 ms.
         """
         if given is not None:
+            if not _GIVEN[0] <= given <= _GIVEN[1]:
+                raise TrialsError(f"an update period of {given * 1e3:g} ms: it must be 0.1 ms to 10 s")
             return given
         told = [trial for trial in self.trials if trial.speed > 0.0]
         step, speed = np.abs([trial.step for trial in told]), np.array([trial.speed for trial in told])
@@ -105,7 +110,10 @@ class StepTrials:
         listed, sampled = _table(Path(folder), "trials"), _table(Path(folder), "samples")
         notes = [*listed.notes, *sampled.notes]
         step = _numbers(listed, "step", notes)
-        speed = listed.plain("speed_m_s")[0] if "speed_m_s" in listed.columns else np.full(listed.rows, np.nan)
+        speed, remark = (
+            listed.plain("speed_m_s") if "speed_m_s" in listed.columns else (np.full(listed.rows, np.nan), None)
+        )
+        notes.extend([] if remark is None else [remark])
         names, axes = listed.texts("trial"), listed.texts("axis")
         own = {"trial", "axis", "speed_m_s", _column(listed, "step")}
         factors = {column: listed.texts(column) for column in listed.columns if column not in own}
@@ -120,7 +128,7 @@ class StepTrials:
                 notes.append(f"{listed.path.name}: row {row + 1} names no trial: left out")
                 continue
             time, position = samples.get(name, (np.zeros(0), np.zeros(0)))
-            found = np.isfinite(time) & np.isfinite(position)
+            found = (np.abs(time) < _LATEST) & (np.abs(position) < _FARTHEST)
             reason = _unusable(known[name], axes[row], float(step[row]), time[found])
             if reason is not None:
                 notes.append(f"trial '{name}': {reason}: left out")
@@ -145,9 +153,13 @@ def _unusable(times_listed: int, axis: str, step: float, time: FloatArray) -> st
         return f"listed {times_listed} times"
     if not axis:
         return "it names no axis"
-    if not np.isfinite(step) or step == 0.0:
-        return "its step is 0 or no number"
-    after = int((time >= 0.0).sum())
+    if not _STEPS[0] <= abs(step) <= _STEPS[1]:
+        return (
+            "its step is 0 or no number"
+            if step == 0.0 or not np.isfinite(step)
+            else "its step is of no size an arm has"
+        )
+    after = len(np.unique(time[time >= 0.0]))
     return f"{after} samples from the step on, at least {_FEWEST} are needed" if after < _FEWEST else None
 
 
@@ -178,6 +190,8 @@ def _samples(table: tables.Table, notes: list[str]) -> dict[str, tuple[FloatArra
     notes.extend([] if note is None else [note])
     time = seconds(stamp)
     position = _numbers(table, "position", notes)
+    if not table.rows:
+        return {}
     names, place = np.unique(np.array(table.texts("trial"), dtype=object), return_inverse=True)
     order = np.argsort(place, kind="stable")
     parts = np.split(order, np.cumsum(np.bincount(place, minlength=len(names)))[:-1])

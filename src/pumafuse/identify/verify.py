@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import units
 from ..arrays import FloatArray, TimeArray
-from ..errors import RunError
+from ..errors import ConfigError, RunError
 from ..fusion import timeline as timelines
 from ..fusion.config import FusionConfig, Sensor
 from ..fusion.timeline import AxisInput
@@ -31,8 +31,9 @@ RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
 REFERENCE = "reference"
 _FEWEST = 20  # readings
 _MOST_LEVELS = 8  # of a run whose start level is looked for among them
-_AS_GOOD = 1.2  # times the floor
-_OUTLYING = 8.0  # robust standard deviations
+_AS_GOOD, _FAR = 1.2, 3.0  # times the floor
+_FARTHEST, _SLOWEST = 1e6, 1e4  # m, s: sizes beyond which nothing can be computed
+_SPIKE = 8.0  # robust standard deviations
 _HOLDS = 50.0  # % fit
 _DELAYS, _LATEST = 13, 9.0  # of the floor's first grid: how many, up to how many periods
 _LAGS, _RATIOS = 5, (0.05, 0.25, 0.8)  # of 2ζ/ω; of 1/ω² over its square
@@ -86,7 +87,7 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
         with_recovery: With a gain that recovers.
         recovery: Its time constant [s].
         floor: The best that a linear model of this order can do on this run.
-        outlying: Readings further than eight robust standard deviations from the model.
+        outlying: Readings that jump eight robust standard deviations away from their neighbours, which are left out.
         verdict: In words.
         notes: What was wrong with the run, a sentence each; with the first axis and source of each part of it.
     """
@@ -180,6 +181,20 @@ class _Measured:
     time: TimeArray
     position: FloatArray
 
+    def without_spikes(self, modelled: FloatArray) -> _Measured:
+        """The readings that do not jump away from their neighbours: what is left runs on, whatever the model.
+
+        A model that is wrong for a while must not be spared: only eight robust standard deviations from the running
+        median of five count.
+        """
+        from scipy.ndimage import median_filter
+        from scipy.stats import median_abs_deviation
+
+        left = self.position - modelled
+        jump = left - median_filter(left, size=5, mode="nearest")
+        kept = np.abs(jump) <= _SPIKE * max(float(median_abs_deviation(left, scale="normal")), 1e-9)
+        return replace(self, time=self.time[kept], position=self.position[kept])
+
     def fit(self, modelled: FloatArray, amplitude: float) -> Fit:
         left = self.position - modelled
         rms, signal = float(np.std(left)), float(np.std(self.position))
@@ -206,9 +221,12 @@ def _verified(
     measured: _Measured, driven: AxisInput, arm: ArmModel, given: bool, notes: list[str]
 ) -> tuple[AxisVerification, Trace]:
     model, delay = arm.axes[driven.name], arm.delay_of(driven.name)
+    _check_sizes(driven, model, delay)
     command = _Commands(driven.given, driven.command, arm.update_period)
     recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
     start, words = _start(measured, command, driven.start, model, delay, given)
+    every = len(measured.time)
+    measured = measured.without_spikes(command.moved(model, delay, start, measured.time))
 
     def simulated(axis: AxisModel) -> FloatArray:
         return command.moved(axis, delay, start, measured.time)
@@ -224,10 +242,6 @@ def _verified(
         measured.position - measured.position.mean(),
         modelled - modelled.mean(),
     )
-    from scipy.stats import median_abs_deviation
-
-    left = trace.measured - trace.modelled
-    outlying = int(np.sum(np.abs(left) > _OUTLYING * max(float(median_abs_deviation(left, scale="normal")), 1e-9)))
     verification = AxisVerification(
         run=measured.run,
         axis=driven.name,
@@ -241,12 +255,25 @@ def _verified(
         with_recovery=fits["recovering"],
         recovery=recovery,
         floor=floor,
-        outlying=outlying,
-        verdict=_verdict(fits["as it is"], model, delay, floor, outlying)
+        outlying=every - len(measured.time),
+        verdict=_verdict(fits["as it is"], model, delay, floor)
         + _recovers(fits["as it is"], fits["recovering"], recovery),
         notes=notes,
     )
     return verification, trace
+
+
+def _check_sizes(driven: AxisInput, model: AxisModel, delay: float) -> None:
+    """Refuse numbers with which nothing can be computed."""
+    rate = 1.0 / model.plant.lag
+    if not 1.0 / _SLOWEST <= rate <= _FARTHEST or (
+        isinstance(model.plant, SecondOrder) and not 1.0 / _SLOWEST <= model.plant.natural_frequency <= _FARTHEST
+    ):
+        raise ConfigError(f"axis '{driven.name}': a plant of no speed that an arm has")
+    if not (
+        max(abs(driven.start), abs(model.gain.slope), abs(model.gain.intercept)) <= _FARTHEST and delay <= _SLOWEST
+    ):
+        raise ConfigError(f"axis '{driven.name}': a start level, gain or delay of no size that an arm has")
 
 
 @dataclass(frozen=True)
@@ -364,17 +391,16 @@ def _plant_at(x: FloatArray) -> PLANTS:
     return SecondOrder(natural_frequency=omega, damping=0.5 * q * omega)
 
 
-def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor, outlying: int) -> str:
+def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor) -> str:
     """How near the model is to the best of its order, and where the two differ."""
     if max(floor.fit.fit, model.fit) < _HOLDS:
-        outliers = f" ({outlying} outlying readings)" if outlying else ""
-        return f"no linear model of this order fits: look at the log{outliers}"
+        return "no linear model of this order fits: look at the log"
     ratio = model.rms / floor.fit.rms if floor.fit.rms > 0.0 else 1.0 if model.rms == 0.0 else np.inf
     if ratio < _AS_GOOD:
         return "as good as any model of its order"
     later = (floor.delay + floor.plant.lag) - (delay + axis.plant.lag)
     differ = f"here the arm answers {abs(later) * units.MM:.1f} ms {'later' if later > 0.0 else 'sooner'}"
-    held = "holds" if model.fit >= _HOLDS else "does not hold"
+    held = "does not hold" if model.fit < _HOLDS else "follows the motion" if ratio > _FAR else "holds"
     return (
         f"{held}, with {ratio:.1f} times the error of the best model of its order: {differ}, with gain {floor.gain:.2f}"
     )

@@ -67,8 +67,9 @@ class Table:
             RunError: The column is absent or has no text.
         """
         column = self._column(name)
-        if pa.types.is_floating(column.type) and pc.all(pc.equal(column, pc.round(column))).as_py():
-            column = column.cast(pa.int64())
+        if pa.types.is_floating(column.type):
+            whole = pc.and_(pc.less(pc.abs(column), 1e15), pc.equal(column, pc.round(column)))
+            column = column.cast(pa.int64()) if pc.all(whole).as_py() else column
         return [(cell or "").strip() for cell in self._cast(name, column, pa.string()).to_pylist()]
 
     def stamps(self, name: str) -> tuple[TimeArray, str | None]:

@@ -25,9 +25,9 @@ def with_interval(value: float, interval: Interval | None, unit: float = 1.0) ->
     return f"{value * unit:.{digits}f} ± {half:.{digits}f}"
 
 
-def milliseconds(estimate: Estimate) -> str:
+def milliseconds(estimate: Estimate | None) -> str:
     """An estimate in seconds, shown in milliseconds."""
-    return with_interval(estimate.value, estimate.ci95, MM)
+    return "–" if estimate is None else with_interval(estimate.value, estimate.ci95, MM)
 
 
 def p_value(value: float | None) -> str:
@@ -61,7 +61,7 @@ def verification(one: AxisVerification) -> list[str]:
         f"{one.amplitude * MM:.4g}",
         f"{one.model.rms * MM:.3f}",
         f"{one.model.percent:.1f} %",
-        f"{one.model.fit:.1f} %",
+        f"{one.model.fit:.1f} %" if np.isfinite(one.model.fit) else "–",
         f"{one.without_recovery.rms * MM:.3f}",
         f"{one.with_recovery.rms * MM:.3f}",
         f"{one.floor.fit.rms * MM:.3f}",

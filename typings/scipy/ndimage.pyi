@@ -1,0 +1,4 @@
+import numpy as np
+import numpy.typing as npt
+
+def median_filter(input: npt.NDArray[np.float64], *, size: int, mode: str) -> npt.NDArray[np.float64]: ...
