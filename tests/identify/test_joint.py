@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 from scipy.optimize import minimize_scalar
 
-from pumafuse import FirstOrder
+from pumafuse import FirstOrder, SecondOrder
 from pumafuse.identify.combine import Combination, Fitted, combine
 from pumafuse.identify.fit import fit_steps
 from pumafuse.identify.joint import JointFit, fit_together
@@ -248,3 +248,17 @@ def test_half_widths_hold(order: int, plant: tuple[float, float]) -> None:
     assert (inside >= 0.87).all(), inside
     ratio = np.sqrt(np.mean((halves / stats.t.ppf(0.975, 7)) ** 2, axis=0)) / values.std(axis=0)
     assert ((ratio > 0.8) & (ratio < 1.35)).all(), ratio
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("damping", "noise"), [(0.7, 0.02), (1.4, 0.01), (2.0, 0.005), (3.0, 0.002)])
+def test_a_second_order_arm_is_told_to_be_one(damping: float, noise: float) -> None:
+    """In 18 of 20 campaigns or more, also where its poles lie far apart; its delay is then in its interval in 15."""
+    told = held = 0
+    for seed in range(20):
+        axis = combined(campaign((2.0 * damping / 60.0, 60.0**-2), noise, seed)[0]).axis
+        told += isinstance(axis.model.plant, SecondOrder)
+        low, high = axis.model.delay_ci95
+        held += low < np.mean(campaign((2.0 * damping / 60.0, 60.0**-2), noise, seed)[1]) < high
+    assert told >= 18
+    assert held >= 15

@@ -133,8 +133,8 @@ def combine(fitted: Sequence[Fitted], period: float, samples: int | None, paper:
     Returns:
         The model, or why there is none.
     """
-    if usual_gain(fitted) == 0.0 or not any(np.isfinite(one.onset) for one in fitted):
-        return "the arm is never seen to move"
+    if usual_gain(fitted) == 0.0:
+        return "the arm does not move"
     left_out = _unseen(fitted, samples) if paper else _outlying(fitted)
     left_out |= _still(fitted)
     used = [one for one in fitted if one.trial.name not in left_out]

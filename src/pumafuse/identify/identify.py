@@ -24,6 +24,7 @@ from .trials import StepTrials, Trial, TrialsError
 TOLERANCE = 1e-3  # m, the paper's
 _BATCH = 100  # trials a job
 _DIGITS = 6
+_PLAUSIBLE = (0.1, 10.0)  # gains
 
 
 class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
@@ -176,8 +177,11 @@ def identify(
             notes.append(f"{axis}: no model: {found}")
         else:
             combined[axis] = found
-            if usual_gain([one for one in fitted if one.trial.axis == axis]) < 0.0:
+            gain = usual_gain([one for one in fitted if one.trial.axis == axis])
+            if gain < 0.0:
                 notes.append(f"{axis}: the arm moves against its commands; is a sign wrong?")
+            if not _PLAUSIBLE[0] < abs(gain) < _PLAUSIBLE[1]:
+                notes.append(f"{axis}: the arm moves {gain:.3g} times as far as it is told; is a unit wrong?")
     if not combined:
         raise TrialsError("; ".join(["no axis has trials enough for a model", *notes]))
     arm, one_delay = _arm(combined, period, name)

@@ -142,6 +142,9 @@ def verify(
     Raises:
         PumafuseError: The run has no such sensor, commands an axis that the arm has not, or nothing to compare with.
     """
+    for axis, level in (start or {}).items():
+        if not abs(level) <= _FARTHEST:
+            raise ConfigError(f"start level of '{axis}': {level * units.MM:g} mm is nowhere an arm can be")
     chosen = _with_reference(run, None if sensors is None else tuple(sensors))
     config = FusionConfig(arm=arm, sensors={name: Sensor(sd=1e-3) for name in chosen.sensors})
     parts, said = segments(in_axes(chosen, None)[0])
@@ -265,10 +268,8 @@ def _verified(
 
 def _check_sizes(driven: AxisInput, model: AxisModel, delay: float) -> None:
     """Refuse numbers with which nothing can be computed."""
-    rate = 1.0 / model.plant.lag
-    if not 1.0 / _SLOWEST <= rate <= _FARTHEST or (
-        isinstance(model.plant, SecondOrder) and not 1.0 / _SLOWEST <= model.plant.natural_frequency <= _FARTHEST
-    ):
+    rates = [model.plant.natural_frequency] if isinstance(model.plant, SecondOrder) else []
+    if not all(1.0 / _SLOWEST <= rate <= _FARTHEST for rate in (*rates, 1.0 / max(model.plant.lag, 1e-300))):
         raise ConfigError(f"axis '{driven.name}': a plant of no speed that an arm has")
     if not (
         max(abs(driven.start), abs(model.gain.slope), abs(model.gain.intercept)) <= _FARTHEST and delay <= _SLOWEST
