@@ -144,7 +144,9 @@ def verify(
     """
     for axis, level in (start or {}).items():
         if not abs(level) <= _FARTHEST:
-            raise ConfigError(f"start level of '{axis}': {level * units.MM:g} mm is nowhere an arm can be")
+            raise ConfigError(
+                f"start level of '{axis}': {level * units.MM:g} mm is not finite, or nowhere an arm can be"
+            )
     chosen = _with_reference(run, None if sensors is None else tuple(sensors))
     config = FusionConfig(arm=arm, sensors={name: Sensor(sd=1e-3) for name in chosen.sensors})
     parts, said = segments(in_axes(chosen, None)[0])
