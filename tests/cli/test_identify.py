@@ -227,6 +227,7 @@ def test_broken_trials_cost_only_themselves(tmp_path: Path) -> None:
     assert arm.axes["radial"].plant.time_constant == pytest.approx(0.0425, rel=0.01)
 
 
+@pytest.mark.long
 def test_an_axis_with_too_few_trials_gets_no_model(tmp_path: Path) -> None:
     """It is said, and the others are done."""
     few = "".join(f"{name},vertical,8.0,0.285714\n" for name in ("a", "b"))

@@ -124,6 +124,7 @@ def test_one_run_that_fails_stops_no_other(scenario: Path, tmp_path: Path) -> No
     assert (out / "seed-4").read_text() == "in the way"
 
 
+@pytest.mark.long
 def test_fusing_goes_on_past_a_run_that_cannot_be_read(scenario: Path, tmp_path: Path) -> None:
     """Torn tables, strange folders and missing runs are listed in the order given."""
     runs = tmp_path / "runs"

@@ -102,6 +102,7 @@ def test_the_table_shows_the_same_numbers(run: Path, found: list[dict[str, objec
         assert f"the floor is K {one['floor']['gain']:.3f}, Td {one['floor']['delay_ms']:.1f} ms" in joined
 
 
+@pytest.mark.long
 def test_several_runs_and_a_preset(run: Path) -> None:
     """A preset by its name; each run is there, compared with its reference, which fits better than any sensor."""
     done = pumafuse("verify", run, run, "--arm", "puma560-internal", "--json")

@@ -107,7 +107,7 @@ def test_both_engines_make_the_same_of_a_run(case: Case, mode: str) -> None:
     agree(*both(run, config, mode, case.rate))
 
 
-@settings(derandomize=True, deadline=None, max_examples=100)
+@settings(derandomize=True, deadline=None, max_examples=40)
 @given(cases(), mode_names)
 def test_both_engines_make_the_same_of_any_run_of_the_oracle(case: Case, mode: str) -> None:
     """Random plants, delays, gains, gaps, noise and sensors, smoothed with priors that leave the reference digits."""
@@ -252,7 +252,7 @@ def check_logs(count: int, mode: str) -> None:
         assert seen[outcome] > count / 20, outcome
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ["filtered", "smoothed", pytest.param("as-live", marks=pytest.mark.long)])
 def test_both_engines_make_the_same_of_any_log(mode: str) -> None:
     """Random axes, sensors, gates, outliers, gaps, latencies: every scalar's fate and every estimate are the same."""
     check_logs(30, mode)

@@ -316,7 +316,7 @@ def test_the_likelihood_alone_is_that_of_the_filter(case: Case) -> None:
 ROUNDING = 2e-12  # of one standard deviation, and of the variance and likelihood
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(derandomize=True, deadline=None, max_examples=30)
 @given(cases())
 def test_a_run_alone_and_among_others_agree_to_rounding(case: Case) -> None:
     """The kernels for one run and for many differ by less than 2e-12 of an error bar over 50 steps."""

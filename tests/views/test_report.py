@@ -108,7 +108,7 @@ def test_names_are_text_and_nothing_else(tmp_path: Path) -> None:
     outline(text)
 
 
-@pytest.mark.parametrize("speeds", [1, 2])
+@pytest.mark.parametrize("speeds", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_a_small_campaign_has_a_page_too(speeds: int, tmp_path: Path) -> None:
     """One speed, no factor that varies but a tool; or none at all."""
     of = trials(speeds=speeds)
