@@ -100,7 +100,7 @@ def _models(found: Identification) -> Table:
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column("axis")
     for heading in ("trials", "plant", "K at speed s [m/s]", "Td, ms", "onset, ms", "lag, ms", "RMS, mm"):
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", no_wrap=True)
     for axis, one in found.axes.items():
         delays, plant = one.delays, one.model.plant
         used = [trial.combined_rms for trial in found.trials if trial.axis == axis and trial.left_out is None]
