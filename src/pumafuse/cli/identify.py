@@ -98,9 +98,9 @@ def _show(found: Identification, options: Options) -> None:
 
 def _models(found: Identification) -> Table:
     table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("axis")
+    table.add_column("axis", no_wrap=True)
     for heading in ("trials", "plant", "K at speed s [m/s]", "Td, ms", "onset, ms", "lag, ms", "RMS, mm"):
-        table.add_column(heading, justify="right", no_wrap=True)
+        table.add_column(heading, justify="right")
     for axis, one in found.axes.items():
         delays, plant = one.delays, one.model.plant
         used = [trial.combined_rms for trial in found.trials if trial.axis == axis and trial.left_out is None]
