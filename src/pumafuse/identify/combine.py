@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from statsmodels.regression.linear_model import RegressionResults
 
 _FEWEST = 3  # trials that a model is combined from
+_FASTEST = 1e-3  # of 2ζ/ω, that 1/ω is at least: faster poles are like none
 _ORDERS: tuple[Order, Order] = (1, 2)
 
 
@@ -282,6 +283,7 @@ def _published(used: Sequence[Fitted], samples: int | None) -> Common:
         plant: PLANTS = FirstOrder(time_constant=tau.value, time_constant_ci95=tau.ci95)
     else:
         q, p = minimised(trials, own, 2, samples)
+        p = max(p, (_FASTEST * q) ** 2)
         parts = sensitivities(trials, own, q, p, samples)
         lag = q + parts[:, 0]
         halves = [mean(parts @ slope) for slope in ([0.0, -0.5 / p], [1.0 / q, -0.5 / p])]

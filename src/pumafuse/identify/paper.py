@@ -19,6 +19,7 @@ from .trials import Trial
 _REST = 5  # samples that show the rest level, at least
 _LAST = 3  # samples of which the gain is read off
 _SIGMAS, _SHARE = 3.0, 0.02  # of the noise at rest, of the step: what counts as motion
+_REACH = 1e-3  # of q and q², over which a second derivative is taken
 _STARTS = ((1.0, 0.0), (1.0, 0.05), (1.2, 0.25), (0.8, 0.5), (0.8, 1.5))  # q over the mean lag, p/q²
 
 
@@ -94,17 +95,30 @@ def minimised(
 def sensitivities(
     trials: Sequence[Trial], read: Sequence[StepFit], q: float, p: float, samples: int | None
 ) -> FloatArray:
-    """N times each trial's part in the errors of q and p, (n, 2)."""
-    slopes: list[FloatArray] = []
-    left: list[FloatArray] = []
-    for trial, fit in zip(trials, read, strict=True):
-        t, z, height = _since_onset([trial], [fit], samples)
+    """Each trial's part in the errors of q and p, times how many trials there are, (n, 2).
+
+    With delay and gain as read the response is off for a while in every trial alike, so the whole second derivative of
+    the squares counts, not only that of the slopes.
+    """
+    since = [_since_onset([trial], [fit], samples) for trial, fit in zip(trials, read, strict=True)]
+
+    def scores(at: FloatArray) -> FloatArray:
+        q, p = at.tolist()
         shape = Shape(0.0, q, p)
-        slopes.append(height[:, None] * sensitivity(t, shape, 2)[:, 1:])
-        left.append(z - height * unit_response(t, q, p))
-    whole = np.concatenate(slopes)
-    each = np.array([slope.T @ rest for slope, rest in zip(slopes, left, strict=True)])
-    return len(trials) * each @ np.linalg.pinv(whole.T @ whole, hermitian=True)
+        return np.array(
+            [
+                (height[:, None] * sensitivity(t, shape, 2)[:, 1:]).T @ (z - height * unit_response(t, q, p))
+                for t, z, height in since
+            ]
+        )
+
+    at = np.array([q, p])
+    changes = np.minimum(_REACH * np.array([q, q * q]), 0.5 * at)
+    bent = [
+        (scores(at - change).sum(axis=0) - scores(at + change).sum(axis=0)) / (2.0 * change.sum())
+        for change in np.diag(changes)
+    ]
+    return len(trials) * scores(at) @ np.linalg.pinv(np.array(bent).T)
 
 
 def _since_onset(
