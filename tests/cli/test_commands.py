@@ -10,18 +10,10 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-EXECUTABLE = Path(sys.executable).parent / "pumafuse"
+from executable import pumafuse
+
 DATA = Path(str(files("pumafuse") / "data"))
 SCAN, FUSION = DATA / "scan1", DATA / "fusion.toml"
-
-
-def pumafuse(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run the command line; its exit code must be ``code`` and it must never show a traceback."""
-    words = [str(EXECUTABLE), *map(str, arguments)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
 
 
 def refused(*arguments: object) -> str:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import pumafuse as pf
+from executable import pumafuse
 
-EXECUTABLE = Path(sys.executable).parent / "pumafuse"
 TIMES = np.arange(-5, 60) * 0.00563  # s, a few samples before the command
 TRUE = {
     "radial": pf.FirstOrder(time_constant=0.0425),
@@ -31,14 +29,6 @@ duration_s = 2.0
 rate_hz = 30.0
 sd_mm = 0.5
 """
-
-
-def pumafuse(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
-    words = [str(EXECUTABLE), *map(str, arguments)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
 
 
 def refused(*arguments: object) -> str:

@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-PUMAFUSE = Path(sys.executable).with_name("pumafuse")
-
-
-def pumafuse(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run([PUMAFUSE, *map(str, arguments)], capture_output=True, text=True, check=False)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
+from executable import pumafuse
 
 
 def test_axes_and_period_are_the_arms(tmp_path: Path) -> None:

@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 
 import pumafuse as pf
+from executable import EXECUTABLE, pumafuse
 from pumafuse import folders
 from pumafuse.cli import many
 from pumafuse.simulate import simulate as simulation
 
-EXECUTABLE = Path(sys.executable).parent / "pumafuse"
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SCENARIO = """
 name = "short"
@@ -38,14 +38,6 @@ sd_mm = 0.5
 """
 FILES = {"scenario.toml", "run.toml", "fusion.toml", "arm.toml", "commands.csv", "eye.csv", "truth.csv"}
 RESULT = {"estimates.parquet", "readings.parquet", "reference.parquet", "summary.json", "fusion.toml", "arm.toml"}
-
-
-def pumafuse(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
-    words = [str(EXECUTABLE), *map(str, arguments)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
 
 
 @pytest.fixture

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import pumafuse as pf
+from executable import pumafuse
 
-EXECUTABLE = Path(sys.executable).parent / "pumafuse"
 SCENARIO = """
 name = "noise"
 seed = 4
@@ -34,14 +32,6 @@ rate_hz = 30.0
 sd_mm = 0.5
 """
 MEASURED = {"rms_mm", "percent_of_signal", "fit_percent"}
-
-
-def pumafuse(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
-    words = [str(EXECUTABLE), *map(str, arguments)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
 
 
 def refused(*arguments: object) -> str:
