@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from .runs.run import Run
     from .simulate.scenario import Scenario
     from .simulate.simulate import Simulated, simulate
+    from .tune.learnable import TuneError
+    from .tune.tune import Tuning, tune
     from .views.rerun import to_rerun
 
 _HOME = {
@@ -56,6 +58,8 @@ _HOME = {
     "StepTrials": "identify.trials",
     "TickEstimates": "fusion.ticks",
     "TrialsError": "identify.trials",
+    "TuneError": "tune.learnable",
+    "Tuning": "tune.tune",
     "UnknownNameError": "errors",
     "Validity": "model.arm",
     "discretize": "model.discrete",
@@ -67,6 +71,7 @@ _HOME = {
     "smooth_ticks": "fusion.ticks",
     "tick_likelihood": "fusion.ticks",
     "to_rerun": "views.rerun",
+    "tune": "tune.tune",
     "verify": "identify.verify",
 }
 
@@ -98,6 +103,8 @@ __all__ = [
     "StepTrials",
     "TickEstimates",
     "TrialsError",
+    "TuneError",
+    "Tuning",
     "UnknownNameError",
     "Validity",
     "discretize",
@@ -109,6 +116,7 @@ __all__ = [
     "smooth_ticks",
     "tick_likelihood",
     "to_rerun",
+    "tune",
     "verify",
 ]
 

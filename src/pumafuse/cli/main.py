@@ -244,6 +244,47 @@ def verify(
 
 
 @app.command()
+def tune(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")],
+    config: Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="What is known before.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the tuned files go.")],
+    fit: Annotated[str, typer.Option(metavar="A,B", help="What to fit: noise, delay, plant, gain, latency.")] = "noise",
+    hold: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KEY", help="Leave this as it is: a name or part of one, as sensors.tracker; repeatable."),
+    ] = None,
+    teacher: Annotated[
+        str | None,
+        typer.Option(metavar="SENSOR", help="A good sensor that teaches the arm; the others learn after it."),
+    ] = None,
+    validate: Annotated[
+        Path | None, typer.Option(metavar="RUN", help="Did it help there? Default: a single run's last third.")
+    ] = None,
+    report: Annotated[bool, typer.Option("--report", help="Also write report.html into DIR.")] = False,
+    json: Json = False,
+    force: Force = False,
+) -> None:
+    """Let recorded runs tell noise, delays, plant and latencies by maximum likelihood, and how sure they are.
+
+    Exit code 3: done, but worse on what was held back.
+    """
+    from . import tune as command
+
+    options = command.Options(
+        config=config,
+        output=output,
+        fit=_names(fit, "--fit"),
+        hold=[name for listed in hold or () for name in _names(listed, "--hold")],
+        teacher=teacher,
+        validate=validate,
+        report=report,
+        json=json,
+        force=force,
+    )
+    command.run(runs, options)
+
+
+@app.command()
 def demo(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")] = Path(
         "demo"

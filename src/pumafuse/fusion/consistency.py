@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import FloatArray
+from ..arrays import CodeArray, FloatArray
 from ..units import MM
 from .config import Sensor
 from .estimates import Estimates, Readings, outcome_counts
@@ -53,17 +53,30 @@ class Consistency:
 
 
 def log_likelihood(readings: Readings, sensors: Mapping[str, Sensor]) -> float:
-    """Log-likelihood of the scalars with positions in mm.
+    """Log-likelihood of the scalars that the filter met, with positions in mm."""
+    return float(densities_of(readings.where(readings.outcome <= Outcome.REOPENED), sensors).sum())
 
-    Σ −½(ln 2πS + ν²/S) over fused and reopened scalars; a gated one contributes −½(ln 2πS + gate²), so that rejecting
+
+def densities_of(met: Readings, sensors: Mapping[str, Sensor]) -> FloatArray:
+    """:func:`log_density` of scalars that the filter met, (m,)."""
+    gate = np.array([sensors[name].gate if name in sensors else 0.0 for name in met.sensors])
+    return log_density(met.innovation, met.innovation_sd, met.outcome, gate[met.sensor])
+
+
+def log_density(innovation: FloatArray, innovation_sd: FloatArray, outcome: CodeArray, gate: FloatArray) -> FloatArray:
+    """Log of each scalar's predicted density with positions in mm, (m,).
+
+    −½(ln 2πS + ν²/S) where it was fused or reopened the gate; −½(ln 2πS + gate²) where it was gated, so that rejecting
     a reading never costs less than meeting the gate and a tuner cannot gain by rejecting.
+
+    Args:
+        innovation: ν [m], (m,).
+        innovation_sd: √S [m], (m,).
+        outcome: Fused, gated or reopened, (m,).
+        gate: Of each scalar's sensor, (m,).
     """
-    gate = np.array([sensors[name].gate if name in sensors else 0.0 for name in readings.sensors])
-    met = readings.outcome <= Outcome.REOPENED
-    variance = (readings.innovation_sd[met] * MM) ** 2
-    gated = readings.outcome[met] == Outcome.GATED
-    square = np.where(gated, gate[readings.sensor[met]] ** 2, readings.nis[met])
-    return float(-0.5 * np.sum(np.log(2.0 * np.pi * variance) + square))
+    square = np.where(outcome == Outcome.GATED, gate**2, (innovation / innovation_sd) ** 2)
+    return -0.5 * (np.log(2.0 * np.pi * (innovation_sd * MM) ** 2) + square)
 
 
 def chi_square_band(count: int) -> tuple[float, float]:

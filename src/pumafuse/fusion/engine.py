@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, TimeArray
+from ..arrays import CodeArray, FloatArray, IntArray, TimeArray
 from ..model import closed
 from ..model.plants import FirstOrder
 from . import kernels, smoother_kernels
@@ -17,11 +17,8 @@ from .track import AxisEstimate, Bias, Fused
 def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mode: Mode) -> Fused:
     """Filter or smooth one timeline, with estimates at ``times`` (int64 ns, ascending, none before the origin)."""
     scalars, candidates = timeline.scalars, timeline.scalars.candidates
-    sensors, biases = _sensors(timeline, config)
-    axes = _axes(timeline, config, [len(names) for names in biases])
-    rows = _rows(timeline)
-    count, width = len(timeline.axes), int(axes.states.max())
-    state = _start(axes, timeline, config, biases, width)
+    axes, sensors, rows, state, biases = _arranged(timeline, config)
+    count, width = len(timeline.axes), state.x.shape[1]
     met = kernels.Met(np.empty(len(candidates)), np.empty(len(candidates)), np.empty(len(candidates), dtype=np.uint8))
     outputs = kernels.Outputs(*(np.empty((count, len(times))) for _ in kernels.Outputs._fields))
     smooth = mode == "smoothed"
@@ -57,6 +54,39 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
         outcome,
         _known_biases(timeline, axes, state, biases),
     )
+
+
+def innovations(timeline: Timeline, config: FusionConfig, outcome: CodeArray | None = None) -> kernels.Met:
+    """What each candidate scalar tells the filter, without any estimate; in the timeline's order.
+
+    Args:
+        timeline: The readings.
+        config: Arm, noise and sensors.
+        outcome: What became of each in an earlier fusion, to be repeated whatever the gates would say; None: they say.
+    """
+    axes, sensors, rows, state, _ = _arranged(timeline, config)
+    count, width = len(rows.axis), state.x.shape[1]
+    log = _log(axes, None, width)
+    if outcome is not None:
+        met = kernels.Met(np.empty(count), np.empty(count), outcome.copy())
+        kernels.replay(axes, sensors, rows, state, met, log)
+        return met
+    met = kernels.Met(np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8))
+    nothing, none = np.empty((len(timeline.axes), 0)), np.empty(0, dtype=np.int64)
+    held = kernels.Held(np.empty((len(axes.order), 0, width)), np.empty((len(axes.order), 0, width, width)), nothing)
+    outputs = kernels.Outputs(*(nothing for _ in kernels.Outputs._fields))
+    kernels.filter_run(axes, sensors, rows, state, none, met, log, held, outputs)
+    return met
+
+
+def _arranged(
+    timeline: Timeline, config: FusionConfig
+) -> tuple[kernels.Axes, kernels.Sensors, kernels.Rows, kernels.State, list[list[str]]]:
+    """The kernels' arrays, and for each axis the sensors whose bias is in its state."""
+    sensors, biases = _sensors(timeline, config)
+    axes = _axes(timeline, config, [len(names) for names in biases])
+    state = _start(axes, timeline, config, biases, int(axes.states.max()))
+    return axes, sensors, _rows(timeline), state, biases
 
 
 def _biases_on(timeline: Timeline, config: FusionConfig) -> list[list[str]]:

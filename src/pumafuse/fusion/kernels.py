@@ -495,6 +495,21 @@ def filter_run(
 
 
 @compiled
+def replay(axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log: Log) -> None:
+    """Every row at its valid time with the outcomes that ``met`` brings, whatever a gate would say now."""
+    for row in range(len(rows.valid)):
+        sensor = rows.sensor[row]
+        for scalar in range(rows.first[row], rows.first[row + 1]):
+            advance(axes, state, log, rows.axis[scalar], rows.valid[row])
+            nu, S = predicted(axes, sensors, rows, state, scalar, sensor)
+            met.innovation[scalar], met.innovation_sd[scalar] = nu, math.sqrt(S)
+            if met.outcome[scalar] == _FUSED:
+                fuse(axes, sensors, rows, state, met, log, row, scalar, math.inf)
+            elif met.outcome[scalar] == _REOPENED:
+                fuse(axes, sensors, rows, state, met, log, row, scalar, 0.0)
+
+
+@compiled
 def keep(state: State, kept: State, place: int) -> None:
     """Copy a state to ``place`` among many."""
     for axis in range(len(state.clock)):

@@ -46,12 +46,15 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         plant: The plant, of unit gain.
         gain: The gain against speed that acts on the command before it.
         gain_recovery: Time constant [s] with which the arm's integral action takes the gain's error back; None: never.
+        gain_recovery_ci95: Its 95 % interval [s], where it was fitted.
         delay: Dead time [s] of this axis where it differs from the arm's.
+        delay_ci95: Its 95 % interval [s], where it was fitted.
     """
 
     plant: PLANTS
     gain: Gain = Gain()
     gain_recovery: Positive | None = msgspec.field(name="gain_recovery_ms", default=None)
+    gain_recovery_ci95: Interval | None = msgspec.field(name="gain_recovery_ms_ci95", default=None)
     delay: Delay | None = msgspec.field(name="delay_ms", default=None)
     delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
 

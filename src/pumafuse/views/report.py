@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from .. import folders
@@ -17,6 +16,7 @@ from ..identify.verify import AxisVerification, Trace
 from ..model.arm import ArmModel
 from ..units import MM
 from . import step_figures, words
+from .render import render
 
 PAGE = "report.html"
 
@@ -262,7 +262,6 @@ def _coefficients(fit: OrderFit) -> list[str]:
 
 def _write(template: str, content: Mapping[str, Any], folder: Path, force: bool) -> None:
     check_writable(folder, force)
-    pages = Environment(loader=PackageLoader("pumafuse.views", "pages"), autoescape=True, undefined=StrictUndefined)
-    text = pages.get_template(template).render(content)
+    text = render(template, content)
     with folders.replacing(folder) as new:
         (new / PAGE).write_text(text, encoding="utf-8")

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, MaxNLocator, NullLocator
 
 from ..identify.anova import Level, factors_of, levels_of, numbers
@@ -19,24 +15,17 @@ from ..identify.trials import StepTrials, Trial
 from ..identify.verify import AxisVerification, Trace
 from ..units import MM
 from . import style
+from .sheet import drawing
 
 _SECONDS = 1.2  # of a white-noise run that is shown in detail
 _GRID = 40  # points each way of a contour plot
 _SPREAD = 4.0  # how far it goes from ω and ζ, as a factor
 
 
-class Sheet:
-    """Axes to draw on; ``svg`` is the picture when the drawing is done."""
-
-    def __init__(self, axes: list[Axes]) -> None:
-        self.axes = axes
-        self.svg = ""
-
-
 def responses(found: Identification, trials: StepTrials) -> str:
     """Every trial over its own gain, from its own delay on, beside the combined plant."""
     measured = {trial.name: trial for trial in trials.trials}
-    with _sheet(len(found.axes)) as sheet:
+    with drawing(len(found.axes)) as sheet:
         for axes, (axis, combined) in zip(sheet.axes, found.axes.items(), strict=True):
             plant = combined.model.plant
             longest = 0.0
@@ -59,7 +48,7 @@ def responses(found: Identification, trials: StepTrials) -> str:
 
 def delays(found: Identification) -> str:
     """Td of each trial in the order of the campaign."""
-    with _sheet(len(found.axes)) as sheet:
+    with drawing(len(found.axes)) as sheet:
         for axes, (axis, combined) in zip(sheet.axes, found.axes.items(), strict=True):
             values = [one.common_delay for one in found.trials if one.axis == axis and one.common_delay is not None]
             axes.plot(np.arange(1, len(values) + 1), np.array(values) * MM, ".", color=style.ESTIMATE, ms=4)
@@ -74,7 +63,7 @@ def delays(found: Identification) -> str:
 
 def gains(found: Identification) -> str:
     """K of each trial against speed, with the line."""
-    with _sheet(len(found.axes)) as sheet:
+    with drawing(len(found.axes)) as sheet:
         for axes, (axis, combined) in zip(sheet.axes, found.axes.items(), strict=True):
             used = [one for one in found.trials if one.axis == axis]
             pairs = [(one.speed, one.common_gain) for one in used if one.common_gain is not None]
@@ -96,7 +85,7 @@ def histograms(found: Identification) -> str:
         "gain": [one.first.gain for one in used],
         "time constant [ms]": [(one.first.time_constant or 0.0) * MM for one in used],
     }
-    with _sheet(3) as sheet:
+    with drawing(3) as sheet:
         for axes, (name, values) in zip(sheet.axes, columns.items(), strict=True):
             axes.hist(values, bins="auto", color=style.BAND, edgecolor="white")
             axes.yaxis.set_major_locator(MaxNLocator(integer=True))
@@ -116,7 +105,7 @@ def fits_by_factor(found: Identification, trials: StepTrials) -> str:
         order: np.array([(one.first if order == "first order" else one.second).rms for one in used]) * MM
         for order in ("first order", "second order")
     }
-    with _sheet(len(factors)) as sheet:
+    with drawing(len(factors)) as sheet:
         for axes, (factor, cells) in zip(sheet.axes, factors.items(), strict=True):
             for number, (order, values) in enumerate(rms.items()):
                 colour = (style.COMMAND, style.ESTIMATE)[number]
@@ -132,7 +121,7 @@ def performance(found: Identification) -> str:
     """RMS of the combined model by each factor (the paper's Fig. 7)."""
     if not found.performance:
         return ""
-    with _sheet(len(found.performance)) as sheet:
+    with drawing(len(found.performance)) as sheet:
         for axes, one in zip(sheet.axes, found.performance, strict=True):
             _levels(axes, one.levels, style.ESTIMATE, "combined model", 0.0)
             top = max(level.mean + 2.0 * (level.sd or 0.0) for level in one.levels)
@@ -153,7 +142,7 @@ def valleys(found: Identification, trials: StepTrials) -> tuple[str, list[str]]:
     chosen = [
         _flattest([one for one in found.trials if one.axis == axis and one.left_out is None]) for axis in found.axes
     ]
-    with _sheet(len(chosen)) as sheet:
+    with drawing(len(chosen)) as sheet:
         for axes, one in zip(sheet.axes, chosen, strict=True):
             _valley(axes, one, measured[one.trial], found.samples)
         sheet.axes[0].set_ylabel("damping ζ")
@@ -162,7 +151,7 @@ def valleys(found: Identification, trials: StepTrials) -> tuple[str, list[str]]:
 
 def verification(verified: AxisVerification, trace: Trace) -> str:
     """Measured and modelled position, without means: the first second in detail (the paper's Figs. 8 and 9)."""
-    with _sheet(1, width=9.0) as sheet:
+    with drawing(1, width=9.0) as sheet:
         axes = sheet.axes[0]
         shown = trace.time <= trace.time[0] + _SECONDS
         axes.plot(trace.time[shown], trace.measured[shown] * MM, color=style.REFERENCE, lw=1.0, label="measured")
@@ -219,23 +208,3 @@ def _levels(axes: Axes, levels: Sequence[Level], colour: str, label: str, aside:
     axes.set_xticks(np.arange(len(levels)), [level.level for level in levels])
     if numbers([level.level for level in levels]) is None:
         axes.tick_params(axis="x", rotation=20)
-
-
-@contextmanager
-def _sheet(columns: int, width: float | None = None) -> Generator[Sheet]:
-    """A row of axes, drawn to SVG when done."""
-    with matplotlib.rc_context(
-        {
-            "font.size": 9,
-            "axes.titlesize": 9,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "svg.hashsalt": "pumafuse",  # the same data give the same page
-        }
-    ):
-        figure = Figure(figsize=(width or 3.6 * columns, 2.9), layout="constrained")
-        sheet = Sheet(figure.subplots(1, columns, squeeze=False)[0].tolist())
-        yield sheet
-        text = io.StringIO()
-        figure.savefig(text, format="svg", metadata={"Date": None})
-        sheet.svg = text.getvalue()[text.getvalue().index("<svg") :]

@@ -1,0 +1,171 @@
+"""`pumafuse tune`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from .. import folders
+from ..fusion.config import FusionConfig
+from ..runs.run import Run
+from ..tune.parameters import check_holds, kinds_of
+from ..tune.search import Point
+from ..tune.summary import Fitted, TuningSummary
+from ..tune.tune import Tuning, tune
+from ..tune.validate import Check
+from .tables import console
+
+SUMMARY = "tuning.json"
+PAGE = "report.html"
+OURS = frozenset({SUMMARY, PAGE, "fusion.toml", "arm.toml"})
+_WORSE, _INTERRUPTED = 3, 130
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What the command line asks of a tuning; see ``pumafuse tune --help``."""
+
+    config: Path
+    output: Path
+    fit: Sequence[str]
+    hold: Sequence[str]
+    teacher: str | None
+    validate: Path | None
+    report: bool
+    json: bool
+    force: bool
+
+
+def run(paths: Sequence[Path], options: Options) -> None:
+    """Tune a configuration on recorded runs and write what was learnt.
+
+    Raises:
+        PumafuseError: Nothing can be learnt, or what is to be written is in the way.
+        Exit: With 3 where what was learnt is worse on what was held back; with 130 after Ctrl-C.
+    """
+    folders.check_writable(options.output, options.force, [SUMMARY], OURS.__contains__)
+    config, kinds = FusionConfig.load(options.config), kinds_of(options.fit)
+    check_holds(config, options.hold)
+    runs = [Run.read(path) for path in paths]
+    validate = None if options.validate is None else Run.read(options.validate)
+    with _progress() as progress:
+        found = tune(
+            runs,
+            config,
+            fit=kinds,
+            hold=options.hold,
+            teacher=options.teacher,
+            validate=validate,
+            progress=progress,
+        )
+    with folders.replacing(options.output) as new:
+        found.config.save(new)
+        (new / SUMMARY).write_text(found.to_json(), encoding="utf-8")
+        if options.report:
+            from ..views.tuning_report import page
+
+            (new / PAGE).write_text(page(found, runs), encoding="utf-8")
+    if options.json:
+        print(found.to_json(), end="")
+    else:
+        _show(found, options)
+    if found.summary.interrupted:
+        raise typer.Exit(_INTERRUPTED)
+    if found.summary.worse:
+        raise typer.Exit(_WORSE)
+
+
+@contextmanager
+def _progress() -> Generator[Callable[[str, Point], None]]:
+    """One line on stderr that says how far the search is; nothing where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        yield lambda _, __: None
+        return
+    with Console(stderr=True).status("reading") as status:
+
+        def tell(what: str, at: Point) -> None:
+            status.update(f"{what}: log-likelihood {at.value.total:.1f} (Ctrl-C keeps the best so far)")
+
+        yield tell
+
+
+def _show(found: Tuning, options: Options) -> None:
+    out, summary = console(), found.summary
+    out.print(_parameters(summary.parameters))
+    for axis, why in summary.orders.items():
+        out.print(f"{axis}: {why}", markup=False)
+    for one in summary.held:
+        out.print(one, markup=False)
+    for pair in summary.correlations:
+        out.print(f"{pair.first} and {pair.second} go together: correlation {pair.correlation:+.2f}", markup=False)
+    out.print(_likelihoods(summary))
+    if summary.validation:
+        out.print(_validation(summary.validation))
+    out.print(f"written to {options.output}", markup=False, soft_wrap=True)
+    out.print(f"next: pumafuse fuse RUN -c {options.output / 'fusion.toml'} -o DIR", markup=False, soft_wrap=True)
+
+
+def _parameters(fitted: Sequence[Fitted]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD)
+    table.add_column("parameter", no_wrap=True)
+    for heading in ("before", "fitted", "95 % interval"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("", overflow="fold")
+    for one in fitted:
+        low, high = ("" if end is None else f"{end:.4g}" for end in one.ci95)
+        interval = "" if one.ci95 == (None, None) else f"{low or '…'} to {high or '…'}"
+        before = "–" if one.before is None else f"{one.before:.4g}"
+        table.add_row(escape(one.key), before, f"{one.value:.4g}", interval, one.said)
+    return table
+
+
+def _likelihoods(summary: TuningSummary) -> Table:
+    table = Table(box=box.SIMPLE_HEAD)
+    table.add_column("learnt from")
+    for heading in ("readings", "log-likelihood before", "after"):
+        table.add_column(heading, justify="right")
+    for axis, one in summary.likelihood.items():
+        table.add_row(escape(axis), str(one.scalars), f"{one.before:.1f}", f"{one.after:.1f}")
+    return table
+
+
+def _validation(checks: Sequence[Check]) -> Table:
+    """Before and after, on what was held back."""
+    table = Table(box=box.SIMPLE_HEAD)
+    table.add_column("held back", overflow="fold")
+    table.add_column("axis")
+    for heading in ("NIS", "lag 1", "RMSE, mm", "coverage"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("verdict", overflow="fold")
+    for one in checks:
+        since = f" from {one.since_s:.1f} s" if one.since_s else ""
+        pair = (one.before, one.after)
+        sensors = list(one.before.sensors)
+        table.add_row(
+            escape(one.run) + since,
+            escape(one.axis),
+            "\n".join(
+                _change([state.sensors[n].nis if n in state.sensors else None for state in pair]) for n in sensors
+            ),
+            "\n".join(
+                _change([state.sensors[n].correlation if n in state.sensors else None for state in pair], "+.2f")
+                for n in sensors
+            ),
+            _change([state.rmse_mm for state in pair], ".3f"),
+            _change([state.coverage for state in pair], ".3f"),
+            one.verdict,
+        )
+    return table
+
+
+def _change(values: Sequence[float | None], form: str = ".2f") -> str:
+    return " → ".join("–" if value is None else format(value, form) for value in values)

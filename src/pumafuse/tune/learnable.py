@@ -1,0 +1,65 @@
+"""Can anything be learnt from these readings? A line for each reason why not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..errors import PumafuseError
+from ..fusion.config import FusionConfig
+from ..units import MM
+from .likelihood import Evidence
+
+_FEWEST = 30  # scalars of an axis
+_STILL = 3.0  # motion over noise below which an axis has not moved
+_AGREES = 0.5  # correlation of readings with the arm's answer to its commands
+_MOVES = 10.0  # motion over scatter from which it must agree
+
+
+class TuneError(PumafuseError):
+    """Recorded runs from which nothing can be learnt."""
+
+
+def moving(evidence: Evidence, config: FusionConfig) -> list[str]:
+    """The axes that move and are seen to.
+
+    Raises:
+        TuneError: There are too few readings, no axis moves, or a sensor does not follow the commands at all.
+    """
+    for axis, count in zip(evidence.axes, evidence.count.tolist(), strict=True):
+        if 0 < count < _FEWEST:
+            raise TuneError(f"{axis}: only {count} readings; to learn from, at least {_FEWEST} are needed")
+    if not evidence.count.any():
+        raise TuneError("no reading of a configured sensor lies within the runs: nothing to learn from")
+    found = [axis for axis in evidence.axes if _moves(evidence, axis)]
+    if not found:
+        widest = max(evidence.travel.values()) * MM
+        raise TuneError(
+            f"no axis is commanded to move by more than its sensors' noise (at most {widest:.3g} mm): what rests tells"
+            " nothing of an arm; record a run with motion"
+        )
+    _agreeing(evidence, config, found)
+    return found
+
+
+def _moves(evidence: Evidence, axis: str) -> bool:
+    sds = [evidence.scatter.get(f"sensors.{name}.sd_mm.{axis}", 0.0) for name in evidence.heard[axis]]
+    return bool(sds) and evidence.travel[axis] > _STILL * min(sds)
+
+
+def _agreeing(evidence: Evidence, config: FusionConfig, axes: Sequence[str]) -> None:
+    """Refuse a sensor that does not go where the arm must go under its commands, whatever its noise."""
+    for (name, axis), (answer, seen) in evidence.answers(config).items():
+        scatter = evidence.scatter.get(f"sensors.{name}.sd_mm.{axis}", 0.0)
+        if axis not in axes or float(np.ptp(answer)) < _MOVES * scatter:
+            continue
+        near = np.abs(seen) <= 10.0 * np.median(np.abs(seen)) + 1e-12  # outliers tell nothing
+        power = float(np.sqrt(np.sum(answer[near] ** 2) * np.sum(seen[near] ** 2)))
+        follows = float(np.sum(answer[near] * seen[near])) / power if power > 0.0 else 0.0
+        if follows < _AGREES:
+            what = "moves against" if follows < -_AGREES else "does not follow"
+            raise TuneError(
+                f"sensor '{name}' {what} the commands of {axis} (correlation {follows:+.2f}): is it that axis, is its"
+                " scale right (-1 for a distance that falls), are both stamped by one clock?"
+            )

@@ -1,0 +1,124 @@
+"""One lesson: which numbers may move, the search for them, and what the readings cannot tell apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import msgspec
+
+from ..fusion.config import FusionConfig
+from ..runs.run import Run
+from .diagnose import Tie, untold
+from .learnable import moving
+from .likelihood import Evidence
+from .parameters import FARTHEST_LATENCY, Fit, Parameter, parameters
+from .search import Point, Tell, climb, search
+
+_GATE = 5.0  # with which a sensor without a gate is learnt from: outliers must not teach
+_TIES = 8  # combinations of which one number each is held, at most
+_AT_REST = ("input_noise_mm_rtHz", "drift_mm_rts", "sd_mm")  # what an axis that does not move still tells
+
+
+@dataclass(frozen=True)
+class Syllabus:
+    """What is to be learnt from which sensors.
+
+    Attributes:
+        fit: The kinds.
+        hold: Names that are not to move.
+        sensors: Which sensors are heard; None: all.
+        may: Which of the numbers that kinds and names leave may move.
+    """
+
+    fit: Sequence[Fit]
+    hold: Sequence[str]
+    sensors: Sequence[str] | None = None
+    may: Callable[[Parameter], bool] = lambda _: True
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What was learnt.
+
+    Attributes:
+        syllabus: What was to be learnt.
+        evidence: From these readings.
+        best: The most likely configuration.
+        free: What was fitted.
+        ties: What the readings could not tell, so that one number of each was held.
+        orders: Why each axis's plant has its order, where that was chosen.
+        notes: What else to know.
+    """
+
+    syllabus: Syllabus
+    evidence: Evidence
+    best: Point
+    free: Sequence[Parameter]
+    ties: Sequence[Tie] = ()
+    orders: dict[str, str] = field(default_factory=dict[str, str])
+    notes: Sequence[str] = ()
+
+    def again(self, runs: Sequence[Run], start: FusionConfig, tell: Tell) -> Lesson:
+        """The same lesson from other readings, without a new search: from ``start`` to the nearest maximum."""
+        evidence = _evidence(runs, self.evidence.config, self.syllabus, None)
+        keys = {one.key for one in self.free}
+        free = [
+            one for one in parameters(start, self.evidence.config, evidence.heard, self.syllabus.fit) if one.key in keys
+        ]
+        best = climb(evidence, start, free, tell)
+        return Lesson(self.syllabus, evidence, best, free, self.ties, self.orders, self.notes)
+
+
+def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: float | None, tell: Tell) -> Lesson:
+    """Search for the most likely numbers; where the readings do not tell a combination, hold one of it and go on.
+
+    Args:
+        runs: From these.
+        config: What is known before.
+        syllabus: What is to be learnt.
+        until: Readings after that are left out [s after the first command].
+        tell: Called with each better point.
+
+    Raises:
+        PumafuseError: Nothing can be learnt from the readings.
+    """
+    evidence = _evidence(runs, config, syllabus, until)
+    active = moving(evidence, config)
+    ties: list[Tie] = []
+
+    def free(at: FusionConfig) -> list[Parameter]:
+        held = [*syllabus.hold, *(tie.held for tie in ties)]
+        found = parameters(at, config, evidence.heard, syllabus.fit, held)
+        return [one for one in found if syllabus.may(one) and (one.axis is None or one.axis in active or _rests(one))]
+
+    best, orders = search(evidence, evidence.config, free, tell)
+    while len(ties) < _TIES and (tie := untold(evidence, best, free(best.config))) is not None:
+        held = next(one for one in free(best.config) if one.key == tie.held)
+        ties.append(tie)
+        best = climb(evidence, held.put(best.config, held.get(config)), free(best.config), tell)
+    notes = [
+        f"{axis}: does not move; only its noise at rest was learnt" for axis in evidence.axes if axis not in active
+    ]
+    notes += [
+        f"{name}: has no gate (gate = 0); learnt with one of {_GATE:g}, so that outliers do not teach"
+        for name, sensor in config.sensors.items()
+        if sensor.gate == 0.0 and any(name in heard for heard in evidence.heard.values())
+    ]
+    return Lesson(syllabus, evidence, best, free(best.config), ties, orders, notes)
+
+
+def _rests(one: Parameter) -> bool:
+    return any(key in one.key.split(".") for key in _AT_REST)
+
+
+def _evidence(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: float | None) -> Evidence:
+    """The readings; where latencies move, without those that a latency could put before the first command."""
+    gated = {
+        name: sensor if sensor.gate > 0.0 else msgspec.structs.replace(sensor, gate=_GATE)
+        for name, sensor in config.sensors.items()
+    }
+    latest = None
+    if "latency" in syllabus.fit:
+        latest = FARTHEST_LATENCY + max((sensor.latency for sensor in config.sensors.values()), default=0.0)
+    return Evidence(runs, msgspec.structs.replace(config, sensors=gated), syllabus.sensors, until=until, latest=latest)

@@ -1,0 +1,364 @@
+"""What recorded runs say of a configuration: the log-likelihood of their readings, and how it changes.
+
+The likelihood is the one of :func:`pumafuse.fusion.consistency.log_density`, gates and all, on the compiled engine. Its
+slopes come from how innovations ν and their variances S move with each parameter while the outcomes stay as they are:
+
+    ∂L/∂a = Σ −ν ∂ν/S + ½ (ν²/S − 1) ∂S/S,    information = Σ ∂ν ∂ν′/S + ½ ∂S ∂S′/S²
+
+(Gupta & Mehra, "Computational aspects of maximum likelihood estimation", IEEE Trans. AC 19(6), 1974).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import CodeArray, FloatArray, IntArray
+from ..fusion.config import FusionConfig, Process, Start
+from ..fusion.consistency import log_density
+from ..fusion.engine import innovations
+from ..fusion.ticks import usable_cores
+from ..fusion.timeline import AxisInput, Outcome, Scalars, Timeline, build
+from ..model.arm import ordered_axes
+from ..model.drive import drive
+from ..runs.axes import in_axes
+from ..runs.clock import segments
+from ..runs.run import Run
+from .parameters import Parameter
+
+T = TypeVar("T", bound=np.generic)
+_LOG_STEP = 1e-4  # of a logarithm, by which slopes are taken: their error is half of it, the rounding 1e-11
+_SMALLEST = 1e-6  # m; misfit of a simulated arm without any noise
+_TIME_STEP = 2e-5  # s; both ways, as a reading that passes a command bends the likelihood
+
+
+@dataclass(frozen=True)
+class Value:
+    """The log-likelihood of a configuration.
+
+    Attributes:
+        axes: Of each axis's scalars, with positions in mm, (A,).
+        outcomes: What became of each scalar, for each segment, (m,).
+    """
+
+    axes: FloatArray
+    outcomes: Sequence[CodeArray]
+
+    @property
+    def total(self) -> float:
+        """Of all axes."""
+        return float(self.axes.sum())
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """How the log-likelihood changes with k parameters.
+
+    Attributes:
+        score: ∂L/∂a, (k,).
+        information: The expected −∂²L/∂a², (k, k).
+    """
+
+    score: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True)
+class _Strand:
+    """One axis of one segment.
+
+    Attributes:
+        number: The axis among those of the evidence.
+        timeline: Its scalars alone.
+        places: Where they are among the segment's, (m,).
+    """
+
+    number: int
+    timeline: Timeline
+    places: IntArray
+
+
+@dataclass(frozen=True)
+class _Segment:
+    whole: Timeline
+    strands: tuple[_Strand, ...]
+
+
+class Evidence:
+    """The readings of runs, ready to be met again and again.
+
+    Attributes:
+        config: Where the search starts; timelines are built with it.
+        axes: All commanded axes, in their order.
+        heard: For each axis the sensors with readings of it.
+        count: How many scalars each axis has, (A,).
+    """
+
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        config: FusionConfig,
+        sensors: Iterable[str] | None = None,
+        *,
+        until: float | None = None,
+        latest: float | None = None,
+    ) -> None:
+        """Put the readings of runs in order.
+
+        Args:
+            runs: Recorded runs.
+            config: Arm and sensors.
+            sensors: Which to use; all for None.
+            until: Leave out readings valid later than this after the first command [s].
+            latest: Leave out readings that would lie before the first command with this latency [s]; None: each with
+                its own.
+
+        Raises:
+            PumafuseError: A run and the configuration do not fit together.
+        """
+        chosen = config.sensor_names(sensors)
+        built = [build(part, config, chosen) for run in runs for part in segments(in_axes(run, config.frame)[0])[0]]
+        self.config = config
+        self.axes = ordered_axes({axis.name for timeline in built for axis in timeline.axes})
+        parts = [_kept(timeline, until, latest) for timeline in built]
+        self._segments = [_Segment(part, tuple(_strands(part, self.axes))) for part in parts]
+        told: set[tuple[str, str]] = {
+            (self.axes[strand.number], strand.timeline.scalars.sensors[sensor])
+            for segment in self._segments
+            for strand in segment.strands
+            for sensor in np.unique(strand.timeline.scalars.sensor).tolist()
+        }
+        self.heard: Mapping[str, Sequence[str]] = {
+            axis: [name for name in chosen if (axis, name) in told] for axis in self.axes
+        }
+        self.count = np.zeros(len(self.axes), dtype=np.int64)
+        for segment in self._segments:
+            for strand in segment.strands:
+                self.count[strand.number] += len(strand.places)
+
+    def alone(self, axis: str, outcomes: Sequence[CodeArray]) -> tuple[Evidence, Sequence[CodeArray]]:
+        """The readings of one axis, and what became of them; ``axes`` stay as they are."""
+        number = self.axes.index(axis)
+        found = copy(self)
+        pairs = [
+            (strand, outcome[strand.places])
+            for segment, outcome in zip(self._segments, outcomes, strict=True)
+            for strand in segment.strands
+            if strand.number == number
+        ]
+        found._segments = [
+            _Segment(strand.timeline, (replace(strand, places=np.arange(len(strand.places))),)) for strand, _ in pairs
+        ]
+        return found, [outcome for _, outcome in pairs]
+
+    @cached_property
+    def scatter(self) -> dict[str, float]:
+        """What each sensor's readings scatter by from one to the next on each axis [m], by the name of its sd.
+
+        From third differences, which smooth motion leaves alone: their variance is 20 times the noise's. Outliers
+        hardly move the median.
+        """
+        found: dict[str, list[float]] = {}
+        for segment in self._segments:
+            for strand in segment.strands:
+                scalars = strand.timeline.scalars
+                for number, name in enumerate(scalars.sensors):
+                    third = np.diff(scalars.value[scalars.sensor == number], 3)
+                    if len(third):
+                        sd = 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)
+                        found.setdefault(f"sensors.{name}.sd_mm.{self.axes[strand.number]}", []).append(sd)
+        return {key: float(np.median(sds)) for key, sds in found.items() if min(sds) > 0.0}
+
+    @cached_property
+    def travel(self) -> dict[str, float]:
+        """How far each axis is commanded to move in a run, at most [m]."""
+        found = dict.fromkeys(self.axes, 0.0)
+        for segment in self._segments:
+            for axis in segment.whole.axes:
+                reached = float(np.ptp(np.append(axis.command, axis.start)))
+                found[axis.name] = max(found[axis.name], reached)
+        return found
+
+    def answers(self, config: FusionConfig) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
+        """What the arm alone would show each sensor on each axis, and what was read, [m] from their medians, (m,)."""
+        certain = msgspec.structs.replace(
+            config,
+            start=Start(offset_sd=0.0),
+            process=dict.fromkeys(config.process, Process(input_noise=0.0, drift=0.0)),
+            sensors={name: msgspec.structs.replace(one, bias_sd=0.0, gate=0.0) for name, one in config.sensors.items()},
+        )
+        found: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
+        for segment in self._segments:
+            for strand in segment.strands:
+                scalars = strand.timeline.scalars
+                expected = scalars.value - innovations(strand.timeline, certain).innovation
+                for number, name in enumerate(scalars.sensors):
+                    mine = scalars.sensor == number
+                    if mine.any():
+                        pair = (
+                            expected[mine] - np.median(expected[mine]),
+                            scalars.value[mine] - np.median(scalars.value[mine]),
+                        )
+                        found.setdefault((name, self.axes[strand.number]), []).append(pair)
+        return {
+            key: (np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]))
+            for key, pairs in found.items()
+        }
+
+    def misfit(self, config: FusionConfig) -> FloatArray:
+        """How far the arm alone is from the readings of each axis [m], by the median of each sensor's, (A,)."""
+        found: list[list[float]] = [[0.0] for _ in self.axes]
+        for (name, axis), (answer, seen) in self.answers(config).items():
+            apart = 1.4826 * float(np.median(np.abs(seen - answer)))
+            found[self.axes.index(axis)].append(apart / abs(config.sensors[name].scale))
+        return np.array([max(min(apart[1:], default=0.0), _SMALLEST) for apart in found])
+
+    def value(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> Value:
+        """The log-likelihood of the readings under a configuration.
+
+        Args:
+            config: The configuration.
+            outcomes: What became of each scalar, to be repeated; None: the configuration's gates decide.
+        """
+        axes, found = np.zeros(len(self.axes)), list[CodeArray]()
+        for number, segment in enumerate(self._segments):
+            timeline, order = _retimed(segment.whole, self.config, config)
+            known = None if outcomes is None else outcomes[number] if order is None else outcomes[number][order]
+            met = innovations(timeline, config, known)
+            gates = np.array([config.sensors[name].gate for name in timeline.scalars.sensors])
+            density = log_density(met.innovation, met.innovation_sd, met.outcome, gates[timeline.scalars.sensor])
+            density, outcome = (
+                (density, met.outcome) if order is None else (_back(density, order), _back(met.outcome, order))
+            )
+            found.append(outcome)
+            for strand in segment.strands:
+                axes[strand.number] += float(density[strand.places].sum())
+        return Value(axes, found)
+
+    def slopes(self, config: FusionConfig, parameters: Sequence[Parameter], outcomes: Sequence[CodeArray]) -> Slopes:
+        """How the log-likelihood changes with parameters while each scalar's outcome stays as it is."""
+        score, information = np.zeros(len(parameters)), np.zeros((len(parameters), len(parameters)))
+        jobs = [
+            (strand, outcome[strand.places])
+            for segment, outcome in zip(self._segments, outcomes, strict=True)
+            for strand in segment.strands
+        ]
+
+        def one(job: tuple[_Strand, CodeArray]) -> tuple[list[int], FloatArray, FloatArray]:
+            return self._strand_slopes(job[0], job[1], config, parameters)
+
+        with ThreadPoolExecutor(min(usable_cores(), len(jobs))) as pool:
+            for mine, part, square in pool.map(one, jobs):
+                score[mine] += part
+                information[np.ix_(mine, mine)] += square
+        return Slopes(score, information)
+
+    def _strand_slopes(
+        self, strand: _Strand, outcome: CodeArray, config: FusionConfig, parameters: Sequence[Parameter]
+    ) -> tuple[list[int], FloatArray, FloatArray]:
+        axis = self.axes[strand.number]
+        mine = [number for number, one in enumerate(parameters) if one.axis in (None, axis)]
+        nu, S = self._met(strand, outcome, config)
+        fused = outcome != Outcome.GATED
+        d_nu, d_S = np.empty((len(mine), len(nu))), np.empty((len(mine), len(nu)))
+        for place, number in enumerate(mine):
+            one = parameters[number]
+            at = one.coordinate(one.get(config))
+            if one.log:
+                nu_up, S_up = self._met(strand, outcome, one.move(config, at + _LOG_STEP))
+                d_nu[place], d_S[place] = (nu_up - nu) / _LOG_STEP, (S_up - S) / _LOG_STEP
+            else:
+                nu_up, S_up = self._met(strand, outcome, one.put(config, at + _TIME_STEP))
+                nu_down, S_down = self._met(strand, outcome, one.put(config, at - _TIME_STEP))
+                d_nu[place] = (nu_up - nu_down) / (2.0 * _TIME_STEP)
+                d_S[place] = (S_up - S_down) / (2.0 * _TIME_STEP)
+        d_nu *= fused / np.sqrt(S)
+        d_S /= S
+        r = nu / np.sqrt(S)
+        excess = np.where(fused, r * r - 1.0, -1.0)
+        score = -d_nu @ r + 0.5 * d_S @ excess
+        return mine, score, d_nu @ d_nu.T + 0.5 * d_S @ d_S.T
+
+    def _met(self, strand: _Strand, outcome: CodeArray, config: FusionConfig) -> tuple[FloatArray, FloatArray]:
+        """ν and S of a strand's scalars, whose outcomes are known."""
+        timeline, order = _retimed(strand.timeline, self.config, config)
+        met = innovations(timeline, config, outcome if order is None else outcome[order])
+        nu, S = met.innovation, met.innovation_sd**2
+        return (nu, S) if order is None else (_back(nu, order), _back(S, order))
+
+
+def _back(values: npt.NDArray[T], order: IntArray) -> npt.NDArray[T]:
+    """``values`` that are in ``order`` in the order before."""
+    found = np.empty_like(values)
+    found[order] = values
+    return found
+
+
+def _kept(timeline: Timeline, until: float | None, latest: float | None) -> Timeline:
+    """A timeline with only the scalars that a filter decides on."""
+    scalars = timeline.scalars
+    chosen = scalars.outcome == Outcome.FUSED
+    if until is not None:
+        chosen &= scalars.valid <= timeline.origin + round(until * 1e9)
+    if latest is not None:
+        chosen &= scalars.stamp - round(latest * 1e9) >= timeline.origin
+    return replace(timeline, scalars=_subset(scalars, np.flatnonzero(chosen)))
+
+
+def _strands(timeline: Timeline, axes: Sequence[str]) -> Iterable[_Strand]:
+    for number, axis in enumerate(timeline.axes):
+        places = np.flatnonzero(timeline.scalars.axis == number)
+        if len(places):
+            scalars = _subset(timeline.scalars, places)
+            alone = replace(scalars, axis=np.zeros_like(scalars.axis))
+            yield _Strand(axes.index(axis.name), replace(timeline, axes=(axis,), scalars=alone), places)
+
+
+def _subset(scalars: Scalars, places: IntArray) -> Scalars:
+    return Scalars(
+        scalars.valid[places],
+        scalars.stamp[places],
+        scalars.sensor[places],
+        scalars.axis[places],
+        scalars.value[places],
+        scalars.row[places],
+        None if scalars.spread is None else scalars.spread[places],
+        scalars.outcome[places],
+        scalars.sensors,
+    )
+
+
+def _retimed(timeline: Timeline, built: FusionConfig, config: FusionConfig) -> tuple[Timeline, IntArray | None]:
+    """A timeline with the delays, gains and latencies of another configuration than the one it was built with.
+
+    Returns:
+        The timeline, and the order in which the scalars now stand; None where they stand as they did.
+    """
+    axes = tuple(_driven(axis, built, config) for axis in timeline.axes)
+    scalars, order = timeline.scalars, None
+    late = np.array(
+        [round(config.sensors[n].latency * 1e9) - round(built.sensors[n].latency * 1e9) for n in scalars.sensors]
+    )
+    if late.any():
+        valid = scalars.valid - late[scalars.sensor]
+        order = np.lexsort((scalars.row, scalars.sensor, valid))
+        scalars = replace(_subset(scalars, order), valid=valid[order])
+    return replace(timeline, axes=axes, scalars=scalars), order
+
+
+def _driven(axis: AxisInput, built: FusionConfig, config: FusionConfig) -> AxisInput:
+    before, now = built.arm.axes[axis.name], config.arm.axes[axis.name]
+    delay = round(config.arm.delay_of(axis.name) * 1e9)
+    if (before.gain, before.gain_recovery) == (now.gain, now.gain_recovery):
+        return axis if delay == axis.delay else replace(axis, delay=delay)
+    driven = drive(now, axis.given, axis.command, axis.start, config.arm.update_period)
+    return replace(axis, drive=driven, delay=delay)

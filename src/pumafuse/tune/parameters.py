@@ -1,0 +1,286 @@
+"""What can be fitted: each number of a configuration by the name it has in its file, and a coordinate to search in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import msgspec
+
+from ..errors import ConfigError, suggestion
+from ..fusion.config import FusionConfig, Process, Sensor
+from ..model.arm import AxisModel
+from ..model.plants import FirstOrder, SecondOrder
+from ..units import EXPONENTS, ending
+
+Fit = Literal["noise", "delay", "plant", "gain", "latency"]
+FITS: tuple[Fit, ...] = get_args(Fit)
+
+_replace = msgspec.structs.replace
+_NOISES = {  # field of Process: the range it is looked for in, SI; the lower end stands for none
+    "input_noise": (1e-7, 1.0),
+    "drift": (1e-7, 10.0),
+    "maneuver_noise": (1e-6, 30.0),
+    "maneuver_drift": (1e-5, 300.0),
+}
+_SDS = (1e-7, 1.0)  # m
+FARTHEST_LATENCY = 0.5  # s; from the configured one
+_TICK = 0.028  # s; what is a large change of a time, on any arm
+RECOVERY = ".gain_recovery_ms"
+_RECOVERY = (0.020, 0.500)  # s
+_RECOVERY_SD = math.log(_RECOVERY[1] / _RECOVERY[0]) / (2.0 * 1.96)  # 95 % of the prior lie in that range
+_GAIN_SD = 0.1
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number to fit.
+
+    Attributes:
+        key: Its name: table, axis or sensor, and key as in ``fusion.toml`` or ``arm.toml``.
+        fit: Which kind of fitting it belongs to.
+        axis: The axis it is of; None where it is of all.
+        log: Whether it is searched on a log scale: the coordinate is then the number's logarithm.
+        bounds: Least and greatest value [SI].
+        scale: What is a large change of the coordinate.
+        get: The number in a configuration [SI].
+        put: The configuration with another number [SI].
+        prior: Mean and standard deviation of the coordinate before any reading; None: any within the bounds.
+    """
+
+    key: str
+    fit: Fit
+    axis: str | None
+    log: bool
+    bounds: tuple[float, float]
+    scale: float
+    get: Callable[[FusionConfig], float]
+    put: Callable[[FusionConfig, float], FusionConfig]
+    prior: tuple[float, float] | None = None
+
+    @property
+    def unit(self) -> float:
+        """What one unit of the key is in SI: 1e-3 for ``delay_ms``."""
+        endings = [found for part in self.key.split(".") if (found := ending(part)) is not None]
+        return 10.0 ** EXPONENTS[endings[0]] if endings else 1.0
+
+    @property
+    def vanishes(self) -> bool:
+        """Whether it may be 0, for which its least value stands."""
+        return self.key.startswith("process.")
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The bounds as coordinates."""
+        return self.coordinate(self.bounds[0]), self.coordinate(self.bounds[1])
+
+    def coordinate(self, value: float) -> float:
+        """Of a number, which is moved into the bounds."""
+        inside = min(max(value, self.bounds[0]), self.bounds[1])
+        return math.log(inside) if self.log else inside
+
+    def value(self, coordinate: float) -> float:
+        """The number at a coordinate [SI]."""
+        return math.exp(coordinate) if self.log else coordinate
+
+    def move(self, config: FusionConfig, coordinate: float) -> FusionConfig:
+        """The configuration with this number at ``coordinate``."""
+        return self.put(config, self.value(coordinate))
+
+
+def parameters(
+    config: FusionConfig,
+    known: FusionConfig,
+    heard: Mapping[str, Sequence[str]],
+    fit: Sequence[Fit],
+    hold: Iterable[str] = (),
+) -> list[Parameter]:
+    """The numbers to fit, those of each axis together.
+
+    Args:
+        config: Its plants are of the orders to fit.
+        known: What is known before: priors and bounds are around its gains and latencies.
+        heard: For each axis the sensors with readings of it.
+        fit: Which kinds.
+        hold: Parts of names: what has all the parts of one, in their order, stays as it is.
+    """
+    every = [*_of_axes(config, known, heard), *_latencies(known, heard)]
+    return [one for one in every if one.fit in fit and not any(_named(name, one.key) for name in hold)]
+
+
+def kinds_of(fit: Iterable[str]) -> list[Fit]:
+    """The kinds that are asked for, in their order.
+
+    Raises:
+        ConfigError: One is unknown, or there is none.
+    """
+    asked = list(fit)
+    for kind in asked:
+        if kind not in FITS:
+            raise ConfigError(f"--fit: unknown '{kind}'; {suggestion(kind, FITS)}")
+    if not asked:
+        raise ConfigError(f"--fit: names nothing; accepted: {', '.join(FITS)}")
+    return [kind for kind in FITS if kind in asked]
+
+
+def check_holds(config: FusionConfig, hold: Iterable[str]) -> None:
+    """Refuse what names no number of a configuration, whichever the order of its plants.
+
+    Raises:
+        ConfigError: It names none.
+    """
+    heard = dict.fromkeys(config.arm.axes, tuple(config.sensors))
+    keys: set[str] = set()
+    for order in (1, 2):
+        for axis in heard:
+            config = with_order(config, axis, order)
+        keys |= {one.key for one in parameters(config, config, heard, FITS)}
+    for name in hold:
+        if not any(_named(name, key) for key in keys):
+            parts = sorted({part for key in keys for part in key.split(".")})
+            raise ConfigError(f"--hold: '{name}' names nothing that can be fitted; parts of names: {', '.join(parts)}")
+
+
+def _of_axes(config: FusionConfig, known: FusionConfig, heard: Mapping[str, Sequence[str]]) -> list[Parameter]:
+    found: list[Parameter] = []
+    for axis, sensors in heard.items():
+        found += [_noise(axis, field, bounds) for field, bounds in _NOISES.items()]
+        found += [_sd(axis, name) for name in sensors]
+        found.append(_delay(axis))
+        found += _plant(axis, config.arm.axes[axis])
+        found += _gain(axis, known.arm.axes[axis].gain.intercept)
+    return found
+
+
+def _named(name: str, key: str) -> bool:
+    """Whether all parts of ``name`` are among those of ``key``, in their order."""
+    parts = iter(key.split("."))
+    return all(part in parts for part in name.split("."))
+
+
+def _key(kind: type[msgspec.Struct], field: str) -> str:
+    return next(entry.encode_name for entry in msgspec.structs.fields(kind) if entry.name == field)
+
+
+def _noise(axis: str, field: str, bounds: tuple[float, float]) -> Parameter:
+    def put(config: FusionConfig, value: float) -> FusionConfig:
+        return _replace(config, process={**config.process, axis: _replace(config.process[axis], **{field: value})})
+
+    key = f"process.{axis}.{_key(Process, field)}"
+    return Parameter(key, "noise", axis, True, bounds, 1.0, lambda config: getattr(config.process[axis], field), put)
+
+
+def _sd(axis: str, name: str) -> Parameter:
+    def get(config: FusionConfig) -> float:
+        return config.sensors[name].sd_of(axis) or 0.0
+
+    def put(config: FusionConfig, value: float) -> FusionConfig:
+        sensor = config.sensors[name]
+        every = sensor.sd if isinstance(sensor.sd, dict) else dict.fromkeys(config.arm.axes, sensor.sd)
+        return _with_sensor(config, name, _replace(sensor, sd={**every, axis: value}))
+
+    return Parameter(f"sensors.{name}.sd_mm.{axis}", "noise", axis, True, _SDS, 1.0, get, put)
+
+
+def _delay(axis: str) -> Parameter:
+    def put(config: FusionConfig, value: float) -> FusionConfig:
+        return _with_axis(config, axis, _replace(config.arm.axes[axis], delay=value))
+
+    key = f"axes.{axis}.delay_ms"
+    return Parameter(key, "delay", axis, False, (0.0, 1.0), _TICK, lambda config: config.arm.delay_of(axis), put)
+
+
+def _plant(axis: str, model: AxisModel) -> list[Parameter]:
+    def of(field: str, bounds: tuple[float, float]) -> Parameter:
+        def get(config: FusionConfig) -> float:
+            return getattr(config.arm.axes[axis].plant, field)
+
+        def put(config: FusionConfig, value: float) -> FusionConfig:
+            plant = _replace(config.arm.axes[axis].plant, **{field: value})
+            return _with_axis(config, axis, _replace(config.arm.axes[axis], plant=plant))
+
+        return Parameter(f"axes.{axis}.{_key(type(model.plant), field)}", "plant", axis, True, bounds, 1.0, get, put)
+
+    if isinstance(model.plant, FirstOrder):
+        return [of("time_constant", (1e-4, 10.0))]
+    return [of("natural_frequency", (0.5, 5e3)), of("damping", (0.05, 20.0))]
+
+
+def _gain(axis: str, centre: float) -> list[Parameter]:
+    def intercept(config: FusionConfig) -> float:
+        return config.arm.axes[axis].gain.intercept
+
+    def put_intercept(config: FusionConfig, value: float) -> FusionConfig:
+        gain = _replace(config.arm.axes[axis].gain, intercept=value)
+        return _with_axis(config, axis, _replace(config.arm.axes[axis], gain=gain))
+
+    def put_recovery(config: FusionConfig, value: float) -> FusionConfig:
+        return _with_axis(config, axis, _replace(config.arm.axes[axis], gain_recovery=value))
+
+    middle = 0.5 * math.log(_RECOVERY[0] * _RECOVERY[1])
+    return [
+        Parameter(
+            f"axes.{axis}.gain.intercept", "gain", axis, False, (centre - 0.5, centre + 0.5), _GAIN_SD,
+            intercept, put_intercept, (centre, _GAIN_SD),
+        ),
+        Parameter(
+            f"axes.{axis}{RECOVERY}", "gain", axis, True, _RECOVERY, 1.0,
+            lambda config: config.arm.axes[axis].gain_recovery or math.exp(middle), put_recovery,
+            (middle, _RECOVERY_SD),
+        ),
+    ]  # fmt: skip
+
+
+def _latencies(known: FusionConfig, heard: Mapping[str, Sequence[str]]) -> list[Parameter]:
+    used = {name for sensors in heard.values() for name in sensors}
+    return [_latency(name, sensor.latency) for name, sensor in known.sensors.items() if name in used]
+
+
+def _latency(name: str, configured: float) -> Parameter:
+    def put(config: FusionConfig, value: float) -> FusionConfig:
+        return _with_sensor(config, name, _replace(config.sensors[name], latency=value))
+
+    key = f"sensors.{name}.latency_ms"
+    bounds = (configured - FARTHEST_LATENCY, configured + FARTHEST_LATENCY)
+    return Parameter(key, "latency", None, False, bounds, _TICK, lambda config: config.sensors[name].latency, put)
+
+
+def _with_axis(config: FusionConfig, axis: str, model: AxisModel) -> FusionConfig:
+    return _replace(config, arm=_replace(config.arm, axes={**config.arm.axes, axis: model}))
+
+
+def _with_sensor(config: FusionConfig, name: str, sensor: Sensor) -> FusionConfig:
+    return _replace(config, sensors={**config.sensors, name: sensor})
+
+
+def with_order(config: FusionConfig, axis: str, order: int) -> FusionConfig:
+    """The configuration with an axis's plant of this order, which lags as far behind as before."""
+    model = config.arm.axes[axis]
+    if (1 if isinstance(model.plant, FirstOrder) else 2) == order:
+        return config
+    lag = model.plant.lag
+    plant = FirstOrder(time_constant=lag) if order == 1 else SecondOrder(natural_frequency=2.0 / lag, damping=1.0)
+    return _with_axis(config, axis, _replace(model, plant=plant))
+
+
+def with_lag(config: FusionConfig, axis: str, lag: float) -> FusionConfig:
+    """The configuration with an axis's plant so far behind an input of constant velocity [s], in the same shape."""
+    model = config.arm.axes[axis]
+    if isinstance(model.plant, FirstOrder):
+        return _with_axis(config, axis, _replace(model, plant=FirstOrder(time_constant=lag)))
+    plant = _replace(model.plant, natural_frequency=2.0 * model.plant.damping / lag)
+    return _with_axis(config, axis, _replace(model, plant=plant))
+
+
+def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> FusionConfig:
+    """The configuration with all numbers of one axis as another has them: its model, its noise and its readings'."""
+    config = _with_axis(config, axis, other.arm.axes[axis])
+    sensors = dict(config.sensors)
+    for name, sensor in other.sensors.items():
+        if isinstance(sensor.sd, dict) and axis in sensor.sd:
+            mine = sensors[name].sd
+            every = mine if isinstance(mine, dict) else dict.fromkeys(config.arm.axes, mine)
+            sensors[name] = _replace(sensors[name], sd={**every, axis: sensor.sd[axis]})
+    return _replace(config, process={**config.process, axis: other.process[axis]}, sensors=sensors)

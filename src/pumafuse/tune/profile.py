@@ -1,0 +1,147 @@
+"""The log-likelihood along one parameter at a time, the others following: what an interval is read off."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import CodeArray, FloatArray
+from .diagnose import at_bound, covariance
+from .lesson import Lesson
+from .likelihood import Evidence
+from .parameters import Parameter
+from .search import Point, moved, point, slopes
+from .summary import Fitted
+
+_SIDE = 6  # points on each side of the best, of which the fourth is the end of the interval
+_BEYOND = 1.5  # how far they go, as a multiple of the interval
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The log-likelihood along one parameter.
+
+    Attributes:
+        key: The parameter's name.
+        log: Whether it belongs on a log scale. A noise that may be none does not: none must be on the scale too.
+        values: The parameter, in the unit of its key, ascending, (n,).
+        drop: The log-likelihood there less that of the best point, (n,).
+    """
+
+    key: str
+    log: bool
+    values: FloatArray
+    drop: FloatArray
+
+
+def profiles(lesson: Lesson, fitted: Sequence[Fitted]) -> list[Profile]:
+    """The log-likelihood along each parameter of a lesson, to one and a half times its interval each way.
+
+    The others follow the line of their regression on it, Cov(·, a) / Var a, bent to where one step of Fisher scoring
+    puts them at the interval's ends. That is a lower bound of the profile likelihood, and close to it. What became of
+    each reading stays as it is at the best point.
+
+    Args:
+        lesson: What was learnt.
+        fitted: Its parameters with their intervals, perhaps among others.
+    """
+    ci95 = {one.key: one.ci95 for one in fitted}
+    inside = [one for one in lesson.free if at_bound(one, lesson.best.config) is None]
+    cov = np.zeros((0, 0))
+    if inside:
+        cov = covariance(slopes(lesson.evidence, lesson.best, inside).information, inside)
+    return [_profile(_ridge(lesson, one, inside, cov), ci95[one.key]) for one in lesson.free]
+
+
+@dataclass(frozen=True)
+class _Ridge:
+    """Where the likelihood is highest for each value of one parameter.
+
+    Attributes:
+        evidence: The readings that it and what follows it bear on.
+        outcomes: What became of them.
+        best: The best point.
+        mine: The parameter, and after it those that follow it.
+        start: Their coordinates at the best point, (k,).
+        line: How they change with the first, (k,).
+    """
+
+    evidence: Evidence
+    outcomes: Sequence[CodeArray]
+    best: Point
+    mine: Sequence[Parameter]
+    start: FloatArray
+    line: FloatArray
+
+    def straight(self, coordinate: float) -> FloatArray:
+        """All coordinates for one of the first, by regression, (k,); as a noise shrinks, on its variance."""
+        change = coordinate - float(self.start[0])
+        if self.mine[0].fit == "noise" and change < 0.0:
+            change = 0.5 * math.expm1(2.0 * change)
+        return np.append(coordinate, (self.start + self.line * change)[1:])
+
+    def at(self, coordinates: FloatArray) -> Point:
+        """What the readings say there."""
+        low, high = np.array([one.range for one in self.mine]).T
+        config = moved(self.best.config, self.mine, np.clip(coordinates, low, high))
+        return point(self.evidence, config, self.mine, self.outcomes)
+
+    def bend(self, coordinate: float) -> FloatArray:
+        """How far beside the straight line the ridge lies there, (k,); of parameters of all axes it is not asked."""
+        straight, found = self.straight(coordinate), np.zeros(len(self.mine))
+        places = [n for n, other in enumerate(self.mine) if n and self.mine[0].axis in (None, other.axis)]
+        if places:
+            others, there = [self.mine[n] for n in places], self.at(straight)
+            slope = slopes(self.evidence, there, others)
+            scale = np.array([other.scale for other in others])
+            found[places] = np.clip(covariance(slope.information, others) @ slope.score, -scale, scale)
+            if self.at(straight + found).height < there.height:
+                found[:] = 0.0
+        return found
+
+
+def _ridge(lesson: Lesson, one: Parameter, inside: Sequence[Parameter], cov: FloatArray) -> _Ridge:
+    """Of a parameter; those of its axis follow it, or all where a latency moves, which every axis shares."""
+    shared = one.axis is None or any(other.axis is None for other in inside)
+    mine = [one, *(other for other in inside if other is not one and (shared or other.axis == one.axis))]
+    evidence, outcomes = lesson.evidence, lesson.best.value.outcomes
+    if not shared:
+        evidence, outcomes = evidence.alone(str(one.axis), outcomes)
+    line = np.zeros(len(mine))
+    if one in inside:
+        number = inside.index(one)
+        line = cov[[inside.index(other) for other in mine], number] / cov[number, number]
+    start = np.array([other.coordinate(other.get(lesson.best.config)) for other in mine])
+    return _Ridge(evidence, outcomes, lesson.best, mine, start, line)
+
+
+def _profile(ridge: _Ridge, ci95: tuple[float | None, float | None]) -> Profile:
+    one = ridge.mine[0]
+    ends = [bound if end is None else end * one.unit for end, bound in zip(ci95, one.bounds, strict=True)]
+    log = one.log and not (one.vanishes and ends[0] <= one.bounds[0])
+    best, top = one.value(float(ridge.start[0])), ridge.at(ridge.start).height
+    values, drop = [best], [0.0]
+    for end in ends:
+        for value, height in _side(ridge, best, max(end, one.bounds[0]), log):
+            values.append(value)
+            drop.append(height - top)
+    order = np.argsort(values)
+    return Profile(one.key, log, np.array(values)[order] / one.unit, np.array(drop)[order])
+
+
+def _side(ridge: _Ridge, best: float, end: float, log: bool) -> list[tuple[float, float]]:
+    """Values [SI] from the best to beyond an end of the interval, and the height of each."""
+    if end == best:
+        return []
+    one = ridge.mine[0]
+    shares = np.linspace(0.0, _BEYOND, _SIDE + 1)[1:]
+    values = best * (end / best) ** shares if log else best + (end - best) * shares
+    within = (values >= one.bounds[0]) & (values <= one.bounds[1]) | np.isclose(shares, 1.0)
+    bend = ridge.bend(one.coordinate(end))
+    return [
+        (value, ridge.at(ridge.straight(one.coordinate(value)) + bend * share**2).height)
+        for value, share in zip(values[within].tolist(), shares[within].tolist(), strict=True)
+    ]

@@ -1,0 +1,145 @@
+"""``tuning.json``: what was learnt and how sure it is, in the units of files. The classes here are its schema."""
+
+from __future__ import annotations
+
+import msgspec
+
+from ..fusion.config import FusionConfig
+from .diagnose import Sure, Tie, correlations
+from .lesson import Lesson
+from .parameters import RECOVERY, Parameter
+from .validate import Check
+
+
+class Fitted(msgspec.Struct, frozen=True, kw_only=True):
+    """A number that was fitted, in the unit of its key.
+
+    Attributes:
+        key: Its name: table, axis or sensor, and key as in ``fusion.toml`` or ``arm.toml``.
+        before: As configured; null where it was not there.
+        value: As fitted.
+        ci95: Its 95 % interval; null at an end that the readings do not limit.
+        profiled: Whether the likelihood's profile was followed to the ends, not only its curvature.
+        said: What to know of it, in words; empty if nothing.
+    """
+
+    key: str
+    before: float | None
+    value: float
+    ci95: tuple[float | None, float | None]
+    profiled: bool
+    said: str
+
+
+class Correlation(msgspec.Struct, frozen=True, kw_only=True):
+    """Two numbers that the readings tell only together."""
+
+    first: str
+    second: str
+    correlation: float
+
+
+class Likelihood(msgspec.Struct, frozen=True, kw_only=True):
+    """Log-likelihood of an axis's scalars in the runs learnt from, with positions in mm.
+
+    Attributes:
+        scalars: How many.
+        before: With the configuration as given.
+        after: As tuned.
+    """
+
+    scalars: int
+    before: float
+    after: float
+
+
+class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """``tuning.json``.
+
+    Attributes:
+        pumafuse: Version that wrote it.
+        runs: Names of the runs learnt from.
+        fit: What was fitted.
+        hold: What of it was held, as asked.
+        teacher: The sensor that taught the arm, if one did.
+        interrupted: Whether it was stopped before the end; the numbers are the best until then.
+        likelihood: By axis.
+        parameters: What was fitted.
+        correlations: Pairs beyond 0.9.
+        held: Combinations that the readings do not tell, a sentence each.
+        orders: Why each axis's plant has its order, where that was chosen.
+        validation: Before and after on what was held back; null where nothing was.
+        worse: Whether any axis got worse there.
+        notes: Everything noticed, a sentence each.
+    """
+
+    pumafuse: str
+    runs: list[str]
+    fit: list[str]
+    hold: list[str]
+    teacher: str | None
+    interrupted: bool
+    likelihood: dict[str, Likelihood]
+    parameters: list[Fitted]
+    correlations: list[Correlation]
+    held: list[str]
+    orders: dict[str, str]
+    validation: list[Check] | None
+    worse: bool
+    notes: list[str]
+
+
+def fitted(one: Parameter, before: FusionConfig, after: FusionConfig, sure: Sure | None) -> Fitted:
+    """A parameter in the unit of its key; without its interval where nobody asked for it."""
+    earlier, value = _given(one, before), one.get(after)
+    ends: tuple[float | None, float | None] = (None, None)
+    if sure is not None:
+        low, high = sure.ci95
+        ends = (None if sure.open[0] else low / one.unit, None if sure.open[1] else high / one.unit)
+        if sure.open[0] and one.vanishes:
+            ends = (0.0, ends[1])
+    return Fitted(
+        key=one.key,
+        before=None if earlier is None else earlier / one.unit,
+        value=value / one.unit,
+        ci95=ends,
+        profiled=sure is not None and sure.profiled,
+        said="" if sure is None else _said(one, sure),
+    )
+
+
+def _given(one: Parameter, config: FusionConfig) -> float | None:
+    """A number as configured [SI]; None where it was not: a recovery, or what a plant of the other order has."""
+    if one.key.endswith(RECOVERY) and one.axis is not None and config.arm.axes[one.axis].gain_recovery is None:
+        return None
+    try:
+        return one.get(config)
+    except AttributeError:
+        return None
+
+
+def _said(one: Parameter, sure: Sure) -> str:
+    low, high = (f"{bound / one.unit:g}" for bound in one.bounds)
+    if sure.at == "least" and one.vanishes:
+        return "the readings show no sign of it"
+    if sure.at is not None:
+        return f"at the {sure.at} that is looked for ({low if sure.at == 'least' else high}): the model does not fit"
+    if all(sure.open):
+        return "the readings tell nothing of it"
+    if sure.open[0]:
+        return "it may as well be none" if one.vanishes else f"the readings do not limit it below ({low} is looked for)"
+    return f"the readings do not limit it above ({high} is looked for)" if sure.open[1] else ""
+
+
+def correlated(lesson: Lesson) -> list[Correlation]:
+    """The pairs of a lesson that its readings tell only together."""
+    pairs = correlations(lesson.evidence, lesson.best, lesson.free)
+    return [Correlation(first=first, second=second, correlation=value) for first, second, value in pairs]
+
+
+def told(tie: Tie) -> str:
+    """What was held and why, in words."""
+    others = ", ".join(key for key in tie.members if key != tie.held)
+    if not others:
+        return f"{tie.held} is held: the readings do not tell it"
+    return f"{tie.held} is held: the readings do not tell it from {others}"
