@@ -8,15 +8,17 @@ from dataclasses import dataclass, field
 import msgspec
 
 from ..fusion.config import FusionConfig
+from ..fusion.score import Z95
 from ..runs.run import Run
-from .diagnose import Tie, untold
+from .diagnose import Tie, untold, untold_noise
 from .learnable import moving
 from .likelihood import Evidence
 from .parameters import FARTHEST_LATENCY, Fit, Parameter, parameters
-from .search import Point, Tell, climb, search
+from .search import Point, Tell, climb, point, search, settle
 
 _GATE = 5.0  # with which a sensor without a gate is learnt from: outliers must not teach
 _TIES = 8  # combinations of which one number each is held, at most
+_ENDLESS = 30.0  # large changes in a row that the readings would not notice
 _AT_REST = ("input_noise_mm_rtHz", "drift_mm_rts", "sd_mm")  # what an axis that does not move still tells
 
 
@@ -92,11 +94,21 @@ def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: 
         found = parameters(at, config, evidence.heard, syllabus.fit, held)
         return [one for one in found if syllabus.may(one) and (one.axis is None or one.axis in active or _rests(one))]
 
+    if "latency" in syllabus.fit and "delay" in syllabus.fit:
+        # All latencies less and all delays more by as much is the same, wherever the search goes.
+        tie = untold(evidence, point(evidence, evidence.config, ()), free(evidence.config), _ENDLESS)
+        ties += [tie] if tie is not None and tie.held.endswith("latency_ms") else []
     best, orders = search(evidence, evidence.config, free, tell)
     while len(ties) < _TIES and (tie := untold(evidence, best, free(best.config))) is not None:
         held = next(one for one in free(best.config) if one.key == tie.held)
         ties.append(tie)
-        best = climb(evidence, held.put(best.config, held.get(config)), free(best.config), tell)
+        best = settle(evidence, _as_configured(held, best.config, config), free(best.config), tell)
+    for one in untold_noise(evidence, best, free(best.config)):
+        others = [other for other in free(best.config) if other.key != one.key]
+        held = settle(evidence, _as_configured(one, best.config, config), others)
+        if held.height > best.height - 0.5 * Z95**2:
+            ties.append(Tie((one.key,), one.key))
+            best = held
     notes = [
         f"{axis}: does not move; only its noise at rest was learnt" for axis in evidence.axes if axis not in active
     ]
@@ -106,6 +118,12 @@ def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: 
         if sensor.gate == 0.0 and any(name in heard for heard in evidence.heard.values())
     ]
     return Lesson(syllabus, evidence, best, free(best.config), ties, orders, notes)
+
+
+def _as_configured(one: Parameter, config: FusionConfig, known: FusionConfig) -> FusionConfig:
+    """The configuration with a number back where it was, if it was there."""
+    value = one.given(known)
+    return config if value is None else one.put(config, value)
 
 
 def _rests(one: Parameter) -> bool:

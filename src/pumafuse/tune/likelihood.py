@@ -145,20 +145,27 @@ class Evidence:
             for strand in segment.strands:
                 self.count[strand.number] += len(strand.places)
 
-    def alone(self, axis: str, outcomes: Sequence[CodeArray]) -> tuple[Evidence, Sequence[CodeArray]]:
-        """The readings of one axis, and what became of them; ``axes`` stay as they are."""
+    def alone(self, axis: str) -> Evidence:
+        """The readings of one axis; ``axes`` stay as they are."""
         number = self.axes.index(axis)
         found = copy(self)
-        pairs = [
-            (strand, outcome[strand.places])
+        found._segments = [
+            _Segment(strand.timeline, (replace(strand, places=np.arange(len(strand.places))),))
+            for segment in self._segments
+            for strand in segment.strands
+            if strand.number == number
+        ]
+        return found
+
+    def outcomes_of(self, axis: str, outcomes: Sequence[CodeArray]) -> list[CodeArray]:
+        """The outcomes of one axis's scalars among those of all, for each segment of :meth:`alone`."""
+        number = self.axes.index(axis)
+        return [
+            outcome[strand.places]
             for segment, outcome in zip(self._segments, outcomes, strict=True)
             for strand in segment.strands
             if strand.number == number
         ]
-        found._segments = [
-            _Segment(strand.timeline, (replace(strand, places=np.arange(len(strand.places))),)) for strand, _ in pairs
-        ]
-        return found, [outcome for _, outcome in pairs]
 
     @cached_property
     def scatter(self) -> dict[str, float]:

@@ -71,6 +71,15 @@ class Parameter:
         """Whether it may be 0, for which its least value stands."""
         return self.key.startswith("process.")
 
+    def given(self, config: FusionConfig) -> float | None:
+        """The number as configured [SI]; None where it is not: a recovery, or what a plant of the other order has."""
+        if self.axis is not None and self.key.endswith(RECOVERY) and config.arm.axes[self.axis].gain_recovery is None:
+            return None
+        try:
+            return self.get(config)
+        except AttributeError:
+            return None
+
     @property
     def range(self) -> tuple[float, float]:
         """The bounds as coordinates."""

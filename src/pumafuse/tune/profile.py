@@ -109,7 +109,7 @@ def _ridge(lesson: Lesson, one: Parameter, inside: Sequence[Parameter], cov: Flo
     mine = [one, *(other for other in inside if other is not one and (shared or other.axis == one.axis))]
     evidence, outcomes = lesson.evidence, lesson.best.value.outcomes
     if not shared:
-        evidence, outcomes = evidence.alone(str(one.axis), outcomes)
+        evidence, outcomes = evidence.alone(str(one.axis)), evidence.outcomes_of(str(one.axis), outcomes)
     line = np.zeros(len(mine))
     if one in inside:
         number = inside.index(one)

@@ -12,6 +12,7 @@ a row is gated as a whole it is so only at the end.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -20,6 +21,7 @@ import numpy as np
 
 from ..arrays import CodeArray, FloatArray
 from ..fusion.config import FusionConfig, Process
+from ..fusion.ticks import usable_cores
 from .likelihood import Evidence, Slopes, Value
 from .parameters import RECOVERY, Parameter, with_axis_of, with_lag, with_order
 
@@ -28,6 +30,7 @@ _ENOUGH = 2e-3  # expected gain in log-likelihood that is not worth another step
 _ROUGHLY = 0.1  # likewise, where peaks are only compared
 _LEAST = 1e-4  # damping to begin with
 _STUBBORN = 1e8  # damping at which no step will do
+_DOUBLES = (2.0, 4.0, 8.0)
 _SETTLING = 12  # times that the gates are asked again
 _SHARES = (1.0, 0.5, 0.2)
 _REACH = 1.5  # longest step of a coordinate, in its scale
@@ -53,7 +56,8 @@ class Point:
     Attributes:
         config: The configuration.
         value: Its log-likelihood.
-        prior: Logarithm of the prior density of each axis's numbers, but for a constant, (A,).
+        prior: Logarithm of the prior density of each axis's numbers (what all share at the first), but for a constant,
+            (A,).
     """
 
     config: FusionConfig
@@ -84,9 +88,9 @@ def point(
     """What the readings and the priors say of a configuration; with ``outcomes`` whatever its gates would say."""
     prior = np.zeros(len(evidence.axes))
     for one in free:
-        if one.prior is not None and one.axis is not None:
+        if one.prior is not None:
             z = (one.coordinate(one.get(config)) - one.prior[0]) / one.prior[1]
-            prior[evidence.axes.index(one.axis)] -= 0.5 * z * z
+            prior[0 if one.axis is None else evidence.axes.index(one.axis)] -= 0.5 * z * z
     return Point(config, evidence.value(config, outcomes), prior)
 
 
@@ -111,11 +115,18 @@ def search(evidence: Evidence, config: FusionConfig, free: Free, tell: Tell) -> 
         free: What may move, which depends on the order of the plants.
         tell: Called with each better point.
     """
+
+    def own(at: FusionConfig) -> list[Parameter]:
+        return [one for one in free(at) if one.axis is not None]
+
     best = _in_time(evidence, _with_gates(config, _WIDER), free(config))
-    best = _noise_first(evidence, _with_gates(with_gates_of(best, config), 1.0), free(config), tell)
+    best = _noise_first(evidence, _with_gates(with_gates_of(best, config), 1.0), own(config), tell)
+    shared = [one for one in free(best) if one.axis is None]
+    if shared:
+        best = climb(evidence, best, shared, tell, enough=_ROUGHLY).config
     orders: dict[str, str] = {}
-    if any(one.fit != "noise" for one in free(best)):
-        best, orders = _with_the_arm(evidence, best, free, tell)
+    if any(one.fit != "noise" for one in own(best)):
+        best, orders = _with_the_arm(evidence, best, own, tell)
     return settle(evidence, with_gates_of(best, config), free(best), tell), orders
 
 
@@ -163,11 +174,47 @@ def climb(
             failed = True
             if expected < enough:
                 return best
-        best = trial
+        best = _farther(evidence, best, trial, step, free, outcomes)
         tell(best)
         if expected < enough and gained < enough:
             return best
     return best
+
+
+def _farther(
+    evidence: Evidence,
+    start: Point,
+    trial: Point,
+    step: FloatArray,
+    free: Sequence[Parameter],
+    outcomes: Sequence[CodeArray] | None,
+) -> Point:
+    """The best of a step and its doubles: along a valley the information promises too short ones."""
+    at = np.array([one.coordinate(one.get(start.config)) for one in free])
+    for double in _DOUBLES:
+        longer = point(evidence, moved(start.config, free, at + double * step), free, outcomes)
+        if longer.height < trial.height + _ENOUGH:
+            break
+        trial = longer
+    return trial
+
+
+def climb_apart(evidence: Evidence, start: FusionConfig, free: Sequence[Parameter], tell: Tell, enough: float) -> Point:
+    """The nearest maximum of each axis for itself, several at a time; of all together where they share a number."""
+    if any(one.axis is None for one in free):
+        return climb(evidence, start, free, tell, enough=enough)
+
+    def of(axis: str) -> FusionConfig:
+        mine = [one for one in free if one.axis == axis]
+        return climb(evidence.alone(axis), start, mine, enough=enough).config
+
+    best = start
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        for axis, config in zip(evidence.axes, pool.map(of, evidence.axes), strict=True):
+            best = with_axis_of(best, config, axis)
+    found = point(evidence, best, free)
+    tell(found)
+    return found
 
 
 def settle(evidence: Evidence, start: FusionConfig, free: Sequence[Parameter], tell: Tell = lambda _: None) -> Point:
@@ -176,7 +223,8 @@ def settle(evidence: Evidence, start: FusionConfig, free: Sequence[Parameter], t
     A row that a gate newly rejects costs more than what a step gains, so a climb that asked at every step would stop at
     the first one. Where the peak with the old outcomes turns out worse, a part of the way there is tried.
     """
-    best = climb(evidence, start, free, tell)
+    apart = all(not sensor.gate_rows for sensor in start.sensors.values())
+    best = climb_apart(evidence, start, free, tell, _ENOUGH) if apart else climb(evidence, start, free, tell)
     for _ in range(_SETTLING):
         peak = climb(evidence, best.config, free, outcomes=best.value.outcomes)
         at = np.array([one.coordinate(one.get(best.config)) for one in free])
@@ -226,7 +274,7 @@ def _in_time(evidence: Evidence, config: FusionConfig, free: Sequence[Parameter]
     levels of noise, before any is fitted.
     """
     noise = [one for one in free if one.fit == "noise"]
-    levels = [_with_noise(config, process, evidence.scatter, noise) for process in _processes(evidence, config)[:3]]
+    levels = [_with_noise(config, process, evidence.scatter, noise) for process in _processes(evidence, config)[:2]]
     delays = [one for one in free if one.fit == "delay"]
     if delays:
         tried = [(shift, point(evidence, _shifted(at, delays, shift), free)) for shift in _DELAYS for at in levels]
@@ -259,12 +307,12 @@ def _noise_first(evidence: Evidence, config: FusionConfig, free: Sequence[Parame
     if not noise:
         return config
     peaks = [
-        climb(
+        climb_apart(
             evidence,
-            with_gates_of(climb(evidence, start, noise, tell, enough=_ROUGHLY).config, config),
+            with_gates_of(climb_apart(evidence, start, noise, tell, _ROUGHLY).config, config),
             noise,
             tell,
-            enough=_ROUGHLY,
+            _ROUGHLY,
         )
         for gates, count in _STARTS
         for start in _best_starts(evidence, _with_gates(config, gates), noise, count)
@@ -324,14 +372,14 @@ def _with_the_arm(
     starts = [_with_lag(second, whole, free(second), times) for times in _LAGS]
     if any(one.key.endswith(RECOVERY) for one in free(second)):
         starts += [_with_gain(second, free(second), more, recovery) for more, recovery in _GAINS]
-    peaks = [climb(evidence, start, free(start), tell, enough=_ROUGHLY) for start in starts]
+    peaks = [climb_apart(evidence, start, free(start), tell, _ROUGHLY) for start in starts]
     best = _best_of_each(evidence, peaks, [peak.heights for peak in peaks])
     if not whole:
         return best, {}
     first = best
     for axis in whole:
         first = with_order(first, axis, 1)
-    pair = [climb(evidence, at, free(at), tell, enough=_ROUGHLY) for at in (best, first)]
+    pair = [climb_apart(evidence, at, free(at), tell, _ROUGHLY) for at in (best, first)]
     gains = pair[0].heights - pair[1].heights
     parts = [np.array([sum(one.axis == axis for one in free(peak.config)) for axis in evidence.axes]) for peak in pair]
     penalised = [

@@ -5,9 +5,10 @@ from __future__ import annotations
 import msgspec
 
 from ..fusion.config import FusionConfig
-from .diagnose import Sure, Tie, correlations
+from .diagnose import Tie, correlations
+from .intervals import Sure
 from .lesson import Lesson
-from .parameters import RECOVERY, Parameter
+from .parameters import Parameter
 from .validate import Check
 
 
@@ -91,7 +92,7 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 def fitted(one: Parameter, before: FusionConfig, after: FusionConfig, sure: Sure | None) -> Fitted:
     """A parameter in the unit of its key; without its interval where nobody asked for it."""
-    earlier, value = _given(one, before), one.get(after)
+    earlier, value = one.given(before), one.get(after)
     ends: tuple[float | None, float | None] = (None, None)
     if sure is not None:
         low, high = sure.ci95
@@ -106,16 +107,6 @@ def fitted(one: Parameter, before: FusionConfig, after: FusionConfig, sure: Sure
         profiled=sure is not None and sure.profiled,
         said="" if sure is None else _said(one, sure),
     )
-
-
-def _given(one: Parameter, config: FusionConfig) -> float | None:
-    """A number as configured [SI]; None where it was not: a recovery, or what a plant of the other order has."""
-    if one.key.endswith(RECOVERY) and one.axis is not None and config.arm.axes[one.axis].gain_recovery is None:
-        return None
-    try:
-        return one.get(config)
-    except AttributeError:
-        return None
 
 
 def _said(one: Parameter, sure: Sure) -> str:

@@ -14,7 +14,8 @@ from ..errors import PumafuseWarning
 from ..fusion.config import FusionConfig
 from ..model.arm import AxisModel
 from ..runs.run import Run
-from .diagnose import Sure, at_bound, sureness
+from .diagnose import at_bound
+from .intervals import Sure, sureness
 from .learnable import TuneError
 from .lesson import Lesson, Syllabus, learn
 from .likelihood import Evidence

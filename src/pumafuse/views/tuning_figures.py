@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
 
+from ..arrays import FloatArray
 from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates
 from ..fusion.score import Z95
@@ -22,13 +23,14 @@ _WIDTH = 11.0  # inch; as wide as a page
 _TITLE = 32  # letters over a panel
 _TICKS = 3
 _WITHIN_REACH = 4.0  # last over first of a log scale, up to which its ticks are evenly spaced
+_SMOOTH = 100  # points of its curve
 _DEEPEST = -6.2  # of a profile; what lies below −5 has room for the number before
 
 
 def profiles(found: Sequence[Profile], fitted: Mapping[str, Fitted]) -> str:
     """How the log-likelihood drops along each parameter, with its 95 % interval and where it was before."""
     rows = -(-len(found) // _COLUMNS)
-    with drawing(_COLUMNS, rows, width=_WIDTH, height=1.9) as sheet:
+    with drawing(_COLUMNS, rows, width=_WIDTH, height=1.95, room=(0.45, 0.3, 0.42)) as sheet:
         for axes, one in zip(sheet.axes, found, strict=False):
             _profile(axes, one, fitted[one.key])
         for axes in sheet.axes[len(found) :]:
@@ -41,7 +43,7 @@ def profiles(found: Sequence[Profile], fitted: Mapping[str, Fitted]) -> str:
 def innovations(before: Estimates, after: Estimates, sensor: str, axis: str) -> str:
     """One sensor's normalised innovations on one axis before and after, and their autocorrelations."""
     colour = style.sensor_colours(after.readings.sensors)[sensor]
-    with drawing(3, width=_WIDTH, height=2.2, ratios=(2.2, 2.2, 1.0)) as sheet:
+    with drawing(3, width=_WIDTH, height=2.2, ratios=(2.2, 2.2, 1.0), room=(0.6, 0.45, 0.25)) as sheet:
         *series, correlation = sheet.axes
         highest = 4.0
         for number, (axes, est) in enumerate(zip(series, (before, after), strict=True)):
@@ -51,19 +53,14 @@ def innovations(before: Estimates, after: Estimates, sensor: str, axis: str) -> 
             highest = max(highest, 1.05 * float(np.abs(normalised).max(initial=0.0)))
             axes.plot(fused.time, normalised, ".", ms=1.5, color=(style.COMMAND, colour)[number], rasterized=True)
             axes.axhspan(-Z95, Z95, color=style.ESTIMATE, alpha=0.15, lw=0)
-            axes.set_title(f"{axis}, {sensor}: {('before', 'after')[number]}", loc="left")
+            axes.set_title(f"{('before', 'after')[number]}: {_cut(axis)}, {_cut(sensor)}", loc="left")
             axes.set_xlabel("time since the first command [s]")
-            tests = consistency(est, sensor, axis)
-            if tests is not None:
-                shade = (style.COMMAND, colour)[number]
-                _correlation(correlation, tests, shade, ("before", "after")[number], 0.2 * (2 * number - 1))
         for axes in series:
             axes.set_ylim(-highest, highest)
+            axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
         series[0].set_ylabel("innovation / sd")
-        correlation.set_title("autocorrelation", loc="left")
-        correlation.set_xlabel("lag [readings]")
-        correlation.set_xlim(0, LAGS + 1)
-        correlation.legend(frameon=False, fontsize=8)
+        tests = [consistency(est, sensor, axis) for est in (before, after)]
+        _correlations(correlation, tests, (style.COMMAND, colour))
     return sheet.svg
 
 
@@ -76,7 +73,7 @@ def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
     ends = [edge if end is None else end for end, edge in zip(fitted.ci95, (low, high), strict=True)]
     axes.axvspan(*ends, color=style.ESTIMATE, alpha=0.15, lw=0)
     axes.axhline(-0.5 * Z95**2, color=style.COMMAND, lw=0.8, ls="--")
-    axes.plot(one.values, one.drop, color=style.ESTIMATE, lw=1.2)
+    axes.plot(*_smooth(one), color=style.ESTIMATE, lw=1.2)
     if fitted.before is not None:
         _before(axes, fitted.before, low, high)
     axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high, one.log)))
@@ -86,6 +83,15 @@ def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
     axes.tick_params(labelsize=8)
     parts = one.key.split(".")
     axes.set_title("\n".join(_cut(".".join(half)) for half in (parts[:2], parts[2:])), loc="left", fontsize=8)
+
+
+def _smooth(one: Profile) -> tuple[FloatArray, FloatArray]:
+    """A curve through a profile's points: the root of what it drops is nearly a straight line."""
+    peak = int(np.argmax(one.drop))
+    root: FloatArray = np.sqrt(one.drop[peak] - one.drop) * np.sign(np.arange(len(one.drop)) - peak)
+    places: FloatArray = np.log(one.values) if one.log else one.values
+    at = np.linspace(float(places[0]), float(places[-1]), _SMOOTH)
+    return np.exp(at) if one.log else at, one.drop[peak] - np.interp(at, places, root) ** 2
 
 
 def _before(axes: Axes, before: float, low: float, high: float) -> None:
@@ -113,7 +119,17 @@ def _cut(text: str) -> str:
     return text if len(text) <= _TITLE else f"{text[: _TITLE - 1]}…"
 
 
-def _correlation(axes: Axes, tests: Consistency, colour: str, label: str, aside: float) -> None:
-    lags = np.arange(1, len(tests.correlation) + 1)
-    axes.bar(lags + aside, tests.correlation, color=colour, width=0.4, label=label)
-    axes.axhspan(-tests.correlation_band, tests.correlation_band, color=style.ESTIMATE, alpha=0.1, lw=0)
+def _correlations(axes: Axes, tests: Sequence[Consistency | None], colours: Sequence[str]) -> None:
+    """Autocorrelations before and after side by side, with the band of the better known."""
+    highest, band = 0.12, 1.0
+    for number, (one, colour) in enumerate(zip(tests, colours, strict=True)):
+        if one is not None:
+            lags = np.arange(1, len(one.correlation) + 1) + 0.2 * (2 * number - 1)
+            axes.bar(lags, one.correlation, color=colour, width=0.4)
+            highest = max(highest, 1.1 * float(np.abs(one.correlation).max(initial=0.0)))
+            band = min(band, one.correlation_band)
+    axes.axhspan(-band, band, color=style.ESTIMATE, alpha=0.15, lw=0)
+    axes.set_title("autocorrelation", loc="left")
+    axes.set_xlabel("lag [readings]")
+    axes.set_xlim(0, LAGS + 1)
+    axes.set_ylim(-highest, highest)

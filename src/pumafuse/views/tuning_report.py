@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -120,12 +119,12 @@ def _check(one: Check) -> Mapping[str, Any]:
     names = list(dict.fromkeys(name for state in states for name in state.sensors))
     pairs = [[state.sensors.get(name) for state in states] for name in names]
     return {
-        "run": f"{one.run} from {one.since_s:.1f} s" if one.since_s else one.run,
+        "run": f"{one.run} from\u00a0{one.since_s:.1f}\u00a0s" if one.since_s else one.run,
         "axis": one.axis,
         "sensors": [
             names,
             [_change([None if check is None else check.nis for check in pair]) for pair in pairs],
-            [_change([None if check is None else check.correlation for check in pair], "+.2f") for pair in pairs],
+            [_change([None if check is None else check.correlation for check in pair], "+z.2f") for pair in pairs],
         ],
         "numbers": [
             _change([state.gated for state in states], "d"),
@@ -184,13 +183,11 @@ def _says_profiles(drawn: Sequence[Profile], fitted: Mapping[str, Fitted]) -> st
 def _says_validation(checks: Sequence[Check]) -> str:
     if not checks:
         return ""
-    words_of = Counter(one.verdict.partition(":")[0] for one in checks)
-    said = ", ".join(f"{word} on {count} of {len(checks)} axes" for word, count in words_of.items())
-    since = any(one.since_s for one in checks)
+    axes = ", ".join(f"{one.axis} is {one.verdict.partition(':')[0]}" for one in checks)
     return (
-        f"On readings that nothing was learnt from: {said}. NIS should be 1, the lag-1 correlation of innovations 0,"
-        " and coverage, the share of errors within the 95 % band, 0.95."
-        + (" The numbers checked are those learnt before that part; then it was learnt from too." if since else "")
+        f"On readings that nothing had been learnt from, {axes}. NIS should be 1, the lag-1 correlation of innovations"
+        " 0, and coverage, the share of errors within the 95 % band, 0.95."
+        + (" After that these readings were learnt from too." if any(one.since_s for one in checks) else "")
     )
 
 
@@ -199,7 +196,7 @@ def _says_tests(sensor: str, axis: str, tests: _Tests) -> str:
     white = " → ".join("–" if one is None else words.p_value(one.whiteness) for one in tests)
     after = tests[1]
     expected = "" if after is None else f" (expected {after.nis_band[0]:.2f} to {after.nis_band[1]:.2f})"
-    return f"{axis}, {sensor}: NIS {nis}{expected}; that they are white has p {white}."
+    return f"{axis}, {sensor}: NIS {nis}{expected}; whiteness p {white}."
 
 
 def _says_innovations(run: str, met: Sequence[_Tests]) -> str:
@@ -210,7 +207,7 @@ def _says_innovations(run: str, met: Sequence[_Tests]) -> str:
     )
     return (
         f"How far each reading of {run} lay from what was expected of it, over how far it was expected to: 95 % should"
-        " lie in the band, and none should tell the next (bars within the narrow band). NIS, their mean square, should"
-        f" be 1 and came nearer to it for {nearer} of {len(met)}; {white} of {len(met)} pass for white (p above"
-        f" {_WHITE:g})."
+        " lie in the band, and none should tell the next: their autocorrelations (grey before, coloured after) should"
+        f" lie in the band too. NIS, their mean square, should be 1 and came nearer to it for {nearer} of {len(met)};"
+        f" {white} of {len(met)} pass for white (p above {_WHITE:g})."
     )
