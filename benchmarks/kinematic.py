@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize
+from scipy.optimize import differential_evolution, minimize
 
 import pumafuse as pf
 from pumafuse.fusion.score import interpolated
@@ -29,10 +29,11 @@ REOPEN_SPAN = REOPEN_SPAN_NS / 1e9
 REST = (0.01, 0.1)  # m/s and m/s²: how well they know that the arm begins at rest; wider priors cost them up to 0.5 %
 ORDERS = {"velocity": 2, "acceleration": 3}  # what is constant, and how many states the motion takes
 
-# Where a search begins: all of a grid are tried, the best are followed downhill.
+# Where the search for the greatest likelihood begins: all of a grid are tried, the best are followed downhill.
 DENSITIES = np.log(10.0) * np.arange(-5.0, 4.01, 0.5)  # logarithms of the random walk's
 SDS = np.log([0.3, 1.0, 3.0])  # and of the sensors' sds over the configured ones
 STARTS = 4
+REACH = 50.0  # the oracle's sds are at most so many times smaller or greater than the configured ones
 
 
 class Known(NamedTuple):
@@ -188,20 +189,23 @@ class Axis:
 
     def likeliest(self, order: int) -> Array:
         """The numbers of maximum likelihood: what ``pumafuse tune`` is to a generic filter."""
-        return self._search(lambda numbers: -self.follow(order, numbers)[1])
+
+        def cost(numbers: Array) -> float:
+            return -self.follow(order, numbers)[1]
+
+        grid = [np.concatenate(([q], np.log(self.sds) + sd)) for q, sd in product(DENSITIES, SDS)]
+        return min((descend(cost, start) for start in sorted(grid, key=cost)[:STARTS]), key=cost)
 
     def closest(self, order: int, likeliest: Array) -> Array:
-        """The numbers of the least error, which only the truth can tell."""
+        """The numbers of the least error, which only the truth can tell; gates make many valleys, so by evolution."""
         scored = np.isfinite(self.truth)
 
         def rmse_mm(numbers: Array) -> float:
             return 1e3 * float(np.sqrt(np.mean((self.follow(order, numbers)[0] - self.truth)[scored] ** 2)))
 
-        return self._search(rmse_mm, likeliest)
-
-    def _search(self, cost: Callable[[Array], float], *also: Array) -> Array:
-        grid = [np.concatenate(([q], np.log(self.sds) + sd)) for q, sd in product(DENSITIES, SDS)]
-        return min((descend(cost, start) for start in (*also, *sorted(grid, key=cost)[:STARTS])), key=cost)
+        bounds = [(DENSITIES[0], DENSITIES[-1]), *((math.log(sd / REACH), math.log(sd * REACH)) for sd in self.sds)]
+        evolved = differential_evolution(rmse_mm, bounds, popsize=12, maxiter=60, polish=False, rng=1).x
+        return min((descend(rmse_mm, start) for start in (likeliest, evolved)), key=rmse_mm)
 
 
 def descend(cost: Callable[[Array], float], start: Array) -> Array:

@@ -20,3 +20,10 @@ def least_squares(
     max_nfev: int,
 ) -> OptimizeResult: ...
 def brentq(f: Callable[[float], float], a: float, b: float) -> float: ...
+def lsq_linear(
+    A: npt.NDArray[np.float64],
+    b: npt.NDArray[np.float64],
+    bounds: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]],
+    *,
+    method: Literal["bvls", "trf"],
+) -> OptimizeResult: ...

@@ -67,7 +67,9 @@ def sureness(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> dict
 
     From the curvature: 1.96 sd of the coordinate each way. Where the likelihood at an end, the others moved along, has
     not dropped by what that says (1.92), the end is where the profile has (Cox & Hinkley, Theoretical Statistics, 9.3).
+    Gates make the likelihood jump; the intervals are those of the peak that it has while the outcomes stay as they are.
     """
+    best = climb(evidence, best.config, free, outcomes=best.value.outcomes)
     views = _views(evidence, best, [one for one in free if at_bound(one, best.config) is None])
 
     def of(one: Parameter) -> Sure:

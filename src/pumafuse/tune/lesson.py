@@ -14,7 +14,7 @@ from .diagnose import Tie, untold, untold_noise
 from .learnable import moving
 from .likelihood import Evidence
 from .parameters import FARTHEST_LATENCY, Fit, Parameter, parameters
-from .search import Point, Tell, climb, point, search, settle
+from .search import Point, Tell, point, search, settle
 
 _GATE = 5.0  # with which a sensor without a gate is learnt from: outliers must not teach
 _TIES = 8  # combinations of which one number each is held, at most
@@ -68,7 +68,7 @@ class Lesson:
         free = [
             one for one in parameters(start, self.evidence.config, evidence.heard, self.syllabus.fit) if one.key in keys
         ]
-        best = climb(evidence, start, free, tell)
+        best = settle(evidence, start, free, tell)
         return Lesson(self.syllabus, evidence, best, free, self.ties, self.orders, self.notes)
 
 

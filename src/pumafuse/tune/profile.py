@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray
+from ..fusion.ticks import usable_cores
 from .diagnose import at_bound, covariance
+from .intervals import _View, _views  # pyright: ignore[reportPrivateUsage]
 from .lesson import Lesson
 from .likelihood import Evidence
 from .parameters import Parameter
@@ -18,6 +21,9 @@ from .summary import Fitted
 
 _SIDE = 6  # points on each side of the best, of which the fourth is the end of the interval
 _BEYOND = 1.5  # how far they go, as a multiple of the interval
+_STEPS = 4  # towards the ridge at an end of the interval
+_SHARES = (1.0, 0.4, 0.1)  # of a step, the first that goes up
+_ENOUGH = 0.1  # log-likelihood that is not worth another step
 
 
 @dataclass(frozen=True)
@@ -40,20 +46,22 @@ class Profile:
 def profiles(lesson: Lesson, fitted: Sequence[Fitted]) -> list[Profile]:
     """The log-likelihood along each parameter of a lesson, to one and a half times its interval each way.
 
-    The others follow the line of their regression on it, Cov(·, a) / Var a, bent to where one step of Fisher scoring
-    puts them at the interval's ends. That is a lower bound of the profile likelihood, and close to it. What became of
+    The others follow the line of their regression on it, Cov(·, a) / Var a, bent to where a few steps of Fisher scoring
+    put them at the interval's ends. That is a lower bound of the profile likelihood, and close to it. What became of
     each reading stays as it is at the best point.
 
     Args:
         lesson: What was learnt.
         fitted: Its parameters with their intervals, perhaps among others.
     """
-    ci95 = {one.key: one.ci95 for one in fitted}
-    inside = [one for one in lesson.free if at_bound(one, lesson.best.config) is None]
-    cov = np.zeros((0, 0))
-    if inside:
-        cov = covariance(slopes(lesson.evidence, lesson.best, inside).information, inside)
-    return [_profile(_ridge(lesson, one, inside, cov), ci95[one.key]) for one in lesson.free]
+    best, ci95 = lesson.best, {one.key: one.ci95 for one in fitted}
+    views = _views(lesson.evidence, best, [one for one in lesson.free if at_bound(one, best.config) is None])
+
+    def of(one: Parameter) -> Profile:
+        return _profile(_ridge(views[one.axis], best, one), ci95[one.key])
+
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        return list(pool.map(of, lesson.free))
 
 
 @dataclass(frozen=True)
@@ -90,32 +98,33 @@ class _Ridge:
         return point(self.evidence, config, self.mine, self.outcomes)
 
     def bend(self, coordinate: float) -> FloatArray:
-        """How far beside the straight line the ridge lies there, (k,); of parameters of all axes it is not asked."""
-        straight, found = self.straight(coordinate), np.zeros(len(self.mine))
-        places = [n for n, other in enumerate(self.mine) if n and self.mine[0].axis in (None, other.axis)]
-        if places:
-            others, there = [self.mine[n] for n in places], self.at(straight)
+        """How far beside the straight line the ridge lies there, (k,)."""
+        found = np.zeros(len(self.mine))
+        others = self.mine[1:]
+        scale = np.array([other.scale for other in others])
+        straight = self.straight(coordinate)
+        there = self.at(straight)
+        for _ in range(_STEPS if others else 0):
             slope = slopes(self.evidence, there, others)
-            scale = np.array([other.scale for other in others])
-            found[places] = np.clip(covariance(slope.information, others) @ slope.score, -scale, scale)
-            if self.at(straight + found).height < there.height:
-                found[:] = 0.0
+            step = np.append(0.0, np.clip(covariance(slope.information, others) @ slope.score, -scale, scale))
+            trials = ((share, self.at(straight + found + share * step)) for share in _SHARES)
+            share, trial = next((pair for pair in trials if pair[1].height > there.height), (0.0, there))
+            gained, there, found = trial.height - there.height, trial, found + share * step
+            if gained < _ENOUGH:
+                break
         return found
 
 
-def _ridge(lesson: Lesson, one: Parameter, inside: Sequence[Parameter], cov: FloatArray) -> _Ridge:
-    """Of a parameter; those of its axis follow it, or all where a latency moves, which every axis shares."""
-    shared = one.axis is None or any(other.axis is None for other in inside)
-    mine = [one, *(other for other in inside if other is not one and (shared or other.axis == one.axis))]
-    evidence, outcomes = lesson.evidence, lesson.best.value.outcomes
-    if not shared:
-        evidence, outcomes = evidence.alone(str(one.axis)), evidence.outcomes_of(str(one.axis), outcomes)
+def _ridge(view: _View, best: Point, one: Parameter) -> _Ridge:
+    keys = [other.key for other in view.free]
+    mine = [one, *(other for other in view.free if other.key != one.key)]
     line = np.zeros(len(mine))
-    if one in inside:
-        number = inside.index(one)
-        line = cov[[inside.index(other) for other in mine], number] / cov[number, number]
-    start = np.array([other.coordinate(other.get(lesson.best.config)) for other in mine])
-    return _Ridge(evidence, outcomes, lesson.best, mine, start, line)
+    if one.key in keys:
+        number = keys.index(one.key)
+        along = view.covariance[:, number] / view.covariance[number, number]
+        line = along[[keys.index(other.key) for other in mine]]
+    start = np.array([other.coordinate(other.get(best.config)) for other in mine])
+    return _Ridge(view.evidence, view.outcomes, best, mine, start, line)
 
 
 def _profile(ridge: _Ridge, ci95: tuple[float | None, float | None]) -> Profile:

@@ -29,6 +29,7 @@ _ITERATIONS = 60
 _ENOUGH = 2e-3  # expected gain in log-likelihood that is not worth another step
 _ROUGHLY = 0.1  # likewise, where peaks are only compared
 _LEAST = 1e-4  # damping to begin with
+_ROUNDING = 1e-10  # of a matrix with a diagonal of 1, below which its eigenvalues say nothing
 _STUBBORN = 1e8  # damping at which no step will do
 _DOUBLES = (2.0, 4.0, 8.0)
 _SETTLING = 12  # times that the gates are asked again
@@ -248,22 +249,20 @@ def moved(config: FusionConfig, free: Sequence[Parameter], coordinates: Iterable
 
 
 def _step(found: Slopes, low: FloatArray, high: FloatArray, damping: FloatArray) -> FloatArray:
-    """The δ with (I + λ diag I) δ = g in the box from ``low`` to ``high``: what would leave it stays at its side.
+    """The δ in the box from ``low`` to ``high`` that gains most: ½ δᵀ(I + λ diag I)δ − gᵀδ is least there.
 
     The matrix is scaled so that its diagonal is 1 + λ. What nothing tells does not move.
     """
+    from scipy.linalg import solve_triangular
+    from scipy.optimize import lsq_linear
+
     diagonal = np.diag(found.information)
-    size = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    matrix = found.information * np.outer(size, size) + np.diag(damping + 1e-12)
-    score, step, free = size * found.score, np.zeros(len(size)), diagonal > 0.0
-    while free.any():
-        rest = score - matrix @ np.where(free, 0.0, step / size)
-        step[free] = size[free] * np.linalg.solve(matrix[np.ix_(free, free)], rest[free])
-        outside = free & ((step < low) | (step > high))
-        if not outside.any():
-            break
-        step = np.where(outside, np.clip(step, low, high), step)
-        free &= ~outside
+    told = diagonal > 0.0
+    step, size = np.zeros(len(diagonal)), 1.0 / np.sqrt(diagonal[told])
+    matrix = found.information[np.ix_(told, told)] * np.outer(size, size) + np.diag(damping[told] + _ROUNDING)
+    root = np.linalg.cholesky(matrix)
+    aim = solve_triangular(root, size * found.score[told], lower=True)
+    step[told] = size * lsq_linear(root.T, aim, (low[told] / size, high[told] / size), method="bvls").x
     return step
 
 
