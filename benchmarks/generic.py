@@ -18,6 +18,7 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ Row = dict[str, Any]
 DATA = Path(pf.__file__).parent / "data"
 REPOSITORY = Path(__file__).resolve().parents[1]
 SERVO = REPOSITORY.parent / "shared" / "data" / "servo"  # recordings of a real one, not part of this repository
-SCENARIOS = ("panel-vision", "panel-tracker-outage", "mismatched-arm", "fast-arm")
+SCENARIOS = ("panel-vision", "panel-tracker-outage", "mismatched-arm", "fast-arm", "wrong-latency")
 SEED = 1
 LEARNT = 40.0  # s of the scan, where its end is kept back
 FITS = {"noise": ["noise"], "delay, plant": ["noise", "delay", "plant"], "gain": ["noise", "delay", "plant", "gain"]}
@@ -42,12 +43,21 @@ change = msgspec.structs.replace
 
 @dataclass(frozen=True)
 class Case:
-    """What is learnt from, and what is scored with that: names, runs and from when on [s]; all axes or some."""
+    """What is learnt from, and what is scored with that.
+
+    Attributes:
+        learnt: What every filter is tuned on.
+        config: What is known before.
+        scored: Names, runs, and from when on [s].
+        axes: Which to tell of; all for None.
+        also: What pumafuse is to fit besides.
+    """
 
     learnt: pf.Run
     config: pf.FusionConfig
     scored: Sequence[tuple[str, pf.Run, float]]
     axes: Sequence[str] | None = None
+    also: Sequence[Any] = ()
 
 
 def with_sensors(config: pf.FusionConfig, names: Sequence[str]) -> pf.FusionConfig:
@@ -81,8 +91,10 @@ def cases() -> Iterator[Case]:
         simulated = pf.simulate(pf.Scenario.load(REPOSITORY / "scenarios" / f"{name}.toml"), SEED)
         run, every = simulated.run, list(simulated.config.sensors)
         for sensors in (every, ["vision"]) if len(every) > 1 else (every,):
-            scored = [(f"{name}: {' + '.join(sensors)}", run, 0.0)]
-            yield Case(run, with_sensors(simulated.config, sensors), scored)
+            chosen, title = with_sensors(simulated.config, sensors), f"{name}: {' + '.join(sensors)}"
+            yield Case(run, chosen, [(title, run, 0.0)])
+            if name == "wrong-latency":
+                yield Case(run, chosen, [(f"{title}, its latency fitted too", run, 0.0)], also=["latency"])
     if SERVO.is_dir():
         runs = {name: pf.Run.read(SERVO / name) for name in ("sin_time_square", "sin_sin")}
         tip = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.030))
@@ -102,7 +114,7 @@ def error(est: pf.Estimates, axis: str, since: float, position: Array) -> float:
 
 def measure(case: Case) -> Iterator[Row]:
     """A row for each axis of what is scored."""
-    tuned = {name: pf.tune([case.learnt], case.config, fit=fit).config for name, fit in FITS.items()}
+    tuned = {name: pf.tune([case.learnt], case.config, fit=[*fit, *case.also]).config for name, fit in FITS.items()}
     numbers: dict[str, dict[str, list[Array]]] = {}
     for name, axis in axes_of(case.learnt, case.config).items():
         if case.axes is None or name in case.axes:
@@ -148,6 +160,12 @@ def main() -> None:
             for row in measure(case):
                 rows.append(row)
                 print(f"| {' | '.join(cells(row))} |", flush=True)
+    above = [
+        f"{row['set']}, {row['axis']}, {fit} ({', '.join(f'{ratio:.3f}' for ratio in row[f'{fit}, ratios'])})"
+        for row, fit in product(rows, FITS)
+        if max(row[f"{fit}, ratios"]) > 1.0
+    ]
+    print(f"\nA ratio above 1: {'; '.join(above) or 'none'}.")
     if given.json:
         given.json.write_text(json.dumps(rows, indent=1) + "\n")
 

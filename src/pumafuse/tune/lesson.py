@@ -10,6 +10,7 @@ import msgspec
 from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..runs.run import Run
+from .biases import far_off, slightly_off
 from .diagnose import Tie, untold, untold_noise
 from .learnable import moving
 from .likelihood import Evidence
@@ -87,6 +88,9 @@ def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: 
     """
     evidence = _evidence(runs, config, syllabus, until)
     active = moving(evidence, config)
+    begin, notes = evidence.config, list[str]()
+    if "noise" in syllabus.fit:
+        begin, notes = far_off(evidence, begin, syllabus.hold)
     ties: list[Tie] = []
 
     def free(at: FusionConfig) -> list[Parameter]:
@@ -96,9 +100,12 @@ def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: 
 
     if "latency" in syllabus.fit and "delay" in syllabus.fit:
         # All latencies less and all delays more by as much is the same, wherever the search goes.
-        tie = untold(evidence, point(evidence, evidence.config, ()), free(evidence.config), _ENDLESS)
+        tie = untold(evidence, point(evidence, begin, ()), free(begin), _ENDLESS)
         ties += [tie] if tie is not None and tie.held.endswith("latency_ms") else []
-    best, orders = search(evidence, evidence.config, free, tell)
+    best, orders = search(evidence, begin, free, tell)
+    if "noise" in syllabus.fit:
+        biased, more = slightly_off(evidence, best, syllabus.hold)
+        best, notes = (settle(evidence, biased, free(biased), tell), [*notes, *more]) if more else (best, notes)
     while len(ties) < _TIES and (tie := untold(evidence, best, free(best.config))) is not None:
         held = next(one for one in free(best.config) if one.key == tie.held)
         ties.append(tie)
@@ -109,7 +116,7 @@ def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: 
         if held.height > best.height - 0.5 * Z95**2:
             ties.append(Tie((one.key,), one.key))
             best = held
-    notes = [
+    notes += [
         f"{axis}: does not move; only its noise at rest was learnt" for axis in evidence.axes if axis not in active
     ]
     notes += [

@@ -195,8 +195,15 @@ class Evidence:
                 found[axis.name] = max(found[axis.name], reached)
         return found
 
-    def answers(self, config: FusionConfig) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
-        """What the arm alone would show each sensor on each axis, and what was read, [m] from their medians, (m,)."""
+    def answers(
+        self, config: FusionConfig, *, centred: bool = True
+    ) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
+        """What the arm alone would show each sensor on each axis, and what was read, [m], (m,).
+
+        Args:
+            config: The configuration.
+            centred: Both from their medians in each run.
+        """
         certain = msgspec.structs.replace(
             config,
             start=Start(offset_sd=0.0),
@@ -211,11 +218,10 @@ class Evidence:
                 for number, name in enumerate(scalars.sensors):
                     mine = scalars.sensor == number
                     if mine.any():
-                        pair = (
-                            expected[mine] - np.median(expected[mine]),
-                            scalars.value[mine] - np.median(scalars.value[mine]),
-                        )
-                        found.setdefault((name, self.axes[strand.number]), []).append(pair)
+                        answer, seen = expected[mine], scalars.value[mine]
+                        if centred:
+                            answer, seen = answer - np.median(answer), seen - np.median(seen)
+                        found.setdefault((name, self.axes[strand.number]), []).append((answer, seen))
         return {
             key: (np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]))
             for key, pairs in found.items()

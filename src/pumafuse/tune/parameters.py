@@ -116,7 +116,7 @@ def parameters(
         hold: Parts of names: what has all the parts of one, in their order, stays as it is.
     """
     every = [*_of_axes(config, known, heard), *_latencies(known, heard)]
-    return [one for one in every if one.fit in fit and not any(_named(name, one.key) for name in hold)]
+    return [one for one in every if one.fit in fit and not is_held(one.key, hold)]
 
 
 def kinds_of(fit: Iterable[str]) -> list[Fit]:
@@ -141,7 +141,7 @@ def check_holds(config: FusionConfig, hold: Iterable[str]) -> None:
         ConfigError: It names none.
     """
     heard = dict.fromkeys(config.arm.axes, tuple(config.sensors))
-    keys: set[str] = set()
+    keys = {f"sensors.{name}.bias_sd_mm" for name in config.sensors}
     for order in (1, 2):
         for axis in heard:
             config = with_order(config, axis, order)
@@ -161,6 +161,11 @@ def _of_axes(config: FusionConfig, known: FusionConfig, heard: Mapping[str, Sequ
         found += _plant(axis, config.arm.axes[axis])
         found += _gain(axis, known.arm.axes[axis].gain.intercept)
     return found
+
+
+def is_held(key: str, hold: Iterable[str]) -> bool:
+    """Whether any of the names to hold is part of ``key``."""
+    return any(_named(name, key) for name in hold)
 
 
 def _named(name: str, key: str) -> bool:

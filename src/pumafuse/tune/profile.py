@@ -10,20 +10,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray
+from ..fusion.config import FusionConfig
 from ..fusion.ticks import usable_cores
-from .diagnose import at_bound, covariance
+from .diagnose import at_bound
 from .intervals import _View, _views  # pyright: ignore[reportPrivateUsage]
 from .lesson import Lesson
 from .likelihood import Evidence
 from .parameters import Parameter
-from .search import Point, moved, point, slopes
+from .search import Point, climb, moved, point
 from .summary import Fitted
 
 _SIDE = 6  # points on each side of the best, of which the fourth is the end of the interval
 _BEYOND = 1.5  # how far they go, as a multiple of the interval
-_STEPS = 4  # towards the ridge at an end of the interval
-_SHARES = (1.0, 0.4, 0.1)  # of a step, the first that goes up
-_ENOUGH = 0.1  # log-likelihood that is not worth another step
+_ENOUGH = 0.3  # log-likelihood to which the ridge is climbed there
 
 
 @dataclass(frozen=True)
@@ -32,12 +31,14 @@ class Profile:
 
     Attributes:
         key: The parameter's name.
+        axis: The axis it is of; None where it is of all.
         log: Whether it belongs on a log scale. A noise that may be none does not: none must be on the scale too.
         values: The parameter, in the unit of its key, ascending, (n,).
-        drop: The log-likelihood there less that of the best point, (n,).
+        drop: The log-likelihood there less that of the peak, (n,).
     """
 
     key: str
+    axis: str | None
     log: bool
     values: FloatArray
     drop: FloatArray
@@ -46,22 +47,25 @@ class Profile:
 def profiles(lesson: Lesson, fitted: Sequence[Fitted]) -> list[Profile]:
     """The log-likelihood along each parameter of a lesson, to one and a half times its interval each way.
 
-    The others follow the line of their regression on it, Cov(·, a) / Var a, bent to where a few steps of Fisher scoring
-    put them at the interval's ends. That is a lower bound of the profile likelihood, and close to it. What became of
-    each reading stays as it is at the best point.
+    The others follow the line of their regression on it, Cov(·, a) / Var a, bent to where they are most likely at the
+    interval's ends. That is a lower bound of the profile likelihood, and close to it. As for the intervals, what became of each reading stays as it is at the best point, and the peak is the one that it has then.
 
     Args:
         lesson: What was learnt.
         fitted: Its parameters with their intervals, perhaps among others.
+
+    Returns:
+        One for each parameter but those whose interval has no width.
     """
-    best, ci95 = lesson.best, {one.key: one.ci95 for one in fitted}
+    ci95 = {one.key: one.ci95 for one in fitted}
+    best = climb(lesson.evidence, lesson.best.config, lesson.free, outcomes=lesson.best.value.outcomes)
     views = _views(lesson.evidence, best, [one for one in lesson.free if at_bound(one, best.config) is None])
 
     def of(one: Parameter) -> Profile:
         return _profile(_ridge(views[one.axis], best, one), ci95[one.key])
 
     with ThreadPoolExecutor(usable_cores()) as pool:
-        return list(pool.map(of, lesson.free))
+        return [one for one in pool.map(of, lesson.free) if len(one.values) > 1]
 
 
 @dataclass(frozen=True)
@@ -93,26 +97,19 @@ class _Ridge:
 
     def at(self, coordinates: FloatArray) -> Point:
         """What the readings say there."""
+        return point(self.evidence, self.config(coordinates), self.mine, self.outcomes)
+
+    def config(self, coordinates: FloatArray) -> FusionConfig:
+        """The configuration there, or the nearest that may be."""
         low, high = np.array([one.range for one in self.mine]).T
-        config = moved(self.best.config, self.mine, np.clip(coordinates, low, high))
-        return point(self.evidence, config, self.mine, self.outcomes)
+        return moved(self.best.config, self.mine, np.clip(coordinates, low, high))
 
     def bend(self, coordinate: float) -> FloatArray:
         """How far beside the straight line the ridge lies there, (k,)."""
-        found = np.zeros(len(self.mine))
-        others = self.mine[1:]
-        scale = np.array([other.scale for other in others])
         straight = self.straight(coordinate)
-        there = self.at(straight)
-        for _ in range(_STEPS if others else 0):
-            slope = slopes(self.evidence, there, others)
-            step = np.append(0.0, np.clip(covariance(slope.information, others) @ slope.score, -scale, scale))
-            trials = ((share, self.at(straight + found + share * step)) for share in _SHARES)
-            share, trial = next((pair for pair in trials if pair[1].height > there.height), (0.0, there))
-            gained, there, found = trial.height - there.height, trial, found + share * step
-            if gained < _ENOUGH:
-                break
-        return found
+        others = self.mine[1:]
+        there = climb(self.evidence, self.config(straight), others, outcomes=self.outcomes, enough=_ENOUGH).config
+        return np.append(0.0, np.array([one.coordinate(one.get(there)) for one in others]) - straight[1:])
 
 
 def _ridge(view: _View, best: Point, one: Parameter) -> _Ridge:
@@ -138,12 +135,12 @@ def _profile(ridge: _Ridge, ci95: tuple[float | None, float | None]) -> Profile:
             values.append(value)
             drop.append(height - top)
     order = np.argsort(values)
-    return Profile(one.key, log, np.array(values)[order] / one.unit, np.array(drop)[order])
+    return Profile(one.key, one.axis, log, np.array(values)[order] / one.unit, np.array(drop)[order])
 
 
 def _side(ridge: _Ridge, best: float, end: float, log: bool) -> list[tuple[float, float]]:
     """Values [SI] from the best to beyond an end of the interval, and the height of each."""
-    if end == best:
+    if math.isclose(end, best):
         return []
     one = ridge.mine[0]
     shares = np.linspace(0.0, _BEYOND, _SIDE + 1)[1:]

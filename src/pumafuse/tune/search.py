@@ -260,7 +260,7 @@ def _step(found: Slopes, low: FloatArray, high: FloatArray, damping: FloatArray)
     told = diagonal > 0.0
     step, size = np.zeros(len(diagonal)), 1.0 / np.sqrt(diagonal[told])
     matrix = found.information[np.ix_(told, told)] * np.outer(size, size) + np.diag(damping[told] + _ROUNDING)
-    root = np.linalg.cholesky(matrix)
+    root = np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
     aim = solve_triangular(root, size * found.score[told], lower=True)
     step[told] = size * lsq_linear(root.T, aim, (low[told] / size, high[told] / size), method="bvls").x
     return step

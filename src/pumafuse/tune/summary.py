@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import warnings
+
 import msgspec
 
+from ..errors import PumafuseWarning
 from ..fusion.config import FusionConfig
+from ..fusion.offline import fuse
+from ..runs.run import Run
+from ..units import MM
 from .diagnose import Tie, correlations
 from .intervals import Sure
 from .lesson import Lesson
@@ -40,6 +46,24 @@ class Correlation(msgspec.Struct, frozen=True, kw_only=True):
     correlation: float
 
 
+class FoundBias(msgspec.Struct, frozen=True, kw_only=True):
+    """The constant that a sensor is off by on an axis in a run, in the log's coordinates.
+
+    Attributes:
+        run: The run's name.
+        sensor: The sensor.
+        axis: The axis.
+        bias_mm: The bias.
+        sd_mm: Its standard deviation.
+    """
+
+    run: str
+    sensor: str
+    axis: str
+    bias_mm: float
+    sd_mm: float
+
+
 class Likelihood(msgspec.Struct, frozen=True, kw_only=True):
     """Log-likelihood of an axis's scalars in the runs learnt from, with positions in mm.
 
@@ -66,6 +90,7 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
         interrupted: Whether it was stopped before the end; the numbers are the best until then.
         likelihood: By axis.
         parameters: What was fitted.
+        biases: Of the sensors that have one to estimate.
         correlations: Pairs beyond 0.9.
         held: Combinations that the readings do not tell, a sentence each.
         orders: Why each axis's plant has its order, where that was chosen.
@@ -82,6 +107,7 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
     interrupted: bool
     likelihood: dict[str, Likelihood]
     parameters: list[Fitted]
+    biases: list[FoundBias]
     correlations: list[Correlation]
     held: list[str]
     orders: dict[str, str]
@@ -120,6 +146,20 @@ def _said(one: Parameter, sure: Sure) -> str:
     if sure.open[0]:
         return "it may as well be none" if one.vanishes else f"the readings do not limit it below ({low} is looked for)"
     return f"the readings do not limit it above ({high} is looked for)" if sure.open[1] else ""
+
+
+def biases(run: Run, config: FusionConfig) -> list[FoundBias]:
+    """What a configuration finds the sensors of a run to be off by."""
+    if all(sensor.bias_sd == 0.0 for sensor in config.sensors.values()):
+        return []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PumafuseWarning)  # they are the run's, and `fuse` says them
+        found = fuse(run, config).biases
+    return [
+        FoundBias(run=run.name, sensor=sensor, axis=axis, bias_mm=one.value * MM, sd_mm=one.sd * MM)
+        for sensor, by_axis in found.items()
+        for axis, one in by_axis.items()
+    ]
 
 
 def correlated(lesson: Lesson) -> list[Correlation]:

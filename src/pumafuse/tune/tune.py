@@ -21,7 +21,7 @@ from .lesson import Lesson, Syllabus, learn
 from .likelihood import Evidence
 from .parameters import Fit, Parameter, check_holds, kinds_of
 from .search import Point, with_gates_of
-from .summary import Likelihood, TuningSummary, correlated, fitted, told
+from .summary import Likelihood, TuningSummary, biases, correlated, fitted, told
 from .validate import Check, check
 
 _LEARNT = 2.0 / 3.0  # of a single run; the rest is held back
@@ -118,6 +118,7 @@ def tune(
         interrupted=interrupted,
         likelihood=_likelihoods(Evidence(runs, config), config, tuned),
         parameters=[fitted(one, config, tuned, sure.get(one.key)) for lesson in course.lessons for one in lesson.free],
+        biases=[one for run in runs for one in biases(run, tuned)],
         correlations=[pair for lesson in course.lessons for pair in correlated(lesson)],
         held=[told(tie) for lesson in course.lessons for tie in lesson.ties],
         orders={axis: why for lesson in course.lessons for axis, why in lesson.orders.items()},

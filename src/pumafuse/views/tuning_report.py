@@ -69,8 +69,8 @@ def _profiles(found: Tuning) -> dict[str | None, list[Profile]]:
     """The profiles of each axis, and under None those of what all axes share."""
     drawn: dict[str | None, list[Profile]] = {}
     for lesson in found.lessons:
-        for one, profile in zip(lesson.free, profiles(lesson, found.summary.parameters), strict=True):
-            drawn.setdefault(one.axis, []).append(profile)
+        for one in profiles(lesson, found.summary.parameters):
+            drawn.setdefault(one.axis, []).append(one)
     return drawn
 
 

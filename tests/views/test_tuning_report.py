@@ -1,0 +1,257 @@
+"""The page of a tuning stands alone, holds every number with its sentence, and draws the likelihood that it says."""
+
+from __future__ import annotations
+
+import html
+import re
+import warnings
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from outline import outline
+from pumafuse.errors import PumafuseWarning
+from pumafuse.fusion.consistency import consistency, densities_of
+from pumafuse.model.arm import AxisModel
+from pumafuse.model.plants import FirstOrder
+from pumafuse.tune.profile import Profile, profiles
+from pumafuse.tune.search import climb
+from pumafuse.tune.summary import Fitted
+from pumafuse.views.tuning_report import page
+
+T, END = 0.02, 20.0
+
+
+def recorded(axis: str, sensor: str, name: str) -> pf.Run:
+    """An arm with a delay of 30 ms and a time constant of 40 ms, seen with a noise of 0.2 mm."""
+    rng = np.random.default_rng(1)
+    stamp = np.arange(0.0, END, T)
+    command = 0.001 * np.cumsum(rng.standard_normal(len(stamp)))
+    fine = np.arange(0.0, END, 0.001)
+    true = np.empty(len(fine))
+    at = command[0]
+    for number, aim in enumerate(command[np.maximum(((fine - 0.03) / T).astype(int), 0)]):
+        at += 0.001 / 0.04 * (aim - at)
+        true[number] = at
+    true += 3e-4 * np.cumsum(np.sqrt(1e-3) * rng.standard_normal(len(fine)))
+    seen = np.arange(0.1, END - 0.1, 0.0173)
+    reading = np.interp(seen, fine, true) + 2e-4 * rng.standard_normal(len(seen))
+    return pf.Run.from_arrays(
+        stamp, {axis: command}, {sensor: (seen, {axis: reading})}, (fine, {axis: true}), name=name
+    )
+
+
+def known(axis: str, sensor: str) -> pf.FusionConfig:
+    """What is thought of it before: too slow, too noisy."""
+    model = AxisModel(plant=FirstOrder(time_constant=0.06))
+    arm = pf.ArmModel(name="an arm", update_period=T, delay=0.05, axes={axis: model})
+    return pf.FusionConfig(arm=arm, sensors={sensor: pf.Sensor(sd=5e-4)})
+
+
+@cache
+def tuned(axis: str = "tip", sensor: str = "camera", name: str = "a run", runs: int = 1) -> tuple[pf.Tuning, pf.Run]:
+    run = recorded(axis, sensor, name)
+    return quietly([run] * runs, known(axis, sensor), ["noise", "delay", "plant"]), run
+
+
+def quietly(runs: list[pf.Run], config: pf.FusionConfig, fit: list[str], **more: object) -> pf.Tuning:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PumafuseWarning)
+        return pf.tune(runs, config, fit=fit, **more)
+
+
+def fitted(found: pf.Tuning) -> dict[str, Fitted]:
+    return {one.key: one for one in found.summary.parameters}
+
+
+def drawn(found: pf.Tuning) -> dict[str, Profile]:
+    return {one.key: one for one in profiles(found.lessons[0], found.summary.parameters)}
+
+
+def test_every_part_of_the_page_has_its_heading_and_sentence_and_nothing_is_loaded() -> None:
+    """All parts in their order, pictures under their headings; the only addresses are those of the page itself."""
+    found, run = tuned()
+    text = page(found, [run])
+    seen = outline(text)
+    parts = [
+        "Tuning: a run",
+        "What to know first",
+        "What was fitted",
+        "How sure it is",
+        "Before and after on what was held back",
+        "Innovations before and after",
+    ]
+    assert seen.headings == [*parts, "fusion.toml", "arm.toml"]
+    for heading in (parts[0], *parts[2:]):
+        assert len(seen.sentences[heading]) > 60, heading
+    assert seen.pictures == [parts[3], parts[5]]
+    assert not re.search(r"""(src|href)=["'](?!#|data:image/png;base64,)""", text)
+    assert "<script" not in text and "@import" not in text and "url(http" not in text
+
+
+def test_the_table_has_every_number_with_its_interval() -> None:
+    """Key, before, fitted and both ends of each parameter, in its row."""
+    found, run = tuned()
+    text = page(found, [run])
+    assert len(found.summary.parameters) == 7
+    for one in found.summary.parameters:
+        row = re.search(rf"<tr><td>{re.escape(one.key)}</td>(.*)</tr>", text)
+        assert row is not None, one.key
+        low, high = ("…" if end is None else f"{end:.4g}" for end in one.ci95)
+        cells = re.findall(r"<td[^>]*>([^<]*)</td>", row[1])
+        assert cells == [f"{one.before:.4g}", f"{one.value:.4g}", f"{low} to {high}", one.said]
+
+
+def test_an_interval_ends_where_its_profile_has_dropped_by_half_a_chi_square() -> None:
+    """At each end that the readings limit the curve is at −1.92, nowhere is it above 0, and 0 is where the best is."""
+    found, _ = tuned()
+    curves, ends = drawn(found), 0
+    assert curves.keys() == fitted(found).keys()
+    for key, one in fitted(found).items():
+        curve = curves[key]
+        assert (np.diff(curve.values) > 0.0).all()
+        assert curve.drop.max() == pytest.approx(0.0, abs=0.01)
+        assert curve.values[np.argmax(curve.drop)] == pytest.approx(one.value, rel=1e-3, abs=0.01 * curve.values[-1])
+        for end in one.ci95:
+            if end:  # neither open nor none
+                ends += 1
+                assert np.interp(end, curve.values, curve.drop) == pytest.approx(-1.92, abs=0.25), key
+    assert ends >= 10
+
+
+def test_a_noise_that_may_be_none_is_drawn_from_none_on() -> None:
+    """On a linear scale, from 0, where the likelihood is as good as nowhere else, to beyond its greatest."""
+    found, _ = tuned()
+    one, curve = fitted(found)["process.tip.input_noise_mm_rtHz"], drawn(found)["process.tip.input_noise_mm_rtHz"]
+    assert one.value == 0.0 and one.ci95[1] is not None
+    assert not curve.log
+    assert curve.values[0] < 0.01 * one.ci95[1] < one.ci95[1] < curve.values[-1]
+    assert (np.diff(curve.drop) < 0.0).all()
+
+
+def test_the_others_follow_along_the_ridge() -> None:
+    """Nowhere more likely than the best that a climb finds with this number held, and hardly less."""
+    found, _ = tuned()
+    lesson = found.lessons[0]
+    (delay,) = [one for one in lesson.free if one.key == "axes.tip.delay_ms"]
+    others = [one for one in lesson.free if one is not delay]
+    best = climb(lesson.evidence, lesson.best.config, lesson.free, outcomes=lesson.best.value.outcomes)
+    curve = drawn(found)["axes.tip.delay_ms"]
+    for value, drop in zip(curve.values, curve.drop, strict=True):
+        held = delay.put(best.config, value * delay.unit)
+        highest = climb(lesson.evidence, held, others, outcomes=best.value.outcomes).height - best.height
+        alone = lesson.evidence.value(held, best.value.outcomes).total - best.height
+        assert highest - 0.3 < drop < highest + 0.01
+        if abs(highest) > 1.0:
+            assert alone < 1.3 * highest  # were they to stay, it would drop much faster
+
+
+def test_a_lone_number_is_drawn_with_the_likelihood_of_the_filter_itself() -> None:
+    """With all else held, the curve is the log density of what `fuse` reports, less the one at the best."""
+    run, config = recorded("tip", "camera", "a run"), known("tip", "camera")
+    found = quietly([run], with_sd(config, 5e-4, gate=50.0), ["noise"], hold=["process"])
+    (curve,) = drawn(found).values()
+    assert curve.key == "sensors.camera.sd_mm.tip"
+    assert curve.log
+
+    def height(sd: float) -> float:
+        est = pf.fuse(run, with_sd(config, sd, gate=50.0))
+        return float(densities_of(est.readings, est.config.sensors).sum())
+
+    heights = np.array([height(value * 1e-3) for value in curve.values])
+    np.testing.assert_allclose(curve.drop, heights - heights[np.argmax(curve.drop)], atol=1e-3)
+    assert curve.drop.min() < -3.0
+
+
+def with_sd(config: pf.FusionConfig, sd: float, gate: float) -> pf.FusionConfig:
+    return msgspec.structs.replace(config, sensors={"camera": pf.Sensor(sd=sd, gate=gate)})
+
+
+def test_what_is_said_of_innovations_is_what_the_filter_says() -> None:
+    """NIS and whiteness of the run before and after, as `fuse` has them."""
+    found, run = tuned()
+    tests = [consistency(pf.fuse(run, config), "camera", "tip") for config in (found.before, found.config)]
+    before, after = (one for one in tests if one is not None)
+    assert abs(after.nis - 1.0) < 0.1 < abs(before.nis - 1.0)
+    said = outline(page(found, [run])).sentences["Innovations before and after"]
+    assert f"tip, camera: NIS {before.nis:.2f} → {after.nis:.2f}" in said
+    assert "came nearer to it for 1 of 1; 0 → 1 of 1 pass for white" in said
+
+
+def test_files_are_shown_as_they_are_written(tmp_path: Path) -> None:
+    """What stands under fusion.toml and arm.toml is what `pumafuse tune` writes there."""
+    found, run = tuned()
+    shown = [html.unescape(text) for text in re.findall(r"<pre>(.*?)</pre>", page(found, [run]), re.DOTALL)]
+    found.config.save(tmp_path)
+    assert shown == [(tmp_path / name).read_text(encoding="utf-8") for name in ("fusion.toml", "arm.toml")]
+
+
+def test_what_was_held_back_is_there_before_and_after() -> None:
+    """Numbers of the check in their row, and the sentence says which axis is better."""
+    found, run = tuned()
+    text = page(found, [run])
+    (check,) = found.summary.validation or ()
+    old, new = check.before, check.after
+    for shown in (
+        f"{old.sensors['camera'].nis:.2f} → {new.sensors['camera'].nis:.2f}",
+        f"{old.rmse_mm:.3f} → {new.rmse_mm:.3f}",
+        f"{old.coverage:.3f} → {new.coverage:.3f}",
+        check.verdict,
+    ):
+        assert shown in text
+    assert "learnt from, tip is better." in outline(text).sentences["Before and after on what was held back"]
+
+
+def test_without_a_run_to_validate_on_the_page_says_so() -> None:
+    """Two runs and none held back: no table, but the note."""
+    found, run = tuned(runs=2)
+    text = page(found, [run, run])
+    assert "Before and after on what was held back" not in outline(text).headings
+    assert "nothing says whether the numbers hold elsewhere" in text
+
+
+def test_names_are_text_and_nothing_else() -> None:
+    """Runs, sensors and axes named like markup or mathematics are shown as they are written."""
+    found, run = tuned("<i>tip$x^$", "<b>&</b>", "<u>run</u>")
+    text = page(found, [run])
+    outline(text)
+    assert "sensors.&lt;b&gt;&amp;&lt;/b&gt;.sd_mm.&lt;i&gt;tip$x^$" in text
+    assert "Tuning: &lt;u&gt;run&lt;/u&gt;" in text
+    assert not re.search("<[biu]>", text)
+
+
+def test_the_same_tuning_gives_the_same_page() -> None:
+    """To the byte: a report can be kept under version control."""
+    found, run = tuned()
+    assert page(found, [run]) == page(found, [run])
+
+
+@pytest.mark.parametrize("after", ["searching", "learning from the whole run"])
+def test_an_interrupted_tuning_has_a_page_too(after: str) -> None:
+    """With what was learnt until then, and without profiles of what is no peak."""
+    run = recorded("tip", "camera", "a run")
+
+    def interrupt(what: str, _: object) -> None:
+        if what == after:
+            raise KeyboardInterrupt
+
+    found = quietly([run], known("tip", "camera"), ["noise"], progress=interrupt)
+    seen = outline(page(found, [run]))
+    assert found.summary.interrupted
+    assert "How sure it is" not in seen.headings
+    assert seen.pictures == ["Innovations before and after"]
+
+
+@pytest.mark.long
+def test_the_page_of_the_shipped_scan_is_of_a_size_to_be_sent() -> None:
+    """28 numbers, 7 pairs of sensor and axis with 25000 readings: less than 3 MB."""
+    data = Path(pf.__file__).parent / "data"
+    run = pf.Run.read(data / "scan1")
+    found = quietly([run], pf.FusionConfig.load(data / "fusion.toml"), ["noise", "delay", "plant"])
+    text = page(found, [run])
+    assert len(text.encode()) < 3e6
+    assert len(outline(text).pictures) == 3 + 7
