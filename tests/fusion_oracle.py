@@ -243,6 +243,16 @@ class AxisOracle:
             sd = np.diagonal(L)
             return (sd * w).astype(float), sd.astype(float)
 
+    def jointly(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (m,) and covariance (m, m) of all readings before any is known, noise and all; latencies that are sure."""
+        assert not self.jumps
+        rows = self._readings_as_rows(self.readings)
+        sensors = [self.config.sensors[reading.sensor] for reading in self.readings]
+        assert not any(sensor.latency_sd for sensor in sensors)
+        joint = self._joint(self.readings, rows)
+        own = np.array([sensor.sd_of(self.axis) for sensor in sensors]) ** 2
+        return rows.position * self.start + joint.mean.astype(float), joint.cross.astype(float) + np.diag(own)
+
     def undisturbed(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Position [m] and velocity [m/s] at ``times`` [ns since the first command] without noise and offset."""
         fed = entries(self.run, self.config, self.axis, int(max(times)) + 1)

@@ -16,6 +16,7 @@ from rich.table import Table
 
 from .. import folders
 from ..fusion.config import FusionConfig
+from ..fusion.score import Z95
 from ..runs.run import Run
 from ..tune.parameters import check_holds, kinds_of
 from ..tune.search import Point
@@ -107,9 +108,14 @@ def _show(found: Tuning, options: Options) -> None:
         out.print(one, markup=False)
     for pair in summary.correlations:
         out.print(f"{pair.first} and {pair.second} go together: correlation {pair.correlation:+.2f}", markup=False)
+    for bias in summary.biases:
+        off = f"{bias.bias_mm:.3f} ± {Z95 * bias.sd_mm:.3f} mm"
+        out.print(f"{bias.run}: {bias.sensor} is off by {off} on {bias.axis}", markup=False)
     out.print(_likelihoods(summary))
     if summary.validation:
         out.print(_validation(summary.validation))
+        for one in summary.validation:
+            out.print(f"{one.run}, {one.axis}: {one.verdict}", markup=False, soft_wrap=True)
     out.print(f"written to {options.output}", markup=False, soft_wrap=True)
     out.print(f"next: pumafuse fuse RUN -c {options.output / 'fusion.toml'} -o DIR", markup=False, soft_wrap=True)
 
@@ -139,33 +145,34 @@ def _likelihoods(summary: TuningSummary) -> Table:
 
 
 def _validation(checks: Sequence[Check]) -> Table:
-    """Before and after, on what was held back."""
+    """Before and after, on what was held back: a row for each sensor, an axis's score in its first."""
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column("held back", overflow="fold")
     table.add_column("axis")
-    for heading in ("NIS", "lag 1", "RMSE, mm", "coverage"):
+    for heading in ("RMSE, mm", "coverage"):
         table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("verdict", overflow="fold")
+    table.add_column("sensor")
+    for heading in ("NIS", "correlation at lag 1"):
+        table.add_column(heading, justify="right", no_wrap=True)
     for one in checks:
         since = f" from {one.since_s:.1f} s" if one.since_s else ""
         pair = (one.before, one.after)
-        sensors = list(one.before.sensors)
-        table.add_row(
+        scores = (
             escape(one.run) + since,
             escape(one.axis),
-            "\n".join(
-                _change([state.sensors[n].nis if n in state.sensors else None for state in pair]) for n in sensors
-            ),
-            "\n".join(
-                _change([state.sensors[n].correlation if n in state.sensors else None for state in pair], "+.2f")
-                for n in sensors
-            ),
             _change([state.rmse_mm for state in pair], ".3f"),
             _change([state.coverage for state in pair], ".3f"),
-            one.verdict,
         )
+        for number, name in enumerate(one.before.sensors):
+            found = [state.sensors.get(name) for state in pair]
+            table.add_row(
+                *(scores if number == 0 else ("", "", "", "")),
+                escape(name),
+                _change([None if sensor is None else sensor.nis for sensor in found], ".2f"),
+                _change([None if sensor is None else sensor.correlation for sensor in found], "+.2f"),
+            )
     return table
 
 
-def _change(values: Sequence[float | None], form: str = ".2f") -> str:
+def _change(values: Sequence[float | None], form: str) -> str:
     return " → ".join("–" if value is None else format(value, form) for value in values)

@@ -48,7 +48,8 @@ def profiles(lesson: Lesson, fitted: Sequence[Fitted]) -> list[Profile]:
     """The log-likelihood along each parameter of a lesson, to one and a half times its interval each way.
 
     The others follow the line of their regression on it, Cov(·, a) / Var a, bent to where they are most likely at the
-    interval's ends. That is a lower bound of the profile likelihood, and close to it. As for the intervals, what became of each reading stays as it is at the best point, and the peak is the one that it has then.
+    interval's ends. That is a lower bound of the profile likelihood, and close to it. As for the intervals, what became
+    of each reading stays as it is at the best point, and the peak is the one that it has then.
 
     Args:
         lesson: What was learnt.

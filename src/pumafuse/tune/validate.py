@@ -120,9 +120,9 @@ def _axis(run: str, axis: str, since: float, before: Estimates, after: Estimates
     gained, chance = float(gains.sum()), Z95 * float(np.sqrt(np.sum(gains**2)))
     closer = None if old.rmse_mm is None or new.rmse_mm is None else new.rmse_mm / max(old.rmse_mm, 1e-12)
     worse = gained < -chance or (closer is not None and closer > _WORSE)
-    said = f"log-likelihood {gained:+.1f} (± {chance:.1f} by chance)"
+    said = f"log-likelihood {gained:+.1f} (chance: ± {chance:.1f})"
     if closer is not None:
-        said += f", error on the reference {100.0 * (closer - 1.0):+.1f} %"
+        said += f", RMSE {100.0 * (closer - 1.0):+.1f} %"
     verdict = f"{'worse' if worse else 'better' if gained > chance else 'no different'}: {said}"
     return Check(
         run=run,

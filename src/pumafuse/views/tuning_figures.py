@@ -18,7 +18,7 @@ from ..tune.summary import Fitted
 from . import style
 from .sheet import drawing
 
-_COLUMNS = 5  # of profiles
+_COLUMNS = 6  # of profiles
 _WIDTH = 11.0  # inch; as wide as a page
 _TITLE = 32  # letters over a panel
 _TICKS = 3
@@ -69,7 +69,7 @@ def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
     if one.log:
         axes.set_xscale("log")
     axes.set_xlim(low, high)
-    axes.set_ylim(_DEEPEST, 0.5)
+    axes.set_ylim(_DEEPEST, max(0.5, 1.1 * float(one.drop.max())))
     ends = [edge if end is None else end for end, edge in zip(fitted.ci95, (low, high), strict=True)]
     axes.axvspan(*ends, color=style.ESTIMATE, alpha=0.15, lw=0)
     axes.axhline(-0.5 * Z95**2, color=style.COMMAND, lw=0.8, ls="--")
@@ -82,7 +82,7 @@ def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
     axes.yaxis.set_major_locator(FixedLocator([-4.0, -2.0, 0.0]))
     axes.tick_params(labelsize=8)
     parts = one.key.split(".")
-    axes.set_title("\n".join(_cut(".".join(half)) for half in (parts[:2], parts[2:])), loc="left", fontsize=8)
+    axes.set_title("\n".join(_cut(".".join(half)) for half in (parts[:2], parts[2:])), loc="left", fontsize=7.5)
 
 
 def _smooth(one: Profile) -> tuple[FloatArray, FloatArray]:

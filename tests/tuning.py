@@ -1,0 +1,101 @@
+"""What the tests of tuning share: short simulated runs, and configurations that are wrong about them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+
+import pumafuse as pf
+from pumafuse.tune.intervals import Sure, sureness
+from pumafuse.tune.lesson import Lesson, Syllabus, learn
+from pumafuse.tune.likelihood import Evidence
+from pumafuse.tune.parameters import Fit, Parameter, parameters
+from pumafuse.tune.summary import Fitted
+
+SCENARIOS = Path(__file__).parent.parent / "scenarios"
+ALL: tuple[Fit, ...] = ("noise", "delay", "plant", "gain", "latency")
+T = TypeVar("T")
+replaced = msgspec.structs.replace
+
+
+def scenario(name: str, width: float | None = None, height: float | None = None, **changes: object) -> pf.Scenario:
+    """A shipped scenario, on a panel of another size [m], and with other changes."""
+    found = pf.Scenario.load(SCENARIOS / f"{name}.toml")
+    sizes = {"width": width, "height": height}
+    trajectory = replaced(found.trajectory, **{key: size for key, size in sizes.items() if size is not None})
+    return replaced(found, trajectory=trajectory, **changes)
+
+
+def with_sensors(config: pf.FusionConfig, *names: str, **changes: object) -> pf.FusionConfig:
+    """The configuration with the same changes of these sensors, of all for none."""
+    chosen = names or tuple(config.sensors)
+    each = {name: replaced(one, **changes) if name in chosen else one for name, one in config.sensors.items()}
+    return replaced(config, sensors=each)
+
+
+def with_process(config: pf.FusionConfig, **changes: float) -> pf.FusionConfig:
+    """The configuration with the same changes of every axis's noise."""
+    return replaced(config, process={axis: replaced(one, **changes) for axis, one in config.process.items()})
+
+
+def spoiled(config: pf.FusionConfig) -> pf.FusionConfig:
+    """Sensors half as good as they are, a process three times as noisy that drifts a third as much."""
+    process = {
+        axis: pf.Process(input_noise=3.0 * one.input_noise, drift=0.3 * one.drift, maneuver_noise=2e-4, maneuver_drift=1e-3)
+        for axis, one in config.process.items()
+    }  # fmt: skip
+    sensors = {name: replaced(one, sd=2.0 * one.sd) for name, one in config.sensors.items()}
+    return replaced(config, process=process, sensors=sensors)
+
+
+def spoiled_arm(config: pf.FusionConfig) -> pf.FusionConfig:
+    """Likewise, and delays 8 ms too long and plants too slow."""
+    config, arm = spoiled(config), config.arm
+    axes: dict[str, pf.AxisModel] = {}
+    for axis, model in arm.axes.items():
+        plant = model.plant
+        if isinstance(plant, pf.FirstOrder):
+            plant = pf.FirstOrder(time_constant=1.3 * plant.time_constant)
+        else:
+            plant = pf.SecondOrder(natural_frequency=0.8 * plant.natural_frequency, damping=1.2 * plant.damping)
+        axes[axis] = replaced(model, plant=plant, delay=arm.delay_of(axis) + 0.008)
+    return replaced(config, arm=replaced(arm, axes=axes))
+
+
+def free_of(evidence: Evidence, config: pf.FusionConfig, fit: Sequence[Fit], *hold: str) -> list[Parameter]:
+    """What may move."""
+    return parameters(config, evidence.config, evidence.heard, fit, hold)
+
+
+def learnt(
+    run: pf.Run | Sequence[pf.Run], config: pf.FusionConfig, fit: Sequence[Fit] = ("noise",), *hold: str
+) -> Lesson:
+    """One lesson from whole runs."""
+    return learn([run] if isinstance(run, pf.Run) else run, config, Syllabus(fit, hold), None, lambda _: None)
+
+
+def sure_of(lesson: Lesson) -> dict[str, Sure]:
+    """The intervals of a lesson."""
+    return sureness(lesson.evidence, lesson.best, lesson.free)
+
+
+def holds(one: Parameter, sure: Sure, truth: pf.FusionConfig) -> bool:
+    """Whether an interval has the truth in it; none is in one that is open below."""
+    low, high = sure.ci95
+    return (0.0 if sure.open[0] and one.vanishes else low) <= one.get(truth) <= high
+
+
+def quietly(work: Callable[[], T]) -> T:
+    """Do it without what it warns of."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        return work()
+
+
+def fitted(found: pf.Tuning) -> dict[str, Fitted]:
+    """What was fitted, by its name."""
+    return {one.key: one for one in found.summary.parameters}
