@@ -44,10 +44,13 @@ def with_process(config: pf.FusionConfig, **changes: float) -> pf.FusionConfig:
 
 def spoiled(config: pf.FusionConfig) -> pf.FusionConfig:
     """Sensors half as good as they are, a process three times as noisy that drifts a third as much."""
-    process = {
-        axis: pf.Process(input_noise=3.0 * one.input_noise, drift=0.3 * one.drift, maneuver_noise=2e-4, maneuver_drift=1e-3)
-        for axis, one in config.process.items()
-    }  # fmt: skip
+
+    def noisy(one: pf.Process) -> pf.Process:
+        return replaced(
+            one, input_noise=3.0 * one.input_noise, drift=0.3 * one.drift, maneuver_noise=2e-4, maneuver_drift=1e-3
+        )
+
+    process = {axis: noisy(one) for axis, one in config.process.items()}
     sensors = {name: replaced(one, sd=2.0 * one.sd) for name, one in config.sensors.items()}
     return replaced(config, process=process, sensors=sensors)
 

@@ -32,9 +32,7 @@ def quietly(run: Run, config: FusionConfig) -> Estimates:
 
 
 def gated(config: FusionConfig, gate: float = GATE, gate_rows: bool = True) -> FusionConfig:
-    each = {
-        name: msgspec.structs.replace(one, gate=gate, gate_rows=gate_rows) for name, one in config.sensors.items()
-    }
+    each = {name: msgspec.structs.replace(one, gate=gate, gate_rows=gate_rows) for name, one in config.sensors.items()}
     return msgspec.structs.replace(config, sensors=each)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -11,23 +12,27 @@ import pytest
 from scipy.stats import chi2, multivariate_normal
 
 import pumafuse as pf
-from fusion.test_oracle import CASES, MS, THREE, VISION, Case, Heard, every, sensor
+from fusion.test_oracle import CASES, Case, anomalous
 from fusion_oracle import AxisOracle
 from pumafuse.fusion.consistency import densities_of, log_likelihood
+from pumafuse.runs.run import Source
+from pumafuse.simulate.scenario import Outliers
 from pumafuse.tune.likelihood import Evidence
-from pumafuse.tune.parameters import Parameter, parameters, with_order
-from pumafuse.tune.search import moved, point, slopes
-from tuning import ALL, free_of, quietly, replaced, scenario, spoiled, spoiled_arm, with_process, with_sensors
+from pumafuse.tune.parameters import with_order
+from pumafuse.tune.search import Point, moved, point, slopes
+from tuning import ALL, SCENARIOS, free_of, quietly, replaced, scenario, spoiled_arm, with_process, with_sensors
 
 DATA = Path(pf.__file__).parent / "data"
+AXES = ("tangential", "vertical")
 
 
 @cache
-def outage(seed: int = 1) -> pf.Simulated:
-    """Tracker and camera on two axes for 4 seconds, the camera with outliers."""
+def two_sensors(seed: int = 1) -> pf.Simulated:
+    """Tracker and camera on two axes for 4 seconds; both throw outliers."""
     found = scenario("panel-tracker-outage", 0.1, 0.02)
-    camera = replaced(found.sensors["vision"], outliers=pf.simulate.__globals__["Scenario"] and None)
-    return pf.simulate(replaced(found, sensors={**found.sensors, "vision": camera}), seed)
+    wild = Outliers(share=0.03, smallest=0.005, largest=0.02)
+    sensors = {name: replaced(one, outliers=wild) for name, one in found.sensors.items()}
+    return pf.simulate(replaced(found, sensors=sensors), seed)
 
 
 def of_the_filter(run: pf.Run, config: pf.FusionConfig) -> dict[str, float]:
@@ -35,3 +40,336 @@ def of_the_filter(run: pf.Run, config: pf.FusionConfig) -> dict[str, float]:
     est = quietly(lambda: pf.fuse(run, config))
     mine = {axis: est.readings.where(est.readings.axis == number) for number, axis in enumerate(est.readings.axes)}
     return {axis: log_likelihood(readings, config.sensors) for axis, readings in mine.items()}
+
+
+def by_axis(evidence: Evidence, config: pf.FusionConfig) -> dict[str, float]:
+    return dict(zip(evidence.axes, evidence.value(config).axes.tolist(), strict=True))
+
+
+# ---- the value ------------------------------------------------------------------------------------------------------
+
+
+def two_clocks() -> tuple[pf.Run, pf.FusionConfig]:
+    """A log whose clock is set back by an hour in its middle."""
+    sim = two_sensors()
+    cut = int(2e9)
+
+    def back(source: Source) -> Source:
+        return replace(source, stamp=np.where(source.stamp > cut, source.stamp - 3_600_000_000_000, source.stamp))
+
+    sensors = {name: back(one) for name, one in sim.run.sensors.items()}
+    return replace(sim.run, command=back(sim.run.command), sensors=sensors, reference=None), sim.config
+
+
+def shipped() -> tuple[pf.Run, pf.FusionConfig]:
+    return pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
+
+
+def in_x_y_z() -> tuple[pf.Run, pf.FusionConfig]:
+    sim = pf.simulate(pf.Scenario.load(SCENARIOS / "cylindrical-cartesian.toml"))
+    return sim.run, sim.config
+
+
+def two_with_outliers() -> tuple[pf.Run, pf.FusionConfig]:
+    return two_sensors().run, two_sensors().config
+
+
+@pytest.mark.parametrize("made", [two_with_outliers, two_clocks, shipped, in_x_y_z])
+def test_the_value_is_the_log_likelihood_of_what_fuse_says(made: Callable[[], tuple[pf.Run, pf.FusionConfig]]) -> None:
+    """By axis and with its gates, which reject some: rows or scalars, axes and frames, clocks set back, biases."""
+    run, config = made()
+    for gate_rows in (True, False):
+        here = with_sensors(config, gate_rows=gate_rows, gate=3.5)
+        evidence = Evidence([run], here)
+        assert by_axis(evidence, here) == pytest.approx(of_the_filter(run, here), rel=1e-11)
+        outcomes = np.concatenate(evidence.value(here).outcomes)
+        assert (outcomes == pf.Outcome.GATED).any()
+        assert len(outcomes) == evidence.count.sum()
+
+
+SURE = {
+    name: case
+    for name, case in CASES.items()
+    if case.heard and not any(heard.sensor.latency_sd or heard.sensor.bias_sd for heard in case.heard.values())
+}
+
+
+@pytest.mark.parametrize("case", SURE.values(), ids=SURE.keys())
+def test_without_gates_it_is_the_density_of_the_joint_gaussian(case: Case) -> None:
+    """All readings of an axis at once, under a mean and a covariance that no filter worked out; lengths in mm."""
+    run, config = case.made()
+    assert all(one.gate == 0.0 for one in config.sensors.values())
+    evidence = Evidence([run], config)
+    for axis, value in by_axis(evidence, config).items():
+        mean, covariance = AxisOracle(run, config, axis).jointly()
+        readings = [reading.value for reading in AxisOracle(run, config, axis).readings]
+        if readings:
+            wanted = multivariate_normal(1e3 * mean, 1e6 * covariance).logpdf(1e3 * np.array(readings))
+            assert value == pytest.approx(wanted, rel=1e-7, abs=1e-6), axis
+    assert anomalous(run, config) or evidence.count.sum() == sum(
+        len(values) for source in run.sensors.values() for values in source.values.values()
+    )
+
+
+def test_runs_add_up_and_so_do_axes() -> None:
+    """Two runs say the sum of what each says, and an axis alone says its share: value, score and information."""
+    one, two = two_sensors(1), two_sensors(2)
+    config = with_sensors(spoiled_arm(one.config), gate=5.0)
+    both, each = Evidence([one.run, two.run], config), [Evidence([sim.run], config) for sim in (one, two)]
+    free = free_of(both, config, ALL)
+    known = [evidence.value(config) for evidence in each]
+    together = both.value(config)
+    np.testing.assert_allclose(together.axes, known[0].axes + known[1].axes, rtol=1e-12)
+    found = both.slopes(config, free, together.outcomes)
+    parts = [evidence.slopes(config, free, value.outcomes) for evidence, value in zip(each, known, strict=True)]
+    np.testing.assert_allclose(found.score, parts[0].score + parts[1].score, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.information, parts[0].information + parts[1].information, rtol=1e-9, atol=1e-6)
+    assert (together.axes != 0.0).all() and tuple(both.axes) == AXES
+    shares, informations = [], []
+    for number, axis in enumerate(AXES):
+        alone, outcomes = both.alone(axis), both.outcomes_of(axis, together.outcomes)
+        value = alone.value(config, outcomes)
+        assert value.axes[number] == pytest.approx(together.axes[number], rel=1e-12)
+        assert value.total == value.axes[number]
+        told = alone.slopes(config, free, outcomes)
+        foreign = [place for place, parameter in enumerate(free) if parameter.axis not in (None, axis)]
+        assert not told.score[foreign].any() and not told.information[foreign].any()
+        shares.append(told.score)
+        informations.append(told.information)
+    np.testing.assert_allclose(sum(shares), found.score, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(sum(informations), found.information, rtol=1e-9, atol=1e-6)
+
+
+def test_an_axis_alone_has_its_own_gates() -> None:
+    """Where scalars are gated one by one, the axes' values need no outcomes to be the shares of the whole."""
+    sim = two_sensors()
+    config = with_sensors(sim.config, gate=3.0, gate_rows=False)
+    evidence = Evidence([sim.run], config)
+    for number, axis in enumerate(AXES):
+        assert evidence.alone(axis).value(config).total == evidence.value(config).axes[number]
+
+
+def test_until_leaves_out_what_is_valid_later() -> None:
+    """What remains has the densities it had: a filter knows nothing of later readings."""
+    sim, until = two_sensors(), 1.7
+    est = pf.fuse(sim.run, sim.config)
+    early = est.readings.where(est.readings.time <= until)
+    density = densities_of(early, sim.config.sensors)
+    evidence = Evidence([sim.run], sim.config, until=until)
+    assert evidence.count.sum() == len(early.value) < len(est.readings.value)
+    wanted = [density[early.axis == number].sum() for number in range(2)]
+    np.testing.assert_allclose(evidence.value(sim.config).axes, wanted, rtol=1e-12)
+
+
+def test_chosen_sensors_are_heard_alone() -> None:
+    """As in a fusion of these only."""
+    sim = two_sensors()
+    evidence = Evidence([sim.run], sim.config, ["vision"])
+    est = pf.fuse(sim.run, sim.config, sensors=["vision"])
+    assert evidence.value(sim.config).total == pytest.approx(log_likelihood(est.readings, sim.config.sensors), 1e-12)
+    assert evidence.heard == {axis: ["vision"] for axis in AXES}
+    assert Evidence([sim.run], sim.config).heard == {axis: ["tracker", "vision"] for axis in AXES}
+
+
+# ---- another arm and other latencies --------------------------------------------------------------------------------
+
+
+def with_axis(config: pf.FusionConfig, axis: str, **changes: object) -> pf.FusionConfig:
+    arm = config.arm
+    return replaced(config, arm=replaced(arm, axes={**arm.axes, axis: replaced(arm.axes[axis], **changes)}))
+
+
+OTHERS = {
+    "a latency": lambda config: with_sensors(config, "vision", latency=0.02),
+    "both latencies, past each other": lambda config: with_sensors(
+        with_sensors(config, "vision", latency=-0.03), "tracker", latency=0.0712345678
+    ),
+    "the same latency for both": lambda config: with_sensors(config, latency=0.03),
+    "a delay": lambda config: with_axis(config, "tangential", delay=0.0211),
+    "no delay": lambda config: with_axis(config, "vertical", delay=0.0),
+    "a gain": lambda config: with_axis(config, "tangential", gain=pf.Gain(slope=0.0518, intercept=1.21)),
+    "a recovery": lambda config: with_axis(config, "vertical", gain_recovery=0.033),
+    "a gain that stays": lambda config: with_axis(config, "tangential", gain_recovery=None),
+    "another plant": lambda config: with_order(config, "vertical", 2),
+    "everything": lambda config: with_process(
+        with_sensors(
+            with_axis(
+                with_axis(config, "vertical", delay=0.1, gain_recovery=0.4),
+                "tangential",
+                gain=pf.Gain(slope=0.05, intercept=0.7),
+            ),
+            "tracker",
+            latency=0.051,
+            sd=1e-4,
+        ),
+        drift=1e-3,
+        maneuver_noise=1e-3,
+    ),
+}
+
+
+@pytest.mark.parametrize("other", OTHERS.values(), ids=OTHERS.keys())
+def test_another_configuration_is_as_if_built_with_it(other: Callable[[pf.FusionConfig], pf.FusionConfig]) -> None:
+    """Delays, gains and latencies moved after the readings were put in order: value, outcomes and slopes as anew.
+
+    Row by row where a row is gated as a whole. Only readings that no latency here puts before the first command.
+    """
+    sim = two_sensors()
+    late = {name: replace(one.rows(one.stamp > int(0.2e9))) for name, one in sim.run.sensors.items()}
+    run = replace(sim.run, sensors=late)
+    config = other(sim.config)
+    old, new = Evidence([run], sim.config), Evidence([run], config)
+    moved_there, built_there = old.value(config), new.value(config)
+    np.testing.assert_allclose(moved_there.axes, built_there.axes, rtol=1e-13)
+    assert np.sum(moved_there.outcomes[0]) == np.sum(built_there.outcomes[0]) > 0
+    assert moved_there.total != pytest.approx(old.value(sim.config).total, abs=0.1)
+    free = free_of(new, config, ALL)
+    found, wanted = (
+        evidence.slopes(config, free, value.outcomes) for evidence, value in ((old, moved_there), (new, built_there))
+    )
+    np.testing.assert_allclose(found.score, wanted.score, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found.information, wanted.information, rtol=1e-6, atol=1e-4)
+
+
+def test_readings_that_a_latency_could_put_before_the_run_are_left_out() -> None:
+    """With ``latest`` 0.5 s those stamped in the first half second; what remains is met at any latency up to it."""
+    sim = two_sensors()
+    evidence = Evidence([sim.run], sim.config, latest=0.5)
+    kept = sum(
+        int(np.isfinite(value[one.stamp >= int(0.5e9)]).sum())
+        for one in sim.run.sensors.values()
+        for value in one.values.values()
+    )
+    assert evidence.count.sum() == kept
+    late = with_sensors(sim.config, latency=0.5)
+    values = evidence.value(late)
+    assert np.isfinite(values.axes).all() and len(values.outcomes[0]) == kept
+
+
+# ---- slopes ---------------------------------------------------------------------------------------------------------
+
+
+def at_a_slope(order: int) -> tuple[Evidence, Point, pf.FusionConfig]:
+    """Two sensors under a configuration that is wrong about everything, so that the likelihood rises steeply."""
+    sim = two_sensors()
+    config = spoiled_arm(sim.config)
+    for axis in AXES:
+        config = with_order(config, axis, order)
+    config = with_axis(config, "tangential", gain_recovery=0.06)
+    config = with_sensors(config, "vision", latency=0.04, gate=4.0)
+    config = with_process(config, maneuver_noise=3e-4, maneuver_drift=2e-3)
+    evidence = Evidence([sim.run], config)
+    return evidence, point(evidence, config, free_of(evidence, config, ALL)), config
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_score_is_the_slope_of_the_value(order: int) -> None:
+    """Of every kind of parameter, by central differences while outcomes stay, with and without priors.
+
+    To a thousandth of it and a hundredth of what a standard deviation is worth; some readings are gated.
+    """
+    evidence, at, config = at_a_slope(order)
+    free = free_of(evidence, config, ALL)
+    kinds = {one.key.rpartition(".")[2] if one.fit != "noise" else one.key.split(".")[2] for one in free}
+    plant = {"time_constant_ms"} if order == 1 else {"natural_frequency_rad_s", "damping"}
+    assert kinds >= {"sd_mm", "drift_mm_rts", "delay_ms", "intercept", "gain_recovery_ms", "latency_ms", *plant}
+    assert (np.concatenate(at.value.outcomes) == pf.Outcome.GATED).any()
+    bare, found = evidence.slopes(config, free, at.value.outcomes), slopes(evidence, at, free)
+    steep = 0
+    for number, one in enumerate(free):
+        here, step = one.coordinate(one.get(config)), 1e-4 if one.log else 2e-5
+        up, down = (
+            point(evidence, moved(config, [one], [here + sign * step]), free, at.value.outcomes) for sign in (1, -1)
+        )
+        sd = 1.0 / np.sqrt(found.information[number, number])
+        within = 0.01 / sd
+        wanted = (up.value.total - down.value.total) / (2.0 * step)
+        assert bare.score[number] == pytest.approx(wanted, rel=1e-3, abs=within), one.key
+        with_prior = (up.height - down.height) / (2.0 * step)
+        assert found.score[number] == pytest.approx(with_prior, rel=1e-3, abs=within), one.key
+        steep += abs(wanted) * sd > 1.0
+    assert steep > 0.6 * len(free)
+
+
+def test_scores_at_the_truth_have_the_information_as_their_covariance() -> None:
+    """Over 60 simulated runs the scores, whitened by each run's information, have mean 0 and covariance 1.
+
+    Gates off. Σ |z|² is chi-square with 60 k degrees of freedom and each mean normal; the bands hold 99.9 % (each
+    mean's by Bonferroni). The scores of noises are skewed, for which the band of the sum is half as wide again.
+    """
+    whitened = list[np.ndarray]()
+    found = scenario("panel-tracker-outage", 0.1, 0.02)
+    process = {
+        axis: pf.Process(input_noise=2e-4, drift=8e-4, maneuver_noise=2e-3, maneuver_drift=0.01) for axis in AXES
+    }
+    for seed in range(60):
+        sim = pf.simulate(replaced(found, process=process), seed)
+        config = with_sensors(sim.config, gate=0.0)
+        evidence = Evidence([sim.run], config)
+        free = free_of(evidence, config, ALL, "tracker.latency_ms")  # it is told together with the delays
+        told = evidence.slopes(config, free, evidence.value(config).outcomes)
+        information = told.information
+        np.testing.assert_allclose(information, information.T, rtol=1e-12, atol=1e-9)
+        whitened.append(np.linalg.solve(np.linalg.cholesky(information), told.score))
+    z = np.array(whitened)
+    runs, count = z.shape
+    assert count >= 18
+    low, high = (chi2.ppf(p, runs * count) / (runs * count) for p in (0.0005, 0.9995))
+    assert 1.0 - 1.5 * (1.0 - low) < np.mean(z**2) < 1.0 + 1.5 * (high - 1.0)
+    assert np.abs(z.mean(axis=0)).max() * np.sqrt(runs) < 4.2
+
+
+def test_what_a_number_does_not_touch_has_no_slope() -> None:
+    """Parameters of one axis and of another know nothing of each other."""
+    evidence, at, config = at_a_slope(1)
+    free = free_of(evidence, config, ALL)
+    information = evidence.slopes(config, free, at.value.outcomes).information
+    for i, one in enumerate(free):
+        for j, other in enumerate(free):
+            if None not in (one.axis, other.axis) and one.axis != other.axis:
+                assert information[i, j] == 0.0
+
+
+# ---- what readings say without a filter -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02])
+def test_scatter_is_the_noise_whatever_the_motion(share: float) -> None:
+    """From one reading to the next, on a swing of 50 mm: to 8 %, and to 20 % with 2 % of wild readings."""
+    rng = np.random.default_rng(3)
+    time = np.arange(3000) * 0.01
+    swing = 0.05 * np.sin(2.0 * time)
+    noise = {"tracker": 0.05e-3, "camera": 0.4e-3}
+    wild = (rng.random(len(time)) < share) * rng.choice([-0.02, 0.02], len(time))
+    read = {name: (time, {"radial": swing + sd * rng.standard_normal(len(time)) + wild}) for name, sd in noise.items()}
+    run = pf.Run.from_arrays(time[::3], {"radial": swing[::3]}, read)
+    arm = pf.ArmModel.load("puma560-internal")
+    evidence = Evidence([run], pf.FusionConfig(arm=arm, sensors={name: pf.Sensor(sd=7.0) for name in noise}))
+    wanted = {f"sensors.{name}.sd_mm.radial": sd for name, sd in noise.items()}
+    assert evidence.scatter == pytest.approx(wanted, rel=0.2 if share else 0.08)
+
+
+def test_the_arms_own_answer_is_the_superposition_of_its_responses() -> None:
+    """What a sensor would read of an arm without noise, as the oracle superposes it; scale, start and delays too."""
+    case = CASES["axes and missing values"]
+    run, config = case.made()
+    evidence = Evidence([run], config)
+    answers = evidence.answers(config, centred=False)
+    assert {name for name, _ in answers} == set(case.heard)
+    for (name, axis), (answer, seen) in answers.items():
+        oracle = AxisOracle(run, config, axis)
+        mine = [reading for reading in oracle.readings if reading.sensor == name]
+        position, _ = oracle.undisturbed(np.array([reading.valid for reading in mine]))
+        np.testing.assert_allclose(answer, config.sensors[name].scale * position, atol=1e-12)
+        assert seen.tolist() == [reading.value for reading in mine]
+
+
+def test_travel_is_how_far_commands_go() -> None:
+    """From the start level on, the farthest of the runs."""
+    time = np.arange(5) * 0.028
+    runs = [
+        pf.Run.from_arrays(time, {"radial": 0.5 + 0.01 * np.arange(5)}, start={"radial": 0.45}),
+        pf.Run.from_arrays(time, {"radial": 0.5 - 0.015 * np.arange(5), "vertical": np.zeros(5)}),
+    ]
+    evidence = Evidence(runs, pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal")))
+    assert evidence.travel == pytest.approx({"radial": 0.09, "vertical": 0.0})

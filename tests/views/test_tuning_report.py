@@ -17,6 +17,7 @@ import pumafuse as pf
 from outline import outline
 from pumafuse.errors import PumafuseWarning
 from pumafuse.fusion.consistency import consistency, densities_of
+from pumafuse.fusion.timeline import Outcome
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
 from pumafuse.tune.profile import Profile, profiles
@@ -179,16 +180,22 @@ def with_sd(config: pf.FusionConfig, sd: float, gate: float) -> pf.FusionConfig:
     return msgspec.structs.replace(config, sensors={"camera": pf.Sensor(sd=sd, gate=gate)})
 
 
-def test_panels_show_profile_interval_and_the_number_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A panel for each number: the curve through the profile's points, the interval shaded, a tick at what it was or an arrow."""
-    figures: list[Figure] = []
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that were saved, kept to look into them."""
+    kept: list[Figure] = []
     save = Figure.savefig
 
     def keep(figure: Figure, *args: object, **more: object) -> None:
-        figures.append(figure)
+        kept.append(figure)
         save(figure, *args, **more)
 
     monkeypatch.setattr(Figure, "savefig", keep)
+    return kept
+
+
+def test_panels_show_profile_interval_and_the_number_before(figures: list[Figure]) -> None:
+    """A panel for each: a curve through the profile, the interval shaded, a tick at what it was or an arrow to it."""
     found, _ = tuned()
     tuning_figures.profiles(list(drawn(found).values()), fitted(found))
     panels = {axes.get_title(loc="left").replace("\n", "."): axes for axes in figures[0].axes if axes.get_visible()}
@@ -205,6 +212,23 @@ def test_panels_show_profile_interval_and_the_number_before(monkeypatch: pytest.
         arrows = [text.get_text() for text in axes.texts]
         within = one.before < profile.values[-1]
         assert (ticks, arrows) == (([one.before], []) if within else ([], [f"{one.before:.4g} →"]))
+
+
+def test_innovations_are_shown_before_and_after_on_one_scale(figures: list[Figure]) -> None:
+    """Those that were fused, over what was expected of them; and the autocorrelations of both."""
+    found, run = tuned()
+    pair = [pf.fuse(run, config) for config in (found.before, found.config)]
+    tuning_figures.innovations(*pair, "camera", "tip")
+    *series, correlation = figures[0].axes
+    for axes, est in zip(series, pair, strict=True):
+        fused = est.readings.where(est.readings.outcome == Outcome.FUSED)
+        (dots,) = axes.lines
+        np.testing.assert_array_equal(dots.get_xdata(), fused.time)
+        np.testing.assert_array_equal(dots.get_ydata(), fused.innovation / fused.innovation_sd)
+    assert series[0].get_ylim() == series[1].get_ylim()
+    bars = [bar.get_height() for bars in correlation.containers for bar in bars]
+    tests = [consistency(est, "camera", "tip") for est in pair]
+    np.testing.assert_array_equal(bars, np.concatenate([one.correlation for one in tests if one is not None]))
 
 
 def test_what_is_said_of_innovations_is_what_the_filter_says() -> None:

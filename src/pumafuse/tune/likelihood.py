@@ -101,6 +101,7 @@ class Evidence:
         axes: All commanded axes, in their order.
         heard: For each axis the sensors with readings of it.
         count: How many scalars each axis has, (A,).
+        notes: Every anomaly of the runs, a sentence each.
     """
 
     def __init__(
@@ -126,7 +127,11 @@ class Evidence:
             PumafuseError: A run and the configuration do not fit together.
         """
         chosen = config.sensor_names(sensors)
-        built = [build(part, config, chosen) for run in runs for part in segments(in_axes(run, config.frame)[0])[0]]
+        named = [(run.name, part) for run in runs for part in segments(in_axes(run, config.frame)[0])[0]]
+        built = [build(part, config, chosen) for _, part in named]
+        self.notes = [
+            f"run '{name}': {note}" for (name, _), timeline in zip(named, built, strict=True) for note in timeline.notes
+        ]
         self.config = config
         self.axes = ordered_axes({axis.name for timeline in built for axis in timeline.axes})
         parts = [_kept(timeline, until, latest) for timeline in built]

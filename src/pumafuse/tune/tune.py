@@ -13,6 +13,7 @@ from ..arrays import NO_STAMP
 from ..errors import PumafuseWarning
 from ..fusion.config import FusionConfig
 from ..model.arm import AxisModel
+from ..runs.clock import segments
 from ..runs.run import Run
 from .diagnose import at_bound
 from .intervals import Sure, sureness
@@ -108,6 +109,7 @@ def tune(
             sure |= sureness(lesson.evidence, lesson.best, lesson.free)
     except KeyboardInterrupt:
         interrupted = True
+        course.keep_the_better()
     tuned = _with_provenance(course.result(), sure, [run.name for run in runs])
     summary = TuningSummary(
         pumafuse=version("pumafuse"),
@@ -150,6 +152,12 @@ class _Course:
             again = lesson.again(self.runs, self.best, self._following("learning from the whole run"))
             self.lessons[number], self.best = again, again.best.config
 
+    def keep_the_better(self) -> None:
+        """Of where the search was and the configuration as given: it may have been on its way from a poor start."""
+        evidence, best = Evidence(self.runs, self.config), with_gates_of(self.best, self.config)
+        if evidence.value(best).total < evidence.value(self.config).total:
+            self.best = self.config
+
     def result(self) -> FusionConfig:
         """The best configuration: gates as they were, rounded, and without the noise that is worth nothing."""
         best = with_gates_of(self.best, self.config)
@@ -185,8 +193,10 @@ def _syllabi(config: FusionConfig, kinds: Sequence[Fit], hold: Sequence[str], te
     return [Syllabus(arm, hold, [teacher]), Syllabus(others, hold, None, of_others)]
 
 
-def _held_back(run: Run) -> float:
-    """From when on a single run is held back [s after the first command]."""
+def _held_back(run: Run) -> float | None:
+    """From when on a single run is held back [s after the first command]; None where its clock was set back."""
+    if len(segments(run)[0]) > 1:
+        return None
     stamp = run.command.stamp[run.command.stamp != NO_STAMP]
     return _LEARNT * float(stamp.max() - stamp.min()) / 1e9
 
@@ -225,14 +235,14 @@ def _with_provenance(config: FusionConfig, sure: Mapping[str, Sure], runs: Seque
 
 
 def _notes(course: _Course, validation: Sequence[Check] | None, interrupted: bool) -> list[str]:
-    found = [note for lesson in course.lessons for note in lesson.notes]
+    found = [note for lesson in course.lessons for note in (*lesson.evidence.notes, *lesson.notes)]
     if interrupted:
         found.append(
             "interrupted: these are the best numbers until then, and not all of them were asked how sure they are"
         )
     elif validation is None:
         found.append(
-            "several runs and none to validate on (--validate RUN): nothing says whether the numbers hold elsewhere"
+            "nothing was held back to validate on (--validate RUN): nothing says whether the numbers hold elsewhere"
         )
     found += [f"{one.run}, {one.axis}: {one.verdict}" for one in validation or () if one.worse]
     return list(dict.fromkeys(found))

@@ -18,7 +18,7 @@ from ..tune.summary import Fitted
 from . import style
 from .sheet import drawing
 
-_COLUMNS = 6  # of profiles
+_COLUMNS = 5  # of profiles
 _WIDTH = 11.0  # inch; as wide as a page
 _TITLE = 32  # letters over a panel
 _TICKS = 3
@@ -82,7 +82,7 @@ def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
     axes.yaxis.set_major_locator(FixedLocator([-4.0, -2.0, 0.0]))
     axes.tick_params(labelsize=8)
     parts = one.key.split(".")
-    axes.set_title("\n".join(_cut(".".join(half)) for half in (parts[:2], parts[2:])), loc="left", fontsize=7.5)
+    axes.set_title("\n".join(_cut(".".join(half)) for half in (parts[:2], parts[2:])), loc="left", fontsize=8)
 
 
 def _smooth(one: Profile) -> tuple[FloatArray, FloatArray]:
