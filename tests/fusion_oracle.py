@@ -244,7 +244,7 @@ class AxisOracle:
             return (sd * w).astype(float), sd.astype(float)
 
     def jointly(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (m,) and covariance (m, m) of all readings before any is known, noise and all; latencies must be sure."""
+        """Mean (m,) and covariance (m, m) of all readings before any is known, with their noise; latencies are sure."""
         assert not self.jumps
         rows = self._readings_as_rows(self.readings)
         sensors = [self.config.sensors[reading.sensor] for reading in self.readings]

@@ -20,8 +20,8 @@ from pumafuse.fusion.consistency import consistency, densities_of
 from pumafuse.fusion.timeline import Outcome
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
+from pumafuse.tune.climb import climb
 from pumafuse.tune.profile import Profile, profiles
-from pumafuse.tune.search import climb
 from pumafuse.tune.summary import Fitted
 from pumafuse.views import style, tuning_figures
 from pumafuse.views.tuning_report import page

@@ -18,8 +18,8 @@ from .. import folders
 from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..runs.run import Run
+from ..tune.climb import Point
 from ..tune.parameters import check_holds, kinds_of
-from ..tune.search import Point
 from ..tune.summary import Fitted, TuningSummary
 from ..tune.tune import Tuning, tune
 from ..tune.validate import Check

@@ -10,9 +10,9 @@ import numpy as np
 
 from ..fusion.config import FusionConfig
 from ..units import MM
+from .climb import Point
 from .likelihood import Evidence
 from .parameters import is_held
-from .search import Point
 
 _GAIN = 3.0  # log-likelihood that a bias must be worth; its prior's width has been paid for in it
 _TRIED = (1e-3, 1e-2, 1e-1)  # m, widths of the prior

@@ -9,9 +9,9 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
+from .climb import Point, slopes
 from .likelihood import Evidence
 from .parameters import Parameter
-from .search import Point, slopes
 
 _ENOUGH = 0.02  # log-likelihood to which a profile is followed
 _SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which the profile is followed

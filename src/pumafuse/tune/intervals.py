@@ -13,10 +13,10 @@ from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..fusion.ticks import usable_cores
 from ..model.plants import Interval
+from .climb import Point, climb, moved, point, slopes
 from .diagnose import at_bound, covariance
 from .likelihood import Evidence
 from .parameters import Parameter
-from .search import Point, climb, moved, point, slopes
 
 _ENOUGH = 0.02  # log-likelihood to which a profile is followed
 _SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which the profile is followed

@@ -11,15 +11,16 @@ from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..runs.run import Run
 from .biases import far_off, slightly_off
+from .climb import Point, Tell, point, settle
 from .diagnose import Tie, untold, untold_noise
 from .learnable import moving
 from .likelihood import Evidence
 from .parameters import FARTHEST_LATENCY, Fit, Parameter, parameters
-from .search import Point, Tell, point, search, settle
+from .search import search
 
 _GATE = 5.0  # with which a sensor without a gate is learnt from: outliers must not teach
 _TIES = 8  # combinations of which one number each is held, at most
-_ENDLESS = 30.0  # large changes in a row that the readings would not notice
+_ENDLESS = 3.0  # large changes in a row that the readings would not notice
 _AT_REST = ("input_noise_mm_rtHz", "drift_mm_rts", "sd_mm")  # what an axis that does not move still tells
 
 

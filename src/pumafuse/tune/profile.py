@@ -12,16 +12,15 @@ import numpy as np
 from ..arrays import CodeArray, FloatArray
 from ..fusion.config import FusionConfig
 from ..fusion.ticks import usable_cores
+from .climb import Point, climb, moved, point
 from .diagnose import at_bound
 from .intervals import _View, _views  # pyright: ignore[reportPrivateUsage]
 from .lesson import Lesson
 from .likelihood import Evidence
 from .parameters import Parameter
-from .search import Point, climb, moved, point
 from .summary import Fitted
 
-_SIDE = 6  # points on each side of the best, of which the fourth is the end of the interval
-_BEYOND = 1.5  # how far they go, as a multiple of the interval
+_SHARES = (0.3, 0.65, 1.0, 1.5)  # of the way from the best to an end of the interval, where the points are
 _ENOUGH = 0.3  # log-likelihood to which the ridge is climbed there
 
 
@@ -144,9 +143,9 @@ def _side(ridge: _Ridge, best: float, end: float, log: bool) -> list[tuple[float
     if math.isclose(end, best):
         return []
     one = ridge.mine[0]
-    shares = np.linspace(0.0, _BEYOND, _SIDE + 1)[1:]
+    shares = np.array(_SHARES)
     values = best * (end / best) ** shares if log else best + (end - best) * shares
-    within = (values >= one.bounds[0]) & (values <= one.bounds[1]) | np.isclose(shares, 1.0)
+    within = (values >= one.bounds[0]) & (values <= one.bounds[1]) | (shares == 1.0)
     bend = ridge.bend(one.coordinate(end))
     return [
         (value, ridge.at(ridge.straight(one.coordinate(value)) + bend * share**2).height)

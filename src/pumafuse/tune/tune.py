@@ -15,13 +15,14 @@ from ..fusion.config import FusionConfig
 from ..model.arm import AxisModel
 from ..runs.clock import segments
 from ..runs.run import Run
+from .climb import Point
 from .diagnose import at_bound
 from .intervals import Sure, sureness
 from .learnable import TuneError
 from .lesson import Lesson, Syllabus, learn
 from .likelihood import Evidence
 from .parameters import Fit, Parameter, check_holds, kinds_of
-from .search import Point, with_gates_of
+from .search import with_gates_of
 from .summary import Likelihood, TuningSummary, biases, correlated, fitted, told
 from .validate import Check, check
 

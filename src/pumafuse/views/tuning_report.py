@@ -146,11 +146,12 @@ def _says_parameters(summary: TuningSummary) -> str:
     known = [one for one in summary.parameters if one.before is not None]
     outside = sum(not _holds(one.ci95, one.before) for one in known if one.before is not None)
     none = sum(one.value == 0.0 for one in summary.parameters)
+    limitless = not summary.interrupted and any(None in one.ci95 for one in summary.parameters)
     return (
         f"{len(summary.parameters)} numbers were fitted, each in the unit that its name ends with. {outside} of the"
         f" {len(known)} that were there before lay outside the interval that the readings leave them"
         + (f"; {none} turned out to be none (0)." if none else ".")
-        + " An end marked … is not limited by the readings."
+        + (" An end marked … is not limited by the readings." if limitless else "")
     )
 
 
