@@ -10,6 +10,7 @@ from typing import TypeVar
 import msgspec
 
 import pumafuse as pf
+from pumafuse.simulate.scenario import Outliers
 from pumafuse.tune.intervals import Sure, sureness
 from pumafuse.tune.lesson import Lesson, Syllabus, learn
 from pumafuse.tune.likelihood import Evidence
@@ -28,6 +29,19 @@ def scenario(name: str, width: float | None = None, height: float | None = None,
     sizes = {"width": width, "height": height}
     trajectory = replaced(found.trajectory, **{key: size for key, size in sizes.items() if size is not None})
     return replaced(found, trajectory=trajectory, **changes)
+
+
+def with_outliers(seed: int, share: float = 0.03) -> pf.Simulated:
+    """A camera on two axes for 4 seconds: some 105 rows, a few of them 5 to 20 mm off."""
+    found = scenario("panel-vision", 0.1, 0.02)
+    wild = Outliers(share=share, smallest=0.005, largest=0.02)
+    camera = replaced(found.sensors["vision"], outliers=wild, dropouts=0.0)
+    return pf.simulate(replaced(found, sensors={"vision": camera}), seed)
+
+
+def outage(seed: int) -> pf.Simulated:
+    """Tracker and camera on two axes for 4 seconds."""
+    return pf.simulate(scenario("panel-tracker-outage", 0.1, 0.02), seed)
 
 
 def with_sensors(config: pf.FusionConfig, *names: str, **changes: object) -> pf.FusionConfig:

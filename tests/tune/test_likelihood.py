@@ -17,9 +17,9 @@ from fusion_oracle import AxisOracle
 from pumafuse.fusion.consistency import densities_of, log_likelihood
 from pumafuse.runs.run import Source
 from pumafuse.simulate.scenario import Outliers
+from pumafuse.tune.climb import Point, moved, point, slopes
 from pumafuse.tune.likelihood import Evidence
 from pumafuse.tune.parameters import with_order
-from pumafuse.tune.climb import Point, moved, point, slopes
 from tuning import ALL, SCENARIOS, free_of, quietly, replaced, scenario, spoiled_arm, with_process, with_sensors
 
 DATA = Path(pf.__file__).parent / "data"

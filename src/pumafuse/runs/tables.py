@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from .. import units
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, UnknownNameError
 
+N = TypeVar("N", np.float64, np.int64)
 REACH_NS = 4.6e18  # |stamp| whose differences int64 ns can hold: the years 1824 to 2115
 
 
@@ -234,8 +236,19 @@ def _read_csv(path: Path) -> tuple[pa.Table, list[str]]:
 
 
 def _filled(column: pa.ChunkedArray) -> TimeArray:
-    return column.fill_null(NO_STAMP).to_numpy().astype(np.int64)
+    return _copied(column, np.int64, NO_STAMP)
 
 
 def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[np.float64]:
-    return column.to_numpy(zero_copy_only=False).astype(np.float64)
+    return _copied(column, np.float64, np.nan)
+
+
+def _copied(column: pa.ChunkedArray, kind: type[N], missing: float) -> npt.NDArray[N]:
+    """The numbers of a column of ``kind``, straight from memory: pyarrow's own way would import pandas (0.2 s)."""
+    whole = column.combine_chunks()
+    if not len(whole):
+        return np.empty(0, dtype=kind)
+    found = np.frombuffer(whole.buffers()[1], dtype=kind, count=len(whole), offset=whole.offset * 8).copy()
+    if whole.null_count:
+        found[np.from_dlpack(pc.is_null(whole).cast(pa.uint8())) > 0] = missing
+    return found

@@ -27,6 +27,7 @@ _ROUNDING = 1e-10  # of a matrix with a diagonal of 1, below which its eigenvalu
 _STUBBORN = 1e8  # damping at which no step will do
 _DOUBLES = (2.0, 4.0, 8.0)
 _SETTLING = 12  # times that the gates are asked again
+_BUMPS = tuple(sign * shift for shift in (2e-4, 5e-4, 1e-3, 2e-3) for sign in (-1.0, 1.0))  # s
 _SHARES = (1.0, 0.5, 0.2)
 _REACH = 1.5  # longest step of a coordinate, in its scale
 
@@ -182,6 +183,7 @@ def settle(evidence: Evidence, start: FusionConfig, free: Sequence[Parameter], t
     """
     apart = all(not sensor.gate_rows for sensor in start.sensors.values())
     best = climb_apart(evidence, start, free, tell, _ENOUGH) if apart else climb(evidence, start, free, tell)
+    best = _past_bumps(evidence, best, free, tell)
     for _ in range(_SETTLING):
         peak = climb(evidence, best.config, free, outcomes=best.value.outcomes)
         at = np.array([one.coordinate(one.get(best.config)) for one in free])
@@ -195,6 +197,21 @@ def settle(evidence: Evidence, start: FusionConfig, free: Sequence[Parameter], t
         best = trial
         tell(best)
     return best
+
+
+def _past_bumps(evidence: Evidence, best: Point, free: Sequence[Parameter], tell: Tell) -> Point:
+    """Over the small bumps that the likelihood has in a time, where readings pass commands and each other."""
+    times = [one for one in free if one.fit in ("delay", "latency")]
+    for one in times:
+        at = one.coordinate(one.get(best.config))
+        beside = max((point(evidence, one.move(best.config, at + shift), free) for shift in _BUMPS), key=_height)
+        if beside.height > best.height + _ENOUGH:
+            best = climb(evidence, beside.config, free, tell)
+    return best
+
+
+def _height(found: Point) -> float:
+    return found.height
 
 
 def moved(config: FusionConfig, free: Sequence[Parameter], coordinates: Iterable[float]) -> FusionConfig:

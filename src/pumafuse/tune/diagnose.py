@@ -68,17 +68,11 @@ def correlations(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> 
     ]
 
 
-def untold(evidence: Evidence, best: Point, free: Sequence[Parameter], worth: float = 1.0) -> Tie | None:
+def untold(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> Tie | None:
     """The combination of delays, latencies, plants and gains that the readings tell least, if they do not tell it.
 
     They do not where its standard deviation, without any prior, is more than a large change of it: a factor e, a tick
     of 28 ms, a tenth of the gain. The one to hold is a latency first, that of the sensor with the least noise.
-
-    Args:
-        evidence: The readings.
-        best: Where.
-        free: What may move.
-        worth: So many large changes are too many.
     """
     inside = [one for one in free if at_bound(one, best.config) is None]
     arm = [number for number, one in enumerate(inside) if one.fit != "noise"]
@@ -88,7 +82,7 @@ def untold(evidence: Evidence, best: Point, free: Sequence[Parameter], worth: fl
     cov = covariance(found.information, inside)[np.ix_(arm, arm)]
     scale = np.array([inside[number].scale for number in arm])
     values, vectors = np.linalg.eigh(cov / np.outer(scale, scale))
-    if values[-1] < worth**2:
+    if values[-1] < 1.0:
         return None
     weight = np.abs(vectors[:, -1])
     order = [int(place) for place in np.argsort(-weight) if weight[place] > _MEMBER * weight.max()]

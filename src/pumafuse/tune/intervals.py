@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -21,10 +21,9 @@ from .parameters import Parameter
 _ENOUGH = 0.02  # log-likelihood to which a profile is followed
 _SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which the profile is followed
 _SKEWED_FOR_ALL = 0.2  # likewise of a number of all axes, whose profile takes ten times as long
-_STEPS = 8  # of a profile towards its end
+_STEPS = 12  # of a profile towards its end
 _CLOSE = 0.03  # relative, of √(2 drop)
-_HALVINGS = 16
-_POWER = 3.0  # of a noise, between those with which the likelihood drops where it is small (4) and large (2)
+_HALVINGS = 60
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class Sure:
 
 
 @dataclass(frozen=True)
-class _View:
+class View:
     """What bears on the numbers of one axis, or of all.
 
     Attributes:
@@ -70,7 +69,7 @@ def sureness(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> dict
     Gates make the likelihood jump; the intervals are those of the peak that it has while the outcomes stay as they are.
     """
     best = climb(evidence, best.config, free, outcomes=best.value.outcomes)
-    views = _views(evidence, best, [one for one in free if at_bound(one, best.config) is None])
+    views = views_of(evidence, best, free)
 
     def of(one: Parameter) -> Sure:
         view = views[one.axis]
@@ -84,8 +83,9 @@ def sureness(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> dict
         return dict(zip([one.key for one in free], pool.map(of, free), strict=True))
 
 
-def _views(evidence: Evidence, best: Point, inside: Sequence[Parameter]) -> Mapping[str | None, _View]:
-    """For each axis what bears on it alone, and under None everything."""
+def views_of(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> Mapping[str | None, View]:
+    """For each axis what bears on it alone, and under None, where a number is of all axes, everything."""
+    inside = [one for one in free if at_bound(one, best.config) is None]
     shared = [one for one in inside if one.axis is None]
     own = {axis: [one for one in inside if one.axis == axis] for axis in evidence.axes}
     alone = {axis: (evidence.alone(axis), evidence.outcomes_of(axis, best.value.outcomes)) for axis in evidence.axes}
@@ -93,7 +93,7 @@ def _views(evidence: Evidence, best: Point, inside: Sequence[Parameter]) -> Mapp
         axis: _told_of_shared(part.slopes(best.config, [*own[axis], *shared], outcomes).information, len(own[axis]))
         for axis, (part, outcomes) in (alone.items() if shared else ())
     }
-    views: dict[str | None, _View] = {}
+    views: dict[str | None, View] = {}
     for axis, (part, outcomes) in alone.items():
         elsewhere = sum((told[other] for other in told if other != axis), np.zeros(len(shared)))
         priors = [
@@ -101,7 +101,7 @@ def _views(evidence: Evidence, best: Point, inside: Sequence[Parameter]) -> Mapp
             for one, told_of in zip(shared, elsewhere, strict=True)
         ]
         views[axis] = _view(part, outcomes, best, [*own[axis], *priors])
-    if shared:
+    if any(one.axis is None for one in free):
         views[None] = _view(evidence, best.value.outcomes, best, inside)
     return views
 
@@ -113,11 +113,11 @@ def _told_of_shared(information: FloatArray, own: int) -> FloatArray:
     return np.diag(information[own:, own:] - across.T @ inner @ across)
 
 
-def _view(evidence: Evidence, outcomes: Sequence[CodeArray], best: Point, free: Sequence[Parameter]) -> _View:
+def _view(evidence: Evidence, outcomes: Sequence[CodeArray], best: Point, free: Sequence[Parameter]) -> View:
     if not free:
-        return _View(evidence, outcomes, free, np.zeros((0, 0)))
+        return View(evidence, outcomes, free, np.zeros((0, 0)))
     there = point(evidence, best.config, free, outcomes)
-    return _View(evidence, outcomes, free, covariance(slopes(evidence, there, free).information, free))
+    return View(evidence, outcomes, free, covariance(slopes(evidence, there, free).information, free))
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class _End:
     open: bool
 
 
-def _end(view: _View, best: Point, one: Parameter, sign: float) -> _End:
+def _end(view: View, best: Point, one: Parameter, sign: float) -> _End:
     """The lower (−1) or upper (+1) end of an interval."""
     place = [other.key for other in view.free].index(one.key)
     others = [other for other in view.free if other.key != one.key]
@@ -135,61 +135,98 @@ def _end(view: _View, best: Point, one: Parameter, sign: float) -> _End:
     along = sign * view.covariance[:, place] / np.sqrt(view.covariance[place, place])  # how all move for one sd of it
     low, high = np.array([other.range for other in view.free]).T
     top = point(view.evidence, best.config, view.free, view.outcomes).height
-    reach = Z95
-    limit = (high[place] - at[place]) / along[place] if along[place] > 0.0 else (low[place] - at[place]) / along[place]
-    profiled = False
-    for _ in range(_STEPS):
-        reach = min(reach, limit)
+    limit = float(((high if along[place] > 0.0 else low)[place] - at[place]) / along[place])
+
+    def curvature(reach: float) -> float:
         there = moved(best.config, view.free, np.clip(at + reach * along, low, high))
-        if profiled:
-            peak = climb(view.evidence, there, others, outcomes=view.outcomes, enough=_ENOUGH)
-            height = peak.height + _prior_of(one, there)
-            along = (np.array([other.coordinate(other.get(peak.config)) for other in view.free]) - at) / reach
+        return _root(top - point(view.evidence, there, view.free, view.outcomes).height)
+
+    def profile(reach: float) -> float:
+        nonlocal along
+        there = moved(best.config, view.free, np.clip(at + reach * along, low, high))
+        peak = climb(view.evidence, there, others, outcomes=view.outcomes, enough=_ENOUGH)
+        along = (np.array([other.coordinate(other.get(peak.config)) for other in view.free]) - at) / reach
+        return _root(top - peak.height - _prior_of(one, there))
+
+    skewed = _SKEWED if one.axis else _SKEWED_FOR_ALL
+    if limit > Z95 and abs((curvature(Z95) / Z95) ** 2 - 1.0) < skewed:
+        return _End(float(at[place] + Z95 * along[place]), profiled=False, open=False)
+    unit = float(along[place])
+    reach, beyond = _crossing(profile, min(Z95, limit), limit)
+    return _End(float(at[place] + reach * unit), profiled=True, open=beyond)
+
+
+def _from_the_bound(view: View, best: Point, one: Parameter) -> Sure:
+    """The interval of a parameter at a bound: from there to where the profile has dropped by 1.92.
+
+    It begins where the likelihood has dropped as far with the others held, which is too near.
+    """
+    every = [*view.free, one]
+    bound, (low, high) = one.coordinate(one.get(best.config)), one.range
+    upwards, span = bound < 0.5 * (low + high), high - low
+    top, along = point(view.evidence, best.config, every, view.outcomes).height, best.config
+
+    def place(distance: float) -> float:
+        """The coordinate so far from the bound; of a noise that may be none, far in the noise itself."""
+        if one.vanishes:
+            return one.coordinate(one.bounds[0] + distance)
+        return bound + (distance if upwards else -distance)
+
+    def held(distance: float) -> float:
+        there = point(view.evidence, one.move(best.config, place(distance)), every, view.outcomes)
+        return _root(top - there.height)
+
+    def profile(distance: float) -> float:
+        nonlocal along
+        peak = climb(view.evidence, one.move(along, place(distance)), view.free, outcomes=view.outcomes, enough=_ENOUGH)
+        along = peak.config
+        return _root(top - peak.height - _prior_of(one, along))
+
+    limit = one.bounds[1] - one.bounds[0] if one.vanishes else span
+    first = limit
+    for _ in range(_HALVINGS):
+        if held(first) < Z95:
+            break
+        first *= 0.5
+    distance, beyond = _crossing(profile, first, limit)
+    end = one.value(place(distance))
+    if upwards:
+        return Sure((one.bounds[0], end), True, "least", (True, beyond))
+    return Sure((end, one.bounds[1]), True, "greatest", (beyond, True))
+
+
+def _root(drop: float) -> float:
+    """What a drop of the likelihood is in standard deviations, were it a parabola."""
+    return float(np.sqrt(2.0 * max(drop, 1e-9)))
+
+
+def _crossing(root: Callable[[float], float], first: float, limit: float) -> tuple[float, bool]:
+    """How far a root of the drop is 1.96, and whether that is beyond the limit; ``first`` is where to begin.
+
+    Bracketed, then by its logarithm, which is nearly a line over that of the distance.
+    """
+    below, above, at = (0.0, 0.0), (np.inf, np.inf), first
+    for _ in range(_STEPS):
+        found = root(at)
+        if abs(found / Z95 - 1.0) < _CLOSE:
+            break
+        if found < Z95:
+            if at >= limit:
+                return limit, True
+            below = (at, found)
         else:
-            height = point(view.evidence, there, view.free, view.outcomes).height
-        root = float(np.sqrt(2.0 * max(top - height, 1e-9)))
-        if (
-            not profiled
-            and abs((root / reach) ** 2 - 1.0) < (_SKEWED if one.axis else _SKEWED_FOR_ALL)
-            and reach < limit
-        ):
-            break
-        if profiled and (abs(root / Z95 - 1.0) < _CLOSE or (reach >= limit and root < Z95)):
-            break
-        if profiled:
-            reach *= min(max(Z95 / root, 0.4), 3.0)
-        profiled = True
-    return _End(float(at[place] + reach * along[place]), profiled, bool(reach >= limit))
+            above = (at, found)
+        if above[0] == np.inf:
+            at = min(at * min(max(Z95 / found, 1.2), 4.0), limit)
+        elif below[0] == 0.0:
+            at *= max(Z95 / found, 0.1)
+        else:
+            share = np.log(Z95 / below[1]) / np.log(above[1] / below[1])
+            at = float(below[0] * (above[0] / below[0]) ** min(max(share, 0.1), 0.9))
+    return at, False
 
 
 def _prior_of(one: Parameter, config: FusionConfig) -> float:
     if one.prior is None:
         return 0.0
     return -0.5 * ((one.coordinate(one.get(config)) - one.prior[0]) / one.prior[1]) ** 2
-
-
-def _from_the_bound(view: _View, best: Point, one: Parameter) -> Sure:
-    """The interval of a parameter at a bound: from there to where the profile has dropped by 1.92.
-
-    The others stay at first, which drops faster; then they move, and the end goes on as a power of the distance says.
-    """
-    every = [*view.free, one]
-    bound, (low, high) = one.coordinate(one.get(best.config)), one.range
-    upwards = bound < 0.5 * (low + high)
-    top, enough = point(view.evidence, best.config, every, view.outcomes).height, 0.5 * Z95**2
-    near, far = (low, high) if upwards else (high, low)
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (near + far)
-        held = point(view.evidence, one.move(best.config, middle), every, view.outcomes)
-        near, far = (middle, far) if top - held.height < enough else (near, middle)
-    end, along = near, best.config
-    for _ in range(_STEPS):
-        there = climb(view.evidence, one.move(along, end), view.free, outcomes=view.outcomes, enough=_ENOUGH)
-        drop, along = top - there.height - _prior_of(one, there.config), there.config
-        if abs(np.sqrt(max(drop, 0.0) / enough) - 1.0) < _CLOSE or end == far:
-            break
-        change = np.log(enough / max(drop, 0.02 * enough)) / _POWER
-        end = float(np.clip(end + (change if upwards else -change) * (1.0 if one.log else abs(end - bound)), low, high))
-    if upwards:
-        return Sure((one.bounds[0], one.value(end)), True, "least", (True, False))
-    return Sure((one.value(end), one.bounds[1]), True, "greatest", (False, True))

@@ -20,7 +20,6 @@ from .search import search
 
 _GATE = 5.0  # with which a sensor without a gate is learnt from: outliers must not teach
 _TIES = 8  # combinations of which one number each is held, at most
-_ENDLESS = 3.0  # large changes in a row that the readings would not notice
 _AT_REST = ("input_noise_mm_rtHz", "drift_mm_rts", "sd_mm")  # what an axis that does not move still tells
 
 
@@ -101,7 +100,7 @@ def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: 
 
     if "latency" in syllabus.fit and "delay" in syllabus.fit:
         # All latencies less and all delays more by as much is the same, wherever the search goes.
-        tie = untold(evidence, point(evidence, begin, ()), free(begin), _ENDLESS)
+        tie = untold(evidence, point(evidence, begin, ()), free(begin))
         ties += [tie] if tie is not None and tie.held.endswith("latency_ms") else []
     best, orders = search(evidence, begin, free, tell)
     if "noise" in syllabus.fit:

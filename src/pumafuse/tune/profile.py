@@ -13,8 +13,7 @@ from ..arrays import CodeArray, FloatArray
 from ..fusion.config import FusionConfig
 from ..fusion.ticks import usable_cores
 from .climb import Point, climb, moved, point
-from .diagnose import at_bound
-from .intervals import _View, _views  # pyright: ignore[reportPrivateUsage]
+from .intervals import View, views_of
 from .lesson import Lesson
 from .likelihood import Evidence
 from .parameters import Parameter
@@ -59,7 +58,7 @@ def profiles(lesson: Lesson, fitted: Sequence[Fitted]) -> list[Profile]:
     """
     ci95 = {one.key: one.ci95 for one in fitted}
     best = climb(lesson.evidence, lesson.best.config, lesson.free, outcomes=lesson.best.value.outcomes)
-    views = _views(lesson.evidence, best, [one for one in lesson.free if at_bound(one, best.config) is None])
+    views = views_of(lesson.evidence, best, lesson.free)
 
     def of(one: Parameter) -> Profile:
         return _profile(_ridge(views[one.axis], best, one), ci95[one.key])
@@ -112,7 +111,7 @@ class _Ridge:
         return np.append(0.0, np.array([one.coordinate(one.get(there)) for one in others]) - straight[1:])
 
 
-def _ridge(view: _View, best: Point, one: Parameter) -> _Ridge:
+def _ridge(view: View, best: Point, one: Parameter) -> _Ridge:
     keys = [other.key for other in view.free]
     mine = [one, *(other for other in view.free if other.key != one.key)]
     line = np.zeros(len(mine))

@@ -15,13 +15,14 @@ from ..fusion.config import FusionConfig
 from ..fusion.consistency import consistency, densities_of
 from ..fusion.estimates import Estimates
 from ..fusion.offline import fuse
-from ..fusion.score import Z95, score
+from ..fusion.score import Z95, interpolated, score
 from ..fusion.timeline import Outcome
 from ..fusion.track import AxisEstimate
 from ..runs.run import Run
 from ..units import MM
 
 _WORSE = 1.02  # RMSE after over before
+_BATCHES = 20
 
 
 class SensorCheck(msgspec.Struct, frozen=True, kw_only=True):
@@ -119,7 +120,8 @@ def _axis(run: str, axis: str, since: float, before: Estimates, after: Estimates
     old, new, gains = _state(before, axis), _state(after, axis), _gains(before, after, axis)
     gained, chance = float(gains.sum()), Z95 * float(np.sqrt(np.sum(gains**2)))
     closer = None if old.rmse_mm is None or new.rmse_mm is None else new.rmse_mm / max(old.rmse_mm, 1e-12)
-    worse = gained < -chance or (closer is not None and closer > _WORSE)
+    farther = closer is not None and closer > _WORSE and _beyond_chance(_squares(after, axis) - _squares(before, axis))
+    worse = gained < -chance or farther
     said = f"log-likelihood {gained:+.1f} (chance: ± {chance:.1f})"
     if closer is not None:
         said += f", RMSE {100.0 * (closer - 1.0):+.1f} %"
@@ -134,6 +136,19 @@ def _axis(run: str, axis: str, since: float, before: Estimates, after: Estimates
         worse=worse,
         verdict=verdict,
     )
+
+
+def _squares(est: Estimates, axis: str) -> FloatArray:
+    """Squared errors on the reference [m²], NaN where it says nothing, (n,)."""
+    if est.reference is None:
+        return np.zeros(len(est.time))
+    return (est[axis].position - interpolated(est.time, est.segment, est.reference, axis)) ** 2
+
+
+def _beyond_chance(growth: FloatArray) -> bool:
+    """Whether a mean is above 0 by more than chance; neighbours go together, so means of batches are compared."""
+    means = [float(batch.mean()) for batch in np.array_split(growth[np.isfinite(growth)], _BATCHES) if len(batch)]
+    return float(np.mean(means)) > Z95 * float(np.std(means, ddof=1)) / np.sqrt(len(means)) if len(means) > 1 else True
 
 
 def _gains(before: Estimates, after: Estimates, axis: str) -> FloatArray:
