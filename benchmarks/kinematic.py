@@ -29,7 +29,7 @@ REOPEN_SPAN = REOPEN_SPAN_NS / 1e9
 REST = (0.01, 0.1)  # m/s and m/s²: how well they know that the arm begins at rest; wider priors cost them up to 0.5 %
 ORDERS = {"velocity": 2, "acceleration": 3}  # what is constant, and how many states the motion takes
 
-# Where the search for the greatest likelihood begins: all of a grid are tried, the best are followed downhill.
+# Where a search begins: all of a grid are tried, the best are followed downhill.
 DENSITIES = np.log(10.0) * np.arange(-5.0, 4.01, 0.5)  # logarithms of the random walk's
 SDS = np.log([0.3, 1.0, 3.0])  # and of the sensors' sds over the configured ones
 STARTS = 4
@@ -193,8 +193,7 @@ class Axis:
         def cost(numbers: Array) -> float:
             return -self.follow(order, numbers)[1]
 
-        grid = [np.concatenate(([q], np.log(self.sds) + sd)) for q, sd in product(DENSITIES, SDS)]
-        return min((descend(cost, start) for start in sorted(grid, key=cost)[:STARTS]), key=cost)
+        return self._search(cost)
 
     def closest(self, order: int, likeliest: Array) -> Array:
         """The numbers of the least error, which only the truth can tell; gates make many valleys, so by evolution."""
@@ -205,7 +204,11 @@ class Axis:
 
         bounds = [(DENSITIES[0], DENSITIES[-1]), *((math.log(sd / REACH), math.log(sd * REACH)) for sd in self.sds)]
         evolved = differential_evolution(rmse_mm, bounds, popsize=12, maxiter=60, polish=False, rng=1).x
-        return min((descend(rmse_mm, start) for start in (likeliest, evolved)), key=rmse_mm)
+        return self._search(rmse_mm, likeliest, evolved)
+
+    def _search(self, cost: Callable[[Array], float], *also: Array) -> Array:
+        grid = [np.concatenate(([q], np.log(self.sds) + sd)) for q, sd in product(DENSITIES, SDS)]
+        return min((descend(cost, start) for start in (*also, *sorted(grid, key=cost)[:STARTS])), key=cost)
 
 
 def descend(cost: Callable[[Array], float], start: Array) -> Array:

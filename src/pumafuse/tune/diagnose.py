@@ -107,5 +107,5 @@ def _noise_of(one: Parameter, config: FusionConfig) -> float:
     """The least noise of the sensor that a latency is of [m]."""
     if one.fit != "latency":
         return 0.0
-    sd = config.sensors[one.key.split(".")[1]].sd
+    sd = config.sensors[one.key.removeprefix("sensors.").removesuffix(".latency_ms")].sd
     return min(sd.values()) if isinstance(sd, dict) else sd

@@ -21,7 +21,6 @@ from .parameters import RECOVERY, Parameter, with_axis_of, with_lag, with_order
 
 _ROUGHLY = 0.1  # log-likelihood that is not worth another step where peaks are only compared
 _WIDER = 3.0
-_STARTS = ((_WIDER, 1), (1.0, 1))  # how many to climb from with gates so many times as wide
 _DELAYS = np.linspace(-0.060, 0.060, 13)  # s, from the configured
 _LATENCIES = np.linspace(-0.100, 0.300, 41)  # s, likewise
 _LAGS = (1.0, 0.5, 1.8)  # starts, times the configured; a delay can be taken for a lag and a lag for a delay
@@ -96,41 +95,26 @@ def _shifted(config: FusionConfig, times: Sequence[Parameter], shift: float) -> 
 
 
 def _noise_first(evidence: Evidence, config: FusionConfig, free: Sequence[Parameter], tell: Tell) -> FusionConfig:
-    """The best noise that can be climbed to from the best starts, each axis for itself."""
+    """The best noise that can be climbed to from the best start, with wide gates or without, each axis for itself."""
     noise = [one for one in free if one.fit == "noise"]
     if not noise:
         return config
-    peaks = [
-        climb_apart(
-            evidence,
-            with_gates_of(climb_apart(evidence, start, noise, tell, _ROUGHLY).config, config),
-            noise,
-            tell,
-            _ROUGHLY,
-        )
-        for gates, count in _STARTS
-        for start in _best_starts(evidence, _with_gates(config, gates), noise, count)
-    ]
+    peaks: list[Point] = []
+    for times in (_WIDER, 1.0):
+        start = _best_start(evidence, _with_gates(config, times), noise)
+        foot = climb_apart(evidence, start, noise, tell, _ROUGHLY).config
+        peaks.append(climb_apart(evidence, with_gates_of(foot, config), noise, tell, _ROUGHLY))
     return _best_of_each(evidence, peaks, [peak.heights for peak in peaks])
 
 
-def _best_starts(
-    evidence: Evidence, config: FusionConfig, noise: Sequence[Parameter], count: int
-) -> list[FusionConfig]:
+def _best_start(evidence: Evidence, config: FusionConfig, noise: Sequence[Parameter]) -> FusionConfig:
     """The most likely of many starts, each axis for itself."""
     starts = [
         point(evidence, _with_noise(config, process, sds, noise), noise)
         for process in (config.process, *_processes(evidence, config))
         for sds in ({}, evidence.scatter)
     ]
-    ranked = np.argsort([-start.heights for start in starts], axis=0)
-    found: list[FusionConfig] = []
-    for rank in range(count):
-        best = config
-        for number, axis in enumerate(evidence.axes):
-            best = with_axis_of(best, starts[int(ranked[rank, number])].config, axis)
-        found.append(best)
-    return found
+    return _best_of_each(evidence, starts, [start.heights for start in starts])
 
 
 def _processes(evidence: Evidence, config: FusionConfig) -> list[dict[str, Process]]:
