@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import msgspec
 
@@ -16,7 +16,7 @@ from .diagnose import Tie, untold, untold_noise
 from .learnable import moving
 from .likelihood import Evidence
 from .parameters import FARTHEST_LATENCY, Fit, Parameter, parameters
-from .search import search
+from .search import Free, search
 
 _GATE = 5.0  # with which a sensor without a gate is learnt from: outliers must not teach
 _TIES = 8  # combinations of which one number each is held, at most
@@ -46,7 +46,9 @@ class Lesson:
 
     Attributes:
         syllabus: What was to be learnt.
+        known: What was known before.
         evidence: From these readings.
+        active: The axes that move.
         best: The most likely configuration.
         free: What was fitted.
         ties: What the readings could not tell, so that one number of each was held.
@@ -55,22 +57,14 @@ class Lesson:
     """
 
     syllabus: Syllabus
+    known: FusionConfig
     evidence: Evidence
+    active: Sequence[str]
     best: Point
     free: Sequence[Parameter]
-    ties: Sequence[Tie] = ()
-    orders: dict[str, str] = field(default_factory=dict[str, str])
-    notes: Sequence[str] = ()
-
-    def again(self, runs: Sequence[Run], start: FusionConfig, tell: Tell) -> Lesson:
-        """The same lesson from other readings, without a new search: from ``start`` to the nearest maximum."""
-        evidence = _evidence(runs, self.evidence.config, self.syllabus, None)
-        keys = {one.key for one in self.free}
-        free = [
-            one for one in parameters(start, self.evidence.config, evidence.heard, self.syllabus.fit) if one.key in keys
-        ]
-        best = settle(evidence, start, free, tell)
-        return Lesson(self.syllabus, evidence, best, free, self.ties, self.orders, self.notes)
+    ties: Sequence[Tie]
+    orders: dict[str, str]
+    notes: Sequence[str]
 
 
 def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: float | None, tell: Tell) -> Lesson:
@@ -92,12 +86,7 @@ def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: 
     if "noise" in syllabus.fit:
         begin, notes = far_off(evidence, begin, syllabus.hold)
     ties: list[Tie] = []
-
-    def free(at: FusionConfig) -> list[Parameter]:
-        held = [*syllabus.hold, *(tie.held for tie in ties)]
-        found = parameters(at, config, evidence.heard, syllabus.fit, held)
-        return [one for one in found if syllabus.may(one) and (one.axis is None or one.axis in active or _rests(one))]
-
+    free = _free(syllabus, config, evidence, active, ties)
     if "latency" in syllabus.fit and "delay" in syllabus.fit:
         # All latencies less and all delays more by as much is the same, wherever the search goes.
         tie = untold(evidence, point(evidence, begin, ()), free(begin))
@@ -106,16 +95,7 @@ def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: 
     if "noise" in syllabus.fit:
         biased, more = slightly_off(evidence, best, syllabus.hold)
         best, notes = (settle(evidence, biased, free(biased), tell), [*notes, *more]) if more else (best, notes)
-    while len(ties) < _TIES and (tie := untold(evidence, best, free(best.config))) is not None:
-        held = next(one for one in free(best.config) if one.key == tie.held)
-        ties.append(tie)
-        best = settle(evidence, _as_configured(held, best.config, config), free(best.config), tell)
-    for one in untold_noise(evidence, best, free(best.config)):
-        others = [other for other in free(best.config) if other.key != one.key]
-        held = settle(evidence, _as_configured(one, best.config, config), others)
-        if held.height > best.height - 0.5 * Z95**2:
-            ties.append(Tie((one.key,), one.key))
-            best = held
+    best = _told_apart(evidence, best, free, config, ties, tell)
     notes += [
         f"{axis}: does not move; only its noise at rest was learnt" for axis in evidence.axes if axis not in active
     ]
@@ -124,7 +104,45 @@ def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: 
         for name, sensor in config.sensors.items()
         if sensor.gate == 0.0 and any(name in heard for heard in evidence.heard.values())
     ]
-    return Lesson(syllabus, evidence, best, free(best.config), ties, orders, notes)
+    return Lesson(syllabus, config, evidence, active, best, free(best.config), ties, orders, notes)
+
+
+def again(lesson: Lesson, runs: Sequence[Run], start: FusionConfig, tell: Tell) -> Lesson:
+    """The same lesson from more readings, without a new search: from ``start`` to the nearest maximum."""
+    evidence = _evidence(runs, lesson.evidence.config, lesson.syllabus, None)
+    ties = [tie for tie in lesson.ties if tie.held.endswith("latency_ms")]
+    free = _free(lesson.syllabus, lesson.known, evidence, lesson.active, ties)
+    best = settle(evidence, start, free(start), tell)
+    best = _told_apart(evidence, best, free, lesson.known, ties, tell)
+    return replace(lesson, evidence=evidence, best=best, free=free(best.config), ties=ties)
+
+
+def _free(
+    syllabus: Syllabus, known: FusionConfig, evidence: Evidence, active: Sequence[str], ties: Sequence[Tie]
+) -> Free:
+    """What may move: as the syllabus says, without what is held because of ``ties`` by then."""
+
+    def free(at: FusionConfig) -> list[Parameter]:
+        held = [*syllabus.hold, *(tie.held for tie in ties)]
+        found = parameters(at, known, evidence.heard, syllabus.fit, held)
+        return [one for one in found if syllabus.may(one) and (one.axis is None or one.axis in active or _rests(one))]
+
+    return free
+
+
+def _told_apart(evidence: Evidence, best: Point, free: Free, known: FusionConfig, ties: list[Tie], tell: Tell) -> Point:
+    """The best point with one number held of each combination that the readings do not tell; ``ties`` has them then."""
+    while len(ties) < _TIES and (tie := untold(evidence, best, free(best.config))) is not None:
+        held = next(one for one in free(best.config) if one.key == tie.held)
+        ties.append(tie)
+        best = settle(evidence, _as_configured(held, best.config, known), free(best.config), tell)
+    for one in untold_noise(evidence, best, free(best.config)):
+        others = [other for other in free(best.config) if other.key != one.key]
+        held = settle(evidence, _as_configured(one, best.config, known), others)
+        if held.height > best.height - 0.5 * Z95**2:
+            ties.append(Tie((one.key,), one.key))
+            best = held
+    return best
 
 
 def _as_configured(one: Parameter, config: FusionConfig, known: FusionConfig) -> FusionConfig:

@@ -19,7 +19,7 @@ from .climb import Point
 from .diagnose import at_bound
 from .intervals import Sure, sureness
 from .learnable import TuneError
-from .lesson import Lesson, Syllabus, learn
+from .lesson import Lesson, Syllabus, again, learn
 from .likelihood import Evidence
 from .parameters import Fit, Parameter, check_holds, kinds_of
 from .search import with_gates_of
@@ -150,8 +150,8 @@ class _Course:
     def repeat(self) -> None:
         """All lessons once more, from all readings."""
         for number, lesson in enumerate(self.lessons):
-            again = lesson.again(self.runs, self.best, self._following("learning from the whole run"))
-            self.lessons[number], self.best = again, again.best.config
+            more = again(lesson, self.runs, self.best, self._following("learning from the whole run"))
+            self.lessons[number], self.best = more, more.best.config
 
     def keep_the_better(self) -> None:
         """Of where the search was and the configuration as given: it may have been on its way from a poor start."""
