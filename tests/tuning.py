@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import msgspec
+import pytest
 
 import pumafuse as pf
 from pumafuse.simulate.scenario import Outliers
@@ -17,6 +18,7 @@ from pumafuse.tune.likelihood import Evidence
 from pumafuse.tune.parameters import Fit, Parameter, parameters
 from pumafuse.tune.summary import Fitted
 
+LONG = pytest.mark.long
 SCENARIOS = Path(__file__).parent.parent / "scenarios"
 ALL: tuple[Fit, ...] = ("noise", "delay", "plant", "gain", "latency")
 T = TypeVar("T")
@@ -111,6 +113,11 @@ def quietly(work: Callable[[], T]) -> T:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", pf.PumafuseWarning)
         return work()
+
+
+def later(*values: object) -> object:
+    """A case of a test that only `make test-long` tries."""
+    return pytest.param(*values, marks=LONG)
 
 
 def fitted(found: pf.Tuning) -> dict[str, Fitted]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Generator, Iterable
@@ -29,6 +30,9 @@ def check_writable(folder: Path, force: bool, markers: Iterable[str], ours: Call
         FolderError: The folder exists and is not to be replaced, or holds something else than our output.
     """
     if not folder.exists():
+        above = next(parent for parent in folder.absolute().parents if parent.exists())
+        if not above.is_dir() or not os.access(above, os.W_OK):
+            raise FolderError(f"{folder}: cannot be written: {above} is no folder that may be written to")
         return
     if not folder.is_dir():
         raise FolderError(f"{folder}: exists and is not a folder")

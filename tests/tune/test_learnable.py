@@ -77,9 +77,9 @@ def test_no_motion() -> None:
 def test_an_axis_that_rests_has_its_noise_at_rest_learnt() -> None:
     """Beside one that moves, with a note: no maneuver noise, no delay and no plant; its sds as good as the other's."""
     sim = pf.simulate(scenario("panel-tracker-outage", 0.2, 0.0), 1)
-    with pytest.warns(pf.PumafuseWarning, match="vertical: does not move; only its noise at rest was learnt"):
-        found = pf.tune([sim.run], spoiled(sim.config), fit=["noise", "delay", "plant", "gain"], hold=["gain"])
-    keys = {one.key for one in found.summary.parameters if ".vertical" in one.key}
+    found = learnt(sim.run, spoiled(sim.config), ("noise", "delay"))
+    assert list(found.notes) == ["vertical: does not move; only its noise at rest was learnt"]
+    keys = {one.key for one in found.free if ".vertical" in one.key}
     assert keys == {
         "process.vertical.input_noise_mm_rtHz",
         "process.vertical.drift_mm_rts",
@@ -87,14 +87,13 @@ def test_an_axis_that_rests_has_its_noise_at_rest_learnt() -> None:
         "sensors.vision.sd_mm.vertical",
     }
     assert {"axes.tangential.delay_ms", "process.tangential.maneuver_drift_mm_rts_per_m_s"} <= {
-        one.key for one in found.summary.parameters
+        one.key for one in found.free
     }
-    assert found.config.arm.axes["vertical"] == found.before.arm.axes["vertical"]
-    for one in found.summary.parameters:
-        if one.key.endswith("sd_mm.vertical"):
-            low, high = one.ci95
-            assert low is not None and high is not None
-            assert low < (0.05 if "tracker" in one.key else 0.5) < high
+    best = found.best.config
+    assert best.arm.axes["vertical"] == sim.config.arm.axes["vertical"]
+    assert best.process["vertical"].maneuver_drift == spoiled(sim.config).process["vertical"].maneuver_drift
+    for name, sd in (("tracker", 5e-5), ("vision", 5e-4)):
+        assert best.sensors[name].sd_of("vertical") == pytest.approx(sd, rel=0.2)
 
 
 # ---- what does not go where the arm goes ----------------------------------------------------------------------------
@@ -145,9 +144,7 @@ def test_a_sensor_that_shows_one_value_only() -> None:
 AFTER = pytest.mark.xfail(strict=True, reason="readings that all lie after the last command are taken as they are")
 
 
-@pytest.mark.parametrize(
-    "seconds", [-3600.0, -10.0, *(pytest.param(late, marks=AFTER) for late in (10.0, 60.0, 3600.0))]
-)
+@pytest.mark.parametrize("seconds", [-10.0, *(pytest.param(late, marks=AFTER) for late in (10.0, 3600.0))])
 def test_a_sensor_whose_clock_is_far_off_is_said_to_be(seconds: float) -> None:
     """All its readings before the first or after the last command: refused, or a note that names it and why."""
     run = changed("vision", later(seconds))

@@ -11,11 +11,13 @@ import pytest
 import pumafuse as pf
 from pumafuse.simulate.scenario import Outliers, TrueSensor
 from pumafuse.tune.intervals import Sure
-from pumafuse.tune.lesson import Lesson, Syllabus, learn
+from pumafuse.tune.lesson import Lesson, Syllabus, again, learn
 from pumafuse.tune.likelihood import Evidence
 from pumafuse.tune.parameters import with_order
+from pumafuse.tune.summary import told
 from tuning import (
     SCENARIOS,
+    later,
     learnt,
     outage,
     quietly,
@@ -46,7 +48,7 @@ def wrong_latency(seed: int, width: float = 0.1) -> tuple[Lesson, Sure]:
     return found, sure_of(found)["sensors.vision.latency_ms"]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, later(2), later(3)])
 def test_a_wrong_latency_is_found(seed: int) -> None:
     """45 ms within 4 ms from 9, by some 105 rows; its 95 % interval holds it and is at most 16 ms wide."""
     found, sure = wrong_latency(seed)
@@ -78,7 +80,7 @@ def test_latencies_far_beyond_a_tick_are_found() -> None:
         assert found.best.config.sensors["vision"].latency == pytest.approx(0.045, abs=0.004)
 
 
-@pytest.mark.parametrize("believed", [0.008, 0.020, -0.004])
+@pytest.mark.parametrize("believed", [0.020, later(0.008), later(-0.004)])
 def test_delay_and_latency_together_hold_one_latency(believed: float) -> None:
     """That of the sensor with the least noise, named with the delays and the other latency, and left as configured.
 
@@ -115,7 +117,7 @@ def test_a_latency_that_is_held_tells_the_delays() -> None:
 # ---- gains ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("fit", [("noise", "gain"), ("noise", "delay", "plant", "gain")], ids="-".join)
+@pytest.mark.parametrize("fit", [("noise", "gain"), later(("noise", "delay", "plant", "gain"))], ids="-".join)
 def test_a_gain_of_one_does_not_run_away(fit: Sequence[str]) -> None:
     """With K = 1 nothing recovers: each axis's recovery is held and named, its number stays as it was configured.
 
@@ -124,18 +126,19 @@ def test_a_gain_of_one_does_not_run_away(fit: Sequence[str]) -> None:
     arm = outage(1).config.arm
     flat = {axis: replaced(model, gain=pf.Gain(slope=0.0, intercept=1.0)) for axis, model in arm.axes.items()}
     sim = pf.simulate(scenario("panel-tracker-outage", 0.1, 0.02, arm=replaced(arm, axes=flat)), 1)
-    found = quietly(lambda: pf.tune([sim.run], spoiled(sim.config), fit=fit))
+    found = learnt(sim.run, spoiled(sim.config), fit)
+    sentences = [told(tie) for tie in found.ties]
     for axis in AXES:
-        model = found.config.arm.axes[axis]
+        model = found.best.config.arm.axes[axis]
         assert model.gain_recovery == 0.1
-        assert any(line.startswith(f"axes.{axis}.gain_recovery_ms is held: ") for line in found.summary.held)
+        assert any(line.startswith(f"axes.{axis}.gain_recovery_ms is held: ") for line in sentences)
         assert model.gain.intercept == pytest.approx(1.0, abs=0.06)
-        assert found.config.arm.delay_of(axis) == pytest.approx(0.06045, abs=0.003)
-    assert all("readings do not tell it" in line for line in found.summary.held)
-    fitted = {one.key for one in found.summary.parameters}
-    assert not [key for key in fitted if key.endswith("gain_recovery_ms")]
+        assert found.best.config.arm.delay_of(axis) == pytest.approx(0.06045, abs=0.003)
+    assert all("readings do not tell it" in line for line in sentences)
+    assert not [key for key in numbers(found) if key.endswith("gain_recovery_ms")]
 
 
+@pytest.mark.long
 def test_a_gain_is_found_where_it_shows() -> None:
     """K = 1.6 that recovers in 60 ms, told to be 1.3 and 200 ms: both within 10 and 25 %."""
     found = scenario("panel-tracker-outage", 0.1, 0.02)
@@ -149,16 +152,16 @@ def test_a_gain_is_found_where_it_shows() -> None:
         axis: replaced(model, gain=pf.Gain(slope=0.0, intercept=1.3), gain_recovery=0.2) for axis, model in axes.items()
     }
     known = replaced(sim.config, arm=replaced(sim.config.arm, axes=wrong))
-    told = numbers(learnt(sim.run, known, ("noise", "gain")))
+    values = numbers(learnt(sim.run, known, ("noise", "gain")))
     for axis in AXES:
-        assert told[f"axes.{axis}.gain.intercept"] == pytest.approx(1.6, rel=0.1)
-        assert told[f"axes.{axis}.gain_recovery_ms"] == pytest.approx(60.0, rel=0.25)
+        assert values[f"axes.{axis}.gain.intercept"] == pytest.approx(1.6, rel=0.1)
+        assert values[f"axes.{axis}.gain_recovery_ms"] == pytest.approx(60.0, rel=0.25)
 
 
 # ---- orders ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, later(2), later(3)])
 @pytest.mark.parametrize("begin", [1, 2])
 def test_the_order_of_a_plant_is_its_own(seed: int, begin: int) -> None:
     """By BIC: second for ω = 53.9 rad/s, ζ = 0.864, first for τ = 35.6 ms, whichever it was configured to be.
@@ -204,7 +207,7 @@ def camera(share: float, seed: int) -> tuple[pf.Run, pf.FusionConfig]:
     return sim.run, spoiled(sim.config)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, later(2), later(3)])
 def test_outliers_do_not_teach(seed: int) -> None:
     """1 % of readings 5 to 20 mm off leave the fitted sd within 3 % of the same run's without them.
 
@@ -216,13 +219,16 @@ def test_outliers_do_not_teach(seed: int) -> None:
     assert np.sum(np.abs(off) > 4.9e-3) == np.sum(off != 0.0) >= 1
     for gate in (5.0, 0.0):
         found = learnt(run, with_sensors(config, gate=gate))
+        assert found.best.config.sensors["vision"].gate == 5.0
         for axis in AXES:
             sd, wanted = (lesson.best.config.sensors["vision"].sd_of(axis) for lesson in (found, clean))
             assert sd == pytest.approx(wanted, rel=0.03)
-        note = "vision: has no gate (gate = 0); learnt with one of 5, so that outliers do not teach"
-        assert list(found.notes) == ([] if gate else [note])
-    tuned = quietly(lambda: pf.tune([run], with_sensors(config, gate=0.0)))
-    assert tuned.config.sensors["vision"].gate == 0.0 and note in tuned.summary.notes
+        assert len(found.notes) == (gate == 0.0)
+    tuned = quietly(lambda: pf.tune([run], with_sensors(config, gate=0.0), hold=["process"]))
+    assert tuned.config.sensors["vision"].gate == 0.0
+    assert [
+        note for note in tuned.summary.notes if note.startswith("vision: was learnt from with a gate of 5, not of 0")
+    ]
 
 
 def test_a_noise_that_the_readings_cannot_tell_is_held() -> None:
@@ -230,16 +236,16 @@ def test_a_noise_that_the_readings_cannot_tell_is_held() -> None:
 
     It stays as configured and is named, alone.
     """
-    found = scenario("panel-vision", 0.1, 0.02)
+    camera_alone = scenario("panel-vision", 0.1, 0.02)
     gauge = TrueSensor(rate=5.0, sd=4e-6)
-    sim = pf.simulate(replaced(found, sensors={**found.sensors, "gauge": gauge}), 1)
+    sim = pf.simulate(replaced(camera_alone, sensors={**camera_alone.sensors, "gauge": gauge}), 1)
     config = with_sensors(sim.config, "gauge", sd=5e-6)
-    told = learnt(sim.run, config)
+    found = learnt(sim.run, config)
     keys = [f"sensors.gauge.sd_mm.{axis}" for axis in AXES]
-    assert sorted(tie.held for tie in told.ties) == keys
-    assert all(tie.members == (tie.held,) for tie in told.ties)
-    assert all(told.best.config.sensors["gauge"].sd_of(axis) == 5e-6 for axis in AXES)
-    assert not set(keys) & set(numbers(told))
+    assert sorted(tie.held for tie in found.ties) == keys
+    assert all(tie.members == (tie.held,) for tie in found.ties)
+    assert all(found.best.config.sensors["gauge"].sd_of(axis) == 5e-6 for axis in AXES)
+    assert not set(keys) & set(numbers(found))
 
 
 def test_what_is_held_stays_to_the_last_bit_and_the_rest_moves() -> None:
@@ -263,8 +269,8 @@ def test_the_same_lesson_from_other_readings_ends_on_their_maximum() -> None:
     config = spoiled(sim.config)
     early = learn([sim.run], config, Syllabus(("noise",), ["tracker.sd_mm"]), 2.4, lambda _: None)
     assert early.evidence.count.sum() < Evidence([sim.run], config).count.sum()
-    again = early.again([sim.run], early.best.config, lambda _: None)
+    more = again(early, [sim.run], early.best.config, lambda _: None)
     whole = learnt(sim.run, config, ("noise",), "tracker.sd_mm")
-    assert [one.key for one in again.free] == [one.key for one in early.free] == [one.key for one in whole.free]
-    assert again.best.height == pytest.approx(whole.best.height, abs=0.1)
-    assert again.best.config.sensors["tracker"] == config.sensors["tracker"]
+    assert [one.key for one in more.free] == [one.key for one in early.free] == [one.key for one in whole.free]
+    assert more.best.height == pytest.approx(whole.best.height, abs=0.1)
+    assert more.best.config.sensors["tracker"] == config.sensors["tracker"]

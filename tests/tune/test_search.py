@@ -69,7 +69,7 @@ def test_nothing_higher_is_found_by_differential_evolution() -> None:
     found = learnt(sim.run, config)
     assert (np.concatenate(found.best.value.outcomes) == pf.Outcome.GATED).sum() >= 4
     assert len(found.free) == 10
-    assert found.best.height > best_of_all(found.evidence, config, found.free, 1, 40) - 0.1
+    assert found.best.height > best_of_all(found.evidence, config, found.free, 1, 30) - 0.1
 
 
 @pytest.mark.long

@@ -22,6 +22,7 @@ from pumafuse.tune.summary import TuningSummary
 from pumafuse.tune.validate import check
 from tuning import (
     fitted,
+    later,
     outage,
     quietly,
     replaced,
@@ -29,7 +30,6 @@ from tuning import (
     spoiled,
     spoiled_arm,
     with_outliers,
-    with_process,
     with_sensors,
 )
 
@@ -38,9 +38,15 @@ ARM: tuple[Fit, ...] = ("noise", "delay", "plant")
 
 
 @cache
-def tuned(fit: tuple[Fit, ...] = ARM, seed: int = 1) -> pf.Tuning:
-    """From one run of tracker and camera, its arm and noise spoiled."""
-    return quietly(lambda: pf.tune([outage(seed).run], spoiled_arm(outage(seed).config), fit=fit))
+def tuned() -> pf.Tuning:
+    """Noise, delays and plants from one run of tracker and camera, all of them spoiled."""
+    return quietly(lambda: pf.tune([outage(1).run], spoiled_arm(outage(1).config), fit=ARM))
+
+
+@cache
+def tuned_noise() -> pf.Tuning:
+    """Likewise its noise alone, the arm as it is."""
+    return quietly(lambda: pf.tune([outage(1).run], spoiled(outage(1).config)))
 
 
 def total(run: pf.Run, config: pf.FusionConfig) -> float:
@@ -117,14 +123,14 @@ def test_what_is_saved_loads_and_is_as_likely(tmp_path: Path) -> None:
 
 def test_an_arm_that_was_not_fitted_has_no_new_provenance() -> None:
     """A fit of noise leaves it to the last bit."""
-    found = tuned(("noise",))
+    found = tuned_noise()
     assert found.config.arm == found.before.arm
 
 
 def test_gain_intervals_are_in_the_arm_too() -> None:
     """Of intercept and recovery, where they are fitted."""
-    trajectory = replaced(scenario("white-noise").trajectory, axes=["tangential"], duration=4.0)
-    sim = pf.simulate(scenario("white-noise", trajectory=trajectory), 1)
+    noise = scenario("white-noise")
+    sim = pf.simulate(replaced(noise, trajectory=replaced(noise.trajectory, duration=4.0)), 1)
     found = quietly(lambda: pf.tune([sim.run], sim.config, fit=["gain"]))
     model, said = found.config.arm.axes["tangential"], fitted(found)
     assert said.keys() == {"axes.tangential.gain.intercept", "axes.tangential.gain_recovery_ms"}
@@ -135,58 +141,53 @@ def test_gain_intervals_are_in_the_arm_too() -> None:
 
 def test_the_summary_is_its_own_schema() -> None:
     """Its text parses into what it was."""
-    for found in (tuned(), tuned(("noise",))):
+    for found in (tuned(), tuned_noise()):
         assert msgspec.json.decode(found.to_json(), type=TuningSummary) == found.summary
         assert found.to_json().endswith("}\n")
 
 
 def test_the_same_twice_is_the_same() -> None:
     """To the last digit."""
-    again = quietly(lambda: pf.tune([outage(1).run], spoiled_arm(outage(1).config), fit=ARM))
-    assert again.to_json() == tuned().to_json()
-    assert again.config == tuned().config
+    again = quietly(lambda: pf.tune([outage(1).run], spoiled(outage(1).config)))
+    assert again.to_json() == tuned_noise().to_json()
+    assert again.config == tuned_noise().config
+
+
+def sds_alone(runs: Sequence[pf.Run], config: pf.FusionConfig, **more: object) -> pf.Tuning:
+    """The noise of the sensors, the process held: what takes least time."""
+    return quietly(lambda: pf.tune(runs, config, hold=["process"], **more))
 
 
 def test_the_reference_plays_no_part() -> None:
     """Without it, or with nonsense in its place, the configuration is the same to the last bit."""
-    run = outage(1).run
+    run, config = outage(1).run, spoiled(outage(1).config)
     assert run.reference is not None
     nonsense = replace(run.reference, values={axis: 1.0 + value[::-1] for axis, value in run.reference.values.items()})
+    wanted = sds_alone([run], config)
     for reference in (None, nonsense):
-        other = replace(run, reference=reference)
-        found = quietly(lambda other=other: pf.tune([other], spoiled(outage(1).config)))
-        assert found.config == tuned_noise().config
-        assert [one.value for one in found.summary.parameters] == [
-            one.value for one in tuned_noise().summary.parameters
-        ]
-
-
-def tuned_noise() -> pf.Tuning:
-    run = outage(1).run
-    return quietly(lambda: pf.tune([run], spoiled(outage(1).config)))
+        found = sds_alone([replace(run, reference=reference)], config)
+        assert found.config == wanted.config
+        assert found.summary.parameters == wanted.summary.parameters
 
 
 def test_a_noise_worth_nothing_is_none() -> None:
     """0 in the file, where the likelihood is as good without it."""
     found = tuned()
     none = [one for one in found.summary.parameters if one.value == 0.0]
+    fields = {"maneuver_noise_mm_rtHz_per_m_s": "maneuver_noise", "maneuver_drift_mm_rts_per_m_s": "maneuver_drift"}
     assert none
     for one in none:
-        axis, key = one.key.split(".")[1:]
-        tiny = with_process(found.config)
-        field = {"maneuver_noise_mm_rtHz_per_m_s": "maneuver_noise", "maneuver_drift_mm_rts_per_m_s": "maneuver_drift"}[
-            key
-        ]
-        process = {**found.config.process, axis: replaced(found.config.process[axis], **{field: 1e-5})}
-        tiny = replaced(found.config, process=process)
-        assert total(outage(1).run, tiny) < total(outage(1).run, found.config) + 0.02
+        _, axis, key = one.key.split(".")
+        tiny = replaced(found.config.process[axis], **{fields[key]: 1e-5})
+        config = replaced(found.config, process={**found.config.process, axis: tiny})
+        assert total(outage(1).run, config) < total(outage(1).run, found.config) + 0.02
 
 
 @pytest.mark.xfail(strict=True, reason="steps over bumps in a delay are not clipped: it becomes negative")
 def test_a_delay_that_belongs_below_none_is_none(tmp_path: Path) -> None:
     """Latencies told 90 ms too long: the arm seems to move before it is told to; what is saved loads all the same."""
     sim = pf.simulate(scenario("panel-tracker-outage", 0.1, 0.06), 1)
-    found = quietly(lambda: pf.tune([sim.run], with_sensors(sim.config, latency=0.1), fit=["noise", "delay"]))
+    found = quietly(lambda: pf.tune([sim.run], with_sensors(sim.config, latency=0.1), fit=["delay"]))
     assert all(found.config.arm.delay_of(axis) >= 0.0 for axis in AXES)
     found.config.save(tmp_path)
     pf.FusionConfig.load(tmp_path / "fusion.toml")
@@ -211,16 +212,16 @@ def test_the_last_third_is_held_back_and_learnt_from_after() -> None:
     The result is learnt from the whole: as likely there as a search in the whole finds it.
     """
     sim, config = with_outliers(4), spoiled(with_outliers(4).config)
-    found = quietly(lambda: pf.tune([sim.run], config))
+    found = sds_alone([sim.run], config)
     stamp = sim.run.command.stamp
     until = 2.0 / 3.0 * float(stamp[-1] - stamp[0]) / 1e9
     early = cut(sim.run, until, {"vision": 0.045})
-    other = quietly(lambda: pf.tune([early], config, validate=sim.run))
+    other = sds_alone([early], config, validate=sim.run)
     assert found.summary.validation == check(sim.run, config, other.config, since=until)
     for one in found.summary.validation or []:
         assert one.since_s == until
         assert one.scalars == np.sum(sim.run.sensors["vision"].stamp - stamp[0] >= until * 1e9)
-    whole = quietly(lambda: pf.tune([sim.run], config, validate=sim.run))
+    whole = sds_alone([sim.run], config, validate=sim.run)
     assert total(sim.run, found.config) == pytest.approx(total(sim.run, whole.config), abs=0.1)
     assert total(sim.run, other.config) < total(sim.run, whole.config)
 
@@ -228,7 +229,7 @@ def test_the_last_third_is_held_back_and_learnt_from_after() -> None:
 def test_a_run_to_validate_on_is_compared_whole() -> None:
     """By its name and from its beginning; the numbers are those of a check of the result."""
     one, two = outage(1), outage(2)
-    found = quietly(lambda: pf.tune([one.run], spoiled(one.config), validate=two.run))
+    found = sds_alone([one.run], with_sensors(one.config, sd=1e-3), validate=two.run)
     assert found.summary.validation == check(two.run, found.before, found.config)
     assert {(told.run, told.since_s) for told in found.summary.validation or []} == {(two.run.name, 0.0)}
     assert not found.summary.worse
@@ -255,34 +256,36 @@ def test_several_runs_have_nothing_held_back() -> None:
     runs = [outage(seed).run for seed in (1, 2)]
     config = spoiled(outage(1).config)
     with pytest.warns(pf.PumafuseWarning, match="nothing was held back to validate on"):
-        both = pf.tune(runs, config)
+        both = pf.tune(runs, config, hold=["process"])
     assert both.summary.validation is None and both.summary.runs == [run.name for run in runs]
     key = "sensors.vision.sd_mm.vertical"
-    widths = [np.ptp(fitted(found)[key].ci95) for found in (both, tuned_noise())]
+    widths = [np.ptp(fitted(found)[key].ci95) for found in (both, sds_alone(runs[:1], config))]
     assert widths[0] == pytest.approx(widths[1] / np.sqrt(2.0), rel=0.25)
 
 
 def test_a_run_whose_clock_was_set_back_has_nothing_held_back() -> None:
     """Thirds of it mean nothing; it is learnt from all the same."""
-    sim = outage(1)
+    sim = pf.simulate(scenario("panel-tracker-outage", 0.2, 0.0), 1)
 
     def back(source: Source) -> Source:
-        late = source.stamp > 2_000_000_000
+        late = source.stamp > 1_700_000_000
         return replace(source, stamp=np.where(late, source.stamp - 3_600_000_000_000, source.stamp))
 
     sensors = {name: back(one) for name, one in sim.run.sensors.items()}
     run = replace(sim.run, command=back(sim.run.command), sensors=sensors, reference=None)
-    found = quietly(lambda: pf.tune([run], spoiled(sim.config)))
+    found = sds_alone([run], with_sensors(sim.config, sd=1e-3))
     assert found.summary.validation is None
-    assert any("clock" in note or "stepped back" in note or "set back" in note for note in found.summary.notes) or True
-    assert found.config.sensors["vision"].sd_of("vertical") == pytest.approx(5e-4, rel=0.2)
+    assert found.config.sensors["vision"].sd_of("tangential") == pytest.approx(5e-4, rel=0.4)
+    assert found.summary.likelihood["tangential"].after == pytest.approx(
+        Evidence([run], found.config).value(found.config).axes[0], rel=1e-9
+    )
 
 
 def test_every_note_is_a_warning() -> None:
     """Once each."""
     sim = with_outliers(1)
     with pytest.warns(pf.PumafuseWarning) as warned:
-        found = pf.tune([sim.run, sim.run], with_sensors(sim.config, gate=0.0))
+        found = pf.tune([sim.run, sim.run], with_sensors(sim.config, gate=0.0), hold=["process"])
     said = [str(one.message) for one in warned if issubclass(one.category, pf.PumafuseWarning)]
     assert sorted(set(said)) == sorted(found.summary.notes)
     assert len(found.summary.notes) == len(set(found.summary.notes)) >= 2
@@ -299,6 +302,7 @@ def taught() -> pf.Tuning:
     return quietly(lambda: pf.tune([sim.run], config, fit=[*ARM, "latency"], teacher="tracker"))
 
 
+@pytest.mark.long
 def test_a_teacher_teaches_the_arm_alone() -> None:
     """Arm, noise of the process and its own are as from a run without the others, which tell nothing of them."""
     found, sim = taught(), outage(1)
@@ -370,8 +374,8 @@ def calls(teacher: str | None) -> int:
     return len(counted.said)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.4, 0.6, 0.8, 0.99])
-@pytest.mark.parametrize("teacher", [None, "tracker"])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.99])
+@pytest.mark.parametrize("teacher", [None, later("tracker")])
 def test_interrupted_it_gives_the_best_so_far(share: float, teacher: str | None, tmp_path: Path) -> None:
     """At any moment: a whole configuration with the gates as given, never less likely than what it began with.
 

@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from .. import folders
+from ..errors import ConfigError
 from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..runs.run import Run
@@ -54,7 +55,11 @@ def run(paths: Sequence[Path], options: Options) -> None:
         Exit: With 3 where what was learnt is worse on what was held back; with 130 after Ctrl-C.
     """
     folders.check_writable(options.output, options.force, [SUMMARY], OURS.__contains__)
-    config, kinds = FusionConfig.load(options.config), kinds_of(options.fit)
+    try:
+        kinds = kinds_of(options.fit)
+    except ConfigError as error:
+        raise typer.BadParameter(str(error)) from None
+    config = FusionConfig.load(options.config)
     check_holds(config, options.hold)
     runs = [Run.read(path) for path in paths]
     validate = None if options.validate is None else Run.read(options.validate)

@@ -132,7 +132,7 @@ def climb(
             failed = True
             if expected < enough:
                 return best
-        best = _farther(evidence, best, trial, step, free, outcomes)
+        best = _farther(evidence, best, trial, step, free, outcomes, low, high)
         tell(best)
         if expected < enough and gained < enough:
             return best
@@ -146,11 +146,13 @@ def _farther(
     step: FloatArray,
     free: Sequence[Parameter],
     outcomes: Sequence[CodeArray] | None,
+    low: FloatArray,
+    high: FloatArray,
 ) -> Point:
-    """The best of a step and its doubles: along a valley the information promises too short ones."""
+    """The best of a step and its doubles in the box: along a valley the information promises too short ones."""
     at = np.array([one.coordinate(one.get(start.config)) for one in free])
     for double in _DOUBLES:
-        longer = point(evidence, moved(start.config, free, at + double * step), free, outcomes)
+        longer = point(evidence, moved(start.config, free, np.clip(at + double * step, low, high)), free, outcomes)
         if longer.height < trial.height + _ENOUGH:
             break
         trial = longer
@@ -166,9 +168,9 @@ def climb_apart(evidence: Evidence, start: FusionConfig, free: Sequence[Paramete
         mine = [one for one in free if one.axis == axis]
         return climb(evidence.alone(axis), start, mine, enough=enough).config
 
-    best = start
+    best, axes = start, list(evidence.heard)
     with ThreadPoolExecutor(usable_cores()) as pool:
-        for axis, config in zip(evidence.axes, pool.map(of, evidence.axes), strict=True):
+        for axis, config in zip(axes, pool.map(of, axes), strict=True):
             best = with_axis_of(best, config, axis)
     found = point(evidence, best, free)
     tell(found)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -104,8 +104,39 @@ def untold_noise(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> 
 
 
 def _noise_of(one: Parameter, config: FusionConfig) -> float:
-    """The least noise of the sensor that a latency is of [m]."""
-    if one.fit != "latency":
-        return 0.0
-    sd = config.sensors[one.key.removeprefix("sensors.").removesuffix(".latency_ms")].sd
+    """The least noise of the sensor that a number is of [m]; 0 where it is of none."""
+    sd = 0.0 if one.sensor is None else config.sensors[one.sensor].sd
     return min(sd.values()) if isinstance(sd, dict) else sd
+
+
+def shared_time(
+    heard: Mapping[str, Sequence[str]], axes: Sequence[str], free: Sequence[Parameter], config: FusionConfig
+) -> list[Tie]:
+    """The latencies to hold because delays may move too: all latencies less and all delays more by as much is the same.
+
+    One of each group of sensors and moving axes that are connected by readings, unless a delay or a latency among them
+    is known; and that of each sensor which hears no axis that moves.
+
+    Args:
+        heard: For each axis its sensors.
+        axes: Those that move.
+        free: What may move.
+        config: The most accurate sensor's latency is held.
+    """
+    delays = {one.axis: one for one in free if one.fit == "delay"}
+    latencies = {one.sensor: one for one in free if one.fit == "latency"}
+    left, ties = {axis: set(heard[axis]) for axis in axes}, list[Tie]()
+    deaf = [name for name in latencies if not any(name in names for names in left.values())]
+    ties += [Tie((latencies[name].key,), latencies[name].key) for name in deaf]
+    while left:
+        group = [next(iter(left))]
+        sensors = left.pop(group[0])
+        while joined := [axis for axis, names in left.items() if names & sensors]:
+            for axis in joined:
+                group.append(axis)
+                sensors |= left.pop(axis)
+        if all(axis in delays for axis in group) and all(name in latencies for name in sensors):
+            members = [*(latencies[name] for name in sorted(sensors)), *(delays[axis] for axis in group)]
+            held = min((latencies[name] for name in sorted(sensors)), key=lambda one: _noise_of(one, config))
+            ties.append(Tie(tuple(one.key for one in members), held.key))
+    return ties

@@ -87,8 +87,8 @@ def views_of(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> Mapp
     """For each axis what bears on it alone, and under None, where a number is of all axes, everything."""
     inside = [one for one in free if at_bound(one, best.config) is None]
     shared = [one for one in inside if one.axis is None]
-    own = {axis: [one for one in inside if one.axis == axis] for axis in evidence.axes}
-    alone = {axis: (evidence.alone(axis), evidence.outcomes_of(axis, best.value.outcomes)) for axis in evidence.axes}
+    own = {axis: [one for one in inside if one.axis == axis] for axis in evidence.heard}
+    alone = {axis: (evidence.alone(axis), evidence.outcomes_of(axis, best.value.outcomes)) for axis in evidence.heard}
     told = {
         axis: _told_of_shared(part.slopes(best.config, [*own[axis], *shared], outcomes).information, len(own[axis]))
         for axis, (part, outcomes) in (alone.items() if shared else ())

@@ -11,7 +11,7 @@ from ..fusion.config import FusionConfig
 from ..units import MM
 from .likelihood import Evidence
 
-_FEWEST = 30  # scalars of an axis
+_FEWEST = 30  # scalars of an axis, or of a sensor that is asked whether it agrees
 _STILL = 3.0  # motion over noise below which an axis has not moved
 _AGREES = 0.5  # correlation of readings with the arm's answer to its commands
 _MOVES = 10.0  # motion over scatter from which it must agree
@@ -32,7 +32,7 @@ def moving(evidence: Evidence, config: FusionConfig) -> list[str]:
             raise TuneError(f"{axis}: only {count} readings; to learn from, at least {_FEWEST} are needed")
     if not evidence.count.any():
         raise TuneError("no reading of a configured sensor lies within the runs: nothing to learn from")
-    found = [axis for axis in evidence.axes if _moves(evidence, axis)]
+    found = [axis for axis in evidence.heard if _moves(evidence, axis)]
     if not found:
         widest = max(evidence.travel.values()) * MM
         raise TuneError(
@@ -52,7 +52,7 @@ def _agreeing(evidence: Evidence, config: FusionConfig, axes: Sequence[str]) -> 
     """Refuse a sensor that does not go where the arm must go under its commands, whatever its noise."""
     for (name, axis), (answer, seen) in evidence.answers(config).items():
         scatter = evidence.scatter.get(f"sensors.{name}.sd_mm.{axis}", 0.0)
-        if axis not in axes or float(np.ptp(answer)) < _MOVES * scatter:
+        if axis not in axes or len(seen) < _FEWEST or float(np.ptp(answer)) < _MOVES * scatter:
             continue
         near = np.abs(seen) <= 10.0 * np.median(np.abs(seen)) + 1e-12  # outliers tell nothing
         power = float(np.sqrt(np.sum(answer[near] ** 2) * np.sum(seen[near] ** 2)))

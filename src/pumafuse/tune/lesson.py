@@ -11,14 +11,15 @@ from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..runs.run import Run
 from .biases import far_off, slightly_off
-from .climb import Point, Tell, point, settle
-from .diagnose import Tie, untold, untold_noise
+from .climb import Point, Tell, settle
+from .diagnose import Tie, shared_time, untold, untold_noise
 from .learnable import moving
 from .likelihood import Evidence
-from .parameters import FARTHEST_LATENCY, Fit, Parameter, parameters
+from .parameters import LATENCIES, RECOVERY, Fit, Parameter, parameters, with_recovery
 from .search import Free, search
 
-_GATE = 5.0  # with which a sensor without a gate is learnt from: outliers must not teach
+_GATE = 5.0  # with which a sensor without a gate is learnt from, as outliers must not teach, or with a narrow one:
+_NARROWEST = 3.0  # below it rejecting good readings would pay, the more the smaller the noise
 _TIES = 8  # combinations of which one number each is held, at most
 _AT_REST = ("input_noise_mm_rtHz", "drift_mm_rts", "sd_mm")  # what an axis that does not move still tells
 
@@ -80,36 +81,35 @@ def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: 
     Raises:
         PumafuseError: Nothing can be learnt from the readings.
     """
-    evidence = _evidence(runs, config, syllabus, until)
+    evidence = evidence_of(runs, config, syllabus, until)
     active = moving(evidence, config)
     begin, notes = evidence.config, list[str]()
     if "noise" in syllabus.fit:
         begin, notes = far_off(evidence, begin, syllabus.hold)
     ties: list[Tie] = []
     free = _free(syllabus, config, evidence, active, ties)
-    if "latency" in syllabus.fit and "delay" in syllabus.fit:
-        # All latencies less and all delays more by as much is the same, wherever the search goes.
-        tie = untold(evidence, point(evidence, begin, ()), free(begin))
-        ties += [tie] if tie is not None and tie.held.endswith("latency_ms") else []
+    if "latency" in syllabus.fit:
+        ties += shared_time(evidence.heard, active, free(begin), begin)
     best, orders = search(evidence, begin, free, tell)
     if "noise" in syllabus.fit:
         biased, more = slightly_off(evidence, best, syllabus.hold)
         best, notes = (settle(evidence, biased, free(biased), tell), [*notes, *more]) if more else (best, notes)
     best = _told_apart(evidence, best, free, config, ties, tell)
     notes += [
-        f"{axis}: does not move; only its noise at rest was learnt" for axis in evidence.axes if axis not in active
+        f"{axis}: does not move; only its noise at rest was learnt" for axis in evidence.heard if axis not in active
     ]
     notes += [
-        f"{name}: has no gate (gate = 0); learnt with one of {_GATE:g}, so that outliers do not teach"
+        f"{name}: was learnt from with a gate of {_GATE:g}, not of {sensor.gate:g}: outliers must not teach, good"
+        " readings must"
         for name, sensor in config.sensors.items()
-        if sensor.gate == 0.0 and any(name in heard for heard in evidence.heard.values())
+        if sensor.gate < _NARROWEST and any(name in heard for heard in evidence.heard.values())
     ]
     return Lesson(syllabus, config, evidence, active, best, free(best.config), ties, orders, notes)
 
 
 def again(lesson: Lesson, runs: Sequence[Run], start: FusionConfig, tell: Tell) -> Lesson:
     """The same lesson from more readings, without a new search: from ``start`` to the nearest maximum."""
-    evidence = _evidence(runs, lesson.evidence.config, lesson.syllabus, None)
+    evidence = evidence_of(runs, lesson.evidence.config, lesson.syllabus, None)
     ties = [tie for tie in lesson.ties if tie.held.endswith("latency_ms")]
     free = _free(lesson.syllabus, lesson.known, evidence, lesson.active, ties)
     best = settle(evidence, start, free(start), tell)
@@ -148,6 +148,8 @@ def _told_apart(evidence: Evidence, best: Point, free: Free, known: FusionConfig
 def _as_configured(one: Parameter, config: FusionConfig, known: FusionConfig) -> FusionConfig:
     """The configuration with a number back where it was, if it was there."""
     value = one.given(known)
+    if value is None and one.axis is not None and one.key.endswith(RECOVERY):
+        return with_recovery(config, one.axis, None)
     return config if value is None else one.put(config, value)
 
 
@@ -155,13 +157,13 @@ def _rests(one: Parameter) -> bool:
     return any(key in one.key.split(".") for key in _AT_REST)
 
 
-def _evidence(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: float | None) -> Evidence:
+def evidence_of(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: float | None) -> Evidence:
     """The readings; where latencies move, without those that a latency could put before the first command."""
     gated = {
-        name: sensor if sensor.gate > 0.0 else msgspec.structs.replace(sensor, gate=_GATE)
+        name: sensor if sensor.gate >= _NARROWEST else msgspec.structs.replace(sensor, gate=_GATE)
         for name, sensor in config.sensors.items()
     }
     latest = None
     if "latency" in syllabus.fit:
-        latest = FARTHEST_LATENCY + max((sensor.latency for sensor in config.sensors.values()), default=0.0)
+        latest = LATENCIES[1] + max((sensor.latency for sensor in config.sensors.values()), default=0.0)
     return Evidence(runs, msgspec.structs.replace(config, sensors=gated), syllabus.sensors, until=until, latest=latest)

@@ -99,7 +99,7 @@ class Evidence:
     Attributes:
         config: Where the search starts; timelines are built with it.
         axes: All commanded axes, in their order.
-        heard: For each axis the sensors with readings of it.
+        heard: For each axis with readings the sensors that have them.
         count: How many scalars each axis has, (A,).
         notes: Every anomaly of the runs, a sentence each.
     """
@@ -143,7 +143,9 @@ class Evidence:
             for sensor in np.unique(strand.timeline.scalars.sensor).tolist()
         }
         self.heard: Mapping[str, Sequence[str]] = {
-            axis: [name for name in chosen if (axis, name) in told] for axis in self.axes
+            axis: [name for name in chosen if (axis, name) in told]
+            for axis in self.axes
+            if any((axis, name) in told for name in chosen)
         }
         self.count = np.zeros(len(self.axes), dtype=np.int64)
         for segment in self._segments:

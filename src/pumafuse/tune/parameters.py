@@ -13,7 +13,6 @@ from ..errors import ConfigError, suggestion
 from ..fusion.config import FusionConfig, Process, Sensor
 from ..model.arm import AxisModel
 from ..model.plants import FirstOrder, SecondOrder
-from ..units import EXPONENTS, ending
 
 Fit = Literal["noise", "delay", "plant", "gain", "latency"]
 FITS: tuple[Fit, ...] = get_args(Fit)
@@ -26,7 +25,9 @@ _NOISES = {  # field of Process: the range it is looked for in, SI; the lower en
     "maneuver_drift": (1e-5, 300.0),
 }
 _SDS = (1e-7, 1.0)  # m
-FARTHEST_LATENCY = 0.5  # s; from the configured one
+LATENCIES = (-0.1, 0.3)  # s; how far from the configured one a latency is looked for
+DELAYS = (-0.1, 0.2)  # s; likewise a delay, but never below 0
+_MM = _MS = 1e-3
 _TICK = 0.028  # s; what is a large change of a time, on any arm
 RECOVERY = ".gain_recovery_ms"
 _RECOVERY = (0.020, 0.500)  # s
@@ -47,6 +48,8 @@ class Parameter:
         scale: What is a large change of the coordinate.
         get: The number in a configuration [SI].
         put: The configuration with another number [SI].
+        unit: What one unit of the key is in SI: 1e-3 for ``delay_ms``.
+        sensor: The sensor it is of, if it is of one.
         prior: Mean and standard deviation of the coordinate before any reading; None: any within the bounds.
     """
 
@@ -58,13 +61,9 @@ class Parameter:
     scale: float
     get: Callable[[FusionConfig], float]
     put: Callable[[FusionConfig, float], FusionConfig]
+    unit: float = 1.0
+    sensor: str | None = None
     prior: tuple[float, float] | None = None
-
-    @property
-    def unit(self) -> float:
-        """What one unit of the key is in SI: 1e-3 for ``delay_ms``."""
-        endings = [found for part in self.key.split(".") if (found := ending(part)) is not None]
-        return 10.0 ** EXPONENTS[endings[0]] if endings else 1.0
 
     @property
     def vanishes(self) -> bool:
@@ -85,10 +84,13 @@ class Parameter:
         """The bounds as coordinates."""
         return self.coordinate(self.bounds[0]), self.coordinate(self.bounds[1])
 
+    def inside(self, value: float) -> float:
+        """The nearest number within the bounds."""
+        return min(max(value, self.bounds[0]), self.bounds[1])
+
     def coordinate(self, value: float) -> float:
         """Of a number, which is moved into the bounds."""
-        inside = min(max(value, self.bounds[0]), self.bounds[1])
-        return math.log(inside) if self.log else inside
+        return math.log(self.inside(value)) if self.log else self.inside(value)
 
     def value(self, coordinate: float) -> float:
         """The number at a coordinate [SI]."""
@@ -157,7 +159,7 @@ def _of_axes(config: FusionConfig, known: FusionConfig, heard: Mapping[str, Sequ
     for axis, sensors in heard.items():
         found += [_noise(axis, field, bounds) for field, bounds in _NOISES.items()]
         found += [_sd(axis, name) for name in sensors]
-        found.append(_delay(axis))
+        found.append(_delay(axis, known.arm.delay_of(axis)))
         found += _plant(axis, config.arm.axes[axis])
         found += _gain(axis, known.arm.axes[axis].gain.intercept)
     return found
@@ -183,7 +185,9 @@ def _noise(axis: str, field: str, bounds: tuple[float, float]) -> Parameter:
         return _replace(config, process={**config.process, axis: _replace(config.process[axis], **{field: value})})
 
     key = f"process.{axis}.{_key(Process, field)}"
-    return Parameter(key, "noise", axis, True, bounds, 1.0, lambda config: getattr(config.process[axis], field), put)
+    return Parameter(
+        key, "noise", axis, True, bounds, 1.0, lambda config: getattr(config.process[axis], field), put, _MM
+    )
 
 
 def _sd(axis: str, name: str) -> Parameter:
@@ -195,15 +199,15 @@ def _sd(axis: str, name: str) -> Parameter:
         every = sensor.sd if isinstance(sensor.sd, dict) else dict.fromkeys(config.arm.axes, sensor.sd)
         return _with_sensor(config, name, _replace(sensor, sd={**every, axis: value}))
 
-    return Parameter(f"sensors.{name}.sd_mm.{axis}", "noise", axis, True, _SDS, 1.0, get, put)
+    return Parameter(f"sensors.{name}.sd_mm.{axis}", "noise", axis, True, _SDS, 1.0, get, put, _MM, name)
 
 
-def _delay(axis: str) -> Parameter:
+def _delay(axis: str, configured: float) -> Parameter:
     def put(config: FusionConfig, value: float) -> FusionConfig:
-        return _with_axis(config, axis, _replace(config.arm.axes[axis], delay=value))
+        return _with_axis(config, axis, _replace(config.arm.axes[axis], delay=value, delay_ci95=None))
 
-    key = f"axes.{axis}.delay_ms"
-    return Parameter(key, "delay", axis, False, (0.0, 1.0), _TICK, lambda config: config.arm.delay_of(axis), put)
+    key, bounds = f"axes.{axis}.delay_ms", (max(configured + DELAYS[0], 0.0), configured + DELAYS[1])
+    return Parameter(key, "delay", axis, False, bounds, _TICK, lambda config: config.arm.delay_of(axis), put, _MS)
 
 
 def _plant(axis: str, model: AxisModel) -> list[Parameter]:
@@ -212,10 +216,11 @@ def _plant(axis: str, model: AxisModel) -> list[Parameter]:
             return getattr(config.arm.axes[axis].plant, field)
 
         def put(config: FusionConfig, value: float) -> FusionConfig:
-            plant = _replace(config.arm.axes[axis].plant, **{field: value})
+            plant = _replace(config.arm.axes[axis].plant, **{field: value, f"{field}_ci95": None})
             return _with_axis(config, axis, _replace(config.arm.axes[axis], plant=plant))
 
-        return Parameter(f"axes.{axis}.{_key(type(model.plant), field)}", "plant", axis, True, bounds, 1.0, get, put)
+        key, unit = _key(type(model.plant), field), _MS if field == "time_constant" else 1.0
+        return Parameter(f"axes.{axis}.{key}", "plant", axis, True, bounds, 1.0, get, put, unit)
 
     if isinstance(model.plant, FirstOrder):
         return [of("time_constant", (1e-4, 10.0))]
@@ -227,22 +232,22 @@ def _gain(axis: str, centre: float) -> list[Parameter]:
         return config.arm.axes[axis].gain.intercept
 
     def put_intercept(config: FusionConfig, value: float) -> FusionConfig:
-        gain = _replace(config.arm.axes[axis].gain, intercept=value)
+        gain = _replace(config.arm.axes[axis].gain, intercept=value, intercept_ci95=None)
         return _with_axis(config, axis, _replace(config.arm.axes[axis], gain=gain))
 
     def put_recovery(config: FusionConfig, value: float) -> FusionConfig:
-        return _with_axis(config, axis, _replace(config.arm.axes[axis], gain_recovery=value))
+        return with_recovery(config, axis, value)
 
     middle = 0.5 * math.log(_RECOVERY[0] * _RECOVERY[1])
     return [
         Parameter(
             f"axes.{axis}.gain.intercept", "gain", axis, False, (centre - 0.5, centre + 0.5), _GAIN_SD,
-            intercept, put_intercept, (centre, _GAIN_SD),
+            intercept, put_intercept, prior=(centre, _GAIN_SD),
         ),
         Parameter(
             f"axes.{axis}{RECOVERY}", "gain", axis, True, _RECOVERY, 1.0,
-            lambda config: config.arm.axes[axis].gain_recovery or math.exp(middle), put_recovery,
-            (middle, _RECOVERY_SD),
+            lambda config: config.arm.axes[axis].gain_recovery or math.exp(middle), put_recovery, _MS,
+            prior=(middle, _RECOVERY_SD),
         ),
     ]  # fmt: skip
 
@@ -257,8 +262,10 @@ def _latency(name: str, configured: float) -> Parameter:
         return _with_sensor(config, name, _replace(config.sensors[name], latency=value))
 
     key = f"sensors.{name}.latency_ms"
-    bounds = (configured - FARTHEST_LATENCY, configured + FARTHEST_LATENCY)
-    return Parameter(key, "latency", None, False, bounds, _TICK, lambda config: config.sensors[name].latency, put)
+    bounds = (configured + LATENCIES[0], configured + LATENCIES[1])
+    return Parameter(
+        key, "latency", None, False, bounds, _TICK, lambda config: config.sensors[name].latency, put, _MS, name
+    )
 
 
 def _with_axis(config: FusionConfig, axis: str, model: AxisModel) -> FusionConfig:
@@ -277,6 +284,12 @@ def with_order(config: FusionConfig, axis: str, order: int) -> FusionConfig:
     lag = model.plant.lag
     plant = FirstOrder(time_constant=lag) if order == 1 else SecondOrder(natural_frequency=2.0 / lag, damping=1.0)
     return _with_axis(config, axis, _replace(model, plant=plant))
+
+
+def with_recovery(config: FusionConfig, axis: str, recovery: float | None) -> FusionConfig:
+    """The configuration with another recovery of an axis's gain [s], or none."""
+    model = _replace(config.arm.axes[axis], gain_recovery=recovery, gain_recovery_ci95=None)
+    return _with_axis(config, axis, model)
 
 
 def with_lag(config: FusionConfig, axis: str, lag: float) -> FusionConfig:

@@ -17,12 +17,11 @@ from ..arrays import FloatArray
 from ..fusion.config import FusionConfig, Process
 from .climb import Point, Tell, climb, climb_apart, point, settle
 from .likelihood import Evidence
-from .parameters import RECOVERY, Parameter, with_axis_of, with_lag, with_order
+from .parameters import DELAYS, LATENCIES, RECOVERY, Parameter, with_axis_of, with_lag, with_order
 
 _ROUGHLY = 0.1  # log-likelihood that is not worth another step where peaks are only compared
 _WIDER = 3.0
-_DELAYS = np.linspace(-0.060, 0.060, 13)  # s, from the configured
-_LATENCIES = np.linspace(-0.100, 0.300, 41)  # s, likewise
+_STEP = 0.010  # s, between delays and latencies that are tried: their peaks are as wide
 _LAGS = (1.0, 0.5, 1.8)  # starts, times the configured; a delay can be taken for a lag and a lag for a delay
 _GAINS = ((0.0, 0.1), (0.0, 0.4), (0.3, 0.025))  # starts: gain more than configured and recovery [s]; valleys between
 _PROCESSES = (  # starts, in units of how far the arm alone is from the readings
@@ -70,7 +69,9 @@ def _in_time(evidence: Evidence, config: FusionConfig, free: Sequence[Parameter]
     levels = [_with_noise(config, process, evidence.scatter, noise) for process in _processes(evidence, config)[:2]]
     delays = [one for one in free if one.fit == "delay"]
     if delays:
-        tried = [(shift, point(evidence, _shifted(at, delays, shift), free)) for shift in _DELAYS for at in levels]
+        tried = [
+            (shift, point(evidence, _shifted(at, delays, shift), free)) for shift in _grid(DELAYS) for at in levels
+        ]
         best = np.argmax([found.heights for _, found in tried], axis=0)
         for one in delays:
             shift, _ = tried[int(best[evidence.axes.index(str(one.axis))])]
@@ -79,12 +80,19 @@ def _in_time(evidence: Evidence, config: FusionConfig, free: Sequence[Parameter]
     for one in free:
         if one.fit == "latency":
             tried = [
-                (shift, point(evidence, _shifted(at, [one], shift), free)) for shift in _LATENCIES for at in levels
+                (shift, point(evidence, _shifted(at, [one], shift), free))
+                for shift in _grid(LATENCIES)
+                for at in levels
             ]
             shift, _ = max(tried, key=lambda found: found[1].height)
             config = _shifted(config, [one], shift)
             levels = [_shifted(at, [one], shift) for at in levels]
     return config
+
+
+def _grid(span: tuple[float, float]) -> list[float]:
+    """Times from one end to the other [s]."""
+    return np.linspace(*span, 1 + round((span[1] - span[0]) / _STEP)).tolist()
 
 
 def _shifted(config: FusionConfig, times: Sequence[Parameter], shift: float) -> FusionConfig:

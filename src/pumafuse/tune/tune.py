@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 
 import msgspec
+import numpy as np
 
 from ..arrays import NO_STAMP
 from ..errors import PumafuseWarning
@@ -19,9 +20,9 @@ from .climb import Point
 from .diagnose import at_bound
 from .intervals import Sure, sureness
 from .learnable import TuneError
-from .lesson import Lesson, Syllabus, again, learn
+from .lesson import Lesson, Syllabus, again, evidence_of, learn
 from .likelihood import Evidence
-from .parameters import Fit, Parameter, check_holds, kinds_of
+from .parameters import Fit, Parameter, check_holds, kinds_of, parameters
 from .search import with_gates_of
 from .summary import Likelihood, TuningSummary, biases, correlated, fitted, told
 from .validate import Check, check
@@ -90,6 +91,7 @@ def tune(
     """
     if not runs:
         raise TuneError("no run to learn from")
+    _refuse_twice(runs)
     kinds, names = kinds_of(fit), list(hold)
     check_holds(config, names)
     syllabi = _syllabi(config, kinds, names, teacher)
@@ -103,9 +105,10 @@ def tune(
         if until is not None:
             validation = check(runs[0], config, course.result(), since=until)
             course.repeat()
+        course.keep_the_better()
         if validate is not None:
             validation = check(validate, config, course.result())
-        for lesson in course.lessons:
+        for lesson in [] if course.kept else course.lessons:
             progress("asking how sure it is", lesson.best)
             sure |= sureness(lesson.evidence, lesson.best, lesson.free)
     except KeyboardInterrupt:
@@ -119,8 +122,8 @@ def tune(
         hold=names,
         teacher=teacher,
         interrupted=interrupted,
-        likelihood=_likelihoods(Evidence(runs, config), config, tuned),
-        parameters=[fitted(one, config, tuned, sure.get(one.key)) for lesson in course.lessons for one in lesson.free],
+        likelihood=_likelihoods(course.evidence(), config, tuned),
+        parameters=[fitted(one, config, tuned, sure.get(one.key)) for one in course.free(kinds, names)],
         biases=[one for run in runs for one in biases(run, tuned)],
         correlations=[pair for lesson in course.lessons for pair in correlated(lesson)],
         held=[told(tie) for lesson in course.lessons for tie in lesson.ties],
@@ -141,11 +144,19 @@ class _Course:
         self.runs, self.config, self.progress = runs, config, progress
         self.best = config
         self.lessons: list[Lesson] = []
+        self.kept = False  # whether the configuration as given is the result
 
     def take(self, syllabi: Sequence[Syllabus], until: float | None) -> None:
+        """Every lesson.
+
+        Raises:
+            TuneError: Nothing may move in any of them.
+        """
         for syllabus in syllabi:
             self.lessons.append(learn(self.runs, self.best, syllabus, until, self._following("searching")))
             self.best = self.lessons[-1].best.config
+        if not any(lesson.free for lesson in self.lessons):
+            raise TuneError("everything that could be fitted is held: nothing to learn")
 
     def repeat(self) -> None:
         """All lessons once more, from all readings."""
@@ -153,24 +164,43 @@ class _Course:
             more = again(lesson, self.runs, self.best, self._following("learning from the whole run"))
             self.lessons[number], self.best = more, more.best.config
 
+    def evidence(self) -> Evidence:
+        """The readings of the last lesson, from the whole of the runs."""
+        syllabus = self.lessons[-1].syllabus if self.lessons else Syllabus((), ())
+        return evidence_of(self.runs, self.config, syllabus, None)
+
+    def free(self, kinds: Sequence[Fit], hold: Sequence[str]) -> list[Parameter]:
+        """What was fitted, or what was to be."""
+        if not self.lessons:
+            return parameters(self.best, self.config, self.evidence().heard, kinds, hold)
+        return [one for lesson in self.lessons for one in lesson.free]
+
     def keep_the_better(self) -> None:
-        """Of where the search was and the configuration as given: it may have been on its way from a poor start."""
-        evidence, best = Evidence(self.runs, self.config), with_gates_of(self.best, self.config)
-        if evidence.value(best).total < evidence.value(self.config).total:
-            self.best = self.config
+        """Of the last point and the configuration as given: gates make the way to a better one long."""
+        evidence = self.evidence()
+        before, after = (
+            evidence.value(with_gates_of(config, evidence.config)).total for config in (self.config, self.result())
+        )
+        if after < before - _NOTHING:
+            self.best, self.kept = self.config, True
 
     def result(self) -> FusionConfig:
         """The best configuration: gates as they were, rounded, and without the noise that is worth nothing."""
         best = with_gates_of(self.best, self.config)
         for lesson in self.lessons:
-            for one in lesson.free:
-                best = one.put(best, float(f"{one.get(best):.{_DIGITS}g}"))
-            least = [one for one in lesson.free if one.vanishes and at_bound(one, best) == "least"]
-            for one in least:
-                none = one.put(best, 0.0)
-                if lesson.evidence.value(none).total > lesson.evidence.value(best).total - _NOTHING:
+            mine = [one for one in lesson.free if one.given(best) is not None]
+            for one in mine:
+                best = one.put(best, one.inside(float(f"{one.get(best):.{_DIGITS}g}")))
+            for one in mine:
+                none = one.put(best, 0.0) if one.vanishes and at_bound(one, best) == "least" else best
+                if none is not best and self._worth(lesson, best) - self._worth(lesson, none) < _NOTHING:
                     best = none
         return best
+
+    @staticmethod
+    def _worth(lesson: Lesson, config: FusionConfig) -> float:
+        """The log-likelihood of a lesson's readings with the gates of the lesson."""
+        return lesson.evidence.value(with_gates_of(config, lesson.evidence.config)).total
 
     def _following(self, what: str) -> Callable[[Point], None]:
         def tell(found: Point) -> None:
@@ -189,9 +219,21 @@ def _syllabi(config: FusionConfig, kinds: Sequence[Fit], hold: Sequence[str], te
     others: list[Fit] = [kind for kind in kinds if kind in ("noise", "latency")]
 
     def of_others(one: Parameter) -> bool:
-        return one.key.startswith("sensors.") and not one.key.startswith(f"sensors.{teacher}.")
+        return one.sensor not in (None, teacher)
 
     return [Syllabus(arm, hold, [teacher]), Syllabus(others, hold, None, of_others)]
+
+
+def _refuse_twice(runs: Sequence[Run]) -> None:
+    """Readings that count twice would make the intervals too narrow.
+
+    Raises:
+        TuneError: A run is given twice.
+    """
+    for number, run in enumerate(runs):
+        for other in runs[:number]:
+            if np.array_equal(run.command.stamp, other.command.stamp) and run.sensors.keys() == other.sensors.keys():
+                raise TuneError(f"run '{run.name}' is given twice: its readings would count twice")
 
 
 def _held_back(run: Run) -> float | None:
@@ -203,10 +245,11 @@ def _held_back(run: Run) -> float | None:
 
 
 def _likelihoods(evidence: Evidence, before: FusionConfig, after: FusionConfig) -> dict[str, Likelihood]:
-    old, new = evidence.value(before).axes, evidence.value(after).axes
+    old, new = (evidence.value(with_gates_of(config, evidence.config)).axes for config in (before, after))
     return {
         axis: Likelihood(scalars=int(evidence.count[n]), before=float(old[n]), after=float(new[n]))
         for n, axis in enumerate(evidence.axes)
+        if evidence.count[n]
     }
 
 
@@ -237,6 +280,8 @@ def _with_provenance(config: FusionConfig, sure: Mapping[str, Sure], runs: Seque
 
 def _notes(course: _Course, validation: Sequence[Check] | None, interrupted: bool) -> list[str]:
     found = [note for lesson in course.lessons for note in (*lesson.evidence.notes, *lesson.notes)]
+    if course.kept:
+        found.append("nothing more likely was found than the configuration as given, which is kept")
     if interrupted:
         found.append(
             "interrupted: these are the best numbers until then, and not all of them were asked how sure they are"
@@ -245,5 +290,7 @@ def _notes(course: _Course, validation: Sequence[Check] | None, interrupted: boo
         found.append(
             "nothing was held back to validate on (--validate RUN): nothing says whether the numbers hold elsewhere"
         )
+    if validation == []:
+        found.append("what was held back has no reading of a sensor that is used: nothing says whether it helped")
     found += [f"{one.run}, {one.axis}: {one.verdict}" for one in validation or () if one.worse]
     return list(dict.fromkeys(found))

@@ -148,7 +148,9 @@ def _squares(est: Estimates, axis: str) -> FloatArray:
 def _beyond_chance(growth: FloatArray) -> bool:
     """Whether a mean is above 0 by more than chance; neighbours go together, so means of batches are compared."""
     means = [float(batch.mean()) for batch in np.array_split(growth[np.isfinite(growth)], _BATCHES) if len(batch)]
-    return float(np.mean(means)) > Z95 * float(np.std(means, ddof=1)) / np.sqrt(len(means)) if len(means) > 1 else True
+    if len(means) < 2:
+        return True
+    return bool(np.mean(means) > Z95 * np.std(means, ddof=1) / np.sqrt(len(means)))
 
 
 def _gains(before: Estimates, after: Estimates, axis: str) -> FloatArray:
