@@ -80,10 +80,7 @@ def test_a_parameter_at_a_bound_is_said_to_be() -> None:
 
 
 def test_pairs_beyond_nine_tenths_are_named() -> None:
-    """Delay and time constant by a camera alone: the correlations of the inverted information, those beyond, no other.
-
-    With a tracker they are told apart.
-    """
+    """Delay and time constant by a camera alone: the correlations of the inverted information, no others."""
     sim = with_outliers(1)
     found = learnt(sim.run, sim.config, ("noise", "delay", "plant"))
     inside = [one for one in found.free if at_bound(one, found.best.config) is None]
@@ -100,8 +97,6 @@ def test_pairs_beyond_nine_tenths_are_named() -> None:
     named = correlations(found.evidence, found.best, found.free)
     assert {frozenset((one, other)): value for one, other, value in named} == pytest.approx(wanted, rel=1e-6)
     assert frozenset(("axes.vertical.time_constant_ms", "axes.vertical.delay_ms")) in wanted
-    tracked = learnt(outage(1).run, outage(1).config, ("noise", "delay", "plant"))
-    assert not correlations(tracked.evidence, tracked.best, tracked.free)
 
 
 def test_delays_and_latencies_are_told_only_as_a_sum() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.runs.run import Source
-from tuning import learnt, outage, quietly, scenario, spoiled
+from tuning import LONG, later, learnt, outage, quietly, scenario, spoiled
 
 
 def changed(name: str, change: Callable[[Source], Source]) -> pf.Run:
@@ -32,7 +32,7 @@ def scaled(factor: float) -> Callable[[Source], Source]:
     return lambda one: replace(one, values={axis: factor * value for axis, value in one.values.items()})
 
 
-def later(seconds: float) -> Callable[[Source], Source]:
+def delayed(seconds: float) -> Callable[[Source], Source]:
     return lambda one: replace(one, stamp=one.stamp + round(seconds * 1e9))
 
 
@@ -48,6 +48,19 @@ def test_no_run_and_no_reading() -> None:
     early = replace(camera, stamp=camera.stamp - 3_600_000_000_000)
     for sensors in ({}, {"eye": camera}, {"vision": gaps}, {"vision": early}):
         assert refused([replace(run, sensors=sensors)]) == nothing
+
+
+def test_a_run_given_twice() -> None:
+    """Its readings would count twice."""
+    run = outage(1).run
+    assert refused([run, run]) == f"run '{run.name}' is given twice: its readings would count twice"
+
+
+def test_nothing_that_may_move() -> None:
+    """Everything that is asked for is held."""
+    assert refused([outage(1).run], fit=["delay"], hold=["delay_ms"]).startswith(
+        "everything that could be fitted is held"
+    )
 
 
 def test_too_few_readings() -> None:
@@ -117,10 +130,13 @@ def test_a_sensor_with_a_scale_that_is_told_is_not_refused() -> None:
     assert sd == pytest.approx(5e-4, rel=0.2)
 
 
-@pytest.mark.parametrize("seconds", [-2.0, -1.0, 1.0, 2.0])
+AFTER = pytest.mark.xfail(strict=True, reason="readings of the last third alone are never asked whether they agree")
+
+
+@pytest.mark.parametrize("seconds", [-2.0, -1.0, 1.0, pytest.param(2.0, marks=[AFTER, LONG])])
 def test_a_sensor_stamped_by_another_clock(seconds: float) -> None:
     """Seconds early or late, it does not follow, or moves against, the commands; one clock is asked for."""
-    line = refused([changed("vision", later(seconds))])
+    line = refused([changed("vision", delayed(seconds))])
     assert line.startswith(("sensor 'vision' does not follow the", "sensor 'vision' moves against the"))
     assert line.endswith("are both stamped by one clock?")
 
@@ -141,15 +157,12 @@ def test_a_sensor_that_shows_one_value_only() -> None:
     assert "sensor 'vision' does not follow the commands of tangential" in refused([changed("vision", scaled(0.0))])
 
 
-AFTER = pytest.mark.xfail(strict=True, reason="readings that all lie after the last command are taken as they are")
-
-
-@pytest.mark.parametrize("seconds", [-10.0, *(pytest.param(late, marks=AFTER) for late in (10.0, 3600.0))])
+@pytest.mark.parametrize("seconds", [-10.0, pytest.param(10.0, marks=AFTER), pytest.param(3600.0, marks=[AFTER, LONG])])
 def test_a_sensor_whose_clock_is_far_off_is_said_to_be(seconds: float) -> None:
     """All its readings before the first or after the last command: refused, or a note that names it and why."""
-    run = changed("vision", later(seconds))
+    run = changed("vision", delayed(seconds))
     try:
-        found = quietly(lambda: pf.tune([run], spoiled(outage(1).config)))
+        found = quietly(lambda: pf.tune([run], outage(1).config, hold=["process"]))
     except pf.PumafuseError as error:
         said = [str(error)]
     else:
@@ -187,8 +200,9 @@ def test_an_axis_that_rests_most_of_the_time_is_followed(share: float) -> None:
     assert learnt(run, config).best.config.sensors["tracker"].sd_of("radial") == pytest.approx(5e-5, rel=0.15)
 
 
-@pytest.mark.xfail(strict=True, raises=ValueError, reason="slopes of an axis without readings: max_workers is 0")
-@pytest.mark.parametrize("fit", [("noise",), ("noise", "delay", "plant"), ("noise", "latency")], ids="-".join)
+@pytest.mark.parametrize(
+    "fit", [("noise",), later(("noise", "latency")), later(("noise", "delay", "plant"))], ids="-".join
+)
 def test_an_axis_that_nobody_hears_is_left_as_it_is(fit: Sequence[str]) -> None:
     """Commanded, but read by no sensor: what belongs to it stays, the others are learnt as without it."""
     run, config = outage(1).run, spoiled(outage(1).config)

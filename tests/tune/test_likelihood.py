@@ -292,9 +292,9 @@ def test_the_score_is_the_slope_of_the_value(order: int) -> None:
 
 
 def test_scores_at_the_truth_have_the_information_as_their_covariance() -> None:
-    """Over 40 simulated runs the scores, whitened by each run's information, have mean 0 and covariance 1.
+    """Over 30 simulated runs the scores, whitened by each run's information, have mean 0 and covariance 1.
 
-    Gates off. Σ |z|² is chi-square with 40 k degrees of freedom and each mean normal; the bands hold 99.9 % (each
+    Gates off. Σ |z|² is chi-square with 30 k degrees of freedom and each mean normal; the bands hold 99.9 % (each
     mean's by Bonferroni). The scores of noises are skewed, for which the band of the sum is half as wide again.
     """
     whitened = list[np.ndarray]()
@@ -302,7 +302,7 @@ def test_scores_at_the_truth_have_the_information_as_their_covariance() -> None:
     process = {
         axis: pf.Process(input_noise=2e-4, drift=8e-4, maneuver_noise=2e-3, maneuver_drift=0.01) for axis in AXES
     }
-    for seed in range(40):
+    for seed in range(30):
         sim = pf.simulate(replaced(found, process=process), seed)
         config = with_sensors(sim.config, gate=0.0)
         evidence = Evidence([sim.run], config)

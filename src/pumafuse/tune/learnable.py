@@ -39,8 +39,19 @@ def moving(evidence: Evidence, config: FusionConfig) -> list[str]:
             f"no axis is commanded to move by more than its sensors' noise (at most {widest:.3g} mm): what rests tells"
             " nothing of an arm; record a run with motion"
         )
+    _in_time(evidence)
     _agreeing(evidence, config, found)
     return found
+
+
+def _in_time(evidence: Evidence) -> None:
+    """Refuse a sensor whose clock is another one."""
+    for name, share in evidence.afterwards.items():
+        if share > 0.5:
+            raise TuneError(
+                f"sensor '{name}': {share:.0%} of its readings lie more than 1 s after the last command: are both"
+                " stamped by one clock?"
+            )
 
 
 def _moves(evidence: Evidence, axis: str) -> bool:
@@ -54,7 +65,8 @@ def _agreeing(evidence: Evidence, config: FusionConfig, axes: Sequence[str]) -> 
         scatter = evidence.scatter.get(f"sensors.{name}.sd_mm.{axis}", 0.0)
         if axis not in axes or len(seen) < _FEWEST or float(np.ptp(answer)) < _MOVES * scatter:
             continue
-        near = np.abs(seen) <= 10.0 * np.median(np.abs(seen)) + 1e-12  # outliers tell nothing
+        apart = np.abs(seen - answer)
+        near = apart <= 10.0 * np.median(apart) + 1e-12  # outliers tell nothing
         power = float(np.sqrt(np.sum(answer[near] ** 2) * np.sum(seen[near] ** 2)))
         follows = float(np.sum(answer[near] * seen[near])) / power if power > 0.0 else 0.0
         if follows < _AGREES:

@@ -193,6 +193,18 @@ class Evidence:
         return {key: float(np.median(sds)) for key, sds in found.items() if min(sds) > 0.0}
 
     @cached_property
+    def afterwards(self) -> dict[str, float]:
+        """Which share of each sensor's readings lies more than 1 s after the last command."""
+        late, every = dict[str, int](), dict[str, int]()
+        for segment in self._segments:
+            scalars, end = segment.whole.scalars, int(segment.whole.commands[-1]) + 1_000_000_000
+            for number, name in enumerate(scalars.sensors):
+                mine = scalars.valid[scalars.sensor == number]
+                late[name] = late.get(name, 0) + int(np.count_nonzero(mine > end))
+                every[name] = every.get(name, 0) + len(mine)
+        return {name: late[name] / count for name, count in every.items() if count}
+
+    @cached_property
     def travel(self) -> dict[str, float]:
         """How far each axis is commanded to move in a run, at most [m]."""
         found = dict.fromkeys(self.axes, 0.0)

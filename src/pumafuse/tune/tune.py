@@ -232,8 +232,21 @@ def _refuse_twice(runs: Sequence[Run]) -> None:
     """
     for number, run in enumerate(runs):
         for other in runs[:number]:
-            if np.array_equal(run.command.stamp, other.command.stamp) and run.sensors.keys() == other.sensors.keys():
+            if _same(run, other):
                 raise TuneError(f"run '{run.name}' is given twice: its readings would count twice")
+
+
+def _same(run: Run, other: Run) -> bool:
+    """Whether two runs have the same readings."""
+    if run.sensors.keys() != other.sensors.keys():
+        return False
+    pairs = [(source, other.sensors[name]) for name, source in run.sensors.items()]
+    return all(
+        np.array_equal(one.stamp, two.stamp)
+        and one.values.keys() == two.values.keys()
+        and all(np.array_equal(value, two.values[axis], equal_nan=True) for axis, value in one.values.items())
+        for one, two in pairs
+    )
 
 
 def _held_back(run: Run) -> float | None:
