@@ -23,7 +23,7 @@ _SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which
 _SKEWED_FOR_ALL = 0.2  # likewise of a number of all axes, whose profile takes ten times as long
 _STEPS = 12  # of a profile towards its end
 _CLOSE = 0.03  # relative, of √(2 drop)
-_HALVINGS = 60
+_HALVINGS = 26
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from ..fusion.track import AxisEstimate
 from ..runs.run import Run
 from ..units import MM
 
-_WORSE = 1.02  # RMSE after over before
+_WORSE = 1.02  # RMSE after over before that is worse where it is beyond chance
+_FAR_WORSE = 1.2  # likewise, whatever chance would make of it
 _BATCHES = 20
 
 
@@ -120,7 +121,9 @@ def _axis(run: str, axis: str, since: float, before: Estimates, after: Estimates
     old, new, gains = _state(before, axis), _state(after, axis), _gains(before, after, axis)
     gained, chance = float(gains.sum()), Z95 * float(np.sqrt(np.sum(gains**2)))
     closer = None if old.rmse_mm is None or new.rmse_mm is None else new.rmse_mm / max(old.rmse_mm, 1e-12)
-    farther = closer is not None and closer > _WORSE and _beyond_chance(_squares(after, axis) - _squares(before, axis))
+    farther = closer is not None and (
+        closer > _FAR_WORSE or (closer > _WORSE and _beyond_chance(_squares(after, axis) - _squares(before, axis)))
+    )
     worse = gained < -chance or farther
     said = f"log-likelihood {gained:+.1f} (chance: ± {chance:.1f})"
     if closer is not None:
