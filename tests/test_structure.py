@@ -8,7 +8,16 @@ import pytest
 import pumafuse as pf
 
 SOURCE = Path(pf.__file__).parent
-ROOMS = ["model", "runs", "fusion", "simulate", "identify", "tune", "views", "cli"]  # each imports itself and those before it
+ROOMS = [
+    "model",
+    "runs",
+    "fusion",
+    "simulate",
+    "identify",
+    "tune",
+    "views",
+    "cli",
+]  # each imports itself and those before it
 GROUND = {"arrays", "errors", "units", "toml", "folders", "compiled"}
 
 

@@ -205,11 +205,6 @@ def cut(run: pf.Run, until: float, delay: dict[str, float]) -> pf.Run:
     return replace(run, sensors={name: early(name, one) for name, one in run.sensors.items()})
 
 
-SAME_STAMPS = pytest.mark.xfail(
-    strict=True, raises=pf.PumafuseError, reason="two runs with the same command stamps are taken for one given twice"
-)
-
-
 def test_the_last_third_is_held_back_and_learnt_from_after() -> None:
     """What is compared there was learnt from the first two thirds: as from a run cut there, to the last digit.
 
@@ -255,7 +250,6 @@ def test_what_got_worse_is_said_to_have() -> None:
         assert told.worse and f"{two.run.name}, {told.axis}: {told.verdict}" in found.summary.notes
 
 
-@SAME_STAMPS
 def test_several_runs_have_nothing_held_back() -> None:
     """A note says so; two runs tell more than one: the interval of an sd is narrower by about √2."""
     runs = [outage(seed).run for seed in (1, 2)]

@@ -19,7 +19,7 @@ from ..runs.run import Run
 from .climb import Point
 from .diagnose import at_bound
 from .intervals import Sure, sureness
-from .learnable import TuneError
+from .learnable import TuneError, moving
 from .lesson import Lesson, Syllabus, again, evidence_of, learn
 from .likelihood import Evidence
 from .parameters import Fit, Parameter, check_holds, kinds_of, parameters
@@ -96,6 +96,7 @@ def tune(
     check_holds(config, names)
     syllabi = _syllabi(config, kinds, names, teacher)
     course = _Course(runs, config, progress)
+    moving(course.evidence(), config)  # of the whole, before a part of it is asked
     until = _held_back(runs[0]) if len(runs) == 1 and validate is None else None
     sure: dict[str, Sure] = {}
     validation: list[Check] | None = None
