@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.tune.climb import point
-from pumafuse.tune.diagnose import at_bound, correlations, covariance, untold
+from pumafuse.tune.diagnose import at_bound, correlations, covariance, shared_time, untold
 from pumafuse.tune.likelihood import Evidence
 from pumafuse.tune.parameters import Parameter, parameters
 from pumafuse.tune.summary import told
@@ -112,6 +112,58 @@ def test_delays_and_latencies_are_told_only_as_a_sum() -> None:
     assert all(key in sentence for key in tie.members)
     held = [one for one in every if one.key != tie.held]
     assert untold(evidence, point(evidence, sim.config, held), held) is None
+
+
+Heard = dict[str, list[str]]
+HEARD: dict[str, tuple[Heard, list[str], list[str], list[tuple[str, set[str]]]]] = {
+    "all hear all": (
+        {"tangential": ["good", "poor"], "vertical": ["good", "poor"]},
+        ["tangential", "vertical"],
+        [],
+        [("good", {"good", "poor", "tangential", "vertical"})],
+    ),
+    "two that hear nothing of each other": (
+        {"tangential": ["good"], "vertical": ["poor"]},
+        ["tangential", "vertical"],
+        [],
+        [("good", {"good", "tangential"}), ("poor", {"poor", "vertical"})],
+    ),
+    "connected by a third": (
+        {"tangential": ["good", "third"], "vertical": ["poor", "third"]},
+        ["tangential", "vertical"],
+        [],
+        [("good", {"good", "poor", "third", "tangential", "vertical"})],
+    ),
+    "a delay that is known": (
+        {"tangential": ["good", "poor"], "vertical": ["good"]},
+        ["tangential", "vertical"],
+        ["axes.tangential"],
+        [],
+    ),
+    "a latency that is known": ({"tangential": ["good", "poor"]}, ["tangential"], ["good.latency_ms"], []),
+    "an axis that rests": (
+        {"tangential": ["good"], "vertical": ["poor"]},
+        ["tangential"],
+        [],
+        [("poor", {"poor"}), ("good", {"good", "tangential"})],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("heard", "moving", "hold", "wanted"), HEARD.values(), ids=HEARD.keys())
+def test_a_time_is_shared_by_those_who_hear_one_another(
+    heard: Heard, moving: list[str], hold: list[str], wanted: list[tuple[str, set[str]]]
+) -> None:
+    """One latency is held of each group of sensors and moving axes connected by readings, all of whose times are free.
+
+    That of a sensor which hears nothing that moves is held alone.
+    """
+    sensors = {name: pf.Sensor(sd=sd) for name, sd in (("poor", 1e-3), ("third", 2e-3), ("good", 1e-4))}
+    config = pf.FusionConfig(arm=ARM, sensors=sensors)
+    every = parameters(config, config, heard, ("delay", "latency"), hold)
+    ties = shared_time(heard, moving, every, config)
+    names = {f"axes.{axis}.delay_ms": axis for axis in heard} | {f"sensors.{name}.latency_ms": name for name in sensors}
+    assert [(names[tie.held], {names[key] for key in tie.members}) for tie in ties] == wanted
 
 
 def test_the_latency_that_is_held_is_of_the_sensor_with_the_least_noise() -> None:

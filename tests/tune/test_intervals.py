@@ -180,6 +180,35 @@ def test_a_number_of_all_axes_has_the_profile_of_all_readings() -> None:
     assert (ends[1] - ends[0]) ** -2 == pytest.approx(inverse_squares, rel=0.25)
 
 
+def test_a_number_of_an_axis_knows_what_the_others_say_of_a_shared_one() -> None:
+    """A camera's latency is free, and one axis's delay: it is told by the latency, which is told by the other axis.
+
+    From its own readings the delay is not told at all. At both ends its profile, the latency following over the
+    readings of both axes, has dropped by 1.92 (± 20 %).
+    """
+    sim = outage(2)
+    names = ["axes.vertical.delay_ms", "sensors.vision.latency_ms"]
+    evidence = Evidence([sim.run], sim.config, ["vision"])
+    free = [one for one in free_of(evidence, sim.config, ("delay", "latency")) if one.key in names]
+    best = climb(evidence, sim.config, free)
+    delay, latency = (next(one for one in free if one.key == name) for name in names)
+    found, outcomes = sureness(evidence, best, free)[delay.key], best.value.outcomes
+
+    def highest(value: float) -> float:
+        held, near = delay.put(best.config, value), latency.get(best.config)
+        cost = minimize_scalar(
+            lambda at: -evidence.value(latency.put(held, at), outcomes).total,
+            bounds=(near - 0.02, near + 0.02),
+            method="bounded",
+        )
+        return -float(cost.fun)
+
+    assert found.open == (False, False)
+    top = highest(delay.get(best.config))
+    for end in found.ci95:
+        assert top - highest(end) == pytest.approx(0.5 * ROOT**2, rel=0.2)
+
+
 # ---- how often they hold --------------------------------------------------------------------------------------------
 
 

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, multivariate_normal
+from scipy.stats import multivariate_normal
 
 import pumafuse as pf
-from fusion.test_oracle import CASES, Case, anomalous
+from fusion.test_oracle import CASES, MS, UNDER, Case, Heard, anomalous, every, sensor
 from fusion_oracle import AxisOracle
 from pumafuse.fusion.consistency import densities_of, log_likelihood
+from pumafuse.model.arm import AxisModel
 from pumafuse.runs.run import Source
 from pumafuse.simulate.scenario import Outliers
 from pumafuse.tune.climb import Point, moved, point, slopes
@@ -231,6 +232,21 @@ def test_another_configuration_is_as_if_built_with_it(other: Callable[[pf.Fusion
     np.testing.assert_allclose(found.information, wanted.information, rtol=1e-6, atol=1e-4)
 
 
+def test_readings_that_become_true_at_one_instant_are_met_in_their_order() -> None:
+    """Two sensors whose latencies are such that they read at once: as built with these, the configuration's first."""
+    run, config = CASES["two at the same instants"].made()
+    other = with_sensors(config, "vision", latency=config.sensors["vision"].latency - 0.0131)
+    evidence = Evidence([run], other, latest=0.1)
+    built = Evidence([run], config, latest=0.1)
+    there, anew = evidence.value(config), built.value(config)
+    assert there.total == anew.total
+    np.testing.assert_allclose(
+        evidence.slopes(config, free_of(built, config, ALL), there.outcomes).score,
+        built.slopes(config, free_of(built, config, ALL), anew.outcomes).score,
+        rtol=1e-12,
+    )
+
+
 def test_readings_that_a_latency_could_put_before_the_run_are_left_out() -> None:
     """With ``latest`` 0.5 s those stamped in the first half second; what remains is met at any latency up to it."""
     sim = two_sensors()
@@ -287,36 +303,66 @@ def test_the_score_is_the_slope_of_the_value(order: int) -> None:
         assert bare.score[number] == pytest.approx(wanted, rel=1e-3, abs=within), one.key
         with_prior = (up.height - down.height) / (2.0 * step)
         assert found.score[number] == pytest.approx(with_prior, rel=1e-3, abs=within), one.key
+        more = 0.0 if one.prior is None else one.prior[1] ** -2
+        assert found.information[number, number] - bare.information[number, number] == pytest.approx(more, rel=1e-6)
         steep += abs(wanted) * sd > 1.0
     assert steep > 0.6 * len(free)
 
 
-def test_scores_at_the_truth_have_the_information_as_their_covariance() -> None:
-    """Over 30 simulated runs the scores, whitened by each run's information, have mean 0 and covariance 1.
+WITH_NOISE = Case(
+    {"radial": AxisModel(plant=UNDER, gain=pf.Gain(slope=0.05, intercept=1.1), gain_recovery=0.06)},
+    process=pf.Process(input_noise=3e-4, drift=2e-3, maneuver_noise=2e-3, maneuver_drift=1e-2),
+    heard={
+        "tracker": Heard(sensor(4e-4, latency=0.008), every(50, 20, 30 * MS)),
+        "vision": Heard(sensor(1e-3, latency=0.07), every(25, 10, 47 * MS)),
+    },
+)
 
-    Gates off. Σ |z|² is chi-square with 30 k degrees of freedom and each mean normal; the bands hold 99.9 % (each
-    mean's by Bonferroni). The scores of noises are skewed, for which the band of the sum is half as wide again.
+
+def test_scores_and_information_are_those_of_the_joint_gaussian() -> None:
+    """Of every kind of parameter, for readings drawn from a mean m and a covariance K that no filter worked out.
+
+    The score of each draw is r′K⁻¹∂m + ½ (r′K⁻¹∂K K⁻¹r − tr K⁻¹∂K), to a thousandth of a standard deviation. The
+    information is random but for its mean ∂m′K⁻¹∂m + ½ tr K⁻¹∂K K⁻¹∂K: that of 100 draws is within 4 standard errors.
     """
-    whitened = list[np.ndarray]()
-    found = scenario("panel-tracker-outage", 0.1, 0.02)
-    process = {
-        axis: pf.Process(input_noise=2e-4, drift=8e-4, maneuver_noise=2e-3, maneuver_drift=0.01) for axis in AXES
-    }
-    for seed in range(30):
-        sim = pf.simulate(replaced(found, process=process), seed)
-        config = with_sensors(sim.config, gate=0.0)
-        evidence = Evidence([sim.run], config)
-        free = free_of(evidence, config, ALL, "tracker.latency_ms")  # it is told together with the delays
-        told = evidence.slopes(config, free, evidence.value(config).outcomes)
-        information = told.information
-        np.testing.assert_allclose(information, information.T, rtol=1e-12, atol=1e-9)
-        whitened.append(np.linalg.solve(np.linalg.cholesky(information), told.score))
-    z = np.array(whitened)
-    runs, count = z.shape
-    assert count >= 18
-    low, high = (chi2.ppf(p, runs * count) / (runs * count) for p in (0.0005, 0.9995))
-    assert 1.0 - 1.5 * (1.0 - low) < np.mean(z**2) < 1.0 + 1.5 * (high - 1.0)
-    assert np.abs(z.mean(axis=0)).max() * np.sqrt(runs) < 4.2
+    run, config = WITH_NOISE.made()
+    evidence = Evidence([run], config)
+    free = free_of(evidence, config, ALL)
+
+    def jointly(at: pf.FusionConfig) -> tuple[np.ndarray, np.ndarray]:
+        return AxisOracle(run, at, "radial").jointly()
+
+    mean, covariance = jointly(config)
+    inverse = np.linalg.inv(covariance)
+    d_mean, d_covariance = [], []
+    for one in free:
+        at, step = one.coordinate(one.get(config)), 1e-3 if one.log else 2e-5
+        (m_up, K_up), (m_down, K_down) = (jointly(one.move(config, at + sign * step)) for sign in (1, -1))
+        d_mean.append((m_up - m_down) / (2.0 * step))
+        d_covariance.append(inverse @ (K_up - K_down) / (2.0 * step))
+    moved_by = np.array(d_mean)
+    traces = np.array([[np.trace(one @ other) for other in d_covariance] for one in d_covariance])
+    wanted = moved_by @ inverse @ moved_by.T + 0.5 * traces
+    sd = np.sqrt(np.diag(wanted))
+    rng, root, found = np.random.default_rng(1), np.linalg.cholesky(covariance), []
+    readings = AxisOracle(run, config, "radial").readings
+    for _ in range(100):
+        drawn = mean + root @ rng.standard_normal(len(mean))
+        for reading, value in zip(readings, drawn.tolist(), strict=True):
+            run.sensors[reading.sensor].values["radial"][reading.row] = value
+        told = Evidence([run], config)
+        slopes_there = told.slopes(config, free, told.value(config).outcomes)
+        r = inverse @ (drawn - mean)
+        score = [
+            d_m @ r + 0.5 * (r @ covariance @ d_K @ r - np.trace(d_K))
+            for d_m, d_K in zip(d_mean, d_covariance, strict=True)
+        ]
+        np.testing.assert_allclose(slopes_there.score / sd, score / sd, atol=2e-3, rtol=2e-3)
+        found.append(slopes_there.information / np.outer(sd, sd))
+    scatter = np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
+    off = np.abs(np.mean(found, axis=0) - wanted / np.outer(sd, sd))
+    assert (off < 4.0 * scatter + 2e-3).all(), np.argwhere(off >= 4.0 * scatter + 2e-3)
+    assert scatter.max() < 0.08
 
 
 def test_what_a_number_does_not_touch_has_no_slope() -> None:

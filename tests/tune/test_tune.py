@@ -400,6 +400,14 @@ def test_interrupted_it_gives_the_best_so_far(share: float, teacher: str | None,
         assert total(sim.run, found.config) == pytest.approx(stop.said[-1][1].height, abs=0.05)
 
 
+def test_interrupted_on_a_detour_it_gives_back_what_it_was_given() -> None:
+    """The first rough points of a search are no better than what is the most likely already: it is kept, and said."""
+    sim, best = outage(1), tuned_noise().config
+    found = quietly(lambda: pf.tune([sim.run], best, progress=Stop(1)))
+    assert found.config == best
+    assert [note for note in found.summary.notes if note.startswith("nothing more likely was found")]
+
+
 def test_an_interrupted_search_is_on_its_way() -> None:
     """The later, the likelier, and the last is the uninterrupted result."""
     sim = outage(1)
