@@ -26,7 +26,7 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
     held = kernels.Held(np.empty((count, kept, width)), np.empty((count, kept, width, width)), np.empty((count, kept)))
     log = _log(axes, rows, width) if smooth else _log(axes, None, width)
     if mode == "as-live":
-        arrival = np.maximum(scalars.stamp[candidates[rows.first[:-1]]], rows.valid)
+        arrival = np.maximum(scalars.stamp[candidates[rows.first]], rows.valid)
         queue = np.argsort(arrival, kind="stable")
         back = int((np.maximum.accumulate(queue) - queue).max(initial=0)) + 2
         places = _places(state, back)
@@ -37,7 +37,7 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
     else:
         kernels.filter_run(axes, sensors, rows, state, times, met, log, held, outputs)
     if smooth:
-        sensor_of = np.repeat(rows.sensor, np.diff(rows.first))
+        sensor_of = np.repeat(rows.sensor, rows.end - rows.first)
         room = (
             np.empty((2, width)),
             np.empty((2, width, width)),
@@ -151,7 +151,8 @@ def _rows(timeline: Timeline) -> kernels.Rows:
     return kernels.Rows(
         valid=scalars.valid[chosen][begins],
         sensor=sensor[begins],
-        first=np.append(begins, len(row)),
+        first=begins,
+        end=np.append(begins, len(row))[1:],
         axis=axis,
         value=scalars.value[chosen],
         spread=np.empty(0) if scalars.spread is None else scalars.spread[chosen],
@@ -180,6 +181,7 @@ def _start(
         P=P,
         clock=np.full(count, timeline.origin),
         entry=np.full(count, -1),
+        fused=np.full(count, timeline.origin),
         rejected=np.zeros((sensors, count + 1), dtype=np.int64),
         since=np.zeros((sensors, count + 1), dtype=np.int64),
         work=np.zeros((4, width)),
@@ -193,6 +195,7 @@ def _places(state: kernels.State, count: int) -> kernels.State:
         P=np.empty((count, *state.P.shape)),
         clock=np.empty((count, *state.clock.shape), dtype=np.int64),
         entry=np.empty((count, *state.entry.shape), dtype=np.int64),
+        fused=np.empty((count, *state.fused.shape), dtype=np.int64),
         rejected=np.empty((count, *state.rejected.shape), dtype=np.int64),
         since=np.empty((count, *state.since.shape), dtype=np.int64),
         work=state.work,

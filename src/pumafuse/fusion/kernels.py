@@ -78,7 +78,8 @@ class Rows(NamedTuple):
     Attributes:
         valid: The instant each is true of, int64 ns, (R,).
         sensor: (R,).
-        first: Where each row's scalars begin, and where the last one's end, (R + 1,).
+        first: Where each row's scalars begin, (R,).
+        end: Where they end, (R,).
         axis: Of each scalar, (m,).
         value: z [m] as logged, (m,).
         spread: By what the noise of each is scaled, (m,); (0,) where it is by nothing.
@@ -87,6 +88,7 @@ class Rows(NamedTuple):
     valid: TimeArray
     sensor: IndexArray
     first: IntArray
+    end: IntArray
     axis: IndexArray
     value: FloatArray
     spread: FloatArray
@@ -100,15 +102,17 @@ class State(NamedTuple):
         P: Covariance, (A + 1, s, s).
         clock: The instant each axis stands at, int64 ns, (A,).
         entry: The entry of the drive that acts, −1 before the first, counted from the axis's own first, (A,).
+        fused: When the last scalar that was fused was valid, int64 ns, (A,).
         rejected: Rejections in a row, of each sensor's rows (first column) or scalars by axis, (S, A + 1).
         since: When the first of them was valid, int64 ns, (S, A + 1).
-        work: Room for an update's vectors: H, K, P Hᵀ and (I − K H) P Hᵀ, (4, s).
+        work: Room for an update's vectors: H, K, P Hᵀ and (I − K H) P Hᵀ − R K, (4, s).
     """
 
     x: FloatArray
     P: FloatArray
     clock: TimeArray
     entry: IntArray
+    fused: TimeArray
     rejected: IntArray
     since: TimeArray
     work: FloatArray
@@ -304,7 +308,8 @@ def joseph_three(
 def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> None:
     """P⁺ = (I − K H) P (I − K H)ᵀ + K R Kᵀ with H in ``work[0]`` and K = P Hᵀ / (H P Hᵀ + R), left in ``work[1]``.
 
-    The smoother uses it for its dual, too: information that passes through noise of unit variance along H.
+    The smoother uses it for its dual, too: information that passes through noise of unit variance along H. A state that
+    H does not see and that shares nothing with the others changes no bit of theirs.
     """
     spread, seen = R, 0.0
     for i in range(states):
@@ -324,16 +329,17 @@ def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> N
         )  # fmt: skip
         P[at, 1, 0], P[at, 2, 0], P[at, 2, 1] = P[at, 0, 1], P[at, 0, 2], P[at, 1, 2]
         return
-    for i in range(states):  # W = (I − K H) P and W Hᵀ
+    for i in range(states):  # W = (I − K H) P and W Hᵀ − R K
         across = 0.0
         for j in range(states):
             P[at, i, j] -= work[1, i] * work[2, j]
             across += P[at, i, j] * work[0, j]
-        work[3, i] = across
-    for i in range(states):  # W − W Hᵀ Kᵀ + K R Kᵀ
-        for j in range(i + 1):
-            left = P[at, i, j] - work[3, i] * work[1, j] + P[at, j, i] - work[3, j] * work[1, i]
-            P[at, i, j] = P[at, j, i] = 0.5 * left + work[1, i] * R * work[1, j]
+        work[3, i] = across - R * work[1, i]
+    for i in range(states):  # W − (W Hᵀ − R K) Kᵀ
+        for j in range(i):
+            left = P[at, j, i] - work[3, j] * work[1, i] + P[at, i, j] - work[3, i] * work[1, j]
+            P[at, i, j] = P[at, j, i] = 0.5 * left
+        P[at, i, i] -= work[3, i] * work[1, i]
 
 
 @compiled
@@ -366,7 +372,7 @@ def predicted(axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: in
 @compiled
 def meet(axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log: Log, row: int) -> None:
     """Gate a row and fuse what passes: whole rows or scalar by scalar, as the sensor says."""
-    first, end = rows.first[row], rows.first[row + 1]
+    first, end = rows.first[row], rows.end[row]
     if sensors.rows[rows.sensor[row]]:
         meet_together(axes, sensors, rows, state, met, log, row, first, end, 0)
     else:
@@ -425,6 +431,7 @@ def fuse(
     joseph(state.P, axis, axes.states[axis], R, state.work)
     for i in range(axes.states[axis]):
         state.x[axis, i] += state.work[1, i] * nu
+    state.fused[axis] = rows.valid[row]
     met.outcome[scalar] = _REOPENED if widened > 0.0 else _FUSED
     write_log(log, axis, rows.valid[row], scalar, R, widened, state.work)
 
@@ -499,7 +506,7 @@ def replay(axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log
     """Every row at its valid time with the outcomes that ``met`` brings, whatever a gate would say now."""
     for row in range(len(rows.valid)):
         sensor = rows.sensor[row]
-        for scalar in range(rows.first[row], rows.first[row + 1]):
+        for scalar in range(rows.first[row], rows.end[row]):
             advance(axes, state, log, rows.axis[scalar], rows.valid[row])
             nu, S = predicted(axes, sensors, rows, state, scalar, sensor)
             met.innovation[scalar], met.innovation_sd[scalar] = nu, math.sqrt(S)
@@ -514,6 +521,7 @@ def keep(state: State, kept: State, place: int) -> None:
     """Copy a state to ``place`` among many."""
     for axis in range(len(state.clock)):
         kept.clock[place, axis], kept.entry[place, axis] = state.clock[axis], state.entry[axis]
+        kept.fused[place, axis] = state.fused[axis]
         for i in range(state.x.shape[1]):
             kept.x[place, axis, i] = state.x[axis, i]
             for j in range(state.x.shape[1]):
@@ -529,6 +537,7 @@ def go_back(state: State, kept: State, place: int) -> None:
     """Undo everything since :func:`keep`."""
     for axis in range(len(state.clock)):
         state.clock[axis], state.entry[axis] = kept.clock[place, axis], kept.entry[place, axis]
+        state.fused[axis] = kept.fused[place, axis]
         for i in range(state.x.shape[1]):
             state.x[axis, i] = kept.x[place, axis, i]
             for j in range(state.x.shape[1]):

@@ -10,10 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, TimeArray
-from .arm import AxisModel, commanded_speed
-
-_NEGLIGIBLE = 1e-15  # m; below it a decaying gain error no longer changes any estimate
+from ..arrays import FloatArray, TimeArray
+from .arm import AxisModel
 
 
 @dataclass(frozen=True)
@@ -46,39 +44,14 @@ def drive(axis: AxisModel, time: TimeArray, command: FloatArray, start: float, p
     Returns:
         The commands, and between them an entry each T where a gain error decays.
     """
-    step = np.diff(command, prepend=start)
-    speed = commanded_speed(step, period)
-    maneuver = np.abs(np.diff(step, prepend=0.0)) / period
-    kick = (axis.gain.at(speed) - 1.0) * step
-    interval = np.diff(time) / 1e9
+    from .drive_kernels import follow, spread_out
+
     recovery = np.inf if axis.gain_recovery is None else axis.gain_recovery
-    error = _decaying_sum(np.exp(-np.concatenate(([0.0], interval)) / recovery), kick)
-    highest = float(speed.max(initial=0.0))
-    if not np.isfinite(recovery) or not error.any():
-        return Drive(time, command - start + error, maneuver, highest)
-    held = _grid_points(time, error, recovery, period)
-    source = np.repeat(np.arange(len(time)), held + 1)
-    tick = np.arange(len(source)) - np.repeat(np.cumsum(held + 1) - held - 1, held + 1)
-    value = (command - start)[source] + error[source] * np.exp(-tick * period / recovery)
-    return Drive(time[source] + np.rint(tick * (period * 1e9)).astype(np.int64), value, maneuver[source], highest)
-
-
-def _grid_points(time: TimeArray, error: FloatArray, recovery: float, period: float) -> IntArray:
-    """How many grid points of T lie strictly inside each command's hold, as long as its error is worth decaying."""
-    with np.errstate(divide="ignore"):
-        worth = np.ceil(np.log(np.abs(error) / _NEGLIGIBLE) * (recovery / period))
-    inside, hold, tick = np.full(len(time), np.inf), np.diff(time), period * 1e9
-    inside[:-1] = np.ceil(hold / tick) - 1.0
-    inside[:-1] -= np.rint(inside[:-1] * tick) >= hold  # a point that rounds onto the next command is not inside
-    return np.maximum(np.minimum(inside, worth), 0.0).astype(np.int64)
-
-
-def _decaying_sum(decay: FloatArray, kick: FloatArray) -> FloatArray:
-    """s_n = decay_n · s_(n−1) + kick_n from s = 0, by doubling strides: log2(n) passes and no loop over samples."""
-    factor, total, stride = decay.copy(), kick.copy(), 1
-    while stride < len(total) and factor[stride:].any():
-        total[stride:] += factor[stride:] * total[:-stride].copy()
-        factor[stride:] *= factor[:-stride].copy()
-        factor[:stride] = 0.0
-        stride *= 2
-    return total
+    error, maneuver = np.empty(len(time)), np.empty(len(time))
+    held = np.empty(len(time), dtype=np.int64)
+    gain = axis.gain
+    speed = follow(time, command, start, gain.slope, gain.intercept, recovery, period, error, maneuver, held)
+    entries = len(time) + int(held.sum())
+    made = Drive(np.empty(entries, dtype=np.int64), np.empty(entries), np.empty(entries), speed)
+    spread_out(time, command, start, recovery, period, error, maneuver, held, made.time, made.value, made.maneuver)
+    return made

@@ -6,6 +6,7 @@ the start level. ``rotated``: a fixed rotation about z, for small motions.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -67,7 +68,9 @@ class Placed:
     def _sign(self) -> float:
         return 1.0 if self.frame.positive == "counterclockwise" else -1.0
 
-    def to_axes(self, x: FloatArray, y: FloatArray, near: FloatArray | None = None) -> tuple[FloatArray, ...]:
+    def to_axes(
+        self, x: FloatArray, y: FloatArray, near: FloatArray | None = None, last: float = 0.0
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Tangential and radial [m] of positions in the log's x and y [m], and how the noise of each is scaled.
 
         Args:
@@ -75,32 +78,32 @@ class Placed:
             y: (n,).
             near: Tangential positions [m] near by, (n,), which say how often the arm has gone round; None: the
                 positions follow one another, each less than half a turn from the last.
+            last: The tangential position [m] that the first of those follows.
 
         Returns:
             Tangential (n,), radial (n,), and R0/r (n,), by which the noise of a tangential reading is larger.
         """
-        x, y = np.where(np.isfinite(x + y), (x, y), np.nan)
+        from .frame_kernels import to_cylinder, to_plane
+
+        x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        tangential, radial, spread = np.empty(len(x)), np.empty(len(x)), np.ones(len(x))
         if isinstance(self.frame, Rotated):
-            along = x * np.cos(self.angle) + y * np.sin(self.angle)
-            across = y * np.cos(self.angle) - x * np.sin(self.angle)
-            return self._sign * across, along, np.ones_like(x)
-        dx, dy = x - self.frame.base[0], y - self.frame.base[1]
-        r = np.hypot(dx, dy)
-        r[r == 0.0] = np.nan  # on the base's axis there is no angle: what some sensors send when they are lost
-        turn = np.where(np.isnan(r), np.nan, np.arctan2(dy, dx) - self.angle)
-        if near is None:
-            known = np.isfinite(turn)
-            turn[known] = np.unwrap(np.concatenate(([0.0], turn[known])))[1:]
+            to_plane(x, y, math.cos(self.angle), math.sin(self.angle), self._sign, tangential, radial)
         else:
-            about = self._sign * near / self.radius
-            turn = about + np.remainder(turn - about + np.pi, 2.0 * np.pi) - np.pi
-        return self._sign * self.radius * turn, r, np.where(np.isnan(r), 1.0, self.radius / r)
+            nearby = np.empty(0) if near is None else near
+            to_cylinder(
+                x, y, *self.frame.base, self.radius, self.angle, self._sign, nearby, last, tangential, radial, spread
+            )
+        return tangential, radial, spread
 
     def to_log(self, tangential: FloatArray, radial: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The log's x and y [m] of axis positions [m]; the inverse of :meth:`to_axes`."""
         if isinstance(self.frame, Rotated):
             across = self._sign * tangential
-            cos, sin = np.cos(self.angle), np.sin(self.angle)
+            cos, sin = math.cos(self.angle), math.sin(self.angle)
             return radial * cos - across * sin, radial * sin + across * cos
-        theta = self.angle + self._sign * tangential / self.radius
-        return self.frame.base[0] + radial * np.cos(theta), self.frame.base[1] + radial * np.sin(theta)
+        from .frame_kernels import from_cylinder
+
+        x, y = np.empty(len(tangential)), np.empty(len(tangential))
+        from_cylinder(tangential, radial, *self.frame.base, self.radius, self.angle, self._sign, x, y)
+        return x, y
