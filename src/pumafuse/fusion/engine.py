@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray, IntArray, TimeArray
@@ -29,10 +31,10 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
         arrival = np.maximum(scalars.stamp[candidates[rows.first]], rows.valid)
         queue = np.argsort(arrival, kind="stable")
         back = int((np.maximum.accumulate(queue) - queue).max(initial=0)) + 2
-        places = _places(state, back)
+        checkpoints = places(state, back)
         arrived = np.zeros(len(rows.valid), dtype=np.bool_)
         kernels.filter_as_live(
-            axes, sensors, rows, arrival, queue, arrived, state, places, times, met, log, held, outputs
+            axes, sensors, rows, arrival, queue, arrived, state, checkpoints, times, met, log, held, outputs
         )
     else:
         kernels.filter_run(axes, sensors, rows, state, times, met, log, held, outputs)
@@ -83,9 +85,10 @@ def _arranged(
     timeline: Timeline, config: FusionConfig
 ) -> tuple[kernels.Axes, kernels.Sensors, kernels.Rows, kernels.State, list[list[str]]]:
     """The kernels' arrays, and for each axis the sensors whose bias is in its state."""
-    sensors, biases = _sensors(timeline, config)
-    axes = _axes(timeline, config, [len(names) for names in biases])
-    state = _start(axes, timeline, config, biases, int(axes.states.max()))
+    names, biases = timeline.scalars.sensors, _biases_on(timeline, config)
+    sensors = sensors_of(names, {axis.name: axis.start for axis in timeline.axes}, config, biases)
+    axes = _axes(timeline, config, [len(biased) for biased in biases])
+    state = start_of(axes, len(names), timeline.origin, config, biases)
     return axes, sensors, _rows(timeline), state, biases
 
 
@@ -101,34 +104,42 @@ def _biases_on(timeline: Timeline, config: FusionConfig) -> list[list[str]]:
     ]
 
 
-def _sensors(timeline: Timeline, config: FusionConfig) -> tuple[kernels.Sensors, list[list[str]]]:
-    names, biases = timeline.scalars.sensors, _biases_on(timeline, config)
+def sensors_of(
+    names: Sequence[str], start: Mapping[str, float], config: FusionConfig, biases: Sequence[Sequence[str]]
+) -> kernels.Sensors:
+    """What the kernels know of each sensor.
+
+    Args:
+        names: The sensors in their order; those that are not configured, too.
+        start: The level u₀ [m] of each axis.
+        config: Their noise.
+        biases: For each axis the sensors whose bias is in its state, in the state's order.
+    """
     known = [config.sensors.get(name) for name in names]
-    bias = np.full((len(names), len(timeline.axes)), -1)
-    for number, axis in enumerate(timeline.axes):
-        first = _order(config, axis) + 1
-        for place, name in enumerate(biases[number]):
-            bias[names.index(name), number] = first + place
+    bias = np.full((len(names), len(start)), -1)
+    for number, axis in enumerate(start):
+        for place, name in enumerate(biases[number], order_of(config, axis) + 1):
+            bias[names.index(name), number] = place
     scale = np.array([1.0 if sensor is None else sensor.scale for sensor in known])
-    table = (len(names), len(timeline.axes))
     return kernels.Sensors(
         scale,
-        scale[:, None] * np.array([axis.start for axis in timeline.axes]),
-        np.array([[_noise(sensor, axis.name) for axis in timeline.axes] for sensor in known]).reshape(table),
+        scale[:, None] * np.array(list(start.values())),
+        np.array([[_noise(sensor, axis) for axis in start] for sensor in known]).reshape(bias.shape),
         np.array([0.0 if sensor is None else sensor.latency_sd for sensor in known]),
         np.array([0.0 if sensor is None else sensor.gate for sensor in known]),
         np.array([sensor is None or sensor.gate_rows for sensor in known], dtype=np.bool_),
         bias,
-    ), biases
+    )
 
 
-def _order(config: FusionConfig, axis: AxisInput) -> int:
-    return 1 if isinstance(config.arm.axes[axis.name].plant, FirstOrder) else 2
+def order_of(config: FusionConfig, axis: str) -> int:
+    """The order of an axis's plant."""
+    return 1 if isinstance(config.arm.axes[axis].plant, FirstOrder) else 2
 
 
 def _axes(timeline: Timeline, config: FusionConfig, biases: list[int]) -> kernels.Axes:
     driven = [(axis, config.process[axis.name]) for axis in timeline.axes]
-    order = np.array([_order(config, axis) for axis, _ in driven])
+    order = np.array([order_of(config, axis.name) for axis, _ in driven])
     noise = [p.input_noise**2 + (p.maneuver_noise * axis.drive.maneuver) ** 2 for axis, p in driven]
     drift = [p.drift**2 + (p.maneuver_drift * axis.drive.maneuver) ** 2 for axis, p in driven]
     return kernels.Axes(
@@ -165,11 +176,19 @@ def _chosen(timeline: Timeline) -> slice | IntArray:
     return slice(None) if len(candidates) == len(timeline.scalars.value) else candidates
 
 
-def _start(
-    axes: kernels.Axes, timeline: Timeline, config: FusionConfig, biases: list[list[str]], width: int
+def start_of(
+    axes: kernels.Axes, sensors: int, origin: int, config: FusionConfig, biases: Sequence[Sequence[str]]
 ) -> kernels.State:
-    """At rest at the start level, certain of all but the offset and the biases."""
-    count, sensors = len(axes.order), len(timeline.scalars.sensors)
+    """At rest at the start level at ``origin`` [ns], certain of all but the offset and the biases.
+
+    Args:
+        axes: Which states each axis has.
+        sensors: How many there are.
+        origin: The first command.
+        config: How uncertain the start is.
+        biases: As in :func:`sensors_of`.
+    """
+    count, width = len(axes.order), int(axes.states.max())
     P = np.zeros((count + 1, width, width))
     for number, names in enumerate(biases):
         offset = axes.order[number]
@@ -179,27 +198,23 @@ def _start(
     return kernels.State(
         x=np.zeros((count + 1, width)),
         P=P,
-        clock=np.full(count, timeline.origin),
+        clock=np.full(count, origin),
         entry=np.full(count, -1),
-        fused=np.full(count, timeline.origin),
+        fused=np.full(count, origin),
         rejected=np.zeros((sensors, count + 1), dtype=np.int64),
         since=np.zeros((sensors, count + 1), dtype=np.int64),
         work=np.zeros((4, width)),
     )
 
 
-def _places(state: kernels.State, count: int) -> kernels.State:
-    """Room for ``count`` checkpoints."""
-    return kernels.State(
-        x=np.empty((count, *state.x.shape)),
-        P=np.empty((count, *state.P.shape)),
-        clock=np.empty((count, *state.clock.shape), dtype=np.int64),
-        entry=np.empty((count, *state.entry.shape), dtype=np.int64),
-        fused=np.empty((count, *state.fused.shape), dtype=np.int64),
-        rejected=np.empty((count, *state.rejected.shape), dtype=np.int64),
-        since=np.empty((count, *state.since.shape), dtype=np.int64),
-        work=state.work,
-    )
+def places(state: kernels.State, count: int) -> kernels.State:
+    """Room for ``count`` checkpoints of a state."""
+    room = {
+        name: np.empty((count, *part.shape), dtype=part.dtype)
+        for name, part in state._asdict().items()
+        if name != "work"
+    }
+    return kernels.State(**room, work=state.work)
 
 
 def _log(axes: kernels.Axes, rows: kernels.Rows | None, width: int) -> kernels.Log:

@@ -26,7 +26,7 @@ from .config import FusionConfig, Sensor
 LONGEST_TAIL_NS = 3_600_000_000_000  # readings this long after the last command no longer belong to the run
 REOPEN_AFTER = 10  # rejections in a row of one sensor …
 REOPEN_SPAN_NS = 500_000_000  # … the first of them at least 0.5 s ago
-_FARTHEST = 1e6  # m
+FARTHEST = 1e6  # m; what is farther is a sentinel, no position
 T = TypeVar("T", bound=np.generic)
 _MOST_ESTIMATES = 10_000_000
 
@@ -315,7 +315,7 @@ def _heard(run: Run, config: FusionConfig, name: str, origin: int, notes: list[s
 
 def _plausible(value: FloatArray) -> BoolArray:
     """Finite and no sentinel such as 3.4e38: within a thousand kilometres."""
-    return np.abs(value) < _FARTHEST
+    return np.abs(value) < FARTHEST
 
 
 def _row_outcomes(source: Source, sensor: Sensor | None, valid: TimeArray, origin: int) -> CodeArray:

@@ -55,7 +55,7 @@ def in_axes(run: Run, frame: Frame | None) -> tuple[Run, Placed | None]:
 
 def _placed(run: Run, frame: Frame) -> Placed:
     if isinstance(frame, Rotated):
-        return Placed(frame, 1.0, float(np.deg2rad(frame.azimuth)))
+        return placed_at(frame, 0.0, 0.0, "")
     if "x" in run.start and "y" in run.start:
         x, y = run.start["x"], run.start["y"]
     elif "x" in run.command.values and "y" in run.command.values:
@@ -72,9 +72,20 @@ def _placed(run: Run, frame: Frame) -> Placed:
             f"run '{run.name}': a cylindrical frame takes its radius and angle from the start level; give the commands,"
             " or start, in x and y"
         )
+    return placed_at(frame, x, y, f"run '{run.name}'")
+
+
+def placed_at(frame: Frame, x: float, y: float, label: str) -> Placed:
+    """A frame whose start level is at x and y [m] of the log.
+
+    Raises:
+        RunError: That is on the base's axis, where there is no angle.
+    """
+    if isinstance(frame, Rotated):
+        return Placed(frame, 1.0, float(np.deg2rad(frame.azimuth)))
     dx, dy = x - frame.base[0], y - frame.base[1]
     if dx == 0.0 and dy == 0.0:
-        raise RunError(f"run '{run.name}': the arm starts on its base's axis, where it has no angle; check base_mm")
+        raise RunError(f"{label}: the arm starts on its base's axis, where it has no angle; check base_mm")
     return Placed(frame, float(np.hypot(dx, dy)), float(np.arctan2(dy, dx)))
 
 

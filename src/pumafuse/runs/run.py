@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray
+from ..arrays import NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
 from ..model.arm import CANONICAL_AXES, ordered_axes
 from ..units import nanoseconds
@@ -188,7 +188,7 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
     """Int64 ns of datetime64, int ns or float seconds, all within reach."""
     if time.dtype.kind == "M":
         rough_s = time.astype("M8[s]").astype(np.float64)
-        if (np.abs(rough_s[~np.isnat(time)]) >= tables.REACH_NS / 1e9).any():
+        if (np.abs(rough_s[~np.isnat(time)]) >= REACH_NS / 1e9).any():
             raise ValueError("a stamp beyond the year 2110")
         time = time.astype("M8[ns]").astype(np.int64)
     if time.dtype.kind not in "iuf":
@@ -196,7 +196,7 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
     whole = time.dtype.kind in "iu"
     rough = time.astype(np.float64) * (1.0 if whole else 1e9)
     missing = (time == NO_STAMP) if whole else ~np.isfinite(rough)
-    if (np.abs(rough[~missing]) >= tables.REACH_NS).any():
+    if (np.abs(rough[~missing]) >= REACH_NS).any():
         raise ValueError("a stamp beyond the year 2110")
     return time.astype(np.int64) if whole else nanoseconds(rough / 1e9)
 

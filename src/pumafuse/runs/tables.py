@@ -19,11 +19,10 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as papq
 
 from .. import units
-from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..arrays import NO_STAMP, REACH_NS, FloatArray, TimeArray
 from ..errors import RunError, UnknownNameError
 
 N = TypeVar("N", np.float64, np.int64)
-REACH_NS = 4.6e18  # |stamp| whose differences int64 ns can hold: the years 1824 to 2115
 
 
 @dataclass(frozen=True)

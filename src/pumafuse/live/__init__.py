@@ -1,0 +1,1 @@
+"""Live estimation: the same filter, fed event by event."""

@@ -1,0 +1,115 @@
+"""Where the time of a stream is, told by stamps alone: late, ahead, on another clock, or set back.
+
+The commands are the master: their controller is what the arm obeys. A stamp within the window behind the newest one is
+late, one that is farther behind is too late. One that is ahead of all by more than usual is believed, since everything
+may have paused, and taken back if the next event still has the old time: one sensor's clock was wrong. Commands that
+have another time again and again mean a clock that was set anew: the filter starts again there.
+"""
+
+from __future__ import annotations
+
+import enum
+
+from ..fusion.timeline import LONGEST_TAIL_NS
+
+AHEAD_NS = 1_000_000_000  # stamps may run ahead of all others by this much, or by the window, without a doubt
+AGREE_AFTER = 3  # commands in a row that have another time: the clock was set anew
+
+
+class Verdict(enum.Enum):
+    """What a stamp means."""
+
+    HERE = enum.auto()
+    CONTRADICTED = enum.auto()  # what ran ahead was wrong: it is to be forgotten
+    BEHIND = enum.auto()
+    BEYOND = enum.auto()
+    ANEW = enum.auto()  # a new segment begins
+
+
+class Clock:
+    """The newest stamp of a stream, and whether it is sure.
+
+    Attributes:
+        window: How late an event may be [ns].
+        newest: The newest stamp that is believed, int ns; None at first.
+        low: Stamps from here …
+        high: … to here are plainly right [ns]; none is while there is a doubt.
+    """
+
+    def __init__(self, window: int) -> None:
+        """At no time yet."""
+        self.window = window
+        self.newest: int | None = None
+        self.low, self.high = 1, 0
+        self._ahead = max(window, AHEAD_NS)
+        self._sure: int | None = None  # what the newest stamp was before a jump ahead that is not certain yet
+        self._jumped, self._jumped_commands = 0, 0
+        self._other: list[int] = []  # stamps of commands in a row that are not here
+
+    @property
+    def sure(self) -> int:
+        """The newest stamp that nothing can take back any more, int ns."""
+        assert self.newest is not None
+        return self.newest if self._sure is None else self._sure
+
+    @property
+    def tries(self) -> int:
+        """How many commands in a row had another time."""
+        return len(self._other)
+
+    @property
+    def bound(self) -> int:
+        """What is stamped after it is in doubt [ns]."""
+        return self.sure + self._ahead
+
+    def start(self, stamp: int) -> None:
+        """Be at ``stamp`` [ns], whatever was before."""
+        self._sure, self._other = None, []
+        self._move(stamp)
+
+    def advance(self, stamp: int) -> None:
+        """A stamp that is plainly right, ahead of the newest."""
+        self._move(stamp)
+
+    def judge(self, stamp: int, command: bool) -> Verdict:
+        """What a stamp [ns] means that is not between ``low`` and ``high``, and move on to it if it is believed."""
+        assert self.newest is not None
+        if self._sure is not None and self._sure - self.window <= stamp < self.newest - self.window:
+            self._end_doubt(self._sure)
+            return Verdict.CONTRADICTED
+        if stamp < self.newest - self.window or stamp > self.newest + LONGEST_TAIL_NS:
+            return self._elsewhere(stamp, command)
+        if command:
+            self._other = []
+        if stamp > self.newest + self._ahead:
+            self._sure, self._jumped, self._jumped_commands = self.newest, stamp, int(command)
+            self.newest = stamp
+            self.low, self.high = 1, 0
+            return Verdict.HERE
+        self._jumped_commands += command
+        if self._sure is not None and self._jumped_commands < 2 and stamp - self._jumped < AHEAD_NS:
+            self.newest = max(self.newest, stamp)
+            return Verdict.HERE
+        self._end_doubt(max(self.newest, stamp))
+        return Verdict.HERE
+
+    def here(self) -> None:
+        """A command that is plainly right has come: others that were not are no sign of a clock set anew."""
+        self._other = []
+
+    def _elsewhere(self, stamp: int, command: bool) -> Verdict:
+        assert self.newest is not None
+        if command:
+            follows = self._other and self._other[-1] < stamp <= self._other[-1] + LONGEST_TAIL_NS
+            self._other = [*self._other, stamp] if follows else [stamp]
+            if len(self._other) >= AGREE_AFTER:
+                return Verdict.ANEW
+        return Verdict.BEHIND if stamp < self.newest else Verdict.BEYOND
+
+    def _end_doubt(self, newest: int) -> None:
+        self._sure = None
+        self._move(newest)
+
+    def _move(self, newest: int) -> None:
+        self.newest = newest
+        self.low, self.high = newest - self.window, newest + self._ahead

@@ -1,0 +1,302 @@
+"""The arrays behind a live estimator: made once, grown when a stream is denser than they are, never without bound."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..errors import ConfigError
+from ..fusion import kernels as fusion
+from ..fusion.config import FusionConfig
+from ..fusion.engine import order_of, places, sensors_of, start_of
+from ..fusion.timeline import Outcome
+from ..model import closed
+from . import kernels
+from .kernels import ALWAYS, DONE, NEVER, SECONDS, Commands, Heard, Memory, Tally
+
+MOST_ROWS = 65_536  # of readings or of commands: some 70 MB for three axes; what is more shortens the window
+_ROWS, _COMMANDS, _ENTRIES = 4096, 512, 1024  # at first
+_LONGEST_RECOVERY = 1e4  # periods
+
+
+class Window:
+    """The last seconds of a stream, and the filter at every one of their events.
+
+    Attributes:
+        memory: All arrays.
+        floor: What is valid before it [ns] is gone, because the stream was too dense for the window.
+    """
+
+    def __init__(
+        self, config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, float], tally: Tally | None = None
+    ) -> None:
+        """Nothing heard yet.
+
+        Args:
+            config: Arm, noise and sensors.
+            axes: Every axis in its order.
+            start: The level u₀ [m] of axes that do not rest at their first command before it.
+            tally: What was counted before.
+
+        Raises:
+            ConfigError: A gain's recovery is too slow to be followed.
+        """
+        period = config.arm.update_period
+        for axis in axes:
+            recovery = config.arm.axes[axis].gain_recovery
+            if recovery is not None and recovery > _LONGEST_RECOVERY * period:
+                raise ConfigError(
+                    f"axes.{axis}.gain_recovery_ms: a live stream follows at most {_LONGEST_RECOVERY:g} update periods"
+                )
+        self.floor = ALWAYS
+        self.memory = _empty(config, axes, start)
+        if tally is not None:
+            self.memory.tally.outcomes[:], self.memory.tally.rows[:] = tally.outcomes, tally.rows
+            self.memory.tally.dropouts[:], self.memory.tally.usual[:] = tally.dropouts, tally.usual
+        self._flat = self.memory.flat()
+
+    @property
+    def origin(self) -> int | None:
+        """The first command's stamp, int ns; None before it."""
+        origin = int(self.memory.heard.span[2])
+        return None if origin == NEVER else origin
+
+    def hear(self, stamp: int, sensor: int, given: int, newest: int, oldest: int, horizon: int) -> None:
+        """Take in the row in ``heard.new``: see :func:`pumafuse.live.kernels.hear`; ``oldest`` as in :meth:`command`."""
+        attempt = 0
+        while kernels.hear(self._flat, stamp, sensor, given, newest, horizon) != DONE:
+            self._make_room(attempt, oldest)
+            attempt += 1
+
+    def command(self, stamp: int, given: int, oldest: int, horizon: int) -> None:
+        """Take in the command in ``heard.new``: see :func:`pumafuse.live.kernels.command`.
+
+        Args:
+            stamp: Int ns.
+            given: The axes it gives, as bits.
+            oldest: No command stamped before will ever come [ns].
+            horizon: No row valid before will ever come [ns].
+        """
+        attempt = 0
+        while kernels.command(self._flat, stamp, given, horizon) != DONE:
+            self._make_room(attempt, oldest)
+            attempt += 1
+
+    def estimate(self, time: int, oldest: int) -> fusion.Outputs:
+        """Every axis at ``time`` [ns], relative to its start level; the arrays are (A, 1) and used again."""
+        attempt = 0
+        while kernels.ask(self._flat, time) != DONE:
+            self._make_room(attempt, oldest)
+            attempt += 1
+        return self.memory.outputs
+
+    def forget(self, after: int) -> None:
+        """Take back all that is stamped after ``after`` [ns]."""
+        kernels.forget(self._flat, after)
+
+    def tally(self) -> Tally:
+        """What there was of each sensor until now, with what is still in the window."""
+        copied = Tally(*(part.copy() for part in self.memory.tally))
+        kernels.count(self.memory._replace(tally=copied).flat())
+        return copied
+
+    def _make_room(self, attempt: int, oldest: int) -> None:
+        """First let go of old commands; if that was not enough, take more memory or give up the oldest part."""
+        heard, commands = self.memory.heard, self.memory.commands
+        rows, begin = len(heard.stamp), int(heard.span[0])
+        if heard.span[1] - begin == rows:
+            if rows < MOST_ROWS:
+                self.memory = _with_rows(self.memory, 2 * rows)
+            else:
+                self.floor = int(self.memory.rows.valid[(begin + rows // 8) % rows]) + 1
+                kernels.let_go(self._flat, self.floor)
+        elif attempt == 0:
+            kernels.compact(self._flat, max(oldest, self.floor))
+        else:
+            full = commands.stamp.shape[1] >= MOST_ROWS and commands.count.max() == commands.stamp.shape[1]
+            if full:
+                longest = int(commands.count.argmax())
+                self.floor = int(commands.stamp[longest, MOST_ROWS // 8]) + 1
+                kernels.let_go(self._flat, self.floor)
+                kernels.compact(self._flat, self.floor)
+            else:
+                self.memory = _with_commands(self.memory)
+        self._flat = self.memory.flat()
+
+
+def _empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, float]) -> Memory:
+    names, count = tuple(config.sensors), len(axes)
+    level = {axis: start.get(axis, 0.0) for axis in axes}
+    biases = [
+        [name for name, sensor in config.sensors.items() if sensor.bias_sd > 0.0 and sensor.sd_of(axis) is not None]
+        for axis in axes
+    ]
+    models, process = [config.arm.axes[axis] for axis in axes], [config.process[axis] for axis in axes]
+    order = np.array([order_of(config, axis) for axis in axes])
+    driven = fusion.Axes(
+        order=order,
+        constants=np.array([closed.constants(model.plant) for model in models]),
+        states=order + 1 + np.array([len(biased) for biased in biases]),
+        first=np.arange(count + 1) * _ENTRIES,
+        acting=np.full(count * _ENTRIES, NEVER),
+        value=np.zeros(count * _ENTRIES),
+        noise=np.zeros(count * _ENTRIES),
+        drift=np.zeros(count * _ENTRIES),
+        resting=np.array([[part.input_noise**2, part.drift**2] for part in process]),
+    )
+    state = start_of(driven, len(names), NEVER, config, biases)
+    scalars, width = _ROWS * count, state.x.shape[1]
+    kept = places(state, _ROWS + 2)
+    fusion.keep(state, kept, _ROWS + 1)
+    table = (count, _COMMANDS)
+    return Memory(
+        driven,
+        sensors_of(names, level, config, biases),
+        fusion.Rows(
+            np.zeros(_ROWS, np.int64),
+            np.zeros(_ROWS, np.int16),
+            np.zeros(_ROWS, np.int64),
+            np.zeros(_ROWS, np.int64),
+            np.zeros(scalars, np.int16),
+            np.zeros(scalars),
+            np.zeros(scalars),
+        ),
+        state,
+        kept,
+        fusion.Met(np.zeros(scalars), np.zeros(scalars), np.zeros(scalars, np.uint8)),
+        fusion.Log(
+            np.zeros(count + 1, np.int64),
+            np.zeros(count, np.int64),
+            np.zeros(0, np.int64),
+            np.zeros(0, np.int64),
+            np.zeros(0),
+            np.zeros(0),
+            np.zeros((0, width)),
+        ),
+        fusion.Held(np.zeros((count, 0, width)), np.zeros((count, 0, width, width)), np.zeros((count, 0))),
+        fusion.Outputs(*(np.zeros((count, 1)) for _ in fusion.Outputs._fields)),
+        Commands(
+            stamp=np.zeros(table, np.int64),
+            value=np.zeros(table),
+            given=np.zeros(table, np.int64),
+            held=np.zeros(table),
+            step=np.zeros(table),
+            error=np.zeros(table),
+            maneuver=np.zeros(table),
+            count=np.zeros(count, np.int64),
+            entries=np.zeros(count, np.int64),
+            latest=np.zeros(count, np.int64),
+            ticks=np.zeros(count, np.int64),
+            worth=np.zeros(count, np.int64),
+            start=np.array(list(level.values())),
+            fixed=np.array([axis in start for axis in axes]),
+            delay=np.array([round(config.arm.delay_of(axis) * 1e9) for axis in axes]),
+            gain=np.array(
+                [
+                    [
+                        model.gain.slope,
+                        model.gain.intercept,
+                        np.inf if model.gain_recovery is None else model.gain_recovery,
+                        config.arm.update_period,
+                    ]
+                    for model in models
+                ]
+            ),
+            process=np.array(
+                [[part.input_noise**2, part.drift**2, part.maneuver_noise, part.maneuver_drift] for part in process]
+            ),
+        ),
+        Heard(
+            span=np.array([0, 0, NEVER]),
+            stamp=np.zeros(_ROWS, np.int64),
+            value=np.zeros((_ROWS, count)),
+            spread=np.ones((_ROWS, count)),
+            known=np.zeros((_ROWS, count), np.uint8),
+            outcome=np.zeros((_ROWS, count), np.uint8),
+            latency=np.array([round(sensor.latency * 1e9) for sensor in config.sensors.values()], dtype=np.int64),
+            new=np.zeros(count),
+            new_spread=np.ones(count),
+            told=np.zeros(count, np.uint8),
+            fused=np.zeros(count, np.int64),
+        ),
+        Tally(
+            outcomes=np.zeros((len(names), len(Outcome)), np.int64),
+            rows=np.zeros(len(names), np.int64),
+            last=np.full(len(names), ALWAYS),
+            usual=np.zeros(len(names)),
+            dropouts=np.zeros(len(names), np.int64),
+            second=np.full((len(names), SECONDS), ALWAYS),
+            minute=np.zeros((len(names), SECONDS, 5)),
+        ),
+    )
+
+
+def _with_rows(memory: Memory, rows: int) -> Memory:
+    """The same with room for ``rows`` rows in the ring; what is in it keeps its positions."""
+    held, axes = len(memory.heard.stamp), len(memory.heard.new)
+    positions = np.arange(memory.heard.span[0], memory.heard.span[1])
+    here, there = positions % held, positions % rows
+    extra = np.array([held, held + 1])
+
+    def of_rows(part: np.ndarray) -> np.ndarray:
+        found = np.zeros((rows, *part.shape[1:]), dtype=part.dtype)
+        found[there] = part[here]
+        return found
+
+    def of_scalars(part: np.ndarray) -> np.ndarray:
+        return of_rows(part.reshape(held, axes)).reshape(-1)
+
+    def of_places(part: np.ndarray) -> np.ndarray:
+        found = np.zeros((rows + 2, *part.shape[1:]), dtype=part.dtype)
+        found[there], found[rows:] = part[here], part[extra]
+        return found
+
+    scalars_begin = memory.rows.first - np.arange(held) * axes  # 0 for each row that was ever arranged
+    first = of_rows(scalars_begin) + np.arange(rows) * axes
+    return memory._replace(
+        rows=fusion.Rows(
+            of_rows(memory.rows.valid),
+            of_rows(memory.rows.sensor),
+            first,
+            first + of_rows(memory.rows.end - memory.rows.first),
+            of_scalars(memory.rows.axis),
+            of_scalars(memory.rows.value),
+            of_scalars(memory.rows.spread),
+        ),
+        kept=fusion.State(
+            **{name: of_places(part) for name, part in memory.kept._asdict().items() if name != "work"},
+            work=memory.kept.work,
+        ),
+        met=fusion.Met(*(of_scalars(part) for part in memory.met)),
+        heard=memory.heard._replace(
+            stamp=of_rows(memory.heard.stamp),
+            value=of_rows(memory.heard.value),
+            spread=of_rows(memory.heard.spread),
+            known=of_rows(memory.heard.known),
+            outcome=of_rows(memory.heard.outcome),
+        ),
+    )
+
+
+def _with_commands(memory: Memory) -> Memory:
+    """The same with twice the room for commands and for the entries that they make."""
+    count, axes, commands = len(memory.heard.new), memory.axes, memory.commands
+
+    def wider(part: np.ndarray, filled: float = 0) -> np.ndarray:
+        return np.concatenate((part, np.full_like(part, filled)), axis=1)
+
+    def of_entries(part: np.ndarray, filled: float = 0) -> np.ndarray:
+        return wider(part.reshape(count, -1), filled).reshape(-1)
+
+    tables = ("stamp", "value", "given", "held", "step", "error", "maneuver")
+    return memory._replace(
+        axes=axes._replace(
+            first=axes.first * 2,
+            acting=of_entries(axes.acting, NEVER),
+            value=of_entries(axes.value),
+            noise=of_entries(axes.noise),
+            drift=of_entries(axes.drift),
+        ),
+        commands=commands._replace(**{name: wider(getattr(commands, name)) for name in tables}),
+    )
