@@ -15,6 +15,7 @@ ROOMS = [
     "simulate",
     "identify",
     "tune",
+    "live",
     "views",
     "cli",
 ]  # each imports itself and those before it

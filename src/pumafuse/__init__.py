@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from .identify.identify import Identification, identify
     from .identify.trials import StepTrials, TrialsError
     from .identify.verify import AxisVerification, verify
+    from .live.estimator import AxisNow, LiveEstimate, LiveEstimator, Told
+    from .live.health import Health, SensorHealth
     from .model.arm import ArmModel, AxisModel, Gain, Validity
     from .model.discrete import DiscreteModel, discretize
     from .model.plants import FirstOrder, SecondOrder
@@ -34,6 +36,7 @@ _HOME = {
     "ArmModel": "model.arm",
     "AxisEstimate": "fusion.track",
     "AxisModel": "model.arm",
+    "AxisNow": "live.estimator",
     "AxisVerification": "identify.verify",
     "ConfigError": "errors",
     "DiscreteModel": "model.discrete",
@@ -41,7 +44,10 @@ _HOME = {
     "FirstOrder": "model.plants",
     "FusionConfig": "fusion.config",
     "Gain": "model.arm",
+    "Health": "live.health",
     "Identification": "identify.identify",
+    "LiveEstimate": "live.estimator",
+    "LiveEstimator": "live.estimator",
     "Outcome": "fusion.timeline",
     "Process": "fusion.config",
     "PumafuseError": "errors",
@@ -53,10 +59,12 @@ _HOME = {
     "Score": "fusion.score",
     "SecondOrder": "model.plants",
     "Sensor": "fusion.config",
+    "SensorHealth": "live.health",
     "Simulated": "simulate.simulate",
     "Start": "fusion.config",
     "StepTrials": "identify.trials",
     "TickEstimates": "fusion.ticks",
+    "Told": "live.estimator",
     "TrialsError": "identify.trials",
     "TuneError": "tune.learnable",
     "Tuning": "tune.tune",
@@ -79,6 +87,7 @@ __all__ = [
     "ArmModel",
     "AxisEstimate",
     "AxisModel",
+    "AxisNow",
     "AxisVerification",
     "ConfigError",
     "DiscreteModel",
@@ -86,7 +95,10 @@ __all__ = [
     "FirstOrder",
     "FusionConfig",
     "Gain",
+    "Health",
     "Identification",
+    "LiveEstimate",
+    "LiveEstimator",
     "Outcome",
     "Process",
     "PumafuseError",
@@ -98,10 +110,12 @@ __all__ = [
     "Score",
     "SecondOrder",
     "Sensor",
+    "SensorHealth",
     "Simulated",
     "Start",
     "StepTrials",
     "TickEstimates",
+    "Told",
     "TrialsError",
     "TuneError",
     "Tuning",

@@ -19,7 +19,8 @@ from ..runs.axes import placed_at
 from ..runs.frames import CARTESIAN, Placed, Rotated
 from .clock import Clock, Verdict
 from .health import Health, health_of
-from .kernels import ABSENT, Tally
+from .command_kernels import COMMANDS, STAMP, U
+from .kernels import ABSENT, SPREAD, VALUE, Tally
 from .window import Window
 
 Time: TypeAlias = float | int  # float seconds, or int nanoseconds
@@ -213,8 +214,8 @@ class LiveEstimator:
         if stamp > newest + LONGEST_TAIL_NS:
             return _nowhere(stamp, _INVALID, "more than an hour ahead")
         outputs, memory = self._window.estimate(stamp, self._oldest()), self._window.memory
-        position = outputs.position[:, 0] + memory.commands.start
-        known = memory.commands.count.tolist()
+        position = outputs.position[:, 0] + memory.commands.level[:, 0]
+        known = memory.commands.count[:, COMMANDS].tolist()
         columns = (position.tolist(), *(part[:, 0].tolist() for part in outputs[1:]))
         rows = zip(self.axes, known, zip(*columns, strict=True), strict=True)
         axes = {axis: AxisNow(*row) for axis, commanded, row in rows if commanded}
@@ -269,6 +270,7 @@ class LiveEstimator:
         if "z" in others:
             known["vertical"] = start["z"]
         self._window = Window(self.config, self.axes, known, tally)
+        self._new, self._told = self._window.memory.heard.new[:, VALUE], self._window.memory.heard.told
         # A frame about the base is placed by the first command; one that comes late, but was given before, moves it.
         self._early: list[_Event] | None = [] if frame is not None and self._placed is None else None
 
@@ -373,8 +375,7 @@ class LiveEstimator:
         number = self._sensors.get(sensor, -1)
         if number < 0 and sensor:
             return self._refuse(sensor, values, _UNKNOWN, f"unknown sensor '{sensor:.40}'; {suggestion(sensor, self._sensors)}")
-        heard, given, stranger = self._window.memory.heard, 0, ""
-        new = heard.new
+        new, given, stranger = self._new, 0, ""
         for name, value in values.items():
             axis = self._bits.get(name)
             if axis is None:
@@ -399,7 +400,9 @@ class LiveEstimator:
             self._window.hear(stamp, number, given, newest, oldest, oldest - self._longest_latency)
         else:
             self._window.command(stamp, given, oldest, oldest - self._longest_latency)
-        codes = heard.told.tobytes()
+        if self._placed is not None:
+            self._window.memory.heard.new[:, SPREAD] = 1.0
+        codes = self._told.tobytes()
         return self._answers.get((codes, stranger)) or self._answer(codes, stranger)
 
     def _in_axes(self, event: _Event) -> tuple[int, str]:
@@ -418,21 +421,21 @@ class LiveEstimator:
                 self._last_tangential = float(tangential[0])
             for axis, value in {"tangential": tangential, "radial": radial}.items():
                 if axis in self._bits:
-                    heard.new[self._bits[axis]] = value[0]
+                    heard.new[self._bits[axis], VALUE] = value[0]
                     given |= 1 << self._bits[axis]
             if "tangential" in self._bits:
-                heard.new_spread[self._bits["tangential"]] = spread[0]
+                heard.new[self._bits["tangential"], SPREAD] = spread[0]
         if "z" in values and "vertical" in self._bits:
-            heard.new[self._bits["vertical"]] = values["z"]
+            heard.new[self._bits["vertical"], VALUE] = values["z"]
             given |= 1 << self._bits["vertical"]
         return given, ""
 
     def _commanded(self, stamp: int) -> FloatArray:
         """The tangential position [m] commanded at ``stamp`` or before it, as far as is known, (1,)."""
         commands, axis = self._window.memory.commands, self._bits.get("tangential", 0)
-        count = int(commands.count[axis])
-        row = int(np.searchsorted(commands.stamp[axis, :count], stamp, side="right")) - 1
-        return commands.value[axis, max(row, 0) : max(row, 0) + 1] if count else np.zeros(1)
+        count = int(commands.count[axis, COMMANDS])
+        row = int(np.searchsorted(commands.time[axis, :count, STAMP], stamp, side="right")) - 1
+        return commands.row[axis, max(row, 0) : max(row, 0) + 1, U] if count else np.zeros(1)
 
     def _to_log(self, axes: Mapping[str, AxisNow]) -> dict[str, float] | None:
         """An estimate in the stream's x, y and z."""

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ..fusion.timeline import Outcome
-from .kernels import ALWAYS, LATENESS, LATEST, NIS, ROWS, SCALARS, SECONDS, Tally
+from .command_kernels import ALWAYS
+from .kernels import CAME, DROPOUTS, LATENESS, LATEST_ROW, NIS, ROWS, SCALARS, SECONDS, Tally
 
 
 @dataclass(frozen=True)
@@ -81,15 +82,15 @@ def health_of(
         rows, scalars = float(minute[:, ROWS].sum()), float(minute[:, SCALARS].sum())
         span = float(age[recent].max(initial=0)) + (0.0 if newest is None else newest / 1e9 - now)
         sensors[name] = SensorHealth(
-            rows=int(tally.rows[number]),
+            rows=int(tally.count[number, CAME]),
             rate=rows / max(span, 1.0),
             lateness=float(minute[:, LATENESS].sum()) / max(rows, 1.0),
-            lateness_max=float(minute[:, LATEST].max(initial=0.0)),
+            lateness_max=float(minute[:, LATEST_ROW].max(initial=0.0)),
             silent=silent,
             stale=silent is None or silent > stale_ns / 1e9,
-            dropouts=int(tally.dropouts[number]),
+            dropouts=int(tally.count[number, DROPOUTS]),
             nis=float(minute[:, NIS].sum()) / scalars if scalars else None,
-            outcomes={outcome.word: int(tally.outcomes[number, outcome]) + more[outcome] for outcome in Outcome},
+            outcomes={outcome.word: int(tally.count[number, outcome]) + more[outcome] for outcome in Outcome},
         )
     by_word = {outcome.word: count for outcome, count in commands.items()}
     return Health(newest, segment + 1, by_word, sensors, unknown)

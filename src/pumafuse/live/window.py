@@ -10,10 +10,10 @@ from ..errors import ConfigError
 from ..fusion import kernels as fusion
 from ..fusion.config import FusionConfig
 from ..fusion.engine import order_of, places, sensors_of, start_of
-from ..fusion.timeline import Outcome
 from ..model import closed
 from . import kernels
-from .kernels import ALWAYS, DONE, NEVER, SECONDS, Commands, Heard, Memory, Tally
+from .command_kernels import ALWAYS, COMMANDS, NEVER, STAMP, Commands
+from .kernels import BEGIN, CAME, CHANGED, DONE, DROPOUTS, END, ORIGIN, SECONDS, Heard, Memory, Nothing, Tally
 
 MOST_ROWS = 65_536  # of readings or of commands: some 70 MB for three axes; what is more shortens the window
 _ROWS, _COMMANDS, _ENTRIES = 4096, 512, 1024  # at first
@@ -52,14 +52,18 @@ class Window:
         self.floor = ALWAYS
         self.memory = _empty(config, axes, start)
         if tally is not None:
-            self.memory.tally.outcomes[:], self.memory.tally.rows[:] = tally.outcomes, tally.rows
-            self.memory.tally.dropouts[:], self.memory.tally.usual[:] = tally.dropouts, tally.usual
+            self.memory.tally.count[:], self.memory.tally.usual[:] = tally.count, tally.usual
         self._flat = self.memory.flat()
+        width = self.memory.state.x.shape[1]
+        nothing = np.zeros((len(axes), 0))
+        self._held = (np.zeros((len(axes), 0, width)), np.zeros((len(axes), 0, width, width)), nothing)
+        self._outputs = fusion.Outputs(*(np.zeros((len(axes), 1)) for _ in fusion.Outputs._fields))
+        self._places = tuple(self._outputs)
 
     @property
     def origin(self) -> int | None:
         """The first command's stamp, int ns; None before it."""
-        origin = int(self.memory.heard.span[2])
+        origin = int(self.memory.heard.span[ORIGIN])
         return None if origin == NEVER else origin
 
     def hear(self, stamp: int, sensor: int, given: int, newest: int, oldest: int, horizon: int) -> None:
@@ -82,18 +86,20 @@ class Window:
         while kernels.command(self._flat, stamp, given, horizon) != DONE:
             self._make_room(attempt, oldest)
             attempt += 1
+        self._resume()
 
     def estimate(self, time: int, oldest: int) -> fusion.Outputs:
         """Every axis at ``time`` [ns], relative to its start level; the arrays are (A, 1) and used again."""
         attempt = 0
-        while kernels.ask(self._flat, time) != DONE:
+        while kernels.ask(self._flat, self._held, self._places, time) != DONE:
             self._make_room(attempt, oldest)
             attempt += 1
-        return self.memory.outputs
+        return self._outputs
 
     def forget(self, after: int) -> None:
         """Take back all that is stamped after ``after`` [ns]."""
         kernels.forget(self._flat, after)
+        self._resume()
 
     def tally(self) -> Tally:
         """What there was of each sensor until now, with what is still in the window."""
@@ -101,11 +107,16 @@ class Window:
         kernels.count(self.memory._replace(tally=copied).flat())
         return copied
 
+    def _resume(self) -> None:
+        span = self.memory.heard.span
+        if span[CHANGED] < span[END]:
+            kernels.hear(self._flat, 0, 0, 0, 0, 0)
+
     def _make_room(self, attempt: int, oldest: int) -> None:
         """First let go of old commands; if that was not enough, take more memory or give up the oldest part."""
         heard, commands = self.memory.heard, self.memory.commands
-        rows, begin = len(heard.stamp), int(heard.span[0])
-        if heard.span[1] - begin == rows:
+        rows, begin = len(heard.stamp), int(heard.span[BEGIN])
+        if heard.span[END] - begin == rows:
             if rows < MOST_ROWS:
                 self.memory = _with_rows(self.memory, 2 * rows)
             else:
@@ -114,10 +125,10 @@ class Window:
         elif attempt == 0:
             kernels.compact(self._flat, max(oldest, self.floor))
         else:
-            full = commands.stamp.shape[1] >= MOST_ROWS and commands.count.max() == commands.stamp.shape[1]
-            if full:
-                longest = int(commands.count.argmax())
-                self.floor = int(commands.stamp[longest, MOST_ROWS // 8]) + 1
+            room = commands.time.shape[1]
+            longest = int(commands.count[:, COMMANDS].argmax())
+            if room >= MOST_ROWS and commands.count[longest, COMMANDS] == room:
+                self.floor = int(commands.time[longest, room // 8, STAMP]) + 1
                 kernels.let_go(self._flat, self.floor)
                 kernels.compact(self._flat, self.floor)
             else:
@@ -165,33 +176,11 @@ def _empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, floa
         state,
         kept,
         fusion.Met(np.zeros(scalars), np.zeros(scalars), np.zeros(scalars, np.uint8)),
-        fusion.Log(
-            np.zeros(count + 1, np.int64),
-            np.zeros(count, np.int64),
-            np.zeros(0, np.int64),
-            np.zeros(0, np.int64),
-            np.zeros(0),
-            np.zeros(0),
-            np.zeros((0, width)),
-        ),
-        fusion.Held(np.zeros((count, 0, width)), np.zeros((count, 0, width, width)), np.zeros((count, 0))),
-        fusion.Outputs(*(np.zeros((count, 1)) for _ in fusion.Outputs._fields)),
         Commands(
-            stamp=np.zeros(table, np.int64),
-            value=np.zeros(table),
-            given=np.zeros(table, np.int64),
-            held=np.zeros(table),
-            step=np.zeros(table),
-            error=np.zeros(table),
-            maneuver=np.zeros(table),
-            count=np.zeros(count, np.int64),
-            entries=np.zeros(count, np.int64),
-            latest=np.zeros(count, np.int64),
-            ticks=np.zeros(count, np.int64),
-            worth=np.zeros(count, np.int64),
-            start=np.array(list(level.values())),
-            fixed=np.array([axis in start for axis in axes]),
-            delay=np.array([round(config.arm.delay_of(axis) * 1e9) for axis in axes]),
+            time=np.zeros((*table, 2), np.int64),
+            row=np.zeros((*table, 5)),
+            count=np.array([[0, 0, 0, 0, 0, round(config.arm.delay_of(axis) * 1e9)] for axis in axes]),
+            level=np.array([[u, float(axis in start)] for axis, u in level.items()]),
             gain=np.array(
                 [
                     [
@@ -208,34 +197,30 @@ def _empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, floa
             ),
         ),
         Heard(
-            span=np.array([0, 0, NEVER]),
+            span=np.array([0, 0, NEVER, 0]),
             stamp=np.zeros(_ROWS, np.int64),
-            value=np.zeros((_ROWS, count)),
-            spread=np.ones((_ROWS, count)),
-            known=np.zeros((_ROWS, count), np.uint8),
-            outcome=np.zeros((_ROWS, count), np.uint8),
+            value=np.zeros((_ROWS, count, 2)),
+            code=np.zeros((_ROWS, count, 2), np.uint8),
             latency=np.array([round(sensor.latency * 1e9) for sensor in config.sensors.values()], dtype=np.int64),
-            new=np.zeros(count),
-            new_spread=np.ones(count),
+            new=np.tile([0.0, 1.0], (count, 1)),
             told=np.zeros(count, np.uint8),
             fused=np.zeros(count, np.int64),
         ),
         Tally(
-            outcomes=np.zeros((len(names), len(Outcome)), np.int64),
-            rows=np.zeros(len(names), np.int64),
+            count=np.zeros((len(names), max(CAME, DROPOUTS) + 1), np.int64),
             last=np.full(len(names), ALWAYS),
             usual=np.zeros(len(names)),
-            dropouts=np.zeros(len(names), np.int64),
             second=np.full((len(names), SECONDS), ALWAYS),
             minute=np.zeros((len(names), SECONDS, 5)),
         ),
+        Nothing(np.zeros(count + 1, np.int64), np.zeros(0), np.zeros((0, width))),
     )
 
 
 def _with_rows(memory: Memory, rows: int) -> Memory:
     """The same with room for ``rows`` rows in the ring; what is in it keeps its positions."""
-    held, axes = len(memory.heard.stamp), len(memory.heard.new)
-    positions = np.arange(memory.heard.span[0], memory.heard.span[1])
+    held, axes = len(memory.heard.stamp), len(memory.heard.told)
+    positions = np.arange(memory.heard.span[BEGIN], memory.heard.span[END])
     here, there = positions % held, positions % rows
     extra = np.array([held, held + 1])
 
@@ -272,16 +257,14 @@ def _with_rows(memory: Memory, rows: int) -> Memory:
         heard=memory.heard._replace(
             stamp=of_rows(memory.heard.stamp),
             value=of_rows(memory.heard.value),
-            spread=of_rows(memory.heard.spread),
-            known=of_rows(memory.heard.known),
-            outcome=of_rows(memory.heard.outcome),
+            code=of_rows(memory.heard.code),
         ),
     )
 
 
 def _with_commands(memory: Memory) -> Memory:
     """The same with twice the room for commands and for the entries that they make."""
-    count, axes, commands = len(memory.heard.new), memory.axes, memory.commands
+    count, axes, commands = len(memory.heard.told), memory.axes, memory.commands
 
     def wider(part: np.ndarray, filled: float = 0) -> np.ndarray:
         return np.concatenate((part, np.full_like(part, filled)), axis=1)
@@ -289,7 +272,6 @@ def _with_commands(memory: Memory) -> Memory:
     def of_entries(part: np.ndarray, filled: float = 0) -> np.ndarray:
         return wider(part.reshape(count, -1), filled).reshape(-1)
 
-    tables = ("stamp", "value", "given", "held", "step", "error", "maneuver")
     return memory._replace(
         axes=axes._replace(
             first=axes.first * 2,
@@ -298,5 +280,5 @@ def _with_commands(memory: Memory) -> Memory:
             noise=of_entries(axes.noise),
             drift=of_entries(axes.drift),
         ),
-        commands=commands._replace(**{name: wider(getattr(commands, name)) for name in tables}),
+        commands=commands._replace(time=wider(commands.time), row=wider(commands.row)),
     )
