@@ -52,7 +52,7 @@ def feed(live: pf.LiveEstimator, event: Event) -> pf.Told:
 def differences(
     live: pf.LiveEstimator, arrivals: Iterable[Event], offline: pf.Estimates, settled_after: float
 ) -> list[str]:
-    """Feed all events and ask for every offline estimate once ``settled_after`` [s] has gone by; what is not the same."""
+    """Feed all events, ask for every offline estimate once ``settled_after`` [s] has gone by, and list what differs."""
     found: list[str] = []
     origin = offline.origin
     stamps = [origin + round(time * 1e9) for time in offline.time.tolist()]

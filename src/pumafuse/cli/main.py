@@ -285,6 +285,38 @@ def tune(
 
 
 @app.command()
+def live(
+    source: Annotated[
+        str, typer.Argument(metavar="SOURCE", help="stdin, or replay:RUN?speed=4 (speed=max: as fast as it can be).")
+    ],
+    config: Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")],
+    rate: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")
+    ] = None,
+    window: Annotated[float, typer.Option(metavar="S", help="How late an event may come.")] = 2.0,
+    stale_after: Annotated[
+        float, typer.Option(metavar="S", help="Without a reading for so long an axis is called stale.")
+    ] = 1.0,
+    status: Annotated[bool, typer.Option("--status", help="Show estimates and sensors on one live screen.")] = False,
+) -> None:
+    """Estimate from a stream of commands and readings, as they come.
+
+    One JSON object a line, in mm and s. In: {"t": 12.345, "command": {"radial": 570.0}} and {"t": 12.351, "sensor":
+    "tracker", "radial": 569.7}. Out: {"t": ..., "radial": {"position_mm": ..., "sd_mm": ..., "velocity_mm_s": ...}}.
+    """
+    from . import live as command
+
+    options = command.Options(
+        config=config,
+        rate=_positive(rate, "--rate"),
+        window=_positive(window, "--window"),
+        stale_after=_positive(stale_after, "--stale-after"),
+        status=status,
+    )
+    command.run(source, options)
+
+
+@app.command()
 def demo(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")] = Path(
         "demo"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -209,7 +210,7 @@ def start_of(
 
 def places(state: kernels.State, count: int) -> kernels.State:
     """Room for ``count`` checkpoints of a state."""
-    room = {
+    room: dict[str, Any] = {
         name: np.empty((count, *part.shape), dtype=part.dtype)
         for name, part in state._asdict().items()
         if name != "work"

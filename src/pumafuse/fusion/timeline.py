@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, TypeVar
 
@@ -159,11 +159,7 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     used = {name: _actual_commands(command.stamp, command.values[name], arm.update_period) for name in run.axes}
     stamp = command.stamp
     if run.clock == "regular":
-        rows = np.unique(np.concatenate(list(used.values())))
-        distinct, place = np.unique(stamp[rows], return_inverse=True)
-        grid, note = regular_grid(distinct, arm.update_period, run.command.label)
-        stamp = stamp.copy()
-        stamp[rows] = grid[place]
+        stamp, note = _on_grid(command, used, arm.update_period)
         notes.extend([] if note is None else [note])
     inputs: list[AxisInput] = []
     for name in run.axes:
@@ -184,6 +180,37 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     end = int(valid[valid <= commands[-1] + LONGEST_TAIL_NS].max(initial=commands[-1]))
     speed = max(axis.drive.speed for axis in inputs)
     return Timeline(origin, commands, tuple(inputs), scalars, end, speed, tuple(notes))
+
+
+def as_commanded(run: Run, period: float) -> Source:
+    """The rows of a run's commands as they are believed: as logged, or where the run says so on the grid of T.
+
+    Args:
+        run: One segment of a recorded run.
+        period: T [s].
+
+    Raises:
+        RunError: The stamps do not follow ticks of T.
+    """
+    if run.clock == "stamps":
+        return run.command
+    command = _sorted_commands(run.command, [])
+    used = {name: _actual_commands(command.stamp, command.values[name], period) for name in command.values}
+    stamp, _ = _on_grid(command, used, period)
+    values = {name: np.full(len(stamp), np.nan) for name in used}
+    for name, rows in used.items():
+        values[name][rows] = command.values[name][rows]
+    return replace(command, stamp=stamp, values=values).rows(np.unique(np.concatenate(list(used.values()))))
+
+
+def _on_grid(command: Source, used: Mapping[str, IntArray], period: float) -> tuple[TimeArray, str | None]:
+    """Stamps with those of the used rows on the grid of T, and what is to be said of it."""
+    rows = np.unique(np.concatenate(list(used.values())))
+    distinct, place = np.unique(command.stamp[rows], return_inverse=True)
+    grid, note = regular_grid(distinct, period, command.label)
+    stamp = command.stamp.copy()
+    stamp[rows] = grid[place]
+    return stamp, note
 
 
 def output_times(timeline: Timeline, rate: float | None) -> TimeArray:

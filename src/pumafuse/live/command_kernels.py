@@ -28,7 +28,7 @@ class Commands(NamedTuple):
     Attributes:
         time: ``STAMP`` and ``GIVEN``, int64 ns, ``ALWAYS`` where none was given, (A, c, 2).
         row: ``U``, ``HELD``, ``STEP``, ``ERROR`` and ``MANEUVER``, (A, c, 5).
-        count: Rows (``COMMANDS``), ``ENTRIES`` of the drive, the row of the command that the last entry belongs to
+        number: Of rows (``COMMANDS``), ``ENTRIES`` of the drive, the row of the command that the last entry belongs to
             (``LATEST``) and which of its grid points that is (``TICK``) of how many that its error is ``WORTH``, and Td
             [ns] (``DELAY``), (A, 6).
         level: u₀ [m], and 1 where it is known beforehand, (A, 2).
@@ -39,7 +39,7 @@ class Commands(NamedTuple):
 
     time: TimeArray
     row: FloatArray
-    count: IntArray
+    number: IntArray
     level: FloatArray
     gain: FloatArray
     process: FloatArray
@@ -48,7 +48,7 @@ class Commands(NamedTuple):
 @compiled
 def place_of(commands: Commands, axis: int, stamp: int) -> int:
     """Where a row of this stamp goes: after those of the same one."""
-    at = commands.count[axis, COMMANDS]
+    at = commands.number[axis, COMMANDS]
     while at > 0 and commands.time[axis, at - 1, STAMP] > stamp:
         at -= 1
     return at
@@ -69,10 +69,10 @@ def put(commands: Commands, axis: int, stamp: int, u: float) -> int:
     time, row = commands.time, commands.row
     if at > 0 and time[axis, at - 1, STAMP] == stamp and row[axis, at - 1, U] == u:
         return -1
-    for later in range(commands.count[axis, COMMANDS], at, -1):
+    for later in range(commands.number[axis, COMMANDS], at, -1):
         time[axis, later, STAMP], row[axis, later, U] = time[axis, later - 1, STAMP], row[axis, later - 1, U]
     time[axis, at, STAMP], row[axis, at, U] = stamp, u
-    commands.count[axis, COMMANDS] += 1
+    commands.number[axis, COMMANDS] += 1
     return at
 
 
@@ -82,11 +82,11 @@ def drive(axes: Axes, commands: Commands, axis: int, first: int) -> None:
 
     Of rows with one stamp the last counts; the value of the row before, said again within half a period, is none.
     """
-    time, table, count = commands.time, commands.row, commands.count
+    time, table, number = commands.time, commands.row, commands.number
     cut(axes, commands, axis, time[axis, first, STAMP])
-    for row in range(first, count[axis, COMMANDS]):
+    for row in range(first, number[axis, COMMANDS]):
         stamp, u = time[axis, row, STAMP], table[axis, row, U]
-        superseded = row + 1 < count[axis, COMMANDS] and time[axis, row + 1, STAMP] == stamp
+        superseded = row + 1 < number[axis, COMMANDS] and time[axis, row + 1, STAMP] == stamp
         before = first_alike(commands, axis, row) - 1
         again = before >= 0 and u == table[axis, before, U]
         again = again and stamp - time[axis, before, STAMP] < 0.5e9 * commands.gain[axis, PERIOD]
@@ -101,7 +101,7 @@ def drive(axes: Axes, commands: Commands, axis: int, first: int) -> None:
 @compiled
 def answer(axes: Axes, commands: Commands, axis: int, row: int) -> None:
     """What the command of a row makes of the one in force before it."""
-    time, table, count, gain = commands.time, commands.row, commands.count, commands.gain
+    time, table, number, gain = commands.time, commands.row, commands.number, commands.gain
     stamp, u = time[axis, row, STAMP], table[axis, row, U]
     step, interval, step_before, error = u - commands.level[axis, 0], 0.0, 0.0, 0.0
     if row > 0 and time[axis, row - 1, GIVEN] > ALWAYS:
@@ -115,7 +115,7 @@ def answer(axes: Axes, commands: Commands, axis: int, row: int) -> None:
     time[axis, row, GIVEN] = stamp
     table[axis, row, HELD], table[axis, row, STEP] = u, step
     table[axis, row, ERROR], table[axis, row, MANEUVER] = error, maneuver
-    count[axis, LATEST], count[axis, TICK], count[axis, WORTH] = row, 0, ticks_worth(error, recovery, period)
+    number[axis, LATEST], number[axis, TICK], number[axis, WORTH] = row, 0, ticks_worth(error, recovery, period)
     enter(axes, commands, axis, stamp, (u - commands.level[axis, 0]) + error, maneuver)
 
 
@@ -130,70 +130,70 @@ def leave(commands: Commands, axis: int, here: int, there: int) -> None:
 @compiled
 def cut(axes: Axes, commands: Commands, axis: int, since: int) -> None:
     """Take back the entries issued at ``since`` [ns] or later, and see how far the command before is carried on."""
-    time, count, gain = commands.time, commands.count, commands.gain
-    delay, first = count[axis, DELAY], axes.first[axis]
-    at = first + count[axis, ENTRIES] - 1
+    time, number, gain = commands.time, commands.number, commands.gain
+    delay, first = number[axis, DELAY], axes.first[axis]
+    at = first + number[axis, ENTRIES] - 1
     while at >= first and axes.acting[at] - delay >= since:
         axes.acting[at] = NEVER
         at -= 1
-    count[axis, ENTRIES] = at + 1 - first
+    number[axis, ENTRIES] = at + 1 - first
     row = place_of(commands, axis, since - 1) - 1
-    count[axis, LATEST], count[axis, TICK], count[axis, WORTH] = row, 0, 0
+    number[axis, LATEST], number[axis, TICK], number[axis, WORTH] = row, 0, 0
     if row >= 0 and time[axis, row, GIVEN] > ALWAYS:
         held = axes.acting[at] - delay - time[axis, row, GIVEN]
-        count[axis, TICK] = int(held / (gain[axis, PERIOD] * 1e9) + 0.5)
-        count[axis, WORTH] = ticks_worth(commands.row[axis, row, ERROR], gain[axis, RECOVERY], gain[axis, PERIOD])
+        number[axis, TICK] = int(held / (gain[axis, PERIOD] * 1e9) + 0.5)
+        number[axis, WORTH] = ticks_worth(commands.row[axis, row, ERROR], gain[axis, RECOVERY], gain[axis, PERIOD])
 
 
 @compiled
 def lengthen(axes: Axes, commands: Commands, axis: int, until: int) -> None:
     """Carry the latest command on over the grid points of T up to ``until`` [ns], as far as its error lasts."""
-    count, row = commands.count, commands.count[axis, LATEST]
+    number, row = commands.number, commands.number[axis, LATEST]
     recovery, period = commands.gain[axis, RECOVERY], commands.gain[axis, PERIOD]
-    while count[axis, TICK] < count[axis, WORTH]:
-        tick = count[axis, TICK] + 1
+    while number[axis, TICK] < number[axis, WORTH]:
+        tick = number[axis, TICK] + 1
         issued = commands.time[axis, row, GIVEN] + tick_time(tick, period)
         if issued > until:
             return
         value = decayed(commands.row[axis, row, ERROR], tick, recovery, period)
         value = (commands.row[axis, row, HELD] - commands.level[axis, 0]) + value
-        count[axis, TICK] = tick
+        number[axis, TICK] = tick
         enter(axes, commands, axis, issued, value, commands.row[axis, row, MANEUVER])
 
 
 @compiled
 def enter(axes: Axes, commands: Commands, axis: int, issued: int, value: float, maneuver: float) -> None:
     """One more entry of the drive."""
-    process, at = commands.process, axes.first[axis] + commands.count[axis, ENTRIES]
+    process, at = commands.process, axes.first[axis] + commands.number[axis, ENTRIES]
     noise, drift = process[axis, MANEUVER_NOISE] * maneuver, process[axis, MANEUVER_DRIFT] * maneuver
-    axes.acting[at], axes.value[at] = issued + commands.count[axis, DELAY], value
+    axes.acting[at], axes.value[at] = issued + commands.number[axis, DELAY], value
     axes.noise[at] = process[axis, INPUT_NOISE] + noise * noise
     axes.drift[at] = process[axis, DRIFT] + drift * drift
-    commands.count[axis, ENTRIES] += 1
+    commands.number[axis, ENTRIES] += 1
 
 
 @compiled
 def crowded(axes: Axes, commands: Commands, axis: int, since: int, until: int) -> bool:
     """Whether the entries might not fit that rows from ``since`` [ns] on make, with grid points up to ``until``."""
     recovery, period = commands.gain[axis, RECOVERY], commands.gain[axis, PERIOD]
-    first, count = place_of(commands, axis, since), commands.count[axis, COMMANDS]
+    first, count = place_of(commands, axis, since), commands.number[axis, COMMANDS]
     made = count - first + 2
     if recovery < math.inf and count > 0:
         begins = commands.time[axis, first - 1, STAMP] if first > 0 else since
         ends = max(until, commands.time[axis, count - 1, STAMP])
         most = (made + 1) * (_LONGEST_DECAY * recovery / period + 1.0)
         made += int(min((ends - begins) / (period * 1e9) + 1.0, most))
-    return commands.count[axis, ENTRIES] + made > axes.first[axis + 1] - axes.first[axis]
+    return commands.number[axis, ENTRIES] + made > axes.first[axis + 1] - axes.first[axis]
 
 
 @compiled
 def withdraw(axes: Axes, commands: Commands, axis: int, after: int) -> int:
     """Take back the rows stamped after ``after`` [ns]; returns the stamp of the first of them, or ``NEVER``."""
     first = place_of(commands, axis, after)
-    if first == commands.count[axis, COMMANDS]:
+    if first == commands.number[axis, COMMANDS]:
         return NEVER
     stamp = commands.time[axis, first, STAMP]
-    commands.count[axis, COMMANDS] = first
+    commands.number[axis, COMMANDS] = first
     cut(axes, commands, axis, after + 1)
     if first > 0:
         drive(axes, commands, axis, first_alike(commands, axis, first - 1))
@@ -207,9 +207,9 @@ def drop_rows(commands: Commands, axis: int, oldest: int) -> None:
     gone = first_alike(commands, axis, last) if last > 0 else 0
     if gone == 0:
         return
-    commands.count[axis, COMMANDS] -= gone
-    commands.count[axis, LATEST] -= gone
-    for row in range(commands.count[axis, COMMANDS]):
+    commands.number[axis, COMMANDS] -= gone
+    commands.number[axis, LATEST] -= gone
+    for row in range(commands.number[axis, COMMANDS]):
         commands.time[axis, row, STAMP] = commands.time[axis, row + gone, STAMP]
         commands.row[axis, row, U] = commands.row[axis, row + gone, U]
         leave(commands, axis, row + gone, row)
@@ -219,7 +219,7 @@ def drop_rows(commands: Commands, axis: int, oldest: int) -> None:
 def drop_entries(axes: Axes, commands: Commands, axis: int, gone: int) -> None:
     """Let go of the first ``gone`` entries."""
     end = axes.first[axis + 1]
-    commands.count[axis, ENTRIES] -= gone
+    commands.number[axis, ENTRIES] -= gone
     for at in range(axes.first[axis], end - gone):
         axes.acting[at], axes.value[at] = axes.acting[at + gone], axes.value[at + gone]
         axes.noise[at], axes.drift[at] = axes.noise[at + gone], axes.drift[at + gone]

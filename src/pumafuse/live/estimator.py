@@ -16,10 +16,10 @@ from ..fusion.config import FusionConfig
 from ..fusion.timeline import LONGEST_TAIL_NS, Outcome
 from ..model.arm import ordered_axes
 from ..runs.axes import placed_at
-from ..runs.frames import CARTESIAN, Placed, Rotated
+from ..runs.frames import CARTESIAN, Rotated
 from .clock import Clock, Verdict
-from .health import Health, health_of
 from .command_kernels import COMMANDS, STAMP, U
+from .health import Health, health_of
 from .kernels import ABSENT, SPREAD, VALUE, Tally
 from .window import Window
 
@@ -136,7 +136,7 @@ class LiveEstimator:
         window: float = 2.0,
         stale_after: float = 1.0,
         start: Mapping[str, float] | None = None,
-        on_notice: Callable[[str], None] | None = None,
+        on_notice: Callable[[str], None] = lambda _: None,
     ) -> None:
         """Nothing heard yet.
 
@@ -161,7 +161,7 @@ class LiveEstimator:
         self._bits = {name: number for number, name in enumerate(self.axes)}
         self._stale_ns = round(stale_after * 1e9)
         self._longest_latency = round(max([0.0, *(sensor.latency for sensor in config.sensors.values())]) * 1e9)
-        self._notice = on_notice or (lambda _: None)
+        self._notice = on_notice
         self._refused: dict[str, dict[Outcome, int]] = {name: dict.fromkeys(Outcome, 0) for name in config.sensors}
         self._strangers = 0
         self._commands = dict.fromkeys(Outcome, 0)
@@ -201,7 +201,7 @@ class LiveEstimator:
         """
         newest = self._clock.newest
         try:
-            stamp = (0 if newest is None else newest) if at is None else _nanoseconds(at)
+            stamp = (0 if newest is None else newest) if at is None else nanoseconds(at)
         except (ValueError, OverflowError, TypeError):
             return _nowhere(0, _INVALID, f"no time: {at!r}")
         origin = self._window.origin
@@ -215,13 +215,15 @@ class LiveEstimator:
             return _nowhere(stamp, _INVALID, "more than an hour ahead")
         outputs, memory = self._window.estimate(stamp, self._oldest()), self._window.memory
         position = outputs.position[:, 0] + memory.commands.level[:, 0]
-        known = memory.commands.count[:, COMMANDS].tolist()
+        known = memory.commands.number[:, COMMANDS].tolist()
         columns = (position.tolist(), *(part[:, 0].tolist() for part in outputs[1:]))
         rows = zip(self.axes, known, zip(*columns, strict=True), strict=True)
         axes = {axis: AxisNow(*row) for axis, commanded, row in rows if commanded}
         fused = memory.heard.fused.tolist()
         stale = tuple(
-            axis for axis, since in zip(self.axes, fused, strict=True) if axis in axes and stamp - since > self._stale_ns
+            axis
+            for axis, since in zip(self.axes, fused, strict=True)
+            if axis in axes and stamp - since > self._stale_ns
         )
         reason = "now" if stamp == newest else "filtered" if stamp < newest else "predicted, the last command held"
         return LiveEstimate(stamp, axes, self._to_log(axes), stale, _FUSED, reason)
@@ -240,6 +242,17 @@ class LiveEstimator:
     def origin(self) -> int | None:
         """The first command's stamp (of this segment), int ns; None before it."""
         return self._window.origin
+
+    def until(self, t: Time) -> int | None:
+        """Up to which instant [ns] a clock may go on before an event stamped ``t`` comes in; None before the first one.
+
+        To the event's own time if its stamp is plainly right, else no farther than it is.
+        """
+        try:
+            stamp = nanoseconds(t)
+        except (ValueError, OverflowError, TypeError):
+            return self._clock.newest
+        return stamp if self._clock.low <= stamp <= self._clock.high else self._clock.newest
 
     def health(self) -> Health:
         """How each sensor does, and what became of everything so far."""
@@ -281,7 +294,7 @@ class LiveEstimator:
     def _take(self, t: Time, sensor: str, values: Mapping[str, SupportsFloat]) -> Told:
         """Put an event where its stamp says, if that can be."""
         try:
-            stamp = _nanoseconds(t)
+            stamp = nanoseconds(t)
         except (ValueError, OverflowError, TypeError):
             return self._refuse(sensor, values, _INVALID, f"no time: {t!r:.40}")
         clock = self._clock
@@ -289,7 +302,7 @@ class LiveEstimator:
             refused = self._judged(stamp, sensor, values)
             if refused is not None:
                 return refused
-        elif stamp > clock.newest:
+        elif clock.newest is not None and stamp > clock.newest:
             clock.advance(stamp)
         if self._aside and not sensor:
             clock.here()
@@ -311,7 +324,8 @@ class LiveEstimator:
         while verdict is Verdict.CONTRADICTED:
             self._window.forget(clock.bound)
             self._notice(
-                f"what was stamped {(newest - stamp) / 1e9:.3f} s ahead of the others is taken back; are all stamps of one clock?"
+                f"what was stamped {(newest - stamp) / 1e9:.3f} s ahead of the others is taken back;"
+                " are all stamps of one clock?"
             )
             if clock.low <= stamp <= clock.high:
                 if stamp > clock.sure:
@@ -374,7 +388,9 @@ class LiveEstimator:
         """Give an event that is in time to the window."""
         number = self._sensors.get(sensor, -1)
         if number < 0 and sensor:
-            return self._refuse(sensor, values, _UNKNOWN, f"unknown sensor '{sensor:.40}'; {suggestion(sensor, self._sensors)}")
+            return self._refuse(
+                sensor, values, _UNKNOWN, f"unknown sensor '{sensor:.40}'; {suggestion(sensor, self._sensors)}"
+            )
         new, given, stranger = self._new, 0, ""
         for name, value in values.items():
             axis = self._bits.get(name)
@@ -410,7 +426,11 @@ class LiveEstimator:
         heard, given = self._window.memory.heard, 0
         values = {name: _number(event.values[name]) for name in CARTESIAN if name in event.values}
         if "x" in values or "y" in values:
-            if self._placed is None and not event.sensor and np.isfinite(values.get("x", np.nan) + values.get("y", np.nan)):
+            if (
+                self._placed is None
+                and not event.sensor
+                and np.isfinite(values.get("x", np.nan) + values.get("y", np.nan))
+            ):
                 self._place(event)
             if self._placed is None:
                 return 0, "no command has said yet where x and y are in the arm's axes"
@@ -433,7 +453,7 @@ class LiveEstimator:
     def _commanded(self, stamp: int) -> FloatArray:
         """The tangential position [m] commanded at ``stamp`` or before it, as far as is known, (1,)."""
         commands, axis = self._window.memory.commands, self._bits.get("tangential", 0)
-        count = int(commands.count[axis, COMMANDS])
+        count = int(commands.number[axis, COMMANDS])
         row = int(np.searchsorted(commands.time[axis, :count, STAMP], stamp, side="right")) - 1
         return commands.row[axis, max(row, 0) : max(row, 0) + 1, U] if count else np.zeros(1)
 
@@ -475,7 +495,7 @@ class LiveEstimator:
         return Told(outcome, MappingProxyType(dict.fromkeys(values, outcome)), reason)
 
 
-def _nanoseconds(t: Time) -> int:
+def nanoseconds(t: Time) -> int:
     """Int ns of float seconds or int nanoseconds.
 
     Raises:

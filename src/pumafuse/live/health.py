@@ -82,16 +82,15 @@ def health_of(
         rows, scalars = float(minute[:, ROWS].sum()), float(minute[:, SCALARS].sum())
         span = float(age[recent].max(initial=0)) + (0.0 if newest is None else newest / 1e9 - now)
         sensors[name] = SensorHealth(
-            rows=int(tally.count[number, CAME]),
+            rows=int(tally.number[number, CAME]),
             rate=rows / max(span, 1.0),
             lateness=float(minute[:, LATENESS].sum()) / max(rows, 1.0),
             lateness_max=float(minute[:, LATEST_ROW].max(initial=0.0)),
             silent=silent,
             stale=silent is None or silent > stale_ns / 1e9,
-            dropouts=int(tally.count[number, DROPOUTS]),
+            dropouts=int(tally.number[number, DROPOUTS]),
             nis=float(minute[:, NIS].sum()) / scalars if scalars else None,
-            outcomes={outcome.word: int(tally.count[number, outcome]) + more[outcome] for outcome in Outcome},
+            outcomes={outcome.word: int(tally.number[number, outcome]) + more[outcome] for outcome in Outcome},
         )
     by_word = {outcome.word: count for outcome, count in commands.items()}
     return Health(newest, segment + 1, by_word, sensors, unknown)
-

@@ -24,8 +24,8 @@ from .command_kernels import (
     GIVEN,
     NEVER,
     STAMP,
-    U,
     Commands,
+    U,
     crowded,
     drive,
     drop_entries,
@@ -56,11 +56,11 @@ class Heard(NamedTuple):
 
     Attributes:
         span: Positions of the first row (``BEGIN``) and after the last one (``END``), the first command's stamp [ns]
-            (``ORIGIN``), and the position of the first row for which an event has ``CHANGED`` something, (4,).
+            (``ORIGIN``), and the position of the first row for which an event ``CHANGED`` something, (4,).
         stamp: Int64 ns, (R,).
         value: z [m] of each axis, and by what its noise is scaled, (R, A, 2).
-        code: What is ``KNOWN`` of each scalar before filtering and what ``BECAME`` of it: codes of Outcome, or ``ABSENT``,
-            (R, A, 2).
+        code: What is ``KNOWN`` of each scalar before filtering and what ``BECAME`` of it: codes of Outcome, or
+            ``ABSENT``, (R, A, 2).
         latency: Of each sensor, int64 ns, (S,).
         new: Values [m] of the event that comes in, and by what the noise of each is scaled, (A, 2).
         told: What became of them, (A,).
@@ -81,15 +81,15 @@ class Tally(NamedTuple):
     """What there was of each sensor.
 
     Attributes:
-        count: Scalars that have left the window by their outcome, rows that ``CAME``, and ``DROPOUTS``: intervals over
-            three times the usual one, (S, 10).
+        number: Of scalars that have left the window by their outcome, rows that ``CAME``, and ``DROPOUTS``: intervals
+            over three times the usual one, (S, 10).
         last: Latest stamp, int64 ns, (S,).
         usual: Usual interval [s], (S,).
         second: Which second of stream time each entry of ``minute`` is, (S, 60).
         minute: For each second: rows, sum and maximum of how late they came [s], sum of NIS, fused scalars, (S, 60, 5).
     """
 
-    count: IntArray
+    number: IntArray
     last: TimeArray
     usual: FloatArray
     second: TimeArray
@@ -164,7 +164,7 @@ def hear(flat: Flat, stamp: int, sensor: int, given: int, newest: int, horizon: 
             for axis in range(axes):
                 if heard.told[axis] != ABSENT:
                     heard.told[axis] = _DUPLICATE
-                    m.tally.count[sensor, _DUPLICATE] += 1
+                    m.tally.number[sensor, _DUPLICATE] += 1
             return DONE
         late = at + 1 < heard.span[END]
     log = Log(
@@ -178,7 +178,7 @@ def hear(flat: Flat, stamp: int, sensor: int, given: int, newest: int, horizon: 
     )
     last = rows.valid[(heard.span[END] - 1) & mask]
     for axis in range(axes):
-        lengthen(m.axes, m.commands, axis, last - m.commands.count[axis, DELAY])
+        lengthen(m.axes, m.commands, axis, last - m.commands.number[axis, DELAY])
     if late:
         go_back(m.state, m.kept, at & mask)
     for position in range(at, heard.span[END]):
@@ -206,7 +206,7 @@ def command(flat: Flat, stamp: int, given: int, horizon: int) -> int:
     for axis in range(len(heard.told)):
         heard.told[axis] = ABSENT
         if given >> axis & 1:
-            if commands.count[axis, COMMANDS] == commands.time.shape[1] or crowded(axes, commands, axis, stamp, last):
+            if commands.number[axis, COMMANDS] == commands.time.shape[1] or crowded(axes, commands, axis, stamp, last):
                 return NO_ROOM
             heard.told[axis] = _FUSED if abs(heard.new[axis, VALUE]) < _FARTHEST else _INVALID
             first |= heard.told[axis] == _FUSED and stamp < heard.span[ORIGIN]
@@ -225,7 +225,7 @@ def command(flat: Flat, stamp: int, given: int, horizon: int) -> int:
             if at_once == 0 and settle(m.sensors, commands, axis):
                 start_again(m.state, m.kept, heard, axis)
             drive(axes, commands, axis, at_once)
-            since = min(since, stamp + commands.count[axis, DELAY] if at_once > 0 else ALWAYS)
+            since = min(since, stamp + commands.number[axis, DELAY] if at_once > 0 else ALWAYS)
             if commands.time[axis, at, GIVEN] != stamp:
                 heard.told[axis] = _DUPLICATE
     heard.span[CHANGED] = first_valid(m.rows, heard, since)
@@ -237,7 +237,7 @@ def ask(flat: Flat, held: tuple[FloatArray, ...], outputs: tuple[FloatArray, ...
     """Every axis at ``time`` [ns] by all rows valid until then, into ``outputs``; nothing changes."""
     m = opened(flat)
     for axis in range(len(m.heard.told)):
-        until = time - m.commands.count[axis, DELAY]
+        until = time - m.commands.number[axis, DELAY]
         if crowded(m.axes, m.commands, axis, NEVER, until):
             return NO_ROOM
         lengthen(m.axes, m.commands, axis, until)
@@ -269,7 +269,7 @@ def forget(flat: Flat, after: int) -> None:
     rows, heard, mask, since = m.rows, m.heard, len(m.rows.valid) - 1, NEVER
     for axis in range(len(heard.told)):
         stamp = withdraw(m.axes, m.commands, axis, after)
-        since = min(since, stamp + m.commands.count[axis, DELAY]) if stamp < NEVER else since
+        since = min(since, stamp + m.commands.number[axis, DELAY]) if stamp < NEVER else since
     left, first, end = heard.span[BEGIN], heard.span[END], heard.span[END]
     for position in range(heard.span[BEGIN], end):
         here = position & mask
@@ -281,7 +281,7 @@ def forget(flat: Flat, after: int) -> None:
         first = min(first, position)
         for axis in range(len(heard.told)):
             if heard.code[here, axis, KNOWN] != ABSENT:
-                m.tally.count[rows.sensor[here], _INVALID] += 1
+                m.tally.number[rows.sensor[here], _INVALID] += 1
     heard.span[END] = left
     heard.span[CHANGED] = min(first, first_valid(rows, heard, since))
     if heard.span[CHANGED] == left and left < end:
@@ -305,7 +305,7 @@ def let_go(flat: Flat, horizon: int) -> None:
 
 @compiled
 def compact(flat: Flat, oldest: int) -> None:
-    """Let go of commands stamped before ``oldest`` [ns], but for the last of them, and of entries that no state needs."""
+    """Let go of commands stamped before ``oldest`` [ns], all but the last, and of entries that no state needs."""
     m = opened(flat)
     begin, end, mask = m.heard.span[BEGIN], m.heard.span[END], len(m.rows.valid) - 1
     for axis in range(len(m.heard.told)):
@@ -326,7 +326,7 @@ def full(axes: Axes, commands: Commands, rows: Rows, heard: Heard, valid: int) -
         return True
     last = max(valid, rows.valid[(end - 1) & mask]) if end > heard.span[BEGIN] else valid
     for axis in range(len(heard.told)):
-        if crowded(axes, commands, axis, NEVER, last - commands.count[axis, DELAY]):
+        if crowded(axes, commands, axis, NEVER, last - commands.number[axis, DELAY]):
             return True
     return False
 
@@ -367,7 +367,10 @@ def insert(
     rows.valid[here], rows.sensor[here], heard.stamp[here] = valid, sensor, stamp
     for axis in range(len(heard.told)):
         heard.code[here, axis, KNOWN] = heard.told[axis]
-        heard.value[here, axis, VALUE], heard.value[here, axis, SPREAD] = heard.new[axis, VALUE], heard.new[axis, SPREAD]
+        heard.value[here, axis, VALUE], heard.value[here, axis, SPREAD] = (
+            heard.new[axis, VALUE],
+            heard.new[axis, SPREAD],
+        )
     return True
 
 
@@ -401,7 +404,7 @@ def arrange(rows: Rows, commands: Commands, heard: Heard, here: int) -> None:
     rows.first[here] = scalar
     for axis in range(axes):
         known = heard.code[here, axis, KNOWN]
-        if known == _FUSED and (commands.count[axis, COMMANDS] == 0 or rows.valid[here] < heard.span[ORIGIN]):
+        if known == _FUSED and (commands.number[axis, COMMANDS] == 0 or rows.valid[here] < heard.span[ORIGIN]):
             known = _BEFORE_START
         heard.code[here, axis, BECAME] = known
         if known == _FUSED:
@@ -423,16 +426,16 @@ def retire(rows: Rows, met: Met, heard: Heard, tally: Tally, horizon: int) -> No
 @compiled
 def came(tally: Tally, sensor: int, stamp: int, newest: int) -> None:
     """Count a row that has come."""
-    tally.count[sensor, CAME] += 1
+    tally.number[sensor, CAME] += 1
     if tally.last[sensor] == ALWAYS:
         tally.last[sensor] = stamp
     elif stamp > tally.last[sensor]:
         interval, usual = (stamp - tally.last[sensor]) / 1e9, tally.usual[sensor]
         tally.last[sensor] = stamp
-        if tally.count[sensor, CAME] > _FEW and interval > 3.0 * usual:
-            tally.count[sensor, DROPOUTS] += 1
+        if tally.number[sensor, CAME] > _FEW and interval > 3.0 * usual:
+            tally.number[sensor, DROPOUTS] += 1
         else:
-            tally.usual[sensor] = usual + (interval - usual) / min(tally.count[sensor, CAME] - 1, _MANY)
+            tally.usual[sensor] = usual + (interval - usual) / min(tally.number[sensor, CAME] - 1, _MANY)
     slot = slot_of(tally, sensor, stamp)
     if slot >= 0:
         lateness = max(newest - stamp, 0) / 1e9
@@ -447,7 +450,7 @@ def became(rows: Rows, met: Met, heard: Heard, tally: Tally, here: int) -> None:
     sensor = rows.sensor[here]
     for axis in range(len(heard.told)):
         if heard.code[here, axis, BECAME] != ABSENT:
-            tally.count[sensor, heard.code[here, axis, BECAME]] += 1
+            tally.number[sensor, heard.code[here, axis, BECAME]] += 1
     slot = slot_of(tally, sensor, heard.stamp[here])
     for scalar in range(rows.first[here], rows.end[here]):
         fused = met.outcome[scalar] == _FUSED or met.outcome[scalar] == _REOPENED
@@ -504,9 +507,9 @@ def start_again(state: State, kept: State, heard: Heard, axis: int) -> None:
 
 @compiled
 def settle(sensors: Sensors, commands: Commands, axis: int) -> bool:
-    """Let the axis start from its first command, where its start level is not known; True if that is another than so far."""
+    """Let the axis start from its first command, where its start level is not known; True if that is a new level."""
     last = 0
-    while last + 1 < commands.count[axis, COMMANDS] and (
+    while last + 1 < commands.number[axis, COMMANDS] and (
         commands.time[axis, last + 1, STAMP] == commands.time[axis, 0, STAMP]
     ):
         last += 1

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..arrays import IntArray
 from ..errors import ConfigError
 from ..fusion import kernels as fusion
 from ..fusion.config import FusionConfig
@@ -52,7 +53,7 @@ class Window:
         self.floor = ALWAYS
         self.memory = _empty(config, axes, start)
         if tally is not None:
-            self.memory.tally.count[:], self.memory.tally.usual[:] = tally.count, tally.usual
+            self.memory.tally.number[:], self.memory.tally.usual[:] = tally.number, tally.usual
         self._flat = self.memory.flat()
         width = self.memory.state.x.shape[1]
         nothing = np.zeros((len(axes), 0))
@@ -67,7 +68,7 @@ class Window:
         return None if origin == NEVER else origin
 
     def hear(self, stamp: int, sensor: int, given: int, newest: int, oldest: int, horizon: int) -> None:
-        """Take in the row in ``heard.new``: see :func:`pumafuse.live.kernels.hear`; ``oldest`` as in :meth:`command`."""
+        """Take in the row in ``heard.new``; see :func:`pumafuse.live.kernels.hear` and :meth:`command`."""
         attempt = 0
         while kernels.hear(self._flat, stamp, sensor, given, newest, horizon) != DONE:
             self._make_room(attempt, oldest)
@@ -103,7 +104,8 @@ class Window:
 
     def tally(self) -> Tally:
         """What there was of each sensor until now, with what is still in the window."""
-        copied = Tally(*(part.copy() for part in self.memory.tally))
+        now = self.memory.tally
+        copied = Tally(now.number.copy(), now.last.copy(), now.usual.copy(), now.second.copy(), now.minute.copy())
         kernels.count(self.memory._replace(tally=copied).flat())
         return copied
 
@@ -126,8 +128,8 @@ class Window:
             kernels.compact(self._flat, max(oldest, self.floor))
         else:
             room = commands.time.shape[1]
-            longest = int(commands.count[:, COMMANDS].argmax())
-            if room >= MOST_ROWS and commands.count[longest, COMMANDS] == room:
+            longest = int(commands.number[:, COMMANDS].argmax())
+            if room >= MOST_ROWS and commands.number[longest, COMMANDS] == room:
                 self.floor = int(commands.time[longest, room // 8, STAMP]) + 1
                 kernels.let_go(self._flat, self.floor)
                 kernels.compact(self._flat, self.floor)
@@ -179,7 +181,7 @@ def _empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, floa
         Commands(
             time=np.zeros((*table, 2), np.int64),
             row=np.zeros((*table, 5)),
-            count=np.array([[0, 0, 0, 0, 0, round(config.arm.delay_of(axis) * 1e9)] for axis in axes]),
+            number=np.array([[0, 0, 0, 0, 0, round(config.arm.delay_of(axis) * 1e9)] for axis in axes]),
             level=np.array([[u, float(axis in start)] for axis, u in level.items()]),
             gain=np.array(
                 [
@@ -207,7 +209,7 @@ def _empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, floa
             fused=np.zeros(count, np.int64),
         ),
         Tally(
-            count=np.zeros((len(names), max(CAME, DROPOUTS) + 1), np.int64),
+            number=np.zeros((len(names), max(CAME, DROPOUTS) + 1), np.int64),
             last=np.full(len(names), ALWAYS),
             usual=np.zeros(len(names)),
             second=np.full((len(names), SECONDS), ALWAYS),
@@ -220,7 +222,7 @@ def _empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, floa
 def _with_rows(memory: Memory, rows: int) -> Memory:
     """The same with room for ``rows`` rows in the ring; what is in it keeps its positions."""
     held, axes = len(memory.heard.stamp), len(memory.heard.told)
-    positions = np.arange(memory.heard.span[BEGIN], memory.heard.span[END])
+    positions: IntArray = np.arange(int(memory.heard.span[BEGIN]), int(memory.heard.span[END]), dtype=np.int64)
     here, there = positions % held, positions % rows
     extra = np.array([held, held + 1])
 

@@ -37,7 +37,7 @@ def ticks_worth(error: float, recovery: float, period: float) -> int:
     """On how many grid points of T a held command's error is worth decaying."""
     if error == 0.0 or recovery == math.inf:
         return 0
-    return max(int(math.ceil(math.log(abs(error) / _NEGLIGIBLE) * (recovery / period))), 0)
+    return max(math.ceil(math.log(abs(error) / _NEGLIGIBLE) * (recovery / period)), 0)
 
 
 @compiled
@@ -78,7 +78,7 @@ def follow(
 
 @compiled
 def _ticks_held(error: float, hold: int, recovery: float, period: float) -> int:
-    """Grid points that are worth it strictly inside a hold [ns]; one that rounds onto the next command is not inside."""
+    """Grid points that are worth it strictly inside a hold [ns]; one that rounds onto its end is not inside."""
     worth = ticks_worth(error, recovery, period)
     if worth == 0 or tick_time(worth, period) < hold:
         return worth

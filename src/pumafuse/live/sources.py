@@ -1,0 +1,130 @@
+"""Where events come from: standard input, or a recorded run as it happened."""
+
+from __future__ import annotations
+
+import math
+import os
+import select
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..errors import ConfigError
+from ..fusion import timeline
+from ..fusion.config import FusionConfig
+from ..runs.clock import segments
+from ..runs.run import Run, Source
+from .wire import Event
+
+QUIET = 0.1  # s without an event after which a source says so
+_PIECE = 1 << 16
+_BATCH = 1000  # events that a replay hands over at once when nothing makes it wait
+
+
+@dataclass(frozen=True)
+class Address:
+    """What a source is called on the command line.
+
+    Attributes:
+        kind: ``stdin`` or ``replay``.
+        path: Of the run to replay.
+        speed: How many seconds of the run go by in one; infinite: as fast as it can be.
+    """
+
+    kind: str
+    path: str = ""
+    speed: float = 1.0
+
+    @staticmethod
+    def parse(text: str) -> Address:
+        """Read ``stdin`` or ``replay:RUN?speed=4``.
+
+        Raises:
+            ConfigError: It is neither; says what is accepted.
+        """
+        if text == "stdin":
+            return Address("stdin")
+        kind, colon, rest = text.partition(":")
+        if kind != "replay" or not colon:
+            raise ConfigError(
+                f"no source '{text}'; there are: stdin, replay:RUN, replay:RUN?speed=4, replay:RUN?speed=max"
+            )
+        path, asked, option = rest.rpartition("?") if "?" in rest else (rest, "", "")
+        if not asked:
+            return Address("replay", path)
+        name, _, value = option.partition("=")
+        try:
+            speed = math.inf if value == "max" else float(value)
+        except ValueError:
+            speed = math.nan
+        if name != "speed" or not speed > 0.0:
+            raise ConfigError(f"source '{text}': expected ?speed= and a positive number or max after the run")
+        return Address("replay", path, speed)
+
+
+def standard_input(descriptor: int = 0) -> Iterator[bytes]:
+    """Pieces of standard input as they come; an empty one whenever it is quiet."""
+    while True:
+        if os.name == "posix" and not select.select([descriptor], [], [], QUIET)[0]:
+            yield b""
+            continue
+        piece = os.read(descriptor, _PIECE)
+        if not piece:
+            return
+        yield piece
+
+
+def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Event]]:
+    """A run's events in the order of their arrival, at a multiple of its own pace; an empty list whenever it is quiet.
+
+    A row has arrived when its stamp says, one that steps back with the row before it; readings come before commands of
+    the same instant.
+
+    Raises:
+        RunError: The clocks of the run cannot be followed.
+    """
+    for part in segments(run)[0]:
+        yield from _paced(*_arrivals(part, config), speed)
+
+
+def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
+    """When each event arrives [ns], ascending, (n,), and the events."""
+    arrival: list[TimeArray] = []
+    events: list[Event] = []
+    command = timeline.as_commanded(run, config.arm.update_period)
+    for name, source in [*run.sensors.items(), ("", command)]:
+        events += _events(name, source)
+        arrival.append(np.maximum.accumulate(source.stamp))
+    order = np.argsort(np.concatenate(arrival), kind="stable")
+    return np.concatenate(arrival)[order], [events[place] for place in order.tolist()]
+
+
+def _events(name: str, source: Source) -> list[Event]:
+    columns: list[list[float]] = [value.tolist() for value in source.values.values()]
+    stamps: list[float | int] = [math.nan if stamp == NO_STAMP else stamp for stamp in source.stamp.tolist()]
+    rows = zip(stamps, zip(*columns, strict=True), strict=True)
+    if name:
+        return [Event(stamp, name, dict(zip(source.values, row, strict=True))) for stamp, row in rows]
+    return [
+        Event(stamp, name, {axis: u for axis, u in zip(source.values, row, strict=True) if u == u})  # NaN: no command
+        for stamp, row in rows
+    ]
+
+
+def _paced(arrival: TimeArray, events: list[Event], speed: float) -> Iterator[list[Event]]:
+    usable = arrival[arrival != NO_STAMP]
+    due: FloatArray = (arrival - (usable[0] if len(usable) else 0)) / 1e9 / speed
+    begin, at = time.monotonic(), 0
+    while at < len(events):
+        gone = time.monotonic() - begin
+        end = min(max(int(np.searchsorted(due, gone, side="right")), at), at + _BATCH)
+        if end == at:
+            time.sleep(min(float(due[at]) - gone, QUIET))
+            if due[at] - gone > QUIET:
+                yield []
+            continue
+        yield events[at:end]
+        at = end
