@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple, SupportsFloat, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ..arrays import REACH_NS, FloatArray
-from ..errors import ConfigError, UnknownNameError, suggestion
+from ..errors import ConfigError, RunError, UnknownNameError, suggestion
 from ..fusion.config import FusionConfig
 from ..fusion.timeline import LONGEST_TAIL_NS, Outcome
 from ..model.arm import ordered_axes
-from ..runs.axes import placed_at
-from ..runs.frames import CARTESIAN, Rotated
+from ..runs.frames import CARTESIAN
 from .clock import Clock, Verdict
 from .command_kernels import COMMANDS, STAMP, U
 from .health import Health, health_of
 from .kernels import ABSENT, SPREAD, VALUE, Tally
+from .placing import Placing
 from .window import Window
 
 Time: TypeAlias = float | int  # float seconds, or int nanoseconds
@@ -112,21 +113,26 @@ class LiveEstimate:
 
 
 class _Event(NamedTuple):
-    """What was given, to be fed again; ``sensor`` is empty for a command."""
+    """What was given, to be fed again; without a sensor it is a command."""
 
     stamp: int
-    sensor: str
-    values: Mapping[str, SupportsFloat]
+    sensor: str | None
+    values: Mapping[str, Any]
 
 
 class LiveEstimator:
     """The filter of :func:`pumafuse.fuse`, fed event by event as they arrive, in any order.
 
     What comes late, up to ``window``, is fused exactly as if it had come in time: once all events of a recorded run are
-    in, the estimates are those of ``fuse``, bit for bit. Time is that of the stamps; a stamp that steps back by more
-    than the window is too late, and a clock of the commands that was set anew restarts the filter.
+    in, the estimates are those of ``fuse``, bit for bit. Time is that of the stamps. One that is farther behind than
+    the window is too late; a clock of the commands that was set anew restarts the filter.
 
     Positions are in m, in the stream's own coordinates; times are float seconds or int nanoseconds.
+
+    Attributes:
+        config: As given.
+        axes: The arm's, in their order.
+        segment: How often the commands' clock was set anew.
     """
 
     def __init__(
@@ -160,15 +166,15 @@ class LiveEstimator:
         self._sensors = {name: number for number, name in enumerate(config.sensors)}
         self._bits = {name: number for number, name in enumerate(self.axes)}
         self._stale_ns = round(stale_after * 1e9)
-        self._longest_latency = round(max([0.0, *(sensor.latency for sensor in config.sensors.values())]) * 1e9)
+        self._latency = round(max([0.0, *(sensor.latency for sensor in config.sensors.values())]) * 1e9)
         self._notice = on_notice
         self._refused: dict[str, dict[Outcome, int]] = {name: dict.fromkeys(Outcome, 0) for name in config.sensors}
         self._strangers = 0
         self._commands = dict.fromkeys(Outcome, 0)
         self._answers: dict[tuple[bytes, str], Told] = {}
-        self._aside: list[_Event] = []
+        self._aside: list[tuple[_Event, Outcome]] = []
         self._clock = Clock(round(window * 1e9))
-        self._start = dict(start or {})
+        self._start, self._before = dict(start or {}), None
         self._begin(None)
 
     def command(self, t: Time, /, **axes: float) -> Told:
@@ -178,9 +184,7 @@ class LiveEstimator:
             t: When, float seconds or int nanoseconds.
             **axes: u [m] of each commanded axis; x, y and z with a frame.
         """
-        told = self._take(t, "", axes)
-        self._commands[told.outcome] += 1
-        return told
+        return self._take(t, None, axes)
 
     def reading(self, t: Time, sensor: str, /, **axes: float) -> Told:
         """A sensor says where the tool was.
@@ -226,7 +230,8 @@ class LiveEstimator:
             if axis in axes and stamp - since > self._stale_ns
         )
         reason = "now" if stamp == newest else "filtered" if stamp < newest else "predicted, the last command held"
-        return LiveEstimate(stamp, axes, self._to_log(axes), stale, _FUSED, reason)
+        placed = self._placing.in_log({axis: now.position for axis, now in axes.items()})
+        return LiveEstimate(stamp, axes, placed, stale, _FUSED, reason)
 
     @property
     def newest(self) -> int | None:
@@ -268,207 +273,165 @@ class LiveEstimator:
 
     def _begin(self, tally: Tally | None) -> None:
         """An empty window, with what was counted before."""
-        frame, start = self.config.frame, self._start
-        known = {name: level for name, level in start.items() if name in self._bits}
-        self._placed = placed_at(frame, 0.0, 0.0, "") if isinstance(frame, Rotated) else None
-        self._placed_since = 0
-        self._last_tangential = 0.0
-        others = set(start) - set(known)
-        if others and (frame is None or not others <= set(CARTESIAN) or ("x" in others) != ("y" in others)):
-            raise UnknownNameError("start", "axis", sorted(others)[0], self.axes)
-        if frame is not None and "x" in others:
-            self._placed = self._placed or placed_at(frame, start["x"], start["y"], "start")
-            tangential, radial, _ = self._placed.to_axes(np.array([start["x"]]), np.array([start["y"]]))
-            known |= {"tangential": float(tangential[0]), "radial": float(radial[0])}
-        if "z" in others:
-            known["vertical"] = start["z"]
-        self._window = Window(self.config, self.axes, known, tally)
-        self._new, self._told = self._window.memory.heard.new[:, VALUE], self._window.memory.heard.told
-        # A frame about the base is placed by the first command; one that comes late, but was given before, moves it.
-        self._early: list[_Event] | None = [] if frame is not None and self._placed is None else None
+        self._before = tally
+        self._placing = Placing(self.config.frame, self.axes)
+        self._window = Window(self.config, self.axes, self._placing.start(self._start), tally)
+        self._new, self._told = self._window.memory.heard.new, self._window.memory.heard.told
+        # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it.
+        self._early: list[_Event] | None = [] if self._placing.waits else None
 
     def _oldest(self) -> int:
         """No event stamped before is taken [ns]."""
         return max(self._clock.sure - self._clock.window, self._window.floor)
 
-    def _take(self, t: Time, sensor: str, values: Mapping[str, SupportsFloat]) -> Told:
+    def _take(self, t: Time, sensor: str | None, values: Mapping[str, Any]) -> Told:
         """Put an event where its stamp says, if that can be."""
         try:
             stamp = nanoseconds(t)
         except (ValueError, OverflowError, TypeError):
             return self._refuse(sensor, values, _INVALID, f"no time: {t!r:.40}")
+        if sensor is not None and sensor not in self._sensors:
+            return self._refuse(sensor, values, _UNKNOWN, f"unknown sensor; {suggestion(sensor, self._sensors)}")
         clock = self._clock
         if not clock.low <= stamp <= clock.high:
-            refused = self._judged(stamp, sensor, values)
+            refused = self._judged(_Event(stamp, sensor, values))
             if refused is not None:
                 return refused
         elif clock.newest is not None and stamp > clock.newest:
             clock.advance(stamp)
-        if self._aside and not sensor:
+        if sensor is None and self._aside:
             clock.here()
             self._aside = []
         if self._early is not None:
-            return self._take_early(_Event(stamp, sensor, values))
+            return self._take_early(_Event(stamp, sensor, dict(values)))
         return self._feed(stamp, sensor, values)
 
-    def _judged(self, stamp: int, sensor: str, values: Mapping[str, SupportsFloat]) -> Told | None:
+    def _judged(self, event: _Event) -> Told | None:
         """What becomes of an event whose stamp is not plainly right; None if it is to be taken."""
-        clock = self._clock
-        newest = clock.newest
-        if newest is None or (self._window.origin is None and (not sensor or stamp > newest)):
-            if newest is not None and not sensor:
+        clock, (stamp, sensor, values) = self._clock, event
+        newest, command = clock.newest, sensor is None
+        if newest is None or (self._window.origin is None and (command or stamp > newest)):
+            if newest is not None and command:
                 self._begin(self._window.tally())  # the commands' clock counts: what was heard before is of another
             clock.start(stamp)
             return None
-        verdict = clock.judge(stamp, command=not sensor)
+        verdict = clock.judge(stamp, command)
         while verdict is Verdict.CONTRADICTED:
             self._window.forget(clock.bound)
-            self._notice(
-                f"what was stamped {(newest - stamp) / 1e9:.3f} s ahead of the others is taken back;"
-                " are all stamps of one clock?"
-            )
+            ahead = (newest - stamp) / 1e9
+            self._notice(f"{ahead:.3f} s ahead of the others: taken back; are all stamps of one clock?")
             if clock.low <= stamp <= clock.high:
-                if stamp > clock.sure:
-                    clock.advance(stamp)
+                clock.advance(max(stamp, clock.sure))
                 return None
-            verdict = clock.judge(stamp, command=not sensor)
+            verdict = clock.judge(stamp, command)
         if verdict is Verdict.HERE:
             return None
-        if clock.tries and len(self._aside) < _MOST_ASIDE:
-            self._aside = [*(self._aside if sensor or clock.tries > 1 else []), _Event(stamp, sensor, dict(values))]
         if verdict is Verdict.ANEW:
-            return self._start_anew(newest)
+            return self._start_anew(event, newest)
+        outcome = _TOO_LATE if verdict is Verdict.BEHIND else _INVALID
+        if clock.tries == 1 and command:
+            self._aside = []
+        if clock.tries and len(self._aside) < _MOST_ASIDE:
+            self._aside.append((event._replace(values=dict(values)), outcome))
         if verdict is Verdict.BEYOND:
-            return self._refuse(sensor, values, _INVALID, f"stamped {(stamp - newest) / 1e9:.0f} s ahead of all others")
-        behind = f"stamped {(newest - stamp) / 1e9:.3f} s behind the newest"
-        return self._refuse(sensor, values, _TOO_LATE, f"{behind}; the window is {clock.window / 1e9:g} s")
+            return self._refuse(sensor, values, outcome, f"stamped {(stamp - newest) / 1e9:.0f} s ahead of all others")
+        return self._refuse(sensor, values, outcome, self._behind(stamp))
 
-    def _start_anew(self, newest: int) -> Told:
+    def _behind(self, stamp: int) -> str:
+        late, window = (self._clock.sure - stamp) / 1e9, (self._clock.sure - self._oldest()) / 1e9
+        return f"stamped {late:.3f} s behind the newest; the window is {window:g} s"
+
+    def _start_anew(self, event: _Event, newest: int) -> Told:
         """A new segment from the events that have shown the commands' clock to be another."""
-        events, self._aside = self._aside, []
-        first = next(event.stamp for event in events if not event.sensor)
+        aside, self._aside = self._aside, []
+        first = next(other.stamp for other, _ in aside if other.sensor is None)
+        for (_, sensor, values), outcome in aside:
+            self._count(sensor, values, outcome, -1)
         self.segment += 1
+        way = "back" if first < newest else "ahead"
         self._notice(
-            f"the commands' clock was set {'back' if first < newest else 'ahead'} by {abs(newest - first) / 1e9:.3f} s:"
-            " new segment, filter restarted"
+            f"the commands' clock was set {way} by {abs(newest - first) / 1e9:.3f} s: new segment, filter restarted"
         )
         self._start = {}
         self._begin(self._window.tally())
-        self._clock.start(max(event.stamp for event in events))
-        return [self._take(*event) for event in events][-1]
+        self._clock.start(first)
+        for other, _ in aside:
+            self._take(*other)
+        return self._take(*event)
 
     def _take_early(self, event: _Event) -> Told:
         """Take an event while the frame's place may still change; a command before all others moves it."""
-        early, newest, origin = self._early, self._clock.sure, self._window.origin
-        assert early is not None
-        if origin is not None and newest - origin > self._clock.window:
+        assert self._early is not None
+        oldest, origin, since = self._oldest(), self._window.origin, self._placing.since
+        if origin is not None and self._clock.sure - origin > self._clock.window:
             self._early = None
             return self._feed(*event)
-        oldest = self._oldest()
-        kept = [one for one in early[-_MOST_ASIDE:] if one.stamp >= oldest] if len(early) > 2 * _MOST_ASIDE else early
-        self._early = [*kept, event] if kept is not early else early
-        if kept is early:
-            early.append(event)
-        places = not event.sensor and _finite(event.values, "x", "y")
-        if not places or (self._placed is not None and event.stamp >= self._placed_since):
+        self._early.append(event)
+        if len(self._early) > _MOST_ASIDE:
+            self._early = [one for one in self._early[-_MOST_ASIDE // 2 :] if one.stamp >= oldest]
+        x, y = (_number(event.values.get(name)) for name in ("x", "y"))
+        if event.sensor is not None or not math.isfinite(x + y) or (since is not None and event.stamp >= since):
             return self._feed(*event)
         events = [one for one in self._early if one.stamp >= oldest]
-        self._begin(None)
+        self._begin(self._before)
+        try:
+            self._placing.place(event.stamp, x, y)
+        except RunError as error:
+            return self._refuse(None, event.values, _INVALID, str(error))
         self._early = events
-        self._place(event)
         return [self._feed(*one) for one in events][-1]
 
-    def _place(self, command: _Event) -> None:
-        """Let a command's position say where the frame about the base is."""
-        assert self.config.frame is not None
-        x, y = float(command.values["x"]), float(command.values["y"])
-        self._placed, self._placed_since = placed_at(self.config.frame, x, y, "the first command"), command.stamp
-
-    def _feed(self, stamp: int, sensor: str, values: Mapping[str, SupportsFloat]) -> Told:
+    def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> Told:
         """Give an event that is in time to the window."""
-        number = self._sensors.get(sensor, -1)
-        if number < 0 and sensor:
-            return self._refuse(
-                sensor, values, _UNKNOWN, f"unknown sensor '{sensor:.40}'; {suggestion(sensor, self._sensors)}"
-            )
         new, given, stranger = self._new, 0, ""
         for name, value in values.items():
             axis = self._bits.get(name)
             if axis is None:
                 stranger = name
                 continue
-            try:
-                new[axis] = value
-            except (TypeError, ValueError):
-                new[axis] = np.nan
+            new[axis, VALUE] = _number(value)
             given |= 1 << axis
-        if stranger and self.config.frame is not None and any(name in values for name in CARTESIAN):
-            turned, why = self._in_axes(_Event(stamp, sensor, values))
-            if why:
-                return self._refuse(sensor, values, Outcome.BEFORE_START, why)
-            given |= turned
+        if stranger and self.config.frame is not None:
+            given |= self._turned(stamp, sensor, values)
             stranger = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
-        if not given:
-            return self._refuse(sensor, values, _UNKNOWN, self._no_axis(stranger))
         oldest = self._oldest()
-        if sensor:
-            newest = self._clock.newest or stamp
-            self._window.hear(stamp, number, given, newest, oldest, oldest - self._longest_latency)
+        if stamp < oldest:
+            return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
+        if not given:
+            missing = not stranger and len(values) > 0
+            why = "no command has said yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
+            return self._refuse(sensor, values, Outcome.BEFORE_START if missing else _UNKNOWN, why)
+        if sensor is None:
+            self._window.command(stamp, given, oldest, oldest - self._latency)
         else:
-            self._window.command(stamp, given, oldest, oldest - self._longest_latency)
-        if self._placed is not None:
-            self._window.memory.heard.new[:, SPREAD] = 1.0
+            newest = self._clock.sure
+            self._window.hear(stamp, self._sensors[sensor], given, newest, oldest, oldest - self._latency)
+        if self.config.frame is not None:
+            new[:, SPREAD] = 1.0
         codes = self._told.tobytes()
-        return self._answers.get((codes, stranger)) or self._answer(codes, stranger)
+        told = self._answers.get((codes, stranger)) or self._answer(codes, stranger)
+        if sensor is None:
+            self._commands[told.outcome] += 1
+        return told
 
-    def _in_axes(self, event: _Event) -> tuple[int, str]:
-        """Turn x, y and z of an event into the axes; which ones as bits, and why not."""
-        heard, given = self._window.memory.heard, 0
-        values = {name: _number(event.values[name]) for name in CARTESIAN if name in event.values}
-        if "x" in values or "y" in values:
-            if (
-                self._placed is None
-                and not event.sensor
-                and np.isfinite(values.get("x", np.nan) + values.get("y", np.nan))
-            ):
-                self._place(event)
-            if self._placed is None:
-                return 0, "no command has said yet where x and y are in the arm's axes"
-            x, y = (np.array([values.get(name, np.nan)]) for name in ("x", "y"))
-            near = self._commanded(event.stamp) if event.sensor else None
-            tangential, radial, spread = self._placed.to_axes(x, y, near, self._last_tangential)
-            if not event.sensor and np.isfinite(tangential[0]):
-                self._last_tangential = float(tangential[0])
-            for axis, value in {"tangential": tangential, "radial": radial}.items():
-                if axis in self._bits:
-                    heard.new[self._bits[axis], VALUE] = value[0]
-                    given |= 1 << self._bits[axis]
-            if "tangential" in self._bits:
-                heard.new[self._bits["tangential"], SPREAD] = spread[0]
-        if "z" in values and "vertical" in self._bits:
-            heard.new[self._bits["vertical"], VALUE] = values["z"]
-            given |= 1 << self._bits["vertical"]
-        return given, ""
+    def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
+        """Put an event's x, y and z into ``heard.new`` as axes; which ones, as bits."""
+        placed = self._placing.in_axes(
+            {name: _number(values[name]) for name in CARTESIAN if name in values},
+            None if sensor is None else self._commanded(stamp),
+        )
+        given = 0
+        for axis, scalar in placed.items():
+            self._new[self._bits[axis]] = scalar
+            given |= 1 << self._bits[axis]
+        return given
 
     def _commanded(self, stamp: int) -> FloatArray:
         """The tangential position [m] commanded at ``stamp`` or before it, as far as is known, (1,)."""
         commands, axis = self._window.memory.commands, self._bits.get("tangential", 0)
         count = int(commands.number[axis, COMMANDS])
-        row = int(np.searchsorted(commands.time[axis, :count, STAMP], stamp, side="right")) - 1
-        return commands.row[axis, max(row, 0) : max(row, 0) + 1, U] if count else np.zeros(1)
-
-    def _to_log(self, axes: Mapping[str, AxisNow]) -> dict[str, float] | None:
-        """An estimate in the stream's x, y and z."""
-        if self._placed is None:
-            return None
-        found: dict[str, float] = {}
-        if "tangential" in axes and "radial" in axes:
-            position = (np.array([axes[axis].position]) for axis in ("tangential", "radial"))
-            x, y = self._placed.to_log(*position)
-            found["x"], found["y"] = float(x[0]), float(y[0])
-        if "vertical" in axes:
-            found["z"] = axes["vertical"].position
-        return found
+        row = max(int(np.searchsorted(commands.time[axis, :count, STAMP], stamp, side="right")) - 1, 0)
+        return commands.row[axis, row : row + 1, U] if count else np.zeros(1)
 
     def _no_axis(self, stranger: str) -> str:
         return f"unknown axis '{stranger:.40}'; {suggestion(stranger, self.axes)}" if stranger else "gives no axis"
@@ -486,13 +449,18 @@ class LiveEstimator:
             self._answers[codes, stranger] = told
         return told
 
-    def _refuse(self, sensor: str, values: Mapping[str, object], outcome: Outcome, reason: str) -> Told:
+    def _refuse(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str) -> Told:
         """Count an event that never comes into the window."""
-        if sensor in self._refused:
-            self._refused[sensor][outcome] += len(values)
-        elif sensor:
-            self._strangers += 1
+        self._count(sensor, values, outcome, 1)
         return Told(outcome, MappingProxyType(dict.fromkeys(values, outcome)), reason)
+
+    def _count(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, times: int) -> None:
+        if sensor is None:
+            self._commands[outcome] += times
+        elif sensor in self._refused:
+            self._refused[sensor][outcome] += times * len(values)
+        else:
+            self._strangers += times
 
 
 def nanoseconds(t: Time) -> int:
@@ -515,9 +483,5 @@ def _nowhere(stamp: int, outcome: Outcome, reason: str) -> LiveEstimate:
 def _number(value: object) -> float:
     try:
         return float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError):
-        return np.nan
-
-
-def _finite(values: Mapping[str, object], *names: str) -> bool:
-    return all(np.isfinite(_number(values.get(name))) for name in names)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan

@@ -26,7 +26,7 @@ class Window:
 
     Attributes:
         memory: All arrays.
-        floor: What is valid before it [ns] is gone, because the stream was too dense for the window.
+        floor: What is stamped before it [ns] can no longer be taken, because the stream was too dense for the window.
     """
 
     def __init__(
@@ -51,6 +51,7 @@ class Window:
                     f"axes.{axis}.gain_recovery_ms: a live stream follows at most {_LONGEST_RECOVERY:g} update periods"
                 )
         self.floor = ALWAYS
+        self._latency = round(max([0.0, *(sensor.latency for sensor in config.sensors.values())]) * 1e9)
         self.memory = _empty(config, axes, start)
         if tally is not None:
             self.memory.tally.number[:], self.memory.tally.usual[:] = tally.number, tally.usual
@@ -122,8 +123,9 @@ class Window:
             if rows < MOST_ROWS:
                 self.memory = _with_rows(self.memory, 2 * rows)
             else:
-                self.floor = int(self.memory.rows.valid[(begin + rows // 8) % rows]) + 1
-                kernels.let_go(self._flat, self.floor)
+                horizon = int(self.memory.rows.valid[(begin + rows // 8) % rows]) + 1
+                self.floor = horizon + self._latency
+                kernels.let_go(self._flat, horizon)
         elif attempt == 0:
             kernels.compact(self._flat, max(oldest, self.floor))
         else:
@@ -131,7 +133,7 @@ class Window:
             longest = int(commands.number[:, COMMANDS].argmax())
             if room >= MOST_ROWS and commands.number[longest, COMMANDS] == room:
                 self.floor = int(commands.time[longest, room // 8, STAMP]) + 1
-                kernels.let_go(self._flat, self.floor)
+                kernels.let_go(self._flat, self.floor - self._latency)
                 kernels.compact(self._flat, self.floor)
             else:
                 self.memory = _with_commands(self.memory)

@@ -1,0 +1,87 @@
+"""Where a stream's x, y and z are in the arm's axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..errors import UnknownNameError
+from ..runs.axes import placed_at
+from ..runs.frames import CARTESIAN, Frame, Placed, Rotated
+
+
+class Placing:
+    """A frame that gets its place from the start level, or from the first command.
+
+    Attributes:
+        placed: The frame in its place; None as long as it has none.
+        since: Stamp of the command that placed it, int ns; None where none had to.
+    """
+
+    def __init__(self, frame: Frame | None, axes: tuple[str, ...]) -> None:
+        """Not placed yet, but for a rotated frame, which has no place."""
+        self._frame, self._axes = frame, axes
+        self.placed: Placed | None = placed_at(frame, 0.0, 0.0, "") if isinstance(frame, Rotated) else None
+        self.since: int | None = None
+        self._last = 0.0  # tangential position of the command before [m]
+
+    @property
+    def waits(self) -> bool:
+        """Whether a command is needed to place the frame."""
+        return self._frame is not None and self.placed is None
+
+    def start(self, level: Mapping[str, float]) -> dict[str, float]:
+        """A start level by axes [m]; x and y in it place the frame.
+
+        Raises:
+            PumafuseError: It is of no axis, gives half a position, or one on the base's axis.
+        """
+        found = {name: value for name, value in level.items() if name in self._axes}
+        rest = {name: value for name, value in level.items() if name not in found}
+        if rest and (self._frame is None or not rest.keys() <= set(CARTESIAN) or ("x" in rest) != ("y" in rest)):
+            raise UnknownNameError("start", "axis", next(iter(rest)), self._axes)
+        if self._frame is not None and "x" in rest:
+            self.placed = self.placed or placed_at(self._frame, rest["x"], rest["y"], "start")
+        return found | {axis: value for axis, (value, _) in self.in_axes(rest, None).items()}
+
+    def place(self, stamp: int, x: float, y: float) -> None:
+        """Let a command's position say where the frame about the base is.
+
+        Raises:
+            RunError: That is on the base's axis.
+        """
+        assert self._frame is not None
+        self.placed, self.since = placed_at(self._frame, x, y, "command"), stamp
+
+    def in_axes(self, values: Mapping[str, float], near: FloatArray | None) -> dict[str, tuple[float, float]]:
+        """The axes' positions [m] of values in x, y and z, and by what the noise of each is scaled.
+
+        Args:
+            values: x, y and z [m] as far as they are given; NaN on both axes for x without y.
+            near: For a reading the commanded tangential position [m], (1,); None for a command.
+        """
+        found: dict[str, tuple[float, float]] = {}
+        if self.placed is not None and ("x" in values or "y" in values):
+            x, y = (np.array([values.get(name, np.nan)]) for name in ("x", "y"))
+            tangential, radial, spread = self.placed.to_axes(x, y, near, self._last)
+            if near is None and np.isfinite(tangential[0]):
+                self._last = float(tangential[0])
+            found["tangential"] = float(tangential[0]), float(spread[0])
+            found["radial"] = float(radial[0]), 1.0
+        if "z" in values:
+            found["vertical"] = values["z"], 1.0
+        return {axis: given for axis, given in found.items() if axis in self._axes}
+
+    def in_log(self, positions: Mapping[str, float]) -> dict[str, float] | None:
+        """The stream's x, y and z [m] of axis positions [m], as far as these give them; None without a place."""
+        if self.placed is None:
+            return None
+        found: dict[str, float] = {}
+        if "tangential" in positions and "radial" in positions:
+            x, y = self.placed.to_log(*(np.array([positions[axis]]) for axis in ("tangential", "radial")))
+            found["x"], found["y"] = float(x[0]), float(y[0])
+        if "vertical" in positions:
+            found["z"] = positions["vertical"]
+        return found
