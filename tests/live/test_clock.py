@@ -1,0 +1,124 @@
+"""Late, ahead, on another clock, set back: what stamps alone tell."""
+
+import pytest
+
+import pumafuse as pf
+from pumafuse.live.clock import Clock, Verdict
+
+SECOND = 1_000_000_000
+T = 28_000_000
+
+
+def at(seconds: float) -> Clock:
+    clock = Clock(2 * SECOND)
+    clock.start(round(seconds * 1e9))
+    return clock
+
+
+def test_a_stamp_within_the_window_is_here_and_one_before_it_is_behind() -> None:
+    """Late by exactly the window is in time."""
+    clock = at(10.0)
+    assert clock.low == 8 * SECOND
+    assert clock.judge(8 * SECOND - 1, command=False) is Verdict.BEHIND
+    assert clock.newest == 10 * SECOND
+
+
+def test_a_jump_ahead_is_believed_until_it_is_contradicted() -> None:
+    """One stamp 30 s ahead, then the old time: back to it, and all after it in doubt is to be forgotten."""
+    clock = at(10.0)
+    assert clock.judge(40 * SECOND, command=False) is Verdict.HERE
+    assert (clock.newest, clock.sure) == (40 * SECOND, 10 * SECOND)
+    assert clock.judge(10 * SECOND + T, command=True) is Verdict.CONTRADICTED
+    assert (clock.newest, clock.sure, clock.bound) == (10 * SECOND, 10 * SECOND, 12 * SECOND)
+
+
+@pytest.mark.parametrize("gap", [5, 60, 3000])
+def test_after_a_pause_of_all_time_goes_on(gap: int) -> None:
+    """Two commands after a pause, or a second of readings, end the doubt."""
+    clock = at(0.0)
+    assert clock.judge(gap * SECOND, command=True) is Verdict.HERE
+    assert clock.sure == 0
+    assert clock.judge(gap * SECOND + T, command=True) is Verdict.HERE
+    assert clock.sure == gap * SECOND + T
+    clock = at(0.0)
+    for step in range(11):
+        assert clock.judge(gap * SECOND + step * SECOND // 10, command=False) is Verdict.HERE
+    assert clock.sure == (gap + 1) * SECOND
+
+
+def test_events_that_are_always_far_apart_are_all_believed() -> None:
+    """A command every 10 s, and nothing between."""
+    clock = at(0.0)
+    for step in range(1, 20):
+        assert clock.judge(10 * step * SECOND, command=True) is Verdict.HERE
+        assert clock.newest == 10 * step * SECOND
+
+
+@pytest.mark.parametrize("to", [-3600, -3, 4000, 31_536_000])
+def test_three_commands_of_another_time_are_a_clock_set_anew(to: int) -> None:
+    """Set back, or ahead by more than an hour."""
+    clock = at(100.0)
+    stamps = [(100 + to) * SECOND + step * T for step in range(3)]
+    verdicts = [clock.judge(stamp, command=True) for stamp in stamps]
+    away = Verdict.BEHIND if to < 0 else Verdict.BEYOND
+    assert verdicts == [away, away, Verdict.ANEW]
+
+
+def test_a_command_of_the_right_time_clears_what_was_said_against_it() -> None:
+    """Two stale commands, a current one, two stale ones: no restart."""
+    clock = at(100.0)
+    for step in range(2):
+        assert clock.judge(50 * SECOND + step * T, command=True) is Verdict.BEHIND
+    clock.here()
+    for step in range(2, 4):
+        assert clock.judge(50 * SECOND + step * T, command=True) is Verdict.BEHIND
+
+
+def test_readings_alone_never_set_the_clock() -> None:
+    """A sensor an hour behind or a year ahead is refused for as long as it goes on."""
+    clock = at(100.0)
+    for step in range(1000):
+        assert clock.judge(50 * SECOND + step * T, command=False) is Verdict.BEHIND
+        assert clock.judge(31_536_000 * SECOND + step * T, command=False) is Verdict.BEYOND
+
+
+CONFIG = pf.FusionConfig(
+    arm=pf.ArmModel.load("puma560-internal"), sensors={"tracker": pf.Sensor(sd=1e-4), "camera": pf.Sensor(sd=5e-4)}
+)
+
+
+@pytest.mark.parametrize("off", [30.0, -30.0, 5.0, 86_400.0 * 365])
+def test_one_sensor_of_another_clock_disturbs_nobody(off: float) -> None:
+    """A sensor whose clock is wrong, from the beginning on: the estimate is that without it, and the filter goes on."""
+    notices: list[str] = []
+    live, alone = pf.LiveEstimator(CONFIG, on_notice=notices.append), pf.LiveEstimator(CONFIG)
+    for step in range(500):
+        t = 0.028 * step
+        for one in (live, alone):
+            one.command(t, radial=0.5 + 1e-4 * step)
+            one.reading(t + 0.01, "tracker", radial=0.5 + 1e-4 * step)
+        live.reading(t + 0.012 + off, "camera", radial=0.9)
+    live.command(14.0, radial=0.55)
+    alone.command(14.0, radial=0.55)
+    assert live.estimate(14.0)["radial"] == alone.estimate(14.0)["radial"]
+    assert live.segment == 0
+    outcomes = live.health().sensors["camera"].outcomes
+    assert outcomes["fused"] == 0
+    assert outcomes["too_late" if off < 0 else "invalid"] == 500
+    assert live.health().sensors["tracker"].outcomes["fused"] == 500
+
+
+def test_a_wild_command_is_taken_back() -> None:
+    """One command half an hour ahead: when the next has the right time again, it is as if it had never come."""
+    notices: list[str] = []
+    live, clean = pf.LiveEstimator(CONFIG, on_notice=notices.append), pf.LiveEstimator(CONFIG)
+    for step in range(200):
+        t = 0.028 * step
+        for one in (live, clean):
+            one.command(t, radial=0.5 + 1e-4 * step, vertical=0.1)
+            one.reading(t + 0.01, "tracker", radial=0.5, vertical=0.1)
+        if step in (100, 150):
+            assert live.command(t + 1800.0, radial=9.0, vertical=9.0).outcome is pf.Outcome.FUSED
+    assert live.estimate(5.6) == clean.estimate(5.6)
+    assert len(notices) == 2
+    assert "taken back" in notices[0]

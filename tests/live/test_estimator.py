@@ -1,0 +1,232 @@
+"""What each call answers: outcomes with their reasons, and estimates of the past, the present and the future."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.runs.frames import Cylindrical, Rotated
+
+ARM = pf.ArmModel.load("puma560-internal")
+CONFIG = pf.FusionConfig(
+    arm=ARM,
+    sensors={
+        "tracker": pf.Sensor(sd=5e-5, latency=0.008),
+        "camera": pf.Sensor(sd={"radial": 5e-4}, latency=0.045, gate=3.0),
+    },
+)
+PERIOD = 0.028
+
+
+def running(seconds: float = 1.0, **options: object) -> pf.LiveEstimator:
+    """An arm at rest that a tracker sees."""
+    live = pf.LiveEstimator(CONFIG, **options)
+    for step in range(round(seconds / PERIOD) + 1):
+        live.command(step * PERIOD, radial=0.57, vertical=0.1)
+        live.reading(step * PERIOD + 0.01, "tracker", radial=0.57, vertical=0.1)
+    return live
+
+
+def test_the_readme_way() -> None:
+    """A command, a reading and an estimate, in m and s."""
+    live = pf.LiveEstimator(CONFIG)
+    assert live.command(0.0, radial=0.57).outcome is pf.Outcome.FUSED
+    told = live.reading(0.02, "tracker", radial=0.5697)
+    assert (told.outcome, dict(told.axes)) == (pf.Outcome.FUSED, {"radial": pf.Outcome.FUSED})
+    estimate = live.estimate(at=0.02)
+    assert abs(estimate["radial"].position - 0.5697) < 1e-4
+    assert estimate.time == 0.02
+    assert list(estimate.axes) == ["radial"]
+
+
+def test_now_is_the_newest_stamp() -> None:
+    """Without a time the estimate is that at the newest stamp, whoever said it."""
+    live = running()
+    assert live.estimate().stamp == live.newest
+    assert live.estimate() == live.estimate(live.newest)
+
+
+def test_the_future_is_where_the_last_command_leads() -> None:
+    """A step is given: long after it the arm is there, and on the way the model alone says where; sd only grows."""
+    live = running()
+    t = 1.1
+    live.command(t, radial=0.58)
+    ahead = [live.estimate(t + dt) for dt in (0.0, 0.06, 0.1, 0.2, 1.0, 10.0)]
+    positions = [estimate["radial"].position for estimate in ahead]
+    assert positions == sorted(positions)
+    assert abs(positions[1] - 0.57) < 1e-4
+    assert abs(positions[-1] - 0.58) < 2e-4
+    spread = [estimate["radial"].position_sd for estimate in ahead]
+    assert spread == sorted(spread)
+
+
+def test_the_past_knows_no_later_reading() -> None:
+    """An estimate in the past is filtered by what was valid until then, and asking changes nothing."""
+    live = running()
+    before, now = live.estimate(0.8), live.estimate()
+    live.reading(1.3, "tracker", radial=0.60, vertical=0.1)
+    assert live.estimate(0.8)["radial"] == before["radial"]
+    assert now.reason == "now"
+    assert before.reason == "filtered"
+
+
+def test_times_that_have_no_estimate_say_why() -> None:
+    """Before the first command, before the window, more than an hour ahead, or no time at all."""
+    live = running(4.0)
+    assert live.estimate(-0.1).outcome is pf.Outcome.BEFORE_START
+    assert live.estimate(1.0).outcome is pf.Outcome.TOO_LATE
+    assert "before the window" in live.estimate(1.0).reason
+    assert live.estimate(2.1).outcome is pf.Outcome.FUSED
+    assert live.estimate(4000.0).outcome is pf.Outcome.INVALID
+    for nonsense in (math.nan, math.inf, 1e300, "now", [1.0]):
+        assert live.estimate(nonsense).outcome is pf.Outcome.INVALID
+    with pytest.raises(pf.UnknownNameError, match="before the window"):
+        live.estimate(1.0)["radial"]
+    with pytest.raises(pf.UnknownNameError, match="accepted: radial, vertical"):
+        live.estimate(3.0)["tangential"]
+
+
+def test_a_late_reading_within_the_window_is_fused_and_beyond_it_is_too_late() -> None:
+    """Two seconds late is in time, a nanosecond more is not; the reason tells by how much."""
+    live = running(4.0)
+    newest = live.newest
+    assert live.reading(newest - 2_000_000_000, "tracker", radial=0.57).outcome is pf.Outcome.FUSED
+    told = live.reading(newest - 2_000_000_001, "tracker", radial=0.57)
+    assert told.outcome is pf.Outcome.TOO_LATE
+    assert told.reason == "stamped 2.000 s behind the newest; the window is 2 s"
+    assert live.command(newest - 2_000_000_001, radial=0.57).outcome is pf.Outcome.TOO_LATE
+    wider = running(4.0, window=3.0)
+    assert wider.reading(newest - 2_500_000_000, "tracker", radial=0.57).outcome is pf.Outcome.FUSED
+
+
+@pytest.mark.parametrize(
+    ("sensor", "axes", "outcome", "reason"),
+    [
+        ("lidar", {"radial": 0.57}, "unknown", "accepted: tracker, camera"),
+        ("traker", {"radial": 0.57}, "unknown", "did you mean 'tracker'"),
+        ("", {"radial": 0.57}, "unknown", "unknown sensor"),
+        ("tracker", {"radal": 0.57}, "unknown", "did you mean 'radial'"),
+        ("tracker", {}, "unknown", "gives no axis"),
+        ("camera", {"vertical": 0.1}, "unknown", "no such sensor or axis"),
+        ("tracker", {"radial": math.nan}, "invalid", "not a finite position"),
+        ("tracker", {"radial": math.inf}, "invalid", "not a finite position"),
+        ("tracker", {"radial": 1e300}, "invalid", "not a finite position"),
+        ("tracker", {"radial": "much"}, "invalid", "not a finite position"),
+        ("tracker", {"radial": None}, "invalid", "not a finite position"),
+        ("tracker", {"radial": 10**400}, "invalid", "not a finite position"),
+        ("camera", {"radial": 0.9}, "gated", "gate"),
+    ],
+)
+def test_what_cannot_be_used_says_so(sensor: str, axes: dict, outcome: str, reason: str) -> None:
+    """No bad reading raises or changes the estimate; the outcome and the reason say what is wrong."""
+    live = running()
+    before = live.estimate(1.2)["radial"].position
+    told = live.reading(1.05, sensor, **axes)
+    assert told.outcome.word == outcome
+    assert reason in told.reason
+    assert live.estimate(1.2)["radial"].position == before
+
+
+def test_a_row_that_is_good_in_part_is_used_in_part() -> None:
+    """One axis is not a number, one name is unknown: the rest is fused, and each has its outcome."""
+    live = running()
+    told = live.reading(1.05, "tracker", radial=0.57, vertical=math.nan, quality=0.9)
+    assert told.outcome is pf.Outcome.FUSED
+    assert {axis: outcome.word for axis, outcome in told.axes.items()} == {
+        "radial": "fused",
+        "vertical": "invalid",
+        "quality": "unknown",
+    }
+    assert "unknown axis 'quality'" in told.reason
+
+
+def test_commands_answer_too() -> None:
+    """Taken, said before, repeated within half a period, not finite, of no axis."""
+    live = running()
+    assert live.command(1.1, radial=0.58).outcome is pf.Outcome.FUSED
+    assert live.command(1.1, radial=0.58).outcome is pf.Outcome.DUPLICATE
+    assert live.command(1.105, radial=0.58).outcome is pf.Outcome.DUPLICATE
+    assert live.command(1.128, radial=0.58).outcome is pf.Outcome.FUSED
+    assert live.command(1.15, radial=math.nan).outcome is pf.Outcome.INVALID
+    assert live.command(1.15, x=0.1).outcome is pf.Outcome.UNKNOWN
+    assert live.command(math.nan, radial=0.5).outcome is pf.Outcome.INVALID
+
+
+def test_silence_only_makes_the_estimate_less_certain() -> None:
+    """Without readings the sd grows and the axis is stale after the limit; a reading ends that."""
+    live = running(1.0, stale_after=0.5)
+    assert live.estimate().stale == ()
+    for step in range(37, 100):
+        live.command(step * PERIOD, radial=0.57, vertical=0.1)
+    late = live.estimate()
+    assert late.stale == ("radial", "vertical")
+    assert late["radial"].position_sd > 2.0 * live.estimate(1.0)["radial"].position_sd
+    live.reading(late.stamp, "tracker", radial=0.57)
+    assert live.estimate().stale == ("vertical",)
+    assert live.estimate(live.newest + 10_000_000_000).stale == ("radial", "vertical")
+
+
+def test_the_start_level_is_where_the_arm_rests() -> None:
+    """With a start level the first command is a step from there; without one the arm is there already."""
+    told, untold = pf.LiveEstimator(CONFIG, start={"radial": 0.5}), pf.LiveEstimator(CONFIG)
+    for live in (told, untold):
+        live.command(0.0, radial=0.57)
+    assert told.estimate(0.0)["radial"].position == 0.5
+    assert untold.estimate(0.0)["radial"].position == 0.57
+    assert abs(told.estimate(5.0)["radial"].position - 0.57) < 1e-3
+
+
+def test_int_times_are_nanoseconds() -> None:
+    """Stamps of a clock since 1970 keep their nanoseconds."""
+    live, origin = pf.LiveEstimator(CONFIG), 1_700_000_000_123_456_789
+    live.command(origin, radial=0.57)
+    live.reading(np.int64(origin + 10_000_001), "tracker", radial=0.57)
+    assert live.newest == origin + 10_000_001
+    assert live.estimate().stamp == origin + 10_000_001
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"window": 0.0}, {"window": math.nan}, {"stale_after": -1.0}, {"start": {"radal": 0.1}}]
+)
+def test_what_is_wrong_at_the_start_is_refused(wrong: dict) -> None:
+    """One clear line, as for files."""
+    with pytest.raises(pf.PumafuseError, match="window|stale_after|radal"):
+        pf.LiveEstimator(CONFIG, **wrong)
+
+
+def test_a_recovery_too_slow_to_follow_is_refused() -> None:
+    """A gain error that lasts for days would need an entry for each period of them."""
+    slow = msgspec.structs.replace(ARM.axes["radial"], gain_recovery=1e5)
+    arm = msgspec.structs.replace(ARM, axes={"radial": slow})
+    with pytest.raises(pf.ConfigError, match="gain_recovery_ms"):
+        pf.LiveEstimator(pf.FusionConfig(arm=arm, sensors={}))
+
+
+@pytest.mark.parametrize("frame", [Cylindrical(positive="clockwise"), Rotated(azimuth=90.0)])
+def test_x_y_z_in_and_out(frame: Cylindrical | Rotated) -> None:
+    """With a frame events come in x, y, z and estimates go back there."""
+    live = pf.LiveEstimator(msgspec.structs.replace(CONFIG, frame=frame))
+    for step in range(100):
+        t = step * PERIOD
+        assert live.command(t, x=0.01, y=0.56, z=-0.1).outcome is pf.Outcome.FUSED
+        assert live.reading(t + 0.01, "tracker", x=0.0101, y=0.5601, z=-0.1002).outcome is pf.Outcome.FUSED
+    found = live.estimate().cartesian
+    assert found is not None
+    np.testing.assert_allclose([found["x"], found["y"], found["z"]], [0.0101, 0.5601, -0.1002], atol=2e-5)
+    half = live.reading(2.9, "tracker", x=0.01)
+    assert {axis: outcome.word for axis, outcome in half.axes.items()} == {"tangential": "invalid", "radial": "invalid"}
+
+
+def test_x_and_y_mean_nothing_before_the_frame_has_its_place() -> None:
+    """A frame about the base waits for a command in x and y; on the base's axis there is no place."""
+    live = pf.LiveEstimator(msgspec.structs.replace(CONFIG, frame=Cylindrical()))
+    told = live.reading(0.0, "tracker", x=0.1, y=0.5)
+    assert told.outcome is pf.Outcome.BEFORE_START
+    assert "where x and y are" in told.reason
+    assert live.command(0.01, x=0.0, y=0.0).outcome is pf.Outcome.INVALID
+    assert live.command(0.03, x=0.1, y=0.5).outcome is pf.Outcome.FUSED
+    assert live.estimate().outcome is pf.Outcome.FUSED
