@@ -129,14 +129,15 @@ class Window:
         elif attempt == 0:
             kernels.compact(self._flat, max(oldest, self.floor))
         else:
-            room = commands.time.shape[1]
-            longest = int(commands.number[:, COMMANDS].argmax())
-            if room >= MOST_ROWS and commands.number[longest, COMMANDS] == room:
+            room, longest = commands.time.shape[1], int(commands.number[:, COMMANDS].argmax())
+            if commands.number[longest, COMMANDS] < room:
+                self.memory = _with_entries(self.memory)
+            elif room < MOST_ROWS:
+                self.memory = _with_commands(self.memory)
+            else:
                 self.floor = int(commands.time[longest, room // 8, STAMP]) + 1
                 kernels.let_go(self._flat, self.floor - self._latency)
                 kernels.compact(self._flat, self.floor)
-            else:
-                self.memory = _with_commands(self.memory)
         self._flat = self.memory.flat()
 
 
@@ -267,22 +268,26 @@ def _with_rows(memory: Memory, rows: int) -> Memory:
 
 
 def _with_commands(memory: Memory) -> Memory:
-    """The same with twice the room for commands and for the entries that they make."""
-    count, axes, commands = len(memory.heard.told), memory.axes, memory.commands
+    """The same with twice the room for commands."""
+    commands = memory.commands
+    time, row = (np.concatenate((part, np.zeros_like(part)), axis=1) for part in (commands.time, commands.row))
+    return memory._replace(commands=commands._replace(time=time, row=row))
+
+
+def _with_entries(memory: Memory) -> Memory:
+    """The same with twice the room for the entries that commands make."""
+    count, axes = len(memory.heard.told), memory.axes
 
     def wider(part: np.ndarray, filled: float = 0) -> np.ndarray:
-        return np.concatenate((part, np.full_like(part, filled)), axis=1)
-
-    def of_entries(part: np.ndarray, filled: float = 0) -> np.ndarray:
-        return wider(part.reshape(count, -1), filled).reshape(-1)
+        table = part.reshape(count, -1)
+        return np.concatenate((table, np.full_like(table, filled)), axis=1).reshape(-1)
 
     return memory._replace(
         axes=axes._replace(
             first=axes.first * 2,
-            acting=of_entries(axes.acting, NEVER),
-            value=of_entries(axes.value),
-            noise=of_entries(axes.noise),
-            drift=of_entries(axes.drift),
-        ),
-        commands=commands._replace(time=wider(commands.time), row=wider(commands.row)),
+            acting=wider(axes.acting, NEVER),
+            value=wider(axes.value),
+            noise=wider(axes.noise),
+            drift=wider(axes.drift),
+        )
     )

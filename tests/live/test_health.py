@@ -1,0 +1,98 @@
+"""Rate, lateness, dropouts, NIS and outcomes of each sensor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from streams import delayed, events_of, feed
+
+import pumafuse as pf
+
+CONFIG = pf.FusionConfig(
+    arm=pf.ArmModel.load("puma560-internal"),
+    process={"radial": pf.Process(input_noise=1e-7, drift=1e-7)},
+    sensors={"tracker": pf.Sensor(sd=1e-4, gate=4.0), "camera": pf.Sensor(sd=5e-4), "never": pf.Sensor(sd=1.0)},
+)
+
+
+def stream(seconds: float, sd: float = 1e-4) -> pf.Run:
+    rng = np.random.default_rng(7)
+    given, heard = np.arange(0.0, seconds, 0.028), np.arange(0.0, seconds, 0.01)
+    return pf.Run.from_arrays(
+        given,
+        {"radial": np.full(len(given), 0.57)},
+        {"tracker": (heard, {"radial": 0.57 + rng.normal(0.0, sd, len(heard))})},
+    )
+
+
+def test_a_right_sensor_has_its_rate_and_a_nis_of_one() -> None:
+    """100 Hz and noise as configured: rate 100 Hz, NIS within the 99.99 % band of 6000 scalars, nothing late."""
+    live = pf.LiveEstimator(CONFIG)
+    for event in events_of(stream(100.0)):
+        feed(live, event)
+    health = live.health().sensors["tracker"]
+    assert health.rows == 10_000
+    assert health.rate == pytest.approx(100.0, abs=1.0)
+    assert health.nis == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 6000.0))
+    assert (health.dropouts, health.lateness_max, health.stale) == (0, 0.0, False)
+    assert health.outcomes["fused"] + health.outcomes["gated"] == 10_000
+
+
+def test_noise_twice_as_large_shows_as_a_nis_of_four() -> None:
+    """Of the last minute only: before it the noise was as configured."""
+    live = pf.LiveEstimator(CONFIG)
+    for event in events_of(stream(61.0)):
+        feed(live, event)
+    louder = [event._replace(stamp=event.stamp + round(61.04e9)) for event in events_of(stream(60.0, sd=2e-4))]
+    for event in louder:
+        feed(live, event)
+    nis = live.health().sensors["tracker"].nis
+    assert nis is not None
+    assert 3.0 < nis < 4.5  # the gate takes the largest away
+
+
+def test_lateness_is_how_far_behind_the_newest_stamp_a_row_comes() -> None:
+    """Delays even between 0 and 0.5 s: the mean is a little below 0.25 s, as the newest was late too."""
+    live = pf.LiveEstimator(CONFIG)
+    for event in delayed(events_of(stream(30.0)), 0.5, seed=1):
+        feed(live, event)
+    health = live.health().sensors["tracker"]
+    assert 0.15 < health.lateness < 0.25
+    assert 0.4 < health.lateness_max <= 0.5
+
+
+def test_gaps_are_dropouts_and_silence_is_stale() -> None:
+    """Three gaps of 50 ms in a 100 Hz stream are three dropouts; a sensor that says nothing more is stale."""
+    live = pf.LiveEstimator(CONFIG)
+    live.command(0.0, radial=0.57)
+    for row in range(1000):
+        if row % 300 not in range(100, 105):
+            live.reading(row * 0.01, "tracker", radial=0.57)
+    assert live.health().sensors["tracker"].dropouts == 3
+    assert not live.health().sensors["tracker"].stale
+    live.command(11.5, radial=0.57)
+    health = live.health().sensors
+    assert health["tracker"].stale
+    assert health["tracker"].silent == pytest.approx(1.51)
+    assert health["never"].silent is None
+    assert health["never"].stale
+
+
+def test_reopenings_and_all_outcomes_are_counted() -> None:
+    """A sensor that jumps by 20 mm is gated, then reopened; unknown and refused rows are counted, too."""
+    live = pf.LiveEstimator(CONFIG)
+    for row in range(400):
+        live.command(row * 0.01, radial=0.57)
+        live.reading(row * 0.01, "tracker", radial=0.57 if row < 200 else 0.59)
+    live.reading(1.0, "tracker", radial=0.57)
+    live.reading(float("nan"), "tracker", radial=0.57)
+    live.reading(4.0, "lidar", radial=0.57)
+    health = live.health()
+    tracker = health.sensors["tracker"]
+    assert tracker.reopened == 1
+    assert tracker.outcomes["gated"] == 50
+    assert tracker.outcomes["too_late"] == 1
+    assert tracker.outcomes["invalid"] == 1
+    assert health.unknown == 1
+    assert health.commands["fused"] + health.commands["duplicate"] == 400
+    assert health.segments == 1

@@ -1,0 +1,114 @@
+"""The window's memory: it grows with a dense stream, within a bound, and nothing in it is lost or left behind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from streams import differences, events_of
+
+import pumafuse as pf
+from pumafuse.live import window
+
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+MS = 1_000_000
+GAIN = pf.Gain(slope=0.05, intercept=0.98)
+
+
+def config_of(recovery: float | None = 0.1, period: float = 0.028) -> pf.FusionConfig:
+    axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05), gain=GAIN, gain_recovery=recovery)
+    arm = pf.ArmModel(name="one", update_period=period, delay=0.06, axes={"radial": axis})
+    return pf.FusionConfig(arm=arm, sensors={"fast": pf.Sensor(sd=1e-4, latency=0.01), "slow": pf.Sensor(sd=1e-3)})
+
+
+def run_of(seconds: float, command_hz: float, reading_hz: float) -> pf.Run:
+    rng = np.random.default_rng(3)
+    given = np.arange(0, seconds, 1.0 / command_hz)
+    heard = np.arange(0, seconds, 1.0 / reading_hz)
+    readings = (heard, {"radial": 0.5 + rng.normal(0.0, 1e-4, len(heard))})
+    return pf.Run.from_arrays(given, {"radial": 0.5 + 0.01 * np.sin(given)}, {"fast": readings})
+
+
+@pytest.mark.parametrize(("command_hz", "reading_hz"), [(36.0, 6000.0), (1000.0, 100.0), (3000.0, 3000.0)])
+def test_more_than_the_first_arrays_hold(command_hz: float, reading_hz: float) -> None:
+    """Thousands of rows and commands in the window: the arrays grow, and the estimates are the offline ones."""
+    run, config = run_of(3.0, command_hz, reading_hz), config_of(period=1.0 / command_hz)
+    live = pf.LiveEstimator(config)
+    assert differences(live, events_of(run), pf.fuse(run, config), 1.5) == []
+    memory = live._window.memory
+    assert max(len(memory.heard.stamp) - 4096, memory.commands.time.shape[1] - 512) > 0
+
+
+def test_the_first_arrays_serve_for_ever() -> None:
+    """A usual stream is kept in the arrays that were there at first, however long it is."""
+    run, config = run_of(120.0, 36.0, 200.0), config_of()
+    live = pf.LiveEstimator(config)
+    assert differences(live, events_of(run), pf.fuse(run, config), 0.1) == []
+    memory = live._window.memory
+    assert len(memory.heard.stamp) == 4096
+    assert memory.commands.time.shape[1] == 512
+    assert memory.axes.first[-1] == 1024
+
+
+def test_long_decays_and_long_silence() -> None:
+    """A gain error that recovers slowly is carried on over a minute of silence, and far ahead, as offline does."""
+    config = config_of(recovery=20.0)
+    given = np.concatenate((np.arange(0.0, 2.0, 0.028), [60.0, 60.028, 60.5]))
+    run = pf.Run.from_arrays(
+        given, {"radial": 0.5 + 0.001 * given}, {"fast": ([0.5, 30.0, 61.0], {"radial": [0.5] * 3})}
+    )
+    live, offline = pf.LiveEstimator(config, window=100.0), pf.fuse(run, config)
+    assert live.estimate(90.0).outcome is pf.Outcome.BEFORE_START
+    events = events_of(run)
+    for event in events[:50]:
+        live.command(event.stamp, **event.values) if not event.sensor else live.reading(event.stamp, "fast", radial=0.5)
+        live.estimate(event.stamp + 120_000_000_000)
+    assert differences(live, events[50:], offline, 1e9) == []
+
+
+def test_a_flood_shortens_the_window_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More rows than are ever kept: the oldest are let go, what is late beyond them is refused, estimates go on."""
+    monkeypatch.setattr(window, "MOST_ROWS", 4096)
+    live, config = pf.LiveEstimator(config_of()), config_of()
+    live.command(0, radial=0.5)
+    rng = np.random.default_rng(1)
+    values = (0.5 + rng.normal(0.0, 1e-4, 20_000)).tolist()
+    for row, value in enumerate(values):
+        assert (
+            live.reading(row * MS // 20, "fast" if row % 2 else "slow", radial=value).outcome is not pf.Outcome.TOO_LATE
+        )
+    assert len(live._window.memory.heard.stamp) == 4096
+    newest = live.newest
+    assert live.reading(newest - 300 * MS, "slow", radial=0.5).outcome is pf.Outcome.TOO_LATE
+    assert live.estimate(newest - 300 * MS).outcome is pf.Outcome.TOO_LATE
+    assert live.reading(newest - 50 * MS, "slow", radial=0.5).outcome is pf.Outcome.FUSED
+    assert sum(sum(sensor.outcomes.values()) for sensor in live.health().sensors.values()) == 20_002
+    run = pf.Run.from_arrays(
+        np.array([0]),
+        {"radial": np.array([0.5])},
+        {
+            name: (np.arange(start, 20_000, 2) * MS // 20, {"radial": np.array(values[start::2])})
+            for name, start in (("fast", 1), ("slow", 0))
+        },
+    )
+    untouched = pf.LiveEstimator(config)
+    for event in events_of(run):
+        untouched.reading(event.stamp, event.sensor, **event.values) if event.sensor else untouched.command(
+            event.stamp, **event.values
+        )
+    expected = pf.fuse(run, config, rate=1000.0)
+    assert untouched.estimate(round(expected.time[-1] * 1e9))["radial"].position == expected["radial"].position[-1]
+
+
+def test_a_flood_of_commands_shortens_the_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More commands than are ever kept: the oldest are let go, and the estimate is still the offline one."""
+    monkeypatch.setattr(window, "MOST_ROWS", 1024)
+    config = config_of(recovery=None)
+    given = np.arange(5000) * MS // 4
+    run = pf.Run.from_arrays(given, {"radial": 0.5 + 1e-6 * np.arange(5000)}, {"fast": ([0], {"radial": [0.5]})})
+    live = pf.LiveEstimator(config)
+    for event in events_of(run):
+        live.command(event.stamp, **event.values) if not event.sensor else live.reading(event.stamp, "fast", radial=0.5)
+    assert live._window.memory.commands.time.shape[1] == 1024
+    offline = pf.fuse(run, config)
+    assert live.estimate(int(given[-1]))["radial"].position == offline["radial"].position[-1]
+    assert live.command(int(given[0]) + 1, radial=0.4).outcome is pf.Outcome.TOO_LATE
