@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.arrays import NO_STAMP
+from pumafuse.live.stream import Stream
 
+MS = 1_000_000
+T = 28 * MS
 FIELDS = ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd")
 
 
@@ -93,3 +98,87 @@ def outcomes_of(offline: pf.Estimates) -> dict[str, dict[str, int]]:
         }
         for number, sensor in enumerate(readings.sensors)
     }
+
+
+def axes_of(draw: st.DrawFn) -> pf.ArmModel:
+    def one() -> pf.AxisModel:
+        plant = draw(
+            st.sampled_from(
+                [
+                    pf.FirstOrder(time_constant=0.05),
+                    pf.SecondOrder(natural_frequency=50.0, damping=0.8),
+                    pf.SecondOrder(natural_frequency=30.0, damping=1.3),
+                ]
+            )
+        )
+        gain = pf.Gain(slope=draw(st.sampled_from([0.0, 0.05])), intercept=draw(st.sampled_from([1.0, 0.97])))
+        recovery = draw(st.sampled_from([None, 0.01, 0.1, 3.0]))
+        return pf.AxisModel(plant=plant, gain=gain, gain_recovery=recovery, delay=draw(st.sampled_from([None, 0.0])))
+
+    return pf.ArmModel(name="any", update_period=0.028, delay=0.06, axes={"radial": one(), "vertical": one()})
+
+
+@st.composite
+def any_stream(draw: st.DrawFn) -> tuple[pf.FusionConfig, pf.Run, int]:
+    """A configuration, a run of commands and readings at any times, and a seed for the order in which they come."""
+    arm = axes_of(draw)
+    sensors = {
+        "tracker": pf.Sensor(sd=1e-4, latency=draw(st.sampled_from([0.008, -0.02])), gate=3.0),
+        "vision": pf.Sensor(
+            sd={"radial": 5e-4}, latency=0.1, latency_sd=0.002, gate=2.0, gate_rows=False, bias_sd=1e-3
+        ),
+        "range": pf.Sensor(sd=3e-4, scale=-1.0, bias_sd=1.0, gate=0.0),
+    }
+    process = pf.Process(maneuver_noise=1e-3, maneuver_drift=1e-2)
+    config = pf.FusionConfig(arm=arm, sensors=sensors, process={"radial": process})
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    commands = draw(st.integers(1, 40))
+    gaps = draw(st.sampled_from([[T], [T, T, 3 * MS], [T, 0, 10 * MS, 400 * MS]]))
+    stamp = np.cumsum(rng.choice(gaps, commands))
+    levels = np.array([0.5, 0.501, 0.51])
+    command = {axis: rng.choice(levels, commands) for axis in ("radial", "vertical")}
+    command["vertical"][: draw(st.integers(0, commands - 1))] = np.nan
+    heard = {}
+    for name in sensors:
+        rows = draw(st.integers(1, 60))
+        when = np.sort(rng.integers(stamp[0] - 200 * MS, stamp[-1] + 500 * MS, rows))
+        value = (-0.5 if name == "range" else 0.5) + rng.normal(0.0, 3e-3, rows)
+        value[rng.random(rows) < 0.05] = np.nan
+        heard[name] = (when, {"radial": value, "vertical": value[::-1].copy()})
+    return config, pf.Run.from_arrays(stamp, command, heard), draw(st.integers(0, 2**32))
+
+
+TRACKED = pf.FusionConfig(
+    arm=pf.ArmModel.load("puma560-internal"), sensors={"tracker": pf.Sensor(sd=5e-5, latency=0.008)}
+)
+
+
+class Both:
+    """A stream whose output is kept."""
+
+    def __init__(self, config: pf.FusionConfig = TRACKED, rate: float | None = None, **options: float) -> None:
+        self.said: list[str] = []
+        self.written = b""
+        self.live = pf.LiveEstimator(config, on_notice=self.said.append, **options)
+        self.stream = Stream(self.live, self.keep, self.said.append, rate)
+
+    def keep(self, lines: bytes) -> None:
+        assert lines.endswith(b"\n")
+        self.written += lines
+
+    @property
+    def estimates(self) -> list[dict]:
+        return [json.loads(line) for line in self.written.splitlines()]
+
+
+def line(t: float, sensor: str = "", **axes: float) -> bytes:
+    body = {"t": t, "sensor": sensor, **axes} if sensor else {"t": t, "command": axes}
+    return json.dumps(body).encode() + b"\n"
+
+
+def lines(seconds: float, begin: float = 0.0) -> bytes:
+    found = b""
+    for step in range(round(seconds / 0.028)):
+        t = begin + step * 0.028
+        found += line(t, radial=570.0) + line(t + 0.01, "tracker", radial=570.0)
+    return found

@@ -194,7 +194,7 @@ def test_int_times_are_nanoseconds() -> None:
 )
 def test_what_is_wrong_at_the_start_is_refused(wrong: dict) -> None:
     """One clear line, as for files."""
-    with pytest.raises(pf.PumafuseError, match="window|stale_after|radal"):
+    with pytest.raises(pf.PumafuseError, match=r"window|stale_after|radal"):
         pf.LiveEstimator(CONFIG, **wrong)
 
 

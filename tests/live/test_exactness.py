@@ -10,16 +10,13 @@ import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
-from streams import delayed, differences, events_of, feed, outcomes_of
 
 import pumafuse as pf
+from streams import any_stream, delayed, differences, events_of, feed, outcomes_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 RUNS = sorted(path.stem for path in SCENARIOS.glob("*.toml") if "[trajectory]" in path.read_text(encoding="utf-8"))
-MS = 1_000_000
-T = 28 * MS
 
 
 def recorded(name: str) -> tuple[pf.Run, pf.FusionConfig]:
@@ -40,7 +37,7 @@ def told(live: pf.LiveEstimator, *without: str) -> dict[str, dict[str, int]]:
 @pytest.mark.parametrize("longest", [0.0, 0.3, 1.2])
 @pytest.mark.parametrize("name", ["scan1", *RUNS])
 def test_in_any_order(name: str, longest: float) -> None:
-    """Each event up to 1.2 s late, a tenth of them twice: every estimate is the offline one once its readings are in."""
+    """Each event up to 1.2 s late, a tenth of them twice: estimates are the offline ones once their readings are in."""
     run, config = recorded(name)
     offline = pf.fuse(run, config)
     live = pf.LiveEstimator(config, start=run.start)
@@ -59,10 +56,11 @@ def test_what_live_said_at_the_time(name: str) -> None:
     """Fed in order, the estimate at each command is that of `fuse --as-live`."""
     run, config = recorded(name)
     offline, live = pf.fuse(run, config, as_live=True), pf.LiveEstimator(config, start=run.start)
-    said = []
-    for event in events_of(run):
-        if feed(live, event).outcome is pf.Outcome.FUSED and not event.sensor:
-            said.append(live.estimate(event.stamp))
+    said = [
+        live.estimate(event.stamp)
+        for event in events_of(run)
+        if feed(live, event).outcome is pf.Outcome.FUSED and not event.sensor
+    ]
     assert [estimate.stamp for estimate in said] == (offline.origin + np.rint(offline.time * 1e9)).astype(int).tolist()
     for axis, track in offline.axes.items():
         assert [estimate[axis].position for estimate in said] == track.position.tolist()
@@ -114,56 +112,8 @@ def test_a_clock_set_back_begins_a_segment_as_offline() -> None:
     assert counts["too_late"] == 0
 
 
-def axes_of(draw: st.DrawFn) -> pf.ArmModel:
-    def one() -> pf.AxisModel:
-        plant = draw(
-            st.sampled_from(
-                [
-                    pf.FirstOrder(time_constant=0.05),
-                    pf.SecondOrder(natural_frequency=50.0, damping=0.8),
-                    pf.SecondOrder(natural_frequency=30.0, damping=1.3),
-                ]
-            )
-        )
-        gain = pf.Gain(slope=draw(st.sampled_from([0.0, 0.05])), intercept=draw(st.sampled_from([1.0, 0.97])))
-        recovery = draw(st.sampled_from([None, 0.01, 0.1, 3.0]))
-        return pf.AxisModel(plant=plant, gain=gain, gain_recovery=recovery, delay=draw(st.sampled_from([None, 0.0])))
-
-    return pf.ArmModel(name="any", update_period=0.028, delay=0.06, axes={"radial": one(), "vertical": one()})
-
-
-@st.composite
-def streams(draw: st.DrawFn) -> tuple[pf.FusionConfig, pf.Run, int]:
-    """A configuration, a run of commands and readings at any times, and a seed for the order in which they come."""
-    arm = axes_of(draw)
-    sensors = {
-        "tracker": pf.Sensor(sd=1e-4, latency=draw(st.sampled_from([0.008, -0.02])), gate=3.0),
-        "vision": pf.Sensor(
-            sd={"radial": 5e-4}, latency=0.1, latency_sd=0.002, gate=2.0, gate_rows=False, bias_sd=1e-3
-        ),
-        "range": pf.Sensor(sd=3e-4, scale=-1.0, bias_sd=1.0, gate=0.0),
-    }
-    process = pf.Process(maneuver_noise=1e-3, maneuver_drift=1e-2)
-    config = pf.FusionConfig(arm=arm, sensors=sensors, process={"radial": process})
-    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
-    commands = draw(st.integers(1, 40))
-    gaps = draw(st.sampled_from([[T], [T, T, 3 * MS], [T, 0, 10 * MS, 400 * MS]]))
-    stamp = np.cumsum(rng.choice(gaps, commands))
-    levels = np.array([0.5, 0.501, 0.51])
-    command = {axis: rng.choice(levels, commands) for axis in ("radial", "vertical")}
-    command["vertical"][: draw(st.integers(0, commands - 1))] = np.nan
-    heard = {}
-    for name in sensors:
-        rows = draw(st.integers(1, 60))
-        when = np.sort(rng.integers(stamp[0] - 200 * MS, stamp[-1] + 500 * MS, rows))
-        value = (-0.5 if name == "range" else 0.5) + rng.normal(0.0, 3e-3, rows)
-        value[rng.random(rows) < 0.05] = np.nan
-        heard[name] = (when, {"radial": value, "vertical": value[::-1].copy()})
-    return config, pf.Run.from_arrays(stamp, command, heard), draw(st.integers(0, 2**32))
-
-
 @settings(derandomize=True, deadline=None, max_examples=120)
-@given(streams())
+@given(any_stream())
 def test_any_stream_in_any_order(stream: tuple[pf.FusionConfig, pf.Run, int]) -> None:
     """Commands that repeat, share a stamp or begin late, gates that reopen, biases, any latency: the same bits."""
     config, run, seed = stream

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from streams import delayed, events_of, feed
 
 import pumafuse as pf
+from streams import delayed, events_of, feed
 
 CONFIG = pf.FusionConfig(
     arm=pf.ArmModel.load("puma560-internal"),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from streams import differences, events_of
 
 import pumafuse as pf
 from pumafuse.live import window
+from streams import differences, events_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 MS = 1_000_000

@@ -83,8 +83,8 @@ def _follow(
         if piece:
             stream.feed(piece) if isinstance(piece, bytes) else stream.take(piece)
             heard = now
-        elif stream.live.newest is not None and math.isfinite(speed):
-            stream.idle(stream.live.newest + round((now - heard - QUIET) * speed * 1e9))
+        elif (sure := stream.live.sure) is not None and math.isfinite(speed):
+            stream.idle(sure + round((now - heard - QUIET) * speed * 1e9))
         if screen is not None and now - drawn >= _REDRAWN:
             screen.update(status(stream), refresh=True)
             drawn = now

@@ -256,8 +256,8 @@ class LiveEstimator:
         try:
             stamp = nanoseconds(t)
         except (ValueError, OverflowError, TypeError):
-            return self._clock.newest
-        return stamp if self._clock.low <= stamp <= self._clock.high else self._clock.newest
+            return self.sure
+        return stamp if self._clock.low <= stamp <= self._clock.high else self.sure
 
     def health(self) -> Health:
         """How each sensor does, and what became of everything so far."""

@@ -108,8 +108,8 @@ class Stream:
         if self._torn:
             self.line(self._torn)
             self._torn = b""
-        if self._step is not None and self.live.newest is not None:
-            self._on_grid(self.live.newest + 1)
+        if self._step is not None and self.live.sure is not None:
+            self._on_grid(self.live.sure + 1)
         self.flush()
 
     def flush(self) -> None:
@@ -141,7 +141,7 @@ class Stream:
         self.lines += 1
         self.bad += 1
         shown = repr(line[:_SHOWN])[1:] + (" ..." if len(line) > _SHOWN else "")
-        self._sampled("bad line", f"bad line {self.lines}: {reason[:200]}: {shown}")
+        self._sampled(f"bad line, {reason.partition(':')[0]}", f"bad line {self.lines}: {reason[:200]}: {shown}")
 
     def _sampled(self, kind: str, text: str) -> None:
         """Say the first of a kind, the tenth, the hundredth and so on."""

@@ -1,0 +1,199 @@
+"""From lines to lines: estimates at commands or on a grid, and bad lines that are counted and sampled."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.live.sources import Address, replayed
+from streams import TRACKED, Both, line, lines
+
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+
+
+def test_one_estimate_for_each_command() -> None:
+    """As many lines out as commands in, each at its command's time."""
+    both = Both()
+    both.stream.feed(lines(1.0))
+    both.stream.end()
+    assert [found["t"] for found in both.estimates] == [step * 28 / 1000 for step in range(36)]
+    assert both.said == []
+
+
+def test_pieces_of_any_size() -> None:
+    """The stream cut anywhere, a last line without its end, empty lines and Windows line ends: the same estimates."""
+    whole = Both()
+    whole.stream.feed(lines(1.0))
+    rng, cut = np.random.default_rng(0), Both()
+    data = lines(1.0).replace(b"\n", b"\r\n\n")[:-3]
+    while data:
+        size = int(rng.integers(1, 200))
+        cut.stream.feed(data[:size])
+        data = data[size:]
+    cut.stream.end()
+    assert cut.estimates == whole.estimates
+    assert cut.stream.bad == 0
+
+
+@pytest.mark.parametrize("rate", [10.0, 100.0, 333.0])
+def test_an_even_grid_is_as_live(rate: float) -> None:
+    """With a rate the estimates are those of `fuse --as-live --rate`, to the last bit."""
+    data = files("pumafuse") / "data"
+    run, config = pf.Run.read(str(data / "scan1")), pf.FusionConfig.load(str(data / "fusion.toml"))
+    offline, both = pf.fuse(run, config, rate=rate, as_live=True), Both(config, rate)
+    for events in replayed(run, config, np.inf):
+        both.stream.take(events)
+    both.stream.end()
+    found = both.estimates
+    assert 0 <= len(found) - len(offline.time) <= 0.01 * rate  # up to the last stamp, 8 ms after the last valid time
+    for axis, track in offline.axes.items():
+        positions = [one[axis]["position_mm"] for one in found[: len(offline.time)]]
+        assert positions == (track.position * 1e3).tolist()
+
+
+def test_silence_goes_on_by_the_wall_clock() -> None:
+    """While nothing comes the grid goes on with growing sd, told as stale; the state is not touched."""
+    both = Both(rate=10.0)
+    both.stream.feed(lines(2.0))
+    before = both.live.estimate()
+    both.stream.idle(5_000_000_000)
+    assert [found["t"] for found in both.estimates] == [step / 10 for step in range(51)]
+    spread = [found["radial"]["sd_mm"] for found in both.estimates[20:]]
+    assert spread == sorted(spread)
+    assert both.estimates[-1]["stale"] == ["radial"]
+    assert both.live.estimate() == before
+    both.stream.feed(lines(1.0, begin=5.5))
+    times = [found["t"] for found in both.estimates]
+    assert times == sorted(set(times))
+
+
+def test_a_wild_stamp_makes_no_grid() -> None:
+    """A reading half an hour ahead does not let the grid run half an hour ahead."""
+    both = Both(rate=100.0)
+    both.stream.feed(lines(1.0) + line(1800.0, "tracker", radial=570.0) + lines(1.0, begin=1.008))
+    both.stream.end()
+    assert max(found["t"] for found in both.estimates) < 2.1
+    assert any("taken back" in text for text in both.said)
+
+
+BAD = [
+    b"x" * 70_000,
+    b'{"t": 1.0, "sensor": "tracker", "radial": ' + b"1" * 70_000 + b"}",
+    b'{"t": 31536000.0, "sensor": "tracker", "radial": 570.0}',
+    b'{"t": -31536000.0, "command": {"radial": 570.0}}',
+    b'{"t": 1.0, "sensor": "tracker", "radial": 1e300}',
+    b'{"t": 1.0, "command": {"radial": 1e300}}',
+    b'{"t": 1e300, "command": {"radial": 570.0}}',
+    b"[" * 50_000,
+    b'{"t": 1.0, "sensor": "tracker", "radial": ' + b"[" * 30_000 + b"}",
+    bytes(range(1, 10)) + bytes(range(11, 256)),
+    b'{"t": 1.0, "sensor": "lidar", "radial": 570.0}',
+    b'{"t": 1.0, "sensor": "tracker", "radal": 570.0}',
+    b'{"t": 1.0, "command": {"radal": 570.0}}',
+    b"null",
+    b'{"t_ns": 9223372036854775808, "sensor": "tracker", "radial": 570.0}',
+    b'{"t_ns": 99999999999999999999999999, "sensor": "tracker", "radial": 570.0}',
+]
+
+
+def test_bad_lines_change_nothing_and_are_told() -> None:
+    """Between good lines, each kind of bad one: the estimates are those without them, and the log names each kind."""
+    clean, both = Both(), Both()
+    clean.stream.feed(lines(1.0) + lines(1.0, begin=1.008))
+    both.stream.feed(lines(1.0) + b"\n".join(BAD) + b"\n" + lines(1.0, begin=1.008))
+    assert both.estimates == clean.estimates
+    told = "\n".join(both.said)
+    for expected in ("longer than 64 KiB", "lidar", "radal", "days|s ahead", "not a finite position", "not JSON"):
+        assert any(part in told for part in expected.split("|")), expected
+    assert all(len(text) < 400 for text in both.said)
+    health = both.live.health()
+    refused = sum(count for word, count in health.commands.items() if word != "fused")
+    refused += sum(count for one in health.sensors.values() for word, count in one.outcomes.items() if word != "fused")
+    assert both.stream.bad + refused + health.unknown == len(BAD)
+
+
+def test_the_log_stays_short() -> None:
+    """A hundred thousand bad lines are six lines of log: the first, the tenth, and so on."""
+    both = Both()
+    both.stream.feed(lines(0.1) + b"nonsense\n" * 100_000)
+    assert both.stream.bad == 100_000
+    assert len(both.said) == 6
+    assert "100000 of this kind" in both.said[-1]
+
+
+def test_a_line_without_end_is_not_kept() -> None:
+    """A megabyte without a line end is one bad line, held nowhere."""
+    both = Both()
+    for _ in range(100):
+        both.stream.feed(b"x" * 10_000)
+    assert len(both.stream._torn) <= 64 * 1024
+    both.stream.feed(b"\n" + lines(0.1))
+    assert both.stream.bad == 1
+    assert len(both.estimates) == 4
+
+
+def test_a_clock_set_back_begins_the_grid_anew() -> None:
+    """After a restart the grid begins at the new first command."""
+    both = Both(rate=100.0)
+    both.stream.feed(lines(1.0, begin=1000.0) + lines(1.0, begin=10.0))
+    both.stream.end()
+    times = [found["t"] for found in both.estimates]
+    second = times.index(10.0)
+    assert max(times[:second]) > 1000.9
+    assert times[second:] == [round(10.0 + step / 100, 2) for step in range(len(times) - second)]
+    assert max(times[second:]) > 10.9
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("stdin", Address("stdin")),
+        ("replay:runs/one", Address("replay", "runs/one")),
+        ("replay:runs/one?speed=4", Address("replay", "runs/one", 4.0)),
+        ("replay:odd?name?speed=max", Address("replay", "odd?name", np.inf)),
+    ],
+)
+def test_sources_by_name(text: str, expected: Address) -> None:
+    """What the command line may say."""
+    assert Address.parse(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["stdout", "", "replay", "udp", "replay:a?speed=0", "replay:a?speed=fast", "replay:a?x=1"]
+)
+def test_other_sources_are_refused(text: str) -> None:
+    """With what is accepted."""
+    with pytest.raises(pf.ConfigError, match="source"):
+        Address.parse(text)
+
+
+def test_a_replay_keeps_its_pace() -> None:
+    """Four times as fast: 0.8 s of a run take 0.2 s, and never less."""
+    import time
+
+    run = pf.Run.from_arrays(
+        np.arange(0.0, 0.8, 0.028), {"radial": np.full(29, 0.57)}, {"tracker": ([0.1, 0.9], {"radial": [0.57, 0.57]})}
+    )
+    begin = time.monotonic()
+    events = [event for batch in replayed(run, TRACKED, 4.0) for event in batch]
+    assert time.monotonic() - begin >= 0.9 / 4.0
+    assert len(events) == 31
+
+
+def test_a_replay_follows_the_controllers_grid() -> None:
+    """A run whose commands are to be fitted by a grid is replayed on that grid, as offline fuses it."""
+    rng = np.random.default_rng(2)
+    given = np.arange(200) * 0.028 + rng.uniform(0.0, 0.004, 200)
+    run = pf.Run.from_arrays(
+        given,
+        {"radial": 0.57 + 1e-4 * np.arange(200)},
+        {"tracker": (np.arange(0.0, 5.5, 0.01), {"radial": np.full(550, 0.57)})},
+        clock="regular",
+    )
+    offline, both = pf.fuse(run, TRACKED, as_live=True), Both()
+    for events in replayed(run, TRACKED, np.inf):
+        both.stream.take(events)
+    assert [found["radial"]["position_mm"] for found in both.estimates] == (offline["radial"].position * 1e3).tolist()
