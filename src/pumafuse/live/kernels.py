@@ -167,15 +167,7 @@ def hear(flat: Flat, stamp: int, sensor: int, given: int, newest: int, horizon: 
                     m.tally.number[sensor, _DUPLICATE] += 1
             return DONE
         late = at + 1 < heard.span[END]
-    log = Log(
-        m.nothing.whole,
-        m.nothing.whole,
-        m.nothing.whole,
-        m.nothing.whole,
-        m.nothing.real,
-        m.nothing.real,
-        m.nothing.table,
-    )
+    log = no_log(m.nothing)
     last = rows.valid[(heard.span[END] - 1) & mask]
     for axis in range(axes):
         lengthen(m.axes, m.commands, axis, last - m.commands.number[axis, DELAY])
@@ -248,15 +240,7 @@ def ask(flat: Flat, held: tuple[FloatArray, ...], outputs: tuple[FloatArray, ...
         go_back(m.state, m.kept, at & mask)
     for axis in range(len(m.heard.told)):
         m.heard.fused[axis] = m.state.fused[axis]
-    log = Log(
-        m.nothing.whole,
-        m.nothing.whole,
-        m.nothing.whole,
-        m.nothing.whole,
-        m.nothing.real,
-        m.nothing.real,
-        m.nothing.table,
-    )
+    log = no_log(m.nothing)
     estimate(m.axes, m.state, log, time, Held(*held), Outputs(*outputs), 0)
     go_back(m.state, m.kept, mask + 1)
     return DONE
@@ -483,26 +467,32 @@ def first_valid(rows: Rows, heard: Heard, since: int) -> int:
 
 
 @compiled
+def no_log(nothing: Nothing) -> Log:
+    """A smoother's log that nothing is written to."""
+    whole, real = nothing.whole, nothing.real
+    return Log(whole, whole, whole, whole, real, real, nothing.table)
+
+
+@compiled
 def start_again(state: State, kept: State, heard: Heard, axis: int) -> None:
     """Put an axis to rest at its start level, before all that is still in the window."""
-    start = len(kept.clock) - 1
-    first = heard.span[BEGIN] & (len(heard.stamp) - 1)
-    empty = heard.span[BEGIN] == heard.span[END]
-    if empty:
-        state.clock[axis], state.entry[axis], state.fused[axis] = kept.clock[start, axis], -1, kept.fused[start, axis]
+    if heard.span[BEGIN] == heard.span[END]:
+        rest(state.x, state.P, state.clock, state.entry, state.fused, kept, axis)
     else:
-        kept.clock[first, axis], kept.entry[first, axis] = kept.clock[start, axis], -1
-        kept.fused[first, axis] = kept.fused[start, axis]
-    for i in range(state.x.shape[1]):
-        if empty:
-            state.x[axis, i] = 0.0
-        else:
-            kept.x[first, axis, i] = 0.0
-        for j in range(state.x.shape[1]):
-            if empty:
-                state.P[axis, i, j] = kept.P[start, axis, i, j]
-            else:
-                kept.P[first, axis, i, j] = kept.P[start, axis, i, j]
+        first = heard.span[BEGIN] & (len(heard.stamp) - 1)
+        rest(kept.x[first], kept.P[first], kept.clock[first], kept.entry[first], kept.fused[first], kept, axis)
+
+
+@compiled
+def rest(
+    x: FloatArray, P: FloatArray, clock: TimeArray, entry: IntArray, fused: TimeArray, kept: State, axis: int
+) -> None:
+    """One axis as it is at rest, which is kept in the last place."""
+    clock[axis], entry[axis], fused[axis] = kept.clock[-1, axis], kept.entry[-1, axis], kept.fused[-1, axis]
+    for i in range(x.shape[1]):
+        x[axis, i] = kept.x[-1, axis, i]
+        for j in range(x.shape[1]):
+            P[axis, i, j] = kept.P[-1, axis, i, j]
 
 
 @compiled
