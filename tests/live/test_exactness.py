@@ -75,6 +75,8 @@ def test_the_frame_is_where_the_first_command_is_however_late_it_comes() -> None
     for seed in range(4):
         live = pf.LiveEstimator(config)
         assert differences(live, delayed(events_of(run), 1.2, seed), offline, 1.45) == []
+        assert told(live) == outcomes_of(offline)
+        assert live.health().commands["fused"] == len(run.command.stamp)
 
 
 def test_a_clock_set_back_begins_a_segment_as_offline() -> None:

@@ -169,7 +169,7 @@ class LiveEstimator:
         self._latency = round(max([0.0, *(sensor.latency for sensor in config.sensors.values())]) * 1e9)
         self._notice = on_notice
         self._refused: dict[str, dict[Outcome, int]] = {name: dict.fromkeys(Outcome, 0) for name in config.sensors}
-        self._strangers = 0
+        self._strangers = self._refusals = 0
         self._commands = dict.fromkeys(Outcome, 0)
         self._answers: dict[tuple[bytes, str], Told] = {}
         self._aside: list[tuple[_Event, Outcome]] = []
@@ -194,7 +194,7 @@ class LiveEstimator:
             sensor: Its name there.
             **axes: z [m] of each axis it saw; x, y and z with a frame.
         """
-        return self._take(t, sensor, axes)
+        return self._take(t, str(sensor), axes)
 
     def estimate(self, at: Time | None = None) -> LiveEstimate:
         """Where the tool is.
@@ -278,7 +278,8 @@ class LiveEstimator:
         self._window = Window(self.config, self.axes, self._placing.start(self._start), tally)
         self._new, self._told = self._window.memory.heard.new, self._window.memory.heard.told
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it.
-        self._early: list[_Event] | None = [] if self._placing.waits else None
+        # With each goes its outcome, and whether it never came into the window.
+        self._early: list[tuple[_Event, Outcome, bool]] | None = [] if self._placing.waits else None
 
     def _oldest(self) -> int:
         """No event stamped before is taken [ns]."""
@@ -366,20 +367,29 @@ class LiveEstimator:
         if origin is not None and self._clock.sure - origin > self._clock.window:
             self._early = None
             return self._feed(*event)
-        self._early.append(event)
-        if len(self._early) > _MOST_ASIDE:
-            self._early = [one for one in self._early[-_MOST_ASIDE // 2 :] if one.stamp >= oldest]
         x, y = (_number(event.values.get(name)) for name in ("x", "y"))
-        if event.sensor is not None or not math.isfinite(x + y) or (since is not None and event.stamp >= since):
-            return self._feed(*event)
-        events = [one for one in self._early if one.stamp >= oldest]
-        self._begin(self._before)
-        try:
-            self._placing.place(event.stamp, x, y)
-        except RunError as error:
-            return self._refuse(None, event.values, _INVALID, str(error))
-        self._early = events
-        return [self._feed(*one) for one in events][-1]
+        if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
+            events = [one for one, _, _ in self._early if one.stamp >= oldest]
+            for (_, sensor, values), outcome, refused in self._early:
+                if sensor is None or refused:
+                    self._count(sensor, values, outcome, -1)
+            self._begin(self._before)
+            try:
+                self._placing.place(event.stamp, x, y)
+            except RunError as error:
+                return self._refuse(None, event.values, _INVALID, str(error))
+            for one in events:
+                self._feed_early(one)
+        return self._feed_early(event)
+
+    def _feed_early(self, event: _Event) -> Told:
+        assert self._early is not None
+        before = self._refusals
+        told = self._feed(*event)
+        if len(self._early) >= _MOST_ASIDE:
+            del self._early[: _MOST_ASIDE // 2]
+        self._early.append((event, told.outcome, self._refusals > before))
+        return told
 
     def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> Told:
         """Give an event that is in time to the window."""
@@ -451,6 +461,7 @@ class LiveEstimator:
 
     def _refuse(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str) -> Told:
         """Count an event that never comes into the window."""
+        self._refusals += 1
         self._count(sensor, values, outcome, 1)
         return Told(outcome, MappingProxyType(dict.fromkeys(values, outcome)), reason)
 
