@@ -108,6 +108,19 @@ def test_wrong_sources_are_one_line(data, source: str, said: str) -> None:
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_a_closed_input_and_a_full_output_are_one_line(data) -> None:
+    """No standard input at all, and no room for the estimates: one line, exit code 1."""
+    arguments = f"-c {data / 'fusion.toml'}"
+    for command, said in (
+        (f"{EXECUTABLE} live stdin {arguments} <&-", "standard input: cannot be read"),
+        (f"{EXECUTABLE} live replay:{data / 'scan1'}?speed=max {arguments} > /dev/full", "standard output"),
+    ):
+        done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 1
+        assert said in done.stderr
+        assert "Traceback" not in done.stderr
+
+
 def test_wrong_options_are_usage(data) -> None:
     """Exit code 2."""
     for option in ("--rate", "--window", "--stale-after"):

@@ -19,16 +19,16 @@ def test_a_stamp_within_the_window_is_here_and_one_before_it_is_behind() -> None
     """Late by exactly the window is in time."""
     clock = at(10.0)
     assert clock.low == 8 * SECOND
-    assert clock.judge(8 * SECOND - 1, command=False) is Verdict.BEHIND
+    assert clock.judge(8 * SECOND - 1, source="tracker") is Verdict.BEHIND
     assert clock.newest == 10 * SECOND
 
 
 def test_a_jump_ahead_is_believed_until_it_is_contradicted() -> None:
     """One stamp 30 s ahead, then the old time: back to it, and all after it in doubt is to be forgotten."""
     clock = at(10.0)
-    assert clock.judge(40 * SECOND, command=False) is Verdict.HERE
+    assert clock.judge(40 * SECOND, source="tracker") is Verdict.HERE
     assert (clock.newest, clock.sure) == (40 * SECOND, 10 * SECOND)
-    assert clock.judge(10 * SECOND + T, command=True) is Verdict.CONTRADICTED
+    assert clock.judge(10 * SECOND + T, source=None) is Verdict.CONTRADICTED
     assert (clock.newest, clock.sure, clock.bound) == (10 * SECOND, 10 * SECOND, 12 * SECOND)
 
 
@@ -36,13 +36,13 @@ def test_a_jump_ahead_is_believed_until_it_is_contradicted() -> None:
 def test_after_a_pause_of_all_time_goes_on(gap: int) -> None:
     """Two commands after a pause, or a second of readings, end the doubt."""
     clock = at(0.0)
-    assert clock.judge(gap * SECOND, command=True) is Verdict.HERE
+    assert clock.judge(gap * SECOND, source=None) is Verdict.HERE
     assert clock.sure == 0
-    assert clock.judge(gap * SECOND + T, command=True) is Verdict.HERE
+    assert clock.judge(gap * SECOND + T, source=None) is Verdict.HERE
     assert clock.sure == gap * SECOND + T
     clock = at(0.0)
     for step in range(11):
-        assert clock.judge(gap * SECOND + step * SECOND // 10, command=False) is Verdict.HERE
+        assert clock.judge(gap * SECOND + step * SECOND // 10, source="tracker") is Verdict.HERE
     assert clock.sure == (gap + 1) * SECOND
 
 
@@ -50,7 +50,7 @@ def test_events_that_are_always_far_apart_are_all_believed() -> None:
     """A command every 10 s, and nothing between."""
     clock = at(0.0)
     for step in range(1, 20):
-        assert clock.judge(10 * step * SECOND, command=True) is Verdict.HERE
+        assert clock.judge(10 * step * SECOND, source=None) is Verdict.HERE
         assert clock.newest == 10 * step * SECOND
 
 
@@ -59,7 +59,7 @@ def test_three_commands_of_another_time_are_a_clock_set_anew(to: int) -> None:
     """Set back, or ahead by more than an hour."""
     clock = at(100.0)
     stamps = [(100 + to) * SECOND + step * T for step in range(3)]
-    verdicts = [clock.judge(stamp, command=True) for stamp in stamps]
+    verdicts = [clock.judge(stamp, source=None) for stamp in stamps]
     away = Verdict.BEHIND if to < 0 else Verdict.BEYOND
     assert verdicts == [away, away, Verdict.ANEW]
 
@@ -68,18 +68,18 @@ def test_a_command_of_the_right_time_clears_what_was_said_against_it() -> None:
     """Two stale commands, a current one, two stale ones: no restart."""
     clock = at(100.0)
     for step in range(2):
-        assert clock.judge(50 * SECOND + step * T, command=True) is Verdict.BEHIND
+        assert clock.judge(50 * SECOND + step * T, source=None) is Verdict.BEHIND
     clock.here()
     for step in range(2, 4):
-        assert clock.judge(50 * SECOND + step * T, command=True) is Verdict.BEHIND
+        assert clock.judge(50 * SECOND + step * T, source=None) is Verdict.BEHIND
 
 
 def test_readings_alone_never_set_the_clock() -> None:
     """A sensor an hour behind or a year ahead is refused for as long as it goes on."""
     clock = at(100.0)
     for step in range(1000):
-        assert clock.judge(50 * SECOND + step * T, command=False) is Verdict.BEHIND
-        assert clock.judge(31_536_000 * SECOND + step * T, command=False) is Verdict.BEYOND
+        assert clock.judge(50 * SECOND + step * T, source="tracker") is Verdict.BEHIND
+        assert clock.judge(31_536_000 * SECOND + step * T, source="tracker") is Verdict.BEYOND
 
 
 CONFIG = pf.FusionConfig(
@@ -120,5 +120,69 @@ def test_a_wild_command_is_taken_back() -> None:
         if step in (100, 150):
             assert live.command(t + 1800.0, radial=9.0, vertical=9.0).outcome is pf.Outcome.FUSED
     assert live.estimate(5.6) == clean.estimate(5.6)
-    assert len(notices) == 2
-    assert "taken back" in notices[0]
+    assert live.health().commands["invalid"] == 2
+    assert live.health().commands == {**clean.health().commands, "invalid": 2}
+    assert len(notices) == 1  # the next will be the tenth
+    assert "a command ran 1799.972 s ahead of the others: taken back" in notices[0]
+
+
+def test_a_reading_cannot_contradict_a_command() -> None:
+    """The controller's clock is set ahead by 30 s, the sensors' is not: commands go on, readings are too late."""
+    notices: list[str] = []
+    live = pf.LiveEstimator(CONFIG, on_notice=notices.append)
+    for step in range(1000):
+        t = 0.028 * step
+        live.command(t + (30.0 if step > 300 else 0.0), radial=0.5 + 1e-5 * step)
+        live.reading(t + 0.005, "tracker", radial=0.5 + 1e-5 * step)
+    health = live.health()
+    assert health.commands["fused"] == 1000
+    assert live.newest == round((0.028 * 999 + 30.0) * 1e9)
+    assert abs(live.estimate()["radial"].position - 0.51) < 1e-3
+    assert 690 < health.sensors["tracker"].outcomes["too_late"] < 700
+    assert notices == []
+
+
+def test_two_sensors_that_are_wrong_do_not_make_each_other_right() -> None:
+    """One 30 s ahead, one 60 s ahead, and right commands: no restart, and the estimate is that of the commands."""
+    live, alone = pf.LiveEstimator(CONFIG), pf.LiveEstimator(CONFIG)
+    for step in range(500):
+        t = 0.028 * step
+        live.command(t, radial=0.5 + 1e-4 * step)
+        alone.command(t, radial=0.5 + 1e-4 * step)
+        live.reading(t + 30.0, "tracker", radial=0.9)
+        live.reading(t + 60.0, "camera", radial=0.1)
+    live.command(14.0, radial=0.55)
+    alone.command(14.0, radial=0.55)
+    assert live.segment == 0
+    assert live.estimate(14.0) == alone.estimate(14.0)
+    assert live.health().sensors["camera"].outcomes["invalid"] == 500
+
+
+def test_an_axis_that_only_a_wild_command_gave_is_forgotten() -> None:
+    """Row gates look at axes that have begun: one that a wrong stamp began shuts no gate after it is taken back."""
+    config = pf.FusionConfig(
+        arm=CONFIG.arm, sensors={"tracker": pf.Sensor(sd=1e-4, gate=3.0)}, start=pf.Start(offset_sd=1e-5)
+    )
+    live, clean = pf.LiveEstimator(config), pf.LiveEstimator(config)
+    for step in range(150):
+        for one in (live, clean):
+            one.command(0.028 * step, radial=0.5)
+            one.reading(0.028 * step + 0.01, "tracker", radial=0.5, vertical=0.1 + 0.01 * (step % 7))
+        if step == 50:
+            live.command(20.0, radial=0.5, vertical=0.9)
+    assert live.health().sensors["tracker"].outcomes == clean.health().sensors["tracker"].outcomes
+    assert live.estimate() == clean.estimate()
+
+
+def test_now_is_not_where_a_sensor_alone_has_run_to() -> None:
+    """In doubt about a reading 30 s ahead, now is where all others are, and they are not called stale."""
+    live = pf.LiveEstimator(CONFIG)
+    for step in range(100):
+        live.command(0.028 * step, radial=0.5)
+        live.reading(0.028 * step, "tracker", radial=0.5)
+    live.reading(32.0, "camera", radial=0.5)
+    assert live.estimate().stamp == round(0.028 * 99e9)
+    assert not live.health().sensors["tracker"].stale
+    live.command(2.8, radial=0.5)
+    camera = live.health().sensors["camera"]
+    assert (camera.silent, camera.outcomes["invalid"]) == (None, 1)

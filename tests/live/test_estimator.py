@@ -82,8 +82,10 @@ def test_times_that_have_no_estimate_say_why() -> None:
     assert "before the window" in live.estimate(1.0).reason
     assert live.estimate(2.1).outcome is pf.Outcome.FUSED
     assert live.estimate(4000.0).outcome is pf.Outcome.INVALID
-    for nonsense in (math.nan, math.inf, 1e300, "now", [1.0]):
+    for nonsense in (math.nan, math.inf, 1e300, "now", [1.0], 10**5000, True):
         assert live.estimate(nonsense).outcome is pf.Outcome.INVALID
+        assert live.command(nonsense, radial=0.57).outcome is pf.Outcome.INVALID
+        assert live.reading(nonsense, "tracker", radial=0.57).outcome is pf.Outcome.INVALID
     with pytest.raises(pf.UnknownNameError, match="before the window"):
         live.estimate(1.0)["radial"]
     with pytest.raises(pf.UnknownNameError, match="accepted: radial, vertical"):
@@ -118,6 +120,10 @@ def test_a_late_reading_within_the_window_is_fused_and_beyond_it_is_too_late() -
         ("tracker", {"radial": "much"}, "invalid", "not a finite position"),
         ("tracker", {"radial": None}, "invalid", "not a finite position"),
         ("tracker", {"radial": 10**400}, "invalid", "not a finite position"),
+        ("tracker", {"radial": "0.57"}, "invalid", "not a finite position"),
+        ("tracker", {"radial": True}, "invalid", "not a finite position"),
+        (None, {"radial": 0.57}, "unknown", "unknown sensor"),
+        (["tracker"], {"radial": 0.57}, "unknown", "unknown sensor"),
         ("camera", {"radial": 0.9}, "gated", "gate"),
     ],
 )
@@ -190,11 +196,20 @@ def test_int_times_are_nanoseconds() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"window": 0.0}, {"window": math.nan}, {"stale_after": -1.0}, {"start": {"radal": 0.1}}]
+    "wrong",
+    [
+        {"window": 0.0},
+        {"window": math.nan},
+        {"window": "2"},
+        {"stale_after": -1.0},
+        {"start": {"radal": 0.1}},
+        {"start": {"radial": math.nan}},
+        {"start": {"radial": "a"}},
+    ],
 )
 def test_what_is_wrong_at_the_start_is_refused(wrong: dict) -> None:
     """One clear line, as for files."""
-    with pytest.raises(pf.PumafuseError, match=r"window|stale_after|radal"):
+    with pytest.raises(pf.PumafuseError, match=r"window|stale_after|radal|start"):
         pf.LiveEstimator(CONFIG, **wrong)
 
 
@@ -230,3 +245,27 @@ def test_x_and_y_mean_nothing_before_the_frame_has_its_place() -> None:
     assert live.command(0.01, x=0.0, y=0.0).outcome is pf.Outcome.INVALID
     assert live.command(0.03, x=0.1, y=0.5).outcome is pf.Outcome.FUSED
     assert live.estimate().outcome is pf.Outcome.FUSED
+
+
+def test_a_command_on_the_bases_axis_costs_nothing_but_itself() -> None:
+    """A late first command where the frame has no angle is refused, and all that was there stays."""
+    live = pf.LiveEstimator(msgspec.structs.replace(CONFIG, frame=Cylindrical()))
+    for step in range(10):
+        live.command(1.0 + step * PERIOD, x=0.1, y=0.5)
+    before = live.estimate()
+    assert live.command(0.9, x=0.0, y=0.0).outcome is pf.Outcome.INVALID
+    assert live.estimate() == before
+    assert live.health().commands["fused"] == 10
+
+
+def test_an_axis_with_a_start_level_is_there_before_its_first_command() -> None:
+    """Readings of an axis that is commanded late are fused from the first command of all on, if its level is known."""
+    told, untold = pf.LiveEstimator(CONFIG, start={"vertical": 0.1}), pf.LiveEstimator(CONFIG)
+    for live in (told, untold):
+        for step in range(200):
+            live.command(step * PERIOD, radial=0.57)
+            live.reading(step * PERIOD + 0.01, "tracker", radial=0.57, vertical=0.1001)
+        live.command(5.6, vertical=0.1)
+    assert told.health().sensors["tracker"].outcomes["before_start"] == 0
+    assert untold.health().sensors["tracker"].outcomes["before_start"] > 0
+    assert told.estimate()["vertical"].position_sd < 1e-3

@@ -96,3 +96,16 @@ def test_reopenings_and_all_outcomes_are_counted() -> None:
     assert health.unknown == 1
     assert health.commands["fused"] + health.commands["duplicate"] == 400
     assert health.segments == 1
+
+
+def test_a_slower_sensor_has_a_new_usual_interval() -> None:
+    """From 100 to 20 Hz: some dropouts until that is usual, then none; the first interval may be any."""
+    live = pf.LiveEstimator(CONFIG)
+    live.command(0.0, radial=0.57)
+    times = np.concatenate(([0.0], 1.9 + 0.01 * np.arange(1000), 11.9 + 0.05 * np.arange(1000)))
+    dropouts = []
+    for t in times.tolist():
+        live.command(t, radial=0.57)
+        live.reading(t, "tracker", radial=0.57)
+        dropouts.append(live.health().sensors["tracker"].dropouts) if t in (11.85, times[1200]) else None
+    assert dropouts[-1] == live.health().sensors["tracker"].dropouts < 60

@@ -124,6 +124,43 @@ def test_the_log_stays_short() -> None:
     assert "100000 of this kind" in both.said[-1]
 
 
+def test_the_log_is_plain_whatever_a_line_calls_itself() -> None:
+    """Names of 60 kB, with colours and line breaks in them, thousands of them: short plain lines, and little memory."""
+    both = Both()
+    both.stream.feed(lines(0.1))
+    for number in range(2000):
+        name = f"\x1b[31m{number}\n" + "x" * 1000
+        both.stream.feed(line(0.1, name, radial=570.0) + line(0.1, "tracker", radial=570.0, **{name: 1.0}))
+    assert len(both.said) < 20
+    assert all(text.isprintable() and len(text) < 500 for text in both.said)
+    assert len(both.live._answers) < 10
+
+
+def test_a_command_within_a_command_is_no_recursion() -> None:
+    """Names of a line where an axis should be are strangers."""
+    both = Both()
+    both.stream.feed(b'{"t": 1.0, "command": {"t": 5.0, "command": {"radial": 1.0}}}\n')
+    assert both.live.health().commands["unknown"] == 1
+
+
+@pytest.mark.parametrize("pause", [600.0, 3500.0])
+def test_a_long_pause_is_not_filled(pause: float) -> None:
+    """At 1 kHz a pause of minutes would be hundreds of thousands of lines at once: it is left out, and said."""
+    both = Both(rate=1000.0)
+    both.stream.feed(lines(1.0) + lines(1.0, begin=pause))
+    both.stream.end()
+    assert 1900 < len(both.estimates) < 4000
+    assert any("no estimates on the grid" in text for text in both.said)
+    times = [found["t"] for found in both.estimates]
+    assert times == sorted(times)
+
+
+def test_a_rate_beyond_reason_is_refused() -> None:
+    """More than 10 kHz."""
+    with pytest.raises(pf.ConfigError, match="10000"):
+        Both(rate=1e6)
+
+
 def test_a_line_without_end_is_not_kept() -> None:
     """A megabyte without a line end is one bad line, held nowhere."""
     both = Both()

@@ -112,3 +112,52 @@ def test_a_flood_of_commands_shortens_the_window(monkeypatch: pytest.MonkeyPatch
     offline = pf.fuse(run, config)
     assert live.estimate(int(given[-1]))["radial"].position == offline["radial"].position[-1]
     assert live.command(int(given[0]) + 1, radial=0.4).outcome is pf.Outcome.TOO_LATE
+
+
+def test_what_the_window_lets_go_for_an_event_is_gone_for_that_event_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Room for a late event costs the oldest eighth of the window: an event that is older still is too late."""
+    monkeypatch.setattr(window, "MOST_ROWS", 1024)
+    live, clean = (pf.LiveEstimator(config_of(recovery=None), window=600.0) for _ in range(2))
+    for step in range(1024):
+        for one in (live, clean):
+            one.command(step * 28 * MS, radial=0.5 + 1e-5 * step)
+            one.reading(step * 28 * MS, "fast", radial=0.5 + 1e-5 * step)
+    told = live.command(14 * MS, radial=0.4)
+    assert told.outcome is pf.Outcome.TOO_LATE
+    assert "the window holds no more" in told.reason
+    assert live.estimate(1023 * 28 * MS) == clean.estimate(1023 * 28 * MS)
+
+
+def test_a_repeated_command_before_a_long_silence() -> None:
+    """The last command is said again at once, then only readings come: its error decays on as it does offline."""
+    config = config_of(recovery=5.0)
+    heard = np.arange(0.0, 80.0, 0.1)
+    run = pf.Run.from_arrays(
+        [0.0, 1.0, 1.01], {"radial": [0.5, 0.51, 0.51]}, {"fast": (heard, {"radial": np.full(len(heard), 0.51)})}
+    )
+    offline = pf.fuse(run, config, rate=50.0)
+    live = pf.LiveEstimator(config)
+    assert differences(live, events_of(run), offline, 0.5) == []
+
+
+def test_an_hour_ahead_with_a_long_recovery() -> None:
+    """The farthest estimate there is, of an arm with a tick each ms: memory is bounded, the command table as it was."""
+    live = pf.LiveEstimator(config_of(recovery=9.9, period=0.001))
+    live.command(0, radial=0.5)
+    live.command(MS, radial=0.51)
+    assert live.estimate(3600 * 1000 * MS).outcome is pf.Outcome.FUSED
+    memory = live._window.memory
+    assert memory.axes.first[1] <= 2**20
+    assert memory.commands.time.shape[1] == 512
+
+
+def test_a_frozen_stamp_ends_in_a_shorter_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sensor whose stamp stands still: its rows are taken as far as they fit, then refused with the reason."""
+    monkeypatch.setattr(window, "MOST_ROWS", 4096)
+    live = pf.LiveEstimator(config_of())
+    live.command(0, radial=0.5)
+    told = [live.reading(100 * MS, "slow", radial=0.5 + 1e-9 * row) for row in range(5000)]
+    assert told[4000].outcome is pf.Outcome.FUSED
+    assert told[-1].outcome is pf.Outcome.TOO_LATE
+    assert "the window holds no more" in told[-1].reason
+    assert live.command(128 * MS, radial=0.5).outcome is pf.Outcome.FUSED

@@ -19,6 +19,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from ..errors import RunError
 from ..fusion.config import FusionConfig
 from ..fusion.timeline import Outcome
 from ..live.estimator import LiveEstimator
@@ -60,8 +61,14 @@ def run(source: str, options: Options) -> None:
         errors.print(text, markup=False, soft_wrap=True)
 
     def write(lines: bytes) -> None:
-        sys.stdout.buffer.write(lines)
-        sys.stdout.buffer.flush()
+        try:
+            sys.stdout.buffer.write(lines)
+            sys.stdout.buffer.flush()
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            sys.stdout = None  # what is left in its buffer would be tried once more at exit
+            raise RunError(f"standard output: cannot be written: {error.strerror}") from None
 
     live = LiveEstimator(config, window=options.window, stale_after=options.stale_after, start=start, on_notice=say)
     hidden = options.status and sys.stdout.isatty()  # the screen and the lines would write over each other
@@ -69,7 +76,7 @@ def run(source: str, options: Options) -> None:
     pieces = standard_input() if recorded is None else replayed(recorded, config, address.speed)
     with ended_by_signals() as ended, _screen(errors, options.status) as screen:
         _follow(stream, pieces, ended, screen, 1.0 if recorded is None else address.speed)
-        stream.end()
+        stream.end(cut=bool(ended))
     summarise(stream, errors)
 
 
@@ -135,7 +142,7 @@ def status(stream: Stream) -> Group:
             f"{axis.velocity * MM:.1f}",
             stale,
         )
-    told = "no event yet" if live.newest is None else f"t = {live.newest / 1e9:.3f} s, {estimate.reason}"
+    told = "no event yet" if live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
     return Group(Text(told), axes, sensor_table(health), Text(counted(stream, health)))
 
 

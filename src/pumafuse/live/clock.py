@@ -1,9 +1,10 @@
-"""Where the time of a stream is, told by stamps alone: late, ahead, on another clock, or set back.
+"""Where the time of a stream is, told by stamps alone: late, ahead, on another clock, or set anew.
 
 The commands are the master: their controller is what the arm obeys. A stamp within the window behind the newest one is
 late, one that is farther behind is too late. One that is ahead of all by more than usual is believed, since everything
-may have paused, and taken back if the next event still has the old time: one sensor's clock was wrong. Commands that
-have another time again and again mean a clock that was set anew: the filter starts again there.
+may have paused, and taken back if what comes next still has the old time: if one sensor ran ahead, anything that comes;
+if a command did, the next command. Commands that have another time again and again mean a clock that was set anew: the
+filter starts again there.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ class Verdict(enum.Enum):
     """What a stamp means."""
 
     HERE = enum.auto()
-    CONTRADICTED = enum.auto()  # what ran ahead was wrong: it is to be forgotten
+    CONTRADICTED = enum.auto()  # what ran ahead was wrong and is to be forgotten
     BEHIND = enum.auto()
     BEYOND = enum.auto()
     ANEW = enum.auto()  # a new segment begins
@@ -34,6 +35,7 @@ class Clock:
         newest: The newest stamp that is believed, int ns; None at first.
         low: Stamps from here …
         high: … to here are plainly right [ns]; none is while there is a doubt.
+        ahead_of: Who raised the latest doubt: a sensor's name, None for a command.
     """
 
     def __init__(self, window: int) -> None:
@@ -41,16 +43,28 @@ class Clock:
         self.window = window
         self.newest: int | None = None
         self.low, self.high = 1, 0
+        self.ahead_of: str | None = None
         self._ahead = max(window, AHEAD_NS)
         self._sure: int | None = None  # what the newest stamp was before a jump ahead that is not certain yet
-        self._jumped, self._jumped_commands = 0, 0
+        self._jumped, self._commands = 0, 0  # where it jumped to, and how many commands have been there
         self._other: list[int] = []  # stamps of commands in a row that are not here
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the newest stamps may have to be taken back."""
+        return self._sure is not None
 
     @property
     def sure(self) -> int:
         """The newest stamp that nothing can take back any more, int ns."""
         assert self.newest is not None
         return self.newest if self._sure is None else self._sure
+
+    @property
+    def now(self) -> int:
+        """The newest stamp that a command or no doubt stands for, int ns."""
+        assert self.newest is not None
+        return self.newest if self._sure is None or self._commands else self._sure
 
     @property
     def tries(self) -> int:
@@ -64,38 +78,46 @@ class Clock:
 
     def start(self, stamp: int) -> None:
         """Be at ``stamp`` [ns], whatever was before."""
-        self._sure, self._other = None, []
-        self._move(stamp)
+        self._other = []
+        self._settle(stamp)
 
     def advance(self, stamp: int) -> None:
         """A stamp that is plainly right, ahead of the newest."""
-        self._move(stamp)
-
-    def judge(self, stamp: int, command: bool) -> Verdict:
-        """What a stamp [ns] means that is not between ``low`` and ``high``, and move on to it if it is believed."""
-        assert self.newest is not None
-        if self._sure is not None and self._sure - self.window <= stamp < self.newest - self.window:
-            self._end_doubt(self._sure)
-            return Verdict.CONTRADICTED
-        if stamp < self.newest - self.window or stamp > self.newest + LONGEST_TAIL_NS:
-            return self._elsewhere(stamp, command)
-        if command:
-            self._other = []
-        if stamp > self.newest + self._ahead:
-            self._sure, self._jumped, self._jumped_commands = self.newest, stamp, int(command)
-            self.newest = stamp
-            self.low, self.high = 1, 0
-            return Verdict.HERE
-        self._jumped_commands += command
-        if self._sure is not None and self._jumped_commands < 2 and stamp - self._jumped < AHEAD_NS:
-            self.newest = max(self.newest, stamp)
-            return Verdict.HERE
-        self._end_doubt(max(self.newest, stamp))
-        return Verdict.HERE
+        self._settle(stamp)
 
     def here(self) -> None:
         """A command that is plainly right has come: others that were not are no sign of a clock set anew."""
         self._other = []
+
+    def judge(self, stamp: int, source: str | None) -> Verdict:
+        """What a stamp [ns] means that is not between ``low`` and ``high``, and move on to it if it is believed.
+
+        Args:
+            stamp: Int ns.
+            source: The sensor that gave it; None for a command.
+        """
+        assert self.newest is not None
+        command = source is None
+        if self._sure is not None and self._sure - self.window <= stamp < self.newest - self.window:
+            if command or not self._commands:
+                self._settle(self._sure)
+                return Verdict.CONTRADICTED
+            if stamp > self.bound:
+                return Verdict.BEYOND
+            self._sure = max(self._sure, stamp)
+            return Verdict.HERE
+        if stamp < self.newest - self.window or stamp > self.newest + LONGEST_TAIL_NS:
+            return self._elsewhere(stamp, command)
+        self._other = [] if command else self._other
+        if self._sure is None and stamp > self.newest + self._ahead:
+            self._sure, self._jumped, self._commands, self.ahead_of = self.newest, stamp, 0, source
+            self.low, self.high = 1, 0
+        self._commands += command
+        self.newest = max(self.newest, stamp)
+        agreed = self._commands >= 2 or (source == self.ahead_of and stamp - self._jumped >= AHEAD_NS)
+        if agreed or self._sure is None:
+            self._settle(self.newest)
+        return Verdict.HERE
 
     def _elsewhere(self, stamp: int, command: bool) -> Verdict:
         assert self.newest is not None
@@ -106,10 +128,7 @@ class Clock:
                 return Verdict.ANEW
         return Verdict.BEHIND if stamp < self.newest else Verdict.BEYOND
 
-    def _end_doubt(self, newest: int) -> None:
-        self._sure = None
-        self._move(newest)
-
-    def _move(self, newest: int) -> None:
+    def _settle(self, newest: int) -> None:
+        self._sure, self._commands = None, 0
         self.newest = newest
         self.low, self.high = newest - self.window, newest + self._ahead

@@ -182,6 +182,8 @@ def crowded(axes: Axes, commands: Commands, axis: int, since: int, until: int) -
         begins = commands.time[axis, first - 1, STAMP] if first > 0 else since
         ends = max(until, commands.time[axis, count - 1, STAMP])
         most = (made + 1) * (_LONGEST_DECAY * recovery / period + 1.0)
+        if since == NEVER:  # no new command: only what is left of the latest one's grid
+            most = float(commands.number[axis, WORTH] - commands.number[axis, TICK])
         made += int(min((ends - begins) / (period * 1e9) + 1.0, most))
     return commands.number[axis, ENTRIES] + made > axes.first[axis + 1] - axes.first[axis]
 
@@ -208,7 +210,8 @@ def drop_rows(commands: Commands, axis: int, oldest: int) -> None:
     if gone == 0:
         return
     commands.number[axis, COMMANDS] -= gone
-    commands.number[axis, LATEST] -= gone
+    # The row in force may be gone; the first that is left carries the same, for only repetitions follow it there.
+    commands.number[axis, LATEST] = max(commands.number[axis, LATEST] - gone, 0)
     for row in range(commands.number[axis, COMMANDS]):
         commands.time[axis, row, STAMP] = commands.time[axis, row + gone, STAMP]
         commands.row[axis, row, U] = commands.row[axis, row + gone, U]

@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import REACH_NS, FloatArray
 from ..errors import ConfigError, RunError, UnknownNameError, suggestion
 from ..fusion.config import FusionConfig
-from ..fusion.timeline import LONGEST_TAIL_NS, Outcome
+from ..fusion.timeline import FARTHEST, LONGEST_TAIL_NS, Outcome
 from ..model.arm import ordered_axes
 from ..runs.frames import CARTESIAN
 from .clock import Clock, Verdict
@@ -22,7 +22,8 @@ from .command_kernels import COMMANDS, STAMP, U
 from .health import Health, health_of
 from .kernels import ABSENT, SPREAD, VALUE, Tally
 from .placing import Placing
-from .window import Window
+from .sampler import Sampler
+from .window import MOST_ROWS, Window
 
 Time: TypeAlias = float | int  # float seconds, or int nanoseconds
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
@@ -151,15 +152,19 @@ class LiveEstimator:
             window: How late an event may be [s].
             stale_after: For how long [s] an axis may go without a fused reading until it is called stale.
             start: Level [m] of axes that do not rest at their first command before it; x and y with a frame.
-            on_notice: Is told in one sentence what a user should know: a clock set anew, and the like.
+            on_notice: Is told in one sentence what a user should know: a clock set anew, and the like; of what happens
+                again and again the first time, the tenth, the hundredth …
 
         Raises:
             PumafuseError: ``window`` or ``stale_after`` is not a time in reach, ``start`` is of no axis, or a model
                 cannot be followed live.
         """
         for name, value in {"window": window, "stale_after": stale_after}.items():
-            if not 0.0 < value <= LONGEST_TAIL_NS / 1e9:
-                raise ConfigError(f"{name}: must be more than 0 s and at most an hour, not {value}")
+            if not 0.0 < _number(value) <= LONGEST_TAIL_NS / 1e9:
+                raise ConfigError(f"{name}: must be more than 0 s and at most an hour, not {value!r:.40}")
+        for name, value in (start or {}).items():
+            if not abs(_number(value)) < FARTHEST:
+                raise ConfigError(f"start: the level of {name} must be a finite position in m, not {value!r:.40}")
         self.config = config
         self.segment = 0
         self.axes = ordered_axes(set(config.arm.axes))
@@ -167,11 +172,12 @@ class LiveEstimator:
         self._bits = {name: number for number, name in enumerate(self.axes)}
         self._stale_ns = round(stale_after * 1e9)
         self._latency = round(max([0.0, *(sensor.latency for sensor in config.sensors.values())]) * 1e9)
-        self._notice = on_notice
+        self._log = Sampler(on_notice)
         self._refused: dict[str, dict[Outcome, int]] = {name: dict.fromkeys(Outcome, 0) for name in config.sensors}
         self._strangers = self._refusals = 0
+        self._doubtful = 0  # commands that may have to be taken back
         self._commands = dict.fromkeys(Outcome, 0)
-        self._answers: dict[tuple[bytes, str], Told] = {}
+        self._answers: dict[bytes, Told] = {}
         self._aside: list[tuple[_Event, Outcome]] = []
         self._clock = Clock(round(window * 1e9))
         self._start, self._before = dict(start or {}), None
@@ -201,13 +207,15 @@ class LiveEstimator:
 
         Args:
             at: In the past, within the window: filtered by all readings valid until then that have come so far. In
-                the future: predicted with the last command held. None: at the newest stamp.
+                the future: predicted with the last command held. None: at the newest stamp (but not at one that a
+                sensor alone has run ahead to).
         """
         newest = self._clock.newest
+        now = 0 if newest is None else self._clock.now
         try:
-            stamp = (0 if newest is None else newest) if at is None else nanoseconds(at)
-        except (ValueError, OverflowError, TypeError):
-            return _nowhere(0, _INVALID, f"no time: {at!r}")
+            stamp = now if at is None else nanoseconds(at)
+        except ValueError as error:
+            return _nowhere(0, _INVALID, str(error))
         origin = self._window.origin
         if origin is None or newest is None:
             return _nowhere(stamp, Outcome.BEFORE_START, "no command yet")
@@ -219,7 +227,7 @@ class LiveEstimator:
             return _nowhere(stamp, _INVALID, "more than an hour ahead")
         outputs, memory = self._window.estimate(stamp, self._oldest()), self._window.memory
         position = outputs.position[:, 0] + memory.commands.level[:, 0]
-        known = memory.commands.number[:, COMMANDS].tolist()
+        known = ((memory.commands.number[:, COMMANDS] > 0) | (memory.commands.level[:, 1] > 0.0)).tolist()
         columns = (position.tolist(), *(part[:, 0].tolist() for part in outputs[1:]))
         rows = zip(self.axes, known, zip(*columns, strict=True), strict=True)
         axes = {axis: AxisNow(*row) for axis, commanded, row in rows if commanded}
@@ -229,7 +237,7 @@ class LiveEstimator:
             for axis, since in zip(self.axes, fused, strict=True)
             if axis in axes and stamp - since > self._stale_ns
         )
-        reason = "now" if stamp == newest else "filtered" if stamp < newest else "predicted, the last command held"
+        reason = "now" if stamp == now else "filtered" if stamp < now else "predicted, the last command held"
         placed = self._placing.in_log({axis: now.position for axis, now in axes.items()})
         return LiveEstimate(stamp, axes, placed, stale, _FUSED, reason)
 
@@ -255,7 +263,7 @@ class LiveEstimator:
         """
         try:
             stamp = nanoseconds(t)
-        except (ValueError, OverflowError, TypeError):
+        except ValueError:
             return self.sure
         return stamp if self._clock.low <= stamp <= self._clock.high else self.sure
 
@@ -267,7 +275,7 @@ class LiveEstimator:
             self._commands,
             self._strangers,
             self.segment,
-            self._clock.newest,
+            None if self._clock.newest is None else self._clock.now,
             self._stale_ns,
         )
 
@@ -289,8 +297,8 @@ class LiveEstimator:
         """Put an event where its stamp says, if that can be."""
         try:
             stamp = nanoseconds(t)
-        except (ValueError, OverflowError, TypeError):
-            return self._refuse(sensor, values, _INVALID, f"no time: {t!r:.40}")
+        except ValueError as error:
+            return self._refuse(sensor, values, _INVALID, str(error))
         if sensor is not None and sensor not in self._sensors:
             return self._refuse(sensor, values, _UNKNOWN, f"unknown sensor; {suggestion(sensor, self._sensors)}")
         clock = self._clock
@@ -316,15 +324,21 @@ class LiveEstimator:
                 self._begin(self._window.tally())  # the commands' clock counts: what was heard before is of another
             clock.start(stamp)
             return None
-        verdict = clock.judge(stamp, command)
+        verdict = clock.judge(stamp, sensor)
         while verdict is Verdict.CONTRADICTED:
-            self._window.forget(clock.bound)
+            self._window.forget(clock.bound, self._oldest())
+            self._commands[_FUSED] -= self._doubtful
+            self._commands[_INVALID] += self._doubtful
+            self._doubtful = 0
+            who = "a command" if clock.ahead_of is None else f"sensor '{clock.ahead_of}'"
             ahead = (newest - stamp) / 1e9
-            self._notice(f"{ahead:.3f} s ahead of the others: taken back; are all stamps of one clock?")
+            self._log.say(who, f"{who} ran {ahead:.3f} s ahead of the others: taken back; are all stamps of one clock?")
             if clock.low <= stamp <= clock.high:
                 clock.advance(max(stamp, clock.sure))
                 return None
-            verdict = clock.judge(stamp, command)
+            verdict = clock.judge(stamp, sensor)
+        if not clock.doubtful:
+            self._doubtful = 0
         if verdict is Verdict.HERE:
             return None
         if verdict is Verdict.ANEW:
@@ -339,8 +353,11 @@ class LiveEstimator:
         return self._refuse(sensor, values, outcome, self._behind(stamp))
 
     def _behind(self, stamp: int) -> str:
-        late, window = (self._clock.sure - stamp) / 1e9, (self._clock.sure - self._oldest()) / 1e9
-        return f"stamped {late:.3f} s behind the newest; the window is {window:g} s"
+        """Why a stamp is too late."""
+        if stamp >= self._clock.sure - self._clock.window:
+            return f"more than {MOST_ROWS} events came since: the window holds no more"
+        late = (self._clock.sure - stamp) / 1e9
+        return f"stamped {late:.3f} s behind the newest; the window is {self._clock.window / 1e9:g} s"
 
     def _start_anew(self, event: _Event, newest: int) -> Told:
         """A new segment from the events that have shown the commands' clock to be another."""
@@ -350,9 +367,8 @@ class LiveEstimator:
             self._count(sensor, values, outcome, -1)
         self.segment += 1
         way = "back" if first < newest else "ahead"
-        self._notice(
-            f"the commands' clock was set {way} by {abs(newest - first) / 1e9:.3f} s: new segment, filter restarted"
-        )
+        moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
+        self._log.say("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
         self._start = {}
         self._begin(self._window.tally())
         self._clock.start(first)
@@ -369,15 +385,17 @@ class LiveEstimator:
             return self._feed(*event)
         x, y = (_number(event.values.get(name)) for name in ("x", "y"))
         if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
+            placing = Placing(self.config.frame, self.axes)
+            try:
+                placing.place(event.stamp, x, y)
+            except RunError as error:
+                return self._refuse(None, event.values, _INVALID, str(error))
             events = [one for one, _, _ in self._early if one.stamp >= oldest]
             for (_, sensor, values), outcome, refused in self._early:
                 if sensor is None or refused:
                     self._count(sensor, values, outcome, -1)
             self._begin(self._before)
-            try:
-                self._placing.place(event.stamp, x, y)
-            except RunError as error:
-                return self._refuse(None, event.values, _INVALID, str(error))
+            self._placing = placing
             for one in events:
                 self._feed_early(one)
         return self._feed_early(event)
@@ -412,16 +430,20 @@ class LiveEstimator:
             why = "no command has said yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
             return self._refuse(sensor, values, Outcome.BEFORE_START if missing else _UNKNOWN, why)
         if sensor is None:
-            self._window.command(stamp, given, oldest, oldest - self._latency)
+            taken = self._window.command(stamp, given, oldest, oldest - self._latency)
         else:
             newest = self._clock.sure
-            self._window.hear(stamp, self._sensors[sensor], given, newest, oldest, oldest - self._latency)
+            taken = self._window.hear(stamp, self._sensors[sensor], given, newest, oldest, oldest - self._latency)
         if self.config.frame is not None:
             new[:, SPREAD] = 1.0
+        if not taken:
+            return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
         codes = self._told.tobytes()
-        told = self._answers.get((codes, stranger)) or self._answer(codes, stranger)
+        told = self._answers.get(codes) if not stranger else None
+        told = told or self._answer(codes, stranger)
         if sensor is None:
             self._commands[told.outcome] += 1
+            self._doubtful += self._clock.doubtful and told.outcome is _FUSED
         return told
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
@@ -447,17 +469,15 @@ class LiveEstimator:
         return f"unknown axis '{stranger:.40}'; {suggestion(stranger, self.axes)}" if stranger else "gives no axis"
 
     def _answer(self, codes: bytes, stranger: str) -> Told:
-        """What is told of an event by the codes of its axes; the same for all alike."""
+        """What is told of an event by the codes of its axes; the same for all alike, but for strangers."""
         outcomes = {axis: Outcome(code) for axis, code in zip(self.axes, codes, strict=True) if code != ABSENT}
         best = min(outcomes.values(), key=_BEST.index)
-        reasons = dict.fromkeys(_REASONS[outcome] for outcome in outcomes.values())
+        reasons = "; ".join(dict.fromkeys(_REASONS[outcome] for outcome in outcomes.values()))
         if stranger:
-            outcomes[stranger] = _UNKNOWN
-            reasons[self._no_axis(stranger)] = None
-        told = Told(best, MappingProxyType(outcomes), "; ".join(reasons))
-        if len(self._answers) < _MOST_ASIDE:
-            self._answers[codes, stranger] = told
-        return told
+            return Told(
+                best, MappingProxyType({**outcomes, stranger: _UNKNOWN}), f"{reasons}; {self._no_axis(stranger)}"
+            )
+        return self._answers.setdefault(codes, Told(best, MappingProxyType(outcomes), reasons))
 
     def _refuse(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str) -> Told:
         """Count an event that never comes into the window."""
@@ -478,12 +498,16 @@ def nanoseconds(t: Time) -> int:
     """Int ns of float seconds or int nanoseconds.
 
     Raises:
-        ValueError: Not finite, or out of reach of int64 ns.
-        TypeError: Not a number.
+        ValueError: No finite number, or out of reach of int64 ns; says which.
     """
-    stamp = round(t * 1e9) if isinstance(t, float) else operator.index(t)
+    try:
+        stamp = round(float(t) * 1e9) if isinstance(t, float | np.floating) else operator.index(t)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError("no time: expected float seconds or int nanoseconds") from None
+    if isinstance(t, bool):
+        raise ValueError("no time: expected float seconds or int nanoseconds")
     if not -REACH_NS < stamp < REACH_NS:
-        raise ValueError
+        raise ValueError("a time out of reach: the years 1824 to 2115 are in ns since 1970")
     return stamp
 
 
@@ -492,6 +516,9 @@ def _nowhere(stamp: int, outcome: Outcome, reason: str) -> LiveEstimate:
 
 
 def _number(value: object) -> float:
+    """A number as it is; NaN for what is none."""
+    if isinstance(value, str | bytes | bool):
+        return math.nan
     try:
         return float(value)  # pyright: ignore[reportArgumentType]
     except (TypeError, ValueError, OverflowError):

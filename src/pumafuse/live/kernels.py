@@ -43,12 +43,13 @@ VALUE, SPREAD = range(2)
 KNOWN, BECAME = range(2)
 SECONDS = 60  # of the past that a tally tells of
 ROWS, LATENESS, LATEST_ROW, NIS, SCALARS = range(5)  # of each of them
-CAME, DROPOUTS = 8, 9  # of a sensor, after the outcomes
+CAME, DROPOUTS, INTERVALS = 8, 9, 10  # of a sensor, after the outcomes
 
 _FUSED, _REOPENED, _INVALID = int(Outcome.FUSED), int(Outcome.REOPENED), int(Outcome.INVALID)
 _DUPLICATE, _BEFORE_START, _UNKNOWN = int(Outcome.DUPLICATE), int(Outcome.BEFORE_START), int(Outcome.UNKNOWN)
 _FARTHEST = FARTHEST
-_FEW, _MANY = 20, 100  # rows before a usual interval is known, and rows that it is a mean of
+_FEW, _MANY = 20, 100  # intervals before a usual one is known, and those that it is a mean of
+_SLOWER = 1.02  # a dropout makes the usual interval longer, so that a slower sensor soon has a usual interval again
 
 
 class Heard(NamedTuple):
@@ -82,7 +83,7 @@ class Tally(NamedTuple):
 
     Attributes:
         number: Of scalars that have left the window by their outcome, rows that ``CAME``, and ``DROPOUTS``: intervals
-            over three times the usual one, (S, 10).
+            over three times the usual one, of how many ``INTERVALS`` that was learnt, (S, 11).
         last: Latest stamp, int64 ns, (S,).
         usual: Usual interval [s], (S,).
         second: Which second of stream time each entry of ``minute`` is, (S, 60).
@@ -152,12 +153,17 @@ def hear(flat: Flat, stamp: int, sensor: int, given: int, newest: int, horizon: 
     """
     m = opened(flat)
     rows, heard, axes, mask = m.rows, m.heard, len(m.heard.told), len(m.rows.valid) - 1
-    at, late = heard.span[CHANGED], True
+    at, late, valid = heard.span[CHANGED], True, ALWAYS
     if given:
         retire(rows, m.met, heard, m.tally, horizon)
         valid = stamp - heard.latency[sensor]
-        if full(m.axes, m.commands, rows, heard, valid):
+        if heard.span[END] - heard.span[BEGIN] > mask:
             return NO_ROOM
+    last = max(valid, rows.valid[(heard.span[END] - 1) & mask]) if heard.span[END] > heard.span[BEGIN] else valid
+    for axis in range(axes):
+        if crowded(m.axes, m.commands, axis, NEVER, last - m.commands.number[axis, DELAY]):
+            return NO_ROOM
+    if given:
         at = row_place(rows, heard, valid, sensor)
         came(m.tally, sensor, stamp, newest)
         if not insert(m.sensors, rows, heard, at, stamp, valid, sensor, given):
@@ -168,7 +174,6 @@ def hear(flat: Flat, stamp: int, sensor: int, given: int, newest: int, horizon: 
             return DONE
         late = at + 1 < heard.span[END]
     log = no_log(m.nothing)
-    last = rows.valid[(heard.span[END] - 1) & mask]
     for axis in range(axes):
         lengthen(m.axes, m.commands, axis, last - m.commands.number[axis, DELAY])
     if late:
@@ -253,11 +258,19 @@ def forget(flat: Flat, after: int) -> None:
     rows, heard, mask, since = m.rows, m.heard, len(m.rows.valid) - 1, NEVER
     for axis in range(len(heard.told)):
         stamp = withdraw(m.axes, m.commands, axis, after)
-        since = min(since, stamp + m.commands.number[axis, DELAY]) if stamp < NEVER else since
+        if stamp < NEVER and m.commands.number[axis, COMMANDS] == 0:  # it had only just begun
+            since = ALWAYS
+            start_again(m.state, m.kept, heard, axis)
+        elif stamp < NEVER:
+            since = min(since, stamp + m.commands.number[axis, DELAY])
+    for sensor in range(len(m.tally.last)):
+        unheard(m.tally, sensor, after)
     left, first, end = heard.span[BEGIN], heard.span[END], heard.span[END]
     for position in range(heard.span[BEGIN], end):
         here = position & mask
         if heard.stamp[here] <= after:
+            sensor = rows.sensor[here]
+            m.tally.last[sensor] = max(m.tally.last[sensor], heard.stamp[here])
             if left < position:
                 move(rows, heard, here, left & mask)
             left += 1
@@ -300,19 +313,6 @@ def compact(flat: Flat, oldest: int) -> None:
             m.state.entry[axis] -= gone
             for position in range(begin, end):
                 m.kept.entry[position & mask, axis] -= gone
-
-
-@compiled
-def full(axes: Axes, commands: Commands, rows: Rows, heard: Heard, valid: int) -> bool:
-    """Whether a row, or the entries that act until then, might not fit."""
-    mask, end = len(rows.valid) - 1, heard.span[END]
-    if end - heard.span[BEGIN] > mask:
-        return True
-    last = max(valid, rows.valid[(end - 1) & mask]) if end > heard.span[BEGIN] else valid
-    for axis in range(len(heard.told)):
-        if crowded(axes, commands, axis, NEVER, last - commands.number[axis, DELAY]):
-            return True
-    return False
 
 
 @compiled
@@ -388,7 +388,8 @@ def arrange(rows: Rows, commands: Commands, heard: Heard, here: int) -> None:
     rows.first[here] = scalar
     for axis in range(axes):
         known = heard.code[here, axis, KNOWN]
-        if known == _FUSED and (commands.number[axis, COMMANDS] == 0 or rows.valid[here] < heard.span[ORIGIN]):
+        unstarted = commands.number[axis, COMMANDS] == 0 and commands.level[axis, 1] == 0.0
+        if known == _FUSED and (unstarted or rows.valid[here] < heard.span[ORIGIN]):
             known = _BEFORE_START
         heard.code[here, axis, BECAME] = known
         if known == _FUSED:
@@ -408,6 +409,16 @@ def retire(rows: Rows, met: Met, heard: Heard, tally: Tally, horizon: int) -> No
 
 
 @compiled
+def unheard(tally: Tally, sensor: int, after: int) -> None:
+    """Let a sensor's tally not know of what is stamped after ``after`` [ns]."""
+    if tally.last[sensor] > after:
+        tally.last[sensor] = ALWAYS
+    for slot in range(SECONDS):
+        if tally.second[sensor, slot] > after // 1_000_000_000:
+            tally.second[sensor, slot] = ALWAYS
+
+
+@compiled
 def came(tally: Tally, sensor: int, stamp: int, newest: int) -> None:
     """Count a row that has come."""
     tally.number[sensor, CAME] += 1
@@ -416,10 +427,12 @@ def came(tally: Tally, sensor: int, stamp: int, newest: int) -> None:
     elif stamp > tally.last[sensor]:
         interval, usual = (stamp - tally.last[sensor]) / 1e9, tally.usual[sensor]
         tally.last[sensor] = stamp
-        if tally.number[sensor, CAME] > _FEW and interval > 3.0 * usual:
+        tally.number[sensor, INTERVALS] += 1
+        if tally.number[sensor, INTERVALS] > _FEW and interval > 3.0 * usual:
             tally.number[sensor, DROPOUTS] += 1
+            tally.usual[sensor] *= _SLOWER
         else:
-            tally.usual[sensor] = usual + (interval - usual) / min(tally.number[sensor, CAME] - 1, _MANY)
+            tally.usual[sensor] = usual + (interval - usual) / min(tally.number[sensor, INTERVALS], _MANY)
     slot = slot_of(tally, sensor, stamp)
     if slot >= 0:
         lateness = max(newest - stamp, 0) / 1e9

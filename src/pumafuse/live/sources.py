@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
-from ..errors import ConfigError
+from ..errors import ConfigError, RunError
 from ..fusion import timeline
 from ..fusion.config import FusionConfig
 from ..runs.clock import segments
@@ -66,12 +66,19 @@ class Address:
 
 
 def standard_input(descriptor: int = 0) -> Iterator[bytes]:
-    """Pieces of standard input as they come; an empty one whenever it is quiet."""
+    """Pieces of standard input as they come; an empty one whenever it is quiet.
+
+    Raises:
+        RunError: It cannot be read.
+    """
     while True:
-        if os.name == "posix" and not select.select([descriptor], [], [], QUIET)[0]:
-            yield b""
-            continue
-        piece = os.read(descriptor, _PIECE)
+        try:
+            if os.name == "posix" and not select.select([descriptor], [], [], QUIET)[0]:
+                yield b""
+                continue
+            piece = os.read(descriptor, _PIECE)
+        except OSError as error:
+            raise RunError(f"standard input: cannot be read: {error.strerror}") from None
         if not piece:
             return
         yield piece
@@ -115,8 +122,8 @@ def _events(name: str, source: Source) -> list[Event]:
 
 
 def _paced(arrival: TimeArray, events: list[Event], speed: float) -> Iterator[list[Event]]:
-    usable = arrival[arrival != NO_STAMP]
-    due: FloatArray = (arrival - (usable[0] if len(usable) else 0)) / 1e9 / speed
+    first = int(arrival[arrival != NO_STAMP].min(initial=np.iinfo(np.int64).max))
+    due: FloatArray = (np.maximum(arrival, first) - first) / 1e9 / speed  # rows without a stamp come at once
     begin, at = time.monotonic(), 0
     while at < len(events):
         gone = time.monotonic() - begin

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
+from ..errors import ConfigError
 from ..fusion.timeline import Outcome
-from .estimator import LiveEstimator, Told, nanoseconds
+from .estimator import LiveEstimator, nanoseconds
+from .sampler import Sampler
 from .wire import LONGEST, BadLine, Event, Wire, encode
 
 _SHOWN = 60  # characters of a bad line in the log
-_TAKEN = (Outcome.FUSED, Outcome.REOPENED, Outcome.GATED)
+_MOST_AT_ONCE = 50_000  # estimates on the grid between two events
+_FASTEST = 1e4  # Hz
+_TAKEN = frozenset({Outcome.FUSED, Outcome.REOPENED, Outcome.GATED})
 
 
 class Stream:
@@ -36,9 +40,14 @@ class Stream:
             write: Takes whole lines of estimates, some at a time.
             say: Takes a sentence for the log.
             rate: Estimates on an even grid [Hz] from the first command on; one for each command for None.
+
+        Raises:
+            ConfigError: The rate is not positive, or too high.
         """
+        if rate is not None and not 0.0 < rate <= _FASTEST:
+            raise ConfigError(f"rate: at most {_FASTEST:g} estimates a second, not {rate:g}")
         self.live, self.lines, self.bad, self.estimates = live, 0, 0, 0
-        self._write, self._say = write, say
+        self._write = write
         self._wire = Wire(live.axes, live.config.frame is not None)
         self._step = None if rate is None else 1e9 / rate
         self._grid: tuple[int, int] | None = None  # the segment, and where its grid begins [ns]
@@ -46,7 +55,7 @@ class Stream:
         self._whole = False  # whether the stream tells its time in ns
         self._torn, self._too_long = b"", False
         self._out: list[bytes] = []
-        self._counts: dict[str, int] = {}
+        self._log = Sampler(say)
 
     def feed(self, data: bytes) -> None:
         """Take in a piece of the stream, of any length, and write what is to be said after it."""
@@ -86,8 +95,10 @@ class Stream:
         if self._step is not None:
             self._on_grid(live.until(t))
         told = live.reading(t, sensor, **values) if sensor else live.command(t, **values)
-        if told.outcome not in _TAKEN or len(told.axes) != len(values) or Outcome.UNKNOWN in told.axes.values():
-            self._sampled(f"{sensor or 'command'} {told.outcome.word}", f"{sensor or 'command'} at {t}: {_said(told)}")
+        if told.outcome not in _TAKEN or not _TAKEN.issuperset(told.axes.values()):
+            who = sensor if sensor in live.config.sensors else "unknown sensor" if sensor else "command"
+            became = f"{told.outcome.word}, {told.reason}"
+            self._log.say(f"{who} {told.outcome.word}", f"{sensor[:40] or who} at {t}: {became}")
         if self._step is None and not sensor and told.outcome is Outcome.FUSED:
             self._estimate(nanoseconds(t))
 
@@ -103,9 +114,9 @@ class Stream:
             self._on_grid(now + 1)
             self.flush()
 
-    def end(self) -> None:
-        """No more will come."""
-        if self._torn:
+    def end(self, cut: bool = False) -> None:
+        """No more will come; what is left of a line counts, unless it was ``cut`` short."""
+        if self._torn and not cut:
             self.line(self._torn)
             self._torn = b""
         if self._step is not None and self.live.sure is not None:
@@ -119,17 +130,19 @@ class Stream:
             self._write(lines)
 
     def _on_grid(self, before: int | None) -> None:
-        """An estimate at each point of the grid before an instant [ns]."""
+        """An estimate at each point of the grid before an instant [ns]; a long pause is left out."""
         origin = self.live.origin
         if origin is None or before is None or self._step is None:
             return
         if self._grid is None or self._grid[0] != self.live.segment:
             self._grid, self._due = (self.live.segment, origin), 0
+        missing = int((before - self._grid[1]) / self._step) - self._due
+        if missing > _MOST_AT_ONCE:
+            self._due += missing
+            self._log.say("pause", f"a pause of {missing * self._step / 1e9:.0f} s: no estimates on the grid over it")
         while (at := self._grid[1] + round(self._due * self._step)) < before:
             self._estimate(at)
             self._due += 1
-            if len(self._out) >= _FLUSHED:
-                self.flush()
 
     def _estimate(self, stamp: int) -> None:
         estimate = self.live.estimate(stamp)
@@ -141,20 +154,4 @@ class Stream:
         self.lines += 1
         self.bad += 1
         shown = repr(line[:_SHOWN])[1:] + (" ..." if len(line) > _SHOWN else "")
-        self._sampled(f"bad line, {reason.partition(':')[0]}", f"bad line {self.lines}: {reason[:200]}: {shown}")
-
-    def _sampled(self, kind: str, text: str) -> None:
-        """Say the first of a kind, the tenth, the hundredth and so on."""
-        count = self._counts.get(kind, 0) + 1 if kind in self._counts or len(self._counts) < _KINDS else 0
-        if count:
-            self._counts[kind] = count
-            if count == 10 ** (len(str(count)) - 1):
-                self._say(text if count == 1 else f"{text} ({count} of this kind so far)")
-
-
-_FLUSHED = 1000  # lines that are written at once
-_KINDS = 1000
-
-
-def _said(told: Told) -> str:
-    return f"{told.outcome.word}, {told.reason}"
+        self._log.say(f"bad line, {reason.partition(':')[0]}", f"bad line {self.lines}: {reason[:200]}: {shown}")

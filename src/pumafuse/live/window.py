@@ -14,7 +14,7 @@ from ..fusion.engine import order_of, places, sensors_of, start_of
 from ..model import closed
 from . import kernels
 from .command_kernels import ALWAYS, COMMANDS, NEVER, STAMP, Commands
-from .kernels import BEGIN, CAME, CHANGED, DONE, DROPOUTS, END, ORIGIN, SECONDS, Heard, Memory, Nothing, Tally
+from .kernels import BEGIN, CHANGED, DONE, END, INTERVALS, ORIGIN, SECONDS, Heard, Memory, Nothing, Tally
 
 MOST_ROWS = 65_536  # of readings or of commands: some 70 MB for three axes; what is more shortens the window
 _ROWS, _COMMANDS, _ENTRIES = 4096, 512, 1024  # at first
@@ -68,14 +68,17 @@ class Window:
         origin = int(self.memory.heard.span[ORIGIN])
         return None if origin == NEVER else origin
 
-    def hear(self, stamp: int, sensor: int, given: int, newest: int, oldest: int, horizon: int) -> None:
+    def hear(self, stamp: int, sensor: int, given: int, newest: int, oldest: int, horizon: int) -> bool:
         """Take in the row in ``heard.new``; see :func:`pumafuse.live.kernels.hear` and :meth:`command`."""
         attempt = 0
         while kernels.hear(self._flat, stamp, sensor, given, newest, horizon) != DONE:
-            self._make_room(attempt, oldest)
+            self._make_room(attempt, oldest, event=True)
+            if stamp < self.floor:
+                return False
             attempt += 1
+        return True
 
-    def command(self, stamp: int, given: int, oldest: int, horizon: int) -> None:
+    def command(self, stamp: int, given: int, oldest: int, horizon: int) -> bool:
         """Take in the command in ``heard.new``: see :func:`pumafuse.live.kernels.command`.
 
         Args:
@@ -83,25 +86,31 @@ class Window:
             given: The axes it gives, as bits.
             oldest: No command stamped before will ever come [ns].
             horizon: No row valid before will ever come [ns].
+
+        Returns:
+            False if to make room the window had to let go of its time.
         """
         attempt = 0
         while kernels.command(self._flat, stamp, given, horizon) != DONE:
-            self._make_room(attempt, oldest)
+            self._make_room(attempt, oldest, event=True)
+            if stamp < self.floor:
+                return False
             attempt += 1
-        self._resume()
+        self._resume(oldest)
+        return True
 
     def estimate(self, time: int, oldest: int) -> fusion.Outputs:
         """Every axis at ``time`` [ns], relative to its start level; the arrays are (A, 1) and used again."""
         attempt = 0
         while kernels.ask(self._flat, self._held, self._places, time) != DONE:
-            self._make_room(attempt, oldest)
+            self._make_room(attempt, oldest, event=False)
             attempt += 1
         return self._outputs
 
-    def forget(self, after: int) -> None:
+    def forget(self, after: int, oldest: int) -> None:
         """Take back all that is stamped after ``after`` [ns]."""
         kernels.forget(self._flat, after)
-        self._resume()
+        self._resume(oldest)
 
     def tally(self) -> Tally:
         """What there was of each sensor until now, with what is still in the window."""
@@ -110,35 +119,44 @@ class Window:
         kernels.count(self.memory._replace(tally=copied).flat())
         return copied
 
-    def _resume(self) -> None:
-        span = self.memory.heard.span
-        if span[CHANGED] < span[END]:
-            kernels.hear(self._flat, 0, 0, 0, 0, 0)
+    def _resume(self, oldest: int) -> None:
+        """Meet the rows again for which something has changed."""
+        span, attempt = self.memory.heard.span, 0
+        while span[CHANGED] < span[END] and kernels.hear(self._flat, 0, 0, 0, 0, 0) != DONE:
+            self._make_room(attempt, oldest, event=False)
+            attempt += 1
 
-    def _make_room(self, attempt: int, oldest: int) -> None:
-        """First let go of old commands; if that was not enough, take more memory or give up the oldest part."""
+    def _make_room(self, attempt: int, oldest: int, event: bool) -> None:
+        """First let go of old commands; if that was not enough, take more memory or give up the oldest part.
+
+        Args:
+            attempt: How often room was made for the same thing already.
+            oldest: No command stamped before will ever come [ns].
+            event: Whether it is for an event, and not only for the entries of commands that are there.
+        """
         heard, commands = self.memory.heard, self.memory.commands
-        rows, begin = len(heard.stamp), int(heard.span[BEGIN])
-        if heard.span[END] - begin == rows:
+        rows, begin, room = len(heard.stamp), int(heard.span[BEGIN]), commands.time.shape[1]
+        longest = int(commands.number[:, COMMANDS].argmax())
+        if event and heard.span[END] - begin == rows:
             if rows < MOST_ROWS:
                 self.memory = _with_rows(self.memory, 2 * rows)
             else:
-                horizon = int(self.memory.rows.valid[(begin + rows // 8) % rows]) + 1
-                self.floor = horizon + self._latency
-                kernels.let_go(self._flat, horizon)
+                self._give_up(int(self.memory.rows.valid[(begin + rows // 8) % rows]) + 1 + self._latency)
         elif attempt == 0:
             kernels.compact(self._flat, max(oldest, self.floor))
+        elif not event or commands.number[longest, COMMANDS] < room:
+            self.memory = _with_entries(self.memory)
+        elif room < MOST_ROWS:
+            self.memory = _with_commands(self.memory)
         else:
-            room, longest = commands.time.shape[1], int(commands.number[:, COMMANDS].argmax())
-            if commands.number[longest, COMMANDS] < room:
-                self.memory = _with_entries(self.memory)
-            elif room < MOST_ROWS:
-                self.memory = _with_commands(self.memory)
-            else:
-                self.floor = int(commands.time[longest, room // 8, STAMP]) + 1
-                kernels.let_go(self._flat, self.floor - self._latency)
-                kernels.compact(self._flat, self.floor)
+            self._give_up(int(commands.time[longest, room // 8, STAMP]) + 1)
         self._flat = self.memory.flat()
+
+    def _give_up(self, floor: int) -> None:
+        """Let go of everything stamped before ``floor`` [ns]."""
+        self.floor = floor
+        kernels.let_go(self._flat, floor - self._latency)
+        kernels.compact(self._flat, floor)
 
 
 def _empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, float]) -> Memory:
@@ -212,7 +230,7 @@ def _empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, floa
             fused=np.zeros(count, np.int64),
         ),
         Tally(
-            number=np.zeros((len(names), max(CAME, DROPOUTS) + 1), np.int64),
+            number=np.zeros((len(names), INTERVALS + 1), np.int64),
             last=np.full(len(names), ALWAYS),
             usual=np.zeros(len(names)),
             second=np.full((len(names), SECONDS), ALWAYS),

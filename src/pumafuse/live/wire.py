@@ -73,13 +73,14 @@ class Wire:
             BadLine: It is none.
         """
         try:
-            t, t_ns, command, sensor, *values = msgspec.structs.astuple(self._decoder.decode(line))
+            found, strangers = self._decoder.decode(line), {}
         except msgspec.ValidationError as error:
-            if "unknown field" in str(error):
-                return self._with_strangers(line)
-            raise BadLine(str(error)) from None
+            if "unknown field" not in str(error):
+                raise BadLine(str(error)) from None
+            found, strangers = self._with_strangers(line)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise BadLine(f"not JSON: {error}") from None
+        t, t_ns, command, sensor, *values = msgspec.structs.astuple(found)
         if command is not None:
             values, given = msgspec.structs.astuple(command), [value for value in values if value is not UNSET]
             if sensor is not None or given:
@@ -89,31 +90,27 @@ class Wire:
             raise BadLine("gives neither 'command' nor 'sensor'")
         elif not sensor:
             raise BadLine("'sensor' is empty")
-        found = {
+        by_axis: dict[str, Any] = {
             axis: float("nan") if value is None else cast(float, value) / MM
             for axis, value in zip(self._axes, values, strict=True)
             if value is not UNSET
         }
-        return Event(_time(t, t_ns), sensor, found)
+        return Event(_time(t, t_ns), sensor, by_axis | strangers)
 
-    def _with_strangers(self, line: bytes) -> Event:
-        """A line with unknown names: these are kept as they stand, to be told, and the rest is taken."""
+    def _with_strangers(self, line: bytes) -> tuple[msgspec.Struct, dict[str, Any]]:
+        """A line with unknown names: these apart, to be told, and the rest of it."""
         try:
             tree = cast(dict[str, Any], msgspec.json.decode(line))
+            known = {*_NAMES, *self._axes}
+            strangers = {name: tree.pop(name) for name in list(tree) if name not in known}
+            if isinstance(tree.get("command"), dict):
+                command = cast(dict[str, Any], tree["command"])
+                strangers |= {name: command.pop(name) for name in list(command) if name not in self._axes}
+            return self._decoder.decode(msgspec.json.encode(tree)), strangers
+        except msgspec.ValidationError as error:
+            raise BadLine(str(error)) from None
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise BadLine(f"not JSON: {error}") from None
-        command = tree.get("command")
-        inner = cast(dict[str, Any], command) if isinstance(command, dict) else {}
-        place = inner if inner else tree
-        strangers = {name: place.pop(name) for name in list(place) if name not in self._axes and name not in _NAMES}
-        if inner:
-            strangers |= {name: tree.pop(name) for name in list(tree) if name not in _NAMES}
-            inner.pop("", None)
-        try:
-            event = self.decode(msgspec.json.encode(tree))
-        except RecursionError as error:
-            raise BadLine(f"not JSON: {error}") from None
-        return event._replace(values={**event.values, **strangers})
 
 
 def _time(t: float | None, t_ns: int | None) -> float | int:
