@@ -372,12 +372,11 @@ def predicted(axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: in
 @compiled
 def meet(axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log: Log, row: int) -> None:
     """Gate a row and fuse what passes: whole rows or scalar by scalar, as the sensor says."""
-    first, end = rows.first[row], rows.end[row]
-    if sensors.rows[rows.sensor[row]]:
-        meet_together(axes, sensors, rows, state, met, log, row, first, end, 0)
-    else:
-        for scalar in range(first, end):
-            meet_together(axes, sensors, rows, state, met, log, row, scalar, scalar + 1, rows.axis[scalar] + 1)
+    scalar, together = rows.first[row], sensors.rows[rows.sensor[row]]
+    while scalar < rows.end[row]:  # one call: each would be compiled as a copy of its own
+        end, part = (rows.end[row], 0) if together else (scalar + 1, rows.axis[scalar] + 1)
+        meet_together(axes, sensors, rows, state, met, log, row, scalar, end, part)
+        scalar = end
 
 
 @compiled
