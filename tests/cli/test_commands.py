@@ -83,6 +83,7 @@ def test_result_tables_have_the_documented_columns(with_tracker: Path) -> None:
     assert counted == readings.num_rows
 
 
+@pytest.mark.long
 def test_the_configuration_as_used_gives_the_same_result(demo: Path, tmp_path: Path) -> None:
     """fusion.toml and arm.toml of a result folder reproduce it to the last bit."""
     again = tmp_path / "again"
@@ -90,6 +91,7 @@ def test_the_configuration_as_used_gives_the_same_result(demo: Path, tmp_path: P
     assert pq.read_table(again / "estimates.parquet").equals(pq.read_table(demo / "estimates.parquet"))
 
 
+@pytest.mark.long
 def test_a_reference_from_elsewhere_scores_the_same(demo: Path) -> None:
     """The run itself, or the reference table of a result, gives the scores of the folder's own reference."""
     own = scores([demo])
@@ -107,6 +109,7 @@ def test_as_live_knows_less(demo: Path, tmp_path: Path) -> None:
     assert json.loads((folder / "summary.json").read_text())["mode"] == "as-live"
 
 
+@pytest.mark.long
 def test_several_runs_get_a_folder_each_and_a_failure_stops_no_other(tmp_path: Path) -> None:
     """The good runs are there, the bad one is named, the exit code says that something failed."""
     done = pumafuse("fuse", tmp_path / "none", SCAN, "-c", FUSION, "-o", tmp_path / "out", "--sensors", "range", code=1)
@@ -131,6 +134,7 @@ def test_force_never_replaces_a_folder_that_holds_something_else(tmp_path: Path)
     assert (tmp_path / "thesis.tex").exists()
 
 
+@pytest.mark.long
 def test_force_replaces_an_earlier_result(tmp_path: Path) -> None:
     """The new result takes the old one's place whole."""
     folder = tmp_path / "result"
@@ -208,6 +212,7 @@ def servo(name: str) -> Path:
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "limit"), [("sin_sin", 1.4), ("sin_time_square", 5.4)])
 def test_a_real_servo_is_followed_between_rare_readings(name: str, limit: float, tmp_path: Path) -> None:
     """Within 1.4 and 5.4 mm, where the last reading held is 10 and 26.6 mm off.

@@ -160,6 +160,7 @@ def test_fuse_takes_the_file_as_it_is(identified: tuple[Path, dict[str, object]]
     assert set(json.loads((tmp_path / "out" / "summary.json").read_text())["axes"]) == {"radial", "vertical"}
 
 
+@pytest.mark.long
 def test_an_arm_file_is_kept_unless_forced(
     trials: Path, identified: tuple[Path, dict[str, object]], tmp_path: Path
 ) -> None:
@@ -174,6 +175,7 @@ def test_an_arm_file_is_kept_unless_forced(
     assert [one.name for one in tmp_path.iterdir()] == ["arm.toml"]
 
 
+@pytest.mark.long
 def test_broken_trials_cost_only_themselves(tmp_path: Path) -> None:
     """Each is named in one line on stderr; the arm is that of the whole ones, and of the one that could be mended."""
     good = TRUE["radial"]
@@ -243,6 +245,7 @@ def test_a_period_that_is_not_told_must_be_given(how: str, header: str, tmp_path
         assert arm.axes["radial"].gain.slope == pytest.approx(SLOPE, abs=0.02)
 
 
+@pytest.mark.long
 def test_samples_and_the_papers_method_change_the_answer(
     trials: Path, identified: tuple[Path, dict[str, object]], tmp_path: Path
 ) -> None:
@@ -267,6 +270,7 @@ def test_samples_and_the_papers_method_change_the_answer(
     assert arms["paper"].delay != pytest.approx(arms["fitted"].delay, abs=1e-4)
 
 
+@pytest.mark.long
 def test_a_campaign_of_velocity_steps(tmp_path: Path) -> None:
     """One step size and a speed column that is no period of it: --period, and a gain without a slope."""
     plant = TRUE["radial"]

@@ -83,6 +83,7 @@ def test_the_executable_gives_the_bytes_that_python_gives(scenario: Path, tmp_pa
     assert digests(tmp_path / "one") != digests(tmp_path / "python-4")
 
 
+@pytest.mark.long
 def test_many_runs_are_fused_into_one_table(scenario: Path, tmp_path: Path) -> None:
     """A line for each run and axis, then one for each axis over all of them; a result folder for each run."""
     pumafuse("simulate", scenario, "-o", tmp_path / "runs", "--runs", 4)
@@ -131,6 +132,7 @@ def test_fusing_goes_on_past_a_run_that_cannot_be_read(scenario: Path, tmp_path:
     assert "all 2" in done.stdout
 
 
+@pytest.mark.long
 def test_when_every_run_fails_nothing_is_promised(scenario: Path, tmp_path: Path) -> None:
     """No table and no next step, only what was wrong."""
     done = pumafuse("fuse", tmp_path / "a", tmp_path / "b", "-c", SCENARIOS / "none.toml", "-o", tmp_path / "o", code=1)
@@ -336,6 +338,7 @@ def test_a_simulated_run_is_replaced_only_with_force(scenario: Path, tmp_path: P
     assert digests(run) != before and names(run) == FILES
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("more", [(), ("fusion.toml", "arm.toml")])
 @pytest.mark.parametrize("runs", [(), ("--runs", 1)])
 def test_a_run_that_was_recorded_is_not_replaced_even_with_force(
@@ -377,6 +380,7 @@ def test_a_file_put_into_a_simulated_run_is_not_lost_even_with_force(scenario: P
     assert digests(run) == before
 
 
+@pytest.mark.long
 def test_a_run_along_a_path_is_simulated_anew_where_it_lies(scenario: Path, tmp_path: Path) -> None:
     """Its table goes with it: the same bytes, also in its own place."""
     (tmp_path / "there").mkdir()
@@ -392,6 +396,7 @@ def test_a_run_along_a_path_is_simulated_anew_where_it_lies(scenario: Path, tmp_
     assert digests(tmp_path / "two") == before == digests(tmp_path / "one")
 
 
+@pytest.mark.long
 def test_a_written_run_is_simulated_anew_from_its_own_scenario(scenario: Path, tmp_path: Path) -> None:
     """By the executable, from another folder and of a seed that is not the scenario's own: the same bytes."""
     pumafuse("simulate", scenario, "-o", tmp_path / "many", "--runs", 2)
@@ -399,6 +404,7 @@ def test_a_written_run_is_simulated_anew_from_its_own_scenario(scenario: Path, t
     assert digests(tmp_path / "again") == digests(tmp_path / "many" / "seed-4")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("file", ["eye.csv", "truth.csv"])
 def test_a_table_without_rows_is_a_note_and_the_run_is_fused(file: str, scenario: Path, tmp_path: Path) -> None:
     """A sensor that was silent, a reference that was never recorded: exit code 0, and the summary says so."""

@@ -101,6 +101,7 @@ def test_several_runs_and_a_preset(run: Path) -> None:
     assert all(one["model"]["rms_mm"] < 0.001 for one in found)
 
 
+@pytest.mark.long
 def test_a_start_level_can_be_given(run: Path) -> None:
     """By axis, in millimetres; no number is a usage error, an axis that the run has not is one line."""
     arguments = ("verify", run, "--arm", run / "arm.toml", "--sensors", "scope", "--json", "--start")

@@ -99,7 +99,10 @@ WANDERING = Case(
 EVERY = CASES | {"a latency that wanders": WANDERING}
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "mode",
+    ["filtered", pytest.param("smoothed", marks=pytest.mark.long), pytest.param("as-live", marks=pytest.mark.long)],
+)
 @pytest.mark.parametrize("case", EVERY.values(), ids=EVERY.keys())
 def test_both_engines_make_the_same_of_a_run(case: Case, mode: str) -> None:
     """Plants, delays, gains, clocks, sensors, axes: wherever the oracle is asked, either engine gives its answer."""
@@ -252,7 +255,10 @@ def check_logs(count: int, mode: str) -> None:
         assert seen[outcome] > count / 20, outcome
 
 
-@pytest.mark.parametrize("mode", ["filtered", "smoothed", pytest.param("as-live", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "mode",
+    ["filtered", pytest.param("smoothed", marks=pytest.mark.long), pytest.param("as-live", marks=pytest.mark.long)],
+)
 def test_both_engines_make_the_same_of_any_log(mode: str) -> None:
     """Random axes, sensors, gates, outliers, gaps, latencies: every scalar's fate and every estimate are the same."""
     check_logs(30, mode)

@@ -468,7 +468,7 @@ OFFSETS = {
 
 @pytest.mark.parametrize("offset", OFFSETS.values(), ids=OFFSETS.keys())
 @pytest.mark.parametrize("sd", SDS)
-@pytest.mark.parametrize("plant", [UNDER, LAG])
+@pytest.mark.parametrize("plant", [UNDER, pytest.param(LAG, marks=pytest.mark.long)])
 def test_any_noise_of_readings_is_met(plant: Plant, sd: float, offset: tuple[float | None, float]) -> None:
     """Against 50 digits: 1e-9 while what was not known is under 1e5 sd, 1e-6 up to 1e6, beyond that still sound."""
     for noise in (0.0, 0.03e-3, 0.3e-3, 10e-3):

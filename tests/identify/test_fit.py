@@ -100,6 +100,7 @@ def finest(of: Trial, order: int) -> float:
     return best
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.05e-3, pytest.param(0.5e-3, marks=pytest.mark.long), 5e-3])
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize(("q", "p"), [SLOW, SWINGING])

@@ -34,7 +34,7 @@ def told(live: pf.LiveEstimator, *without: str) -> dict[str, dict[str, int]]:
     return {name: {o: n for o, n in one.outcomes.items() if o not in without} for name, one in sensors if one.rows}
 
 
-@pytest.mark.parametrize("longest", [0.0, 0.3, 1.2])
+@pytest.mark.parametrize("longest", [0.0, pytest.param(0.3, marks=pytest.mark.long), 1.2])
 @pytest.mark.parametrize("name", ["scan1", *RUNS])
 def test_in_any_order(name: str, longest: float) -> None:
     """Each event up to 1.2 s late, a tenth of them twice: estimates are the offline ones once their readings are in."""

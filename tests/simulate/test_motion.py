@@ -326,6 +326,7 @@ def test_backlash_holds_under_noise(seed: int) -> None:
     assert np.abs(loose.position - play(bare.position, 0.0006)).max() <= 1e-12 * np.abs(command).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("width", [0.002, pytest.param(0.010, marks=pytest.mark.long)])
 def test_backlash_knows_the_turning_points_between_its_instants(width: float) -> None:
     """An overshoot pushes the tool as far as it would if the play were worked out every 0.04 ms.
@@ -468,7 +469,7 @@ RISING = [0.014, 0.056]  # changes of speed by 0.5 and 1.0 m/s
 
 
 @PLANTS
-@pytest.mark.parametrize("lag", [None, 0.02, pytest.param(0.0021, marks=pytest.mark.long)])
+@pytest.mark.parametrize("lag", [0.02, *(pytest.param(lag, marks=pytest.mark.long) for lag in (None, 0.0021))])
 def test_noise_has_exactly_the_covariance_of_its_impulse_response(
     plant: FirstOrder | SecondOrder, lag: float | None
 ) -> None:

@@ -71,6 +71,7 @@ def test_every_scenario_is_covered_here() -> None:
     }
 
 
+@pytest.mark.long
 def test_a_camera_with_dropouts_and_outliers(tmp_path: Path) -> None:
     """panel-vision: readings of 0.5 mm noise give 0.21 mm, outliers are gated, error bars hold."""
     worked = Worked("panel-vision", tmp_path)
@@ -82,6 +83,7 @@ def test_a_camera_with_dropouts_and_outliers(tmp_path: Path) -> None:
         assert 1 <= sensor["outcomes"]["gated"] <= 22  # 1 % of the rows
 
 
+@pytest.mark.long
 def test_a_camera_that_is_later_than_the_filter_is_told(tmp_path: Path) -> None:
     """wrong-latency: a verdict names the latency, 25 ms at 60 mm/s are missing, error bars are worth nothing."""
     worked = Worked("wrong-latency", tmp_path)

@@ -205,6 +205,7 @@ def cut(run: pf.Run, until: float, delay: dict[str, float]) -> pf.Run:
     return replace(run, sensors={name: early(name, one) for name, one in run.sensors.items()})
 
 
+@pytest.mark.long
 def test_the_last_third_is_held_back_and_learnt_from_after() -> None:
     """What is compared there was learnt from the first two thirds: as from a run cut there, to the last digit.
 
@@ -303,6 +304,7 @@ def taught() -> pf.Tuning:
     return quietly(lambda: pf.tune([sim.run], config, fit=["noise", "delay", "latency"], teacher="tracker"))
 
 
+@pytest.mark.long
 def test_a_teacher_teaches_the_arm_alone() -> None:
     """Arm, noise of the process and its own are as from a run without the others, which tell nothing of them."""
     found, sim = taught(), outage(1)

@@ -103,7 +103,9 @@ def check_png(path: Path, rows: int) -> None:
     assert data[-8:-4] == b"IEND"
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", ["three axes", *(pytest.param(name, marks=pytest.mark.long) for name in CASES if name != "three axes")]
+)
 def test_every_figure_is_drawn_for_every_kind_of_run(name: str, tmp_path: Path) -> None:
     """With and without reference, sensors, frame and bias: a whole PNG each, and nothing where there is nothing."""
     this = CASES[name]()

@@ -52,6 +52,7 @@ def test_the_page_of_the_recorded_campaign_has_the_papers_tables_and_figures(tmp
     assert "stiction" in text
 
 
+@pytest.mark.long
 def test_the_same_trials_give_the_same_page(tmp_path: Path) -> None:
     """To the byte: a report can be kept under version control."""
     assert page_of(tmp_path / "a", trials()) == page_of(tmp_path / "b", trials())
