@@ -269,3 +269,18 @@ def test_an_axis_with_a_start_level_is_there_before_its_first_command() -> None:
     assert told.health().sensors["tracker"].outcomes["before_start"] == 0
     assert untold.health().sensors["tracker"].outcomes["before_start"] > 0
     assert told.estimate()["vertical"].position_sd < 1e-3
+
+
+def test_commands_beyond_the_models_limits_are_said() -> None:
+    """Faster than the model is valid for, or farther out: once, and the tenth time; within them nothing is said."""
+    said: list[str] = []
+    config = msgspec.structs.replace(CONFIG, frame=Cylindrical())
+    live = pf.LiveEstimator(config, on_notice=said.append)
+    for step in range(20):
+        live.command(step * PERIOD, x=0.0, y=0.56 + 0.001 * step)
+    assert said == []
+    for step in range(20, 40):
+        live.command(step * PERIOD, x=0.0, y=0.56 + 0.02 * (step - 20))
+    assert [text.split(" ")[0] for text in said] == ["commanded", "commands", "commanded", "commands"]
+    assert "0.5 m/s that the arm model is valid for" in said[0]
+    assert "700 mm that the arm model is valid for" in said[1]

@@ -43,6 +43,7 @@ def test_unknown_names_are_kept_to_be_told() -> None:
     ("line", "reason"),
     [
         (b"hello", "not JSON"),
+        (b'{"t": 1, "sensor": "tracker", "radial": ' + b"1" * 70_000 + b"}", "longer than 64 KiB"),
         (b"", "not JSON"),
         (b"\xff\xfe\x00\x01", "not JSON"),
         (b'{"t": 1, "sensor": "tracker", "radial": 5', "not JSON"),

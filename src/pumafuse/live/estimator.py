@@ -16,9 +16,9 @@ from ..errors import ConfigError, RunError, UnknownNameError, suggestion
 from ..fusion.config import FusionConfig
 from ..fusion.timeline import FARTHEST, LONGEST_TAIL_NS, Outcome
 from ..model.arm import ordered_axes
-from ..runs.frames import CARTESIAN
+from ..runs.frames import CARTESIAN, Cylindrical
 from .clock import Clock, Verdict
-from .command_kernels import COMMANDS, STAMP, U
+from .command_kernels import COMMANDS, STAMP, STEP, U
 from .health import Health, health_of
 from .kernels import ABSENT, SPREAD, VALUE, Tally
 from .placing import Placing
@@ -444,7 +444,21 @@ class LiveEstimator:
         if sensor is None:
             self._commands[told.outcome] += 1
             self._doubtful += self._clock.doubtful and told.outcome is _FUSED
+            self._watch_limits()
         return told
+
+    def _watch_limits(self) -> None:
+        """Say when a command leaves what the arm model is valid for."""
+        validity = self.config.arm.validity
+        if validity.max_speed is None and validity.max_radius is None:
+            return
+        commands = self._window.memory.commands
+        last = commands.row[np.arange(len(self.axes)), commands.number[:, COMMANDS] - 1]  # zeros where there is none
+        speed = float(np.abs(last[:, STEP]).max()) / self.config.arm.update_period
+        framed = isinstance(self.config.frame, Cylindrical) and "radial" in self._bits
+        radius = float(last[self._bits["radial"], U]) if framed else None
+        for passed in validity.excess(speed, radius):
+            self._log.say(passed.split(" reach")[0], passed)
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
         """Put an event's x, y and z into ``heard.new`` as axes; which ones, as bits."""

@@ -63,15 +63,13 @@ class Stream:
         for line in lines:
             if self._too_long:
                 self._too_long = False
-            elif len(self._torn) + len(line) > LONGEST:
-                self._bad("longer than 64 KiB", self._torn + line)
             else:
                 self.line(self._torn + line)
             self._torn = b""
         if not self._too_long:
             self._torn += rest
             if len(self._torn) > LONGEST:
-                self._bad("longer than 64 KiB", self._torn)
+                self.line(self._torn)
                 self._torn, self._too_long = b"", True
         self.flush()
 
@@ -83,8 +81,10 @@ class Stream:
         try:
             event = self._wire.decode(line)
         except BadLine as error:
-            self.lines -= 1
-            self._bad(str(error), line)
+            self.bad += 1
+            shown = repr(line[:_SHOWN])[1:] + (" ..." if len(line) > _SHOWN else "")
+            reason = str(error)
+            self._log.say(f"bad line, {reason.partition(':')[0]}", f"bad line {self.lines}: {reason[:200]}: {shown}")
             return
         self.event(event)
 
@@ -149,9 +149,3 @@ class Stream:
         if estimate.outcome is Outcome.FUSED:
             self.estimates += 1
             self._out.append(encode(estimate, self._whole))
-
-    def _bad(self, reason: str, line: bytes) -> None:
-        self.lines += 1
-        self.bad += 1
-        shown = repr(line[:_SHOWN])[1:] + (" ..." if len(line) > _SHOWN else "")
-        self._log.say(f"bad line, {reason.partition(':')[0]}", f"bad line {self.lines}: {reason[:200]}: {shown}")

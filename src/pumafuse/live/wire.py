@@ -72,6 +72,8 @@ class Wire:
         Raises:
             BadLine: It is none.
         """
+        if len(line) > LONGEST:
+            raise BadLine("longer than 64 KiB")
         try:
             found, strangers = self._decoder.decode(line), {}
         except msgspec.ValidationError as error:
