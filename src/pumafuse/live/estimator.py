@@ -284,7 +284,8 @@ class LiveEstimator:
         self._before = tally
         self._placing = Placing(self.config.frame, self.axes)
         self._window = Window(self.config, self.axes, self._placing.start(self._start), tally)
-        self._new, self._told = self._window.memory.heard.new, self._window.memory.heard.told
+        heard = self._window.memory.heard
+        self._new, self._told = (heard.new[:, VALUE], heard.new[:, SPREAD]), heard.told
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it.
         # With each goes its outcome, and whether it never came into the window.
         self._early: list[tuple[_Event, Outcome, bool]] | None = [] if self._placing.waits else None
@@ -411,13 +412,13 @@ class LiveEstimator:
 
     def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> Told:
         """Give an event that is in time to the window."""
-        new, given, stranger = self._new, 0, ""
+        new, given, stranger = self._new[0], 0, ""
         for name, value in values.items():
             axis = self._bits.get(name)
             if axis is None:
                 stranger = name
                 continue
-            new[axis, VALUE] = _number(value)
+            new[axis] = value if type(value) is float else _number(value)
             given |= 1 << axis
         if stranger and self.config.frame is not None:
             given |= self._turned(stamp, sensor, values)
@@ -435,7 +436,7 @@ class LiveEstimator:
             newest = self._clock.sure
             taken = self._window.hear(stamp, self._sensors[sensor], given, newest, oldest, oldest - self._latency)
         if self.config.frame is not None:
-            new[:, SPREAD] = 1.0
+            self._new[1][:] = 1.0
         if not taken:
             return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
         codes = self._told.tobytes()
@@ -468,7 +469,7 @@ class LiveEstimator:
         )
         given = 0
         for axis, scalar in placed.items():
-            self._new[self._bits[axis]] = scalar
+            self._new[0][self._bits[axis]], self._new[1][self._bits[axis]] = scalar
             given |= 1 << self._bits[axis]
         return given
 
@@ -515,7 +516,10 @@ def nanoseconds(t: Time) -> int:
         ValueError: No finite number, or out of reach of int64 ns; says which.
     """
     try:
-        stamp = round(float(t) * 1e9) if isinstance(t, float | np.floating) else operator.index(t)
+        if type(t) is float:
+            stamp = round(t * 1e9)
+        else:
+            stamp = round(float(t) * 1e9) if isinstance(t, float | np.floating) else operator.index(t)
     except (TypeError, ValueError, OverflowError):
         raise ValueError("no time: expected float seconds or int nanoseconds") from None
     if isinstance(t, bool):
