@@ -105,7 +105,7 @@ class State(NamedTuple):
         fused: When the last scalar that was fused was valid, int64 ns, (A,).
         rejected: Rejections in a row, of each sensor's rows (first column) or scalars by axis, (S, A + 1).
         since: When the first of them was valid, int64 ns, (S, A + 1).
-        work: Room for an update's vectors: H, K, P Hᵀ and (I − K H) P Hᵀ − R K, (4, s).
+        work: Room for an update's vectors: H, K, P Hᵀ and (I − K H) P Hᵀ, (4, s).
     """
 
     x: FloatArray
@@ -291,16 +291,16 @@ def joseph_three(
     w00, w01, w02 = a - k0 * s0, b - k0 * s1, d - k0 * s2
     w10, w11, w12 = b - k1 * s0, c - k1 * s1, e - k1 * s2
     w20, w21, w22 = d - k2 * s0, e - k2 * s1, f - k2 * s2
-    r0 = w00 * h0 + w01 * h1 + w02 * h2 - R * k0
-    r1 = w10 * h0 + w11 * h1 + w12 * h2 - R * k1
-    r2 = w20 * h0 + w21 * h1 + w22 * h2 - R * k2
+    r0 = w00 * h0 + w01 * h1 + w02 * h2
+    r1 = w10 * h0 + w11 * h1 + w12 * h2
+    r2 = w20 * h0 + w21 * h1 + w22 * h2
     return (
-        w00 - r0 * k0,
-        0.5 * (w01 - r0 * k1 + w10 - r1 * k0),
-        w11 - r1 * k1,
-        0.5 * (w02 - r0 * k2 + w20 - r2 * k0),
-        0.5 * (w12 - r1 * k2 + w21 - r2 * k1),
-        w22 - r2 * k2,
+        0.5 * (w00 - r0 * k0 + w00 - r0 * k0) + k0 * R * k0,
+        0.5 * (w10 - r1 * k0 + w01 - r0 * k1) + k1 * R * k0,
+        0.5 * (w11 - r1 * k1 + w11 - r1 * k1) + k1 * R * k1,
+        0.5 * (w20 - r2 * k0 + w02 - r0 * k2) + k2 * R * k0,
+        0.5 * (w21 - r2 * k1 + w12 - r1 * k2) + k2 * R * k1,
+        0.5 * (w22 - r2 * k2 + w22 - r2 * k2) + k2 * R * k2,
     )
 
 
@@ -329,17 +329,16 @@ def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> N
         )  # fmt: skip
         P[at, 1, 0], P[at, 2, 0], P[at, 2, 1] = P[at, 0, 1], P[at, 0, 2], P[at, 1, 2]
         return
-    for i in range(states):  # W = (I − K H) P and W Hᵀ − R K
+    for i in range(states):  # W = (I − K H) P and W Hᵀ
         across = 0.0
         for j in range(states):
             P[at, i, j] -= work[1, i] * work[2, j]
             across += P[at, i, j] * work[0, j]
-        work[3, i] = across - R * work[1, i]
-    for i in range(states):  # W − (W Hᵀ − R K) Kᵀ
-        for j in range(i):
-            left = P[at, j, i] - work[3, j] * work[1, i] + P[at, i, j] - work[3, i] * work[1, j]
-            P[at, i, j] = P[at, j, i] = 0.5 * left
-        P[at, i, i] -= work[3, i] * work[1, i]
+        work[3, i] = across
+    for i in range(states):  # W − W Hᵀ Kᵀ + K R Kᵀ; the last apart, or beside a wide prior it would be rounded away
+        for j in range(i + 1):
+            left = P[at, i, j] - work[3, i] * work[1, j] + P[at, j, i] - work[3, j] * work[1, i]
+            P[at, i, j] = P[at, j, i] = 0.5 * left + work[1, i] * R * work[1, j]
 
 
 @compiled
