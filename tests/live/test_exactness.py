@@ -163,3 +163,46 @@ def test_the_last_of_one_stamp_counts() -> None:
 
     assert end(0.11, 0.12) == end(0.12)
     assert end(0.11, 0.12, 0.11) == end(0.11)
+
+
+def test_readings_of_one_instant_are_met_in_the_order_of_the_sensors() -> None:
+    """Two sensors valid at the same instants, the later one in the configuration always first to come: as offline."""
+    config = pf.FusionConfig(
+        arm=pf.ArmModel.load("puma560-internal"),
+        sensors={"first": pf.Sensor(sd=1e-4, latency=0.02), "second": pf.Sensor(sd=3e-4, bias_sd=0.01)},
+    )
+    rng = np.random.default_rng(4)
+    valid = np.arange(1, 80) * 10_000_000
+    run = pf.Run.from_arrays(
+        np.arange(30) * 28_000_000,
+        {"radial": 0.5 + 1e-3 * np.arange(30)},
+        {
+            "first": (valid + 20_000_000, {"radial": 0.5 + rng.normal(0.0, 1e-3, 79)}),
+            "second": (valid, {"radial": 0.5 + rng.normal(0.0, 1e-3, 79)}),
+        },
+    )
+    for seed in range(3):
+        arrivals = events_of(run) if seed == 0 else delayed(events_of(run), 0.1, seed)
+        assert differences(pf.LiveEstimator(config), arrivals, pf.fuse(run, config), 0.2) == []
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.5, 1.5])
+def test_late_by_nearly_the_window_and_by_its_latency_too(latency: float) -> None:
+    """Readings that come 1.9 s late, of a sensor that sees the past besides: nothing was let go too soon."""
+    config = pf.FusionConfig(
+        arm=pf.ArmModel.load("puma560-internal"),
+        sensors={"camera": pf.Sensor(sd=1e-4, latency=latency), "tracker": pf.Sensor(sd=2e-4)},
+    )
+    rng, stamp = np.random.default_rng(4), np.arange(10_000_000, 8_000_000_000, 10_000_000)
+    given = np.arange(0, 8_000_000_000, 28_000_000)
+    values = {"radial": 0.5 + rng.normal(0.0, 1e-3, len(stamp))}
+    run = pf.Run.from_arrays(
+        given, {"radial": 0.5 + 1e-4 * np.arange(len(given))}, {"camera": (stamp, values), "tracker": (stamp, values)}
+    )
+    offline, live = pf.fuse(run, config), pf.LiveEstimator(config)
+    late = 1_900_000_000
+    arrivals = sorted(events_of(run), key=lambda event: event.stamp + late * (event.stamp % 7 < 4))
+    for event in arrivals:
+        assert feed(live, event).outcome in (pf.Outcome.FUSED, pf.Outcome.GATED, pf.Outcome.BEFORE_START)
+    last = live.estimate(int(given[-1]))["radial"]
+    assert (last.position, last.position_sd) == (offline["radial"].position[-1], offline["radial"].position_sd[-1])
