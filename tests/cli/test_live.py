@@ -7,13 +7,16 @@ import signal
 import subprocess
 import time
 from importlib.resources import as_file, files
+from io import StringIO
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 import pumafuse as pf
 from executable import EXECUTABLE, pumafuse
-from streams import events_of
+from pumafuse.cli.live import status
+from streams import Both, events_of, line, lines
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 
@@ -69,8 +72,8 @@ def test_signals_end_with_a_summary(data, number: int) -> None:
         process.send_signal(number)
         rest, told = process.communicate(timeout=30)
     assert process.returncode == 0, told
-    for line in (first + rest).splitlines():
-        assert "radial" in json.loads(line)
+    for estimate in (first + rest).splitlines():
+        assert "radial" in json.loads(estimate)
     assert "estimates" in told
     assert "Traceback" not in told
 
@@ -161,3 +164,18 @@ def test_the_status_screen(data) -> None:
     assert b"position, mm" in shown
     assert json.loads(out.splitlines()[0])["t"] >= 0.0
     assert process.returncode == 0
+
+
+def test_the_status_shows_milliseconds_and_millimetres() -> None:
+    """Half a second late is 500.0 ms, 0.57 m is 570.000 mm; what is stale is marked."""
+    both = Both()
+    both.stream.feed(lines(4.0) + line(3.49, "tracker", radial=570.0) + line(6.0, radial=570.0))
+    out = Console(width=140, record=True, file=StringIO())
+    out.print(status(both.stream))
+    shown = out.export_text()
+    late = both.live.health().sensors["tracker"].lateness_max
+    assert f"{late * 1e3:.1f}" in shown
+    assert late == pytest.approx(0.486 + 0.01, abs=0.03)
+    assert "570.000" in shown
+    assert "stale" in shown
+    assert "2.0" in shown

@@ -234,3 +234,15 @@ def test_a_replay_follows_the_controllers_grid() -> None:
     for events in replayed(run, TRACKED, np.inf):
         both.stream.take(events)
     assert [found["radial"]["position_mm"] for found in both.estimates] == (offline["radial"].position * 1e3).tolist()
+
+
+def test_the_log_tells_the_time_in_seconds() -> None:
+    """Of a stream in ns, too; of no time nothing."""
+    both = Both()
+    both.stream.feed(
+        b'{"t_ns": 1500000000, "sensor": "lidar", "radial": 1}\n{"t_ns": 9'
+        + b"9" * 400
+        + b', "command": {"radial": 1}}\n'
+    )
+    assert both.said[0].startswith("lidar at 1.500 s: unknown sensor")
+    assert "out of reach" in both.said[1] or "bad line" in both.said[1]

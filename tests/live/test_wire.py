@@ -9,6 +9,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.live.wire import BadLine, Event, Wire, encode
+from pumafuse.runs.frames import Cylindrical
 
 WIRE = Wire(("radial", "vertical"), framed=True)
 
@@ -99,3 +100,22 @@ def test_an_estimate_is_one_line() -> None:
         "stale": ["radial"],
     }
     assert "t_ns" not in json.loads(encode(estimate, whole=False))
+
+
+def test_velocity_and_x_y_z_are_in_mm_too() -> None:
+    """An arm that moves, in a frame: what goes out is a thousand times what Python has, each under its own name."""
+    config = pf.FusionConfig(
+        arm=pf.ArmModel.load("puma560-internal"), sensors={"tracker": pf.Sensor(sd=1e-4)}, frame=Cylindrical()
+    )
+    live = pf.LiveEstimator(config)
+    for step in range(40):
+        live.command(0.028 * step, x=0.1 + 1e-3 * step, y=0.5, z=-0.1)
+    estimate, line = live.estimate(1.0), json.loads(encode(live.estimate(1.0), whole=False))
+    assert estimate.cartesian is not None
+    assert [line[f"{name}_mm"] / 1e3 for name in "xyz"] == pytest.approx(list(estimate.cartesian.values()))
+    assert 0.11 < estimate.cartesian["x"] < 0.14  # not where z or y is
+    assert estimate.cartesian["y"] == pytest.approx(0.5, abs=1e-3)
+    for axis, now in estimate.axes.items():
+        assert line[axis]["velocity_mm_s"] == pytest.approx(now.velocity * 1e3)
+        assert line[axis]["position_mm"] == pytest.approx(now.position * 1e3)
+    assert abs(line["tangential"]["velocity_mm_s"]) == pytest.approx(1e3 * 1e-3 / 0.028, rel=0.1)

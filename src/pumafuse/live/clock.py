@@ -79,11 +79,13 @@ class Clock:
     def start(self, stamp: int) -> None:
         """Be at ``stamp`` [ns], whatever was before."""
         self._other = []
-        self._settle(stamp)
+        self.settle(stamp)
 
-    def advance(self, stamp: int) -> None:
-        """A stamp that is plainly right, ahead of the newest."""
-        self._settle(stamp)
+    def settle(self, newest: int) -> None:
+        """Be sure that ``newest`` [ns] is the newest stamp."""
+        self._sure, self._commands = None, 0
+        self.newest = newest
+        self.low, self.high = newest - self.window, newest + self._ahead
 
     def here(self) -> None:
         """A command that is plainly right has come: others that were not are no sign of a clock set anew."""
@@ -100,7 +102,7 @@ class Clock:
         command = source is None
         if self._sure is not None and self._sure - self.window <= stamp < self.newest - self.window:
             if command or not self._commands:
-                self._settle(self._sure)
+                self.settle(self._sure)
                 return Verdict.CONTRADICTED
             if stamp > self.bound:
                 return Verdict.BEYOND
@@ -116,7 +118,7 @@ class Clock:
         self.newest = max(self.newest, stamp)
         agreed = self._commands >= 2 or (source == self.ahead_of and stamp - self._jumped >= AHEAD_NS)
         if agreed or self._sure is None:
-            self._settle(self.newest)
+            self.settle(self.newest)
         return Verdict.HERE
 
     def _elsewhere(self, stamp: int, command: bool) -> Verdict:
@@ -127,8 +129,3 @@ class Clock:
             if len(self._other) >= AGREE_AFTER:
                 return Verdict.ANEW
         return Verdict.BEHIND if stamp < self.newest else Verdict.BEYOND
-
-    def _settle(self, newest: int) -> None:
-        self._sure, self._commands = None, 0
-        self.newest = newest
-        self.low, self.high = newest - self.window, newest + self._ahead

@@ -171,7 +171,6 @@ class LiveEstimator:
         self._sensors = {name: number for number, name in enumerate(config.sensors)}
         self._bits = {name: number for number, name in enumerate(self.axes)}
         self._stale_ns = round(stale_after * 1e9)
-        self._latency = round(max([0.0, *(sensor.latency for sensor in config.sensors.values())]) * 1e9)
         self._log = Sampler(on_notice)
         self._refused: dict[str, dict[Outcome, int]] = {name: dict.fromkeys(Outcome, 0) for name in config.sensors}
         self._strangers = self._refusals = 0
@@ -308,7 +307,7 @@ class LiveEstimator:
             if refused is not None:
                 return refused
         elif clock.newest is not None and stamp > clock.newest:
-            clock.advance(stamp)
+            clock.settle(stamp)
         if sensor is None and self._aside:
             clock.here()
             self._aside = []
@@ -335,7 +334,7 @@ class LiveEstimator:
             ahead = (newest - stamp) / 1e9
             self._log.say(who, f"{who} ran {ahead:.3f} s ahead of the others: taken back; are all stamps of one clock?")
             if clock.low <= stamp <= clock.high:
-                clock.advance(max(stamp, clock.sure))
+                clock.settle(max(stamp, clock.sure))
                 return None
             verdict = clock.judge(stamp, sensor)
         if not clock.doubtful:
@@ -431,10 +430,10 @@ class LiveEstimator:
             why = "no command has said yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
             return self._refuse(sensor, values, Outcome.BEFORE_START if missing else _UNKNOWN, why)
         if sensor is None:
-            taken = self._window.command(stamp, given, oldest, oldest - self._latency)
+            taken = self._window.command(stamp, given, oldest)
         else:
             newest = self._clock.sure
-            taken = self._window.hear(stamp, self._sensors[sensor], given, newest, oldest, oldest - self._latency)
+            taken = self._window.hear(stamp, self._sensors[sensor], given, newest, oldest)
         if self.config.frame is not None:
             self._new[1][:] = 1.0
         if not taken:
@@ -481,6 +480,8 @@ class LiveEstimator:
         return commands.row[axis, row : row + 1, U] if count else np.zeros(1)
 
     def _no_axis(self, stranger: str) -> str:
+        if stranger in CARTESIAN and self.config.frame is None:
+            return f"'{stranger}' needs a [frame] in fusion.toml; {suggestion(stranger, self.axes)}"
         return f"unknown axis '{stranger:.40}'; {suggestion(stranger, self.axes)}" if stranger else "gives no axis"
 
     def _answer(self, codes: bytes, stranger: str) -> Told:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ..fusion.timeline import Outcome
 from .command_kernels import ALWAYS
-from .kernels import CAME, DROPOUTS, LATENESS, LATEST_ROW, NIS, ROWS, SCALARS, SECONDS, Tally
+from .kernels import CAME, DROPOUTS, LATENESS, MOST_LATE, NIS, ROWS, SCALARS, SECONDS, Tally
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class SensorHealth:
         lateness_max: The highest of that minute [s].
         silent: For how long nothing has come, in stream time [s]; None if nothing ever did.
         stale: Whether that is longer than the limit.
-        dropouts: Intervals longer than three times the usual one.
+        dropouts: Intervals longer than one and a half times the usual one, once late rows are in.
         nis: Mean ν²/S of the last minute; 1 where the noise is as configured; None without a fused scalar.
         outcomes: Of all its scalars by the word.
     """
@@ -85,7 +85,7 @@ def health_of(
             rows=int(tally.number[number, CAME]),
             rate=rows / max(span, 1.0),
             lateness=float(minute[:, LATENESS].sum()) / max(rows, 1.0),
-            lateness_max=float(minute[:, LATEST_ROW].max(initial=0.0)),
+            lateness_max=float(minute[:, MOST_LATE].max(initial=0.0)),
             silent=silent,
             stale=silent is None or silent > stale_ns / 1e9,
             dropouts=int(tally.number[number, DROPOUTS]),

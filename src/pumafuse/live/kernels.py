@@ -42,14 +42,15 @@ ABSENT = 255  # an axis that a row does not give
 VALUE, SPREAD = range(2)
 KNOWN, BECAME = range(2)
 SECONDS = 60  # of the past that a tally tells of
-ROWS, LATENESS, LATEST_ROW, NIS, SCALARS = range(5)  # of each of them
-CAME, DROPOUTS, INTERVALS = 8, 9, 10  # of a sensor, after the outcomes
+ROWS, LATENESS, MOST_LATE, NIS, SCALARS = range(5)  # of each of them
+CAME, DROPOUTS, INTERVALS, IN_A_ROW = 8, 9, 10, 11  # of a sensor, after the outcomes
 
 _FUSED, _REOPENED, _INVALID = int(Outcome.FUSED), int(Outcome.REOPENED), int(Outcome.INVALID)
 _DUPLICATE, _BEFORE_START, _UNKNOWN = int(Outcome.DUPLICATE), int(Outcome.BEFORE_START), int(Outcome.UNKNOWN)
 _FARTHEST = FARTHEST
 _FEW, _MANY = 20, 100  # intervals before a usual one is known, and those that it is a mean of
-_SLOWER = 1.02  # a dropout makes the usual interval longer, so that a slower sensor soon has a usual interval again
+_GAP = 1.5  # usual intervals without a row: one is missing
+_SLOWER = 1.1  # by dropouts in a row the usual interval grows until a slower sensor has one again
 
 
 class Heard(NamedTuple):
@@ -82,9 +83,11 @@ class Tally(NamedTuple):
     """What there was of each sensor.
 
     Attributes:
-        number: Of scalars that have left the window by their outcome, rows that ``CAME``, and ``DROPOUTS``: intervals
-            over three times the usual one, of how many ``INTERVALS`` that was learnt, (S, 11).
-        last: Latest stamp, int64 ns, (S,).
+        number: Of scalars that have left the window by their outcome, rows that ``CAME``, ``DROPOUTS``: intervals
+            over one and a half times the usual one, of how many ``INTERVALS`` that was learnt, and dropouts
+            ``IN_A_ROW``, (S, 12).
+        last: Latest stamp, int64 ns, ``ALWAYS`` without one, (S,).
+        left: Stamp of the latest row that has left the window, int64 ns, ``ALWAYS`` without one, (S,).
         usual: Usual interval [s], (S,).
         second: Which second of stream time each entry of ``minute`` is, (S, 60).
         minute: For each second: rows, sum and maximum of how late they came [s], sum of NIS, fused scalars, (S, 60, 5).
@@ -92,6 +95,7 @@ class Tally(NamedTuple):
 
     number: IntArray
     last: TimeArray
+    left: TimeArray
     usual: FloatArray
     second: TimeArray
     minute: FloatArray
@@ -422,29 +426,39 @@ def unheard(tally: Tally, sensor: int, after: int) -> None:
 def came(tally: Tally, sensor: int, stamp: int, newest: int) -> None:
     """Count a row that has come."""
     tally.number[sensor, CAME] += 1
-    if tally.last[sensor] == ALWAYS:
-        tally.last[sensor] = stamp
-    elif stamp > tally.last[sensor]:
-        interval, usual = (stamp - tally.last[sensor]) / 1e9, tally.usual[sensor]
-        tally.last[sensor] = stamp
-        tally.number[sensor, INTERVALS] += 1
-        if tally.number[sensor, INTERVALS] > _FEW and interval > 3.0 * usual:
-            tally.number[sensor, DROPOUTS] += 1
-            tally.usual[sensor] *= _SLOWER
-        else:
-            tally.usual[sensor] = usual + (interval - usual) / min(tally.number[sensor, INTERVALS], _MANY)
+    tally.last[sensor] = max(tally.last[sensor], stamp)
     slot = slot_of(tally, sensor, stamp)
     if slot >= 0:
         lateness = max(newest - stamp, 0) / 1e9
         tally.minute[sensor, slot, ROWS] += 1.0
         tally.minute[sensor, slot, LATENESS] += lateness
-        tally.minute[sensor, slot, LATEST_ROW] = max(tally.minute[sensor, slot, LATEST_ROW], lateness)
+        tally.minute[sensor, slot, MOST_LATE] = max(tally.minute[sensor, slot, MOST_LATE], lateness)
+
+
+@compiled
+def followed(tally: Tally, sensor: int, stamp: int) -> None:
+    """Look at the interval from the row before; rows leave the window in order, when those that came late are in."""
+    number, before = tally.number, tally.left[sensor]
+    tally.left[sensor] = stamp
+    if before == ALWAYS:
+        return
+    interval, usual = (stamp - before) / 1e9, tally.usual[sensor]
+    number[sensor, INTERVALS] += 1
+    if number[sensor, INTERVALS] > _FEW and interval > _GAP * usual:
+        number[sensor, DROPOUTS] += 1
+        number[sensor, IN_A_ROW] += 1
+        if number[sensor, IN_A_ROW] > 1:  # not a row that is missing: the sensor is slower now
+            tally.usual[sensor] *= _SLOWER
+        return
+    number[sensor, IN_A_ROW] = 0
+    tally.usual[sensor] = usual + (interval - usual) / min(number[sensor, INTERVALS], _MANY)
 
 
 @compiled
 def became(rows: Rows, met: Met, heard: Heard, tally: Tally, here: int) -> None:
     """Count what became of a row."""
     sensor = rows.sensor[here]
+    followed(tally, sensor, heard.stamp[here])
     for axis in range(len(heard.told)):
         if heard.code[here, axis, BECAME] != ABSENT:
             tally.number[sensor, heard.code[here, axis, BECAME]] += 1

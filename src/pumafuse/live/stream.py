@@ -97,8 +97,8 @@ class Stream:
         told = live.reading(t, sensor, **values) if sensor else live.command(t, **values)
         if told.outcome not in _TAKEN or not _TAKEN.issuperset(told.axes.values()):
             who = sensor if sensor in live.config.sensors else "unknown sensor" if sensor else "command"
-            became = f"{told.outcome.word}, {told.reason}"
-            self._log.say(f"{who} {told.outcome.word}", f"{sensor[:40] or who} at {t}: {became}")
+            became = f"{told.reason} ({told.outcome.word})"
+            self._log.say(f"{who} {told.outcome.word}", f"{sensor[:40] or who}{_at(t)}: {became}")
         if self._step is None and not sensor and told.outcome is Outcome.FUSED:
             self._estimate(nanoseconds(t))
 
@@ -149,3 +149,11 @@ class Stream:
         if estimate.outcome is Outcome.FUSED:
             self.estimates += 1
             self._out.append(encode(estimate, self._whole))
+
+
+def _at(t: float | int) -> str:
+    """When, for people; nothing where that is no time."""
+    try:
+        return f" at {nanoseconds(t) / 1e9:.3f} s"
+    except ValueError:
+        return ""

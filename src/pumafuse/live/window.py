@@ -14,7 +14,7 @@ from ..fusion.engine import order_of, places, sensors_of, start_of
 from ..model import closed
 from . import kernels
 from .command_kernels import ALWAYS, COMMANDS, NEVER, STAMP, Commands
-from .kernels import BEGIN, CHANGED, DONE, END, INTERVALS, ORIGIN, SECONDS, Heard, Memory, Nothing, Tally
+from .kernels import BEGIN, CHANGED, DONE, END, IN_A_ROW, ORIGIN, SECONDS, Heard, Memory, Nothing, Tally
 
 MOST_ROWS = 65_536  # of readings or of commands: some 70 MB for three axes; what is more shortens the window
 _ROWS, _COMMANDS, _ENTRIES = 4096, 512, 1024  # at first
@@ -68,30 +68,29 @@ class Window:
         origin = int(self.memory.heard.span[ORIGIN])
         return None if origin == NEVER else origin
 
-    def hear(self, stamp: int, sensor: int, given: int, newest: int, oldest: int, horizon: int) -> bool:
+    def hear(self, stamp: int, sensor: int, given: int, newest: int, oldest: int) -> bool:
         """Take in the row in ``heard.new``; see :func:`pumafuse.live.kernels.hear` and :meth:`command`."""
         attempt = 0
-        while kernels.hear(self._flat, stamp, sensor, given, newest, horizon) != DONE:
+        while kernels.hear(self._flat, stamp, sensor, given, newest, oldest - self._latency) != DONE:
             self._make_room(attempt, oldest, event=True)
             if stamp < self.floor:
                 return False
             attempt += 1
         return True
 
-    def command(self, stamp: int, given: int, oldest: int, horizon: int) -> bool:
+    def command(self, stamp: int, given: int, oldest: int) -> bool:
         """Take in the command in ``heard.new``: see :func:`pumafuse.live.kernels.command`.
 
         Args:
             stamp: Int ns.
             given: The axes it gives, as bits.
-            oldest: No command stamped before will ever come [ns].
-            horizon: No row valid before will ever come [ns].
+            oldest: No event stamped before will ever come [ns].
 
         Returns:
             False if to make room the window had to let go of its time.
         """
         attempt = 0
-        while kernels.command(self._flat, stamp, given, horizon) != DONE:
+        while kernels.command(self._flat, stamp, given, oldest - self._latency) != DONE:
             self._make_room(attempt, oldest, event=True)
             if stamp < self.floor:
                 return False
@@ -115,7 +114,9 @@ class Window:
     def tally(self) -> Tally:
         """What there was of each sensor until now, with what is still in the window."""
         now = self.memory.tally
-        copied = Tally(now.number.copy(), now.last.copy(), now.usual.copy(), now.second.copy(), now.minute.copy())
+        copied = Tally(
+            now.number.copy(), now.last.copy(), now.left.copy(), now.usual.copy(), now.second.copy(), now.minute.copy()
+        )
         kernels.count(self.memory._replace(tally=copied).flat())
         return copied
 
@@ -230,8 +231,9 @@ def _empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, floa
             fused=np.zeros(count, np.int64),
         ),
         Tally(
-            number=np.zeros((len(names), INTERVALS + 1), np.int64),
+            number=np.zeros((len(names), IN_A_ROW + 1), np.int64),
             last=np.full(len(names), ALWAYS),
+            left=np.full(len(names), ALWAYS),
             usual=np.zeros(len(names)),
             second=np.full((len(names), SECONDS), ALWAYS),
             minute=np.zeros((len(names), SECONDS, 5)),
