@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.arrays import NO_STAMP
+from pumafuse.live.lines import Lines
 from pumafuse.live.stream import Stream
 
 MS = 1_000_000
@@ -161,10 +162,18 @@ class Both:
         self.written = b""
         self.live = pf.LiveEstimator(config, on_notice=self.said.append, **options)
         self.stream = Stream(self.live, self.keep, self.said.append, rate)
+        self.lines = Lines()
 
-    def keep(self, lines: bytes) -> None:
-        assert lines.endswith(b"\n")
-        self.written += lines
+    def feed(self, piece: bytes) -> None:
+        self.stream.take(self.lines.cut(piece))
+
+    def end(self) -> None:
+        self.stream.take(self.lines.rest())
+        self.stream.end()
+
+    def keep(self, lines: list[bytes]) -> None:
+        assert all(line.endswith(b"\n") and line.count(b"\n") == 1 for line in lines)
+        self.written += b"".join(lines)
 
     @property
     def estimates(self) -> list[dict]:

@@ -169,7 +169,7 @@ def test_the_status_screen(data) -> None:
 def test_the_status_shows_milliseconds_and_millimetres() -> None:
     """Half a second late is 500.0 ms, 0.57 m is 570.000 mm; what is stale is marked."""
     both = Both()
-    both.stream.feed(lines(4.0) + line(3.49, "tracker", radial=570.0) + line(6.0, radial=570.0))
+    both.feed(lines(4.0) + line(3.49, "tracker", radial=570.0) + line(6.0, radial=570.0))
     out = Console(width=140, record=True, file=StringIO())
     out.print(status(both.stream))
     shown = out.export_text()

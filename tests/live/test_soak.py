@@ -122,11 +122,11 @@ def test_hundreds_of_thousands_of_broken_lines(rate: float | None) -> None:
     """No line stops the stream; what goes out is whole and finite; good lines after it are taken as ever."""
     rng, both = np.random.default_rng(11), Both(rate=rate)
     good = lines(2.0).splitlines()
-    both.stream.feed(lines(2.0))
+    both.feed(lines(2.0))
     for piece in range(300):
         now = [line(2.0 + piece * 0.028, radial=570.0), line(2.01 + piece * 0.028, "tracker", radial=570.0)]
         mixed = [broken(rng, [*good, *now]) for _ in range(500)]
-        both.stream.feed(b"\n".join([*mixed, *now]) + b"\n")
+        both.feed(b"\n".join([*mixed, *now]) + b"\n")
         for found in both.written.splitlines():
             estimate = json.loads(found)
             assert all(
@@ -135,8 +135,8 @@ def test_hundreds_of_thousands_of_broken_lines(rate: float | None) -> None:
         both.written = b""
     assert both.stream.bad > 50_000
     assert len(both.said) < 5000
-    both.stream.feed(lines(10.0, begin=100.0))
-    both.stream.end()
+    both.feed(lines(10.0, begin=100.0))
+    both.end()
     assert abs(both.live.estimate()["radial"].position - 0.57) < 1e-3
 
 
@@ -145,10 +145,10 @@ def test_random_bytes_change_no_bit() -> None:
     rng, clean, both = np.random.default_rng(12), Both(), Both()
     for piece in range(100):
         good = lines(0.28, begin=piece * 0.28)
-        clean.stream.feed(good)
+        clean.feed(good)
         noise = rng.integers(1, 256, 250_000, dtype=np.uint8)
         noise[rng.random(len(noise)) < 0.02] = 10
-        both.stream.feed(noise.tobytes() + b"\n" + good)
+        both.feed(noise.tobytes() + b"\n" + good)
     assert both.stream.bad > 450_000
     assert both.written == clean.written
 

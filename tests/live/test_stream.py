@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from pumafuse.live.sources import Address, replayed
+from pumafuse.live.sources import replayed
 from streams import TRACKED, Both, line, lines
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -17,8 +17,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 def test_one_estimate_for_each_command() -> None:
     """As many lines out as commands in, each at its command's time."""
     both = Both()
-    both.stream.feed(lines(1.0))
-    both.stream.end()
+    both.feed(lines(1.0))
+    both.end()
     assert [found["t"] for found in both.estimates] == [step * 28 / 1000 for step in range(36)]
     assert both.said == []
 
@@ -26,14 +26,14 @@ def test_one_estimate_for_each_command() -> None:
 def test_pieces_of_any_size() -> None:
     """The stream cut anywhere, a last line without its end, empty lines and Windows line ends: the same estimates."""
     whole = Both()
-    whole.stream.feed(lines(1.0))
+    whole.feed(lines(1.0))
     rng, cut = np.random.default_rng(0), Both()
     data = lines(1.0).replace(b"\n", b"\r\n\n")[:-3]
     while data:
         size = int(rng.integers(1, 200))
-        cut.stream.feed(data[:size])
+        cut.feed(data[:size])
         data = data[size:]
-    cut.stream.end()
+    cut.end()
     assert cut.estimates == whole.estimates
     assert cut.stream.bad == 0
 
@@ -46,7 +46,7 @@ def test_an_even_grid_is_as_live(rate: float) -> None:
     offline, both = pf.fuse(run, config, rate=rate, as_live=True), Both(config, rate)
     for events in replayed(run, config, np.inf):
         both.stream.take(events)
-    both.stream.end()
+    both.end()
     found = both.estimates
     assert 0 <= len(found) - len(offline.time) <= 0.01 * rate  # up to the last stamp, 8 ms after the last valid time
     for axis, track in offline.axes.items():
@@ -57,7 +57,7 @@ def test_an_even_grid_is_as_live(rate: float) -> None:
 def test_silence_goes_on_by_the_wall_clock() -> None:
     """While nothing comes the grid goes on with growing sd, told as stale; the state is not touched."""
     both = Both(rate=10.0)
-    both.stream.feed(lines(2.0))
+    both.feed(lines(2.0))
     before = both.live.estimate()
     both.stream.idle(5_000_000_000)
     assert [found["t"] for found in both.estimates] == [step / 10 for step in range(51)]
@@ -65,7 +65,7 @@ def test_silence_goes_on_by_the_wall_clock() -> None:
     assert spread == sorted(spread)
     assert both.estimates[-1]["stale"] == ["radial"]
     assert both.live.estimate() == before
-    both.stream.feed(lines(1.0, begin=5.5))
+    both.feed(lines(1.0, begin=5.5))
     times = [found["t"] for found in both.estimates]
     assert times == sorted(set(times))
 
@@ -73,8 +73,8 @@ def test_silence_goes_on_by_the_wall_clock() -> None:
 def test_a_wild_stamp_makes_no_grid() -> None:
     """A reading half an hour ahead does not let the grid run half an hour ahead."""
     both = Both(rate=100.0)
-    both.stream.feed(lines(1.0) + line(1800.0, "tracker", radial=570.0) + lines(1.0, begin=1.008))
-    both.stream.end()
+    both.feed(lines(1.0) + line(1800.0, "tracker", radial=570.0) + lines(1.0, begin=1.008))
+    both.end()
     assert max(found["t"] for found in both.estimates) < 2.1
     assert any("taken back" in text for text in both.said)
 
@@ -102,8 +102,8 @@ BAD = [
 def test_bad_lines_change_nothing_and_are_told() -> None:
     """Between good lines, each kind of bad one: the estimates are those without them, and the log names each kind."""
     clean, both = Both(), Both()
-    clean.stream.feed(lines(1.0) + lines(1.0, begin=1.008))
-    both.stream.feed(lines(1.0) + b"\n".join(BAD) + b"\n" + lines(1.0, begin=1.008))
+    clean.feed(lines(1.0) + lines(1.0, begin=1.008))
+    both.feed(lines(1.0) + b"\n".join(BAD) + b"\n" + lines(1.0, begin=1.008))
     assert both.estimates == clean.estimates
     told = "\n".join(both.said)
     for expected in ("longer than 64 KiB", "lidar", "radal", "days|s ahead", "not a finite position", "not JSON"):
@@ -118,7 +118,7 @@ def test_bad_lines_change_nothing_and_are_told() -> None:
 def test_the_log_stays_short() -> None:
     """A hundred thousand bad lines are six lines of log: the first, the tenth, and so on."""
     both = Both()
-    both.stream.feed(lines(0.1) + b"nonsense\n" * 100_000)
+    both.feed(lines(0.1) + b"nonsense\n" * 100_000)
     assert both.stream.bad == 100_000
     assert len(both.said) == 6
     assert "100000 of this kind" in both.said[-1]
@@ -127,10 +127,10 @@ def test_the_log_stays_short() -> None:
 def test_the_log_is_plain_whatever_a_line_calls_itself() -> None:
     """Names of 60 kB, with colours and line breaks in them, thousands of them: short plain lines, and little memory."""
     both = Both()
-    both.stream.feed(lines(0.1))
+    both.feed(lines(0.1))
     for number in range(2000):
         name = f"\x1b[31m{number}\n" + "x" * 1000
-        both.stream.feed(line(0.1, name, radial=570.0) + line(0.1, "tracker", radial=570.0, **{name: 1.0}))
+        both.feed(line(0.1, name, radial=570.0) + line(0.1, "tracker", radial=570.0, **{name: 1.0}))
     assert len(both.said) < 20
     assert all(text.isprintable() and len(text) < 500 for text in both.said)
     assert len(both.live._answers) < 10
@@ -139,7 +139,7 @@ def test_the_log_is_plain_whatever_a_line_calls_itself() -> None:
 def test_a_command_within_a_command_is_no_recursion() -> None:
     """Names of a line where an axis should be are strangers."""
     both = Both()
-    both.stream.feed(b'{"t": 1.0, "command": {"t": 5.0, "command": {"radial": 1.0}}}\n')
+    both.feed(b'{"t": 1.0, "command": {"t": 5.0, "command": {"radial": 1.0}}}\n')
     assert both.live.health().commands["unknown"] == 1
 
 
@@ -147,8 +147,8 @@ def test_a_command_within_a_command_is_no_recursion() -> None:
 def test_a_long_pause_is_not_filled(pause: float) -> None:
     """At 1 kHz a pause of minutes would be hundreds of thousands of lines at once: it is left out, and said."""
     both = Both(rate=1000.0)
-    both.stream.feed(lines(1.0) + lines(1.0, begin=pause))
-    both.stream.end()
+    both.feed(lines(1.0) + lines(1.0, begin=pause))
+    both.end()
     assert 1900 < len(both.estimates) < 4000
     assert any("no estimates on the grid" in text for text in both.said)
     times = [found["t"] for found in both.estimates]
@@ -165,9 +165,9 @@ def test_a_line_without_end_is_not_kept() -> None:
     """A megabyte without a line end is one bad line, held nowhere."""
     both = Both()
     for _ in range(100):
-        both.stream.feed(b"x" * 10_000)
-    assert len(both.stream._torn) <= 64 * 1024
-    both.stream.feed(b"\n" + lines(0.1))
+        both.feed(b"x" * 10_000)
+    assert len(both.lines._torn) <= 64 * 1024
+    both.feed(b"\n" + lines(0.1))
     assert both.stream.bad == 1
     assert len(both.estimates) == 4
 
@@ -175,36 +175,13 @@ def test_a_line_without_end_is_not_kept() -> None:
 def test_a_clock_set_back_begins_the_grid_anew() -> None:
     """After a restart the grid begins at the new first command."""
     both = Both(rate=100.0)
-    both.stream.feed(lines(1.0, begin=1000.0) + lines(1.0, begin=10.0))
-    both.stream.end()
+    both.feed(lines(1.0, begin=1000.0) + lines(1.0, begin=10.0))
+    both.end()
     times = [found["t"] for found in both.estimates]
     second = times.index(10.0)
     assert max(times[:second]) > 1000.9
     assert times[second:] == [round(10.0 + step / 100, 2) for step in range(len(times) - second)]
     assert max(times[second:]) > 10.9
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("stdin", Address("stdin")),
-        ("replay:runs/one", Address("replay", "runs/one")),
-        ("replay:runs/one?speed=4", Address("replay", "runs/one", 4.0)),
-        ("replay:odd?name?speed=max", Address("replay", "odd?name", np.inf)),
-    ],
-)
-def test_sources_by_name(text: str, expected: Address) -> None:
-    """What the command line may say."""
-    assert Address.parse(text) == expected
-
-
-@pytest.mark.parametrize(
-    "text", ["stdout", "", "replay", "udp", "replay:a?speed=0", "replay:a?speed=fast", "replay:a?x=1"]
-)
-def test_other_sources_are_refused(text: str) -> None:
-    """With what is accepted."""
-    with pytest.raises(pf.ConfigError, match="source"):
-        Address.parse(text)
 
 
 def test_a_replay_keeps_its_pace() -> None:
@@ -239,7 +216,7 @@ def test_a_replay_follows_the_controllers_grid() -> None:
 def test_the_log_tells_the_time_in_seconds() -> None:
     """Of a stream in ns, too; of no time nothing."""
     both = Both()
-    both.stream.feed(
+    both.feed(
         b'{"t_ns": 1500000000, "sensor": "lidar", "radial": 1}\n{"t_ns": 9'
         + b"9" * 400
         + b', "command": {"radial": 1}}\n'

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import gc
 import math
 import signal
 import sys
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
 import msgspec
 from rich import box
@@ -22,15 +25,26 @@ from rich.text import Text
 from ..errors import RunError
 from ..fusion.config import FusionConfig
 from ..fusion.timeline import Outcome
+from ..live import network
+from ..live.address import NETWORK, Address
 from ..live.estimator import LiveEstimator
 from ..live.health import Health
-from ..live.sources import QUIET, Address, replayed, standard_input
+from ..live.record import Recorder
+from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream
 from ..live.wire import Event
+from ..runs.frames import CARTESIAN
 from ..runs.run import Run
 from ..units import MM
 
+if TYPE_CHECKING:
+    from ..views.live import LiveView
+
 _REDRAWN = 0.25  # s between two pictures of the status
+
+
+class _Part(Protocol):
+    def told(self) -> str: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,13 +56,18 @@ class Options:
     window: float
     stale_after: float
     status: bool
+    out: str | None
+    record: Path | None
+    rerun: str | None
+    listen: str | None
+    allow: list[str]
 
 
 def run(source: str, options: Options) -> None:
     """Estimate from a stream until it ends, or somebody ends it.
 
     Raises:
-        PumafuseError: The configuration, the source or the run is wrong.
+        PumafuseError: The configuration, the source, the run or a folder is wrong.
     """
     address, config, start = Address.parse(source), FusionConfig.load(options.config), dict[str, float]()
     recorded = Run.read(address.path) if address.kind == "replay" else None
@@ -60,47 +79,121 @@ def run(source: str, options: Options) -> None:
     def say(text: str) -> None:
         errors.print(text, markup=False, soft_wrap=True)
 
-    def write(lines: bytes) -> None:
-        try:
-            sys.stdout.buffer.write(lines)
-            sys.stdout.buffer.flush()
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            sys.stdout = None  # what is left in its buffer would be tried once more at exit
-            raise RunError(f"standard output: cannot be written: {error.strerror}") from None
+    remote = network.source(address, options.listen, options.allow, say) if address.kind in NETWORK else None
+    out = network.Out(options.out) if options.out else None
+    _warm_up(config, options)
+    with contextlib.ExitStack() as stack:
+        recorder = Recorder(options.record, config, start, say) if options.record else None
+        live = LiveEstimator(
+            config,
+            window=options.window,
+            stale_after=options.stale_after,
+            start=start,
+            on_notice=say,
+            journal=recorder,
+        )
+        if recorder is not None:
+            stack.callback(lambda: recorder.close(live.sure))
+        view = None
+        if options.rerun:
+            from ..views.live import LiveView
 
-    live = LiveEstimator(config, window=options.window, stale_after=options.stale_after, start=start, on_notice=say)
-    hidden = options.status and sys.stdout.isatty()  # the screen and the lines would write over each other
-    stream = Stream(live, (lambda _: None) if hidden else write, say, options.rate)
-    pieces = standard_input() if recorded is None else replayed(recorded, config, address.speed)
-    with ended_by_signals() as ended, _screen(errors, options.status) as screen:
-        _follow(stream, pieces, ended, screen, 1.0 if recorded is None else address.speed)
-        stream.end(cut=bool(ended))
-    summarise(stream, errors)
+            view = LiveView(options.rerun, config, say)
+            stack.callback(view.close)
+        hidden = options.status and sys.stdout.isatty()  # the screen and the lines would write over each other
+        write = out or (_to_nobody if hidden else _to_standard_output)
+        stream = Stream(live, write, say, options.rate, [] if view is None else [view])
+        ended = stack.enter_context(_ended_by_signals())
+        parts = [part for part in (remote, recorder, out) if part is not None]
+        screen = stack.enter_context(_screen(errors, options.status))
+        follower = _Follower(stream, parts, address.speed, recorder, view, screen)
+        if remote is not None:
+            with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:  # Windows' own reads no datagrams
+                runner.run(_listen(remote, follower, ended))
+        else:
+            for items in standard_input() if recorded is None else replayed(recorded, config, address.speed):
+                follower.take(items)
+                if ended:
+                    break
+        stream.end()
+    summarise(stream, parts, errors)
 
 
-def _follow(
-    stream: Stream, pieces: Iterator[bytes | list[Event]], ended: list[int], screen: Live | None, speed: float
-) -> None:
-    """Feed the stream until the source or a signal ends it; when it is quiet its time goes on by the wall's."""
-    heard, drawn = time.monotonic(), 0.0
-    for piece in pieces:
-        now = time.monotonic()
-        if piece:
-            stream.feed(piece) if isinstance(piece, bytes) else stream.take(piece)
-            heard = now
-        elif (sure := stream.live.sure) is not None and math.isfinite(speed):
-            stream.idle(sure + round((now - heard - QUIET) * speed * 1e9))
-        if screen is not None and now - drawn >= _REDRAWN:
-            screen.update(status(stream), refresh=True)
-            drawn = now
-        if ended:
-            return
+def _to_nobody(_: list[bytes]) -> None:
+    pass
+
+
+def _to_standard_output(lines: list[bytes]) -> None:
+    try:
+        sys.stdout.buffer.write(b"".join(lines))
+        sys.stdout.buffer.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        sys.stdout = None  # what is left in its buffer would be tried once more at exit
+        raise RunError(f"standard output: cannot be written: {error.strerror}") from None
+
+
+def _warm_up(config: FusionConfig, options: Options) -> None:
+    """Have the kernels in memory before the first event: while they load, datagrams would be lost."""
+    live = LiveEstimator(config, window=options.window, stale_after=options.stale_after)
+    position = dict.fromkeys((*live.axes, *(CARTESIAN if config.frame is not None else ())), 1.0)
+    live.command(0, **position)
+    for sensor in config.sensors:
+        live.reading(0, sensor, **position)
+    live.estimate()
+    live.health()
+    gc.freeze()  # what is here stays: looking through it again and again would take longer than an estimate may
+
+
+async def _listen(remote: network.Source, follower: _Follower, ended: list[int]) -> None:
+    """Feed what comes from the network until a signal ends it."""
+    await remote.start()
+    try:
+        while not ended:
+            follower.take(await remote.get())
+    finally:
+        await remote.stop()
+
+
+class _Follower:
+    """Feeds a stream, and sees to what is due beside it."""
+
+    def __init__(
+        self,
+        stream: Stream,
+        parts: Sequence[_Part],
+        speed: float,
+        recorder: Recorder | None,
+        view: LiveView | None,
+        screen: Live | None,
+    ) -> None:
+        self._stream, self._parts, self._speed = stream, parts, speed
+        self._recorder, self._view, self._screen = recorder, view, screen
+        self._sure: int | None = None
+        self._moved = self._drawn = time.monotonic()
+
+    def take(self, items: Sequence[bytes | Event]) -> None:
+        """Feed some items, or none: where the stream's time stands still it goes on by the wall's."""
+        stream, now = self._stream, time.monotonic()
+        if items:
+            stream.take(items)
+        sure = stream.live.sure
+        if sure != self._sure:
+            self._sure, self._moved = sure, now
+        elif sure is not None and now - self._moved > QUIET and math.isfinite(self._speed):
+            stream.idle(sure + round((now - self._moved - QUIET) * self._speed * 1e9))
+        if self._recorder is not None:
+            self._recorder.tick(sure)
+        if self._view is not None:
+            self._view.tick(stream.live.health)
+        if self._screen is not None and now - self._drawn >= _REDRAWN:
+            self._screen.update(status(stream, self._parts), refresh=True)
+            self._drawn = now
 
 
 @contextlib.contextmanager
-def ended_by_signals() -> Generator[list[int]]:
+def _ended_by_signals() -> Generator[list[int]]:
     """The signals that have asked for an end: Ctrl-C and SIGTERM; a second one ends at once."""
     caught: list[int] = []
 
@@ -126,7 +219,7 @@ def _screen(errors: Console, wanted: bool) -> Generator[Live | None]:
         yield screen
 
 
-def status(stream: Stream) -> Group:
+def status(stream: Stream, parts: Sequence[_Part] = ()) -> Group:
     """One picture of the stream: where the tool is, and how each sensor does."""
     live, health = stream.live, stream.live.health()
     estimate = live.estimate()
@@ -143,7 +236,7 @@ def status(stream: Stream) -> Group:
             stale,
         )
     told = "no event yet" if live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
-    return Group(Text(told), axes, sensor_table(health), Text(counted(stream, health)))
+    return Group(Text(told), axes, sensor_table(health), Text(counted(stream, health)), *map(Text, _told(parts)))
 
 
 def sensor_table(health: Health) -> Table:
@@ -184,9 +277,15 @@ def counted(stream: Stream, health: Health) -> str:
     return "; ".join(said)
 
 
-def summarise(stream: Stream, errors: Console) -> None:
+def summarise(stream: Stream, parts: Sequence[_Part], errors: Console) -> None:
     """What there was, for people."""
     health = stream.live.health()
-    errors.print(counted(stream, health), markup=False)
+    for said in (counted(stream, health), *_told(parts)):
+        errors.print(said, markup=False, soft_wrap=True)
     if any(sensor.rows for sensor in health.sensors.values()):
         errors.print(sensor_table(health))
+
+
+def _told(parts: Sequence[_Part]) -> list[str]:
+    """What the source, the recording and the way out have to say."""
+    return [said for said in (part.told() for part in parts) if said]

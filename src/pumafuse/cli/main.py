@@ -287,7 +287,12 @@ def tune(
 @app.command()
 def live(
     source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="stdin, or replay:RUN?speed=4 (speed=max: as fast as it can be).")
+        str,
+        typer.Argument(
+            metavar="SOURCE",
+            help="stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, or replay:RUN?speed=4 (speed=max:"
+            " as fast as it can be).",
+        ),
     ],
     config: Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")],
     rate: Annotated[
@@ -297,7 +302,22 @@ def live(
     stale_after: Annotated[
         float, typer.Option(metavar="S", help="Without a reading for so long an axis is called stale.")
     ] = 1.0,
+    out: Annotated[
+        str | None, typer.Option(metavar="udp://HOST:PORT", help="Send the estimates there; default: standard output.")
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write what comes as a recorded run, into a new folder.")
+    ] = None,
+    rerun: Annotated[
+        str | None, typer.Option(metavar="spawn|connect|web", help="Draw live: a new viewer, one that runs, a browser.")
+    ] = None,
     status: Annotated[bool, typer.Option("--status", help="Show estimates and sensors on one live screen.")] = False,
+    listen: Annotated[
+        str | None, typer.Option(metavar="ADDR", help="Listen there instead of on loopback; needs --allow.")
+    ] = None,
+    allow: Annotated[
+        list[str] | None, typer.Option(metavar="CIDR", help="Who is heard with --listen; may be given again.")
+    ] = None,
 ) -> None:
     """Estimate from a stream of commands and readings, as they come.
 
@@ -306,12 +326,19 @@ def live(
     """
     from . import live as command
 
+    if (listen is None) != (not allow):
+        raise typer.BadParameter("--listen ADDR and --allow CIDR go together", param_hint="--listen")
     options = command.Options(
         config=config,
         rate=_positive(rate, "--rate"),
         window=_positive(window, "--window"),
         stale_after=_positive(stale_after, "--stale-after"),
         status=status,
+        out=out,
+        record=record,
+        rerun=rerun,
+        listen=listen,
+        allow=allow or [],
     )
     command.run(source, options)
 

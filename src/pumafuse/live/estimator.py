@@ -7,7 +7,7 @@ import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -121,6 +121,22 @@ class _Event(NamedTuple):
     values: Mapping[str, Any]
 
 
+class Journal(Protocol):
+    """Who writes down what a live estimator believes."""
+
+    def begin(self) -> None:
+        """What comes from here on is stamped by another clock."""
+        ...
+
+    def taken(self, stamp: int, sensor: str | None, values: Mapping[str, Any], /) -> None:
+        """An event's stamp [ns] is believed; without a sensor it is a command, its values are in m."""
+        ...
+
+    def forget(self, after: int, /) -> None:
+        """What is stamped after ``after`` [ns] was wrong."""
+        ...
+
+
 class LiveEstimator:
     """The filter of :func:`pumafuse.fuse`, fed event by event as they arrive, in any order.
 
@@ -144,6 +160,7 @@ class LiveEstimator:
         stale_after: float = 1.0,
         start: Mapping[str, float] | None = None,
         on_notice: Callable[[str], None] = lambda _: None,
+        journal: Journal | None = None,
     ) -> None:
         """Nothing heard yet.
 
@@ -154,6 +171,7 @@ class LiveEstimator:
             start: Level [m] of axes that do not rest at their first command before it; x and y with a frame.
             on_notice: Is told in one sentence what a user should know: a clock set anew, and the like; of what happens
                 again and again the first time, the tenth, the hundredth …
+            journal: Is told what is believed.
 
         Raises:
             PumafuseError: ``window`` or ``stale_after`` is not a time in reach, ``start`` is of no axis, or a model
@@ -171,7 +189,7 @@ class LiveEstimator:
         self._sensors = {name: number for number, name in enumerate(config.sensors)}
         self._bits = {name: number for number, name in enumerate(self.axes)}
         self._stale_ns = round(stale_after * 1e9)
-        self._log = Sampler(on_notice)
+        self._log, self._journal = Sampler(on_notice), journal
         self._refused: dict[str, dict[Outcome, int]] = {name: dict.fromkeys(Outcome, 0) for name in config.sensors}
         self._strangers = self._refusals = 0
         self._doubtful = 0  # commands that may have to be taken back
@@ -224,21 +242,22 @@ class LiveEstimator:
             return _nowhere(stamp, _TOO_LATE, f"{(newest - stamp) / 1e9:.3f} s ago, before the window")
         if stamp > newest + LONGEST_TAIL_NS:
             return _nowhere(stamp, _INVALID, "more than an hour ahead")
-        outputs, memory = self._window.estimate(stamp, self._oldest()), self._window.memory
-        position = outputs.position[:, 0] + memory.commands.level[:, 0]
-        known = ((memory.commands.number[:, COMMANDS] > 0) | (memory.commands.level[:, 1] > 0.0)).tolist()
-        columns = (position.tolist(), *(part[:, 0].tolist() for part in outputs[1:]))
-        rows = zip(self.axes, known, zip(*columns, strict=True), strict=True)
-        axes = {axis: AxisNow(*row) for axis, commanded, row in rows if commanded}
-        fused = memory.heard.fused.tolist()
-        stale = tuple(
-            axis
-            for axis, since in zip(self.axes, fused, strict=True)
-            if axis in axes and stamp - since > self._stale_ns
-        )
+        found, memory = self._window.estimate(stamp, self._oldest()), self._window.memory
+        commands, levels = memory.commands.number[:, COMMANDS].tolist(), memory.commands.level.tolist()
+        axes: dict[str, AxisNow] = {}
+        stale: list[str] = []
+        for axis, (position, *rest), commanded, (level, given), since in zip(
+            self.axes, found, commands, levels, memory.heard.fused.tolist(), strict=True
+        ):
+            if commanded or given:
+                axes[axis] = AxisNow(position + level, *rest)
+                if stamp - since > self._stale_ns:
+                    stale.append(axis)
         reason = "now" if stamp == now else "filtered" if stamp < now else "predicted, the last command held"
-        placed = self._placing.in_log({axis: now.position for axis, now in axes.items()})
-        return LiveEstimate(stamp, axes, placed, stale, _FUSED, reason)
+        placed = None
+        if self._placing.placed is not None:
+            placed = self._placing.in_log({axis: now.position for axis, now in axes.items()})
+        return LiveEstimate(stamp, axes, placed, tuple(stale), _FUSED, reason)
 
     @property
     def newest(self) -> int | None:
@@ -311,6 +330,8 @@ class LiveEstimator:
         if sensor is None and self._aside:
             clock.here()
             self._aside = []
+        if self._journal is not None:
+            self._journal.taken(stamp, sensor, values)
         if self._early is not None:
             return self._take_early(_Event(stamp, sensor, dict(values)))
         return self._feed(stamp, sensor, values)
@@ -322,11 +343,15 @@ class LiveEstimator:
         if newest is None or (self._window.origin is None and (command or stamp > newest)):
             if newest is not None and command:
                 self._begin(self._window.tally())  # the commands' clock counts: what was heard before is of another
+                if self._journal is not None:
+                    self._journal.begin()
             clock.start(stamp)
             return None
         verdict = clock.judge(stamp, sensor)
         while verdict is Verdict.CONTRADICTED:
             self._window.forget(clock.bound, self._oldest())
+            if self._journal is not None:
+                self._journal.forget(clock.bound)
             self._commands[_FUSED] -= self._doubtful
             self._commands[_INVALID] += self._doubtful
             self._doubtful = 0
@@ -371,6 +396,8 @@ class LiveEstimator:
         self._log.say("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
         self._start = {}
         self._begin(self._window.tally())
+        if self._journal is not None:
+            self._journal.begin()
         self._clock.start(first)
         for other, _ in aside:
             self._take(*other)
@@ -453,10 +480,14 @@ class LiveEstimator:
         if validity.max_speed is None and validity.max_radius is None:
             return
         commands = self._window.memory.commands
-        last = commands.row[np.arange(len(self.axes)), commands.number[:, COMMANDS] - 1]  # zeros where there is none
-        speed = float(np.abs(last[:, STEP]).max()) / self.config.arm.update_period
-        framed = isinstance(self.config.frame, Cylindrical) and "radial" in self._bits
-        radius = float(last[self._bits["radial"], U]) if framed else None
+        rows, counts = commands.row, commands.number[:, COMMANDS].tolist()
+        step, radius = 0.0, None
+        for axis, count in enumerate(counts):
+            if count:
+                step = max(step, abs(rows.item(axis, count - 1, STEP)))
+        if isinstance(self.config.frame, Cylindrical) and (axis := self._bits.get("radial")) is not None:
+            radius = rows.item(axis, counts[axis] - 1, U) if counts[axis] else None
+        speed = step / self.config.arm.update_period
         for passed in validity.excess(speed, radius):
             self._log.say(passed.split(" reach")[0], passed)
 

@@ -1,4 +1,4 @@
-"""Where events come from: standard input, or a recorded run as it happened."""
+"""Where events come from on this machine: standard input, or a recorded run as it happened."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import os
 import select
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
-from ..errors import ConfigError, RunError
+from ..errors import RunError
 from ..fusion import timeline
 from ..fusion.config import FusionConfig
 from ..runs.clock import segments
 from ..runs.run import Run, Source
+from .lines import Lines
 from .wire import Event
 
 QUIET = 0.1  # s without an event after which a source says so
@@ -24,64 +24,25 @@ _PIECE = 1 << 16
 _BATCH = 1000  # events that a replay hands over at once when nothing makes it wait
 
 
-@dataclass(frozen=True)
-class Address:
-    """What a source is called on the command line.
-
-    Attributes:
-        kind: ``stdin`` or ``replay``.
-        path: Of the run to replay.
-        speed: How many seconds of the run go by in one; infinite: as fast as it can be.
-    """
-
-    kind: str
-    path: str = ""
-    speed: float = 1.0
-
-    @staticmethod
-    def parse(text: str) -> Address:
-        """Read ``stdin`` or ``replay:RUN?speed=4``.
-
-        Raises:
-            ConfigError: It is neither; says what is accepted.
-        """
-        if text == "stdin":
-            return Address("stdin")
-        kind, colon, rest = text.partition(":")
-        if kind != "replay" or not colon:
-            raise ConfigError(
-                f"no source '{text}'; there are: stdin, replay:RUN, replay:RUN?speed=4, replay:RUN?speed=max"
-            )
-        path, asked, option = rest.rpartition("?") if "?" in rest else (rest, "", "")
-        if not asked:
-            return Address("replay", path)
-        name, _, value = option.partition("=")
-        try:
-            speed = math.inf if value == "max" else float(value)
-        except ValueError:
-            speed = math.nan
-        if name != "speed" or not speed > 0.0:
-            raise ConfigError(f"source '{text}': expected ?speed= and a positive number or max after the run")
-        return Address("replay", path, speed)
-
-
-def standard_input(descriptor: int = 0) -> Iterator[bytes]:
-    """Pieces of standard input as they come; an empty one whenever it is quiet.
+def standard_input(descriptor: int = 0) -> Iterator[list[bytes]]:
+    """Lines of standard input as they come; none whenever it is quiet.
 
     Raises:
         RunError: It cannot be read.
     """
+    lines = Lines()
     while True:
         try:
             if os.name == "posix" and not select.select([descriptor], [], [], QUIET)[0]:
-                yield b""
+                yield []
                 continue
             piece = os.read(descriptor, _PIECE)
         except OSError as error:
             raise RunError(f"standard input: cannot be read: {error.strerror}") from None
         if not piece:
+            yield lines.rest()
             return
-        yield piece
+        yield lines.cut(piece)
 
 
 def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Event]]:

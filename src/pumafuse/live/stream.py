@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol
 
 from ..errors import ConfigError
 from ..fusion.timeline import Outcome
-from .estimator import LiveEstimator, nanoseconds
+from .estimator import LiveEstimate, LiveEstimator, Told, nanoseconds
 from .sampler import Sampler
-from .wire import LONGEST, BadLine, Event, Wire, encode
+from .wire import BadLine, Event, Wire, encode
 
 _SHOWN = 60  # characters of a bad line in the log
 _MOST_AT_ONCE = 50_000  # estimates on the grid between two events
 _FASTEST = 1e4  # Hz
 _TAKEN = frozenset({Outcome.FUSED, Outcome.REOPENED, Outcome.GATED})
+
+
+class Watcher(Protocol):
+    """Who is told what comes in and what goes out, at once: it must not take long."""
+
+    def event(self, event: Event, told: Told) -> None:
+        """An event came, and this became of it."""
+        ...
+
+    def estimate(self, estimate: LiveEstimate) -> None:
+        """An estimate goes out."""
+        ...
 
 
 class Stream:
@@ -29,17 +42,19 @@ class Stream:
     def __init__(
         self,
         live: LiveEstimator,
-        write: Callable[[bytes], None],
+        write: Callable[[list[bytes]], None],
         say: Callable[[str], None],
         rate: float | None = None,
+        watchers: Sequence[Watcher] = (),
     ) -> None:
         """Nothing in, nothing out.
 
         Args:
             live: The estimator.
-            write: Takes whole lines of estimates, some at a time.
+            write: Takes lines of estimates with their ends, some at a time.
             say: Takes a sentence for the log.
             rate: Estimates on an even grid [Hz] from the first command on; one for each command for None.
+            watchers: Are told of everything.
 
         Raises:
             ConfigError: The rate is not positive, or too high.
@@ -47,31 +62,20 @@ class Stream:
         if rate is not None and not 0.0 < rate <= _FASTEST:
             raise ConfigError(f"rate: at most {_FASTEST:g} estimates a second, not {rate:g}")
         self.live, self.lines, self.bad, self.estimates = live, 0, 0, 0
-        self._write = write
+        self._write, self._watchers = write, tuple(watchers)
         self._wire = Wire(live.axes, live.config.frame is not None)
         self._step = None if rate is None else 1e9 / rate
         self._grid: tuple[int, int] | None = None  # the segment, and where its grid begins [ns]
         self._due = 0
         self._whole = False  # whether the stream tells its time in ns
-        self._torn, self._too_long = b"", False
         self._out: list[bytes] = []
         self._log = Sampler(say)
 
-    def feed(self, data: bytes) -> None:
-        """Take in a piece of the stream, of any length, and write what is to be said after it."""
-        *lines, rest = data.split(b"\n")
-        for line in lines:
-            if self._too_long:
-                self._too_long = False
-            else:
-                self.line(self._torn + line)
-            self._torn = b""
-        if not self._too_long:
-            self._torn += rest
-            if len(self._torn) > LONGEST:
-                self.line(self._torn)
-                self._torn, self._too_long = b"", True
-        self.flush()
+    def take(self, items: Iterable[bytes | Event]) -> None:
+        """Take in lines and events, and write what is to be said after each."""
+        for item in items:
+            self.line(item) if isinstance(item, bytes) else self.event(item)
+            self.flush()
 
     def line(self, line: bytes) -> None:
         """Take in one line."""
@@ -95,6 +99,8 @@ class Stream:
         if self._step is not None:
             self._on_grid(live.until(t))
         told = live.reading(t, sensor, **values) if sensor else live.command(t, **values)
+        for watcher in self._watchers:
+            watcher.event(event, told)
         if told.outcome not in _TAKEN or not _TAKEN.issuperset(told.axes.values()):
             who = sensor if sensor in live.config.sensors else "unknown sensor" if sensor else "command"
             became = f"{told.reason} ({told.outcome.word})"
@@ -102,23 +108,14 @@ class Stream:
         if self._step is None and not sensor and told.outcome is Outcome.FUSED:
             self._estimate(nanoseconds(t))
 
-    def take(self, events: Iterable[Event]) -> None:
-        """Take in events, and write what is to be said after them."""
-        for event in events:
-            self.event(event)
-        self.flush()
-
     def idle(self, now: int) -> None:
         """Nothing has come for a while, and by the stream's own time it is ``now`` [ns]: the grid goes on."""
         if self._step is not None:
             self._on_grid(now + 1)
             self.flush()
 
-    def end(self, cut: bool = False) -> None:
-        """No more will come; what is left of a line counts, unless it was ``cut`` short."""
-        if self._torn and not cut:
-            self.line(self._torn)
-            self._torn = b""
+    def end(self) -> None:
+        """No more will come."""
         if self._step is not None and self.live.sure is not None:
             self._on_grid(self.live.sure + 1)
         self.flush()
@@ -126,7 +123,7 @@ class Stream:
     def flush(self) -> None:
         """Write the estimates that are ready."""
         if self._out:
-            lines, self._out = b"".join(self._out), []
+            lines, self._out = self._out, []
             self._write(lines)
 
     def _on_grid(self, before: int | None) -> None:
@@ -149,6 +146,8 @@ class Stream:
         if estimate.outcome is Outcome.FUSED:
             self.estimates += 1
             self._out.append(encode(estimate, self._whole))
+            for watcher in self._watchers:
+                watcher.estimate(estimate)
 
 
 def _at(t: float | int) -> str:

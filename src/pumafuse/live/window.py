@@ -59,7 +59,7 @@ class Window:
         width = self.memory.state.x.shape[1]
         nothing = np.zeros((len(axes), 0))
         self._held = (np.zeros((len(axes), 0, width)), np.zeros((len(axes), 0, width, width)), nothing)
-        self._outputs = fusion.Outputs(*(np.zeros((len(axes), 1)) for _ in fusion.Outputs._fields))
+        self._outputs = np.zeros((len(fusion.Outputs._fields), len(axes), 1))
         self._places = tuple(self._outputs)
 
     @property
@@ -98,13 +98,13 @@ class Window:
         self._resume(oldest)
         return True
 
-    def estimate(self, time: int, oldest: int) -> fusion.Outputs:
-        """Every axis at ``time`` [ns], relative to its start level; the arrays are (A, 1) and used again."""
+    def estimate(self, time: int, oldest: int) -> list[list[float]]:
+        """For each axis at ``time`` [ns] what :class:`fusion.Outputs` has, relative to its start level."""
         attempt = 0
         while kernels.ask(self._flat, self._held, self._places, time) != DONE:
             self._make_room(attempt, oldest, event=False)
             attempt += 1
-        return self._outputs
+        return self._outputs[:, :, 0].T.tolist()
 
     def forget(self, after: int, oldest: int) -> None:
         """Take back all that is stamped after ``after`` [ns]."""

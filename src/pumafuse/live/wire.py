@@ -12,8 +12,8 @@ from ..errors import ConfigError
 from ..runs.frames import CARTESIAN
 from ..units import MM
 from .estimator import LiveEstimate
+from .lines import LONGEST
 
-LONGEST = 64 * 1024  # bytes of a line
 _NAMES = ("t", "t_ns", "command", "sensor")
 
 

@@ -212,7 +212,7 @@ def _read_manifest(path: Path) -> Run:
 
     def source(entry: manifest.SourceEntry) -> Source:
         if entry.file not in loaded:
-            loaded[entry.file] = tables.read(path.parent / entry.file)
+            loaded[entry.file] = tables.read(path.parent / entry.file, growing=True)
             notes.extend(loaded[entry.file].notes)
         table = loaded[entry.file]
         stamp, note = table.stamps(entry.time)
@@ -238,7 +238,7 @@ def _read_manifest(path: Path) -> Run:
 
 def _read_single(path: Path) -> Run:
     """One table: ``time_s``, ``command.<axis>_mm``, ``<sensor>.<axis>_mm``, ``reference.<axis>_mm``."""
-    table = tables.read(path)
+    table = tables.read(path, growing=True)
     clocks = [name for name in table.columns if name.startswith("time_")]
     if len(clocks) != 1:
         raise RunError(f"{path}: a single table needs one time column, 'time_s'; it has: {', '.join(table.columns)}")

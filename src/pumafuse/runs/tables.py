@@ -6,8 +6,8 @@ told in one sentence each. Nothing here knows what a command or a sensor is.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -160,19 +160,25 @@ class Table:
         return column, None
 
 
+_COMPRESSED = {".gz", ".bz2", ".lz4", ".zst", ".br"}  # a torn one cannot be read at all
 _WHOLE = r"^[+-]?\d{1,19}$"
 _NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
 _BLANK = {"", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None"}
 
 
-def read(path: Path) -> Table:
+def read(path: Path, *, growing: bool = False) -> Table:
     """Read a CSV or Parquet table, gzip allowed for CSV (``.csv.gz``).
+
+    Args:
+        path: The file.
+        growing: Whether it may be in the writing, or may have been when its writer died: then a last line of a CSV
+            without its end may be torn in the middle of a number, and is left out and told.
 
     Raises:
         RunError: The file is absent, empty, or neither CSV nor Parquet inside.
     """
     try:
-        table, notes = (papq.read_table(path), list[str]()) if path.suffix == ".parquet" else _read_csv(path)
+        table, notes = (papq.read_table(path), list[str]()) if path.suffix == ".parquet" else _read_csv(path, growing)
         names: list[str] = table.column_names
     except FileNotFoundError:
         raise RunError(f"{path}: no such file") from None
@@ -203,34 +209,54 @@ def write(table: pa.Table, path: Path) -> None:
         papq.write_table(table, path, compression="zstd")
 
 
-def _read_csv(path: Path) -> tuple[pa.Table, list[str]]:
-    """A CSV file; lines with the wrong number of cells (a torn last line) are left out and told."""
+def _read_csv(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
+    """A CSV file; lines with the wrong number of cells, and a torn last line, are left out and told."""
     if path.stat().st_size == 0:
         raise RunError(f"{path}: the file is empty")
-    torn: list[pacsv.InvalidRow] = []
+    text, notes = _without_torn_end(path) if growing else (None, [])
+    wrong: list[pacsv.InvalidRow] = []
 
     def leave_out(row: pacsv.InvalidRow) -> str:
-        torn.append(row)
+        wrong.append(row)
         return "skip"
 
-    read = partial(
-        pacsv.read_csv,
-        path,
-        read_options=pacsv.ReadOptions(use_threads=False),
-        convert_options=pacsv.ConvertOptions(null_values=sorted(_BLANK), strings_can_be_null=True),
-    )
+    def parsed(**options: pacsv.ParseOptions) -> pa.Table:
+        return pacsv.read_csv(
+            path if text is None else pa.BufferReader(text),
+            read_options=pacsv.ReadOptions(use_threads=False),
+            convert_options=pacsv.ConvertOptions(null_values=sorted(_BLANK), strings_can_be_null=True),
+            **options,
+        )
+
     try:
-        return read(), []
+        return parsed(), notes
     except pa.ArrowInvalid as error:
         if " columns, got " not in str(error):
             raise
-    pa.input_stream(str(path)).read().decode("utf-8")  # pyarrow cannot hand over a torn line that is not UTF-8
-    table = read(parse_options=pacsv.ParseOptions(invalid_row_handler=leave_out))
-    lines = "1 line" if len(torn) == 1 else f"{len(torn)} lines"
-    where = "" if torn[0].number is None else f", first in line {torn[0].number}"
+    pa.input_stream(str(path)).read().decode("utf-8")  # pyarrow cannot hand over a wrong line that is not UTF-8
+    table = parsed(parse_options=pacsv.ParseOptions(invalid_row_handler=leave_out))
+    lines = "1 line" if len(wrong) == 1 else f"{len(wrong)} lines"
+    where = "" if wrong[0].number is None else f", first in line {wrong[0].number}"
     return table, [
-        f"{path.name}: {lines} left out: {torn[0].actual_columns} cells where the header has"
-        f" {torn[0].expected_columns}{where}"
+        f"{path.name}: {lines} left out: {wrong[0].actual_columns} cells where the header has"
+        f" {wrong[0].expected_columns}{where}",
+        *notes,
+    ]
+
+
+def _without_torn_end(path: Path) -> tuple[pa.Buffer | None, list[str]]:
+    """A file up to the end of its last whole line, and a note if that is not all; None for the file as it is."""
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        if path.suffix in _COMPRESSED or file.read(1) in b"\n\r":
+            return None, []
+        file.seek(0)
+        text = file.read()
+    end = text.rfind(b"\n") + 1
+    if not end:
+        return None, []
+    return pa.py_buffer(memoryview(text)[:end]), [
+        f"{path.name}: the last line has no end and may be torn: left out (if it is whole, end it with a line break)"
     ]
 
 

@@ -1,0 +1,162 @@
+"""What sources and receivers are called on the command line, and on which addresses a stream may be heard."""
+
+from __future__ import annotations
+
+import math
+import socket
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
+from typing import TypeAlias
+from urllib.parse import urlsplit
+
+from ..errors import ConfigError
+
+Socket: TypeAlias = tuple[socket.AddressFamily, tuple[str, int]]
+
+LISTENERS = ("udp", "tcp-listen")
+NETWORK = (*LISTENERS, "tcp")
+_LOOPBACK = "127.0.0.1"
+_ACCEPTED = "stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, replay:RUN, replay:RUN?speed=4 (or max)"
+
+
+@dataclass(frozen=True)
+class Address:
+    """What a source is called on the command line.
+
+    Attributes:
+        kind: ``stdin``, ``replay``, ``udp``, ``tcp-listen`` or ``tcp``.
+        path: Of the run to replay.
+        speed: How many seconds of the run go by in one; infinite: as fast as it can be.
+        host: Of a network source, empty where none is given.
+        port: Of a network source.
+    """
+
+    kind: str
+    path: str = ""
+    speed: float = 1.0
+    host: str = ""
+    port: int = 0
+
+    @staticmethod
+    def parse(text: str) -> Address:
+        """Read what stands on the command line, as in ``udp://127.0.0.1:5005`` or ``replay:RUN?speed=4``.
+
+        Raises:
+            ConfigError: It is no source; says what is accepted.
+        """
+        kind, colon, rest = text.partition(":")
+        if text == "stdin":
+            return Address("stdin")
+        if kind == "replay" and colon:
+            return _replay(text, rest)
+        if kind in NETWORK and rest.startswith("//"):
+            return _remote(text, f"source '{text}'")
+        raise ConfigError(f"no source '{text}'; there are: {_ACCEPTED}")
+
+    @property
+    def text(self) -> str:
+        """A network source as it is written."""
+        return f"{self.kind}://{shown(self.host, self.port)}"
+
+
+def shown(host: str, port: int) -> str:
+    """A host and port as people write them."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def receiver(text: str) -> Socket:
+    """Where ``udp://HOST:PORT`` is, to send to.
+
+    Raises:
+        ConfigError: It is no such address, or nothing is known of the host.
+    """
+    if not text.startswith("udp://"):
+        raise ConfigError(f"--out '{text}': expected udp://HOST:PORT")
+    address = _remote(text, f"--out '{text}'")
+    if not address.host or not address.port:
+        raise ConfigError(f"--out '{text}': expected udp://HOST:PORT")
+    return resolved(address.host, address.port, f"--out '{text}'")
+
+
+def bound(address: Address, listen: str | None, allow: Sequence[str]) -> tuple[Socket, Callable[[str], bool]]:
+    """Where a listener is to be, and who may be heard there: on loopback everybody, elsewhere only who is allowed.
+
+    Args:
+        address: The source.
+        listen: An address to listen on instead, which may be another than loopback.
+        allow: Networks that are heard then, as in ``192.168.1.0/24``, and nobody else.
+
+    Raises:
+        ConfigError: An address is none, or is not loopback without ``listen``.
+    """
+    networks = [_network(text) for text in allow]
+    family, place = resolved(listen or address.host or _LOOPBACK, address.port, f"source '{address.text}'")
+    if listen is None:
+        if not ip_address(place[0]).is_loopback:
+            raise ConfigError(
+                f"source '{address.text}': is heard on loopback only; to be reached from elsewhere, give"
+                f" --listen {place[0]} --allow CIDR, as in --allow 192.168.1.0/24"
+            )
+        return (family, place), lambda _: True
+    if address.host and address.host != listen:
+        host = resolved(address.host, 0, f"source '{address.text}'")[1][0]
+        if host != place[0] and not ip_address(host).is_loopback:
+            raise ConfigError(f"source '{address.text}': names another address than --listen {listen}")
+
+    @lru_cache(maxsize=4096)
+    def allowed(host: str) -> bool:
+        peer = ip_address(host.partition("%")[0])
+        peer = peer.ipv4_mapped or peer if isinstance(peer, IPv6Address) else peer
+        return any(peer in network for network in networks)
+
+    return (family, place), allowed
+
+
+def resolved(host: str, port: int, where: str) -> Socket:
+    """The first address of a host.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    try:
+        family, _, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a host's name"
+        raise ConfigError(f"{where}: no address of host '{host}' is known: {reason}") from None
+    return family, (str(place[0]), port)
+
+
+def _replay(text: str, rest: str) -> Address:
+    path, asked, option = rest.rpartition("?") if "?" in rest else (rest, "", "")
+    if not asked:
+        return Address("replay", path)
+    name, _, value = option.partition("=")
+    try:
+        speed = math.inf if value == "max" else float(value)
+    except ValueError:
+        speed = math.nan
+    if name != "speed" or not speed > 0.0:
+        raise ConfigError(f"source '{text}': expected ?speed= and a positive number or max after the run")
+    return Address("replay", path, speed)
+
+
+def _remote(text: str, where: str) -> Address:
+    kind = text.partition(":")[0]
+    try:
+        parts = urlsplit(text)
+        host, port = parts.hostname or "", parts.port
+    except ValueError:
+        host, port = "", None
+    plain = port is not None and text == f"{kind}://{shown(host, port)}"
+    if port is None or not plain or (kind == "tcp" and not (host and port)):
+        raise ConfigError(f"{where}: expected {kind}://HOST:PORT, as in {kind}://{_LOOPBACK}:5005")
+    return Address(kind, host=host, port=port)
+
+
+def _network(text: str) -> IPv4Network | IPv6Network:
+    try:
+        return ip_network(text)
+    except ValueError as error:
+        raise ConfigError(f"--allow {text}: {error}; expected a network, as in 192.168.1.0/24") from None

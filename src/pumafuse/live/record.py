@@ -1,0 +1,355 @@
+"""A stream as a recorded run while it comes: a CSV file for each source beside ``run.toml``.
+
+Rows are written twice a second by a thread of their own, whole lines at the end of a file, so that whoever reads finds
+a run at any moment, with a torn last line at worst. A disk that refuses is tried again every second; meanwhile rows
+wait, and when too many wait the new ones are not recorded. Nothing here makes the estimator wait.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import queue
+import threading
+import time
+from collections.abc import Callable, Container, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from .. import toml
+from ..folders import FolderError, write_file
+from ..fusion.config import FusionConfig
+from ..model.arm import ordered_axes
+from ..runs.clock import TOLERATED_STEP_BACK_NS
+from ..runs.frames import CARTESIAN
+from ..runs.save import check_axis, check_name
+from ..units import MM
+
+_FLUSHED = 0.5  # s between two writes
+_TRIED_AGAIN = 1.0  # s after the disk refused
+_SAID_AGAIN = 60.0  # s until a trouble that lasts is told again
+_MOST_WAITING = 64 << 20  # bytes that wait for a disk
+_MOST_BEFORE = 65_536  # readings that are kept until the first command
+_PATIENCE = 5.0  # s for the disk at the end
+_COMMANDS, _MANIFEST, _TIME = "commands.csv", "run.toml", "time_ns"
+
+
+class _Row(NamedTuple):
+    stamp: int
+    sensor: str | None
+    line: bytes
+
+
+class _Job(NamedTuple):
+    """What is to be written: more rows of files, and the manifest if it has changed."""
+
+    folder: Path
+    rows: dict[str, bytes]
+    manifest: str
+    number: int
+
+
+class Recorder:
+    """What a live estimator believes, written down; see :class:`pumafuse.live.estimator.Journal`.
+
+    A controller's clock that is set anew begins another run, beside the first: ``DIR.2``, ``DIR.3``, and so on.
+
+    Attributes:
+        late: How many were left out, as they stood more than 1 s behind an earlier one of their source, which a
+            recorded run's clock may not.
+        lost: How many were not recorded as the disk refused for too long.
+    """
+
+    def __init__(
+        self, folder: Path, config: FusionConfig, start: Mapping[str, float], say: Callable[[str], None]
+    ) -> None:
+        """Make the folder and wait for rows.
+
+        Args:
+            folder: New, or empty.
+            config: Says which sensors and axes there are, and the frame.
+            start: Level [m] of axes that do not rest at their first command before it.
+            say: Takes a sentence for the log.
+
+        Raises:
+            FolderError: The folder holds something, or cannot be made.
+            RunError: A sensor or axis has a name that a recorded run cannot have.
+        """
+        axes = ordered_axes(set(config.arm.axes))
+        for sensor in config.sensors:
+            check_name(sensor)
+        for axis in axes:
+            check_axis(axis)
+        framed = CARTESIAN if config.frame is not None else ()
+        self._columns = tuple(dict.fromkeys((*axes, *framed)))
+        self._frame, self._start, self._say = config.frame, dict(start), say
+        self._first, self._folder = folder, folder
+        self.late = self.lost = self._given = 0
+        self._segment = 1
+        _make(folder)
+        self._writer = _Writer(",".join((_TIME, *(f"{axis}_mm" for axis in self._columns))).encode() + b"\n")
+        self._due, self._said, self._troubled = 0.0, -math.inf, False
+        self._clear()
+
+    def begin(self) -> None:
+        """What comes is on another clock: write what was before, and begin a new run if there was a command."""
+        if self._commanded:
+            self._flush(self._pending)
+            self._segment += 1
+            self._folder = self._first.with_name(f"{self._first.name}.{self._segment}")
+            self._start = {}
+            self._say(f"record: goes on in {self._folder}")
+        self._clear()
+
+    def taken(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> None:
+        """An event is believed.
+
+        Args:
+            stamp: Int ns.
+            sensor: None for a command.
+            values: By axis [m].
+        """
+        given = [axis for axis in self._columns if axis in values]
+        if not given:
+            return
+        self._seen.setdefault(sensor, set()).update(given)
+        if sensor is None and not self._commanded:
+            self._commanded, self._due = True, 0.0
+        elif not self._commanded and len(self._pending) >= _MOST_BEFORE:
+            del self._pending[: _MOST_BEFORE // 2]
+        cells = ",".join([_cell(values[axis]) if axis in values else "" for axis in self._columns])
+        self._pending.append(_Row(stamp, sensor, f"{stamp},{cells}\n".encode()))
+
+    def forget(self, after: int) -> None:
+        """What is stamped after ``after`` [ns] was wrong."""
+        self._pending = [row for row in self._pending if row.stamp <= after]
+
+    def tick(self, sure: int | None) -> None:
+        """Hand over twice a second what is to be written, and say whether it can be.
+
+        Args:
+            sure: The newest stamp [ns] that nothing will take back; None before any.
+        """
+        if (now := time.monotonic()) < self._due:
+            return
+        self._due = now + _FLUSHED
+        self._tell(now)  # of what was handed over before
+        self._flush_until(sure)
+
+    def close(self, sure: int | None) -> None:
+        """Write what is left; a disk that does not take it within five seconds does not get it."""
+        self._flush_until(sure)
+        self._writer.close()
+
+    def told(self) -> str:
+        """What was recorded, in a sentence."""
+        return f"{self._first}: {self._state()}"
+
+    def _tell(self, now: float) -> None:
+        """Say once a minute what is wrong with the disk, and once that it is well again."""
+        trouble = self._writer.trouble
+        if trouble and now - self._said >= _SAID_AGAIN:
+            self._say(f"record: cannot be written: {trouble}; {self._state()}; estimates go on")
+            self._said, self._troubled = now, True
+        elif not trouble and self._troubled:
+            self._say(f"record: is written again; {self._state()}")
+            self._troubled = False
+
+    def _state(self) -> str:
+        written = self._writer.rows
+        said = [f"{written} rows recorded"]
+        said += [f"{self._given - written} wait"] if self._writer.trouble else []
+        said += [f"{self.late} left out, more than 1 s behind their source's newest"] if self.late else []
+        said += [f"{self.lost} lost"] if self.lost else []
+        return ", ".join(said)
+
+    def _clear(self) -> None:
+        """Nothing of this run yet."""
+        self._pending: list[_Row] = []
+        self._newest: dict[str | None, int] = {}
+        self._seen: dict[str | None, set[str]] = {}
+        self._listed: set[str | None] = set()  # whose rows have been handed over
+        self._commanded = False
+
+    def _flush_until(self, sure: int | None) -> None:
+        """Hand over the rows that nothing will take back."""
+        if self._commanded and sure is not None:
+            ready = [row for row in self._pending if row.stamp <= sure]
+            self._pending = [row for row in self._pending if row.stamp > sure]
+            self._flush(ready)
+
+    def _flush(self, ready: list[_Row]) -> None:
+        """Hand over rows, with the manifest that names their files."""
+        by_source: dict[str | None, list[bytes]] = {}
+        for row in ready:
+            newest = self._newest.get(row.sensor, row.stamp)
+            if row.stamp < newest - TOLERATED_STEP_BACK_NS:
+                self.late += 1
+                continue
+            self._newest[row.sensor] = max(newest, row.stamp)
+            by_source.setdefault(row.sensor, []).append(row.line)
+        listed = self._listed | by_source.keys()
+        number = sum(map(len, by_source.values()))
+        if None not in listed:  # the first command was lost: there is no run without one
+            self.lost += number
+        elif number:
+            rows = {_file(sensor): b"".join(lines) for sensor, lines in by_source.items()}
+            if self._writer.hand_over(_Job(self._folder, rows, self._manifest(listed), number)):
+                self._given += number
+                self._listed = listed
+            else:
+                self.lost += number
+
+    def _manifest(self, listed: Container[str | None]) -> str:
+        """``run.toml`` with the listed sources and the axes that there have been."""
+        entries = {
+            sensor: {
+                "file": _file(sensor),
+                "time": _TIME,
+                **{axis: f"{axis}_mm" for axis in self._columns if axis in seen},
+            }
+            for sensor, seen in self._seen.items()
+            if sensor in listed
+        }
+        tree: dict[str, Any] = {"name": self._folder.name, "command": entries.pop(None)}
+        if self._start:
+            tree["command"]["start"] = {f"{axis}_mm": level for axis, level in self._start.items()}
+        if entries:
+            tree["sensors"] = entries
+        if self._frame is not None:
+            tree["frame"] = toml.builtins(self._frame)
+        return toml.text(tree)
+
+
+class _File:
+    """An open file, and whether its last line is whole."""
+
+    def __init__(self, path: Path) -> None:
+        self.descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        self.torn = False
+
+    def is_at(self, path: Path) -> bool:
+        """Whether it still has its name."""
+        try:
+            return os.path.samestat(os.fstat(self.descriptor), path.stat())
+        except FileNotFoundError:
+            return False
+
+
+class _Writer:
+    """The thread that waits for the disk.
+
+    Attributes:
+        trouble: Why the disk refuses, or that the folder had gone; empty while all is well.
+        rows: How many are written.
+    """
+
+    def __init__(self, header: bytes) -> None:
+        self.trouble, self.rows = "", 0
+        self._header = header
+        self._folder, self._manifest = Path(), ""
+        self._files: dict[str, _File] = {}
+        self._jobs = queue.SimpleQueue[_Job | None]()
+        self._given = self._done = 0  # bytes; each is counted by one thread alone
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="record", daemon=True)  # a dead disk may hold it
+        self._thread.start()
+
+    def hand_over(self, job: _Job) -> bool:
+        """Whether there is room for a job."""
+        size = sum(map(len, job.rows.values()))
+        if self._given - self._done + size > _MOST_WAITING:
+            return False
+        self._given += size
+        self._jobs.put(job)
+        return True
+
+    def close(self) -> None:
+        """Finish, if the disk lets us."""
+        self._ended.set()
+        self._jobs.put(None)
+        self._thread.join(_PATIENCE)
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            size = sum(map(len, job.rows.values()))
+            while not self._tried(job):
+                if self._ended.wait(_TRIED_AGAIN) and not self._tried(job):
+                    return
+            self._done += size
+            self.rows += job.number
+        self._close_files()
+
+    def _tried(self, job: _Job) -> bool:
+        """Write what is left of a job; whether all of it is written."""
+        trouble = ""
+        try:
+            if job.folder != self._folder:
+                self._close_files()
+                self._folder, self._manifest = job.folder, ""
+            elif not all(file.is_at(job.folder / name) for name, file in self._files.items()):
+                trouble = f"{job.folder} or a file in it had gone, and is begun anew"
+                for name in [name for name, file in self._files.items() if file.torn]:
+                    job.rows[name] = job.rows[name].partition(b"\n")[2]
+                self._close_files()
+            job.folder.mkdir(exist_ok=True)
+            for name in list(job.rows):
+                self._append(job, name)
+            if job.manifest != self._manifest or not (job.folder / _MANIFEST).exists():
+                write_file(job.folder / _MANIFEST, job.manifest)
+                self._manifest = job.manifest
+        except OSError as error:
+            self.trouble = f"{job.folder}: {error.strerror or error}"
+            return False
+        except FolderError as error:
+            self.trouble = str(error)
+            return False
+        self.trouble = trouble
+        return True
+
+    def _append(self, job: _Job, name: str) -> None:
+        """Write a file's rows; what a full disk took of them is not written twice."""
+        file = self._files.get(name)
+        if file is None:
+            file = self._files[name] = _File(job.folder / name)
+            if not os.fstat(file.descriptor).st_size:
+                job.rows[name] = self._header + job.rows[name]
+        while rows := job.rows[name]:
+            written = os.write(file.descriptor, rows)
+            job.rows[name], file.torn = rows[written:], rows[written - 1 : written] != b"\n"
+        del job.rows[name]
+
+    def _close_files(self) -> None:
+        for file in self._files.values():
+            os.close(file.descriptor)
+        self._files = {}
+
+
+def _file(sensor: str | None) -> str:
+    return _COMMANDS if sensor is None else f"{sensor}.csv"
+
+
+def _make(folder: Path) -> None:
+    """Make a folder.
+
+    Raises:
+        FolderError: It holds something, or cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise FolderError(f"{folder}: is not empty; a recording needs a folder of its own")
+    except OSError as error:
+        raise FolderError(f"{folder}: cannot be written: {error.strerror}") from None
+
+
+def _cell(value: object) -> str:
+    """A length [m] in mm, with the digits that bring the same float back."""
+    if not isinstance(value, float | int) or not math.isfinite(value):
+        return ""
+    mm = value * MM
+    short = f"{mm:.12g}"
+    if float(short) / MM == value:
+        return short
+    around = (mm, math.nextafter(mm, -math.inf), math.nextafter(mm, math.inf))
+    return repr(next((one for one in around if one / MM == value), mm))
