@@ -159,7 +159,7 @@ class Both:
 
     def __init__(self, config: pf.FusionConfig = TRACKED, rate: float | None = None, **options: float) -> None:
         self.said: list[str] = []
-        self.written = b""
+        self._written: list[bytes] = []
         self.live = pf.LiveEstimator(config, on_notice=self.said.append, **options)
         self.stream = Stream(self.live, self.keep, self.said.append, rate)
         self.lines = Lines()
@@ -173,7 +173,14 @@ class Both:
 
     def keep(self, lines: list[bytes]) -> None:
         assert all(line.endswith(b"\n") and line.count(b"\n") == 1 for line in lines)
-        self.written += b"".join(lines)
+        self._written += lines
+
+    def forget_written(self) -> None:
+        self._written = []
+
+    @property
+    def written(self) -> bytes:
+        return b"".join(self._written)
 
     @property
     def estimates(self) -> list[dict]:

@@ -132,7 +132,7 @@ def test_hundreds_of_thousands_of_broken_lines(rate: float | None) -> None:
             assert all(
                 math.isfinite(part) for axis in estimate.values() if isinstance(axis, dict) for part in axis.values()
             )
-        both.written = b""
+        both.forget_written()
     assert both.stream.bad > 50_000
     assert len(both.said) < 5000
     both.feed(lines(10.0, begin=100.0))

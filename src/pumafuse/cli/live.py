@@ -80,9 +80,9 @@ def run(source: str, options: Options) -> None:
         errors.print(text, markup=False, soft_wrap=True)
 
     remote = network.source(address, options.listen, options.allow, say) if address.kind in NETWORK else None
-    out = network.Out(options.out) if options.out else None
-    _warm_up(config, options)
     with contextlib.ExitStack() as stack:
+        out = stack.enter_context(contextlib.closing(network.Out(options.out))) if options.out else None
+        _warm_up(config, options)
         recorder = Recorder(options.record, config, start, say) if options.record else None
         live = LiveEstimator(
             config,
@@ -147,13 +147,14 @@ def _warm_up(config: FusionConfig, options: Options) -> None:
 
 
 async def _listen(remote: network.Source, follower: _Follower, ended: list[int]) -> None:
-    """Feed what comes from the network until a signal ends it."""
+    """Feed what comes from the network until a signal ends it, and what has come until then."""
     await remote.start()
     try:
         while not ended:
             follower.take(await remote.get())
     finally:
-        await remote.stop()
+        left = await remote.stop()
+    follower.take(left)
 
 
 class _Follower:

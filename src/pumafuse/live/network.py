@@ -51,8 +51,8 @@ class Source(Protocol):
         """The next lines; none after a tenth of a second without any."""
         ...
 
-    async def stop(self) -> None:
-        """Be gone."""
+    async def stop(self) -> list[bytes]:
+        """Be gone; the lines that have come and were not given yet."""
         ...
 
     def told(self) -> str:
@@ -122,23 +122,29 @@ class Udp:
                 async with asyncio.timeout(QUIET):
                     await self._some.wait()
         self._tell_drops()
-        lines: list[bytes] = []
-        for _ in range(min(len(self._waiting), _MOST_AT_ONCE)):
-            datagram = self._waiting.popleft()
-            self._bytes -= len(datagram)
-            lines += datagram.split(b"\n")
-        return lines
+        return self._lines(_MOST_AT_ONCE)
 
-    async def stop(self) -> None:
+    async def stop(self) -> list[bytes]:
         """Close the socket."""
         asyncio.get_running_loop().remove_reader(self._socket)
+        self._empty()
         self._let_go = self._lost()
         self._socket.close()
+        return self._lines(_MOST_WAITING)
 
     def told(self) -> str:
         """How many came, and how many were lost or refused."""
         said = f"{self._name}: {self._came} datagrams, {self._lost()} lost"
         return f"{said}, {self._refused} refused" if self._refused else said
+
+    def _lines(self, most: int) -> list[bytes]:
+        """The lines of at most so many datagrams."""
+        lines: list[bytes] = []
+        for _ in range(min(len(self._waiting), most)):
+            datagram = self._waiting.popleft()
+            self._bytes -= len(datagram)
+            lines += datagram.split(b"\n")
+        return lines
 
     def _empty(self) -> None:
         """Take what has come out of the system's hands."""
@@ -197,6 +203,13 @@ class _Tcp:
         except TimeoutError:
             return []
 
+    def _left(self) -> list[bytes]:
+        """Lines that have come and were not given."""
+        lines: list[bytes] = []
+        while not self._pieces.empty():
+            lines += self._pieces.get_nowait()
+        return lines
+
     async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """All lines of a connection until it ends; a last line without its end counts."""
         _keep_alive(writer.get_extra_info("socket"))
@@ -232,12 +245,13 @@ class Server(_Tcp):
         self._name = f"tcp-listen://{shown(*self._server.sockets[0].getsockname()[:2])}"
         self._say(f"listening at {self._name}")
 
-    async def stop(self) -> None:
+    async def stop(self) -> list[bytes]:
         """Close all connections."""
         self._server.close()
         for task in self._open:
             task.cancel()
-        await asyncio.gather(*self._open, return_exceptions=True)
+        await asyncio.gather(*self._open)
+        return self._left()
 
     def told(self) -> str:
         """How many connections there were and are."""
@@ -260,6 +274,8 @@ class Server(_Tcp):
         self._open.add(task)
         try:
             await self._read(reader, writer)
+        except asyncio.CancelledError:  # at the end; asyncio would log a task that was cancelled
+            return
         finally:
             self._open.discard(task)
         self._log.say("gone", f"the connection from {peer} has ended")
@@ -278,10 +294,11 @@ class Client(_Tcp):
         """Begin to try."""
         self._task = asyncio.create_task(self._keep_connected())
 
-    async def stop(self) -> None:
+    async def stop(self) -> list[bytes]:
         """Close the connection."""
         self._task.cancel()
         await asyncio.gather(self._task, return_exceptions=True)
+        return self._left()
 
     def told(self) -> str:
         """How often the connection was made, and whether it is there."""
@@ -333,6 +350,10 @@ class Out:
                 self._socket.sendto(line, self._place)
             except OSError:  # no room, no way there, or too long: the next one may get through
                 self._lost += 1
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
 
     def told(self) -> str:
         """How many could not be sent; empty for none."""

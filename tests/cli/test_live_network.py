@@ -1,0 +1,369 @@
+"""`pumafuse live` over the network and with a record: the real executable, real sockets, real kills."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import select
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Generator
+from importlib.resources import as_file, files
+from pathlib import Path
+
+import pytest
+
+import pumafuse as pf
+from executable import EXECUTABLE, pumafuse
+from pumafuse.live.stream import Stream
+from streams import events_of, lines
+
+pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+LONGEST = 60.0  # s that anything here may take
+
+
+@pytest.fixture(scope="module")
+def data():
+    with as_file(files("pumafuse") / "data") as folder:
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def scan(data) -> list[bytes]:
+    """The shipped run's first seconds as lines, in the order of their stamps."""
+    found = []
+    for stamp, sensor, values in events_of(pf.Run.read(data / "scan1")):
+        if stamp < 4_000_000_000:
+            body = {axis: value * 1e3 for axis, value in values.items()}
+            found.append(json.dumps({"t_ns": stamp, **({"sensor": sensor, **body} if sensor else {"command": body})}))
+    return [line.encode() for line in found]
+
+
+def expected(data: Path, sent: list[bytes]) -> list[bytes]:
+    """What goes out when these lines come in."""
+    written: list[bytes] = []
+    config = pf.FusionConfig.load(data / "fusion.toml")
+    Stream(pf.LiveEstimator(config), written.extend, lambda _: None).take(sent)
+    return written
+
+
+class Live:
+    """A live process whose estimates come to a socket of ours."""
+
+    def __init__(self, source: str, config: Path, *options: str, out: bool = True) -> None:
+        self.estimates = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.estimates.bind(("127.0.0.1", 0))
+        self.estimates.settimeout(LONGEST)
+        self.estimates.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+        words = [str(EXECUTABLE), "live", source, "-c", str(config), *options]
+        words += ["--out", f"udp://127.0.0.1:{self.estimates.getsockname()[1]}"] if out else []
+        self.process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    def port(self) -> int:
+        assert self.process.stderr is not None
+        for said in self.process.stderr:
+            if "listening at" in said:
+                return int(said.rsplit(":", 1)[1])
+        raise AssertionError(self.process.wait())
+
+    def received(self, count: int) -> list[bytes]:
+        return [self.estimates.recv(65536) for _ in range(count)]
+
+    def memory(self) -> int:
+        """Resident memory [kB]."""
+        status = Path(f"/proc/{self.process.pid}/status").read_text()
+        return int(status.split("VmRSS:")[1].split()[0])
+
+    def end(self, number: int = signal.SIGTERM) -> str:
+        """Ask for an end; what was said."""
+        self.process.send_signal(number)
+        out, told = self.process.communicate(timeout=LONGEST)
+        assert self.process.returncode == 0, told
+        assert "Traceback" not in told
+        assert out == ""
+        return told
+
+
+@contextlib.contextmanager
+def live(source: str, config: Path, *options: str) -> Generator[Live]:
+    process = Live(source, config, *options)
+    try:
+        yield process
+    finally:
+        process.process.kill()
+        process.process.communicate()
+        process.estimates.close()
+
+
+def test_datagrams_in_and_out(data, scan) -> None:
+    """Each command's estimate comes back as a datagram at once, the very bytes that lines would have given."""
+    found = []
+    with live("udp://127.0.0.1:0", data / "fusion.toml") as process, socket.socket(type=socket.SOCK_DGRAM) as ours:
+        place = ("127.0.0.1", process.port())
+        for line in scan:
+            ours.sendto(line, place)
+            if b'"command"' in line:
+                found += process.received(1)
+        told = process.end()
+    assert found == expected(data, scan)
+    assert f"{len(scan)} datagrams, 0 lost" in told
+
+
+def test_twenty_thousand_rows_over_tcp(data) -> None:
+    """A connection that gives all it can: every row is taken in, every command answered."""
+    sent = lines(20_000 * 0.014)
+    with live("tcp-listen://127.0.0.1:0", data / "fusion.toml") as process:
+        with socket.create_connection(("127.0.0.1", process.port())) as connection:
+            connection.sendall(sent)
+        last = json.loads(sent.splitlines()[-2])["t"]
+        while json.loads(process.received(1)[0])["t"] < last:
+            pass
+        told = process.end()
+    assert "20000 lines, 0 of them bad; commands: 10000 fused; 10000 estimates" in told
+
+
+def test_a_server_that_is_connected_to(data, scan) -> None:
+    """Lines from a server, whose connection breaks off in between: it is made again, and no line is lost."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(LONGEST)
+        port = server.getsockname()[1]
+        with live(f"tcp://127.0.0.1:{port}", data / "fusion.toml") as process:
+            middle = len(scan) // 2
+            for part in (scan[:middle], scan[middle:]):
+                connection, _ = server.accept()
+                connection.sendall(b"\n".join(part) + b"\n")
+                connection.close()
+            want = expected(data, scan)
+            assert process.received(len(want)) == want
+            told = process.end()
+    assert "connections made: 2" in told
+    assert "the connection has ended; made again in 0.5 s" in told
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["udp://0.0.0.0:5005"], 1, "--listen 0.0.0.0 --allow CIDR"),
+        (["udp://:5005", "--listen", "0.0.0.0"], 2, "go together"),
+        (["udp://:5005", "--allow", "10.0.0.0/8"], 2, "go together"),
+        (["tcp://127.0.0.1:5005", "--listen", "0.0.0.0", "--allow", "10.0.0.0/8"], 1, "tcp-listen://HOST:PORT"),
+        (["udp://:5005", "--listen", "0.0.0.0", "--allow", "all"], 1, "expected a network"),
+        (["udp://127.0.0.1"], 1, "expected udp://HOST:PORT"),
+        (["stdin", "--out", "tcp://127.0.0.1:5005"], 1, "expected udp://HOST:PORT"),
+        (["stdin", "--out", "udp://no.such.host.invalid:5005"], 1, "no address of host"),
+        (["stdin", "--record", "/dev/null"], 1, "/dev/null"),
+        (["stdin", "--rerun", "paper"], 1, "paper"),
+    ],
+)
+def test_what_cannot_be_is_one_line(data, words: list[str], code: int, said: str) -> None:
+    """What, where, what to do."""
+    done = pumafuse("live", *words, "-c", data / "fusion.toml", code=code)
+    assert said in done.stderr
+    assert code == 2 or len(done.stderr.splitlines()) == 1
+
+
+def test_a_port_that_is_taken(data) -> None:
+    """Two processes cannot be one robot's."""
+    with socket.socket(type=socket.SOCK_DGRAM) as ours, socket.create_server(("127.0.0.1", 0)) as server:
+        ours.bind(("127.0.0.1", 0))
+        for kind, taken in (("udp", ours), ("tcp-listen", server)):
+            done = pumafuse("live", f"{kind}://127.0.0.1:{taken.getsockname()[1]}", "-c", data / "fusion.toml", code=1)
+            assert "cannot be listened at: " in done.stderr.splitlines()[-1]
+
+
+def test_elsewhere_only_who_is_allowed(data) -> None:
+    """Listening on all addresses is said; who is not named is not heard."""
+    options = ("--listen", "0.0.0.0", "--allow", "127.0.0.2/32")
+    with live("udp://:0", data / "fusion.toml", *options) as process:
+        port = process.port()
+        for host, radial in (("127.0.0.1", 1.0), ("127.0.0.2", 560.0)):
+            with socket.socket(type=socket.SOCK_DGRAM) as ours:
+                ours.bind((host, 0))
+                ours.sendto(b'{"t": 1.0, "command": {"radial": %f}}' % radial, ("127.0.0.1", port))
+        assert json.loads(process.received(1)[0])["radial"]["position_mm"] == 560.0
+        told = process.end()
+    assert "1 datagrams, 0 lost, 1 refused" in told
+
+
+def test_a_record_holds_what_came(data, scan, tmp_path) -> None:
+    """SIGTERM: everything that came is in the record, and the command line fuses it."""
+    with live("udp://127.0.0.1:0", data / "fusion.toml", "--record", str(tmp_path / "run")) as process:
+        place = ("127.0.0.1", process.port())
+        with socket.socket(type=socket.SOCK_DGRAM) as ours:
+            for line in scan:
+                ours.sendto(line, place)
+                if b'"command"' in line:
+                    process.received(1)
+        told = process.end()
+    assert f"{tmp_path / 'run'}: {len(scan)} rows recorded" in told
+    done = pumafuse("fuse", tmp_path / "run", "-c", data / "fusion.toml", "-o", tmp_path / "out")
+    assert "run" in done.stdout + done.stderr
+    found = pf.Run.read(tmp_path / "run")
+    assert len(found.command.stamp) + sum(len(source.stamp) for source in found.sensors.values()) == len(scan)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
+def test_estimates_go_on_when_the_disk_is_full(data, tmp_path) -> None:
+    """No file may grow beyond 16 KiB: said once, every estimate comes all the same, and what is there fuses."""
+    sent = lines(4000 * 0.014)
+    words = f"ulimit -f 16; exec {EXECUTABLE} live stdin -c {data / 'fusion.toml'} --record {tmp_path / 'run'}"
+    with subprocess.Popen(
+        ["bash", "-c", words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        for part in range(4):  # long enough for the recorder to see the disk refuse while rows still come
+            piece = b"".join(sent.splitlines(keepends=True)[part * 1000 : part * 1000 + 1000])
+            process.stdin.write(piece)
+            process.stdin.flush()
+            for _ in range(500):
+                assert process.stdout.readline()
+            time.sleep(0.7)
+        _, told = process.communicate(timeout=LONGEST)
+    assert process.returncode == 0
+    assert told.count(b"File too large") == 1
+    assert b"commands: 2000 fused; 2000 estimates" in told
+    found = pf.Run.read(tmp_path / "run")
+    pf.fuse(found, pf.FusionConfig.load(data / "fusion.toml"))
+    assert 500 < len(found.command.stamp) < 2000
+
+
+class Fed:
+    """A live process that gets lines of the time at which they are sent, and is killed."""
+
+    def __init__(self, data: Path, folder: Path) -> None:
+        self.folder, self.sent, self.killed = folder, list[tuple[float, int]](), 0.0
+        words = [str(EXECUTABLE), "live", "stdin", "-c", str(data / "fusion.toml"), "--record", str(folder)]
+        self.process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+
+    def feed(self, step: int) -> None:
+        stamp = time.time_ns()
+        body = {"command": {"radial": 560.0}} if step % 6 == 0 else {"sensor": "tracker", "radial": 560.0}
+        assert self.process.stdin is not None
+        os.write(self.process.stdin.fileno(), json.dumps({"t_ns": stamp, **body}).encode() + b"\n")
+        self.sent.append((time.monotonic(), stamp))
+
+    def drain(self) -> bool:
+        """Read what has come out; whether anything has."""
+        assert self.process.stdout is not None
+        descriptor, some = self.process.stdout.fileno(), False
+        while select.select([descriptor], [], [], 0.0)[0] and os.read(descriptor, 65536):
+            some = True
+        return some
+
+    def kill(self) -> None:
+        self.killed = time.monotonic()
+        self.process.kill()
+        self.process.communicate()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(20))
+def test_killed_at_any_moment(data, tmp_path, seed: int) -> None:
+    """A hundred kills at random moments: each record fuses, and lacks the last second at most."""
+    rng, config = random.Random(seed), pf.FusionConfig.load(data / "fusion.toml")
+    fed = [Fed(data, tmp_path / f"run{number}") for number in range(5)]
+    answered, step = set[int](), 0
+    while len(answered) < len(fed):
+        for number, one in enumerate(fed):
+            one.feed(step)
+            if one.drain():
+                answered.add(number)
+        step += 1
+        time.sleep(0.005)
+    due = {number: time.monotonic() + 0.6 + rng.uniform(0.0, 2.0) for number in range(len(fed))}
+    while due:
+        for number in list(due):
+            if time.monotonic() > due[number]:
+                fed[number].kill()
+                del due[number]
+            else:
+                fed[number].feed(step)
+                fed[number].drain()
+        step += 1
+        time.sleep(0.005)
+    for one in fed:
+        found = pf.Run.read(one.folder)
+        pf.fuse(found, config)
+        there = {stamp for source in (found.command, *found.sensors.values()) for stamp in source.stamp.tolist()}
+        first = int(found.command.stamp[0])
+        missing = [at for at, stamp in one.sent if stamp >= first and at < one.killed - 1.0 and stamp not in there]
+        assert missing == []
+
+
+def broken(rng: random.Random, good: bytes, other: bytes) -> bytes:
+    """A datagram with bytes changed, cut, doubled, or spliced with another."""
+    found = bytearray(good)
+    for _ in range(rng.randint(1, 4)):
+        at = rng.randrange(len(found) + 1)
+        match rng.randrange(6):
+            case 0:
+                found[at : at + 1] = rng.randbytes(1)
+            case 1:
+                del found[at : at + rng.randint(1, 10)]
+            case 2:
+                found[at:at] = rng.randbytes(rng.randint(1, 20))
+            case 3:
+                found[at:at] = rng.choice(
+                    (b"9" * 30, b"e308", b"-", b"[" * 50, b"{", b'"', b"null", b"NaN", b"\0", b"\n")
+                )
+            case 4:
+                found[at:] = other[at:]
+            case _:
+                found[at:at] = found[: rng.randrange(len(found) + 1)]
+    return bytes(found)
+
+
+def is_json(line: bytes) -> bool:
+    """Whether a line may be an event by the standard library's opinion, which is not ours."""
+    try:
+        return isinstance(json.loads(line), dict)
+    except (ValueError, RecursionError):
+        return False
+
+
+def attacked(data: Path, count: int) -> None:
+    """Send ``count`` mutated datagrams among good ones, and see that nothing but events moves an estimate."""
+    rng, written = random.Random(count), list[bytes]()
+    shadow = Stream(pf.LiveEstimator(pf.FusionConfig.load(data / "fusion.toml")), written.extend, lambda _: None)
+    garbage, least = 0, 0
+    with live("udp://127.0.0.1:0", data / "fusion.toml") as process, socket.socket(type=socket.SOCK_DGRAM) as ours:
+        place = ("127.0.0.1", process.port())
+        for piece in range(count // 100):
+            t = piece * 0.028
+            good = [
+                line.encode()
+                for line in (
+                    json.dumps(
+                        {"t": t, "sensor": "tracker", "radial": 560.0 + rng.gauss(0.0, 0.05), "vertical": -90.0}
+                    ),
+                    json.dumps({"t": t, "command": {"radial": 560.0, "vertical": -90.0}}),
+                )
+            ]
+            for _ in range(100):
+                datagram = broken(rng, rng.choice(good), rng.choice(good))
+                ours.sendto(datagram, place)
+                events = [line for line in datagram.split(b"\n") if is_json(line)]
+                shadow.take(events)
+                garbage += not events
+            for line in good:
+                ours.sendto(line, place)
+            shadow.take(good)
+            assert process.received(len(written)) == written
+            written.clear()
+            if piece == count // 500:
+                least = process.memory()
+        assert process.memory() < least + 4096, "memory grows"
+        told = process.end()
+    assert garbage > 0.5 * count
+    assert f"{count + 2 * (count // 100)} datagrams, 0 lost" in told
+
+
+@pytest.mark.long
+def test_a_million_broken_datagrams(data) -> None:
+    """No crash, no hang, no memory; every estimate is, to the last bit, what it would be without the garbage."""
+    attacked(data, 1_000_000)
