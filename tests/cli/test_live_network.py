@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import random
 import select
-import signal
 import socket
 import subprocess
 import time
-from collections.abc import Generator
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -19,11 +16,11 @@ import pytest
 
 import pumafuse as pf
 from executable import EXECUTABLE, pumafuse
+from listening import LONGEST, live
 from pumafuse.live.stream import Stream
 from streams import events_of, lines
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
-LONGEST = 60.0  # s that anything here may take
 
 
 @pytest.fixture(scope="module")
@@ -49,54 +46,6 @@ def expected(data: Path, sent: list[bytes]) -> list[bytes]:
     config = pf.FusionConfig.load(data / "fusion.toml")
     Stream(pf.LiveEstimator(config), written.extend, lambda _: None).take(sent)
     return written
-
-
-class Live:
-    """A live process whose estimates come to a socket of ours."""
-
-    def __init__(self, source: str, config: Path, *options: str, out: bool = True) -> None:
-        self.estimates = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.estimates.bind(("127.0.0.1", 0))
-        self.estimates.settimeout(LONGEST)
-        self.estimates.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
-        words = [str(EXECUTABLE), "live", source, "-c", str(config), *options]
-        words += ["--out", f"udp://127.0.0.1:{self.estimates.getsockname()[1]}"] if out else []
-        self.process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-    def port(self) -> int:
-        assert self.process.stderr is not None
-        for said in self.process.stderr:
-            if "listening at" in said:
-                return int(said.rsplit(":", 1)[1])
-        raise AssertionError(self.process.wait())
-
-    def received(self, count: int) -> list[bytes]:
-        return [self.estimates.recv(65536) for _ in range(count)]
-
-    def memory(self) -> int:
-        """Resident memory [kB]."""
-        status = Path(f"/proc/{self.process.pid}/status").read_text()
-        return int(status.split("VmRSS:")[1].split()[0])
-
-    def end(self, number: int = signal.SIGTERM) -> str:
-        """Ask for an end; what was said."""
-        self.process.send_signal(number)
-        out, told = self.process.communicate(timeout=LONGEST)
-        assert self.process.returncode == 0, told
-        assert "Traceback" not in told
-        assert out == ""
-        return told
-
-
-@contextlib.contextmanager
-def live(source: str, config: Path, *options: str) -> Generator[Live]:
-    process = Live(source, config, *options)
-    try:
-        yield process
-    finally:
-        process.process.kill()
-        process.process.communicate()
-        process.estimates.close()
 
 
 def test_datagrams_in_and_out(data, scan) -> None:
