@@ -23,7 +23,21 @@ else:
     # Kernels own no arrays, so nothing in them is counted (`_nrt`), and all calls between them vanish (`forceinline`):
     # together that is a factor of twenty. A division by zero gives an infinity, as in numpy.
     # A product and a sum stay two roundings: contracted to one, variances of extreme priors fall below 0.
-    compiled = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True, _nrt=False)
+    def _kept() -> bool:
+        """Whether there is a place on disk for what is compiled: a service without a home may have none."""
+        try:
+            numba.njit(cache=True)(_kept)
+        except RuntimeError:
+            return False
+        return True
+
+    _KEPT = _kept()
+    compiled = numba.njit(cache=_KEPT, nogil=True, error_model="numpy", forceinline=True, _nrt=False)
+    _HOW_OFTEN = (
+        "only this once (some 10 s)"
+        if _KEPT
+        else "at each start (some 30 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
+    )
 
     class _Announcer(event.Listener):
         """Says once in a process that kernels are compiled; those found on disk are no event."""
@@ -34,9 +48,7 @@ else:
             ours = event.data["dispatcher"].py_func.__module__.startswith(__package__)
             if ours and not self.said:
                 self.said = True
-                print(
-                    "compiling the filter for this machine, only this once (some 10 s) ...", file=sys.stderr, flush=True
-                )
+                print(f"compiling the filter for this machine, {_HOW_OFTEN} ...", file=sys.stderr, flush=True)
 
         def on_end(self, event: event.Event) -> None:
             """Nothing to say."""

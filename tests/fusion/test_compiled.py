@@ -28,3 +28,15 @@ def test_the_first_use_says_once_that_it_compiles_and_the_next_loads(tmp_path: P
     assert first.stderr.splitlines() == ["compiling the filter for this machine, only this once (some 10 s) ..."]
     assert second.stderr == ""
     assert first.stdout == second.stdout
+
+
+@pytest.mark.long
+def test_without_a_place_on_disk_it_compiles_all_the_same() -> None:
+    """A service without a home on files that it may not write: a word on what to do, and the result."""
+    nowhere = "from numba.core.caching import CacheImpl\nCacheImpl._locator_classes = []\n"
+    found, usual = (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=200)
+        for code in (nowhere + CODE, CODE)
+    )
+    assert "set NUMBA_CACHE_DIR to a folder" in found.stderr
+    assert found.stdout == usual.stdout
