@@ -8,7 +8,6 @@ All against seconds since the run's first command, positions in mm.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import rerun as rr
@@ -22,11 +21,8 @@ from ..runs.axes import in_axes
 from ..runs.frames import CARTESIAN
 from ..runs.run import Run
 from ..units import MM, seconds
-from . import style
+from . import looks, style
 
-Marker = Literal["Circle", "Cross"]
-
-_TIMELINE = "time"
 _OPENING_S = 4.0
 _PATH_POINTS = 20_000  # a 3D path needs no more, whatever the rate of the estimates
 
@@ -98,7 +94,7 @@ def _paths(stream: rr.RecordingStream, est: Estimates, run: Run) -> None:
     look = rr.Points3D.from_fields(colors=[style.rgb(style.REJECTED)], radii=[2.5])
     rr.log("path/tool", look, static=True, recording=stream)
     columns = rr.Points3D.columns(positions=position)
-    rr.send_columns("path/tool", [rr.TimeColumn(_TIMELINE, duration=est.time[::every])], columns, recording=stream)
+    rr.send_columns("path/tool", [rr.TimeColumn(looks.TIMELINE, duration=est.time[::every])], columns, recording=stream)
 
 
 def _strip(stream: rr.RecordingStream, path: str, coordinates: list[FloatArray], colour: str, radius: float) -> None:
@@ -110,44 +106,33 @@ def _strip(stream: rr.RecordingStream, path: str, coordinates: list[FloatArray],
 
 
 def _band(stream: rr.RecordingStream, path: str, time: FloatArray, upper: FloatArray, lower: FloatArray) -> None:
-    _line(stream, f"{path}/upper", time, upper, style.BAND, width=0.7, label="+2σ")
-    _line(stream, f"{path}/lower", time, lower, style.BAND, width=0.7, label="−2σ")
+    _series(stream, f"{path}/upper", looks.edge("+2σ"), time, upper)
+    _series(stream, f"{path}/lower", looks.edge("−2σ"), time, lower)
 
 
 def _line(
+    stream: rr.RecordingStream, path: str, time: FloatArray, value: FloatArray, colour: str, *, step: bool = False
+) -> None:
+    _series(stream, path, looks.line(colour, path.rpartition("/")[2], step=step), time, value)
+
+
+def _points(
     stream: rr.RecordingStream,
     path: str,
     time: FloatArray,
     value: FloatArray,
     colour: str,
-    *,
-    width: float = 1.5,
-    step: bool = False,
-    label: str | None = None,
+    marker: looks.Marker = "Circle",
 ) -> None:
-    label = path.rpartition("/")[2] if label is None else label
-    mode = "StepAfter" if step else "Linear"
-    look = rr.SeriesLines(colors=[style.rgb(colour)], widths=[width], names=label, interpolation_mode=mode)
-    _series(stream, path, look, time, value)
-
-
-def _points(
-    stream: rr.RecordingStream, path: str, time: FloatArray, value: FloatArray, colour: str, marker: Marker = "Circle"
-) -> None:
-    size, label = (3.0, "rejected") if marker == "Cross" else (1.2, path.rpartition("/")[2])
-    look = rr.SeriesPoints(colors=[style.rgb(colour)], marker_sizes=[size], names=label, markers=[marker])
-    _series(stream, path, look, time, value)
+    _series(stream, path, looks.points(colour, path.rpartition("/")[2], marker), time, value)
 
 
 def _series(
     stream: rr.RecordingStream, path: str, look: rr.SeriesLines | rr.SeriesPoints, time: FloatArray, value: FloatArray
 ) -> None:
-    there = np.isfinite(time) & np.isfinite(value)
-    if not there.any():
-        return
-    rr.log(path, look, static=True, recording=stream)
-    columns = rr.Scalars.columns(scalars=value[there] * MM)
-    rr.send_columns(path, [rr.TimeColumn(_TIMELINE, duration=time[there])], columns, recording=stream)
+    if (np.isfinite(time) & np.isfinite(value)).any():
+        rr.log(path, look, static=True, recording=stream)
+        looks.send(stream, path, time, value * MM)
 
 
 def _blueprint(est: Estimates) -> rrb.Blueprint:

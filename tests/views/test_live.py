@@ -1,0 +1,335 @@
+"""The live view: what its process draws into a real server, and that nothing which becomes of it holds up a stream."""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+import pumafuse as pf
+from pumafuse.live.wire import Event
+from pumafuse.views import live as live_view
+from pumafuse.views.live import LiveView
+from pumafuse.views.live_frames import Frame
+from pumafuse.views.live_viewer import _program
+
+AXES = ("tangential", "radial", "vertical")
+SENSORS = {
+    "tracker": pf.Sensor(sd=5e-5, latency=0.008),
+    "range": pf.Sensor(sd=3e-4, scale=-1.0, bias_sd=1.0, gate=0.0),
+}
+CONFIG = pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal"), sensors=SENSORS)
+LONGEST = 30.0  # s until a test gives up
+
+
+@pytest.fixture(autouse=True)
+def ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every test asks for ports of its own."""
+    monkeypatch.setattr(live_view, "PORT", free())
+    monkeypatch.setattr(live_view, "WEB_PORT", free())
+
+
+def free() -> int:
+    with socket.socket() as asked:
+        asked.bind(("127.0.0.1", 0))
+        return int(asked.getsockname()[1])
+
+
+def until(there: Callable[[], object]) -> None:
+    deadline = time.monotonic() + LONGEST
+    while not there():
+        assert time.monotonic() < deadline, "never happened"
+        time.sleep(0.02)
+
+
+class Driven:
+    """A live estimator with a view of it, fed with an arm that is told to stay, or to move."""
+
+    def __init__(self, mode: str, config: pf.FusionConfig = CONFIG) -> None:
+        self.said: list[str] = []
+        self.live = pf.LiveEstimator(config)
+        self.view = LiveView(mode, config, self.said.append)
+        self.step = 0
+
+    def event(self, event: Event) -> None:
+        feed = self.live.reading if event.sensor else self.live.command
+        self.view.event(event, feed(event.t, *([event.sensor] if event.sensor else []), **event.values))
+
+    def go(self, steps: int = 1) -> None:
+        """Some update periods: a command, a reading of each sensor, an estimate."""
+        for _ in range(steps):
+            t = 100.0 + 0.028 * self.step
+            self.event(Event(t, "", dict.fromkeys(AXES, 0.5)))
+            self.view.estimate(self.live.estimate(t))
+            self.event(Event(t + 0.010, "tracker", dict.fromkeys(AXES, 0.5 if self.step != 20 else 0.6)))
+            self.event(Event(t + 0.012, "range", {"radial": 0.8 - 0.5}))
+            self.view.tick(self.live.health)
+            self.step += 1
+
+    def rest(self) -> None:
+        self.view.tick(self.live.health)
+
+    def heard(self, words: str) -> bool:
+        self.rest()
+        return any(words in line for line in self.said)
+
+
+@pytest.fixture
+def recorder(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
+    """A server of Rerun that keeps what arrives in a file."""
+    path = tmp_path / "arrived.rrd"
+    server = start_recorder(path)
+    yield server, path
+    server.send_signal(signal.SIGCONT)
+    server.kill()
+    server.wait()
+
+
+def start_recorder(path: Path) -> subprocess.Popen[bytes]:
+    port = live_view.PORT
+    options = ["--bind", "127.0.0.1", "--port", str(port), "--save", str(path)]
+    quiet = {"CI": "1", "RUST_LOG": "off"}
+    server = subprocess.Popen([_program(), *options], env={**os.environ, **quiet}, stdout=subprocess.DEVNULL)
+    until(lambda: listens(port))
+    return server
+
+
+def listens(port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0):
+        return True
+    return False
+
+
+def series(path: Path, entity: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times [s] and values of an entity, as far as they have arrived."""
+    times, values = [np.empty(0)], [np.empty(0)]
+    with contextlib.suppress(Exception), warnings.catch_warnings():  # the file is being written, and has no end yet
+        warnings.simplefilter("ignore")
+        for chunk in RrdReader(str(path)).stream():
+            if chunk.entity_path == entity and not chunk.is_static:
+                batch = chunk.to_record_batch()
+                columns = dict(zip(batch.schema.names, batch.columns, strict=True))
+                moment = columns["time"].to_numpy(zero_copy_only=False).astype("m8[ns]")
+                times.append(moment / np.timedelta64(1, "s"))
+                values.append(columns["Scalars:scalars"].flatten().to_numpy())
+    return np.concatenate(times), np.concatenate(values)
+
+
+def children(pid: int) -> list[int]:
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            after = stat.read_text().rpartition(")")[2].split()
+            if int(after[1]) == pid and after[0] != "Z":
+                found.append(int(stat.parent.name))
+    return found
+
+
+def alive(pid: int) -> bool:
+    with contextlib.suppress(OSError):
+        return (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()[0] not in ("Z", "X")
+    return False
+
+
+def listening(pids: list[int]) -> set[str]:
+    """Addresses, in hexadecimal, that processes listen at."""
+    held = set()
+    for pid in pids:
+        for descriptor in (Path("/proc") / str(pid) / "fd").iterdir():
+            with contextlib.suppress(OSError):
+                held.add(str(descriptor.readlink()))
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in (Path("/proc/net") / table).read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == "0A" and f"socket:[{fields[9]}]" in held:
+                found.add(fields[1].partition(":")[0])
+    return found
+
+
+def test_the_view_needs_a_mode_that_exists() -> None:
+    """One line that names those there are."""
+    with pytest.raises(pf.ConfigError, match=r"^--rerun: no mode 'film'; there are: spawn, connect, web$"):
+        LiveView("film", CONFIG, print)
+
+
+def test_the_estimators_process_does_not_load_rerun() -> None:
+    """It is slow to load, and what draws is another process."""
+    code = "import sys, pumafuse.views.live; sys.exit(bool({'rerun', 'rerun_bindings'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_what_is_heard_and_said_arrives(recorder: tuple[subprocess.Popen[bytes], Path]) -> None:
+    """In mm, at seconds since the first event: commands, estimates, readings at their valid times, one rejected."""
+    driven, path = Driven("connect"), recorder[1]
+    until(lambda: driven.heard("drawing into the viewer"))
+    driven.go(60)
+    asked = driven.view._asked
+    until(lambda: driven.rest() or driven.view._asked > asked)
+    driven.view.close()
+    until(lambda: len(series(path, "/radial/estimate")[0]) == 60)
+    time_, value = series(path, "/radial/command")
+    assert np.allclose(time_, 0.028 * np.arange(60), atol=1e-6)
+    assert np.allclose(value, 500.0)
+    upper, lower = (series(path, f"/radial/estimate/{edge}")[1] for edge in ("upper", "lower"))
+    assert np.allclose((upper + lower) / 2.0, series(path, "/radial/estimate")[1])
+    half = 2e3 * driven.live.estimate(100.0 + 0.028 * 59)["radial"].position_sd
+    assert np.isclose((upper - lower)[-1] / 2.0, half, rtol=1e-6)
+    time_, value = series(path, "/vertical/tracker")
+    assert np.allclose(time_, np.delete(0.002 + 0.028 * np.arange(59), 20), atol=1e-6)
+    assert np.allclose(value, 500.0)
+    time_, value = series(path, "/vertical/tracker/rejected")
+    assert np.allclose(time_, 0.002 + 0.028 * 20, atol=1e-6)
+    assert np.all(value > 500.0) and np.all(value < 510.0)  # at the edge of the plot
+    assert np.allclose(series(path, "/radial/range")[1], 500.0, atol=0.5)
+    assert np.all(np.abs(series(path, "/residual/radial/range")[1]) < 0.5)
+    assert len(series(path, "/nis/tracker")[0])
+
+
+def test_more_than_a_plot_can_show_is_thinned_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame stays small however much comes between two; all that is missing is counted."""
+    driven = Driven("connect")
+    frames: list[Frame] = []
+    monkeypatch.setattr(driven.view, "_send", frames.append)
+    driven.event(Event(100.0, "", dict.fromkeys(AXES, 0.5)))
+    now = driven.live.estimate(100.0)
+    for _ in range(100_000):
+        driven.view.estimate(now)
+    monkeypatch.setattr(live_view, "_FRAME", 0.0)
+    driven.rest()
+    shown = len(frames[0].estimates["radial"].time)
+    assert 100 < shown <= 500
+    assert driven.view.left_out == 100_000 - shown
+    driven.view.close()
+
+
+def test_a_drawing_process_that_stalls_holds_nothing_up() -> None:
+    """Frames that do not fit into the pipe are left out and counted; the end is not waited for longer than 2 s."""
+    driven = Driven("connect")
+    child = driven.view._child
+    assert child is not None
+    os.kill(child.pid, signal.SIGSTOP)
+
+    def dropped() -> bool:
+        driven.go(20)
+        return driven.view.dropped > 3
+
+    until(dropped)
+    driven.view.close()
+    assert child.returncode == -signal.SIGKILL
+
+
+def test_a_drawing_process_that_dies_is_said_once() -> None:
+    """After that nothing more is gathered."""
+    driven = Driven("connect")
+    child = driven.view._child
+    assert child is not None
+    os.kill(child.pid, signal.SIGKILL)
+    until(lambda: driven.heard("the drawing process ended by itself (signal 9)"))
+    frames = driven.view.frames
+    driven.go(20)
+    driven.view.close()
+    assert sum("ended" in line for line in driven.said) == 1
+    assert driven.view.frames == frames
+
+
+def test_without_a_viewer_it_is_said_once_and_waited_for(tmp_path: Path) -> None:
+    """The first viewer that opens is drawn into, with what is new then."""
+    driven = Driven("connect")
+    until(lambda: driven.heard("no viewer listens at"))
+    driven.go(20)
+    server = start_recorder(tmp_path / "late.rrd")
+    try:
+        until(lambda: driven.heard("drawing into the viewer"))
+        until(lambda: (driven.go(5), len(series(tmp_path / "late.rrd", "/radial/estimate")[0]))[1])
+        driven.view.close()
+    finally:
+        server.kill()
+        server.wait()
+    assert sum("no viewer" in line for line in driven.said) == 1
+
+
+def test_the_page_is_for_this_machine_and_tells_nobody_else() -> None:
+    """Server and page listen on loopback; the page's policy lets the viewer speak with its server only."""
+    driven = Driven("web")
+    until(lambda: driven.heard("open http://127.0.0.1:"))
+    child = driven.view._child
+    assert child is not None
+    processes = [child.pid, *children(child.pid)]
+    assert len(processes) == 2
+    assert listening(processes) == {"0100007F"}
+    with socket.create_connection(("127.0.0.1", live_view.WEB_PORT)) as asked:
+        asked.sendall(b"GET / HTTP/1.0\r\n\r\n")
+        page = b"".join(iter(lambda: asked.recv(1 << 16), b"")).decode()
+    assert f"connect-src 'self' http://127.0.0.1:{live_view.PORT}\r\n" in page
+    assert "re_viewer.js" in page
+    environment = (Path("/proc") / str(processes[1]) / "environ").read_bytes().split(b"\0")
+    assert b"CI=1" in environment  # what Rerun sends no statistics with
+    driven.view.close()
+    until(lambda: not any(alive(process) for process in processes))
+
+
+def test_taken_ports_are_not_insisted_on() -> None:
+    """Two views at once: the second one finds other ports."""
+    with socket.create_server(("127.0.0.1", live_view.PORT)), socket.create_server(("127.0.0.1", live_view.WEB_PORT)):
+        driven = Driven("web")
+        until(lambda: driven.heard("open http://127.0.0.1:"))
+        assert f":{live_view.WEB_PORT}/" not in driven.said[0]
+        driven.view.close()
+
+
+def test_nothing_is_left_when_the_estimator_is_killed() -> None:
+    """Its end of the pipe closes, and with it all that was started."""
+    code = (
+        "import time, pumafuse as pf; from pumafuse.views import live as v\n"
+        f"v.PORT, v.WEB_PORT = {live_view.PORT}, {live_view.WEB_PORT}\n"
+        "view = v.LiveView('web', pf.FusionConfig(arm=pf.ArmModel.load('puma560-internal')), print)\n"
+        "while True: time.sleep(0.05); view.tick(lambda: pf.LiveEstimator(view_config).health())\n"
+    ).replace("view_config", "pf.FusionConfig(arm=pf.ArmModel.load('puma560-internal'))")
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL)
+    until(lambda: listens(live_view.WEB_PORT))
+    (child,) = children(parent.pid)
+    left = [child, *children(child)]
+    parent.kill()
+    parent.wait()
+    until(lambda: not any(alive(process) for process in left))
+
+
+@pytest.mark.long
+def test_a_viewer_that_stalls_is_left_alone_until_it_goes_on(recorder: tuple[subprocess.Popen[bytes], Path]) -> None:
+    """Nothing piles up in the drawing process meanwhile; later readings arrive after all."""
+    driven, (server, path) = Driven("connect"), recorder
+    child = driven.view._child
+    assert child is not None
+    until(lambda: driven.heard("drawing into the viewer"))
+    driven.go(20)
+    server.send_signal(signal.SIGSTOP)
+
+    def stalled() -> bool:
+        driven.go()
+        time.sleep(0.02)
+        return driven.heard("does not take what is drawn")
+
+    until(stalled)
+    resident = Path(f"/proc/{child.pid}/statm")
+    before = int(resident.read_text().split()[1])
+    deadline = time.monotonic() + 10.0
+    while time.monotonic() < deadline:
+        driven.go(5)
+        time.sleep(0.02)
+    assert int(resident.read_text().split()[1]) - before < 5_000  # pages
+    server.send_signal(signal.SIGCONT)
+    until(lambda: (driven.go(), time.sleep(0.02), driven.heard("the viewer draws again"))[2])
+    driven.go(5)
+    driven.view.close()
+    last = 0.028 * (driven.step - 1)
+    until(lambda: len(found := series(path, "/radial/command")[0]) and found.max() > last - 1e-6)
