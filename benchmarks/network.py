@@ -1,6 +1,6 @@
 """How fast estimates come back over the network: datagrams in and out on loopback, and lines over TCP.
 
-    python benchmarks/network.py [--seconds S] [--rows N] [-- further options of `pumafuse live`]
+    python benchmarks/network.py [--seconds S] [--rows N]
 
 Three axes, the shipped configuration: rows at 1 kHz and commands at 36 Hz as datagrams, an estimate for each command as
 a datagram; the time from sending a command to receiving its estimate. Then as many rows as go through a TCP connection.
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import select
 import signal
 import socket
@@ -35,9 +34,11 @@ def live(source: str, *options: str) -> Iterator[tuple[int, subprocess.Popen[str
     command += ["-c", str(DATA / "fusion.toml"), *options]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
-        said = process.stderr.readline()
+        said = ""
         while "listening at" not in said:
             said = process.stderr.readline()
+            if not said:
+                sys.exit(f"the live process ended with {process.wait()}")
         yield int(said.rsplit(":", 1)[1]), process
         process.send_signal(signal.SIGTERM)
         print("    " + process.stderr.read().replace("\n", "\n    ").rstrip())
@@ -53,12 +54,12 @@ def row(t_ns: int) -> bytes:
     return json.dumps({"t_ns": t_ns, "sensor": "tracker", **START}).encode()
 
 
-def latencies(seconds: float, *options: str) -> np.ndarray:
+def latencies(seconds: float) -> np.ndarray:
     """From each command's datagram to its estimate's [ms]."""
     ours = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     ours.bind(("127.0.0.1", 0))
     out = f"udp://127.0.0.1:{ours.getsockname()[1]}"
-    with live("udp://127.0.0.1:0", "--out", out, *options) as (port, _):
+    with live("udp://127.0.0.1:0", "--out", out) as (port, _):
         place, sent, found = ("127.0.0.1", port), {}, []
         begin, step = time.perf_counter(), 0
         while step < seconds * 1000 or (sent and time.perf_counter() - begin < seconds + 1.0):
@@ -82,7 +83,7 @@ def latencies(seconds: float, *options: str) -> np.ndarray:
     return np.array(found[20:])
 
 
-def through_tcp(rows: int, *options: str) -> float:
+def through_tcp(rows: int) -> float:
     """Rows a second that go through a connection."""
     lines = b"".join(
         (command(step * 1_000_000) + b"\n" if step % 28 == 0 else b"") + row(step * 1_000_000) + b"\n"
@@ -92,7 +93,7 @@ def through_tcp(rows: int, *options: str) -> float:
     ours = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     ours.bind(("127.0.0.1", 0))
     out = f"udp://127.0.0.1:{ours.getsockname()[1]}"
-    with live("tcp-listen://127.0.0.1:0", "--out", out, *options) as (port, _):
+    with live("tcp-listen://127.0.0.1:0", "--out", out) as (port, _):
         begin = time.perf_counter()
         with socket.create_connection(("127.0.0.1", port)) as connection:
             connection.sendall(lines + end)
@@ -106,14 +107,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=60.0, help="of datagrams")
     parser.add_argument("--rows", type=int, default=200_000, help="over TCP")
-    arguments, options = parser.parse_known_args()
-    options = [option for option in options if option != "--"]
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, os.sched_getaffinity(0))
-    found = latencies(arguments.seconds, *options)
+    arguments = parser.parse_args()
+    found = latencies(arguments.seconds)
     shown = ", ".join(f"{name} {np.percentile(found, share):.3f} ms" for name, share in (("50 %", 50), ("99 %", 99)))
     print(f"datagram in to estimate out: {shown}, most {found.max():.3f} ms ({len(found)} commands)")
-    print(f"over TCP: {through_tcp(arguments.rows, *options):,.0f} rows a second")
+    print(f"over TCP: {through_tcp(arguments.rows):,.0f} rows a second")
 
 
 if __name__ == "__main__":
