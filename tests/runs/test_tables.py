@@ -447,3 +447,27 @@ def test_errors_of_tables_are_run_errors_or_unknown_names(tmp_path: Path) -> Non
         tables.read(tmp_path / "absent.csv")
     with pytest.raises(UnknownNameError):
         csv(tmp_path, "t_s\n0\n").stamps("time_s")
+
+
+@given(cut=st.integers(0, 200), ends=st.sampled_from(["\n", "\r\n"]))
+def test_a_growing_file_read_at_any_moment(tmp_path_factory: pytest.TempPathFactory, cut: int, ends: str) -> None:
+    """Cut anywhere, a table that may be growing has whole rows only, and says so if a line was left out."""
+    rows = [(1000 + row, (569_700_001 + row) / 1e6) for row in range(12)]
+    text = ends.join(["t_ns,x_mm", *(f"{stamp},{x:.6f}" for stamp, x in rows)]) + ends
+    header, cut = text.index(ends) + len(ends), min(cut, len(text))
+    path = tmp_path_factory.mktemp("growing") / "log.csv"
+    path.write_bytes(text[: header + cut].encode())
+    table = tables.read(path, growing=True)
+    there = text[: header + cut].replace("\r\n", "\n").replace("\r", "\n")
+    whole = there.count("\n") - 1
+    assert table.stamps("t_ns")[0].tolist() == [stamp for stamp, _ in rows[:whole]]
+    np.testing.assert_array_equal(table.numbers("x_mm")[0], [x / 1e3 for _, x in rows[:whole]])
+    assert there.endswith("\n") != any("may be torn" in note for note in table.notes)
+
+
+def test_a_compressed_table_is_whole(tmp_path: Path) -> None:
+    """A gzip that was torn cannot be read at all; one that can has all it should."""
+    (tmp_path / "log.csv.gz").write_bytes(gzip.compress(b"t_ns,x_mm\n1,2\n3,4"))
+    table = tables.read(tmp_path / "log.csv.gz", growing=True)
+    assert table.rows == 2
+    assert table.notes == ()

@@ -192,9 +192,9 @@ def read(path: Path, *, growing: bool = False) -> Table:
     except ValueError:  # a null character in the path
         raise RunError(f"{str(path)!r}: no such file") from None
     if table.num_rows == 0:
-        if notes or path.is_dir():  # every line was left out: not the kind of table that it should be
-            raise RunError("; ".join([f"{path}: the table has no rows", *notes]))
-        notes = [f"{path.name}: the table has no rows"]
+        if path.is_dir():
+            raise RunError(f"{path}: the table has no rows")
+        notes = [f"{path.name}: the table has no rows", *notes]
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
         raise RunError(f"{path}: two columns are named '{repeated}'")
@@ -237,11 +237,13 @@ def _read_csv(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
     table = parsed(parse_options=pacsv.ParseOptions(invalid_row_handler=leave_out))
     lines = "1 line" if len(wrong) == 1 else f"{len(wrong)} lines"
     where = "" if wrong[0].number is None else f", first in line {wrong[0].number}"
-    return table, [
+    note = (
         f"{path.name}: {lines} left out: {wrong[0].actual_columns} cells where the header has"
-        f" {wrong[0].expected_columns}{where}",
-        *notes,
-    ]
+        f" {wrong[0].expected_columns}{where}"
+    )
+    if table.num_rows == 0:  # not the kind of table that it should be
+        raise RunError(f"{path}: the table has no rows; {note}")
+    return table, [note, *notes]
 
 
 def _without_torn_end(path: Path) -> tuple[pa.Buffer | None, list[str]]:
