@@ -117,11 +117,20 @@ def test_a_closed_input_and_a_full_output_are_one_line(data) -> None:
     for command, said in (
         (f"{EXECUTABLE} live stdin {arguments} <&-", "standard input: cannot be read"),
         (f"{EXECUTABLE} live replay:{data / 'scan1'}?speed=max {arguments} > /dev/full", "standard output"),
+        (f"{EXECUTABLE} live replay:{data / 'scan1'}?speed=max {arguments} >&-", "standard output is closed"),
     ):
         done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 1
         assert said in done.stderr
         assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("log", ["2> /dev/full", "2>&-"])
+def test_a_log_that_cannot_be_written_costs_no_estimate(data, log: str) -> None:
+    """A full partition of logs, or none."""
+    command = f"{EXECUTABLE} live 'replay:{data / 'scan1'}?speed=max' -c {data / 'fusion.toml'} {log}"
+    done = subprocess.run(["sh", "-c", command], stdout=subprocess.PIPE, text=True, timeout=60, check=True)
+    assert len(done.stdout.splitlines()) == 2143
 
 
 def test_wrong_options_are_usage(data) -> None:

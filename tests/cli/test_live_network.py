@@ -59,7 +59,7 @@ def test_datagrams_in_and_out(data, scan) -> None:
                 found += process.received(1)
         told = process.end()
     assert found == expected(data, scan)
-    assert f"{len(scan)} datagrams, 0 lost" in told
+    assert f"{len(scan)} datagrams taken in, 0 lost" in told
 
 
 def test_twenty_thousand_rows_over_tcp(data) -> None:
@@ -100,6 +100,7 @@ def test_a_server_that_is_connected_to(data, scan) -> None:
         (["udp://:5005", "--listen", "0.0.0.0"], 2, "go together"),
         (["udp://:5005", "--allow", "10.0.0.0/8"], 2, "go together"),
         (["tcp://127.0.0.1:5005", "--listen", "0.0.0.0", "--allow", "10.0.0.0/8"], 1, "tcp-listen://HOST:PORT"),
+        (["stdin", "--listen", "0.0.0.0", "--allow", "10.0.0.0/8"], 1, "tcp-listen://HOST:PORT"),
         (["udp://:5005", "--listen", "0.0.0.0", "--allow", "all"], 1, "expected a network"),
         (["udp://127.0.0.1"], 1, "expected udp://HOST:PORT"),
         (["stdin", "--out", "tcp://127.0.0.1:5005"], 1, "expected udp://HOST:PORT"),
@@ -135,7 +136,7 @@ def test_elsewhere_only_who_is_allowed(data) -> None:
                 ours.sendto(b'{"t": 1.0, "command": {"radial": %f}}' % radial, ("127.0.0.1", port))
         assert json.loads(process.received(1)[0])["radial"]["position_mm"] == 560.0
         told = process.end()
-    assert "1 datagrams, 0 lost, 1 refused" in told
+    assert "1 datagrams taken in, 0 lost, 1 refused" in told
 
 
 def test_a_record_holds_what_came(data, scan, tmp_path) -> None:
@@ -148,7 +149,7 @@ def test_a_record_holds_what_came(data, scan, tmp_path) -> None:
                 if b'"command"' in line:
                     process.received(1)
         told = process.end()
-    assert f"{tmp_path / 'run'}: {len(scan)} rows recorded" in told
+    assert f"{tmp_path / 'run'}: {len(scan)} rows written" in told
     done = pumafuse("fuse", tmp_path / "run", "-c", data / "fusion.toml", "-o", tmp_path / "out")
     assert "run" in done.stdout + done.stderr
     found = pf.Run.read(tmp_path / "run")
@@ -309,7 +310,7 @@ def attacked(data: Path, count: int) -> None:
         assert process.memory() < least + 4096, "memory grows"
         told = process.end()
     assert garbage > 0.5 * count
-    assert f"{count + 2 * (count // 100)} datagrams, 0 lost" in told
+    assert f"{count + 2 * (count // 100)} datagrams taken in, 0 lost" in told
 
 
 @pytest.mark.long

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 
 import msgspec
 import numpy as np
@@ -284,3 +286,23 @@ def test_commands_beyond_the_models_limits_are_said() -> None:
     assert [text.split(" ")[0] for text in said] == ["commanded", "commands", "commanded", "commands"]
     assert "0.5 m/s that the arm model is valid for" in said[0]
     assert "700 mm that the arm model is valid for" in said[1]
+
+
+def test_after_warming_up_nothing_is_left_to_compile() -> None:
+    """In a new process: every kernel that Python calls is ready, also those of a flood and of a clock set anew."""
+    code = """
+import pumafuse as pf
+from pumafuse.live import kernels
+arm, sensors = pf.ArmModel.load("puma560-internal"), {"tracker": pf.Sensor(sd=1e-4)}
+live = pf.LiveEstimator(pf.FusionConfig(arm=arm, sensors=sensors))
+live.warm_up()
+called = ("hear", "command", "ask", "forget", "count", "let_go", "compact")
+assert all(len(getattr(kernels, name).signatures) == 1 for name in called)
+for row in range(70_000):
+    live.reading(row, "tracker", radial=0.5) if row else live.command(0, radial=0.5)
+for stamp in (10**12, 2 * 10**12, 10**10, 10**10 + 1, 10**10 + 2):
+    live.command(stamp, radial=0.5)
+assert live.newest is not None
+assert all(len(getattr(kernels, name).signatures) == 1 for name in called)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=100)

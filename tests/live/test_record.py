@@ -156,6 +156,61 @@ def test_a_clock_set_anew_begins_another_record(tmp_path: Path) -> None:
     assert any("record.2" in text for text in recorded.said)
 
 
+def test_what_is_there_already_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock set anew while the next folder's name is taken, recording into the folder one is in: another number."""
+    (tmp_path / "record.2").mkdir()
+    (tmp_path / "record.2" / "commands.csv").write_text("mine")
+    (tmp_path / "record").mkdir()
+    monkeypatch.chdir(tmp_path / "record")
+    recorded = Recorded(Path())
+    recorded.go(100, begin=50_000 * T)
+    recorded.go(80)
+    recorded.close()
+    assert (tmp_path / "record.2" / "commands.csv").read_text() == "mine"
+    runs = [pf.Run.read(tmp_path / name) for name in ("record", "record.3")]
+    assert [len(run.command.stamp) for run in runs] == [100, 80]
+
+
+def test_an_axis_without_a_number_is_none_of_the_run(tmp_path: Path) -> None:
+    """Commands and readings whose other axis is always null: a run of one axis, which fuses."""
+    recorded = Recorded(tmp_path / "record")
+    recorded.live.reading(0, "tracker", radial=np.nan)
+    for step in range(50):
+        recorded.command(step * T, radial=0.57, vertical=np.nan)
+        recorded.live.reading(step * T + 10_000_000, "tracker", radial=0.57, vertical=np.nan)
+        recorded.live.reading(step * T + 10_000_001, "tracker", radial=np.nan)
+    recorded.close()
+    found = pf.Run.read(recorded.folder)
+    assert found.axes == ("radial",)
+    assert len(found.sensors["tracker"].stamp) == 100  # that it saw nothing is a row, too
+    pf.fuse(found, TRACKED)
+
+
+def test_a_header_is_written_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk that is full from the first byte on, and a folder removed before it has room again."""
+    monkeypatch.setattr(record, "_TRIED_AGAIN", 0.01)
+    recorded, write = Recorded(tmp_path / "record"), os.write
+
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    recorded.go(10)
+    recorded.tick_until(lambda: any("No space" in text for text in recorded.said))
+    shutil.rmtree(recorded.folder)
+    monkeypatch.setattr(os, "write", write)
+    recorded.tick_until(lambda: recorded.recorder._writer.rows == 20)
+    recorded.close()
+    assert (recorded.folder / "commands.csv").read_text().count("time_ns") == 1
+    assert pf.Run.read(recorded.folder).notes == ()
+
+
+def test_a_record_of_nothing_leaves_nothing(tmp_path: Path) -> None:
+    """A service that cannot start makes no folder at each try."""
+    Recorded(tmp_path / "record").close()
+    assert not (tmp_path / "record").exists()
+
+
 def test_rows_that_a_run_may_not_have_are_left_out_and_counted(tmp_path: Path) -> None:
     """A command 1.5 s behind its predecessors is fused live, but would be a new segment of a recorded run."""
     recorded = Recorded(tmp_path / "record")
@@ -258,7 +313,7 @@ def test_rows_beyond_what_may_wait_are_lost_and_counted(tmp_path: Path, monkeypa
     recorded.go(100, begin=10 * T)
     recorded.tick()
     recorded.close()
-    assert "20 rows recorded, 200 lost" in recorded.recorder.told()
+    assert "20 rows written, 200 lost" in recorded.recorder.told()
 
 
 def test_a_folder_that_goes_is_made_anew(tmp_path: Path) -> None:

@@ -9,8 +9,10 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -22,18 +24,17 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from ..errors import RunError
+from ..errors import ConfigError, RunError
 from ..fusion.config import FusionConfig
 from ..fusion.timeline import Outcome
 from ..live import network
-from ..live.address import NETWORK, Address
+from ..live.address import LISTENERS, NETWORK, Address
 from ..live.estimator import LiveEstimator
 from ..live.health import Health
 from ..live.record import Recorder
 from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream
 from ..live.wire import Event
-from ..runs.frames import CARTESIAN
 from ..runs.run import Run
 from ..units import MM
 
@@ -70,28 +71,29 @@ def run(source: str, options: Options) -> None:
         PumafuseError: The configuration, the source, the run or a folder is wrong.
     """
     address, config, start = Address.parse(source), FusionConfig.load(options.config), dict[str, float]()
+    if options.listen and address.kind not in LISTENERS:
+        raise ConfigError(f"--listen: goes with a source udp://HOST:PORT or tcp-listen://HOST:PORT, not {source}")
     recorded = Run.read(address.path) if address.kind == "replay" else None
     if recorded is not None:
         start = dict(recorded.start)
         config = msgspec.structs.replace(config, frame=recorded.frame or config.frame)
-    errors = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else 120)
+    errors = _log()
 
     def say(text: str) -> None:
-        errors.print(text, markup=False, soft_wrap=True)
+        with contextlib.suppress(OSError):  # a log that is full costs the log, not the estimates
+            errors.print(text, markup=False, soft_wrap=True)
 
     remote = network.source(address, options.listen, options.allow, say) if address.kind in NETWORK else None
     with contextlib.ExitStack() as stack:
+        ended = stack.enter_context(_ended_by_signals())
         out = stack.enter_context(contextlib.closing(network.Out(options.out))) if options.out else None
-        _warm_up(config, options)
-        recorder = Recorder(options.record, config, start, say) if options.record else None
-        live = LiveEstimator(
-            config,
-            window=options.window,
-            stale_after=options.stale_after,
-            start=start,
-            on_notice=say,
-            journal=recorder,
+        estimator = partial(
+            LiveEstimator, config, window=options.window, stale_after=options.stale_after, start=start, on_notice=say
         )
+        estimator().warm_up()  # before anything is made or listens: meanwhile datagrams would be lost
+        gc.freeze()  # what is here stays: looking through it again and again would take longer than an estimate may
+        recorder = Recorder(options.record, config, start, say) if options.record else None
+        live = estimator(journal=recorder)
         if recorder is not None:
             stack.callback(lambda: recorder.close(live.sure))
         view = None
@@ -100,15 +102,13 @@ def run(source: str, options: Options) -> None:
 
             view = LiveView(options.rerun, config, say)
             stack.callback(view.close)
-        hidden = options.status and sys.stdout.isatty()  # the screen and the lines would write over each other
-        write = out or (_to_nobody if hidden else _to_standard_output)
-        stream = Stream(live, write, say, options.rate, [] if view is None else [view])
-        ended = stack.enter_context(_ended_by_signals())
+        stream = Stream(live, _way_out(out, options.status), say, options.rate, [] if view is None else [view])
         parts = [part for part in (remote, recorder, out) if part is not None]
         screen = stack.enter_context(_screen(errors, options.status))
         follower = _Follower(stream, parts, address.speed, recorder, view, screen)
         if remote is not None:
             with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:  # Windows' own reads no datagrams
+                runner.get_loop().set_exception_handler(lambda _, context: say(f"network: {context['message']}"))
                 runner.run(_listen(remote, follower, ended))
         else:
             for items in standard_input() if recorded is None else replayed(recorded, config, address.speed):
@@ -116,7 +116,24 @@ def run(source: str, options: Options) -> None:
                 if ended:
                     break
         stream.end()
-    summarise(stream, parts, errors)
+    with contextlib.suppress(OSError):
+        summarise(stream, parts, errors)
+
+
+def _log() -> Console:
+    """Standard error, or nothing where it is closed."""
+    there = sys.stderr is not None  # pyright: ignore[reportUnnecessaryComparison]
+    file = sys.stderr if there else StringIO()
+    return Console(file=file, highlight=False, width=None if file.isatty() else 120)
+
+
+def _way_out(out: network.Out | None, status: bool) -> Callable[[list[bytes]], None]:
+    """Where estimates go: not on the screen that shows the status, as both would write over each other."""
+    if out is not None:
+        return out
+    if sys.stdout is None:  # pyright: ignore[reportUnnecessaryComparison]
+        raise RunError("standard output is closed; send the estimates elsewhere with --out udp://HOST:PORT")
+    return _to_nobody if status and sys.stdout.isatty() else _to_standard_output
 
 
 def _to_nobody(_: list[bytes]) -> None:
@@ -132,18 +149,6 @@ def _to_standard_output(lines: list[bytes]) -> None:
     except OSError as error:
         sys.stdout = None  # what is left in its buffer would be tried once more at exit
         raise RunError(f"standard output: cannot be written: {error.strerror}") from None
-
-
-def _warm_up(config: FusionConfig, options: Options) -> None:
-    """Have the kernels in memory before the first event: while they load, datagrams would be lost."""
-    live = LiveEstimator(config, window=options.window, stale_after=options.stale_after)
-    position = dict.fromkeys((*live.axes, *(CARTESIAN if config.frame is not None else ())), 1.0)
-    live.command(0, **position)
-    for sensor in config.sensors:
-        live.reading(0, sensor, **position)
-    live.estimate()
-    live.health()
-    gc.freeze()  # what is here stays: looking through it again and again would take longer than an estimate may
 
 
 async def _listen(remote: network.Source, follower: _Follower, ended: list[int]) -> None:

@@ -326,7 +326,7 @@ def live(
     """
     from . import live as command
 
-    if (listen is None) != (not allow):
+    if bool(listen) != bool(allow) or listen == "":
         raise typer.BadParameter("--listen ADDR and --allow CIDR go together", param_hint="--listen")
     options = command.Options(
         config=config,

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 from ..errors import ConfigError
 
-Socket: TypeAlias = tuple[socket.AddressFamily, tuple[str, int]]
+Place: TypeAlias = tuple[socket.AddressFamily, tuple[str, int]]
 
 LISTENERS = ("udp", "tcp-listen")
 NETWORK = (*LISTENERS, "tcp")
@@ -66,7 +66,7 @@ def shown(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-def receiver(text: str) -> Socket:
+def receiver(text: str) -> Place:
     """Where ``udp://HOST:PORT`` is, to send to.
 
     Raises:
@@ -80,7 +80,7 @@ def receiver(text: str) -> Socket:
     return resolved(address.host, address.port, f"--out '{text}'")
 
 
-def bound(address: Address, listen: str | None, allow: Sequence[str]) -> tuple[Socket, Callable[[str], bool]]:
+def bound(address: Address, listen: str | None, allow: Sequence[str]) -> tuple[Place, Callable[[str], bool]]:
     """Where a listener is to be, and who may be heard there: on loopback everybody, elsewhere only who is allowed.
 
     Args:
@@ -114,7 +114,7 @@ def bound(address: Address, listen: str | None, allow: Sequence[str]) -> tuple[S
     return (family, place), allowed
 
 
-def resolved(host: str, port: int, where: str) -> Socket:
+def resolved(host: str, port: int, where: str) -> Place:
     """The first address of a host.
 
     Raises:

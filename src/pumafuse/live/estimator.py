@@ -200,6 +200,17 @@ class LiveEstimator:
         self._start, self._before = dict(start or {}), None
         self._begin(None)
 
+    def warm_up(self) -> None:
+        """Compile or load now what else takes a second, the first time half a minute, when it is first needed."""
+        other = LiveEstimator(self.config)
+        place = dict.fromkeys((*self.axes, *(CARTESIAN if self.config.frame is not None else ())), 1.0)
+        other.command(0, **place)
+        for sensor in self.config.sensors:
+            other.reading(0, sensor, **place)
+        other.estimate()
+        other.health()
+        other._window.rehearse()
+
     def command(self, t: Time, /, **axes: float) -> Told:
         """The arm is told to go to a position [m] on each of ``axes``.
 

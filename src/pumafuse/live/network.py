@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import socket
 import struct
 import sys
@@ -16,8 +17,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
-from ..errors import ConfigError, RunError
-from .address import LISTENERS, Address, Socket, bound, receiver, shown
+from ..errors import RunError
+from .address import Address, Place, bound, receiver, shown
 from .lines import Lines
 from .sampler import Sampler
 from .sources import QUIET
@@ -28,7 +29,7 @@ _MOST_BYTES = 16 << 20  # of waiting datagrams
 _MOST_AT_ONCE = 64  # datagrams taken in before the socket is emptied again: about a ms of work
 _ROOM = 8 << 20  # bytes that the system is asked to keep for a socket; it may give less
 _SO_MEMINFO, _DROPS = 55, 8  # Linux: a socket's counters, and which of them counts what found no room
-_MOST_CONNECTIONS = 64
+_MOST_CONNECTIONS = 256
 _MOST_PIECES = 16
 _FIRST_WAIT, _LONGEST_WAIT = 0.5, 30.0  # s until a connection is tried again
 _PATIENCE = 10.0  # s for a connection to be made
@@ -72,8 +73,6 @@ def source(address: Address, listen: str | None, allow: list[str], say: Callable
     Raises:
         ConfigError: The address may not be listened on.
     """
-    if listen is not None and address.kind not in LISTENERS:
-        raise ConfigError(f"--listen: goes with a source udp://HOST:PORT or tcp-listen://HOST:PORT, not {address.text}")
     if address.kind == "tcp":
         return Client(address, say)
     place, allowed = bound(address, listen, allow)
@@ -88,12 +87,12 @@ def source(address: Address, listen: str | None, allow: list[str], say: Callable
 class Udp:
     """Datagrams of one or more lines."""
 
-    def __init__(self, place: Socket, allowed: Allowed, say: Callable[[str], None]) -> None:
+    def __init__(self, place: Place, allowed: Allowed, say: Callable[[str], None]) -> None:
         """Not open yet."""
         self._place, self._allowed, self._say, self._log = place, allowed, say, Sampler(say)
         self._waiting, self._bytes = deque[bytes](), 0
         self._some = asyncio.Event()
-        self._came = self._let_go = self._refused = self._told = 0
+        self._came = self._let_go = self._dropped = self._refused = self._told = 0
         self._next_look = 0.0
 
     async def start(self) -> None:
@@ -128,13 +127,13 @@ class Udp:
         """Close the socket."""
         asyncio.get_running_loop().remove_reader(self._socket)
         self._empty()
-        self._let_go = self._lost()
+        self._lost()  # for the last time
         self._socket.close()
         return self._lines(_MOST_WAITING)
 
     def told(self) -> str:
         """How many came, and how many were lost or refused."""
-        said = f"{self._name}: {self._came} datagrams, {self._lost()} lost"
+        said = f"{self._name}: {self._came - self._let_go} datagrams taken in, {self._lost()} lost"
         return f"{said}, {self._refused} refused" if self._refused else said
 
     def _lines(self, most: int) -> list[bytes]:
@@ -167,13 +166,11 @@ class Udp:
 
     def _lost(self) -> int:
         """How many datagrams found no room, here or in the system."""
-        if sys.platform != "linux" or self._socket.fileno() < 0:
-            return self._let_go
-        try:
-            counters = struct.unpack("=9I", self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 36))
-        except OSError:
-            return self._let_go
-        return self._let_go + counters[_DROPS]
+        if sys.platform == "linux" and self._socket.fileno() >= 0:
+            with contextlib.suppress(OSError):
+                counters = struct.unpack("=9I", self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 36))
+                self._dropped = counters[_DROPS]
+        return self._let_go + self._dropped
 
     def _tell_drops(self) -> None:
         """Say now and then that datagrams are lost."""
@@ -210,24 +207,28 @@ class _Tcp:
             lines += self._pieces.get_nowait()
         return lines
 
-    async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """All lines of a connection until it ends; a last line without its end counts."""
-        _keep_alive(writer.get_extra_info("socket"))
-        lines = Lines()
+    async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+        """All lines of a connection until it ends, a last one without its end, too; whether there was anything."""
+        lines, some = Lines(), False
         try:
+            _keep_alive(writer.get_extra_info("socket"))
             while piece := await reader.read(_LARGEST):
-                await self._pieces.put(lines.cut(piece))
+                some = True
+                if whole := lines.cut(piece):
+                    await self._pieces.put(whole)
         except OSError:
             pass
         finally:
             writer.close()
-        await self._pieces.put(lines.rest())
+        if rest := lines.rest():
+            await self._pieces.put(rest)
+        return some
 
 
 class Server(_Tcp):
     """Lines from all who connect."""
 
-    def __init__(self, place: Socket, allowed: Allowed, say: Callable[[str], None]) -> None:
+    def __init__(self, place: Place, allowed: Allowed, say: Callable[[str], None]) -> None:
         """Not open yet."""
         super().__init__(say)
         self._place, self._allowed = place, allowed
@@ -313,17 +314,17 @@ class Client(_Tcp):
                         self._address.host, self._address.port, limit=_LARGEST
                     )
             except (OSError, UnicodeError) as error:  # a TimeoutError is an OSError
-                reason = (error.strerror if isinstance(error, OSError) else None) or "no answer"
+                reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else "no answer"
+                reason = error.strerror or reason if isinstance(error, socket.gaierror) else reason
                 self._log.say("unreachable", f"{self._name}: cannot be reached: {reason}; tried again in {wait:g} s")
                 await asyncio.sleep(wait)
                 wait = min(2.0 * wait, _LONGEST_WAIT)
                 continue
-            self._made, self._connected, begin = self._made + 1, True, time.monotonic()
+            self._made, self._connected = self._made + 1, True
             self._log.say("connected", f"{self._name}: connected")
-            await self._read(reader, writer)
-            self._connected = False
-            if time.monotonic() - begin > _LONGEST_WAIT:
+            if await self._read(reader, writer):
                 wait = _FIRST_WAIT
+            self._connected = False
             self._log.say("ended", f"{self._name}: the connection has ended; made again in {wait:g} s")
             await asyncio.sleep(wait)
             wait = min(2.0 * wait, _LONGEST_WAIT)

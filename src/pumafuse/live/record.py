@@ -13,6 +13,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Container, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,7 +84,7 @@ class Recorder:
         framed = CARTESIAN if config.frame is not None else ()
         self._columns = tuple(dict.fromkeys((*axes, *framed)))
         self._frame, self._start, self._say = config.frame, dict(start), say
-        self._first, self._folder = folder, folder
+        self._first = self._folder = folder = folder.absolute()
         self.late = self.lost = self._given = 0
         self._segment = 1
         _make(folder)
@@ -95,10 +96,11 @@ class Recorder:
         """What comes is on another clock: write what was before, and begin a new run if there was a command."""
         if self._commanded:
             self._flush(self._pending)
-            self._segment += 1
-            self._folder = self._first.with_name(f"{self._first.name}.{self._segment}")
+            while self._folder.exists():
+                self._segment += 1
+                self._folder = self._first.with_name(f"{self._first.name}.{self._segment}")
             self._start = {}
-            self._say(f"record: goes on in {self._folder}")
+            self._say(f"record: another clock, so it goes on in {self._folder}")
         self._clear()
 
     def taken(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> None:
@@ -109,16 +111,17 @@ class Recorder:
             sensor: None for a command.
             values: By axis [m].
         """
-        given = [axis for axis in self._columns if axis in values]
-        if not given:
+        cells = {axis: _cell(values[axis]) for axis in self._columns if axis in values}
+        given = [axis for axis, cell in cells.items() if cell]
+        if not given and (not cells or sensor not in self._seen):  # nothing, before there was anything
             return
         self._seen.setdefault(sensor, set()).update(given)
         if sensor is None and not self._commanded:
             self._commanded, self._due = True, 0.0
         elif not self._commanded and len(self._pending) >= _MOST_BEFORE:
             del self._pending[: _MOST_BEFORE // 2]
-        cells = ",".join([_cell(values[axis]) if axis in values else "" for axis in self._columns])
-        self._pending.append(_Row(stamp, sensor, f"{stamp},{cells}\n".encode()))
+        line = ",".join([cells.get(axis, "") for axis in self._columns])
+        self._pending.append(_Row(stamp, sensor, f"{stamp},{line}\n".encode()))
 
     def forget(self, after: int) -> None:
         """What is stamped after ``after`` [ns] was wrong."""
@@ -140,6 +143,10 @@ class Recorder:
         """Write what is left; a disk that does not take it within five seconds does not get it."""
         self._flush_until(sure)
         self._writer.close()
+        self.lost += self._given - self._writer.rows
+        self._given = self._writer.rows
+        with suppress(OSError):  # nothing ever came
+            self._first.rmdir()
 
     def told(self) -> str:
         """What was recorded, in a sentence."""
@@ -157,8 +164,8 @@ class Recorder:
 
     def _state(self) -> str:
         written = self._writer.rows
-        said = [f"{written} rows recorded"]
-        said += [f"{self._given - written} wait"] if self._writer.trouble else []
+        said = [f"{written} rows written"]
+        said += [f"{self._given - written} wait"] if self._writer.trouble and self._given > written else []
         said += [f"{self.late} left out, more than 1 s behind their source's newest"] if self.late else []
         said += [f"{self.lost} lost"] if self.lost else []
         return ", ".join(said)
@@ -312,7 +319,7 @@ class _Writer:
         file = self._files.get(name)
         if file is None:
             file = self._files[name] = _File(job.folder / name)
-            if not os.fstat(file.descriptor).st_size:
+            if not os.fstat(file.descriptor).st_size and not job.rows[name].startswith(self._header):
                 job.rows[name] = self._header + job.rows[name]
         while rows := job.rows[name]:
             written = os.write(file.descriptor, rows)

@@ -111,6 +111,12 @@ class Window:
         kernels.forget(self._flat, after)
         self._resume(oldest)
 
+    def rehearse(self) -> None:
+        """Have every kernel compiled and in memory; on a window that nobody needs."""
+        self.forget(0, 0)
+        self.tally()
+        self._give_up(0)
+
     def tally(self) -> Tally:
         """What there was of each sensor until now, with what is still in the window."""
         now = self.memory.tally
