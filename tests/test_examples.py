@@ -8,7 +8,6 @@ import math
 import shutil
 import subprocess
 import sys
-from importlib.resources import as_file, files
 from pathlib import Path
 
 import pytest
@@ -29,7 +28,7 @@ def test_commands_and_readings_are_fused(tmp_path: Path, language: str) -> None:
         for name in ("commands", "readings"):
             flags = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-o", str(tmp_path / name)]
             subprocess.run([compiler, *flags, str(EXAMPLES / f"{name}.c"), "-lm"], check=True)
-    with as_file(files("pumafuse") / "data") as data, live("udp://127.0.0.1:0", data / "fusion.toml") as process:
+    with live("udp://127.0.0.1:0", EXAMPLES / "fusion.toml") as process:
         where = ["127.0.0.1", str(process.port()), SECONDS]
         words = [
             [str(tmp_path / name), *where]
