@@ -128,7 +128,7 @@ def test_what_the_estimator_does_not_believe_is_not_recorded(tmp_path: Path) -> 
     """A command half an hour ahead that is taken back, stamps of another year, and unknown names leave no row."""
     recorded = Recorded(tmp_path / "record")
     recorded.go(100)
-    recorded.command(1800 * 10**9, radial=0.6)
+    recorded.command(1800 * 10**9, radial=0.6, vertical=0.1)
     recorded.tick()  # it is in doubt, and waits
     recorded.live.reading(10**18, "tracker", radial=0.57)
     recorded.live.reading(100 * T, "lidar", radial=0.57)
@@ -137,6 +137,7 @@ def test_what_the_estimator_does_not_believe_is_not_recorded(tmp_path: Path) -> 
     recorded.close()
     found = pf.Run.read(recorded.folder)
     assert found.command.stamp.tolist() == [step * T for step in range(200)]
+    assert found.axes == ("radial",)
     assert found.sensors["tracker"].stamp.max() < 200 * T
     assert any("taken back" in text for text in recorded.said)
 

@@ -38,6 +38,7 @@ _COMMANDS, _MANIFEST, _TIME = "commands.csv", "run.toml", "time_ns"
 class _Row(NamedTuple):
     stamp: int
     sensor: str | None
+    given: list[str]
     line: bytes
 
 
@@ -96,9 +97,7 @@ class Recorder:
         """What comes is on another clock: write what was before, and begin a new run if there was a command."""
         if self._commanded:
             self._flush(self._pending)
-            while self._folder.exists():
-                self._segment += 1
-                self._folder = self._first.with_name(f"{self._first.name}.{self._segment}")
+            self._folder = self._next_folder()
             self._start = {}
             self._say(f"record: another clock, so it goes on in {self._folder}")
         self._clear()
@@ -112,16 +111,15 @@ class Recorder:
             values: By axis [m].
         """
         cells = {axis: _cell(values[axis]) for axis in self._columns if axis in values}
-        given = [axis for axis, cell in cells.items() if cell]
-        if not given and (not cells or sensor not in self._seen):  # nothing, before there was anything
+        if not cells:
             return
-        self._seen.setdefault(sensor, set()).update(given)
-        if sensor is None and not self._commanded:
+        given = [axis for axis, cell in cells.items() if cell]
+        if sensor is None and given and not self._commanded:
             self._commanded, self._due = True, 0.0
         elif not self._commanded and len(self._pending) >= _MOST_BEFORE:
             del self._pending[: _MOST_BEFORE // 2]
         line = ",".join([cells.get(axis, "") for axis in self._columns])
-        self._pending.append(_Row(stamp, sensor, f"{stamp},{line}\n".encode()))
+        self._pending.append(_Row(stamp, sensor, given, f"{stamp},{line}\n".encode()))
 
     def forget(self, after: int) -> None:
         """What is stamped after ``after`` [ns] was wrong."""
@@ -170,6 +168,14 @@ class Recorder:
         said += [f"{self.lost} lost"] if self.lost else []
         return ", ".join(said)
 
+    def _next_folder(self) -> Path:
+        """The first of the numbered ones that is not there."""
+        while True:
+            self._segment += 1
+            folder = self._first.with_name(f"{self._first.name}.{self._segment}")
+            if not folder.exists():
+                return folder
+
     def _clear(self) -> None:
         """Nothing of this run yet."""
         self._pending: list[_Row] = []
@@ -193,7 +199,10 @@ class Recorder:
             if row.stamp < newest - TOLERATED_STEP_BACK_NS:
                 self.late += 1
                 continue
+            if not row.given and row.sensor not in self._seen:  # of no axis yet
+                continue
             self._newest[row.sensor] = max(newest, row.stamp)
+            self._seen.setdefault(row.sensor, set()).update(row.given)
             by_source.setdefault(row.sensor, []).append(row.line)
         listed = self._listed | by_source.keys()
         number = sum(map(len, by_source.values()))
