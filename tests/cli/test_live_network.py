@@ -156,6 +156,7 @@ def test_a_record_holds_what_came(data, scan, tmp_path) -> None:
     assert len(found.command.stamp) + sum(len(source.stamp) for source in found.sensors.values()) == len(scan)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
 def test_estimates_go_on_when_the_disk_is_full(data, tmp_path) -> None:
     """No file may grow beyond 16 KiB: said once, every estimate comes all the same, and what is there fuses."""

@@ -212,6 +212,7 @@ def test_more_than_a_plot_can_show_is_thinned_out_and_counted(monkeypatch: pytes
     driven.view.close()
 
 
+@pytest.mark.long
 def test_a_drawing_process_that_stalls_holds_nothing_up() -> None:
     """Frames that do not fit into the pipe are left out and counted; the end is not waited for longer than 2 s."""
     driven = Driven("connect")
