@@ -134,11 +134,13 @@ def test_what_the_estimator_does_not_believe_is_not_recorded(tmp_path: Path) -> 
     recorded.live.reading(100 * T, "lidar", radial=0.57)
     recorded.live.reading(100 * T, "tracker", azimuth=0.57)
     recorded.go(100, begin=100 * T)
+    later = 66_000  # ticks: after a pause over which the time of the wrong command goes by
+    recorded.go(100, begin=later * T)
     recorded.close()
     found = pf.Run.read(recorded.folder)
-    assert found.command.stamp.tolist() == [step * T for step in range(200)]
+    assert found.command.stamp.tolist() == [step * T for step in (*range(200), *range(later, later + 100))]
     assert found.axes == ("radial",)
-    assert found.sensors["tracker"].stamp.max() < 200 * T
+    assert found.sensors["tracker"].stamp.max() < (later + 100) * T
     assert any("taken back" in text for text in recorded.said)
 
 

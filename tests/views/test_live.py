@@ -18,8 +18,9 @@ from rerun.chunk import RrdReader
 import pumafuse as pf
 from pumafuse.live.wire import Event
 from pumafuse.views import live as live_view
+from pumafuse.views import live_picture
 from pumafuse.views.live import LiveView
-from pumafuse.views.live_frames import Frame
+from pumafuse.views.live_frames import Frame, Met, SensorHead
 from pumafuse.views.live_viewer import _program
 
 AXES = ("tangential", "radial", "vertical")
@@ -193,6 +194,16 @@ def test_what_is_heard_and_said_arrives(recorder: tuple[subprocess.Popen[bytes],
     assert np.allclose(series(path, "/radial/range")[1], 500.0, atol=0.5)
     assert np.all(np.abs(series(path, "/residual/radial/range")[1]) < 0.5)
     assert len(series(path, "/nis/tracker")[0])
+
+
+def test_a_scaled_reading_is_where_it_saw_the_tool() -> None:
+    """Z = −2 p, 8 ms late: the position at the valid time, and what it is off the estimate between two others."""
+    track = live_picture._Track()
+    track.add(np.array([1.0, 1.1]), np.array([0.50, 0.60]))
+    compared = live_picture._Compared(SensorHead(scale=-2.0, latency=0.008, biased=False), track)
+    compared.hear(Met([1.058], [-1.12], [False]))
+    time_, position, residual, _ = compared.take()
+    assert np.allclose([time_[0], position[0], residual[0]], [1.05, 0.56, 0.01])
 
 
 def test_more_than_a_plot_can_show_is_thinned_out_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
