@@ -5,16 +5,18 @@ READY := .venv/.ready
 # Matrices are small: threads of a BLAS would only wait for each other.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: help demo test test-long lint bench lock clean
+.PHONY: help demo test test-long lint docs notebooks bench lock clean
 
 help:
 	@echo "make demo       fuse a recorded run, score it, draw it (into ./demo)"
 	@echo "make test       the tests, under 3 minutes"
-	@echo "make test-long  statistics and soak tests, under 30 minutes"
+	@echo "make test-long  statistics, soak tests, notebooks and every command of the documentation, under 30 minutes"
 	@echo "make lint       ruff and pyright"
+	@echo "make docs       the documentation as a site (into ./site)"
+	@echo "make notebooks  run the notebooks anew, in place"
 	@echo "make bench      pumafuse against its peers (into .venv-bench; some minutes)"
 	@echo "make lock       write requirements.lock anew (needs uv)"
-	@echo "make clean      remove .venv and ./demo"
+	@echo "make clean      remove .venv, ./demo and ./site"
 
 $(READY): requirements.lock pyproject.toml
 	@echo "Setting up .venv from requirements.lock ..."
@@ -30,13 +32,22 @@ demo: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest -m "not long" -n 2
 
+# Tests of one group (those that listen on a port that a page names) go to one worker.
 test-long: $(READY)
-	$(BIN)/python -m pytest -m long -n 2
+	$(BIN)/python -m pytest -m long -n 2 --dist loadgroup
 
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+# mkdocs finds the command line's words by `typer`.
+docs: $(READY)
+	PATH="$(CURDIR)/$(BIN):$$PATH" NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --site-dir site
+	@echo "open site/index.html"
+
+notebooks: $(READY)
+	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
 
 # Peers live apart: what they need may be older or newer than what pumafuse is locked to.
 .venv-bench/.ready: requirements.lock pyproject.toml benchmarks/requirements-peers.txt
@@ -54,4 +65,4 @@ lock:
 	uv pip compile pyproject.toml --group dev --universal --generate-hashes --no-emit-index-url --no-header --quiet --output-file requirements.lock
 
 clean:
-	rm -rf .venv .venv-bench demo
+	rm -rf .venv .venv-bench demo site

@@ -21,6 +21,8 @@ from pumafuse.views import step_figures, style
 HERE = Path(__file__).parent
 DATA = Path(pf.__file__).parent / "data"
 SD, GATE = 0.5e-3, 4.0  # m, sigma: the camera's, the same for both filters
+STRETCH = (33.6, 36.2)  # s of the scan, with an outlier and dropouts
+COLOURS = ["#c2c6cc", "#8a8f98", "#e8890c", style.ESTIMATE, "#0a3d7a"]
 
 
 def constant_velocity(time, value, density, at):
@@ -62,35 +64,67 @@ def rows(est, axis):
     }
 
 
+def errors(axes, methods, truth):
+    """RMS error of each method on each axis as bars; prints them, too."""
+    for place, (axis, positions) in enumerate(methods.items()):
+        for number, (name, position) in enumerate(positions.items()):
+            rms = float(np.sqrt(np.nanmean((position - truth[axis]) ** 2))) * 1e3
+            print(f"{axis:11} {name:42} {rms:.3f} mm")
+            at = place + 0.17 * (number - 2)
+            axes.bar(at, rms, 0.16, color=COLOURS[number], label=name if place == 0 else None)
+            axes.text(at, rms + 0.02, f"{rms:.2f}", ha="center", fontsize=8)
+    axes.set_title("60 s of scanning: error of each method", loc="left")
+    axes.set_xticks(range(len(methods)), list(methods))
+    axes.set_ylabel("RMS error [mm]")
+    axes.legend(frameon=False, fontsize=8)
+
+
+def stretch(axes, est, methods, truth):
+    """A few seconds of the radial axis: what the camera says, what becomes of it, and the truth."""
+    start, end = STRETCH
+    shown = (est.time >= start) & (est.time <= end)
+    time, truth = est.time[shown], truth["radial"][shown] * 1e3
+    middle, span = np.median(truth), 1.9 * np.ptp(truth)
+    low, high = middle - 0.5 * span, middle + 0.5 * span
+    seen = est.readings.of("vision", "radial")
+    seen = seen.where((seen.time >= start) & (seen.time <= end))
+    fused, value = seen.outcome == pf.Outcome.FUSED, seen.value * 1e3
+    axes.plot(seen.time[fused], value[fused], "o", ms=3.5, color=COLOURS[1], label="camera readings")
+    for when, far in zip(seen.time[~fused], value[~fused], strict=True):
+        edge = np.clip(far, low + 0.04 * span, high - 0.04 * span)
+        axes.plot(when, edge, "x", ms=8, mew=2, color=style.REJECTED)
+        axes.annotate(
+            f"outlier, {far - np.interp(when, time, truth):+.0f} mm: rejected",
+            (when, edge),
+            (7, -3),
+            textcoords="offset points",
+            color=style.REJECTED,
+            fontsize=8,
+        )
+    radial = methods["radial"]
+    other = "constant-velocity filter, tuned"
+    axes.plot(time, radial[other][shown] * 1e3, color=COLOURS[2], lw=1.2, label=other)
+    position, sd = est["radial"].position[shown] * 1e3, est["radial"].position_sd[shown] * 1e3
+    axes.fill_between(time, position - 1.96 * sd, position + 1.96 * sd, color=style.ESTIMATE, alpha=0.22, lw=0)
+    axes.plot(time, position, color=style.ESTIMATE, lw=1.8, label="pumafuse, with its 95 % error bars")
+    axes.plot(time, truth, "k--", lw=1.1, label="truth, which no filter sees")
+    axes.set(xlim=STRETCH, ylim=(low, high), xlabel="time [s]", ylabel="radial position [mm]")
+    axes.set_title("a camera of 0.5 mm noise, 45 ms late, and what is made of it", loc="left")
+    axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper right")
+
+
 def main() -> None:
-    """Write the comparison picture and print its numbers."""
+    """Write the pictures and print the numbers of the comparison."""
     warnings.simplefilter("ignore", pf.PumafuseWarning)
     run, config = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
     est = pf.fuse(run, config, sensors=["vision"], rate=200.0)
     smooth = pf.fuse(run, config, sensors=["vision"], rate=200.0, smooth=True)
-    colours = ["#c2c6cc", "#8a8f98", "#e8890c", style.ESTIMATE, "#0a3d7a"]
     methods = {axis: {**rows(est, axis), "pumafuse --smooth (afterwards)": smooth[axis].position} for axis in est.axes}
     truth = {axis: interpolated(est.time, est.segment, est.reference, axis) for axis in est.axes}
-    figure, (bars, trace) = plt.subplots(1, 2, figsize=(13.0, 4.2), layout="constrained", width_ratios=[3, 2])
-    start, end = style.busiest(est, 1.2)
-    shown = (est.time >= start) & (est.time <= end)
-    for number, colour in enumerate(colours):
-        for place, axis in enumerate(est.axes):
-            name, position = list(methods[axis].items())[number]
-            rms = float(np.sqrt(np.nanmean((position - truth[axis]) ** 2))) * 1e3
-            print(f"{axis:11} {name:42} {rms:.3f} mm")
-            bars.bar(place + 0.17 * (number - 2), rms, 0.16, color=colour, label=name if place == 0 else None)
-            bars.text(place + 0.17 * (number - 2), rms + 0.03, f"{rms:.2f}", ha="center", fontsize=8)
-            if axis == "radial" and number > 0:
-                trace.plot(est.time[shown], position[shown] * 1e3, color=colour, lw=1.4, label=name)
-    trace.plot(est.time[shown], truth["radial"][shown] * 1e3, "k--", lw=1.0, label="truth")
-    bars.set_xticks(range(3), list(est.axes))
-    bars.set_ylabel("RMS error [mm]")
-    bars.legend(frameon=False, fontsize=8)
-    trace.set_xlabel("time [s]")
-    trace.set_ylabel("radial [mm]")
-    trace.legend(frameon=False, fontsize=8)
-    for axes in (bars, trace):
+    figure, (left, right) = plt.subplots(1, 2, figsize=(13.0, 4.4), layout="constrained", width_ratios=[5, 4])
+    stretch(left, est, methods, truth)
+    errors(right, methods, truth)
+    for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(HERE / "images" / "comparison.png", dpi=110)
 

@@ -1,0 +1,43 @@
+"""What README and documentation say: every command and snippet is carried out, page by page."""
+
+from pathlib import Path
+
+import pytest
+
+from pages import Reader, blocks, paths, shows
+
+LANGUAGES = {"bash", "python", "toml", "text", "json"}
+
+
+@pytest.mark.parametrize("page", paths(), ids=lambda page: page.stem)
+def test_blocks_are_of_a_kind_that_is_carried_out(page: Path) -> None:
+    """Each block has a language that means something here, or a reason why it is left out."""
+    for block in blocks(page):
+        assert block.left_out or block.language in LANGUAGES, f"{page.name}:{block.line}"
+        assert block.left_out or block.language != "toml" or block.file, f"{page.name}:{block.line}: which file?"
+
+
+@pytest.mark.long
+@pytest.mark.xdist_group("pages")  # they listen on the ports that they name
+@pytest.mark.parametrize("page", paths(), ids=lambda page: page.stem)
+def test_a_page_does_what_it_says(page: Path, tmp_path: Path) -> None:
+    """From top to bottom in a new folder, every command ends well and prints what the page shows."""
+    Reader(page, tmp_path).read()
+
+
+@pytest.mark.parametrize(
+    ("expected", "found"),
+    [
+        ("b  1\nc 2\n", True),
+        ("b …\n…\nd", True),
+        ("a\nb 1\nc 2\nd", True),
+        ("…\nd", True),
+        ("b 2", False),
+        ("b", False),
+        ("c 2\nb 1", False),
+        ("b …\nd", False),
+    ],
+)
+def test_expected_lines_are_looked_for_in_a_row(expected: str, found: bool) -> None:
+    """White space does not count; an ellipsis is anything in its line, alone any lines; all else is as it stands."""
+    assert shows("a\nb   1\nc 2\nd\n", expected) is found
