@@ -16,6 +16,7 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).parent.parent
 PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+FIRST_NOTEBOOK = "notebooks/1-step-trials-to-arm-model.ipynb"
 _LINK = re.compile(r"(?<=\]\()([^)#:\s]+)(?=[)#])")  # of Markdown, to a file
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
@@ -24,7 +25,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add what lies elsewhere in the repository; a page's place there is kept in its file."""
     for source, place in PAGES.items():
         files.append(File.generated(config, place, abs_src_path=str(ROOT / source)))
-    for pattern in ("notebooks/*.ipynb", "examples/*", "scenarios/*"):
+    for pattern in ("notebooks/*.ipynb", "examples/**/*.*", "scenarios/*"):
         for path in sorted(ROOT.glob(pattern)):
             files.append(File.generated(config, str(path.relative_to(ROOT)), abs_src_path=str(path)))
     for file in files:
@@ -39,7 +40,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     def place(link: re.Match[str]) -> str:
         target = normpath(f"{at}/../{link[1]}")
-        return PAGES.get(target, target.removeprefix("docs/"))
+        return (PAGES | {"notebooks": FIRST_NOTEBOOK}).get(target, target.removeprefix("docs/"))
 
     return markdown if page.file.src_uri.endswith(".ipynb") else _LINK.sub(place, markdown)
 
