@@ -1,10 +1,13 @@
 """What README and documentation say: every command and snippet is carried out, page by page."""
 
+import ast
+import re
 from pathlib import Path
 
 import pytest
 
-from pages import Reader, blocks, paths, shows
+import pumafuse as pf
+from pages import ROOT, Reader, blocks, paths, shows
 
 LANGUAGES = {"bash", "python", "toml", "text", "json"}
 
@@ -41,3 +44,24 @@ def test_a_page_does_what_it_says(page: Path, tmp_path: Path) -> None:
 def test_expected_lines_are_looked_for_in_a_row(expected: str, found: bool) -> None:
     """White space does not count; an ellipsis is anything in its line, alone any lines; all else is as it stands."""
     assert shows("a\nb   1\nc 2\nd\n", expected) is found
+
+
+def _told() -> list[str]:
+    """Every text in the sources that the program may say, f-strings in pieces."""
+    return [
+        node.value
+        for path in Path(pf.__file__).parent.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+
+
+@pytest.mark.parametrize("page", ["symptoms", "network"])
+def test_messages_that_a_table_quotes_are_what_the_program_says(page: str) -> None:
+    """What stands in backquotes at the beginning of a row is a text of the program, whatever stands for its `…`."""
+    rows = [row for row in (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8").splitlines() if row[:3] == "| `"]
+    quoted = [piece for row in rows for text in re.findall("`([^`]+)`", row.split("|")[1]) for piece in text.split("…")]
+    assert len(rows) > 10
+    told = _told()
+    for piece in quoted:
+        assert any(piece.strip() in text for text in told), piece
