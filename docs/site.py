@@ -6,13 +6,19 @@ Pages link to each other as they lie in the repository, so that they can be read
 from __future__ import annotations
 
 import re
+from html import unescape
 from pathlib import Path
 from posixpath import normpath
 
+from click import Context
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
+from typer.cli import get_docs_for_click
+from typer.main import get_command
+
+from pumafuse.cli.main import app
 
 ROOT = Path(__file__).parent.parent
 PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
@@ -35,18 +41,27 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Links between files of the repository as links between places of the site."""
+    """Links between files of the repository as links between places of the site, and the command line in its place."""
     at = {place: source for source, place in PAGES.items()}.get(page.file.src_uri, f"docs/{page.file.src_uri}")
 
     def place(link: re.Match[str]) -> str:
         target = normpath(f"{at}/../{link[1]}")
         return (PAGES | {"notebooks": FIRST_NOTEBOOK}).get(target, target.removeprefix("docs/"))
 
-    return markdown if page.file.src_uri.endswith(".ipynb") else _LINK.sub(place, markdown)
+    if page.file.src_uri.endswith(".ipynb"):
+        return markdown
+    return _LINK.sub(place, markdown).replace("{{ commands }}", commands())
+
+
+def commands() -> str:
+    """What each command's help says, as Markdown."""
+    command = get_command(app)
+    told = get_docs_for_click(obj=command, ctx=Context(command), name="pumafuse")
+    return told[told.index("\n## ") :].replace("```console\n$ ", "```text\n")
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """LaTeX as MathML, which browsers draw by themselves."""
     return _FORMULA.sub(
-        lambda formula: convert(formula[2], display="inline" if formula[1] == "span" else "block"), html
+        lambda found: convert(unescape(found[2]), display="inline" if found[1] == "span" else "block"), html
     )

@@ -27,9 +27,9 @@ class TickEstimates:
     """Estimates at the ticks, relative to the level at which the arm rested; shapes follow the readings.
 
     Attributes:
-        position: p[n] [m], with every reading up to n; with all of them where smoothed.
+        position: p at each tick [m], with every reading up to it; with all of them where smoothed.
         position_sd: Its standard deviation [m].
-        innovation: z[n] less its prediction [m], NaN where missing.
+        innovation: Reading less its prediction [m], NaN where missing.
         innovation_sd: Its predicted standard deviation [m].
         log_likelihood: Of each run's readings (in metres), one number a run.
     """

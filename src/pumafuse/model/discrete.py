@@ -98,7 +98,7 @@ class DiscreteModel:
         return split_delay(self.delay, self.period)
 
     def step_response(self, ticks: int) -> FloatArray:
-        """p[0] … p[ticks-1] [m] after v stepped to 1 m at tick 0, (ticks,)."""
+        """Position [m] at ticks 0 … ticks − 1 after v stepped to 1 m at tick 0, (ticks,)."""
         x = np.zeros((len(self.F), 1))
         response = np.empty(ticks)
         for n in range(ticks):

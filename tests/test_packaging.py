@@ -1,0 +1,66 @@
+"""Wheel and sdist, each in an environment that holds nothing else."""
+
+import subprocess
+import sys
+import tarfile
+import venv
+import zipfile
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+def run(*words: object) -> str:
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The wheel and the sdist."""
+    folder = tmp_path_factory.mktemp("dist")
+    subprocess.run([sys.executable, "-m", "hatchling", "build", "-d", str(folder)], cwd=ROOT, check=True)
+    return next(folder.glob("*.whl")), next(folder.glob("*.tar.gz"))
+
+
+@pytest.mark.long
+def test_the_wheel_works_in_an_empty_environment(built: tuple[Path, Path], tmp_path: Path) -> None:
+    """Installed with nothing but what it asks for, at the locked versions: version, demo and completion work."""
+    versions = tmp_path / "constraints.txt"
+    locked = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
+    versions.write_text("\n".join(line.rstrip(" \\") for line in locked if "==" in line and line[0] != " "))
+    venv.create(tmp_path / "empty", with_pip=True)
+    place = tmp_path / "empty" / "bin"
+    run(place / "python", "-m", "pip", "install", "--quiet", "--constraint", versions, built[0])
+    assert run(place / "pumafuse", "--version") == f"pumafuse {version('pumafuse')}\n"
+    assert "0.364" in run(place / "pumafuse", "demo", "--output", tmp_path / "demo")
+    assert {"fused.png", "fused.rrd", "summary.json"} <= {path.name for path in (tmp_path / "demo").iterdir()}
+    assert "_PUMAFUSE_COMPLETE" in run(place / "pumafuse", "--show-completion", "bash")
+
+
+@pytest.mark.long
+def test_the_sdist_makes_the_same_wheel(built: tuple[Path, Path], tmp_path: Path) -> None:
+    """What pip builds from the sdist is, file by file, the wheel."""
+    run(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, built[1])
+    made, direct = (zipfile.ZipFile(wheel) for wheel in (next(tmp_path.glob("*.whl")), built[0]))
+    assert {name: made.read(name) for name in made.namelist()} == {
+        name: direct.read(name) for name in direct.namelist()
+    }
+
+
+@pytest.mark.long
+def test_what_is_in_them(built: tuple[Path, Path]) -> None:
+    """The wheel holds the package, typed, with its data and nothing else; the sdist all that tests and docs need."""
+    wheel = set(zipfile.ZipFile(built[0]).namelist())
+    sources = {str(path.relative_to(ROOT / "src")) for path in (ROOT / "src").rglob("*") if path.is_file()}
+    sources = {name for name in sources if "__pycache__" not in name and ".egg-info" not in name}
+    assert {name for name in wheel if ".dist-info" not in name} == sources
+    assert {"pumafuse/py.typed", "pumafuse/data/fusion.toml", "pumafuse/data/scan1/run.toml"} <= wheel
+    with tarfile.open(built[1]) as archive:
+        inside = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"Makefile", "requirements.lock", "mkdocs.yml", "docs/model.md", "tests/pages.py"} <= inside
+    assert not [name for name in inside if name.startswith((".venv", "demo/", "site/"))]
