@@ -21,6 +21,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +33,7 @@ import pumafuse as pf
 
 ROOT = Path(__file__).parent.parent
 LONGEST = 120.0  # s that any block may take
-_FILE = re.compile(r"# ([\w.-]+\.(?:toml|py))\n")
+_FILE = re.compile(r"# ([\w./-]+\.(?:toml|py))\n")
 _LEFT_OUT = re.compile(r"<!-- not executed: (.+) -->")
 _COLOUR = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -116,6 +117,8 @@ class Reader:
             case "json":
                 assert all(isinstance(json.loads(line), dict) for line in block.text.splitlines()), where
             case "toml" | "python" if block.file:
+                compile(block.text, where, "exec") if block.language == "python" else tomllib.loads(block.text)
+                Path(block.file).parent.mkdir(exist_ok=True)
                 Path(block.file).write_text(block.text, encoding="utf-8")
             case "python":
                 self.said = self._python(block.text, where)
