@@ -176,7 +176,7 @@ def test_the_status_screen(data) -> None:
 
 
 def test_the_status_shows_milliseconds_and_millimetres() -> None:
-    """Half a second late is 500.0 ms, 0.57 m is 570.000 mm; what is stale is marked."""
+    """Half a second late is 500.0 ms, 0.57 m is 570.000 mm; what is stale is marked, and what is counted said."""
     both = Both()
     both.feed(lines(4.0) + line(3.49, "tracker", radial=570.0) + line(6.0, radial=570.0))
     out = Console(width=140, record=True, file=StringIO())
@@ -188,3 +188,4 @@ def test_the_status_shows_milliseconds_and_millimetres() -> None:
     assert "570.000" in shown
     assert "stale" in shown
     assert "2.0" in shown
+    assert "outcomes count scalars" in shown

@@ -246,8 +246,9 @@ def status(stream: Stream, parts: Sequence[_Part] = ()) -> Group:
 
 
 def sensor_table(health: Health) -> Table:
-    """Rate, lateness, dropouts, NIS and outcomes of each sensor."""
-    table = Table(box=box.SIMPLE_HEAD)
+    """Rate, lateness, dropouts and NIS of each sensor, and its scalars by outcome."""
+    caption = "outcomes count scalars: each axis of a row by itself"
+    table = Table(box=box.SIMPLE_HEAD, caption=caption, caption_justify="left")
     words = [
         word for word in (o.word for o in Outcome) if any(sensor.outcomes[word] for sensor in health.sensors.values())
     ]
