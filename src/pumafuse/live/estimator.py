@@ -11,16 +11,15 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from ..arrays import REACH_NS, FloatArray
+from ..arrays import REACH_NS
 from ..errors import ConfigError, RunError, UnknownNameError, suggestion
 from ..fusion.config import FusionConfig
 from ..fusion.timeline import FARTHEST, LONGEST_TAIL_NS, Outcome
 from ..model.arm import ordered_axes
 from ..runs.frames import CARTESIAN, Cylindrical
 from .clock import Clock, Verdict
-from .command_kernels import COMMANDS, STAMP, STEP, U
 from .health import Health, health_of
-from .kernels import ABSENT, SPREAD, VALUE, Tally
+from .kernels import ABSENT, Tally
 from .placing import Placing
 from .sampler import Sampler
 from .window import MOST_ROWS, Window
@@ -253,16 +252,13 @@ class LiveEstimator:
             return _nowhere(stamp, _TOO_LATE, f"{(newest - stamp) / 1e9:.3f} s ago, before the window")
         if stamp > newest + LONGEST_TAIL_NS:
             return _nowhere(stamp, _INVALID, "more than an hour ahead")
-        found, memory = self._window.estimate(stamp, self._oldest()), self._window.memory
-        commands, levels = memory.commands.number[:, COMMANDS].tolist(), memory.commands.level.tolist()
         axes: dict[str, AxisNow] = {}
         stale: list[str] = []
-        for axis, (position, *rest), commanded, (level, given), since in zip(
-            self.axes, found, commands, levels, memory.heard.fused.tolist(), strict=True
-        ):
-            if commanded or given:
-                axes[axis] = AxisNow(position + level, *rest)
-                if stamp - since > self._stale_ns:
+        for axis, found in zip(self.axes, self._window.estimate(stamp, self._oldest()), strict=True):
+            if found is not None:
+                outputs, fused = found
+                axes[axis] = AxisNow(*outputs)
+                if stamp - fused > self._stale_ns:
                     stale.append(axis)
         reason = "now" if stamp == now else "filtered" if stamp < now else "predicted, the last command held"
         placed = None
@@ -313,8 +309,6 @@ class LiveEstimator:
         self._before = tally
         self._placing = Placing(self.config.frame, self.axes)
         self._window = Window(self.config, self.axes, self._placing.start(self._start), tally)
-        heard = self._window.memory.heard
-        self._new, self._told = (heard.new[:, VALUE], heard.new[:, SPREAD]), heard.told
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it.
         # With each goes its outcome, and whether it never came into the window.
         self._early: list[tuple[_Event, Outcome, bool]] | None = [] if self._placing.waits else None
@@ -449,7 +443,8 @@ class LiveEstimator:
 
     def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> Told:
         """Give an event that is in time to the window."""
-        new, given, stranger = self._new[0], 0, ""
+        window, given, stranger = self._window, 0, ""
+        new = window.value
         for name, value in values.items():
             axis = self._bits.get(name)
             if axis is None:
@@ -468,15 +463,15 @@ class LiveEstimator:
             why = "no command has said yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
             return self._refuse(sensor, values, Outcome.BEFORE_START if missing else _UNKNOWN, why)
         if sensor is None:
-            taken = self._window.command(stamp, given, oldest)
+            taken = window.command(stamp, given, oldest)
         else:
             newest = self._clock.sure
-            taken = self._window.hear(stamp, self._sensors[sensor], given, newest, oldest)
+            taken = window.hear(stamp, self._sensors[sensor], given, newest, oldest)
         if self.config.frame is not None:
-            self._new[1][:] = 1.0
+            window.spread[:] = 1.0
         if not taken:
             return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
-        codes = self._told.tobytes()
+        codes = window.told.tobytes()
         told = self._answers.get(codes) if not stranger else None
         told = told or self._answer(codes, stranger)
         if sensor is None:
@@ -490,36 +485,24 @@ class LiveEstimator:
         validity = self.config.arm.validity
         if validity.max_speed is None and validity.max_radius is None:
             return
-        commands = self._window.memory.commands
-        rows, counts = commands.row, commands.number[:, COMMANDS].tolist()
-        step, radius = 0.0, None
-        for axis, count in enumerate(counts):
-            if count:
-                step = max(step, abs(rows.item(axis, count - 1, STEP)))
+        speed, radius = self._window.latest_step() / self.config.arm.update_period, None
         if isinstance(self.config.frame, Cylindrical) and (axis := self._bits.get("radial")) is not None:
-            radius = rows.item(axis, counts[axis] - 1, U) if counts[axis] else None
-        speed = step / self.config.arm.update_period
+            radius = self._window.latest_command(axis)
         for passed in validity.excess(speed, radius):
             self._log.say(passed.split(" reach")[0], passed)
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
-        """Put an event's x, y and z into ``heard.new`` as axes; which ones, as bits."""
+        """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
+        window, given = self._window, 0
         placed = self._placing.in_axes(
             {name: _number(values[name]) for name in CARTESIAN if name in values},
-            None if sensor is None else self._commanded(stamp),
+            None if sensor is None else window.commanded(self._bits.get("tangential", 0), stamp),
         )
-        given = 0
-        for axis, scalar in placed.items():
-            self._new[0][self._bits[axis]], self._new[1][self._bits[axis]] = scalar
-            given |= 1 << self._bits[axis]
+        for name, scalar in placed.items():
+            axis = self._bits[name]
+            window.value[axis], window.spread[axis] = scalar
+            given |= 1 << axis
         return given
-
-    def _commanded(self, stamp: int) -> FloatArray:
-        """The tangential position [m] commanded at ``stamp`` or before it, as far as is known, (1,)."""
-        commands, axis = self._window.memory.commands, self._bits.get("tangential", 0)
-        count = int(commands.number[axis, COMMANDS])
-        row = max(int(np.searchsorted(commands.time[axis, :count, STAMP], stamp, side="right")) - 1, 0)
-        return commands.row[axis, row : row + 1, U] if count else np.zeros(1)
 
     def _no_axis(self, stranger: str) -> str:
         if stranger in CARTESIAN and self.config.frame is None:

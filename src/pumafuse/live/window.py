@@ -6,15 +6,29 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..arrays import IntArray
+from ..arrays import FloatArray, IntArray
 from ..errors import ConfigError
 from ..fusion import kernels as fusion
 from ..fusion.config import FusionConfig
 from ..fusion.engine import order_of, places, sensors_of, start_of
 from ..model import closed
 from . import kernels
-from .command_kernels import ALWAYS, COMMANDS, NEVER, STAMP, Commands
-from .kernels import BEGIN, CHANGED, DONE, END, IN_A_ROW, ORIGIN, SECONDS, Heard, Memory, Nothing, Tally
+from .command_kernels import ALWAYS, COMMANDS, NEVER, STAMP, STEP, Commands, U
+from .kernels import (
+    BEGIN,
+    CHANGED,
+    DONE,
+    END,
+    IN_A_ROW,
+    ORIGIN,
+    SECONDS,
+    SPREAD,
+    VALUE,
+    Heard,
+    Memory,
+    Nothing,
+    Tally,
+)
 
 MOST_ROWS = 65_536  # of readings or of commands: some 70 MB for three axes; what is more shortens the window
 _ROWS, _COMMANDS, _ENTRIES = 4096, 512, 1024  # at first
@@ -24,8 +38,14 @@ _LONGEST_RECOVERY = 1e4  # periods
 class Window:
     """The last seconds of a stream, and the filter at every one of their events.
 
+    An event comes in through ``value`` and ``spread``, then :meth:`hear` or :meth:`command`, which say which of their
+    axes it gives; what became of these is in ``told`` then.
+
     Attributes:
         memory: All arrays.
+        value: Of the event that comes in [m], (A,).
+        spread: By what the noise of each of its values is scaled, 1 if nobody says otherwise, (A,).
+        told: What became of its axes: codes of Outcome, or ``ABSENT`` for an axis that it does not give, (A,).
         floor: What is stamped before it [ns] can no longer be taken, because the stream was too dense for the window.
     """
 
@@ -55,6 +75,8 @@ class Window:
         self.memory = _empty(config, axes, start)
         if tally is not None:
             self.memory.tally.number[:], self.memory.tally.usual[:] = tally.number, tally.usual
+        heard = self.memory.heard
+        self.value, self.spread, self.told = heard.new[:, VALUE], heard.new[:, SPREAD], heard.told
         self._flat = self.memory.flat()
         width = self.memory.state.x.shape[1]
         nothing = np.zeros((len(axes), 0))
@@ -69,7 +91,7 @@ class Window:
         return None if origin == NEVER else origin
 
     def hear(self, stamp: int, sensor: int, given: int, newest: int, oldest: int) -> bool:
-        """Take in the row in ``heard.new``; see :func:`pumafuse.live.kernels.hear` and :meth:`command`."""
+        """Take in a row of readings; see :func:`pumafuse.live.kernels.hear` and :meth:`command`."""
         attempt = 0
         while kernels.hear(self._flat, stamp, sensor, given, newest, oldest - self._latency) != DONE:
             self._make_room(attempt, oldest, event=True)
@@ -79,7 +101,7 @@ class Window:
         return True
 
     def command(self, stamp: int, given: int, oldest: int) -> bool:
-        """Take in the command in ``heard.new``: see :func:`pumafuse.live.kernels.command`.
+        """Take in a command; see :func:`pumafuse.live.kernels.command`.
 
         Args:
             stamp: Int ns.
@@ -98,13 +120,54 @@ class Window:
         self._resume(oldest)
         return True
 
-    def estimate(self, time: int, oldest: int) -> list[list[float]]:
-        """For each axis at ``time`` [ns] what :class:`fusion.Outputs` has, relative to its start level."""
+    def estimate(self, time: int, oldest: int) -> list[tuple[list[float], int] | None]:
+        """Every axis at an instant.
+
+        Args:
+            time: Int ns.
+            oldest: No event stamped before will ever come [ns].
+
+        Returns:
+            For each axis what :class:`fusion.Outputs` has, in the stream's own coordinates and SI, and when the last
+            scalar was valid that it knows of [ns]; None as long as the axis has no start level.
+        """
         attempt = 0
         while kernels.ask(self._flat, self._held, self._places, time) != DONE:
             self._make_room(attempt, oldest, event=False)
             attempt += 1
-        return self._outputs[:, :, 0].T.tolist()
+        commands = self.memory.commands
+        answers: list[tuple[list[float], int] | None] = []
+        for found, commanded, (level, given), fused in zip(
+            self._outputs[:, :, 0].T.tolist(),
+            commands.number[:, COMMANDS].tolist(),
+            commands.level.tolist(),
+            self.memory.heard.fused.tolist(),
+            strict=True,
+        ):
+            found[0] += level
+            answers.append((found, fused) if commanded or given else None)
+        return answers
+
+    def commanded(self, axis: int, stamp: int) -> FloatArray:
+        """The position [m] commanded on an axis at ``stamp`` [ns] or before it, as far as is known, (1,)."""
+        commands = self.memory.commands
+        count = int(commands.number[axis, COMMANDS])
+        row = max(int(np.searchsorted(commands.time[axis, :count, STAMP], stamp, side="right")) - 1, 0)
+        return commands.row[axis, row : row + 1, U] if count else np.zeros(1)
+
+    def latest_command(self, axis: int) -> float | None:
+        """The position [m] that was commanded last on an axis; None before any."""
+        commands = self.memory.commands
+        count = commands.number.item(axis, COMMANDS)
+        return commands.row.item(axis, count - 1, U) if count else None
+
+    def latest_step(self) -> float:
+        """The largest step [m] that the latest commands of the axes made."""
+        rows, step = self.memory.commands.row, 0.0
+        for axis, count in enumerate(self.memory.commands.number[:, COMMANDS].tolist()):
+            if count:
+                step = max(step, abs(rows.item(axis, count - 1, STEP)))
+        return step
 
     def forget(self, after: int, oldest: int) -> None:
         """Take back all that is stamped after ``after`` [ns]."""
