@@ -274,7 +274,10 @@ def test_an_axis_with_a_start_level_is_there_before_its_first_command() -> None:
 
 
 def test_commands_beyond_the_models_limits_are_said() -> None:
-    """Faster than the model is valid for, or farther out: once, and the tenth time; within them nothing is said."""
+    """Faster than the model is valid for, or farther out: once, and the tenth time; within them nothing is said.
+
+    Each with the command's stamp, which tells a fast motion from the first command after a pause.
+    """
     said: list[str] = []
     config = msgspec.structs.replace(CONFIG, frame=Cylindrical())
     live = pf.LiveEstimator(config, on_notice=said.append)
@@ -284,8 +287,8 @@ def test_commands_beyond_the_models_limits_are_said() -> None:
     for step in range(20, 40):
         live.command(step * PERIOD, x=0.0, y=0.56 + 0.02 * (step - 20))
     assert [text.split(" ")[0] for text in said] == ["commanded", "commands", "commanded", "commands"]
-    assert "0.5 m/s that the arm model is valid for" in said[0]
-    assert "700 mm that the arm model is valid for" in said[1]
+    assert f"0.5 m/s that the arm model is valid for, at {20 * PERIOD:.3f} s" in said[0]
+    assert f"700 mm that the arm model is valid for, at {27 * PERIOD:.3f} s" in said[1]
 
 
 def test_after_warming_up_nothing_is_left_to_compile() -> None:

@@ -485,11 +485,12 @@ class LiveEstimator:
         validity = self.config.arm.validity
         if validity.max_speed is None and validity.max_radius is None:
             return
-        speed, radius = self._window.latest_step() / self.config.arm.update_period, None
+        stamp, step = self._window.latest_step()
+        speed, radius = step / self.config.arm.update_period, None
         if isinstance(self.config.frame, Cylindrical) and (axis := self._bits.get("radial")) is not None:
             radius = self._window.latest_command(axis)
         for passed in validity.excess(speed, radius):
-            self._log.say(passed.split(" reach")[0], passed)
+            self._log.say(passed.split(" reach")[0], f"{passed}, at {stamp / 1e9:.3f} s")
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""

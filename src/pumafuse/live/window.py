@@ -161,13 +161,14 @@ class Window:
         count = commands.number.item(axis, COMMANDS)
         return commands.row.item(axis, count - 1, U) if count else None
 
-    def latest_step(self) -> float:
-        """The largest step [m] that the latest commands of the axes made."""
-        rows, step = self.memory.commands.row, 0.0
-        for axis, count in enumerate(self.memory.commands.number[:, COMMANDS].tolist()):
+    def latest_step(self) -> tuple[int, float]:
+        """The stamp [ns] of the latest command, and the largest step [m] that the latest ones of the axes made."""
+        commands, stamp, step = self.memory.commands, ALWAYS, 0.0
+        for axis, count in enumerate(commands.number[:, COMMANDS].tolist()):
             if count:
-                step = max(step, abs(rows.item(axis, count - 1, STEP)))
-        return step
+                stamp = max(stamp, commands.time.item(axis, count - 1, STAMP))
+                step = max(step, abs(commands.row.item(axis, count - 1, STEP)))
+        return stamp, step
 
     def forget(self, after: int, oldest: int) -> None:
         """Take back all that is stamped after ``after`` [ns]."""
