@@ -7,13 +7,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ..arrays import FloatArray, IntArray, TimeArray
+from ..arrays import ALWAYS, NEVER, FloatArray, IntArray, TimeArray
 from ..compiled import compiled
 from ..fusion.kernels import Axes
 from ..model.drive_kernels import answered, decayed, tick_time, ticks_worth
 
-NEVER = 2**63 - 1
-ALWAYS = -NEVER
 STAMP, GIVEN = range(2)  # of a row of commands: its own, and that of the command in force then
 U, HELD, STEP, ERROR, MANEUVER = range(5)  # of a row: its u, and of the command in force u, step, e [m], maneuver [m/s]
 COMMANDS, ENTRIES, LATEST, TICK, WORTH, DELAY = range(6)  # of an axis

@@ -19,9 +19,10 @@ from ..model.arm import ordered_axes
 from ..runs.frames import CARTESIAN, Cylindrical
 from .clock import Clock, Verdict
 from .health import Health, health_of
-from .kernels import ABSENT, Tally
+from .kernels import ABSENT
 from .placing import Placing
 from .sampler import Sampler
+from .tally_kernels import Tally
 from .window import MOST_ROWS, Window
 
 Time: TypeAlias = float | int  # float seconds, or int nanoseconds

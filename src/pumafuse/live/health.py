@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ..arrays import ALWAYS
 from ..fusion.timeline import Outcome
-from .command_kernels import ALWAYS
-from .kernels import CAME, DROPOUTS, LATENESS, MOST_LATE, NIS, ROWS, SCALARS, SECONDS, Tally
+from .tally_kernels import CAME, DROPOUTS, LATENESS, MOST_LATE, NIS, ROWS, SCALARS, SECONDS, Tally
 
 
 @dataclass(frozen=True)

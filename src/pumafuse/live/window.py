@@ -6,29 +6,27 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import ALWAYS, NEVER, FloatArray, IntArray
 from ..errors import ConfigError
 from ..fusion import kernels as fusion
 from ..fusion.config import FusionConfig
 from ..fusion.engine import order_of, places, sensors_of, start_of
 from ..model import closed
 from . import kernels
-from .command_kernels import ALWAYS, COMMANDS, NEVER, STAMP, STEP, Commands, U
+from .command_kernels import COMMANDS, STAMP, STEP, Commands, U
 from .kernels import (
     BEGIN,
     CHANGED,
     DONE,
     END,
-    IN_A_ROW,
     ORIGIN,
-    SECONDS,
     SPREAD,
     VALUE,
     Heard,
     Memory,
     Nothing,
-    Tally,
 )
+from .tally_kernels import IN_A_ROW, SECONDS, Tally
 
 MOST_ROWS = 65_536  # of readings or of commands: some 70 MB for three axes; what is more shortens the window
 _ROWS, _COMMANDS, _ENTRIES = 4096, 512, 1024  # at first
