@@ -10,9 +10,11 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 import pumafuse as pf
-from pumafuse.live import network
+from pumafuse.live import tcp, udp
 from pumafuse.live.address import Address
-from pumafuse.live.network import Client, Out, Server, Source, Udp
+from pumafuse.live.network import Source
+from pumafuse.live.tcp import Client, Server
+from pumafuse.live.udp import Out, Udp
 
 LOOPBACK = (socket.AF_INET, ("127.0.0.1", 0))
 
@@ -72,7 +74,7 @@ class TestUdp:
 
     def test_the_oldest_are_let_go_and_counted(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """When too many wait, what remains is the newest."""
-        monkeypatch.setattr(network, "_MOST_WAITING", 10)
+        monkeypatch.setattr(udp, "_MOST_WAITING", 10)
         said: list[str] = []
         source = Udp(LOOPBACK, everybody, said.append)
 
@@ -88,7 +90,7 @@ class TestUdp:
 
     def test_large_ones_wait_only_up_to_a_size(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Sixty datagrams of 10 kB where 50 kB may wait."""
-        monkeypatch.setattr(network, "_MOST_BYTES", 50_000)
+        monkeypatch.setattr(udp, "_MOST_BYTES", 50_000)
         said: list[str] = []
         source = Udp(LOOPBACK, everybody, said.append)
 
@@ -220,7 +222,7 @@ class TestServer:
                 before = sent[0]
                 await asyncio.sleep(0.5)
             assert before < total - 1
-            assert source._pieces.qsize() == network._MOST_PIECES
+            assert source._pieces.qsize() == tcp._MOST_PIECES
             expected = 0
             while expected < total:
                 for line in await source.get():
@@ -232,7 +234,7 @@ class TestServer:
 
     def test_who_is_not_allowed_or_too_many_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """The connection is closed at once, counted and said."""
-        monkeypatch.setattr(network, "_MOST_CONNECTIONS", 2)
+        monkeypatch.setattr(tcp, "_MOST_CONNECTIONS", 2)
         said: list[str] = []
         source = Server(LOOPBACK, lambda host: host != "127.0.0.3", said.append)
 
@@ -259,7 +261,7 @@ class TestServer:
 class TestClient:
     def test_it_connects_again(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Nobody there, then a server that ends each connection in the middle of a line: tried again, no line lost."""
-        monkeypatch.setattr(network, "_FIRST_WAIT", 0.01)
+        monkeypatch.setattr(tcp, "_FIRST_WAIT", 0.01)
         with sender() as place, socket.socket() as reserved:
             del place
             reserved.bind(("127.0.0.1", 0))
@@ -296,8 +298,8 @@ class TestClient:
         async def nobody(*_: object, **__: object) -> None:
             raise ConnectionRefusedError(111, "Connection refused")
 
-        monkeypatch.setattr(network.asyncio, "sleep", sleep)
-        monkeypatch.setattr(network.asyncio, "open_connection", nobody)
+        monkeypatch.setattr(tcp.asyncio, "sleep", sleep)
+        monkeypatch.setattr(tcp.asyncio, "open_connection", nobody)
         source = Client(Address.parse("tcp://127.0.0.1:9"), lambda _: None)
         with pytest.raises(asyncio.CancelledError):
             asyncio.run(source._keep_connected())

@@ -34,6 +34,7 @@ from ..live.health import Health
 from ..live.record import Recorder
 from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream
+from ..live.udp import Out
 from ..live.wire import Event
 from ..runs.run import Run
 from ..units import MM
@@ -86,7 +87,7 @@ def run(source: str, options: Options) -> None:
     remote = network.source(address, options.listen, options.allow, say) if address.kind in NETWORK else None
     with contextlib.ExitStack() as stack:
         ended = stack.enter_context(_ended_by_signals())
-        out = stack.enter_context(contextlib.closing(network.Out(options.out))) if options.out else None
+        out = stack.enter_context(contextlib.closing(Out(options.out))) if options.out else None
         estimator = partial(
             LiveEstimator, config, window=options.window, stale_after=options.stale_after, start=start, on_notice=say
         )
@@ -127,7 +128,7 @@ def _log() -> Console:
     return Console(file=file, highlight=False, width=None if file.isatty() else 120)
 
 
-def _way_out(out: network.Out | None, status: bool) -> Callable[[list[bytes]], None]:
+def _way_out(out: Out | None, status: bool) -> Callable[[list[bytes]], None]:
     """Where estimates go: not on the screen that shows the status, as both would write over each other."""
     if out is not None:
         return out

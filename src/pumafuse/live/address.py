@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 from ..errors import ConfigError
 
 Place: TypeAlias = tuple[socket.AddressFamily, tuple[str, int]]
+Allowed: TypeAlias = Callable[[str], bool]  # whether a host may be heard
 
 LISTENERS = ("udp", "tcp-listen")
 NETWORK = (*LISTENERS, "tcp")
@@ -80,7 +81,7 @@ def receiver(text: str) -> Place:
     return resolved(address.host, address.port, f"--out '{text}'")
 
 
-def bound(address: Address, listen: str | None, allow: Sequence[str]) -> tuple[Place, Callable[[str], bool]]:
+def bound(address: Address, listen: str | None, allow: Sequence[str]) -> tuple[Place, Allowed]:
     """Where a listener is to be, and who may be heard there: on loopback everybody, elsewhere only who is allowed.
 
     Args:
