@@ -1,16 +1,12 @@
 """A stream as a recorded run while it comes: a CSV file for each source beside ``run.toml``.
 
-Rows are written twice a second by a thread of their own, whole lines at the end of a file, so that whoever reads finds
-a run at any moment, with a torn last line at worst. A disk that refuses is tried again every second; meanwhile rows
-wait, and when too many wait the new ones are not recorded. Nothing here makes the estimator wait.
+Rows are handed over twice a second to a thread of their own (:mod:`pumafuse.live.writer`), as far as nothing will take
+them back any more. Nothing here makes the estimator wait.
 """
 
 from __future__ import annotations
 
 import math
-import os
-import queue
-import threading
 import time
 from collections.abc import Callable, Container, Mapping
 from contextlib import suppress
@@ -18,21 +14,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .. import toml
-from ..folders import FolderError, write_file
+from ..folders import FolderError
 from ..fusion.config import FusionConfig
 from ..model.arm import ordered_axes
 from ..runs.clock import TOLERATED_STEP_BACK_NS
 from ..runs.frames import CARTESIAN
 from ..runs.save import check_axis, check_name
 from ..units import MM
+from .writer import Job, Writer
 
 _FLUSHED = 0.5  # s between two writes
-_TRIED_AGAIN = 1.0  # s after the disk refused
 _SAID_AGAIN = 60.0  # s until a trouble that lasts is told again
-_MOST_WAITING = 64 << 20  # bytes that wait for a disk
 _MOST_BEFORE = 65_536  # readings that are kept until the first command
-_PATIENCE = 5.0  # s for the disk at the end
-_COMMANDS, _MANIFEST, _TIME = "commands.csv", "run.toml", "time_ns"
+_COMMANDS, _TIME = "commands.csv", "time_ns"
 
 
 class _Row(NamedTuple):
@@ -40,15 +34,6 @@ class _Row(NamedTuple):
     sensor: str | None
     given: list[str]
     line: bytes
-
-
-class _Job(NamedTuple):
-    """What is to be written: more rows of files, and the manifest if it has changed."""
-
-    folder: Path
-    rows: dict[str, bytes]
-    manifest: str
-    number: int
 
 
 class Recorder:
@@ -89,7 +74,7 @@ class Recorder:
         self.late = self.lost = self._given = 0
         self._segment = 1
         _make(folder)
-        self._writer = _Writer(",".join((_TIME, *(f"{axis}_mm" for axis in self._columns))).encode() + b"\n")
+        self._writer = Writer(",".join((_TIME, *(f"{axis}_mm" for axis in self._columns))).encode() + b"\n")
         self._due, self._said, self._troubled = 0.0, -math.inf, False
         self._clear()
 
@@ -210,7 +195,7 @@ class Recorder:
             self.lost += number
         elif number:
             rows = {_file(sensor): b"".join(lines) for sensor, lines in by_source.items()}
-            if self._writer.hand_over(_Job(self._folder, rows, self._manifest(listed), number)):
+            if self._writer.hand_over(Job(self._folder, rows, self._manifest(listed), number)):
                 self._given += number
                 self._listed = listed
             else:
@@ -235,110 +220,6 @@ class Recorder:
         if self._frame is not None:
             tree["frame"] = toml.builtins(self._frame)
         return toml.text(tree)
-
-
-class _File:
-    """An open file, and whether its last line is whole."""
-
-    def __init__(self, path: Path) -> None:
-        self.descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        self.torn = False
-
-    def is_at(self, path: Path) -> bool:
-        """Whether it still has its name."""
-        try:
-            return os.path.samestat(os.fstat(self.descriptor), path.stat())
-        except FileNotFoundError:
-            return False
-
-
-class _Writer:
-    """The thread that waits for the disk.
-
-    Attributes:
-        trouble: Why the disk refuses, or that the folder had gone; empty while all is well.
-        rows: How many are written.
-    """
-
-    def __init__(self, header: bytes) -> None:
-        self.trouble, self.rows = "", 0
-        self._header = header
-        self._folder, self._manifest = Path(), ""
-        self._files: dict[str, _File] = {}
-        self._jobs = queue.SimpleQueue[_Job | None]()
-        self._given = self._done = 0  # bytes; each is counted by one thread alone
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="record", daemon=True)  # a dead disk may hold it
-        self._thread.start()
-
-    def hand_over(self, job: _Job) -> bool:
-        """Whether there is room for a job."""
-        size = sum(map(len, job.rows.values()))
-        if self._given - self._done + size > _MOST_WAITING:
-            return False
-        self._given += size
-        self._jobs.put(job)
-        return True
-
-    def close(self) -> None:
-        """Finish, if the disk lets us."""
-        self._ended.set()
-        self._jobs.put(None)
-        self._thread.join(_PATIENCE)
-
-    def _work(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            size = sum(map(len, job.rows.values()))
-            while not self._tried(job):
-                if self._ended.wait(_TRIED_AGAIN) and not self._tried(job):
-                    return
-            self._done += size
-            self.rows += job.number
-        self._close_files()
-
-    def _tried(self, job: _Job) -> bool:
-        """Write what is left of a job; whether all of it is written."""
-        trouble = ""
-        try:
-            if job.folder != self._folder:
-                self._close_files()
-                self._folder, self._manifest = job.folder, ""
-            elif not all(file.is_at(job.folder / name) for name, file in self._files.items()):
-                trouble = f"{job.folder} or a file in it had gone, and is begun anew"
-                for name in [name for name, file in self._files.items() if file.torn]:
-                    job.rows[name] = job.rows[name].partition(b"\n")[2]
-                self._close_files()
-            job.folder.mkdir(exist_ok=True)
-            for name in list(job.rows):
-                self._append(job, name)
-            if job.manifest != self._manifest or not (job.folder / _MANIFEST).exists():
-                write_file(job.folder / _MANIFEST, job.manifest)
-                self._manifest = job.manifest
-        except OSError as error:
-            self.trouble = f"{job.folder}: {error.strerror or error}"
-            return False
-        except FolderError as error:
-            self.trouble = str(error)
-            return False
-        self.trouble = trouble
-        return True
-
-    def _append(self, job: _Job, name: str) -> None:
-        """Write a file's rows; what a full disk took of them is not written twice."""
-        file = self._files.get(name)
-        if file is None:
-            file = self._files[name] = _File(job.folder / name)
-            if not os.fstat(file.descriptor).st_size and not job.rows[name].startswith(self._header):
-                job.rows[name] = self._header + job.rows[name]
-        while rows := job.rows[name]:
-            written = os.write(file.descriptor, rows)
-            job.rows[name], file.torn = rows[written:], rows[written - 1 : written] != b"\n"
-        del job.rows[name]
-
-    def _close_files(self) -> None:
-        for file in self._files.values():
-            os.close(file.descriptor)
-        self._files = {}
 
 
 def _file(sensor: str | None) -> str:
