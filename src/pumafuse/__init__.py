@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from .identify.identify import Identification, identify
     from .identify.trials import StepTrials, TrialsError
     from .identify.verify import AxisVerification, verify
-    from .live.estimator import AxisNow, LiveEstimate, LiveEstimator, Told
+    from .live.answers import AxisNow, LiveEstimate, Told
+    from .live.estimator import LiveEstimator
     from .live.health import Health, SensorHealth
     from .model.arm import ArmModel, AxisModel, Gain, Validity
     from .model.discrete import DiscreteModel, discretize
@@ -36,7 +37,7 @@ _HOME = {
     "ArmModel": "model.arm",
     "AxisEstimate": "fusion.track",
     "AxisModel": "model.arm",
-    "AxisNow": "live.estimator",
+    "AxisNow": "live.answers",
     "AxisVerification": "identify.verify",
     "ConfigError": "errors",
     "DiscreteModel": "model.discrete",
@@ -46,7 +47,7 @@ _HOME = {
     "Gain": "model.arm",
     "Health": "live.health",
     "Identification": "identify.identify",
-    "LiveEstimate": "live.estimator",
+    "LiveEstimate": "live.answers",
     "LiveEstimator": "live.estimator",
     "Outcome": "fusion.timeline",
     "Process": "fusion.config",
@@ -64,7 +65,7 @@ _HOME = {
     "Start": "fusion.config",
     "StepTrials": "identify.trials",
     "TickEstimates": "fusion.ticks",
-    "Told": "live.estimator",
+    "Told": "live.answers",
     "TrialsError": "identify.trials",
     "TuneError": "tune.learnable",
     "Tuning": "tune.tune",

@@ -10,11 +10,38 @@ filter starts again there.
 from __future__ import annotations
 
 import enum
+import operator
+from typing import TypeAlias
 
+import numpy as np
+
+from ..arrays import REACH_NS
 from ..fusion.timeline import LONGEST_TAIL_NS
+
+Time: TypeAlias = float | int  # float seconds, or int nanoseconds
 
 AHEAD_NS = 1_000_000_000  # stamps may run ahead of all others by this much, or by the window, without a doubt
 AGREE_AFTER = 3  # commands in a row that have another time: the clock was set anew
+
+
+def nanoseconds(t: Time) -> int:
+    """Int ns of float seconds or int nanoseconds.
+
+    Raises:
+        ValueError: No finite number, or out of reach of int64 ns; says which.
+    """
+    try:
+        if type(t) is float:
+            stamp = round(t * 1e9)
+        else:
+            stamp = round(float(t) * 1e9) if isinstance(t, float | np.floating) else operator.index(t)
+    except (TypeError, ValueError, OverflowError):
+        raise ValueError("no time: expected float seconds or int nanoseconds") from None
+    if isinstance(t, bool):
+        raise ValueError("no time: expected float seconds or int nanoseconds")
+    if not -REACH_NS < stamp < REACH_NS:
+        raise ValueError("a time out of reach: the years 1824 to 2115 are in ns since 1970")
+    return stamp
 
 
 class Verdict(enum.Enum):

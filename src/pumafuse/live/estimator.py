@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol
 
-import numpy as np
-
-from ..arrays import REACH_NS
-from ..errors import ConfigError, RunError, UnknownNameError, suggestion
+from ..errors import ConfigError, RunError, suggestion
 from ..fusion.config import FusionConfig
 from ..fusion.timeline import FARTHEST, LONGEST_TAIL_NS, Outcome
 from ..model.arm import ordered_axes
 from ..runs.frames import CARTESIAN, Cylindrical
-from .clock import Clock, Verdict
+from .answers import AxisNow, LiveEstimate, Told, nowhere, told_of
+from .clock import Clock, Time, Verdict, nanoseconds
 from .health import Health, health_of
 from .kernels import ABSENT
 from .placing import Placing
@@ -25,92 +21,8 @@ from .sampler import Sampler
 from .tally_kernels import Tally
 from .window import MOST_ROWS, Window
 
-Time: TypeAlias = float | int  # float seconds, or int nanoseconds
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
-_BEST = (_FUSED, Outcome.REOPENED, Outcome.GATED, *(outcome for outcome in Outcome if outcome > Outcome.REOPENED))
-_REASONS: Mapping[Outcome, str] = {
-    Outcome.FUSED: "taken",
-    Outcome.GATED: "farther from its prediction than the sensor's gate allows",
-    Outcome.REOPENED: "the gate was reopened after many rejections in a row: the offset was widened, the reading taken",
-    Outcome.DUPLICATE: "said before: the same stamp and values, or a command repeated within half a period",
-    Outcome.BEFORE_START: "valid before the first command",
-    Outcome.TOO_LATE: "stamped before the window",
-    Outcome.INVALID: "not a finite position",
-    Outcome.UNKNOWN: "no such sensor or axis",
-}
-
-
-class Told(NamedTuple):
-    """What became of an event.
-
-    Attributes:
-        outcome: Of the event: of its axes the best, ``fused`` before ``reopened`` before ``gated`` and so on. A command
-            that is taken is ``fused``, too.
-        axes: Of each axis that it gives.
-        reason: In words.
-    """
-
-    outcome: Outcome
-    axes: Mapping[str, Outcome]
-    reason: str
-
-
-class AxisNow(NamedTuple):
-    """One axis at one instant; SI units.
-
-    Attributes:
-        position: [m], in the stream's own coordinates.
-        position_sd: [m].
-        velocity: The model's drift [m/s].
-        velocity_sd: [m/s].
-        offset: How far the arm is from its model [m].
-        offset_sd: [m].
-    """
-
-    position: float
-    position_sd: float
-    velocity: float
-    velocity_sd: float
-    offset: float
-    offset_sd: float
-
-
-@dataclass(frozen=True, slots=True)
-class LiveEstimate:
-    """Where the tool is, was, or will be; ``est["radial"]`` is one axis.
-
-    Attributes:
-        stamp: At which instant, int ns.
-        axes: Every axis that has been commanded.
-        cartesian: With a frame, x, y and z [m] as far as the axes give them.
-        stale: Axes on which no reading was fused for longer than the limit.
-        outcome: ``fused``; ``before_start`` or ``too_late`` where there is no estimate; ``invalid`` where there is none
-            that far ahead.
-        reason: In words.
-    """
-
-    stamp: int
-    axes: Mapping[str, AxisNow]
-    cartesian: Mapping[str, float] | None
-    stale: tuple[str, ...]
-    outcome: Outcome
-    reason: str
-
-    @property
-    def time(self) -> float:
-        """The instant in s."""
-        return self.stamp / 1e9
-
-    def __getitem__(self, axis: str) -> AxisNow:
-        """The estimate of one axis.
-
-        Raises:
-            UnknownNameError: There is none; says why.
-        """
-        if axis not in self.axes:
-            raise UnknownNameError(f"estimate at {self.time:.3f} s ({self.reason})", "axis", axis, self.axes)
-        return self.axes[axis]
 
 
 class _Event(NamedTuple):
@@ -243,16 +155,16 @@ class LiveEstimator:
         try:
             stamp = now if at is None else nanoseconds(at)
         except ValueError as error:
-            return _nowhere(0, _INVALID, str(error))
+            return nowhere(0, _INVALID, str(error))
         origin = self._window.origin
         if origin is None or newest is None:
-            return _nowhere(stamp, Outcome.BEFORE_START, "no command yet")
+            return nowhere(stamp, Outcome.BEFORE_START, "no command yet")
         if stamp < origin:
-            return _nowhere(stamp, Outcome.BEFORE_START, "before the first command")
+            return nowhere(stamp, Outcome.BEFORE_START, "before the first command")
         if stamp < self._oldest():
-            return _nowhere(stamp, _TOO_LATE, f"{(newest - stamp) / 1e9:.3f} s ago, before the window")
+            return nowhere(stamp, _TOO_LATE, f"{(newest - stamp) / 1e9:.3f} s ago, before the window")
         if stamp > newest + LONGEST_TAIL_NS:
-            return _nowhere(stamp, _INVALID, "more than an hour ahead")
+            return nowhere(stamp, _INVALID, "more than an hour ahead")
         axes: dict[str, AxisNow] = {}
         stale: list[str] = []
         for axis, found in zip(self.axes, self._window.estimate(stamp, self._oldest()), strict=True):
@@ -514,13 +426,11 @@ class LiveEstimator:
     def _answer(self, codes: bytes, stranger: str) -> Told:
         """What is told of an event by the codes of its axes; the same for all alike, but for strangers."""
         outcomes = {axis: Outcome(code) for axis, code in zip(self.axes, codes, strict=True) if code != ABSENT}
-        best = min(outcomes.values(), key=_BEST.index)
-        reasons = "; ".join(dict.fromkeys(_REASONS[outcome] for outcome in outcomes.values()))
+        told = told_of(outcomes)
         if stranger:
-            return Told(
-                best, MappingProxyType({**outcomes, stranger: _UNKNOWN}), f"{reasons}; {self._no_axis(stranger)}"
-            )
-        return self._answers.setdefault(codes, Told(best, MappingProxyType(outcomes), reasons))
+            axes = MappingProxyType({**outcomes, stranger: _UNKNOWN})
+            return told._replace(axes=axes, reason=f"{told.reason}; {self._no_axis(stranger)}")
+        return self._answers.setdefault(codes, told)
 
     def _refuse(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str) -> Told:
         """Count an event that never comes into the window."""
@@ -535,30 +445,6 @@ class LiveEstimator:
             self._refused[sensor][outcome] += times * len(values)
         else:
             self._strangers += times
-
-
-def nanoseconds(t: Time) -> int:
-    """Int ns of float seconds or int nanoseconds.
-
-    Raises:
-        ValueError: No finite number, or out of reach of int64 ns; says which.
-    """
-    try:
-        if type(t) is float:
-            stamp = round(t * 1e9)
-        else:
-            stamp = round(float(t) * 1e9) if isinstance(t, float | np.floating) else operator.index(t)
-    except (TypeError, ValueError, OverflowError):
-        raise ValueError("no time: expected float seconds or int nanoseconds") from None
-    if isinstance(t, bool):
-        raise ValueError("no time: expected float seconds or int nanoseconds")
-    if not -REACH_NS < stamp < REACH_NS:
-        raise ValueError("a time out of reach: the years 1824 to 2115 are in ns since 1970")
-    return stamp
-
-
-def _nowhere(stamp: int, outcome: Outcome, reason: str) -> LiveEstimate:
-    return LiveEstimate(stamp, {}, None, (), outcome, reason)
 
 
 def _number(value: object) -> float:

@@ -47,7 +47,7 @@ class Health:
     """All that has come.
 
     Attributes:
-        newest: The newest stamp, int ns; None before any event.
+        newest: The newest stamp (but not one that a sensor alone has run ahead to), int ns; None before any event.
         segments: How often the filter has started: 1, and once more each time the commands' clock was set anew.
         commands: Of all commands by the outcome's word.
         sensors: In the order of the configuration.

@@ -7,14 +7,15 @@ from typing import Protocol
 
 from ..errors import ConfigError
 from ..fusion.timeline import Outcome
-from .estimator import LiveEstimate, LiveEstimator, Told, nanoseconds
+from .answers import MET, LiveEstimate, Told
+from .clock import nanoseconds
+from .estimator import LiveEstimator
 from .sampler import Sampler
 from .wire import BadLine, Event, Wire, encode
 
 _SHOWN = 60  # characters of a bad line in the log
 _MOST_AT_ONCE = 50_000  # estimates on the grid between two events
 _FASTEST = 1e4  # Hz
-_TAKEN = frozenset({Outcome.FUSED, Outcome.REOPENED, Outcome.GATED})
 
 
 class Watcher(Protocol):
@@ -101,7 +102,7 @@ class Stream:
         told = live.reading(t, sensor, **values) if sensor else live.command(t, **values)
         for watcher in self._watchers:
             watcher.event(event, told)
-        if told.outcome not in _TAKEN or not _TAKEN.issuperset(told.axes.values()):
+        if told.outcome not in MET or not MET.issuperset(told.axes.values()):
             who = sensor if sensor in live.config.sensors else "unknown sensor" if sensor else "command"
             became = f"{told.reason} ({told.outcome.word})"
             self._log.say(f"{who} {told.outcome.word}", f"{sensor[:40] or who}{_at(t)}: {became}")

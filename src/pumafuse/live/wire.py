@@ -11,7 +11,7 @@ from msgspec import UNSET, UnsetType
 from ..errors import ConfigError
 from ..runs.frames import CARTESIAN
 from ..units import MM
-from .estimator import LiveEstimate
+from .answers import LiveEstimate
 from .lines import LONGEST
 
 _NAMES = ("t", "t_ns", "command", "sensor")

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..errors import ConfigError
 from ..fusion.timeline import Outcome
+from ..live.answers import MET
 from ..model.arm import CANONICAL_AXES, ordered_axes
 from ..runs.frames import CARTESIAN
 from .live_frames import Band, Frame, Header, Met, Path, SensorHead, Series, packed
@@ -32,7 +33,7 @@ from .live_frames import Health as SensorsNow
 
 if TYPE_CHECKING:
     from ..fusion.config import FusionConfig
-    from ..live.estimator import LiveEstimate, Told
+    from ..live.answers import LiveEstimate, Told
     from ..live.health import Health
     from ..live.wire import Event
 
@@ -44,7 +45,6 @@ _HEALTH = 1.0  # s between looks at the health
 _MOST = 500  # rows of one source in a frame; a plot is not wider
 _LONGEST_END = 2.0  # s
 _Row: TypeAlias = "tuple[float, Mapping[str, Any], Mapping[str, Outcome]]"
-_MET = frozenset({Outcome.FUSED, Outcome.REOPENED, Outcome.GATED})
 
 
 class _Gathered:
@@ -122,7 +122,7 @@ class LiveView:
 
     def event(self, event: Event, told: Told) -> None:
         """Take in an event and what became of it."""
-        if self._child is None or told.outcome not in _MET:
+        if self._child is None or told.outcome not in MET:
             return
         t, sensor, values = event
         moment = t if type(t) is float else t / 1e9
@@ -302,7 +302,7 @@ def _met(rows: Sequence[_Row], axes: Sequence[str]) -> dict[str, Met]:
     found = {axis: Met() for axis in axes}
     for moment, values, outcomes in rows:
         for axis, outcome in outcomes.items():
-            if outcome in _MET and axis in values:
+            if outcome in MET and axis in values:
                 one = found[axis]
                 one.time.append(moment)
                 one.value.append(float(values[axis]))
