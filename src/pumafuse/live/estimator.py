@@ -15,7 +15,7 @@ from ..runs.frames import CARTESIAN, Cylindrical
 from .answers import AxisNow, LiveEstimate, Told, nowhere, told_of
 from .clock import Clock, Time, Verdict, nanoseconds
 from .health import Health, health_of
-from .kernels import ABSENT
+from .memory import ABSENT
 from .placing import Placing
 from .sampler import Sampler
 from .tally_kernels import Tally

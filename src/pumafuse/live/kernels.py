@@ -11,11 +11,10 @@ kernels that fuse a recorded run.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, TypeAlias
 
-from ..arrays import ALWAYS, NEVER, CodeArray, FloatArray, IntArray, TimeArray
+from ..arrays import ALWAYS, NEVER, FloatArray, IntArray, TimeArray
 from ..compiled import compiled
-from ..fusion.kernels import Axes, Held, Log, Met, Outputs, Rows, Sensors, State, estimate, go_back, keep, meet
+from ..fusion.kernels import Held, Log, Met, Outputs, Rows, Sensors, State, estimate, go_back, keep, meet
 from ..fusion.timeline import FARTHEST, Outcome
 from .command_kernels import (
     COMMANDS,
@@ -33,90 +32,27 @@ from .command_kernels import (
     put,
     withdraw,
 )
+from .memory import (
+    ABSENT,
+    BECAME,
+    BEGIN,
+    CHANGED,
+    END,
+    KNOWN,
+    ORIGIN,
+    SPREAD,
+    VALUE,
+    Flat,
+    Heard,
+    Nothing,
+    opened,
+)
 from .tally_kernels import NIS, SCALARS, Tally, came, followed, slot_of, unheard
 
 DONE, NO_ROOM = range(2)
-BEGIN, END, ORIGIN, CHANGED = range(4)  # of a window's span
-ABSENT = 255  # an axis that a row does not give
-VALUE, SPREAD = range(2)
-KNOWN, BECAME = range(2)
 
 _FUSED, _REOPENED, _INVALID = int(Outcome.FUSED), int(Outcome.REOPENED), int(Outcome.INVALID)
 _DUPLICATE, _BEFORE_START, _UNKNOWN = int(Outcome.DUPLICATE), int(Outcome.BEFORE_START), int(Outcome.UNKNOWN)
-_FARTHEST = FARTHEST
-
-
-class Heard(NamedTuple):
-    """The rows of readings as they came, in a ring of R, and what is asked and answered.
-
-    Attributes:
-        span: Positions of the first row (``BEGIN``) and after the last one (``END``), the first command's stamp [ns]
-            (``ORIGIN``), and the position of the first row for which an event ``CHANGED`` something, (4,).
-        stamp: Int64 ns, (R,).
-        value: z [m] of each axis, and by what its noise is scaled, (R, A, 2).
-        code: What is ``KNOWN`` of each scalar before filtering and what ``BECAME`` of it: codes of Outcome, or
-            ``ABSENT``, (R, A, 2).
-        latency: Of each sensor, int64 ns, (S,).
-        new: Values [m] of the event that comes in, and by what the noise of each is scaled, (A, 2).
-        told: What became of them, (A,).
-        fused: When the last scalar that an estimate knows of was valid, int64 ns, (A,).
-    """
-
-    span: IntArray
-    stamp: TimeArray
-    value: FloatArray
-    code: CodeArray
-    latency: TimeArray
-    new: FloatArray
-    told: CodeArray
-    fused: TimeArray
-
-
-class Nothing(NamedTuple):
-    """Empty arrays, for a smoother's log that nobody keeps: (A + 1,), (0,) and (0, s)."""
-
-    whole: IntArray
-    real: FloatArray
-    table: FloatArray
-
-
-class Memory(NamedTuple):
-    """All of it. ``kept`` has two places more than the ring: one to put the state aside, one for the start."""
-
-    axes: Axes
-    sensors: Sensors
-    rows: Rows
-    state: State
-    kept: State
-    met: Met
-    commands: Commands
-    heard: Heard
-    tally: Tally
-    nothing: Nothing
-
-    def flat(self) -> Flat:
-        """As plain tuples, which a kernel takes a hundred times faster."""
-        return tuple(tuple(part) for part in self)
-
-
-Flat: TypeAlias = tuple[tuple[Any, ...], ...]
-
-
-@compiled
-def opened(flat: Flat) -> Memory:
-    """The names again."""
-    return Memory(
-        Axes(*flat[0]),
-        Sensors(*flat[1]),
-        Rows(*flat[2]),
-        State(*flat[3]),
-        State(*flat[4]),
-        Met(*flat[5]),
-        Commands(*flat[6]),
-        Heard(*flat[7]),
-        Tally(*flat[8]),
-        Nothing(*flat[9]),
-    )
 
 
 @compiled
@@ -180,7 +116,7 @@ def command(flat: Flat, stamp: int, given: int, horizon: int) -> int:
         if given >> axis & 1:
             if commands.number[axis, COMMANDS] == commands.time.shape[1] or crowded(axes, commands, axis, stamp, last):
                 return NO_ROOM
-            heard.told[axis] = _FUSED if abs(heard.new[axis, VALUE]) < _FARTHEST else _INVALID
+            heard.told[axis] = _FUSED if abs(heard.new[axis, VALUE]) < FARTHEST else _INVALID
             first |= heard.told[axis] == _FUSED and stamp < heard.span[ORIGIN]
     if first:
         since, heard.span[ORIGIN] = ALWAYS, stamp
@@ -311,7 +247,7 @@ def insert(
     for axis in range(len(heard.told)):
         heard.told[axis] = ABSENT
         if given >> axis & 1:
-            possible = abs(heard.new[axis, VALUE]) < _FARTHEST
+            possible = abs(heard.new[axis, VALUE]) < FARTHEST
             heard.told[axis] = _UNKNOWN if math.isnan(sensors.sd[sensor, axis]) else _FUSED if possible else _INVALID
     for position in range(at - 1, heard.span[BEGIN] - 1, -1):
         here = position & mask

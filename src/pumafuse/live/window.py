@@ -1,4 +1,4 @@
-"""The arrays behind a live estimator: made once, grown when a stream is denser than they are, never without bound."""
+"""The last seconds of a stream: events go in, estimates come out; a denser stream gets more room, up to a bound."""
 
 from __future__ import annotations
 
@@ -6,30 +6,17 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..arrays import ALWAYS, NEVER, FloatArray, IntArray
+from ..arrays import ALWAYS, NEVER, FloatArray
 from ..errors import ConfigError
 from ..fusion import kernels as fusion
 from ..fusion.config import FusionConfig
-from ..fusion.engine import order_of, places, sensors_of, start_of
-from ..model import closed
 from . import kernels
-from .command_kernels import COMMANDS, STAMP, STEP, Commands, U
-from .kernels import (
-    BEGIN,
-    CHANGED,
-    DONE,
-    END,
-    ORIGIN,
-    SPREAD,
-    VALUE,
-    Heard,
-    Memory,
-    Nothing,
-)
-from .tally_kernels import IN_A_ROW, SECONDS, Tally
+from .command_kernels import COMMANDS, STAMP, STEP, U
+from .kernels import DONE
+from .memory import BEGIN, CHANGED, END, ORIGIN, SPREAD, VALUE, empty, with_commands, with_entries, with_rows
+from .tally_kernels import Tally
 
 MOST_ROWS = 65_536  # of readings or of commands: some 70 MB for three axes; what is more shortens the window
-_ROWS, _COMMANDS, _ENTRIES = 4096, 512, 1024  # at first
 _LONGEST_RECOVERY = 1e4  # periods
 
 
@@ -70,7 +57,7 @@ class Window:
                 )
         self.floor = ALWAYS
         self._latency = round(max([0.0, *(sensor.latency for sensor in config.sensors.values())]) * 1e9)
-        self.memory = _empty(config, axes, start)
+        self.memory = empty(config, axes, start)
         if tally is not None:
             self.memory.tally.number[:], self.memory.tally.usual[:] = tally.number, tally.usual
         heard = self.memory.heard
@@ -208,15 +195,15 @@ class Window:
         longest = int(commands.number[:, COMMANDS].argmax())
         if event and heard.span[END] - begin == rows:
             if rows < MOST_ROWS:
-                self.memory = _with_rows(self.memory, 2 * rows)
+                self.memory = with_rows(self.memory, 2 * rows)
             else:
                 self._give_up(int(self.memory.rows.valid[(begin + rows // 8) % rows]) + 1 + self._latency)
         elif attempt == 0:
             kernels.compact(self._flat, max(oldest, self.floor))
         elif not event or commands.number[longest, COMMANDS] < room:
-            self.memory = _with_entries(self.memory)
+            self.memory = with_entries(self.memory)
         elif room < MOST_ROWS:
-            self.memory = _with_commands(self.memory)
+            self.memory = with_commands(self.memory)
         else:
             self._give_up(int(commands.time[longest, room // 8, STAMP]) + 1)
         self._flat = self.memory.flat()
@@ -226,156 +213,3 @@ class Window:
         self.floor = floor
         kernels.let_go(self._flat, floor - self._latency)
         kernels.compact(self._flat, floor)
-
-
-def _empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, float]) -> Memory:
-    names, count = tuple(config.sensors), len(axes)
-    level = {axis: start.get(axis, 0.0) for axis in axes}
-    biases = [
-        [name for name, sensor in config.sensors.items() if sensor.bias_sd > 0.0 and sensor.sd_of(axis) is not None]
-        for axis in axes
-    ]
-    models, process = [config.arm.axes[axis] for axis in axes], [config.process[axis] for axis in axes]
-    order = np.array([order_of(config, axis) for axis in axes])
-    driven = fusion.Axes(
-        order=order,
-        constants=np.array([closed.constants(model.plant) for model in models]),
-        states=order + 1 + np.array([len(biased) for biased in biases]),
-        first=np.arange(count + 1) * _ENTRIES,
-        acting=np.full(count * _ENTRIES, NEVER),
-        value=np.zeros(count * _ENTRIES),
-        noise=np.zeros(count * _ENTRIES),
-        drift=np.zeros(count * _ENTRIES),
-        resting=np.array([[part.input_noise**2, part.drift**2] for part in process]),
-    )
-    state = start_of(driven, len(names), NEVER, config, biases)
-    scalars, width = _ROWS * count, state.x.shape[1]
-    kept = places(state, _ROWS + 2)
-    fusion.keep(state, kept, _ROWS + 1)
-    table = (count, _COMMANDS)
-    return Memory(
-        driven,
-        sensors_of(names, level, config, biases),
-        fusion.Rows(
-            np.zeros(_ROWS, np.int64),
-            np.zeros(_ROWS, np.int16),
-            np.zeros(_ROWS, np.int64),
-            np.zeros(_ROWS, np.int64),
-            np.zeros(scalars, np.int16),
-            np.zeros(scalars),
-            np.zeros(scalars),
-        ),
-        state,
-        kept,
-        fusion.Met(np.zeros(scalars), np.zeros(scalars), np.zeros(scalars, np.uint8)),
-        Commands(
-            time=np.zeros((*table, 2), np.int64),
-            row=np.zeros((*table, 5)),
-            number=np.array([[0, 0, 0, 0, 0, round(config.arm.delay_of(axis) * 1e9)] for axis in axes]),
-            level=np.array([[u, float(axis in start)] for axis, u in level.items()]),
-            gain=np.array(
-                [
-                    [
-                        model.gain.slope,
-                        model.gain.intercept,
-                        np.inf if model.gain_recovery is None else model.gain_recovery,
-                        config.arm.update_period,
-                    ]
-                    for model in models
-                ]
-            ),
-            process=np.array(
-                [[part.input_noise**2, part.drift**2, part.maneuver_noise, part.maneuver_drift] for part in process]
-            ),
-        ),
-        Heard(
-            span=np.array([0, 0, NEVER, 0]),
-            stamp=np.zeros(_ROWS, np.int64),
-            value=np.zeros((_ROWS, count, 2)),
-            code=np.zeros((_ROWS, count, 2), np.uint8),
-            latency=np.array([round(sensor.latency * 1e9) for sensor in config.sensors.values()], dtype=np.int64),
-            new=np.tile([0.0, 1.0], (count, 1)),
-            told=np.zeros(count, np.uint8),
-            fused=np.zeros(count, np.int64),
-        ),
-        Tally(
-            number=np.zeros((len(names), IN_A_ROW + 1), np.int64),
-            last=np.full(len(names), ALWAYS),
-            left=np.full(len(names), ALWAYS),
-            usual=np.zeros(len(names)),
-            second=np.full((len(names), SECONDS), ALWAYS),
-            minute=np.zeros((len(names), SECONDS, 5)),
-        ),
-        Nothing(np.zeros(count + 1, np.int64), np.zeros(0), np.zeros((0, width))),
-    )
-
-
-def _with_rows(memory: Memory, rows: int) -> Memory:
-    """The same with room for ``rows`` rows in the ring; what is in it keeps its positions."""
-    held, axes = len(memory.heard.stamp), len(memory.heard.told)
-    positions: IntArray = np.arange(int(memory.heard.span[BEGIN]), int(memory.heard.span[END]), dtype=np.int64)
-    here, there = positions % held, positions % rows
-    extra = np.array([held, held + 1])
-
-    def of_rows(part: np.ndarray) -> np.ndarray:
-        found = np.zeros((rows, *part.shape[1:]), dtype=part.dtype)
-        found[there] = part[here]
-        return found
-
-    def of_scalars(part: np.ndarray) -> np.ndarray:
-        return of_rows(part.reshape(held, axes)).reshape(-1)
-
-    def of_places(part: np.ndarray) -> np.ndarray:
-        found = np.zeros((rows + 2, *part.shape[1:]), dtype=part.dtype)
-        found[there], found[rows:] = part[here], part[extra]
-        return found
-
-    scalars_begin = memory.rows.first - np.arange(held) * axes  # 0 for each row that was ever arranged
-    first = of_rows(scalars_begin) + np.arange(rows) * axes
-    return memory._replace(
-        rows=fusion.Rows(
-            of_rows(memory.rows.valid),
-            of_rows(memory.rows.sensor),
-            first,
-            first + of_rows(memory.rows.end - memory.rows.first),
-            of_scalars(memory.rows.axis),
-            of_scalars(memory.rows.value),
-            of_scalars(memory.rows.spread),
-        ),
-        kept=fusion.State(
-            **{name: of_places(part) for name, part in memory.kept._asdict().items() if name != "work"},
-            work=memory.kept.work,
-        ),
-        met=fusion.Met(*(of_scalars(part) for part in memory.met)),
-        heard=memory.heard._replace(
-            stamp=of_rows(memory.heard.stamp),
-            value=of_rows(memory.heard.value),
-            code=of_rows(memory.heard.code),
-        ),
-    )
-
-
-def _with_commands(memory: Memory) -> Memory:
-    """The same with twice the room for commands."""
-    commands = memory.commands
-    time, row = (np.concatenate((part, np.zeros_like(part)), axis=1) for part in (commands.time, commands.row))
-    return memory._replace(commands=commands._replace(time=time, row=row))
-
-
-def _with_entries(memory: Memory) -> Memory:
-    """The same with twice the room for the entries that commands make."""
-    count, axes = len(memory.heard.told), memory.axes
-
-    def wider(part: np.ndarray, filled: float = 0) -> np.ndarray:
-        table = part.reshape(count, -1)
-        return np.concatenate((table, np.full_like(table, filled)), axis=1).reshape(-1)
-
-    return memory._replace(
-        axes=axes._replace(
-            first=axes.first * 2,
-            acting=wider(axes.acting, NEVER),
-            value=wider(axes.value),
-            noise=wider(axes.noise),
-            drift=wider(axes.drift),
-        )
-    )
