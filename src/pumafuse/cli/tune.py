@@ -24,6 +24,7 @@ from ..tune.parameters import check_holds, kinds_of
 from ..tune.summary import Fitted, TuningSummary
 from ..tune.tune import Tuning, tune
 from ..tune.validate import Check
+from ..views import words
 from .tables import console
 
 SUMMARY = "tuning.json"
@@ -112,7 +113,7 @@ def _show(found: Tuning, options: Options) -> None:
     for one in summary.held:
         out.print(one, markup=False)
     for pair in summary.correlations:
-        out.print(f"{pair.first} and {pair.second} go together: correlation {pair.correlation:+.2f}", markup=False)
+        out.print(words.together(pair), markup=False)
     for bias in summary.biases:
         off = f"{bias.bias_mm:.3f} ± {Z95 * bias.sd_mm:.3f} mm"
         out.print(f"{bias.run}: {bias.sensor} is off by {off} on {bias.axis}", markup=False)
@@ -165,19 +166,15 @@ def _validation(checks: Sequence[Check]) -> Table:
         scores = (
             escape(one.run) + since,
             escape(one.axis),
-            _change([state.rmse_mm for state in pair], ".3f"),
-            _change([state.coverage for state in pair], ".3f"),
+            words.change([state.rmse_mm for state in pair], ".3f"),
+            words.change([state.coverage for state in pair], ".3f"),
         )
         for number, name in enumerate(one.before.sensors):
             found = [state.sensors.get(name) for state in pair]
             table.add_row(
                 *(scores if number == 0 else ("", "", "", "")),
                 escape(name),
-                _change([None if sensor is None else sensor.nis for sensor in found], ".2f"),
-                _change([None if sensor is None else sensor.correlation for sensor in found], "+.2f"),
+                words.change([None if sensor is None else sensor.nis for sensor in found], ".2f"),
+                words.change([None if sensor is None else sensor.correlation for sensor in found], "+.2f"),
             )
     return table
-
-
-def _change(values: Sequence[float | None], form: str) -> str:
-    return " → ".join("–" if value is None else format(value, form) for value in values)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from ..arrays import FloatArray
 from ..fusion.consistency import LAGS, consistency
-from ..fusion.estimates import Estimates, Readings
+from ..fusion.estimates import Estimates
 from ..fusion.score import Z95, interpolated
 from ..fusion.timeline import Outcome
 from ..runs.axes import in_axes
@@ -70,7 +70,7 @@ def error_figure(est: Estimates, path: Path) -> None:
         for (axes,), name in zip(grid, known, strict=True):
             error = est[name].position - truth[name]
             for sensor, colour in style.sensor_colours(est.readings.sensors).items():
-                scalars = _positions(est, sensor, name)
+                scalars = style.positions(est, sensor, name)
                 first = np.zeros(len(scalars.time), dtype=np.int64)  # the first segment's will do for a picture
                 raw = scalars.value - interpolated(scalars.time, first, est.reference, name)
                 label = f"{sensor}, latency removed"
@@ -154,21 +154,12 @@ def _band(axes: Axes, est: Estimates, name: str, centre: FloatArray) -> None:
 
 def _scatter(axes: Axes, est: Estimates, name: str) -> None:
     for sensor, colour in style.sensor_colours(est.readings.sensors).items():
-        scalars = _positions(est, sensor, name)
+        scalars = style.positions(est, sensor, name)
         fused = scalars.where(scalars.outcome != Outcome.GATED)
         gated = scalars.where(scalars.outcome == Outcome.GATED)
         axes.plot(fused.time, fused.value * MM, ".", ms=2.5, color=colour, label=sensor)
         if len(gated.time):
             axes.plot(gated.time, gated.value * MM, "x", ms=4, color=style.REJECTED, label=f"{sensor}, gated")
-
-
-def _positions(est: Estimates, sensor: str, axis: str) -> Readings:
-    """A sensor's scalars as positions in the log's coordinates: scale and the estimated bias taken off."""
-    readings = est.readings.of(sensor, axis)
-    if sensor not in est.config.sensors:
-        return readings.where(np.zeros(len(readings.value), dtype=bool))
-    bias = est.biases.get(sensor, {}).get(axis)
-    return readings.as_position(est.config.sensors[sensor].scale, 0.0 if bias is None else bias.value)
 
 
 def _limits(axes: Axes, values: FloatArray) -> None:

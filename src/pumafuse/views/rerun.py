@@ -61,15 +61,13 @@ def _send(est: Estimates, run: Run, stream: rr.RecordingStream) -> None:
 
 
 def _sensor(stream: rr.RecordingStream, est: Estimates, sensor: str, axis: str, colour: str) -> None:
-    readings = est.readings.of(sensor, axis)
-    if sensor not in est.config.sensors or not len(readings.value):
+    seen = style.positions(est, sensor, axis)
+    if not len(seen.value):
         return
-    bias = est.biases.get(sensor, {}).get(axis)
-    seen = readings.as_position(est.config.sensors[sensor].scale, 0.0 if bias is None else bias.value)
     fused = (seen.outcome == Outcome.FUSED) | (seen.outcome == Outcome.REOPENED)
     _points(stream, f"{axis}/{sensor}", seen.time[fused], seen.value[fused], colour)
     _points(stream, f"{axis}/{sensor}/rejected", seen.time[~fused], seen.value[~fused], style.REJECTED, marker="Cross")
-    _innovations(stream, f"innovation/{axis}/{sensor}", readings.where(np.isfinite(readings.innovation)), colour)
+    _innovations(stream, f"innovation/{axis}/{sensor}", seen.where(np.isfinite(seen.innovation)), colour)
 
 
 def _innovations(stream: rr.RecordingStream, path: str, met: Readings, colour: str) -> None:

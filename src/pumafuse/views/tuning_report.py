@@ -99,10 +99,7 @@ def _summary(summary: TuningSummary) -> str:
 
 
 def _notes(summary: TuningSummary) -> list[str]:
-    together = [
-        f"{pair.first} and {pair.second} go together: correlation {pair.correlation:+.2f}"
-        for pair in summary.correlations
-    ]
+    together = [words.together(pair) for pair in summary.correlations]
     orders = [f"{axis}: {why}" for axis, why in summary.orders.items()]
     return [*summary.notes, *summary.held, *together, *orders]
 
@@ -123,21 +120,17 @@ def _check(one: Check) -> Mapping[str, Any]:
         "axis": one.axis,
         "sensors": [
             names,
-            [_change([None if check is None else check.nis for check in pair]) for pair in pairs],
-            [_change([None if check is None else check.correlation for check in pair], "+z.2f") for pair in pairs],
+            [words.change([None if check is None else check.nis for check in pair], ".2f") for pair in pairs],
+            [words.change([None if check is None else check.correlation for check in pair], "+z.2f") for pair in pairs],
         ],
         "numbers": [
-            _change([state.gated for state in states], "d"),
-            _change([state.rmse_mm for state in states], ".3f"),
-            _change([state.coverage for state in states], ".3f"),
+            words.change([state.gated for state in states], "d"),
+            words.change([state.rmse_mm for state in states], ".3f"),
+            words.change([state.coverage for state in states], ".3f"),
         ],
         "verdict": one.verdict,
         "worse": one.worse,
     }
-
-
-def _change(values: Sequence[float | None], form: str = ".2f") -> str:
-    return " → ".join("–" if value is None else format(value, form) for value in values)
 
 
 def _says_parameters(summary: TuningSummary) -> str:
@@ -193,7 +186,7 @@ def _says_validation(checks: Sequence[Check]) -> str:
 
 
 def _says_tests(sensor: str, axis: str, tests: _Tests) -> str:
-    nis = _change([None if one is None else one.nis for one in tests])
+    nis = words.change([None if one is None else one.nis for one in tests], ".2f")
     white = " → ".join("–" if one is None else words.p_value(one.whiteness) for one in tests)
     after = tests[1]
     expected = "" if after is None else f" (expected {after.nis_band[0]:.2f} to {after.nis_band[1]:.2f})"

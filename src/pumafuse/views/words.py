@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,7 @@ from ..units import MM
 
 if TYPE_CHECKING:
     from ..identify.verify import AxisVerification
+    from ..tune.summary import Correlation
 
 
 def with_interval(value: float, interval: Interval | None, unit: float = 1.0) -> str:
@@ -53,6 +55,16 @@ def gain(found: Gain) -> str:
     """K against speed s."""
     line = with_interval(found.intercept, found.intercept_ci95)
     return f"{line} + ({with_interval(found.slope, found.slope_ci95)}) s" if found.slope else line
+
+
+def change(values: Sequence[float | None], form: str) -> str:
+    """Numbers before and after; ``form`` is a format specification."""
+    return " → ".join("–" if value is None else format(value, form) for value in values)
+
+
+def together(pair: Correlation) -> str:
+    """Two numbers that the readings tell only together."""
+    return f"{pair.first} and {pair.second} go together: correlation {pair.correlation:+.2f}"
 
 
 def verification(one: AxisVerification) -> list[str]:
