@@ -14,39 +14,29 @@ from dataclasses import dataclass
 from functools import partial
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import msgspec
-from rich import box
-from rich.console import Console, Group
+from rich.console import Console
 from rich.live import Live
-from rich.markup import escape
-from rich.table import Table
-from rich.text import Text
 
 from ..errors import ConfigError, RunError
 from ..fusion.config import FusionConfig
-from ..fusion.timeline import Outcome
 from ..live import network
 from ..live.address import LISTENERS, NETWORK, Address
 from ..live.estimator import LiveEstimator
-from ..live.health import Health
 from ..live.record import Recorder
 from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream
 from ..live.udp import Out
 from ..live.wire import Event
 from ..runs.run import Run
-from ..units import MM
+from .live_status import Part, status, summarise
 
 if TYPE_CHECKING:
     from ..views.live import LiveView
 
 _REDRAWN = 0.25  # s between two pictures of the status
-
-
-class _Part(Protocol):
-    def told(self) -> str: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +159,7 @@ class _Follower:
     def __init__(
         self,
         stream: Stream,
-        parts: Sequence[_Part],
+        parts: Sequence[Part],
         speed: float,
         recorder: Recorder | None,
         view: LiveView | None,
@@ -224,76 +214,3 @@ def _screen(errors: Console, wanted: bool) -> Generator[Live | None]:
         return
     with Live(console=errors, auto_refresh=False, transient=True) as screen:
         yield screen
-
-
-def status(stream: Stream, parts: Sequence[_Part] = ()) -> Group:
-    """One picture of the stream: where the tool is, and how each sensor does."""
-    live, health = stream.live, stream.live.health()
-    estimate = live.estimate()
-    axes = Table(box=box.SIMPLE_HEAD)
-    for heading in ("axis", "position, mm", "± sd, mm", "velocity, mm/s", ""):
-        axes.add_column(heading, justify="left" if heading in ("axis", "") else "right")
-    for name, axis in estimate.axes.items():
-        stale = "[red]stale[/red]" if name in estimate.stale else ""
-        axes.add_row(
-            escape(name),
-            f"{axis.position * MM:.3f}",
-            f"{axis.position_sd * MM:.3f}",
-            f"{axis.velocity * MM:.1f}",
-            stale,
-        )
-    told = "no event yet" if live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
-    return Group(Text(told), axes, sensor_table(health), Text(counted(stream, health)), *map(Text, _told(parts)))
-
-
-def sensor_table(health: Health) -> Table:
-    """Rate, lateness, dropouts and NIS of each sensor, and its scalars by outcome."""
-    caption = "outcomes count scalars: each axis of a row by itself"
-    table = Table(box=box.SIMPLE_HEAD, caption=caption, caption_justify="left")
-    words = [
-        word for word in (o.word for o in Outcome) if any(sensor.outcomes[word] for sensor in health.sensors.values())
-    ]
-    table.add_column("sensor")
-    for heading in ("rows", "rate, Hz", "late, ms", "at most", "dropouts", "NIS", "silent, s", *words):
-        table.add_column(heading, justify="right")
-    for name, sensor in health.sensors.items():
-        silent = "never heard" if sensor.silent is None else f"{sensor.silent:.1f}"
-        table.add_row(
-            escape(name),
-            str(sensor.rows),
-            f"{sensor.rate:.1f}",
-            f"{sensor.lateness * MM:.1f}",
-            f"{sensor.lateness_max * MM:.1f}",
-            str(sensor.dropouts),
-            "" if sensor.nis is None else f"{sensor.nis:.2f}",
-            f"[red]{silent}[/red]" if sensor.stale else silent,
-            *(str(sensor.outcomes[word]) for word in words),
-        )
-    return table
-
-
-def counted(stream: Stream, health: Health) -> str:
-    """Lines, commands, restarts and estimates in one sentence."""
-    parts = [f"{count} {word}" for word, count in health.commands.items() if count]
-    said = [f"commands: {', '.join(parts) or 'none'}", f"{stream.estimates} estimates"]
-    if stream.lines:
-        said.insert(0, f"{stream.lines} lines, {stream.bad} of them bad")
-    if health.unknown:
-        said.append(f"{health.unknown} rows of unknown sensors")
-    if health.segments > 1:
-        said.append(f"{health.segments} segments")
-    return "; ".join(said)
-
-
-def summarise(stream: Stream, parts: Sequence[_Part], errors: Console) -> None:
-    """What there was, for people."""
-    health = stream.live.health()
-    for said in (counted(stream, health), *_told(parts)):
-        errors.print(said, markup=False, soft_wrap=True)
-    if any(sensor.rows for sensor in health.sensors.values()):
-        errors.print(sensor_table(health))
-
-
-def _told(parts: Sequence[_Part]) -> list[str]:
-    """What the source, the recording and the way out have to say."""
-    return [said for said in (part.told() for part in parts) if said]
