@@ -28,8 +28,7 @@ from ..fusion.timeline import Outcome
 from ..live.answers import MET
 from ..model.arm import CANONICAL_AXES, ordered_axes
 from ..runs.frames import CARTESIAN
-from .live_frames import Band, Frame, Header, Met, Path, SensorHead, Series, packed
-from .live_frames import Health as SensorsNow
+from .live_frames import Band, Frame, Header, Met, Path, SensorHead, SensorsNow, Series, packed
 
 if TYPE_CHECKING:
     from ..fusion.config import FusionConfig

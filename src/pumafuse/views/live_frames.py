@@ -78,7 +78,7 @@ class Path(msgspec.Struct, array_like=True):
     position: list[tuple[float, float, float]] = []
 
 
-class Health(msgspec.Struct, array_like=True):
+class SensorsNow(msgspec.Struct, array_like=True):
     """NIS and rate [Hz] of the sensors that have them, at one time [s]."""
 
     time: float
@@ -101,7 +101,7 @@ class Frame(msgspec.Struct):
     readings: dict[str, dict[str, Met]] = {}
     estimates: dict[str, Band] = {}
     paths: dict[str, Path] = {}
-    health: Health | None = None
+    health: SensorsNow | None = None
 
     def add(self, later: Frame) -> None:
         """Take in what came after."""

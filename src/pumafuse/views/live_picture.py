@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from ..arrays import FloatArray
 from ..units import MM
 from . import looks, style
-from .live_frames import Band, Frame, Header, Health, Met, Path, SensorHead
+from .live_frames import Band, Frame, Header, Met, Path, SensorHead, SensorsNow
 
 _SHOWN = 30.0  # s
 _MARGIN = 8.0  # s on the left for a legend
@@ -114,7 +114,7 @@ class Picture:
             tool = rr.Points3D(strip[-1:], colors=[style.rgb(style.REJECTED)], radii=-5.0)
             self._stream.log("path/tool", tool)
 
-    def _health(self, health: Health) -> None:
+    def _health(self, health: SensorsNow) -> None:
         for kind, values in (("nis", health.nis), ("rate", health.rate)):
             for name, value in values.items():
                 looks.send(self._stream, f"{kind}/{name}", np.array([health.time]), np.array([value]))
