@@ -24,7 +24,7 @@ from .tables import console
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line asks for."""
+    """What the command line asks for, in s and m; see ``pumafuse identify --help``."""
 
     output: Path
     period: float | None

@@ -41,7 +41,7 @@ _REDRAWN = 0.25  # s between two pictures of the status
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What the command line asks of a stream; see ``pumafuse live --help``."""
+    """What the command line asks of a stream, in s and Hz; see ``pumafuse live --help``."""
 
     config: Path
     rate: float | None

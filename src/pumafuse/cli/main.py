@@ -357,7 +357,10 @@ def demo(
 
 
 def main() -> None:
-    """Run the command line: 0 done, 1 data or configuration is wrong, 2 usage, 3 a check asked for failed."""
+    """Run the command line.
+
+    Exit codes: 0 done, 1 data or configuration is wrong, 2 usage, 3 a check asked for failed, 130 interrupted.
+    """
     warnings.showwarning = _one_line
     warnings.simplefilter("always", PumafuseWarning)
     try:

@@ -19,7 +19,7 @@ _PERIOD = 0.028  # s, the paper's
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the command line asks for; axes and period as None are the arm's."""
+    """What the command line asks for, in s, m and m/s; axes and period as None are the arm's."""
 
     axes: Sequence[str] | None
     speeds: tuple[float, ...]

@@ -149,6 +149,7 @@ class Clock:
         return Verdict.HERE
 
     def _elsewhere(self, stamp: int, command: bool) -> Verdict:
+        """What a stamp means that no clock here can have: too late, too far ahead, or a command of a clock set anew."""
         assert self.newest is not None
         if command:
             follows = self._other and self._other[-1] < stamp <= self._other[-1] + LONGEST_TAIL_NS

@@ -346,6 +346,7 @@ class LiveEstimator:
         return self._feed_early(event)
 
     def _feed_early(self, event: _Event) -> Told:
+        """Feed an event, and keep it for when the frame's place changes."""
         assert self._early is not None
         before = self._refusals
         told = self._feed(*event)
@@ -419,6 +420,7 @@ class LiveEstimator:
         return given
 
     def _no_axis(self, stranger: str) -> str:
+        """Why what an event gives under a name is of no axis."""
         if stranger in CARTESIAN and self.config.frame is None:
             return f"'{stranger}' needs a [frame] in fusion.toml; {suggestion(stranger, self.axes)}"
         return f"unknown axis '{stranger:.40}'; {suggestion(stranger, self.axes)}" if stranger else "gives no axis"
@@ -439,6 +441,7 @@ class LiveEstimator:
         return Told(outcome, MappingProxyType(dict.fromkeys(values, outcome)), reason)
 
     def _count(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, times: int) -> None:
+        """Count an event's outcome: a command once, a reading for each of its scalars; ``times`` −1 takes it back."""
         if sensor is None:
             self._commands[outcome] += times
         elif sensor in self._refused:

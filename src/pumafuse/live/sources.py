@@ -71,6 +71,7 @@ def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
 
 
 def _events(name: str, source: Source) -> list[Event]:
+    """The rows of a source in their order; without a name they are commands, of the axes that each has a value for."""
     columns: list[list[float]] = [value.tolist() for value in source.values.values()]
     stamps: list[float | int] = [math.nan if stamp == NO_STAMP else stamp for stamp in source.stamp.tolist()]
     rows = zip(stamps, zip(*columns, strict=True), strict=True)
@@ -83,6 +84,7 @@ def _events(name: str, source: Source) -> list[Event]:
 
 
 def _paced(arrival: TimeArray, events: list[Event], speed: float) -> Iterator[list[Event]]:
+    """Events when their time has come by the wall's clock, given when each arrives, int64 ns, ascending, (n,)."""
     first = int(arrival[arrival != NO_STAMP].min(initial=np.iinfo(np.int64).max))
     due: FloatArray = (np.maximum(arrival, first) - first) / 1e9 / speed  # rows without a stamp come at once
     begin, at = time.monotonic(), 0

@@ -102,6 +102,7 @@ class Server(_Tcp):
         return f"{said}, {self._refused} refused" if self._refused else said
 
     async def _meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Read one who has connected to the end, unless it may not be heard or too many are."""
         peer = str((writer.get_extra_info("peername") or ("somewhere",))[0])
         why = "" if self._allowed(peer) else "--allow does not name it"
         why = f"{_MOST_CONNECTIONS} are open" if not why and len(self._open) >= _MOST_CONNECTIONS else why
@@ -148,6 +149,7 @@ class Client(_Tcp):
         return f"{self._name}: connections made: {self._made}, {'open' if self._connected else 'none open'}"
 
     async def _keep_connected(self) -> None:
+        """Connect and read, again and again, with waits that double as long as nothing comes."""
         wait = _FIRST_WAIT
         while True:
             try:
