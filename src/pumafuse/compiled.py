@@ -34,9 +34,9 @@ else:
     _KEPT = _kept()
     compiled = numba.njit(cache=_KEPT, nogil=True, error_model="numpy", forceinline=True, _nrt=False)
     _HOW_OFTEN = (
-        "only this once (some 10 s)"
+        "only this once (some 20 s)"
         if _KEPT
-        else "at each start (some 30 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
+        else "at each start (some 20 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
     )
 
     class _Announcer(event.Listener):
