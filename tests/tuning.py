@@ -11,7 +11,7 @@ import msgspec
 import pytest
 
 import pumafuse as pf
-from pumafuse.simulate.scenario import Outliers
+from pumafuse.simulate.true_sensor import Outliers
 from pumafuse.tune.intervals import Sure, sureness
 from pumafuse.tune.lesson import Lesson, Syllabus, learn
 from pumafuse.tune.likelihood import Evidence

@@ -27,8 +27,9 @@ from scipy.stats import chi2
 from pumafuse.fusion.config import Process
 from pumafuse.model.arm import Gain
 from pumafuse.model.plants import FirstOrder, SecondOrder
-from pumafuse.simulate.motion import Motion, lattice, move
-from pumafuse.simulate.scenario import LATTICE, GainCurve, TrueAxis
+from pumafuse.simulate.lattice import LATTICE, lattice
+from pumafuse.simulate.motion import Motion, move
+from pumafuse.simulate.true_arm import GainCurve, TrueAxis
 
 Floats = NDArray[np.float64]
 PERIOD = 0.028

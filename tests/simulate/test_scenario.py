@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import pumafuse as pf
-from pumafuse.simulate.scenario import TrueAxis
+from pumafuse.simulate.true_arm import TrueAxis
 
 EXECUTABLE = Path(sys.executable).parent / "pumafuse"
 SCENARIOS = Path(__file__).parents[2] / "scenarios"

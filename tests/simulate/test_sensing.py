@@ -13,9 +13,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pumafuse.runs.run import Source
-from pumafuse.simulate.motion import lattice
-from pumafuse.simulate.scenario import Bursts, Outliers, TrueSensor
+from pumafuse.simulate.lattice import lattice
 from pumafuse.simulate.sensing import measure, valid_times
+from pumafuse.simulate.true_sensor import Bursts, Outliers, TrueSensor
 
 Floats = NDArray[np.float64]
 ROWS = 20_000

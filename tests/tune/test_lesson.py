@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from pumafuse.simulate.scenario import Outliers, TrueSensor
+from pumafuse.simulate.true_sensor import Outliers, TrueSensor
 from pumafuse.tune.intervals import Sure
 from pumafuse.tune.lesson import Lesson, Syllabus, again, learn
 from pumafuse.tune.likelihood import Evidence

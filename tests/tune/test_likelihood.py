@@ -17,7 +17,7 @@ from fusion_oracle import AxisOracle
 from pumafuse.fusion.consistency import densities_of, log_likelihood
 from pumafuse.model.arm import AxisModel
 from pumafuse.runs.run import Source
-from pumafuse.simulate.scenario import Outliers
+from pumafuse.simulate.true_sensor import Outliers
 from pumafuse.tune.climb import Point, moved, point, slopes
 from pumafuse.tune.likelihood import Evidence
 from pumafuse.tune.parameters import with_order

@@ -17,7 +17,8 @@ from ..arrays import FloatArray, TimeArray
 from ..errors import ConfigError
 from ..fusion.config import Process
 from ..model.plants import FirstOrder
-from .scenario import LATTICE, TrueAxis
+from .lattice import lattice
+from .true_arm import TrueAxis
 
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
@@ -114,11 +115,6 @@ def _stick(v: FloatArray, stiction: float) -> FloatArray:
             held = wanted
         found[number] = held
     return found
-
-
-def lattice(ticks: int, period: float) -> TimeArray:
-    """The instants of ``ticks`` periods of T [s] at which readings and reference rows may be, int64 ns."""
-    return np.rint(np.arange(ticks * LATTICE + 1) * (period * 1e9 / LATTICE)).astype(np.int64)
 
 
 def _modes(axis: TrueAxis) -> tuple[ComplexArray, ComplexArray]:

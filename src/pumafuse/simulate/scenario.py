@@ -2,215 +2,29 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias, cast
+from typing import Annotated, Any, cast
 
 import msgspec
 import numpy as np
 
 from .. import toml, units
-from ..arrays import FloatArray
 from ..errors import ConfigError, PumafuseError, UnknownNameError
 from ..fusion.config import FusionConfig, Process, by_axis, load_arm
-from ..model.arm import ArmModel, AxisModel, Gain
-from ..model.plants import PLANTS, FirstOrder, NotNegative, Positive, SecondOrder
+from ..model.arm import ArmModel
+from ..model.plants import NotNegative
 from ..runs import save
 from ..runs.frames import CARTESIAN, Frame
 from ..runs.manifest import axis_of
 from ..runs.run import Clock
+from .lattice import LATTICE
 from .trajectory import TRAJECTORIES, PathFromFile, Steps
+from .true_arm import TrueArm, TrueAxis
+from .true_sensor import TrueSensor
 
 _OVERRIDES = ("start", "process", "sensors")
 _LEAST, _FARTHEST, _LONGEST = 1e-12, 1e5, 4e9  # SI; 100 km, 127 years
-LATTICE = 60  # instants in each period: all that is random is drawn on them, so that it is the same whoever looks
-
-Share: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1)]
-PerAxis: TypeAlias = float | dict[str, float]
-
-
-class GainCurve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A gain that is no line: K at some speeds [m/s], linear between them and level outside."""
-
-    speed: Annotated[list[NotNegative], msgspec.Meta(min_length=1)] = msgspec.field(name="speed_m_s")
-    gain: Annotated[list[float], msgspec.Meta(min_length=1)]
-
-    def __post_init__(self) -> None:
-        if len(self.speed) != len(self.gain) or sorted(self.speed) != self.speed:
-            raise ConfigError("gain_curve: speed_m_s must ascend and gain have as many entries")
-
-
-class TrueArm(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is different about the true arm, on one axis or all; what is absent is as the filter believes.
-
-    Attributes:
-        plant: Order of the plant.
-        time_constant: τ of a first-order plant [s].
-        natural_frequency: ω of a second-order plant [rad/s].
-        damping: ζ of a second-order plant.
-        delay: Td [s].
-        delay_jitter: Standard deviation of each command's own Td [s]; commands do not overtake one another.
-        gain: K as a line over speed.
-        gain_curve: K as a curve over speed.
-        gain_recovery: Time constant [s], or "never".
-        extra_pole: Time constant of a lag that the model does not have, in series with the plant [s].
-        backlash: Width of the play between plant and tool [m].
-        stiction: The drive does not follow changes of its input smaller than this [m].
-        slow_drift: Amplitude of a slow sine on the position, as of warming up [m].
-        slow_drift_period: Its period [s].
-    """
-
-    plant: Literal["first-order", "second-order"] | None = None
-    time_constant: Positive | None = msgspec.field(name="time_constant_ms", default=None)
-    natural_frequency: Positive | None = msgspec.field(name="natural_frequency_rad_s", default=None)
-    damping: Positive | None = None
-    delay: NotNegative | None = msgspec.field(name="delay_ms", default=None)
-    delay_jitter: NotNegative = msgspec.field(name="delay_jitter_ms", default=0.0)
-    gain: Gain | None = None
-    gain_curve: GainCurve | None = None
-    gain_recovery: Positive | Literal["never"] | None = msgspec.field(name="gain_recovery_ms", default=None)
-    extra_pole: Positive | None = msgspec.field(name="extra_pole_ms", default=None)
-    backlash: NotNegative = msgspec.field(name="backlash_mm", default=0.0)
-    stiction: NotNegative = msgspec.field(name="stiction_mm", default=0.0)
-    slow_drift: NotNegative = msgspec.field(name="slow_drift_mm", default=0.0)
-    slow_drift_period: Positive = msgspec.field(name="slow_drift_period_s", default=600.0)
-
-    def over(self, believed: AxisModel, delay: float, where: str) -> TrueAxis:
-        """The true axis: this over the believed one, whose Td is ``delay`` [s]; errors call it ``where``.
-
-        Raises:
-            ConfigError: A parameter of the other plant is given, or one of a new plant is missing.
-        """
-        recovery = believed.gain_recovery if self.gain_recovery is None else self.gain_recovery
-        return TrueAxis(
-            plant=self._plant(believed.plant, where),
-            gain=believed.gain if self.gain is None else self.gain,
-            gain_curve=self.gain_curve,
-            gain_recovery=None if recovery == "never" else recovery,
-            delay=delay if self.delay is None else self.delay,
-            delay_jitter=self.delay_jitter,
-            extra_pole=self.extra_pole,
-            backlash=self.backlash,
-            stiction=self.stiction,
-            slow_drift=self.slow_drift,
-            slow_drift_period=self.slow_drift_period,
-        )
-
-    def _plant(self, believed: PLANTS, where: str) -> PLANTS:
-        kind = self.plant or believed.__struct_config__.tag
-        parameters = {
-            "time_constant_ms": self.time_constant,
-            "natural_frequency_rad_s": self.natural_frequency,
-            "damping": self.damping,
-        }
-        given = {name: value for name, value in parameters.items() if value is not None}
-        chosen = FirstOrder if kind == "first-order" else SecondOrder
-        kept = toml.builtins(believed) if believed.__struct_config__.tag == kind else {}
-        tree = {key: value for key, value in {**kept, **given}.items() if key != "plant"}
-        return toml.struct(tree, chosen, f"{where}, a {kind} plant")
-
-
-class TrueAxis(msgspec.Struct, frozen=True, kw_only=True):
-    """One axis of the true arm, whole; fields as in :class:`TrueArm`."""
-
-    plant: PLANTS
-    gain: Gain
-    gain_curve: GainCurve | None
-    gain_recovery: float | None
-    delay: float
-    delay_jitter: float
-    extra_pole: float | None
-    backlash: float
-    stiction: float
-    slow_drift: float
-    slow_drift_period: float
-
-    def gain_at(self, speed: FloatArray) -> FloatArray:
-        """K at ``speed`` [m/s]."""
-        if self.gain_curve is None:
-            return self.gain.at(speed)
-        return np.interp(speed, self.gain_curve.speed, self.gain_curve.gain)
-
-
-class Bursts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Rows lost together.
-
-    Attributes:
-        per_minute: How often, at random instants.
-        length: How long each lasts [s].
-    """
-
-    per_minute: Annotated[float, msgspec.Meta(gt=0, le=6000)]
-    length: Positive = msgspec.field(name="length_s")
-
-
-class Outliers(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Readings that are wildly wrong.
-
-    Attributes:
-        share: Of the rows.
-        smallest: How wrong at least [m].
-        largest: How wrong at most [m]; either sign.
-    """
-
-    share: Share
-    smallest: NotNegative = msgspec.field(name="from_mm")
-    largest: NotNegative = msgspec.field(name="to_mm")
-
-
-class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a sensor truly does: z = scale · p(stamp − latency) + bias + noise.
-
-    Attributes:
-        rate: Rows a second [Hz].
-        rate_jitter: Standard deviation of each row's instant around an even grid [s].
-        axes: What it measures; absent: everything, in x, y, z with a frame. With a frame, a sensor that names its
-            axes is logged in them.
-        sd: Noise [m], one number or one for each axis.
-        latency: From the valid time to the stamp [s].
-        latency_sd: How far it wanders, from row to row [s].
-        scale: Of the position in the reading.
-        bias: Constant [m].
-        bias_sd: More bias, drawn for each run [m].
-        quantisation: Step between two values [m].
-        dropouts: Share of rows lost, one by one.
-        bursts: Rows lost together.
-        outliers: Rows that are wildly wrong.
-        outages: From and to, since the first command [s].
-        clock_offset: Of the sensor's clock against the commands' [s].
-        clock_drift: Of the sensor's clock against the commands' [parts per million].
-    """
-
-    rate: Positive = msgspec.field(name="rate_hz")
-    rate_jitter: NotNegative = msgspec.field(name="rate_jitter_ms", default=0.0)
-    axes: Annotated[list[str], msgspec.Meta(min_length=1)] | None = None
-    sd: Positive | dict[str, Positive] = msgspec.field(name="sd_mm")
-    latency: float = msgspec.field(name="latency_ms", default=0.0)
-    latency_sd: NotNegative = msgspec.field(name="latency_sd_ms", default=0.0)
-    scale: float = 1.0
-    bias: PerAxis = msgspec.field(name="bias_mm", default=0.0)
-    bias_sd: NotNegative = msgspec.field(name="bias_sd_mm", default=0.0)
-    quantisation: NotNegative = msgspec.field(name="quantisation_mm", default=0.0)
-    dropouts: Share = 0.0
-    bursts: Bursts | None = None
-    outliers: Outliers | None = None
-    outages: list[tuple[float, float]] = msgspec.field(name="outages_s", default=[])
-    clock_offset: float = msgspec.field(name="clock_offset_ms", default=0.0)
-    clock_drift: float = msgspec.field(name="clock_drift_ppm", default=0.0)
-
-    def believed(self) -> dict[str, Any]:
-        """The keys of ``fusion.toml`` for a filter that knows this sensor, in SI."""
-        sd = self.sd if isinstance(self.sd, dict) else dict.fromkeys(self.axes or [""], self.sd)
-        with_steps = {axis: math.hypot(value, self.quantisation / math.sqrt(12.0)) for axis, value in sd.items()}
-        biases = self.bias.values() if isinstance(self.bias, dict) else [self.bias]
-        return {
-            "sd_mm": with_steps if self.axes or isinstance(self.sd, dict) else with_steps[""],
-            "latency_ms": self.latency,
-            "latency_sd_ms": self.latency_sd,
-            "scale": self.scale,
-            "bias_sd_mm": math.hypot(self.bias_sd, *biases),
-        }
 
 
 class CommandLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, TimeArray
 from ..runs.run import Source
-from .scenario import PerAxis, TrueSensor
+from .true_sensor import PerAxis, TrueSensor
 
 
 def valid_times(sensor: TrueSensor, lattice: TimeArray, rng: np.random.Generator) -> TimeArray:

@@ -22,8 +22,9 @@ from ..runs.frames import Cylindrical, Placed, Rotated
 from ..runs.run import Reference, Run, Source
 from ..units import MM
 from . import sensing
-from .motion import Motion, lattice, move
-from .scenario import LATTICE, Scenario
+from .lattice import LATTICE, lattice
+from .motion import Motion, move
+from .scenario import Scenario
 from .trajectory import PathFromFile, Steps
 
 TRIALS, SAMPLES = "trials.csv", "samples.csv"
