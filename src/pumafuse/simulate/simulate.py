@@ -10,50 +10,26 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import pyarrow as pa
 
 from .. import folders, toml
-from ..arrays import FloatArray, IntArray, TimeArray
+from ..arrays import FloatArray, TimeArray
 from ..errors import ConfigError
 from ..fusion.config import ARM_FILE, FusionConfig, Process
 from ..model.arm import ordered_axes
-from ..runs import save, tables
+from ..runs import save
 from ..runs.frames import Cylindrical, Placed, Rotated
 from ..runs.run import Reference, Run, Source
 from ..units import MM
-from . import sensing
+from . import campaign, sensing
 from .lattice import LATTICE, lattice
 from .motion import Motion, move
 from .scenario import Scenario
-from .trajectory import PathFromFile, Steps
+from .trajectory import PathFromFile
 
-TRIALS, SAMPLES = "trials.csv", "samples.csv"
-_BEFORE = 0.05  # s of rest that a trial's samples begin with
 SCENARIO = "scenario.toml"
 MANIFEST = "run.toml"
 _OURS = frozenset({SCENARIO, MANIFEST, "fusion.toml", ARM_FILE})
 _PATHS = ("path.csv", "path.csv.gz", "path.parquet")
-
-
-@dataclass(frozen=True)
-class Trials:
-    """A campaign of step trials; arrays are (trials,) and (samples,).
-
-    Attributes:
-        axis: Which axis is stepped.
-        step: By how much, signed [m].
-        speed: Of the step: its size over T [m/s].
-        trial: Of each sample, its trial's number.
-        time: Of each sample since its step's command [s].
-        position: Of each sample [m], as the scope has it.
-    """
-
-    axis: tuple[str, ...]
-    step: FloatArray
-    speed: FloatArray
-    trial: IntArray
-    time: FloatArray
-    position: FloatArray
 
 
 @dataclass(frozen=True)
@@ -72,7 +48,7 @@ class Simulated:
     seed: int
     run: Run
     config: FusionConfig
-    trials: Trials | None
+    trials: campaign.Trials | None
 
 
 def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
@@ -122,7 +98,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
         clock=scenario.command.clock,
         frame=scenario.frame,
     )
-    return Simulated(scenario, seed, run, scenario.config, _trials(scenario, tick, told, sensors))
+    return Simulated(scenario, seed, run, scenario.config, campaign.cut(scenario, tick, told, sensors))
 
 
 def check_writable(folder: Path, force: bool) -> None:
@@ -149,7 +125,7 @@ def write(simulated: Simulated, folder: Path, force: bool) -> None:
         scenario = _with_path(simulated.scenario, new)
         (new / SCENARIO).write_text(scenario.to_toml(simulated.seed, ARM_FILE), encoding="utf-8")
         if simulated.trials is not None:
-            _write_trials(simulated.trials, new)
+            campaign.write(simulated.trials, new)
 
 
 def _with_path(scenario: Scenario, folder: Path) -> Scenario:
@@ -171,7 +147,7 @@ def _files_of(folder: Path) -> set[str]:
         return set(_OURS)
     sensors = manifest.get("sensors")
     sources = [manifest.get("command"), manifest.get("reference"), *(sensors.values() if sensors else ())]
-    return {*_OURS, TRIALS, SAMPLES, *_PATHS, *(str(source["file"]) for source in sources if source)}
+    return {*_OURS, campaign.TRIALS, campaign.SAMPLES, *_PATHS, *(str(source["file"]) for source in sources if source)}
 
 
 class _Log:
@@ -235,48 +211,3 @@ def _nanometres(value: FloatArray) -> FloatArray:
 
 def _rounded(source: Source) -> Source:
     return replace(source, values={axis: _nanometres(value) for axis, value in source.values.items()})
-
-
-def _trials(
-    scenario: Scenario, tick: TimeArray, told: Mapping[str, FloatArray], sensors: Mapping[str, Source]
-) -> Trials | None:
-    """The trials of a step campaign, cut from its run; None for another trajectory."""
-    campaign = scenario.trajectory
-    if not isinstance(campaign, Steps):
-        return None
-    scope, period = sensors[campaign.scope], scenario.arm.update_period
-    valid = scope.stamp / 1e9 - scenario.sensors[campaign.scope].latency
-    axis_of, step, samples = list[str](), list[float](), list[tuple[int, FloatArray, FloatArray]]()
-    for number in range(1, len(tick) // campaign.ticks_between(period)):
-        at = number * campaign.ticks_between(period)
-        axis = next(axis for axis, command in told.items() if command[at] != command[at - 1])
-        since = valid - tick[at] / 1e9
-        kept = (since >= -_BEFORE) & (since <= campaign.window)
-        axis_of.append(axis)
-        step.append(float(told[axis][at] - told[axis][at - 1]))
-        samples.append((number, since[kept], scope.values[axis][kept]))
-    return Trials(
-        tuple(axis_of),
-        np.array(step),
-        np.abs(step) / period,
-        np.concatenate([np.full(len(time), number) for number, time, _ in samples]),
-        np.concatenate([time for _, time, _ in samples]),
-        np.concatenate([position for _, _, position in samples]),
-    )
-
-
-def _write_trials(trials: Trials, folder: Path) -> None:
-    listed = {
-        "trial": np.arange(1, len(trials.axis) + 1),
-        "axis": list(trials.axis),
-        "step_mm": np.round(trials.step * MM, 6),
-        "speed_m_s": np.round(trials.speed, 6),
-        "direction": ["up" if step > 0.0 else "down" for step in trials.step.tolist()],
-    }
-    sampled = {
-        "trial": trials.trial,
-        "time_s": np.round(trials.time, 9),
-        "position_mm": np.round(trials.position * MM, 6),
-    }
-    tables.write(pa.table(listed), folder / TRIALS)
-    tables.write(pa.table(sampled), folder / SAMPLES)
