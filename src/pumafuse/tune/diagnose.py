@@ -13,12 +13,6 @@ from .climb import Point, slopes
 from .likelihood import Evidence
 from .parameters import Parameter
 
-_ENOUGH = 0.02  # log-likelihood to which a profile is followed
-_SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which the profile is followed
-_STEPS = 8  # of a profile towards its end
-_CLOSE = 0.03  # relative, of √(2 drop)
-_HALVINGS = 16
-_POWER = 3.0  # of a noise, between those with which the likelihood drops where it is small (4) and large (2)
 _HIGHLY = 0.9  # a correlation worth naming
 _MEMBER = 0.3  # share of the largest weight, from which a parameter belongs to a combination
 _AT_BOUND = 1e-6
