@@ -13,8 +13,8 @@ from pumafuse.simulate.true_sensor import Outliers, TrueSensor
 from pumafuse.tune.intervals import Sure
 from pumafuse.tune.lesson import Lesson, Syllabus, again, learn
 from pumafuse.tune.likelihood import Evidence
-from pumafuse.tune.parameters import with_order
 from pumafuse.tune.summary import told
+from pumafuse.tune.variants import with_order
 from tuning import (
     SCENARIOS,
     later,

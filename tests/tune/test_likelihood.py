@@ -20,7 +20,7 @@ from pumafuse.runs.run import Source
 from pumafuse.simulate.true_sensor import Outliers
 from pumafuse.tune.climb import Point, moved, point, slopes
 from pumafuse.tune.likelihood import Evidence
-from pumafuse.tune.parameters import with_order
+from pumafuse.tune.variants import with_order
 from tuning import ALL, SCENARIOS, free_of, quietly, replaced, scenario, spoiled_arm, with_process, with_sensors
 
 DATA = Path(pf.__file__).parent / "data"

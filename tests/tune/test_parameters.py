@@ -21,10 +21,8 @@ from pumafuse.tune.parameters import (
     is_held,
     kinds_of,
     parameters,
-    with_axis_of,
-    with_lag,
-    with_order,
 )
+from pumafuse.tune.variants import with_axis_of, with_lag, with_order
 from tuning import replaced
 
 ARM = pf.ArmModel.load("puma560-internal")  # tangential is second order, radial and vertical are first

@@ -17,9 +17,10 @@ import pumafuse as pf
 from pumafuse.runs.run import Source
 from pumafuse.tune.climb import Point
 from pumafuse.tune.likelihood import Evidence
-from pumafuse.tune.parameters import Fit, with_order
+from pumafuse.tune.parameters import Fit
 from pumafuse.tune.summary import TuningSummary
 from pumafuse.tune.validate import check
+from pumafuse.tune.variants import with_order
 from tuning import (
     fitted,
     later,

@@ -12,7 +12,7 @@ from ..fusion.config import FusionConfig
 from ..units import MM
 from .climb import Point
 from .likelihood import Evidence
-from .parameters import is_held
+from .parameters import is_held, least_sd
 
 _GAIN = 3.0  # log-likelihood that a bias must be worth; its prior's width has been paid for in it
 _TRIED = (1e-3, 1e-2, 1e-1)  # m, widths of the prior
@@ -48,7 +48,8 @@ def slightly_off(evidence: Evidence, best: Point, hold: Sequence[str]) -> tuple[
         The configuration, and a sentence on each.
     """
     config, notes = best.config, list[str]()
-    ranked = sorted({name for heard in evidence.heard.values() for name in heard}, key=lambda name: _sd(config, name))
+    heard = {name for names in evidence.heard.values() for name in names}
+    ranked = sorted(heard, key=lambda name: least_sd(config, name))
     for name in reversed(ranked[1:]):  # the most accurate is believed
         if not _may(config, name, hold):
             continue
@@ -66,11 +67,6 @@ def slightly_off(evidence: Evidence, best: Point, hold: Sequence[str]) -> tuple[
 
 def _may(config: FusionConfig, name: str, hold: Collection[str]) -> bool:
     return config.sensors[name].bias_sd == 0.0 and not is_held(f"sensors.{name}.bias_sd_mm", hold)
-
-
-def _sd(config: FusionConfig, name: str) -> float:
-    sd = config.sensors[name].sd
-    return min(sd.values()) if isinstance(sd, dict) else sd
 
 
 def _with_biases(config: FusionConfig, widths: Mapping[str, float]) -> FusionConfig:

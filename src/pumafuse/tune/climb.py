@@ -18,7 +18,8 @@ from ..arrays import CodeArray, FloatArray
 from ..fusion.config import FusionConfig
 from ..fusion.ticks import usable_cores
 from .likelihood import Evidence, Slopes, Value
-from .parameters import Parameter, with_axis_of
+from .parameters import Parameter
+from .variants import with_axis_of
 
 _ITERATIONS = 60
 _ENOUGH = 2e-3  # expected gain in log-likelihood that is not worth another step

@@ -11,7 +11,7 @@ from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
 from .climb import Point, slopes
 from .likelihood import Evidence
-from .parameters import Parameter
+from .parameters import Parameter, least_sd
 
 _HIGHLY = 0.9  # a correlation worth naming
 _MEMBER = 0.3  # share of the largest weight, from which a parameter belongs to a combination
@@ -99,8 +99,7 @@ def untold_noise(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> 
 
 def _noise_of(one: Parameter, config: FusionConfig) -> float:
     """The least noise of the sensor that a number is of [m]; 0 where it is of none."""
-    sd = 0.0 if one.sensor is None else config.sensors[one.sensor].sd
-    return min(sd.values()) if isinstance(sd, dict) else sd
+    return 0.0 if one.sensor is None else least_sd(config, one.sensor)
 
 
 def shared_time(

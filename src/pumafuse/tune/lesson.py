@@ -15,8 +15,9 @@ from .climb import Point, Tell, settle
 from .diagnose import Tie, shared_time, untold, untold_noise
 from .learnable import moving
 from .likelihood import Evidence
-from .parameters import LATENCIES, RECOVERY, Fit, Parameter, parameters, with_recovery
+from .parameters import LATENCIES, RECOVERY, Fit, Parameter, parameters
 from .search import Free, search
+from .variants import with_recovery
 
 _GATE = 5.0  # with which a sensor without a gate is learnt from, as outliers must not teach, or with a narrow one:
 _NARROWEST = 3.0  # below it rejecting good readings would pay, the more the smaller the noise

@@ -10,9 +10,10 @@ from typing import Literal, get_args
 import msgspec
 
 from ..errors import ConfigError, suggestion
-from ..fusion.config import FusionConfig, Process, Sensor
+from ..fusion.config import FusionConfig, Process
 from ..model.arm import AxisModel
-from ..model.plants import FirstOrder, SecondOrder
+from ..model.plants import FirstOrder
+from .variants import with_axis, with_order, with_process, with_recovery, with_sd, with_sensor
 
 Fit = Literal["noise", "delay", "plant", "gain", "latency"]
 FITS: tuple[Fit, ...] = get_args(Fit)
@@ -154,6 +155,12 @@ def check_holds(config: FusionConfig, hold: Iterable[str]) -> None:
             raise ConfigError(f"--hold: '{name}' names nothing that can be fitted; parts of names: {', '.join(parts)}")
 
 
+def least_sd(config: FusionConfig, name: str) -> float:
+    """The noise of a sensor [m], on the axis where it has least."""
+    sd = config.sensors[name].sd
+    return min(sd.values()) if isinstance(sd, dict) else sd
+
+
 def _of_axes(config: FusionConfig, known: FusionConfig, heard: Mapping[str, Sequence[str]]) -> list[Parameter]:
     found: list[Parameter] = []
     for axis, sensors in heard.items():
@@ -182,7 +189,7 @@ def _key(kind: type[msgspec.Struct], field: str) -> str:
 
 def _noise(axis: str, field: str, bounds: tuple[float, float]) -> Parameter:
     def put(config: FusionConfig, value: float) -> FusionConfig:
-        return _replace(config, process={**config.process, axis: _replace(config.process[axis], **{field: value})})
+        return with_process(config, axis, _replace(config.process[axis], **{field: value}))
 
     key = f"process.{axis}.{_key(Process, field)}"
     return Parameter(
@@ -195,16 +202,14 @@ def _sd(axis: str, name: str) -> Parameter:
         return config.sensors[name].sd_of(axis) or 0.0
 
     def put(config: FusionConfig, value: float) -> FusionConfig:
-        sensor = config.sensors[name]
-        every = sensor.sd if isinstance(sensor.sd, dict) else dict.fromkeys(config.arm.axes, sensor.sd)
-        return _with_sensor(config, name, _replace(sensor, sd={**every, axis: value}))
+        return with_sd(config, name, axis, value)
 
     return Parameter(f"sensors.{name}.sd_mm.{axis}", "noise", axis, True, _SDS, 1.0, get, put, _MM, name)
 
 
 def _delay(axis: str, configured: float) -> Parameter:
     def put(config: FusionConfig, value: float) -> FusionConfig:
-        return _with_axis(config, axis, _replace(config.arm.axes[axis], delay=value, delay_ci95=None))
+        return with_axis(config, axis, _replace(config.arm.axes[axis], delay=value, delay_ci95=None))
 
     key, bounds = f"axes.{axis}.delay_ms", (max(configured + DELAYS[0], 0.0), configured + DELAYS[1])
     return Parameter(key, "delay", axis, False, bounds, _TICK, lambda config: config.arm.delay_of(axis), put, _MS)
@@ -217,7 +222,7 @@ def _plant(axis: str, model: AxisModel) -> list[Parameter]:
 
         def put(config: FusionConfig, value: float) -> FusionConfig:
             plant = _replace(config.arm.axes[axis].plant, **{field: value, f"{field}_ci95": None})
-            return _with_axis(config, axis, _replace(config.arm.axes[axis], plant=plant))
+            return with_axis(config, axis, _replace(config.arm.axes[axis], plant=plant))
 
         key, unit = _key(type(model.plant), field), _MS if field == "time_constant" else 1.0
         return Parameter(f"axes.{axis}.{key}", "plant", axis, True, bounds, 1.0, get, put, unit)
@@ -233,7 +238,7 @@ def _gain(axis: str, centre: float) -> list[Parameter]:
 
     def put_intercept(config: FusionConfig, value: float) -> FusionConfig:
         gain = _replace(config.arm.axes[axis].gain, intercept=value, intercept_ci95=None)
-        return _with_axis(config, axis, _replace(config.arm.axes[axis], gain=gain))
+        return with_axis(config, axis, _replace(config.arm.axes[axis], gain=gain))
 
     def put_recovery(config: FusionConfig, value: float) -> FusionConfig:
         return with_recovery(config, axis, value)
@@ -259,55 +264,10 @@ def _latencies(known: FusionConfig, heard: Mapping[str, Sequence[str]]) -> list[
 
 def _latency(name: str, configured: float) -> Parameter:
     def put(config: FusionConfig, value: float) -> FusionConfig:
-        return _with_sensor(config, name, _replace(config.sensors[name], latency=value))
+        return with_sensor(config, name, _replace(config.sensors[name], latency=value))
 
     key = f"sensors.{name}.latency_ms"
     bounds = (configured + LATENCIES[0], configured + LATENCIES[1])
     return Parameter(
         key, "latency", None, False, bounds, _TICK, lambda config: config.sensors[name].latency, put, _MS, name
     )
-
-
-def _with_axis(config: FusionConfig, axis: str, model: AxisModel) -> FusionConfig:
-    return _replace(config, arm=_replace(config.arm, axes={**config.arm.axes, axis: model}))
-
-
-def _with_sensor(config: FusionConfig, name: str, sensor: Sensor) -> FusionConfig:
-    return _replace(config, sensors={**config.sensors, name: sensor})
-
-
-def with_order(config: FusionConfig, axis: str, order: int) -> FusionConfig:
-    """The configuration with an axis's plant of this order, which lags as far behind as before."""
-    model = config.arm.axes[axis]
-    if (1 if isinstance(model.plant, FirstOrder) else 2) == order:
-        return config
-    lag = model.plant.lag
-    plant = FirstOrder(time_constant=lag) if order == 1 else SecondOrder(natural_frequency=2.0 / lag, damping=1.0)
-    return _with_axis(config, axis, _replace(model, plant=plant))
-
-
-def with_recovery(config: FusionConfig, axis: str, recovery: float | None) -> FusionConfig:
-    """The configuration with another recovery of an axis's gain [s], or none."""
-    model = _replace(config.arm.axes[axis], gain_recovery=recovery, gain_recovery_ci95=None)
-    return _with_axis(config, axis, model)
-
-
-def with_lag(config: FusionConfig, axis: str, lag: float) -> FusionConfig:
-    """The configuration with an axis's plant so far behind an input of constant velocity [s], in the same shape."""
-    model = config.arm.axes[axis]
-    if isinstance(model.plant, FirstOrder):
-        return _with_axis(config, axis, _replace(model, plant=FirstOrder(time_constant=lag)))
-    plant = _replace(model.plant, natural_frequency=2.0 * model.plant.damping / lag)
-    return _with_axis(config, axis, _replace(model, plant=plant))
-
-
-def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> FusionConfig:
-    """The configuration with all numbers of one axis as another has them: its model, its noise and its readings'."""
-    config = _with_axis(config, axis, other.arm.axes[axis])
-    sensors = dict(config.sensors)
-    for name, sensor in other.sensors.items():
-        if isinstance(sensor.sd, dict) and axis in sensor.sd:
-            mine = sensors[name].sd
-            every = mine if isinstance(mine, dict) else dict.fromkeys(config.arm.axes, mine)
-            sensors[name] = _replace(sensors[name], sd={**every, axis: sensor.sd[axis]})
-    return _replace(config, process={**config.process, axis: other.process[axis]}, sensors=sensors)

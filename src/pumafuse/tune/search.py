@@ -17,7 +17,8 @@ from ..arrays import FloatArray
 from ..fusion.config import FusionConfig, Process
 from .climb import Point, Tell, climb, climb_apart, point, settle
 from .likelihood import Evidence
-from .parameters import DELAYS, LATENCIES, RECOVERY, Parameter, with_axis_of, with_lag, with_order
+from .parameters import DELAYS, LATENCIES, RECOVERY, Parameter
+from .variants import with_axis_of, with_gates, with_gates_of, with_lag, with_order
 
 _ROUGHLY = 0.1  # log-likelihood that is not worth another step where peaks are only compared
 _WIDER = 3.0
@@ -48,8 +49,8 @@ def search(evidence: Evidence, config: FusionConfig, free: Free, tell: Tell) -> 
     def own(at: FusionConfig) -> list[Parameter]:
         return [one for one in free(at) if one.axis is not None]
 
-    best = _in_time(evidence, _with_gates(config, _WIDER), free(config))
-    best = _noise_first(evidence, _with_gates(with_gates_of(best, config), 1.0), own(config), tell)
+    best = _in_time(evidence, with_gates(config, _WIDER), free(config))
+    best = _noise_first(evidence, with_gates(with_gates_of(best, config), 1.0), own(config), tell)
     shared = [one for one in free(best) if one.axis is None]
     if shared:
         best = climb(evidence, best, shared, tell, enough=_ROUGHLY).config
@@ -109,7 +110,7 @@ def _noise_first(evidence: Evidence, config: FusionConfig, free: Sequence[Parame
         return config
     peaks: list[Point] = []
     for times in (_WIDER, 1.0):
-        start = _best_start(evidence, _with_gates(config, times), noise)
+        start = _best_start(evidence, with_gates(config, times), noise)
         foot = climb_apart(evidence, start, noise, tell, _ROUGHLY).config
         peaks.append(climb_apart(evidence, with_gates_of(foot, config), noise, tell, _ROUGHLY))
     return _best_of_each(evidence, peaks, [peak.heights for peak in peaks])
@@ -217,21 +218,3 @@ def _best_of_each(evidence: Evidence, peaks: Sequence[Point], heights: Sequence[
         highest = peaks[int(np.argmax([height[number] for height in heights]))]
         best = with_axis_of(best, highest.config, axis)
     return best
-
-
-def _with_gates(config: FusionConfig, times: float) -> FusionConfig:
-    """The configuration with gates so many times as wide, each scalar for itself."""
-    sensors = {
-        name: msgspec.structs.replace(sensor, gate=times * sensor.gate, gate_rows=False)
-        for name, sensor in config.sensors.items()
-    }
-    return msgspec.structs.replace(config, sensors=sensors)
-
-
-def with_gates_of(config: FusionConfig, other: FusionConfig) -> FusionConfig:
-    """The configuration with the gates that another has."""
-    sensors = {
-        name: msgspec.structs.replace(sensor, gate=other.sensors[name].gate, gate_rows=other.sensors[name].gate_rows)
-        for name, sensor in config.sensors.items()
-    }
-    return msgspec.structs.replace(config, sensors=sensors)

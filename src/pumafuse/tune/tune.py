@@ -23,9 +23,9 @@ from .learnable import TuneError, moving
 from .lesson import Lesson, Syllabus, again, evidence_of, learn
 from .likelihood import Evidence
 from .parameters import Fit, Parameter, check_holds, kinds_of, parameters
-from .search import with_gates_of
 from .summary import Likelihood, TuningSummary, biases, correlated, fitted, told
 from .validate import Check, check
+from .variants import with_gates_of
 
 _LEARNT = 2.0 / 3.0  # of a single run; the rest is held back
 _NOTHING = 0.01  # log-likelihood that a noise must be worth, or it is none
