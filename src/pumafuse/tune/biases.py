@@ -49,8 +49,8 @@ def slightly_off(evidence: Evidence, best: Point, hold: Sequence[str]) -> tuple[
     """
     config, notes = best.config, list[str]()
     heard = {name for names in evidence.heard.values() for name in names}
-    ranked = sorted(heard, key=lambda name: least_sd(config, name))
-    for name in reversed(ranked[1:]):  # the most accurate is believed
+    ranked = sorted((name for name in config.sensors if name in heard), key=lambda name: least_sd(config, name))
+    for name in reversed(ranked[1:]):  # the most accurate is believed, of equals the first in the file
         if not _may(config, name, hold):
             continue
         before = evidence.value(config).total
