@@ -16,29 +16,26 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from ..arrays import CodeArray, FloatArray, IntArray
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations
 from ..fusion.ticks import usable_cores
-from ..fusion.timeline import AxisInput, Outcome, Scalars, Timeline, build
+from ..fusion.timeline import Outcome, Timeline, build
 from ..model.arm import ordered_axes
-from ..model.drive import drive
 from ..runs.axes import in_axes
 from ..runs.clock import segments
 from ..runs.run import Run
 from .parameters import Parameter
+from .retimed import retimed, subset
 
-T = TypeVar("T", bound=np.generic)
 _LOG_STEP = 1e-4  # of a logarithm, by which slopes are taken: their error is half of it, the rounding 1e-11
+_STEP = 2e-5  # s, or of a gain; both ways, as a reading that passes a command bends the likelihood
 _SMALLEST = 1e-6  # m; misfit of a simulated arm without any noise
-_TIME_STEP = 2e-5  # s; both ways, as a reading that passes a command bends the likelihood
 
 
 @dataclass(frozen=True)
@@ -263,14 +260,12 @@ class Evidence:
         """
         axes, found = np.zeros(len(self.axes)), list[CodeArray]()
         for number, segment in enumerate(self._segments):
-            timeline, order = _retimed(segment.whole, self.config, config)
-            known = None if outcomes is None else outcomes[number] if order is None else outcomes[number][order]
-            met = innovations(timeline, config, known)
-            gates = np.array([config.sensors[name].gate for name in timeline.scalars.sensors])
-            density = log_density(met.innovation, met.innovation_sd, met.outcome, gates[timeline.scalars.sensor])
-            density, outcome = (
-                (density, met.outcome) if order is None else (_back(density, order), _back(met.outcome, order))
-            )
+            now = retimed(segment.whole, self.config, config)
+            met = innovations(now.timeline, config, None if outcomes is None else now.there(outcomes[number]))
+            scalars = now.timeline.scalars
+            gates = np.array([config.sensors[name].gate for name in scalars.sensors])
+            density = log_density(met.innovation, met.innovation_sd, met.outcome, gates[scalars.sensor])
+            density, outcome = now.back(density), now.back(met.outcome)
             found.append(outcome)
             for strand in segment.strands:
                 axes[strand.number] += float(density[strand.places].sum())
@@ -309,10 +304,10 @@ class Evidence:
                 nu_up, S_up = self._met(strand, outcome, one.move(config, at + _LOG_STEP))
                 d_nu[place], d_S[place] = (nu_up - nu) / _LOG_STEP, (S_up - S) / _LOG_STEP
             else:
-                nu_up, S_up = self._met(strand, outcome, one.put(config, at + _TIME_STEP))
-                nu_down, S_down = self._met(strand, outcome, one.put(config, at - _TIME_STEP))
-                d_nu[place] = (nu_up - nu_down) / (2.0 * _TIME_STEP)
-                d_S[place] = (S_up - S_down) / (2.0 * _TIME_STEP)
+                nu_up, S_up = self._met(strand, outcome, one.put(config, at + _STEP))
+                nu_down, S_down = self._met(strand, outcome, one.put(config, at - _STEP))
+                d_nu[place] = (nu_up - nu_down) / (2.0 * _STEP)
+                d_S[place] = (S_up - S_down) / (2.0 * _STEP)
         d_nu *= fused / np.sqrt(S)
         d_S /= S
         r = nu / np.sqrt(S)
@@ -322,17 +317,9 @@ class Evidence:
 
     def _met(self, strand: _Strand, outcome: CodeArray, config: FusionConfig) -> tuple[FloatArray, FloatArray]:
         """ν and S of a strand's scalars, whose outcomes are known."""
-        timeline, order = _retimed(strand.timeline, self.config, config)
-        met = innovations(timeline, config, outcome if order is None else outcome[order])
-        nu, S = met.innovation, met.innovation_sd**2
-        return (nu, S) if order is None else (_back(nu, order), _back(S, order))
-
-
-def _back(values: npt.NDArray[T], order: IntArray) -> npt.NDArray[T]:
-    """``values`` that are in ``order`` in the order before."""
-    found = np.empty_like(values)
-    found[order] = values
-    return found
+        now = retimed(strand.timeline, self.config, config)
+        met = innovations(now.timeline, config, now.there(outcome))
+        return now.back(met.innovation), now.back(met.innovation_sd**2)
 
 
 def _kept(timeline: Timeline, until: float | None, latest: float | None) -> Timeline:
@@ -343,54 +330,13 @@ def _kept(timeline: Timeline, until: float | None, latest: float | None) -> Time
         chosen &= scalars.valid <= timeline.origin + round(until * 1e9)
     if latest is not None:
         chosen &= scalars.stamp - round(latest * 1e9) >= timeline.origin
-    return replace(timeline, scalars=_subset(scalars, np.flatnonzero(chosen)))
+    return replace(timeline, scalars=subset(scalars, np.flatnonzero(chosen)))
 
 
 def _strands(timeline: Timeline, axes: Sequence[str]) -> Iterable[_Strand]:
     for number, axis in enumerate(timeline.axes):
         places = np.flatnonzero(timeline.scalars.axis == number)
         if len(places):
-            scalars = _subset(timeline.scalars, places)
+            scalars = subset(timeline.scalars, places)
             alone = replace(scalars, axis=np.zeros_like(scalars.axis))
             yield _Strand(axes.index(axis.name), replace(timeline, axes=(axis,), scalars=alone), places)
-
-
-def _subset(scalars: Scalars, places: IntArray) -> Scalars:
-    return Scalars(
-        scalars.valid[places],
-        scalars.stamp[places],
-        scalars.sensor[places],
-        scalars.axis[places],
-        scalars.value[places],
-        scalars.row[places],
-        None if scalars.spread is None else scalars.spread[places],
-        scalars.outcome[places],
-        scalars.sensors,
-    )
-
-
-def _retimed(timeline: Timeline, built: FusionConfig, config: FusionConfig) -> tuple[Timeline, IntArray | None]:
-    """A timeline with the delays, gains and latencies of another configuration than the one it was built with.
-
-    Returns:
-        The timeline, and the order in which the scalars now stand; None where they stand as they did.
-    """
-    axes = tuple(_driven(axis, built, config) for axis in timeline.axes)
-    scalars, order = timeline.scalars, None
-    late = np.array(
-        [round(config.sensors[n].latency * 1e9) - round(built.sensors[n].latency * 1e9) for n in scalars.sensors]
-    )
-    if late.any():
-        valid = scalars.valid - late[scalars.sensor]
-        order = np.lexsort((scalars.row, scalars.sensor, valid))
-        scalars = replace(_subset(scalars, order), valid=valid[order])
-    return replace(timeline, axes=axes, scalars=scalars), order
-
-
-def _driven(axis: AxisInput, built: FusionConfig, config: FusionConfig) -> AxisInput:
-    before, now = built.arm.axes[axis.name], config.arm.axes[axis.name]
-    delay = round(config.arm.delay_of(axis.name) * 1e9)
-    if (before.gain, before.gain_recovery) == (now.gain, now.gain_recovery):
-        return axis if delay == axis.delay else replace(axis, delay=delay)
-    driven = drive(now, axis.given, axis.command, axis.start, config.arm.update_period)
-    return replace(axis, drive=driven, delay=delay)
