@@ -34,6 +34,7 @@ RECOVERY = ".gain_recovery_ms"
 _RECOVERY = (0.020, 0.500)  # s
 _RECOVERY_SD = math.log(_RECOVERY[1] / _RECOVERY[0]) / (2.0 * 1.96)  # 95 % of the prior lie in that range
 _GAIN_SD = 0.1
+_DIGITS = 6  # of a number that is written
 
 
 @dataclass(frozen=True)
@@ -159,6 +160,11 @@ def least_sd(config: FusionConfig, name: str) -> float:
     """The noise of a sensor [m], on the axis where it has least."""
     sd = config.sensors[name].sd
     return min(sd.values()) if isinstance(sd, dict) else sd
+
+
+def rounded(value: float) -> float:
+    """A number as it is written: more digits would only look exact."""
+    return float(f"{value:.{_DIGITS}g}")
 
 
 def _of_axes(config: FusionConfig, known: FusionConfig, heard: Mapping[str, Sequence[str]]) -> list[Parameter]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 
@@ -16,23 +16,19 @@ from ..fusion.config import FusionConfig
 from ..model.arm import AxisModel
 from ..runs.clock import segments
 from ..runs.run import Run
-from .climb import Point
-from .diagnose import at_bound
+from .course import Course, Progress, syllabi
 from .intervals import Sure, sureness
 from .learnable import TuneError, moving
-from .lesson import Lesson, Syllabus, again, evidence_of, learn
+from .lesson import Lesson
 from .likelihood import Evidence
-from .parameters import Fit, Parameter, check_holds, kinds_of, parameters
+from .parameters import Fit, check_holds, kinds_of, rounded
 from .summary import Likelihood, TuningSummary, biases, correlated, fitted, told
 from .validate import Check, check
 from .variants import with_gates_of
 
 _LEARNT = 2.0 / 3.0  # of a single run; the rest is held back
-_NOTHING = 0.01  # log-likelihood that a noise must be worth, or it is none
-_DIGITS = 6  # of the numbers written: more would only look exact
 
 _replace = msgspec.structs.replace
-Progress = Callable[[str, Point], None]
 
 
 @dataclass(frozen=True)
@@ -94,15 +90,15 @@ def tune(
     _refuse_twice(runs)
     kinds, names = kinds_of(fit), list(hold)
     check_holds(config, names)
-    syllabi = _syllabi(config, kinds, names, teacher)
-    course = _Course(runs, config, progress)
+    lessons = syllabi(config, kinds, names, teacher)
+    course = Course(runs, config, progress)
     moving(course.evidence(), config)  # of the whole, before a part of it is asked
     until = _held_back(runs[0]) if len(runs) == 1 and validate is None else None
     sure: dict[str, Sure] = {}
     validation: list[Check] | None = None
     interrupted = False
     try:
-        course.take(syllabi, until)
+        course.take(lessons, until)
         if until is not None:
             validation = check(runs[0], config, course.result(), since=until)
             course.repeat()
@@ -136,93 +132,6 @@ def tune(
     for note in summary.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=2)
     return Tuning(tuned, config, summary, tuple(course.lessons))
-
-
-class _Course:
-    """Lessons one after the other, each from where the last one ended; what was best last is kept at any moment."""
-
-    def __init__(self, runs: Sequence[Run], config: FusionConfig, progress: Progress) -> None:
-        self.runs, self.config, self.progress = runs, config, progress
-        self.best = config
-        self.lessons: list[Lesson] = []
-        self.kept = False  # whether the configuration as given is the result
-
-    def take(self, syllabi: Sequence[Syllabus], until: float | None) -> None:
-        """Every lesson.
-
-        Raises:
-            TuneError: Nothing may move in any of them.
-        """
-        for syllabus in syllabi:
-            self.lessons.append(learn(self.runs, self.best, syllabus, until, self._following("searching")))
-            self.best = self.lessons[-1].best.config
-        if not any(lesson.free for lesson in self.lessons):
-            raise TuneError("everything that could be fitted is held: nothing to learn")
-
-    def repeat(self) -> None:
-        """All lessons once more, from all readings."""
-        for number, lesson in enumerate(self.lessons):
-            more = again(lesson, self.runs, self.best, self._following("learning from the whole run"))
-            self.lessons[number], self.best = more, more.best.config
-
-    def evidence(self) -> Evidence:
-        """The readings of the last lesson, from the whole of the runs."""
-        syllabus = self.lessons[-1].syllabus if self.lessons else Syllabus((), ())
-        return evidence_of(self.runs, self.config, syllabus, None)
-
-    def free(self, kinds: Sequence[Fit], hold: Sequence[str]) -> list[Parameter]:
-        """What was fitted, or what was to be."""
-        if not self.lessons:
-            return parameters(self.best, self.config, self.evidence().heard, kinds, hold)
-        return [one for lesson in self.lessons for one in lesson.free]
-
-    def keep_the_better(self) -> None:
-        """Of the last point and the configuration as given: gates make the way to a better one long."""
-        evidence = self.evidence()
-        before, after = (
-            evidence.value(with_gates_of(config, evidence.config)).total for config in (self.config, self.result())
-        )
-        if after < before - _NOTHING:
-            self.best, self.kept = self.config, True
-
-    def result(self) -> FusionConfig:
-        """The best configuration: gates as they were, rounded, and without the noise that is worth nothing."""
-        best = with_gates_of(self.best, self.config)
-        for lesson in self.lessons:
-            mine = [one for one in lesson.free if one.given(best) is not None]
-            for one in mine:
-                best = one.put(best, one.inside(float(f"{one.get(best):.{_DIGITS}g}")))
-            for one in mine:
-                none = one.put(best, 0.0) if one.vanishes and at_bound(one, best) == "least" else best
-                if none is not best and self._worth(lesson, best) - self._worth(lesson, none) < _NOTHING:
-                    best = none
-        return best
-
-    @staticmethod
-    def _worth(lesson: Lesson, config: FusionConfig) -> float:
-        """The log-likelihood of a lesson's readings with the gates of the lesson."""
-        return lesson.evidence.value(with_gates_of(config, lesson.evidence.config)).total
-
-    def _following(self, what: str) -> Callable[[Point], None]:
-        def tell(found: Point) -> None:
-            self.best = found.config
-            self.progress(what, found)
-
-        return tell
-
-
-def _syllabi(config: FusionConfig, kinds: Sequence[Fit], hold: Sequence[str], teacher: str | None) -> list[Syllabus]:
-    """One lesson from all sensors; with a teacher one from it, then one on the others' noise and latency."""
-    if teacher is None:
-        return [Syllabus(kinds, hold)]
-    config.sensor_names([teacher])
-    arm: list[Fit] = [kind for kind in kinds if kind != "latency"]
-    others: list[Fit] = [kind for kind in kinds if kind in ("noise", "latency")]
-
-    def of_others(one: Parameter) -> bool:
-        return one.sensor not in (None, teacher)
-
-    return [Syllabus(arm, hold, [teacher]), Syllabus(others, hold, None, of_others)]
 
 
 def _refuse_twice(runs: Sequence[Run]) -> None:
@@ -275,7 +184,7 @@ def _with_provenance(config: FusionConfig, sure: Mapping[str, Sure], runs: Seque
             key.removeprefix(f"axes.{axis}."): one.ci95 for key, one in sure.items() if key.startswith(f"axes.{axis}.")
         }
         for key, ci95 in found.items():
-            interval = tuple(float(f"{end:.{_DIGITS}g}") for end in ci95)
+            interval = tuple(rounded(end) for end in ci95)
             match key:
                 case "delay_ms":
                     model = _replace(model, delay_ci95=interval)
@@ -292,7 +201,7 @@ def _with_provenance(config: FusionConfig, sure: Mapping[str, Sure], runs: Seque
     return _replace(config, arm=_replace(config.arm, axes=axes, provenance=provenance))
 
 
-def _notes(course: _Course, validation: Sequence[Check] | None, interrupted: bool) -> list[str]:
+def _notes(course: Course, validation: Sequence[Check] | None, interrupted: bool) -> list[str]:
     found = [note for lesson in course.lessons for note in (*lesson.evidence.notes, *lesson.notes)]
     if course.kept:
         found.append("nothing more likely was found than the configuration as given, which is kept")
