@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
-from pumafuse.tune.climb import Point, _step, climb, moved, point, settle, slopes
+from pumafuse.tune.climb import Point, _step, climb, point, settle, slopes
 from pumafuse.tune.likelihood import Evidence, Slopes
-from pumafuse.tune.parameters import Fit, Parameter
+from pumafuse.tune.parameters import Fit, Parameter, moved
 from tuning import free_of, outage, replaced, scenario, spoiled, spoiled_arm, with_outliers, with_process, with_sensors
 
 

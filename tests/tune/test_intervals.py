@@ -12,10 +12,10 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.stats import multivariate_normal
 
 import pumafuse as pf
-from pumafuse.tune.climb import climb, moved
+from pumafuse.tune.climb import climb
 from pumafuse.tune.intervals import Sure, sureness
 from pumafuse.tune.likelihood import Evidence
-from pumafuse.tune.parameters import Fit, Parameter
+from pumafuse.tune.parameters import Fit, Parameter, moved
 from tuning import free_of, holds, learnt, outage, scenario, spoiled, spoiled_arm, sure_of
 
 ROOT = 1.96  # √(2 · 1.92): how far an interval's end is from the best, in signed roots of twice the drop

@@ -18,8 +18,9 @@ from pumafuse.fusion.consistency import densities_of, log_likelihood
 from pumafuse.model.arm import AxisModel
 from pumafuse.runs.run import Source
 from pumafuse.simulate.true_sensor import Outliers
-from pumafuse.tune.climb import Point, moved, point, slopes
+from pumafuse.tune.climb import Point, point, slopes
 from pumafuse.tune.likelihood import Evidence
+from pumafuse.tune.parameters import moved
 from pumafuse.tune.variants import with_order
 from tuning import ALL, SCENARIOS, free_of, quietly, replaced, scenario, spoiled_arm, with_process, with_sensors
 

@@ -9,9 +9,9 @@ import pytest
 from scipy.optimize import differential_evolution
 
 import pumafuse as pf
-from pumafuse.tune.climb import moved, point, settle
+from pumafuse.tune.climb import point, settle
 from pumafuse.tune.likelihood import Evidence
-from pumafuse.tune.parameters import Parameter
+from pumafuse.tune.parameters import Parameter, moved
 from pumafuse.tune.search import search
 from pumafuse.tune.variants import with_gates_of
 from tuning import free_of, learnt, outage, spoiled, spoiled_arm, with_outliers, with_process, with_sensors

@@ -7,7 +7,7 @@ taken where the likelihood itself, gates and all, is better there (λ as Levenbe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -18,7 +18,7 @@ from ..arrays import CodeArray, FloatArray
 from ..fusion.config import FusionConfig
 from ..fusion.ticks import usable_cores
 from .likelihood import Evidence, Slopes, Value
-from .parameters import Parameter
+from .parameters import Parameter, coordinates, moved
 from .variants import with_axis_of
 
 _ITERATIONS = 60
@@ -72,7 +72,7 @@ def point(
     prior = np.zeros(len(evidence.axes))
     for one in free:
         if one.prior is not None:
-            z = (one.coordinate(one.get(config)) - one.prior[0]) / one.prior[1]
+            z = (one.at(config) - one.prior[0]) / one.prior[1]
             prior[0 if one.axis is None else evidence.axes.index(one.axis)] -= 0.5 * z * z
     return Point(config, evidence.value(config, outcomes), prior)
 
@@ -84,7 +84,7 @@ def slopes(evidence: Evidence, at: Point, free: Sequence[Parameter]) -> Slopes:
     for number, one in enumerate(free):
         if one.prior is not None:
             middle, sd = one.prior
-            score[number] -= (one.coordinate(one.get(at.config)) - middle) / sd**2
+            score[number] -= (one.at(at.config) - middle) / sd**2
             information[number, number] += 1.0 / sd**2
     return Slopes(score, information)
 
@@ -115,7 +115,7 @@ def climb(
     axis = np.array([-1 if one.axis is None else evidence.axes.index(one.axis) for one in free])
     damping = np.full(len(free), _LEAST)
     for _ in range(_ITERATIONS):
-        at = np.array([one.coordinate(one.get(best.config)) for one in free])
+        at = coordinates(best.config, free)
         found = slopes(evidence, best, free)
         failed = False
         while True:
@@ -151,7 +151,7 @@ def _farther(
     high: FloatArray,
 ) -> Point:
     """The best of a step and its doubles in the box: along a valley the information promises too short ones."""
-    at = np.array([one.coordinate(one.get(start.config)) for one in free])
+    at = coordinates(start.config, free)
     for double in _DOUBLES:
         longer = point(evidence, moved(start.config, free, np.clip(at + double * step, low, high)), free, outcomes)
         if longer.height < trial.height + _ENOUGH:
@@ -189,8 +189,8 @@ def settle(evidence: Evidence, start: FusionConfig, free: Sequence[Parameter], t
     best = _past_bumps(evidence, best, free, tell)
     for _ in range(_SETTLING):
         peak = climb(evidence, best.config, free, outcomes=best.value.outcomes)
-        at = np.array([one.coordinate(one.get(best.config)) for one in free])
-        there = np.array([one.coordinate(one.get(peak.config)) for one in free])
+        at = coordinates(best.config, free)
+        there = coordinates(peak.config, free)
         for share in _SHARES:
             trial = point(evidence, moved(best.config, free, at + share * (there - at)), free)
             if trial.height > best.height + _ENOUGH:
@@ -206,7 +206,7 @@ def _past_bumps(evidence: Evidence, best: Point, free: Sequence[Parameter], tell
     """Over the small bumps that the likelihood has in a time, where readings pass commands and each other."""
     times = [one for one in free if one.fit in ("delay", "latency")]
     for one in times:
-        at = one.coordinate(one.get(best.config))
+        at = one.at(best.config)
         beside = max((point(evidence, one.move(best.config, at + shift), free) for shift in _BUMPS), key=_height)
         if beside.height > best.height + _ENOUGH:
             best = climb(evidence, beside.config, free, tell)
@@ -215,13 +215,6 @@ def _past_bumps(evidence: Evidence, best: Point, free: Sequence[Parameter], tell
 
 def _height(found: Point) -> float:
     return found.height
-
-
-def moved(config: FusionConfig, free: Sequence[Parameter], coordinates: Iterable[float]) -> FusionConfig:
-    """The configuration with every parameter at its coordinate."""
-    for one, coordinate in zip(free, coordinates, strict=True):
-        config = one.move(config, float(coordinate))
-    return config
 
 
 def _step(found: Slopes, low: FloatArray, high: FloatArray, damping: FloatArray) -> FloatArray:

@@ -42,7 +42,7 @@ def covariance(information: FloatArray, free: Sequence[Parameter]) -> FloatArray
 def at_bound(one: Parameter, config: FusionConfig) -> str | None:
     """``least`` or ``greatest`` where a parameter lies at that bound."""
     low, high = one.range
-    at, margin = one.coordinate(one.get(config)), _AT_BOUND * (high - low)
+    at, margin = one.at(config), _AT_BOUND * (high - low)
     return "least" if at <= low + margin else "greatest" if at >= high - margin else None
 
 

@@ -13,10 +13,10 @@ from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..fusion.ticks import usable_cores
 from ..model.plants import Interval
-from .climb import Point, climb, moved, point, slopes
+from .climb import Point, climb, point, slopes
 from .diagnose import at_bound, covariance
 from .likelihood import Evidence
-from .parameters import Parameter
+from .parameters import Parameter, coordinates, moved
 
 _ENOUGH = 0.02  # log-likelihood to which a profile is followed
 _SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which the profile is followed
@@ -97,7 +97,7 @@ def views_of(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> Mapp
     for axis, (part, outcomes) in alone.items():
         elsewhere = sum((told[other] for other in told if other != axis), np.zeros(len(shared)))
         priors = [
-            replace(one, prior=(one.coordinate(one.get(best.config)), 1.0 / np.sqrt(max(float(told_of), 1e-12))))
+            replace(one, prior=(one.at(best.config), 1.0 / np.sqrt(max(float(told_of), 1e-12))))
             for one, told_of in zip(shared, elsewhere, strict=True)
         ]
         views[axis] = _view(part, outcomes, best, [*own[axis], *priors])
@@ -131,7 +131,7 @@ def _end(view: View, best: Point, one: Parameter, sign: float) -> _End:
     """The lower (−1) or upper (+1) end of an interval."""
     place = [other.key for other in view.free].index(one.key)
     others = [other for other in view.free if other.key != one.key]
-    at = np.array([other.coordinate(other.get(best.config)) for other in view.free])
+    at = coordinates(best.config, view.free)
     along = sign * view.covariance[:, place] / np.sqrt(view.covariance[place, place])  # how all move for one sd of it
     low, high = np.array([other.range for other in view.free]).T
     top = point(view.evidence, best.config, view.free, view.outcomes).height
@@ -145,7 +145,7 @@ def _end(view: View, best: Point, one: Parameter, sign: float) -> _End:
         nonlocal along
         there = moved(best.config, view.free, np.clip(at + reach * along, low, high))
         peak = climb(view.evidence, there, others, outcomes=view.outcomes, enough=_ENOUGH)
-        along = (np.array([other.coordinate(other.get(peak.config)) for other in view.free]) - at) / reach
+        along = (coordinates(peak.config, view.free) - at) / reach
         return _root(top - peak.height - _prior_of(one, there))
 
     skewed = _SKEWED if one.axis else _SKEWED_FOR_ALL
@@ -162,7 +162,7 @@ def _from_the_bound(view: View, best: Point, one: Parameter) -> Sure:
     It begins where the likelihood has dropped as far with the others held, which is too near.
     """
     every = [*view.free, one]
-    bound, (low, high) = one.coordinate(one.get(best.config)), one.range
+    bound, (low, high) = one.at(best.config), one.range
     upwards, span = bound < 0.5 * (low + high), high - low
     top, along = point(view.evidence, best.config, every, view.outcomes).height, best.config
 
@@ -229,4 +229,4 @@ def _crossing(root: Callable[[float], float], first: float, limit: float) -> tup
 def _prior_of(one: Parameter, config: FusionConfig) -> float:
     if one.prior is None:
         return 0.0
-    return -0.5 * ((one.coordinate(one.get(config)) - one.prior[0]) / one.prior[1]) ** 2
+    return -0.5 * ((one.at(config) - one.prior[0]) / one.prior[1]) ** 2

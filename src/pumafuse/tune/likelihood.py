@@ -299,7 +299,7 @@ class Evidence:
         d_nu, d_S = np.empty((len(mine), len(nu))), np.empty((len(mine), len(nu)))
         for place, number in enumerate(mine):
             one = parameters[number]
-            at = one.coordinate(one.get(config))
+            at = one.at(config)
             if one.log:
                 nu_up, S_up = self._met(strand, outcome, one.move(config, at + _LOG_STEP))
                 d_nu[place], d_S[place] = (nu_up - nu) / _LOG_STEP, (S_up - S) / _LOG_STEP

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import msgspec
+import numpy as np
 
+from ..arrays import FloatArray
 from ..errors import ConfigError, suggestion
 from ..fusion.config import FusionConfig, Process
 from ..model.arm import AxisModel
@@ -94,6 +96,10 @@ class Parameter:
         """Of a number, which is moved into the bounds."""
         return math.log(self.inside(value)) if self.log else self.inside(value)
 
+    def at(self, config: FusionConfig) -> float:
+        """The coordinate of the number in a configuration."""
+        return self.coordinate(self.get(config))
+
     def value(self, coordinate: float) -> float:
         """The number at a coordinate [SI]."""
         return math.exp(coordinate) if self.log else coordinate
@@ -160,6 +166,18 @@ def least_sd(config: FusionConfig, name: str) -> float:
     """The noise of a sensor [m], on the axis where it has least."""
     sd = config.sensors[name].sd
     return min(sd.values()) if isinstance(sd, dict) else sd
+
+
+def coordinates(config: FusionConfig, free: Sequence[Parameter]) -> FloatArray:
+    """The coordinate of each parameter in a configuration, (k,)."""
+    return np.array([one.at(config) for one in free])
+
+
+def moved(config: FusionConfig, free: Sequence[Parameter], coordinates: Iterable[float]) -> FusionConfig:
+    """The configuration with every parameter at its coordinate."""
+    for one, coordinate in zip(free, coordinates, strict=True):
+        config = one.move(config, float(coordinate))
+    return config
 
 
 def rounded(value: float) -> float:

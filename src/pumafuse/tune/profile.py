@@ -12,11 +12,11 @@ import numpy as np
 from ..arrays import CodeArray, FloatArray
 from ..fusion.config import FusionConfig
 from ..fusion.ticks import usable_cores
-from .climb import Point, climb, moved, point
+from .climb import Point, climb, point
 from .intervals import View, views_of
 from .lesson import Lesson
 from .likelihood import Evidence
-from .parameters import Parameter
+from .parameters import Parameter, coordinates, moved
 from .summary import Fitted
 
 _SHARES = (0.3, 0.65, 1.0, 1.5)  # of the way from the best to an end of the interval, where the points are
@@ -108,7 +108,7 @@ class _Ridge:
         straight = self.straight(coordinate)
         others = self.mine[1:]
         there = climb(self.evidence, self.config(straight), others, outcomes=self.outcomes, enough=_ENOUGH).config
-        return np.append(0.0, np.array([one.coordinate(one.get(there)) for one in others]) - straight[1:])
+        return np.append(0.0, coordinates(there, others) - straight[1:])
 
 
 def _ridge(view: View, best: Point, one: Parameter) -> _Ridge:
@@ -119,7 +119,7 @@ def _ridge(view: View, best: Point, one: Parameter) -> _Ridge:
         number = keys.index(one.key)
         along = view.covariance[:, number] / view.covariance[number, number]
         line = along[[keys.index(other.key) for other in mine]]
-    start = np.array([other.coordinate(other.get(best.config)) for other in mine])
+    start = coordinates(best.config, mine)
     return _Ridge(view.evidence, view.outcomes, best, mine, start, line)
 
 
