@@ -12,7 +12,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.simulate.true_sensor import Outliers
-from pumafuse.tune.intervals import Sure, sureness
+from pumafuse.tune.intervals import ConfidenceInterval, confidence_intervals
 from pumafuse.tune.lesson import Lesson, Syllabus, learn
 from pumafuse.tune.likelihood import Evidence
 from pumafuse.tune.parameters import Fit, Parameter, parameters
@@ -97,12 +97,12 @@ def learnt(
     return learn([run] if isinstance(run, pf.Run) else run, config, Syllabus(fit, hold), None, lambda _: None)
 
 
-def sure_of(lesson: Lesson) -> dict[str, Sure]:
+def sure_of(lesson: Lesson) -> dict[str, ConfidenceInterval]:
     """The intervals of a lesson."""
-    return sureness(lesson.evidence, lesson.best, lesson.free)
+    return confidence_intervals(lesson.evidence, lesson.best, lesson.free)
 
 
-def holds(one: Parameter, sure: Sure, truth: pf.FusionConfig) -> bool:
+def holds(one: Parameter, sure: ConfidenceInterval, truth: pf.FusionConfig) -> bool:
     """Whether an interval has the truth in it; none is in one that is open below."""
     low, high = sure.ci95
     return (0.0 if sure.open[0] and one.vanishes else low) <= one.get(truth) <= high

@@ -13,7 +13,7 @@ from scipy.stats import multivariate_normal
 
 import pumafuse as pf
 from pumafuse.tune.climb import climb
-from pumafuse.tune.intervals import Sure, sureness
+from pumafuse.tune.intervals import ConfidenceInterval, confidence_intervals
 from pumafuse.tune.likelihood import Evidence
 from pumafuse.tune.parameters import Fit, Parameter, moved
 from tuning import free_of, holds, learnt, outage, scenario, spoiled, spoiled_arm, sure_of
@@ -40,11 +40,13 @@ def at_rest(values: np.ndarray, drift: float, sd: float) -> tuple[Evidence, pf.F
     return Evidence([run], config), config
 
 
-def sure(evidence: Evidence, config: pf.FusionConfig, *keys: str) -> tuple[pf.FusionConfig, dict[str, Sure]]:
+def sure(
+    evidence: Evidence, config: pf.FusionConfig, *keys: str
+) -> tuple[pf.FusionConfig, dict[str, ConfidenceInterval]]:
     """The best configuration and the intervals of these numbers, all others held."""
     free = [one for one in free_of(evidence, config, ("noise", "latency")) if one.key in keys]
     best = climb(evidence, config, free)
-    return best.config, sureness(evidence, best, free)
+    return best.config, confidence_intervals(evidence, best, free)
 
 
 # ---- against likelihoods that no filter works out -------------------------------------------------------------------
@@ -192,7 +194,7 @@ def test_a_number_of_an_axis_knows_what_the_others_say_of_a_shared_one() -> None
     free = [one for one in free_of(evidence, sim.config, ("delay", "latency")) if one.key in names]
     best = climb(evidence, sim.config, free)
     delay, latency = (next(one for one in free if one.key == name) for name in names)
-    found, outcomes = sureness(evidence, best, free)[delay.key], best.value.outcomes
+    found, outcomes = confidence_intervals(evidence, best, free)[delay.key], best.value.outcomes
 
     def highest(value: float) -> float:
         held, near = delay.put(best.config, value), latency.get(best.config)

@@ -10,7 +10,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.simulate.true_sensor import Outliers, TrueSensor
-from pumafuse.tune.intervals import Sure
+from pumafuse.tune.intervals import ConfidenceInterval
 from pumafuse.tune.lesson import Lesson, Syllabus, again, learn
 from pumafuse.tune.likelihood import Evidence
 from pumafuse.tune.summary import told
@@ -41,7 +41,7 @@ def numbers(lesson: Lesson) -> dict[str, float]:
 # ---- latencies ------------------------------------------------------------------------------------------------------
 
 
-def wrong_latency(seed: int, *size: float) -> tuple[Lesson, Sure]:
+def wrong_latency(seed: int, *size: float) -> tuple[Lesson, ConfidenceInterval]:
     """A camera that is 45 ms late and is told to be 9; noise as wrong as elsewhere."""
     sim = pf.simulate(scenario("wrong-latency", *size), seed)
     found = learnt(sim.run, with_sensors(spoiled(sim.config), latency=0.009), ("noise", "latency"))

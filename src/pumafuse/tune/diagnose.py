@@ -1,4 +1,4 @@
-"""How sure a fit is: intervals, parameters that go together, and what the readings cannot tell."""
+"""What the readings cannot tell: parameters that only go together, combinations, noises of rare sensors."""
 
 from __future__ import annotations
 

@@ -27,8 +27,8 @@ _HALVINGS = 26
 
 
 @dataclass(frozen=True)
-class Sure:
-    """How well a parameter is known.
+class ConfidenceInterval:
+    """The 95 % confidence interval of a parameter.
 
     Attributes:
         ci95: The 95 % interval [SI]; an end at the parameter's bound is open.
@@ -61,7 +61,7 @@ class View:
     covariance: FloatArray
 
 
-def sureness(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> dict[str, Sure]:
+def confidence_intervals(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> dict[str, ConfidenceInterval]:
     """The 95 % interval of each free parameter, by its name.
 
     From the curvature: 1.96 sd of the coordinate each way. Where the likelihood at an end, the others moved along, has
@@ -71,13 +71,13 @@ def sureness(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> dict
     best = climb(evidence, best.config, free, outcomes=best.value.outcomes)
     views = views_of(evidence, best, free)
 
-    def of(one: Parameter) -> Sure:
+    def of(one: Parameter) -> ConfidenceInterval:
         view = views[one.axis]
         if at_bound(one, best.config) is not None:
             return _from_the_bound(view, best, one)
         low, high = (_end(view, best, one, sign) for sign in (-1.0, 1.0))
         ci95 = (one.value(low.coordinate), one.value(high.coordinate))
-        return Sure(ci95, low.profiled or high.profiled, None, (low.open, high.open))
+        return ConfidenceInterval(ci95, low.profiled or high.profiled, None, (low.open, high.open))
 
     with ThreadPoolExecutor(usable_cores()) as pool:
         return dict(zip([one.key for one in free], pool.map(of, free), strict=True))
@@ -156,7 +156,7 @@ def _end(view: View, best: Point, one: Parameter, sign: float) -> _End:
     return _End(float(at[place] + reach * unit), profiled=True, open=beyond)
 
 
-def _from_the_bound(view: View, best: Point, one: Parameter) -> Sure:
+def _from_the_bound(view: View, best: Point, one: Parameter) -> ConfidenceInterval:
     """The interval of a parameter at a bound: from there to where the profile has dropped by 1.92.
 
     It begins where the likelihood has dropped as far with the others held, which is too near.
@@ -191,8 +191,8 @@ def _from_the_bound(view: View, best: Point, one: Parameter) -> Sure:
     distance, beyond = _crossing(profile, first, limit)
     end = one.value(place(distance))
     if upwards:
-        return Sure((one.bounds[0], end), True, "least", (True, beyond))
-    return Sure((end, one.bounds[1]), True, "greatest", (beyond, True))
+        return ConfidenceInterval((one.bounds[0], end), True, "least", (True, beyond))
+    return ConfidenceInterval((end, one.bounds[1]), True, "greatest", (beyond, True))
 
 
 def _root(drop: float) -> float:

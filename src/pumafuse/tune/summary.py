@@ -12,7 +12,7 @@ from ..fusion.offline import fuse
 from ..runs.run import Run
 from ..units import MM
 from .diagnose import Tie, correlations
-from .intervals import Sure
+from .intervals import ConfidenceInterval
 from .lesson import Lesson
 from .parameters import Parameter
 from .validate import Check
@@ -116,36 +116,37 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
     notes: list[str]
 
 
-def fitted(one: Parameter, before: FusionConfig, after: FusionConfig, sure: Sure | None) -> Fitted:
+def fitted(one: Parameter, before: FusionConfig, after: FusionConfig, interval: ConfidenceInterval | None) -> Fitted:
     """A parameter in the unit of its key; without its interval where nobody asked for it."""
     earlier, value = one.given(before), one.get(after)
     ends: tuple[float | None, float | None] = (None, None)
-    if sure is not None:
-        low, high = sure.ci95
-        ends = (None if sure.open[0] else low / one.unit, None if sure.open[1] else high / one.unit)
-        if sure.open[0] and one.vanishes:
+    if interval is not None:
+        low, high = interval.ci95
+        ends = (None if interval.open[0] else low / one.unit, None if interval.open[1] else high / one.unit)
+        if interval.open[0] and one.vanishes:
             ends = (0.0, ends[1])
     return Fitted(
         key=one.key,
         before=None if earlier is None else earlier / one.unit,
         value=value / one.unit,
         ci95=ends,
-        profiled=sure is not None and sure.profiled,
-        said="" if sure is None else _said(one, sure),
+        profiled=interval is not None and interval.profiled,
+        said="" if interval is None else _said(one, interval),
     )
 
 
-def _said(one: Parameter, sure: Sure) -> str:
+def _said(one: Parameter, interval: ConfidenceInterval) -> str:
     low, high = (f"{bound / one.unit:g}" for bound in one.bounds)
-    if sure.at == "least" and one.vanishes:
+    if interval.at == "least" and one.vanishes:
         return "the readings show no sign of it"
-    if sure.at is not None:
-        return f"at the {sure.at} that is looked for ({low if sure.at == 'least' else high}): the model does not fit"
-    if all(sure.open):
+    if interval.at is not None:
+        bound = low if interval.at == "least" else high
+        return f"at the {interval.at} that is looked for ({bound}): the model does not fit"
+    if all(interval.open):
         return "the readings tell nothing of it"
-    if sure.open[0]:
+    if interval.open[0]:
         return "it may as well be none" if one.vanishes else f"the readings do not limit it below ({low} is looked for)"
-    return f"the readings do not limit it above ({high} is looked for)" if sure.open[1] else ""
+    return f"the readings do not limit it above ({high} is looked for)" if interval.open[1] else ""
 
 
 def biases(run: Run, config: FusionConfig) -> list[FoundBias]:

@@ -17,7 +17,7 @@ from ..model.arm import AxisModel
 from ..runs.clock import segments
 from ..runs.run import Run
 from .course import Course, Progress, syllabi
-from .intervals import Sure, sureness
+from .intervals import ConfidenceInterval, confidence_intervals
 from .learnable import TuneError, moving
 from .lesson import Lesson
 from .likelihood import Evidence
@@ -94,7 +94,7 @@ def tune(
     course = Course(runs, config, progress)
     moving(course.evidence(), config)  # of the whole, before a part of it is asked
     until = _held_back(runs[0]) if len(runs) == 1 and validate is None else None
-    sure: dict[str, Sure] = {}
+    intervals: dict[str, ConfidenceInterval] = {}
     validation: list[Check] | None = None
     interrupted = False
     try:
@@ -107,11 +107,11 @@ def tune(
             validation = check(validate, config, course.result())
         for lesson in [] if course.kept else course.lessons:
             progress("asking how sure it is", lesson.best)
-            sure |= sureness(lesson.evidence, lesson.best, lesson.free)
+            intervals |= confidence_intervals(lesson.evidence, lesson.best, lesson.free)
     except KeyboardInterrupt:
         interrupted = True
         course.keep_the_better()
-    tuned = _with_provenance(course.result(), sure, [run.name for run in runs])
+    tuned = _with_provenance(course.result(), intervals, [run.name for run in runs])
     summary = TuningSummary(
         pumafuse=version("pumafuse"),
         runs=[run.name for run in runs],
@@ -120,7 +120,7 @@ def tune(
         teacher=teacher,
         interrupted=interrupted,
         likelihood=_likelihoods(course.evidence(), config, tuned),
-        parameters=[fitted(one, config, tuned, sure.get(one.key)) for one in course.free(kinds, names)],
+        parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in course.free(kinds, names)],
         biases=[one for run in runs for one in biases(run, tuned)],
         correlations=[pair for lesson in course.lessons for pair in correlated(lesson)],
         held=[told(tie) for lesson in course.lessons for tie in lesson.ties],
@@ -176,12 +176,16 @@ def _likelihoods(evidence: Evidence, before: FusionConfig, after: FusionConfig) 
     }
 
 
-def _with_provenance(config: FusionConfig, sure: Mapping[str, Sure], runs: Sequence[str]) -> FusionConfig:
+def _with_provenance(
+    config: FusionConfig, intervals: Mapping[str, ConfidenceInterval], runs: Sequence[str]
+) -> FusionConfig:
     """The arm with the intervals of what was fitted, and where it is from."""
     axes: dict[str, AxisModel] = {}
     for axis, model in config.arm.axes.items():
         found = {
-            key.removeprefix(f"axes.{axis}."): one.ci95 for key, one in sure.items() if key.startswith(f"axes.{axis}.")
+            key.removeprefix(f"axes.{axis}."): one.ci95
+            for key, one in intervals.items()
+            if key.startswith(f"axes.{axis}.")
         }
         for key, ci95 in found.items():
             interval = tuple(rounded(end) for end in ci95)
@@ -196,7 +200,7 @@ def _with_provenance(config: FusionConfig, sure: Mapping[str, Sure], runs: Seque
                     name = key.removesuffix("_ms").removesuffix("_rad_s")
                     model = _replace(model, plant=_replace(model.plant, **{f"{name}_ci95": interval}))
         axes[axis] = model
-    tuned = any(key.startswith("axes.") for key in sure)
+    tuned = any(key.startswith("axes.") for key in intervals)
     provenance = {**config.arm.provenance, "tuned_on": list(runs)} if tuned else config.arm.provenance
     return _replace(config, arm=_replace(config.arm, axes=axes, provenance=provenance))
 
