@@ -15,7 +15,8 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.arrays import FloatArray
-from pumafuse.identify.verify import Fit, Trace
+from pumafuse.identify.measured import Fit
+from pumafuse.identify.verify import Trace
 from pumafuse.model.plants import PLANTS
 from pumafuse.runs.frames import Rotated
 

@@ -7,25 +7,25 @@ kind can do better, so what is left is noise, friction and everything else that 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 
 from .. import units
-from ..arrays import FloatArray, TimeArray
+from ..arrays import FloatArray
 from ..errors import ConfigError, RunError
 from ..fusion import timeline as timelines
 from ..fusion.config import FusionConfig, Sensor
 from ..fusion.timeline import AxisInput
-from ..model.arm import ArmModel, AxisModel, Gain, commanded_speed
-from ..model.drive import drive
-from ..model.plants import PLANTS, FirstOrder, SecondOrder
-from ..model.respond import respond
+from ..model.arm import ArmModel, AxisModel
+from ..model.plants import SecondOrder
 from ..runs.axes import in_axes
 from ..runs.clock import segments
 from ..runs.run import Run
+from .floor import Floor, best_of_order
+from .measured import Commands, Fit, Measured
 
 RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
 REFERENCE = "reference"
@@ -33,42 +33,8 @@ _FEWEST = 20  # readings
 _MOST_LEVELS = 8  # of a run whose start level is looked for among them
 _AS_GOOD, _FAR = 1.2, 3.0  # times the floor
 _FARTHEST, _SLOWEST = 1e6, 1e4  # m, s: sizes beyond which nothing can be computed
-_SPIKE = 8.0  # robust standard deviations
 _HOLDS = 50.0  # % fit
-_DELAYS, _LATEST = 13, 9.0  # of the floor's first grid: how many, up to how many periods
-_LAGS, _RATIOS = 5, (0.05, 0.25, 0.8)  # of 2ζ/ω; of 1/ω² over its square
-_STARTS = 3
 _BETTER = 0.8  # share of the error that is worth a word
-
-
-class Fit(msgspec.Struct, frozen=True, kw_only=True):
-    """How well a simulated position fits the measured one.
-
-    Attributes:
-        rms: Of the difference, without its mean [m].
-        percent: Of the amplitude of the commands.
-        fit: 100 (1 − ‖difference‖ / ‖measured‖), both without their means.
-    """
-
-    rms: float = msgspec.field(name="rms_mm")
-    percent: float = msgspec.field(name="percent_of_signal")
-    fit: float = msgspec.field(name="fit_percent")
-
-
-class Floor(msgspec.Struct, frozen=True, kw_only=True):
-    """The best linear model of the order, refitted on the run.
-
-    Attributes:
-        fit: How well it fits.
-        delay: Td [s].
-        gain: K, at the commands' mean speed.
-        plant: Of unit gain.
-    """
-
-    fit: Fit
-    delay: float = msgspec.field(name="delay_ms")
-    gain: float
-    plant: PLANTS
 
 
 class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
@@ -171,43 +137,10 @@ def _part(run: Run, config: FusionConfig, said: Sequence[str]) -> list[tuple[Axi
         for index, source in enumerate(scalars.sensors):
             here = scalars.candidates[(axis == number) & (sensor == index)]
             if len(here) >= _FEWEST and np.ptp(driven.command) > 0.0:
-                measured = _Measured(run.name, source, scalars.valid[here], scalars.value[here])
+                measured = Measured(run.name, source, scalars.valid[here], scalars.value[here])
                 notes = [*said, *timeline.notes] if not found else []
                 found.append(_verified(measured, driven, config.arm, driven.name in run.start, notes))
     return found
-
-
-@dataclass(frozen=True)
-class _Measured:
-    """Readings of one axis: when [ns] and where [m], (n,)."""
-
-    run: str
-    source: str
-    time: TimeArray
-    position: FloatArray
-
-    def without_spikes(self, modelled: FloatArray) -> _Measured:
-        """The readings that do not jump away from their neighbours: what is left runs on, whatever the model.
-
-        A model that is wrong for a while must not be spared: only eight robust standard deviations from the running
-        median of five count.
-        """
-        from scipy.ndimage import median_filter
-        from scipy.stats import median_abs_deviation
-
-        left = self.position - modelled
-        jump = left - median_filter(left, size=5, mode="nearest")
-        kept = np.abs(jump) <= _SPIKE * max(float(median_abs_deviation(left, scale="normal")), 1e-9)
-        return replace(self, time=self.time[kept], position=self.position[kept])
-
-    def fit(self, modelled: FloatArray, amplitude: float) -> Fit:
-        left = self.position - modelled
-        rms, signal = float(np.std(left)), float(np.std(self.position))
-        return Fit(
-            rms=rms,
-            percent=100.0 * rms / amplitude if amplitude > 0.0 else np.inf,
-            fit=100.0 * (1.0 - rms / signal) if signal > 0.0 else -np.inf,
-        )
 
 
 def _with_reference(run: Run, sensors: Sequence[str] | None) -> Run:
@@ -223,11 +156,11 @@ def _with_reference(run: Run, sensors: Sequence[str] | None) -> Run:
 
 
 def _verified(
-    measured: _Measured, driven: AxisInput, arm: ArmModel, given: bool, notes: list[str]
+    measured: Measured, driven: AxisInput, arm: ArmModel, given: bool, notes: list[str]
 ) -> tuple[AxisVerification, Trace]:
     model, delay = arm.axes[driven.name], arm.delay_of(driven.name)
     _check_sizes(driven, model, delay)
-    command = _Commands(driven.given, driven.command, arm.update_period)
+    command = Commands(driven.given, driven.command, arm.update_period)
     recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
     start, words = _start(measured, command, driven.start, model, delay, given)
     every = len(measured.time)
@@ -240,7 +173,7 @@ def _verified(
         key: measured.fit(simulated(msgspec.structs.replace(model, gain_recovery=value)), command.amplitude)
         for key, value in (("as it is", model.gain_recovery), ("never", None), ("recovering", recovery))
     }
-    floor = _floor(measured, command, model, delay, start)
+    floor = best_of_order(measured, command, model, delay, start)
     modelled = simulated(model)
     trace = Trace(
         units.seconds(measured.time, int(command.time[0])),
@@ -279,32 +212,8 @@ def _check_sizes(driven: AxisInput, model: AxisModel, delay: float) -> None:
         raise ConfigError(f"axis '{driven.name}': a start level, gain or delay of no size that an arm has")
 
 
-@dataclass(frozen=True)
-class _Commands:
-    """Commands of one axis: when [ns] and u [m], (k,); the update period [s]."""
-
-    time: TimeArray
-    value: FloatArray
-    period: float
-
-    @property
-    def amplitude(self) -> float:
-        """From the lowest to the highest [m]."""
-        return float(np.ptp(self.value))
-
-    @property
-    def speeds(self) -> FloatArray:
-        """Of the commands that move [m/s]."""
-        return commanded_speed(np.diff(self.value)[np.diff(self.value) != 0.0], self.period)
-
-    def moved(self, axis: AxisModel, delay: float, start: float, time: TimeArray) -> FloatArray:
-        """Where the axis is at ``time`` [ns], relative to ``start`` [m], (n,)."""
-        driven = drive(axis, self.time, self.value, start, self.period)
-        return respond(axis.plant, driven.time + round(delay * 1e9), driven.value, time)
-
-
 def _start(
-    measured: _Measured, command: _Commands, first: float, model: AxisModel, delay: float, given: bool
+    measured: Measured, command: Commands, first: float, model: AxisModel, delay: float, given: bool
 ) -> tuple[float, str]:
     """Where the arm rested before the first command [m], and how that is known."""
     if given:
@@ -314,84 +223,6 @@ def _start(
         return first, "the first command"
     rms = [np.std(measured.position - command.moved(model, delay, level, measured.time)) for level in levels.tolist()]
     return float(levels[np.argmin(rms)]), f"chosen among the run's {len(levels)} levels by RMS"
-
-
-def _floor(measured: _Measured, command: _Commands, model: AxisModel, delay: float, start: float) -> Floor:
-    """The best gain, delay and plant of the model's order on this run; gain and bias are linear."""
-    from scipy.optimize import least_squares
-
-    z = measured.position - measured.position.mean()
-    columns = _gain_columns(command, model)
-
-    def basis(x: FloatArray) -> FloatArray:
-        moved = [command.moved(_with(axis, _plant_at(x)), float(x[0]) ** 2, start, measured.time) for axis in columns]
-        independent = np.stack([moved[0], *(column - moved[0] for column in moved[1:])], axis=1)
-        return independent - independent.mean(axis=0)
-
-    def shares(design: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.lstsq(design, z, rcond=None)[0], dtype=np.float64)
-
-    def left(x: FloatArray) -> FloatArray:
-        design = basis(x)
-        return z - design @ shares(design)
-
-    starts = [_coordinates(delay, model.plant), *_starts(left, command.period, model.plant)]
-    best = min(
-        (least_squares(left, x, x_scale="jac", xtol=1e-10, ftol=1e-12, gtol=1e-12, max_nfev=300) for x in starts),
-        key=lambda found: found.cost,
-    )
-    design = basis(best.x)
-    share = shares(design)
-    speed = np.array(command.speeds.mean())
-    return Floor(
-        fit=measured.fit(design @ share, command.amplitude),
-        delay=float(best.x[0]) ** 2,
-        gain=float(share[0] + sum(share[k] * (columns[k].gain.at(speed) - 1.0) for k in range(1, len(columns)))),
-        plant=_plant_at(best.x),
-    )
-
-
-def _gain_columns(command: _Commands, model: AxisModel) -> list[AxisModel]:
-    """Axes whose responses span those of all gains: K = 1; another K where it recovers; K that rises with speed."""
-    gains = [Gain()]
-    if model.gain_recovery is not None:
-        gains.append(Gain(intercept=2.0))
-    if np.ptp(command.speeds) > 1e-6 * command.speeds.max():
-        gains.append(Gain(slope=1.0))
-    return [msgspec.structs.replace(model, gain=gain) for gain in gains]
-
-
-def _with(axis: AxisModel, plant: PLANTS) -> AxisModel:
-    return msgspec.structs.replace(axis, plant=plant)
-
-
-def _starts(left: Callable[[FloatArray], FloatArray], period: float, plant: PLANTS) -> list[FloatArray]:
-    """The best cells of a grid of delays and plants, of different delays."""
-    ratios = (None,) if isinstance(plant, FirstOrder) else _RATIOS
-    found: list[tuple[float, FloatArray]] = []
-    for delay in np.linspace(0.0, _LATEST * period, _DELAYS).tolist():
-        cells = [
-            np.array([np.sqrt(delay), np.log(q), *([] if ratio is None else [0.5 * np.log(ratio * q * q)])])
-            for q in np.geomspace(0.2 * period, 10.0 * period, _LAGS).tolist()
-            for ratio in ratios
-        ]
-        found.append(min(((float(np.sum(left(x) ** 2)), x) for x in cells), key=lambda one: one[0]))
-    return [x for _, x in sorted(found, key=lambda one: one[0])[:_STARTS]]
-
-
-def _coordinates(delay: float, plant: PLANTS) -> FloatArray:
-    """√Td and log τ, or log 2ζ/ω and log 1/ω: free of bounds."""
-    if isinstance(plant, FirstOrder):
-        return np.array([np.sqrt(delay), np.log(plant.time_constant)])
-    return np.array([np.sqrt(delay), np.log(plant.lag), -np.log(plant.natural_frequency)])
-
-
-def _plant_at(x: FloatArray) -> PLANTS:
-    q = float(np.exp(np.clip(x[1], -12.0, 6.0)))
-    if len(x) == 2:
-        return FirstOrder(time_constant=q)
-    omega = float(np.exp(-np.clip(x[2], -12.0, 6.0)))
-    return SecondOrder(natural_frequency=omega, damping=0.5 * q * omega)
 
 
 def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor) -> str:
