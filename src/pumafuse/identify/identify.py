@@ -11,13 +11,14 @@ import numpy as np
 
 from .. import units
 from ..arrays import FloatArray
-from ..model.arm import ArmModel, Validity, ordered_axes
+from ..model.arm import ArmModel, ordered_axes
 from ..model.plants import FirstOrder, Interval, SecondOrder
 from . import anova
 from .combine import Combination, CombinedAxis, Fitted, combine, combined_rms, usual_gain
 from .estimate import common
 from .fit import StepFit, fit_steps, flags
 from .paper import fit_as_published, onset
+from .performance import Performance, performances, validity
 from .rows import window
 from .trials import StepTrials, Trial, TrialsError
 
@@ -93,22 +94,6 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     common_gain: float | None
     combined_rms: float | None = msgspec.field(name="combined_rms_mm")
     left_out: str | None
-
-
-class Performance(msgspec.Struct, frozen=True, kw_only=True):
-    """How well the combined model fits by one factor; levels hold RMS in mm.
-
-    Attributes:
-        factor: What was varied.
-        levels: RMS [mm] of the trials at each level.
-        limit: Where the mean RMS passes the tolerance, in the factor's unit; null where it does not.
-        verdict: In words.
-    """
-
-    factor: str
-    levels: list[anova.Level]
-    limit: float | None
-    verdict: str
 
 
 class Identification(msgspec.Struct, frozen=True, kw_only=True):
@@ -203,8 +188,8 @@ def identify(
         )
     }
     factors = anova.factors_of([one.trial for one in used], period)
-    performance = _performances(factors, np.array([rms[one.trial.name] for one in used]) * units.MM, tolerance)
-    limited = _valid(performance, used, period)
+    performance = performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance)
+    limited = validity(performance, max(one.trial.speed_at(period) for one in used))
     provenance = {
         "made_by": f"pumafuse identify {version('pumafuse')}",
         "trials": {axis: found.axis.trials for axis, found in combined.items()},
@@ -284,44 +269,6 @@ def _rounded(arm: ArmModel) -> ArmModel:
                 return value
 
     return msgspec.convert(rounded(msgspec.to_builtins(arm)), ArmModel)
-
-
-def _performances(factors: Mapping[str, Sequence[str]], rms: FloatArray, tolerance: float) -> list[Performance]:
-    """RMS [mm] by each factor."""
-    found: list[Performance] = []
-    for factor, cells in factors.items():
-        levels = anova.levels_of(rms, cells)
-        limit, verdict = _limit(levels, tolerance * units.MM)
-        found.append(Performance(factor=factor, levels=levels, limit=limit, verdict=verdict))
-    return found
-
-
-def _limit(levels: Sequence[anova.Level], tolerance: float) -> tuple[float | None, str]:
-    """Where the mean RMS passes the tolerance, and in words. RMS and tolerance in mm."""
-    within = [level.mean <= tolerance for level in levels]
-    if all(within):
-        return None, f"within {tolerance:g} mm at every level tried"
-    if not any(within):
-        return None, f"beyond {tolerance:g} mm at every level tried"
-    first = within.index(False)
-    numbers = anova.numbers([level.level for level in levels])
-    if numbers is None or not first or any(within[first:]):
-        good = ", ".join(level.level for level, fine in zip(levels, within, strict=True) if fine)
-        return None, f"within {tolerance:g} mm at {good} only"
-    low, high = levels[first - 1].mean, levels[first].mean
-    limit = numbers[first - 1] + (tolerance - low) / (high - low) * (numbers[first] - numbers[first - 1])
-    between = f"between the levels {levels[first - 1].level} and {levels[first].level}"
-    return limit, f"within {tolerance:g} mm up to {limit:.3g} ({between})"
-
-
-def _valid(performance: Sequence[Performance], used: Sequence[Fitted], period: float) -> Validity:
-    """Limits that fuse can check: speed, and distance from the base where a factor is called so."""
-    limits = {one.factor: one.limit for one in performance}
-    fastest = max(one.trial.speed_at(period) for one in used)
-    radius = limits.get("radius_mm")
-    return Validity(
-        max_speed=limits.get("speed_m_s") or fastest, max_radius=None if radius is None else radius / units.MM
-    )
 
 
 def _coefficients(used: Sequence[Fitted]) -> dict[str, FloatArray]:
