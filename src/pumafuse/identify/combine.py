@@ -19,7 +19,7 @@ from ..model.plants import PLANTS, FirstOrder, SecondOrder
 from .anova import ordered, outlying, speed_levels
 from .choice import OrderChoice, choose
 from .estimate import Estimate, common, mean, regression, robust
-from .fit import HARDLY_MOVED, TOO_FEW, StepFit, flags
+from .fit import HARDLY_MOVED, TOO_FEW, StepFit, flags, least_p
 from .joint import JointFit, fit_together, inverse_square
 from .paper import minimised, sensitivities
 from .rows import Order, window
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from statsmodels.regression.linear_model import RegressionResults
 
 _FEWEST = 3  # trials that a model is combined from
-_FASTEST = 1e-3  # of 2ζ/ω, that 1/ω is at least: faster poles are like none
 _ORDERS: tuple[Order, Order] = (1, 2)
 
 
@@ -116,10 +115,17 @@ class Common:
 
 @dataclass(frozen=True)
 class Combination:
-    """A combined axis, and what its trials have in common."""
+    """A combined axis, the trials that it is made of, and what they have in common."""
 
     axis: CombinedAxis
+    used: Sequence[Fitted]
     common: Common
+
+    @property
+    def own(self) -> dict[str, tuple[float, float]]:
+        """Td [s] and K of each trial under the common plant, by the trial's name."""
+        pairs = zip(self.common.delay.tolist(), self.common.gain.tolist(), strict=True)
+        return dict(zip((one.trial.name for one in self.used), pairs, strict=True))
 
 
 def combine(fitted: Sequence[Fitted], period: float, samples: int | None, paper: bool) -> Combination | str:
@@ -165,7 +171,7 @@ def combine(fitted: Sequence[Fitted], period: float, samples: int | None, paper:
         lack_of_fit_p=lack,
         gain_words=words,
     )
-    return Combination(axis, found)
+    return Combination(axis, used, found)
 
 
 def combined_rms(trial: Trial, model: AxisModel, delay: float, period: float, samples: int | None) -> float:
@@ -203,13 +209,13 @@ def usual_gain(fitted: Sequence[Fitted]) -> float:
 def _outlying(fitted: Sequence[Fitted]) -> dict[str, str]:
     """Trials of which a coefficient is far from all the others."""
     found: dict[str, str] = {}
-    for word, place, values in (
-        ("delay", 0, [one.first.shape.delay for one in fitted]),
-        ("time constant", 1, [one.first.shape.q for one in fitted]),
-        ("gain", 2, [one.first.gain for one in fitted]),
+    fits = [one.first for one in fitted]
+    for word, values, sds in (
+        ("delay", [fit.shape.delay for fit in fits], [fit.delay_sd for fit in fits]),
+        ("time constant", [fit.shape.q for fit in fits], [fit.q_sd for fit in fits]),
+        ("gain", [fit.gain for fit in fits], [fit.gain_sd for fit in fits]),
     ):
-        sd = np.sqrt([one.first.covariance[place, place] for one in fitted])
-        for one, value, far in zip(fitted, values, outlying(np.array(values), sd), strict=True):
+        for one, value, far in zip(fitted, values, outlying(np.array(values), np.array(sds)), strict=True):
             if far:
                 shown = f"{value:.2f}" if word == "gain" else f"{1e3 * value:.0f} ms"
                 found.setdefault(one.trial.name, f"outlying: its {word} is {shown}")
@@ -283,7 +289,7 @@ def _published(used: Sequence[Fitted], samples: int | None) -> Common:
         plant: PLANTS = FirstOrder(time_constant=tau.value, time_constant_ci95=tau.ci95)
     else:
         q, p = minimised(trials, own, 2, samples)
-        p = max(p, (_FASTEST * q) ** 2)
+        p = max(p, least_p(q))
         parts = sensitivities(trials, own, q, p, samples)
         lag = q + parts[:, 0]
         halves = [mean(parts @ slope) for slope in ([0.0, -0.5 / p], [1.0 / q, -0.5 / p])]

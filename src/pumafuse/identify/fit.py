@@ -30,6 +30,7 @@ _SLOWNESSES = 14  # values of q on the grid
 _MOST_DELAYS, _MOST_SAMPLES = 200, 300  # on the grid
 _FINE = 8  # instants between samples at which the grid's responses are known
 _SETTLED = 0.98  # share of the final value that a settled response has reached at the end
+_FASTEST = 1e-3  # of 2ζ/ω, that 1/ω is at least
 _MOVES = 0.5  # share of what is usual below which an arm has hardly moved
 
 
@@ -83,28 +84,43 @@ class StepFit:
         """The plant; one of second order whose p is 0 is given the fastest ω that q allows."""
         if self.order == 1:
             return FirstOrder(time_constant=self.shape.q)
-        omega = 1.0 / np.sqrt(max(self.shape.p, (1e-3 * self.shape.q) ** 2))
+        omega = 1.0 / np.sqrt(max(self.shape.p, least_p(self.shape.q)))
         return SecondOrder(natural_frequency=float(omega), damping=float(0.5 * self.shape.q * omega))
+
+    @property
+    def delay_sd(self) -> float:
+        """Of Td [s]."""
+        return self._sd(0)
+
+    @property
+    def q_sd(self) -> float:
+        """Of 2ζ/ω, or τ [s]."""
+        return self._sd(1)
+
+    @property
+    def gain_sd(self) -> float:
+        """Of K."""
+        return self._sd(self.order + 1)
 
     @property
     def delay_ci95(self) -> Interval:
         """Of Td [s]."""
-        return self._interval(0, self.shape.delay)
+        return self._interval(self.shape.delay, self.delay_sd)
 
     @property
     def q_ci95(self) -> Interval:
         """Of 2ζ/ω, or τ [s]."""
-        return self._interval(1, self.shape.q)
+        return self._interval(self.shape.q, self.q_sd)
 
     @property
     def p_ci95(self) -> Interval:
         """Of 1/ω² [s²]."""
-        return self._interval(2, self.shape.p) if self.order == 2 else (0.0, 0.0)
+        return self._interval(self.shape.p, self._sd(2)) if self.order == 2 else (0.0, 0.0)
 
     @property
     def gain_ci95(self) -> Interval:
         """Of K."""
-        return self._interval(self.order + 1, self.gain)
+        return self._interval(self.gain, self.gain_sd)
 
     @property
     def natural_frequency_ci95(self) -> Interval:
@@ -127,8 +143,11 @@ class StepFit:
         """The fitted position [m] at ``time`` [s since the command], (n,)."""
         return self.zero + self.gain * step * unit_response(time - self.shape.delay, self.shape.q, self.shape.p)
 
-    def _interval(self, place: int, value: float) -> Interval:
-        half = _quantile(self) * float(np.sqrt(self.covariance[place, place]))
+    def _sd(self, place: int) -> float:
+        return float(np.sqrt(self.covariance[place, place]))
+
+    def _interval(self, value: float, sd: float) -> Interval:
+        half = _quantile(self) * sd
         return value - half, value + half
 
 
@@ -255,6 +274,11 @@ def inverse(jacobian: FloatArray) -> FloatArray:
         return np.diag(np.full(len(length), np.inf))
     inverse = np.linalg.inv(np.linalg.qr(jacobian / length, mode="r"))
     return (inverse @ inverse.T) / np.outer(length, length)
+
+
+def least_p(q: float) -> float:
+    """The least 1/ω² [s²] beside 2ζ/ω = ``q`` [s]: faster poles are like none."""
+    return (_FASTEST * q) ** 2
 
 
 def _quantile(fit: StepFit) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from .. import units
 from ..arrays import FloatArray
-from ..model.arm import ArmModel, ordered_axes
+from ..model.arm import ArmModel
 from ..model.plants import FirstOrder, Interval, SecondOrder
 from . import anova
 from .combine import Combination, CombinedAxis, Fitted, combine, combined_rms, usual_gain
@@ -155,18 +155,19 @@ def identify(
     """
     period = trials.period(period)
     fitted = _fitted(trials.trials, samples, paper)
+    by_axis = {axis: [one for one in fitted if one.trial.axis == axis] for axis in trials.axes}
+    usual = {axis: usual_gain(of_axis) for axis, of_axis in by_axis.items()}
     notes, combined = list(trials.notes), dict[str, Combination]()
-    for axis in trials.axes:
-        found = combine([one for one in fitted if one.trial.axis == axis], period, samples, paper)
+    for axis, of_axis in by_axis.items():
+        found = combine(of_axis, period, samples, paper)
         if isinstance(found, str):
             notes.append(f"{axis}: no model: {found}")
         else:
             combined[axis] = found
-            gain = usual_gain([one for one in fitted if one.trial.axis == axis])
-            if gain < 0.0:
+            if usual[axis] < 0.0:
                 notes.append(f"{axis}: the arm moves against its commands; is a sign wrong?")
-            if not _PLAUSIBLE[0] < abs(gain) < _PLAUSIBLE[1]:
-                notes.append(f"{axis}: the arm moves {gain:.3g} times as far as it is told; is a unit wrong?")
+            if not _PLAUSIBLE[0] < abs(usual[axis]) < _PLAUSIBLE[1]:
+                notes.append(f"{axis}: the arm moves {usual[axis]:.3g} times as far as it is told; is a unit wrong?")
     if not combined:
         raise TrialsError("; ".join(["no axis has trials enough for a model", *notes]))
     arm, one_delay = _arm(combined, period, name)
@@ -175,18 +176,9 @@ def identify(
         for one in fitted
         if one.trial.axis in combined
     }
-    usual = {axis: usual_gain([one for one in fitted if one.trial.axis == axis]) for axis in trials.axes}
     left_out = {trial: why for found in combined.values() for trial, why in found.axis.left_out.items()}
     used = [one for one in fitted if one.trial.name in rms and one.trial.name not in left_out]
-    own = {
-        one.trial.name: pair
-        for axis, found in combined.items()
-        for one, pair in zip(
-            [one for one in used if one.trial.axis == axis],
-            zip(found.common.delay.tolist(), found.common.gain.tolist(), strict=True),
-            strict=True,
-        )
-    }
+    own = {trial: pair for found in combined.values() for trial, pair in found.own.items()}
     factors = anova.factors_of([one.trial for one in used], period)
     performance = performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance)
     limited = validity(performance, max(one.trial.speed_at(period) for one in used))
@@ -212,7 +204,7 @@ def identify(
         axes={axis: found.axis for axis, found in combined.items()},
         one_delay=one_delay,
         dependences=anova.dependences(_coefficients(used), factors) if factors else [],
-        scatter=_scatters(fitted),
+        scatter=_scatters(by_axis),
         performance=performance,
         notes=notes,
     )
@@ -280,17 +272,17 @@ def _coefficients(used: Sequence[Fitted]) -> dict[str, FloatArray]:
     }
 
 
-_PLACES = {"delay_ms": (0, units.MM), "gain": (2, 1.0), "time_constant_ms": (1, units.MM)}  # in a covariance; unit
-
-
-def _scatters(fitted: Sequence[Fitted]) -> list[anova.Scatter]:
+def _scatters(by_axis: Mapping[str, Sequence[Fitted]]) -> list[anova.Scatter]:
+    """How each coefficient scatters on each axis."""
     found: list[anova.Scatter] = []
-    for axis in ordered_axes({one.trial.axis for one in fitted}):
-        on_axis = [one for one in fitted if one.trial.axis == axis]
-        for coefficient, values in _coefficients(on_axis).items():
-            place, unit = _PLACES[coefficient]
-            sd = np.sqrt([one.first.covariance[place, place] for one in on_axis]) * unit
-            found.append(anova.scatter(coefficient, [one.trial for one in on_axis], values, sd))
+    for of_axis in by_axis.values():
+        sds = {
+            "delay_ms": np.array([one.first.delay_sd for one in of_axis]) * units.MM,
+            "gain": np.array([one.first.gain_sd for one in of_axis]),
+            "time_constant_ms": np.array([one.first.q_sd for one in of_axis]) * units.MM,
+        }
+        for coefficient, values in _coefficients(of_axis).items():
+            found.append(anova.scatter(coefficient, [one.trial for one in of_axis], values, sds[coefficient]))
     return found
 
 
