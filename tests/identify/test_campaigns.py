@@ -172,6 +172,17 @@ def test_an_outlying_trial_is_named_and_left_out() -> None:
     assert as_published.axes["radial"].time_constant_mean.value > 1.05 * axis.time_constant_mean.value
 
 
+@pytest.mark.parametrize("times", [1e3, 1e-3], ids=["ms for s", "ks for s"])
+def test_a_lag_that_no_arm_has_is_said(times: float) -> None:
+    """Times in another unit than their column's name: everything is found, a thousand times too slow or fast."""
+    trials = Arm(1, noise=0.03e-3).campaign(3)
+    assert identified(trials).notes == []
+    wrong = [replace(trial, time=times * trial.time) for trial in trials]
+    (note,) = pf.identify(pf.StepTrials(tuple(wrong), ()), period=0.028).notes
+    assert note.endswith(" s behind its commands; is the unit of time wrong?")
+    assert float(note.split()[4]) == pytest.approx(times * (DELAY + TAU), rel=0.02)
+
+
 def test_sticking_trials_are_named_and_left_out() -> None:
     """A drive that does not move, and one that hardly does."""
     trials = Arm(2, noise=0.02e-3).campaign(6)

@@ -140,6 +140,22 @@ def test_what_will_spoil_a_campaign_is_said(case: str) -> None:
     assert all(topic in line for line in said), said
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"speeds": (100.0, 200.0)}, "steps are 5.6e+03 mm at most, 200 m/s at T; is a unit wrong?"),
+        ({"amplitudes": (4.0,)}, "steps are 4e+03 mm at most, 143 m/s at T; is a unit wrong?"),
+        ({"period": 28e-6, "amplitudes": ()}, "steps are 0.0112 mm at most, 0.4 m/s at T; is a unit wrong?"),
+        ({"speeds": (1e-3,), "amplitudes": ()}, "steps are 0.028 mm at most, 0.001 m/s at T; is a unit wrong?"),
+        ({"positions": (POSITIONS[0], POSITIONS[0])}, "positions: one is listed twice"),
+    ],
+)
+def test_a_slip_is_said_without_an_arm_too(changes: dict[str, Any], words: str) -> None:
+    """Speeds in mm/s, amplitudes in m, a period in s: steps that no arm makes, or that nobody would see."""
+    assert not any("unit" in line or "twice" in line for line in plan(design()).warnings)
+    assert any(line.startswith(words) for line in plan(design(**changes)).warnings)
+
+
 def test_the_settling_time_is_the_plants() -> None:
     """Td + 2 % settling of τ = 42.5 ms is 60.45 + 166.3 ms: a hold just below it warns, just above does not."""
     needed = 0.06045 - 0.0425 * np.log(0.02)

@@ -107,6 +107,14 @@ def test_nothing_to_use_is_one_line(tmp_path: Path) -> None:
         StepTrials.read(tmp_path)
 
 
+def test_many_reasons_are_still_a_line_to_read(tmp_path: Path) -> None:
+    """The first few of them, and how many more."""
+    listed = "".join(f"{k},radial,10,0.357,0,a\n" for k in range(100))
+    with pytest.raises(TrialsError, match=r"trial '2': 0 samples .*; and 97 more$") as refused:
+        StepTrials.read(written(tmp_path, listed, rows("other")))
+    assert len(str(refused.value)) < 600
+
+
 def campaign(folder: Path, *steps: tuple[float, float]) -> StepTrials:
     listed = "".join(f"{k},radial,{step},{speed},0,a\n" for k, (step, speed) in enumerate(steps))
     return StepTrials.read(written(folder, listed, "".join(rows(str(k)) for k in range(len(steps)))))

@@ -20,12 +20,13 @@ from .fit import StepFit, fit_steps, flags
 from .paper import fit_as_published, onset
 from .performance import Performance, performances, validity
 from .rows import window
-from .trials import StepTrials, Trial, TrialsError
+from .trials import StepTrials, Trial, TrialsError, several
 
 TOLERANCE = 1e-3  # m, the paper's
 _BATCH = 100  # trials a job
 _DIGITS = 6
 _PLAUSIBLE = (0.1, 10.0)  # gains
+_PLAUSIBLE_LAG = (1e-3, 10.0)  # s
 
 
 class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
@@ -158,6 +159,7 @@ def identify(
     by_axis = {axis: [one for one in fitted if one.trial.axis == axis] for axis in trials.axes}
     usual = {axis: usual_gain(of_axis) for axis, of_axis in by_axis.items()}
     notes, combined = list(trials.notes), dict[str, Combination]()
+    read = len(notes)
     for axis, of_axis in by_axis.items():
         found = combine(of_axis, period, samples, paper)
         if isinstance(found, str):
@@ -168,8 +170,13 @@ def identify(
                 notes.append(f"{axis}: the arm moves against its commands; is a sign wrong?")
             if not _PLAUSIBLE[0] < abs(usual[axis]) < _PLAUSIBLE[1]:
                 notes.append(f"{axis}: the arm moves {usual[axis]:.3g} times as far as it is told; is a unit wrong?")
+            lag = found.axis.delays.lag.value
+            if not _PLAUSIBLE_LAG[0] < lag < _PLAUSIBLE_LAG[1]:
+                notes.append(f"{axis}: the arm is {lag:.3g} s behind its commands; is the unit of time wrong?")
     if not combined:
-        raise TrialsError("; ".join(["no axis has trials enough for a model", *notes]))
+        raise TrialsError(
+            "; ".join(["no axis has trials enough for a model", *several([*notes[read:], *notes[:read]])])
+        )
     arm, one_delay = _arm(combined, period, name)
     rms = {
         one.trial.name: combined_rms(one.trial, arm.axes[one.trial.axis], arm.delay_of(one.trial.axis), period, samples)

@@ -26,6 +26,7 @@ TRIALS, STEPS = "trials.csv", "steps.csv"
 _NOISE = "white-noise-"
 _SETTLED = 0.98  # share of the final value
 _MOST_TRIALS, _MOST_ROWS = 100_000, 5_000_000
+_FASTEST, _SHORTEST = 10.0, 50e-6  # m/s that no arm reaches; m that no arm's sensor tells from rest
 _LEAST, _MOST = 1e-6, 10.0  # m, that a step can be
 _TAKEN = frozenset({"trial", "axis", "step_mm", "speed_m_s", "replicate", "tick", "time_s"})
 
@@ -217,6 +218,11 @@ def _warnings(design: Design, arm: ArmModel | None, max_speed: float | None) -> 
     limit = arm.validity.max_speed if max_speed is None and arm is not None else max_speed
     largest = commanded_speed(np.array(design.amplitudes), design.period)
     fastest = max(*design.speeds, float(largest.max(initial=0.0)))
+    longest = max([speed * design.period for speed in design.speeds] + list(design.amplitudes))
+    if fastest > _FASTEST or longest < _SHORTEST:
+        found.append(f"steps are {longest * MM:.3g} mm at most, {fastest:.3g} m/s at T; is a unit wrong?")
+    if len({tuple(place.items()) for place in design.positions}) < len(design.positions):
+        found.append("positions: one is listed twice: it is tried twice as often as the others")
     if limit is not None and fastest > limit:
         found.append(f"commanded speeds reach {fastest:.3g} m/s, the limit is {limit:.3g} m/s")
     if arm is None:

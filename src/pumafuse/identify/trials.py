@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,7 @@ _AGREE = 0.03  # how far step over speed may differ between trials and still be 
 _PERIODS = (0.001, 0.2)  # s, that an update period can be
 _GIVEN = (1e-4, 10.0)  # s, that one can be given
 _LATEST, _FARTHEST = 3600.0, 1e6  # s and m that a sample can be away from its command and from 0
+_SAID = 4  # sentences in the line of an error
 _STEPS = (1e-9, 1e3)  # m, that a step can be
 
 
@@ -143,8 +144,14 @@ class StepTrials:
             of = {factor: cells[row] for factor, cells in factors.items()}
             trials.append(Trial(name, axes[row], float(step[row]), float(speed[row]), of, time, position))
         if not trials:
-            raise TrialsError("; ".join([f"{folder}: no trial can be used", *notes]))
+            raise TrialsError("; ".join([f"{folder}: no trial can be used", *several(notes)]))
         return StepTrials(tuple(trials), tuple(notes))
+
+
+def several(notes: Sequence[str]) -> list[str]:
+    """The first few of many sentences, and how many more there are: an error is one line that can be read."""
+    more = len(notes) - _SAID
+    return [*notes[:_SAID], *([f"and {more} more"] if more > 0 else [])]
 
 
 def _unusable(times_listed: int, axis: str, step: float, time: FloatArray) -> str | None:
