@@ -120,6 +120,14 @@ def test_a_sensor_with_the_wrong_sign(name: str) -> None:
     assert "is its scale right (-1 for a distance that falls)" in line
 
 
+@pytest.mark.parametrize(("factor", "said"), [(1e-3, "0.001"), (100.0, "100")])
+def test_a_sensor_in_another_unit(factor: float, said: str) -> None:
+    """Metres under a name in mm: it goes the right way, but not as far; nothing learnt from that would hold."""
+    line = refused([changed("tracker", scaled(factor))])
+    assert line.startswith(f"sensor 'tracker' moves {said} times as far as the commands of tangential")
+    assert line.endswith("is a unit wrong?")
+
+
 def test_a_sensor_with_a_scale_that_is_told_is_not_refused() -> None:
     """The same readings with the scale in the configuration, a large constant in them too."""
     run = changed("vision", lambda one: replace(one, values={a: 0.7 - v for a, v in one.values.items()}))

@@ -234,6 +234,15 @@ def test_a_run_to_validate_on_is_compared_whole() -> None:
     assert found.summary.validation == check(two.run, found.before, found.config)
     assert {(told.run, told.since_s) for told in found.summary.validation or []} == {(two.run.name, 0.0)}
     assert not found.summary.worse
+    assert not [note for note in found.summary.notes if "learnt from" in note]
+
+
+def test_a_run_that_was_learnt_from_is_no_validation() -> None:
+    """It is compared as asked for, and a note says what that is worth."""
+    one = outage(1)
+    found = sds_alone([one.run], one.config, validate=replace(one.run, name="another name"))
+    (note,) = [note for note in found.summary.notes if note.startswith("validated on a run that was learnt from")]
+    assert note.endswith("nothing says whether the numbers hold elsewhere") and found.summary.validation
 
 
 def test_what_got_worse_is_said_to_have() -> None:

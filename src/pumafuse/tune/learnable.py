@@ -14,6 +14,7 @@ from .likelihood import Evidence
 _FEWEST = 30  # scalars of an axis, or of a sensor that is asked whether it agrees
 _STILL = 3.0  # motion over noise below which an axis has not moved
 _AGREES = 0.5  # correlation of readings with the arm's answer to its commands
+_AS_FAR = (0.1, 10.0)  # times, that a sensor can move as far as the arm must
 _MOVES = 10.0  # motion over scatter from which it must agree
 
 
@@ -60,7 +61,7 @@ def _moves(evidence: Evidence, axis: str) -> bool:
 
 
 def _agreeing(evidence: Evidence, config: FusionConfig, axes: Sequence[str]) -> None:
-    """Refuse a sensor that does not go where the arm must go under its commands, whatever its noise."""
+    """Refuse a sensor that does not go where the arm must go under its commands, or not as far, whatever its noise."""
     for (name, axis), (answer, seen) in evidence.answers(config).items():
         scatter = evidence.scatter.get(f"sensors.{name}.sd_mm.{axis}", 0.0)
         if axis not in axes or len(seen) < _FEWEST or float(np.ptp(answer)) < _MOVES * scatter:
@@ -74,4 +75,10 @@ def _agreeing(evidence: Evidence, config: FusionConfig, axes: Sequence[str]) -> 
             raise TuneError(
                 f"sensor '{name}' {what} the commands of {axis} (correlation {follows:+.2f}): is it that axis, is its"
                 " scale right (-1 for a distance that falls), are both stamped by one clock?"
+            )
+        size = follows * float(np.sqrt(np.sum(seen[near] ** 2) / np.sum(answer[near] ** 2)))
+        if not _AS_FAR[0] < size < _AS_FAR[1]:
+            raise TuneError(
+                f"sensor '{name}' moves {size:.3g} times as far as the commands of {axis} and its scale say: is a unit"
+                " wrong?"
             )

@@ -127,7 +127,9 @@ def tune(
         orders={axis: why for lesson in course.lessons for axis, why in lesson.orders.items()},
         validation=validation,
         worse=any(one.worse for one in validation or ()),
-        notes=_notes(course, validation, interrupted),
+        notes=_notes(
+            course, validation, interrupted, known=validate is not None and any(_same(validate, run) for run in runs)
+        ),
     )
     for note in summary.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=2)
@@ -205,7 +207,8 @@ def _with_provenance(
     return _replace(config, arm=_replace(config.arm, axes=axes, provenance=provenance))
 
 
-def _notes(course: Course, validation: Sequence[Check] | None, interrupted: bool) -> list[str]:
+def _notes(course: Course, validation: Sequence[Check] | None, interrupted: bool, known: bool) -> list[str]:
+    """Everything noticed, each once; ``known``: what was validated on had been learnt from."""
     found = [note for lesson in course.lessons for note in (*lesson.evidence.notes, *lesson.notes)]
     if course.kept:
         found.append("nothing more likely was found than the configuration as given, which is kept")
@@ -217,6 +220,8 @@ def _notes(course: Course, validation: Sequence[Check] | None, interrupted: bool
         found.append(
             "nothing was held back to validate on (--validate RUN): nothing says whether the numbers hold elsewhere"
         )
+    if known and validation:
+        found.append("validated on a run that was learnt from: nothing says whether the numbers hold elsewhere")
     if validation == []:
         found.append("what was held back has no reading of a sensor that is used: nothing says whether it helped")
     found += [f"{one.run}, {one.axis}: {one.verdict}" for one in validation or () if one.worse]
