@@ -37,7 +37,8 @@ EXPONENTS: Mapping[str, int] = {
 }
 LENGTHS = ("_m", "_mm", "_um")
 TIMES = ("_s", "_ms", "_us", "_ns")
-MM = 1e3  # mm in a metre, and ms in a second: SI arrays times this are what files and screens show
+MM = 1e3  # mm in a metre: SI arrays times this are what files and screens show
+MS = 1e3  # ms in a second, likewise
 PROVENANCE = "provenance"  # a file's table of this name is nobody's numbers but its author's
 INTERVAL = "_ci95"  # `time_constant_ms_ci95` is in ms
 

@@ -17,7 +17,7 @@ from ..identify.anova import Dependence, Scatter
 from ..identify.identify import Identification, identify
 from ..identify.trials import StepTrials
 from ..model.plants import FirstOrder
-from ..units import MM
+from ..units import MM, MS
 from ..views import words
 from .tables import console
 
@@ -80,9 +80,9 @@ def _show(found: Identification, options: Options) -> None:
         out.print(f"{axis}: {combined.choice.why}; {combined.gain_words}", markup=False)
         if combined.delay_spread > 2.0 * combined.delay_noise:
             noise = (
-                f"; the noise within a trial explains {combined.delay_noise * MM:.2g} ms" if not options.paper else ""
+                f"; the noise within a trial explains {combined.delay_noise * MS:.2g} ms" if not options.paper else ""
             )
-            moves = f"the delay moves by {combined.delay_spread * MM:.2g} ms (sd) from trial to trial{noise}"
+            moves = f"the delay moves by {combined.delay_spread * MS:.2g} ms (sd) from trial to trial{noise}"
             out.print(f"{axis}: {moves}", markup=False)
         for trial, why in combined.left_out.items():
             out.print(f"{axis}: trial '{trial}' left out: {why}", markup=False)

@@ -14,7 +14,7 @@ from rich.text import Text
 from ..fusion.timeline import Outcome
 from ..live.health import Health
 from ..live.stream import Stream
-from ..units import MM
+from ..units import MM, MS
 
 
 class Part(Protocol):
@@ -61,8 +61,8 @@ def sensor_table(health: Health) -> Table:
             escape(name),
             str(sensor.rows),
             f"{sensor.rate:.1f}",
-            f"{sensor.lateness * MM:.1f}",
-            f"{sensor.lateness_max * MM:.1f}",
+            f"{sensor.lateness * MS:.1f}",
+            f"{sensor.lateness_max * MS:.1f}",
             str(sensor.dropouts),
             "" if sensor.nis is None else f"{sensor.nis:.2f}",
             f"[red]{silent}[/red]" if sensor.stale else silent,

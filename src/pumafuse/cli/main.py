@@ -396,7 +396,7 @@ def _level(text: str) -> tuple[str, float]:
     """``radial=560`` as an axis and its level [m]."""
     axis, _, level = text.partition("=")
     try:
-        return axis.strip(), float(level) * 1e-3
+        return axis.strip(), _si(float(level))
     except ValueError:
         raise typer.BadParameter(f"expected AXIS=MM, not '{text}'", param_hint="--start") from None
 
@@ -406,8 +406,10 @@ def _si(value: float) -> float: ...
 @overload
 def _si(value: None) -> None: ...
 def _si(value: float | None) -> float | None:
-    """Milliseconds or millimetres of the command line in s or m."""
-    return None if value is None else value * 1e-3
+    """Milliseconds or millimetres of the command line in s or m, without a binary rounding in between."""
+    from ..units import shifted  # brings numpy, which no --help needs
+
+    return None if value is None else shifted(value, -3)
 
 
 @overload

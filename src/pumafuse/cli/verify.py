@@ -16,7 +16,7 @@ from ..errors import PumafuseWarning
 from ..identify.verify import AxisVerification, verify
 from ..model.arm import ArmModel
 from ..runs.run import Run
-from ..units import MM
+from ..units import MM, MS
 from ..views import words
 from .tables import console
 
@@ -74,10 +74,10 @@ def _show(verified: Sequence[AxisVerification], report: Path | None) -> None:
     for one in verified:
         floor = one.floor
         left_out = f"; {one.outlying} outlying readings left out" if one.outlying else ""
-        refitted = f"K {floor.gain:.3f}, Td {floor.delay * MM:.1f} ms, {words.plant(floor.plant)}"
+        refitted = f"K {floor.gain:.3f}, Td {floor.delay * MS:.1f} ms, {words.plant(floor.plant)}"
         out.print(
             f"{one.run}, {one.axis}: {one.verdict}; start level {one.start * MM:g} mm ({one.start_from}); gain recovery"
-            f" tried with {one.recovery * MM:g} ms; the floor is {refitted}{left_out}",
+            f" tried with {one.recovery * MS:g} ms; the floor is {refitted}{left_out}",
             markup=False,
         )
     if report is not None:

@@ -195,7 +195,7 @@ def identify(
         "left_out": left_out,
         "order": {axis: found.axis.choice.why for axis, found in combined.items()},
         "delay": one_delay,
-        "delay_spread_ms": {axis: round(found.axis.delay_spread * units.MM, 2) for axis, found in combined.items()},
+        "delay_spread_ms": {axis: round(found.axis.delay_spread * units.MS, 2) for axis, found in combined.items()},
         "gain": {axis: found.axis.gain_words for axis, found in combined.items()},
         "validity": {one.factor: one.verdict for one in performance},
         "samples": "all" if samples is None else samples,
@@ -273,9 +273,9 @@ def _rounded(arm: ArmModel) -> ArmModel:
 def _coefficients(used: Sequence[Fitted]) -> dict[str, FloatArray]:
     """The paper's three, of first-order fits, in the units that their names tell."""
     return {
-        "delay_ms": np.array([one.first.shape.delay for one in used]) * units.MM,
+        "delay_ms": np.array([one.first.shape.delay for one in used]) * units.MS,
         "gain": np.array([one.first.gain for one in used]),
-        "time_constant_ms": np.array([one.first.shape.q for one in used]) * units.MM,
+        "time_constant_ms": np.array([one.first.shape.q for one in used]) * units.MS,
     }
 
 
@@ -284,9 +284,9 @@ def _scatters(by_axis: Mapping[str, Sequence[Fitted]]) -> list[anova.Scatter]:
     found: list[anova.Scatter] = []
     for of_axis in by_axis.values():
         sds = {
-            "delay_ms": np.array([one.first.delay_sd for one in of_axis]) * units.MM,
+            "delay_ms": np.array([one.first.delay_sd for one in of_axis]) * units.MS,
             "gain": np.array([one.first.gain_sd for one in of_axis]),
-            "time_constant_ms": np.array([one.first.q_sd for one in of_axis]) * units.MM,
+            "time_constant_ms": np.array([one.first.q_sd for one in of_axis]) * units.MS,
         }
         for coefficient, values in _coefficients(of_axis).items():
             found.append(anova.scatter(coefficient, [one.trial for one in of_axis], values, sds[coefficient]))

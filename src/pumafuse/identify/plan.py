@@ -20,7 +20,7 @@ from ..errors import ConfigError
 from ..model.arm import ArmModel, commanded_speed, ordered_axes
 from ..runs import tables
 from ..simulate.trajectory import WhiteNoise, ticks
-from ..units import MM, refuse_unit
+from ..units import MM, MS, refuse_unit
 
 TRIALS, STEPS = "trials.csv", "steps.csv"
 _NOISE = "white-noise-"
@@ -232,10 +232,10 @@ def _warnings(design: Design, arm: ArmModel | None, max_speed: float | None) -> 
         needed = arm.delay_of(axis) + _settling(arm, axis)
         if needed > design.hold:
             found.append(
-                f"{axis}: the hold of {design.hold * MM:.0f} ms is too short to settle: {needed * MM:.0f} ms are needed"
+                f"{axis}: the hold of {design.hold * MS:.0f} ms is too short to settle: {needed * MS:.0f} ms are needed"
             )
         if needed > 2.0 * design.rest + design.period:
-            found.append(f"{axis}: the rest of {2.0 * design.rest * MM:.0f} ms between steps is too short to settle")
+            found.append(f"{axis}: the rest of {2.0 * design.rest * MS:.0f} ms between steps is too short to settle")
     return found
 
 

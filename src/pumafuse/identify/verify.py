@@ -233,7 +233,7 @@ def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor) -> str:
     if ratio < _AS_GOOD:
         return "as good as any model of its order"
     later = (floor.delay + floor.plant.lag) - (delay + axis.plant.lag)
-    differ = f"here the arm answers {abs(later) * units.MM:.1f} ms {'later' if later > 0.0 else 'sooner'}"
+    differ = f"here the arm answers {abs(later) * units.MS:.1f} ms {'later' if later > 0.0 else 'sooner'}"
     held = "does not hold" if model.fit < _HOLDS else "follows the motion" if ratio > _FAR else "holds"
     return (
         f"{held}, with {ratio:.1f} times the error of the best model of its order: {differ}, with gain {floor.gain:.2f}"
@@ -243,4 +243,4 @@ def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor) -> str:
 def _recovers(model: Fit, recovering: Fit, recovery: float) -> str:
     if recovering.rms > _BETTER * model.rms:
         return ""
-    return f"; with gain_recovery_ms = {recovery * units.MM:g} {recovering.rms * units.MM:.3g} mm are left"
+    return f"; with gain_recovery_ms = {recovery * units.MS:g} {recovering.rms * units.MM:.3g} mm are left"

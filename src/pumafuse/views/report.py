@@ -14,7 +14,7 @@ from ..identify.identify import Identification, OrderFit, TrialResult
 from ..identify.trials import StepTrials
 from ..identify.verify import AxisVerification, Trace
 from ..model.arm import ArmModel
-from ..units import MM
+from ..units import MM, MS
 from . import step_figures, words
 from .render import render
 
@@ -75,8 +75,8 @@ def write_identification(found: Identification, trials: StepTrials, folder: Path
                 "onset": words.milliseconds(one.delays.onset),
                 "fitted": words.milliseconds(one.delays.fitted),
                 "lag": words.milliseconds(one.delays.lag),
-                "spread": f"{one.delay_spread * MM:.2g}",
-                "noise": f"{one.delay_noise * MM:.2g}",
+                "spread": f"{one.delay_spread * MS:.2g}",
+                "noise": f"{one.delay_noise * MS:.2g}",
             }
             for axis, one in found.axes.items()
         ],
@@ -146,7 +146,7 @@ def write_verification(
                     f"The model's RMS error is {one.model.rms * MM:.3f} mm, {one.model.percent:.1f} % of the"
                     f" {one.amplitude * MM:g} mm commanded; start level {one.start * MM:g} mm ({one.start_from})."
                     f" The best linear model of this order, refitted here (K {one.floor.gain:.3f},"
-                    f" Td {one.floor.delay * MM:.1f} ms, {words.plant(one.floor.plant)}), leaves"
+                    f" Td {one.floor.delay * MS:.1f} ms, {words.plant(one.floor.plant)}), leaves"
                     f" {one.floor.fit.rms * MM:.3f} mm."
                 ),
             }
@@ -250,10 +250,10 @@ def _trial(one: TrialResult, factors: Sequence[str]) -> Mapping[str, Any]:
 def _coefficients(fit: OrderFit) -> list[str]:
     found = [
         words.with_interval(fit.gain, fit.gain_ci95),
-        words.with_interval(fit.delay, fit.delay_ci95, MM),
+        words.with_interval(fit.delay, fit.delay_ci95, MS),
     ]
     if fit.time_constant is not None:
-        found.append(words.with_interval(fit.time_constant, fit.time_constant_ci95, MM))
+        found.append(words.with_interval(fit.time_constant, fit.time_constant_ci95, MS))
     if fit.natural_frequency is not None and fit.damping is not None:
         found.append(words.with_interval(fit.natural_frequency, fit.natural_frequency_ci95))
         found.append(words.with_interval(fit.damping, fit.damping_ci95))

@@ -13,7 +13,7 @@ from ..identify.identify import Identification, TrialResult
 from ..identify.rows import Rows, window
 from ..identify.trials import StepTrials, Trial
 from ..identify.verify import AxisVerification, Trace
-from ..units import MM
+from ..units import MM, MS
 from . import style
 from .sheet import drawing
 
@@ -35,10 +35,10 @@ def responses(found: Identification, trials: StepTrials) -> str:
                 time, position = window(measured[one.trial], found.samples)
                 t, height = time - one.common_delay, one.common_gain * one.step
                 zero = float(np.mean(position - height * plant.step_response(t)))
-                axes.plot(t * MM, (position - zero) / height, color=style.BAND, lw=0.6, alpha=0.7)
+                axes.plot(t * MS, (position - zero) / height, color=style.BAND, lw=0.6, alpha=0.7)
                 longest = max(longest, float(t[-1]))
             t = np.linspace(-0.02, longest, 400)
-            axes.plot(t * MM, plant.step_response(t), color=style.REFERENCE, lw=1.4)
+            axes.plot(t * MS, plant.step_response(t), color=style.REFERENCE, lw=1.4)
             axes.set_title(axis, loc="left")
             axes.set_xlabel("time since the trial's own delay [ms]")
             axes.set_ylim(-0.15, 1.3)
@@ -51,10 +51,10 @@ def delays(found: Identification) -> str:
     with drawing(len(found.axes)) as sheet:
         for axes, (axis, combined) in zip(sheet.axes, found.axes.items(), strict=True):
             values = [one.common_delay for one in found.trials if one.axis == axis and one.common_delay is not None]
-            axes.plot(np.arange(1, len(values) + 1), np.array(values) * MM, ".", color=style.ESTIMATE, ms=4)
+            axes.plot(np.arange(1, len(values) + 1), np.array(values) * MS, ".", color=style.ESTIMATE, ms=4)
             fitted = combined.delays.fitted
-            axes.axhline(fitted.value * MM, color=style.REFERENCE, lw=1.0)
-            axes.axhspan(fitted.ci95[0] * MM, fitted.ci95[1] * MM, color=style.ESTIMATE, alpha=0.2, lw=0)
+            axes.axhline(fitted.value * MS, color=style.REFERENCE, lw=1.0)
+            axes.axhspan(fitted.ci95[0] * MS, fitted.ci95[1] * MS, color=style.ESTIMATE, alpha=0.2, lw=0)
             axes.set_title(axis, loc="left")
             axes.set_xlabel("trial, in the order of the list")
         sheet.axes[0].set_ylabel("delay [ms]")
@@ -81,9 +81,9 @@ def histograms(found: Identification) -> str:
     """Delay, gain and τ of first-order fits (the paper's Fig. 5)."""
     used = [one for one in found.trials if one.left_out is None]
     columns = {
-        "delay [ms]": [one.first.delay * MM for one in used],
+        "delay [ms]": [one.first.delay * MS for one in used],
         "gain": [one.first.gain for one in used],
-        "time constant [ms]": [(one.first.time_constant or 0.0) * MM for one in used],
+        "time constant [ms]": [(one.first.time_constant or 0.0) * MS for one in used],
     }
     with drawing(3) as sheet:
         for axes, (name, values) in zip(sheet.axes, columns.items(), strict=True):

@@ -11,7 +11,7 @@ from ..identify.anova import Level
 from ..identify.estimate import Estimate
 from ..model.arm import Gain
 from ..model.plants import PLANTS, FirstOrder, Interval
-from ..units import MM
+from ..units import MM, MS
 
 if TYPE_CHECKING:
     from ..identify.verify import AxisVerification
@@ -29,7 +29,7 @@ def with_interval(value: float, interval: Interval | None, unit: float = 1.0) ->
 
 def milliseconds(estimate: Estimate | None) -> str:
     """An estimate in seconds, shown in milliseconds."""
-    return "–" if estimate is None else with_interval(estimate.value, estimate.ci95, MM)
+    return "–" if estimate is None else with_interval(estimate.value, estimate.ci95, MS)
 
 
 def p_value(value: float | None) -> str:
@@ -46,7 +46,7 @@ def level(found: Level) -> str:
 def plant(found: PLANTS) -> str:
     """A plant's parameters."""
     if isinstance(found, FirstOrder):
-        return f"τ {with_interval(found.time_constant, found.time_constant_ci95, MM)} ms"
+        return f"τ {with_interval(found.time_constant, found.time_constant_ci95, MS)} ms"
     omega = with_interval(found.natural_frequency, found.natural_frequency_ci95)
     return f"ω {omega} rad/s, ζ {with_interval(found.damping, found.damping_ci95)}"
 
