@@ -18,8 +18,9 @@ import numpy as np
 from ..arrays import NO_STAMP, BoolArray, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
 from ..model.drive import Drive, drive
-from ..runs.clock import TOLERATED_STEP_BACK_NS, behind, regular_grid
+from ..runs.clock import TOLERATED_STEP_BACK_NS, behind
 from ..runs.frames import CARTESIAN
+from ..runs.grid import regular_grid
 from ..runs.run import Run, Source
 from .config import FusionConfig, Sensor
 
