@@ -157,7 +157,7 @@ def _highest_radius(run: Run, placed: Placed | None) -> float | None:
     if placed is None or not isinstance(placed.frame, Cylindrical) or "radial" not in run.command.values:
         return None
     radial = run.command.values["radial"]
-    return float(np.max(radial[np.isfinite(radial)]))
+    return float(np.max(radial[np.isfinite(radial) & (run.command.stamp != NO_STAMP)]))
 
 
 def _readings(timeline: Timeline, fused: Fused) -> Readings:

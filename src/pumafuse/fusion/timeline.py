@@ -303,7 +303,7 @@ class _Heard(NamedTuple):
 
 def _heard(run: Run, config: FusionConfig, name: str, origin: int, notes: list[str]) -> _Heard:
     source, sensor = run.sensors[name], config.sensors.get(name)
-    label = name if name == source.label else f"{name} ({source.label})"
+    label = source.told_as(name)
     latency = 0 if sensor is None else round(sensor.latency * 1e9)
     valid = np.where(source.stamp == NO_STAMP, NO_STAMP, source.stamp - latency)
     outcomes = _row_outcomes(source, sensor, valid, origin)
