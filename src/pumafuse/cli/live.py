@@ -26,7 +26,7 @@ from rich.text import Text
 
 from ..errors import ConfigError, RunError
 from ..fusion.config import FusionConfig
-from ..fusion.timeline import Outcome
+from ..fusion.outcome import Outcome
 from ..live import network
 from ..live.address import LISTENERS, NETWORK, Address
 from ..live.estimator import LiveEstimator

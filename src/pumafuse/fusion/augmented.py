@@ -21,8 +21,9 @@ from ..model.discrete import transition
 from ..model.plants import Plant
 from .config import FusionConfig, Process, Sensor
 from .estimates import Mode
+from .outcome import REOPEN_AFTER, REOPEN_SPAN_NS, Outcome
 from .smoother import hindsight, hindsight_at
-from .timeline import REOPEN_AFTER, REOPEN_SPAN_NS, AxisInput, Outcome, Timeline
+from .timeline import AxisInput, Timeline
 from .track import AxisEstimate, Bias, Filtered, Fused, Track, Updates, estimate
 
 Progress = Callable[[float], None]

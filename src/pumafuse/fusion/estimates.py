@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
 from ..errors import UnknownNameError
 from .config import FusionConfig
-from .timeline import Outcome
+from .outcome import Outcome
 from .track import AxisEstimate, Bias
 
 Mode = Literal["filtered", "as-live", "smoothed"]

@@ -18,7 +18,7 @@ from typing import NamedTuple
 from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
 from ..compiled import compiled
 from ..model.closed import advance_first, advance_second
-from .timeline import REOPEN_AFTER, REOPEN_SPAN_NS, Outcome
+from .outcome import REOPEN_AFTER, REOPEN_SPAN_NS, Outcome
 
 _FUSED, _GATED, _REOPENED = int(Outcome.FUSED), int(Outcome.GATED), int(Outcome.REOPENED)
 _ROUNDING = 1e-15  # of the variances that S is made of: S cannot be known to be smaller

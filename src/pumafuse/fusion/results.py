@@ -23,9 +23,9 @@ from ..runs.tables import Table
 from ..units import MM, seconds
 from .estimates import Estimates, ReferenceTrack
 from .offline import joined_references, reference_track
+from .outcome import Outcome
 from .score import Score, score
 from .summary import Summary, summarise
-from .timeline import Outcome
 
 ESTIMATES, READINGS, REFERENCE, SUMMARY = "estimates.parquet", "readings.parquet", "reference.parquet", "summary.json"
 OURS = frozenset(

@@ -11,8 +11,8 @@ import numpy as np
 from ..units import MM
 from .consistency import chi_square_band, consistency, log_likelihood
 from .estimates import Estimates
+from .outcome import Outcome
 from .score import Score, score
-from .timeline import Outcome
 
 
 class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):

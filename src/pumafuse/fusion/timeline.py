@@ -7,7 +7,6 @@ still meets its scalars in the order (time, sensor, stamp, place in the file).
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,31 +22,11 @@ from ..runs.frames import CARTESIAN
 from ..runs.grid import regular_grid
 from ..runs.run import Run, Source
 from .config import FusionConfig, Sensor
+from .outcome import FARTHEST, Outcome
 
 LONGEST_TAIL_NS = 3_600_000_000_000  # readings this long after the last command no longer belong to the run
-REOPEN_AFTER = 10  # rejections in a row of one sensor …
-REOPEN_SPAN_NS = 500_000_000  # … the first of them at least 0.5 s ago
-FARTHEST = 1e6  # m; what is farther is a sentinel, no position
 T = TypeVar("T", bound=np.generic)
 _MOST_ESTIMATES = 10_000_000
-
-
-class Outcome(enum.IntEnum):
-    """What became of a scalar."""
-
-    FUSED = 0
-    GATED = 1
-    REOPENED = 2
-    DUPLICATE = 3
-    BEFORE_START = 4
-    TOO_LATE = 5
-    INVALID = 6
-    UNKNOWN = 7
-
-    @property
-    def word(self) -> str:
-        """As files and screens have it."""
-        return self.name.lower()
 
 
 @dataclass(frozen=True)

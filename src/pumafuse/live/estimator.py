@@ -14,7 +14,8 @@ import numpy as np
 from ..arrays import REACH_NS, FloatArray
 from ..errors import ConfigError, RunError, UnknownNameError, suggestion
 from ..fusion.config import FusionConfig
-from ..fusion.timeline import FARTHEST, LONGEST_TAIL_NS, Outcome
+from ..fusion.outcome import FARTHEST, Outcome
+from ..fusion.timeline import LONGEST_TAIL_NS
 from ..model.arm import ordered_axes
 from ..runs.frames import CARTESIAN, Cylindrical
 from .clock import Clock, Verdict

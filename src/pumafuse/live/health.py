@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ..fusion.timeline import Outcome
+from ..fusion.outcome import Outcome
 from .command_kernels import ALWAYS
 from .kernels import CAME, DROPOUTS, LATENESS, MOST_LATE, NIS, ROWS, SCALARS, SECONDS, Tally
 

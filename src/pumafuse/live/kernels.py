@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeAlias
 from ..arrays import CodeArray, FloatArray, IntArray, TimeArray
 from ..compiled import compiled
 from ..fusion.kernels import Axes, Held, Log, Met, Outputs, Rows, Sensors, State, estimate, go_back, keep, meet
-from ..fusion.timeline import FARTHEST, Outcome
+from ..fusion.outcome import FARTHEST, Outcome
 from .command_kernels import (
     ALWAYS,
     COMMANDS,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 from ..errors import ConfigError
-from ..fusion.timeline import Outcome
+from ..fusion.outcome import Outcome
 from .estimator import LiveEstimate, LiveEstimator, Told, nanoseconds
 from .sampler import Sampler
 from .wire import BadLine, Event, Wire, encode
