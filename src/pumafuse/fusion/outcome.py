@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import enum
 
+import numpy as np
+
+from ..arrays import BoolArray, FloatArray
+
 REOPEN_AFTER = 10  # rejections in a row of one sensor …
 REOPEN_SPAN_NS = 500_000_000  # … the first of them at least 0.5 s ago
 FARTHEST = 1e6  # m; what is farther is a sentinel, no position
@@ -25,3 +29,8 @@ class Outcome(enum.IntEnum):
     def word(self) -> str:
         """As files and screens have it."""
         return self.name.lower()
+
+
+def plausible(value: FloatArray) -> BoolArray:
+    """Finite and no sentinel such as 3.4e38: within a thousand kilometres."""
+    return np.abs(value) < FARTHEST

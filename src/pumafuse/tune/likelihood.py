@@ -27,8 +27,9 @@ from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations
 from ..fusion.outcome import Outcome
+from ..fusion.scalars import Scalars
 from ..fusion.ticks import usable_cores
-from ..fusion.timeline import AxisInput, Scalars, Timeline, build
+from ..fusion.timeline import AxisInput, Timeline, build
 from ..model.arm import ordered_axes
 from ..model.drive import drive
 from ..runs.axes import in_axes
