@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
 
 from ..arrays import NO_STAMP, IntArray, TimeArray
 from ..errors import RunError
+from .defects import tell
 from .run import Run, Source
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
@@ -107,16 +109,11 @@ def without_strays(run: Run) -> Run:
 def _without_strays(source: S, label: str, sides: Sequence[str], notes: list[str]) -> S:
     apart = astray(source.stamp)
     for side in sides:
-        rows = np.flatnonzero(apart > 0 if side == "ahead of" else apart < 0)
-        if len(rows):
-            plural = "row has" if len(rows) == 1 else "rows have"
-            notes.append(
-                f"{label}: {len(rows)} {plural} a stray stamp, more than 1 s {side} the rows around: taken for none"
-                f" (first: row {rows[0] + 1}, by {abs(apart[rows[0]]) / 1e9:.3f} s)"
-            )
-            stamp = source.stamp.copy()
-            stamp[rows] = NO_STAMP
-            source = replace(source, stamp=stamp)
+        rows = apart > 0 if side == "ahead of" else apart < 0
+        if rows.any():
+            what = f"a stray stamp, more than 1 s {side} the rows around: taken for none"
+            tell(notes, label, rows, what, f", by {abs(apart[rows][0]) / 1e9:.3f} s")
+            source = replace(source, stamp=np.where(rows, NO_STAMP, source.stamp))
     return source
 
 
@@ -137,22 +134,28 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
     cuts = _jumps(run.command)
     if not cuts:
         return [run], []
-    for source in (*run.sensors.values(), *([] if run.reference is None else [run.reference])):
-        if len(_jumps(source)) != len(cuts):
+
+    def pieces(source: S) -> list[S]:
+        jumps = _jumps(source)
+        if len(jumps) != len(cuts):
             raise RunError(
                 f"{run.command.label}: the commands' clock is set back {len(cuts)} times (first in row {cuts[0] + 1}),"
-                f" that of {source.label} {len(_jumps(source))} times; cut the log there and fuse the parts one by one"
+                f" that of {source.label} {len(jumps)} times; cut the log there and fuse the parts one by one"
             )
+        return [source.rows(slice(*edges)) for edges in pairwise([0, *jumps, len(source.stamp)])]
+
+    sensors = {name: pieces(source) for name, source in run.sensors.items()}
+    references = [None] * (len(cuts) + 1) if run.reference is None else pieces(run.reference)
     parts = [
         replace(
             run,
-            command=_piece(run.command, index),
-            sensors={name: _piece(source, index) for name, source in run.sensors.items()},
-            reference=None if run.reference is None else _piece(run.reference, index),
+            command=command,
+            sensors={name: parts[index] for name, parts in sensors.items()},
+            reference=references[index],
             start=run.start if index == 0 else {},
             notes=run.notes if index == 0 else (),
         )
-        for index in range(len(cuts) + 1)
+        for index, command in enumerate(pieces(run.command))
     ]
     lag = behind(run.command.stamp)
     said = [
@@ -177,9 +180,3 @@ def _jumps(source: Source) -> list[int]:
             raise RunError(
                 f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock"
             )
-
-
-def _piece(source: S, index: int) -> S:
-    """Segment ``index`` of a source: the rows between two of its jumps."""
-    edges = [0, *_jumps(source), len(source.stamp)]
-    return source.rows(slice(edges[index], edges[index + 1]))
