@@ -115,9 +115,9 @@ def _fuse_segment(
     progress: Callable[[float], None] | None,
 ) -> Estimates:
     if engine == "filterpy":
-        from .augmented import fuse_reference
+        from .filterpy_engine import fuse_filterpy
 
-        fused = fuse_reference(timeline, config, times, mode, progress)
+        fused = fuse_filterpy(timeline, config, times, mode, progress)
     else:
         from .engine import fuse_compiled
 
