@@ -18,8 +18,9 @@ import numpy.typing as npt
 from scipy.optimize import differential_evolution, minimize
 
 import pumafuse as pf
+from pumafuse.fusion.outcome import REOPEN_AFTER, REOPEN_SPAN_NS
 from pumafuse.fusion.score import interpolated
-from pumafuse.fusion.timeline import REOPEN_AFTER, REOPEN_SPAN_NS, build
+from pumafuse.fusion.timeline import build
 
 Array = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.int64]

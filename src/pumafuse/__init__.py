@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from .fusion.config import FusionConfig, Process, Sensor, Start
     from .fusion.estimates import Estimates, Readings
     from .fusion.offline import fuse
+    from .fusion.outcome import Outcome
     from .fusion.score import Score, score
     from .fusion.ticks import TickEstimates, filter_ticks, smooth_ticks, tick_likelihood
-    from .fusion.timeline import Outcome
     from .fusion.track import AxisEstimate
     from .identify.identify import Identification, identify
     from .identify.trials import StepTrials, TrialsError
@@ -49,7 +49,7 @@ _HOME = {
     "Identification": "identify.identify",
     "LiveEstimate": "live.answers",
     "LiveEstimator": "live.estimator",
-    "Outcome": "fusion.timeline",
+    "Outcome": "fusion.outcome",
     "Process": "fusion.config",
     "PumafuseError": "errors",
     "PumafuseWarning": "errors",

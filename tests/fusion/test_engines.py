@@ -22,7 +22,7 @@ from fusion.test_oracle import CASES, MS, NOISE, PAPER, UNDER, Case, Heard, T, c
 from fusion.test_oracle import sensor as ungated
 from fusion_oracle import AxisOracle, nanoseconds
 from pumafuse.fusion.estimates import Estimates, Readings
-from pumafuse.fusion.timeline import Outcome
+from pumafuse.fusion.outcome import Outcome
 from pumafuse.runs.run import Run
 from pumafuse.simulate.scenario import Scenario
 from pumafuse.simulate.simulate import simulate

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.fusion.estimates import Estimates
-from pumafuse.fusion.timeline import Outcome
+from pumafuse.fusion.outcome import Outcome
 from pumafuse.model.plants import Plant
 from pumafuse.runs.run import Run
 

@@ -22,7 +22,7 @@ from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.consistency import log_likelihood
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
-from pumafuse.fusion.timeline import Outcome
+from pumafuse.fusion.outcome import Outcome
 from pumafuse.model.arm import ArmModel, AxisModel
 from pumafuse.model.plants import FirstOrder
 from pumafuse.runs.run import Run

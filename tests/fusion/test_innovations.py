@@ -18,7 +18,8 @@ from pumafuse.fusion.engine import innovations
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.kernels import Met
 from pumafuse.fusion.offline import fuse
-from pumafuse.fusion.timeline import Outcome, Timeline, build
+from pumafuse.fusion.outcome import Outcome
+from pumafuse.fusion.timeline import Timeline, build
 from pumafuse.model.arm import AxisModel
 from pumafuse.runs.run import Run
 

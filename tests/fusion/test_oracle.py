@@ -19,7 +19,8 @@ from pumafuse.fusion.augmented import AxisFilter
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
-from pumafuse.fusion.timeline import Outcome, Timeline, build
+from pumafuse.fusion.outcome import Outcome
+from pumafuse.fusion.timeline import Timeline, build
 from pumafuse.model.arm import ArmModel, AxisModel, Gain
 from pumafuse.model.plants import FirstOrder, Plant, SecondOrder
 from pumafuse.runs.run import Run

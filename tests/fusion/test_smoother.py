@@ -39,7 +39,7 @@ from pumafuse.errors import PumafuseWarning
 from pumafuse.fusion.config import FusionConfig, Process, Sensor
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
-from pumafuse.fusion.timeline import Outcome
+from pumafuse.fusion.outcome import Outcome
 from pumafuse.runs.run import Run, Source
 
 LATE = Heard(TRACKER.sensor, every(90, 20, 240 * MS))

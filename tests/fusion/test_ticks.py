@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import pumafuse as pf
 from pumafuse.fusion import ticks
 from pumafuse.fusion.consistency import log_likelihood
-from pumafuse.fusion.timeline import Outcome
+from pumafuse.fusion.outcome import Outcome
 from pumafuse.model.plants import Plant
 
 DIGITS = 50

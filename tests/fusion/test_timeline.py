@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import RunError, UnknownNameError
 from pumafuse.fusion.config import FusionConfig, Sensor
-from pumafuse.fusion.timeline import Outcome, Timeline, build, output_times
+from pumafuse.fusion.outcome import Outcome
+from pumafuse.fusion.timeline import Timeline, build, output_times
 from pumafuse.model.arm import ArmModel, AxisModel
 from pumafuse.model.plants import FirstOrder
 from pumafuse.runs.run import Clock, Run

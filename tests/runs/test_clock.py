@@ -1,7 +1,8 @@
-"""Clocks that are set back cut a run; a controller's own ticks are found behind jittered stamps."""
+"""Clocks that are set back cut a run."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -13,11 +14,10 @@ from hypothesis import strategies as st
 
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import RunError
-from pumafuse.runs.clock import regular_grid, segments
+from pumafuse.runs.clock import astray, segments, without_strays
 from pumafuse.runs.run import Reference, Run, Source
 
 SECOND = 1_000_000_000
-PERIOD = 0.028
 TICK = 28_000_000
 
 properties = settings(derandomize=True, deadline=None, max_examples=50)
@@ -70,6 +70,142 @@ def pieces_by_hand(stamp: Sequence[int]) -> list[list[int]]:
     return [list(range(*edge)) for edge in pairwise(edges)]
 
 
+def strays_by_hand(stamp: Sequence[int]) -> list[int]:
+    """The stray rows, one row after the other: each is held against the last that is none and the one that follows."""
+    rows = [row for row, value in enumerate(stamp) if value != NO_STAMP]
+    apart = [False] * len(rows)
+    believed: list[int] = []
+    at = 0
+    while at < len(rows):
+        count = next((count for count in (1, 2) if contradicted(stamp, believed, rows[at:], count)), 0)
+        apart[at : at + count] = [True] * count
+        believed += rows[at : at + 1] if count == 0 else []
+        at += max(count, 1)
+    groups = "".join("x" if stray else " " for stray in apart)
+    long = {place for group in re.finditer("xxx+", groups) for place in range(*group.span())}
+    return [row for place, row in enumerate(rows) if apart[place] and place not in long]
+
+
+def contradicted(stamp: Sequence[int], believed: Sequence[int], rows: Sequence[int], count: int) -> bool:
+    """Whether the first ``count`` of ``rows`` are, by the last row that is believed and by what comes after them."""
+    out, rest = [stamp[row] for row in rows[:count]], [stamp[row] for row in rows[count:]]
+    if len(out) < count or not (believed or rest):
+        return False
+    before = stamp[believed[-1]] if believed else None
+    if before is None:
+        return len(rest) >= 3 and all(value - rest[0] > SECOND for value in out)
+    if not rest:
+        return believed[-1] >= stamped_rows(stamp)[2] and all(before - value > SECOND for value in out)
+    ahead = [value - before > SECOND and value - rest[0] > SECOND for value in out]
+    return before - rest[0] <= SECOND and all(
+        over or before - value > SECOND for over, value in zip(ahead, out, strict=True)
+    )
+
+
+def stamped_rows(stamp: Sequence[int]) -> list[int]:
+    found = [row for row, value in enumerate(stamp) if value != NO_STAMP]
+    return [*found, *[len(stamp)] * 3]
+
+
+STRAYS: dict[str, tuple[list[float | None], list[int]]] = {
+    "one ahead": ([0, 1, 2, 50, 3, 4], [3]),
+    "two ahead": ([0, 1, 2, 50, 51, 3, 4], [3, 4]),
+    "two ahead, each elsewhere": ([0, 1, 2, 50, 40, 3, 4], [3, 4]),
+    "three ahead: the clock was set anew": ([0, 1, 2, 50, 51, 52, 3, 4, 5], []),
+    "three ahead, each elsewhere": ([0, 1, 2, 50, 40, 30, 3, 4, 5], []),
+    "one back": ([0, 1, 2, -50, 3, 4], [3]),
+    "two back": ([0, 1, 2, -50, -49, 3, 4], [3, 4]),
+    "three back: the clock was set anew": ([0, 1, 2, -50, -49, -48, 3, 4], []),
+    "one ahead, one back": ([0, 1, 2, 50, -50, 3, 4], [3, 4]),
+    "one ahead now and again": ([0, 1, 50, 2, 50, 3, 4], [2, 4]),
+    "the first row ahead": ([50, 0, 1, 2], [0]),
+    "the first two ahead": ([50, 51, 0, 1, 2], [0, 1]),
+    "the first row ahead of two only": ([50, 0, 1], []),
+    "the first row back: a pause follows": ([-50, 0, 1, 2], []),
+    "the last row back": ([0, 1, 2, -50], [3]),
+    "the last two back": ([0, 1, 2, -50, -49], [3, 4]),
+    "the last row behind two only": ([0, 1, -50], []),
+    "the last row ahead: a pause": ([0, 1, 2, 50], []),
+    "a pause": ([0, 1, 2, 50, 51, 52], []),
+    "one row between two pauses": ([0, 1, 2, 50, 100, 101], []),
+    "ahead of a pause": ([0, 1, 2, 50, 30, 31], [3]),
+    "the clock goes back behind where it was": ([0, 1, 2, 50, -50, -49, -48], []),
+    "ahead of what comes next by 1 s": ([0, 1, 3, 2, 3, 4], []),
+    "ahead of what comes next by more": ([0, 1, 3.001, 2, 3, 4], [2]),
+    "behind by 1 s": ([0, 1, 2, 1, 3, 4], []),
+    "behind by more": ([0, 1, 2, 0.999, 3, 4], [3]),
+    "what comes next is 1 s behind": ([0, 1, 2, 50, 1, 2], [3]),
+    "what comes next is farther behind": ([0, 1, 2, 50, 0.97, 0.98, 0.99, 2], []),
+    "rows without a stamp are passed over": ([None, 0, 1, 2, None, 50, None, 3, 4], [5]),
+}
+
+
+@pytest.mark.parametrize("case", STRAYS)
+def test_a_stray_stamp_is_one_that_the_rows_around_it_contradict(case: str) -> None:
+    """One row or two that are elsewhere before the log goes on where it was; a pause and a clock set anew are none."""
+    times, wanted = STRAYS[case]
+    stamp = [NO_STAMP if time is None else round(time * SECOND) for time in times]
+    assert np.flatnonzero(astray(np.array(stamp))).tolist() == wanted == strays_by_hand(stamp)
+
+
+def test_a_stray_stamp_is_apart_from_what_was_before_it_or_first_comes_after() -> None:
+    """By how far is counted from the time that the log was at, ahead or back."""
+    stamp = [time * SECOND for time in (70, 0, 1, 2, 50, 3, -4, 4, 5)]
+    assert (astray(np.array(stamp)) / SECOND).tolist() == [70, 0, 0, 0, 48, 0, -7, 0, 0]
+
+
+wild = st.builds(
+    lambda steps, gone: [NO_STAMP if lost else step * SECOND // 2 for step, lost in zip(steps, gone, strict=False)],
+    st.lists(st.sampled_from([0, 1, 2, 3, 4, 5, 6, 20, 40, 60]), min_size=1, max_size=14),
+    st.lists(st.sampled_from([False] * 9 + [True]), min_size=14, max_size=14),
+)
+
+
+@settings(derandomize=True, deadline=None, max_examples=1000)
+@given(wild)
+def test_any_stamps_are_stray_as_a_walk_from_row_to_row_finds_them(stamp: list[int]) -> None:
+    """Only rows near a step back are looked at; that misses none and finds no other."""
+    assert np.flatnonzero(astray(np.array(stamp, dtype=np.int64))).tolist() == strays_by_hand(stamp)
+
+
+def test_stray_stamps_are_taken_for_none_and_told() -> None:
+    """Commands astray either way lose their stamps, readings and truth only ahead; no row goes, each source is told."""
+    stamp = [time * SECOND for time in (0, 1, 2, 50, 3, -50, 4, 60, 5)]
+    run = recorded(stamp, {"tracker": stamp}, stamp)
+    kept = without_strays(run)
+    assert kept.reference is not None
+    lost = [
+        np.flatnonzero(source.stamp == NO_STAMP).tolist()
+        for source in (kept.command, kept.sensors["tracker"], kept.reference)
+    ]
+    assert lost == [[3, 5, 7], [3, 7], [3, 7]]
+    assert rows(kept.command) == rows(kept.sensors["tracker"]) == rows(kept.reference) == list(range(9))
+    assert kept.notes == (
+        "torn",
+        "host.csv: 2 rows have a stray stamp, more than 1 s ahead of the rows around: taken for none"
+        " (first: row 4, by 48.000 s)",
+        "host.csv: 1 row has a stray stamp, more than 1 s behind the rows around: taken for none"
+        " (first: row 6, by 53.000 s)",
+        "tracker (tracker.csv): 2 rows have a stray stamp, more than 1 s ahead of the rows around: taken for none"
+        " (first: row 4, by 48.000 s)",
+        "truth.csv: 2 rows have a stray stamp, more than 1 s ahead of the rows around: taken for none"
+        " (first: row 4, by 48.000 s)",
+    )
+    assert without_strays(kept) is kept
+    assert run.command.stamp.tolist() == stamp
+
+
+def test_a_stray_command_cuts_nothing_and_a_clock_set_back_still_does() -> None:
+    """A run is cut where its clock was set back, not where a stamp of either part is stray."""
+    first, second = [100, 101, 900, 102, 103], [10, 11, -900, 12, 13]
+    stamp = [time * SECOND for time in (*first, *second)]
+    parts, said = segments(recorded(stamp, {"tracker": [time * SECOND for time in (100, 101, 10, 11)]}))
+    assert [rows(part.command) for part in parts] == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]]
+    assert [part.command.stamp[2] for part in parts] == [NO_STAMP, NO_STAMP]
+    assert len(said) == 1
+    assert "by 93.000 s in row 6" in said[0]
+
+
 def test_a_run_with_one_clock_is_one_segment() -> None:
     """Without a jump the run itself comes back and nothing is said."""
     run = recorded([0, TICK, 3600 * SECOND], {"tracker": [5, 4, 3]})
@@ -79,7 +215,7 @@ def test_a_run_with_one_clock_is_one_segment() -> None:
 @pytest.mark.parametrize(("back", "count"), [(SECOND, 1), (SECOND + 1, 2)])
 def test_a_step_back_of_one_second_is_tolerated_and_a_nanosecond_more_is_a_jump(back: int, count: int) -> None:
     """Up to 1 s rows are out of order; beyond it the clock was set back and a new segment begins."""
-    stamp = [10 * SECOND, 11 * SECOND, 11 * SECOND - back, 12 * SECOND]
+    stamp = [10 * SECOND, 11 * SECOND, *[11 * SECOND - back] * 3, 12 * SECOND]
     parts, said = segments(recorded(stamp, {"tracker": stamp}))
     assert len(parts) == count
     assert len(said) == count - 1
@@ -116,8 +252,10 @@ quarters = st.sampled_from([NO_STAMP, *(quarter * SECOND // 4 for quarter in ran
 @given(st.lists(quarters, min_size=2, max_size=20).filter(lambda stamp: max(stamp) >= 0))
 def test_segments_hold_every_row_once_and_none_jumps(stamp: list[int]) -> None:
     """For any stamps the pieces are those of a walk from row to row, and together they are the whole log."""
-    parts, said = segments(recorded(stamp, {"tracker": stamp}, stamp))
-    wanted = pieces_by_hand(stamp)
+    kept = without_strays(recorded(stamp, {})).command.stamp.tolist()
+    run = replace(recorded(kept, {"tracker": kept}, kept), without_strays=True)
+    parts, said = segments(run)
+    wanted = pieces_by_hand(kept)
     assert [rows(part.command) for part in parts] == wanted
     assert [rows(part.sensors["tracker"]) for part in parts] == wanted
     assert [rows(part.reference) for part in parts] == wanted
@@ -172,125 +310,3 @@ def test_stamps_that_are_no_clock_are_refused() -> None:
     """Nonsense stamps would be a thousand segments: refused by the file's name instead."""
     nonsense = np.random.default_rng(0).integers(0, 1000 * SECOND, 1000).tolist()
     assert "host.csv" in refusal(lambda: segments(recorded(nonsense, {"tracker": nonsense})))
-
-
-def grid_of(ticks: np.ndarray, period_ns: float = TICK, origin: int = 1_700_000_000 * SECOND) -> np.ndarray:
-    return origin + np.rint(ticks * period_ns).astype(np.int64)
-
-
-@properties
-@given(st.sampled_from([PERIOD, 0.004, 1 / 30, 0.0281234567]), st.integers(200, 500), st.integers(0, 2**32 - 1))
-def test_the_grid_behind_jittered_stamps_is_even_to_a_nanosecond(period: float, count: int, seed: int) -> None:
-    """Stamps off by up to a fifth of a period, with commands missing, come back on ticks of exactly T."""
-    rng = np.random.default_rng(seed)
-    ticks = np.cumsum(rng.integers(1, 6, count))
-    jitter = rng.uniform(-0.2, 0.2, count) * period * SECOND
-    stamp = grid_of(ticks, period * SECOND) + np.rint(jitter).astype(np.int64)
-    got, note = regular_grid(stamp, period, "host")
-    assert note is None
-    np.testing.assert_allclose(got - got[0], (ticks - ticks[0]) * period * SECOND, rtol=0, atol=1.001)  # rounded twice
-    assert abs(float(np.median(stamp - got))) <= 1.0
-
-
-def test_the_grid_lies_where_the_ticks_were() -> None:
-    """With many commands the jitter averages out: the grid is within 4 standard errors of the true ticks."""
-    ticks = np.flatnonzero(np.random.default_rng(1).random(4000) < 0.8)
-    truth = grid_of(ticks)
-    sd = 1.5e6
-    stamp = truth + np.rint(np.random.default_rng(2).normal(0.0, sd, len(ticks))).astype(np.int64)
-    got, note = regular_grid(stamp, PERIOD, "host")
-    assert note is None
-    assert set(np.unique(np.diff(got) - np.diff(truth))) == {0}
-    assert abs(int(got[0] - truth[0])) < 4 * sd * np.sqrt(np.pi / 2 / len(ticks))  # of a median
-
-
-@pytest.mark.parametrize("ppm", [50.0, -50.0, 400.0])
-def test_a_drifting_clock_is_followed_and_told(ppm: float) -> None:
-    """50 ppm over an hour are 180 ms, six ticks: the grid stays on the true ticks, and the note tells the drift."""
-    ticks = np.flatnonzero(np.random.default_rng(3).random(130_000) < 0.9)
-    truth = grid_of(ticks, TICK * (1 + ppm * 1e-6))
-    jitter = np.random.default_rng(4).normal(0.0, 1e6, len(ticks))
-    got, note = regular_grid(truth + np.rint(jitter).astype(np.int64), PERIOD, "host")
-    assert np.abs(got - truth).max() < 4 * 1e6 * np.sqrt((4 + np.pi / 2) / len(ticks))  # slope and median together
-    assert note is not None
-    assert "host" in note
-    assert f"{ppm:+.1f} ppm" in note
-
-
-@pytest.mark.parametrize(("stamp", "wanted"), [([5], [5]), ([5, TICK + 1005], [505, TICK + 505])])
-def test_one_or_two_stamps_are_a_grid(stamp: list[int], wanted: list[int]) -> None:
-    """Stamps too few to fit a drift to keep T, and share the error."""
-    got, note = regular_grid(np.array(stamp), PERIOD, "host")
-    assert note is None
-    assert got.tolist() == wanted
-
-
-@pytest.mark.parametrize("count", [3, 5, 10, 20, 40])
-def test_a_short_run_with_jitter_has_a_grid(count: int) -> None:
-    """1 ms of jitter on a few commands is no wrong period: the slope's own error is allowed for."""
-    for seed in range(20):
-        jitter = np.rint(np.random.default_rng(seed).normal(0.0, 1e6, count)).astype(np.int64)
-        got, note = regular_grid(grid_of(np.arange(count)) + jitter, PERIOD, "host")
-        np.testing.assert_array_equal(np.diff(got), TICK)
-        assert note is None
-
-
-@pytest.mark.parametrize("first", [2000, 10, 3997])
-def test_a_late_stamp_moves_no_other_command(first: int) -> None:
-    """One stamp more than half a tick late, the next one less: every command is on its own tick."""
-    truth = grid_of(np.arange(4000))
-    stamp = truth.copy()
-    stamp[first] += 15_000_000
-    stamp[first + 1] += 3_000_000
-    got, note = regular_grid(stamp, PERIOD, "host")
-    assert note == "host: 1 commands are stamped more than half a period late: set back to their ticks"
-    np.testing.assert_allclose(got - truth, 0, atol=1)
-
-
-@pytest.mark.parametrize("mean", [2e6, 3e6])
-def test_stamps_that_are_only_ever_late_have_a_grid(mean: float) -> None:
-    """A logger's delay, exponential with 2 or 3 ms, is now and then over half a tick: the ticks are still clear."""
-    truth = grid_of(np.arange(4000))
-    late = np.random.default_rng(0).exponential(mean, len(truth)).astype(np.int64)
-    got, note = regular_grid(np.maximum.accumulate(truth + late), PERIOD, "host")
-    assert note is not None
-    assert "ppm" not in note
-    np.testing.assert_array_equal(np.diff(got), TICK)
-
-
-@pytest.mark.parametrize("ppm", [50.0, -50.0])
-def test_a_pause_does_not_hide_the_drift(ppm: float) -> None:
-    """50 ppm through a pause of 10 minutes are one tick: the grid is on the true ticks after it."""
-    truth = grid_of(np.concatenate([np.arange(20_000), np.arange(20_000) + 41_500]), TICK * (1 + ppm * 1e-6))
-    got, note = regular_grid(truth, PERIOD, "host")
-    assert note is not None
-    assert f"{ppm:+.1f} ppm" in note
-    assert np.abs(got - truth).max() < 1000
-
-
-@pytest.mark.parametrize("period", [0.056, 0.030, 0.0281, 0.0279, 0.027, 0.0200])
-def test_a_wrong_period_is_refused(period: float) -> None:
-    """Stamps 28 ms apart do not fit another period: refused with both periods and what to do."""
-    ticks = np.arange(500)
-    jitter = np.random.default_rng(5).uniform(-1e6, 1e6, len(ticks))
-    text = refusal(lambda: regular_grid(grid_of(ticks) + np.rint(jitter).astype(np.int64), period, "host"))
-    assert text.startswith("host: ")
-    for words in (f"ticks of {period * 1e3:g} ms", "median interval is 28.0", "clock = 'stamps'"):
-        assert words in text
-
-
-def test_two_commands_in_one_tick_are_refused() -> None:
-    """A command between two ticks cannot be on a grid: refused with the period and what to do."""
-    text = refusal(lambda: regular_grid(np.array([0, TICK, TICK + TICK // 3, 2 * TICK]), PERIOD, "host"))
-    assert text.startswith("host: ")
-    for words in ("ticks of 28 ms", "median interval is 18.6667 ms", "clock = 'stamps'"):
-        assert words in text
-
-
-@pytest.mark.parametrize("place", [50, 100, 190, 3900])
-def test_a_command_between_two_ticks_is_refused(place: int) -> None:
-    """Two commands on one tick are no regular clock; no other command is moved to make room for them."""
-    truth = grid_of(np.arange(4000))
-    stamp = np.sort(np.append(truth, truth[place] + TICK // 2))
-    with pytest.raises(RunError, match="do not come on ticks"):
-        regular_grid(stamp, PERIOD, "host")

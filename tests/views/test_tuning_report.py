@@ -17,7 +17,7 @@ import pumafuse as pf
 from outline import outline
 from pumafuse.errors import PumafuseWarning
 from pumafuse.fusion.consistency import consistency, densities_of
-from pumafuse.fusion.timeline import Outcome
+from pumafuse.fusion.outcome import Outcome
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
 from pumafuse.tune.climb import climb

@@ -15,8 +15,9 @@ from ..arrays import CodeArray, FloatArray
 from ..units import MM
 from .config import Sensor
 from .estimates import Estimates, Readings, outcome_counts
+from .outcome import Outcome
 from .score import Z95
-from .timeline import LONGEST_TAIL_NS, Outcome
+from .timeline import LONGEST_TAIL_NS
 
 LAGS = 20
 _FEW = 30  # scalars below which nothing is said

@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import CodeArray, FloatArray, IntArray, TimeArray
 from ..model import closed
 from ..model.plants import FirstOrder
-from . import kernels, smoother_kernels
+from . import kernels, run_kernels, smoother_kernels
 from .config import FusionConfig, Sensor
 from .estimates import Mode
 from .timeline import AxisInput, Timeline
@@ -34,11 +34,11 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
         back = int((np.maximum.accumulate(queue) - queue).max(initial=0)) + 2
         checkpoints = places(state, back)
         arrived = np.zeros(len(rows.valid), dtype=np.bool_)
-        kernels.filter_as_live(
+        run_kernels.filter_as_live(
             axes, sensors, rows, arrival, queue, arrived, state, checkpoints, times, met, log, held, outputs
         )
     else:
-        kernels.filter_run(axes, sensors, rows, state, times, met, log, held, outputs)
+        run_kernels.filter_run(axes, sensors, rows, state, times, met, log, held, outputs)
     if smooth:
         sensor_of = np.repeat(rows.sensor, rows.end - rows.first)
         room = (
@@ -52,8 +52,8 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
     outcome[candidates] = met.outcome
     return Fused(
         {axis.name: _estimate(axis, outputs, number) for number, axis in enumerate(timeline.axes)},
-        _spread(met.innovation, candidates, len(scalars.value)),
-        _spread(met.innovation_sd, candidates, len(scalars.value)),
+        _among_all(met.innovation, candidates, len(scalars.value)),
+        _among_all(met.innovation_sd, candidates, len(scalars.value)),
         outcome,
         _known_biases(timeline, axes, state, biases),
     )
@@ -72,13 +72,13 @@ def innovations(timeline: Timeline, config: FusionConfig, outcome: CodeArray | N
     log = _log(axes, None, width)
     if outcome is not None:
         met = kernels.Met(np.empty(count), np.empty(count), outcome.copy())
-        kernels.replay(axes, sensors, rows, state, met, log)
+        run_kernels.replay(axes, sensors, rows, state, met, log)
         return met
     met = kernels.Met(np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8))
     nothing, none = np.empty((len(timeline.axes), 0)), np.empty(0, dtype=np.int64)
     held = kernels.Held(np.empty((len(axes.order), 0, width)), np.empty((len(axes.order), 0, width, width)), nothing)
     outputs = kernels.Outputs(*(nothing for _ in kernels.Outputs._fields))
-    kernels.filter_run(axes, sensors, rows, state, none, met, log, held, outputs)
+    run_kernels.filter_run(axes, sensors, rows, state, none, met, log, held, outputs)
     return met
 
 
@@ -258,7 +258,7 @@ def _noise(sensor: Sensor | None, axis: str) -> float:
     return np.nan if sd is None else sd
 
 
-def _spread(values: FloatArray, candidates: IntArray, size: int) -> FloatArray:
+def _among_all(values: FloatArray, candidates: IntArray, size: int) -> FloatArray:
     """Values of the candidates among all scalars, NaN for the others."""
     if len(values) == size:
         return values

@@ -11,7 +11,8 @@ import numpy as np
 from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
 from ..errors import UnknownNameError
 from .config import FusionConfig
-from .timeline import Outcome
+from .outcome import Outcome
+from .reference import ReferenceTrack
 from .track import AxisEstimate, Bias
 
 Mode = Literal["filtered", "as-live", "smoothed"]
@@ -79,23 +80,6 @@ class Readings:
     def counts(self) -> dict[str, int]:
         """How many scalars had each outcome, those that occur."""
         return outcome_counts(self.outcome)
-
-
-@dataclass(frozen=True)
-class ReferenceTrack:
-    """The reference in the run's own time.
-
-    Attributes:
-        time: [s since the first command], ascending, (k,).
-        position: For each axis [m], NaN where it has none, (k,).
-        sd: Standard deviation of its own noise on each axis [m], (k,).
-        segment: As in :class:`Estimates`, (k,).
-    """
-
-    time: FloatArray
-    position: Mapping[str, FloatArray]
-    sd: Mapping[str, FloatArray]
-    segment: IntArray
 
 
 @dataclass(frozen=True)

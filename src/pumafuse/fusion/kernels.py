@@ -1,8 +1,9 @@
-"""The compiled filter: one scalar kernel for every use, on the plant's states, the offset and the biases only.
+"""The compiled filter, event by event: one scalar kernel for every use, on the plant's states, offset, biases.
 
 Commands wait in the drive until they act, so the state needs no delay chain. Each axis steps from instant to instant
 (commands acting, readings valid) in closed form and meets its scalars by Joseph-form updates. Everything an axis has is
 in arrays that change in place: a copy of them is a checkpoint. No fast-math: the same events give the same bits.
+Recorded runs (`run_kernels.py`) and streams (`live/kernels.py`) are both made of these.
 
 State of an axis: the plant's n states (position [m], and its rate [m/s] for a second-order plant), the offset, biases.
 """
@@ -18,7 +19,7 @@ from typing import NamedTuple
 from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
 from ..compiled import compiled
 from ..model.closed import advance_first, advance_second
-from .timeline import REOPEN_AFTER, REOPEN_SPAN_NS, Outcome
+from .outcome import REOPEN_AFTER, REOPEN_SPAN_NS, Outcome
 
 _FUSED, _GATED, _REOPENED = int(Outcome.FUSED), int(Outcome.GATED), int(Outcome.REOPENED)
 _ROUNDING = 1e-15  # of the variances that S is made of: S cannot be known to be smaller
@@ -59,7 +60,7 @@ class Sensors(NamedTuple):
         sd: Noise on each axis [m], (S, A).
         latency_sd: How far the latency wanders [s], (S,).
         gate: In standard deviations, 0 for none, (S,).
-        rows: Whether one axis gated gates the row, (S,).
+        gate_rows: Whether one axis gated gates the row, (S,).
         bias: Which state is its bias on each axis, −1 for none, (S, A).
     """
 
@@ -68,7 +69,7 @@ class Sensors(NamedTuple):
     sd: FloatArray
     latency_sd: FloatArray
     gate: FloatArray
-    rows: BoolArray
+    gate_rows: BoolArray
     bias: IntArray
 
 
@@ -371,7 +372,7 @@ def predicted(axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: in
 @compiled
 def meet(axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log: Log, row: int) -> None:
     """Gate a row and fuse what passes: whole rows or scalar by scalar, as the sensor says."""
-    scalar, together = rows.first[row], sensors.rows[rows.sensor[row]]
+    scalar, together = rows.first[row], sensors.gate_rows[rows.sensor[row]]
     while scalar < rows.end[row]:  # one call: each would be compiled as a copy of its own
         end, part = (rows.end[row], 0) if together else (scalar + 1, rows.axis[scalar] + 1)
         meet_together(axes, sensors, rows, state, met, log, row, scalar, end, part)
@@ -391,7 +392,10 @@ def meet_together(
     end: int,
     part: int,
 ) -> None:
-    """Scalars of one row that pass the gate together or not at all."""
+    """Scalars ``first`` to ``end`` of one row, which pass the gate together or not at all.
+
+    ``part`` is where their rejections in a row are counted (:class:`State`): 0 for whole rows, axis + 1 for a scalar.
+    """
     sensor, valid = rows.sensor[row], rows.valid[row]
     gate, any_beyond = sensors.gate[sensor], False
     for scalar in range(first, end):
@@ -476,45 +480,6 @@ def estimate(axes: Axes, state: State, log: Log, time: int, held: Held, outputs:
 
 
 @compiled
-def filter_run(
-    axes: Axes,
-    sensors: Sensors,
-    rows: Rows,
-    state: State,
-    times: TimeArray,
-    met: Met,
-    log: Log,
-    held: Held,
-    outputs: Outputs,
-) -> None:
-    """Every row at its valid time, whenever it arrived, and an estimate at each of ``times`` (ascending)."""
-    at = 0
-    for row in range(len(rows.valid)):
-        while at < len(times) and times[at] < rows.valid[row]:
-            estimate(axes, state, log, times[at], held, outputs, at)
-            at += 1
-        meet(axes, sensors, rows, state, met, log, row)
-    while at < len(times):
-        estimate(axes, state, log, times[at], held, outputs, at)
-        at += 1
-
-
-@compiled
-def replay(axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log: Log) -> None:
-    """Every row at its valid time with the outcomes that ``met`` brings, whatever a gate would say now."""
-    for row in range(len(rows.valid)):
-        sensor = rows.sensor[row]
-        for scalar in range(rows.first[row], rows.end[row]):
-            advance(axes, state, log, rows.axis[scalar], rows.valid[row])
-            nu, S = predicted(axes, sensors, rows, state, scalar, sensor)
-            met.innovation[scalar], met.innovation_sd[scalar] = nu, math.sqrt(S)
-            if met.outcome[scalar] == _FUSED:
-                fuse(axes, sensors, rows, state, met, log, row, scalar, math.inf)
-            elif met.outcome[scalar] == _REOPENED:
-                fuse(axes, sensors, rows, state, met, log, row, scalar, 0.0)
-
-
-@compiled
 def keep(state: State, kept: State, place: int) -> None:
     """Copy a state to ``place`` among many."""
     for axis in range(len(state.clock)):
@@ -544,46 +509,3 @@ def go_back(state: State, kept: State, place: int) -> None:
         for part in range(state.since.shape[1]):
             state.rejected[sensor, part] = kept.rejected[place, sensor, part]
             state.since[sensor, part] = kept.since[place, sensor, part]
-
-
-@compiled
-def filter_as_live(
-    axes: Axes,
-    sensors: Sensors,
-    rows: Rows,
-    arrival: TimeArray,
-    queue: IntArray,
-    arrived: BoolArray,
-    state: State,
-    kept: State,
-    times: TimeArray,
-    met: Met,
-    log: Log,
-    held: Held,
-    outputs: Outputs,
-) -> None:
-    """At each of ``times`` only the rows that had arrived: late ones make the filter go back and replay.
-
-    ``queue`` lists the rows by ``arrival``, ``arrived`` is all false; ``kept`` has two places more than rows may have
-    to be taken back.
-    """
-    due, done, reach = 0, 0, 0  # rows before `done` are dealt with: fused, or not here yet
-    places = len(kept.clock)
-    for n in range(len(times) + 1):
-        earliest = done
-        while due < len(queue) and (n == len(times) or arrival[queue[due]] <= times[n]):
-            row = queue[due]
-            arrived[row] = True
-            earliest, reach = min(earliest, row), max(reach, row + 1)
-            due += 1
-        if earliest < done:
-            go_back(state, kept, earliest % places)
-        for row in range(earliest, reach):
-            keep(state, kept, row % places)
-            if arrived[row]:
-                meet(axes, sensors, rows, state, met, log, row)
-        done = reach
-        if n < len(times):
-            keep(state, kept, done % places)  # the state goes on with estimates, rows still to come may be before that
-            estimate(axes, state, log, times[n], held, outputs, n)
-            go_back(state, kept, done % places)

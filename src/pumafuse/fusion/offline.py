@@ -12,14 +12,15 @@ import numpy as np
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import PumafuseWarning
 from ..runs.axes import in_axes
-from ..runs.clock import TOLERATED_STEP_BACK_NS, behind, segments
+from ..runs.clock import segments
 from ..runs.frames import Cylindrical, Placed
-from ..runs.run import Reference, Run
+from ..runs.run import Run
 from ..units import seconds
 from . import timeline as timelines
 from .config import FusionConfig
 from .consistency import troubles
-from .estimates import Estimates, Mode, Readings, ReferenceTrack
+from .estimates import Estimates, Mode, Readings
+from .reference import joined_references, late_rows, reference_track
 from .score import interpolated
 from .timeline import Timeline
 from .track import AxisEstimate, Fused
@@ -89,7 +90,7 @@ def _reference_notes(est: Estimates, parts: Sequence[Run]) -> list[str]:
     if est.reference is None:
         return []
     sources = [part.reference for part in parts if part.reference is not None]
-    late = sum(int(np.sum(behind(source.stamp) > TOLERATED_STEP_BACK_NS)) for source in sources)
+    late = sum(int(np.sum(late_rows(source))) for source in sources)
     found = (
         [f"{sources[0].label}: {late} rows are stamped more than 1 s behind an earlier one: not used"] if late else []
     )
@@ -114,9 +115,9 @@ def _fuse_segment(
     progress: Callable[[float], None] | None,
 ) -> Estimates:
     if engine == "filterpy":
-        from .augmented import fuse_reference
+        from .filterpy_engine import fuse_filterpy
 
-        fused = fuse_reference(timeline, config, times, mode, progress)
+        fused = fuse_filterpy(timeline, config, times, mode, progress)
     else:
         from .engine import fuse_compiled
 
@@ -157,7 +158,7 @@ def _highest_radius(run: Run, placed: Placed | None) -> float | None:
     if placed is None or not isinstance(placed.frame, Cylindrical) or "radial" not in run.command.values:
         return None
     radial = run.command.values["radial"]
-    return float(np.max(radial[np.isfinite(radial)]))
+    return float(np.max(radial[np.isfinite(radial) & (run.command.stamp != NO_STAMP)]))
 
 
 def _readings(timeline: Timeline, fused: Fused) -> Readings:
@@ -173,27 +174,6 @@ def _readings(timeline: Timeline, fused: Fused) -> Readings:
         outcome=fused.outcome,
         sensors=scalars.sensors,
         axes=tuple(axis.name for axis in timeline.axes),
-    )
-
-
-def reference_track(reference: Reference, origin: int) -> ReferenceTrack:
-    """A run's reference in order and in seconds since ``origin`` (int ns), without what lies behind a jump back."""
-    usable = (reference.stamp != NO_STAMP) & (behind(reference.stamp) <= TOLERATED_STEP_BACK_NS)
-    kept = reference.rows(usable)
-    order = np.argsort(kept.stamp, kind="stable")
-    position = {axis: value[order] for axis, value in kept.values.items()}
-    sd = {axis: reference.sd * kept.spread.get(axis, np.ones(len(order)))[order] for axis in position}
-    return ReferenceTrack(seconds(kept.stamp[order], origin), position, sd, np.zeros(len(order), dtype=np.int64))
-
-
-def joined_references(parts: Sequence[tuple[ReferenceTrack, float, int]]) -> ReferenceTrack:
-    """The references of several segments, each with what is added to its time [s] and its segment's number."""
-    first = parts[0][0]
-    return ReferenceTrack(
-        np.concatenate([track.time + shift for track, shift, _ in parts]),
-        {axis: np.concatenate([track.position[axis] for track, _, _ in parts]) for axis in first.position},
-        {axis: np.concatenate([track.sd[axis] for track, _, _ in parts]) for axis in first.position},
-        np.concatenate([np.full(len(track.time), number) for track, _, number in parts]),
     )
 
 

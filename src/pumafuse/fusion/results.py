@@ -21,11 +21,11 @@ from ..runs.frames import Frame
 from ..runs.run import Run
 from ..runs.tables import Table
 from ..units import MM, seconds
-from .estimates import Estimates, ReferenceTrack
-from .offline import joined_references, reference_track
+from .estimates import Estimates
+from .outcome import Outcome
+from .reference import ReferenceTrack, joined_references, reference_track
 from .score import Score, score
 from .summary import Summary, summarise
-from .timeline import Outcome
 
 ESTIMATES, READINGS, REFERENCE, SUMMARY = "estimates.parquet", "readings.parquet", "reference.parquet", "summary.json"
 OURS = frozenset(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from .estimates import ReferenceTrack
+from .reference import ReferenceTrack
 
 Z95 = 1.959963984540054  # a normal variable lies within ± this in 95 % of cases
 _SHORTEST_GAP = 0.050  # s; a reference is interpolated at least across this

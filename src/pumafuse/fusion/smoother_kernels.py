@@ -1,8 +1,8 @@
 """The compiled smoother: what all later readings say of a state, carried backward as η and N.
 
 The same algebra as :mod:`pumafuse.fusion.smoother`, which says where it comes from. Over an update
-η ← η + N K ν + Hᵀ ν / R
-and N ← N + Hᵀ H / R; over an interval through its noise, one independent part at a time, and then by Fᵀ.
+η ← η + N K ν + Hᵀ ν / R and N ← N + Hᵀ H / R; over an interval through its noise, one independent part at a time, and
+then by Fᵀ.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportReturnType=false, reportConstantRedefinition=false

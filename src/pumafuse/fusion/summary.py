@@ -11,8 +11,8 @@ import numpy as np
 from ..units import MM
 from .consistency import chi_square_band, consistency, log_likelihood
 from .estimates import Estimates
+from .outcome import Outcome
 from .score import Score, score
-from .timeline import Outcome
 
 
 class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -99,7 +99,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         pumafuse: Version that wrote it.
         run: The run's name.
         arm: The arm's name.
-        mode: ``filtered`` (every reading valid by then) or ``as-live`` (those that had arrived).
+        mode: Which readings an estimate knows: ``filtered`` (all valid by then), ``as-live`` (those that had arrived)
+            or ``smoothed`` (all of the run).
         engine: Which engine computed it.
         origin_ns: Stamp of the first command: time 0 of every table.
         duration_s: From the first to the last estimate.

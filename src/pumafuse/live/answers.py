@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from ..errors import UnknownNameError
-from ..fusion.timeline import Outcome
+from ..fusion.outcome import Outcome
 
 MET = frozenset({Outcome.FUSED, Outcome.REOPENED, Outcome.GATED})  # of what was compared with its prediction
 _BEST = (  # first

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple, Protocol
 
 from ..errors import ConfigError, RunError, suggestion
 from ..fusion.config import FusionConfig
-from ..fusion.timeline import FARTHEST, LONGEST_TAIL_NS, Outcome
+from ..fusion.outcome import FARTHEST, Outcome
+from ..fusion.timeline import LONGEST_TAIL_NS
 from ..model.arm import ordered_axes
 from ..runs.frames import CARTESIAN, Cylindrical
 from .answers import AxisNow, LiveEstimate, Told, nowhere, told_of

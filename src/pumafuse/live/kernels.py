@@ -15,7 +15,7 @@ import math
 from ..arrays import ALWAYS, NEVER, FloatArray, IntArray, TimeArray
 from ..compiled import compiled
 from ..fusion.kernels import Held, Log, Met, Outputs, Rows, Sensors, State, estimate, go_back, keep, meet
-from ..fusion.timeline import FARTHEST, Outcome
+from ..fusion.outcome import FARTHEST, Outcome
 from .command_kernels import (
     COMMANDS,
     DELAY,

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError
-from ..fusion import timeline
+from ..fusion.commands import as_commanded
 from ..fusion.config import FusionConfig
 from ..runs.clock import segments
 from ..runs.run import Run, Source
@@ -62,7 +62,7 @@ def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
     """When each event arrives [ns], ascending, (n,), and the events."""
     arrival: list[TimeArray] = []
     events: list[Event] = []
-    command = timeline.as_commanded(run, config.arm.update_period)
+    command = as_commanded(run, config.arm.update_period)
     for name, source in [*run.sensors.items(), ("", command)]:
         events += _events(name, source)
         arrival.append(np.maximum.accumulate(source.stamp))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 from ..errors import ConfigError
-from ..fusion.timeline import Outcome
+from ..fusion.outcome import Outcome
 from .answers import MET, LiveEstimate, Told
 from .clock import nanoseconds
 from .estimator import LiveEstimator

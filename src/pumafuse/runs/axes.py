@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray
 from ..errors import RunError
-from .clock import TOLERATED_STEP_BACK_NS, behind
+from .clock import TOLERATED_STEP_BACK_NS, behind, without_strays
 from .frames import CARTESIAN, Frame, Placed, Rotated
 from .run import Run, Source
 
@@ -19,16 +19,20 @@ S = TypeVar("S", bound=Source)
 def in_axes(run: Run, frame: Frame | None) -> tuple[Run, Placed | None]:
     """A run with every Cartesian source turned into axes; sources that name axes are taken as they are.
 
+    Stray stamps are taken for none first (:func:`pumafuse.runs.clock.without_strays`): the start level and the turns
+    that x and y leave open must not come from them.
+
     Args:
         run: The run as logged.
         frame: The frame to use where the run itself has none.
 
     Returns:
-        The run in axes, and the frame in its place; the run itself and None without a frame.
+        The run in axes, and the frame in its place; the run as it is and None without a frame.
 
     Raises:
         RunError: A source gives x without y, or names an axis both ways; or the start is not known in x and y.
     """
+    run = without_strays(run)
     frame = frame if run.frame is None else run.frame
     named = {name for source in (run.command, *run.sensors.values()) for name in source.values}
     if frame is None or named.isdisjoint(CARTESIAN):

@@ -1,22 +1,22 @@
-"""Stamps that are not what a clock should give: steps back, jumps, and jitter around a controller's own period."""
+"""Stamps that step back: how far, which of them are stray, and where a clock was set back, which cuts a run."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
 
-from ..arrays import NO_STAMP, FloatArray, IntArray, TimeArray
+from ..arrays import NO_STAMP, IntArray, TimeArray
 from ..errors import RunError
+from .defects import tell
 from .run import Run, Source
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
+_BELIEVED = 3  # rows in a row that have another time: the clock was set anew; fewer are stray
 _MOST_JUMPS = 100
-_BLOCK = 64  # commands over which the two clocks' drift is small against T
-_MOST_DRIFT = 1e-3  # two quartz clocks differ by 1e-4 at the worst
-_MOST_ASTRAY = 0.05  # share of stamps that may be more than half a period off their tick
-_LONGEST_QUEUE = 8  # commands that a stalled logger may stamp late in a row
 
 S = TypeVar("S", bound=Source)
 
@@ -26,8 +26,99 @@ def behind(stamp: TimeArray) -> TimeArray:
     return np.where(stamp == NO_STAMP, 0, np.maximum.accumulate(stamp) - stamp)
 
 
+def astray(stamp: TimeArray) -> IntArray:
+    """How far each row's stamp is from the time that the rows around it agree on [ns], (rows,); 0 unless it is stray.
+
+    One or two rows in a row are stray if the log goes on after them where it was before them. With the row before them
+    that is not stray itself, the row after them, and 1 s for "far":
+
+    - each is far ahead of both, or far behind the one before; and the row after is not far behind the one before;
+    - at the beginning of the log, where no row is before: each is far ahead of the row after;
+    - at its end, where no row is after: each is far behind the row before.
+
+    At the beginning and the end the side that tells must have at least three rows. Of one row and two, one is tried
+    first. Three in a row or more are never stray: there the clock was set anew. What is ahead and never contradicted is
+    no stray stamp but a pause. Rows without a stamp are passed over.
+    """
+    found = np.zeros(len(stamp), dtype=np.int64)
+    stamped = np.flatnonzero(stamp != NO_STAMP) if NO_STAMP in stamp else slice(None)
+    known = stamp[stamped]
+    back = np.flatnonzero(np.diff(known) < -TOLERATED_STEP_BACK_NS) + 1
+    if not len(back):
+        return found
+    apart = np.zeros(len(known), dtype=np.int64)
+    stamps: list[int] = known.tolist()
+    before, after = -1, 0  # the last row that is not stray before `after`
+    for row in np.unique(back[:, None] - [2, 1, 0]).tolist():  # nothing else can begin what ends in a step back
+        if row < after:
+            continue
+        before = before if row == after else row - 1
+        after = row + _stray_from(stamps, before, row)
+        if after > row:
+            apart[row:after] = known[row:after] - known[before if before >= 0 else after]
+    edges = np.flatnonzero(np.diff(apart != 0, prepend=False, append=False))
+    for first, end in edges.reshape(-1, 2).tolist():
+        if end - first >= _BELIEVED:
+            apart[first:end] = 0
+    found[stamped] = apart
+    return found
+
+
+def _stray_from(stamp: Sequence[int], before: int, row: int) -> int:
+    """How many rows from ``row`` on are stray: 0, 1 or 2; ``before`` is the row before them, −1 for none."""
+    far = TOLERATED_STEP_BACK_NS
+    for after in range(row + 1, min(row + _BELIEVED, len(stamp) + 1)):
+        out = stamp[row:after]
+        if before < 0:
+            found = len(stamp) - after >= _BELIEVED and min(out) > stamp[after] + far
+        elif after == len(stamp):
+            found = before + 1 >= _BELIEVED and max(out) < stamp[before] - far
+        else:
+            low, high = stamp[before] - far, max(stamp[before], stamp[after]) + far
+            found = stamp[after] >= low and all(one < low or one > high for one in out)
+        if found:
+            return after - row
+    return 0
+
+
+def without_strays(run: Run) -> Run:
+    """A run whose stray stamps (see :func:`astray`) are taken for none, with a note on each source that has any.
+
+    Their rows stay where they are and are counted as rows without a stamp: commands are not used, readings are invalid,
+    and all other rows are met as if these were not there. Rows of sensors and of the reference that are far behind keep
+    their stamps, since they disturb no other: the timeline calls them too late. Done once: what is left of stamps that
+    make no sense may look stray again.
+    """
+    if run.without_strays:
+        return run
+    notes: list[str] = []
+    command = _without_strays(run.command, run.command.label, ("ahead of", "behind"), notes)
+    sensors = {
+        name: _without_strays(source, source.told_as(name), ("ahead of",), notes)
+        for name, source in run.sensors.items()
+    }
+    reference = run.reference
+    if reference is not None:
+        reference = _without_strays(reference, reference.label, ("ahead of",), notes)
+    if not notes:
+        return run
+    notes = [*run.notes, *notes]
+    return replace(run, command=command, sensors=sensors, reference=reference, notes=tuple(notes), without_strays=True)
+
+
+def _without_strays(source: S, label: str, sides: Sequence[str], notes: list[str]) -> S:
+    apart = astray(source.stamp)
+    for side in sides:
+        rows = apart > 0 if side == "ahead of" else apart < 0
+        if rows.any():
+            what = f"a stray stamp, more than 1 s {side} the rows around: taken for none"
+            tell(notes, label, rows, what, f", by {abs(apart[rows][0]) / 1e9:.3f} s")
+            source = replace(source, stamp=np.where(rows, NO_STAMP, source.stamp))
+    return source
+
+
 def segments(run: Run) -> tuple[list[Run], list[str]]:
-    """Cut a run where the commands' clock was set back by more than 1 s.
+    """Cut a run, without its stray stamps, where the commands' clock was set back by more than 1 s.
 
     A segment is a run of its own: the arm is taken to rest at its first command again. The sensors and the reference
     must have jumped as often as the commands; a sensor that jumped alone is left to the timeline, which calls its rows
@@ -39,25 +130,32 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
     Raises:
         RunError: The commands' clock jumped and another source's did not, or it jumps all the time.
     """
+    run = without_strays(run)
     cuts = _jumps(run.command)
     if not cuts:
         return [run], []
-    for source in (*run.sensors.values(), *([] if run.reference is None else [run.reference])):
-        if len(_jumps(source)) != len(cuts):
+
+    def pieces(source: S) -> list[S]:
+        jumps = _jumps(source)
+        if len(jumps) != len(cuts):
             raise RunError(
                 f"{run.command.label}: the commands' clock is set back {len(cuts)} times (first in row {cuts[0] + 1}),"
-                f" that of {source.label} {len(_jumps(source))} times; cut the log there and fuse the parts one by one"
+                f" that of {source.label} {len(jumps)} times; cut the log there and fuse the parts one by one"
             )
+        return [source.rows(slice(*edges)) for edges in pairwise([0, *jumps, len(source.stamp)])]
+
+    sensors = {name: pieces(source) for name, source in run.sensors.items()}
+    references = [None] * (len(cuts) + 1) if run.reference is None else pieces(run.reference)
     parts = [
         replace(
             run,
-            command=_piece(run.command, index),
-            sensors={name: _piece(source, index) for name, source in run.sensors.items()},
-            reference=None if run.reference is None else _piece(run.reference, index),
+            command=command,
+            sensors={name: parts[index] for name, parts in sensors.items()},
+            reference=references[index],
             start=run.start if index == 0 else {},
             notes=run.notes if index == 0 else (),
         )
-        for index in range(len(cuts) + 1)
+        for index, command in enumerate(pieces(run.command))
     ]
     lag = behind(run.command.stamp)
     said = [
@@ -66,91 +164,6 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
         for row in cuts
     ]
     return parts, said
-
-
-def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray, str | None]:
-    """The controller's own ticks behind jittered stamps: an even grid of T fitted to them.
-
-    The grid's offset is the median of what is left. T is taken as exact unless the stamps' own slope differs from it by
-    more than 5 standard errors: then the two clocks drift apart, the slope is used and the drift told.
-
-    Args:
-        stamp: Strictly ascending stamps, int64 ns, (n,).
-        period: T [s].
-        label: The source, for messages.
-
-    Returns:
-        The stamps on the grid, (n,), and a sentence on drift and late stamps, or None.
-
-    Raises:
-        RunError: The stamps do not follow ticks of T.
-    """
-    tick = period * 1e9
-    since = (stamp - stamp[0]).astype(np.float64)
-    nearest = _nearest_ticks(since, tick)
-    ticks = _ascending(nearest)
-    slope, error = _line(ticks, since)
-    drift, note = slope / tick - 1.0, None
-    significant = len(stamp) >= _BLOCK and abs(drift) * tick > 5.0 * error and abs(drift) * tick * np.ptp(ticks) > 1.0
-    if significant and abs(drift) <= _MOST_DRIFT:
-        tick = slope
-        note = f"{label}: the log's clock runs {drift * 1e6:+.1f} ppm against the controller's; the grid follows it"
-    left = since - ticks * tick
-    offset = float(np.median(left))
-    astray = np.abs(left - offset) > 0.5 * tick
-    moved = np.flatnonzero(np.concatenate(([True], ticks == nearest, [True])))
-    queue = int(np.diff(moved).max()) - 1  # the longest row of commands that are taken to be late
-    if (significant and abs(drift) > _MOST_DRIFT) or np.mean(astray) > _MOST_ASTRAY or queue > _LONGEST_QUEUE:
-        usual = float(np.median(np.diff(stamp))) / 1e6
-        raise RunError(
-            f"{label}: clock = 'regular', but the commands do not come on ticks of {period * 1e3:g} ms (their median"
-            f" interval is {usual:.4f} ms); check update_period_ms, or use clock = 'stamps'"
-        )
-    if astray.any():
-        late = (
-            f"{label}: {int(astray.sum())} commands are stamped more than half a period late: set back to their ticks"
-        )
-        note = late if note is None else f"{note}; {late}"
-    return stamp[0] + np.rint(ticks * tick + offset).astype(np.int64), note
-
-
-def _ascending(nearest: IntArray) -> IntArray:
-    """Ticks of which no two are one: of two stamps on one tick the first was late, and moves to the tick before."""
-    order = np.arange(len(nearest))
-    return np.minimum.accumulate((nearest - order)[::-1])[::-1] + order
-
-
-def _nearest_ticks(since: FloatArray, tick: float) -> IntArray:
-    """The number of the tick nearest to each stamp, (n,).
-
-    Each stamp is rounded to the nearest tick of a phase that follows the clocks' slow drift, so that a late stamp moves
-    no other. The phase is the circular mean of the stamps over blocks, which no missing tick disturbs; over pauses it
-    is carried on with the drift seen between neighbouring blocks.
-    """
-    pauses = np.flatnonzero(np.diff(since) > _BLOCK * tick) + 1
-    edges = np.union1d(np.arange(0, len(since), _BLOCK), pauses)
-    size = np.diff(np.append(edges, len(since)))
-    turn = np.add.reduceat(np.exp(2j * np.pi * since / tick), edges)
-    phase = np.angle(turn) * tick / (2.0 * np.pi)
-    middle = np.add.reduceat(since, edges) / size
-    apart, moved = np.diff(middle), np.diff(phase)
-    moved -= np.rint(moved / tick) * tick
-    near = apart <= 2.0 * _BLOCK * tick
-    drift = float(np.median(moved[near] / apart[near])) if near.any() else 0.0
-    phase = np.unwrap(phase - drift * middle, period=tick) + drift * middle
-    block = np.repeat(np.arange(len(edges)), size)
-    return np.rint((since - phase[block] - drift * (since - middle[block])) / tick).astype(np.int64)
-
-
-def _line(ticks: IntArray, since: FloatArray) -> tuple[float, float]:
-    """Slope of the stamps over their ticks by least squares, and its standard error [ns]."""
-    if len(ticks) < 3:
-        return np.inf, np.inf
-    centred = ticks - ticks.mean()
-    weight = float(centred @ centred)
-    slope = float(centred @ since) / weight
-    left = since - since.mean() - slope * centred
-    return slope, float(np.sqrt(left @ left / (len(ticks) - 2) / weight))
 
 
 def _jumps(source: Source) -> list[int]:
@@ -167,9 +180,3 @@ def _jumps(source: Source) -> list[int]:
             raise RunError(
                 f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock"
             )
-
-
-def _piece(source: S, index: int) -> S:
-    """Segment ``index`` of a source: the rows between two of its jumps."""
-    edges = [0, *_jumps(source), len(source.stamp)]
-    return source.rows(slice(edges[index], edges[index + 1]))

@@ -1,7 +1,7 @@
 """A recorded run: commands, readings and a reference as the log has them, in SI units and file order.
 
-Nothing is mended here: stamps that repeat, step back or are missing and values that are not finite stay where they are;
-the timeline gives each of them its outcome.
+Nothing is mended here: stamps that repeat, step back, are stray or missing and values that are not finite stay where
+they are; the timeline gives each of them its outcome.
 """
 
 from __future__ import annotations
@@ -42,6 +42,10 @@ class Source:
     label: str
     spread: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
 
+    def told_as(self, name: str) -> str:
+        """What notes call it as the source of ``name``."""
+        return name if name == self.label else f"{name} ({self.label})"
+
     def rows(self: S, chosen: BoolArray | IntArray | slice) -> S:
         """The chosen rows, in the order in which they are chosen."""
         values = {axis: value[chosen] for axis, value in self.values.items()}
@@ -69,6 +73,7 @@ class Run:
         clock: Whether the commands' stamps are believed (``stamps``) or fitted by a grid of T (``regular``).
         frame: Where the log's x, y, z are in the arm's axes, for sources that give them.
         notes: What was wrong with the files, a sentence each.
+        without_strays: Whether stray stamps are taken for none already, see :func:`pumafuse.runs.clock.without_strays`.
     """
 
     name: str
@@ -79,6 +84,7 @@ class Run:
     clock: Clock = "stamps"
     frame: Frame | None = None
     notes: tuple[str, ...] = ()
+    without_strays: bool = False
 
     def __post_init__(self) -> None:
         sources = {f"sensor {name}": source for name, source in self.sensors.items()}

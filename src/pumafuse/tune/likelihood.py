@@ -24,8 +24,9 @@ from ..arrays import CodeArray, FloatArray, IntArray
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations
+from ..fusion.outcome import Outcome
 from ..fusion.ticks import usable_cores
-from ..fusion.timeline import Outcome, Timeline, build
+from ..fusion.timeline import Timeline, build
 from ..model.arm import ordered_axes
 from ..runs.axes import in_axes
 from ..runs.clock import segments

@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from ..arrays import IntArray
 from ..fusion.config import FusionConfig
-from ..fusion.timeline import AxisInput, Scalars, Timeline
+from ..fusion.scalars import Scalars
+from ..fusion.timeline import AxisInput, Timeline
 from ..model.drive import drive
 
 T = TypeVar("T", bound=np.generic)

@@ -15,8 +15,8 @@ from ..fusion.config import FusionConfig
 from ..fusion.consistency import consistency, densities_of
 from ..fusion.estimates import Estimates
 from ..fusion.offline import fuse
+from ..fusion.outcome import Outcome
 from ..fusion.score import Z95, interpolated, score
-from ..fusion.timeline import Outcome
 from ..fusion.track import AxisEstimate
 from ..runs.run import Run
 from ..units import MM

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from ..arrays import FloatArray
 from ..fusion.consistency import LAGS, consistency
 from ..fusion.estimates import Estimates
+from ..fusion.outcome import Outcome
 from ..fusion.score import Z95, interpolated
-from ..fusion.timeline import Outcome
 from ..runs.axes import in_axes
 from ..runs.run import Run
 from ..units import MM, seconds

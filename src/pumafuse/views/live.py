@@ -24,7 +24,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..errors import ConfigError
-from ..fusion.timeline import Outcome
+from ..fusion.outcome import Outcome
 from ..live.answers import MET
 from ..model.arm import CANONICAL_AXES, ordered_axes
 from ..runs.frames import CARTESIAN

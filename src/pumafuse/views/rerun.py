@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 
 from ..arrays import FloatArray
 from ..fusion.estimates import Estimates, Readings
-from ..fusion.timeline import Outcome
+from ..fusion.outcome import Outcome
 from ..model.arm import CANONICAL_AXES
 from ..runs.axes import in_axes
 from ..runs.frames import CARTESIAN

@@ -11,8 +11,8 @@ from matplotlib.ticker import FixedLocator, FormatStrFormatter, LogLocator, MaxN
 from ..arrays import FloatArray
 from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates
+from ..fusion.outcome import Outcome
 from ..fusion.score import Z95
-from ..fusion.timeline import Outcome
 from ..tune.profile import Profile
 from ..tune.summary import Fitted
 from . import style

@@ -1,0 +1,181 @@
+"""A run with stray stamps is fused as if their rows were not there, to the bit; each of them is counted and told."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.fusion.estimates import Mode
+from pumafuse.runs.frames import Cylindrical
+
+SECOND = 1_000_000_000
+ORIGIN = 1_700_000_000 * SECOND
+TICK = 28_000_000
+LATENCY = 8_000_000
+
+CONFIG = pf.FusionConfig(
+    arm=pf.ArmModel.load("puma560-internal"),
+    sensors={"tracker": pf.Sensor(sd=5e-5, latency=LATENCY / SECOND), "camera": pf.Sensor(sd=1e-3, bias_sd=0.1)},
+)
+MODES: dict[Mode, dict[str, bool]] = {"filtered": {}, "as-live": {"as_live": True}, "smoothed": {"smooth": True}}
+
+Stray = tuple[str, int, float]  # source, the row before which it stands, and by how many seconds it is off
+
+
+def recorded(strays: Sequence[Stray] = (), frame: Cylindrical | None = None, **more: Any) -> pf.Run:
+    """Three seconds of commands, two sensors and a truth, with rows whose stamps are off by as much as is asked for."""
+    rng = np.random.default_rng(7)
+    stamps = {
+        "command": ORIGIN + TICK * np.arange(108),
+        "tracker": ORIGIN + 10_000_000 * np.arange(1, 300),
+        "camera": ORIGIN + 90_000_000 * np.arange(1, 33),
+        "reference": ORIGIN + 20_000_000 * np.arange(150),
+    }
+    sources: dict[str, tuple[np.ndarray, Mapping[str, np.ndarray]]] = {}
+    for name, own in stamps.items():
+        stamp = own
+        turn = 0.2 * np.sin((stamp - ORIGIN) / SECOND)
+        values = {"x": 0.56 * np.cos(turn), "y": 0.56 * np.sin(turn)} if frame else {"radial": 0.56 + 0.1 * turn}
+        noise = {"tracker": 5e-5, "camera": 1e-3}.get(name, 0.0)
+        values = {axis: value + noise * rng.standard_normal(len(stamp)) for axis, value in values.items()}
+        for source, row, off in reversed(strays):
+            if source == name:
+                stamp = np.insert(stamp, row, own[min(row, len(own) - 1)] + round(off * SECOND))
+                values = {axis: np.insert(value, row, 0.5) for axis, value in values.items()}
+        sources[name] = (stamp, values)
+    reference, command = sources.pop("reference"), sources.pop("command")
+    return pf.Run.from_arrays(*command, sources, reference, frame=frame, **more)
+
+
+def fused(run: pf.Run, **more: Any) -> pf.Estimates:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        return pf.fuse(run, CONFIG, **more)
+
+
+def assert_same(got: pf.Estimates, wanted: pf.Estimates) -> None:
+    """Every estimate, every met scalar, the biases and the truth are equal to the bit."""
+    assert (got.origin, got.last_command, got.speed, got.radius) == (
+        wanted.origin, wanted.last_command, wanted.speed, wanted.radius
+    )  # fmt: skip
+    np.testing.assert_array_equal(got.time, wanted.time)
+    np.testing.assert_array_equal(got.segment, wanted.segment)
+    assert got.axes.keys() == wanted.axes.keys()
+    for axis in wanted.axes:
+        for field in pf.AxisEstimate.FIELDS:
+            np.testing.assert_array_equal(getattr(got[axis], field), getattr(wanted[axis], field), err_msg=field)
+    assert got.biases == wanted.biases
+    met = [est.readings.where(np.isfinite(est.readings.innovation)) for est in (got, wanted)]
+    for field in pf.Readings.ARRAYS:
+        np.testing.assert_array_equal(getattr(met[0], field), getattr(met[1], field), err_msg=field)
+    assert got.reference is not None
+    assert wanted.reference is not None
+    for axis in wanted.axes:
+        np.testing.assert_array_equal(got.reference.position[axis], wanted.reference.position[axis])
+
+
+CASES: dict[str, tuple[list[Stray], list[str]]] = {
+    "a command ahead": ([("command", 50, 3600.0)], ["command: 1 row has a stray stamp, more than 1 s ahead", "row 51"]),
+    "a command a little ahead": ([("command", 50, 1.1)], ["command: 1 row", "(first: row 51, by 1.128 s)"]),
+    "a command back": ([("command", 50, -3600.0)], ["command: 1 row has a stray stamp, more than 1 s behind"]),
+    "the first command ahead": ([("command", 0, 100.0)], ["(first: row 1, by 100.000 s)"]),
+    "the last command back": ([("command", 108, -100.0)], ["(first: row 109, by 100.000 s)"]),
+    "two commands in a row ahead": ([("command", 50, 9.0), ("command", 50, 12.0)], ["command: 2 rows have"]),
+    "two commands, apart": ([("command", 50, 9.0), ("command", 90, -12.0)], ["more than 1 s ahead", "1 s behind"]),
+    "a reading ahead": ([("tracker", 80, 40.0)], ["tracker: 1 row has a stray stamp", "(first: row 81, by 40.010 s)"]),
+    "the first reading ahead": ([("tracker", 0, 40.0)], ["tracker: 1 row", "row 1"]),
+    "two readings in a row ahead": ([("camera", 9, 4.0), ("camera", 9, 9.0)], ["camera: 2 rows have", "row 10"]),
+    "readings of both sensors": ([("tracker", 200, 4.0), ("camera", 9, 9.0)], ["tracker: 1 row", "camera: 1 row"]),
+    "the truth ahead": ([("reference", 60, 40.0)], ["reference: 1 row has a stray stamp"]),
+    "all at once": ([(name, 20, 77.0) for name in ("command", "tracker", "camera", "reference")], ["command: 1 row"]),
+}
+
+
+@pytest.mark.parametrize("framed", [False, True])
+@pytest.mark.parametrize("case", CASES)
+def test_a_stray_row_changes_no_estimate_and_is_told(case: str, framed: bool) -> None:
+    """The run goes on as if the row had not been there; a note names the source, the row and by how much it is off."""
+    strays, words = CASES[case]
+    frame = Cylindrical() if framed else None
+    got, wanted = fused(recorded(strays, frame)), fused(recorded(frame=frame))
+    assert_same(got, wanted)
+    for word in words:
+        assert any(word in note for note in got.notes), (word, got.notes)
+    assert not any("stray" in note for note in wanted.notes)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("engine", ["compiled", "filterpy"])
+def test_stray_rows_change_no_estimate_in_any_mode_of_either_engine(mode: Mode, engine: str) -> None:
+    """Filtered, as live and smoothed, by both engines."""
+    strays = [("command", 50, 9.0), ("tracker", 0, 40.0), ("tracker", 80, 40.0), ("camera", 5, 5.0)]
+    more = {**MODES[mode], "engine": engine}
+    assert_same(fused(recorded(strays), **more), fused(recorded(), **more))
+
+
+def test_stray_rows_change_no_estimate_on_a_grid_of_ticks() -> None:
+    """The controller's own ticks are fitted to the stamps that are believed."""
+    strays = [("command", 0, 3600.0), ("command", 50, 9.0), ("command", 108, -9.0)]
+    assert_same(fused(recorded(strays, clock="regular")), fused(recorded(clock="regular")))
+
+
+def test_every_row_is_in_the_counts() -> None:
+    """A stray reading is invalid, one that is far behind too late: none of the rows is lost, no other is touched."""
+    strays = [("tracker", 80, 40.0), ("tracker", 120, -40.0), ("tracker", 160, 40.0), ("tracker", 160, 50.0)]
+    tracker = fused(recorded(strays)).readings.of("tracker", "radial")
+    assert tracker.counts() == {"fused": 299, "too_late": 1, "invalid": 3}
+    assert len(tracker.value) == 303
+
+
+def test_three_readings_in_a_row_are_no_stray() -> None:
+    """A sensor whose clock stays ahead for three rows is believed: what comes after is too late, as ever."""
+    strays = [("tracker", 80, 40.0 + k) for k in range(3)]
+    counts = fused(recorded(strays)).readings.of("tracker", "radial").counts()
+    assert counts["too_late"] == 299 - 80
+    assert "invalid" not in counts
+
+
+def test_three_commands_in_a_row_are_a_clock_that_is_set_back() -> None:
+    """They and what follows are two segments if the sensors agree, and refused if they do not."""
+    with pytest.raises(pf.RunError, match=r"set back 1 times \(first in row 54\)"):
+        fused(recorded([("command", 50, 40.0 + k) for k in range(3)]))
+
+
+def test_a_command_after_a_pause_is_no_stray() -> None:
+    """Nothing contradicts a last command that is far ahead: everything had paused."""
+    run = recorded([("command", 108, 40.0)])
+    est = fused(run)
+    assert est.last_command == pytest.approx(107 * 0.028 + 40.0)
+    assert not any("stray" in note for note in est.notes)
+
+
+def test_a_clock_that_is_set_back_is_a_segment_with_or_without_strays() -> None:
+    """The log of a controller that starts again: the same two segments, whatever single stamps do."""
+
+    def twice(strays: Sequence[Stray]) -> pf.Run:
+        one, other = recorded(strays), recorded(strays[:1])
+        sensors = {
+            name: (
+                np.concatenate([source.stamp + 500 * SECOND, other.sensors[name].stamp]),
+                {"radial": np.concatenate([source.values["radial"], other.sensors[name].values["radial"]])},
+            )
+            for name, source in one.sensors.items()
+        }
+        stamp = np.concatenate([one.command.stamp + 500 * SECOND, other.command.stamp])
+        values = np.concatenate([one.command.values["radial"], other.command.values["radial"]])
+        truth = [(part.reference.stamp, part.reference.values["radial"]) for part in (one, other) if part.reference]
+        reference = (
+            np.concatenate([truth[0][0] + 500 * SECOND, truth[1][0]]),
+            {"radial": np.concatenate([truth[0][1], truth[1][1]])},
+        )
+        return pf.Run.from_arrays(stamp, {"radial": values}, sensors, reference)
+
+    got, wanted = fused(twice([("command", 50, 9.0), ("tracker", 80, 40.0)])), fused(twice([]))
+    assert wanted.segment.max() == 1
+    assert_same(got, wanted)
+    assert sum("new segment" in note for note in got.notes) == 1
