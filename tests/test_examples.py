@@ -18,6 +18,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 SECONDS = "1.5"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("language", ["python", "c"])
 def test_commands_and_readings_are_fused(tmp_path: Path, language: str) -> None:
     """A second and a half of both loops at their own pace: every datagram is taken, the readings are fused."""

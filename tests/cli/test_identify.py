@@ -230,6 +230,7 @@ def test_an_axis_with_too_few_trials_gets_no_model(tmp_path: Path) -> None:
     assert pf.ArmModel.load(tmp_path / "arm.toml").axes.keys() == {"radial"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("how", "header"), [("none", "trial,axis,step_mm,note\n"), ("two", "")])
 def test_a_period_that_is_not_told_must_be_given(how: str, header: str, tmp_path: Path) -> None:
     """No speeds, or speeds that disagree: one line; with --period it is done, and K is against step over period."""

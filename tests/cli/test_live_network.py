@@ -93,6 +93,7 @@ def test_a_server_that_is_connected_to(data, scan) -> None:
     assert "the connection has ended; made again in 0.5 s" in told
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [

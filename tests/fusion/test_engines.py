@@ -110,6 +110,7 @@ def test_both_engines_make_the_same_of_a_run(case: Case, mode: str) -> None:
     agree(*both(run, config, mode, case.rate))
 
 
+@pytest.mark.long
 @settings(derandomize=True, deadline=None, max_examples=40)
 @given(cases(), mode_names)
 def test_both_engines_make_the_same_of_any_run_of_the_oracle(case: Case, mode: str) -> None:

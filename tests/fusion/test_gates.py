@@ -329,6 +329,7 @@ def logs(draw: st.DrawFn) -> tuple[list[Row], dict[str, Sensor]]:
     return found, sensors
 
 
+@pytest.mark.long
 @settings(derandomize=True, deadline=None, max_examples=150)
 @given(logs(), st.booleans())
 def test_any_log_is_gated_as_the_design_says(log: tuple[list[Row], dict[str, Sensor]], as_live: bool) -> None:

@@ -136,6 +136,7 @@ def transitions(draw: st.DrawFn) -> tuple[float, float, float]:
     return omega, zeta, min(max(t, 1e-9), 1e5)
 
 
+@pytest.mark.long
 @settings(derandomize=True, deadline=None, max_examples=1500)
 @given(transitions())
 @example((9997.97309637579, 0.999999999998836, 147.78737883089568))

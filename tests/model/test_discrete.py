@@ -172,6 +172,7 @@ def test_transition_is_exact_everywhere(omega: float, damping: float, interval: 
     assert_transition(SecondOrder(natural_frequency=10.0**omega, damping=10.0**damping), 10.0**interval)
 
 
+@pytest.mark.long
 @settings(derandomize=True, deadline=None, max_examples=100)
 @given(plant=plants, interval=st.floats(1e-6, 10.0), share=st.floats(0.0, 1.0))
 def test_splitting_an_interval_changes_nothing(plant: Plant, interval: float, share: float) -> None:

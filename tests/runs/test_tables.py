@@ -420,6 +420,7 @@ def test_an_unsigned_stamp_beyond_reach_is_refused(tmp_path: Path, value: int) -
     assert "'t_ns'" in refusal(lambda: written(tmp_path, t_ns=pa.array([value], pa.uint64())).stamps("t_ns"))
 
 
+@pytest.mark.long
 def test_only_pumafuse_errors_come_out_of_a_mangled_file(tmp_path: Path) -> None:
     """Whatever happens to the text of a log on its way, reading it works or fails with one line."""
     rng, sane = random.Random(1), "t_s,x_mm\n" + "".join(f"{row / 100},{row}\n" for row in range(30))
