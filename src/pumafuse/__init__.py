@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .fusion.offline import fuse
     from .fusion.outcome import Outcome
     from .fusion.score import Score, score
+    from .fusion.summary import Summary, summarise
     from .fusion.ticks import TickEstimates, filter_ticks, smooth_ticks, tick_likelihood
     from .fusion.track import AxisEstimate
     from .identify.identify import Identification, identify
@@ -64,6 +65,7 @@ _HOME = {
     "Simulated": "simulate.simulate",
     "Start": "fusion.config",
     "StepTrials": "identify.trials",
+    "Summary": "fusion.summary",
     "TickEstimates": "fusion.ticks",
     "Told": "live.answers",
     "TrialsError": "identify.trials",
@@ -78,6 +80,7 @@ _HOME = {
     "score": "fusion.score",
     "simulate": "simulate.simulate",
     "smooth_ticks": "fusion.ticks",
+    "summarise": "fusion.summary",
     "tick_likelihood": "fusion.ticks",
     "to_rerun": "views.rerun",
     "tune": "tune.tune",
@@ -115,6 +118,7 @@ __all__ = [
     "Simulated",
     "Start",
     "StepTrials",
+    "Summary",
     "TickEstimates",
     "Told",
     "TrialsError",
@@ -129,6 +133,7 @@ __all__ = [
     "score",
     "simulate",
     "smooth_ticks",
+    "summarise",
     "tick_likelihood",
     "to_rerun",
     "tune",

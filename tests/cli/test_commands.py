@@ -1,6 +1,7 @@
 """The real executable on real files."""
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -116,6 +117,22 @@ def test_several_runs_get_a_folder_each_and_a_failure_stops_no_other(tmp_path: P
     assert "none: no such file" in done.stderr
     assert "1 of 2 runs failed" in done.stderr
     assert (tmp_path / "out" / "scan1" / "summary.json").exists()
+
+
+def test_runs_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    """Two copies of a run that call themselves scan1: the table names where each result is."""
+    for name in ("before", "after"):
+        shutil.copytree(SCAN, tmp_path / name)
+    runs = (tmp_path / "before", tmp_path / "after")
+    done = pumafuse("fuse", *runs, "-c", FUSION, "-o", tmp_path / "out", "--sensors", "range")
+    lines = [line.split()[0] for line in done.stdout.splitlines() if " radial " in line]
+    assert lines == ["before", "after", "all"]
+
+
+def test_the_module_is_the_command() -> None:
+    """`python -m pumafuse` says what `pumafuse` says."""
+    words = [sys.executable, "-m", "pumafuse", "--version"]
+    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == pumafuse("--version").stdout
 
 
 def test_an_existing_folder_is_replaced_only_with_force(demo: Path) -> None:

@@ -8,6 +8,7 @@ say which.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -273,3 +274,24 @@ def test_half_the_noise_blames_sd_first():
         assert found.correlation[0] < 0.0
         assert "the process noise too small" not in found.verdict
         assert "sd_mm" in found.verdict
+
+
+@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+def test_a_verdict_on_what_a_gate_has_left_says_so(moving: pf.Run) -> None:
+    """Told a third of the noise and a gate of 2, what is left fits by selection: how many were gated is the verdict."""
+    for axis, found in judged(moving, World(sd=0.17e-3, gate=2.0)).items():
+        assert re.search(r"but \d\d% were gated", found.verdict), (axis, found.verdict)
+
+
+def test_innovations_are_looked_at_beyond_the_next_one(moving: pf.Run) -> None:
+    """Each like the third before it (w + 0.5 w₋₃ has a correlation of 0.4 there): not white, and the lag is named."""
+    world = World()
+    est = pf.fuse(moving, world.config(moving))
+    noise = np.random.default_rng(3).standard_normal(len(est.readings.value) + 3)
+    coloured = (noise[3:] + 0.5 * noise[:-3]) / math.sqrt(1.25)
+    order = np.lexsort((est.readings.time, est.readings.axis))
+    innovation = np.empty(len(order))
+    innovation[order] = coloured * est.readings.innovation_sd[order]
+    spoilt = replace(est, readings=replace(est.readings, innovation=innovation))
+    found = [consistency(spoilt, "camera", axis) for axis in est.axes]
+    assert found and all(re.search(r"not white \(lag 3: \+0\.[345]", one.verdict) for one in found if one)

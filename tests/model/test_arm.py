@@ -306,6 +306,7 @@ def test_validity_says_by_how_much() -> None:
     ("limits", "speed", "radius", "passed"),
     [
         (LIMITS, 0.5, 0.7, 0),
+        (LIMITS, 0.5001, 0.7, 0),
         (LIMITS, 0.51, 0.7, 1),
         (LIMITS, 0.5, 0.701, 1),
         (LIMITS, 0.51, None, 1),
@@ -314,7 +315,7 @@ def test_validity_says_by_how_much() -> None:
     ],
 )
 def test_validity_counts_only_what_is_passed(limits: Validity, speed: float, radius: float | None, passed: int) -> None:
-    """At a limit is within it; a limit that is absent, or a radius that is not known, is not checked."""
+    """At a limit, or past it by less than is shown, is within it; absent limits and an unknown radius are no limits."""
     assert len(limits.excess(speed, radius)) == passed
 
 

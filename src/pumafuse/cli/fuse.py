@@ -61,7 +61,8 @@ def run(runs: Sequence[Path], options: Options) -> None:
     }
     done, failed = each("fusing", jobs, places)
     if done:
-        console().print(runs_table(list(done.values())))
+        names = dict(zip(jobs, (place.name for place in places), strict=True))
+        console().print(runs_table({names[path]: summary for path, summary in done.items()}))
         console(soft_wrap=True).print(f"written to {options.output}", markup=False)
     tell(failed, len(jobs), str(options.output))
 

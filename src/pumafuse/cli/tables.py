@@ -66,17 +66,18 @@ def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Ta
     return table
 
 
-def runs_table(summaries: Sequence[Summary]) -> Table:
-    """Many runs: a line for each run and axis of a few, and for each axis all of them together."""
+def runs_table(results: Mapping[str, Summary]) -> Table:
+    """Many results by name: a line for each of a few and its axes, and for each axis all of them together."""
+    summaries = list(results.values())
     table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("run", overflow="fold")
+    table.add_column("result", overflow="fold")
     table.add_column("axis")
     for heading in ("RMSE, mm", "worst, mm", "95 % cover", "NEES", "NIS", "fused", "gated", "notes"):
         table.add_column(heading, justify="right")
     if len(summaries) <= _FEW_RUNS:
-        for summary in summaries:
+        for name, summary in results.items():
             for axis in summary.axes:
-                table.add_row(escape(summary.run), escape(axis), *_pooled([summary], axis))
+                table.add_row(escape(name), escape(axis), *_pooled([summary], axis))
         table.add_section()
     for axis in dict.fromkeys(axis for summary in summaries for axis in summary.axes):
         having = [summary for summary in summaries if axis in summary.axes]

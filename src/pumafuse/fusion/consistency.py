@@ -24,7 +24,8 @@ _FEW = 30  # scalars below which nothing is said
 _FROZEN = 10  # equal values in a row of a sensor with noise
 _WIDEST = 1e6  # prior over noise up to which error bars are held to
 _NEVER = 1e-6  # expected number below which something does not happen by chance
-_NOTABLE = 0.1  # mean lag-1 correlation below which whiteness is beside the point, however significant
+_NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
+_MANY_GATED = 0.1  # share of gated scalars beyond which those that are left say little
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,8 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
         return None
     correlation, whiteness = ljung_box(fused.innovation / fused.innovation_sd)
     nis, band = float(np.mean(fused.nis)), chi_square_band(count)
-    verdict = _verdict(est, axis, fused, nis, band, correlation, whiteness)
+    gated = 1.0 - count / np.count_nonzero(readings.outcome <= Outcome.REOPENED)
+    verdict = _verdict(est, axis, fused, nis, band, correlation, whiteness, gated)
     return Consistency(count, nis, band, correlation, whiteness, verdict)
 
 
@@ -129,8 +131,9 @@ def troubles(est: Estimates) -> list[str]:
             continue
         reopened = len(np.unique(time[outcome == Outcome.REOPENED]))
         if reopened:
+            times = "once" if reopened == 1 else f"{reopened} times"
             found.append(
-                f"{name}: its gate reopened {reopened} times after half a second of rejections: it"
+                f"{name}: its gate reopened {times} after half a second of rejections: it"
                 " contradicts the others or the model; if it is off by a constant, give it bias_sd_mm"
             )
         if counts.get(Outcome.BEFORE_START.word, 0) > 0.5 * total:
@@ -143,7 +146,7 @@ def troubles(est: Estimates) -> list[str]:
             )
         elif float(np.mean(time > est.last_command + 1.0)) > 0.5:
             found.append(f"{name}: most readings lie after the last command: are both stamped by one clock?")
-        if counts.get(Outcome.GATED.word, 0) > 0.1 * total:
+        if counts.get(Outcome.GATED.word, 0) > _MANY_GATED * total:
             share = counts[Outcome.GATED.word] / total
             found.append(
                 f"{name}: {share:.0%} of its scalars were gated: sd_mm, latency_ms or the process noise too small"
@@ -195,11 +198,14 @@ def _verdict(
     band: tuple[float, float],
     correlation: FloatArray,
     whiteness: float,
+    gated: float,
 ) -> str:
     if len(fused.value) < _FEW:
         return f"too few readings ({len(fused.value)}) to tell"
     said = f"NIS {nis:.2f}, expected {band[0]:.2f} to {band[1]:.2f}"
-    first = float(correlation[0])
+    if gated > _MANY_GATED:  # what is left has been chosen to fit
+        return f"{said}, but {gated:.0%} were gated: sd_mm, latency_ms or the process noise too small"
+    first, strongest = float(correlation[0]), int(np.argmax(np.abs(correlation)))
     coloured = whiteness < 0.01 and abs(first) > _NOTABLE
     if nis > band[1]:
         if coloured and _follows_velocity(est, axis, fused):
@@ -213,8 +219,8 @@ def _verdict(
         if coloured and first < 0.0:
             return f"{said}, one innovation against the next: the process noise too large"
         return f"{said}: sd_mm or the process noise too large"
-    if coloured:
-        return f"{said}: consistent in size, but not white (lag 1: {first:+.2f})"
+    if whiteness < 0.01 and abs(correlation[strongest]) > _NOTABLE:
+        return f"{said}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
     return f"{said}: consistent"
 
 

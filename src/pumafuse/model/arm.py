@@ -17,6 +17,7 @@ from .plants import PLANTS, Delay, Interval, Positive
 from .presets import PRESETS
 
 CANONICAL_AXES = ("tangential", "radial", "vertical")
+_PASSED = 1.005  # share of a limit from which two decimals show that it is passed
 
 
 class Gain(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -73,7 +74,7 @@ class Validity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def excess(self, speed: float, radius: float | None) -> list[str]:
         """One sentence for each limit that the highest commanded ``speed`` [m/s] or ``radius`` [m] passes."""
         found: list[str] = []
-        if self.max_speed is not None and speed > self.max_speed:
+        if self.max_speed is not None and speed > self.max_speed * _PASSED:
             found.append(
                 f"commanded speed reaches {speed:.3g} m/s, {speed / self.max_speed:.2f} times the"
                 f" {self.max_speed:g} m/s that the arm model is valid for"

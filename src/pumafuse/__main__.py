@@ -1,0 +1,5 @@
+"""`python -m pumafuse`, the same as `pumafuse`."""
+
+from .cli.main import main
+
+main()
