@@ -13,6 +13,7 @@ from posixpath import normpath
 from click import Context
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
 from typer.cli import get_docs_for_click
@@ -27,13 +28,14 @@ _LINK = re.compile(r"(?<=\]\()([^)#:\s]+)(?=[)#])")  # of Markdown, to a file
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
+@event_priority(50)  # before the plugin that makes pages of notebooks
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add what lies elsewhere in the repository; a page's place there is kept in its file."""
     for source, place in PAGES.items():
         files.append(File.generated(config, place, abs_src_path=str(ROOT / source)))
     for pattern in ("notebooks/*.ipynb", "examples/**/*.*", "scenarios/*"):
         for path in sorted(ROOT.glob(pattern)):
-            files.append(File.generated(config, str(path.relative_to(ROOT)), abs_src_path=str(path)))
+            files.append(File(str(path.relative_to(ROOT)), str(ROOT), config.site_dir, config.use_directory_urls))
     for file in files:
         if file.src_uri.endswith(".py") and not file.src_uri.startswith("examples/"):
             file.inclusion = InclusionLevel.EXCLUDED
