@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 import msgspec
 import tomli_w
@@ -19,6 +19,10 @@ from .errors import ConfigError, PumafuseError, suggestion
 from .units import from_si, to_si
 
 S = TypeVar("S", bound=msgspec.Struct)
+
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+Interval = tuple[float, float]  # its lower and its upper end
 
 
 def read(path: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from pumafuse import FirstOrder, SecondOrder
 from pumafuse.identify.fit import StepFit, fit_steps, flags
 from pumafuse.identify.trials import StepTrials, Trial
-from pumafuse.model.response import unit_response
+from pumafuse.model.unit_response import unit_response
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 TIMES = np.arange(60) * 0.00563  # s, the paper's oscilloscope

@@ -17,7 +17,7 @@ from pumafuse.identify.joint import JointFit, fit_together
 from pumafuse.identify.paper import onset
 from pumafuse.identify.rows import Rows
 from pumafuse.identify.trials import Trial
-from pumafuse.model.response import unit_response
+from pumafuse.model.unit_response import unit_response
 
 TIMES = np.arange(60) * 0.00563  # s, the paper's oscilloscope
 FIRST, SWINGING, DAMPED = (0.04, 0.0), (2 * 0.864 / 53.9, 53.9**-2), (0.06, 4e-4)

@@ -11,7 +11,7 @@ import pumafuse as pf
 from pumafuse.identify.fit import StepFit
 from pumafuse.identify.paper import fit_as_published, minimised, onset, sensitivities
 from pumafuse.identify.trials import Trial
-from pumafuse.model.response import unit_response
+from pumafuse.model.unit_response import unit_response
 
 TIMES = np.arange(60) * 0.00563  # s
 SWINGING = (2 * 0.864 / 53.9, 53.9**-2)

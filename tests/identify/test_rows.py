@@ -13,7 +13,7 @@ from scipy.signal import lti
 
 from pumafuse.identify.rows import Rows, window
 from pumafuse.identify.trials import Trial
-from pumafuse.model.response import unit_response
+from pumafuse.model.unit_response import unit_response
 
 STEPS = (0.008, -0.004, 0.002, 0.012)
 LENGTHS = (60, 41, 73, 25)

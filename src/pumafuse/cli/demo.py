@@ -25,8 +25,8 @@ def run(output: Path, force: bool) -> None:
     out = console(soft_wrap=True)
     out.print(
         "A 60 s scan of a panel by a PUMA 560 (simulated with masses, friction, elastic joints and servos of which the"
-        " filter knows\nnothing): a command every 28 ms, a camera (0.5 mm noise, 45 ms late, dropouts and outliers), and a"
-        " truth to score against\nthat the filter never sees.\n"
+        " filter knows\nnothing): a command every 28 ms, a camera (0.5 mm noise, 45 ms late, dropouts and outliers),"
+        " and a truth to score against\nthat the filter never sees.\n"
     )
     with as_file(files("pumafuse") / "data") as data:
         recorded, config = Run.read(data / "scan1"), FusionConfig.load(data / "fusion.toml")

@@ -13,9 +13,9 @@ import msgspec
 from .. import toml
 from ..errors import ConfigError, UnknownNameError
 from ..model.arm import ArmModel
-from ..model.plants import NotNegative, Positive
 from ..model.presets import PRESETS
 from ..runs.frames import Frame
+from ..toml import NotNegative, Positive
 from ..units import refuse_unit
 
 _LONGEST_LATENCY = 3600.0  # s

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from ..arrays import FloatArray
-from ..model.plants import Interval
+from ..toml import Interval
 
 if TYPE_CHECKING:
     from statsmodels.regression.linear_model import RegressionResults

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import FloatArray
-from ..model.plants import PLANTS, FirstOrder, Interval, SecondOrder
-from ..model.response import unit_response
+from ..model.plants import PLANTS, FirstOrder, SecondOrder
+from ..model.unit_response import unit_response
+from ..toml import Interval
 from .estimate import t_quantile
 from .rows import Order, Rows, window
 from .trials import Trial

@@ -12,7 +12,8 @@ import numpy as np
 from .. import units
 from ..arrays import FloatArray
 from ..model.arm import ArmModel
-from ..model.plants import FirstOrder, Interval, SecondOrder
+from ..model.plants import FirstOrder, SecondOrder
+from ..toml import Interval
 from . import anova
 from .combine import Combination, CombinedAxis, Fitted, combine, combined_rms, usual_gain
 from .estimate import common

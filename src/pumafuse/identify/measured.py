@@ -10,7 +10,7 @@ import numpy as np
 from ..arrays import FloatArray, TimeArray
 from ..model.arm import AxisModel, commanded_speed
 from ..model.drive import drive
-from ..model.respond import respond
+from ..model.forced_response import forced_response
 
 _SPIKE = 8.0  # robust standard deviations
 
@@ -97,4 +97,4 @@ class Commands:
     def moved(self, axis: AxisModel, delay: float, start: float, time: TimeArray) -> FloatArray:
         """Where the axis is at ``time`` [ns], relative to ``start`` [m], (n,)."""
         driven = drive(axis, self.time, self.value, start, self.period)
-        return respond(axis.plant, driven.time + round(delay * 1e9), driven.value, time)
+        return forced_response(axis.plant, driven.time + round(delay * 1e9), driven.value, time)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..arrays import FloatArray
-from ..model.response import unit_response
+from ..model.unit_response import unit_response
 from .fit import Shape, StepFit, inverse, reached, sensitivity
 from .rows import Order, window
 from .trials import Trial

@@ -12,8 +12,9 @@ import numpy as np
 from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError, suggestion
+from ..toml import Interval, Positive
 from ..units import MM, refuse_unit
-from .plants import PLANTS, Delay, Interval, Positive
+from .plants import PLANTS, Delay
 from .presets import PRESETS
 
 CANONICAL_AXES = ("tangential", "radial", "vertical")

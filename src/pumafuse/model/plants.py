@@ -13,15 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import FloatArray
-from .response import unit_response
+from ..toml import Interval, Positive
+from .unit_response import unit_response
 
 if TYPE_CHECKING:
     import control
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Delay = Annotated[float, msgspec.Meta(ge=0, le=1e6)]  # s
-Interval = tuple[float, float]
 
 
 class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid_unknown_fields=True):

@@ -9,7 +9,7 @@ import msgspec
 
 from .. import toml
 from ..errors import ConfigError
-from ..model.plants import NotNegative
+from ..toml import NotNegative
 from ..units import LENGTHS, ending
 from .frames import Frame
 

@@ -13,11 +13,11 @@ from .. import toml, units
 from ..errors import ConfigError, PumafuseError, UnknownNameError
 from ..fusion.config import FusionConfig, Process, by_axis, load_arm
 from ..model.arm import ArmModel
-from ..model.plants import NotNegative
 from ..runs import save
 from ..runs.frames import CARTESIAN, Frame
 from ..runs.manifest import axis_of
 from ..runs.run import Clock
+from ..toml import NotNegative
 from .lattice import LATTICE
 from .trajectory import TRAJECTORIES, PathFromFile, Steps
 from .true_arm import TrueArm, TrueAxis

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..arrays import FloatArray, IntArray
 from ..errors import ConfigError
-from ..model.plants import NotNegative, Positive
 from ..runs import tables
+from ..toml import NotNegative, Positive
 from ..units import seconds
 
 _MOST_TICKS = 200_000  # 93 minutes at 28 ms; a gigabyte of work

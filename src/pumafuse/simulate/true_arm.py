@@ -11,7 +11,8 @@ from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError
 from ..model.arm import AxisModel, Gain
-from ..model.plants import PLANTS, FirstOrder, NotNegative, Positive, SecondOrder
+from ..model.plants import PLANTS, FirstOrder, SecondOrder
+from ..toml import NotNegative, Positive
 
 
 class GainCurve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

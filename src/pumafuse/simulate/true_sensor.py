@@ -7,7 +7,7 @@ from typing import Annotated, Any, TypeAlias
 
 import msgspec
 
-from ..model.plants import NotNegative, Positive
+from ..toml import NotNegative, Positive
 
 Share: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1)]
 PerAxis: TypeAlias = float | dict[str, float]

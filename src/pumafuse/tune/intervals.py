@@ -12,7 +12,7 @@ from ..arrays import CodeArray, FloatArray
 from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..fusion.ticks import usable_cores
-from ..model.plants import Interval
+from ..toml import Interval
 from .climb import Point, climb, point, slopes
 from .diagnose import at_bound, covariance
 from .likelihood import Evidence

@@ -10,7 +10,8 @@ import numpy as np
 from ..identify.anova import Level
 from ..identify.estimate import Estimate
 from ..model.arm import Gain
-from ..model.plants import PLANTS, FirstOrder, Interval
+from ..model.plants import PLANTS, FirstOrder
+from ..toml import Interval
 from ..units import MM, MS
 
 if TYPE_CHECKING:

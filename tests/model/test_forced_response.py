@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 
 from pumafuse import FirstOrder, SecondOrder
 from pumafuse.arrays import FloatArray, TimeArray
+from pumafuse.model.forced_response import forced_response
 from pumafuse.model.plants import PLANTS
-from pumafuse.model.respond import respond
 
 EPOCH = 1_790_000_000_000_000_000  # ns: stamps of a logger in 2026, too large for a float to hold
 KNOWN: dict[str, PLANTS] = {
@@ -45,7 +45,7 @@ def test_inputs_superpose(plant: PLANTS, seed: int, commands: int, times: int) -
     acting = EPOCH + np.sort(rng.integers(0, 2 * 10**9, commands))
     time = EPOCH + np.sort(rng.integers(-(10**8), 3 * 10**9, times))
     value = rng.normal(0.0, 0.01, commands)
-    found = respond(plant, acting, value, time)
+    found = forced_response(plant, acting, value, time)
     assert found.shape == (times,)
     np.testing.assert_allclose(found, superposed(plant, acting, value, time), rtol=0.0, atol=1e-14)
 
@@ -70,7 +70,7 @@ def test_the_plants_equation_is_solved(name: str) -> None:
         )  # fmt: skip
         expected[here] = (C @ solved.y)[0, :-1]
         state = solved.y[:, -1]
-    np.testing.assert_allclose(respond(plant, acting, value, time), expected, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(forced_response(plant, acting, value, time), expected, rtol=0.0, atol=1e-10)
 
 
 @pytest.mark.parametrize("name", KNOWN)
@@ -80,10 +80,10 @@ def test_at_the_instant_of_an_input_it_has_moved_nothing_yet(name: str) -> None:
     acting = np.array([0, 30, 70], dtype=np.int64) * 10**6
     value = np.array([1.0, -2.0, 0.5])
     for at in (0, 1, 2):
-        found = respond(plant, acting, value, acting[at : at + 1])
+        found = forced_response(plant, acting, value, acting[at : at + 1])
         without = superposed(plant, acting[:at], value[:at], acting[at : at + 1])
         np.testing.assert_allclose(found, without, rtol=0.0, atol=1e-14)
-    soon = respond(plant, acting, value, np.array([10**5]))[0]
+    soon = forced_response(plant, acting, value, np.array([10**5]))[0]
     assert soon == pytest.approx(float(plant.step_response(1e-4)), abs=1e-15)
     assert soon > 0.0
 
@@ -92,8 +92,8 @@ def test_at_the_instant_of_an_input_it_has_moved_nothing_yet(name: str) -> None:
 def test_of_two_inputs_at_one_instant_the_later_one_counts(name: str) -> None:
     """As if the first had not been."""
     time = np.arange(0, 200, 7) * 10**6
-    twice = respond(KNOWN[name], np.array([10, 10, 50]) * 10**6, np.array([9.0, 1.0, 2.0]), time)
-    once = respond(KNOWN[name], np.array([10, 50]) * 10**6, np.array([1.0, 2.0]), time)
+    twice = forced_response(KNOWN[name], np.array([10, 10, 50]) * 10**6, np.array([9.0, 1.0, 2.0]), time)
+    once = forced_response(KNOWN[name], np.array([10, 50]) * 10**6, np.array([1.0, 2.0]), time)
     np.testing.assert_array_equal(twice, once)
 
 
@@ -102,10 +102,10 @@ def test_nothing_moves_before_the_first_input_or_without_one(name: str) -> None:
     """Exactly 0, not nearly; and no times give no positions."""
     acting, value = np.array([EPOCH]), np.array([3.0])
     before = EPOCH + np.array([-(10**12), -1, 0])
-    np.testing.assert_array_equal(respond(KNOWN[name], acting, value, before), 0.0)
-    np.testing.assert_array_equal(respond(KNOWN[name], acting[:0], value[:0], before), 0.0)
-    assert respond(KNOWN[name], acting, value, before[:0]).shape == (0,)
-    assert respond(KNOWN[name], acting[:0], value[:0], before[:0]).shape == (0,)
+    np.testing.assert_array_equal(forced_response(KNOWN[name], acting, value, before), 0.0)
+    np.testing.assert_array_equal(forced_response(KNOWN[name], acting[:0], value[:0], before), 0.0)
+    assert forced_response(KNOWN[name], acting, value, before[:0]).shape == (0,)
+    assert forced_response(KNOWN[name], acting[:0], value[:0], before[:0]).shape == (0,)
 
 
 @pytest.mark.parametrize("name", KNOWN)
@@ -116,8 +116,10 @@ def test_what_is_asked_for_changes_no_answer(name: str) -> None:
     value = rng.normal(0.0, 1.0, 30)
     time = np.sort(rng.integers(0, 10**9, 400))
     kept = acting.copy(), value.copy(), time.copy()
-    dense = respond(KNOWN[name], acting, value, time)
-    np.testing.assert_allclose(respond(KNOWN[name], acting, value, time[::13]), dense[::13], rtol=0.0, atol=1e-13)
+    dense = forced_response(KNOWN[name], acting, value, time)
+    np.testing.assert_allclose(
+        forced_response(KNOWN[name], acting, value, time[::13]), dense[::13], rtol=0.0, atol=1e-13
+    )
     for now, then in zip((acting, value, time), kept, strict=True):
         np.testing.assert_array_equal(now, then)
 
@@ -126,5 +128,5 @@ def test_what_is_asked_for_changes_no_answer(name: str) -> None:
 def test_it_settles_at_its_input_however_long_it_rests(name: str) -> None:
     """Unit gain: an hour later it is where it was sent, to the last bits."""
     hour = 3600 * 10**9
-    found = respond(KNOWN[name], np.array([0, hour]), np.array([0.56, 0.57]), np.array([hour, 2 * hour]))
+    found = forced_response(KNOWN[name], np.array([0, hour]), np.array([0.56, 0.57]), np.array([hour, 2 * hour]))
     np.testing.assert_allclose(found, [0.56, 0.57], rtol=1e-15)

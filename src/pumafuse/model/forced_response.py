@@ -13,7 +13,7 @@ from .closed import advance_first, advance_second, constants
 from .plants import PLANTS, FirstOrder
 
 
-def respond(plant: PLANTS, acting: TimeArray, value: FloatArray, time: TimeArray) -> FloatArray:
+def forced_response(plant: PLANTS, acting: TimeArray, value: FloatArray, time: TimeArray) -> FloatArray:
     """The position of a plant that rests at 0 until its input steps.
 
     Args:
@@ -27,12 +27,12 @@ def respond(plant: PLANTS, acting: TimeArray, value: FloatArray, time: TimeArray
     """
     found = np.empty(len(time))
     order = 1 if isinstance(plant, FirstOrder) else 2
-    _respond(order, constants(plant)[None], acting, value, time, found)
+    _walk(order, constants(plant)[None], acting, value, time, found)
     return found
 
 
 @compiled
-def _respond(
+def _walk(
     order: int, constants: FloatArray, acting: TimeArray, value: FloatArray, time: TimeArray, found: FloatArray
 ) -> None:
     entry, v, position, rate = 0, 0.0, 0.0, 0.0
