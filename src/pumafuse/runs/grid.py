@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, TimeArray
+from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError
 
 _BLOCK = 64  # commands over which the two clocks' drift is small against T
 _MOST_DRIFT = 1e-3  # two quartz clocks differ by 1e-4 at the worst
-_MOST_ASTRAY = 0.05  # share of stamps that may be more than half a period off their tick
+_MOST_ASTRAY = 0.08  # share of stamps that may be more than half a period off their tick
 _LONGEST_QUEUE = 8  # commands that a stalled logger may stamp late in a row
+_LEAST_CLEAR = 0.2  # resultant of the stamps' phases: that of a Gaussian jitter of 0.29 T; 0 where there are no ticks
+_MOST_EARLY = 5.0  # standard deviations of the jitter; nothing but jitter stamps a command before it is given
+_MOST_ASIDE = 0.01  # share of commands that the jitter may put on a free tick beside their own, unseen
 
 
 def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray, str | None]:
     """The controller's own ticks behind jittered stamps: an even grid of T fitted to them.
 
+    Each command has a tick of its own, in the order of the stamps, and of all such rows of ticks the one is taken that
+    the stamps are nearest to in the sum of squares: for a Gaussian jitter that is the likeliest. Where all nearest
+    ticks differ they are it. Where two stamps are nearest to one tick, as a jitter of a fifth of T makes them every
+    hundred commands, one of them is off by little more than half a period; to move a whole row of others would cost
+    more. Late stamps beyond 0.7 T cost the same however late they are, since a logger that stalls stamps a queue of
+    commands at once: they too are set back between their neighbours and move no other.
+
     The grid's offset is the median of what is left. T is taken as exact unless the stamps' own slope differs from it by
     more than 5 standard errors: then the two clocks drift apart, the slope is used and the drift told.
+
+    A wrong row of ticks shows in what is left, and is refused: too many stamps off their ticks, a row of them on one
+    side longer than a logger's queue, one earlier than the jitter explains, phases so spread that any period would do
+    as well, or so much jitter beside missing ticks that more than a hundredth of the commands may be a tick aside.
 
     Args:
         stamp: Strictly ascending stamps, int64 ns, (n,).
@@ -25,55 +41,109 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
         label: The source, for messages.
 
     Returns:
-        The stamps on the grid, (n,), and a sentence on drift and late stamps, or None.
+        The stamps on the grid, (n,), and a sentence on drift and stamps off their ticks, or None.
 
     Raises:
         RunError: The stamps do not follow ticks of T.
     """
     tick = period * 1e9
     since = (stamp - stamp[0]).astype(np.float64)
-    nearest = _nearest_ticks(since, tick)
-    ticks = _ascending(nearest)
+    place = _places(since, tick)
+    ticks = _ticks_of_their_own(place)
+    if ticks is None:
+        shared = int(np.sum(np.diff(np.rint(place)) <= 0))
+        seen = f"{shared} of {len(stamp)} are stamped nearest to the tick of the one before"
+        raise _refusal(seen, stamp, period, label)
     slope, error = _line(ticks, since)
     drift, note = slope / tick - 1.0, None
-    significant = len(stamp) >= _BLOCK and abs(drift) * tick > 5.0 * error and abs(drift) * tick * np.ptp(ticks) > 1.0
-    if significant and abs(drift) <= _MOST_DRIFT:
+    if len(stamp) >= _BLOCK and abs(drift) * tick > 5.0 * error and abs(drift) * tick * np.ptp(ticks) > 1.0:
+        if abs(drift) > _MOST_DRIFT:
+            raise _refusal(f"on the nearest ticks they are {slope / 1e6:.4f} ms a tick", stamp, period, label)
         tick = slope
         note = f"{label}: the log's clock runs {drift * 1e6:+.1f} ppm against the controller's; the grid follows it"
     left = since - ticks * tick
     offset = float(np.median(left))
-    astray = np.abs(left - offset) > 0.5 * tick
-    moved = np.flatnonzero(np.concatenate(([True], ticks == nearest, [True])))
-    queue = int(np.diff(moved).max()) - 1  # the longest row of commands that are taken to be late
-    if (significant and abs(drift) > _MOST_DRIFT) or np.mean(astray) > _MOST_ASTRAY or queue > _LONGEST_QUEUE:
-        usual = float(np.median(np.diff(stamp))) / 1e6
-        raise RunError(
-            f"{label}: clock = 'regular', but the commands do not come on ticks of {period * 1e3:g} ms (their median"
-            f" interval is {usual:.4f} ms); check update_period_ms, or use clock = 'stamps'"
-        )
-    if astray.any():
-        late = (
-            f"{label}: {int(astray.sum())} commands are stamped more than half a period late: set back to their ticks"
-        )
-        note = late if note is None else f"{note}; {late}"
+    off = (left - offset) / tick
+    doubt = _doubt(ticks, off)
+    late, early = int(np.sum(off > 0.5)), int(np.sum(off < -0.5))
+    if doubt is not None:
+        seen = f"{late + early} of {len(stamp)} are stamped more than half a period off their ticks, {doubt}"
+        raise _refusal(seen, stamp, period, label)
+    if late or early:
+        how = "late: set back to their ticks" if not early else f"off their ticks, {early} of them early: put on them"
+        astray = f"{label}: {late + early} commands are stamped more than half a period {how}"
+        note = astray if note is None else f"{note}; {astray}"
     return stamp[0] + np.rint(ticks * tick + offset).astype(np.int64), note
 
 
-def _ascending(nearest: IntArray) -> IntArray:
-    """Ticks of which no two are one: of two stamps on one tick the first was late, and moves to the tick before."""
-    order = np.arange(len(nearest))
-    return np.minimum.accumulate((nearest - order)[::-1])[::-1] + order
+def _refusal(seen: str, stamp: TimeArray, period: float, label: str) -> RunError:
+    """What was seen, and what to do."""
+    usual = float(np.median(np.diff(stamp))) / 1e9
+    beside = f" (their median interval is {usual * 1e3:.4f} ms)" if f"{usual:.3g}" != f"{period:.3g}" else ""
+    return RunError(
+        f"{label}: clock = 'regular', but the commands do not come on ticks of {period * 1e3:g} ms: {seen}{beside};"
+        " check update_period_ms, or use clock = 'stamps'"
+    )
 
 
-def _nearest_ticks(since: FloatArray, tick: float) -> IntArray:
-    """The number of the tick nearest to each stamp, (n,).
+def _doubt(ticks: IntArray, off: FloatArray) -> str | None:
+    """Why these may not be the ticks of stamps that are ``off`` them by so many periods, or None."""
+    if len(off) <= 2:
+        return None
+    late, early = off > 0.5, -float(off.min())
+    row = max(_longest(late), _longest(off < -0.5))
+    clear = min(float(np.abs(np.mean(np.exp(2j * np.pi * off)))), 1.0)
+    spread = math.sqrt(-2.0 * math.log(clear)) / (2.0 * math.pi) if clear > 0.0 else math.inf
+    aside = _aside(ticks, late, spread)
+    if np.mean(np.abs(off) > 0.5) > _MOST_ASTRAY:
+        return f"and more than {_MOST_ASTRAY:.0%} is too many"
+    if row > _LONGEST_QUEUE:
+        return f"{row} of them in a row"
+    if clear < max(_LEAST_CLEAR, 3.0 / math.sqrt(len(off) + 9)):  # without ticks by chance in one case of e⁹
+        return "and the others lie about the ticks as they would about any"
+    if early > max(0.5, _MOST_EARLY * spread):
+        return f"one of them {early:.2f} periods early, where the jitter's standard deviation is {spread:.2f}"
+    if aside > max(_MOST_ASIDE * len(off), 2.0):
+        return f"and some {aside:.0f} beside missing ticks may be of those"
+    return None
 
-    Each stamp is rounded to the nearest tick of a phase that follows the clocks' slow drift, so that a late stamp moves
-    no other. The phase is the circular mean of the stamps over blocks, which no missing tick disturbs; over pauses it
-    is carried on with the drift seen between neighbouring blocks.
+
+def _aside(ticks: IntArray, late: BoolArray, spread: float) -> float:
+    """How many commands may be a tick aside: by the jitter beside a free tick, or in a queue behind one."""
+    free = np.concatenate(([False], np.diff(ticks) > 1))
+    order = np.arange(len(ticks))
+    queue = np.maximum.accumulate(np.where(late, 0, order + 1))  # where the row of late ones began
+    behind = late & (np.maximum.accumulate(np.where(free, order, -1)) >= queue)
+    beside = math.erfc(0.5 / (spread * math.sqrt(2.0))) if spread > 0.0 else 0.0
+    return float(behind.sum()) + beside * float(free.sum())
+
+
+def _longest(flag: BoolArray) -> int:
+    """The longest row of flags."""
+    return int(np.diff(np.flatnonzero(np.concatenate(([True], ~flag, [True])))).max()) - 1
+
+
+def _ticks_of_their_own(place: FloatArray) -> IntArray | None:
+    """For stamps in periods the ascending ticks they are nearest to in all, (n,); None if there are too few ticks."""
+    ticks = np.rint(place).astype(np.int64)
+    if np.all(np.diff(ticks) > 0):
+        return ticks
+    from .grid_kernels import CHOICES, MOST_LATE, cheapest_ticks
+
+    first = np.floor(place).astype(np.int64) - MOST_LATE
+    room = np.empty(CHOICES), np.empty((len(place), CHOICES), dtype=np.uint8)
+    return ticks if cheapest_ticks(place, first, *room, ticks) else None
+
+
+def _places(since: FloatArray, tick: float) -> FloatArray:
+    """The stamps in periods from a tick, (n,): whole numbers where they do not jitter.
+
+    They are seen from a phase that follows the clocks' slow drift, so that a late stamp moves no other. The phase is
+    the circular mean of the stamps over blocks, which no missing tick disturbs; over pauses it is carried on with the
+    drift seen between neighbouring blocks.
     """
     pauses = np.flatnonzero(np.diff(since) > _BLOCK * tick) + 1
-    edges = np.union1d(np.arange(0, len(since), _BLOCK), pauses)
+    edges = _blocks(np.concatenate(([0], pauses)), len(since))
     size = np.diff(np.append(edges, len(since)))
     turn = np.add.reduceat(np.exp(2j * np.pi * since / tick), edges)
     phase = np.angle(turn) * tick / (2.0 * np.pi)
@@ -84,7 +154,15 @@ def _nearest_ticks(since: FloatArray, tick: float) -> IntArray:
     drift = float(np.median(moved[near] / apart[near])) if near.any() else 0.0
     phase = np.unwrap(phase - drift * middle, period=tick) + drift * middle
     block = np.repeat(np.arange(len(edges)), size)
-    return np.rint((since - phase[block] - drift * (since - middle[block])) / tick).astype(np.int64)
+    return (since - phase[block] - drift * (since - middle[block])) / tick
+
+
+def _blocks(start: IntArray, end: int) -> IntArray:
+    """Where blocks begin: what is between two pauses is cut evenly, so that each has enough stamps to tell a phase."""
+    size = np.diff(np.append(start, end))
+    count = -(-size // _BLOCK)
+    number = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+    return np.repeat(start, count) + number * np.repeat(size, count) // np.repeat(count, count)
 
 
 def _line(ticks: IntArray, since: FloatArray) -> tuple[float, float]:
