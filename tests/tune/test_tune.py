@@ -16,9 +16,12 @@ import pytest
 import pumafuse as pf
 from pumafuse.runs.run import Source
 from pumafuse.tune.climb import Point
+from pumafuse.tune.course import Course, syllabi
 from pumafuse.tune.likelihood import Evidence
 from pumafuse.tune.parameters import Fit
+from pumafuse.tune.profile import profiles
 from pumafuse.tune.summary import TuningSummary
+from pumafuse.tune.summary import fitted as fitted_one
 from pumafuse.tune.validate import check
 from pumafuse.tune.variants import with_order
 from tuning import (
@@ -418,6 +421,27 @@ def test_interrupted_on_a_detour_it_gives_back_what_it_was_given() -> None:
     found = quietly(lambda: pf.tune([sim.run], best, progress=Stop(1)))
     assert found.config == best
     assert [note for note in found.summary.notes if note.startswith("nothing more likely was found")]
+
+
+def test_what_is_kept_is_told_in_its_own_numbers() -> None:
+    """A search that chose other orders and ended lower: lessons have the plants' numbers as given, no order is told."""
+    sim = outage(1)
+    given = with_order(with_order(sim.config, "tangential", 1), "vertical", 2)
+    course = Course([sim.run], given, lambda _, __: None)
+    course.take(syllabi(given, ARM, [], None), None)
+    chosen = course.best.arm.axes
+    assert isinstance(chosen["tangential"].plant, pf.SecondOrder)
+    assert isinstance(chosen["vertical"].plant, pf.FirstOrder)
+    course.best = with_sensors(course.best, sd=0.1)
+    course.keep_the_better()
+    assert course.kept
+    (lesson,) = course.lessons
+    assert lesson.orders == {} and lesson.best.config.arm == given.arm
+    found = {one.key: fitted_one(one, given, course.result(), None) for one in course.free(ARM, [])}
+    assert all(one.value == pytest.approx(one.before, rel=1e-5) for one in found.values())
+    plants = ["axes.tangential.time_constant_ms", "axes.vertical.natural_frequency_rad_s", "axes.vertical.damping"]
+    assert [key for key in found if key.startswith("axes") and not key.endswith("delay_ms")] == plants
+    assert profiles(lesson, list(found.values()))
 
 
 def test_an_interrupted_search_is_on_its_way() -> None:

@@ -10,7 +10,7 @@ from ..runs.run import Run
 from .climb import Point
 from .diagnose import at_bound
 from .learnable import TuneError
-from .lesson import Lesson, Syllabus, again, evidence_of, learn
+from .lesson import Lesson, Syllabus, again, evidence_of, kept, learn
 from .likelihood import Evidence
 from .parameters import Fit, Parameter, parameters, rounded
 from .variants import with_gates_of
@@ -90,6 +90,7 @@ class Course:
         )
         if after < before - _NOTHING:
             self.best, self.kept = self.config, True
+            self.lessons = [kept(lesson, self.config) for lesson in self.lessons]
 
     def result(self) -> FusionConfig:
         """The best configuration: gates as they were, rounded, and without the noise that is worth nothing."""

@@ -11,13 +11,13 @@ from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..runs.run import Run
 from .biases import far_off, slightly_off
-from .climb import Point, Tell, settle
+from .climb import Point, Tell, point, settle
 from .diagnose import Tie, shared_time, untold, untold_noise
 from .learnable import moving
 from .likelihood import Evidence
 from .parameters import LATENCIES, RECOVERY, Fit, Parameter, parameters
 from .search import Free, search
-from .variants import with_recovery
+from .variants import with_gates_of, with_recovery
 
 _GATE = 5.0  # with which a sensor without a gate is learnt from, as outliers must not teach, or with a narrow one:
 _NARROWEST = 3.0  # below it rejecting good readings would pay, the more the smaller the noise
@@ -116,6 +116,13 @@ def again(lesson: Lesson, runs: Sequence[Run], start: FusionConfig, tell: Tell) 
     best = settle(evidence, start, free(start), tell)
     best = _told_apart(evidence, best, free, lesson.known, ties, tell)
     return replace(lesson, evidence=evidence, best=best, free=free(best.config), ties=ties)
+
+
+def kept(lesson: Lesson, config: FusionConfig) -> Lesson:
+    """The lesson as if it had ended at ``config``: its numbers are those of that configuration's plants."""
+    free = _free(lesson.syllabus, lesson.known, lesson.evidence, lesson.active, lesson.ties)(config)
+    best = point(lesson.evidence, with_gates_of(config, lesson.evidence.config), free)
+    return replace(lesson, best=best, free=free, orders={})
 
 
 def _free(
