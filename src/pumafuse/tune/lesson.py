@@ -16,8 +16,8 @@ from .diagnose import Tie, shared_time, untold, untold_noise
 from .learnable import moving
 from .likelihood import Evidence
 from .parameters import LATENCIES, RECOVERY, Fit, Parameter, parameters
-from .search import Free, search
-from .variants import with_gates_of, with_recovery
+from .search import Free, penalised, search
+from .variants import with_axis, with_gates_of, with_recovery
 
 _GATE = 5.0  # with which a sensor without a gate is learnt from, as outliers must not teach, or with a narrow one:
 _NARROWEST = 3.0  # below it rejecting good readings would pay, the more the smaller the noise
@@ -109,13 +109,33 @@ def learn(runs: Sequence[Run], config: FusionConfig, syllabus: Syllabus, until: 
 
 
 def again(lesson: Lesson, runs: Sequence[Run], start: FusionConfig, tell: Tell) -> Lesson:
-    """The same lesson from more readings, without a new search: from ``start`` to the nearest maximum."""
+    """The same lesson from more readings: the nearest maximum to ``start``, or what a new search finds.
+
+    Where fewer readings do not tell a delay from a lag or from noise, the nearest maximum to what they said is a false
+    peak of more. So the search begins with the arm as it was known.
+    """
     evidence = evidence_of(runs, lesson.evidence.config, lesson.syllabus, None)
     ties = [tie for tie in lesson.ties if tie.held.endswith("latency_ms")]
     free = _free(lesson.syllabus, lesson.known, evidence, lesson.active, ties)
-    best = settle(evidence, start, free(start), tell)
+    best, orders = settle(evidence, start, free(start), tell), lesson.orders
+    if any(one.fit in ("delay", "plant") for one in free(start)):
+        found, others = search(evidence, _arm_as_known(best.config, lesson.known, free(start)), free, lambda _: None)
+        if _penalised(evidence, found, free) > _penalised(evidence, best, free):
+            # nobody is told of a plant of another order before the lesson with its numbers is there
+            best, orders, tell = found, others, lambda _: None
     best = _told_apart(evidence, best, free, lesson.known, ties, tell)
-    return replace(lesson, evidence=evidence, best=best, free=free(best.config), ties=ties)
+    return replace(lesson, evidence=evidence, best=best, free=free(best.config), ties=ties, orders=orders)
+
+
+def _arm_as_known(config: FusionConfig, known: FusionConfig, free: Sequence[Parameter]) -> FusionConfig:
+    """The configuration with the axes of which a number of the arm is free as they were known."""
+    for axis in {one.axis for one in free if one.axis is not None and one.fit in ("delay", "plant", "gain")}:
+        config = with_axis(config, axis, known.arm.axes[axis])
+    return config
+
+
+def _penalised(evidence: Evidence, best: Point, free: Free) -> float:
+    return float(penalised(evidence, best, free(best.config)).sum())
 
 
 def kept(lesson: Lesson, config: FusionConfig) -> Lesson:

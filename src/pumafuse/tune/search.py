@@ -24,6 +24,7 @@ _ROUGHLY = 0.1  # log-likelihood that is not worth another step where peaks are 
 _WIDER = 3.0
 _STEP = 0.010  # s, between delays and latencies that are tried: their peaks are as wide
 _LAGS = (1.0, 0.5, 1.8)  # starts, times the configured; a delay can be taken for a lag and a lag for a delay
+_LEAST_SHARE = 0.2  # of a lag that is left where a tick less of it is tried
 _GAINS = ((0.0, 0.1), (0.0, 0.4), (0.3, 0.025))  # starts: gain more than configured and recovery [s]; valleys between
 _PROCESSES = (  # starts, in units of how far the arm alone is from the readings
     Process(input_noise=0.1, drift=1.0, maneuver_noise=1.0, maneuver_drift=10.0),
@@ -151,7 +152,7 @@ def _with_noise(
 def _with_the_arm(
     evidence: Evidence, config: FusionConfig, free: Free, tell: Tell
 ) -> tuple[FusionConfig, dict[str, str]]:
-    """The best of the arm's numbers too, from several recoveries and with both orders where the plant is free."""
+    """The best of the arm's numbers too, from several lags and recoveries, with both orders where the plant is free."""
     whole = [axis for axis in evidence.axes if _plant_is_free(free(config), axis)]
     second = config
     for axis in whole:
@@ -163,25 +164,30 @@ def _with_the_arm(
     best = _best_of_each(evidence, peaks, [peak.heights for peak in peaks])
     if not whole:
         return best, {}
+    beside = [_lagging_more(best, whole, free(best), ticks) for ticks in (-1.0, 1.0)]
+    peaks = [point(evidence, best, free(best)), *(climb_apart(evidence, at, free(at), tell, _ROUGHLY) for at in beside)]
+    best = _best_of_each(evidence, peaks, [peak.heights for peak in peaks])
     first = best
     for axis in whole:
         first = with_order(first, axis, 1)
     pair = [climb_apart(evidence, at, free(at), tell, _ROUGHLY) for at in (best, first)]
     gains = pair[0].heights - pair[1].heights
-    parts = [np.array([sum(one.axis == axis for one in free(peak.config)) for axis in evidence.axes]) for peak in pair]
-    penalised = [
-        peak.heights - 0.5 * count * np.log(np.maximum(evidence.count, 2))
-        for peak, count in zip(pair, parts, strict=True)
-    ]
+    lowered = [penalised(evidence, peak, free(peak.config)) for peak in pair]
     orders: dict[str, str] = {}
     for number, axis in enumerate(evidence.axes):
         if axis in whole:
-            ahead = float(penalised[0][number] - penalised[1][number])
+            ahead = float(lowered[0][number] - lowered[1][number])
             orders[axis] = (
                 f"{'second' if ahead >= 0.0 else 'first'} order: second gains {gains[number]:.1f} in log-likelihood,"
                 f" {ahead:+.1f} after the penalty for one number more (BIC)"
             )
-    return _best_of_each(evidence, pair, penalised), orders
+    return _best_of_each(evidence, pair, lowered), orders
+
+
+def penalised(evidence: Evidence, peak: Point, free: Sequence[Parameter]) -> FloatArray:
+    """The height of each axis, less the Bayesian information criterion's penalty for its numbers, (A,)."""
+    count = np.array([sum(one.axis == axis for one in free) for axis in evidence.axes])
+    return peak.heights - 0.5 * count * np.log(np.maximum(evidence.count, 2))
 
 
 def _plant_is_free(free: Sequence[Parameter], axis: str) -> bool:
@@ -198,6 +204,17 @@ def _with_lag(config: FusionConfig, axes: Sequence[str], free: Sequence[Paramete
         for one in free:
             if one.axis == axis and one.fit == "delay":
                 config = _shifted(config, [one], (1.0 - times) * lag)
+    return config
+
+
+def _lagging_more(config: FusionConfig, axes: Sequence[str], free: Sequence[Parameter], ticks: float) -> FusionConfig:
+    """The configuration with plants that lag so many ticks more, and delays that are as much shorter where they may be.
+
+    The arm is told where to go once a tick: the likelihood has a false peak a tick of delay on either side.
+    """
+    for axis in axes:
+        more = ticks * config.arm.update_period / config.arm.axes[axis].plant.lag
+        config = _with_lag(config, [axis], free, max(1.0 + more, _LEAST_SHARE))
     return config
 
 
