@@ -12,10 +12,10 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.stats import multivariate_normal
 
 import pumafuse as pf
-from pumafuse.tune.climb import climb
+from pumafuse.tune.climb import climb, point, settle
 from pumafuse.tune.intervals import ConfidenceInterval, confidence_intervals
 from pumafuse.tune.likelihood import Evidence
-from pumafuse.tune.parameters import Fit, Parameter, moved
+from pumafuse.tune.parameters import Fit, Parameter, moved, rounded
 from tuning import free_of, holds, learnt, outage, scenario, spoiled, spoiled_arm, sure_of
 
 ROOT = 1.96  # √(2 · 1.92): how far an interval's end is from the best, in signed roots of twice the drop
@@ -209,6 +209,23 @@ def test_a_number_of_an_axis_knows_what_the_others_say_of_a_shared_one() -> None
     top = highest(delay.get(best.config))
     for end in found.ci95:
         assert top - highest(end) == pytest.approx(0.5 * ROOT**2, rel=0.2)
+
+
+def test_an_interval_reaches_to_what_is_told() -> None:
+    """Where gates stop the search beside the peak that the likelihood has with their outcomes held, or at none."""
+    sim = outage(2)
+    evidence = Evidence([sim.run], sim.config)
+    free = [one for one in free_of(evidence, sim.config, ("noise",), "vision") if one.axis == "vertical"]
+    free = [one for one in free if "maneuver" not in one.key]
+    peak = settle(evidence, sim.config, free)
+    for one in free:
+        low, high = confidence_intervals(evidence, peak, free)[one.key].ci95
+        for aside in (0.5 * low, 2.0 * high, one.bounds[0] if one.vanishes else low):
+            value = one.inside(rounded(aside))
+            there = point(evidence, one.put(peak.config, value), free, peak.value.outcomes)
+            found = confidence_intervals(evidence, there, free)[one.key]
+            assert found.ci95[0] <= value <= found.ci95[1], one.key
+            assert found.open[0] or value > one.bounds[0], one.key
 
 
 # ---- how often they hold --------------------------------------------------------------------------------------------

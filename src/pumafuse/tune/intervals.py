@@ -16,7 +16,7 @@ from ..toml import Interval
 from .climb import Point, climb, point, slopes
 from .diagnose import at_bound, covariance
 from .likelihood import Evidence
-from .parameters import Parameter, coordinates, moved
+from .parameters import Parameter, coordinates, moved, rounded
 
 _ENOUGH = 0.02  # log-likelihood to which a profile is followed
 _SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which the profile is followed
@@ -67,20 +67,31 @@ def confidence_intervals(evidence: Evidence, best: Point, free: Sequence[Paramet
     From the curvature: 1.96 sd of the coordinate each way. Where the likelihood at an end, the others moved along, has
     not dropped by what that says (1.92), the end is where the profile has (Cox & Hinkley, Theoretical Statistics, 9.3).
     Gates make the likelihood jump; the intervals are those of the peak that it has while the outcomes stay as they are.
+    That peak is not what is told: at it the gates decide otherwise, and to a lower likelihood, or the search would have
+    gone there. What the search ended with is the likeliest that is known, so an interval beside it reaches to it.
     """
-    best = climb(evidence, best.config, free, outcomes=best.value.outcomes)
+    told = best.config
+    best = climb(evidence, told, free, outcomes=best.value.outcomes)
     views = views_of(evidence, best, free)
 
     def of(one: Parameter) -> ConfidenceInterval:
         view = views[one.axis]
         if at_bound(one, best.config) is not None:
-            return _from_the_bound(view, best, one)
+            return _reaching(_from_the_bound(view, best, one), one, told)
         low, high = (_end(view, best, one, sign) for sign in (-1.0, 1.0))
         ci95 = (one.value(low.coordinate), one.value(high.coordinate))
-        return ConfidenceInterval(ci95, low.profiled or high.profiled, None, (low.open, high.open))
+        found = ConfidenceInterval(ci95, low.profiled or high.profiled, None, (low.open, high.open))
+        return _reaching(found, one, told)
 
     with ThreadPoolExecutor(usable_cores()) as pool:
         return dict(zip([one.key for one in free], pool.map(of, free), strict=True))
+
+
+def _reaching(found: ConfidenceInterval, one: Parameter, told: FusionConfig) -> ConfidenceInterval:
+    """The interval as far as to the value that is told, as it is written; open where that is at a bound."""
+    value, at, (low, high) = one.inside(rounded(one.get(told))), at_bound(one, told), found.ci95
+    ends = (found.open[0] or at == "least", found.open[1] or at == "greatest")
+    return replace(found, ci95=(min(low, value), max(high, value)), open=ends)
 
 
 def views_of(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> Mapping[str | None, View]:
