@@ -119,12 +119,16 @@ def again(lesson: Lesson, runs: Sequence[Run], start: FusionConfig, tell: Tell) 
     free = _free(lesson.syllabus, lesson.known, evidence, lesson.active, ties)
     best, orders = settle(evidence, start, free(start), tell), lesson.orders
     if any(one.fit in ("delay", "plant") for one in free(start)):
-        found, others = search(evidence, _arm_as_known(best.config, lesson.known, free(start)), free, lambda _: None)
+        found, others = search(evidence, _arm_as_known(best.config, lesson.known, free(start)), free, _silently)
         if _penalised(evidence, found, free) > _penalised(evidence, best, free):
             # nobody is told of a plant of another order before the lesson with its numbers is there
-            best, orders, tell = found, others, lambda _: None
+            best, orders, tell = found, others, _silently
     best = _told_apart(evidence, best, free, lesson.known, ties, tell)
     return replace(lesson, evidence=evidence, best=best, free=free(best.config), ties=ties, orders=orders)
+
+
+def _silently(_: Point) -> None:
+    """Tell nobody."""
 
 
 def _arm_as_known(config: FusionConfig, known: FusionConfig, free: Sequence[Parameter]) -> FusionConfig:
