@@ -23,7 +23,7 @@ from .variants import with_axis_of, with_gates, with_gates_of, with_lag, with_or
 _ROUGHLY = 0.1  # log-likelihood that is not worth another step where peaks are only compared
 _WIDER = 3.0
 _STEP = 0.010  # s, between delays and latencies that are tried: their peaks are as wide
-_LAGS = (1.0, 0.5, 1.8)  # starts, times the configured; a delay can be taken for a lag and a lag for a delay
+_LAGS = (1.0, 1.8)  # starts, times the configured; a delay can be taken for a lag and a lag for a delay
 _LEAST_SHARE = 0.2  # of a lag that is left where a tick less of it is tried
 _GAINS = ((0.0, 0.1), (0.0, 0.4), (0.3, 0.025))  # starts: gain more than configured and recovery [s]; valleys between
 _PROCESSES = (  # starts, in units of how far the arm alone is from the readings
