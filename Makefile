@@ -46,7 +46,7 @@ docs: $(READY)
 	@echo "open site/index.html; its search needs a server: python3 -m http.server --bind 127.0.0.1 --directory site"
 
 notebooks: $(READY)
-	$(BIN)/jupyter execute --inplace notebooks/*.ipynb
+	$(BIN)/python notebooks/run.py
 
 # Peers live apart: what they need may be older or newer than what pumafuse is locked to.
 .venv-bench/.ready: requirements.lock pyproject.toml benchmarks/requirements-peers.txt
