@@ -164,11 +164,13 @@ def test_fuse_takes_the_file_as_it_is(identified: tuple[Path, dict[str, object]]
 def test_an_arm_file_is_kept_unless_forced(
     trials: Path, identified: tuple[Path, dict[str, object]], tmp_path: Path
 ) -> None:
-    """To the last byte; what replaces it is what was written elsewhere before."""
+    """To the last byte; what replaces it is what was written elsewhere before. What is no model is never replaced."""
     path = tmp_path / "arm.toml"
     path.write_text("mine")
     assert refused("identify", trials, "-o", path) == f"pumafuse: {path}: exists; --force replaces it"
+    assert "no arm model, which is not ours to replace" in refused("identify", trials, "-o", path, "--force")
     assert path.read_text() == "mine"
+    path.write_text(identified[0].read_text().replace('name = "', 'name = "an older '))
     said = pumafuse("identify", trials, "-o", path, "--force").stdout
     assert path.read_bytes() == identified[0].read_bytes()
     assert f"next: pumafuse verify RUN --arm {path}" in said

@@ -11,11 +11,12 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from ..errors import PumafuseWarning
+from ..errors import ConfigError, PumafuseWarning
 from ..folders import FolderError, write_file
 from ..identify.anova import Dependence, Scatter
 from ..identify.identify import Identification, identify
 from ..identify.trials import StepTrials
+from ..model.arm import ArmModel
 from ..model.plants import FirstOrder
 from ..units import MM, MS
 from ..views import words
@@ -44,8 +45,10 @@ def run(folder: Path, options: Options) -> None:
     """
     if options.output.is_dir():
         raise FolderError(f"{options.output}: is a folder; give the name of a file")
-    if options.output.exists() and not options.force:
-        raise FolderError(f"{options.output}: exists; --force replaces it")
+    if options.output.exists():
+        if not options.force:
+            raise FolderError(f"{options.output}: exists; --force replaces it")
+        _refuse_what_is_no_model(options.output)
     if options.report is not None:
         from ..views import report
 
@@ -71,6 +74,14 @@ def run(folder: Path, options: Options) -> None:
         _show(found, options)
     else:
         print(shown)
+
+
+def _refuse_what_is_no_model(path: Path) -> None:
+    """A slip in a file's name must not cost somebody's thesis, whatever is forced."""
+    try:
+        ArmModel.load(path)
+    except ConfigError:
+        raise FolderError(f"{path}: exists and is no arm model, which is not ours to replace; choose another") from None
 
 
 def _show(found: Identification, options: Options) -> None:
