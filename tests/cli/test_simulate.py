@@ -90,14 +90,14 @@ def test_many_runs_are_fused_into_one_table(scenario: Path, tmp_path: Path) -> N
     runs = sorted((tmp_path / "runs").iterdir())
     config = tmp_path / "runs" / "seed-3" / "fusion.toml"
     table = pumafuse("fuse", *runs, "-c", config, "-o", tmp_path / "out").stdout.splitlines()
-    own = [line.split() for line in table if line.strip().startswith("short, seed")]
-    assert [(line[2], line[3]) for line in own] == [(s, a) for s in "3456" for a in ("radial", "vertical")]
+    own = [line.split() for line in table if line.strip().startswith("seed-")]
+    assert [(line[0], line[1]) for line in own] == [(f"seed-{s}", a) for s in "3456" for a in ("radial", "vertical")]
     pooled = [line.split() for line in table if line.strip().startswith("all 4")]
     assert [line[2] for line in pooled] == ["radial", "vertical"]
     assert names(tmp_path / "out") == {run.name for run in runs}
     assert all(names(folder) == RESULT for folder in (tmp_path / "out").iterdir())
     for axis, number in (("radial", 0), ("vertical", 1)):
-        squares = [float(line[4]) ** 2 for line in own if line[3] == axis]
+        squares = [float(line[2]) ** 2 for line in own if line[1] == axis]
         assert float(pooled[number][3]) == pytest.approx((sum(squares) / 4) ** 0.5, abs=0.001)
         assert float(pooled[number][4]) == pytest.approx(max(squares) ** 0.5, abs=0.001)
 
