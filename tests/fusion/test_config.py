@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pumafuse.errors import ConfigError, PumafuseError, UnknownNameError
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.model.arm import ArmModel
+from refusals import one_line
 
 PRESET = "puma560-internal"
 AXES = ("tangential", "radial", "vertical")
@@ -52,12 +53,7 @@ def load(folder: Path, text: str) -> FusionConfig:
     return FusionConfig.load(folder / "fusion.toml")
 
 
-def refusal(call: Callable[[], object]) -> str:
-    with pytest.raises(PumafuseError) as caught:
-        call()
-    text = str(caught.value)
-    assert len(text.splitlines()) == 1, text
-    return text
+refusal = partial(one_line, PumafuseError)
 
 
 def test_every_key_arrives_in_si_units(tmp_path: Path) -> None:

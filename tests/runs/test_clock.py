@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,7 @@ from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import RunError
 from pumafuse.runs.clock import astray, segments, without_strays
 from pumafuse.runs.run import Reference, Run, Source
+from refusals import one_line
 
 SECOND = 1_000_000_000
 TICK = 28_000_000
@@ -44,12 +46,7 @@ def rows(piece: Source | None) -> list[int]:
     return piece.values["radial"].astype(int).tolist()
 
 
-def refusal(call: Callable[[], object]) -> str:
-    with pytest.raises(RunError) as caught:
-        call()
-    text = str(caught.value)
-    assert len(text.splitlines()) == 1, text
-    return text
+refusal = partial(one_line, RunError)
 
 
 def cuts_by_hand(stamp: Sequence[int]) -> list[int]:

@@ -6,8 +6,8 @@ A path is made from radii and angles with cos and sin; what the frame makes of i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 import pumafuse as pf
 from pumafuse.runs.axes import in_axes
 from pumafuse.runs.frames import Cylindrical, Frame, Rotated
+from refusals import one_line
 
 PERIOD = 0.028
 SIGN = {"counterclockwise": 1.0, "clockwise": -1.0}
@@ -74,12 +75,7 @@ def config(frame: Frame | None = None, sd: float = 1e-3, **process: float) -> pf
     return pf.FusionConfig(arm=arm, process=noise, frame=frame, sensors={"camera": pf.Sensor(sd=sd, gate=0.0)})
 
 
-def refusal(call: Callable[[], object]) -> str:
-    with pytest.raises(pf.RunError) as caught:
-        call()
-    text = str(caught.value)
-    assert len(text.splitlines()) == 1, text
-    return text
+refusal = partial(one_line, pf.RunError)
 
 
 @settings(derandomize=True, deadline=None, max_examples=60)

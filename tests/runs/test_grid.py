@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from pumafuse.errors import RunError
 from pumafuse.runs.grid import regular_grid
 from pumafuse.runs.grid_kernels import CHOICES, MOST_LATE, cheapest_ticks
+from refusals import one_line
 
 SECOND = 1_000_000_000
 PERIOD = 0.028
@@ -21,12 +22,7 @@ TICK = 28_000_000
 properties = settings(derandomize=True, deadline=None, max_examples=50)
 
 
-def refusal(call: Callable[[], object]) -> str:
-    with pytest.raises(RunError) as caught:
-        call()
-    text = str(caught.value)
-    assert len(text.splitlines()) == 1, text
-    return text
+refusal = partial(one_line, RunError)
 
 
 def grid_of(ticks: np.ndarray, period_ns: float = TICK, origin: int = 1_700_000_000 * SECOND) -> np.ndarray:

@@ -14,6 +14,7 @@ import pytest
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import ConfigError, PumafuseError, RunError, UnknownNameError
 from pumafuse.runs.run import Reference, Run, Source
+from refusals import one_line
 
 HOST = "t_ms,nominal_mm,correction_um,z_m,note\n0,560,500,0.1,a\n28,561,-500,0.2,b\n"
 TRACKER = "stamp_us,y_mm,z_mm\n5000,569.5,\n15000,,-93\n"
@@ -66,11 +67,7 @@ def single(folder: Path, text: str, name: str = "log.csv") -> Run:
 
 
 def refusal(call: Callable[[], object], kind: type[PumafuseError] = PumafuseError) -> str:
-    with pytest.raises(kind) as caught:
-        call()
-    text = str(caught.value)
-    assert len(text.splitlines()) == 1, text
-    return text
+    return one_line(kind, call)
 
 
 def check_source(source: Source, stamp: list[int], **values: list[float]) -> None:

@@ -7,6 +7,7 @@ import random
 from collections.abc import Callable
 from decimal import Decimal
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import PumafuseError, RunError, UnknownNameError
 from pumafuse.runs import tables
 from pumafuse.runs.tables import Table
+from refusals import one_line
 
 LENGTHS = {"_m": 0, "_mm": 3, "_um": 6}
 TIMES = {"_s": 9, "_ms": 6, "_us": 3, "_ns": 0}
@@ -43,12 +45,7 @@ def column(folder: Path, name: str, cells: list[str]) -> Table:
     return csv(folder, "".join(f"{cell},0\n" for cell in [name, *cells]))
 
 
-def refusal(call: Callable[[], object]) -> str:
-    with pytest.raises(PumafuseError) as caught:
-        call()
-    text = str(caught.value)
-    assert len(text.splitlines()) == 1, text
-    return text
+refusal = partial(one_line, PumafuseError)
 
 
 def written(folder: Path, **columns: object) -> Table:

@@ -109,6 +109,8 @@ def validation_figure(est: Estimates, path: Path) -> None:
             series.axhspan(-Z95, Z95, color=style.ESTIMATE, alpha=0.15, lw=0)
             series.set_title(f"{axis}, {sensor}. {found.verdict}", loc="left", fontsize=9)
             series.set_ylabel("innovation / sd")
+            spread.set_ylabel("density")
+            correlation.set_ylabel("autocorrelation")
             at = np.linspace(-4.5, 4.5, 91)
             spread.hist(
                 np.clip(normalised, -4.5, 4.5),
