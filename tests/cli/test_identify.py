@@ -235,7 +235,7 @@ def test_an_axis_with_too_few_trials_gets_no_model(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(("how", "header"), [("none", "trial,axis,step_mm,note\n"), ("two", "")])
 def test_a_period_that_is_not_told_must_be_given(how: str, header: str, tmp_path: Path) -> None:
-    """No speeds, or speeds that disagree: one line; with --period it is done, and K is against step over period."""
+    """No speeds, or speeds that disagree: one line; with --period it is done, K against step over exactly that."""
     other = "x,radial,8.0,0.4\n" if how == "two" else ""
     trials = campaign(tmp_path / "bench", ("radial",), other, samples("x", TRUE["radial"], 8.0, 9), header)
     line = refused("identify", trials, "-o", tmp_path / "arm.toml")
@@ -246,6 +246,8 @@ def test_a_period_that_is_not_told_must_be_given(how: str, header: str, tmp_path
         arm = pf.ArmModel.load(tmp_path / "arm.toml")
         assert arm.update_period == 0.028
         assert arm.axes["radial"].gain.slope == pytest.approx(SLOPE, abs=0.02)
+        pumafuse("identify", trials, "-o", tmp_path / "arm.toml", "--period", 33.3, "--force")
+        assert "update_period_ms = 33.3\n" in (tmp_path / "arm.toml").read_text()
 
 
 @pytest.mark.long

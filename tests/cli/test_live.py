@@ -50,6 +50,19 @@ def test_a_replay_says_what_as_live_says(data) -> None:
     assert "vision" in done.stderr
 
 
+def test_how_late_a_sensor_is_is_told_in_ms(data) -> None:
+    """Ten rows 40 ms behind the newest stamp and one 90 ms: 44.5 ms in the mean, 90 at most."""
+    told = ['{"t": 100.0, "command": {"radial": 560.0}}']
+    for number in range(11):
+        now, late = 101.0 + 0.1 * number, 0.09 if number == 5 else 0.04
+        told.append(json.dumps({"t": now, "command": {"radial": 560.0}}))
+        told.append(json.dumps({"t": round(now - late, 3), "sensor": "tracker", "radial": 560.0}))
+    command = [str(EXECUTABLE), "live", "stdin", "-c", str(data / "fusion.toml")]
+    done = subprocess.run(command, input="\n".join(told) + "\n", capture_output=True, text=True, timeout=60, check=True)
+    row = next(line.split() for line in done.stderr.splitlines() if line.split()[:1] == ["tracker"])
+    assert (row[1], row[3], row[4]) == ("11", f"{(10 * 40 + 90) / 11:.1f}", "90.0")
+
+
 def test_lines_from_standard_input(data) -> None:
     """Five seconds of the run with some nonsense between: estimates for each command, the nonsense told and counted."""
     good = text_of(pf.Run.read(data / "scan1"), 5.0).splitlines()

@@ -259,6 +259,15 @@ def test_a_period_that_fits_now_and_then_is_refused(ratio: float, count: int, sd
     refusal(lambda: regular_grid(stamp, PERIOD * ratio, "host"))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_much_jitter_beside_many_missing_ticks_is_refused(seed: int) -> None:
+    """Of 0.25 T, with every second tick missing, some 2 % lie nearer to a free tick: no order tells which."""
+    rng = np.random.default_rng(seed)
+    ticks = np.flatnonzero(rng.random(5000) < 0.5)
+    place = np.sort(ticks + rng.normal(0.0, 0.25, len(ticks)))
+    assert "beside missing ticks may be of those" in refusal(lambda: regular_grid(grid_of(place), PERIOD, "host"))
+
+
 def test_a_refusal_tells_how_many_stamps_are_off_and_what_to_do() -> None:
     """Every seventh stamp is 0.7 T late: the ticks are clear, but that is no jitter about them."""
     truth = grid_of(np.arange(1000))
