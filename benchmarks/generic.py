@@ -2,10 +2,11 @@
 
     python benchmarks/generic.py [--only TEXT] [--json FILE]
 
-All filters see the same readings, are tuned by maximum likelihood on the same run and are scored by one function at
-the same instants, those of the commands; an estimate knows every reading that is valid by then.
+All filters see the same measurements, are tuned by maximum likelihood on the same run and are scored by one function at
+the same instants, those of the commands; an estimate knows every measurement that is valid by then.
 
-The columns: readings held (the best sensor's); constant velocity; constant acceleration; the best that those two can do
+The columns: measurements held (the best sensor's); constant velocity; constant acceleration; the best that those two
+can do
 if the truth tunes them (``oracle``); pumafuse with more and more of its numbers fitted, and in brackets the error over
 that of the better generic filter, and over the oracle's.
 """
@@ -61,13 +62,13 @@ class Case:
 
 
 def with_sensors(config: pf.FusionConfig, names: Sequence[str]) -> pf.FusionConfig:
-    """The configuration with these sensors, each gated like the generic filters', axis by axis."""
+    """The configuration with these sensors, each rejected like the generic filters', axis by axis."""
     sensors = {name: sensor for name, sensor in config.sensors.items() if name in names}
     return change(config, sensors={n: change(sensor, gate=GATE, gate_rows=False) for n, sensor in sensors.items()})
 
 
 def beginning(run: pf.Run, config: pf.FusionConfig, until: float) -> pf.Run:
-    """What is commanded, and what readings are valid, up to that long after the first command [s]."""
+    """What is commanded, and what measurements are valid, up to that long after the first command [s]."""
     end = int(run.command.stamp.min()) + round(until * 1e9)
     sensors = {name: run.sensors[name] for name in config.sensors}
     latest = {name: end + round(config.sensors[name].latency * 1e9) for name in sensors}

@@ -1,7 +1,7 @@
 """Kalman filters that know nothing of the commands: constant velocity or constant acceleration, disturbed by noise.
 
-What is constant is a random walk, exactly integrated between the irregular instants at which readings are valid. Of the
-sensors and of the start they know what pumafuse knows; their gate and their likelihood are pumafuse's, too.
+What is constant is a random walk, exactly integrated between the irregular instants at which measurements are valid. Of
+the sensors and of the start they know what pumafuse knows; their gate and their likelihood are pumafuse's, too.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ class Known(NamedTuple):
     """What a filter is told of one axis.
 
     Attributes:
-        scale: Of the position in each sensor's readings.
+        scale: Of the position in each sensor's measurements.
         latency_sd: How far each sensor's latency wanders [s].
         bias: Which of the biases each sensor has, -1 for none.
-        bias_sd: Of each bias before any reading [m].
+        bias_sd: Of each bias before any measurement [m].
         start: Where the arm rests before the first command [m].
         start_sd: How well that is known [m].
     """
@@ -58,7 +58,7 @@ class Known(NamedTuple):
 
 
 class Heard(NamedTuple):
-    """The readings of one axis in order: when each is valid [s since the first command], which sensor's, value [m]."""
+    """The measurements of one axis in order: when each is valid [s since the first command], which sensor's, value [m]."""
 
     time: Array
     sensor: Whole
@@ -67,10 +67,11 @@ class Heard(NamedTuple):
 
 @numba.njit(cache=True, error_model="numpy")
 def follow(order: int, numbers: Array, known: Known, heard: Heard, times: Array, position: Array) -> float:
-    """Filter all readings; write the position at each of ``times`` [m] and return the log-likelihood, m in mm.
+    """Filter all measurements; write the position at each of ``times`` [m] and return the log-likelihood, m in mm.
 
     ``numbers`` are logarithms: of the density of the random walk, then of each sensor's sd [m]. The state is the
-    position with its derivatives, ``order`` in all, and the biases. A gated reading counts as if it were at the gate.
+    position with its derivatives, ``order`` in all, and the biases. A rejected measurement counts as if it were at the
+    gate.
     """
     size, density, sds = order + len(known.bias_sd), math.exp(2.0 * numbers[0]), np.exp(numbers[1:])
     x, P, H, K = np.zeros(size), np.zeros((size, size)), np.zeros(size), np.zeros(size)
@@ -162,7 +163,7 @@ class Axis:
         times: Of estimates [s since the first command].
         truth: The reference then [m], NaN where there is none.
         known: What they know.
-        heard: The readings that pumafuse meets.
+        heard: The measurements that pumafuse meets.
         sds: Of the sensors as configured [m].
     """
 
@@ -179,7 +180,7 @@ class Axis:
         return position, follow(order, numbers, self.known, self.heard, self.times, position)
 
     def held(self) -> list[Array]:
-        """Each sensor's last reading as a position [m], with the start before the first; a bias is the first one's."""
+        """Each sensor's last measurement as a position [m], with the start before the first; a bias is the first one's."""
         found: list[Array] = []
         for s, scale in enumerate(self.known.scale):
             valid, value = (values[self.heard.sensor == s] for values in (self.heard.time, self.heard.value))
@@ -226,11 +227,13 @@ def axes_of(run: pf.Run, config: pf.FusionConfig) -> dict[str, Axis]:
     est, starts = pf.fuse(run, config), {axis.name: axis.start for axis in build(run, config).axes}
     assert est.reference is not None
     found: dict[str, Axis] = {}
-    for number, name in enumerate(est.readings.axes):
-        mine = est.readings.where((est.readings.axis == number) & (est.readings.outcome <= pf.Outcome.REOPENED))
+    for number, name in enumerate(est.measurements.axes):
+        mine = est.measurements.where(
+            (est.measurements.axis == number) & (est.measurements.outcome <= pf.Outcome.REACQUIRED)
+        )
         used = np.unique(mine.sensor)
         if len(used) and name in est.reference.position:
-            sensors = [config.sensors[est.readings.sensors[s]] for s in used]
+            sensors = [config.sensors[est.measurements.sensors[s]] for s in used]
             told = [(s.scale, s.latency_sd, s.bias_sd, s.sd_of(name)) for s in sensors]
             scale, latency_sd, bias_sd, sds = np.array(told, dtype=np.float64).T.copy()
             biased = bias_sd > 0.0

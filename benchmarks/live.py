@@ -3,7 +3,7 @@
     python benchmarks/live.py [--rows N]
 
 Three axes, the shipped configuration, one core. Beside it the loop that many write: a `filterpy` filter for each axis,
-predicted and updated at each reading, in order, without delay, latency, gate or late readings.
+predicted and updated at each measurement, in order, without delay, latency, gate or late measurements.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ def percentiles(calls: list[Callable[[], object]]) -> tuple[float, float]:
 
 
 def thousand_hertz(live: pf.LiveEstimator, rows: int) -> list[Callable[[], object]]:
-    """Readings at 1 kHz on three axes."""
+    """Measurements at 1 kHz on three axes."""
     rng = np.random.default_rng(0)
     values = rng.normal(0.0, 5e-5, (rows, 3))
     return [
-        lambda row=row: live.reading(
+        lambda row=row: live.measurement(
             (row + 1) * MS,
             "tracker",
             tangential=values[row, 0],
@@ -57,7 +57,7 @@ def thousand_hertz(live: pf.LiveEstimator, rows: int) -> list[Callable[[], objec
 
 
 def textbook(rows: int) -> list[Callable[[], object]]:
-    """The same readings into a `filterpy` filter for each axis."""
+    """The same measurements into a `filterpy` filter for each axis."""
     rng = np.random.default_rng(0)
     values = rng.normal(0.0, 5e-5, (rows, 3))
     filters = []
@@ -109,24 +109,24 @@ def main() -> None:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     live = pf.LiveEstimator(pf.FusionConfig.load(DATA / "fusion.toml"))
     live.command(0, **START)
-    readings = thousand_hertz(live, 30_000)
-    percentiles(readings[:5000])
-    reading, theirs = percentiles(readings[5000:]), percentiles(textbook(5000))
+    measurements = thousand_hertz(live, 30_000)
+    percentiles(measurements[:5000])
+    measurement, theirs = percentiles(measurements[5000:]), percentiles(textbook(5000))
     newest = live.newest or 0
     late = [
-        lambda n=n: live.reading(newest - 100 * MS + n, "tracker", tangential=1e-6 * n, radial=0.56, vertical=-0.1)
+        lambda n=n: live.measurement(newest - 100 * MS + n, "tracker", tangential=1e-6 * n, radial=0.56, vertical=-0.1)
         for n in range(1, 1000)
     ]
     table = [
-        ("`reading()` in order, three axes", reading),
-        ("`reading()` 100 ms late: 100 rows of 1 kHz met again", percentiles(late)),
+        ("`measurement()` in order, three axes", measurement),
+        ("`measurement()` 100 ms late: 100 rows of 1 kHz met again", percentiles(late)),
         ("`command()`", percentiles([lambda n=n: live.command(newest + n, **START) for n in range(2000)])),
         ("`estimate()` now", percentiles([live.estimate] * 2000)),
         ("a `filterpy` loop, three axes, two states each", theirs),
     ]
-    print("| call | median, µs | 99 %, µs | median over `reading()` |\n|---|---|---|---|")
+    print("| call | median, µs | 99 %, µs | median over `measurement()` |\n|---|---|---|---|")
     for name, (median, high) in table:
-        print(f"| {name} | {median:.1f} | {high:.1f} | {median / reading[0]:.2f} |")
+        print(f"| {name} | {median:.1f} | {high:.1f} | {median / measurement[0]:.2f} |")
     print(f"\nfrom standard input: {rows_a_second(rows):,.0f} rows a second, an estimate a command")
     print(f"with --rate 100: {rows_a_second(rows, '--rate', '100'):,.0f}")
 

@@ -50,7 +50,7 @@ def command(t_ns: int) -> bytes:
 
 
 def row(t_ns: int) -> bytes:
-    """A reading at a time."""
+    """A measurement at a time."""
     return json.dumps({"t_ns": t_ns, "sensor": "tracker", **START}).encode()
 
 

@@ -73,8 +73,8 @@ def scan(mode: Mode) -> Callable[[int], list[Row]]:
             est = fuse(run, mode)
             seconds.append(time.perf_counter() - start)
             del est
-        rows, scalars = rows_of(run), sum(len(s.stamp) * len(s.values) for s in run.sensors.values())
-        each = f"{min(seconds):.2f} s in all, {1e9 * min(seconds) / scalars:,.0f} ns a value"
+        rows, components = rows_of(run), sum(len(s.stamp) * len(s.values) for s in run.sensors.values())
+        each = f"{min(seconds):.2f} s in all, {1e9 * min(seconds) / components:,.0f} ns a value"
         return [row("scan", f"pumafuse.fuse, {mode}", "ns", [1e9 * s / rows / len(AXES) for s in seconds], rows, each)]
 
     return measure

@@ -1,6 +1,7 @@
 """The pictures and the numbers of the README, made anew from the shipped data: ``python docs/pictures.py``.
 
-Sets side by side, with the camera alone: its raw readings, the readings interpolated, a constant-velocity Kalman filter
+Sets side by side, with the camera alone: its raw measurements, the measurements interpolated, a constant-velocity
+Kalman filter
 tuned by maximum likelihood, and pumafuse. All have the camera's latency removed; errors are against the truth.
 """
 
@@ -38,7 +39,7 @@ def constant_velocity(time, value, density, at):
         nis = (z - kf.x[0, 0]) ** 2 / S
         rejected = rejected + 1 if nis > GATE**2 else 0
         likelihood -= 0.5 * (np.log(2 * np.pi * S) + min(nis, GATE**2))
-        if nis <= GATE**2 or rejected > 5:  # a gate that never reopened would lose the arm for good
+        if nis <= GATE**2 or rejected > 5:  # a gate that never reacquired would lose the arm for good
             kf.update(np.array([[z]]))
         states.append((states[-1][0] + step, kf.x[:, 0]))
     stamps, mean = np.array([stamp for stamp, _ in states]), np.array([x for _, x in states])
@@ -48,7 +49,7 @@ def constant_velocity(time, value, density, at):
 
 def rows(est, axis):
     """Positions on the even grid by each method."""
-    seen = est.readings.of("vision", axis)
+    seen = est.measurements.of("vision", axis)
     good = seen.where(seen.outcome == pf.Outcome.FUSED)
 
     def misfit(log_density):
@@ -57,8 +58,8 @@ def rows(est, axis):
     best = minimize_scalar(misfit, bounds=(-6.0, 3.0), method="bounded")
     held = np.maximum(np.searchsorted(good.time, est.time, side="right") - 1, 0)
     return {
-        "last camera reading held": good.value[held],
-        "camera readings interpolated (afterwards)": np.interp(est.time, good.time, good.value),
+        "last camera measurement held": good.value[held],
+        "camera measurements interpolated (afterwards)": np.interp(est.time, good.time, good.value),
         "constant-velocity filter, tuned": constant_velocity(seen.time, seen.value, np.exp(best.x), est.time)[0],
         "pumafuse": est[axis].position,
     }
@@ -86,10 +87,10 @@ def stretch(axes, est, methods, truth):
     time, truth = est.time[shown], truth["radial"][shown] * 1e3
     middle, span = np.median(truth), 1.9 * np.ptp(truth)
     low, high = middle - 0.5 * span, middle + 0.5 * span
-    seen = est.readings.of("vision", "radial")
+    seen = est.measurements.of("vision", "radial")
     seen = seen.where((seen.time >= start) & (seen.time <= end))
     fused, value = seen.outcome == pf.Outcome.FUSED, seen.value * 1e3
-    axes.plot(seen.time[fused], value[fused], "o", ms=3.5, color=COLOURS[1], label="camera readings")
+    axes.plot(seen.time[fused], value[fused], "o", ms=3.5, color=COLOURS[1], label="camera measurements")
     for when, far in zip(seen.time[~fused], value[~fused], strict=True):
         edge = np.clip(far, low + 0.04 * span, high - 0.04 * span)
         axes.plot(when, edge, "x", ms=8, mew=2, color=style.REJECTED)

@@ -1,6 +1,6 @@
-/* A sensor's loop that tells pumafuse each reading; to copy.
+/* A sensor's loop that tells pumafuse each measurement; to copy.
 
-       cc -std=c11 -O2 -o readings examples/readings.c -lm && ./readings HOST PORT [SECONDS]
+       cc -std=c11 -O2 -o measurements examples/readings.c -lm && ./measurements HOST PORT [SECONDS]
 
    A hundred times a second the sensor is read, and goes as a datagram to `pumafuse live udp://...` under the name that
    it has in fusion.toml. What it does not see is left out. POSIX. */

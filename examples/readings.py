@@ -1,4 +1,4 @@
-"""A sensor's loop that tells pumafuse each reading; to copy.
+"""A sensor's loop that tells pumafuse each measurement; to copy.
 
     python examples/readings.py HOST PORT [SECONDS]
 
@@ -32,9 +32,9 @@ def main() -> None:
     begin, row = time.monotonic(), 0
     while row * PERIOD < seconds:
         time.sleep(max(begin + row * PERIOD - time.monotonic(), 0.0))
-        reading = read_sensor(time.time())
+        measurement = read_sensor(time.time())
         stamp = time.time_ns()  # when it arrived; until then it took the sensor's latency_ms of fusion.toml
-        line = json.dumps({"t_ns": stamp, "sensor": SENSOR, **reading})
+        line = json.dumps({"t_ns": stamp, "sensor": SENSOR, **measurement})
         with contextlib.suppress(OSError):  # the next one may get through
             link.sendto(line.encode(), place)
         row += 1

@@ -21,7 +21,7 @@ for how in ({}, {"as_live": True}, {"smooth": True}):
 """
 OTHERS = """
 live = pf.LiveEstimator(config)
-live.command(0, radial=0.5), live.reading(0, "tracker", radial=0.5), live.estimate(), live.health()
+live.command(0, radial=0.5), live.measurement(0, "tracker", radial=0.5), live.estimate(), live.health()
 model = pf.discretize(config.arm.axes["radial"], period=0.028, delay=0.06, input_noise=3e-5, drift=4e-4)
 for runs in (1, 8):
     pf.filter_ticks(model, np.zeros((runs, 9)), np.zeros((runs, 9)), 1e-3)

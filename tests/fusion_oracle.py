@@ -6,8 +6,8 @@ Section 2 of the design says p(t) = ∫ g(t − s) (v(s − Td) + w(s)) ds + o(t
     covariance ∫ q(s) g(t − s) g(t' − s) ds + var(o₀) + ∫ drift²(s) ds over what lies before both t and t'.
 
 Velocity has g' in the place of g. No state space and no recursion in time: closed-form responses, superposition,
-Gauss-Legendre quadrature. The priors are added and the readings conditioned on in 50-digit decimals, because a bias of
-1 m against noise of 0.05 mm leaves a double too few digits.
+Gauss-Legendre quadrature. The priors are added and the measurements conditioned on in 50-digit decimals, because a bias
+of 1 m against noise of 0.05 mm leaves a double too few digits.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from decimal import Decimal, localcontext
 import numpy as np
 
 from pumafuse.fusion.config import FusionConfig
-from pumafuse.fusion.estimates import Estimates, Readings
+from pumafuse.fusion.estimates import Estimates, Measurements
+from pumafuse.logs.run import Run
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
-from pumafuse.runs.run import Run
 
 DIGITS = 50
 FIELDS = ("position", "velocity", "offset")
@@ -41,12 +41,12 @@ def check_estimates(estimate: object, belief: Belief) -> None:
         _check_sd(f"{field}_sd", getattr(estimate, f"{field}_sd"), getattr(belief, f"{field}_sd"))
 
 
-def check_innovations(readings: Readings, oracle: AxisOracle) -> None:
-    """Innovations of one axis's fused scalars agree with the oracle's, to the same tolerances."""
+def check_innovations(measurements: Measurements, oracle: AxisOracle) -> None:
+    """Innovations of one axis's fused components agree with the oracle's, to the same tolerances."""
     nu, sd = oracle.innovations()
-    assert readings.value.tolist() == [reading.value for reading in oracle.readings]
-    _check("innovation", readings.innovation, nu, sd)
-    _check_sd("innovation_sd", readings.innovation_sd, sd)
+    assert measurements.value.tolist() == [measurement.value for measurement in oracle.measurements]
+    _check("innovation", measurements.innovation, nu, sd)
+    _check_sd("innovation_sd", measurements.innovation_sd, sd)
 
 
 def nanoseconds(estimates: Estimates) -> np.ndarray:
@@ -126,7 +126,7 @@ class Entries:
 
 
 def entries(run: Run, config: FusionConfig, axis: str, end: int) -> Entries:
-    """Section 2's scalar recursion for the gain, up to ``end`` [ns]; commands as given, stamps believed."""
+    """Section 2's component recursion for the gain, up to ``end`` [ns]; commands as given, stamps believed."""
     model, period = config.arm.axes[axis], config.arm.update_period
     delay = round(config.arm.delay_of(axis) * 1e9)
     kept = np.isfinite(run.command.values[axis])
@@ -153,8 +153,8 @@ def entries(run: Run, config: FusionConfig, axis: str, end: int) -> Entries:
 
 
 @dataclass(frozen=True)
-class Reading:
-    """One finite scalar, valid at or after the run's first command; ns since that command, SI."""
+class Measurement:
+    """One finite component, valid at or after the run's first command; ns since that command, SI."""
 
     sensor: str
     row: int
@@ -204,8 +204,8 @@ class AxisOracle:
     """One axis of a run, gates off.
 
     Attributes:
-        readings: What there is to condition on, in the total order.
-        jumps: Readings just before which the offset jumps by N(0, variance [m²]): what a gate that reopens adds.
+        measurements: What there is to condition on, in the total order.
+        jumps: Measurements just before which the offset jumps by N(0, variance [m²]): what a gate that reopens adds.
     """
 
     def __init__(
@@ -215,41 +215,42 @@ class AxisOracle:
         axis: str,
         *,
         leave_out: Collection[tuple[str, int]] = (),
-        reopened: Collection[tuple[str, int]] = (),
+        reacquired: Collection[tuple[str, int]] = (),
     ) -> None:
         """Collect what ``run`` says of ``axis``.
 
         Args:
-            run: Commands and readings.
+            run: Commands and measurements.
             config: Arm, noise and sensors.
             axis: Which axis.
-            leave_out: Readings not to condition on: sensor and row.
-            reopened: Readings that reopened the gate: each adds its ν² to the offset's variance before it is fused.
+            leave_out: Measurements not to condition on: sensor and row.
+            reacquired: Measurements that reacquired the gate: each adds its ν² to the offset's variance before it is
+                fused.
         """
         self.run, self.config, self.axis = run, config, axis
         self.process, self.response = config.process[axis], Response(config.arm.axes[axis])
         first = run.command.values[axis][np.isfinite(run.command.values[axis])][0]
         self.start = run.start.get(axis, float(first))
-        self.readings = self._collect(set(leave_out))
+        self.measurements = self._collect(set(leave_out))
         self.jumps = dict[int, float]()
-        for k, reading in enumerate(self.readings):
-            if (reading.sensor, reading.row) in reopened:
+        for k, measurement in enumerate(self.measurements):
+            if (measurement.sensor, measurement.row) in reacquired:
                 self.jumps[k] = float(self.innovations()[0][k] ** 2)
 
     def innovations(self) -> tuple[np.ndarray, np.ndarray]:
-        """ν and √S of each reading, given all before it in the total order."""
+        """ν and √S of each measurement, given all before it in the total order."""
         with localcontext(prec=DIGITS):
-            L, w, _ = self._condition(self.readings, self._readings_as_rows(self.readings))
+            L, w, _ = self._condition(self.measurements, self._measurements_as_rows(self.measurements))
             sd = np.diagonal(L)
             return (sd * w).astype(float), sd.astype(float)
 
     def jointly(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (m,) and covariance (m, m) of all readings before any is known, with their noise; latencies are sure."""
+        """Mean (m,) and covariance (m, m) of all measurements before any is known, with their noise; latencies are sure."""
         assert not self.jumps
-        rows = self._readings_as_rows(self.readings)
-        sensors = [self.config.sensors[reading.sensor] for reading in self.readings]
+        rows = self._measurements_as_rows(self.measurements)
+        sensors = [self.config.sensors[measurement.sensor] for measurement in self.measurements]
         assert not any(sensor.latency_sd for sensor in sensors)
-        joint = self._joint(self.readings, rows)
+        joint = self._joint(self.measurements, rows)
         own = np.array([sensor.sd_of(self.axis) for sensor in sensors]) ** 2
         return rows.position * self.start + joint.mean.astype(float), joint.cross.astype(float) + np.diag(own)
 
@@ -260,34 +261,34 @@ class AxisOracle:
         return self.start + position, velocity
 
     def biases(self) -> dict[str, tuple[float, float]]:
-        """Mean and standard deviation [m] of each read sensor's bias, given every reading there is."""
+        """Mean and standard deviation [m] of each read sensor's bias, given every measurement there is."""
         found = dict[str, tuple[float, float]]()
         with localcontext(prec=DIGITS):
-            L, w, _ = self._condition(self.readings, self._readings_as_rows(self.readings))
-            for name in {reading.sensor for reading in self.readings}:
+            L, w, _ = self._condition(self.measurements, self._measurements_as_rows(self.measurements))
+            for name in {measurement.sensor for measurement in self.measurements}:
                 prior = Decimal(self.config.sensors[name].bias_sd) ** 2
-                shares = [[prior * (reading.sensor == name) for reading in self.readings]]
+                shares = [[prior * (measurement.sensor == name) for measurement in self.measurements]]
                 C = _substituted(np.array(shares), L)[0]
                 if prior:
                     found[name] = float(_dot(C, w)), float((prior - _dot(C, C)).sqrt())
         return found
 
     def filtered(self, times: np.ndarray) -> Belief:
-        """Given every reading valid at or before each of ``times`` [ns since the first command]."""
-        return self._believe(times, self.readings, [reading.valid for reading in self.readings])
+        """Given every measurement valid at or before each of ``times`` [ns since the first command]."""
+        return self._believe(times, self.measurements, [measurement.valid for measurement in self.measurements])
 
     def as_live(self, times: np.ndarray) -> Belief:
-        """Given every reading whose stamp and valid time are at or before each of ``times``."""
-        assert not any(self.config.sensors[reading.sensor].latency_sd for reading in self.readings)
+        """Given every measurement whose stamp and valid time are at or before each of ``times``."""
+        assert not any(self.config.sensors[measurement.sensor].latency_sd for measurement in self.measurements)
         assert not self.jumps
-        arrived = sorted(self.readings, key=lambda reading: max(reading.stamp, reading.valid))
-        return self._believe(times, arrived, [max(reading.stamp, reading.valid) for reading in arrived])
+        arrived = sorted(self.measurements, key=lambda measurement: max(measurement.stamp, measurement.valid))
+        return self._believe(times, arrived, [max(measurement.stamp, measurement.valid) for measurement in arrived])
 
     def smoothed(self, times: np.ndarray) -> Belief:
-        """Given every reading there is."""
-        return self._believe(times, self.readings, [min(times)] * len(self.readings))
+        """Given every measurement there is."""
+        return self._believe(times, self.measurements, [min(times)] * len(self.measurements))
 
-    def _collect(self, leave_out: set[tuple[str, int]]) -> list[Reading]:
+    def _collect(self, leave_out: set[tuple[str, int]]) -> list[Measurement]:
         origin, found = int(self.run.command.stamp.min()), []
         for rank, (name, sensor) in enumerate(self.config.sensors.items()):
             source = self.run.sensors.get(name)
@@ -297,14 +298,14 @@ class AxisOracle:
                 stamp = int(source.stamp[row]) - origin
                 valid = stamp - round(sensor.latency * 1e9)
                 if np.isfinite(value) and valid >= 0 and (name, row) not in leave_out:
-                    found.append((valid, rank, stamp, row, Reading(name, row, valid, stamp, float(value))))
-        return [reading for *_, reading in sorted(found)]
+                    found.append((valid, rank, stamp, row, Measurement(name, row, valid, stamp, float(value))))
+        return [measurement for *_, measurement in sorted(found)]
 
-    def _believe(self, times: np.ndarray, order: Sequence[Reading], known_from: Sequence[int]) -> Belief:
-        """Given, for each of ``times``, the readings of ``order`` that are known by then: the first so many."""
+    def _believe(self, times: np.ndarray, order: Sequence[Measurement], known_from: Sequence[int]) -> Belief:
+        """Given, for each of ``times``, the measurements of ``order`` that are known by then: the first so many."""
         count = np.searchsorted(known_from, times, side="right")
         targets = (Rows.each(times, *weights) for weights in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
-        rows = self._readings_as_rows(order)
+        rows = self._measurements_as_rows(order)
         for target in targets:
             rows = rows + target
         with localcontext(prec=DIGITS):
@@ -320,14 +321,14 @@ class AxisOracle:
         means = [part.astype(float) for part in (position, velocity, offset)]
         return Belief(*(part for pair in zip(means, sd, strict=True) for part in pair))
 
-    def _condition(self, order: Sequence[Reading], rows: Rows) -> tuple[np.ndarray, np.ndarray, _Joint]:
-        """Cholesky factor of the readings' covariance and the whitened readings; the first of ``rows`` are theirs."""
+    def _condition(self, order: Sequence[Measurement], rows: Rows) -> tuple[np.ndarray, np.ndarray, _Joint]:
+        """Cholesky factor of the measurements' covariance and the whitened measurements; the first of ``rows`` are theirs."""
         n = len(order)
-        speeds = Rows.each([reading.valid for reading in order], 0, 1, 0)
+        speeds = Rows.each([measurement.valid for measurement in order], 0, 1, 0)
         joint = self._joint(order, rows + speeds)
         L, w = np.full((n, n), Decimal(0)), np.full(n, Decimal(0))
-        for k, reading in enumerate(order):
-            sensor = self.config.sensors[reading.sensor]
+        for k, measurement in enumerate(order):
+            sensor = self.config.sensors[measurement.sensor]
             scale, sd = Decimal(sensor.scale), Decimal(sensor.sd_of(self.axis))
             here = [k, len(rows.time) + k]
             L[k, :k], speed = _substituted(joint.cross[here, :k], L[:k, :k])
@@ -335,11 +336,11 @@ class AxisOracle:
             noise = sd**2 + (scale * speed * Decimal(sensor.latency_sd)) ** 2
             L[k, k] = (joint.variance[k] + noise - _dot(L[k, :k], L[k, :k])).sqrt()
             predicted = scale * Decimal(self.start) + joint.mean[k] + _dot(L[k, :k], w[:k])
-            w[k] = (Decimal(reading.value) - predicted) / L[k, k]
+            w[k] = (Decimal(measurement.value) - predicted) / L[k, k]
         return L, w, joint.first(len(rows.time))
 
-    def _joint(self, order: Sequence[Reading], rows: Rows) -> _Joint:
-        """Prior of ``rows``, the first of which are the readings without their noise."""
+    def _joint(self, order: Sequence[Measurement], rows: Rows) -> _Joint:
+        """Prior of ``rows``, the first of which are the measurements without their noise."""
         n = len(order)
         fed = entries(self.run, self.config, self.axis, int(rows.time.max(initial=0)) + 1)
         mean = self._mean(rows, fed)
@@ -393,14 +394,14 @@ class AxisOracle:
         seen = rows.position[:, None] * impulse[place] + rows.velocity[:, None] * rate[place]
         return noise, drift, seen, rows.level[:, None] * past[place]
 
-    def _readings_as_rows(self, order: Sequence[Reading]) -> Rows:
-        scale = [self.config.sensors[reading.sensor].scale for reading in order]
-        return Rows.each([reading.valid for reading in order], scale, 0, 0)
+    def _measurements_as_rows(self, order: Sequence[Measurement]) -> Rows:
+        scale = [self.config.sensors[measurement.sensor].scale for measurement in order]
+        return Rows.each([measurement.valid for measurement in order], scale, 0, 0)
 
 
 @dataclass(frozen=True)
 class _Joint:
-    """Prior of some rows in decimals: mean (rows,), variance (rows,), covariance with the readings (rows, readings)."""
+    """Prior of some rows in decimals: mean (rows,), variance (rows,), covariance with the measurements (rows, measurements)."""
 
     mean: np.ndarray
     variance: np.ndarray

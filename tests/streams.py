@@ -20,7 +20,7 @@ FIELDS = ("position", "position_sd", "velocity", "velocity_sd", "offset", "offse
 
 
 class Event(NamedTuple):
-    """A command (no sensor) or a reading: stamp in int ns, values in m."""
+    """A command (no sensor) or a measurement: stamp in int ns, values in m."""
 
     stamp: int
     sensor: str
@@ -28,7 +28,7 @@ class Event(NamedTuple):
 
 
 def events_of(run: pf.Run) -> list[Event]:
-    """All rows of a run in the order of their stamps, readings before commands of the same instant."""
+    """All rows of a run in the order of their stamps, measurements before commands of the same instant."""
     found = []
     for sensor, source in [("", run.command), *run.sensors.items()]:
         columns = {axis: value.tolist() for axis, value in source.values.items()}
@@ -49,9 +49,9 @@ def delayed(events: Sequence[Event], longest: float, seed: int, *, twice: float 
     return [pool[place] for place in order]
 
 
-def feed(live: pf.LiveEstimator, event: Event) -> pf.Told:
+def feed(live: pf.LiveEstimator, event: Event) -> pf.UpdateResult:
     if event.sensor:
-        return live.reading(event.stamp, event.sensor, **event.values)
+        return live.measurement(event.stamp, event.sensor, **event.values)
     return live.command(event.stamp, **event.values)
 
 
@@ -90,14 +90,14 @@ def differences(
 
 
 def outcomes_of(offline: pf.Estimates) -> dict[str, dict[str, int]]:
-    """How many scalars of each sensor had which outcome."""
-    readings = offline.readings
+    """How many components of each sensor had which outcome."""
+    measurements = offline.measurements
     return {
         sensor: {
-            outcome.word: int(np.sum((readings.sensor == number) & (readings.outcome == outcome)))
+            outcome.word: int(np.sum((measurements.sensor == number) & (measurements.outcome == outcome)))
             for outcome in pf.Outcome
         }
-        for number, sensor in enumerate(readings.sensors)
+        for number, sensor in enumerate(measurements.sensors)
     }
 
 
@@ -121,7 +121,7 @@ def axes_of(draw: st.DrawFn) -> pf.ArmModel:
 
 @st.composite
 def any_stream(draw: st.DrawFn) -> tuple[pf.FusionConfig, pf.Run, int]:
-    """A configuration, a run of commands and readings at any times, and a seed for the order in which they come."""
+    """A configuration, a run of commands and measurements at any times, and a seed for the order in which they come."""
     arm = axes_of(draw)
     sensors = {
         "tracker": pf.Sensor(sd=1e-4, latency=draw(st.sampled_from([0.008, -0.02])), gate=3.0),

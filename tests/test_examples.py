@@ -20,13 +20,13 @@ SECONDS = "1.5"
 
 @pytest.mark.long
 @pytest.mark.parametrize("language", ["python", "c"])
-def test_commands_and_readings_are_fused(tmp_path: Path, language: str) -> None:
-    """A second and a half of both loops at their own pace: every datagram is taken, the readings are fused."""
+def test_commands_and_measurements_are_fused(tmp_path: Path, language: str) -> None:
+    """A second and a half of both loops at their own pace: every datagram is taken, the measurements are fused."""
     if language == "c":
         compiler = shutil.which("cc")
         if compiler is None:
             pytest.skip("there is no C compiler")
-        for name in ("commands", "readings"):
+        for name in ("commands", "measurements"):
             flags = ["-std=c11", "-Wall", "-Wextra", "-Werror", "-o", str(tmp_path / name)]
             subprocess.run([compiler, *flags, str(EXAMPLES / f"{name}.c"), "-lm"], check=True)
     with live("udp://127.0.0.1:0", EXAMPLES / "fusion.toml") as process:
@@ -35,7 +35,7 @@ def test_commands_and_readings_are_fused(tmp_path: Path, language: str) -> None:
             [str(tmp_path / name), *where]
             if language == "c"
             else [sys.executable, str(EXAMPLES / f"{name}.py"), *where]
-            for name in ("commands", "readings")
+            for name in ("commands", "measurements")
         ]
         senders = [subprocess.Popen(one) for one in words]
         assert [sender.wait(LONGEST) for sender in senders] == [0, 0]

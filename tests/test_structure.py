@@ -10,11 +10,11 @@ import pumafuse as pf
 SOURCE = Path(pf.__file__).parent
 ROOMS = [
     "model",
-    "runs",
+    "logs",
     "fusion",
-    "simulate",
-    "identify",
-    "tune",
+    "simulation",
+    "identification",
+    "tuning",
     "live",
     "views",
     "cli",

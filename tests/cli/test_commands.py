@@ -47,7 +47,7 @@ def with_tracker(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_demo_leaves_everything_it_promises(demo: Path) -> None:
     """Tables, the configuration as used, a picture and a recording that rerun accepts."""
     names = {path.name for path in demo.iterdir()}
-    tables = {"estimates.parquet", "readings.parquet", "reference.parquet"}
+    tables = {"estimates.parquet", "measurements.parquet", "reference.parquet"}
     figures = {"fused.png", "error.png", "validation.png"}
     assert names == tables | figures | {"summary.json", "fusion.toml", "arm.toml", "fused.rrd"}
     assert all((demo / name).read_bytes().startswith(b"\x89PNG") for name in figures)
@@ -65,23 +65,23 @@ def test_the_scan_is_fused_as_well_as_promised(demo: Path, with_tracker: Path) -
 
 
 def test_result_tables_have_the_documented_columns(with_tracker: Path) -> None:
-    """Names and row counts of design and README: an even grid, every scalar of both sensors with its outcome."""
+    """Names and row counts of design and README: an even grid, every component of both sensors with its outcome."""
     estimates = pq.read_table(with_tracker / "estimates.parquet")
     kinds = ("position_mm", "position_sd_mm", "velocity_mm_s", "velocity_sd_mm_s", "offset_mm", "offset_sd_mm")
     expected = [f"{axis}.{kind}" for axis in ("tangential", "radial", "vertical") for kind in kinds]
     assert estimates.column_names == ["time_s", *expected]
     assert estimates["time_s"].to_pylist()[:3] == [0.0, 0.005, 0.01]
-    readings = pq.read_table(with_tracker / "readings.parquet")
-    assert readings.column_names == [
+    measurements = pq.read_table(with_tracker / "measurements.parquet")
+    assert measurements.column_names == [
         *("time_s", "stamp_s", "sensor", "axis", "value_mm"),
         *("innovation_mm", "innovation_sd_mm", "nis", "outcome"),
     ]
-    assert readings.num_rows == 3 * (5999 + 1704)
+    assert measurements.num_rows == 3 * (5999 + 1704)
     summary = json.loads((with_tracker / "summary.json").read_text())
     counted = sum(
         n for axis in summary["axes"].values() for s in axis["sensors"].values() for n in s["outcomes"].values()
     )
-    assert counted == readings.num_rows
+    assert counted == measurements.num_rows
 
 
 @pytest.mark.long
@@ -231,8 +231,8 @@ def servo(name: str) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "limit"), [("sin_sin", 1.4), ("sin_time_square", 5.4)])
-def test_a_real_servo_is_followed_between_rare_readings(name: str, limit: float, tmp_path: Path) -> None:
-    """Within 1.4 and 5.4 mm, where the last reading held is 10 and 26.6 mm off.
+def test_a_real_servo_is_followed_between_rare_measurements(name: str, limit: float, tmp_path: Path) -> None:
+    """Within 1.4 and 5.4 mm, where the last measurement held is 10 and 26.6 mm off.
 
     Commands come every 20 ± 3 ms, the encoder is read once in 100 ms, and arm.toml is written by hand.
     """

@@ -201,4 +201,4 @@ def test_the_status_shows_milliseconds_and_millimetres() -> None:
     assert "570.000" in shown
     assert "stale" in shown
     assert "2.0" in shown
-    assert "outcomes count scalars" in shown
+    assert "outcomes count components" in shown

@@ -19,7 +19,7 @@ import pumafuse as pf
 from executable import EXECUTABLE, pumafuse
 from pumafuse import folders
 from pumafuse.cli import many
-from pumafuse.simulate import simulate as simulation
+from pumafuse.simulation import simulate as simulation
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 SCENARIO = """
@@ -37,7 +37,7 @@ rate_hz = 30.0
 sd_mm = 0.5
 """
 FILES = {"scenario.toml", "run.toml", "fusion.toml", "arm.toml", "commands.csv", "eye.csv", "truth.csv"}
-RESULT = {"estimates.parquet", "readings.parquet", "reference.parquet", "summary.json", "fusion.toml", "arm.toml"}
+RESULT = {"estimates.parquet", "measurements.parquet", "reference.parquet", "summary.json", "fusion.toml", "arm.toml"}
 
 
 @pytest.fixture
@@ -60,7 +60,8 @@ def test_a_run_is_written_whole_and_the_next_command_works(scenario: Path, tmp_p
     said = pumafuse("simulate", scenario, "-o", tmp_path / "run").stdout.splitlines()
     assert said[0] == "short: Nothing much."
     assert (
-        said[1] == f"1 run: 73 commands, {len(pf.Run.read(tmp_path / 'run').sensors['eye'].stamp)} rows of readings,"
+        said[1]
+        == f"1 run: 73 commands, {len(pf.Run.read(tmp_path / 'run').sensors['eye'].stamp)} rows of measurements,"
         f" written to {tmp_path / 'run'}"
     )
     assert names(tmp_path / "run") == FILES

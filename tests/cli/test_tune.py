@@ -16,10 +16,10 @@ import pytest
 
 import pumafuse as pf
 from executable import EXECUTABLE, pumafuse
-from pumafuse.runs.save import save
-from pumafuse.tune.likelihood import Evidence
-from pumafuse.tune.summary import TuningSummary
-from tuning import later, quietly, replaced, scenario, spoiled, spoiled_arm, with_outliers
+from pumafuse.logs.save import save
+from pumafuse.tuning.likelihood import Evidence
+from pumafuse.tuning.summary import TuningSummary
+from tuning_runs import later, quietly, replaced, scenario, spoiled, spoiled_arm, with_outliers
 
 FILES = {"fusion.toml", "arm.toml", "tuning.json"}
 
@@ -113,7 +113,7 @@ def test_json_is_what_the_file_holds(tuned: tuple[Path, subprocess.CompletedProc
 
 
 def test_worse_on_what_was_held_back_is_code_3(place: Place, run: Path) -> None:
-    """Validated on a run of far noisier readings; files are written all the same, the table and the verdict shown.
+    """Validated on a run of far noisier measurements; files are written all the same, the table and the verdict shown.
 
     With --force they take the place of an earlier result, whose page goes with it.
     Everything asked for on the command line is in the summary; keys, intervals and the next command are on the screen.

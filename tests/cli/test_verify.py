@@ -65,7 +65,7 @@ def test_json_says_what_python_says(run: Path, found: list[dict[str, object]]) -
     assert len(found) == 4
     for one, other in zip(found, expected, strict=True):
         assert set(one) == {
-            *("run", "axis", "source", "readings", "amplitude_mm", "start_mm", "start_from", "model"),
+            *("run", "axis", "source", "measurements", "amplitude_mm", "start_mm", "start_from", "model"),
             *("without_recovery", "with_recovery", "recovery_ms", "floor", "outlying", "verdict", "notes"),
         }
         assert set(one["model"]) == MEASURED

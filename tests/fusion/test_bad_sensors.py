@@ -1,6 +1,6 @@
 """The shipped scan with one sensor gone bad: the run ends, the trouble is said in words, the good sensor still counts.
 
-Tracker and camera see all three axes; each test spoils the tracker's readings and leaves the camera's alone.
+Tracker and camera see all three axes; each test spoils the tracker's measurements and leaves the camera's alone.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.fusion.summary import Summary, summarise
-from pumafuse.runs.run import Source
+from pumafuse.logs.run import Source
 
 DATA = Path(pf.__file__).parent / "data"
 AXES = ("tangential", "radial", "vertical")
@@ -81,12 +81,12 @@ def check_same(est: pf.Estimates, wanted: pf.Estimates) -> None:
 def test_a_sensor_that_is_always_wrong_is_named(scan: pf.Run, config: pf.FusionConfig) -> None:
     """50 mm off beside a good one: its gate reopens, which is said with the key to give; the camera's does too."""
     _, summary = fused(scan, config, lambda source: changed(source, lambda value: value + 0.05))
-    assert said(summary, "gate reopened", "contradicts the others", "bias_sd_mm")
-    assert said(summary, "of its scalars were gated")
+    assert said(summary, "gate reacquired", "contradicts the others", "bias_sd_mm")
+    assert said(summary, "of its components were rejected")
     for axis in AXES:
         outcomes = summary.axes[axis].sensors["tracker"].outcomes
-        assert outcomes["reopened"] > 10
-        assert outcomes["gated"] > 0.3 * sum(outcomes.values())
+        assert outcomes["reacquired"] > 10
+        assert outcomes["rejected"] > 0.3 * sum(outcomes.values())
 
 
 def test_a_constant_error_is_found_where_a_bias_is_expected(
@@ -115,14 +115,14 @@ def test_a_frozen_sensor_is_seen(scan: pf.Run, config: pf.FusionConfig) -> None:
     est, summary = fused(scan, config, freeze)
     assert not any(": it froze" in note for note in good.notes)
     for axis in AXES:
-        assert said(summary, f"2000 {axis} readings in a row have the same value", "it froze")
+        assert said(summary, f"2000 {axis} measurements in a row have the same value", "it froze")
         assert rmse(est, axis, after=41.0) == pytest.approx(rmse(good, axis, after=41.0), rel=0.01)
 
 
 def test_a_sensor_of_nothing_but_nan_is_left_out(
     scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
 ) -> None:
-    """A minute of NaN: every reading invalid, counted on each axis, and the estimates are the camera's alone."""
+    """A minute of NaN: every measurement invalid, counted on each axis, and the estimates are the camera's alone."""
     est, summary = fused(scan, config, lambda source: changed(source, lambda value: np.full_like(value, np.nan)))
     check_same(est, camera_alone)
     for axis in AXES:
@@ -133,10 +133,10 @@ def test_a_sensor_of_nothing_but_nan_is_left_out(
         assert found.nis_mean is None
 
 
-def test_an_infinite_reading_is_as_good_as_none(
+def test_an_infinite_measurement_is_as_good_as_none(
     scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
 ) -> None:
-    """A minute of ±∞ is a minute of invalid readings."""
+    """A minute of ±∞ is a minute of invalid measurements."""
     est, summary = fused(scan, config, lambda source: changed(source, lambda value: np.copysign(np.inf, value)))
     check_same(est, camera_alone)
     assert summary.axes["radial"].sensors["tracker"].outcomes == {"invalid": 5999}
@@ -177,7 +177,7 @@ def test_a_sensor_on_a_clock_since_boot_is_asked_about(
     assert summary.axes["radial"].sensors["tracker"].outcomes == {"before_start": 5999}
 
 
-def test_readings_long_after_the_run_are_told(
+def test_measurements_long_after_the_run_are_told(
     scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
 ) -> None:
     """Two hours late, the tracker says nothing of the run: its estimates are the camera's, and the hours are named."""

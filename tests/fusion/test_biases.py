@@ -18,8 +18,8 @@ from fusion_oracle import AxisOracle
 from pumafuse.errors import PumafuseWarning
 from pumafuse.fusion.config import FusionConfig, Process
 from pumafuse.fusion.offline import fuse
+from pumafuse.logs.run import Run
 from pumafuse.model.arm import AxisModel
-from pumafuse.runs.run import Run
 
 # ---- biases ---------------------------------------------------------------------------------------------------------
 
@@ -60,7 +60,7 @@ BIASED = {name: case for name, case in CASES.items() if any(ear.sensor.bias_sd f
 @pytest.mark.parametrize("smooth", [False, True], ids=["filtered", "smoothed"])
 @pytest.mark.parametrize("case", BIASED.values(), ids=BIASED.keys())
 def test_biases_are_conditional_means(case: Case, smooth: bool) -> None:
-    """Each sensor that may have one has its bias on each axis it reads, given all readings; smoothed or not."""
+    """Each sensor that may have one has its bias on each axis it reads, given all measurements; smoothed or not."""
     check(case, smooth=smooth)
 
 
@@ -78,7 +78,7 @@ def test_any_bias_is_estimated_like_the_conditional_gaussian(case: Case) -> None
 @pytest.mark.parametrize("level", [-2.0, 0.0, 0.56, 3.0])
 @pytest.mark.parametrize("start", [None, 5e-3])
 def test_a_bias_is_in_the_coordinates_of_the_log(level: float, start: float | None) -> None:
-    """Readings 600.4 mm − p have a bias of 600.4 mm wherever the arm starts, be it said or the first command."""
+    """Measurements 600.4 mm − p have a bias of 600.4 mm wherever the arm starts, be it said or the first command."""
     case = Case(heard={"panel": PANEL, "tracker": TRACKER}, start={} if start is None else {"radial": 0.5 + start})
     run, config = case.made()
     shift = level - 0.5
@@ -137,20 +137,20 @@ def moving(heard: Heard, process: Process, seed: int = 1) -> tuple[Run, FusionCo
 
 
 @pytest.mark.parametrize("at", [75, 300, 1234, 2400, 2990])
-def test_a_readings_variance_grows_with_the_square_of_the_speed(at: int) -> None:
-    """S of a first reading is that of a sure latency and (scale · predicted velocity · latency_sd)²."""
+def test_a_measurements_variance_grows_with_the_square_of_the_speed(at: int) -> None:
+    """S of a first measurement is that of a sure latency and (scale · predicted velocity · latency_sd)²."""
     spread = []
     for latency_sd in (0.0, JITTER):
         of = sensor(0.1e-3, latency=0.02, scale=SCALE, latency_sd=latency_sd)
         run, config = moving(Heard(of, np.array([at * MS])), Process(input_noise=0.2e-3, drift=0.5e-3))
-        spread.append(fuse(run, config).readings.innovation_sd.item() ** 2)
+        spread.append(fuse(run, config).measurements.innovation_sd.item() ** 2)
     speed = AxisOracle(run, config, "radial").undisturbed(np.array([at * MS]))[1].item()
     assert spread[1] - spread[0] == pytest.approx((SCALE * speed * JITTER) ** 2, rel=1e-9, abs=1e-18)
     assert abs(speed) > 1e-3
 
 
 def jittering_nis(latency_sd: float, seed: int) -> np.ndarray:
-    """NIS of 150 readings whose latency really wanders, of an arm whose offset really walks."""
+    """NIS of 150 measurements whose latency really wanders, of an arm whose offset really walks."""
     rng, valid = np.random.default_rng(seed), every(50, 150)
     of = sensor(0.1e-3, latency=0.02, scale=SCALE, latency_sd=latency_sd)
     run, config = moving(Heard(of, valid), Process(input_noise=0.0, drift=DRIFT))
@@ -161,10 +161,10 @@ def jittering_nis(latency_sd: float, seed: int) -> np.ndarray:
     offset[order] = rng.normal(0.0, config.start.offset_sd) + np.cumsum(step * rng.normal(size=len(valid)))
     position = AxisOracle(run, config, "radial").undisturbed(actual)[0] + offset
     run.sensors["tracker"].values["radial"][:] = SCALE * position + rng.normal(0.0, 0.1e-3, len(valid))
-    return fuse(run, config).readings.nis
+    return fuse(run, config).measurements.nis
 
 
-def test_readings_whose_latency_wanders_are_consistent_where_latency_sd_says_so() -> None:
+def test_measurements_whose_latency_wanders_are_consistent_where_latency_sd_says_so() -> None:
     """Mean NIS over many runs is 1 within the 99.9 % band of χ²; without latency_sd the errors look far too large."""
     told_of, untold = (np.concatenate([jittering_nis(sd, seed) for seed in range(25)]) for sd in (JITTER, 0.0))
     low, high = chi2.ppf([0.0005, 0.9995], len(told_of)) / len(told_of)

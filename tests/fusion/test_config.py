@@ -94,7 +94,7 @@ def test_noise_is_one_number_or_one_for_each_axis(tmp_path: Path) -> None:
 
 
 def test_sensors_keep_the_order_of_the_file(tmp_path: Path) -> None:
-    """The order of the file decides between readings valid at one instant, also for a choice of sensors."""
+    """The order of the file decides between measurements valid at one instant, also for a choice of sensors."""
     names = ("zeta", "alpha", "mu")
     config = load(tmp_path, ARM + "".join(f"[sensors.{name}]\nsd_mm = 1\n" for name in names))
     assert config.sensor_names(None) == names

@@ -1,8 +1,8 @@
 """Consistency: the statistics against scipy and by hand, the verdicts on data made exactly by the model.
 
 The simulation draws from section 2's model itself: a first-order plant with white noise at its input, an offset on a
-random walk, readings with white noise and a latency. A filter told the truth must then be right; one told a lie must
-say which.
+random walk, measurements with white noise and a latency. A filter told the truth must then be right; one told a lie
+must say which.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pumafuse.fusion.consistency import (
 )
 
 PERIOD, DELAY, TAU = 28_000_000, 60_450_000, 0.0425  # ns, ns, s
-FIRST = 40_000_000  # ns, of the first reading
+FIRST = 40_000_000  # ns, of the first measurement
 SEEDS = 120
 
 
@@ -62,17 +62,17 @@ def simulated(world: World, command: np.ndarray, every: float, count: int, axes:
     valid = FIRST + np.rint(every * 1e9 * np.arange(count)).astype(np.int64)
     given = PERIOD * np.arange(len(command))
     change = dict(zip((given + DELAY).tolist(), command - command[0], strict=True))
-    reading = set(valid.tolist())
+    measurement = set(valid.tolist())
     x, o = np.zeros(axes), world.offset_sd * rng.standard_normal(axes)
     v, now, z = 0.0, 0, list[np.ndarray]()
-    for instant in sorted(reading | {time for time in change if time <= valid[-1]}):
+    for instant in sorted(measurement | {time for time in change if time <= valid[-1]}):
         dt = (instant - now) / 1e9
         decay = math.exp(-dt / TAU)
         spread = world.input_noise * math.sqrt((1.0 - decay**2) / (2.0 * TAU))
         x = decay * x + (1.0 - decay) * v + spread * rng.standard_normal(axes)
         o = o + world.drift * math.sqrt(dt) * rng.standard_normal(axes)
         now, v = instant, change.get(instant, v)
-        if instant in reading:
+        if instant in measurement:
             z.append(command[0] + x + o + world.sd * rng.standard_normal(axes))
     names = [f"axis{number}" for number in range(axes)]
     stamps = valid + round(world.latency * 1e9)
@@ -134,8 +134,8 @@ def test_ljung_box_of_what_does_not_vary_accuses_nobody(values: list[float]) -> 
     assert p == 1.0
 
 
-def test_log_likelihood_is_the_joint_density_of_the_readings() -> None:
-    """Gates off, it is the log density of all readings in mm as one dense Gaussian: offset walk plus noise."""
+def test_log_likelihood_is_the_joint_density_of_the_measurements() -> None:
+    """Gates off, it is the log density of all measurements in mm as one dense Gaussian: offset walk plus noise."""
     world = World(input_noise=0.0)
     run = simulated(world, np.zeros(30), 0.02, 40, 2, 1)
     est = pf.fuse(run, world.config(run))
@@ -143,7 +143,7 @@ def test_log_likelihood_is_the_joint_density_of_the_readings() -> None:
     covariance = world.offset_sd**2 + world.drift**2 * np.minimum.outer(time, time) + world.sd**2 * np.eye(40)
     density = stats.multivariate_normal(np.zeros(40), covariance * 1e6)
     wanted = sum(density.logpdf(run.sensors["camera"].values[axis] * 1e3) for axis in run.axes)
-    assert log_likelihood(est.readings, est.config.sensors) == pytest.approx(wanted, rel=1e-9)
+    assert log_likelihood(est.measurements, est.config.sensors) == pytest.approx(wanted, rel=1e-9)
 
 
 def outlying(world: World, rows: range) -> tuple[pf.Run, np.ndarray]:
@@ -155,8 +155,8 @@ def outlying(world: World, rows: range) -> tuple[pf.Run, np.ndarray]:
     return run, good
 
 
-def test_gated_scalars_leave_the_counts() -> None:
-    """With blunders gated, count, NIS, correlation and verdict are those of the run without these rows."""
+def test_rejected_components_leave_the_counts() -> None:
+    """With blunders rejected, count, NIS, correlation and verdict are those of the run without these rows."""
     world = World(gate=6.0)
     run, good = outlying(world, range(10, 250, 20))
     told = judged(run, world)["axis0"]
@@ -168,12 +168,12 @@ def test_gated_scalars_leave_the_counts() -> None:
     assert told.verdict == wanted.verdict
 
 
-def test_a_gated_scalar_costs_as_much_as_one_at_the_gate() -> None:
-    """−½(ln 2πS + gate²) for each gated scalar, −½(ln 2πS + ν²/S) for each other: normal densities in mm."""
+def test_a_rejected_component_costs_as_much_as_one_at_the_gate() -> None:
+    """−½(ln 2πS + gate²) for each rejected component, −½(ln 2πS + ν²/S) for each other: normal densities in mm."""
     world = World(gate=6.0)
     run, good = outlying(world, range(10, 250, 20))
     est = pf.fuse(run, world.config(run))
-    met, sd = est.readings, est.readings.innovation_sd * 1e3
+    met, sd = est.measurements, est.measurements.innovation_sd * 1e3
     at = np.where(good, met.innovation * 1e3, 6.0 * sd)
     assert log_likelihood(met, est.config.sensors) == pytest.approx(stats.norm.logpdf(at, 0.0, sd).sum(), rel=1e-9)
 
@@ -184,7 +184,7 @@ def test_what_is_judged_are_the_normalised_innovations() -> None:
     run = simulated(world, swing(3.0), 0.02, 100, 1, 6)
     est = pf.fuse(run, world.config(run))
     found = consistency(est, "camera", "axis0")
-    normalised = est.readings.innovation / est.readings.innovation_sd
+    normalised = est.measurements.innovation / est.measurements.innovation_sd
     assert found.nis == pytest.approx(np.mean(normalised**2))
     centred = normalised - normalised.mean()
     assert found.correlation[:2] == pytest.approx(
@@ -250,11 +250,11 @@ def test_verdicts_name_the_key_that_is_wrong(moving: pf.Run, told: World, said: 
 
 
 @pytest.mark.parametrize(("count", "told"), [(29, True), (30, False)])
-def test_few_readings_are_not_judged(count: int, told: bool) -> None:
+def test_few_measurements_are_not_judged(count: int, told: bool) -> None:
     """Below 30 the verdict is that there are too few, and how many."""
     world = World()
     found = judged(simulated(world, swing(2.0), 0.033, count, 1, 5), world)["axis0"]
-    assert (found.verdict == f"too few readings ({count}) to tell") == told
+    assert (found.verdict == f"too few measurements ({count}) to tell") == told
     assert found.count == count
 
 
@@ -278,20 +278,20 @@ def test_half_the_noise_blames_sd_first():
 
 @pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 def test_a_verdict_on_what_a_gate_has_left_says_so(moving: pf.Run) -> None:
-    """Told a third of the noise and a gate of 2, what is left fits by selection: how many were gated is the verdict."""
+    """UpdateResult a third of the noise and a gate of 2, what is left fits by selection: how many were rejected is the verdict."""
     for axis, found in judged(moving, World(sd=0.17e-3, gate=2.0)).items():
-        assert re.search(r"but \d\d% were gated", found.verdict), (axis, found.verdict)
+        assert re.search(r"but \d\d% were rejected", found.verdict), (axis, found.verdict)
 
 
 def test_innovations_are_looked_at_beyond_the_next_one(moving: pf.Run) -> None:
     """Each like the third before it (w + 0.5 w₋₃ has a correlation of 0.4 there): not white, and the lag is named."""
     world = World()
     est = pf.fuse(moving, world.config(moving))
-    noise = np.random.default_rng(3).standard_normal(len(est.readings.value) + 3)
+    noise = np.random.default_rng(3).standard_normal(len(est.measurements.value) + 3)
     coloured = (noise[3:] + 0.5 * noise[:-3]) / math.sqrt(1.25)
-    order = np.lexsort((est.readings.time, est.readings.axis))
+    order = np.lexsort((est.measurements.time, est.measurements.axis))
     innovation = np.empty(len(order))
-    innovation[order] = coloured * est.readings.innovation_sd[order]
-    spoilt = replace(est, readings=replace(est.readings, innovation=innovation))
+    innovation[order] = coloured * est.measurements.innovation_sd[order]
+    spoilt = replace(est, measurements=replace(est.measurements, innovation=innovation))
     found = [consistency(spoilt, "camera", axis) for axis in est.axes]
     assert found and all(re.search(r"not white \(lag 3: \+0\.[345]", one.verdict) for one in found if one)

@@ -10,8 +10,8 @@ import pytest
 import pumafuse as pf
 from pumafuse.fusion import results
 from pumafuse.fusion.consistency import consistency
-from pumafuse.runs.axes import in_axes
-from pumafuse.runs.frames import Cylindrical, Rotated
+from pumafuse.logs.axes import in_axes
+from pumafuse.logs.frames import Cylindrical, Rotated
 from pumafuse.views.figures import error_figure, validation_figure
 
 DATA = Path(pf.__file__).parent / "data"
@@ -47,18 +47,18 @@ def arc(frame=None, **spoil):
 def test_infinite_x_or_y_is_invalid(axis):
     """Infinite x or y is invalid."""
     est = quiet(arc(**{axis: np.inf}), config(gate=0.0))
-    assert est.readings.of("camera", "tangential").outcome[50] == pf.Outcome.INVALID
+    assert est.measurements.of("camera", "tangential").outcome[50] == pf.Outcome.INVALID
 
 
 @pytest.mark.parametrize("sensor", [{"gate": 0.0}, {"gate_rows": False}])
-def test_a_reading_on_the_base_axis_does_not_poison_the_filter(sensor):
-    """A reading on the base axis does not poison the filter."""
+def test_a_measurement_on_the_base_axis_does_not_poison_the_filter(sensor):
+    """A measurement on the base axis does not poison the filter."""
     est = quiet(arc(x=0.0, y=0.0), config(**sensor))
     assert np.isfinite(est["tangential"].position).all()
 
 
-def test_a_gated_reading_on_the_base_axis_leaves_a_readable_folder(tmp_path):
-    """A gated reading on the base axis leaves a readable folder."""
+def test_a_rejected_measurement_on_the_base_axis_leaves_a_readable_folder(tmp_path):
+    """A rejected measurement on the base axis leaves a readable folder."""
     results.write(quiet(arc(x=0.0, y=0.0), config()), tmp_path / "out", False)
     results.read(tmp_path / "out")
 
@@ -153,19 +153,19 @@ def test_a_sensor_frozen_for_most_of_the_run_is_told():
     assert any("froze" in note for note in est.notes)
 
 
-def test_reopenings_are_counted_as_often_as_the_gate_reopened():
-    """Reopenings are counted as often as the gate reopened."""
+def test_reopenings_are_counted_as_often_as_the_gate_reacquired():
+    """Reopenings are counted as often as the gate reacquired."""
     scan, conf = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
     tracker = scan.sensors["tracker"]
     off = replace(tracker, values={axis: value + 0.05 for axis, value in tracker.values.items()})
     est = quiet(replace(scan, sensors={**scan.sensors, "tracker": off}), conf, sensors=["tracker", "vision"])
-    mine = est.readings.where(est.readings.sensor == est.readings.sensors.index("tracker"))
-    rows = len(np.unique(mine.stamp[mine.outcome == pf.Outcome.REOPENED]))
-    assert any(f"tracker: its gate reopened {rows} times" in note for note in est.notes), est.notes
+    mine = est.measurements.where(est.measurements.sensor == est.measurements.sensors.index("tracker"))
+    rows = len(np.unique(mine.stamp[mine.outcome == pf.Outcome.REACQUIRED]))
+    assert any(f"tracker: its gate reacquired {rows} times" in note for note in est.notes), est.notes
 
 
-def test_readings_only_after_the_run_are_told():
-    """Readings only after the run are told."""
+def test_measurements_only_after_the_run_are_told():
+    """Measurements only after the run are told."""
     scan, conf = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
     tracker = scan.sensors["tracker"]
     late = replace(tracker, stamp=tracker.stamp + 70_000_000_000)
@@ -211,7 +211,7 @@ def test_a_wrong_direction_is_told_the_accepted_ones(tmp_path):
         pf.FusionConfig.load(tmp_path / "fusion.toml")
 
 
-def test_a_reference_s_own_noise_scales_like_a_reading_s():
+def test_a_reference_s_own_noise_scales_like_a_measurement_s():
     """Scoring: the tangential variance of a reference at r is (sd R0/r)²."""
     time = 0.028 * np.arange(60)
     x = np.linspace(0.5, 0.25, 60)

@@ -1,6 +1,7 @@
 """The compiled engine against the reference engine: the same outcomes, estimates, error bars, innovations, biases.
 
-A reading whose innovation is within rounding of its gate may be judged either way; none of those here comes that near.
+A measurement whose innovation is within rounding of its gate may be judged either way; none of those here comes that
+near.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ import pumafuse as pf
 from fusion.test_oracle import CASES, MS, NOISE, PAPER, UNDER, Case, Heard, T, cases, every, one, plants
 from fusion.test_oracle import sensor as ungated
 from fusion_oracle import AxisOracle, nanoseconds
-from pumafuse.fusion.estimates import Estimates, Readings
+from pumafuse.fusion.estimates import Estimates, Measurements
 from pumafuse.fusion.outcome import Outcome
-from pumafuse.runs.run import Run
-from pumafuse.simulate.scenario import Scenario
-from pumafuse.simulate.simulate import simulate
+from pumafuse.logs.run import Run
+from pumafuse.simulation.scenario import Scenario
+from pumafuse.simulation.simulate import simulate
 
 MODES = {"filtered": {}, "smoothed": {"smooth": True}, "as-live": {"as_live": True}}
 FIELDS = ("position", "velocity", "offset")
@@ -42,12 +43,12 @@ def both(run: Run, config: pf.FusionConfig, mode: str, rate: float | None = None
         return compiled, pf.fuse(run, config, rate=rate, engine="filterpy", **MODES[mode])
 
 
-def margin(readings: Readings, config: pf.FusionConfig) -> float:
-    """By how much any |ν|/√S misses its gate; a scalar that reopened its gate has another √S by now."""
-    gates = np.array([config.sensors[name].gate if name in config.sensors else 0.0 for name in readings.sensors])
-    judged = (readings.outcome <= Outcome.GATED) & (gates[readings.sensor] > 0.0)
-    ratio = np.abs(readings.innovation[judged]) / readings.innovation_sd[judged]
-    return float(np.abs(ratio - gates[readings.sensor][judged]).min(initial=math.inf))
+def margin(measurements: Measurements, config: pf.FusionConfig) -> float:
+    """By how much any |ν|/√S misses its gate; a component that reacquired its gate has another √S by now."""
+    gates = np.array([config.sensors[name].gate if name in config.sensors else 0.0 for name in measurements.sensors])
+    judged = (measurements.outcome <= Outcome.REJECTED) & (gates[measurements.sensor] > 0.0)
+    ratio = np.abs(measurements.innovation[judged]) / measurements.innovation_sd[judged]
+    return float(np.abs(ratio - gates[measurements.sensor][judged]).min(initial=math.inf))
 
 
 def agree(got: Estimates, wanted: Estimates, tolerance: float = 1e-9) -> None:
@@ -55,9 +56,9 @@ def agree(got: Estimates, wanted: Estimates, tolerance: float = 1e-9) -> None:
     assert got.engine == "compiled"
     assert wanted.engine == "filterpy"
     for name in ("time", "stamp", "sensor", "axis", "value", "outcome"):
-        np.testing.assert_array_equal(getattr(got.readings, name), getattr(wanted.readings, name), err_msg=name)
-    _close("innovation", got.readings.innovation, got.readings.innovation_sd,
-           wanted.readings.innovation, wanted.readings.innovation_sd, tolerance)  # fmt: skip
+        np.testing.assert_array_equal(getattr(got.measurements, name), getattr(wanted.measurements, name), err_msg=name)
+    _close("innovation", got.measurements.innovation, got.measurements.innovation_sd,
+           wanted.measurements.innovation, wanted.measurements.innovation_sd, tolerance)  # fmt: skip
     np.testing.assert_array_equal(got.time, wanted.time)
     np.testing.assert_array_equal(got.segment, wanted.segment)
     assert tuple(got.axes) == tuple(wanted.axes)
@@ -120,7 +121,7 @@ def test_both_engines_make_the_same_of_any_run_of_the_oracle(case: Case, mode: s
 
 
 def tame(case: Case) -> Case:
-    """Priors of at most 30 times a reading's noise."""
+    """Priors of at most 30 times a measurement's noise."""
     heard = {
         name: replace(ear, sensor=msgspec.structs.replace(
             ear.sensor, sd=max(ear.sensor.sd, 0.3e-3), bias_sd=min(ear.sensor.bias_sd, 9e-3)))
@@ -232,7 +233,7 @@ def logs(draw: st.DrawFn) -> tuple[Run, pf.FusionConfig, float | None]:
     return run, config, some(draw, None, 70.0)
 
 
-# Where an unknown bias and a gate that reopened leave only sums known, a backward pass loses digits in either engine:
+# Where an unknown bias and a gate that reacquired leave only sums known, a backward pass loses digits in either engine:
 # of 400 logs the two smoothers differ by more than 1e-9 sd in 18, by at most 2.4e-8 sd; the filters never by 5e-11.
 SAME = {"filtered": 1e-9, "as-live": 1e-9, "smoothed": 1e-6}
 
@@ -246,10 +247,10 @@ def check_logs(count: int, mode: str) -> None:
     def check(log: tuple[Run, pf.FusionConfig, float | None]) -> None:
         run, config, rate = log
         got, wanted = both(run, config, mode, rate)
-        assume(margin(wanted.readings, config) > 1e-6)
+        assume(margin(wanted.measurements, config) > 1e-6)
         agree(got, wanted, SAME[mode])
         for outcome in Outcome:
-            seen[outcome] += bool((wanted.readings.outcome == outcome).any())
+            seen[outcome] += bool((wanted.measurements.outcome == outcome).any())
 
     check()
     for outcome in set(Outcome) - {Outcome.TOO_LATE}:
@@ -261,7 +262,7 @@ def check_logs(count: int, mode: str) -> None:
     ["filtered", pytest.param("smoothed", marks=pytest.mark.long), pytest.param("as-live", marks=pytest.mark.long)],
 )
 def test_both_engines_make_the_same_of_any_log(mode: str) -> None:
-    """Random axes, sensors, gates, outliers, gaps, latencies: every scalar's fate and every estimate are the same."""
+    """Random axes, sensors, gates, outliers, gaps, latencies: every component's fate and every estimate are the same."""
     check_logs(30, mode)
 
 
@@ -278,7 +279,7 @@ WIDE = {"offset": (1.0, {}), "bias": (5e-3, {"bias_sd": 1.0}), "both": (1.0, {"b
 
 
 def wide(kind: str, ratio: float) -> Case:
-    """A panel and a tracker, with priors of 1 m that are ``ratio`` times a reading's noise."""
+    """A panel and a tracker, with priors of 1 m that are ``ratio`` times a measurement's noise."""
     offset_sd, panel = WIDE[kind]
     heard = {
         "panel": Heard(ungated(1.0 / ratio, latency=0.004, scale=-1.0, **panel), every(40, 24, 2 * MS)),
@@ -287,7 +288,7 @@ def wide(kind: str, ratio: float) -> Case:
     return Case(one(UNDER), times=np.arange(24) * T, process=NOISE, offset_sd=offset_sd, heard=heard, rate=110.0)
 
 
-# Offset and bias both unknown, one reading tells their sum alone: what is left of it costs as many digits again.
+# Offset and bias both unknown, one measurement tells their sum alone: what is left of it costs as many digits again.
 RATIOS = [
     *((kind, ratio, 1e-9) for kind in ("offset", "bias") for ratio in (1e3, 1e4, 1e5)),
     *((kind, 1e6, 1e-6) for kind in ("offset", "bias")),
@@ -299,7 +300,7 @@ RATIOS = [
 @pytest.mark.parametrize("mode", ["filtered", "as-live"])
 @pytest.mark.parametrize(("kind", "ratio", "tolerance"), RATIOS)
 def test_engines_agree_while_priors_are_wide(kind: str, ratio: float, tolerance: float, mode: str) -> None:
-    """To 1e-9 while a prior is up to 1e5 times a reading's noise, to 1e-6 up to 1e6 times."""
+    """To 1e-9 while a prior is up to 1e5 times a measurement's noise, to 1e-6 up to 1e6 times."""
     agree(*both(*wide(kind, ratio).made(), mode, 110.0), tolerance)
 
 
@@ -328,7 +329,7 @@ def test_both_engines_make_the_same_of_a_scenario(name: str, mode: str) -> None:
     """Every scenario of the repository, whole: the same fates, estimates and error bars."""
     made = simulate(Scenario.load(SCENARIOS / f"{name}.toml"))
     got, wanted = both(made.run, made.config, mode)
-    assert margin(wanted.readings, made.config) > 1e-8
+    assert margin(wanted.measurements, made.config) > 1e-8
     agree(got, wanted)
 
 
@@ -342,5 +343,5 @@ def test_both_engines_make_the_same_of_the_scan(sensors: list[str], mode: str) -
     config = msgspec.structs.replace(config, sensors=known)
     run = replace(run, sensors={name: run.sensors[name] for name in sensors})
     got, wanted = both(run, config, mode, 200.0)
-    assert margin(wanted.readings, config) > 1e-8
+    assert margin(wanted.measurements, config) > 1e-8
     agree(got, wanted)

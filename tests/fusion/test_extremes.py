@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 import pumafuse as pf
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.outcome import Outcome
+from pumafuse.logs.run import Run
 from pumafuse.model.plants import Plant
-from pumafuse.runs.run import Run
 
 MS = 1_000_000  # ns
 DAY = 86_400_000 * MS
@@ -103,7 +103,7 @@ def fused(edge: Edge, mode: str, rate: float | None = None) -> Estimates:
 def parts(estimates: Estimates) -> dict[str, np.ndarray]:
     """Everything that is computed."""
     found = {f"{axis} {name}": getattr(of, name) for axis, of in estimates.axes.items() for name in of.FIELDS}
-    found |= {name: getattr(estimates.readings, name) for name in ("innovation", "innovation_sd", "outcome")}
+    found |= {name: getattr(estimates.measurements, name) for name in ("innovation", "innovation_sd", "outcome")}
     return found | {
         f"bias of {name}": np.array([bias.value, bias.sd])
         for name, of in estimates.biases.items()
@@ -119,18 +119,18 @@ def check(edge: Edge, rate: float | None = None) -> dict[str, Estimates]:
     found = {mode: fused(edge, mode, rate) for mode in MODES}
     for mode, estimates in found.items():
         assert len(estimates.time)
-        readings = estimates.readings
+        measurements = estimates.measurements
         for axis in estimates.axes:
             for name in FIELDS:
                 mean, sd = getattr(estimates[axis], name), getattr(estimates[axis], f"{name}_sd")
                 assert np.isfinite(mean).all(), (mode, name)
                 assert np.isfinite(sd).all(), (mode, name)
                 assert (sd >= 0.0).all(), (mode, name)
-        met = readings.outcome <= Outcome.REOPENED
-        assert np.isfinite(readings.innovation[met]).all(), mode
-        assert np.isfinite(readings.innovation_sd[met]).all(), mode
-        assert (readings.innovation_sd[met] > 0.0).all(), mode
-        assert np.isnan(readings.innovation[~met]).all(), mode
+        met = measurements.outcome <= Outcome.REACQUIRED
+        assert np.isfinite(measurements.innovation[met]).all(), mode
+        assert np.isfinite(measurements.innovation_sd[met]).all(), mode
+        assert (measurements.innovation_sd[met] > 0.0).all(), mode
+        assert np.isnan(measurements.innovation[~met]).all(), mode
         for of in estimates.biases.values():
             for bias in of.values():
                 assert np.isfinite(bias.value)
@@ -164,7 +164,7 @@ def test_any_noise_meets_any_prior(plant: Plant, sd: float, offset_sd: float) ->
 
 @pytest.mark.parametrize("offset_sd", [0.0, 1e3])
 def test_without_noise_an_offset_is_a_mean(offset_sd: float) -> None:
-    """A certain one keeps every error bar at 0, whatever is read; an unknown one is a mean of the readings so far."""
+    """A certain one keeps every error bar at 0, whatever is read; an unknown one is a mean of the measurements so far."""
     for mode, estimates in check(Edge(process=PROCESSES["none"], offset_sd=offset_sd), 170.0).items():
         radial = estimates["radial"]
         assert not radial.velocity_sd.any()
@@ -172,20 +172,20 @@ def test_without_noise_an_offset_is_a_mean(offset_sd: float) -> None:
             assert not radial.position_sd.any()
             assert not radial.offset.any()
         else:
-            readings, live = estimates.readings, mode == "as-live"
-            known = (readings.stamp if live else readings.time) <= (
+            measurements, live = estimates.measurements, mode == "as-live"
+            known = (measurements.stamp if live else measurements.time) <= (
                 np.inf if mode == "smoothed" else estimates.time[-1]
             )
             assert radial.position_sd[-1] == pytest.approx(0.05e-3 / np.sqrt(known.sum()), rel=1e-6)
 
 
 GAPS = {
-    "between readings": Edge(heard=np.concatenate([grid(20), grid(20, first=DAY)])),
+    "between measurements": Edge(heard=np.concatenate([grid(20), grid(20, first=DAY)])),
     "between commands": Edge(commands=np.concatenate([grid(6, T), grid(6, T, DAY)])),
     "between both": Edge(
         commands=np.concatenate([grid(6, T), grid(6, T, DAY)]), heard=np.concatenate([grid(20), grid(20, first=DAY)])
     ),
-    "before the first reading": Edge(commands=np.array([0, DAY]), heard=grid(20, first=DAY + 5 * MS)),
+    "before the first measurement": Edge(commands=np.array([0, DAY]), heard=grid(20, first=DAY + 5 * MS)),
     "after the last one": Edge(commands=np.array([0, DAY]), heard=grid(20)),
 }  # fmt: skip
 
@@ -194,7 +194,7 @@ GAPS = {
 @pytest.mark.parametrize("gap", GAPS.values(), ids=GAPS.keys())
 @pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
 def test_a_day_may_pass(plant: Plant, gap: Edge, process: pf.Process) -> None:
-    """A day without a reading or a command is one step for every plant."""
+    """A day without a measurement or a command is one step for every plant."""
     check(replace(gap, plant=plant, process=process))
 
 
@@ -217,7 +217,7 @@ def test_a_day_of_rest_forgets_the_plant_and_widens_the_offset(plant: Plant) -> 
 
 @pytest.mark.parametrize("sd", [1e-9, 1e-3])
 @pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
-def test_readings_may_be_a_nanosecond_apart(plant: Plant, sd: float) -> None:
+def test_measurements_may_be_a_nanosecond_apart(plant: Plant, sd: float) -> None:
     """Forty in 40 ns, while a command comes to act, and estimates in between."""
     edge = Edge(plant, sensors={"tracker": ear(sd)}, heard=grid(40, 1, 60 * MS - 20), delay=0.06)
     check(edge)
@@ -227,7 +227,7 @@ def test_readings_may_be_a_nanosecond_apart(plant: Plant, sd: float) -> None:
 @pytest.mark.parametrize("gate", [0.0, 5.0])
 @pytest.mark.parametrize("bias_sd", [0.0, 1e-3])
 def test_a_hundred_sensors_may_read_at_one_instant(bias_sd: float, gate: float) -> None:
-    """Each is met in its turn; without biases they are one reading of a tenth of their noise."""
+    """Each is met in its turn; without biases they are one measurement of a tenth of their noise."""
     known = {
         f"s{number}": pf.Sensor(sd=1e-3, bias_sd=bias_sd if number < 20 else 0.0, gate=gate) for number in range(100)
     }
@@ -261,24 +261,24 @@ def test_any_delay(plant: Plant, delay: float) -> None:
 @pytest.mark.parametrize("rate", [None, 100.0])
 @pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
 def test_one_command_is_a_run(plant: Plant, rate: float | None) -> None:
-    """With readings and without."""
+    """With measurements and without."""
     check(Edge(plant, commands=np.zeros(1, dtype=np.int64)), rate)
     check(Edge(plant, commands=np.zeros(1, dtype=np.int64), sensors={}), rate)
 
 
-def test_no_readings_is_a_run() -> None:
+def test_no_measurements_is_a_run() -> None:
     """No sensor at all, a sensor that never speaks, and one that speaks only before the first command."""
     plain = check(Edge(sensors={}))
     early = Edge(heard=grid(10, first=-2000 * MS))
     for mode, estimates in check(early).items():
-        assert set(estimates.readings.outcome) == {Outcome.BEFORE_START}
+        assert set(estimates.measurements.outcome) == {Outcome.BEFORE_START}
         for name, values in parts(plain[mode]).items():
             if name.startswith("radial"):
                 np.testing.assert_array_equal(parts(estimates)[name], values)
     check(Edge(heard=grid(0)))
 
 
-# ---- readings that are no readings ----------------------------------------------------------------------------------
+# ---- measurements that are no measurements ---------------------------------------------------------------------------
 
 SENTINELS = [np.nan, np.inf, -np.inf, 1e300, -1e300, 3.4e38, 1e6, -1.8e308]
 
@@ -292,7 +292,7 @@ def test_a_value_that_is_none_leaves_no_trace(value: float, gate: float) -> None
     spoilt = Edge(sensors=known, heard=heard, values={0: value, 7: value, 8: value, 39: value})
     wanted = replace(spoilt, values={0: np.nan, 7: np.nan, 8: np.nan, 39: np.nan})
     for mode, estimates in check(spoilt, 170.0).items():
-        assert (estimates.readings.outcome == Outcome.INVALID).sum() == 8
+        assert (estimates.measurements.outcome == Outcome.INVALID).sum() == 8
         without = parts(fused(wanted, mode, 170.0))
         for name, values in parts(estimates).items():
             assert values.tobytes() == without[name].tobytes(), (mode, name)
@@ -302,7 +302,7 @@ def test_a_value_that_is_none_leaves_no_trace(value: float, gate: float) -> None
 @pytest.mark.parametrize("value", [9.99e5, -9.99e5, 1e-300, -0.0])
 @pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
 def test_a_value_of_a_thousand_kilometres_is_survived(plant: Plant, value: float, gate: float) -> None:
-    """Fused or gated, what is no sentinel spoils nothing but its own estimate."""
+    """Fused or rejected, what is no sentinel spoils nothing but its own estimate."""
     known = {"tracker": pf.Sensor(sd=1e-3, gate=gate, latency_sd=0.005)}
     check(Edge(plant, sensors=known, values={5: value, 20: value}), 170.0)
 
@@ -314,7 +314,7 @@ def test_a_sensor_that_is_never_right_reopens_its_gate_and_nothing_breaks() -> N
         commands=grid(120, T), sensors={"tracker": pf.Sensor(sd=1e-6, gate=3.0)}, heard=grid(300), values=off
     )  # fmt: skip
     for estimates in check(edge, 170.0).values():
-        assert (estimates.readings.outcome == Outcome.REOPENED).sum() >= 3
+        assert (estimates.measurements.outcome == Outcome.REACQUIRED).sum() >= 3
         assert np.abs(estimates["radial"].offset).max() > 9e5
 
 

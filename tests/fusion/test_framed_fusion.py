@@ -11,7 +11,7 @@ import pytest
 import pumafuse as pf
 from pumafuse.fusion import results
 from pumafuse.fusion.summary import summarise
-from pumafuse.runs.frames import Cylindrical, Rotated
+from pumafuse.logs.frames import Cylindrical, Rotated
 
 DATA = Path(pf.__file__).parent / "data"
 CARTESIAN = {"tangential": "x", "radial": "y", "vertical": "z"}
@@ -62,7 +62,7 @@ def test_the_scan_in_a_rotated_frame_is_the_scan(
     """At azimuth 90°, clockwise, every estimate and outcome is that of the axes, and x, y, z are the axes."""
     est = pf.fuse(scan_in_xyz(tmp_path, ROTATED), config, sensors=["vision", "range"])
     assert by_axes.cartesian is None
-    assert est.readings.outcome.tolist() == by_axes.readings.outcome.tolist()
+    assert est.measurements.outcome.tolist() == by_axes.measurements.outcome.tolist()
     for axis, letter in CARTESIAN.items():
         for field in pf.AxisEstimate.FIELDS:
             np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""Gates, and gates that reopen, against section 2 of the design worked out scalar by scalar.
+"""Gates, and gates that reopen, against section 2 of the design worked out component by component.
 
 An arm at rest with a first-order plant: two numbers know an axis, the plant's deviation x and the offset o, and their
 covariance over time has a closed form.
@@ -23,15 +23,15 @@ from pumafuse.fusion.consistency import log_likelihood
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
 from pumafuse.fusion.outcome import Outcome
+from pumafuse.logs.run import Run
 from pumafuse.model.arm import ArmModel, AxisModel
 from pumafuse.model.plants import FirstOrder
-from pumafuse.runs.run import Run
 
 MS = 1_000_000  # ns
 TAU, INPUT_NOISE, DRIFT, OFFSET_SD = 0.04, 0.1e-3, 0.5e-3, 1e-3
 LEVEL = {"radial": 0.5, "vertical": -0.1}
 OFF = 0.05  # m, far beyond any gate here
-FUSED, GATED, REOPENED, DUPLICATE = Outcome.FUSED, Outcome.GATED, Outcome.REOPENED, Outcome.DUPLICATE
+FUSED, REJECTED, REACQUIRED, DUPLICATE = Outcome.FUSED, Outcome.REJECTED, Outcome.REACQUIRED, Outcome.DUPLICATE
 
 
 # ---- the design, by hand --------------------------------------------------------------------------------------------
@@ -60,7 +60,7 @@ class Known:
         return Known(time, a * self.x, self.o, xx, a * self.xo, self.oo + DRIFT**2 * h)
 
     def given(self, nu: float, S: float, scale: float) -> Known:
-        """Updated with one scalar; the gains are the covariances with it over S."""
+        """Updated with one component; the gains are the covariances with it over S."""
         x, o = scale * (self.xx + self.xo) / S, scale * (self.xo + self.oo) / S
         means = self.x + x * nu, self.o + o * nu
         return Known(self.time, *means, self.xx - x * x * S, self.xo - x * o * S, self.oo - o * o * S)
@@ -82,7 +82,7 @@ class Judge:
     sensors: Mapping[str, Sensor]
     known: dict[str, Known] = field(default_factory=lambda: {axis: Known() for axis in LEVEL})
     rejections: dict[tuple[str, ...], list[int]] = field(default_factory=dict)  # when, of those in a row
-    scalars: list[tuple[str, Outcome, float, float]] = field(default_factory=list)  # sensor, outcome, ν and S
+    components: list[tuple[str, Outcome, float, float]] = field(default_factory=list)  # sensor, outcome, ν and S
     closest: float = math.inf  # of any |ν|/√S to its gate
 
     def meet(self, row: Row) -> None:
@@ -98,7 +98,7 @@ class Judge:
         fails = {axis for axis, (nu, S) in found.items() if sensor.gate and abs(nu) > sensor.gate * math.sqrt(S)}
         if fails and not (len(rejected) >= 10 and row.valid - rejected[0] >= 500 * MS):
             rejected.append(row.valid)
-            self.scalars += [(row.sensor, GATED, nu, S) for nu, S in found.values()]
+            self.components += [(row.sensor, REJECTED, nu, S) for nu, S in found.values()]
             return
         rejected.clear()
         for axis, (nu, S) in found.items():
@@ -106,7 +106,7 @@ class Judge:
                 self.known[axis].oo += nu**2
                 S = self._expected(row, axis)[1]
             self.known[axis] = self.known[axis].given(nu, S, sensor.scale)
-            self.scalars.append((row.sensor, REOPENED if axis in fails else FUSED, nu, S))
+            self.components.append((row.sensor, REACQUIRED if axis in fails else FUSED, nu, S))
 
     def _expected(self, row: Row, axis: str) -> tuple[float, float]:
         """ν and S."""
@@ -181,7 +181,7 @@ def fused(rows: Iterable[Row], sensors: Mapping[str, Sensor], **kwargs: object) 
 
 
 def outcomes(estimates: Estimates, name: str, axis: str = "radial") -> list[Outcome]:
-    return [Outcome(code) for code in estimates.readings.of(name, axis).outcome]
+    return [Outcome(code) for code in estimates.measurements.of(name, axis).outcome]
 
 
 # ---- when a gate reopens --------------------------------------------------------------------------------------------
@@ -203,26 +203,26 @@ def outcomes(estimates: Estimates, name: str, axis: str = "radial") -> list[Outc
 def test_a_gate_reopens_after_ten_rejections_over_half_a_second(
     rate: float, rejected: int, gate_rows: bool, axes: list[str]
 ) -> None:
-    """Rows are counted, not scalars; the one that reopens comes at least 0.5 s after the first of ten or more."""
+    """Rows are counted, not components; the one that reopens comes at least 0.5 s after the first of ten or more."""
     off = [0.0] * 5 + [OFF] * (rejected + 9)
     estimates = fused(series("tracker", rate, off, axes), {"tracker": sensor(gate_rows=gate_rows)})
     for axis in axes:
-        assert outcomes(estimates, "tracker", axis) == [FUSED] * 5 + [GATED] * rejected + [REOPENED] + [FUSED] * 8
+        assert outcomes(estimates, "tracker", axis) == [FUSED] * 5 + [REJECTED] * rejected + [REACQUIRED] + [FUSED] * 8
 
 
 @pytest.mark.parametrize("good", [1, 3])
-def test_a_reading_that_passes_ends_the_row_of_rejections(good: int) -> None:
+def test_a_measurement_that_passes_ends_the_row_of_rejections(good: int) -> None:
     """Count and clock both start anew: 49 rejections before it do not count."""
     off = [OFF] * 49 + [0.0] * good + [OFF] * 52
     estimates = fused(series("tracker", 100.0, off), {"tracker": sensor()})
-    assert outcomes(estimates, "tracker") == [GATED] * 49 + [FUSED] * good + [GATED] * 50 + [REOPENED] + [FUSED]
+    assert outcomes(estimates, "tracker") == [REJECTED] * 49 + [FUSED] * good + [REJECTED] * 50 + [REACQUIRED] + [FUSED]
 
 
-def test_a_gate_that_has_reopened_counts_anew() -> None:
+def test_a_gate_that_has_reacquired_counts_anew() -> None:
     """After it ten rejections over half a second are needed again."""
     off = [OFF] * 51 + [0.0] * 51 + [OFF] * 51
     estimates = fused(series("tracker", 100.0, off), {"tracker": sensor()})
-    assert outcomes(estimates, "tracker") == 3 * ([GATED] * 50 + [REOPENED])
+    assert outcomes(estimates, "tracker") == 3 * ([REJECTED] * 50 + [REACQUIRED])
 
 
 def test_rejections_are_counted_for_each_sensor() -> None:
@@ -232,27 +232,27 @@ def test_rejections_are_counted_for_each_sensor() -> None:
     )
     estimates = fused(rows, {"tracker": sensor(), "vision": sensor()})
     for name in ("tracker", "vision"):
-        assert outcomes(estimates, name) == [FUSED] * 3 + [GATED] * 6 + [FUSED]
+        assert outcomes(estimates, name) == [FUSED] * 3 + [REJECTED] * 6 + [FUSED]
 
 
 def test_another_sensor_that_passes_does_not_end_the_row_of_rejections() -> None:
-    """A sensor that contradicts another reopens its gate although the other's readings are fused in between."""
+    """A sensor that contradicts another reopens its gate although the other's measurements are fused in between."""
     rows = series("tracker", 10.0, [0.0] * 3 + [OFF] * 11) + series("vision", 10.0, [0.0] * 14, first=-50 * MS)[1:]
     estimates = fused(rows, {"tracker": sensor(), "vision": sensor()})
-    assert outcomes(estimates, "tracker") == [FUSED] * 3 + [GATED] * 10 + [REOPENED]
+    assert outcomes(estimates, "tracker") == [FUSED] * 3 + [REJECTED] * 10 + [REACQUIRED]
     assert outcomes(estimates, "vision") == [FUSED] * 13
 
 
 @pytest.mark.parametrize("gate_rows", [True, False])
-def test_rejections_are_counted_for_each_axis_where_rows_are_not_gated(gate_rows: bool) -> None:
-    """Rows off on alternate axes: gated by rows the sensor fails time after time, gated by axes neither axis does."""
+def test_rejections_are_counted_for_each_axis_where_rows_are_not_rejected(gate_rows: bool) -> None:
+    """Rows off on alternate axes: rejected by rows the sensor fails time after time, rejected by axes neither axis does."""
     rows = [Row(k * 50 * MS, "tracker", {"radial": OFF * (k % 2), "vertical": OFF * (1 - k % 2)}) for k in range(12)]
     estimates = fused(rows, {"tracker": sensor(gate_rows=gate_rows)})
     got = [outcomes(estimates, "tracker", axis) for axis in LEVEL]
     if gate_rows:  # the eleventh row fails on its vertical axis alone and takes that far from what the twelfth says
-        assert got == [[GATED] * 10 + [FUSED, GATED], [GATED] * 10 + [REOPENED, GATED]]
+        assert got == [[REJECTED] * 10 + [FUSED, REJECTED], [REJECTED] * 10 + [REACQUIRED, REJECTED]]
     else:
-        assert got == [[FUSED, GATED] * 6, [GATED, FUSED] * 6]
+        assert got == [[FUSED, REJECTED] * 6, [REJECTED, FUSED] * 6]
 
 
 def test_a_row_said_twice_is_rejected_once() -> None:
@@ -260,36 +260,36 @@ def test_a_row_said_twice_is_rejected_once() -> None:
     once = series("tracker", 20.0, [OFF] * 11)
     estimates = fused([row for row in once for _ in range(2)], {"tracker": sensor()})
     got = outcomes(estimates, "tracker")
-    assert got[0::2] == [GATED] * 10 + [REOPENED]
+    assert got[0::2] == [REJECTED] * 10 + [REACQUIRED]
     assert got[1::2] == [DUPLICATE] * 11
 
 
 def test_a_gate_of_zero_rejects_nothing() -> None:
-    """Readings off by thousands of standard deviations are fused at once and plainly."""
+    """Measurements off by thousands of standard deviations are fused at once and plainly."""
     off = [0.0] * 5 + [OFF, -OFF] * 40
     estimates = fused(series("tracker", 100.0, off), {"tracker": sensor(0.0)})
     assert set(outcomes(estimates, "tracker")) == {FUSED}
-    assert np.abs(estimates.readings.innovation / estimates.readings.innovation_sd).max() > 100.0
+    assert np.abs(estimates.measurements.innovation / estimates.measurements.innovation_sd).max() > 100.0
 
 
-def test_a_reopened_gate_is_counted_and_said() -> None:
+def test_a_reacquired_gate_is_counted_and_said() -> None:
     """The outcome is in the counts, and a warning names the sensor."""
     run, config = recorded(series("tracker", 100.0, [0.0] * 5 + [OFF] * 60), {"tracker": sensor()})
     with pytest.warns(PumafuseWarning) as said:
         estimates = fuse(run, config)
-    assert estimates.readings.counts() == {"fused": 14, "gated": 50, "reopened": 1}
-    assert any("tracker" in str(one.message) and "reopened" in str(one.message) for one in said)
+    assert estimates.measurements.counts() == {"fused": 14, "rejected": 50, "reacquired": 1}
+    assert any("tracker" in str(one.message) and "reacquired" in str(one.message) for one in said)
 
 
 # ---- what it does to the estimates ----------------------------------------------------------------------------------
 
 
-def test_a_reopened_gate_takes_the_offset_to_the_reading() -> None:
-    """With ν² more variance the offset moves by nearly ν in one reading, and is as uncertain as that reading."""
+def test_a_reacquired_gate_takes_the_offset_to_the_measurement() -> None:
+    """With ν² more variance the offset moves by nearly ν in one measurement, and is as uncertain as that measurement."""
     estimates = fused(series("tracker", 20.0, [0.0] * 5 + [OFF] * 11), {"tracker": sensor()})
-    radial, readings = estimates["radial"], estimates.readings
-    nu = readings.innovation[-1]
-    assert readings.innovation_sd[-1] == pytest.approx(nu, rel=1e-3)
+    radial, measurements = estimates["radial"], estimates.measurements
+    nu = measurements.innovation[-1]
+    assert measurements.innovation_sd[-1] == pytest.approx(nu, rel=1e-3)
     assert radial.offset[-1] - radial.offset[-2] == pytest.approx(nu, rel=1e-3)
     assert radial.position_sd[-1] == pytest.approx(0.2e-3, rel=1e-3)
     assert radial.offset_sd[-2] < 2e-3
@@ -332,7 +332,7 @@ def logs(draw: st.DrawFn) -> tuple[list[Row], dict[str, Sensor]]:
 @pytest.mark.long
 @settings(derandomize=True, deadline=None, max_examples=150)
 @given(logs(), st.booleans())
-def test_any_log_is_gated_as_the_design_says(log: tuple[list[Row], dict[str, Sensor]], as_live: bool) -> None:
+def test_any_log_is_rejected_as_the_design_says(log: tuple[list[Row], dict[str, Sensor]], as_live: bool) -> None:
     """Outcomes, innovations, estimates and error bars are those worked out by hand, with all that had arrived."""
     rows, sensors = log
     judge = judged(rows, sensors)
@@ -340,8 +340,8 @@ def test_any_log_is_gated_as_the_design_says(log: tuple[list[Row], dict[str, Sen
     estimates = fused(rows, sensors, as_live=as_live)
     times = nanoseconds(estimates)
     if not as_live:
-        met = estimates.readings.where(estimates.readings.outcome <= REOPENED)
-        name, outcome, nu, S = zip(*judge.scalars, strict=True)
+        met = estimates.measurements.where(estimates.measurements.outcome <= REACQUIRED)
+        name, outcome, nu, S = zip(*judge.components, strict=True)
         assert [met.sensors[index] for index in met.sensor] == list(name)
         assert [Outcome(code) for code in met.outcome] == list(outcome)
         np.testing.assert_allclose(met.innovation, nu, rtol=1e-9, atol=1e-12)
@@ -353,22 +353,22 @@ def test_any_log_is_gated_as_the_design_says(log: tuple[list[Row], dict[str, Sen
 # ---- the likelihood -------------------------------------------------------------------------------------------------
 
 
-def test_the_log_likelihood_is_the_sum_over_all_scalars_met() -> None:
-    """−½(ln 2πS + ν²/S) each, in mm, and −½(ln 2πS + gate²) for a gated one, whether or not its own axis failed."""
+def test_the_log_likelihood_is_the_sum_over_all_components_met() -> None:
+    """−½(ln 2πS + ν²/S) each, in mm, and −½(ln 2πS + gate²) for a rejected one, whether or not its own axis failed."""
     off = [{"radial": 0.1e-3 * k, "vertical": OFF * (4 <= k < 40)} for k in range(-5, 50)]
     rows = [Row(k * 30 * MS, "tracker", one) for k, one in enumerate(off)]
     rows += series("vision", 7.0, [1e-3, -1e-3, OFF, 0.0, 2e-3, OFF], first=3 * MS)
     sensors = {"tracker": sensor(4.0), "vision": sensor(0.0, 1e-3)}
     estimates, total = fused(rows, sensors), 0.0
     judge = judged(rows, sensors)
-    for name, outcome, nu, S in judge.scalars:
-        square = sensors[name].gate ** 2 if outcome == GATED else nu**2 / S
+    for name, outcome, nu, S in judge.components:
+        square = sensors[name].gate ** 2 if outcome == REJECTED else nu**2 / S
         total -= 0.5 * (math.log(2.0 * math.pi * S * 1e6) + square)
-    assert {outcome for _, outcome, _, _ in judge.scalars} == {FUSED, GATED, REOPENED}
-    assert log_likelihood(estimates.readings, sensors) == pytest.approx(total, rel=1e-9)
+    assert {outcome for _, outcome, _, _ in judge.components} == {FUSED, REJECTED, REACQUIRED}
+    assert log_likelihood(estimates.measurements, sensors) == pytest.approx(total, rel=1e-9)
 
 
-def test_scalars_that_were_never_met_do_not_count_in_the_likelihood() -> None:
+def test_components_that_were_never_met_do_not_count_in_the_likelihood() -> None:
     """Neither a duplicate, nor a row before the first command, nor a missing value, nor an unknown sensor."""
     rows, sensors = series("tracker", 20.0, [0.1e-3] * 6), {"tracker": sensor()}
     more = [*rows[2:4], Row(-100 * MS, "tracker", {"radial": 0.0}), Row(75 * MS, "tracker", {"radial": math.nan})]
@@ -377,5 +377,5 @@ def test_scalars_that_were_never_met_do_not_count_in_the_likelihood() -> None:
     plain = fused(rows, sensors)
     with pytest.warns(PumafuseWarning):
         estimates = fuse(run, plain.config)
-    assert len(estimates.readings.value) == len(rows) + 5
-    assert log_likelihood(estimates.readings, sensors) == log_likelihood(plain.readings, sensors)
+    assert len(estimates.measurements.value) == len(rows) + 5
+    assert log_likelihood(estimates.measurements, sensors) == log_likelihood(plain.measurements, sensors)

@@ -21,9 +21,9 @@ from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
 from pumafuse.fusion.outcome import Outcome
 from pumafuse.fusion.timeline import Timeline, build
+from pumafuse.logs.run import Run
 from pumafuse.model.arm import ArmModel, AxisModel, Gain
 from pumafuse.model.plants import FirstOrder, Plant, SecondOrder
-from pumafuse.runs.run import Run
 
 MS = 1_000_000  # ns
 T = 28 * MS
@@ -40,7 +40,7 @@ class Heard:
     sensor: Sensor
     valid: np.ndarray
     axes: tuple[str, ...] | None = None
-    missing: float = 0.0  # share of scalars that are NaN
+    missing: float = 0.0  # share of components that are NaN
 
 
 def sensor(sd: float = 0.05e-3, **kwargs: object) -> Sensor:
@@ -53,7 +53,7 @@ def every(rate: float, count: int, first: int = 0) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Case:
-    """What a run and its configuration are made of; the readings follow the commands with 1 mm of noise."""
+    """What a run and its configuration are made of; the measurements follow the commands with 1 mm of noise."""
 
     axes: Mapping[str, AxisModel] = field(default_factory=lambda: {"radial": AxisModel(plant=LAG)})
     delay: float = 0.06045
@@ -80,14 +80,14 @@ class Case:
             process=dict(process),
             sensors={name: heard.sensor for name, heard in self.heard.items()},
         )
-        sensors = {name: self._readings(heard, command, rng) for name, heard in self.heard.items()}
+        sensors = {name: self._measurements(heard, command, rng) for name, heard in self.heard.items()}
         shuffled = dict(reversed(sensors.items()))  # the order that counts is the configuration's
         return Run.from_arrays(self._stamps(self.times), command, shuffled, start=self.start), config
 
     def _stamps(self, ns: np.ndarray) -> np.ndarray:
         return self.origin + (ns if isinstance(self.origin, int) else ns * 1e-9)
 
-    def _readings(
+    def _measurements(
         self, heard: Heard, command: Mapping[str, np.ndarray], rng: np.random.Generator
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         values: dict[str, np.ndarray] = {}
@@ -100,7 +100,7 @@ class Case:
 
 
 def anomalous(run: Run, config: FusionConfig) -> bool:
-    """Some scalar is not finite or valid before the first command: pumafuse has to say so."""
+    """Some component is not finite or valid before the first command: pumafuse has to say so."""
     origin = run.command.stamp.min()
     return any(
         (source.stamp - round(config.sensors[name].latency * 1e9) < origin).any()
@@ -122,7 +122,7 @@ def check(case: Case, *, as_live: bool = False) -> Estimates:
     grid = case.times if case.rate is None else every(case.rate, len(times))
     assert times.tolist() == grid.tolist()
     assert case.rate is None or times[-1] + 1e9 / case.rate > case.times[-1]
-    fused = estimates.readings.where(estimates.readings.outcome == Outcome.FUSED)
+    fused = estimates.measurements.where(estimates.measurements.outcome == Outcome.FUSED)
     for number, axis in enumerate(estimates.axes):
         oracle = AxisOracle(run, config, axis)
         check_innovations(fused.where(fused.axis == number), oracle)
@@ -156,7 +156,7 @@ def test_the_oracles_responses_are_those_of_the_plants(plant: Plant) -> None:
 
 @pytest.mark.parametrize("plant", [LAG, UNDER, CRITICAL, OVER])
 def test_the_oracle_settles_to_the_stationary_variances(plant: Plant) -> None:
-    """Without readings: ∫g² = 1/(2τ) or ω/(4ζ), ∫g'² = 1/(2τ³) or ω³/(4ζ), and an offset that walks."""
+    """Without measurements: ∫g² = 1/(2τ) or ω/(4ζ), ∫g'² = 1/(2τ³) or ω³/(4ζ), and an offset that walks."""
     process = Process(input_noise=0.3e-3, drift=0.8e-3)
     case = Case({"radial": AxisModel(plant=plant)}, times=np.array([0, 3000 * MS]), process=process, heard={})
     belief = AxisOracle(*case.made(), "radial").filtered(case.times)
@@ -173,7 +173,7 @@ def test_the_oracle_settles_to_the_stationary_variances(plant: Plant) -> None:
 
 
 def test_the_oracle_conditions_like_a_dense_solve() -> None:
-    """Mean and variance given three readings, as mpmath solves the 3 by 3 system from integrals of its own."""
+    """Mean and variance given three measurements, as mpmath solves the 3 by 3 system from integrals of its own."""
     heard = {"tracker": Heard(sensor(latency=0.0), np.array([10, 35, 61]) * MS)}
     case = Case(delay=0.02, times=np.array([0, 28, 70]) * MS, heard=heard)
     run, config = case.made()
@@ -270,7 +270,7 @@ CASES = {
     "panel alone": Case(heard={"panel": PANEL}),
     "two panels": Case(heard={"panel": PANEL, "other": Heard(PANEL.sensor, every(40, 16, 2 * MS))}),
     "a factor": Case(heard={"tracker": Heard(sensor(scale=2.5), every(60, 20))}),
-    "without readings": Case(one(UNDER), heard={}),
+    "without measurements": Case(one(UNDER), heard={}),
     "rows before the first command": Case(heard={"tracker": Heard(TRACKER.sensor, every(90, 20, -30 * MS))}),
     "grid": Case(one(UNDER), rate=170.0),
     "sparse grid": Case(rate=7.0, heard={"tracker": TRACKER, "vision": VISION}),
@@ -296,13 +296,13 @@ CASES = {
 @pytest.mark.parametrize("as_live", [False, True], ids=["filtered", "as-live"])
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 def test_estimates_are_conditional_means(case: Case, as_live: bool) -> None:
-    """Every estimate, error bar and innovation is that of the joint Gaussian given the readings it may know."""
+    """Every estimate, error bar and innovation is that of the joint Gaussian given the measurements it may know."""
     check(case, as_live=as_live)
 
 
 @pytest.mark.parametrize("case", [Case(delay=0.0), Case(one(UNDER))], ids=["first order", "second order"])
 def test_wandering_latency_counts_with_speed(case: Case) -> None:
-    """A reading's variance grows by (scale · predicted velocity · latency_sd)²; a command acts before it is read."""
+    """A measurement's variance grows by (scale · predicted velocity · latency_sd)²; a command acts before it is read."""
     wanders = Heard(sensor(latency=0.02, latency_sd=0.004, scale=-1.5), np.union1d(case.times, every(70, 28)))
     check(replace(case, heard={"wandering": wanders, "vision": VISION}))
 
@@ -314,7 +314,7 @@ def plants() -> st.SearchStrategy[Plant]:
 
 
 def sensors(first: int, bias_sd: float) -> st.SearchStrategy[Heard]:
-    """A sensor of up to 13 readings; latencies, so the order of arrival, are anything."""
+    """A sensor of up to 13 measurements; latencies, so the order of arrival, are anything."""
     ms = st.integers(0, 300).map(lambda latency: latency * 1e-3)
     read = st.builds(
         sensor,
@@ -377,7 +377,7 @@ OUTLIER = 13  # the row of the tracker that goes wrong
 
 
 def on_model(gate: float, gate_rows: bool = True) -> tuple[Run, FusionConfig]:
-    """Two axes whose readings are what the model expects, so that every innovation is 0."""
+    """Two axes whose measurements are what the model expects, so that every innovation is 0."""
     tracker = Heard(Sensor(sd=0.2e-3, latency=0.008, gate=gate, gate_rows=gate_rows), every(60, 20))
     prompt = Heard(sensor(0.4e-3), VISION.valid)  # nothing arrives late, so the gate decides alike live
     axes = {"radial": AxisModel(plant=LAG), "vertical": AxisModel(plant=UNDER)}
@@ -395,7 +395,7 @@ def with_outlier(gate: float, sigmas: float, gate_rows: bool = True) -> tuple[Ru
     oracle = AxisOracle(run, config, "radial")
     nu, sd = oracle.innovations()
     stamp = run.sensors["tracker"].stamp[OUTLIER] - run.command.stamp[0]
-    row = [(reading.sensor, reading.stamp) for reading in oracle.readings].index(("tracker", stamp))
+    row = [(measurement.sensor, measurement.stamp) for measurement in oracle.measurements].index(("tracker", stamp))
     assert np.abs(nu).max() < 1e-12
     run.sensors["tracker"].values["radial"][OUTLIER] += sigmas * sd[row]
     return run, config, sd[row]
@@ -415,30 +415,30 @@ def with_outlier(gate: float, sigmas: float, gate_rows: bool = True) -> tuple[Ru
     ],
 )
 def test_the_gate_rejects_beyond_so_many_sigma(gate: float, sigmas: float, passes: bool, as_live: bool) -> None:
-    """A reading beyond gate · √S leaves the estimates as if it had never been; one within is fused; gate 0 is none."""
+    """A measurement beyond gate · √S leaves the estimates as if it had never been; one within is fused; gate 0 is none."""
     run, config, sd = with_outlier(gate, sigmas)
     estimates = fuse(run, config, as_live=as_live)
-    met = estimates.readings.of("tracker", "radial")
+    met = estimates.measurements.of("tracker", "radial")
     outcomes = [Outcome.FUSED] * len(met.value)
-    outcomes[OUTLIER] = Outcome.FUSED if passes else Outcome.GATED
+    outcomes[OUTLIER] = Outcome.FUSED if passes else Outcome.REJECTED
     assert met.outcome.tolist() == outcomes
     assert met.innovation_sd[OUTLIER] == pytest.approx(sd, rel=1e-9)
     assert met.innovation[OUTLIER] == pytest.approx(sigmas * sd, rel=1e-9)
     oracle = AxisOracle(run, config, "radial", leave_out=() if passes else {("tracker", OUTLIER)})
     times = nanoseconds(estimates)
     check_estimates(estimates["radial"], oracle.as_live(times) if as_live else oracle.filtered(times))
-    radial = estimates.readings.where(estimates.readings.axis == estimates.readings.axes.index("radial"))
+    radial = estimates.measurements.where(estimates.measurements.axis == estimates.measurements.axes.index("radial"))
     check_innovations(radial.where(radial.outcome == Outcome.FUSED), oracle)
 
 
 @pytest.mark.parametrize("gate_rows", [True, False])
-def test_a_gated_axis_gates_its_row_where_asked(gate_rows: bool) -> None:
-    """With gate_rows the other axis of the row is gated too and its estimates do without it; otherwise it is fused."""
+def test_a_rejected_axis_gates_its_row_where_asked(gate_rows: bool) -> None:
+    """With gate_rows the other axis of the row is rejected too and its estimates do without it; otherwise it is fused."""
     run, config, _ = with_outlier(5.0, 7.0, gate_rows)
     estimates = fuse(run, config)
-    outcome = {axis: estimates.readings.of("tracker", axis).outcome[OUTLIER] for axis in estimates.axes}
-    assert outcome == {"radial": Outcome.GATED, "vertical": Outcome.GATED if gate_rows else Outcome.FUSED}
-    assert np.count_nonzero(estimates.readings.outcome == Outcome.GATED) == 1 + gate_rows
+    outcome = {axis: estimates.measurements.of("tracker", axis).outcome[OUTLIER] for axis in estimates.axes}
+    assert outcome == {"radial": Outcome.REJECTED, "vertical": Outcome.REJECTED if gate_rows else Outcome.FUSED}
+    assert np.count_nonzero(estimates.measurements.outcome == Outcome.REJECTED) == 1 + gate_rows
     for axis, gone in {"radial": True, "vertical": gate_rows}.items():
         oracle = AxisOracle(run, config, axis, leave_out={("tracker", OUTLIER)} if gone else ())
         check_estimates(estimates[axis], oracle.filtered(nanoseconds(estimates)))
@@ -454,7 +454,7 @@ def one_filter(case: Case) -> tuple[AxisFilter, Timeline, FusionConfig]:
     (name,), (driven,) = config.arm.axes, timeline.axes
     biases = [(sensor, heard.sensor.bias_sd) for sensor, heard in case.heard.items() if heard.sensor.bias_sd]
     plant, process = config.arm.axes[name].plant, config.process[name]
-    valid = np.unique(timeline.scalars.valid)
+    valid = np.unique(timeline.components.valid)
     return AxisFilter(plant, driven, process, case.offset_sd, biases, timeline.origin, valid), timeline, config
 
 
@@ -466,13 +466,13 @@ def meet(axis: AxisFilter, sensor: Sensor, name: str, valid: int, z: float) -> N
 
 @pytest.mark.parametrize("plant", [LAG, UNDER])
 def test_the_covariance_settles_where_riccatis_equation_says(plant: Plant) -> None:
-    """One reading each period, forever: P before a reading solves the discrete algebraic Riccati equation."""
+    """One measurement each period, forever: P before a measurement solves the discrete algebraic Riccati equation."""
     process = Process(input_noise=0.3e-3, drift=0.8e-3)
     read = Heard(sensor(0.1e-3), np.arange(400) * T + 5 * MS)
     axis, timeline, config = one_filter(
         Case(one(plant), times=np.arange(401) * T, process=process, heard={"tracker": read})
     )
-    for valid in timeline.scalars.valid:
+    for valid in timeline.components.valid:
         meet(axis, config.sensors["tracker"], "tracker", int(valid), 0.0)
     A, B, C = companion(plant)
     n = len(A)
@@ -498,10 +498,10 @@ def test_a_million_steps_leave_the_covariance_symmetric_and_positive() -> None:
     }
     case = Case(one(UNDER), times=np.arange(count) * T, process=process, heard=heard)
     axis, timeline, config = one_filter(case)
-    scalars, register = timeline.scalars, 4
+    components, register = timeline.components, 4
     assert len(axis.time) > 1_000_000
-    for number, (valid, of) in enumerate(zip(scalars.valid.tolist(), scalars.sensor.tolist(), strict=True)):
-        name = scalars.sensors[of]
+    for number, (valid, of) in enumerate(zip(components.valid.tolist(), components.sensor.tolist(), strict=True)):
+        name = components.sensors[of]
         meet(axis, config.sensors[name], name, valid, 0.0)
         if number % 500 == 0:
             P = axis.kf.P

@@ -1,4 +1,4 @@
-"""The smoother against the conditional Gaussian given every reading of the run."""
+"""The smoother against the conditional Gaussian given every measurement of the run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from pumafuse.fusion.config import FusionConfig, Process, Sensor
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
 from pumafuse.fusion.outcome import Outcome
-from pumafuse.runs.run import Run, Source
+from pumafuse.logs.run import Run, Source
 
 LATE = Heard(TRACKER.sensor, every(90, 20, 240 * MS))
 EARLY = Heard(TRACKER.sensor, every(90, 15))
@@ -56,7 +56,7 @@ def smoothed(case: Case, rate: float | None = None) -> tuple[Estimates, Run, Fus
 def check(case: Case) -> None:
     """Everything that ``fuse(smooth=True)`` says of a case agrees with the oracle."""
     estimates, run, config = smoothed(case)
-    fused = estimates.readings.where(estimates.readings.outcome == Outcome.FUSED)
+    fused = estimates.measurements.where(estimates.measurements.outcome == Outcome.FUSED)
     for number, axis in enumerate(estimates.axes):
         oracle = AxisOracle(run, config, axis)
         check_innovations(fused.where(fused.axis == number), oracle)
@@ -66,9 +66,9 @@ def check(case: Case) -> None:
 # ---- against the oracle ---------------------------------------------------------------------------------------------
 
 MORE = {
-    "a late first reading": Case(one(UNDER), heard={"tracker": LATE}, rate=110.0),
-    "readings that end early": Case(heard={"tracker": EARLY, "vision": replace(VISION, valid=EARLY.valid)}),
-    "a gap in the readings": Case(one(UNDER), heard={"tracker": Heard(TRACKER.sensor, np.r_[EARLY.valid, LATE.valid])}),
+    "a late first measurement": Case(one(UNDER), heard={"tracker": LATE}, rate=110.0),
+    "measurements that end early": Case(heard={"tracker": EARLY, "vision": replace(VISION, valid=EARLY.valid)}),
+    "a gap in the measurements": Case(one(UNDER), heard={"tracker": Heard(TRACKER.sensor, np.r_[EARLY.valid, LATE.valid])}),
     "read and asked as commands act": Case(
         one(UNDER), delay=0.028, heard={"tracker": Heard(sensor(), GRID), "vision": Heard(VISION.sensor, GRID)}
     ),
@@ -78,19 +78,19 @@ MORE = {
         heard={"wandering": Heard(sensor(latency=0.02, latency_sd=0.004, scale=-1.5), GRID), "vision": VISION},
     ),
     "a panel before the tracker": Case(one(UNDER), heard={"panel": PANEL, "tracker": LATE}, rate=60.0),
-    "one reading": Case(heard={"tracker": Heard(TRACKER.sensor, np.array([200 * MS]))}, rate=90.0),
+    "one measurement": Case(heard={"tracker": Heard(TRACKER.sensor, np.array([200 * MS]))}, rate=90.0),
 }  # fmt: skip
 EVERY = CASES | MORE
 
 
 @pytest.mark.parametrize("case", EVERY.values(), ids=EVERY.keys())
-def test_smoothed_estimates_know_every_reading(case: Case) -> None:
+def test_smoothed_estimates_know_every_measurement(case: Case) -> None:
     """Mean and error bar are those of the joint Gaussian given the whole run; innovations stay one step ahead."""
     check(case)
 
 
 def tame(case: Case) -> Case:
-    """Priors of at most 30 times a reading's noise; beyond, rounding of a velocity's mean can pass 1e-12 m/s."""
+    """Priors of at most 30 times a measurement's noise; beyond, rounding of a velocity's mean can pass 1e-12 m/s."""
     heard = {
         name: replace(ear, sensor=msgspec.structs.replace(
             ear.sensor, sd=max(ear.sensor.sd, 0.3e-3), bias_sd=min(ear.sensor.bias_sd, 9e-3)))
@@ -109,7 +109,7 @@ def test_any_run_is_smoothed_like_the_conditional_gaussian(case: Case) -> None:
 @settings(derandomize=True, deadline=None, max_examples=60)
 @given(cases())
 def test_smoothing_never_widens(case: Case) -> None:
-    """To know more readings never makes anything less certain, whatever their values."""
+    """To know more measurements never makes anything less certain, whatever their values."""
     after, run, config = smoothed(case)
     with told(run, config):
         before = fuse(run, config, rate=case.rate)
@@ -121,9 +121,9 @@ def test_smoothing_never_widens(case: Case) -> None:
 # ---- what must hold whatever the oracle says ------------------------------------------------------------------------
 
 
-def test_after_the_last_reading_smoothed_is_filtered() -> None:
+def test_after_the_last_measurement_smoothed_is_filtered() -> None:
     """Nothing is known of the future there; before it nearly everything is."""
-    after, run, config = smoothed(MORE["readings that end early"], 200.0)
+    after, run, config = smoothed(MORE["measurements that end early"], 200.0)
     before = fuse(run, config, rate=200.0)
     over = nanoseconds(after) >= EARLY.valid[-1]
     assert over.any()
@@ -134,7 +134,7 @@ def test_after_the_last_reading_smoothed_is_filtered() -> None:
 
 
 def test_before_anything_acts_the_arm_rests_and_only_the_offset_is_learnt() -> None:
-    """There velocity is 0 for certain, and the position is the start level and the offset that later readings tell."""
+    """There velocity is 0 for certain, and the position is the start level and the offset that later measurements tell."""
     case = Case(one(UNDER), delay=0.2, start={"radial": 0.507}, heard={"tracker": LATE}, rate=100.0,
                 process=Process(input_noise=0.0, drift=0.8e-3, maneuver_noise=2e-3))  # fmt: skip
     radial = smoothed(case)[0]["radial"]
@@ -152,22 +152,22 @@ def test_an_offset_that_does_not_drift_is_smoothed_to_one_number() -> None:
     case = Case(one(UNDER), process=Process(input_noise=0.3e-3, drift=0.0),
                 heard={"vision": VISION, "tracker": Heard(TRACKER.sensor, every(50, 20, 240 * MS))})  # fmt: skip
     after, run, config = smoothed(case)
-    end = fuse(run, config, rate=50.0)["radial"]  # its last estimate is at the last reading
+    end = fuse(run, config, rate=50.0)["radial"]  # its last estimate is at the last measurement
     np.testing.assert_allclose(after["radial"].offset, end.offset[-1], rtol=0.0, atol=1e-9 * end.offset_sd[-1])
     np.testing.assert_allclose(after["radial"].offset_sd, end.offset_sd[-1], rtol=1e-9)
 
 
-def test_what_the_filter_said_of_readings_and_biases_stays() -> None:
+def test_what_the_filter_said_of_measurements_and_biases_stays() -> None:
     """Innovations, outcomes and biases of a smoothed run are those of the filtered one."""
     run, config = CASES["panel"].made()
     before, after = (fuse(run, config, smooth=smooth) for smooth in (False, True))
     assert (before.mode, after.mode) == ("filtered", "smoothed")
     for field in ("innovation", "innovation_sd", "outcome"):
-        np.testing.assert_array_equal(getattr(after.readings, field), getattr(before.readings, field))
+        np.testing.assert_array_equal(getattr(after.measurements, field), getattr(before.measurements, field))
     assert after.biases == before.biases
 
 
-def test_knowing_all_readings_and_only_those_that_had_arrived_is_refused() -> None:
+def test_knowing_all_measurements_and_only_those_that_had_arrived_is_refused() -> None:
     """``smooth`` and ``as_live`` contradict each other."""
     with pytest.raises(ValueError, match="as_live"):
         fuse(*Case().made(), smooth=True, as_live=True)
@@ -196,8 +196,8 @@ def test_smoothing_does_not_reach_across_a_clock_that_was_set_back() -> None:
 
 
 @pytest.mark.parametrize("sigmas", [6.0, -1e4])
-def test_gated_readings_stay_out(sigmas: float) -> None:
-    """A reading beyond the gate leaves the smoothed estimates as if it had never been."""
+def test_rejected_measurements_stay_out(sigmas: float) -> None:
+    """A measurement beyond the gate leaves the smoothed estimates as if it had never been."""
     run, config, _ = with_outlier(5.0, sigmas)
     estimates = fuse(run, config, smooth=True)
     for axis in estimates.axes:
@@ -222,17 +222,19 @@ def bumped() -> tuple[Run, FusionConfig]:
 
 
 @pytest.mark.parametrize("smooth", [False, True], ids=["filtered", "smoothed"])
-def test_a_reopened_gate_is_a_jump_of_the_offset(smooth: bool) -> None:
+def test_a_reacquired_gate_is_a_jump_of_the_offset(smooth: bool) -> None:
     """Estimates are the Gaussian's with ν² of offset variance let in there and then: smoothed ones before it too."""
     run, config = bumped()
     with pytest.warns(PumafuseWarning):
         estimates = fuse(run, config, rate=30.0, smooth=smooth)
-    outcome = estimates.readings.of("tracker", "radial").outcome
+    outcome = estimates.measurements.of("tracker", "radial").outcome
     rows = {kind: {("tracker", int(row)) for row in np.flatnonzero(outcome == kind)} for kind in Outcome}
-    assert len(rows[Outcome.REOPENED]) == 2
-    assert len(rows[Outcome.GATED]) == 2 * 13  # 25 Hz: the first at least half a second after the first rejection
-    oracle = AxisOracle(run, config, "radial", leave_out=rows[Outcome.GATED], reopened=rows[Outcome.REOPENED])
-    check_innovations(estimates.readings.where(~np.isin(estimates.readings.outcome, [Outcome.GATED])), oracle)
+    assert len(rows[Outcome.REACQUIRED]) == 2
+    assert len(rows[Outcome.REJECTED]) == 2 * 13  # 25 Hz: the first at least half a second after the first rejection
+    oracle = AxisOracle(run, config, "radial", leave_out=rows[Outcome.REJECTED], reacquired=rows[Outcome.REACQUIRED])
+    check_innovations(
+        estimates.measurements.where(~np.isin(estimates.measurements.outcome, [Outcome.REJECTED])), oracle
+    )
     times = nanoseconds(estimates)
     check_estimates(estimates["radial"], oracle.smoothed(times) if smooth else oracle.filtered(times))
 
@@ -252,7 +254,7 @@ def scan() -> tuple[Run, FusionConfig, Estimates]:
 
 
 def _rmse(scan: tuple[Run, FusionConfig, Estimates], axis: str) -> Mapping[str, float]:
-    """RMS errors [m] where both truth and tracker are: of the estimates and of the tracker, between its readings."""
+    """RMS errors [m] where both truth and tracker are: of the estimates and of the tracker, between its measurements."""
     run, config, estimates = scan
     assert run.reference is not None
     known = {"truth": (run.reference, 0.0), "raw": (run.sensors["tracker"], config.sensors["tracker"].latency)}

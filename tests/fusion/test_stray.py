@@ -11,7 +11,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.fusion.estimates import Mode
-from pumafuse.runs.frames import Cylindrical
+from pumafuse.logs.frames import Cylindrical
 
 SECOND = 1_000_000_000
 ORIGIN = 1_700_000_000 * SECOND
@@ -59,7 +59,7 @@ def fused(run: pf.Run, **more: Any) -> pf.Estimates:
 
 
 def assert_same(got: pf.Estimates, wanted: pf.Estimates) -> None:
-    """Every estimate, every met scalar, the biases and the truth are equal to the bit."""
+    """Every estimate, every met component, the biases and the truth are equal to the bit."""
     assert (got.origin, got.last_command, got.speed, got.radius) == (
         wanted.origin, wanted.last_command, wanted.speed, wanted.radius
     )  # fmt: skip
@@ -70,8 +70,8 @@ def assert_same(got: pf.Estimates, wanted: pf.Estimates) -> None:
         for field in pf.AxisEstimate.FIELDS:
             np.testing.assert_array_equal(getattr(got[axis], field), getattr(wanted[axis], field), err_msg=field)
     assert got.biases == wanted.biases
-    met = [est.readings.where(np.isfinite(est.readings.innovation)) for est in (got, wanted)]
-    for field in pf.Readings.ARRAYS:
+    met = [est.measurements.where(np.isfinite(est.measurements.innovation)) for est in (got, wanted)]
+    for field in pf.Measurements.ARRAYS:
         np.testing.assert_array_equal(getattr(met[0], field), getattr(met[1], field), err_msg=field)
     assert got.reference is not None
     assert wanted.reference is not None
@@ -87,10 +87,13 @@ CASES: dict[str, tuple[list[Stray], list[str]]] = {
     "the last command back": ([("command", 108, -100.0)], ["(first: row 109, by 100.000 s)"]),
     "two commands in a row ahead": ([("command", 50, 9.0), ("command", 50, 12.0)], ["command: 2 rows have"]),
     "two commands, apart": ([("command", 50, 9.0), ("command", 90, -12.0)], ["more than 1 s ahead", "1 s behind"]),
-    "a reading ahead": ([("tracker", 80, 40.0)], ["tracker: 1 row has a stray stamp", "(first: row 81, by 40.010 s)"]),
-    "the first reading ahead": ([("tracker", 0, 40.0)], ["tracker: 1 row", "row 1"]),
-    "two readings in a row ahead": ([("camera", 9, 4.0), ("camera", 9, 9.0)], ["camera: 2 rows have", "row 10"]),
-    "readings of both sensors": ([("tracker", 200, 4.0), ("camera", 9, 9.0)], ["tracker: 1 row", "camera: 1 row"]),
+    "a measurement ahead": (
+        [("tracker", 80, 40.0)],
+        ["tracker: 1 row has a stray stamp", "(first: row 81, by 40.010 s)"],
+    ),
+    "the first measurement ahead": ([("tracker", 0, 40.0)], ["tracker: 1 row", "row 1"]),
+    "two measurements in a row ahead": ([("camera", 9, 4.0), ("camera", 9, 9.0)], ["camera: 2 rows have", "row 10"]),
+    "measurements of both sensors": ([("tracker", 200, 4.0), ("camera", 9, 9.0)], ["tracker: 1 row", "camera: 1 row"]),
     "the truth ahead": ([("reference", 60, 40.0)], ["reference: 1 row has a stray stamp"]),
     "all at once": ([(name, 20, 77.0) for name in ("command", "tracker", "camera", "reference")], ["command: 1 row"]),
 }
@@ -125,17 +128,17 @@ def test_stray_rows_change_no_estimate_on_a_grid_of_ticks() -> None:
 
 
 def test_every_row_is_in_the_counts() -> None:
-    """A stray reading is invalid, one that is far behind too late: none of the rows is lost, no other is touched."""
+    """A stray measurement is invalid, one that is far behind too late: none of the rows is lost, no other is touched."""
     strays = [("tracker", 80, 40.0), ("tracker", 120, -40.0), ("tracker", 160, 40.0), ("tracker", 160, 50.0)]
-    tracker = fused(recorded(strays)).readings.of("tracker", "radial")
+    tracker = fused(recorded(strays)).measurements.of("tracker", "radial")
     assert tracker.counts() == {"fused": 299, "too_late": 1, "invalid": 3}
     assert len(tracker.value) == 303
 
 
-def test_three_readings_in_a_row_are_no_stray() -> None:
+def test_three_measurements_in_a_row_are_no_stray() -> None:
     """A sensor whose clock stays ahead for three rows is believed: what comes after is too late, as ever."""
     strays = [("tracker", 80, 40.0 + k) for k in range(3)]
-    counts = fused(recorded(strays)).readings.of("tracker", "radial").counts()
+    counts = fused(recorded(strays)).measurements.of("tracker", "radial").counts()
     assert counts["too_late"] == 299 - 80
     assert "invalid" not in counts
 

@@ -76,7 +76,7 @@ class Wanted:
     log_likelihood: float
 
 
-def dense(axis: Axis, command: np.ndarray, readings: np.ndarray, sd: float, digits: int | None = None) -> Wanted:
+def dense(axis: Axis, command: np.ndarray, measurements: np.ndarray, sd: float, digits: int | None = None) -> Wanted:
     """A Kalman filter in Joseph form on the delay-augmented matrices, in doubles or in decimals."""
     number: type[float] | type[Decimal] = float if digits is None else Decimal
     model, P = axis.start()
@@ -84,7 +84,7 @@ def dense(axis: Axis, command: np.ndarray, readings: np.ndarray, sd: float, digi
     x, R = _as(number, np.zeros_like(model.B)), number(float(sd)) ** 2
     rows, terms = list[tuple[float, ...]](), list[float]()
     with localcontext(prec=digits or DIGITS):
-        for v, z in zip(command, readings, strict=True):
+        for v, z in zip(command, measurements, strict=True):
             S = (H @ P @ H.T)[0, 0] + R
             nu = number(float(z)) - (H @ x)[0, 0]
             if not math.isnan(z):
@@ -97,8 +97,8 @@ def dense(axis: Axis, command: np.ndarray, readings: np.ndarray, sd: float, digi
     return Wanted(*np.array(rows).reshape(-1, 4).T, math.fsum(terms))
 
 
-def conditioned(axis: Axis, command: np.ndarray, readings: np.ndarray, sd: float) -> tuple[np.ndarray, np.ndarray]:
-    """Means and variances of p at all ticks given all readings: their joint Gaussian, conditioned in decimals."""
+def conditioned(axis: Axis, command: np.ndarray, measurements: np.ndarray, sd: float) -> tuple[np.ndarray, np.ndarray]:
+    """Means and variances of p at all ticks given all measurements: their joint Gaussian, conditioned in decimals."""
     model, P = axis.start()
     steps = len(command)
     F, B, H, Q, P = (_as(Decimal, part) for part in (model.F, model.B, model.H, model.Q, P))
@@ -111,9 +111,9 @@ def conditioned(axis: Axis, command: np.ndarray, readings: np.ndarray, sd: float
                 joint[n, later] = joint[later, n] = (H @ column)[0, 0]
                 column = F @ column
             x, P = F @ x + B * Decimal(float(command[n])), F @ P @ F.T + Q
-        for n in np.flatnonzero(~np.isnan(readings)):
+        for n in np.flatnonzero(~np.isnan(measurements)):
             toward = joint[:, n] / (joint[n, n] + R)
-            mean = mean + toward * (Decimal(float(readings[n])) - mean[n])
+            mean = mean + toward * (Decimal(float(measurements[n])) - mean[n])
             joint = joint - np.outer(toward, joint[n])
         return mean.astype(float), np.diagonal(joint).astype(float)
 
@@ -151,7 +151,7 @@ class Case:
 
     Attributes:
         axis: Of the first run; the others' plants, noise and drift differ where ``own_model``.
-        missing: Share of readings that are NaN.
+        missing: Share of measurements that are NaN.
     """
 
     axis: Axis
@@ -161,7 +161,7 @@ class Case:
     missing: float = 0.2
     own_model: bool = False
     own_command: bool = True
-    own_readings: bool = True
+    own_measurements: bool = True
     own_sd: bool = False
     seed: int = 1
 
@@ -182,32 +182,36 @@ class Case:
         ]
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Commands, readings (one or many) and sds (one or many), as the functions take them."""
+        """Commands, measurements (one or many) and sds (one or many), as the functions take them."""
         rng = np.random.default_rng(self.seed)
         command = rng.normal(0.0, 5e-3, (self.runs if self.own_command else 1, self.steps))
-        readings = rng.normal(0.0, 5e-3, (self.runs if self.own_readings else 1, self.steps))
-        readings[rng.random(readings.shape) < self.missing] = np.nan
+        measurements = rng.normal(0.0, 5e-3, (self.runs if self.own_measurements else 1, self.steps))
+        measurements[rng.random(measurements.shape) < self.missing] = np.nan
         sd = self.sd * rng.uniform(0.5, 1.5, self.runs) if self.own_sd else np.array(self.sd)
-        return command if self.own_command else command[0], readings if self.own_readings else readings[0], sd
+        return (
+            command if self.own_command else command[0],
+            measurements if self.own_measurements else measurements[0],
+            sd,
+        )
 
     def asked(self) -> tuple[pf.DiscreteModel | list[pf.DiscreteModel], np.ndarray, np.ndarray, np.ndarray]:
         model = [axis.model for axis in self.axes()] if self.own_model else self.axis.model
         return model, *self.arrays()
 
     def one(self, run: int) -> tuple[Axis, np.ndarray, np.ndarray, float]:
-        command, readings, sd = self.arrays()
-        index = (run if self.own_command else 0, run if self.own_readings else 0)
+        command, measurements, sd = self.arrays()
+        index = (run if self.own_command else 0, run if self.own_measurements else 0)
         return (
             self.axes()[run],
             np.atleast_2d(command)[index[0]],
-            np.atleast_2d(readings)[index[1]],
+            np.atleast_2d(measurements)[index[1]],
             float(np.broadcast_to(sd, self.runs)[run]),
         )
 
     @property
     def count(self) -> int:
         """How many runs the arrays and models tell of."""
-        own = self.own_model or self.own_command or self.own_readings or self.own_sd
+        own = self.own_model or self.own_command or self.own_measurements or self.own_sd
         return self.runs if own else 1
 
 
@@ -244,7 +248,7 @@ def cases(draw: st.DrawFn, most_runs: int = 40, most_steps: int = 50) -> Case:
         missing=draw(st.sampled_from([0.0, 0.1, 0.5, 0.9, 1.0])),
         own_model=draw(yes),
         own_command=draw(yes),
-        own_readings=draw(yes),
+        own_measurements=draw(yes),
         own_sd=draw(yes),
         seed=draw(st.integers(0, 10_000)),
     )
@@ -264,9 +268,9 @@ CASES = {
     "nothing but offset": Case(Axis(UNDER, input_noise=0.0), 50, runs=2),
     "certain": Case(Axis(UNDER, input_noise=0.0, drift=None), 50, runs=2),
     "certain, one run": Case(Axis(LAG, input_noise=0.0, drift=None), 50),
-    "parameter sets on one run": Case(Axis(UNDER), 33, 37, own_command=False, own_readings=False, own_model=True),
+    "parameter sets on one run": Case(Axis(UNDER), 33, 37, own_command=False, own_measurements=False, own_model=True),
     "all its own": Case(Axis(UNDER), 33, runs=37, own_model=True, own_sd=True),
-    "sds on one run": Case(Axis(LAG), 9, runs=5, own_command=False, own_readings=False, own_sd=True),
+    "sds on one run": Case(Axis(LAG), 9, runs=5, own_command=False, own_measurements=False, own_sd=True),
     "lanes full": Case(Axis(UNDER), 16, runs=32),
 }
 
@@ -322,8 +326,8 @@ def test_a_run_alone_and_among_others_agree_to_rounding(case: Case) -> None:
     """The kernels for one run and for many differ by less than 2e-12 of an error bar over 50 steps."""
     many = pf.filter_ticks(*case.asked(), offset_sd=case.axis.offset_sd)
     for run in range(case.count):
-        axis, command, readings, sd = case.one(run)
-        one = pf.filter_ticks(axis.model, command, readings, sd, offset_sd=axis.offset_sd)
+        axis, command, measurements, sd = case.one(run)
+        one = pf.filter_ticks(axis.model, command, measurements, sd, offset_sd=axis.offset_sd)
         for mean, spread in (("position", "position_sd"), ("innovation", "innovation_sd")):
             wanted, got = getattr(one, mean), np.atleast_2d(getattr(many, mean))[run]
             wanted_sd, got_sd = getattr(one, spread), np.atleast_2d(getattr(many, spread))[run]
@@ -338,12 +342,12 @@ def test_a_run_alone_and_among_others_agree_to_rounding(case: Case) -> None:
 @given(cases(), st.integers(0, 100))
 def test_a_run_among_others_does_not_depend_on_its_place(case: Case, seed: int) -> None:
     """Shuffled runs give the same numbers to the last bit, shuffled."""
-    case = replace(case, runs=max(case.runs, 2), own_model=True, own_command=True, own_readings=True, own_sd=True)
-    models, command, readings, sd = case.asked()
+    case = replace(case, runs=max(case.runs, 2), own_model=True, own_command=True, own_measurements=True, own_sd=True)
+    models, command, measurements, sd = case.asked()
     order = np.random.default_rng(seed).permutation(case.runs)
-    wanted = pf.filter_ticks(models, command, readings, sd, offset_sd=case.axis.offset_sd)
+    wanted = pf.filter_ticks(models, command, measurements, sd, offset_sd=case.axis.offset_sd)
     shuffled = [models[k] for k in order]
-    got = pf.filter_ticks(shuffled, command[order], readings[order], sd[order], offset_sd=case.axis.offset_sd)
+    got = pf.filter_ticks(shuffled, command[order], measurements[order], sd[order], offset_sd=case.axis.offset_sd)
     for field in fields(got):
         np.testing.assert_array_equal(getattr(got, field.name), getattr(wanted, field.name)[order])
 
@@ -365,7 +369,7 @@ def test_the_cores_do_not_change_the_numbers(monkeypatch: pytest.MonkeyPatch, ru
 # ---- fuse -----------------------------------------------------------------------------------------------------------
 
 
-def fused(axis: Axis, command: np.ndarray, readings: np.ndarray, sd: float, *, smooth: bool) -> pf.Estimates:
+def fused(axis: Axis, command: np.ndarray, measurements: np.ndarray, sd: float, *, smooth: bool) -> pf.Estimates:
     """What :func:`pumafuse.fuse` makes of a run whose level at rest is 0.5 m."""
     level, stamps = 0.5, np.arange(len(command)) * round(axis.period * 1e9)
     plain = pf.Process(input_noise=axis.input_noise, drift=axis.drift or 0.0)
@@ -378,7 +382,7 @@ def fused(axis: Axis, command: np.ndarray, readings: np.ndarray, sd: float, *, s
         process={"radial": plain},
         sensors={"tracker": pf.Sensor(sd=sd, gate=0.0)},
     )
-    heard = {"tracker": (stamps, {"radial": readings + level})}
+    heard = {"tracker": (stamps, {"radial": measurements + level})}
     run = pf.Run.from_arrays(stamps, {"radial": command + level}, heard, start={"radial": level})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", pf.PumafuseWarning)  # missing values and noise that is not the model's
@@ -400,17 +404,17 @@ def fusible(draw: st.DrawFn) -> Case:
 @given(fusible())
 def test_the_tight_path_gives_what_fuse_gives(smooth: bool, case: Case) -> None:
     """Positions, error bars, innovations and likelihood of a run on its ticks are those of `fuse`."""
-    axis, command, readings, sd = case.one(0)
-    estimates = fused(axis, command, readings, sd, smooth=smooth)
+    axis, command, measurements, sd = case.one(0)
+    estimates = fused(axis, command, measurements, sd, smooth=smooth)
     function = pf.smooth_ticks if smooth else pf.filter_ticks
-    got = function(axis.model, command, readings, sd, offset_sd=axis.offset_sd)
-    wanted, met = estimates["radial"], ~np.isnan(readings)
+    got = function(axis.model, command, measurements, sd, offset_sd=axis.offset_sd)
+    wanted, met = estimates["radial"], ~np.isnan(measurements)
     close(got.position + 0.5, wanted.position, wanted.position_sd)
     np.testing.assert_allclose(got.position_sd**2, wanted.position_sd**2, rtol=1e-9, atol=0.0)
-    scalars = estimates.readings.where(estimates.readings.outcome == Outcome.FUSED)
-    close(got.innovation[met], scalars.innovation, scalars.innovation_sd)
-    np.testing.assert_allclose(got.innovation_sd[met] ** 2, scalars.innovation_sd**2, rtol=1e-9, atol=0.0)
-    in_metres = log_likelihood(scalars, estimates.config.sensors) + met.sum() * math.log(1e3)
+    components = estimates.measurements.where(estimates.measurements.outcome == Outcome.FUSED)
+    close(got.innovation[met], components.innovation, components.innovation_sd)
+    np.testing.assert_allclose(got.innovation_sd[met] ** 2, components.innovation_sd**2, rtol=1e-9, atol=0.0)
+    in_metres = log_likelihood(components, estimates.config.sensors) + met.sum() * math.log(1e3)
     np.testing.assert_allclose(got.log_likelihood[0], in_metres, rtol=1e-9, atol=1e-9)
 
 
@@ -418,19 +422,19 @@ def test_the_tight_path_gives_what_fuse_gives(smooth: bool, case: Case) -> None:
 
 
 def check_smoothed(case: Case) -> None:
-    axis, command, readings, sd = case.one(0)
-    smoothed = pf.smooth_ticks(axis.model, command, readings, sd, offset_sd=axis.offset_sd)
-    position, variance = conditioned(axis, command, readings, sd)
+    axis, command, measurements, sd = case.one(0)
+    smoothed = pf.smooth_ticks(axis.model, command, measurements, sd, offset_sd=axis.offset_sd)
+    position, variance = conditioned(axis, command, measurements, sd)
     close(smoothed.position, position, np.sqrt(variance))
     np.testing.assert_allclose(smoothed.position_sd**2, variance, rtol=1e-9, atol=0.0)
-    check(replace(smoothed, position=(filtered := dense(axis, command, readings, sd)).position,
+    check(replace(smoothed, position=(filtered := dense(axis, command, measurements, sd)).position,
                   position_sd=np.sqrt(filtered.variance)), None, filtered)  # fmt: skip
     assert (smoothed.position_sd**2 <= filtered.variance * (1.0 + 1e-12)).all()
 
 
 @pytest.mark.parametrize("case", [case for case in CASES.values() if case.runs == 1])
 def test_smoothing_conditions_the_joint_gaussian(case: Case) -> None:
-    """Smoothed positions and error bars are those of all positions given all readings at once."""
+    """Smoothed positions and error bars are those of all positions given all measurements at once."""
     check_smoothed(case)
 
 
@@ -446,10 +450,10 @@ def test_smoothing_any_run_conditions_the_joint_gaussian(case: Case) -> None:
 @pytest.mark.parametrize("plant", [UNDER, LAG])
 def test_smoothing_is_as_good_as_it_says(plant: Plant, offset_sd: float, gap: int) -> None:
     """Beside a wide offset prior a smoothed variance is off by no more than a few roundings of the prior's."""
-    axis, command, readings, sd = Case(Axis(plant, offset_sd=offset_sd), 25, sd=0.05e-3).one(0)
-    readings[:gap] = np.nan
-    smoothed = pf.smooth_ticks(axis.model, command, readings + offset_sd, sd, offset_sd=offset_sd)
-    position, variance = conditioned(axis, command, readings + offset_sd, sd)
+    axis, command, measurements, sd = Case(Axis(plant, offset_sd=offset_sd), 25, sd=0.05e-3).one(0)
+    measurements[:gap] = np.nan
+    smoothed = pf.smooth_ticks(axis.model, command, measurements + offset_sd, sd, offset_sd=offset_sd)
+    position, variance = conditioned(axis, command, measurements + offset_sd, sd)
     close(smoothed.position, position, np.sqrt(variance), 1e-6)
     np.testing.assert_allclose(smoothed.position_sd**2, variance, rtol=0.0, atol=1e-15 * offset_sd**2)
 
@@ -469,16 +473,16 @@ OFFSETS = {
 @pytest.mark.parametrize("offset", OFFSETS.values(), ids=OFFSETS.keys())
 @pytest.mark.parametrize("sd", SDS)
 @pytest.mark.parametrize("plant", [UNDER, pytest.param(LAG, marks=pytest.mark.long)])
-def test_any_noise_of_readings_is_met(plant: Plant, sd: float, offset: tuple[float | None, float]) -> None:
+def test_any_noise_of_measurements_is_met(plant: Plant, sd: float, offset: tuple[float | None, float]) -> None:
     """Against 50 digits: 1e-9 while what was not known is under 1e5 sd, 1e-6 up to 1e6, beyond that still sound."""
     for noise in (0.0, 0.03e-3, 0.3e-3, 10e-3):
         axis = Axis(plant, input_noise=noise, drift=offset[0], offset_sd=offset[1])
-        _, command, readings, _ = Case(axis, 40, sd=sd).one(0)
-        wanted = dense(axis, command, readings, sd, DIGITS)
+        _, command, measurements, _ = Case(axis, 40, sd=sd).one(0)
+        wanted = dense(axis, command, measurements, sd, DIGITS)
         ratio = math.sqrt(wanted.innovation_variance.max()) / sd
-        one = pf.filter_ticks(axis.model, command, readings, sd, offset_sd=offset[1])
-        many = pf.filter_ticks(axis.model, command, [readings, readings], sd, offset_sd=offset[1])
-        smooth = pf.smooth_ticks(axis.model, command, readings, sd, offset_sd=offset[1])
+        one = pf.filter_ticks(axis.model, command, measurements, sd, offset_sd=offset[1])
+        many = pf.filter_ticks(axis.model, command, [measurements, measurements], sd, offset_sd=offset[1])
+        smooth = pf.smooth_ticks(axis.model, command, measurements, sd, offset_sd=offset[1])
         for got in (one, many, smooth):
             for values in (got.position, got.position_sd, got.innovation_sd, got.log_likelihood):
                 assert np.isfinite(values).all()
@@ -491,12 +495,12 @@ def test_any_noise_of_readings_is_met(plant: Plant, sd: float, offset: tuple[flo
 @pytest.mark.parametrize("many", [False, True])
 @pytest.mark.parametrize("axis", [Axis(UNDER), Axis(LAG, drift=None)])
 def test_a_long_gap_is_bridged_by_the_model(axis: Axis, many: bool) -> None:
-    """Ten thousand ticks without a reading: positions follow the commands, variances grow to what the model says."""
+    """Ten thousand ticks without a measurement: positions follow the commands, variances grow to what the model says."""
     steps, model = 10_000, axis.model
     command = np.random.default_rng(3).normal(0.0, 5e-3, steps)
-    readings = np.full((1 + many, steps), np.nan)
-    readings[:, 0] = command[0]
-    got = pf.filter_ticks(model, command, readings, 0.1e-3)
+    measurements = np.full((1 + many, steps), np.nan)
+    measurements[:, 0] = command[0]
+    got = pf.filter_ticks(model, command, measurements, 0.1e-3)
     state, settled = np.zeros((len(model.F), 1)), np.empty(steps)
     for n in range(steps):
         settled[n] = (model.H @ state)[0, 0]
@@ -515,25 +519,25 @@ def test_a_long_gap_is_bridged_by_the_model(axis: Axis, many: bool) -> None:
 @pytest.mark.parametrize("value", [np.inf, -np.inf])
 @pytest.mark.parametrize("drift", [None, 0.8e-3])
 @pytest.mark.parametrize("runs", [1, 3])
-def test_an_infinite_reading_is_not_fused(value: float, drift: float | None, runs: int) -> None:
+def test_an_infinite_measurement_is_not_fused(value: float, drift: float | None, runs: int) -> None:
     """It is as good as missing, as `fuse` has it (`invalid`), and poisons nothing."""
     model, command, missing, sd = Case(Axis(UNDER, drift=drift), 20, runs=runs, missing=0.0).asked()
     missing[:, 4] = np.nan
     infinite = np.where(np.isnan(missing), value, missing)
-    wanted, got = (pf.filter_ticks(model, command, readings, sd) for readings in (missing, infinite))
+    wanted, got = (pf.filter_ticks(model, command, measurements, sd) for measurements in (missing, infinite))
     for field in ("position", "position_sd", "log_likelihood"):
         np.testing.assert_array_equal(getattr(got, field), getattr(wanted, field), err_msg=field)
     np.testing.assert_array_equal(pf.tick_likelihood(model, command, infinite, sd), wanted.log_likelihood)
     if runs == 1:
-        smoothed = (pf.smooth_ticks(model, command, readings, float(sd)) for readings in (missing, infinite))
+        smoothed = (pf.smooth_ticks(model, command, measurements, float(sd)) for measurements in (missing, infinite))
         np.testing.assert_array_equal(*(one.position for one in smoothed))
 
 
-def test_a_masked_reading_is_missing() -> None:
+def test_a_masked_measurement_is_missing() -> None:
     """What lies under the mask is nothing that was measured."""
-    model, command, readings, sd = Case(Axis(UNDER), 20, runs=3, missing=0.3).asked()
-    masked = np.ma.masked_array(np.nan_to_num(readings, nan=7.0), mask=np.isnan(readings))
-    wanted, got = (pf.filter_ticks(model, command, one, sd) for one in (readings, masked))
+    model, command, measurements, sd = Case(Axis(UNDER), 20, runs=3, missing=0.3).asked()
+    masked = np.ma.masked_array(np.nan_to_num(measurements, nan=7.0), mask=np.isnan(measurements))
+    wanted, got = (pf.filter_ticks(model, command, one, sd) for one in (measurements, masked))
     np.testing.assert_array_equal(got.position, wanted.position)
     np.testing.assert_array_equal(got.log_likelihood, wanted.log_likelihood)
 
@@ -541,11 +545,11 @@ def test_a_masked_reading_is_missing() -> None:
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("function", [pf.filter_ticks, pf.smooth_ticks, pf.tick_likelihood])
 def test_a_command_that_is_no_number_is_refused(function: Callable[..., object], value: float) -> None:
-    """Else all later positions are NaN, later readings look missing, and a likelihood of the rest looks sound."""
-    model, command, readings, sd = Case(Axis(UNDER), 20).asked()
+    """Else all later positions are NaN, later measurements look missing, and a likelihood of the rest looks sound."""
+    model, command, measurements, sd = Case(Axis(UNDER), 20).asked()
     command[0, 3] = value
     with pytest.raises(ValueError, match=r"^[^\n]*command[^\n]*$"):
-        function(model, command, readings, float(sd))
+        function(model, command, measurements, float(sd))
 
 
 def test_no_steps_are_no_estimates() -> None:
@@ -575,7 +579,7 @@ REFUSED: dict[str, tuple[object, npt.ArrayLike, npt.ArrayLike, npt.ArrayLike, fl
     "no runs": (MODEL, ROW, np.empty((0, 5)), 1e-3, 0.0),
     "no sd": (MODEL, ROW, ROW, [], 0.0),
     "three dimensions": (MODEL, np.zeros((1, 5, 1)), np.zeros((1, 5, 1)), 1e-3, 0.0),
-    "readings of three dimensions": (MODEL, ROW, np.zeros((2, 5, 2)), 1e-3, 0.0),
+    "measurements of three dimensions": (MODEL, ROW, np.zeros((2, 5, 2)), 1e-3, 0.0),
     "several delays": ([MODEL, OTHER], ROW, ROW, 1e-3, 0.0),
     "several periods": ([MODEL, SLOWER], ROW, ROW, 1e-3, 0.0),
     **{f"sd {sd}": (MODEL, ROW, ROW, sd, 0.0) for sd in (0.0, -1e-3, math.nan, math.inf)},
@@ -597,7 +601,7 @@ def test_what_does_not_fit_is_refused_in_one_line(function: Callable[..., object
 @pytest.mark.parametrize(
     "arguments",
     [(MODEL, ROW, ROWS, 1e-3), (MODEL, ROWS, ROW, 1e-3), ([MODEL] * 3, ROW, ROW, 1e-3), (MODEL, ROW, ROW, [1e-3] * 3)],
-    ids=["readings", "commands", "models", "sds"],
+    ids=["measurements", "commands", "models", "sds"],
 )
 def test_only_one_run_is_smoothed(arguments: tuple[object, ...]) -> None:
     """More runs are a ValueError of one line."""
@@ -612,16 +616,16 @@ def test_only_one_run_is_smoothed(arguments: tuple[object, ...]) -> None:
 @pytest.mark.parametrize("flat", [False, True])
 def test_arrays_given_are_neither_changed_nor_kept(case: Case, flat: bool) -> None:
     """Results share no memory with the caller's arrays or with each other, and nothing given is written to."""
-    model, command, readings, sd = case.asked()
+    model, command, measurements, sd = case.asked()
     if flat:
-        command, readings = command[0], readings[0]
-    given = [command, readings, sd, model.F, model.B, model.H, model.Q]
+        command, measurements = command[0], measurements[0]
+    given = [command, measurements, sd, model.F, model.B, model.H, model.Q]
     kept = [array.copy() for array in given]
-    results = [pf.filter_ticks(model, command, readings, sd, offset_sd=case.axis.offset_sd)]
-    results.append(pf.filter_ticks(model, command, readings, sd, offset_sd=case.axis.offset_sd))
+    results = [pf.filter_ticks(model, command, measurements, sd, offset_sd=case.axis.offset_sd)]
+    results.append(pf.filter_ticks(model, command, measurements, sd, offset_sd=case.axis.offset_sd))
     if case.runs == 1:
-        results.append(pf.smooth_ticks(model, command, readings, float(sd), offset_sd=case.axis.offset_sd))
-    pf.tick_likelihood(model, command, readings, sd, offset_sd=case.axis.offset_sd)
+        results.append(pf.smooth_ticks(model, command, measurements, float(sd), offset_sd=case.axis.offset_sd))
+    pf.tick_likelihood(model, command, measurements, sd, offset_sd=case.axis.offset_sd)
     made = [getattr(result, field.name) for result in results for field in fields(result)]
     for array, copy in zip(given, kept, strict=True):
         np.testing.assert_array_equal(array, copy)
@@ -633,8 +637,8 @@ def test_arrays_given_are_neither_changed_nor_kept(case: Case, flat: bool) -> No
 def test_any_layout_and_kind_of_number_is_taken(runs: int) -> None:
     """Lists, other strides, single precision and whole numbers give what contiguous doubles give."""
     rng = np.random.default_rng(5)
-    command, readings = (rng.integers(-9, 9, (runs, 11)).astype(float) for _ in range(2))
-    wanted = pf.filter_ticks(MODEL, command, readings, 0.5)
+    command, measurements = (rng.integers(-9, 9, (runs, 11)).astype(float) for _ in range(2))
+    wanted = pf.filter_ticks(MODEL, command, measurements, 0.5)
     layouts: list[Callable[[np.ndarray], npt.ArrayLike]] = [
         lambda a: a.tolist(),
         np.asfortranarray,
@@ -644,6 +648,6 @@ def test_any_layout_and_kind_of_number_is_taken(runs: int) -> None:
         lambda a: a.astype(np.int64),
     ]
     for layout in layouts:
-        got = pf.filter_ticks(MODEL, layout(command), layout(readings), 0.5)
+        got = pf.filter_ticks(MODEL, layout(command), layout(measurements), 0.5)
         for field in fields(got):
             np.testing.assert_array_equal(getattr(got, field.name), getattr(wanted, field.name))

@@ -1,4 +1,4 @@
-"""The total order of events, what becomes of each reading before any filter, and which rows command the arm."""
+"""The total order of events, what becomes of each measurement before any filter, and which rows command the arm."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from pumafuse.errors import RunError, UnknownNameError
 from pumafuse.fusion.config import FusionConfig, Sensor
 from pumafuse.fusion.outcome import Outcome
 from pumafuse.fusion.timeline import Timeline, build, output_times
+from pumafuse.logs.run import Clock, Run
 from pumafuse.model.arm import ArmModel, AxisModel
 from pumafuse.model.plants import FirstOrder
-from pumafuse.runs.run import Clock, Run
 
 MS = 1_000_000
 SECOND = 1000 * MS
@@ -51,19 +51,19 @@ def config(**sensors: Sensor) -> FusionConfig:
 
 
 def recorded(sensors: Mapping[str, Rows] | None = None, axes: Sequence[str] = ("radial",), **more: Any) -> Run:
-    """Two commands, the first at ``ORIGIN``, and the readings of the sensors."""
+    """Two commands, the first at ``ORIGIN``, and the measurements of the sensors."""
     return Run.from_arrays([ORIGIN, ORIGIN + TICK], {axis: [0.5, 0.51] for axis in axes}, sensors, **more)
 
 
-def readings(*rows: tuple[float, float]) -> Rows:
-    """Radial readings by (ms after the first command, value)."""
+def measurements(*rows: tuple[float, float]) -> Rows:
+    """Radial measurements by (ms after the first command, value)."""
     stamps = [ORIGIN + round(time * MS) if math.isfinite(time) else NO_STAMP for time, _ in rows]
     return stamps, {"radial": [value for _, value in rows]}
 
 
 def outcomes(timeline: Timeline) -> list[str]:
     """Of one sensor on one axis, by their stamps."""
-    return [Outcome(code).word for code in timeline.scalars.outcome]
+    return [Outcome(code).word for code in timeline.components.outcome]
 
 
 def commanded(
@@ -82,12 +82,12 @@ def one_note(timeline: Timeline, word: str) -> str:
     return note
 
 
-# ---- the order of readings
+# ---- the order of measurements
 
 
 @st.composite
 def crowded_runs(draw: st.DrawFn) -> tuple[Run, FusionConfig]:
-    """Runs whose readings collide in valid time, with every defect a row may have."""
+    """Runs whose measurements collide in valid time, with every defect a row may have."""
     latency = st.sampled_from([0.0, 0.002, 0.003, -0.001])
     sd = st.sampled_from([1e-4, {"radial": 1e-4}, {"vertical": 1e-4}])
     names = draw(st.permutations(["b", "a", "c"]))
@@ -105,7 +105,7 @@ def crowded_runs(draw: st.DrawFn) -> tuple[Run, FusionConfig]:
 
 
 def order_by_hand(run: Run, config: FusionConfig) -> list[tuple[Any, ...]]:
-    """(valid, sensor, stamp, row, axis) of every scalar, sorted as the contract says."""
+    """(valid, sensor, stamp, row, axis) of every component, sorted as the contract says."""
     names = [*config.sensors, *(name for name in run.sensors if name not in config.sensors)]
     found: list[tuple[Any, ...]] = []
     for index, name in enumerate(names):
@@ -121,22 +121,22 @@ def order_by_hand(run: Run, config: FusionConfig) -> list[tuple[Any, ...]]:
 
 @properties
 @given(crowded_runs())
-def test_readings_come_in_the_total_order(case: tuple[Run, FusionConfig]) -> None:
+def test_measurements_come_in_the_total_order(case: tuple[Run, FusionConfig]) -> None:
     """By valid time (stamp − latency), then sensors as in fusion.toml, stamp, place in the file; rows hold together."""
     run, conf = case
-    scalars = build(run, conf).scalars
+    components = build(run, conf).components
     wanted = order_by_hand(run, conf)
-    got = list(zip(scalars.valid, scalars.sensor, scalars.stamp, scalars.axis, strict=True))
+    got = list(zip(components.valid, components.sensor, components.stamp, components.axis, strict=True))
     assert got == [(valid, sensor, stamp, axis) for valid, sensor, stamp, _, axis in wanted]
     rows = [(sensor, row) for _, sensor, _, row, _ in wanted]
     changes = [one != other for one, other in pairwise(rows)]
-    assert scalars.row.tolist() == [0, *np.cumsum(changes).tolist()]
-    values = [run.sensors[scalars.sensors[s]].values[run.axes[a]][row] for _, s, _, row, a in wanted]
-    np.testing.assert_array_equal(scalars.value, values)
+    assert components.row.tolist() == [0, *np.cumsum(changes).tolist()]
+    values = [run.sensors[components.sensors[s]].values[run.axes[a]][row] for _, s, _, row, a in wanted]
+    np.testing.assert_array_equal(components.value, values)
 
 
 def reasons(run: Run, conf: FusionConfig, name: str, row: int, axis: str) -> set[str]:
-    """Every reason the contract gives not to fuse one scalar, found by looking at the rows before it."""
+    """Every reason the contract gives not to fuse one component, found by looking at the rows before it."""
     source, sensor = run.sensors[name], conf.sensors.get(name)
     found: set[str] = set()
     if sensor is None or sensor.sd_of(axis) is None:
@@ -157,29 +157,29 @@ def reasons(run: Run, conf: FusionConfig, name: str, row: int, axis: str) -> set
 
 @properties
 @given(crowded_runs())
-def test_a_reading_is_left_out_only_for_a_reason_it_has(case: tuple[Run, FusionConfig]) -> None:
-    """What goes to the filter has no defect; every other scalar gets the name of one that it has."""
+def test_a_measurement_is_left_out_only_for_a_reason_it_has(case: tuple[Run, FusionConfig]) -> None:
+    """What goes to the filter has no defect; every other component gets the name of one that it has."""
     run, conf = case
     timeline = build(run, conf)
-    for (_, sensor, _, row, axis), code in zip(order_by_hand(run, conf), timeline.scalars.outcome, strict=True):
-        wanted = reasons(run, conf, timeline.scalars.sensors[sensor], row, run.axes[axis]) or {"fused"}
+    for (_, sensor, _, row, axis), code in zip(order_by_hand(run, conf), timeline.components.outcome, strict=True):
+        wanted = reasons(run, conf, timeline.components.sensors[sensor], row, run.axes[axis]) or {"fused"}
         assert Outcome(code).word in wanted
-    fused = np.flatnonzero(timeline.scalars.outcome == Outcome.FUSED)
-    assert timeline.scalars.candidates.tolist() == fused.tolist()
+    fused = np.flatnonzero(timeline.components.outcome == Outcome.FUSED)
+    assert timeline.components.candidates.tolist() == fused.tolist()
 
 
 def test_the_order_of_the_configuration_decides_ties() -> None:
     """Valid at one instant, sensors come as in fusion.toml, not by stamp, name or place in the run."""
-    run = recorded({"a": readings((5, 1.0)), "b": readings((15, 2.0)), "c": readings((10, 3.0))})
+    run = recorded({"a": measurements((5, 1.0)), "b": measurements((15, 2.0)), "c": measurements((10, 3.0))})
     sensors = {
         "b": Sensor(sd=1e-4, latency=0.015),
         "c": Sensor(sd=1e-4, latency=0.01),
         "a": Sensor(sd=1e-4, latency=0.005),
     }
     timeline = build(run, config(**sensors))
-    assert timeline.scalars.valid.tolist() == [ORIGIN] * 3
-    assert timeline.scalars.value.tolist() == [2.0, 3.0, 1.0]
-    assert timeline.scalars.sensors == ("b", "c", "a")
+    assert timeline.components.valid.tolist() == [ORIGIN] * 3
+    assert timeline.components.value.tolist() == [2.0, 3.0, 1.0]
+    assert timeline.components.sensors == ("b", "c", "a")
 
 
 @pytest.mark.parametrize(
@@ -187,24 +187,24 @@ def test_the_order_of_the_configuration_decides_ties() -> None:
 )
 def test_valid_times_are_exact_today(latency: float, ns: int) -> None:
     """Stamps of 2023 in ns keep their last digit when the latency, up to an hour, is taken off."""
-    timeline = build(recorded({"a": readings((5, 1.0))}), config(a=Sensor(sd=1e-4, latency=latency)))
-    assert timeline.scalars.valid.tolist() == [ORIGIN + 5 * MS - ns]
-    assert timeline.scalars.stamp.tolist() == [ORIGIN + 5 * MS]
+    timeline = build(recorded({"a": measurements((5, 1.0))}), config(a=Sensor(sd=1e-4, latency=latency)))
+    assert timeline.components.valid.tolist() == [ORIGIN + 5 * MS - ns]
+    assert timeline.components.stamp.tolist() == [ORIGIN + 5 * MS]
 
 
 @pytest.mark.parametrize("chosen", [["a"], ["b", "a"], []])
 def test_only_chosen_sensors_are_on_the_timeline(chosen: list[str]) -> None:
-    """Sensors that are not chosen, configured or not, leave no scalar and no note."""
-    run = recorded({name: readings((5, 1.0)) for name in ("stranger", "b", "a")})
+    """Sensors that are not chosen, configured or not, leave no component and no note."""
+    run = recorded({name: measurements((5, 1.0)) for name in ("stranger", "b", "a")})
     timeline = build(run, config(a=Sensor(sd=1e-4), b=Sensor(sd=1e-4), silent=Sensor(sd=1e-4)), chosen)
-    assert timeline.scalars.sensors == tuple(sorted(chosen))
-    assert len(timeline.scalars.value) == len(chosen)
+    assert timeline.components.sensors == tuple(sorted(chosen))
+    assert len(timeline.components.value) == len(chosen)
     assert timeline.notes == ()
 
 
 def test_a_sensor_that_is_not_configured_cannot_be_chosen() -> None:
     """Choosing what fusion.toml has not is refused, even if the run has it."""
-    run = recorded({"stranger": readings((5, 1.0))})
+    run = recorded({"stranger": measurements((5, 1.0))})
     with pytest.raises(UnknownNameError, match="stranger"):
         build(run, config(a=Sensor(sd=1e-4)), ["stranger"])
 
@@ -225,27 +225,27 @@ nan = math.nan
 OUTCOMES: dict[str, tuple[Rows, list[str], tuple[str, ...]]] = {
     # rows as (ms, value), their outcomes in order of valid time, what the one note of this outcome must say
     "duplicate": (
-        readings((10, 1.0), (11, 2.0), (10, 1.0), (10, 3.0), (11, 2.0)),
+        measurements((10, 1.0), (11, 2.0), (10, 1.0), (10, 3.0), (11, 2.0)),
         ["fused", "duplicate", "fused", "fused", "duplicate"],
         ("2 rows", "row 3"),
     ),
     "before_start": (
-        readings((-3, 1.0), (4.999999, 1.0), (5, 1.0)),
+        measurements((-3, 1.0), (4.999999, 1.0), (5, 1.0)),
         ["before_start", "before_start", "fused"],
         ("2 rows", "row 1"),
     ),
     "too_late": (
-        readings((3000, 1.0), (1999, 2.0), (2000, 3.0), (1000, 4.0)),
+        measurements((3000, 1.0), (1999, 2.0), (2000, 3.0), (1000, 4.0)),
         ["too_late", "too_late", "fused", "fused"],
         ("2 rows", "row 2"),
     ),
     "invalid": (
-        readings((10, 1.0), (11, nan), (12, math.inf), (13, -math.inf)),
+        measurements((10, 1.0), (11, nan), (12, math.inf), (13, -math.inf)),
         ["fused", "invalid", "invalid", "invalid"],
         ("3 rows", "row 2", "no finite radial value"),
     ),
     "no stamp": (
-        readings((10, 1.0), (nan, 1.0), (nan, nan)),
+        measurements((10, 1.0), (nan, 1.0), (nan, nan)),
         ["invalid", "invalid", "fused"],
         ("2 rows", "row 2", "invalid"),
     ),
@@ -265,17 +265,17 @@ def test_each_outcome_is_counted_and_told_once(outcome: str) -> None:
 
 
 def test_a_clean_run_has_no_notes() -> None:
-    """Readings without a defect are all the filter's, and nothing is said."""
-    timeline = build(recorded({"a": readings((5, 1.0), (6, 1.0), (7, 2.0))}), config(a=A))
+    """Measurements without a defect are all the filter's, and nothing is said."""
+    timeline = build(recorded({"a": measurements((5, 1.0), (6, 1.0), (7, 2.0))}), config(a=A))
     assert outcomes(timeline) == ["fused"] * 3
     assert timeline.notes == ()
 
 
 def test_stamps_that_step_back_a_little_are_sorted_and_told() -> None:
     """Up to 1 s out of order is sorted, counted and fused."""
-    rows = readings((1500, 1.0), (500, 2.0), (1600, 3.0), (1599, 4.0))
+    rows = measurements((1500, 1.0), (500, 2.0), (1600, 3.0), (1599, 4.0))
     timeline = build(recorded({"a": rows}), config(a=A))
-    assert timeline.scalars.value.tolist() == [2.0, 1.0, 4.0, 3.0]
+    assert timeline.components.value.tolist() == [2.0, 1.0, 4.0, 3.0]
     assert outcomes(timeline) == ["fused"] * 4
     note = one_note(timeline, "steps back")
     assert "2 rows" in note
@@ -284,10 +284,10 @@ def test_stamps_that_step_back_a_little_are_sorted_and_told() -> None:
 
 def test_a_sensor_that_is_not_configured_is_unknown() -> None:
     """Its rows are kept, named and left out, after those of the configured sensors at the same instant."""
-    run = recorded({"stranger": readings((5, 1.0), (6, nan)), "a": readings((10, 3.0))})
+    run = recorded({"stranger": measurements((5, 1.0), (6, nan)), "a": measurements((10, 3.0))})
     timeline = build(run, config(a=A))
-    assert timeline.scalars.sensors == ("a", "stranger")
-    assert timeline.scalars.value[:2].tolist() == [3.0, 1.0]
+    assert timeline.components.sensors == ("a", "stranger")
+    assert timeline.components.value[:2].tolist() == [3.0, 1.0]
     assert outcomes(timeline) == ["fused", "unknown", "unknown"]
     note = one_note(timeline, "unknown")
     for word in ("stranger", "2 rows", "row 1"):
@@ -298,7 +298,7 @@ def test_an_axis_without_noise_is_unknown_to_its_sensor() -> None:
     """A sensor with noise for one axis is fused on that axis alone, though it logs another."""
     rows = [ORIGIN + 10 * MS, ORIGIN + 11 * MS], {"radial": [1.0, 2.0], "vertical": [3.0, 4.0]}
     timeline = build(recorded({"a": rows}, ("radial", "vertical")), config(a=Sensor(sd={"vertical": 1e-4})))
-    assert timeline.scalars.axis.tolist() == [0, 1, 0, 1]
+    assert timeline.components.axis.tolist() == [0, 1, 0, 1]
     assert outcomes(timeline) == ["unknown", "fused", "unknown", "fused"]
     (note,) = timeline.notes
     for word in ("a: ", "sd_mm", "radial", "unknown"):
@@ -334,11 +334,11 @@ def test_an_empty_axis_of_a_row_leaves_the_others_to_the_filter() -> None:
     assert outcomes(timeline) == ["invalid", "fused"]
 
 
-def test_a_configured_sensor_without_readings_is_told() -> None:
+def test_a_configured_sensor_without_measurements_is_told() -> None:
     """A sensor of fusion.toml that the run has not is a note, not an error."""
     timeline = build(recorded(), config(a=A))
-    assert "'a'" in one_note(timeline, "no readings")
-    assert len(timeline.scalars.value) == 0
+    assert "'a'" in one_note(timeline, "no measurements")
+    assert len(timeline.components.value) == 0
 
 
 def test_notes_of_the_files_come_with_the_run() -> None:
@@ -462,11 +462,11 @@ def test_a_regular_clock_puts_commands_on_even_ticks() -> None:
     assert abs(float(np.median(grid - stamp))) <= 1.0
 
 
-def test_a_regular_clock_moves_the_origin_and_not_the_readings() -> None:
+def test_a_regular_clock_moves_the_origin_and_not_the_measurements() -> None:
     """Time 0 is the first tick of the grid, not the first stamp: what is valid between them is before the start."""
     stamp = ORIGIN + np.arange(101) * TICK
     stamp[0] -= 2 * MS
-    run = Run.from_arrays(stamp, {"radial": np.arange(101.0)}, {"a": readings((4, 1.0), (5, 2.0))}, clock="regular")
+    run = Run.from_arrays(stamp, {"radial": np.arange(101.0)}, {"a": measurements((4, 1.0), (5, 2.0))}, clock="regular")
     timeline = build(run, config(a=A))
     assert timeline.origin == ORIGIN
     assert outcomes(timeline) == ["before_start", "fused"]
@@ -508,13 +508,13 @@ def test_estimates_are_asked_for_at_each_command() -> None:
     ("rows", "end"),
     [
         ([(5, 1.0)], TICK),  # the last command
-        ([(905, 1.0), (5, 1.0)], 900 * MS),  # the last reading, when it was true
+        ([(905, 1.0), (5, 1.0)], 900 * MS),  # the last measurement, when it was true
         ([(905, 1.0), (2000, nan)], 900 * MS),  # not one that is left out
     ],
 )
 def test_the_end_is_the_last_event_that_a_filter_meets(rows: list[tuple[float, float]], end: int) -> None:
-    """The grid of estimates ends with the last command or the last reading that can be fused."""
-    timeline = build(recorded({"a": readings(*rows)}), config(a=A))
+    """The grid of estimates ends with the last command or the last measurement that can be fused."""
+    timeline = build(recorded({"a": measurements(*rows)}), config(a=A))
     assert timeline.end == ORIGIN + end
     assert output_times(timeline, 1000.0)[-1] == ORIGIN + end
 

@@ -34,7 +34,7 @@ def test_a_jump_ahead_is_believed_until_it_is_contradicted() -> None:
 
 @pytest.mark.parametrize("gap", [5, 60, 3000])
 def test_after_a_pause_of_all_time_goes_on(gap: int) -> None:
-    """Two commands after a pause, or a second of readings, end the doubt."""
+    """Two commands after a pause, or a second of measurements, end the doubt."""
     clock = at(0.0)
     assert clock.judge(gap * SECOND, source=None) is Verdict.HERE
     assert clock.sure == 0
@@ -74,7 +74,7 @@ def test_a_command_of_the_right_time_clears_what_was_said_against_it() -> None:
         assert clock.judge(50 * SECOND + step * T, source=None) is Verdict.BEHIND
 
 
-def test_readings_alone_never_set_the_clock() -> None:
+def test_measurements_alone_never_set_the_clock() -> None:
     """A sensor an hour behind or a year ahead is refused for as long as it goes on."""
     clock = at(100.0)
     for step in range(1000):
@@ -96,8 +96,8 @@ def test_one_sensor_of_another_clock_disturbs_nobody(off: float) -> None:
         t = 0.028 * step
         for one in (live, alone):
             one.command(t, radial=0.5 + 1e-4 * step)
-            one.reading(t + 0.01, "tracker", radial=0.5 + 1e-4 * step)
-        live.reading(t + 0.012 + off, "camera", radial=0.9)
+            one.measurement(t + 0.01, "tracker", radial=0.5 + 1e-4 * step)
+        live.measurement(t + 0.012 + off, "camera", radial=0.9)
     live.command(14.0, radial=0.55)
     alone.command(14.0, radial=0.55)
     assert live.estimate(14.0)["radial"] == alone.estimate(14.0)["radial"]
@@ -116,7 +116,7 @@ def test_a_wild_command_is_taken_back() -> None:
         t = 0.028 * step
         for one in (live, clean):
             one.command(t, radial=0.5 + 1e-4 * step, vertical=0.1)
-            one.reading(t + 0.01, "tracker", radial=0.5, vertical=0.1)
+            one.measurement(t + 0.01, "tracker", radial=0.5, vertical=0.1)
         if step in (100, 150):
             assert live.command(t + 1800.0, radial=9.0, vertical=9.0).outcome is pf.Outcome.FUSED
     assert live.estimate(5.6) == clean.estimate(5.6)
@@ -126,14 +126,14 @@ def test_a_wild_command_is_taken_back() -> None:
     assert "a command ran 1799.972 s ahead of the others: taken back" in notices[1]
 
 
-def test_a_reading_cannot_contradict_a_command() -> None:
-    """The controller's clock is set ahead by 30 s, the sensors' is not: commands go on, readings are too late."""
+def test_a_measurement_cannot_contradict_a_command() -> None:
+    """The controller's clock is set ahead by 30 s, the sensors' is not: commands go on, measurements are too late."""
     notices: list[str] = []
     live = pf.LiveEstimator(CONFIG, on_notice=notices.append)
     for step in range(1000):
         t = 0.028 * step
         live.command(t + (30.0 if step > 300 else 0.0), radial=0.5 + 1e-5 * step)
-        live.reading(t + 0.005, "tracker", radial=0.5 + 1e-5 * step)
+        live.measurement(t + 0.005, "tracker", radial=0.5 + 1e-5 * step)
     health = live.health()
     assert health.commands["fused"] == 1000
     assert live.newest == round((0.028 * 999 + 30.0) * 1e9)
@@ -149,8 +149,8 @@ def test_two_sensors_that_are_wrong_do_not_make_each_other_right() -> None:
         t = 0.028 * step
         live.command(t, radial=0.5 + 1e-4 * step)
         alone.command(t, radial=0.5 + 1e-4 * step)
-        live.reading(t + 30.0, "tracker", radial=0.9)
-        live.reading(t + 60.0, "camera", radial=0.1)
+        live.measurement(t + 30.0, "tracker", radial=0.9)
+        live.measurement(t + 60.0, "camera", radial=0.1)
     live.command(14.0, radial=0.55)
     alone.command(14.0, radial=0.55)
     assert live.segment == 0
@@ -167,7 +167,7 @@ def test_an_axis_that_only_a_wild_command_gave_is_forgotten() -> None:
     for step in range(150):
         for one in (live, clean):
             one.command(0.028 * step, radial=0.5)
-            one.reading(0.028 * step + 0.01, "tracker", radial=0.5, vertical=0.1 + 0.01 * (step % 7))
+            one.measurement(0.028 * step + 0.01, "tracker", radial=0.5, vertical=0.1 + 0.01 * (step % 7))
         if step == 50:
             live.command(20.0, radial=0.5, vertical=0.9)
     assert live.health().sensors["tracker"].outcomes == clean.health().sensors["tracker"].outcomes
@@ -175,12 +175,12 @@ def test_an_axis_that_only_a_wild_command_gave_is_forgotten() -> None:
 
 
 def test_now_is_not_where_a_sensor_alone_has_run_to() -> None:
-    """In doubt about a reading 30 s ahead, now is where all others are, and they are not called stale."""
+    """In doubt about a measurement 30 s ahead, now is where all others are, and they are not called stale."""
     live = pf.LiveEstimator(CONFIG)
     for step in range(100):
         live.command(0.028 * step, radial=0.5)
-        live.reading(0.028 * step, "tracker", radial=0.5)
-    live.reading(32.0, "camera", radial=0.5)
+        live.measurement(0.028 * step, "tracker", radial=0.5)
+    live.measurement(32.0, "camera", radial=0.5)
     assert live.estimate().stamp == round(0.028 * 99e9)
     assert not live.health().sensors["tracker"].stale
     live.command(2.8, radial=0.5)

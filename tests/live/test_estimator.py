@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from pumafuse.runs.frames import Cylindrical, Rotated
+from pumafuse.logs.frames import Cylindrical, Rotated
 
 ARM = pf.ArmModel.load("puma560-internal")
 CONFIG = pf.FusionConfig(
@@ -29,15 +29,15 @@ def running(seconds: float = 1.0, **options: object) -> pf.LiveEstimator:
     live = pf.LiveEstimator(CONFIG, **options)
     for step in range(round(seconds / PERIOD) + 1):
         live.command(step * PERIOD, radial=0.57, vertical=0.1)
-        live.reading(step * PERIOD + 0.01, "tracker", radial=0.57, vertical=0.1)
+        live.measurement(step * PERIOD + 0.01, "tracker", radial=0.57, vertical=0.1)
     return live
 
 
 def test_the_readme_way() -> None:
-    """A command, a reading and an estimate, in m and s."""
+    """A command, a measurement and an estimate, in m and s."""
     live = pf.LiveEstimator(CONFIG)
     assert live.command(0.0, radial=0.57).outcome is pf.Outcome.FUSED
-    told = live.reading(0.02, "tracker", radial=0.5697)
+    told = live.measurement(0.02, "tracker", radial=0.5697)
     assert (told.outcome, dict(told.axes)) == (pf.Outcome.FUSED, {"radial": pf.Outcome.FUSED})
     estimate = live.estimate(at=0.02)
     assert abs(estimate["radial"].position - 0.5697) < 1e-4
@@ -66,11 +66,11 @@ def test_the_future_is_where_the_last_command_leads() -> None:
     assert spread == sorted(spread)
 
 
-def test_the_past_knows_no_later_reading() -> None:
+def test_the_past_knows_no_later_measurement() -> None:
     """An estimate in the past is filtered by what was valid until then, and asking changes nothing."""
     live = running()
     before, now = live.estimate(0.8), live.estimate()
-    live.reading(1.3, "tracker", radial=0.60, vertical=0.1)
+    live.measurement(1.3, "tracker", radial=0.60, vertical=0.1)
     assert live.estimate(0.8)["radial"] == before["radial"]
     assert now.reason == "now"
     assert before.reason == "filtered"
@@ -87,24 +87,24 @@ def test_times_that_have_no_estimate_say_why() -> None:
     for nonsense in (math.nan, math.inf, 1e300, "now", [1.0], 10**5000, True):
         assert live.estimate(nonsense).outcome is pf.Outcome.INVALID
         assert live.command(nonsense, radial=0.57).outcome is pf.Outcome.INVALID
-        assert live.reading(nonsense, "tracker", radial=0.57).outcome is pf.Outcome.INVALID
+        assert live.measurement(nonsense, "tracker", radial=0.57).outcome is pf.Outcome.INVALID
     with pytest.raises(pf.UnknownNameError, match="before the window"):
         live.estimate(1.0)["radial"]
     with pytest.raises(pf.UnknownNameError, match="accepted: radial, vertical"):
         live.estimate(3.0)["tangential"]
 
 
-def test_a_late_reading_within_the_window_is_fused_and_beyond_it_is_too_late() -> None:
+def test_a_late_measurement_within_the_window_is_fused_and_beyond_it_is_too_late() -> None:
     """Two seconds late is in time, a nanosecond more is not; the reason tells by how much."""
     live = running(4.0)
     newest = live.newest
-    assert live.reading(newest - 2_000_000_000, "tracker", radial=0.57).outcome is pf.Outcome.FUSED
-    told = live.reading(newest - 2_000_000_001, "tracker", radial=0.57)
+    assert live.measurement(newest - 2_000_000_000, "tracker", radial=0.57).outcome is pf.Outcome.FUSED
+    told = live.measurement(newest - 2_000_000_001, "tracker", radial=0.57)
     assert told.outcome is pf.Outcome.TOO_LATE
     assert told.reason == "stamped 2.000 s behind the newest; the window is 2 s"
     assert live.command(newest - 2_000_000_001, radial=0.57).outcome is pf.Outcome.TOO_LATE
     wider = running(4.0, window=3.0)
-    assert wider.reading(newest - 2_500_000_000, "tracker", radial=0.57).outcome is pf.Outcome.FUSED
+    assert wider.measurement(newest - 2_500_000_000, "tracker", radial=0.57).outcome is pf.Outcome.FUSED
 
 
 @pytest.mark.parametrize(
@@ -126,14 +126,14 @@ def test_a_late_reading_within_the_window_is_fused_and_beyond_it_is_too_late() -
         ("tracker", {"radial": True}, "invalid", "not a finite position"),
         (None, {"radial": 0.57}, "unknown", "unknown sensor"),
         (["tracker"], {"radial": 0.57}, "unknown", "unknown sensor"),
-        ("camera", {"radial": 0.9}, "gated", "gate"),
+        ("camera", {"radial": 0.9}, "rejected", "gate"),
     ],
 )
 def test_what_cannot_be_used_says_so(sensor: str, axes: dict, outcome: str, reason: str) -> None:
-    """No bad reading raises or changes the estimate; the outcome and the reason say what is wrong."""
+    """No bad measurement raises or changes the estimate; the outcome and the reason say what is wrong."""
     live = running()
     before = live.estimate(1.2)["radial"].position
-    told = live.reading(1.05, sensor, **axes)
+    told = live.measurement(1.05, sensor, **axes)
     assert told.outcome.word == outcome
     assert reason in told.reason
     assert live.estimate(1.2)["radial"].position == before
@@ -142,7 +142,7 @@ def test_what_cannot_be_used_says_so(sensor: str, axes: dict, outcome: str, reas
 def test_a_row_that_is_good_in_part_is_used_in_part() -> None:
     """One axis is not a number, one name is unknown: the rest is fused, and each has its outcome."""
     live = running()
-    told = live.reading(1.05, "tracker", radial=0.57, vertical=math.nan, quality=0.9)
+    told = live.measurement(1.05, "tracker", radial=0.57, vertical=math.nan, quality=0.9)
     assert told.outcome is pf.Outcome.FUSED
     assert {axis: outcome.word for axis, outcome in told.axes.items()} == {
         "radial": "fused",
@@ -165,7 +165,7 @@ def test_commands_answer_too() -> None:
 
 
 def test_silence_only_makes_the_estimate_less_certain() -> None:
-    """Without readings the sd grows and the axis is stale after the limit; a reading ends that."""
+    """Without measurements the sd grows and the axis is stale after the limit; a measurement ends that."""
     live = running(1.0, stale_after=0.5)
     assert live.estimate().stale == ()
     for step in range(37, 100):
@@ -173,7 +173,7 @@ def test_silence_only_makes_the_estimate_less_certain() -> None:
     late = live.estimate()
     assert late.stale == ("radial", "vertical")
     assert late["radial"].position_sd > 2.0 * live.estimate(1.0)["radial"].position_sd
-    live.reading(late.stamp, "tracker", radial=0.57)
+    live.measurement(late.stamp, "tracker", radial=0.57)
     assert live.estimate().stale == ("vertical",)
     assert live.estimate(live.newest + 10_000_000_000).stale == ("radial", "vertical")
 
@@ -192,7 +192,7 @@ def test_int_times_are_nanoseconds() -> None:
     """Stamps of a clock since 1970 keep their nanoseconds."""
     live, origin = pf.LiveEstimator(CONFIG), 1_700_000_000_123_456_789
     live.command(origin, radial=0.57)
-    live.reading(np.int64(origin + 10_000_001), "tracker", radial=0.57)
+    live.measurement(np.int64(origin + 10_000_001), "tracker", radial=0.57)
     assert live.newest == origin + 10_000_001
     assert live.estimate().stamp == origin + 10_000_001
 
@@ -230,18 +230,18 @@ def test_x_y_z_in_and_out(frame: Cylindrical | Rotated) -> None:
     for step in range(100):
         t = step * PERIOD
         assert live.command(t, x=0.01, y=0.56, z=-0.1).outcome is pf.Outcome.FUSED
-        assert live.reading(t + 0.01, "tracker", x=0.0101, y=0.5601, z=-0.1002).outcome is pf.Outcome.FUSED
+        assert live.measurement(t + 0.01, "tracker", x=0.0101, y=0.5601, z=-0.1002).outcome is pf.Outcome.FUSED
     found = live.estimate().cartesian
     assert found is not None
     np.testing.assert_allclose([found["x"], found["y"], found["z"]], [0.0101, 0.5601, -0.1002], atol=2e-5)
-    half = live.reading(2.9, "tracker", x=0.01)
+    half = live.measurement(2.9, "tracker", x=0.01)
     assert {axis: outcome.word for axis, outcome in half.axes.items()} == {"tangential": "invalid", "radial": "invalid"}
 
 
 def test_x_and_y_mean_nothing_before_the_frame_has_its_place() -> None:
     """A frame about the base waits for a command in x and y; on the base's axis there is no place."""
     live = pf.LiveEstimator(msgspec.structs.replace(CONFIG, frame=Cylindrical()))
-    told = live.reading(0.0, "tracker", x=0.1, y=0.5)
+    told = live.measurement(0.0, "tracker", x=0.1, y=0.5)
     assert told.outcome is pf.Outcome.BEFORE_START
     assert "where x and y are" in told.reason
     assert live.command(0.01, x=0.0, y=0.0).outcome is pf.Outcome.INVALID
@@ -261,12 +261,12 @@ def test_a_command_on_the_bases_axis_costs_nothing_but_itself() -> None:
 
 
 def test_an_axis_with_a_start_level_is_there_before_its_first_command() -> None:
-    """Readings of an axis that is commanded late are fused from the first command of all on, if its level is known."""
+    """Measurements of an axis that is commanded late are fused from the first command of all on, if its level is known."""
     told, untold = pf.LiveEstimator(CONFIG, start={"vertical": 0.1}), pf.LiveEstimator(CONFIG)
     for live in (told, untold):
         for step in range(200):
             live.command(step * PERIOD, radial=0.57)
-            live.reading(step * PERIOD + 0.01, "tracker", radial=0.57, vertical=0.1001)
+            live.measurement(step * PERIOD + 0.01, "tracker", radial=0.57, vertical=0.1001)
         live.command(5.6, vertical=0.1)
     assert told.health().sensors["tracker"].outcomes["before_start"] == 0
     assert untold.health().sensors["tracker"].outcomes["before_start"] > 0
@@ -302,7 +302,7 @@ live.warm_up()
 called = ("hear", "command", "ask", "forget", "count", "let_go", "compact")
 assert all(len(getattr(kernels, name).signatures) == 1 for name in called)
 for row in range(70_000):
-    live.reading(row, "tracker", radial=0.5) if row else live.command(0, radial=0.5)
+    live.measurement(row, "tracker", radial=0.5) if row else live.command(0, radial=0.5)
 for stamp in (10**12, 2 * 10**12, 10**10, 10**10 + 1, 10**10 + 2):
     live.command(stamp, radial=0.5)
 assert live.newest is not None

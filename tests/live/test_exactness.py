@@ -37,7 +37,7 @@ def told(live: pf.LiveEstimator, *without: str) -> dict[str, dict[str, int]]:
 @pytest.mark.parametrize("longest", [0.0, pytest.param(0.3, marks=pytest.mark.long), 1.2])
 @pytest.mark.parametrize("name", ["scan1", *RUNS])
 def test_in_any_order(name: str, longest: float) -> None:
-    """Each event up to 1.2 s late, a tenth of them twice: estimates are the offline ones once their readings are in."""
+    """Each event up to 1.2 s late, a tenth of them twice: estimates are the offline ones once their measurements are in."""
     run, config = recorded(name)
     offline = pf.fuse(run, config)
     live = pf.LiveEstimator(config, start=run.start)
@@ -128,11 +128,11 @@ def test_any_stream_in_any_order(stream: tuple[pf.FusionConfig, pf.Run, int]) ->
     assert differences(live, arrivals, offline, 1e9) == []
 
 
-def test_a_reading_before_the_first_command_waits_for_it() -> None:
-    """Readings that come before the commands are fused once these are there, if they are valid after the first."""
+def test_a_measurement_before_the_first_command_waits_for_it() -> None:
+    """Measurements that come before the commands are fused once these are there, if they are valid after the first."""
     config = msgspec.structs.replace(recorded("panel-vision")[1])
     live = pf.LiveEstimator(config)
-    assert live.reading(0.30, "vision", vertical=0.101).outcome is pf.Outcome.BEFORE_START
+    assert live.measurement(0.30, "vision", vertical=0.101).outcome is pf.Outcome.BEFORE_START
     assert live.estimate(0.3).outcome is pf.Outcome.BEFORE_START
     live.command(0.0, vertical=0.1)
     assert live.health().sensors["vision"].outcomes["fused"] == 1
@@ -165,7 +165,7 @@ def test_the_last_of_one_stamp_counts() -> None:
     assert end(0.11, 0.12, 0.11) == end(0.11)
 
 
-def test_readings_of_one_instant_are_met_in_the_order_of_the_sensors() -> None:
+def test_measurements_of_one_instant_are_met_in_the_order_of_the_sensors() -> None:
     """Two sensors valid at the same instants, the later one in the configuration always first to come: as offline."""
     config = pf.FusionConfig(
         arm=pf.ArmModel.load("puma560-internal"),
@@ -188,7 +188,7 @@ def test_readings_of_one_instant_are_met_in_the_order_of_the_sensors() -> None:
 
 @pytest.mark.parametrize("latency", [0.0, 0.5, 1.5])
 def test_late_by_nearly_the_window_and_by_its_latency_too(latency: float) -> None:
-    """Readings that come 1.9 s late, of a sensor that sees the past besides: nothing was let go too soon."""
+    """Measurements that come 1.9 s late, of a sensor that sees the past besides: nothing was let go too soon."""
     config = pf.FusionConfig(
         arm=pf.ArmModel.load("puma560-internal"),
         sensors={"camera": pf.Sensor(sd=1e-4, latency=latency), "tracker": pf.Sensor(sd=2e-4)},
@@ -203,6 +203,6 @@ def test_late_by_nearly_the_window_and_by_its_latency_too(latency: float) -> Non
     late = 1_900_000_000
     arrivals = sorted(events_of(run), key=lambda event: event.stamp + late * (event.stamp % 7 < 4))
     for event in arrivals:
-        assert feed(live, event).outcome in (pf.Outcome.FUSED, pf.Outcome.GATED, pf.Outcome.BEFORE_START)
+        assert feed(live, event).outcome in (pf.Outcome.FUSED, pf.Outcome.REJECTED, pf.Outcome.BEFORE_START)
     last = live.estimate(int(given[-1]))["radial"]
     assert (last.position, last.position_sd) == (offline["radial"].position[-1], offline["radial"].position_sd[-1])

@@ -28,7 +28,7 @@ def stream(seconds: float, sd: float = 1e-4) -> pf.Run:
 
 
 def test_a_right_sensor_has_its_rate_and_a_nis_of_one() -> None:
-    """100 Hz and noise as configured: rate 100 Hz, NIS within the 99.99 % band of 6000 scalars, nothing late."""
+    """100 Hz and noise as configured: rate 100 Hz, NIS within the 99.99 % band of 6000 components, nothing late."""
     live = pf.LiveEstimator(CONFIG)
     for event in events_of(stream(100.0)):
         feed(live, event)
@@ -37,7 +37,7 @@ def test_a_right_sensor_has_its_rate_and_a_nis_of_one() -> None:
     assert health.rate == pytest.approx(100.0, abs=1.0)
     assert health.nis == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 6000.0))
     assert (health.dropouts, health.lateness_max, health.stale) == (0, 0.0, False)
-    assert health.outcomes["fused"] + health.outcomes["gated"] == 10_000
+    assert health.outcomes["fused"] + health.outcomes["rejected"] == 10_000
 
 
 def test_noise_twice_as_large_shows_as_a_nis_of_four() -> None:
@@ -69,7 +69,7 @@ def test_gaps_are_dropouts_and_silence_is_stale() -> None:
     live.command(0.0, radial=0.57)
     for row in range(1000):
         if (row % 300 not in range(100, 105) and row != 50) or row // 300 == 2:
-            live.reading(row * 0.01, "tracker", radial=0.57)
+            live.measurement(row * 0.01, "tracker", radial=0.57)
     assert live.health().sensors["tracker"].dropouts == 3
     assert not live.health().sensors["tracker"].stale
     live.command(11.5, radial=0.57)
@@ -81,18 +81,18 @@ def test_gaps_are_dropouts_and_silence_is_stale() -> None:
 
 
 def test_reopenings_and_all_outcomes_are_counted() -> None:
-    """A sensor that jumps by 20 mm is gated, then reopened; unknown and refused rows are counted, too."""
+    """A sensor that jumps by 20 mm is rejected, then reacquired; unknown and refused rows are counted, too."""
     live = pf.LiveEstimator(CONFIG)
     for row in range(400):
         live.command(row * 0.01, radial=0.57)
-        live.reading(row * 0.01, "tracker", radial=0.57 if row < 200 else 0.59)
-    live.reading(1.0, "tracker", radial=0.57)
-    live.reading(float("nan"), "tracker", radial=0.57)
-    live.reading(4.0, "lidar", radial=0.57)
+        live.measurement(row * 0.01, "tracker", radial=0.57 if row < 200 else 0.59)
+    live.measurement(1.0, "tracker", radial=0.57)
+    live.measurement(float("nan"), "tracker", radial=0.57)
+    live.measurement(4.0, "lidar", radial=0.57)
     health = live.health()
     tracker = health.sensors["tracker"]
-    assert tracker.reopened == 1
-    assert tracker.outcomes["gated"] == 50
+    assert tracker.reacquired == 1
+    assert tracker.outcomes["rejected"] == 50
     assert tracker.outcomes["too_late"] == 1
     assert tracker.outcomes["invalid"] == 1
     assert health.unknown == 1
@@ -108,7 +108,7 @@ def test_a_slower_sensor_has_a_new_usual_interval() -> None:
     dropouts = []
     for t in times.tolist():
         live.command(t, radial=0.57)
-        live.reading(t, "tracker", radial=0.57)
+        live.measurement(t, "tracker", radial=0.57)
         dropouts.append(live.health().sensors["tracker"].dropouts) if t in (11.85, times[1200]) else None
     assert dropouts[-1] == live.health().sensors["tracker"].dropouts < 60
 

@@ -20,7 +20,7 @@ import pumafuse as pf
 from pumafuse.live import record, writer
 from pumafuse.live.record import Recorder
 from pumafuse.live.stream import Stream
-from pumafuse.runs.frames import Cylindrical
+from pumafuse.logs.frames import Cylindrical
 from streams import FIELDS, TRACKED, Event, T, any_stream, delayed, events_of, feed
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
@@ -39,10 +39,10 @@ class Recorded:
         self.live.command(stamp, **axes)
 
     def go(self, steps: int, begin: int = 0, radial: float = 0.57) -> None:
-        """Commands every 28 ms, each with a reading 10 ms later."""
+        """Commands every 28 ms, each with a measurement 10 ms later."""
         for step in range(steps):
             self.live.command(begin + step * T, radial=radial)
-            self.live.reading(begin + step * T + 10_000_000, "tracker", radial=radial)
+            self.live.measurement(begin + step * T + 10_000_000, "tracker", radial=radial)
 
     def tick(self) -> None:
         """As if half a second had gone by."""
@@ -106,7 +106,7 @@ def test_what_was_recorded_fuses_to_what_live_said(tmp_path_factory, drawn) -> N
 def test_it_can_be_read_while_it_grows(tmp_path: Path) -> None:
     """From the first command on there is a run, and each half second there is more of it; a late sensor joins."""
     recorded = Recorded(tmp_path / "record")
-    recorded.live.reading(0, "tracker", radial=0.57)
+    recorded.live.measurement(0, "tracker", radial=0.57)
     recorded.tick()
     assert list(recorded.folder.iterdir()) == []
     counts = []
@@ -114,7 +114,7 @@ def test_it_can_be_read_while_it_grows(tmp_path: Path) -> None:
         for step in range(10):
             recorded.live.command((begin * 10 + step) * T, radial=0.57)
             if begin:
-                recorded.live.reading((begin * 10 + step) * T, "tracker", radial=0.57)
+                recorded.live.measurement((begin * 10 + step) * T, "tracker", radial=0.57)
         due = 20 * begin + 11
         recorded.tick_until(lambda due=due: recorded.recorder._writer.rows == due)
         found = pf.Run.read(recorded.folder)
@@ -130,9 +130,9 @@ def test_what_the_estimator_does_not_believe_is_not_recorded(tmp_path: Path) -> 
     recorded.go(100)
     recorded.command(1800 * 10**9, radial=0.6, vertical=0.1)
     recorded.tick()  # it is in doubt, and waits
-    recorded.live.reading(10**18, "tracker", radial=0.57)
-    recorded.live.reading(100 * T, "lidar", radial=0.57)
-    recorded.live.reading(100 * T, "tracker", azimuth=0.57)
+    recorded.live.measurement(10**18, "tracker", radial=0.57)
+    recorded.live.measurement(100 * T, "lidar", radial=0.57)
+    recorded.live.measurement(100 * T, "tracker", azimuth=0.57)
     recorded.go(100, begin=100 * T)
     later = 66_000  # ticks: after a pause over which the time of the wrong command goes by
     recorded.go(100, begin=later * T)
@@ -175,13 +175,13 @@ def test_what_is_there_already_is_left(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_an_axis_without_a_number_is_none_of_the_run(tmp_path: Path) -> None:
-    """Commands and readings whose other axis is always null: a run of one axis, which fuses."""
+    """Commands and measurements whose other axis is always null: a run of one axis, which fuses."""
     recorded = Recorded(tmp_path / "record")
-    recorded.live.reading(0, "tracker", radial=np.nan)
+    recorded.live.measurement(0, "tracker", radial=np.nan)
     for step in range(50):
         recorded.command(step * T, radial=0.57, vertical=np.nan)
-        recorded.live.reading(step * T + 10_000_000, "tracker", radial=0.57, vertical=np.nan)
-        recorded.live.reading(step * T + 10_000_001, "tracker", radial=np.nan)
+        recorded.live.measurement(step * T + 10_000_000, "tracker", radial=0.57, vertical=np.nan)
+        recorded.live.measurement(step * T + 10_000_001, "tracker", radial=np.nan)
     recorded.close()
     found = pf.Run.read(recorded.folder)
     assert found.axes == ("radial",)
@@ -232,7 +232,7 @@ def test_a_cylindrical_stream_is_recorded_with_its_frame(tmp_path: Path) -> None
     recorded = Recorded(tmp_path / "record", config)
     for step in range(50):
         recorded.command(step * T, x=0.66, y=0.001 * step, z=-0.1)
-        recorded.live.reading(step * T + 1, "tracker", x=0.66, y=0.001 * step, z=-0.1)
+        recorded.live.measurement(step * T + 1, "tracker", x=0.66, y=0.001 * step, z=-0.1)
     recorded.close()
     found = pf.Run.read(recorded.folder)
     assert found.frame == frame

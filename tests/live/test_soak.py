@@ -26,7 +26,7 @@ Column = tuple[np.ndarray, np.ndarray]
 
 
 def hour(number: int) -> tuple[Column, Column, Column]:
-    """Commands each 28 ms, a tracker at 90 Hz and a range finder at 10 Hz; readings up to 0.2 s late, 1 % wild."""
+    """Commands each 28 ms, a tracker at 90 Hz and a range finder at 10 Hz; measurements up to 0.2 s late, 1 % wild."""
     rng = np.random.default_rng(number)
 
     def grid(interval: int) -> np.ndarray:
@@ -67,7 +67,7 @@ def test_a_day_at_a_hundred_rows_a_second() -> None:
             if kind == 0:
                 live.command(stamp, radial=value)
             else:
-                live.reading(stamp, "tracker" if kind == 1 else "range", radial=value)
+                live.measurement(stamp, "tracker" if kind == 1 else "range", radial=value)
             if number and not asked and stamp > number * HOUR_NS + 1_000_000_000:
                 said.append(live.estimate(number * HOUR_NS))
                 asked = True
@@ -93,7 +93,7 @@ def test_a_day_at_a_hundred_rows_a_second() -> None:
         assert estimate["radial"].position_sd == offline["radial"].position_sd[number]
     health = live.health()
     assert sum(health.sensors["tracker"].outcomes.values()) == len(near[0])
-    assert health.sensors["tracker"].outcomes["gated"] > 0.005 * len(near[0])
+    assert health.sensors["tracker"].outcomes["rejected"] > 0.005 * len(near[0])
 
 
 def broken(rng: np.random.Generator, good: list[bytes]) -> bytes:

@@ -71,7 +71,7 @@ def test_silence_goes_on_by_the_wall_clock() -> None:
 
 
 def test_a_wild_stamp_makes_no_grid() -> None:
-    """A reading half an hour ahead does not let the grid run half an hour ahead."""
+    """A measurement half an hour ahead does not let the grid run half an hour ahead."""
     both = Both(rate=100.0)
     both.feed(lines(1.0) + line(1800.0, "tracker", radial=570.0) + lines(1.0, begin=1.008))
     both.end()

@@ -20,18 +20,18 @@ def config_of(recovery: float | None = 0.1, period: float = 0.028) -> pf.FusionC
     return pf.FusionConfig(arm=arm, sensors={"fast": pf.Sensor(sd=1e-4, latency=0.01), "slow": pf.Sensor(sd=1e-3)})
 
 
-def run_of(seconds: float, command_hz: float, reading_hz: float) -> pf.Run:
+def run_of(seconds: float, command_hz: float, measurement_hz: float) -> pf.Run:
     rng = np.random.default_rng(3)
     given = np.arange(0, seconds, 1.0 / command_hz)
-    heard = np.arange(0, seconds, 1.0 / reading_hz)
-    readings = (heard, {"radial": 0.5 + rng.normal(0.0, 1e-4, len(heard))})
-    return pf.Run.from_arrays(given, {"radial": 0.5 + 0.01 * np.sin(given)}, {"fast": readings})
+    heard = np.arange(0, seconds, 1.0 / measurement_hz)
+    measurements = (heard, {"radial": 0.5 + rng.normal(0.0, 1e-4, len(heard))})
+    return pf.Run.from_arrays(given, {"radial": 0.5 + 0.01 * np.sin(given)}, {"fast": measurements})
 
 
-@pytest.mark.parametrize(("command_hz", "reading_hz"), [(36.0, 6000.0), (1000.0, 100.0), (3000.0, 3000.0)])
-def test_more_than_the_first_arrays_hold(command_hz: float, reading_hz: float) -> None:
+@pytest.mark.parametrize(("command_hz", "measurement_hz"), [(36.0, 6000.0), (1000.0, 100.0), (3000.0, 3000.0)])
+def test_more_than_the_first_arrays_hold(command_hz: float, measurement_hz: float) -> None:
     """Thousands of rows and commands in the window: the arrays grow, and the estimates are the offline ones."""
-    run, config = run_of(3.0, command_hz, reading_hz), config_of(period=1.0 / command_hz)
+    run, config = run_of(3.0, command_hz, measurement_hz), config_of(period=1.0 / command_hz)
     live = pf.LiveEstimator(config)
     assert differences(live, events_of(run), pf.fuse(run, config), 1.5) == []
     memory = live._window.memory
@@ -60,7 +60,9 @@ def test_long_decays_and_long_silence() -> None:
     assert live.estimate(90.0).outcome is pf.Outcome.BEFORE_START
     events = events_of(run)
     for event in events[:50]:
-        live.command(event.stamp, **event.values) if not event.sensor else live.reading(event.stamp, "fast", radial=0.5)
+        live.command(event.stamp, **event.values) if not event.sensor else live.measurement(
+            event.stamp, "fast", radial=0.5
+        )
         live.estimate(event.stamp + 120_000_000_000)
     assert differences(live, events[50:], offline, 1e9) == []
 
@@ -74,13 +76,14 @@ def test_a_flood_shortens_the_window_and_says_so(monkeypatch: pytest.MonkeyPatch
     values = (0.5 + rng.normal(0.0, 1e-4, 20_000)).tolist()
     for row, value in enumerate(values):
         assert (
-            live.reading(row * MS // 20, "fast" if row % 2 else "slow", radial=value).outcome is not pf.Outcome.TOO_LATE
+            live.measurement(row * MS // 20, "fast" if row % 2 else "slow", radial=value).outcome
+            is not pf.Outcome.TOO_LATE
         )
     assert len(live._window.memory.heard.stamp) == 4096
     newest = live.newest
-    assert live.reading(newest - 300 * MS, "slow", radial=0.5).outcome is pf.Outcome.TOO_LATE
+    assert live.measurement(newest - 300 * MS, "slow", radial=0.5).outcome is pf.Outcome.TOO_LATE
     assert live.estimate(newest - 300 * MS).outcome is pf.Outcome.TOO_LATE
-    assert live.reading(newest - 50 * MS, "slow", radial=0.5).outcome is pf.Outcome.FUSED
+    assert live.measurement(newest - 50 * MS, "slow", radial=0.5).outcome is pf.Outcome.FUSED
     assert sum(sum(sensor.outcomes.values()) for sensor in live.health().sensors.values()) == 20_002
     run = pf.Run.from_arrays(
         np.array([0]),
@@ -92,7 +95,7 @@ def test_a_flood_shortens_the_window_and_says_so(monkeypatch: pytest.MonkeyPatch
     )
     untouched = pf.LiveEstimator(config)
     for event in events_of(run):
-        untouched.reading(event.stamp, event.sensor, **event.values) if event.sensor else untouched.command(
+        untouched.measurement(event.stamp, event.sensor, **event.values) if event.sensor else untouched.command(
             event.stamp, **event.values
         )
     expected = pf.fuse(run, config, rate=1000.0)
@@ -107,7 +110,9 @@ def test_a_flood_of_commands_shortens_the_window(monkeypatch: pytest.MonkeyPatch
     run = pf.Run.from_arrays(given, {"radial": 0.5 + 1e-6 * np.arange(5000)}, {"fast": ([0], {"radial": [0.5]})})
     live = pf.LiveEstimator(config)
     for event in events_of(run):
-        live.command(event.stamp, **event.values) if not event.sensor else live.reading(event.stamp, "fast", radial=0.5)
+        live.command(event.stamp, **event.values) if not event.sensor else live.measurement(
+            event.stamp, "fast", radial=0.5
+        )
     assert live._window.memory.commands.time.shape[1] == 1024
     offline = pf.fuse(run, config)
     assert live.estimate(int(given[-1]))["radial"].position == offline["radial"].position[-1]
@@ -121,7 +126,7 @@ def test_what_the_window_lets_go_for_an_event_is_gone_for_that_event_too(monkeyp
     for step in range(1024):
         for one in (live, clean):
             one.command(step * 28 * MS, radial=0.5 + 1e-5 * step)
-            one.reading(step * 28 * MS, "fast", radial=0.5 + 1e-5 * step)
+            one.measurement(step * 28 * MS, "fast", radial=0.5 + 1e-5 * step)
     told = live.command(14 * MS, radial=0.4)
     assert told.outcome is pf.Outcome.TOO_LATE
     assert "the window holds no more" in told.reason
@@ -129,7 +134,7 @@ def test_what_the_window_lets_go_for_an_event_is_gone_for_that_event_too(monkeyp
 
 
 def test_a_repeated_command_before_a_long_silence() -> None:
-    """The last command is said again at once, then only readings come: its error decays on as it does offline."""
+    """The last command is said again at once, then only measurements come: its error decays on as it does offline."""
     config = config_of(recovery=5.0)
     heard = np.arange(0.0, 80.0, 0.1)
     run = pf.Run.from_arrays(
@@ -156,7 +161,7 @@ def test_a_frozen_stamp_ends_in_a_shorter_window(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(window, "MOST_ROWS", 4096)
     live = pf.LiveEstimator(config_of())
     live.command(0, radial=0.5)
-    told = [live.reading(100 * MS, "slow", radial=0.5 + 1e-9 * row) for row in range(5000)]
+    told = [live.measurement(100 * MS, "slow", radial=0.5 + 1e-9 * row) for row in range(5000)]
     assert told[4000].outcome is pf.Outcome.FUSED
     assert told[-1].outcome is pf.Outcome.TOO_LATE
     assert "the window holds no more" in told[-1].reason

@@ -9,13 +9,13 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.live.wire import BadLine, Event, Wire, encode
-from pumafuse.runs.frames import Cylindrical
+from pumafuse.logs.frames import Cylindrical
 
 WIRE = Wire(("radial", "vertical"), framed=True)
 
 
 def test_the_lines_of_the_design() -> None:
-    """A command and a reading in mm and s are an event in m and s; whole ns stay whole."""
+    """A command and a measurement in mm and s are an event in m and s; whole ns stay whole."""
     assert WIRE.decode(b'{"t": 12.345, "command": {"radial": 570.0}}') == Event(12.345, "", {"radial": 0.57})
     line = b'{"t_ns": 1700000000123456789, "sensor": "tracker", "radial": 569.7, "vertical": -93.2}'
     assert WIRE.decode(line) == Event(1700000000123456789, "tracker", {"radial": 569.7 / 1e3, "vertical": -93.2 / 1e3})

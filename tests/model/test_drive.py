@@ -1,4 +1,4 @@
-"""The plant's input against a scalar loop written from the definition of gain, recovery and maneuver."""
+"""The plant's input against a component loop written from the definition of gain, recovery and maneuver."""
 
 import math
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 import pumafuse as pf
 from pumafuse.fusion.consistency import consistency
-from pumafuse.runs.frames import Cylindrical
+from pumafuse.logs.frames import Cylindrical
 from pumafuse.views.figures import error_figure, fused_figure, validation_figure
 
 NAMES = ("tangential", "radial", "vertical")
@@ -56,7 +56,7 @@ def case(
     seen = np.arange(10.01, time[-1] + 0.02, 0.01)
     truth = {name: moved(np.maximum(seen - 10.1, 0.0), axis) for axis, name in enumerate(names)}
 
-    def readings() -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    def measurements() -> tuple[np.ndarray, dict[str, np.ndarray]]:
         noisy = {name: scale * value + bias + 5e-4 * rng.standard_normal(len(seen)) for name, value in truth.items()}
         if outlier:
             noisy[names[0]][len(seen) // 2] += 0.2
@@ -65,7 +65,7 @@ def case(
     run = pf.Run.from_arrays(
         time,
         {name: moved(time - 10.0, axis) for axis, name in enumerate(names)},
-        {name: readings() for name in sensors},
+        {name: measurements() for name in sensors},
         (seen, truth) if reference else None,
         frame=Cylindrical() if frame else None,
         name="a run",
@@ -138,7 +138,7 @@ def line(axes: Axes, label: str) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(found.get_xdata()), np.asarray(found.get_ydata())
 
 
-def test_the_fused_figure_shows_command_estimate_and_readings(drawn: list[Figure], tmp_path: Path) -> None:
+def test_the_fused_figure_shows_command_estimate_and_measurements(drawn: list[Figure], tmp_path: Path) -> None:
     """In mm against seconds since the first command; each axis twice, whole and zoomed in."""
     this = case(axes=2)
     fused_figure(this.est, this.run, tmp_path / "none.png")
@@ -157,7 +157,7 @@ def test_the_fused_figure_shows_command_estimate_and_readings(drawn: list[Figure
             np.testing.assert_allclose(value, this.run.sensors["camera"].values[name] * 1e3)
 
 
-def test_readings_are_shown_where_they_put_the_tool(drawn: list[Figure], tmp_path: Path) -> None:
+def test_measurements_are_shown_where_they_put_the_tool(drawn: list[Figure], tmp_path: Path) -> None:
     """A range sensor 300 mm off and upside down is shown on the path: scale and estimated bias are taken off."""
     this = case(axes=1, bias=-0.3, scale=-1.0)
     fused_figure(this.est, this.run, tmp_path / "none.png")
@@ -165,13 +165,13 @@ def test_readings_are_shown_where_they_put_the_tool(drawn: list[Figure], tmp_pat
     assert np.median(value) == pytest.approx(np.median(this.est["tangential"].position) * 1e3, abs=1.0)
 
 
-def test_a_gated_reading_is_crossed_out(drawn: list[Figure], tmp_path: Path) -> None:
+def test_a_rejected_measurement_is_crossed_out(drawn: list[Figure], tmp_path: Path) -> None:
     """The outlier alone carries the cross, and is not among the dots."""
     this = case(axes=1, outlier=True)
     fused_figure(this.est, this.run, tmp_path / "none.png")
-    _, gated = line(drawn[0].axes[0], "camera, gated")
+    _, rejected = line(drawn[0].axes[0], "camera, rejected")
     _, fused = line(drawn[0].axes[0], "camera")
-    assert gated == pytest.approx([400.0 + 200.0], abs=25.0)
+    assert rejected == pytest.approx([400.0 + 200.0], abs=25.0)
     assert np.ptp(fused) < 30.0
 
 
@@ -199,14 +199,14 @@ def test_the_error_figure_draws_and_names_the_error(drawn: list[Figure], tmp_pat
 
 
 def test_the_validation_figure_draws_what_it_judges(drawn: list[Figure], tmp_path: Path) -> None:
-    """Each row: the fused scalars' ν/√S, their autocorrelation as bars, and the verdict above."""
+    """Each row: the fused components' ν/√S, their autocorrelation as bars, and the verdict above."""
     this = case(axes=2, outlier=True)
     validation_figure(this.est, tmp_path / "none.png")
     for number, name in enumerate(NAMES[:2]):
         series, _, correlation = drawn[0].axes[3 * number : 3 * number + 3]
         found = consistency(this.est, "camera", name)
         (dots,) = series.lines
-        mine = this.est.readings.of("camera", name)
+        mine = this.est.measurements.of("camera", name)
         mine = mine.where(mine.outcome == pf.Outcome.FUSED)
         np.testing.assert_allclose(dots.get_ydata(), mine.innovation / mine.innovation_sd)
         assert len(mine.value) == len(this.run.sensors["camera"].stamp) - 1

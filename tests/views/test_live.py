@@ -62,11 +62,11 @@ class Driven:
         self.step = 0
 
     def event(self, event: Event) -> None:
-        feed = self.live.reading if event.sensor else self.live.command
+        feed = self.live.measurement if event.sensor else self.live.command
         self.view.event(event, feed(event.t, *([event.sensor] if event.sensor else []), **event.values))
 
     def go(self, steps: int = 1) -> None:
-        """Some update periods: a command, a reading of each sensor, an estimate."""
+        """Some update periods: a command, a measurement of each sensor, an estimate."""
         for _ in range(steps):
             t = 100.0 + 0.028 * self.step
             self.event(Event(t, "", dict.fromkeys(AXES, 0.5)))
@@ -121,7 +121,7 @@ def series(path: Path, entity: str) -> tuple[np.ndarray, np.ndarray]:
                 columns = dict(zip(batch.schema.names, batch.columns, strict=True))
                 moment = columns["time"].to_numpy(zero_copy_only=False).astype("m8[ns]")
                 times.append(moment / np.timedelta64(1, "s"))
-                values.append(columns["Scalars:scalars"].flatten().to_numpy())
+                values.append(columns["Components:components"].flatten().to_numpy())
     return np.concatenate(times), np.concatenate(values)
 
 
@@ -170,7 +170,7 @@ def test_the_estimators_process_does_not_load_rerun() -> None:
 
 
 def test_what_is_heard_and_said_arrives(recorder: tuple[subprocess.Popen[bytes], Path]) -> None:
-    """In mm, at seconds since the first event: commands, estimates, readings at their valid times, one rejected."""
+    """In mm, at seconds since the first event: commands, estimates, measurements at their valid times, one rejected."""
     driven, path = Driven("connect"), recorder[1]
     until(lambda: driven.heard("drawing into the viewer"))
     driven.go(60)
@@ -196,7 +196,7 @@ def test_what_is_heard_and_said_arrives(recorder: tuple[subprocess.Popen[bytes],
     assert len(series(path, "/nis/tracker")[0])
 
 
-def test_a_scaled_reading_is_where_it_saw_the_tool() -> None:
+def test_a_scaled_measurement_is_where_it_saw_the_tool() -> None:
     """Z = −2 p, 8 ms late: the position at the valid time, and what it is off the estimate between two others."""
     track = live_picture._Track()
     track.add(np.array([1.0, 1.1]), np.array([0.50, 0.60]))
@@ -318,7 +318,7 @@ def test_nothing_is_left_when_the_estimator_is_killed() -> None:
 
 @pytest.mark.long
 def test_a_viewer_that_stalls_is_left_alone_until_it_goes_on(recorder: tuple[subprocess.Popen[bytes], Path]) -> None:
-    """Nothing piles up in the drawing process meanwhile; later readings arrive after all."""
+    """Nothing piles up in the drawing process meanwhile; later measurements arrive after all."""
     driven, (server, path) = Driven("connect"), recorder
     child = driven.view._child
     assert child is not None

@@ -12,7 +12,7 @@ import pytest
 import pumafuse as pf
 from outline import outline
 from pumafuse.folders import FolderError
-from pumafuse.identify.trials import Trial
+from pumafuse.identification.trials import Trial
 from pumafuse.views import report
 
 DATA = Path(pf.__file__).parent / "data"

@@ -11,7 +11,7 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 import pumafuse as pf
-from pumafuse.runs.frames import Cylindrical
+from pumafuse.logs.frames import Cylindrical
 
 DATA = Path(pf.__file__).parent / "data"
 
@@ -66,7 +66,7 @@ def moments(column: object) -> npt.NDArray[np.float64]:
 def series(path: Path, entity: str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Times [s] and values of one entity."""
     found = columns(path, entity, static=False)
-    values = np.concatenate([chunk["Scalars:scalars"].flatten().to_numpy() for chunk in found])
+    values = np.concatenate([chunk["Components:components"].flatten().to_numpy() for chunk in found])
     return np.concatenate([moments(chunk["time"]) for chunk in found]), values
 
 
@@ -93,10 +93,10 @@ def test_estimates_and_band_are_in_mm_at_their_own_times(fused: tuple[pf.Estimat
         assert np.allclose(value, (est["radial"].position + factor * est["radial"].position_sd) * 1e3)
 
 
-def test_commands_readings_and_reference_are_on_the_same_clock(
+def test_commands_measurements_and_reference_are_on_the_same_clock(
     fused: tuple[pf.Estimates, pf.Run], recorded: Path
 ) -> None:
-    """Commands from 0, readings at stamp − latency, the reference at its stamps."""
+    """Commands from 0, measurements at stamp − latency, the reference at its stamps."""
     est, run = fused
     time, value = series(recorded, "/radial/command")
     assert np.allclose(time, 0.028 * np.arange(50))
@@ -105,10 +105,10 @@ def test_commands_readings_and_reference_are_on_the_same_clock(
     assert np.allclose(time, np.delete(0.01 * np.arange(1, 140) - 0.005, 69))
     time, _ = series(recorded, "/radial/reference")
     assert np.allclose(time, 0.01 * np.arange(140))
-    assert est.readings.counts() == {"fused": 138, "gated": 1, "before_start": 1}
+    assert est.measurements.counts() == {"fused": 138, "rejected": 1, "before_start": 1}
 
 
-def test_a_rejected_reading_is_marked(recorded: Path) -> None:
+def test_a_rejected_measurement_is_marked(recorded: Path) -> None:
     """The outlier stands among the rejected ones, not among the fused."""
     time, value = series(recorded, "/radial/camera/rejected")
     assert np.allclose(time, [-0.005, 0.695])
@@ -116,17 +116,17 @@ def test_a_rejected_reading_is_marked(recorded: Path) -> None:
 
 
 def test_innovations_stand_in_their_band(fused: tuple[pf.Estimates, pf.Run], recorded: Path) -> None:
-    """Every scalar that the filter met, the outlier too: ν at its valid time between ±2√S, in mm."""
-    readings = fused[0].readings
-    met = np.isfinite(readings.innovation)
+    """Every component that the filter met, the outlier too: ν at its valid time between ±2√S, in mm."""
+    measurements = fused[0].measurements
+    met = np.isfinite(measurements.innovation)
     assert met.sum() == 139
     for entity, wanted in (
-        ("", readings.innovation),
-        ("/upper", 2.0 * readings.innovation_sd),
-        ("/lower", -2.0 * readings.innovation_sd),
+        ("", measurements.innovation),
+        ("/upper", 2.0 * measurements.innovation_sd),
+        ("/lower", -2.0 * measurements.innovation_sd),
     ):
         time, value = series(recorded, f"/innovation/radial/camera{entity}")
-        assert np.allclose(time, readings.time[met], atol=1e-9, rtol=0)
+        assert np.allclose(time, measurements.time[met], atol=1e-9, rtol=0)
         assert np.allclose(value, wanted[met] * 1e3)
 
 
@@ -192,7 +192,7 @@ def test_with_a_frame_the_plots_are_of_the_axes(tmp_path: Path) -> None:
     }
 
 
-def test_readings_are_shown_where_they_put_the_tool(tmp_path: Path) -> None:
+def test_measurements_are_shown_where_they_put_the_tool(tmp_path: Path) -> None:
     """A sensor 300 mm off, upside down and doubled: its estimated bias and its scale are taken off, ν is left alone."""
     stamps = np.arange(0.01, 1.6, 0.01)
     noise = 5e-4 * np.random.default_rng(2).standard_normal(len(stamps))
@@ -207,7 +207,7 @@ def test_readings_are_shown_where_they_put_the_tool(tmp_path: Path) -> None:
     bias = est.biases["range"]["radial"].value
     assert np.allclose(value, (run.sensors["range"].values["radial"] - bias) / -2.0 * 1e3)
     assert abs(np.mean(value) - 500.0) < 5.0
-    assert np.allclose(series(tmp_path / "range.rrd", "/innovation/radial/range")[1], est.readings.innovation * 1e3)
+    assert np.allclose(series(tmp_path / "range.rrd", "/innovation/radial/range")[1], est.measurements.innovation * 1e3)
 
 
 def test_the_shipped_scan_makes_a_small_file_that_rerun_accepts(tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ from pumafuse.fusion.consistency import consistency, densities_of
 from pumafuse.fusion.outcome import Outcome
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
-from pumafuse.tune.climb import climb
-from pumafuse.tune.profile import Profile, profiles
-from pumafuse.tune.summary import Fitted
+from pumafuse.tuning.climb import climb
+from pumafuse.tuning.profile import Profile, profiles
+from pumafuse.tuning.summary import Fitted
 from pumafuse.views import style, tuning_figures
 from pumafuse.views.tuning_report import page
 
@@ -43,9 +43,9 @@ def recorded(axis: str, sensor: str, name: str, seed: int = 1) -> pf.Run:
         true[number] = at
     true += 3e-4 * np.cumsum(np.sqrt(1e-3) * rng.standard_normal(len(fine)))
     seen = np.arange(0.1, END - 0.1, 0.0173)
-    reading = np.interp(seen, fine, true) + 2e-4 * rng.standard_normal(len(seen))
+    measurement = np.interp(seen, fine, true) + 2e-4 * rng.standard_normal(len(seen))
     return pf.Run.from_arrays(
-        stamp, {axis: command}, {sensor: (seen, {axis: reading})}, (fine, {axis: true}), name=name
+        stamp, {axis: command}, {sensor: (seen, {axis: measurement})}, (fine, {axis: true}), name=name
     )
 
 
@@ -116,7 +116,7 @@ def test_the_table_has_every_number_with_its_interval() -> None:
 
 
 def test_an_interval_ends_where_its_profile_has_dropped_by_half_a_chi_square() -> None:
-    """At each end that the readings limit the curve is at −1.92, nowhere is it above 0, and 0 is where the best is."""
+    """At each end that the measurements limit the curve is at −1.92, nowhere is it above 0, and 0 is where the best is."""
     found, _ = tuned()
     curves, ends = drawn(found), 0
     assert curves.keys() == fitted(found).keys()
@@ -169,7 +169,7 @@ def test_a_lone_number_is_drawn_with_the_likelihood_of_the_filter_itself() -> No
 
     def height(sd: float) -> float:
         est = pf.fuse(run, with_sd(config, sd, gate=50.0))
-        return float(densities_of(est.readings, est.config.sensors).sum())
+        return float(densities_of(est.measurements, est.config.sensors).sum())
 
     heights = np.array([height(value * 1e-3) for value in curve.values])
     np.testing.assert_allclose(curve.drop, heights - heights[np.argmax(curve.drop)], atol=1e-3)
@@ -221,7 +221,7 @@ def test_innovations_are_shown_before_and_after_on_one_scale(figures: list[Figur
     tuning_figures.innovations(*pair, "camera", "tip")
     *series, correlation = figures[0].axes
     for axes, est in zip(series, pair, strict=True):
-        fused = est.readings.where(est.readings.outcome == Outcome.FUSED)
+        fused = est.measurements.where(est.measurements.outcome == Outcome.FUSED)
         (dots,) = axes.lines
         np.testing.assert_array_equal(dots.get_xdata(), fused.time)
         np.testing.assert_array_equal(dots.get_ydata(), fused.innovation / fused.innovation_sd)
@@ -306,7 +306,7 @@ def test_an_interrupted_tuning_has_a_page_too(after: str) -> None:
 
 @pytest.mark.long
 def test_the_page_of_the_shipped_scan_is_of_a_size_to_be_sent() -> None:
-    """28 numbers, 7 pairs of sensor and axis with 25000 readings: less than 3 MB."""
+    """28 numbers, 7 pairs of sensor and axis with 25000 measurements: less than 3 MB."""
     data = Path(pf.__file__).parent / "data"
     run = pf.Run.read(data / "scan1")
     found = quietly([run], pf.FusionConfig.load(data / "fusion.toml"), ["noise", "delay", "plant"])

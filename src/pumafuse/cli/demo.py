@@ -8,7 +8,7 @@ from pathlib import Path
 from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.offline import fuse
-from ..runs.run import Run
+from ..logs.run import Run
 from .fuse import draw, progress_of, record, show
 from .tables import console
 
@@ -41,7 +41,7 @@ def run(output: Path, force: bool) -> None:
         show(summary, output)
         out.print(
             f"\nWhat to open next:\n"
-            f"  {output / 'fused.png'}   the run: command, readings, estimate with its band\n"
+            f"  {output / 'fused.png'}   the run: command, measurements, estimate with its band\n"
             f"  {output / 'error.png'}   its error against the truth, and the error bars\n"
             f"  {output / 'validation.png'}   is the filter as good as it says?\n"
             f"  rerun {output / 'fused.rrd'}   the same in the Rerun viewer\n"

@@ -18,7 +18,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.estimates import Estimates
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
-from ..runs.run import Run
+from ..logs.run import Run
 from .many import each, tell
 from .tables import console, outcome_table, runs_table, score_table
 

@@ -13,9 +13,9 @@ from rich.table import Table
 
 from ..errors import ConfigError, PumafuseWarning
 from ..folders import FolderError, write_file
-from ..identify.anova import Dependence, Scatter
-from ..identify.identify import Identification, identify
-from ..identify.trials import StepTrials
+from ..identification.anova import Dependence, Scatter
+from ..identification.identify import Identification, identify
+from ..identification.trials import StepTrials
 from ..model.arm import ArmModel
 from ..model.plants import FirstOrder
 from ..units import MM, MS

@@ -30,7 +30,7 @@ from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream
 from ..live.udp import Out
 from ..live.wire import Event
-from ..runs.run import Run
+from ..logs.run import Run
 from .live_status import Part, status, summarise
 
 if TYPE_CHECKING:

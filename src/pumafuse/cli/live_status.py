@@ -46,8 +46,8 @@ def status(stream: Stream, parts: Sequence[Part] = ()) -> Group:
 
 
 def sensor_table(health: Health) -> Table:
-    """Rate, lateness, dropouts and NIS of each sensor, and its scalars by outcome."""
-    caption = "outcomes count scalars: each axis of a row by itself"
+    """Rate, lateness, dropouts and NIS of each sensor, and its components by outcome."""
+    caption = "outcomes count components: each axis of a row by itself"
     table = Table(box=box.SIMPLE_HEAD, caption=caption, caption_justify="left")
     words = [
         word for word in (o.word for o in Outcome) if any(sensor.outcomes[word] for sensor in health.sensors.values())

@@ -17,7 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 app = typer.Typer(
     name="pumafuse",
-    help="Blend a robot arm's commands with the readings of an external sensor into the best estimate of its position.",
+    help="Blend a robot arm's commands with the measurements of an external sensor into the best estimate of its position.",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -57,9 +57,9 @@ def fuse(
         float | None, typer.Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")
     ] = None,
     smooth: Annotated[
-        bool, typer.Option("--smooth", help="Use later readings too: the best there is, afterwards.")
+        bool, typer.Option("--smooth", help="Use later measurements too: the best there is, afterwards.")
     ] = False,
-    as_live: Annotated[bool, typer.Option("--as-live", help="Use only readings that had arrived by then.")] = False,
+    as_live: Annotated[bool, typer.Option("--as-live", help="Use only measurements that had arrived by then.")] = False,
     rrd: Annotated[bool, typer.Option("--rrd", help="Also write fused.rrd for the Rerun viewer.")] = False,
     figures: Annotated[bool, typer.Option("--figures", help="Also draw the run and its validation.")] = False,
     engine: Annotated[
@@ -67,7 +67,7 @@ def fuse(
     ] = "compiled",
     force: Force = False,
 ) -> None:
-    """Fuse recorded runs: estimates, what became of each reading, and a summary.
+    """Fuse recorded runs: estimates, what became of each measurement, and a summary.
 
     Several runs get a folder each inside DIR.
     """
@@ -300,7 +300,7 @@ def live(
     ] = None,
     window: Annotated[float, typer.Option(metavar="S", help="How late an event may come.")] = 2.0,
     stale_after: Annotated[
-        float, typer.Option(metavar="S", help="Without a reading for so long an axis is called stale.")
+        float, typer.Option(metavar="S", help="Without a measurement for so long an axis is called stale.")
     ] = 1.0,
     out: Annotated[
         str | None, typer.Option(metavar="udp://HOST:PORT", help="Send the estimates there; default: standard output.")
@@ -319,7 +319,7 @@ def live(
         list[str] | None, typer.Option(metavar="CIDR", help="Who is heard with --listen; may be given again.")
     ] = None,
 ) -> None:
-    """Estimate from a stream of commands and readings, as they come.
+    """Estimate from a stream of commands and measurements, as they come.
 
     One JSON object a line, in mm and s. In: {"t": 12.345, "command": {"radial": 570.0}} and {"t": 12.351, "sensor":
     "tracker", "radial": 569.7}. Out: {"t": ..., "radial": {"position_mm": ..., "sd_mm": ..., "velocity_mm_s": ...}}.

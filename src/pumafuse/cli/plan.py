@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import ConfigError, PumafuseWarning
-from ..identify import plan as plans
-from ..identify.plan import Design
+from ..identification import plan as plans
+from ..identification.plan import Design
+from ..logs import tables
 from ..model.arm import CANONICAL_AXES, ArmModel
-from ..runs import tables
 from .tables import console
 
 _PERIOD = 0.028  # s, the paper's

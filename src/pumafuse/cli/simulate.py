@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-from ..simulate import simulate as simulation
-from ..simulate.scenario import Scenario
+from ..simulation import simulate as simulation
+from ..simulation.scenario import Scenario
 from .many import each, tell
 from .tables import console
 
@@ -29,8 +29,10 @@ def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
         done, failed = each("simulating", jobs, [output / name for name in jobs])
         made, runs_in = list(done.values()), str(output / "seed-*")
     if made:
-        commands, readings, trials = (sum(counts) for counts in zip(*made, strict=True))
-        counted = f"{commands} commands, {readings} rows of readings" + (f", {trials} step trials" if trials else "")
+        commands, measurements, trials = (sum(counts) for counts in zip(*made, strict=True))
+        counted = f"{commands} commands, {measurements} rows of measurements" + (
+            f", {trials} step trials" if trials else ""
+        )
         written = f"{'1 run' if len(made) == 1 else f'{len(made)} runs'}: {counted}, written to {output}"
         config = min(output.glob("**/fusion.toml"))
         out.print(f"{written}\nnext: pumafuse fuse {runs_in} -c {config} -o result", markup=False)
@@ -38,7 +40,7 @@ def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
 
 
 def _one(scenario: Scenario, seed: int, folder: Path, force: bool) -> tuple[int, int, int]:
-    """Simulate one run and write it; how many commands, rows of readings and step trials it has."""
+    """Simulate one run and write it; how many commands, rows of measurements and step trials it has."""
     simulation.check_writable(folder, force)
     simulated = simulation.simulate(scenario, seed)
     simulation.write(simulated, folder, force)

@@ -23,7 +23,7 @@ def console(*, soft_wrap: bool = False) -> Console:
 
 
 def outcome_table(summary: Summary) -> Table:
-    """Scalars by outcome, and innovations against what the filter expected, for each axis and sensor."""
+    """Components by outcome, and innovations against what the filter expected, for each axis and sensor."""
     table = Table(box=box.SIMPLE_HEAD)
     biased = any(sensor.bias_mm is not None for axis in summary.axes.values() for sensor in axis.sensors.values())
     words = sorted(
@@ -72,7 +72,7 @@ def runs_table(results: Mapping[str, Summary]) -> Table:
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column("result", overflow="fold")
     table.add_column("axis")
-    for heading in ("RMSE, mm", "worst, mm", "95 % cover", "NEES", "NIS", "fused", "gated", "notes"):
+    for heading in ("RMSE, mm", "worst, mm", "95 % cover", "NEES", "NIS", "fused", "rejected", "notes"):
         table.add_column(heading, justify="right")
     if len(summaries) <= _FEW_RUNS:
         for name, summary in results.items():
@@ -86,12 +86,12 @@ def runs_table(results: Mapping[str, Summary]) -> Table:
 
 
 def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
-    """One axis over several runs: each estimate and each scalar counts once."""
+    """One axis over several runs: each estimate and each component counts once."""
     parts = [summary.axes[axis] for summary in summaries]
     scores = [part.score for part in parts if part.score is not None]
     sensors = [sensor for part in parts for sensor in part.sensors.values()]
     nis = [(sensor.nis_mean, sensor.outcomes.get("fused", 0)) for sensor in sensors if sensor.nis_mean is not None]
-    fused, gated = (sum(sensor.outcomes.get(word, 0) for sensor in sensors) for word in ("fused", "gated"))
+    fused, rejected = (sum(sensor.outcomes.get(word, 0) for sensor in sensors) for word in ("fused", "rejected"))
     rows = sum(score.rows for score in scores)
     cells = ["–"] * 4
     if rows:
@@ -100,7 +100,7 @@ def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
         nees = [(score.nees_mean, score.rows) for score in scores if score.nees_mean is not None]
         cells = [_mm(square**0.5), _mm(max(score.rmse_mm for score in scores)), f"{cover:.1%}", _mean(nees)]
     notes = sum(len(summary.notes) for summary in summaries)
-    return [*cells, _mean(nis), str(fused), str(gated), str(notes)]
+    return [*cells, _mean(nis), str(fused), str(rejected), str(notes)]
 
 
 def _mean(weighted: Sequence[tuple[float, int]]) -> str:

@@ -18,12 +18,12 @@ from .. import folders
 from ..errors import ConfigError
 from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
-from ..runs.run import Run
-from ..tune.climb import Point
-from ..tune.parameters import check_holds, kinds_of
-from ..tune.summary import Fitted, TuningSummary
-from ..tune.tune import Tuning, tune
-from ..tune.validate import Check
+from ..logs.run import Run
+from ..tuning.climb import Point
+from ..tuning.parameters import check_holds, kinds_of
+from ..tuning.summary import Fitted, TuningSummary
+from ..tuning.tune import Tuning, tune
+from ..tuning.validate import Check
 from ..views import words
 from .tables import console
 
@@ -143,10 +143,10 @@ def _parameters(fitted: Sequence[Fitted]) -> Table:
 def _likelihoods(summary: TuningSummary) -> Table:
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column("learnt from")
-    for heading in ("readings", "log-likelihood before", "after"):
+    for heading in ("measurements", "log-likelihood before", "after"):
         table.add_column(heading, justify="right")
     for axis, one in summary.likelihood.items():
-        table.add_row(escape(axis), str(one.scalars), f"{one.before:.1f}", f"{one.after:.1f}")
+        table.add_row(escape(axis), str(one.components), f"{one.before:.1f}", f"{one.after:.1f}")
     return table
 
 

@@ -13,9 +13,9 @@ from rich.table import Table
 
 from .. import units
 from ..errors import PumafuseWarning
-from ..identify.verify import AxisVerification, verify
+from ..identification.verify import AxisVerification, verify
+from ..logs.run import Run
 from ..model.arm import ArmModel
-from ..runs.run import Run
 from ..units import MM, MS
 from ..views import words
 from .tables import console
@@ -73,7 +73,7 @@ def _show(verified: Sequence[AxisVerification], report: Path | None) -> None:
     out.print(table)
     for one in verified:
         floor = one.floor
-        left_out = f"; {one.outlying} outlying readings left out" if one.outlying else ""
+        left_out = f"; {one.outlying} outlying measurements left out" if one.outlying else ""
         refitted = f"K {floor.gain:.3f}, Td {floor.delay * MS:.1f} ms, {words.plant(floor.plant)}"
         out.print(
             f"{one.run}, {one.axis}: {one.verdict}; start level {one.start * MM:g} mm ({one.start_from}); gain recovery"

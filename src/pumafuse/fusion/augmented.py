@@ -30,11 +30,11 @@ Held = tuple[int, FloatArray, FloatArray, Update | None]
 # What brings a filter back: the instant, x, P, and how many states were held.
 AxisPoint = tuple[int, FloatArray, FloatArray, int]
 
-_ACT, _ISSUE, _READ = 0, 1, 2  # at one instant commands come before readings
+_ACT, _ISSUE, _READ = 0, 1, 2  # at one instant commands come before measurements
 
 
 class AxisFilter:
-    """One axis: steps through the instants of its timeline and meets scalars.
+    """One axis: steps through the instants of its timeline and meets components.
 
     Attributes:
         time: Every instant at which something happens on this axis, int64 ns, ascending, (k,).
@@ -49,11 +49,11 @@ class AxisFilter:
         offset_sd: float,
         biases: Sequence[tuple[str, float]],
         origin: int,
-        readings: TimeArray,
+        measurements: TimeArray,
     ) -> None:
         issued, values, acting = driven.drive.time, driven.drive.value, driven.acting
-        times = np.concatenate(([origin], acting, issued, readings))
-        kinds = np.repeat([_READ, _ACT, _ISSUE, _READ], [1, len(acting), len(issued), len(readings)])
+        times = np.concatenate(([origin], acting, issued, measurements))
+        kinds = np.repeat([_READ, _ACT, _ISSUE, _READ], [1, len(acting), len(issued), len(measurements)])
         order = np.concatenate(([0], 1 + np.lexsort((kinds[1:], times[1:]))))
         self.time: TimeArray = times[order]
         kind = kinds[order]
@@ -112,7 +112,7 @@ class AxisFilter:
         return int(np.searchsorted(self.time, time, side="right")) - 1
 
     def observation(self, name: str, sensor: Sensor, sd: float) -> tuple[FloatArray, float]:
-        """H (1, m) and R [m²] of a scalar of ``sensor`` here and now; R grows with speed where latency wanders."""
+        """H (1, m) and R [m²] of a component of ``sensor`` here and now; R grows with speed where latency wanders."""
         H = sensor.scale * self._position
         if name in self._bias:
             H[0, self._bias[name]] = 1.0
@@ -124,7 +124,7 @@ class AxisFilter:
         return z - (H @ self.kf.x).item(), (H @ self.kf.P @ H.T).item() + R
 
     def fuse(self, z: float, H: FloatArray, R: float, widened: float = 0.0) -> None:
-        """Joseph-form update with one scalar, after the offset's variance was ``widened`` [m²]."""
+        """Joseph-form update with one component, after the offset's variance was ``widened`` [m²]."""
         if widened:
             P = self.kf.P.copy()
             P[self._n, self._n] += widened

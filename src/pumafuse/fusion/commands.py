@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray, IntArray, TimeArray
-from ..runs.clock import behind
-from ..runs.defects import said_before, tell
-from ..runs.grid import regular_grid
-from ..runs.run import Run, Source
+from ..logs.clock import behind
+from ..logs.defects import said_before, tell
+from ..logs.grid import regular_grid
+from ..logs.run import Run, Source
 from .outcome import plausible
 
 

@@ -12,9 +12,9 @@ import msgspec
 
 from .. import toml
 from ..errors import ConfigError, UnknownNameError
+from ..logs.frames import Frame
 from ..model.arm import ArmModel
 from ..model.presets import PRESETS
-from ..runs.frames import Frame
 from ..toml import NotNegative, Positive
 from ..units import refuse_unit
 
@@ -49,11 +49,11 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     Attributes:
         sd: Noise [m], one number or one for each axis.
-        latency: From the instant the reading is true of to its stamp [s].
+        latency: From the instant the measurement is true of to its stamp [s].
         latency_sd: How far the latency wanders [s].
-        scale: Of the position in the reading; −1 for a distance to a panel in front.
+        scale: Of the position in the measurement; −1 for a distance to a panel in front.
         bias_sd: Prior uncertainty of a constant bias [m]; 0: no bias is estimated.
-        gate: A reading beyond this many standard deviations is rejected; 0: never.
+        gate: A measurement beyond this many standard deviations is rejected; 0: never.
         gate_rows: One axis rejected rejects the row.
     """
 
@@ -78,7 +78,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         start: What is uncertain before the first command.
         process: How each axis strays from its model; every axis of the arm is there.
         frame: For streams and runs in x, y, z that bring no frame of their own.
-        sensors: By name, in the order that decides between readings valid at the same instant.
+        sensors: By name, in the order that decides between measurements valid at the same instant.
     """
 
     arm: ArmModel
@@ -99,7 +99,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             if abs(sensor.latency) > _LONGEST_LATENCY:
                 raise ConfigError(f"sensors.{name}.latency_ms: more than an hour; is it in ms?")
             if sensor.scale == 0.0:
-                raise ConfigError(f"sensors.{name}.scale: 0 would make the readings say nothing of the position")
+                raise ConfigError(f"sensors.{name}.scale: 0 would make the measurements say nothing of the position")
         complete = {axis: self.process.get(axis, Process()) for axis in self.arm.axes}
         msgspec.structs.force_setattr(self, "process", complete)
 

@@ -1,7 +1,9 @@
 """Is the filter as good as it says? Innovations and errors against their predicted spread, with a verdict in words.
 
-NIS ν²/S averages 1 where the filter's S is right; its mean over n scalars lies in a chi-square band. Innovations of a
-right filter are white in the order of reading: Ljung-Box over their autocorrelation tells. Gated scalars are left out.
+NIS ν²/S averages 1 where the filter's S is right; its mean over n components lies in a chi-square band. Innovations of
+a
+right filter are white in the order of measurement: Ljung-Box over their autocorrelation tells. Rejected components are
+left out.
 """
 
 from __future__ import annotations
@@ -14,23 +16,23 @@ import numpy as np
 from ..arrays import CodeArray, FloatArray
 from ..units import MM
 from .config import Sensor
-from .estimates import Estimates, Readings, outcome_counts
+from .estimates import Estimates, Measurements, outcome_counts
 from .outcome import Outcome
 from .score import Z95
 from .timeline import LONGEST_TAIL_NS
 
 LAGS = 20
-_FEW = 30  # scalars below which nothing is said
+_FEW = 30  # components below which nothing is said
 _FROZEN = 10  # equal values in a row of a sensor with noise
 _WIDEST = 1e6  # prior over noise up to which error bars are held to
 _NEVER = 1e-6  # expected number below which something does not happen by chance
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
-_MANY_GATED = 0.1  # share of gated scalars beyond which those that are left say little
+_MANY_REJECTED = 0.1  # share of rejected components beyond which those that are left say little
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """One sensor's fused scalars on one axis.
+    """One sensor's fused components on one axis.
 
     Attributes:
         count: How many, n.
@@ -54,30 +56,30 @@ class Consistency:
         return Z95 / float(np.sqrt(self.count))
 
 
-def log_likelihood(readings: Readings, sensors: Mapping[str, Sensor]) -> float:
-    """Log-likelihood of the scalars that the filter met, with positions in mm."""
-    return float(densities_of(readings.where(readings.outcome <= Outcome.REOPENED), sensors).sum())
+def log_likelihood(measurements: Measurements, sensors: Mapping[str, Sensor]) -> float:
+    """Log-likelihood of the components that the filter met, with positions in mm."""
+    return float(densities_of(measurements.where(measurements.outcome <= Outcome.REACQUIRED), sensors).sum())
 
 
-def densities_of(met: Readings, sensors: Mapping[str, Sensor]) -> FloatArray:
-    """:func:`log_density` of scalars that the filter met, (m,)."""
+def densities_of(met: Measurements, sensors: Mapping[str, Sensor]) -> FloatArray:
+    """:func:`log_density` of components that the filter met, (m,)."""
     gate = np.array([sensors[name].gate if name in sensors else 0.0 for name in met.sensors])
     return log_density(met.innovation, met.innovation_sd, met.outcome, gate[met.sensor])
 
 
 def log_density(innovation: FloatArray, innovation_sd: FloatArray, outcome: CodeArray, gate: FloatArray) -> FloatArray:
-    """Log of each scalar's predicted density with positions in mm, (m,).
+    """Log of each component's predicted density with positions in mm, (m,).
 
-    −½(ln 2πS + ν²/S) where it was fused or reopened the gate; −½(ln 2πS + gate²) where it was gated, so that rejecting
-    a reading never costs less than meeting the gate and a tuner cannot gain by rejecting.
+    −½(ln 2πS + ν²/S) where it was fused or reacquired the gate; −½(ln 2πS + gate²) where it was rejected, so that
+    rejecting a measurement never costs less than meeting the gate and a tuner cannot gain by rejecting.
 
     Args:
         innovation: ν [m], (m,).
         innovation_sd: √S [m], (m,).
-        outcome: Fused, gated or reopened, (m,).
-        gate: Of each scalar's sensor, (m,).
+        outcome: Fused, rejected or reacquired, (m,).
+        gate: Of each component's sensor, (m,).
     """
-    square = np.where(outcome == Outcome.GATED, gate**2, (innovation / innovation_sd) ** 2)
+    square = np.where(outcome == Outcome.REJECTED, gate**2, (innovation / innovation_sd) ** 2)
     return -0.5 * (np.log(2.0 * np.pi * (innovation_sd * MM) ** 2) + square)
 
 
@@ -106,62 +108,62 @@ def ljung_box(values: FloatArray, lags: int = LAGS) -> tuple[FloatArray, float]:
 
 
 def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
-    """How one sensor's scalars on one axis fit what the filter expected; None where none were fused."""
-    readings = est.readings.of(sensor, axis)
-    fused = readings.where(readings.outcome == Outcome.FUSED)
+    """How one sensor's components on one axis fit what the filter expected; None where none were fused."""
+    measurements = est.measurements.of(sensor, axis)
+    fused = measurements.where(measurements.outcome == Outcome.FUSED)
     count = len(fused.value)
     if not count:
         return None
     correlation, whiteness = ljung_box(fused.innovation / fused.innovation_sd)
     nis, band = float(np.mean(fused.nis)), chi_square_band(count)
-    gated = 1.0 - count / np.count_nonzero(readings.outcome <= Outcome.REOPENED)
-    verdict = _verdict(est, axis, fused, nis, band, correlation, whiteness, gated)
+    rejected = 1.0 - count / np.count_nonzero(measurements.outcome <= Outcome.REACQUIRED)
+    verdict = _verdict(est, axis, fused, nis, band, correlation, whiteness, rejected)
     return Consistency(count, nis, band, correlation, whiteness, verdict)
 
 
 def troubles(est: Estimates) -> list[str]:
-    """What went wrong with whole sensors, a sentence each: gates that reopened, readings that all failed, clocks."""
+    """What went wrong with whole sensors, a sentence each: gates that reacquired, measurements that all failed, clocks."""
     found = _too_wide(est)
-    readings = est.readings
-    for name in readings.sensors:
-        mine = readings.sensor == readings.sensors.index(name)
-        time, outcome = readings.time[mine], readings.outcome[mine]
+    measurements = est.measurements
+    for name in measurements.sensors:
+        mine = measurements.sensor == measurements.sensors.index(name)
+        time, outcome = measurements.time[mine], measurements.outcome[mine]
         total, counts = len(outcome), outcome_counts(outcome)
         if not total:
             continue
-        reopened = len(np.unique(time[outcome == Outcome.REOPENED]))
-        if reopened:
-            times = "once" if reopened == 1 else f"{reopened} times"
+        reacquired = len(np.unique(time[outcome == Outcome.REACQUIRED]))
+        if reacquired:
+            times = "once" if reacquired == 1 else f"{reacquired} times"
             found.append(
-                f"{name}: its gate reopened {times} after half a second of rejections: it"
+                f"{name}: its gate reacquired {times} after half a second of rejections: it"
                 " contradicts the others or the model; if it is off by a constant, give it bias_sd_mm"
             )
         if counts.get(Outcome.BEFORE_START.word, 0) > 0.5 * total:
-            found.append(f"{name}: most readings lie before the first command: are both stamped by one clock?")
+            found.append(f"{name}: most measurements lie before the first command: are both stamped by one clock?")
         last = float(np.nanmax(time, initial=-np.inf))
         if last > est.last_command + LONGEST_TAIL_NS / 1e9:
             found.append(
-                f"{name}: readings go on for {(last - est.last_command) / 3600.0:.1f} hours after the last command: are"
+                f"{name}: measurements go on for {(last - est.last_command) / 3600.0:.1f} hours after the last command: are"
                 " both stamped by one clock?"
             )
         elif float(np.mean(time > est.last_command + 1.0)) > 0.5:
-            found.append(f"{name}: most readings lie after the last command: are both stamped by one clock?")
-        if counts.get(Outcome.GATED.word, 0) > _MANY_GATED * total:
-            share = counts[Outcome.GATED.word] / total
+            found.append(f"{name}: most measurements lie after the last command: are both stamped by one clock?")
+        if counts.get(Outcome.REJECTED.word, 0) > _MANY_REJECTED * total:
+            share = counts[Outcome.REJECTED.word] / total
             found.append(
-                f"{name}: {share:.0%} of its scalars were gated: sd_mm, latency_ms or the process noise too small"
+                f"{name}: {share:.0%} of its components were rejected: sd_mm, latency_ms or the process noise too small"
             )
-        axis, value = readings.axis[mine], readings.value[mine]
-        for number, label in enumerate(readings.axes):
+        axis, value = measurements.axis[mine], measurements.value[mine]
+        for number, label in enumerate(measurements.axes):
             if frozen := _frozen(value[axis == number]):
-                found.append(f"{name}: {frozen} {label} readings in a row have the same value: it froze")
+                found.append(f"{name}: {frozen} {label} measurements in a row have the same value: it froze")
     return found
 
 
 def _too_wide(est: Estimates) -> list[str]:
     """Priors so much wider than a sensor's noise that double precision blurs the error bars."""
     found: list[str] = []
-    for name in est.readings.sensors:
+    for name in est.measurements.sensors:
         sensor = est.config.sensors.get(name)
         sds = [] if sensor is None else [sd for axis in est.axes if (sd := sensor.sd_of(axis)) is not None]
         if sensor is not None and sds:
@@ -178,7 +180,7 @@ def _frozen(values: FloatArray) -> int:
     """How often in a row a sensor repeated a value to the last digit while others would scatter; 0 if it did not.
 
     Coarse steps repeat by themselves: with a share p of repeats elsewhere, L equal values in a row come up n p^(L−1)
-    times in n readings.
+    times in n measurements.
     """
     values = values[np.isfinite(values)]
     changes = np.diff(values) != 0.0
@@ -193,18 +195,18 @@ def _frozen(values: FloatArray) -> int:
 def _verdict(
     est: Estimates,
     axis: str,
-    fused: Readings,
+    fused: Measurements,
     nis: float,
     band: tuple[float, float],
     correlation: FloatArray,
     whiteness: float,
-    gated: float,
+    rejected: float,
 ) -> str:
     if len(fused.value) < _FEW:
-        return f"too few readings ({len(fused.value)}) to tell"
+        return f"too few measurements ({len(fused.value)}) to tell"
     said = f"NIS {nis:.2f}, expected {band[0]:.2f} to {band[1]:.2f}"
-    if gated > _MANY_GATED:  # what is left has been chosen to fit
-        return f"{said}, but {gated:.0%} were gated: sd_mm, latency_ms or the process noise too small"
+    if rejected > _MANY_REJECTED:  # what is left has been chosen to fit
+        return f"{said}, but {rejected:.0%} were rejected: sd_mm, latency_ms or the process noise too small"
     first, strongest = float(correlation[0]), int(np.argmax(np.abs(correlation)))
     coloured = whiteness < 0.01 and abs(first) > _NOTABLE
     if nis > band[1]:
@@ -224,8 +226,8 @@ def _verdict(
     return f"{said}: consistent"
 
 
-def _follows_velocity(est: Estimates, axis: str, fused: Readings) -> bool:
-    """Whether innovations go with the velocity, as those of a reading with the wrong valid time do.
+def _follows_velocity(est: Estimates, axis: str, fused: Measurements) -> bool:
+    """Whether innovations go with the velocity, as those of a measurement with the wrong valid time do.
 
     Which way the latency is wrong they do not tell: the offset takes up most of the error, and what is left of an
     accurate sensor's follows the acceleration.

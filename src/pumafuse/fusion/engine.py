@@ -19,7 +19,7 @@ from .track import AxisEstimate, Bias, Fused
 
 def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mode: Mode) -> Fused:
     """Filter or smooth one timeline, with estimates at ``times`` (int64 ns, ascending, none before the origin)."""
-    scalars, candidates = timeline.scalars, timeline.scalars.candidates
+    components, candidates = timeline.components, timeline.components.candidates
     axes, sensors, rows, state, biases = _arranged(timeline, config)
     count, width = len(timeline.axes), state.x.shape[1]
     met = kernels.Met(np.empty(len(candidates)), np.empty(len(candidates)), np.empty(len(candidates), dtype=np.uint8))
@@ -29,7 +29,7 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
     held = kernels.Held(np.empty((count, kept, width)), np.empty((count, kept, width, width)), np.empty((count, kept)))
     log = _log(axes, rows, width) if smooth else _log(axes, None, width)
     if mode == "as-live":
-        arrival = np.maximum(scalars.stamp[candidates[rows.first]], rows.valid)
+        arrival = np.maximum(components.stamp[candidates[rows.first]], rows.valid)
         queue = np.argsort(arrival, kind="stable")
         back = int((np.maximum.accumulate(queue) - queue).max(initial=0)) + 2
         checkpoints = places(state, back)
@@ -48,22 +48,22 @@ def fuse_compiled(timeline: Timeline, config: FusionConfig, times: TimeArray, mo
             np.empty((width + 1, width)),
         )
         smoother_kernels.smooth_run(axes, sensors, sensor_of, met, log, timeline.origin, times, held, *room, outputs)
-    outcome = scalars.outcome.copy()
+    outcome = components.outcome.copy()
     outcome[candidates] = met.outcome
     return Fused(
         {axis.name: _estimate(axis, outputs, number) for number, axis in enumerate(timeline.axes)},
-        _among_all(met.innovation, candidates, len(scalars.value)),
-        _among_all(met.innovation_sd, candidates, len(scalars.value)),
+        _among_all(met.innovation, candidates, len(components.value)),
+        _among_all(met.innovation_sd, candidates, len(components.value)),
         outcome,
         _known_biases(timeline, axes, state, biases),
     )
 
 
 def innovations(timeline: Timeline, config: FusionConfig, outcome: CodeArray | None = None) -> kernels.Met:
-    """What each candidate scalar tells the filter, without any estimate; in the timeline's order.
+    """What each candidate component tells the filter, without any estimate; in the timeline's order.
 
     Args:
-        timeline: The readings.
+        timeline: The measurements.
         config: Arm, noise and sensors.
         outcome: What became of each in an earlier fusion, to be repeated whatever the gates would say; None: they say.
     """
@@ -86,7 +86,7 @@ def _arranged(
     timeline: Timeline, config: FusionConfig
 ) -> tuple[kernels.Axes, kernels.Sensors, kernels.Rows, kernels.State, list[list[str]]]:
     """The kernels' arrays, and for each axis the sensors whose bias is in its state."""
-    names, biases = timeline.scalars.sensors, _biases_on(timeline, config)
+    names, biases = timeline.components.sensors, _biases_on(timeline, config)
     sensors = sensors_of(names, {axis.name: axis.start for axis in timeline.axes}, config, biases)
     axes = _axes(timeline, config, [len(biased) for biased in biases])
     state = start_of(axes, len(names), timeline.origin, config, biases)
@@ -95,12 +95,12 @@ def _arranged(
 
 def _biases_on(timeline: Timeline, config: FusionConfig) -> list[list[str]]:
     """For each axis the sensors whose bias is in its state: those heard on it, in their order."""
-    scalars, chosen, count = timeline.scalars, _chosen(timeline), len(timeline.axes)
-    both = scalars.sensor[chosen] * count + scalars.axis[chosen]
-    heard = np.bincount(both, minlength=len(scalars.sensors) * count).reshape(-1, count) > 0
-    biased = [name in config.sensors and config.sensors[name].bias_sd > 0.0 for name in scalars.sensors]
+    components, chosen, count = timeline.components, _chosen(timeline), len(timeline.axes)
+    both = components.sensor[chosen] * count + components.axis[chosen]
+    heard = np.bincount(both, minlength=len(components.sensors) * count).reshape(-1, count) > 0
+    biased = [name in config.sensors and config.sensors[name].bias_sd > 0.0 for name in components.sensors]
     return [
-        [name for index, name in enumerate(scalars.sensors) if biased[index] and heard[index, axis]]
+        [name for index, name in enumerate(components.sensors) if biased[index] and heard[index, axis]]
         for axis in range(len(timeline.axes))
     ]
 
@@ -157,24 +157,24 @@ def _axes(timeline: Timeline, config: FusionConfig, biases: list[int]) -> kernel
 
 
 def _rows(timeline: Timeline) -> kernels.Rows:
-    scalars, chosen = timeline.scalars, _chosen(timeline)
-    sensor, axis, row = scalars.sensor[chosen], scalars.axis[chosen], scalars.row[chosen]
+    components, chosen = timeline.components, _chosen(timeline)
+    sensor, axis, row = components.sensor[chosen], components.axis[chosen], components.row[chosen]
     begins = np.flatnonzero(np.diff(row, prepend=-1))
     return kernels.Rows(
-        valid=scalars.valid[chosen][begins],
+        valid=components.valid[chosen][begins],
         sensor=sensor[begins],
         first=begins,
         end=np.append(begins, len(row))[1:],
         axis=axis,
-        value=scalars.value[chosen],
-        spread=np.empty(0) if scalars.spread is None else scalars.spread[chosen],
+        value=components.value[chosen],
+        spread=np.empty(0) if components.spread is None else components.spread[chosen],
     )
 
 
 def _chosen(timeline: Timeline) -> slice | IntArray:
-    """The candidates among all scalars; a slice where they are all of them, which copies nothing."""
-    candidates = timeline.scalars.candidates
-    return slice(None) if len(candidates) == len(timeline.scalars.value) else candidates
+    """The candidates among all components; a slice where they are all of them, which copies nothing."""
+    candidates = timeline.components.candidates
+    return slice(None) if len(candidates) == len(timeline.components.value) else candidates
 
 
 def start_of(
@@ -219,7 +219,7 @@ def places(state: kernels.State, count: int) -> kernels.State:
 
 
 def _log(axes: kernels.Axes, rows: kernels.Rows | None, width: int) -> kernels.Log:
-    """Room for what happens to each axis: an interval for each command, an interval and an update for each scalar."""
+    """Room for what happens to each axis: an interval for each command, an interval and an update for each component."""
     count = len(axes.order)
     room = np.zeros(count, dtype=np.int64)
     if rows is not None:
@@ -259,7 +259,7 @@ def _noise(sensor: Sensor | None, axis: str) -> float:
 
 
 def _among_all(values: FloatArray, candidates: IntArray, size: int) -> FloatArray:
-    """Values of the candidates among all scalars, NaN for the others."""
+    """Values of the candidates among all components, NaN for the others."""
     if len(values) == size:
         return values
     found = np.full(size, np.nan)

@@ -1,4 +1,4 @@
-"""The result of a fusion: estimates in the log's coordinates, what became of each reading, and what was noticed."""
+"""The result of a fusion: estimates in the log's coordinates, what became of each measurement, and what was noticed."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ Mode = Literal["filtered", "as-live", "smoothed"]
 
 
 def outcome_counts(outcomes: CodeArray) -> dict[str, int]:
-    """How many scalars had each outcome, those that occur."""
+    """How many components had each outcome, those that occur."""
     found = {outcome.word: int(np.count_nonzero(outcomes == outcome)) for outcome in Outcome}
     return {word: count for word, count in found.items() if count}
 
 
 @dataclass(frozen=True)
-class Readings:
-    """Every scalar of every sensor used, in the order of processing; arrays are (m,).
+class Measurements:
+    """Every component of every sensor used, in the order of processing; arrays are (m,).
 
     Attributes:
-        time: The instant the reading is true of [s since the first command], NaN without a stamp.
+        time: The instant the measurement is true of [s since the first command], NaN without a stamp.
         stamp: As logged [s since the first command], NaN without a stamp.
         sensor: Index into ``sensors``.
         axis: Index into ``axes``.
         value: As logged [m].
-        innovation: One step ahead [m], NaN where the filter never met the scalar.
+        innovation: One step ahead [m], NaN where the filter never met the component.
         innovation_sd: What the filter expected of it [m].
         outcome: An :class:`Outcome` each.
         sensors: Sensor names.
@@ -59,26 +59,26 @@ class Readings:
         """ν²/S, (m,)."""
         return (self.innovation / self.innovation_sd) ** 2
 
-    def of(self, sensor: str, axis: str) -> Readings:
-        """The scalars of one sensor on one axis."""
+    def of(self, sensor: str, axis: str) -> Measurements:
+        """The components of one sensor on one axis."""
         return self.where((self.sensor == self.sensors.index(sensor)) & (self.axis == self.axes.index(axis)))
 
-    def where(self, mask: BoolArray) -> Readings:
-        """The scalars that ``mask`` (m,) selects."""
+    def where(self, mask: BoolArray) -> Measurements:
+        """The components that ``mask`` (m,) selects."""
         return replace(self, **{name: getattr(self, name)[mask] for name in self.ARRAYS})
 
-    def as_position(self, scale: float, bias: float) -> Readings:
-        """The scalars with their values turned into positions [m]: (z − bias) / scale."""
+    def as_position(self, scale: float, bias: float) -> Measurements:
+        """The components with their values turned into positions [m]: (z − bias) / scale."""
         return replace(self, value=(self.value - bias) / scale)
 
     @staticmethod
-    def joined(parts: Sequence[Readings]) -> Readings:
-        """The scalars of several segments, one after the other."""
-        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in Readings.ARRAYS}
+    def joined(parts: Sequence[Measurements]) -> Measurements:
+        """The components of several segments, one after the other."""
+        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in Measurements.ARRAYS}
         return replace(parts[0], **arrays)
 
     def counts(self) -> dict[str, int]:
-        """How many scalars had each outcome, those that occur."""
+        """How many components had each outcome, those that occur."""
         return outcome_counts(self.outcome)
 
 
@@ -91,13 +91,13 @@ class Estimates:
         time: [s since the run's first command].
         axes: Estimates by axis; ``est["radial"]`` is the short way.
         cartesian: With a frame, the estimates in the log's ``x``, ``y`` and ``z`` [m].
-        readings: What became of every scalar.
-        biases: By sensor and axis, as all readings together know them (of the last segment, if the clock jumped).
+        measurements: What became of every component.
+        biases: By sensor and axis, as all measurements together know them (of the last segment, if the clock jumped).
         reference: The run's reference, where it has one.
         origin: Stamp of the first command, int ns.
         last_command: When the last command was given [s since the first].
         segment: 0, and one more after each time the log's clock was set back.
-        mode: Which readings an estimate knows: all that are valid by then (``filtered``), or only those that had
+        mode: Which measurements an estimate knows: all that are valid by then (``filtered``), or only those that had
             arrived (``as-live``), or all of the run (``smoothed``).
         engine: Which engine computed it.
         config: The configuration as used.
@@ -110,7 +110,7 @@ class Estimates:
     time: FloatArray
     axes: Mapping[str, AxisEstimate]
     cartesian: Mapping[str, FloatArray] | None
-    readings: Readings
+    measurements: Measurements
     biases: Mapping[str, Mapping[str, Bias]]
     reference: ReferenceTrack | None
     origin: int

@@ -26,10 +26,10 @@ _Checkpoint = tuple[tuple[AxisPoint, ...], dict[tuple[str, str], tuple[int, int]
 
 @dataclass(frozen=True)
 class _Row:
-    """The scalars of one row that the filter is to decide on."""
+    """The components of one row that the filter is to decide on."""
 
     sensor: str
-    scalars: IntArray
+    components: IntArray
     valid: int
     stamp: int
 
@@ -38,15 +38,15 @@ class FilterpyEngine:
     """Filters one timeline on all axes together: rows in their total order, each axis catching up to them."""
 
     def __init__(self, timeline: Timeline, config: FusionConfig) -> None:
-        self._scalars = scalars = timeline.scalars
+        self._components = components = timeline.components
         self._sensors = config.sensors
         self._names = [axis.name for axis in timeline.axes]
-        candidates = scalars.candidates
+        candidates = components.candidates
         self._filters: list[AxisFilter] = []
         self._biases: list[tuple[str, ...]] = []
         for number, axis in enumerate(timeline.axes):
-            mine = candidates[scalars.axis[candidates] == number]
-            heard = [scalars.sensors[int(index)] for index in np.unique(scalars.sensor[mine])]
+            mine = candidates[components.axis[candidates] == number]
+            heard = [components.sensors[int(index)] for index in np.unique(components.sensor[mine])]
             biases = [(name, self._sensors[name].bias_sd) for name in heard if self._sensors[name].bias_sd]
             self._biases.append(tuple(name for name, _ in biases))
             self._filters.append(
@@ -57,18 +57,18 @@ class FilterpyEngine:
                     config.start.offset_sd,
                     biases,
                     timeline.origin,
-                    np.unique(scalars.valid[mine]),
+                    np.unique(components.valid[mine]),
                 )
             )
         self._starts = [axis.start for axis in timeline.axes]
         self._rows = self._gather(candidates)
         self._streaks: dict[tuple[str, str], tuple[int, int]] = {}
-        self._innovation = np.full(len(scalars.value), np.nan)
-        self._innovation_sd = np.full(len(scalars.value), np.nan)
-        self._outcome = scalars.outcome.copy()
+        self._innovation = np.full(len(components.value), np.nan)
+        self._innovation_sd = np.full(len(components.value), np.nan)
+        self._outcome = components.outcome.copy()
 
     def filter(self, progress: Progress | None = None) -> Filtered:
-        """Every reading at its valid time, whenever it arrived."""
+        """Every measurement at its valid time, whenever it arrived."""
         for number, row in enumerate(self._rows):
             self._meet(row)
             if progress is not None and number % 1000 == 0:
@@ -78,7 +78,7 @@ class FilterpyEngine:
         return self._filtered(tuple(axis.track(axis.held) for axis in self._filters))
 
     def filter_as_live(self, times: TimeArray, progress: Progress | None = None) -> Filtered:
-        """At each of ``times`` only the readings that had arrived: late ones make the filter go back and replay.
+        """At each of ``times`` only the measurements that had arrived: late ones make the filter go back and replay.
 
         The tracks hold one state for each of ``times``.
         """
@@ -111,17 +111,17 @@ class FilterpyEngine:
         return self._filtered(tuple(axis.track(states) for axis, states in zip(self._filters, kept, strict=True)))
 
     def _meet(self, row: _Row) -> None:
-        """Gate a row and fuse what passes: whole rows or scalar by scalar, as the sensor says."""
+        """Gate a row and fuse what passes: whole rows or component by component, as the sensor says."""
         sensor = self._sensors[row.sensor]
         if sensor.gate_rows:
-            self._meet_together(row, sensor, row.scalars, "")
+            self._meet_together(row, sensor, row.components, "")
         else:
-            for scalar in row.scalars:
-                self._meet_together(row, sensor, (scalar,), self._names[self._scalars.axis[scalar]])
+            for component in row.components:
+                self._meet_together(row, sensor, (component,), self._names[self._components.axis[component]])
 
-    def _meet_together(self, row: _Row, sensor: Sensor, scalars: Sequence[int] | IntArray, part: str) -> None:
-        """Scalars of one row that pass the gate together or not at all."""
-        met = [self._predicted(row, sensor, int(scalar)) for scalar in scalars]
+    def _meet_together(self, row: _Row, sensor: Sensor, components: Sequence[int] | IntArray, part: str) -> None:
+        """Components of one row that pass the gate together or not at all."""
+        met = [self._predicted(row, sensor, int(component)) for component in components]
         beyond = [sensor.gate > 0.0 and abs(nu) > sensor.gate * np.sqrt(S) for _, _, _, _, nu, S in met]
         key = (row.sensor, part)
         if not any(beyond):
@@ -130,37 +130,42 @@ class FilterpyEngine:
         reopens = count >= REOPEN_AFTER and row.valid - since >= REOPEN_SPAN_NS
         if any(beyond) and not reopens:
             self._streaks[key] = (count + 1, since)
-        for scalar, outside, (axis, z, H, R, nu, S) in zip(scalars, beyond, met, strict=True):
-            gated, widened = any(beyond) and not reopens, nu**2 if outside and reopens else 0.0
+        for component, outside, (axis, z, H, R, nu, S) in zip(components, beyond, met, strict=True):
+            rejected, widened = any(beyond) and not reopens, nu**2 if outside and reopens else 0.0
             if widened:
                 self._streaks.pop(key, None)
-            if not gated:
+            if not rejected:
                 axis.fuse(z, H, R, widened)
-            spread = S if gated else float(axis.kf.S[0, 0])
-            self._innovation[scalar], self._innovation_sd[scalar] = nu, np.sqrt(spread)
-            self._outcome[scalar] = Outcome.GATED if gated else Outcome.REOPENED if outside else Outcome.FUSED
+            spread = S if rejected else float(axis.kf.S[0, 0])
+            self._innovation[component], self._innovation_sd[component] = nu, np.sqrt(spread)
+            self._outcome[component] = (
+                Outcome.REJECTED if rejected else Outcome.REACQUIRED if outside else Outcome.FUSED
+            )
 
     def _predicted(
-        self, row: _Row, sensor: Sensor, scalar: int
+        self, row: _Row, sensor: Sensor, component: int
     ) -> tuple[AxisFilter, float, FloatArray, float, float, float]:
-        """The axis filter at the scalar's valid time with z, H, R, ν and S."""
-        number = int(self._scalars.axis[scalar])
+        """The axis filter at the component's valid time with z, H, R, ν and S."""
+        number = int(self._components.axis[component])
         axis = self._filters[number]
         axis.advance(axis.latest(row.valid))
         sd = sensor.sd_of(self._names[number])
-        assert sd is not None  # a scalar without one is `unknown` and never gets here
+        assert sd is not None  # a component without one is `unknown` and never gets here
         H, R = axis.observation(
-            row.sensor, sensor, sd if (spread := self._scalars.spread) is None else sd * float(spread[scalar])
+            row.sensor, sensor, sd if (spread := self._components.spread) is None else sd * float(spread[component])
         )
-        z = float(self._scalars.value[scalar]) - sensor.scale * self._starts[number]
+        z = float(self._components.value[component]) - sensor.scale * self._starts[number]
         return axis, z, H, R, *axis.innovation(z, H, R)
 
     def _gather(self, candidates: IntArray) -> list[_Row]:
-        scalars = self._scalars
-        edges = np.flatnonzero(np.diff(scalars.row[candidates])) + 1
+        components = self._components
+        edges = np.flatnonzero(np.diff(components.row[candidates])) + 1
         return [
             _Row(
-                scalars.sensors[scalars.sensor[part[0]]], part, int(scalars.valid[part[0]]), int(scalars.stamp[part[0]])
+                components.sensors[components.sensor[part[0]]],
+                part,
+                int(components.valid[part[0]]),
+                int(components.stamp[part[0]]),
             )
             for part in np.split(candidates, edges)
             if len(part)

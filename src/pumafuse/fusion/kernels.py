@@ -1,8 +1,8 @@
-"""The compiled filter, event by event: one scalar kernel for every use, on the plant's states, offset, biases.
+"""The compiled filter, event by event: one component kernel for every use, on the plant's states, offset, biases.
 
 Commands wait in the drive until they act, so the state needs no delay chain. Each axis steps from instant to instant
-(commands acting, readings valid) in closed form and meets its scalars by Joseph-form updates. Everything an axis has is
-in arrays that change in place: a copy of them is a checkpoint. No fast-math: the same events give the same bits.
+(commands acting, measurements valid) in closed form and meets its components by Joseph-form updates. Everything an axis
+has is in arrays that change in place: a copy of them is a checkpoint. No fast-math: the same events give the same bits.
 Recorded runs (`run_kernels.py`) and streams (`live/kernels.py`) are both made of these.
 
 State of an axis: the plant's n states (position [m], and its rate [m/s] for a second-order plant), the offset, biases.
@@ -21,7 +21,7 @@ from ..compiled import compiled
 from ..model.closed import advance_first, advance_second
 from .outcome import REOPEN_AFTER, REOPEN_SPAN_NS, Outcome
 
-_FUSED, _GATED, _REOPENED = int(Outcome.FUSED), int(Outcome.GATED), int(Outcome.REOPENED)
+_FUSED, _REJECTED, _REACQUIRED = int(Outcome.FUSED), int(Outcome.REJECTED), int(Outcome.REACQUIRED)
 _ROUNDING = 1e-15  # of the variances that S is made of: S cannot be known to be smaller
 
 
@@ -55,12 +55,12 @@ class Sensors(NamedTuple):
     """What is known of each of the S sensors.
 
     Attributes:
-        scale: Of the position in the reading, (S,).
+        scale: Of the position in the measurement, (S,).
         level: scale · u₀ of each axis [m], (S, A).
         sd: Noise on each axis [m], (S, A).
         latency_sd: How far the latency wanders [s], (S,).
         gate: In standard deviations, 0 for none, (S,).
-        gate_rows: Whether one axis gated gates the row, (S,).
+        gate_rows: Whether one axis rejected gates the row, (S,).
         bias: Which state is its bias on each axis, −1 for none, (S, A).
     """
 
@@ -74,14 +74,14 @@ class Sensors(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """R rows of readings in their total order, with the scalars of each side by side.
+    """R rows of measurements in their total order, with the components of each side by side.
 
     Attributes:
         valid: The instant each is true of, int64 ns, (R,).
         sensor: (R,).
-        first: Where each row's scalars begin, (R,).
+        first: Where each row's components begin, (R,).
         end: Where they end, (R,).
-        axis: Of each scalar, (m,).
+        axis: Of each component, (m,).
         value: z [m] as logged, (m,).
         spread: By what the noise of each is scaled, (m,); (0,) where it is by nothing.
     """
@@ -103,8 +103,8 @@ class State(NamedTuple):
         P: Covariance, (A + 1, s, s).
         clock: The instant each axis stands at, int64 ns, (A,).
         entry: The entry of the drive that acts, −1 before the first, counted from the axis's own first, (A,).
-        fused: When the last scalar that was fused was valid, int64 ns, (A,).
-        rejected: Rejections in a row, of each sensor's rows (first column) or scalars by axis, (S, A + 1).
+        fused: When the last component that was fused was valid, int64 ns, (A,).
+        rejected: Rejections in a row, of each sensor's rows (first column) or components by axis, (S, A + 1).
         since: When the first of them was valid, int64 ns, (S, A + 1).
         work: Room for an update's vectors: H, K, P Hᵀ and (I − K H) P Hᵀ, (4, s).
     """
@@ -120,7 +120,7 @@ class State(NamedTuple):
 
 
 class Met(NamedTuple):
-    """What became of each scalar.
+    """What became of each component.
 
     Attributes:
         innovation: ν [m], (m,).
@@ -160,7 +160,7 @@ class Log(NamedTuple):
         first: Where each axis's entries begin, (A + 1,); all 0 where nothing is to be kept.
         used: How many each axis has, (A,).
         time: The instant after each, int64 ns, (k,).
-        scalar: Which scalar's update it was, −1 for an interval, (k,).
+        component: Which component's update it was, −1 for an interval, (k,).
         noise: Input noise density squared of an interval [m²·s], R of an update [m²], (k,).
         drift: Drift density squared of an interval [m²/s]; of an update, by how much the offset was widened [m²], (k,).
         gain: Of an update, (k, s).
@@ -169,7 +169,7 @@ class Log(NamedTuple):
     first: IntArray
     used: IntArray
     time: TimeArray
-    scalar: IntArray
+    component: IntArray
     noise: FloatArray
     drift: FloatArray
     gain: FloatArray
@@ -252,12 +252,12 @@ def advance(axes: Axes, state: State, log: Log, axis: int, time: int) -> None:
 
 
 @compiled
-def write_log(log: Log, axis: int, time: int, scalar: int, noise: float, drift: float, work: FloatArray) -> None:
+def write_log(log: Log, axis: int, time: int, component: int, noise: float, drift: float, work: FloatArray) -> None:
     """Keep an entry, where entries are kept; an update's gain is in ``work[1]``."""
     at = log.first[axis] + log.used[axis]
     if at < log.first[axis + 1]:
-        log.time[at], log.scalar[at], log.noise[at], log.drift[at] = time, scalar, noise, drift
-        if scalar >= 0:
+        log.time[at], log.component[at], log.noise[at], log.drift[at] = time, component, noise, drift
+        if component >= 0:
             for i in range(log.gain.shape[1]):
                 log.gain[at, i] = work[1, i]
         log.used[axis] += 1
@@ -283,7 +283,7 @@ def observation(axes: Axes, sensors: Sensors, axis: int, sensor: int, work: Floa
 def joseph_three(
     a: float, b: float, c: float, d: float, e: float, f: float, h0: float, h1: float, h2: float, R: float, S: float
 ) -> tuple[float, float, float, float, float, float]:
-    """(I − K H) P (I − K H)ᵀ + K R Kᵀ with P = [a b d; b c e; d e f]; S is infinite without a reading.
+    """(I − K H) P (I − K H)ᵀ + K R Kᵀ with P = [a b d; b c e; d e f]; S is infinite without a measurement.
 
     A quotient is exactly 1 where a prior is all there is to S; a product with 1/S would leave a variance below 0.
     """
@@ -343,10 +343,10 @@ def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> N
 
 
 @compiled
-def noise(axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: int, sensor: int) -> float:
-    """R of a scalar here and now [m²]; it grows with speed where latency wanders."""
-    axis = rows.axis[scalar]
-    sd = sensors.sd[sensor, axis] * (rows.spread[scalar] if len(rows.spread) else 1.0)
+def noise(axes: Axes, sensors: Sensors, rows: Rows, state: State, component: int, sensor: int) -> float:
+    """R of a component here and now [m²]; it grows with speed where latency wanders."""
+    axis = rows.axis[component]
+    sd = sensors.sd[sensor, axis] * (rows.spread[component] if len(rows.spread) else 1.0)
     R = sd * sd
     if sensors.latency_sd[sensor] > 0.0:
         v, _, _ = acting_now(axes, axis, state.entry[axis])
@@ -356,11 +356,13 @@ def noise(axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: int, s
 
 
 @compiled
-def predicted(axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: int, sensor: int) -> tuple[float, float]:
-    """ν = z − H x and S = H P Hᵀ + R of a scalar here and now."""
-    axis, R = rows.axis[scalar], noise(axes, sensors, rows, state, scalar, sensor)
+def predicted(
+    axes: Axes, sensors: Sensors, rows: Rows, state: State, component: int, sensor: int
+) -> tuple[float, float]:
+    """ν = z − H x and S = H P Hᵀ + R of a component here and now."""
+    axis, R = rows.axis[component], noise(axes, sensors, rows, state, component, sensor)
     x, P, o, scale, bias = state.x, state.P, axes.order[axis], sensors.scale[sensor], sensors.bias[sensor, axis]
-    nu = rows.value[scalar] - sensors.level[sensor, axis] - scale * (x[axis, 0] + x[axis, o])
+    nu = rows.value[component] - sensors.level[sensor, axis] - scale * (x[axis, 0] + x[axis, o])
     S = scale * scale * (P[axis, 0, 0] + 2.0 * P[axis, 0, o] + P[axis, o, o])
     if bias >= 0:
         nu -= x[axis, bias]
@@ -371,12 +373,12 @@ def predicted(axes: Axes, sensors: Sensors, rows: Rows, state: State, scalar: in
 
 @compiled
 def meet(axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log: Log, row: int) -> None:
-    """Gate a row and fuse what passes: whole rows or scalar by scalar, as the sensor says."""
-    scalar, together = rows.first[row], sensors.gate_rows[rows.sensor[row]]
-    while scalar < rows.end[row]:  # one call: each would be compiled as a copy of its own
-        end, part = (rows.end[row], 0) if together else (scalar + 1, rows.axis[scalar] + 1)
-        meet_together(axes, sensors, rows, state, met, log, row, scalar, end, part)
-        scalar = end
+    """Gate a row and fuse what passes: whole rows or component by component, as the sensor says."""
+    component, together = rows.first[row], sensors.gate_rows[rows.sensor[row]]
+    while component < rows.end[row]:  # one call: each would be compiled as a copy of its own
+        end, part = (rows.end[row], 0) if together else (component + 1, rows.axis[component] + 1)
+        meet_together(axes, sensors, rows, state, met, log, row, component, end, part)
+        component = end
 
 
 @compiled
@@ -392,50 +394,51 @@ def meet_together(
     end: int,
     part: int,
 ) -> None:
-    """Scalars ``first`` to ``end`` of one row, which pass the gate together or not at all.
+    """Components ``first`` to ``end`` of one row, which pass the gate together or not at all.
 
-    ``part`` is where their rejections in a row are counted (:class:`State`): 0 for whole rows, axis + 1 for a scalar.
+    ``part`` is where their rejections in a row are counted (:class:`State`): 0 for whole rows, axis + 1 for a
+    component.
     """
     sensor, valid = rows.sensor[row], rows.valid[row]
     gate, any_beyond = sensors.gate[sensor], False
-    for scalar in range(first, end):
-        advance(axes, state, log, rows.axis[scalar], valid)
-        nu, S = predicted(axes, sensors, rows, state, scalar, sensor)
+    for component in range(first, end):
+        advance(axes, state, log, rows.axis[component], valid)
+        nu, S = predicted(axes, sensors, rows, state, component, sensor)
         sd = math.sqrt(S)
-        met.innovation[scalar], met.innovation_sd[scalar] = nu, sd
+        met.innovation[component], met.innovation_sd[component] = nu, sd
         any_beyond |= gate > 0.0 and abs(nu) > gate * sd
     if state.rejected[sensor, part] == 0:
         state.since[sensor, part] = valid
     long_enough = valid - state.since[sensor, part] >= REOPEN_SPAN_NS
     reopens = any_beyond and state.rejected[sensor, part] >= REOPEN_AFTER and long_enough
     state.rejected[sensor, part] = state.rejected[sensor, part] + 1 if any_beyond and not reopens else 0
-    for scalar in range(first, end):
+    for component in range(first, end):
         if any_beyond and not reopens:
-            met.outcome[scalar] = _GATED
+            met.outcome[component] = _REJECTED
         else:
-            fuse(axes, sensors, rows, state, met, log, row, scalar, gate if reopens else math.inf)
+            fuse(axes, sensors, rows, state, met, log, row, component, gate if reopens else math.inf)
 
 
 @compiled
 def fuse(
-    axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log: Log, row: int, scalar: int, gate: float
+    axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log: Log, row: int, component: int, gate: float
 ) -> None:
-    """Update with one scalar; one beyond the ``gate``, which reopens, widens the offset by ν² first."""
-    sensor, axis = rows.sensor[row], rows.axis[scalar]
-    nu = met.innovation[scalar]
-    R = noise(axes, sensors, rows, state, scalar, sensor)
-    widened = nu * nu if abs(nu) > gate * met.innovation_sd[scalar] else 0.0
+    """Update with one component; one beyond the ``gate``, which reopens, widens the offset by ν² first."""
+    sensor, axis = rows.sensor[row], rows.axis[component]
+    nu = met.innovation[component]
+    R = noise(axes, sensors, rows, state, component, sensor)
+    widened = nu * nu if abs(nu) > gate * met.innovation_sd[component] else 0.0
     if widened > 0.0:
         state.P[axis, axes.order[axis], axes.order[axis]] += widened
-        _, S = predicted(axes, sensors, rows, state, scalar, sensor)
-        met.innovation_sd[scalar] = math.sqrt(S)
+        _, S = predicted(axes, sensors, rows, state, component, sensor)
+        met.innovation_sd[component] = math.sqrt(S)
     observation(axes, sensors, axis, sensor, state.work)
     joseph(state.P, axis, axes.states[axis], R, state.work)
     for i in range(axes.states[axis]):
         state.x[axis, i] += state.work[1, i] * nu
     state.fused[axis] = rows.valid[row]
-    met.outcome[scalar] = _REOPENED if widened > 0.0 else _FUSED
-    write_log(log, axis, rows.valid[row], scalar, R, widened, state.work)
+    met.outcome[component] = _REACQUIRED if widened > 0.0 else _FUSED
+    write_log(log, axis, rows.valid[row], component, R, widened, state.work)
 
 
 @compiled

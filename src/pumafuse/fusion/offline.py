@@ -11,15 +11,15 @@ import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import PumafuseWarning
-from ..runs.axes import in_axes
-from ..runs.clock import segments
-from ..runs.frames import Cylindrical, Placed
-from ..runs.run import Run
+from ..logs.axes import in_axes
+from ..logs.clock import segments
+from ..logs.frames import Cylindrical, Placed
+from ..logs.run import Run
 from ..units import seconds
 from . import timeline as timelines
 from .config import FusionConfig
 from .consistency import troubles
-from .estimates import Estimates, Mode, Readings
+from .estimates import Estimates, Measurements, Mode
 from .reference import joined_references, late_rows, reference_track
 from .score import interpolated
 from .timeline import Timeline
@@ -39,20 +39,20 @@ def fuse(
     engine: Engine = "compiled",
     progress: Callable[[float], None] | None = None,
 ) -> Estimates:
-    """Blend a run's commands and readings into the best estimate of where the tool was.
+    """Blend a run's commands and measurements into the best estimate of where the tool was.
 
     Args:
         run: The recorded run.
         config: Arm, noise and sensors.
         sensors: Which of the configured sensors to use; all of them for None.
         rate: Estimates on an even grid [Hz] from the first command on; one for each command for None.
-        smooth: An estimate knows every reading of the run, later ones too.
-        as_live: An estimate knows only the readings that had arrived by then, as a live user would have had.
+        smooth: An estimate knows every measurement of the run, later ones too.
+        as_live: An estimate knows only the measurements that had arrived by then, as a live user would have had.
         engine: ``compiled``, or ``filterpy``, the reference: the same meaning, hundreds of times slower.
         progress: Called now and then by the reference engine with the share done, 0 to 1.
 
     Returns:
-        Estimates in the run's own coordinates, and what became of each reading.
+        Estimates in the run's own coordinates, and what became of each measurement.
 
     Warns:
         PumafuseWarning: For each anomaly in the data and each limit of the model that is passed.
@@ -66,7 +66,7 @@ def fuse(
     if engine not in get_args(Engine):
         raise ValueError(f"no engine '{engine}'; there are: {', '.join(get_args(Engine))}")
     if smooth and as_live:
-        raise ValueError("smooth uses every reading and as_live only those that had arrived; choose one")
+        raise ValueError("smooth uses every measurement and as_live only those that had arrived; choose one")
     mode: Mode = "smoothed" if smooth else "as-live" if as_live else "filtered"
     chosen = None if sensors is None else tuple(sensors)
     in_place, placed = in_axes(run, config.frame)
@@ -128,7 +128,7 @@ def _fuse_segment(
         time=seconds(times, origin),
         axes=fused.axes,
         cartesian=None if placed is None else _cartesian(placed, fused.axes),
-        readings=_readings(timeline, fused),
+        measurements=_measurements(timeline, fused),
         biases=fused.biases,
         reference=None if run.reference is None else reference_track(run.reference, origin),
         origin=origin,
@@ -161,18 +161,18 @@ def _highest_radius(run: Run, placed: Placed | None) -> float | None:
     return float(np.max(radial[np.isfinite(radial) & (run.command.stamp != NO_STAMP)]))
 
 
-def _readings(timeline: Timeline, fused: Fused) -> Readings:
-    scalars = timeline.scalars
-    return Readings(
-        time=seconds(scalars.valid, timeline.origin),
-        stamp=seconds(scalars.stamp, timeline.origin),
-        sensor=scalars.sensor,
-        axis=scalars.axis,
-        value=scalars.value,
+def _measurements(timeline: Timeline, fused: Fused) -> Measurements:
+    components = timeline.components
+    return Measurements(
+        time=seconds(components.valid, timeline.origin),
+        stamp=seconds(components.stamp, timeline.origin),
+        sensor=components.sensor,
+        axis=components.axis,
+        value=components.value,
         innovation=fused.innovation,
         innovation_sd=fused.innovation_sd,
         outcome=fused.outcome,
-        sensors=scalars.sensors,
+        sensors=components.sensors,
         axes=tuple(axis.name for axis in timeline.axes),
     )
 
@@ -195,7 +195,8 @@ def _joined(parts: Sequence[Estimates], said: Sequence[str]) -> Estimates:
         for name in first.cartesian or ()
     }
     shifted = [
-        replace(part.readings, time=part.readings.time + t, stamp=part.readings.stamp + t) for part, t, _ in numbers
+        replace(part.measurements, time=part.measurements.time + t, stamp=part.measurements.stamp + t)
+        for part, t, _ in numbers
     ]
     references = [(part.reference, shift, number) for part, shift, number in numbers if part.reference is not None]
     reference = joined_references(references) if references else None
@@ -204,7 +205,7 @@ def _joined(parts: Sequence[Estimates], said: Sequence[str]) -> Estimates:
         time=np.concatenate([part.time + shift for part, shift, _ in numbers]),
         axes=axes,
         cartesian=None if first.cartesian is None else cartesian,
-        readings=Readings.joined(shifted),
+        measurements=Measurements.joined(shifted),
         biases=parts[-1].biases,
         reference=reference,
         last_command=max(part.last_command + shift for part, shift, _ in numbers),

@@ -1,4 +1,4 @@
-"""What may become of a scalar, and the limits that decide it."""
+"""What may become of a component, and the limits that decide it."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ FARTHEST = 1e6  # m; what is farther is a sentinel, no position
 
 
 class Outcome(enum.IntEnum):
-    """What became of a scalar."""
+    """What became of a component."""
 
     FUSED = 0
-    GATED = 1
-    REOPENED = 2
+    REJECTED = 1
+    REACQUIRED = 2
     DUPLICATE = 3
     BEFORE_START = 4
     TOO_LATE = 5

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray
-from ..runs.clock import TOLERATED_STEP_BACK_NS, behind
-from ..runs.run import Reference
+from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
+from ..logs.run import Reference
 from ..units import seconds
 
 

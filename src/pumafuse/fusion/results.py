@@ -14,12 +14,12 @@ from .. import folders
 from ..arrays import FloatArray, IntArray
 from ..errors import RunError
 from ..folders import FolderError
-from ..runs import tables
-from ..runs.axes import in_axes
-from ..runs.clock import segments
-from ..runs.frames import Frame
-from ..runs.run import Run
-from ..runs.tables import Table
+from ..logs import tables
+from ..logs.axes import in_axes
+from ..logs.clock import segments
+from ..logs.frames import Frame
+from ..logs.run import Run
+from ..logs.tables import Table
 from ..units import MM, seconds
 from .estimates import Estimates
 from .outcome import Outcome
@@ -27,9 +27,14 @@ from .reference import ReferenceTrack, joined_references, reference_track
 from .score import Score, score
 from .summary import Summary, summarise
 
-ESTIMATES, READINGS, REFERENCE, SUMMARY = "estimates.parquet", "readings.parquet", "reference.parquet", "summary.json"
+ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY = (
+    "estimates.parquet",
+    "measurements.parquet",
+    "reference.parquet",
+    "summary.json",
+)
 OURS = frozenset(
-    {ESTIMATES, READINGS, REFERENCE, SUMMARY, "fusion.toml", "arm.toml"}
+    {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, "fusion.toml", "arm.toml"}
     | {"fused.rrd", "fused.png", "error.png", "validation.png"}
 )  # a folder with anything else in it is never replaced
 _REFERENCE_PREFIX = "reference."
@@ -91,7 +96,7 @@ def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], No
     summary = summarise(est)
     with folders.replacing(folder) as new:
         tables.write(_estimates_table(est), new / ESTIMATES)
-        tables.write(_readings_table(est), new / READINGS)
+        tables.write(_measurements_table(est), new / MEASUREMENTS)
         if est.reference is not None:
             tables.write(_reference_table(est.reference), new / REFERENCE)
         est.config.save(new)
@@ -169,8 +174,8 @@ def _estimates_table(est: Estimates) -> pa.Table:
     return pa.table({**columns, **_segment_column(est.segment)})
 
 
-def _readings_table(est: Estimates) -> pa.Table:
-    r = est.readings
+def _measurements_table(est: Estimates) -> pa.Table:
+    r = est.measurements
     return pa.table(
         {
             "time_s": _nullable(r.time),

@@ -28,7 +28,7 @@ from .kernels import (
 )
 from .outcome import Outcome
 
-_FUSED, _REOPENED = int(Outcome.FUSED), int(Outcome.REOPENED)
+_FUSED, _REACQUIRED = int(Outcome.FUSED), int(Outcome.REACQUIRED)
 
 
 @compiled
@@ -60,14 +60,14 @@ def replay(axes: Axes, sensors: Sensors, rows: Rows, state: State, met: Met, log
     """Every row at its valid time with the outcomes that ``met`` brings, whatever a gate would say now."""
     for row in range(len(rows.valid)):
         sensor = rows.sensor[row]
-        for scalar in range(rows.first[row], rows.end[row]):
-            advance(axes, state, log, rows.axis[scalar], rows.valid[row])
-            nu, S = predicted(axes, sensors, rows, state, scalar, sensor)
-            met.innovation[scalar], met.innovation_sd[scalar] = nu, math.sqrt(S)
-            if met.outcome[scalar] == _FUSED:
-                fuse(axes, sensors, rows, state, met, log, row, scalar, math.inf)
-            elif met.outcome[scalar] == _REOPENED:
-                fuse(axes, sensors, rows, state, met, log, row, scalar, 0.0)
+        for component in range(rows.first[row], rows.end[row]):
+            advance(axes, state, log, rows.axis[component], rows.valid[row])
+            nu, S = predicted(axes, sensors, rows, state, component, sensor)
+            met.innovation[component], met.innovation_sd[component] = nu, math.sqrt(S)
+            if met.outcome[component] == _FUSED:
+                fuse(axes, sensors, rows, state, met, log, row, component, math.inf)
+            elif met.outcome[component] == _REACQUIRED:
+                fuse(axes, sensors, rows, state, met, log, row, component, 0.0)
 
 
 @compiled

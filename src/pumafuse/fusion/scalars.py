@@ -1,6 +1,7 @@
-"""The scalars of all readings in their total order, and what is known of each before any filter.
+"""The components of all measurements in their total order, and what is known of each before any filter.
 
-Rows of one valid time come in the order of the sensors, then by stamp and place in the file; scalars of a row by axis.
+Rows of one valid time come in the order of the sensors, then by stamp and place in the file; components of a row by
+axis.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import NO_STAMP, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
-from ..runs.clock import TOLERATED_STEP_BACK_NS, behind
-from ..runs.defects import said_before, tell
-from ..runs.run import Run, Source
+from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
+from ..logs.defects import said_before, tell
+from ..logs.run import Run, Source
 from .config import FusionConfig, Sensor
 from .outcome import Outcome, plausible
 
@@ -29,8 +30,8 @@ _REASONS: Mapping[Outcome, str] = {
 
 
 @dataclass(frozen=True)
-class Scalars:
-    """The scalars of all readings in the order of processing; arrays are (m,).
+class Components:
+    """The components of all measurements in the order of processing; arrays are (m,).
 
     Attributes:
         valid: The instant each is true of, int64 ns (``NO_STAMP`` without a stamp).
@@ -38,7 +39,7 @@ class Scalars:
         sensor: Index into ``sensors``.
         axis: Index into the timeline's axes.
         value: z [m] as logged.
-        row: Scalars of one row of one sensor share this number; it never falls.
+        row: Components of one row of one sensor share this number; it never falls.
         spread: By what a frame scales the noise of each; None without one.
         outcome: What is known before filtering; ``Outcome.FUSED`` where the filter is to decide.
         sensors: Sensor names, the configured ones first in their order.
@@ -56,12 +57,12 @@ class Scalars:
 
     @cached_property
     def candidates(self) -> IntArray:
-        """Indices of the scalars that the filter is to decide on."""
+        """Indices of the components that the filter is to decide on."""
         return np.flatnonzero(self.outcome == Outcome.FUSED)
 
 
-def scalars_of(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int, notes: list[str]) -> Scalars:
-    """Put the readings of a run into their total order.
+def components_of(run: Run, config: FusionConfig, names: tuple[str, ...], origin: int, notes: list[str]) -> Components:
+    """Put the measurements of a run into their total order.
 
     Args:
         run: One segment of a recorded run.
@@ -78,7 +79,7 @@ def scalars_of(run: Run, config: FusionConfig, names: tuple[str, ...], origin: i
     order = np.argsort(valid, kind="stable")
     width = np.array([len(part.axes) for part in heard], dtype=np.int64)[sensor[order]]
     count = int(width.sum())
-    first = np.empty(len(order), dtype=np.int64)  # where each row's scalars begin
+    first = np.empty(len(order), dtype=np.int64)  # where each row's components begin
     first[order] = np.cumsum(width) - width
     axis, value, outcome = np.empty(count, np.int16), np.empty(count), np.empty(count, np.uint8)
     spread = np.ones(count) if any(run.sensors[name].spread for name in names) else None
@@ -91,7 +92,7 @@ def scalars_of(run: Run, config: FusionConfig, names: tuple[str, ...], origin: i
             axis[here], value[here], outcome[here] = number, part.value[place], part.outcome[place]
             if spread is not None and part.spread is not None:
                 spread[here] = part.spread[place]
-    return Scalars(
+    return Components(
         np.repeat(valid[order], width),
         np.repeat(stamp[order], width),
         np.repeat(sensor[order], width),

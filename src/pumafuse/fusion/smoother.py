@@ -1,6 +1,6 @@
-"""The smoother: what all later readings say of a state, carried backward over the events as information.
+"""The smoother: what all later measurements say of a state, carried backward over the events as information.
 
-In the deviation δ from the filter's own mean the inputs cancel, and the later readings' likelihood is
+In the deviation δ from the filter's own mean the inputs cancel, and the later measurements' likelihood is
 exp(−½ δᵀ N δ + ηᵀ δ). From the last event backward, N = 0 and η = 0 at first:
 
     over an interval   η ← Fᵀ (I + N Q)⁻¹ η,            N ← Fᵀ (I + N Q)⁻¹ N F
@@ -41,7 +41,7 @@ def hindsight(track: Track, plant: Plant) -> Hindsight:
         H, nu, R = updates.H[number], updates.nu[number], updates.R[number]
         before_eta = later_eta + later_N @ updates.K[number] * nu + H * (nu / R)
         before_N = later_N + np.outer(H, H) / R
-        if updates.widened[number] > 0.0:  # a gate that reopened let the offset move
+        if updates.widened[number] > 0.0:  # a gate that reacquired let the offset move
             jump = np.zeros((size, size))
             jump[offset, offset] = updates.widened[number]
             before_eta, before_N = _over(np.eye(size), jump, before_eta, before_N)

@@ -1,4 +1,4 @@
-"""The compiled smoother: what all later readings say of a state, carried backward as η and N.
+"""The compiled smoother: what all later measurements say of a state, carried backward as η and N.
 
 The same algebra as :mod:`pumafuse.fusion.smoother`, which says where it comes from. Over an update
 η ← η + N K ν + Hᵀ ν / R and N ← N + Hᵀ H / R; over an interval through its noise, one independent part at a time, and
@@ -86,7 +86,7 @@ def pass_noise(
 
 @compiled
 def root(N: FloatArray, eta: FloatArray, at: int, states: int, L: FloatArray, left: FloatArray) -> None:
-    """N[at] = L Lᵀ and η[at] = L y: as columns, readings with unit noise; y is the last row of L (s + 1, s).
+    """N[at] = L Lᵀ and η[at] = L y: as columns, measurements with unit noise; y is the last row of L (s + 1, s).
 
     The state with the largest share of its own information left comes first: N says nothing of some states, or of
     their differences, and in another order a pivot of rounding would be divided by. ``left`` (s,) is room for what is
@@ -131,7 +131,7 @@ def smooth_output(
     L: FloatArray,
     outputs: Outputs,
 ) -> None:
-    """P_s = (I + P N)⁻¹ P and x_s = x + P_s η, reading by reading: at once, wide priors would cancel in P_s η."""
+    """P_s = (I + P N)⁻¹ P and x_s = x + P_s η, measurement by measurement: at once, wide priors would cancel in P_s η."""
     x, P, states = held.x[axis], held.P[axis], axes.states[axis]
     root(N, eta, at, states, L, work[3])
     for k in range(states):
@@ -163,10 +163,10 @@ def smooth_run(
     L: FloatArray,
     outputs: Outputs,
 ) -> None:
-    """Estimates that know every reading: the filter's, with what all later ones say, carried backward as η and N.
+    """Estimates that know every measurement: the filter's, with what all later ones say, carried backward as η and N.
 
-    Over an update η ← η + N K ν + Hᵀ ν / R and N ← N + Hᵀ H / R. ``sensor_of`` is the sensor of each scalar; η (2, s),
-    N (2, s, s), ``work`` (4, s) and L (s + 1, s) are room to compute in.
+    Over an update η ← η + N K ν + Hᵀ ν / R and N ← N + Hᵀ H / R. ``sensor_of`` is the sensor of each component; η (2,
+    s), N (2, s, s), ``work`` (4, s) and L (s + 1, s) are room to compute in.
     """
     for axis in range(len(axes.order)):
         states, n = axes.states[axis], len(times) - 1
@@ -183,7 +183,7 @@ def smooth_run(
                 n -= 1
             if first:
                 break
-            if log.scalar[entry] < 0:
+            if log.component[entry] < 0:
                 start = log.time[entry - 1] if entry > log.first[axis] else origin
                 q, d = log.noise[entry], log.drift[entry]
                 while n >= 0 and times[n] > start:
@@ -196,7 +196,7 @@ def smooth_run(
                     n -= 1
                 carry_back(axes, axis, states, eta, N, 0, until - start, q, d, work)
             else:
-                take_back(axes, sensors, axis, sensor_of[log.scalar[entry]], met, log, entry, eta, N, work)
+                take_back(axes, sensors, axis, sensor_of[log.component[entry]], met, log, entry, eta, N, work)
             entry -= 1
 
 
@@ -216,7 +216,7 @@ def take_back(
     """η[0] and N[0] over an update, backward."""
     states = axes.states[axis]
     observation(axes, sensors, axis, sensor, work)
-    nu, R = met.innovation[log.scalar[entry]], log.noise[entry]
+    nu, R = met.innovation[log.component[entry]], log.noise[entry]
     for i in range(states):
         for j in range(states):
             eta[0, i] += N[0, i, j] * log.gain[entry, j] * nu
@@ -224,5 +224,5 @@ def take_back(
     for i in range(states):
         for j in range(states):
             N[0, i, j] += work[0, i] * work[0, j] / R
-    if log.drift[entry] > 0.0:  # a gate that reopened let the offset move
+    if log.drift[entry] > 0.0:  # a gate that reacquired let the offset move
         pass_noise(eta, N, 0, states, axes.order[axis], math.sqrt(log.drift[entry]), 0.0, work)

@@ -19,11 +19,11 @@ class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):
     """One sensor on one axis.
 
     Attributes:
-        outcomes: How many scalars met each outcome, those that occur.
-        innovation_rms_mm: Root mean square of the fused scalars' innovations; null without any. Of a sensor with a
+        outcomes: How many components met each outcome, those that occur.
+        innovation_rms_mm: Root mean square of the fused components' innovations; null without any. Of a sensor with a
             bias the first is left out.
         innovation_sd_mm: Root mean square of what the filter expected of them.
-        nis_mean: Mean ν²/S of the fused scalars; 1 for a consistent filter.
+        nis_mean: Mean ν²/S of the fused components; 1 for a consistent filter.
         nis_band: Where that mean lies in 95 % of cases for a consistent filter.
         correlation: Autocorrelation of the innovations at lags 1, 2, …
         correlation_band: White innovations' autocorrelations lie within ± this in 95 % of cases.
@@ -70,11 +70,11 @@ class AxisSummary(msgspec.Struct, frozen=True, kw_only=True):
     """One axis.
 
     Attributes:
-        sensors: By name, those with scalars on this axis.
-        log_likelihood: Of its scalars, with positions in mm.
+        sensors: By name, those with components on this axis.
+        log_likelihood: Of its components, with positions in mm.
         score: Against the reference; null without one.
         nees_band: Where the mean NEES lies in 95 % of cases for a consistent filter that knows as many independent
-            errors as scalars; null without scalars.
+            errors as components; null without components.
     """
 
     sensors: dict[str, SensorSummary]
@@ -99,8 +99,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         pumafuse: Version that wrote it.
         run: The run's name.
         arm: The arm's name.
-        mode: Which readings an estimate knows: ``filtered`` (all valid by then), ``as-live`` (those that had arrived)
-            or ``smoothed`` (all of the run).
+        mode: Which measurements an estimate knows: ``filtered`` (all valid by then), ``as-live`` (those that had
+            arrived) or ``smoothed`` (all of the run).
         engine: Which engine computed it.
         origin_ns: Stamp of the first command: time 0 of every table.
         duration_s: From the first to the last estimate.
@@ -162,7 +162,7 @@ def score_summary(found: Score) -> ScoreSummary:
 
 
 def _axis_summary(est: Estimates, axis: str) -> AxisSummary:
-    mine = est.readings.where(est.readings.axis == est.readings.axes.index(axis))
+    mine = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
     sensors = {name: _sensor_summary(est, name, axis) for name in mine.sensors if len(mine.of(name, axis).value)}
     found = None
     if est.reference is not None:
@@ -177,14 +177,16 @@ def _axis_summary(est: Estimates, axis: str) -> AxisSummary:
 
 
 def _sensor_summary(est: Estimates, sensor: str, axis: str) -> SensorSummary:
-    readings, found = est.readings.of(sensor, axis), consistency(est, sensor, axis)
+    measurements, found = est.measurements.of(sensor, axis), consistency(est, sensor, axis)
     if found is None:
-        return SensorSummary(outcomes=readings.counts())
-    fused = readings.where(readings.outcome == Outcome.FUSED)
+        return SensorSummary(outcomes=measurements.counts())
+    fused = measurements.where(measurements.outcome == Outcome.FUSED)
     bias = est.biases.get(sensor, {}).get(axis)
-    learnt = 0 if bias is None or len(fused.value) == 1 else 1  # the first reading of a biased sensor tells its bias
+    learnt = (
+        0 if bias is None or len(fused.value) == 1 else 1
+    )  # the first measurement of a biased sensor tells its bias
     return SensorSummary(
-        outcomes=readings.counts(),
+        outcomes=measurements.counts(),
         innovation_rms_mm=float(np.sqrt(np.mean(fused.innovation[learnt:] ** 2))) * MM,
         innovation_sd_mm=float(np.sqrt(np.mean(fused.innovation_sd[learnt:] ** 2))) * MM,
         nis_mean=found.nis,

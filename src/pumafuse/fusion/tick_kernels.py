@@ -29,7 +29,7 @@ def filter_one(
     prior: float | None,
     delay: int,
     command: FloatArray,
-    readings: FloatArray,
+    measurements: FloatArray,
     likelihood: FloatArray,
     position: FloatArray,
     position_sd: FloatArray,
@@ -50,14 +50,14 @@ def filter_one(
     x, rate, offset, recent, earlier = 0.0, 0.0, 0.0, 0.0, 0.0
     a, b, c, d, e, f = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0 if prior is None else prior
     product, total, since, wanted = 1.0, 0.0, 0, position.shape[1] > 0
-    for n in range(len(readings)):
+    for n in range(len(measurements)):
         if prior is None:
             h0, h1, h2, mean = a, b, 0.0, x
             S = a + R
         else:
             h0, h1, h2, mean = a + d, b + e, d + f, x + offset
             S = h0 + h2 + R
-        nu = readings[n] - mean if abs(readings[n]) < math.inf else math.nan
+        nu = measurements[n] - mean if abs(measurements[n]) < math.inf else math.nan
         there, weight = nu == nu, 1.0 / S
         told, kept = (nu * weight, R * weight) if there else (0.0, 1.0)
         if there:
@@ -71,7 +71,7 @@ def filter_one(
             innovation[0, n], innovation_sd[0, n] = nu, math.sqrt(S)
         if len(before):
             before[n, 0], before[n, 1], before[n, 2], before[n, 3] = mean, h0, h1, h2
-        elif wanted:  # H P Hᵀ after the reading is as written: a + 2 d + f would cancel
+        elif wanted:  # H P Hᵀ after the measurement is as written: a + 2 d + f would cancel
             position[0, n], position_sd[0, n] = mean + (h0 + h2) * told, math.sqrt((h0 + h2) * kept)
         earlier, recent = recent, command[n - delay] if n >= delay else 0.0
         x, rate = (
@@ -111,7 +111,7 @@ def smooth_one(
     """Modified Bryson-Frazier, backward: λ and Λ say what later innovations ask of the prediction at each step.
 
     Bierman, "Fixed interval smoothing with discrete measurements", Int. J. Control 18(1), 1973. It inverts nothing;
-    each estimate is corrected after its own reading, where a wide prior is gone.
+    each estimate is corrected after its own measurement, where a wide prior is gone.
     """
     f11, f12, f21, f22, R = model[0], model[1], model[2], model[3], model[12]
     l0, l1, l2 = 0.0, 0.0, 0.0
@@ -120,7 +120,7 @@ def smooth_one(
         h0, h1, h2 = before[n, 1], before[n, 2], 0.0 if prior is None else before[n, 3]
         weight = 1.0 / (h0 + h2 + R)
         if abs(innovation[0, n]) < math.inf:
-            told, kept = innovation[0, n] * weight, R * weight  # P Hᵀ after the reading is P Hᵀ R / S
+            told, kept = innovation[0, n] * weight, R * weight  # P Hᵀ after the measurement is P Hᵀ R / S
         else:
             told, kept, weight = 0.0, 1.0, 0.0
         g0, g1, g2 = h0 * kept, h1 * kept, h2 * kept
@@ -160,7 +160,7 @@ def filter_many(
     prior: float | None,
     delay: int,
     command: FloatArray,
-    readings: FloatArray,
+    measurements: FloatArray,
     likelihood: FloatArray,
     position: FloatArray,
     position_sd: FloatArray,
@@ -172,11 +172,11 @@ def filter_many(
 ) -> None:
     """Runs ``first`` to ``end``, LANES at a time; outputs of no columns are not wanted, ``prior`` as for one.
 
-    ``command`` and ``readings`` have a row for each run, or one for all. ``room`` holds what each lane is at, one
+    ``command`` and ``measurements`` have a row for each run, or one for all. ``room`` holds what each lane is at, one
     quantity after the other: x, rate, offset, P (a b c d e f), v[n−d], Σ ν²/S + ln 2π, Π S, Σ ln Π S; then its model;
-    then a tile of TILE steps of readings, commands and the four outputs, so that memory is met in whole lines.
+    then a tile of TILE steps of measurements, commands and the four outputs, so that memory is met in whole lines.
     """
-    steps, wanted = readings.shape[1], position.shape[1] > 0
+    steps, wanted = measurements.shape[1], position.shape[1] > 0
     for block in range(first, end, LANES):
         for lane in range(LANES):
             run = min(block + lane, end - 1)
@@ -190,10 +190,10 @@ def filter_many(
             length = min(TILE, steps - start)
             for lane in range(LANES):
                 run = min(block + lane, end - 1)
-                heard, told = min(run, readings.shape[0] - 1), min(run, command.shape[0] - 1)
+                heard, told = min(run, measurements.shape[0] - 1), min(run, command.shape[0] - 1)
                 for k in range(length):
                     n = start + k
-                    room[(_TILE + k) * LANES + lane] = readings[heard, n]
+                    room[(_TILE + k) * LANES + lane] = measurements[heard, n]
                     room[(_TILE + TILE + k) * LANES + lane] = command[told, n - delay] if n >= delay else 0.0
             for k in range(length):
                 step = k & (TILE - 1)  # k itself, but seen not to be negative, without which no loop is a vector's

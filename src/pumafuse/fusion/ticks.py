@@ -1,4 +1,4 @@
-"""The tight path: one axis on its ticks, one sensor, readings at the ticks or missing; one run, or many at a time.
+"""The tight path: one axis on its ticks, one sensor, measurements at the ticks or missing; one run, or many at a time.
 
 Everything is even here, so one :class:`DiscreteModel` is all there is to know. Runs (or parameter sets on one run) lie
 side by side, so that the compiler makes vector instructions of the loop across them; each core takes its share.
@@ -24,14 +24,14 @@ from . import tick_kernels as kernels
 
 @dataclass(frozen=True)
 class TickEstimates:
-    """Estimates at the ticks, relative to the level at which the arm rested; shapes follow the readings.
+    """Estimates at the ticks, relative to the level at which the arm rested; shapes follow the measurements.
 
     Attributes:
-        position: p at each tick [m], with every reading up to it; with all of them where smoothed.
+        position: p at each tick [m], with every measurement up to it; with all of them where smoothed.
         position_sd: Its standard deviation [m].
-        innovation: Reading less its prediction [m], NaN where missing.
+        innovation: Measurement less its prediction [m], NaN where missing.
         innovation_sd: Its predicted standard deviation [m].
-        log_likelihood: Of each run's readings (in metres), one number a run.
+        log_likelihood: Of each run's measurements (in metres), one number a run.
     """
 
     position: FloatArray
@@ -44,12 +44,12 @@ class TickEstimates:
 def filter_ticks(
     model: DiscreteModel | Sequence[DiscreteModel],
     command: npt.ArrayLike,
-    readings: npt.ArrayLike,
+    measurements: npt.ArrayLike,
     sd: npt.ArrayLike,
     *,
     offset_sd: float = 0.0,
 ) -> TickEstimates:
-    """Filter runs whose readings are all at ticks, as :func:`pumafuse.fuse` would with this plant and noise, faster.
+    """Filter runs whose measurements are all at ticks, as :func:`pumafuse.fuse` would with this plant and noise, faster.
 
     There is no gain here (``command`` is v, what the gain makes of u) and no gate, and the prior of the offset is 0
     unless it is given (that of :class:`pumafuse.Start` is 5 mm).
@@ -57,46 +57,46 @@ def filter_ticks(
     Args:
         model: From :func:`pumafuse.discretize`, for all runs or one for each; of one delay and period.
         command: v [m] relative to the level at rest, (steps,) for all runs or (runs, steps).
-        readings: z [m] likewise, (steps,) for one run or (runs, steps); what is not finite, or masked, is missing.
-        sd: Noise of the readings [m], one for all or one for each run.
+        measurements: z [m] likewise, (steps,) for one run or (runs, steps); what is not finite, or masked, is missing.
+        sd: Noise of the measurements [m], one for all or one for each run.
         offset_sd: Prior standard deviation of the offset [m].
 
     Raises:
         ValueError: Shapes do not fit, or the models are of several delays.
     """
-    many = _Many.of(model, command, readings, sd, offset_sd)
+    many = _Many.of(model, command, measurements, sd, offset_sd)
     outputs = _room(many.runs, many.steps)
     likelihood = many.filter(outputs)
-    return _shaped(outputs, likelihood, readings)
+    return _shaped(outputs, likelihood, measurements)
 
 
 def smooth_ticks(
-    model: DiscreteModel, command: npt.ArrayLike, readings: npt.ArrayLike, sd: float, *, offset_sd: float = 0.0
+    model: DiscreteModel, command: npt.ArrayLike, measurements: npt.ArrayLike, sd: float, *, offset_sd: float = 0.0
 ) -> TickEstimates:
-    """One run as :func:`filter_ticks` has it, with positions that know every reading of the run.
+    """One run as :func:`filter_ticks` has it, with positions that know every measurement of the run.
 
     Raises:
         ValueError: As :func:`filter_ticks`.
     """
-    many = _Many.of(model, command, readings, sd, offset_sd)
+    many = _Many.of(model, command, measurements, sd, offset_sd)
     if many.runs != 1:
         raise ValueError("smooth_ticks takes one run at a time")
     outputs, before = _room(1, many.steps), np.empty((many.steps, 4))
     likelihood = many.filter(outputs, before)
     kernels.smooth_one(many.models[0], many.prior, outputs[2], before, *outputs[:2])
-    return _shaped(outputs, likelihood, readings)
+    return _shaped(outputs, likelihood, measurements)
 
 
 def tick_likelihood(
     model: DiscreteModel | Sequence[DiscreteModel],
     command: npt.ArrayLike,
-    readings: npt.ArrayLike,
+    measurements: npt.ArrayLike,
     sd: npt.ArrayLike,
     *,
     offset_sd: float = 0.0,
 ) -> FloatArray:
     """Only the log-likelihood of :func:`filter_ticks`, for each run or parameter set, (runs,)."""
-    many = _Many.of(model, command, readings, sd, offset_sd)
+    many = _Many.of(model, command, measurements, sd, offset_sd)
     return many.filter(_room(many.runs, 0))
 
 
@@ -104,9 +104,9 @@ _LEAST, _MOST = 1e-15, 1e15  # m; squares and products of eight of them fit
 _Outputs: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
-def _shaped(outputs: _Outputs, likelihood: FloatArray, readings: npt.ArrayLike) -> TickEstimates:
+def _shaped(outputs: _Outputs, likelihood: FloatArray, measurements: npt.ArrayLike) -> TickEstimates:
     """One run given as (steps,) comes back as (steps,)."""
-    flat = np.ndim(readings) == 1 and len(likelihood) == 1
+    flat = np.ndim(measurements) == 1 and len(likelihood) == 1
     return TickEstimates(*(part[0] if flat else part for part in outputs), log_likelihood=likelihood)
 
 
@@ -125,14 +125,14 @@ class _Many:
         prior: Variance of the offset at the start [m²]; None where there is none, ever.
         delay: Whole ticks of delay.
         command: (1 or runs, steps).
-        readings: (1 or runs, steps).
+        measurements: (1 or runs, steps).
     """
 
     models: FloatArray
     prior: float | None
     delay: int
     command: FloatArray
-    readings: FloatArray
+    measurements: FloatArray
 
     @property
     def runs(self) -> int:
@@ -140,29 +140,34 @@ class _Many:
 
     @property
     def steps(self) -> int:
-        return self.readings.shape[1]
+        return self.measurements.shape[1]
 
     @staticmethod
     def of(
         model: DiscreteModel | Sequence[DiscreteModel],
         command: npt.ArrayLike,
-        readings: npt.ArrayLike,
+        measurements: npt.ArrayLike,
         sd: npt.ArrayLike,
         offset_sd: float,
     ) -> _Many:
         models = [model] if isinstance(model, DiscreteModel) else list(model)
-        u, z = _in_rows(command), _in_rows(readings)
+        u, z = _in_rows(command), _in_rows(measurements)
         noise = np.atleast_1d(np.asarray(sd, dtype=np.float64))
         runs = max(len(models), len(u), len(z), len(noise))
-        for name, count in (("models", len(models)), ("commands", len(u)), ("readings", len(z)), ("sd", len(noise))):
+        for name, count in (
+            ("models", len(models)),
+            ("commands", len(u)),
+            ("measurements", len(z)),
+            ("sd", len(noise)),
+        ):
             if count not in (1, runs):
                 raise ValueError(f"{name} are for {count} runs, others for {runs}; give one for all, or one each")
         if u.ndim != 2 or z.ndim != 2:
-            raise ValueError("commands and readings are (steps,) or (runs, steps)")
+            raise ValueError("commands and measurements are (steps,) or (runs, steps)")
         if not np.isfinite(u).all():
             raise ValueError("a command that is not a finite number")
         if u.shape[1] != z.shape[1]:
-            raise ValueError(f"{u.shape[1]} commands and {z.shape[1]} readings a run; give one of each for a tick")
+            raise ValueError(f"{u.shape[1]} commands and {z.shape[1]} measurements a run; give one of each for a tick")
         if len({(one.delay, one.period) for one in models}) > 1:
             raise ValueError("the models are of several delays or periods; give one at a time")
         if noise.ndim != 1 or not ((noise >= _LEAST) & (noise <= _MOST)).all() or not 0.0 <= offset_sd <= _MOST:
@@ -182,13 +187,13 @@ class _Many:
         likelihood = np.zeros(self.runs)
         if self.runs == 1:
             before = np.empty((0, 4)) if before is None else before
-            one = (self.models[0], self.prior, self.delay, self.command[0], self.readings[0], likelihood)
+            one = (self.models[0], self.prior, self.delay, self.command[0], self.measurements[0], likelihood)
             kernels.filter_one(*one, *outputs, before)
             return likelihood
         cores, groups = usable_cores(), -(-self.runs // kernels.LANES)
         edges = [groups * part // cores * kernels.LANES for part in range(cores)] + [self.runs]
         shares = [(first, end) for first, end in pairwise(edges) if first < end]
-        many = (self.models, self.prior, self.delay, self.command, self.readings, likelihood)
+        many = (self.models, self.prior, self.delay, self.command, self.measurements, likelihood)
 
         def work(share: tuple[int, int]) -> None:
             kernels.filter_many(*many, *outputs, *share, np.empty(kernels.ROOM))

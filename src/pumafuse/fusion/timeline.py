@@ -1,8 +1,8 @@
-"""The total order of events: what acts on the plant when, and which reading is valid when.
+"""The total order of events: what acts on the plant when, and which measurement is valid when.
 
-Time is int64 ns. At one instant commands come before readings, then sensors in the order of ``fusion.toml``, then
+Time is int64 ns. At one instant commands come before measurements, then sensors in the order of ``fusion.toml``, then
 stamp, place in the file and axis. The axes are independent but for row gates, so rows are kept together and each axis
-still meets its scalars in the order (time, sensor, stamp, place in the file).
+still meets its components in the order (time, sensor, stamp, place in the file).
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import numpy as np
 
 from ..arrays import FloatArray, TimeArray
 from ..errors import RunError, UnknownNameError
+from ..logs.frames import CARTESIAN
+from ..logs.run import Run
 from ..model.drive import Drive, drive
-from ..runs.frames import CARTESIAN
-from ..runs.run import Run
 from .commands import given_commands
+from .components import Components, components_of
 from .config import FusionConfig
-from .scalars import Scalars, scalars_of
 
-LONGEST_TAIL_NS = 3_600_000_000_000  # readings this long after the last command no longer belong to the run
+LONGEST_TAIL_NS = 3_600_000_000_000  # measurements this long after the last command no longer belong to the run
 _MOST_ESTIMATES = 10_000_000
 
 
@@ -59,9 +59,9 @@ class Timeline:
         origin: The first command, int ns: time 0 of the run.
         commands: Stamps of the commands, ascending, int64 ns, (n,).
         axes: What drives each axis.
-        scalars: The readings.
-        end: Where an even grid of estimates ends, int ns: with the last command or reading. Readings an hour after the
-            last command are on another clock.
+        components: The measurements.
+        end: Where an even grid of estimates ends, int ns: with the last command or measurement. Measurements an hour
+            after the last command are on another clock.
         speed: Highest commanded speed on any axis [m/s].
         notes: Every anomaly once: how many, where first.
     """
@@ -69,14 +69,14 @@ class Timeline:
     origin: int
     commands: TimeArray
     axes: tuple[AxisInput, ...]
-    scalars: Scalars
+    components: Components
     end: int
     speed: float
     notes: tuple[str, ...]
 
 
 def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) -> Timeline:
-    """Put a run's commands and readings into their total order.
+    """Put a run's commands and measurements into their total order.
 
     Args:
         run: One segment of a recorded run.
@@ -113,12 +113,12 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     named = tuple(name for name in config.sensor_names(sensors) if name in run.sensors)
     others = tuple(name for name in run.sensors if name not in config.sensors) if sensors is None else ()
     silent = [name for name in config.sensor_names(sensors) if name not in run.sensors]
-    notes.extend(f"sensor '{name}' of the configuration has no readings in this run" for name in silent)
-    scalars = scalars_of(run, config, named + others, origin, notes)
-    valid = scalars.valid[scalars.candidates]
+    notes.extend(f"sensor '{name}' of the configuration has no measurements in this run" for name in silent)
+    components = components_of(run, config, named + others, origin, notes)
+    valid = components.valid[components.candidates]
     end = int(valid[valid <= commands[-1] + LONGEST_TAIL_NS].max(initial=commands[-1]))
     speed = max(axis.drive.speed for axis in inputs)
-    return Timeline(origin, commands, tuple(inputs), scalars, end, speed, tuple(notes))
+    return Timeline(origin, commands, tuple(inputs), components, end, speed, tuple(notes))
 
 
 def output_times(timeline: Timeline, rate: float | None) -> TimeArray:

@@ -24,8 +24,8 @@ class Updates:
         H: Its observation row, (u, s).
         K: Its Kalman gain, (u, s).
         nu: Its innovation [m], (u,).
-        R: Its reading's variance [m²], (u,).
-        widened: By how much a reopened gate widened the offset's variance just before [m²], (u,).
+        R: Its measurement's variance [m²], (u,).
+        widened: By how much a reacquired gate widened the offset's variance just before [m²], (u,).
     """
 
     entry: IntArray
@@ -67,7 +67,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Hindsight:
-    """What all later readings say of states, as information on the deviation from the filter's mean.
+    """What all later measurements say of states, as information on the deviation from the filter's mean.
 
     Attributes:
         eta: η, (k, s).
@@ -84,11 +84,11 @@ class Filtered:
 
     Attributes:
         tracks: For each axis; one state for each event, or one for each output when filtered as live.
-        innovation: ν [m] of each scalar, NaN where the filter never met it, (m,).
+        innovation: ν [m] of each component, NaN where the filter never met it, (m,).
         innovation_sd: √S [m], likewise.
-        outcome: What became of each scalar, (m,).
+        outcome: What became of each component, (m,).
         biases: For each axis the names of the sensors whose bias is in its state, in order.
-        final: For each axis mean (s,) and covariance (s, s) after every reading.
+        final: For each axis mean (s,) and covariance (s, s) after every measurement.
     """
 
     tracks: tuple[Track, ...]
@@ -136,10 +136,10 @@ class Fused:
 
     Attributes:
         axes: Estimates by axis.
-        innovation: ν [m] of each scalar, NaN where the filter never met it, (m,).
+        innovation: ν [m] of each component, NaN where the filter never met it, (m,).
         innovation_sd: √S [m], likewise.
-        outcome: What became of each scalar, (m,).
-        biases: By sensor and axis, as all readings together know it.
+        outcome: What became of each component, (m,).
+        biases: By sensor and axis, as all measurements together know it.
     """
 
     axes: dict[str, AxisEstimate]
@@ -193,7 +193,7 @@ def estimate(
         time: Int64 ns, none before its state.
         plant: The plant of the axis.
         start: The level u₀ [m] that the states are relative to.
-        hindsight: What later readings say of the state at each time.
+        hindsight: What later measurements say of the state at each time.
     """
     A, B, C = plant.state_space()
     n, size = len(A), track.mean.shape[1]

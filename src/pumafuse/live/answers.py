@@ -10,17 +10,17 @@ from typing import NamedTuple
 from ..errors import UnknownNameError
 from ..fusion.outcome import Outcome
 
-MET = frozenset({Outcome.FUSED, Outcome.REOPENED, Outcome.GATED})  # of what was compared with its prediction
+MET = frozenset({Outcome.FUSED, Outcome.REACQUIRED, Outcome.REJECTED})  # of what was compared with its prediction
 _BEST = (  # first
     Outcome.FUSED,
-    Outcome.REOPENED,
-    Outcome.GATED,
-    *(outcome for outcome in Outcome if outcome > Outcome.REOPENED),
+    Outcome.REACQUIRED,
+    Outcome.REJECTED,
+    *(outcome for outcome in Outcome if outcome > Outcome.REACQUIRED),
 )
 _REASONS: Mapping[Outcome, str] = {
     Outcome.FUSED: "taken",
-    Outcome.GATED: "farther from its prediction than the sensor's gate allows",
-    Outcome.REOPENED: "the gate was reopened after many rejections in a row: the offset was widened, the reading taken",
+    Outcome.REJECTED: "farther from its prediction than the sensor's gate allows",
+    Outcome.REACQUIRED: "the gate was reacquired after many rejections in a row: the offset was widened, the measurement taken",
     Outcome.DUPLICATE: "said before: the same stamp and values, or a command repeated within half a period",
     Outcome.BEFORE_START: "valid before the first command",
     Outcome.TOO_LATE: "stamped before the window",
@@ -29,12 +29,12 @@ _REASONS: Mapping[Outcome, str] = {
 }
 
 
-class Told(NamedTuple):
+class UpdateResult(NamedTuple):
     """What became of an event.
 
     Attributes:
-        outcome: Of the event: of its axes the best, ``fused`` before ``reopened`` before ``gated`` and so on. A command
-            that is taken is ``fused``, too.
+        outcome: Of the event: of its axes the best, ``fused`` before ``reacquired`` before ``rejected`` and so on. A
+            command that is taken is ``fused``, too.
         axes: Of each axis that it gives.
         reason: In words.
     """
@@ -72,7 +72,7 @@ class LiveEstimate:
         stamp: At which instant, int ns.
         axes: Every axis that has been commanded.
         cartesian: With a frame, x, y and z [m] as far as the axes give them.
-        stale: Axes on which no reading was fused for longer than the limit.
+        stale: Axes on which no measurement was fused for longer than the limit.
         outcome: ``fused``; ``before_start`` or ``too_late`` where there is no estimate; ``invalid`` where there is none
             that far ahead.
         reason: In words.
@@ -101,11 +101,11 @@ class LiveEstimate:
         return self.axes[axis]
 
 
-def told_of(outcomes: Mapping[str, Outcome]) -> Told:
+def told_of(outcomes: Mapping[str, Outcome]) -> UpdateResult:
     """What is told of an event by the outcome of each of its axes, of which there is at least one."""
     best = min(outcomes.values(), key=_BEST.index)
     reasons = "; ".join(dict.fromkeys(_REASONS[outcome] for outcome in outcomes.values()))
-    return Told(best, MappingProxyType(dict(outcomes)), reasons)
+    return UpdateResult(best, MappingProxyType(dict(outcomes)), reasons)
 
 
 def nowhere(stamp: int, outcome: Outcome, reason: str) -> LiveEstimate:

@@ -11,9 +11,9 @@ from ..errors import ConfigError, RunError, suggestion
 from ..fusion.config import FusionConfig
 from ..fusion.outcome import FARTHEST, Outcome
 from ..fusion.timeline import LONGEST_TAIL_NS
+from ..logs.frames import CARTESIAN, Cylindrical
 from ..model.arm import ordered_axes
-from ..runs.frames import CARTESIAN, Cylindrical
-from .answers import AxisNow, LiveEstimate, Told, nowhere, told_of
+from .answers import AxisNow, LiveEstimate, UpdateResult, nowhere, told_of
 from .clock import Clock, Time, Verdict, nanoseconds
 from .health import Health, health_of
 from .memory import ABSENT
@@ -80,7 +80,7 @@ class LiveEstimator:
         Args:
             config: Arm, noise, sensors, and the frame for sources in x, y, z.
             window: How late an event may be [s].
-            stale_after: For how long [s] an axis may go without a fused reading until it is called stale.
+            stale_after: For how long [s] an axis may go without a fused measurement until it is called stale.
             start: Level [m] of axes that do not rest at their first command before it; x and y with a frame.
             on_notice: Is told in one sentence what a user should know: a clock set anew, and the like; of what happens
                 again and again the first time, the tenth, the hundredth …
@@ -107,7 +107,7 @@ class LiveEstimator:
         self._strangers = self._refusals = 0
         self._doubtful = 0  # commands that may have to be taken back
         self._commands = dict.fromkeys(Outcome, 0)
-        self._answers: dict[bytes, Told] = {}
+        self._answers: dict[bytes, UpdateResult] = {}
         self._aside: list[tuple[_Event, Outcome]] = []
         self._clock = Clock(round(window * 1e9))
         self._start, self._before = dict(start or {}), None
@@ -119,12 +119,12 @@ class LiveEstimator:
         place = dict.fromkeys((*self.axes, *(CARTESIAN if self.config.frame is not None else ())), 1.0)
         other.command(0, **place)
         for sensor in self.config.sensors:
-            other.reading(0, sensor, **place)
+            other.measurement(0, sensor, **place)
         other.estimate()
         other.health()
         other._window.rehearse()
 
-    def command(self, t: Time, /, **axes: float) -> Told:
+    def command(self, t: Time, /, **axes: float) -> UpdateResult:
         """The arm is told to go to a position [m] on each of ``axes``.
 
         Args:
@@ -133,7 +133,7 @@ class LiveEstimator:
         """
         return self._take(t, None, axes)
 
-    def reading(self, t: Time, sensor: str, /, **axes: float) -> Told:
+    def measurement(self, t: Time, sensor: str, /, **axes: float) -> UpdateResult:
         """A sensor says where the tool was.
 
         Args:
@@ -147,7 +147,7 @@ class LiveEstimator:
         """Where the tool is.
 
         Args:
-            at: In the past, within the window: filtered by all readings valid until then that have come so far. In
+            at: In the past, within the window: filtered by all measurements valid until then that have come so far. In
                 the future: predicted with the last command held. None: at the newest stamp (but not at one that a
                 sensor alone has run ahead to).
         """
@@ -231,7 +231,7 @@ class LiveEstimator:
         """No event stamped before is taken [ns]."""
         return max(self._clock.sure - self._clock.window, self._window.floor)
 
-    def _take(self, t: Time, sensor: str | None, values: Mapping[str, Any]) -> Told:
+    def _take(self, t: Time, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
         """Put an event where its stamp says, if that can be."""
         try:
             stamp = nanoseconds(t)
@@ -255,7 +255,7 @@ class LiveEstimator:
             return self._take_early(_Event(stamp, sensor, dict(values)))
         return self._feed(stamp, sensor, values)
 
-    def _judged(self, event: _Event) -> Told | None:
+    def _judged(self, event: _Event) -> UpdateResult | None:
         """What becomes of an event whose stamp is not plainly right; None if it is to be taken."""
         clock, (stamp, sensor, values) = self._clock, event
         newest, command = clock.newest, sensor is None
@@ -303,7 +303,7 @@ class LiveEstimator:
         late = (self._clock.sure - stamp) / 1e9
         return f"stamped {late:.3f} s behind the newest; the window is {self._clock.window / 1e9:g} s"
 
-    def _start_anew(self, event: _Event, newest: int) -> Told:
+    def _start_anew(self, event: _Event, newest: int) -> UpdateResult:
         """A new segment from the events that have shown the commands' clock to be another."""
         aside, self._aside = self._aside, []
         first = next(other.stamp for other, _ in aside if other.sensor is None)
@@ -322,7 +322,7 @@ class LiveEstimator:
             self._take(*other)
         return self._take(*event)
 
-    def _take_early(self, event: _Event) -> Told:
+    def _take_early(self, event: _Event) -> UpdateResult:
         """Take an event while the frame's place may still change; a command before all others moves it."""
         assert self._early is not None
         oldest, origin, since = self._oldest(), self._window.origin, self._placing.since
@@ -346,7 +346,7 @@ class LiveEstimator:
                 self._feed_early(one)
         return self._feed_early(event)
 
-    def _feed_early(self, event: _Event) -> Told:
+    def _feed_early(self, event: _Event) -> UpdateResult:
         """Feed an event, and keep it for when the frame's place changes."""
         assert self._early is not None
         before = self._refusals
@@ -356,7 +356,7 @@ class LiveEstimator:
         self._early.append((event, told.outcome, self._refusals > before))
         return told
 
-    def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> Told:
+    def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
         """Give an event that is in time to the window."""
         window, given, stranger = self._window, 0, ""
         new = window.value
@@ -414,9 +414,9 @@ class LiveEstimator:
             {name: _number(values[name]) for name in CARTESIAN if name in values},
             None if sensor is None else window.commanded(self._bits.get("tangential", 0), stamp),
         )
-        for name, scalar in placed.items():
+        for name, component in placed.items():
             axis = self._bits[name]
-            window.value[axis], window.spread[axis] = scalar
+            window.value[axis], window.spread[axis] = component
             given |= 1 << axis
         return given
 
@@ -426,7 +426,7 @@ class LiveEstimator:
             return f"'{stranger}' needs a [frame] in fusion.toml; {suggestion(stranger, self.axes)}"
         return f"unknown axis '{stranger:.40}'; {suggestion(stranger, self.axes)}" if stranger else "gives no axis"
 
-    def _answer(self, codes: bytes, stranger: str) -> Told:
+    def _answer(self, codes: bytes, stranger: str) -> UpdateResult:
         """What is told of an event by the codes of its axes; the same for all alike, but for strangers."""
         outcomes = {axis: Outcome(code) for axis, code in zip(self.axes, codes, strict=True) if code != ABSENT}
         told = told_of(outcomes)
@@ -435,14 +435,14 @@ class LiveEstimator:
             return told._replace(axes=axes, reason=f"{told.reason}; {self._no_axis(stranger)}")
         return self._answers.setdefault(codes, told)
 
-    def _refuse(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str) -> Told:
+    def _refuse(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str) -> UpdateResult:
         """Count an event that never comes into the window."""
         self._refusals += 1
         self._count(sensor, values, outcome, 1)
-        return Told(outcome, MappingProxyType(dict.fromkeys(values, outcome)), reason)
+        return UpdateResult(outcome, MappingProxyType(dict.fromkeys(values, outcome)), reason)
 
     def _count(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, times: int) -> None:
-        """Count an event's outcome: a command once, a reading for each of its scalars; ``times`` −1 takes it back."""
+        """Count an event's outcome: a command once, a measurement for each of its components; ``times`` −1 takes it back."""
         if sensor is None:
             self._commands[outcome] += times
         elif sensor in self._refused:

@@ -22,8 +22,8 @@ class SensorHealth:
         silent: For how long nothing has come, in stream time [s]; None if nothing ever did.
         stale: Whether that is longer than the limit.
         dropouts: Intervals longer than one and a half times the usual one, once late rows are in.
-        nis: Mean ν²/S of the last minute; 1 where the noise is as configured; None without a fused scalar.
-        outcomes: Of all its scalars by the word.
+        nis: Mean ν²/S of the last minute; 1 where the noise is as configured; None without a fused component.
+        outcomes: Of all its components by the word.
     """
 
     rows: int
@@ -37,9 +37,9 @@ class SensorHealth:
     outcomes: Mapping[str, int]
 
     @property
-    def reopened(self) -> int:
-        """How many scalars a reopened gate has let in."""
-        return self.outcomes[Outcome.REOPENED.word]
+    def reacquired(self) -> int:
+        """How many components a reacquired gate has let in."""
+        return self.outcomes[Outcome.REACQUIRED.word]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def health_of(
     newest: int | None,
     stale_ns: int,
 ) -> Health:
-    """What a tally says, with the scalars that were refused before they were tallied."""
+    """What a tally says, with the components that were refused before they were tallied."""
     sensors: dict[str, SensorHealth] = {}
     for number, (name, more) in enumerate(refused.items()):
         last = int(tally.last[number])
@@ -79,7 +79,7 @@ def health_of(
         age = now - tally.second[number]
         recent = (age >= 0) & (age < SECONDS)
         minute = tally.minute[number][recent]
-        rows, scalars = float(minute[:, ROWS].sum()), float(minute[:, SCALARS].sum())
+        rows, components = float(minute[:, ROWS].sum()), float(minute[:, SCALARS].sum())
         span = float(age[recent].max(initial=0)) + (0.0 if newest is None else newest / 1e9 - now)
         sensors[name] = SensorHealth(
             rows=int(tally.number[number, CAME]),
@@ -89,7 +89,7 @@ def health_of(
             silent=silent,
             stale=silent is None or silent > stale_ns / 1e9,
             dropouts=int(tally.number[number, DROPOUTS]),
-            nis=float(minute[:, NIS].sum()) / scalars if scalars else None,
+            nis=float(minute[:, NIS].sum()) / components if components else None,
             outcomes={outcome.word: int(tally.number[number, outcome]) + more[outcome] for outcome in Outcome},
         )
     by_word = {outcome.word: count for outcome, count in commands.items()}

@@ -1,7 +1,7 @@
 """A window of the stream in the compiled filter's own arrays: rows and commands go in where their stamps say.
 
-Rows of readings lie in a ring in their total order, each beside a checkpoint of the filter before it. What comes late
-is put in its place, the filter goes back to the checkpoint there and meets everything after it again, by the very
+Rows of measurements lie in a ring in their total order, each beside a checkpoint of the filter before it. What comes
+late is put in its place, the filter goes back to the checkpoint there and meets everything after it again, by the very
 kernels that fuse a recorded run.
 """
 
@@ -51,7 +51,7 @@ from .tally_kernels import NIS, SCALARS, Tally, came, followed, slot_of, unheard
 
 DONE, NO_ROOM = range(2)
 
-_FUSED, _REOPENED, _INVALID = int(Outcome.FUSED), int(Outcome.REOPENED), int(Outcome.INVALID)
+_FUSED, _REACQUIRED, _INVALID = int(Outcome.FUSED), int(Outcome.REACQUIRED), int(Outcome.INVALID)
 _DUPLICATE, _BEFORE_START, _UNKNOWN = int(Outcome.DUPLICATE), int(Outcome.BEFORE_START), int(Outcome.UNKNOWN)
 
 
@@ -95,8 +95,8 @@ def hear(flat: Flat, stamp: int, sensor: int, given: int, newest: int, horizon: 
         arrange(rows, m.commands, heard, here)
         if rows.end[here] > rows.first[here]:
             meet(m.axes, m.sensors, rows, m.state, m.met, log, here)
-        for scalar in range(rows.first[here], rows.end[here]):
-            heard.code[here, rows.axis[scalar], BECAME] = m.met.outcome[scalar]
+        for component in range(rows.first[here], rows.end[here]):
+            heard.code[here, rows.axis[component], BECAME] = m.met.outcome[component]
     if given:
         for axis in range(axes):
             heard.told[axis] = heard.code[at & mask, axis, BECAME]
@@ -293,10 +293,10 @@ def move(rows: Rows, heard: Heard, here: int, there: int) -> None:
 
 @compiled
 def arrange(rows: Rows, commands: Commands, heard: Heard, here: int) -> None:
-    """Line up the scalars of a row that the filter is to decide on."""
+    """Line up the components of a row that the filter is to decide on."""
     axes = len(heard.told)
-    scalar = here * axes
-    rows.first[here] = scalar
+    component = here * axes
+    rows.first[here] = component
     for axis in range(axes):
         known = heard.code[here, axis, KNOWN]
         unstarted = commands.number[axis, COMMANDS] == 0 and commands.level[axis, 1] == 0.0
@@ -304,10 +304,10 @@ def arrange(rows: Rows, commands: Commands, heard: Heard, here: int) -> None:
             known = _BEFORE_START
         heard.code[here, axis, BECAME] = known
         if known == _FUSED:
-            rows.axis[scalar], rows.value[scalar] = axis, heard.value[here, axis, VALUE]
-            rows.spread[scalar] = heard.value[here, axis, SPREAD]
-            scalar += 1
-    rows.end[here] = scalar
+            rows.axis[component], rows.value[component] = axis, heard.value[here, axis, VALUE]
+            rows.spread[component] = heard.value[here, axis, SPREAD]
+            component += 1
+    rows.end[here] = component
 
 
 @compiled
@@ -328,16 +328,16 @@ def became(rows: Rows, met: Met, heard: Heard, tally: Tally, here: int) -> None:
         if heard.code[here, axis, BECAME] != ABSENT:
             tally.number[sensor, heard.code[here, axis, BECAME]] += 1
     slot = slot_of(tally, sensor, heard.stamp[here])
-    for scalar in range(rows.first[here], rows.end[here]):
-        fused = met.outcome[scalar] == _FUSED or met.outcome[scalar] == _REOPENED
+    for component in range(rows.first[here], rows.end[here]):
+        fused = met.outcome[component] == _FUSED or met.outcome[component] == _REACQUIRED
         if fused and slot >= 0:
-            tally.minute[sensor, slot, NIS] += (met.innovation[scalar] / met.innovation_sd[scalar]) ** 2
+            tally.minute[sensor, slot, NIS] += (met.innovation[component] / met.innovation_sd[component]) ** 2
             tally.minute[sensor, slot, SCALARS] += 1.0
 
 
 @compiled
 def first_valid(rows: Rows, heard: Heard, since: int) -> int:
-    """Position of the first row valid at ``since`` [ns] or later: commands come before readings of the same instant."""
+    """Position of the first row valid at ``since`` [ns] or later: commands come before measurements of the same instant."""
     mask, at = len(rows.valid) - 1, heard.span[END]
     while at > heard.span[BEGIN] and rows.valid[(at - 1) & mask] >= since:
         at -= 1

@@ -26,19 +26,19 @@ _ROWS, _COMMANDS, _ENTRIES = 4096, 512, 1024  # at first
 
 
 class Heard(NamedTuple):
-    """The rows of readings as they came, in a ring of R, and what is asked and answered.
+    """The rows of measurements as they came, in a ring of R, and what is asked and answered.
 
     Attributes:
         span: Positions of the first row (``BEGIN``) and after the last one (``END``), the first command's stamp [ns]
             (``ORIGIN``), and the position of the first row for which an event ``CHANGED`` something, (4,).
         stamp: Int64 ns, (R,).
         value: z [m] of each axis, and by what its noise is scaled, (R, A, 2).
-        code: What is ``KNOWN`` of each scalar before filtering and what ``BECAME`` of it: codes of Outcome, or
+        code: What is ``KNOWN`` of each component before filtering and what ``BECAME`` of it: codes of Outcome, or
             ``ABSENT``, (R, A, 2).
         latency: Of each sensor, int64 ns, (S,).
         new: Values [m] of the event that comes in, and by what the noise of each is scaled, (A, 2).
         told: What became of them, (A,).
-        fused: When the last scalar that an estimate knows of was valid, int64 ns, (A,).
+        fused: When the last component that an estimate knows of was valid, int64 ns, (A,).
     """
 
     span: IntArray
@@ -126,7 +126,7 @@ def empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, float
         resting=np.array([[part.input_noise**2, part.drift**2] for part in process]),
     )
     state = start_of(driven, len(names), NEVER, config, biases)
-    scalars, width = _ROWS * count, state.x.shape[1]
+    components, width = _ROWS * count, state.x.shape[1]
     kept = places(state, _ROWS + 2)
     keep(state, kept, _ROWS + 1)
     table = (count, _COMMANDS)
@@ -138,13 +138,13 @@ def empty(config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, float
             np.zeros(_ROWS, np.int16),
             np.zeros(_ROWS, np.int64),
             np.zeros(_ROWS, np.int64),
-            np.zeros(scalars, np.int16),
-            np.zeros(scalars),
-            np.zeros(scalars),
+            np.zeros(components, np.int16),
+            np.zeros(components),
+            np.zeros(components),
         ),
         state,
         kept,
-        Met(np.zeros(scalars), np.zeros(scalars), np.zeros(scalars, np.uint8)),
+        Met(np.zeros(components), np.zeros(components), np.zeros(components, np.uint8)),
         Commands(
             time=np.zeros((*table, 2), np.int64),
             row=np.zeros((*table, 5)),
@@ -199,7 +199,7 @@ def with_rows(memory: Memory, rows: int) -> Memory:
         found[there] = part[here]
         return found
 
-    def of_scalars(part: np.ndarray) -> np.ndarray:
+    def of_components(part: np.ndarray) -> np.ndarray:
         return of_rows(part.reshape(held, axes)).reshape(-1)
 
     def of_places(part: np.ndarray) -> np.ndarray:
@@ -207,23 +207,23 @@ def with_rows(memory: Memory, rows: int) -> Memory:
         found[there], found[rows:] = part[here], part[extra]
         return found
 
-    scalars_begin = memory.rows.first - np.arange(held) * axes  # 0 for each row that was ever arranged
-    first = of_rows(scalars_begin) + np.arange(rows) * axes
+    components_begin = memory.rows.first - np.arange(held) * axes  # 0 for each row that was ever arranged
+    first = of_rows(components_begin) + np.arange(rows) * axes
     return memory._replace(
         rows=Rows(
             of_rows(memory.rows.valid),
             of_rows(memory.rows.sensor),
             first,
             first + of_rows(memory.rows.end - memory.rows.first),
-            of_scalars(memory.rows.axis),
-            of_scalars(memory.rows.value),
-            of_scalars(memory.rows.spread),
+            of_components(memory.rows.axis),
+            of_components(memory.rows.value),
+            of_components(memory.rows.spread),
         ),
         kept=State(
             **{name: of_places(part) for name, part in memory.kept._asdict().items() if name != "work"},
             work=memory.kept.work,
         ),
-        met=Met(*(of_scalars(part) for part in memory.met)),
+        met=Met(*(of_components(part) for part in memory.met)),
         heard=memory.heard._replace(
             stamp=of_rows(memory.heard.stamp),
             value=of_rows(memory.heard.value),

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import UnknownNameError
-from ..runs.axes import placed_at
-from ..runs.frames import CARTESIAN, Frame, Placed, Rotated
+from ..logs.axes import placed_at
+from ..logs.frames import CARTESIAN, Frame, Placed, Rotated
 
 
 class Placing:
@@ -60,7 +60,7 @@ class Placing:
 
         Args:
             values: x, y and z [m] as far as they are given; NaN on both axes for x without y.
-            near: For a reading the commanded tangential position [m], (1,); None for a command.
+            near: For a measurement the commanded tangential position [m], (1,); None for a command.
         """
         found: dict[str, tuple[float, float]] = {}
         if self.placed is not None and ("x" in values or "y" in values):

@@ -16,16 +16,16 @@ from typing import Any, NamedTuple
 from .. import toml
 from ..folders import FolderError
 from ..fusion.config import FusionConfig
+from ..logs.clock import TOLERATED_STEP_BACK_NS
+from ..logs.frames import CARTESIAN
+from ..logs.save import check_axis, check_name
 from ..model.arm import ordered_axes
-from ..runs.clock import TOLERATED_STEP_BACK_NS
-from ..runs.frames import CARTESIAN
-from ..runs.save import check_axis, check_name
 from ..units import MM
 from .writer import Job, Writer
 
 _FLUSHED = 0.5  # s between two writes
 _SAID_AGAIN = 60.0  # s until a trouble that lasts is told again
-_MOST_BEFORE = 65_536  # readings that are kept until the first command
+_MOST_BEFORE = 65_536  # measurements that are kept until the first command
 _COMMANDS, _TIME = "commands.csv", "time_ns"
 
 

@@ -14,8 +14,8 @@ from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError
 from ..fusion.commands import as_commanded
 from ..fusion.config import FusionConfig
-from ..runs.clock import segments
-from ..runs.run import Run, Source
+from ..logs.clock import segments
+from ..logs.run import Run, Source
 from .lines import Lines
 from .wire import Event
 
@@ -48,8 +48,8 @@ def standard_input(descriptor: int = 0) -> Iterator[list[bytes]]:
 def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Event]]:
     """A run's events in the order of their arrival, at a multiple of its own pace; an empty list whenever it is quiet.
 
-    A row has arrived when its stamp says, one that steps back with the row before it; readings come before commands of
-    the same instant.
+    A row has arrived when its stamp says, one that steps back with the row before it; measurements come before commands
+    of the same instant.
 
     Raises:
         RunError: The clocks of the run cannot be followed.

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from ..errors import ConfigError
 from ..fusion.outcome import Outcome
-from .answers import MET, LiveEstimate, Told
+from .answers import MET, LiveEstimate, UpdateResult
 from .clock import nanoseconds
 from .estimator import LiveEstimator
 from .sampler import Sampler
@@ -21,7 +21,7 @@ _FASTEST = 1e4  # Hz
 class Watcher(Protocol):
     """Who is told what comes in and what goes out, at once: it must not take long."""
 
-    def event(self, event: Event, told: Told) -> None:
+    def event(self, event: Event, told: UpdateResult) -> None:
         """An event came, and this became of it."""
         ...
 
@@ -99,7 +99,7 @@ class Stream:
         self._whole = isinstance(t, int)
         if self._step is not None:
             self._on_grid(live.until(t))
-        told = live.reading(t, sensor, **values) if sensor else live.command(t, **values)
+        told = live.measurement(t, sensor, **values) if sensor else live.command(t, **values)
         for watcher in self._watchers:
             watcher.event(event, told)
         if told.outcome not in MET or not MET.issuperset(told.axes.values()):

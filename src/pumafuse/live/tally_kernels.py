@@ -22,14 +22,15 @@ class Tally(NamedTuple):
     """What there was of each sensor.
 
     Attributes:
-        number: Of scalars that have left the window by their outcome, rows that ``CAME``, ``DROPOUTS``: intervals
+        number: Of components that have left the window by their outcome, rows that ``CAME``, ``DROPOUTS``: intervals
             over one and a half times the usual one, of how many ``INTERVALS`` that was learnt, and dropouts
             ``IN_A_ROW``, (S, 12).
         last: Latest stamp, int64 ns, ``ALWAYS`` without one, (S,).
         left: Stamp of the latest row that has left the window, int64 ns, ``ALWAYS`` without one, (S,).
         usual: Usual interval [s], (S,).
         second: Which second of stream time each entry of ``minute`` is, (S, 60).
-        minute: For each second: rows, sum and maximum of how late they came [s], sum of NIS, fused scalars, (S, 60, 5).
+        minute: For each second: rows, sum and maximum of how late they came [s], sum of NIS, fused components, (S, 60,
+            5).
     """
 
     number: IntArray

@@ -16,7 +16,7 @@ from .kernels import DONE
 from .memory import BEGIN, CHANGED, END, ORIGIN, SPREAD, VALUE, empty, with_commands, with_entries, with_rows
 from .tally_kernels import Tally
 
-MOST_ROWS = 65_536  # of readings or of commands: some 70 MB for three axes; what is more shortens the window
+MOST_ROWS = 65_536  # of measurements or of commands: some 70 MB for three axes; what is more shortens the window
 _LONGEST_RECOVERY = 1e4  # periods
 
 
@@ -76,7 +76,7 @@ class Window:
         return None if origin == NEVER else origin
 
     def hear(self, stamp: int, sensor: int, given: int, newest: int, oldest: int) -> bool:
-        """Take in a row of readings; see :func:`pumafuse.live.kernels.hear` and :meth:`command`."""
+        """Take in a row of measurements; see :func:`pumafuse.live.kernels.hear` and :meth:`command`."""
         attempt = 0
         while kernels.hear(self._flat, stamp, sensor, given, newest, oldest - self._latency) != DONE:
             self._make_room(attempt, oldest, event=True)
@@ -114,7 +114,7 @@ class Window:
 
         Returns:
             For each axis what :class:`fusion.Outputs` has, in the stream's own coordinates and SI, and when the last
-            scalar was valid that it knows of [ns]; None as long as the axis has no start level.
+            component was valid that it knows of [ns]; None as long as the axis has no start level.
         """
         attempt = 0
         while kernels.ask(self._flat, self._held, self._places, time) != DONE:

@@ -9,7 +9,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from ..errors import ConfigError
-from ..runs.frames import CARTESIAN
+from ..logs.frames import CARTESIAN
 from ..units import MM
 from .answers import LiveEstimate
 from .lines import LONGEST
@@ -22,7 +22,7 @@ class BadLine(Exception):  # noqa: N818 - it is what the line is called, and nev
 
 
 class Event(NamedTuple):
-    """A command (no sensor) or a reading.
+    """A command (no sensor) or a measurement.
 
     Attributes:
         t: Float seconds or int nanoseconds.
@@ -86,7 +86,7 @@ class Wire:
         if command is not None:
             values, given = msgspec.structs.astuple(command), [value for value in values if value is not UNSET]
             if sensor is not None or given:
-                raise BadLine("gives a command and a reading at once")
+                raise BadLine("gives a command and a measurement at once")
             sensor = ""
         elif sensor is None:
             raise BadLine("gives neither 'command' nor 'sensor'")

@@ -19,7 +19,7 @@ from ..compiled import compiled
 from .plants import PLANTS, FirstOrder
 
 _TERMS = 16  # of each series: the next would be below 1e-16 of the sum
-_TINY, _FEW = 0.1, 10  # rad, terms: enough for most intervals between readings
+_TINY, _FEW = 0.1, 10  # rad, terms: enough for most intervals between measurements
 _SHORT = 0.5  # rad; fastest pole × interval up to which the series are used
 _HEAD = 6  # constants before the series
 _APART = 0.5  # difference of the poles over their sum, below which exponentials of the two cancel

@@ -16,16 +16,16 @@ from ..fusion.consistency import LAGS, consistency
 from ..fusion.estimates import Estimates
 from ..fusion.outcome import Outcome
 from ..fusion.score import Z95, interpolated
-from ..runs.axes import in_axes
-from ..runs.run import Run
+from ..logs.axes import in_axes
+from ..logs.run import Run
 from ..units import MM, seconds
 from . import style
 
-_ZOOM_S = 2.0  # of the busiest stretch, where the band and the single readings can be seen
+_ZOOM_S = 2.0  # of the busiest stretch, where the band and the single measurements can be seen
 
 
 def fused_figure(est: Estimates, run: Run, path: Path) -> None:
-    """The fused run: per axis all of it, and beside it its busiest two seconds with readings and 95 % band.
+    """The fused run: per axis all of it, and beside it its busiest two seconds with measurements and 95 % band.
 
     Args:
         est: The estimates.
@@ -50,7 +50,7 @@ def fused_figure(est: Estimates, run: Run, path: Path) -> None:
 
 
 def error_figure(est: Estimates, path: Path) -> None:
-    """The estimate's error against the reference with its 95 % band, over the readings' own errors.
+    """The estimate's error against the reference with its 95 % band, over the measurements' own errors.
 
     Args:
         est: Estimates of a run that has a reference.
@@ -69,12 +69,12 @@ def error_figure(est: Estimates, path: Path) -> None:
     with _sheet(est, path, len(known), 1) as grid:
         for (axes,), name in zip(grid, known, strict=True):
             error = est[name].position - truth[name]
-            for sensor, colour in style.sensor_colours(est.readings.sensors).items():
-                scalars = style.positions(est, sensor, name)
-                first = np.zeros(len(scalars.time), dtype=np.int64)  # the first segment's will do for a picture
-                raw = scalars.value - interpolated(scalars.time, first, est.reference, name)
+            for sensor, colour in style.sensor_colours(est.measurements.sensors).items():
+                components = style.positions(est, sensor, name)
+                first = np.zeros(len(components.time), dtype=np.int64)  # the first segment's will do for a picture
+                raw = components.value - interpolated(components.time, first, est.reference, name)
                 label = f"{sensor}, latency removed"
-                axes.plot(scalars.time, raw * MM, ".", ms=1.5, color=colour, alpha=0.6, label=label)
+                axes.plot(components.time, raw * MM, ".", ms=1.5, color=colour, alpha=0.6, label=label)
             _band(axes, est, name, np.zeros(len(est.time)))
             axes.plot(est.time, error * MM, color=style.REFERENCE, lw=0.8, label="estimate")
             rms = float(np.sqrt(np.nanmean(error**2))) * MM
@@ -95,15 +95,15 @@ def validation_figure(est: Estimates, path: Path) -> None:
         est: The estimates.
         path: Where the picture goes.
     """
-    pairs = [(sensor, axis) for axis in est.axes for sensor in est.readings.sensors]
+    pairs = [(sensor, axis) for axis in est.axes for sensor in est.measurements.sensors]
     met = [(sensor, axis, found) for sensor, axis in pairs if (found := consistency(est, sensor, axis)) is not None]
     if not met:
         return
-    colours = style.sensor_colours(est.readings.sensors)
+    colours = style.sensor_colours(est.measurements.sensors)
     with _sheet(est, path, len(met), 3, share_time=False) as grid:
         for (series, spread, correlation), (sensor, axis, found) in zip(grid, met, strict=True):
-            readings = est.readings.of(sensor, axis)
-            fused = readings.where(readings.outcome == Outcome.FUSED)
+            measurements = est.measurements.of(sensor, axis)
+            fused = measurements.where(measurements.outcome == Outcome.FUSED)
             normalised = fused.innovation / fused.innovation_sd
             series.plot(fused.time, normalised, ".", ms=1.5, color=colours[sensor])
             series.axhspan(-Z95, Z95, color=style.ESTIMATE, alpha=0.15, lw=0)
@@ -126,7 +126,7 @@ def validation_figure(est: Estimates, path: Path) -> None:
             correlation.axhspan(-found.correlation_band, found.correlation_band, color=style.ESTIMATE, alpha=0.2, lw=0)
             correlation.set_ylim(min(-0.3, 1.1 * float(found.correlation.min(initial=0.0))), 1.0)
             correlation.set_xlim(0, LAGS + 1)
-        for axes, label in zip(grid[-1], ("time [s]", "innovation / sd", "lag [readings]"), strict=True):
+        for axes, label in zip(grid[-1], ("time [s]", "innovation / sd", "lag [measurements]"), strict=True):
             axes.set_xlabel(label)
 
 
@@ -143,7 +143,7 @@ def _sheet(
         if share_time:
             for axes in grid[-1]:
                 axes.set_xlabel("time since the first command [s]")
-        sensors = ", ".join(est.readings.sensors) or "commands only"
+        sensors = ", ".join(est.measurements.sensors) or "commands only"
         figure.suptitle(f"{est.run}: {sensors}, {est.mode}, arm {est.config.arm.name}")
         figure.savefig(path, dpi=130)
 
@@ -155,13 +155,13 @@ def _band(axes: Axes, est: Estimates, name: str, centre: FloatArray) -> None:
 
 
 def _scatter(axes: Axes, est: Estimates, name: str) -> None:
-    for sensor, colour in style.sensor_colours(est.readings.sensors).items():
-        scalars = style.positions(est, sensor, name)
-        fused = scalars.where(scalars.outcome != Outcome.GATED)
-        gated = scalars.where(scalars.outcome == Outcome.GATED)
+    for sensor, colour in style.sensor_colours(est.measurements.sensors).items():
+        components = style.positions(est, sensor, name)
+        fused = components.where(components.outcome != Outcome.REJECTED)
+        rejected = components.where(components.outcome == Outcome.REJECTED)
         axes.plot(fused.time, fused.value * MM, ".", ms=2.5, color=colour, label=sensor)
-        if len(gated.time):
-            axes.plot(gated.time, gated.value * MM, "x", ms=4, color=style.REJECTED, label=f"{sensor}, gated")
+        if len(rejected.time):
+            axes.plot(rejected.time, rejected.value * MM, "x", ms=4, color=style.REJECTED, label=f"{sensor}, rejected")
 
 
 def _limits(axes: Axes, values: FloatArray) -> None:

@@ -5,10 +5,11 @@ through a pipe. Whatever becomes of it, of the viewer or of the connection betwe
 a frame that does not fit into the pipe is left out.
 
 Entities: ``<axis>/command``, ``/estimate`` with ``/upper`` and ``/lower`` at ±2σ, ``/<sensor>`` and
-``/<sensor>/rejected``; ``residual/<axis>/<sensor>``, the reading minus the estimate, between ``/upper`` and ``/lower``
+``/<sensor>/rejected``; ``residual/<axis>/<sensor>``, the measurement minus the estimate, between ``/upper`` and
+``/lower``
 of the estimate; ``path/command``, ``path/estimate``, ``path/tool`` in 3D, and with a frame ``path/<sensor>``;
 ``nis/<sensor>``, ``rate/<sensor>``. All against seconds since the first event, positions in mm. With a frame, commands
-and readings in x, y, z are in 3D only. A sensor with a bias is drawn less its mean distance from the estimate.
+and measurements in x, y, z are in 3D only. A sensor with a bias is drawn less its mean distance from the estimate.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from ..errors import ConfigError
 from ..fusion.outcome import Outcome
 from ..live.answers import MET
+from ..logs.frames import CARTESIAN
 from ..model.arm import CANONICAL_AXES, ordered_axes
-from ..runs.frames import CARTESIAN
 from .live_frames import Band, Frame, Header, Met, Path, SensorHead, SensorsNow, Series, packed
 
 if TYPE_CHECKING:
     from ..fusion.config import FusionConfig
-    from ..live.answers import LiveEstimate, Told
+    from ..live.answers import LiveEstimate, UpdateResult
     from ..live.health import Health
     from ..live.wire import Event
 
@@ -119,7 +120,7 @@ class LiveView:
         """How many events and estimates have been thinned out of frames."""
         return self._estimates.left_out + sum(gathered.left_out for gathered in self._events.values())
 
-    def event(self, event: Event, told: Told) -> None:
+    def event(self, event: Event, told: UpdateResult) -> None:
         """Take in an event and what became of it."""
         if self._child is None or told.outcome not in MET:
             return
@@ -170,7 +171,7 @@ class LiveView:
         for source, gathered in self._events.items():
             rows = gathered.take()
             if rows and source:
-                frame.readings[source] = _met(rows, self._axes)
+                frame.measurements[source] = _met(rows, self._axes)
             elif rows:
                 frame.commands = _commanded(rows, self._axes)
             if rows and self._space and (not source or (self._framed and source in self._in_space)):
@@ -305,7 +306,7 @@ def _met(rows: Sequence[_Row], axes: Sequence[str]) -> dict[str, Met]:
                 one = found[axis]
                 one.time.append(moment)
                 one.value.append(float(values[axis]))
-                one.rejected.append(outcome is Outcome.GATED)
+                one.rejected.append(outcome is Outcome.REJECTED)
     return found
 
 

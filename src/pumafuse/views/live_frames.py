@@ -15,10 +15,10 @@ _LARGEST = 1 << 26  # bytes of a frame
 
 
 class SensorHead(msgspec.Struct, array_like=True):
-    """How a sensor's readings become positions: (z − bias) / scale, at stamp − latency.
+    """How a sensor's measurements become positions: (z − bias) / scale, at stamp − latency.
 
     Attributes:
-        scale: Of the position in the reading.
+        scale: Of the position in the measurement.
         latency: [s].
         biased: Whether a constant bias must be found first.
     """
@@ -56,7 +56,7 @@ class Series(msgspec.Struct, array_like=True):
 
 
 class Met(msgspec.Struct, array_like=True):
-    """One sensor's scalars [m] on one axis at their stamps [s], and which of them were rejected."""
+    """One sensor's components [m] on one axis at their stamps [s], and which of them were rejected."""
 
     time: list[float] = []
     value: list[float] = []
@@ -91,14 +91,14 @@ class Frame(msgspec.Struct):
 
     Attributes:
         commands: By axis.
-        readings: By sensor and axis.
+        measurements: By sensor and axis.
         estimates: By axis.
         paths: Of ``command``, ``estimate`` and sensors in x, y, z.
         health: Now and then.
     """
 
     commands: dict[str, Series] = {}
-    readings: dict[str, dict[str, Met]] = {}
+    measurements: dict[str, dict[str, Met]] = {}
     estimates: dict[str, Band] = {}
     paths: dict[str, Path] = {}
     health: SensorsNow | None = None
@@ -109,9 +109,9 @@ class Frame(msgspec.Struct):
             mine = self.commands.setdefault(axis, Series())
             mine.time += series.time
             mine.value += series.value
-        for sensor, axes in later.readings.items():
+        for sensor, axes in later.measurements.items():
             for axis, met in axes.items():
-                mine = self.readings.setdefault(sensor, {}).setdefault(axis, Met())
+                mine = self.measurements.setdefault(sensor, {}).setdefault(axis, Met())
                 mine.time += met.time
                 mine.value += met.value
                 mine.rejected += met.rejected

@@ -1,4 +1,4 @@
-"""What a live view shows: the last seconds of every axis, how far readings are from the estimate, the path, the health.
+"""What a live view shows: the last seconds of every axis, how far measurements are from the estimate, the path, the health.
 
 Entities as in :mod:`pumafuse.views.live`.
 """
@@ -19,11 +19,11 @@ from .live_frames import Band, Frame, Header, Met, Path, SensorHead, SensorsNow
 _SHOWN = 30.0  # s
 _MARGIN = 8.0  # s on the left for a legend
 _SIGHT = np.array([450.0, -750.0, 450.0])  # mm from the first point of a path to the eye
-_KEPT = 5.0  # s of estimates that readings may still be compared with
+_KEPT = 5.0  # s of estimates that measurements may still be compared with
 _MOST_KEPT = 20_000
 _LONGEST_GAP = 0.25  # s between estimates; in a longer one the arm may have gone anywhere
 _TRAIL_STEP = 0.1  # s between points of a path, but for the newest
-_AVERAGED = 1000  # readings that a bias is averaged over
+_AVERAGED = 1000  # measurements that a bias is averaged over
 
 
 class Picture:
@@ -67,11 +67,11 @@ class Picture:
             self._plot(f"{axis}/command", np.array(series.time), np.array(series.value))
         for axis, band in frame.estimates.items():
             self._estimate(axis, band)
-        for name, axes in frame.readings.items():
+        for name, axes in frame.measurements.items():
             for axis, met in axes.items():
                 self._sensors[axis, name].hear(met)
         for (axis, name), compared in self._sensors.items():
-            self._readings(axis, name, compared)
+            self._measurements(axis, name, compared)
         for name, path in frame.paths.items():
             self._path(name, path)
         if frame.health is not None:
@@ -86,7 +86,7 @@ class Picture:
         self._plot(f"residual/{axis}/upper", time, half)
         self._plot(f"residual/{axis}/lower", time, -half)
 
-    def _readings(self, axis: str, name: str, compared: _Compared) -> None:
+    def _measurements(self, axis: str, name: str, compared: _Compared) -> None:
         time, position, residual, rejected = compared.take()
         fused, shown = ~rejected, self._tracks[axis].nearby(position)
         self._plot(f"{axis}/{name}", time[fused], position[fused])
@@ -94,7 +94,7 @@ class Picture:
         self._plot(f"residual/{axis}/{name}", time[fused], residual[fused])
 
     def _path(self, name: str, path: Path) -> None:
-        """The last seconds of a path; readings as points. A negative radius is in points of the screen."""
+        """The last seconds of a path; measurements as points. A negative radius is in points of the screen."""
         points = np.array(path.position).reshape(-1, 3) * MM
         there = np.isfinite(points).all(axis=1)
         if not there.any():
@@ -154,7 +154,7 @@ class _Track:
         return np.where(known, found, np.nan)
 
     def nearby(self, position: FloatArray) -> FloatArray:
-        """Positions [m] with those far off moved to the edge: one wild reading would flatten the plot."""
+        """Positions [m] with those far off moved to the edge: one wild measurement would flatten the plot."""
         if not self._spans:
             return position
         low, high = min(span[1] for span in self._spans), max(span[2] for span in self._spans)
@@ -183,7 +183,7 @@ class _Trail:
 
 
 class _Compared:
-    """One sensor's readings on one axis that wait for the estimate at their valid times."""
+    """One sensor's measurements on one axis that wait for the estimate at their valid times."""
 
     def __init__(self, sensor: SensorHead, track: _Track) -> None:
         self._sensor, self._track = sensor, track
@@ -191,7 +191,7 @@ class _Compared:
         self._bias, self._averaged = 0.0, 0
 
     def hear(self, met: Met) -> None:
-        """Take in readings; the oldest go when no estimate comes."""
+        """Take in measurements; the oldest go when no estimate comes."""
         time = np.array(met.time, dtype=np.float64) - self._sensor.latency
         self._time = np.concatenate([self._time, time])[-_MOST_KEPT:]
         self._value = np.concatenate([self._value, np.array(met.value) / self._sensor.scale])[-_MOST_KEPT:]
@@ -211,7 +211,7 @@ class _Compared:
         return time, position, residual, rejected
 
     def _average(self, residual: FloatArray) -> None:
-        """The mean of what a biased sensor is off the estimate, of its last readings."""
+        """The mean of what a biased sensor is off the estimate, of its last measurements."""
         if len(residual):
             self._averaged = min(self._averaged + len(residual), _AVERAGED)
             share = min(len(residual) / self._averaged, 1.0)
@@ -219,7 +219,7 @@ class _Compared:
 
 
 def _blueprint(header: Header, first: FloatArray | None = None) -> rrb.Blueprint:
-    """Positions, what readings are off, and on the right the path and the sensors' health; all follow the newest.
+    """Positions, what measurements are off, and on the right the path and the sensors' health; all follow the newest.
 
     Args:
         header: The axes.
@@ -228,10 +228,12 @@ def _blueprint(header: Header, first: FloatArray | None = None) -> rrb.Blueprint
     positions = [
         _plot(f"/{axis}", f"{axis} [mm]", legend=not number, margin=_MARGIN) for number, axis in enumerate(header.axes)
     ]
-    residuals = [_plot(f"/residual/{axis}", f"{axis}: reading − estimate [mm]", legend=False) for axis in header.axes]
+    residuals = [
+        _plot(f"/residual/{axis}", f"{axis}: measurement − estimate [mm]", legend=False) for axis in header.axes
+    ]
     right: rrb.Container = rrb.Tabs(
         _plot("/nis", "NIS [1 as configured]", legend=True, margin=_MARGIN),
-        _plot("/rate", "readings [Hz]", legend=True, margin=_MARGIN),
+        _plot("/rate", "measurements [Hz]", legend=True, margin=_MARGIN),
     )
     if header.space:
         right = rrb.Vertical(_scene(first), right, row_shares=[3, 2])

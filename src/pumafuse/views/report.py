@@ -10,9 +10,9 @@ import numpy as np
 from markupsafe import Markup
 
 from .. import folders
-from ..identify.identify import Identification, OrderFit, TrialResult
-from ..identify.trials import StepTrials
-from ..identify.verify import AxisVerification, Trace
+from ..identification.identify import Identification, OrderFit, TrialResult
+from ..identification.trials import StepTrials
+from ..identification.verify import AxisVerification, Trace
 from ..model.arm import ArmModel
 from ..units import MM, MS
 from . import step_figures, words

@@ -14,12 +14,12 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ..arrays import FloatArray
-from ..fusion.estimates import Estimates, Readings
+from ..fusion.estimates import Estimates, Measurements
 from ..fusion.outcome import Outcome
+from ..logs.axes import in_axes
+from ..logs.frames import CARTESIAN
+from ..logs.run import Run
 from ..model.arm import CANONICAL_AXES
-from ..runs.axes import in_axes
-from ..runs.frames import CARTESIAN
-from ..runs.run import Run
 from ..units import MM, seconds
 from . import looks, style
 
@@ -45,14 +45,14 @@ def to_rerun(est: Estimates, run: Run, sink: str | Path | rr.RecordingStream) ->
 
 def _send(est: Estimates, run: Run, stream: rr.RecordingStream) -> None:
     stream.send_recording_name(f"{est.run}, {est.mode}")
-    colours = style.sensor_colours(est.readings.sensors)
+    colours = style.sensor_colours(est.measurements.sensors)
     command = in_axes(run, est.config.frame)[0].command
     time = seconds(command.stamp, est.origin)
     for name, axis in est.axes.items():
         _line(stream, f"{name}/command", time, command.values[name], style.COMMAND, step=True)
         if est.reference is not None and name in est.reference.position:
             _line(stream, f"{name}/reference", est.reference.time, est.reference.position[name], style.REFERENCE_3D)
-        for sensor in est.readings.sensors:
+        for sensor in est.measurements.sensors:
             _sensor(stream, est, sensor, name, colours[sensor])
         half = 2.0 * axis.position_sd
         _band(stream, f"{name}/estimate", est.time, axis.position + half, axis.position - half)
@@ -64,13 +64,13 @@ def _sensor(stream: rr.RecordingStream, est: Estimates, sensor: str, axis: str, 
     seen = style.positions(est, sensor, axis)
     if not len(seen.value):
         return
-    fused = (seen.outcome == Outcome.FUSED) | (seen.outcome == Outcome.REOPENED)
+    fused = (seen.outcome == Outcome.FUSED) | (seen.outcome == Outcome.REACQUIRED)
     _points(stream, f"{axis}/{sensor}", seen.time[fused], seen.value[fused], colour)
     _points(stream, f"{axis}/{sensor}/rejected", seen.time[~fused], seen.value[~fused], style.REJECTED, marker="Cross")
     _innovations(stream, f"innovation/{axis}/{sensor}", seen.where(np.isfinite(seen.innovation)), colour)
 
 
-def _innovations(stream: rr.RecordingStream, path: str, met: Readings, colour: str) -> None:
+def _innovations(stream: rr.RecordingStream, path: str, met: Measurements, colour: str) -> None:
     _points(stream, path, met.time, met.innovation, colour)
     _band(stream, path, met.time, 2.0 * met.innovation_sd, -2.0 * met.innovation_sd)
 
@@ -171,7 +171,7 @@ def _span(position: FloatArray) -> tuple[float, float]:
 
 def _innovation_span(est: Estimates, axis: str) -> tuple[float, float]:
     """Limits [mm] that show the band and leave the far outliers out."""
-    mine = est.readings.where(est.readings.axis == est.readings.axes.index(axis))
+    mine = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
     known = mine.innovation_sd[np.isfinite(mine.innovation_sd)]
     limit = 6.0 * float(np.median(known)) * MM if len(known) else 1.0
     return -limit, limit

@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, MaxNLocator, NullLocator
 
-from ..identify.anova import Level, factors_of, levels_of, numbers
-from ..identify.identify import Identification, TrialResult
-from ..identify.rows import Rows, window
-from ..identify.trials import StepTrials, Trial
-from ..identify.verify import AxisVerification, Trace
+from ..identification.anova import Level, factors_of, levels_of, numbers
+from ..identification.identify import Identification, TrialResult
+from ..identification.rows import Rows, window
+from ..identification.trials import StepTrials, Trial
+from ..identification.verify import AxisVerification, Trace
 from ..units import MM, MS
 from . import style
 from .sheet import drawing

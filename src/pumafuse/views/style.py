@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..fusion.estimates import Estimates, Readings
+from ..fusion.estimates import Estimates, Measurements
 
 COMMAND = "#8a8f98"
 ESTIMATE = "#0b6bcb"
@@ -27,13 +27,13 @@ def rgb(colour: str) -> tuple[int, int, int]:
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
-def positions(est: Estimates, sensor: str, axis: str) -> Readings:
-    """A sensor's scalars as positions in the log's coordinates: scale and the estimated bias taken off."""
-    readings = est.readings.of(sensor, axis)
+def positions(est: Estimates, sensor: str, axis: str) -> Measurements:
+    """A sensor's components as positions in the log's coordinates: scale and the estimated bias taken off."""
+    measurements = est.measurements.of(sensor, axis)
     if sensor not in est.config.sensors:
-        return readings.where(np.zeros(len(readings.value), dtype=bool))
+        return measurements.where(np.zeros(len(measurements.value), dtype=bool))
     bias = est.biases.get(sensor, {}).get(axis)
-    return readings.as_position(est.config.sensors[sensor].scale, 0.0 if bias is None else bias.value)
+    return measurements.as_position(est.config.sensors[sensor].scale, 0.0 if bias is None else bias.value)
 
 
 def busiest(est: Estimates, length: float) -> tuple[float, float]:

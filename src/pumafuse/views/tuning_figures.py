@@ -13,8 +13,8 @@ from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates
 from ..fusion.outcome import Outcome
 from ..fusion.score import Z95
-from ..tune.profile import Profile
-from ..tune.summary import Fitted
+from ..tuning.profile import Profile
+from ..tuning.summary import Fitted
 from . import style
 from .sheet import drawing
 
@@ -42,13 +42,13 @@ def profiles(found: Sequence[Profile], fitted: Mapping[str, Fitted]) -> str:
 
 def innovations(before: Estimates, after: Estimates, sensor: str, axis: str) -> str:
     """One sensor's normalised innovations on one axis before and after, and their autocorrelations."""
-    colour = style.sensor_colours(after.readings.sensors)[sensor]
+    colour = style.sensor_colours(after.measurements.sensors)[sensor]
     with drawing(3, width=_WIDTH, height=2.2, ratios=(2.2, 2.2, 1.0), room=(0.6, 0.45, 0.25)) as sheet:
         *series, correlation = sheet.axes
         highest = 4.0
         for number, (axes, est) in enumerate(zip(series, (before, after), strict=True)):
-            readings = est.readings.of(sensor, axis)
-            fused = readings.where(readings.outcome == Outcome.FUSED)
+            measurements = est.measurements.of(sensor, axis)
+            fused = measurements.where(measurements.outcome == Outcome.FUSED)
             normalised = fused.innovation / fused.innovation_sd
             highest = max(highest, 1.05 * float(np.abs(normalised).max(initial=0.0)))
             axes.plot(fused.time, normalised, ".", ms=1.5, color=(style.COMMAND, colour)[number], rasterized=True)
@@ -130,6 +130,6 @@ def _correlations(axes: Axes, tests: Sequence[Consistency | None], colours: Sequ
             band = min(band, one.correlation_band)
     axes.axhspan(-band, band, color=style.ESTIMATE, alpha=0.15, lw=0)
     axes.set_title("autocorrelation", loc="left")
-    axes.set_xlabel("lag [readings]")
+    axes.set_xlabel("lag [measurements]")
     axes.set_xlim(0, LAGS + 1)
     axes.set_ylim(-highest, highest)

@@ -15,11 +15,11 @@ from ..fusion.config import ARM_FILE, FusionConfig
 from ..fusion.consistency import Consistency, consistency
 from ..fusion.estimates import Estimates
 from ..fusion.offline import fuse
-from ..runs.run import Run
-from ..tune.profile import Profile, profiles
-from ..tune.summary import Fitted, TuningSummary
-from ..tune.tune import Tuning
-from ..tune.validate import Check
+from ..logs.run import Run
+from ..tuning.profile import Profile, profiles
+from ..tuning.summary import Fitted, TuningSummary
+from ..tuning.tune import Tuning
+from ..tuning.validate import Check
 from . import tuning_figures, words
 from .render import render
 
@@ -82,7 +82,7 @@ def _fused(run: Run, config: FusionConfig) -> Estimates:
 
 def _met(before: Estimates, after: Estimates) -> dict[tuple[str, str], _Tests]:
     """By sensor and axis, how the innovations fit what was expected; where there are any, before or after."""
-    pairs = [(sensor, axis) for axis in after.axes for sensor in after.readings.sensors]
+    pairs = [(sensor, axis) for axis in after.axes for sensor in after.measurements.sensors]
     tests = {pair: (consistency(before, *pair), consistency(after, *pair)) for pair in pairs}
     return {pair: both for pair, both in tests.items() if any(both)}
 
@@ -92,7 +92,7 @@ def _summary(summary: TuningSummary) -> str:
     taught = "" if summary.teacher is None else f", with {summary.teacher} as the teacher"
     held = f"; held as asked: {', '.join(summary.hold)}" if summary.hold else ""
     gains = "; ".join(
-        f"{axis} {one.before:.1f} → {one.after:.1f} ({one.scalars} readings)"
+        f"{axis} {one.before:.1f} → {one.after:.1f} ({one.components} measurements)"
         for axis, one in summary.likelihood.items()
     )
     return f"Fitted to {runs}{taught}: {', '.join(summary.fit)}{held}. Log-likelihood before → after: {gains}."
@@ -124,7 +124,7 @@ def _check(one: Check) -> Mapping[str, Any]:
             [words.change([None if check is None else check.correlation for check in pair], "+z.2f") for pair in pairs],
         ],
         "numbers": [
-            words.change([state.gated for state in states], "d"),
+            words.change([state.rejected for state in states], "d"),
             words.change([state.rmse_mm for state in states], ".3f"),
             words.change([state.coverage for state in states], ".3f"),
         ],
@@ -142,9 +142,9 @@ def _says_parameters(summary: TuningSummary) -> str:
     limitless = not summary.interrupted and any(None in one.ci95 for one in summary.parameters)
     return (
         f"{len(summary.parameters)} numbers were fitted, each in the unit that its name ends with. {outside} of the"
-        f" {len(known)} that were there before lay outside the interval that the readings leave them"
+        f" {len(known)} that were there before lay outside the interval that the measurements leave them"
         + (f"; {none} turned out to be none (0)." if none else ".")
-        + (" An end marked … is not limited by the readings." if limitless else "")
+        + (" An end marked … is not limited by the measurements." if limitless else "")
     )
 
 
@@ -179,9 +179,9 @@ def _says_validation(checks: Sequence[Check]) -> str:
         return ""
     axes = ", ".join(f"{one.axis} is {one.verdict.partition(':')[0]}" for one in checks)
     return (
-        f"On readings that nothing had been learnt from, {axes}. NIS should be 1, the lag-1 correlation of innovations"
+        f"On measurements that nothing had been learnt from, {axes}. NIS should be 1, the lag-1 correlation of innovations"
         " 0, and coverage, the share of errors within the 95 % band, 0.95."
-        + (" After that these readings were learnt from too." if any(one.since_s for one in checks) else "")
+        + (" After that these measurements were learnt from too." if any(one.since_s for one in checks) else "")
     )
 
 
@@ -200,7 +200,7 @@ def _says_innovations(run: str, met: Sequence[_Tests]) -> str:
         f"{sum(one is not None and one.whiteness > _WHITE for one in some)}" for some in zip(*met, strict=True)
     )
     return (
-        f"How far each reading of {run} lay from what was expected of it, over how far it was expected to: 95 % should"
+        f"How far each measurement of {run} lay from what was expected of it, over how far it was expected to: 95 % should"
         " lie in the band, and none should tell the next: their autocorrelations (grey before, coloured after) should"
         f" lie in the band too. NIS, their mean square, should be 1 and came nearer to it for {nearer} of {len(met)};"
         f" {white} of {len(met)} pass for white (p above {_WHITE:g})."

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..identify.anova import Level
-from ..identify.estimate import Estimate
+from ..identification.anova import Level
+from ..identification.estimate import Estimate
 from ..model.arm import Gain
 from ..model.plants import PLANTS, FirstOrder
 from ..toml import Interval
 from ..units import MM, MS
 
 if TYPE_CHECKING:
-    from ..identify.verify import AxisVerification
-    from ..tune.summary import Correlation
+    from ..identification.verify import AxisVerification
+    from ..tuning.summary import Correlation
 
 
 def with_interval(value: float, interval: Interval | None, unit: float = 1.0) -> str:
@@ -64,7 +64,7 @@ def change(values: Sequence[float | None], form: str) -> str:
 
 
 def together(pair: Correlation) -> str:
-    """Two numbers that the readings tell only together."""
+    """Two numbers that the measurements tell only together."""
     return f"{pair.first} and {pair.second} go together: correlation {pair.correlation:+.2f}"
 
 

@@ -1,0 +1,342 @@
+"""A campaign of step trials as a model of the arm: every trial fitted, all combined, the model judged against them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+
+from .. import units
+from ..arrays import FloatArray
+from ..model.arm import ArmModel
+from ..model.plants import FirstOrder, SecondOrder
+from ..toml import Interval
+from . import anova
+from .combine import Combination, CombinedAxis, Fitted, combine, combined_rms, usual_gain
+from .estimate import common
+from .fit import StepFit, fit_steps, flags
+from .paper import fit_as_published, onset
+from .performance import Performance, performances, validity
+from .rows import window
+from .trials import StepTrials, Trial, TrialsError, several
+
+TOLERANCE = 1e-3  # m, the paper's
+_BATCH = 100  # trials a job
+_DIGITS = 6
+_PLAUSIBLE = (0.1, 10.0)  # gains
+_PLAUSIBLE_LAG = (1e-3, 10.0)  # s
+
+
+class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
+    """One trial's fit of one order; plant parameters of the other order are null, as are infinite ends of intervals.
+
+    Attributes:
+        gain: K.
+        gain_ci95: Its 95 % interval.
+        delay: Td [s].
+        delay_ci95: Its interval.
+        time_constant: τ [s].
+        time_constant_ci95: Its interval.
+        natural_frequency: ω [rad/s].
+        natural_frequency_ci95: Its interval.
+        damping: ζ.
+        damping_ci95: Its interval.
+        rms: Of what is left, eq. 10 [m].
+        rms_percent: Of the step.
+        fit_percent: 100 (1 − ‖what is left‖ / ‖position without its mean‖).
+        flags: What to know before trusting it.
+    """
+
+    gain: float
+    gain_ci95: Interval
+    delay: float = msgspec.field(name="delay_ms")
+    delay_ci95: Interval = msgspec.field(name="delay_ms_ci95")
+    time_constant: float | None = msgspec.field(name="time_constant_ms", default=None)
+    time_constant_ci95: Interval | None = msgspec.field(name="time_constant_ms_ci95", default=None)
+    natural_frequency: float | None = msgspec.field(name="natural_frequency_rad_s", default=None)
+    natural_frequency_ci95: Interval | None = msgspec.field(name="natural_frequency_rad_s_ci95", default=None)
+    damping: float | None = None
+    damping_ci95: Interval | None = None
+    rms: float = msgspec.field(name="rms_mm")
+    rms_percent: float
+    fit_percent: float
+    flags: list[str]
+
+
+class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
+    """One trial.
+
+    Attributes:
+        trial: Its name.
+        axis: Which was stepped.
+        step: By how much [m].
+        speed: [m/s].
+        factors: What else was varied.
+        onset: When the arm was first seen to move [s]; null: never.
+        first: First-order fit.
+        second: Second-order fit.
+        common_delay: Td under the plant that its axis's trials have in common [s]; null when left out.
+        common_gain: K under it.
+        combined_rms: Of what the combined model leaves [m]; null without one.
+        left_out: Why it is not in the combined model; null when it is.
+    """
+
+    trial: str
+    axis: str
+    step: float = msgspec.field(name="step_mm")
+    speed: float = msgspec.field(name="speed_m_s")
+    factors: Mapping[str, str]
+    onset: float | None = msgspec.field(name="onset_ms")
+    first: OrderFit
+    second: OrderFit
+    common_delay: float | None = msgspec.field(name="common_delay_ms")
+    common_gain: float | None
+    combined_rms: float | None = msgspec.field(name="combined_rms_mm")
+    left_out: str | None
+
+
+class Identification(msgspec.Struct, frozen=True, kw_only=True):
+    """What a campaign tells.
+
+    Attributes:
+        arm: The combined model.
+        method: ``fitted``, or ``published`` with the paper's own measurements.
+        samples: How many from the step on were used; null: all.
+        tolerance: RMS up to which the model is called valid [m].
+        trials: Every usable trial.
+        axes: The combined model of each axis, with how it came about.
+        one_delay: Whether one delay does for all axes, in words.
+        dependences: The paper's Table I.
+        scatter: Normality, outlying trials and replicates of each coefficient.
+        performance: The paper's Fig. 7.
+        notes: What was left out or repaired, a sentence each.
+    """
+
+    arm: ArmModel
+    method: str
+    samples: int | None
+    tolerance: float = msgspec.field(name="tolerance_mm")
+    trials: list[TrialResult]
+    axes: dict[str, CombinedAxis]
+    one_delay: str
+    dependences: list[anova.Dependence]
+    scatter: list[anova.Scatter]
+    performance: list[Performance]
+    notes: list[str]
+
+    def to_json(self) -> str:
+        """All of it, in the units that the names tell."""
+        tree = units.from_si(msgspec.to_builtins(self, enc_hook=float))
+        return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode()
+
+
+def identify(
+    trials: StepTrials,
+    *,
+    period: float | None = None,
+    samples: int | None = None,
+    paper: bool = False,
+    tolerance: float = TOLERANCE,
+    name: str = "identified arm",
+) -> Identification:
+    """Identify an arm from step trials.
+
+    Args:
+        trials: From :meth:`StepTrials.read`.
+        period: T [s]; None: step over speed, where all trials agree on it.
+        samples: Use only so many from each step on, as the paper's 30; None: all.
+        paper: Read delay and gain off each trial, as the paper does, instead of fitting them.
+        tolerance: RMS [m] beyond which the model is not called valid.
+        name: Of the arm.
+
+    Raises:
+        TrialsError: The period is not known, or no axis has trials enough for a model.
+    """
+    period = trials.period(period)
+    fitted = _fitted(trials.trials, samples, paper)
+    by_axis = {axis: [one for one in fitted if one.trial.axis == axis] for axis in trials.axes}
+    usual = {axis: usual_gain(of_axis) for axis, of_axis in by_axis.items()}
+    notes, combined = list(trials.notes), dict[str, Combination]()
+    read = len(notes)
+    for axis, of_axis in by_axis.items():
+        found = combine(of_axis, period, samples, paper)
+        if isinstance(found, str):
+            notes.append(f"{axis}: no model: {found}")
+        else:
+            combined[axis] = found
+            if usual[axis] < 0.0:
+                notes.append(f"{axis}: the arm moves against its commands; is a sign wrong?")
+            if not _PLAUSIBLE[0] < abs(usual[axis]) < _PLAUSIBLE[1]:
+                notes.append(f"{axis}: the arm moves {usual[axis]:.3g} times as far as it is told; is a unit wrong?")
+            lag = found.axis.delays.lag.value
+            if not _PLAUSIBLE_LAG[0] < lag < _PLAUSIBLE_LAG[1]:
+                notes.append(f"{axis}: the arm is {lag:.3g} s behind its commands; is the unit of time wrong?")
+    if not combined:
+        raise TrialsError(
+            "; ".join(["no axis has trials enough for a model", *several([*notes[read:], *notes[:read]])])
+        )
+    arm, one_delay = _arm(combined, period, name)
+    rms = {
+        one.trial.name: combined_rms(one.trial, arm.axes[one.trial.axis], arm.delay_of(one.trial.axis), period, samples)
+        for one in fitted
+        if one.trial.axis in combined
+    }
+    left_out = {trial: why for found in combined.values() for trial, why in found.axis.left_out.items()}
+    used = [one for one in fitted if one.trial.name in rms and one.trial.name not in left_out]
+    own = {trial: pair for found in combined.values() for trial, pair in found.own.items()}
+    factors = anova.factors_of([one.trial for one in used], period)
+    performance = performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance)
+    limited = validity(performance, max(one.trial.speed_at(period) for one in used))
+    provenance = {
+        "made_by": f"pumafuse identify {version('pumafuse')}",
+        "trials": {axis: found.axis.trials for axis, found in combined.items()},
+        "left_out": left_out,
+        "order": {axis: found.axis.choice.why for axis, found in combined.items()},
+        "delay": one_delay,
+        "delay_spread_ms": {axis: round(found.axis.delay_spread * units.MS, 2) for axis, found in combined.items()},
+        "gain": {axis: found.axis.gain_words for axis, found in combined.items()},
+        "validity": {one.factor: one.verdict for one in performance},
+        "samples": "all" if samples is None else samples,
+        "method": "delay and gain read off each trial (--paper)" if paper else "all parameters fitted",
+    }
+    arm = _rounded(msgspec.structs.replace(arm, validity=limited, provenance=provenance))
+    return Identification(
+        arm=arm,
+        method="published" if paper else "fitted",
+        samples=samples,
+        tolerance=tolerance,
+        trials=[_result(one, period, samples, usual[one.trial.axis], own, rms, left_out) for one in fitted],
+        axes={axis: found.axis for axis, found in combined.items()},
+        one_delay=one_delay,
+        dependences=anova.dependences(_coefficients(used), factors) if factors else [],
+        scatter=_scatters(by_axis),
+        performance=performance,
+        notes=notes,
+    )
+
+
+def _fitted(trials: Sequence[Trial], samples: int | None, paper: bool) -> list[Fitted]:
+    """Every trial with its fits, over all cores where there are many."""
+    from joblib import Parallel, delayed
+
+    batches = [trials[first : first + _BATCH] for first in range(0, len(trials), _BATCH)]
+    fit = _published if paper else fit_steps
+    parallel = Parallel(n_jobs=-1 if len(batches) > 1 else 1, return_as="generator")
+    fits = [pair for batch in parallel(delayed(fit)(batch, samples) for batch in batches) for pair in batch]
+    return [Fitted(trial, *pair, onset(trial)) for trial, pair in zip(trials, fits, strict=True)]
+
+
+def _published(trials: Sequence[Trial], samples: int | None) -> list[tuple[StepFit, StepFit]]:
+    return [fit_as_published(trial, samples) for trial in trials]
+
+
+def _arm(combined: Mapping[str, Combination], period: float, name: str) -> tuple[ArmModel, str]:
+    """The arm with one delay, or one for each axis where the data ask for it, and which in words."""
+    delays = [found.common.delay for found in combined.values()]
+    every = common(np.concatenate(delays), np.concatenate([found.common.delay_sd for found in combined.values()]))
+    p = anova.welch(delays) if len(delays) > 1 else None
+    apart = p is not None and p < 0.05
+    if len(delays) == 1:
+        words = "one axis, one delay"
+    elif p is None:
+        words = "one delay: whether axes differ cannot be told"
+    elif apart:
+        words = f"a delay for each axis: they differ (Welch's test, p {'< 0.001' if p < 1e-3 else f'= {p:.2g}'})"
+    else:
+        words = f"one delay: the axes do not differ (Welch's test, p = {p:.2g})"
+    own = {axis: found.axis.model for axis, found in combined.items()}
+    axes = (
+        own if apart else {axis: msgspec.structs.replace(one, delay=None, delay_ci95=None) for axis, one in own.items()}
+    )
+    return ArmModel(name=name, update_period=period, delay=every.value, delay_ci95=every.ci95, axes=axes), words
+
+
+def _rounded(arm: ArmModel) -> ArmModel:
+    """The arm in six digits: more would only look exact."""
+
+    def rounded(value: Any) -> Any:
+        match value:
+            case float():
+                return float(f"{value:.{_DIGITS}g}")
+            case dict():
+                return {key: rounded(item) for key, item in cast(dict[str, Any], value).items()}
+            case list() | tuple():
+                return [rounded(item) for item in cast(list[Any], value)]
+            case _:
+                return value
+
+    return msgspec.convert(rounded(msgspec.to_builtins(arm)), ArmModel)
+
+
+def _coefficients(used: Sequence[Fitted]) -> dict[str, FloatArray]:
+    """The paper's three, of first-order fits, in the units that their names tell."""
+    return {
+        "delay_ms": np.array([one.first.shape.delay for one in used]) * units.MS,
+        "gain": np.array([one.first.gain for one in used]),
+        "time_constant_ms": np.array([one.first.shape.q for one in used]) * units.MS,
+    }
+
+
+def _scatters(by_axis: Mapping[str, Sequence[Fitted]]) -> list[anova.Scatter]:
+    """How each coefficient scatters on each axis."""
+    found: list[anova.Scatter] = []
+    for of_axis in by_axis.values():
+        sds = {
+            "delay_ms": np.array([one.first.delay_sd for one in of_axis]) * units.MS,
+            "gain": np.array([one.first.gain_sd for one in of_axis]),
+            "time_constant_ms": np.array([one.first.q_sd for one in of_axis]) * units.MS,
+        }
+        for coefficient, values in _coefficients(of_axis).items():
+            found.append(anova.scatter(coefficient, [one.trial for one in of_axis], values, sds[coefficient]))
+    return found
+
+
+def _result(
+    one: Fitted,
+    period: float,
+    samples: int | None,
+    usual: float,
+    own: Mapping[str, tuple[float, float]],
+    rms: Mapping[str, float],
+    left_out: Mapping[str, str],
+) -> TrialResult:
+    trial = one.trial
+    delay, gain = own.get(trial.name, (None, None))
+    return TrialResult(
+        trial=trial.name,
+        axis=trial.axis,
+        step=trial.step,
+        speed=trial.speed_at(period),
+        factors=trial.factors,
+        onset=one.onset if np.isfinite(one.onset) else None,
+        first=_order_fit(one.first, trial, usual, samples),
+        second=_order_fit(one.second, trial, usual, samples),
+        common_delay=delay,
+        common_gain=gain,
+        combined_rms=rms.get(trial.name),
+        left_out=left_out.get(trial.name),
+    )
+
+
+def _order_fit(fit: StepFit, trial: Trial, usual: float, samples: int | None) -> OrderFit:
+    moved = float(np.std(window(trial, samples)[1]))
+    plant = fit.plant
+    return OrderFit(
+        gain=fit.gain,
+        gain_ci95=fit.gain_ci95,
+        delay=fit.shape.delay,
+        delay_ci95=fit.delay_ci95,
+        time_constant=plant.time_constant if isinstance(plant, FirstOrder) else None,
+        time_constant_ci95=fit.q_ci95 if fit.order == 1 else None,
+        natural_frequency=plant.natural_frequency if isinstance(plant, SecondOrder) else None,
+        natural_frequency_ci95=fit.natural_frequency_ci95 if fit.order == 2 else None,
+        damping=plant.damping if isinstance(plant, SecondOrder) else None,
+        damping_ci95=fit.damping_ci95 if fit.order == 2 else None,
+        rms=fit.rms,
+        rms_percent=100.0 * fit.rms / abs(trial.step),
+        fit_percent=100.0 * (1.0 - fit.rms / moved) if moved > 0.0 else 0.0,
+        flags=flags(fit, usual),
+    )

@@ -1,0 +1,247 @@
+"""What to send to an arm: a randomised, balanced step campaign, and binary white noise to verify its model with.
+
+Every block of the campaign holds every combination of position, axis and speed once, in an order of its own: what
+drifts during the day does not look like a factor, and a campaign that is cut short after a block is still balanced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from .. import folders
+from ..arrays import FloatArray, IntArray
+from ..errors import ConfigError
+from ..logs import tables
+from ..model.arm import ArmModel, commanded_speed, ordered_axes
+from ..simulation.trajectory import WhiteNoise, ticks
+from ..units import MM, MS, refuse_unit
+
+TRIALS, STEPS = "trials.csv", "steps.csv"
+_NOISE = "white-noise-"
+_SETTLED = 0.98  # share of the final value
+_MOST_TRIALS, _MOST_ROWS = 100_000, 5_000_000
+_FASTEST, _SHORTEST = 10.0, 50e-6  # m/s that no arm reaches; m that no arm's sensor tells from rest
+_LEAST, _MOST = 1e-6, 10.0  # m, that a step can be
+_TAKEN = frozenset({"trial", "axis", "step_mm", "speed_m_s", "replicate", "tick", "time_s"})
+
+
+@dataclass(frozen=True)
+class Design:
+    """What a campaign is to vary.
+
+    Attributes:
+        axes: To step, one at a time.
+        speeds: Of the steps [m/s]; a step is its speed times the update period.
+        period: T [s].
+        positions: A row of coordinates for each place where steps are made, as they are to be written; one empty row
+            where the arm stays.
+        replicates: Blocks.
+        hold: How long a step is held [s].
+        rest: How long the arm rests at 0 before and after each step [s].
+        amplitudes: Of the white noise, a sequence for each axis [m].
+        noise_duration: Of each sequence [s].
+        seed: Of the order and of the noise.
+    """
+
+    axes: tuple[str, ...]
+    speeds: tuple[float, ...]
+    period: float
+    positions: tuple[Mapping[str, str], ...]
+    replicates: int
+    hold: float
+    rest: float
+    amplitudes: tuple[float, ...]
+    noise_duration: float
+    seed: int
+
+    def __post_init__(self) -> None:
+        if not self.axes or len(set(self.axes)) < len(self.axes):
+            raise ConfigError("plan: at least one axis, and each once")
+        for axis in self.axes:
+            refuse_unit("axis", axis)
+            if axis in _TAKEN or not axis.replace("_", "").replace("-", "").replace(" ", "").isalnum():
+                raise ConfigError(f"plan: an axis cannot be called '{axis}'")
+        if not self.speeds:
+            raise ConfigError("plan: at least one speed")
+        sizes = {"speeds": [speed * self.period for speed in self.speeds], "amplitudes": list(self.amplitudes)}
+        for name, lengths in sizes.items():
+            if any(not _LEAST <= length <= _MOST for length in lengths):
+                raise ConfigError(f"plan: {name} must make steps of {_LEAST * MM:g} mm to {_MOST:g} m")
+            if len({_written(length) for length in lengths}) < len(lengths):
+                raise ConfigError(f"plan: two {name} make the same step")
+        if taken := sorted(_TAKEN & set(self.positions[0])):
+            raise ConfigError(f"plan: positions cannot have a column '{taken[0]}': trials.csv needs it itself")
+        count = len(self.positions) * len(self.axes) * len(self.speeds) * self.replicates
+        rows = count * (self.hold + 2.0 * self.rest) / self.period
+        if count > _MOST_TRIALS or not rows <= _MOST_ROWS:
+            raise ConfigError(f"plan: {count} trials of {rows:.3g} ticks; at most {_MOST_TRIALS} of {_MOST_ROWS:g}")
+        ticks(self.noise_duration + 2.0 * self.rest, self.period)
+
+
+@dataclass(frozen=True)
+class PlannedTrial:
+    """One step of a campaign."""
+
+    axis: str
+    speed: float
+    position: Mapping[str, str]
+    replicate: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A campaign, ready to be sent.
+
+    Attributes:
+        design: What it was made for.
+        trials: In the order in which they are to be made.
+        noise: White noise [m] by axis and amplitude, tick by tick, (n,).
+        duration: Of all sequences [s], without the moves between positions.
+        warnings: What will spoil it, a sentence each.
+    """
+
+    design: Design
+    trials: tuple[PlannedTrial, ...]
+    noise: Mapping[tuple[str, float], FloatArray]
+    duration: float
+    warnings: tuple[str, ...] = field(default=())
+
+
+def plan(design: Design, arm: ArmModel | None = None, max_speed: float | None = None) -> Plan:
+    """Lay out a campaign.
+
+    Args:
+        design: What it is to vary.
+        arm: What is known of the arm so far, for warnings; None: nothing.
+        max_speed: The arm's limit [m/s]; None: the arm's validity, where it is known.
+    """
+    rng = np.random.default_rng(design.seed)
+    cells = list(product(design.positions, design.axes, design.speeds))
+    trials: list[PlannedTrial] = []
+    for block in range(1, design.replicates + 1):
+        order: list[int] = rng.permutation(len(cells)).tolist()
+        for position, axis, speed in (cells[index] for index in order):
+            trials.append(PlannedTrial(axis, speed, position, block))
+    noise: dict[tuple[str, float], FloatArray] = {}
+    for axis in design.axes:
+        for amplitude in design.amplitudes:
+            sequence = WhiteNoise(axes=[axis], amplitude=amplitude, duration=design.noise_duration)
+            resting = np.zeros(_ticks(design.rest, design.period))
+            noise[axis, amplitude] = np.concatenate((resting, sequence.offsets(design.period, rng)[axis], resting))
+    steps = len(trials) * len(_one_step(design))
+    count = steps + sum(len(sequence) for sequence in noise.values())
+    return Plan(design, tuple(trials), noise, count * design.period, tuple(_warnings(design, arm, max_speed)))
+
+
+def check_writable(folder: Path, force: bool) -> None:
+    """Refuse early what :func:`write` would refuse late.
+
+    Raises:
+        FolderError: The folder exists and is not to be replaced, or holds something else than a plan.
+    """
+    folders.check_writable(
+        folder, force, (TRIALS, STEPS), lambda name: name in (TRIALS, STEPS) or name.startswith(_NOISE)
+    )
+
+
+def write(planned: Plan, folder: Path, force: bool) -> None:
+    """Write ``trials.csv`` as `identify` reads it, ``steps.csv`` tick by tick, and a file for each noise sequence.
+
+    Raises:
+        FolderError: See :func:`check_writable`, or the disk refuses.
+    """
+    check_writable(folder, force)
+    design, axes = planned.design, ordered_axes(set(planned.design.axes))
+    listed: dict[str, Sequence[object]] = {
+        "trial": range(1, len(planned.trials) + 1),
+        "axis": [trial.axis for trial in planned.trials],
+        "step_mm": [round(trial.speed * design.period * MM, 6) for trial in planned.trials],
+        "speed_m_s": [trial.speed for trial in planned.trials],
+        **{name: [trial.position[name] for trial in planned.trials] for name in design.positions[0]},
+        "replicate": [trial.replicate for trial in planned.trials],
+    }
+    with folders.replacing(folder) as new:
+        tables.write(pa.table({name: list(cells) for name, cells in listed.items()}), new / TRIALS)
+        shape = _one_step(design)
+        number = np.repeat(np.arange(1, len(planned.trials) + 1), len(shape))
+        steps = {axis: np.concatenate([_offsets(design, trial, axis) for trial in planned.trials]) for axis in axes}
+        first = {"trial": number, **_clock(np.tile(np.arange(len(shape)), len(planned.trials)), design.period)}
+        tables.write(pa.table({**first, **_columns(steps)}), new / STEPS)
+        for (axis, amplitude), sequence in planned.noise.items():
+            file = new / f"{_NOISE}{axis}-{_written(amplitude)}mm.csv"
+            clock = _clock(np.arange(len(sequence)), design.period)
+            tables.write(pa.table({**clock, **_columns({axis: sequence})}), file)
+
+
+def _written(length: float) -> str:
+    """In mm, to the nanometre, as files have it."""
+    return f"{round(length * MM, 6):.10g}"
+
+
+def _ticks(duration: float, period: float) -> int:
+    return max(round(duration / period), 1)
+
+
+def _one_step(design: Design) -> FloatArray:
+    """0, 1, 0: a step of size 1 with the rest before and after it, tick by tick."""
+    rest, hold = _ticks(design.rest, design.period), _ticks(design.hold, design.period)
+    return np.concatenate((np.zeros(rest), np.ones(hold), np.zeros(rest)))
+
+
+def _offsets(design: Design, trial: PlannedTrial, axis: str) -> FloatArray:
+    """What one axis is told during one trial [m]."""
+    return _one_step(design) * (trial.speed * design.period if trial.axis == axis else 0.0)
+
+
+def _clock(tick: IntArray, period: float) -> dict[str, IntArray | FloatArray]:
+    return {"tick": tick, "time_s": np.asarray(np.round(tick * period, 9), dtype=np.float64)}
+
+
+def _columns(offsets: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    return {f"{axis}_mm": np.round(values * MM, 6) for axis, values in offsets.items()}
+
+
+def _warnings(design: Design, arm: ArmModel | None, max_speed: float | None) -> list[str]:
+    found: list[str] = []
+    if len(design.speeds) == 1:
+        found.append("one speed only: how the gain depends on speed cannot be told")
+    if design.replicates == 1:
+        found.append("no replicates: what moves from trial to trial cannot be told from what the factors do")
+    if not design.amplitudes:
+        found.append("no white noise: there will be nothing to verify the model with")
+    limit = arm.validity.max_speed if max_speed is None and arm is not None else max_speed
+    largest = commanded_speed(np.array(design.amplitudes), design.period)
+    fastest = max(*design.speeds, float(largest.max(initial=0.0)))
+    longest = max([speed * design.period for speed in design.speeds] + list(design.amplitudes))
+    if fastest > _FASTEST or longest < _SHORTEST:
+        found.append(f"steps are {longest * MM:.3g} mm at most, {fastest:.3g} m/s at T; is a unit wrong?")
+    if len({tuple(place.items()) for place in design.positions}) < len(design.positions):
+        found.append("positions: one is listed twice: it is tried twice as often as the others")
+    if limit is not None and fastest > limit:
+        found.append(f"commanded speeds reach {fastest:.3g} m/s, the limit is {limit:.3g} m/s")
+    if arm is None:
+        found.append("not checked: whether steps settle within the hold; give --arm")
+        return found
+    for axis in design.axes:
+        needed = arm.delay_of(axis) + _settling(arm, axis)
+        if needed > design.hold:
+            found.append(
+                f"{axis}: the hold of {design.hold * MS:.0f} ms is too short to settle: {needed * MS:.0f} ms are needed"
+            )
+        if needed > 2.0 * design.rest + design.period:
+            found.append(f"{axis}: the rest of {2.0 * design.rest * MS:.0f} ms between steps is too short to settle")
+    return found
+
+
+def _settling(arm: ArmModel, axis: str) -> float:
+    """Until the plant stays within 2 % of its final value [s]."""
+    plant = arm.axis(axis).plant
+    time = np.linspace(0.0, 20.0 * plant.lag + 1e-9, 4001)
+    outside = np.flatnonzero(np.abs(plant.step_response(time) - 1.0) > 1.0 - _SETTLED)
+    return float(time[outside[-1]])

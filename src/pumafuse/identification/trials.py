@@ -1,0 +1,205 @@
+"""Step trials as recorded: what each was, and how the tool moved."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..errors import PumafuseError, RunError
+from ..logs import tables
+from ..model.arm import ordered_axes
+from ..units import ending, seconds
+
+_FEWEST = 8  # samples from the step on: a second-order fit with delay, gain and zero has five unknowns
+_AGREE = 0.03  # how far step over speed may differ between trials and still be one update period
+_PERIODS = (0.001, 0.2)  # s, that an update period can be
+_GIVEN = (1e-4, 10.0)  # s, that one can be given
+_LATEST, _FARTHEST = 3600.0, 1e6  # s and m that a sample can be away from its command and from 0
+_SAID = 4  # sentences in the line of an error
+_STEPS = (1e-9, 1e3)  # m, that a step can be
+
+
+class TrialsError(PumafuseError):
+    """Step trials cannot be read or used as they are."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One step; arrays are (n,).
+
+    Attributes:
+        name: Of the trial.
+        axis: Which axis was stepped.
+        step: By how much, signed [m].
+        speed: Step size over the update period [m/s]; NaN where it is not recorded.
+        factors: What else was varied, as written.
+        time: Of each sample since the step's command [s], ascending.
+        position: Of each sample [m]; its zero is the sensor's.
+    """
+
+    name: str
+    axis: str
+    step: float
+    speed: float
+    factors: Mapping[str, str]
+    time: FloatArray
+    position: FloatArray
+
+    def speed_at(self, period: float) -> float:
+        """The speed as recorded, or step over ``period`` [s] where it is not [m/s]."""
+        return self.speed if self.speed > 0.0 else abs(self.step) / period
+
+
+@dataclass(frozen=True)
+class StepTrials:
+    """A campaign.
+
+    Attributes:
+        trials: Those that can be fitted, in the order of the list.
+        notes: Every trial that was left out and every repair, a sentence each.
+    """
+
+    trials: tuple[Trial, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes that were stepped."""
+        return ordered_axes({trial.axis for trial in self.trials})
+
+    def of(self, axis: str) -> list[Trial]:
+        """The trials of one axis."""
+        return [trial for trial in self.trials if trial.axis == axis]
+
+    def period(self, given: float | None = None) -> float:
+        """The update period T [s]: as ``given``, or step over speed where all trials agree on it.
+
+        Raises:
+            TrialsError: The trials do not agree, or on no period of 1 to 200 ms.
+        """
+        if given is not None:
+            if not _GIVEN[0] <= given <= _GIVEN[1]:
+                raise TrialsError(f"an update period of {given * 1e3:g} ms: it must be 0.1 ms to 10 s")
+            return given
+        told = [trial for trial in self.trials if trial.speed > 0.0]
+        step, speed = np.abs([trial.step for trial in told]), np.array([trial.speed for trial in told])
+        middle = float(np.median(step / speed)) if told else np.nan
+        if not _PERIODS[0] <= middle <= _PERIODS[1] or (np.abs(step / speed / middle - 1.0) > _AGREE).any():
+            raise TrialsError("step over speed is not one update period of 1 to 200 ms in all trials: give --period")
+        # least squares through 0: speeds are rounded, the small ones the most for their size
+        found = float(step @ speed / (speed @ speed))
+        whole, scatter = round(found, 3), float(np.std(step / speed / found))
+        return whole if abs(whole / found - 1.0) <= 0.5 * scatter else found
+
+    @staticmethod
+    def read(folder: str | Path) -> StepTrials:
+        """Read ``trials`` and ``samples`` of a folder, CSV (gzip allowed) or Parquet.
+
+        Args:
+            folder: Where they are. ``trials``: ``trial``, ``axis``, ``step_mm``, ``speed_m_s``; any further column is a
+                factor. ``samples``: ``trial``, ``time_s`` since the command, ``position_mm``. Other units by name.
+
+        Raises:
+            RunError: A table is absent or cannot be read.
+            TrialsError: No trial is left.
+        """
+        listed, sampled = _table(Path(folder), "trials"), _table(Path(folder), "samples")
+        notes = [*listed.notes, *sampled.notes]
+        step = _numbers(listed, "step", notes)
+        speed, remark = (
+            listed.plain("speed_m_s") if "speed_m_s" in listed.columns else (np.full(listed.rows, np.nan), None)
+        )
+        notes.extend([] if remark is None else [remark])
+        names, axes = listed.texts("trial"), listed.texts("axis")
+        own = {"trial", "axis", "speed_m_s", _column(listed, "step")}
+        factors = {column: listed.texts(column) for column in listed.columns if column not in own}
+        samples = _samples(sampled, notes)
+        known = Counter(names)
+        strange = [name for name in samples if name not in known]
+        if strange:
+            notes.append(f"{sampled.path.name}: {len(strange)} trials are not listed, first '{strange[0]}': left out")
+        trials: list[Trial] = []
+        for row, name in enumerate(names):
+            if not name:
+                notes.append(f"{listed.path.name}: row {row + 1} names no trial: left out")
+                continue
+            time, position = samples.get(name, (np.zeros(0), np.zeros(0)))
+            found = (np.abs(time) < _LATEST) & (np.abs(position) < _FARTHEST)
+            reason = _unusable(known[name], axes[row], float(step[row]), time[found])
+            if reason is not None:
+                notes.append(f"trial '{name}': {reason}: left out")
+                continue
+            if not found.all():
+                notes.append(f"trial '{name}': {int((~found).sum())} samples without a number: left out")
+            time, position = time[found], position[found]
+            if (np.diff(time) < 0.0).any():
+                notes.append(f"trial '{name}': times step back: sorted")
+                order = np.argsort(time, kind="stable")
+                time, position = time[order], position[order]
+            of = {factor: cells[row] for factor, cells in factors.items()}
+            trials.append(Trial(name, axes[row], float(step[row]), float(speed[row]), of, time, position))
+        if not trials:
+            raise TrialsError("; ".join([f"{folder}: no trial can be used", *several(notes)]))
+        return StepTrials(tuple(trials), tuple(notes))
+
+
+def several(notes: Sequence[str]) -> list[str]:
+    """The first few of many sentences, and how many more there are: an error is one line that can be read."""
+    more = len(notes) - _SAID
+    return [*notes[:_SAID], *([f"and {more} more"] if more > 0 else [])]
+
+
+def _unusable(times_listed: int, axis: str, step: float, time: FloatArray) -> str | None:
+    """Why a trial cannot be fitted; None when it can. ``time`` is of its samples [s]."""
+    if times_listed > 1:
+        return f"listed {times_listed} times"
+    if not axis:
+        return "it names no axis"
+    if not _STEPS[0] <= abs(step) <= _STEPS[1]:
+        return (
+            "its step is 0 or no number"
+            if step == 0.0 or not np.isfinite(step)
+            else "its step is of no size an arm has"
+        )
+    after = len(np.unique(time[time >= 0.0]))
+    return f"{after} samples from the step on, at least {_FEWEST} are needed" if after < _FEWEST else None
+
+
+def _table(folder: Path, stem: str) -> tables.Table:
+    for suffix in (".csv", ".csv.gz", ".parquet"):
+        if (folder / f"{stem}{suffix}").exists():
+            return tables.read(folder / f"{stem}{suffix}")
+    raise RunError(f"{folder}: no {stem}.csv (or .csv.gz, .parquet) in it")
+
+
+def _column(table: tables.Table, stem: str) -> str:
+    """The column of this name with any unit."""
+    for name in table.columns:
+        if name.removesuffix(ending(name) or "") == stem:
+            return name
+    raise RunError(f"{table.path}: no column '{stem}' with a unit in its name; it has {', '.join(table.columns)}")
+
+
+def _numbers(table: tables.Table, stem: str, notes: list[str]) -> FloatArray:
+    values, note = table.numbers(_column(table, stem))
+    notes.extend([] if note is None else [note])
+    return values
+
+
+def _samples(table: tables.Table, notes: list[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Times [s] and positions [m] of each trial, in the order of the file."""
+    stamp, note = table.stamps(_column(table, "time"))
+    notes.extend([] if note is None else [note])
+    time = seconds(stamp)
+    position = _numbers(table, "position", notes)
+    if not table.rows:
+        return {}
+    names, place = np.unique(np.array(table.texts("trial"), dtype=object), return_inverse=True)
+    order = np.argsort(place, kind="stable")
+    parts = np.split(order, np.cumsum(np.bincount(place, minlength=len(names)))[:-1])
+    return {str(name): (time[part], position[part]) for name, part in zip(names.tolist(), parts, strict=True)}

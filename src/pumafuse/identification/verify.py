@@ -1,0 +1,247 @@
+"""Does a model hold on a run it was not made from? The paper's white-noise verification, Table III and Figs. 8 and 9.
+
+The model is driven by the run's commands alone and compared with what was measured, both without their means, as in the
+paper. Beside it stands the floor: the best linear model of the same order, refitted on this very run; no model of that
+kind can do better, so what is left is noise, friction and everything else that is not linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from .. import units
+from ..arrays import FloatArray
+from ..errors import ConfigError, RunError
+from ..fusion import timeline as timelines
+from ..fusion.config import FusionConfig, Sensor
+from ..fusion.timeline import AxisInput
+from ..logs.axes import in_axes
+from ..logs.clock import segments
+from ..logs.run import Run
+from ..model.arm import ArmModel, AxisModel
+from ..model.plants import SecondOrder
+from .floor import Floor, best_of_order
+from .measured import Commands, Fit, Measured
+
+RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
+REFERENCE = "reference"
+_FEWEST = 20  # measurements
+_MOST_LEVELS = 8  # of a run whose start level is looked for among them
+_AS_GOOD, _FAR = 1.2, 3.0  # times the floor
+_FARTHEST, _SLOWEST = 1e6, 1e4  # m, s: sizes beyond which nothing can be computed
+_HOLDS = 50.0  # % fit
+_BETTER = 0.8  # share of the error that is worth a word
+
+
+class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
+    """One axis of a run against one source.
+
+    Attributes:
+        run: Its name.
+        axis: The axis.
+        source: The sensor, or ``reference``.
+        measurements: How many were compared.
+        amplitude: From the lowest to the highest command [m].
+        start: Level at which the arm was taken to rest before the first command [m].
+        start_from: How that was known, in words.
+        model: The model as it is.
+        without_recovery: With a gain that never recovers.
+        with_recovery: With a gain that recovers.
+        recovery: Its time constant [s].
+        floor: The best that a linear model of this order can do on this run.
+        outlying: Measurements that jump eight robust standard deviations away from their neighbours, which are left
+            out.
+        verdict: In words.
+        notes: What was wrong with the run, a sentence each; with the first axis and source of each part of it.
+    """
+
+    run: str
+    axis: str
+    source: str
+    measurements: int
+    amplitude: float = msgspec.field(name="amplitude_mm")
+    start: float = msgspec.field(name="start_mm")
+    start_from: str
+    model: Fit
+    without_recovery: Fit
+    with_recovery: Fit
+    recovery: float = msgspec.field(name="recovery_ms")
+    floor: Floor
+    outlying: int
+    verdict: str
+    notes: list[str]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What was compared, without means, for a picture. Arrays (n,).
+
+    Attributes:
+        time: [s] since the first command.
+        measured: [m].
+        modelled: [m].
+    """
+
+    time: FloatArray
+    measured: FloatArray
+    modelled: FloatArray
+
+
+def verify(
+    run: Run, arm: ArmModel, *, sensors: Iterable[str] | None = None, start: Mapping[str, float] | None = None
+) -> list[tuple[AxisVerification, Trace]]:
+    """Simulate a run's commands and compare with what was measured.
+
+    Args:
+        run: With measurements or a reference that are true at their stamps.
+        arm: The model.
+        sensors: Which sensors, or ``reference``; None: the reference where there is one, else every sensor.
+        start: Level [m] before the first command by axis; where it is not known from here or the run, it is chosen
+            among the run's levels by RMS.
+
+    Returns:
+        For each axis and source the verdict, and the traces it was made of.
+
+    Raises:
+        PumafuseError: The run has no such sensor, commands an axis that the arm has not, or nothing to compare with.
+    """
+    for axis, level in (start or {}).items():
+        if not abs(level) <= _FARTHEST:
+            raise ConfigError(
+                f"start level of '{axis}': {level * units.MM:g} mm is not finite, or nowhere an arm can be"
+            )
+    chosen = _with_reference(run, None if sensors is None else tuple(sensors))
+    config = FusionConfig(arm=arm, sensors={name: Sensor(sd=1e-3) for name in chosen.sensors})
+    parts, said = segments(in_axes(chosen, None)[0])
+    found: list[tuple[AxisVerification, Trace]] = []
+    for number, part in enumerate(parts, 1):
+        name = run.name if len(parts) == 1 else f"{run.name}, part {number}"
+        part = replace(part, name=name, start={**part.start, **(start or {})})
+        found.extend(_part(part, config, said if number == 1 else ()))
+    if not found:
+        raise RunError(
+            f"run '{run.name}': no source has {_FEWEST} measurements of a commanded axis after the first command"
+        )
+    return found
+
+
+def _part(run: Run, config: FusionConfig, said: Sequence[str]) -> list[tuple[AxisVerification, Trace]]:
+    """Every axis and source of one segment of a run."""
+    timeline = timelines.build(run, config)
+    components, found = timeline.components, list[tuple[AxisVerification, Trace]]()
+    axis, sensor = components.axis[components.candidates], components.sensor[components.candidates]
+    for number, driven in enumerate(timeline.axes):
+        for index, source in enumerate(components.sensors):
+            here = components.candidates[(axis == number) & (sensor == index)]
+            if len(here) >= _FEWEST and np.ptp(driven.command) > 0.0:
+                measured = Measured(run.name, source, components.valid[here], components.value[here])
+                notes = [*said, *timeline.notes] if not found else []
+                found.append(_verified(measured, driven, config.arm, driven.name in run.start, notes))
+    return found
+
+
+def _with_reference(run: Run, sensors: Sequence[str] | None) -> Run:
+    """The run with only the sources that it is verified against, as sensors."""
+    sources = dict(run.sensors)
+    if run.reference is not None:
+        sources[REFERENCE] = run.reference
+    if sensors is None:
+        sensors = (REFERENCE,) if run.reference is not None else tuple(sources)
+    if strange := [name for name in sensors if name not in sources]:
+        raise RunError(f"run '{run.name}' has no sensor '{strange[0]}'; it has {', '.join(sources) or 'none'}")
+    return replace(run, sensors={name: sources[name] for name in sensors}, reference=None)
+
+
+def _verified(
+    measured: Measured, driven: AxisInput, arm: ArmModel, given: bool, notes: list[str]
+) -> tuple[AxisVerification, Trace]:
+    model, delay = arm.axes[driven.name], arm.delay_of(driven.name)
+    _check_sizes(driven, model, delay)
+    command = Commands(driven.given, driven.command, arm.update_period)
+    recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
+    start, words = _start(measured, command, driven.start, model, delay, given)
+    every = len(measured.time)
+    measured = measured.without_spikes(command.moved(model, delay, start, measured.time))
+
+    def simulated(axis: AxisModel) -> FloatArray:
+        return command.moved(axis, delay, start, measured.time)
+
+    fits = {
+        key: measured.fit(simulated(msgspec.structs.replace(model, gain_recovery=value)), command.amplitude)
+        for key, value in (("as it is", model.gain_recovery), ("never", None), ("recovering", recovery))
+    }
+    floor = best_of_order(measured, command, model, delay, start)
+    modelled = simulated(model)
+    trace = Trace(
+        units.seconds(measured.time, int(command.time[0])),
+        measured.position - measured.position.mean(),
+        modelled - modelled.mean(),
+    )
+    verification = AxisVerification(
+        run=measured.run,
+        axis=driven.name,
+        source=measured.source,
+        measurements=len(measured.time),
+        amplitude=command.amplitude,
+        start=start,
+        start_from=words,
+        model=fits["as it is"],
+        without_recovery=fits["never"],
+        with_recovery=fits["recovering"],
+        recovery=recovery,
+        floor=floor,
+        outlying=every - len(measured.time),
+        verdict=_verdict(fits["as it is"], model, delay, floor)
+        + _recovers(fits["as it is"], fits["recovering"], recovery),
+        notes=notes,
+    )
+    return verification, trace
+
+
+def _check_sizes(driven: AxisInput, model: AxisModel, delay: float) -> None:
+    """Refuse numbers with which nothing can be computed."""
+    rates = [model.plant.natural_frequency] if isinstance(model.plant, SecondOrder) else []
+    if not all(1.0 / _SLOWEST <= rate <= _FARTHEST for rate in (*rates, 1.0 / max(model.plant.lag, 1e-300))):
+        raise ConfigError(f"axis '{driven.name}': a plant of no speed that an arm has")
+    if not (
+        max(abs(driven.start), abs(model.gain.slope), abs(model.gain.intercept)) <= _FARTHEST and delay <= _SLOWEST
+    ):
+        raise ConfigError(f"axis '{driven.name}': a start level, gain or delay of no size that an arm has")
+
+
+def _start(
+    measured: Measured, command: Commands, first: float, model: AxisModel, delay: float, given: bool
+) -> tuple[float, str]:
+    """Where the arm rested before the first command [m], and how that is known."""
+    if given:
+        return first, "given"
+    levels = np.unique(command.value)
+    if len(levels) > _MOST_LEVELS:
+        return first, "the first command"
+    rms = [np.std(measured.position - command.moved(model, delay, level, measured.time)) for level in levels.tolist()]
+    return float(levels[np.argmin(rms)]), f"chosen among the run's {len(levels)} levels by RMS"
+
+
+def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor) -> str:
+    """How near the model is to the best of its order, and where the two differ."""
+    if max(floor.fit.fit, model.fit) < _HOLDS:
+        return "no linear model of this order fits: look at the log"
+    ratio = model.rms / floor.fit.rms if floor.fit.rms > 0.0 else 1.0 if model.rms == 0.0 else np.inf
+    if ratio < _AS_GOOD:
+        return "as good as any model of its order"
+    later = (floor.delay + floor.plant.lag) - (delay + axis.plant.lag)
+    differ = f"here the arm answers {abs(later) * units.MS:.1f} ms {'later' if later > 0.0 else 'sooner'}"
+    held = "does not hold" if model.fit < _HOLDS else "follows the motion" if ratio > _FAR else "holds"
+    return (
+        f"{held}, with {ratio:.1f} times the error of the best model of its order: {differ}, with gain {floor.gain:.2f}"
+    )
+
+
+def _recovers(model: Fit, recovering: Fit, recovery: float) -> str:
+    if recovering.rms > _BETTER * model.rms:
+        return ""
+    return f"; with gain_recovery_ms = {recovery * units.MS:g} {recovering.rms * units.MM:.3g} mm are left"

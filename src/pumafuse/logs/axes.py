@@ -1,0 +1,125 @@
+"""Runs logged in x, y, z as runs in the arm's axes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from ..arrays import NO_STAMP, FloatArray
+from ..errors import RunError
+from .clock import TOLERATED_STEP_BACK_NS, behind, without_strays
+from .frames import CARTESIAN, Frame, Placed, Rotated
+from .run import Run, Source
+
+S = TypeVar("S", bound=Source)
+
+
+def in_axes(run: Run, frame: Frame | None) -> tuple[Run, Placed | None]:
+    """A run with every Cartesian source turned into axes; sources that name axes are taken as they are.
+
+    Stray stamps are taken for none first (:func:`pumafuse.logs.clock.without_strays`): the start level and the turns
+    that x and y leave open must not come from them.
+
+    Args:
+        run: The run as logged.
+        frame: The frame to use where the run itself has none.
+
+    Returns:
+        The run in axes, and the frame in its place; the run as it is and None without a frame.
+
+    Raises:
+        RunError: A source gives x without y, or names an axis both ways; or the start is not known in x and y.
+    """
+    run = without_strays(run)
+    frame = frame if run.frame is None else run.frame
+    named = {name for source in (run.command, *run.sensors.values()) for name in source.values}
+    if frame is None or named.isdisjoint(CARTESIAN):
+        return run, None
+    if ("x" in run.start) != ("y" in run.start):
+        raise RunError(f"run '{run.name}': start gives one of x and y; a frame needs both")
+    placed = _placed(run, frame)
+    command = _converted(run.command, placed, None)
+    start = {axis: level for axis, level in run.start.items() if axis not in CARTESIAN}
+    if "x" in run.start:
+        tangential, radial, _ = placed.to_axes(np.array([run.start["x"]]), np.array([run.start["y"]]))
+        start |= {"tangential": float(tangential[0]), "radial": float(radial[0])}
+    if "z" in run.start:
+        start["vertical"] = run.start["z"]
+    return replace(
+        run,
+        command=command,
+        sensors={name: _converted(source, placed, command) for name, source in run.sensors.items()},
+        reference=None if run.reference is None else _converted(run.reference, placed, command),
+        start=start,
+        frame=None,
+    ), placed
+
+
+def _placed(run: Run, frame: Frame) -> Placed:
+    if isinstance(frame, Rotated):
+        return placed_at(frame, 0.0, 0.0, "")
+    if "x" in run.start and "y" in run.start:
+        x, y = run.start["x"], run.start["y"]
+    elif "x" in run.command.values and "y" in run.command.values:
+        x_all, y_all = run.command.values["x"], run.command.values["y"]
+        usable = np.flatnonzero(np.isfinite(x_all) & np.isfinite(y_all) & (run.command.stamp != NO_STAMP))
+        if not len(usable):
+            raise RunError(f"{run.command.label}: no command has both x and y")
+        jumps = np.flatnonzero(behind(run.command.stamp) > TOLERATED_STEP_BACK_NS)
+        segment = usable[usable < jumps[0]] if len(jumps) and usable[0] < jumps[0] else usable
+        first = segment[np.argmin(run.command.stamp[segment])]
+        x, y = float(x_all[first]), float(y_all[first])
+    else:
+        raise RunError(
+            f"run '{run.name}': a cylindrical frame takes its radius and angle from the start level; give the commands,"
+            " or start, in x and y"
+        )
+    return placed_at(frame, x, y, f"run '{run.name}'")
+
+
+def placed_at(frame: Frame, x: float, y: float, label: str) -> Placed:
+    """A frame whose start level is at x and y [m] of the log.
+
+    Raises:
+        RunError: That is on the base's axis, where there is no angle.
+    """
+    if isinstance(frame, Rotated):
+        return Placed(frame, 1.0, float(np.deg2rad(frame.azimuth)))
+    dx, dy = x - frame.base[0], y - frame.base[1]
+    if dx == 0.0 and dy == 0.0:
+        raise RunError(f"{label}: the arm starts on its base's axis, where it has no angle; check base_mm")
+    return Placed(frame, float(np.hypot(dx, dy)), float(np.arctan2(dy, dx)))
+
+
+def _converted(source: S, placed: Placed, command: Source | None) -> S:
+    given = [name for name in CARTESIAN if name in source.values]
+    if not given:
+        return source
+    if ("x" in given) != ("y" in given):
+        raise RunError(f"{source.label}: gives {'x without y' if 'x' in given else 'y without x'}; a frame needs both")
+    values = {axis: value for axis, value in source.values.items() if axis not in CARTESIAN}
+    spread = dict(source.spread)
+    found: dict[str, FloatArray] = {}
+    if "x" in given:
+        near = None if command is None or isinstance(placed.frame, Rotated) else _commanded(command, source)
+        found["tangential"], found["radial"], spread["tangential"] = placed.to_axes(
+            source.values["x"], source.values["y"], near
+        )
+    if "z" in given:
+        found["vertical"] = source.values["z"]
+    for axis in found:
+        if axis in values:
+            raise RunError(f"{source.label}: gives {axis} both by its name and by {', '.join(given)}; give one")
+    return replace(source, values={**values, **found}, spread=spread)
+
+
+def _commanded(command: Source, source: Source) -> FloatArray:
+    """The commanded tangential position [m] at each row of a source."""
+    if "tangential" not in command.values:
+        raise RunError(f"{command.label}: {source.label} is in x and y, the commands are not; give them in x and y too")
+    tangential = command.values["tangential"]
+    usable = np.isfinite(tangential) & (command.stamp != NO_STAMP)
+    order = np.argsort(command.stamp[usable], kind="stable")
+    return np.interp(source.stamp, command.stamp[usable][order], tangential[usable][order])

@@ -1,0 +1,183 @@
+"""Stamps that step back: how far, which of them are stray, and where a clock was set back, which cuts a run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import TypeVar
+
+import numpy as np
+
+from ..arrays import NO_STAMP, IntArray, TimeArray
+from ..errors import RunError
+from .defects import tell
+from .run import Run, Source
+
+TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
+_BELIEVED = 3  # rows in a row that have another time: the clock was set anew; fewer are stray
+_MOST_JUMPS = 100
+
+S = TypeVar("S", bound=Source)
+
+
+def behind(stamp: TimeArray) -> TimeArray:
+    """How far each row is behind the latest stamp before it [ns], 0 for a row in order or without a stamp, (rows,)."""
+    return np.where(stamp == NO_STAMP, 0, np.maximum.accumulate(stamp) - stamp)
+
+
+def astray(stamp: TimeArray) -> IntArray:
+    """How far each row's stamp is from the time that the rows around it agree on [ns], (rows,); 0 unless it is stray.
+
+    One or two rows in a row are stray if the log goes on after them where it was before them. With the row before them
+    that is not stray itself, the row after them, and 1 s for "far":
+
+    - each is far ahead of both, or far behind the one before; and the row after is not far behind the one before;
+    - at the beginning of the log, where no row is before: each is far ahead of the row after;
+    - at its end, where no row is after: each is far behind the row before.
+
+    At the beginning and the end the side that tells must have at least three rows. Of one row and two, one is tried
+    first. Three in a row or more are never stray: there the clock was set anew. What is ahead and never contradicted is
+    no stray stamp but a pause. Rows without a stamp are passed over.
+    """
+    found = np.zeros(len(stamp), dtype=np.int64)
+    stamped = np.flatnonzero(stamp != NO_STAMP) if NO_STAMP in stamp else slice(None)
+    known = stamp[stamped]
+    back = np.flatnonzero(np.diff(known) < -TOLERATED_STEP_BACK_NS) + 1
+    if not len(back):
+        return found
+    apart = np.zeros(len(known), dtype=np.int64)
+    stamps: list[int] = known.tolist()
+    before, after = -1, 0  # the last row that is not stray before `after`
+    for row in np.unique(back[:, None] - [2, 1, 0]).tolist():  # nothing else can begin what ends in a step back
+        if row < after:
+            continue
+        before = before if row == after else row - 1
+        after = row + _stray_from(stamps, before, row)
+        if after > row:
+            apart[row:after] = known[row:after] - known[before if before >= 0 else after]
+    edges = np.flatnonzero(np.diff(apart != 0, prepend=False, append=False))
+    for first, end in edges.reshape(-1, 2).tolist():
+        if end - first >= _BELIEVED:
+            apart[first:end] = 0
+    found[stamped] = apart
+    return found
+
+
+def _stray_from(stamp: Sequence[int], before: int, row: int) -> int:
+    """How many rows from ``row`` on are stray: 0, 1 or 2; ``before`` is the row before them, −1 for none."""
+    far = TOLERATED_STEP_BACK_NS
+    for after in range(row + 1, min(row + _BELIEVED, len(stamp) + 1)):
+        out = stamp[row:after]
+        if before < 0:
+            found = len(stamp) - after >= _BELIEVED and min(out) > stamp[after] + far
+        elif after == len(stamp):
+            found = before + 1 >= _BELIEVED and max(out) < stamp[before] - far
+        else:
+            low, high = stamp[before] - far, max(stamp[before], stamp[after]) + far
+            found = stamp[after] >= low and all(one < low or one > high for one in out)
+        if found:
+            return after - row
+    return 0
+
+
+def without_strays(run: Run) -> Run:
+    """A run whose stray stamps (see :func:`astray`) are taken for none, with a note on each source that has any.
+
+    Their rows stay where they are and are counted as rows without a stamp: commands are not used, measurements are
+    invalid,
+    and all other rows are met as if these were not there. Rows of sensors and of the reference that are far behind keep
+    their stamps, since they disturb no other: the timeline calls them too late. Done once: what is left of stamps that
+    make no sense may look stray again.
+    """
+    if run.without_strays:
+        return run
+    notes: list[str] = []
+    command = _without_strays(run.command, run.command.label, ("ahead of", "behind"), notes)
+    sensors = {
+        name: _without_strays(source, source.told_as(name), ("ahead of",), notes)
+        for name, source in run.sensors.items()
+    }
+    reference = run.reference
+    if reference is not None:
+        reference = _without_strays(reference, reference.label, ("ahead of",), notes)
+    if not notes:
+        return run
+    notes = [*run.notes, *notes]
+    return replace(run, command=command, sensors=sensors, reference=reference, notes=tuple(notes), without_strays=True)
+
+
+def _without_strays(source: S, label: str, sides: Sequence[str], notes: list[str]) -> S:
+    apart = astray(source.stamp)
+    for side in sides:
+        rows = apart > 0 if side == "ahead of" else apart < 0
+        if rows.any():
+            what = f"a stray stamp, more than 1 s {side} the rows around: taken for none"
+            tell(notes, label, rows, what, f", by {abs(apart[rows][0]) / 1e9:.3f} s")
+            source = replace(source, stamp=np.where(rows, NO_STAMP, source.stamp))
+    return source
+
+
+def segments(run: Run) -> tuple[list[Run], list[str]]:
+    """Cut a run, without its stray stamps, where the commands' clock was set back by more than 1 s.
+
+    A segment is a run of its own: the arm is taken to rest at its first command again. The sensors and the reference
+    must have jumped as often as the commands; a sensor that jumped alone is left to the timeline, which calls its rows
+    too late.
+
+    Returns:
+        The segments in order, and a sentence on each jump.
+
+    Raises:
+        RunError: The commands' clock jumped and another source's did not, or it jumps all the time.
+    """
+    run = without_strays(run)
+    cuts = _jumps(run.command)
+    if not cuts:
+        return [run], []
+
+    def pieces(source: S) -> list[S]:
+        jumps = _jumps(source)
+        if len(jumps) != len(cuts):
+            raise RunError(
+                f"{run.command.label}: the commands' clock is set back {len(cuts)} times (first in row {cuts[0] + 1}),"
+                f" that of {source.label} {len(jumps)} times; cut the log there and fuse the parts one by one"
+            )
+        return [source.rows(slice(*edges)) for edges in pairwise([0, *jumps, len(source.stamp)])]
+
+    sensors = {name: pieces(source) for name, source in run.sensors.items()}
+    references = [None] * (len(cuts) + 1) if run.reference is None else pieces(run.reference)
+    parts = [
+        replace(
+            run,
+            command=command,
+            sensors={name: parts[index] for name, parts in sensors.items()},
+            reference=references[index],
+            start=run.start if index == 0 else {},
+            notes=run.notes if index == 0 else (),
+        )
+        for index, command in enumerate(pieces(run.command))
+    ]
+    lag = behind(run.command.stamp)
+    said = [
+        f"{run.command.label}: the clock is set back by {lag[row] / 1e9:.3f} s in row {row + 1}: new segment, filter"
+        " restarted"
+        for row in cuts
+    ]
+    return parts, said
+
+
+def _jumps(source: Source) -> list[int]:
+    """Rows at which the clock was set back by more than is tolerated."""
+    stamped = np.flatnonzero(source.stamp != NO_STAMP)
+    stamp, found, first = source.stamp[stamped], list[int](), 0
+    while True:
+        back = np.flatnonzero(behind(stamp[first:]) > TOLERATED_STEP_BACK_NS)
+        if not len(back):
+            return found
+        first += int(back[0])
+        found.append(int(stamped[first]))
+        if len(found) > _MOST_JUMPS:
+            raise RunError(
+                f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock"
+            )

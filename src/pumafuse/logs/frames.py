@@ -1,0 +1,109 @@
+"""Cartesian logs as the arm's cylindrical axes, and back.
+
+``cylindrical``: radial = r, tangential = R0·(θ − θ0), vertical = z about the base's vertical axis, with R0 and θ0 from
+the start level. ``rotated``: a fixed rotation about z, for small motions.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import msgspec
+import numpy as np
+
+from ..arrays import FloatArray
+
+CARTESIAN = ("x", "y", "z")
+Direction = Literal["counterclockwise", "clockwise"]
+
+
+class _Kind(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", forbid_unknown_fields=True):
+    pass
+
+
+class Cylindrical(_Kind, frozen=True, kw_only=True, tag="cylindrical"):
+    """Cylindrical axes about the arm's base.
+
+    Attributes:
+        base: The base's vertical axis in the log's x and y [m].
+        positive: Direction of +tangential seen from above.
+    """
+
+    base: tuple[float, float] = msgspec.field(name="base_mm", default=(0.0, 0.0))
+    positive: Direction = "counterclockwise"
+
+
+class Rotated(_Kind, frozen=True, kw_only=True, tag="rotated"):
+    """Axes at a fixed angle in the log's x and y.
+
+    Attributes:
+        azimuth: Direction of +radial, counterclockwise from x [degrees, as in the file].
+        positive: Direction of +tangential seen from above: to the left of +radial, or to its right.
+    """
+
+    azimuth: float = msgspec.field(name="azimuth_deg")
+    positive: Direction = "counterclockwise"
+
+
+Frame: TypeAlias = Cylindrical | Rotated
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A frame in its place: with R0 and θ0 of a run's start.
+
+    Attributes:
+        frame: The frame.
+        radius: R0 [m]; 1 in a rotated frame, where it has no meaning.
+        angle: θ0, or the azimuth [rad].
+    """
+
+    frame: Frame
+    radius: float
+    angle: float
+
+    @property
+    def _sign(self) -> float:
+        return 1.0 if self.frame.positive == "counterclockwise" else -1.0
+
+    def to_axes(
+        self, x: FloatArray, y: FloatArray, near: FloatArray | None = None, last: float = 0.0
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Tangential and radial [m] of positions in the log's x and y [m], and how the noise of each is scaled.
+
+        Args:
+            x: (n,).
+            y: (n,).
+            near: Tangential positions [m] near by, (n,), which say how often the arm has gone round; None: the
+                positions follow one another, each less than half a turn from the last.
+            last: The tangential position [m] that the first of those follows.
+
+        Returns:
+            Tangential (n,), radial (n,), and R0/r (n,), by which the noise of a tangential measurement is larger.
+        """
+        from .frame_kernels import to_cylinder, to_plane
+
+        x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        tangential, radial, spread = np.empty(len(x)), np.empty(len(x)), np.ones(len(x))
+        if isinstance(self.frame, Rotated):
+            to_plane(x, y, math.cos(self.angle), math.sin(self.angle), self._sign, tangential, radial)
+        else:
+            nearby = np.empty(0) if near is None else near
+            to_cylinder(
+                x, y, *self.frame.base, self.radius, self.angle, self._sign, nearby, last, tangential, radial, spread
+            )
+        return tangential, radial, spread
+
+    def to_log(self, tangential: FloatArray, radial: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The log's x and y [m] of axis positions [m]; the inverse of :meth:`to_axes`."""
+        if isinstance(self.frame, Rotated):
+            across = self._sign * tangential
+            cos, sin = math.cos(self.angle), math.sin(self.angle)
+            return radial * cos - across * sin, radial * sin + across * cos
+        from .frame_kernels import from_cylinder
+
+        x, y = np.empty(len(tangential)), np.empty(len(tangential))
+        from_cylinder(tangential, radial, *self.frame.base, self.radius, self.angle, self._sign, x, y)
+        return x, y

@@ -1,0 +1,280 @@
+"""A recorded run: commands, measurements and a reference as the log has them, in SI units and file order.
+
+Nothing is mended here: stamps that repeat, step back, are stray or missing and values that are not finite stay where
+they are; the timeline gives each of them its outcome.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
+from ..errors import RunError, UnknownNameError
+from ..model.arm import CANONICAL_AXES, ordered_axes
+from ..units import nanoseconds
+from . import manifest, tables
+from .frames import CARTESIAN, Frame
+
+Clock = Literal["stamps", "regular"]
+S = TypeVar("S", bound="Source")
+
+
+@dataclass(frozen=True)
+class Source:
+    """One stream of rows, in the order of the file.
+
+    Attributes:
+        stamp: When the logger stamped each row, int64 ns, ``NO_STAMP`` where it did not, (rows,).
+        values: For each axis the value [m], NaN where the row has none, (rows,).
+        label: What a person calls it: the file, or the column group of a single table.
+        spread: For an axis that a frame has made, by what the noise of each row is scaled, (rows,).
+    """
+
+    stamp: TimeArray
+    values: Mapping[str, FloatArray]
+    label: str
+    spread: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
+
+    def told_as(self, name: str) -> str:
+        """What notes call it as the source of ``name``."""
+        return name if name == self.label else f"{name} ({self.label})"
+
+    def rows(self: S, chosen: BoolArray | IntArray | slice) -> S:
+        """The chosen rows, in the order in which they are chosen."""
+        values = {axis: value[chosen] for axis, value in self.values.items()}
+        spread = {axis: value[chosen] for axis, value in self.spread.items()}
+        return replace(self, stamp=self.stamp[chosen], values=values, spread=spread)
+
+
+@dataclass(frozen=True)
+class Reference(Source):
+    """A truth for scoring, never seen by a filter; ``sd`` [m] is the standard deviation of its own noise."""
+
+    sd: float = 0.0
+
+
+@dataclass(frozen=True)
+class Run:
+    """A recorded run.
+
+    Attributes:
+        name: For people and for result folders.
+        command: The commands u.
+        sensors: The measurements by sensor.
+        reference: A truth, where there is one.
+        start: The level u₀ [m] of axes that do not rest at their first command before it.
+        clock: Whether the commands' stamps are believed (``stamps``) or fitted by a grid of T (``regular``).
+        frame: Where the log's x, y, z are in the arm's axes, for sources that give them.
+        notes: What was wrong with the files, a sentence each.
+        without_strays: Whether stray stamps are taken for none already, see :func:`pumafuse.logs.clock.without_strays`.
+    """
+
+    name: str
+    command: Source
+    sensors: Mapping[str, Source]
+    reference: Reference | None = None
+    start: Mapping[str, float] = field(default_factory=dict[str, float])
+    clock: Clock = "stamps"
+    frame: Frame | None = None
+    notes: tuple[str, ...] = ()
+    without_strays: bool = False
+
+    def __post_init__(self) -> None:
+        sources = {f"sensor {name}": source for name, source in self.sensors.items()}
+        if self.reference is not None:
+            sources["the reference"] = self.reference
+        named = {axis for source in sources.values() for axis in source.values} | set(self.axes)
+        framed = self.frame is not None or not named.isdisjoint(CARTESIAN)
+        accepted = dict.fromkeys((*self.axes, *CARTESIAN, *CANONICAL_AXES)) if framed else self.axes
+        for name, source in sources.items():
+            _known_axes(f"run '{self.name}', {name}", source.values, accepted)
+        _known_axes(f"run '{self.name}', start", self.start, accepted)
+        if self.clock not in get_args(Clock):
+            raise UnknownNameError(f"run '{self.name}'", "clock", str(self.clock), get_args(Clock))
+        for axis, level in self.start.items():
+            if not np.isfinite(level):
+                raise RunError(f"run '{self.name}': the start level of {axis} is not finite")
+        if self.reference is not None and not 0.0 <= self.reference.sd < np.inf:
+            raise RunError(f"run '{self.name}': the reference's sd must be finite and not negative")
+        stamped = self.command.stamp != NO_STAMP
+        for axis, command in self.command.values.items():
+            if not (np.isfinite(command) & stamped).any():
+                raise RunError(f"{self.command.label}: no command for axis '{axis}' has both a stamp and a value")
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The commanded axes, in the order tangential, radial, vertical, then others by name."""
+        return ordered_axes(set(self.command.values))
+
+    @staticmethod
+    def read(path: str | Path) -> Run:
+        """Read a folder with ``run.toml``, a ``run.toml`` itself, or one table with every source in its columns.
+
+        Raises:
+            PumafuseError: Nothing there, or not a recorded run; says what, where, and what is accepted.
+        """
+        path = Path(path)
+        if os.path.isdir(path):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
+            path = path / "run.toml"
+            if not path.exists():
+                raise RunError(f"{path.parent}: a folder without run.toml; write one, or give a single table")
+        if path.suffix == ".toml":
+            return _read_manifest(path)
+        return _read_single(path)
+
+    @staticmethod
+    def from_arrays(
+        time: npt.ArrayLike,
+        command: Mapping[str, npt.ArrayLike],
+        sensors: Mapping[str, tuple[npt.ArrayLike, Mapping[str, npt.ArrayLike]]] | None = None,
+        reference: tuple[npt.ArrayLike, Mapping[str, npt.ArrayLike]] | None = None,
+        *,
+        reference_sd: float = 0.0,
+        start: Mapping[str, float] | None = None,
+        clock: Clock = "stamps",
+        frame: Frame | None = None,
+        name: str = "run",
+    ) -> Run:
+        """A run from arrays in memory; they are copied.
+
+        Args:
+            time: Stamps of the commands, float seconds or int64 ns, (n,).
+            command: u [m] for each axis, (n,).
+            sensors: For each sensor its stamps (m,) and its values [m] for each axis, (m,).
+            reference: Stamps (k,) and true positions [m] for each axis, (k,).
+            reference_sd: Standard deviation of the reference's own noise [m].
+            start: Level [m] of each axis before its first command, where it is another.
+            clock: ``stamps`` or ``regular``.
+            frame: For sources in x, y, z.
+            name: For people.
+
+        Raises:
+            RunError: Lengths differ, or there is no command.
+        """
+        streams = {sensor: _from_arrays(sensor, *arrays) for sensor, arrays in (sensors or {}).items()}
+        truth = None
+        if reference is not None:
+            source = _from_arrays("reference", *reference)
+            truth = _as_reference(source, reference_sd)
+        return Run(name, _from_arrays("command", time, command), streams, truth, dict(start or {}), clock, frame)
+
+
+def _known_axes(where: str, named: Mapping[str, object], axes: Collection[str]) -> None:
+    for axis in named:
+        if axis not in axes:
+            raise UnknownNameError(where, "axis", axis, axes)
+
+
+def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.ArrayLike]) -> Source:
+    try:
+        stamp = _stamps(np.array(time))
+        columns = {axis: np.array(value, dtype=np.float64) for axis, value in values.items()}
+    except (ValueError, TypeError, OverflowError) as error:
+        raise RunError(
+            f"{label}: stamps are int ns, float seconds or datetime64, values are numbers: {error}"
+        ) from None
+    for axis, column in columns.items():
+        if stamp.ndim != 1 or column.shape != stamp.shape:
+            raise RunError(
+                f"{label}: {axis} has shape {column.shape}, its stamps {stamp.shape}; one value a stamp is needed"
+            )
+    if not columns or not len(stamp):
+        raise RunError(f"{label}: no values")
+    return Source(stamp, columns, label)
+
+
+def _stamps(time: npt.NDArray[Any]) -> TimeArray:
+    """Int64 ns of datetime64, int ns or float seconds, all within reach."""
+    if time.dtype.kind == "M":
+        rough_s = time.astype("M8[s]").astype(np.float64)
+        if (np.abs(rough_s[~np.isnat(time)]) >= REACH_NS / 1e9).any():
+            raise ValueError("a stamp beyond the year 2110")
+        time = time.astype("M8[ns]").astype(np.int64)
+    if time.dtype.kind not in "iuf":
+        raise TypeError(f"got {time.dtype}")
+    whole = time.dtype.kind in "iu"
+    rough = time.astype(np.float64) * (1.0 if whole else 1e9)
+    missing = (time == NO_STAMP) if whole else ~np.isfinite(rough)
+    if (np.abs(rough[~missing]) >= REACH_NS).any():
+        raise ValueError("a stamp beyond the year 2110")
+    return time.astype(np.int64) if whole else nanoseconds(rough / 1e9)
+
+
+def _as_reference(source: Source, sd: float) -> Reference:
+    return Reference(source.stamp, source.values, source.label, sd=sd)
+
+
+def _read_manifest(path: Path) -> Run:
+    listed = manifest.load(path)
+    notes: list[str] = []
+    loaded: dict[str, tables.Table] = {}
+
+    def source(entry: manifest.SourceEntry) -> Source:
+        if entry.file not in loaded:
+            loaded[entry.file] = tables.read(path.parent / entry.file, growing=True)
+            notes.extend(loaded[entry.file].notes)
+        table = loaded[entry.file]
+        stamp, note = table.stamps(entry.time)
+        told = [note]
+        values: dict[str, FloatArray] = {}
+        for axis, columns in entry.axes.items():
+            parts = [table.numbers(column) for column in ([columns] if isinstance(columns, str) else columns)]
+            values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
+            told.extend(note for _, note in parts)
+        notes.extend(note for note in told if note is not None and note not in notes)
+        return Source(stamp, values, entry.file)
+
+    command = source(listed.command)
+    sensors = {name: source(entry) for name, entry in listed.sensors.items()}
+    reference = None
+    if listed.reference is not None:
+        reference = _as_reference(source(listed.reference), listed.reference.sd)
+    name = listed.name or path.parent.resolve().name
+    return Run(
+        name, command, sensors, reference, listed.command.start, listed.command.clock, listed.frame, tuple(notes)
+    )
+
+
+def _read_single(path: Path) -> Run:
+    """One table: ``time_s``, ``command.<axis>_mm``, ``<sensor>.<axis>_mm``, ``reference.<axis>_mm``."""
+    table = tables.read(path, growing=True)
+    clocks = [name for name in table.columns if name.startswith("time_")]
+    if len(clocks) != 1:
+        raise RunError(f"{path}: a single table needs one time column, 'time_s'; it has: {', '.join(table.columns)}")
+    stamp, note = table.stamps(clocks[0])
+    notes = [*table.notes, *([note] if note else [])]
+    groups: dict[str, dict[str, FloatArray]] = {}
+    left: list[str] = []
+    for column in table.columns:
+        source, dot, rest = column.partition(".")
+        if not dot:
+            left.extend([column] if column != clocks[0] else [])
+            continue
+        values, note = table.numbers(column)
+        axis = rest[: rest.rindex("_")]
+        if axis in groups.setdefault(source, {}):
+            raise RunError(f"{path}: two columns for {source}.{axis}; give one")
+        groups[source][axis] = values
+        notes.extend([note] if note else [])
+    if left:
+        notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
+    if "command" not in groups:
+        raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {', '.join(table.columns)}")
+
+    def source_of(name: str) -> Source:
+        present = ~np.all([np.isnan(value) for value in groups[name].values()], axis=0)
+        return Source(stamp, groups[name], name).rows(present)
+
+    sensors = {name: source_of(name) for name in groups if name not in ("command", "reference")}
+    reference = None
+    if "reference" in groups:
+        reference = _as_reference(source_of("reference"), 0.0)
+    name = path.name.split(".")[0]
+    return Run(name, source_of("command"), sensors, reference, notes=tuple(notes))

@@ -1,0 +1,244 @@
+"""``scenario.toml``: an arm, what differs in the true one, a trajectory, sensors, and what the filter believes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import msgspec
+import numpy as np
+
+from .. import toml, units
+from ..errors import ConfigError, PumafuseError, UnknownNameError
+from ..fusion.config import FusionConfig, Process, by_axis, load_arm
+from ..logs import save
+from ..logs.frames import CARTESIAN, Frame
+from ..logs.manifest import axis_of
+from ..logs.run import Clock
+from ..model.arm import ArmModel
+from ..toml import NotNegative
+from .lattice import LATTICE
+from .trajectory import TRAJECTORIES, PathFromFile, Steps
+from .true_arm import TrueArm, TrueAxis
+from .true_sensor import TrueSensor
+
+_OVERRIDES = ("start", "process", "sensors")
+_LEAST, _FARTHEST, _LONGEST = 1e-12, 1e5, 4e9  # SI; 100 km, 127 years
+
+
+class CommandLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the commands are logged.
+
+    Attributes:
+        stamp_jitter: Standard deviation of the logger's stamps around the true ticks [s].
+        clock: What ``run.toml`` says of the stamps.
+    """
+
+    stamp_jitter: NotNegative = msgspec.field(name="stamp_jitter_ms", default=0.0)
+    clock: Clock = "stamps"
+
+
+class Truth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the reference is recorded.
+
+    Attributes:
+        rows_per_command: Rows in each update period, the first at the command's own instant.
+        sd: Noise of its own [m].
+    """
+
+    rows_per_command: Annotated[int, msgspec.Meta(gt=0, le=LATTICE)] = 5
+    sd: NotNegative = msgspec.field(name="sd_mm", default=0.0)
+
+
+class TrueStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where the arm rests before the first command.
+
+    Attributes:
+        offset_sd: Of the offset there, drawn for each run and axis [m].
+        level: By axis [m]; 0 where absent.
+    """
+
+    offset_sd: NotNegative = msgspec.field(name="offset_sd_mm", default=0.0)
+    level: dict[str, float] = msgspec.field(default_factory=dict[str, float])
+
+
+class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What ``scenario.toml`` holds, in SI units.
+
+    Attributes:
+        name: For people and for the runs' names.
+        teaches: A sentence on what it is good for.
+        seed: Of the first run.
+        arm: What the filter believes.
+        true_arm: What is different about the true arm, by axis.
+        trajectory: What the arm is told.
+        start: Where it rests before.
+        process: How each axis strays from its model.
+        command: How the commands are logged.
+        reference: How the truth is recorded.
+        sensors: What each sensor truly does.
+        frame: With one, commands, sensors and reference are logged in x, y, z.
+        start_azimuth: Direction of the start level from the base, counterclockwise from x [degrees, as in the file].
+        filter: What the filter believes otherwise than it is: tables of ``fusion.toml`` that override.
+    """
+
+    name: str
+    teaches: str = ""
+    seed: Annotated[int, msgspec.Meta(ge=0)] = 1
+    arm: ArmModel
+    true_arm: dict[str, TrueArm] = {}
+    trajectory: TRAJECTORIES
+    start: TrueStart = TrueStart()
+    process: dict[str, Process] = {}
+    command: CommandLog = CommandLog()
+    reference: Truth = Truth()
+    sensors: dict[str, TrueSensor] = {}
+    frame: Frame | None = None
+    start_azimuth: float = msgspec.field(name="start_azimuth_deg", default=0.0)
+    filter: dict[str, Any] = {}
+
+    def __post_init__(self) -> None:
+        for name in (*self.trajectory.named, *self.start.level):
+            self.arm.axis(name)
+        for name in self.arm.axes:
+            save.check_axis(name)
+        for name, sensor in self.sensors.items():
+            save.check_name(name)
+            self._check(f"sensors.{name}", sensor)
+        if isinstance(self.trajectory, Steps):
+            self._check_steps(self.trajectory)
+        for key in self.filter:
+            if key not in _OVERRIDES:
+                raise UnknownNameError("filter", "table", key, _OVERRIDES)
+        if self.frame is not None:
+            if not {"tangential", "radial"} <= set(self.arm.axes):
+                raise ConfigError("frame: an arm in x, y, z needs the axes tangential and radial")
+            if not self.start.level.get("radial", 0.0) > 0.0:
+                raise ConfigError("frame: start.level.radial_mm must say how far from the base's axis the arm starts")
+        _ = self.config, self.true_axes  # what does not fit together is said now
+
+    def _check(self, where: str, sensor: TrueSensor) -> None:
+        logged = CARTESIAN if self.frame is not None and sensor.axes is None else tuple(self.arm.axes)
+        named = {
+            "axes": sensor.axes or [],
+            "sd_mm": sensor.sd if isinstance(sensor.sd, dict) else [],
+            "bias_mm": sensor.bias if isinstance(sensor.bias, dict) else [],
+        }
+        for key, names in named.items():
+            for name in names:
+                if name not in logged:
+                    raise UnknownNameError(f"{where}.{key}", "axis", name, logged)
+        if logged is CARTESIAN and isinstance(sensor.sd, dict):
+            raise ConfigError(f"{where}.sd_mm: one number for a sensor in x, y, z")
+        seen = set(self.trajectory.named) if sensor.axes is None else set(sensor.axes) & set(self.trajectory.named)
+        for axis in sorted(seen - set(sensor.sd)) if isinstance(sensor.sd, dict) else []:
+            raise ConfigError(f"{where}.sd_mm: no entry for '{axis}', which it measures")
+        fastest = LATTICE / self.arm.update_period
+        if sensor.rate > fastest:
+            raise ConfigError(
+                f"{where}.rate_hz: at most {fastest:g} on this arm ({LATTICE} rows a command), got {sensor.rate:g}"
+            )
+        if sensor.outliers is not None and sensor.outliers.largest < sensor.outliers.smallest:
+            raise ConfigError(f"{where}.outliers: to_mm is smaller than from_mm")
+        for start, end in sensor.outages:
+            if end <= start:
+                raise ConfigError(f"{where}.outages_s: [{start:g}, {end:g}] ends before it begins")
+
+    def _check_steps(self, campaign: Steps) -> None:
+        if campaign.scope not in self.sensors:
+            raise UnknownNameError("trajectory.scope", "sensor", campaign.scope, self.sensors)
+        seen = self.sensors[campaign.scope].axes
+        if self.frame is not None and seen is None:
+            raise ConfigError(f"sensors.{campaign.scope}.axes: name the axes of a scope where the log is in x, y, z")
+        for axis in campaign.axes:
+            if seen is not None and axis not in seen:
+                raise ConfigError(f"sensors.{campaign.scope}.axes: the scope does not see '{axis}', which is stepped")
+
+    @property
+    def true_axes(self) -> dict[str, TrueAxis]:
+        """The true arm, whole."""
+        delay = self.arm.delay_of
+        return {
+            name: self.true_arm.get(name, TrueArm()).over(axis, delay(name), f"true_arm.{name}")
+            for name, axis in self.arm.axes.items()
+        }
+
+    @property
+    def config(self) -> FusionConfig:
+        """What the filter believes: the truth, where ``filter`` says nothing else."""
+        sensors = {name: sensor.believed() for name, sensor in self.sensors.items()}
+        process = {axis: toml.builtins(self.process.get(axis, Process())) for axis in self.arm.axes}
+        tree: dict[str, Any] = {
+            "start": {"offset_sd_mm": self.start.offset_sd},
+            "process": process,
+            "sensors": sensors,
+        }
+        override = dict(self.filter)
+        if isinstance(override.get("process"), dict):
+            override["process"] = by_axis(override["process"], Process, self.arm, "filter", "process")
+        if isinstance(override.get("sensors"), dict):
+            for name in override["sensors"]:
+                if name not in self.sensors:
+                    raise UnknownNameError("filter.sensors", "sensor", name, self.sensors)
+        return toml.struct({**_merged(tree, override), "arm": self.arm}, FusionConfig, "filter")
+
+    def to_toml(self, seed: int, arm: str) -> str:
+        """The text of a ``scenario.toml`` with this ``seed``, and its arm in the file ``arm``."""
+        tree = toml.builtins(self)
+        tree["arm"], tree["seed"] = arm, seed
+        tree["start"]["level"] = {f"{axis}_mm": level for axis, level in self.start.level.items()}
+        return toml.text({key: value for key, value in tree.items() if value != {}})
+
+    @staticmethod
+    def load(path: str | Path) -> Scenario:
+        """Read ``scenario.toml`` and the arm it names.
+
+        Raises:
+            ConfigError: The file or its arm is not as declared; names file, key and the accepted names.
+            UnknownNameError: A table is of an axis that the arm does not have.
+        """
+        path = Path(path)
+        tree, where = toml.read(path), str(path)
+        _check_sizes({key: value for key, value in tree.items() if key != "seed"}, where)
+        tree["arm"] = load_arm(tree, path)
+        for key, kind in (("true_arm", TrueArm), ("process", Process)):
+            if isinstance(tree.get(key), dict):
+                tree[key] = by_axis(tree[key], kind, tree["arm"], where, key)
+        start = tree.get("start")
+        if isinstance(start, dict) and isinstance(levels := cast(dict[str, Any], start).get("level"), dict):
+            named = cast(dict[str, Any], levels)
+            start["level"] = {axis_of(key, where, "start.level"): level for key, level in named.items()}
+            if len(start["level"]) < len(named):
+                raise ConfigError(f"{where}: start.level gives an axis twice")
+        scenario = toml.struct(tree, Scenario, where)
+        trajectory = scenario.trajectory
+        if isinstance(trajectory, PathFromFile):
+            beside = msgspec.structs.replace(trajectory, file=str(path.parent / trajectory.file))
+            scenario = msgspec.structs.replace(scenario, trajectory=beside)
+        try:
+            scenario.trajectory.offsets(scenario.arm.update_period, np.random.default_rng(scenario.seed))
+        except PumafuseError as error:
+            raise ConfigError(f"{where}: {error}") from None
+        return scenario
+
+
+def _check_sizes(tree: Mapping[str, Any], where: str, path: str = "", inherited: str | None = None) -> None:
+    """Refuse numbers (SI) with which nothing could be computed."""
+    for key, value in tree.items():
+        unit = units.ending(key) or inherited
+        most = _FARTHEST if unit in units.LENGTHS else _LONGEST
+        if isinstance(value, Mapping):
+            _check_sizes(cast(Mapping[str, Any], value), where, f"{path}{key}.", unit)
+        for number in cast(list[Any], value if isinstance(value, list) else [value]):
+            if isinstance(number, float | int) and number and not _LEAST <= abs(number) <= most:
+                raise ConfigError(f"{where}: {path}{key}: a size with which nothing can be simulated")
+
+
+def _merged(tree: Mapping[str, Any], override: Mapping[str, Any]) -> dict[str, Any]:
+    """``tree`` with the entries of ``override`` in their places."""
+    merged = dict(tree)
+    for key, value in override.items():
+        there = merged.get(key)
+        merged[key] = _merged(there, value) if isinstance(there, Mapping) and isinstance(value, Mapping) else value  # pyright: ignore
+    return merged

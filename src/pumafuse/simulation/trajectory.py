@@ -1,0 +1,252 @@
+"""What the arm is told to do: commands on the ticks of T, as offsets from the start level."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import msgspec
+import numpy as np
+
+from ..arrays import FloatArray, IntArray
+from ..errors import ConfigError
+from ..logs import tables
+from ..toml import NotNegative, Positive
+from ..units import seconds
+
+_MOST_TICKS = 200_000  # 93 minutes at 28 ms; a gigabyte of work
+
+Offsets: TypeAlias = dict[str, FloatArray]
+Names: TypeAlias = Annotated[list[str], msgspec.Meta(min_length=1)]
+Count: TypeAlias = Annotated[int, msgspec.Meta(gt=0, le=10_000)]
+
+
+class Trajectory(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", forbid_unknown_fields=True):
+    """Base of the trajectories; axes that one does not name hold their start level."""
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The axes that move."""
+        raise NotImplementedError
+
+    def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
+        """Commands [m] relative to the start level at ticks 0, T, 2T, …, by axis, all of one length (ticks,)."""
+        raise NotImplementedError
+
+
+class Raster(Trajectory, frozen=True, kw_only=True, tag="raster"):
+    """Lines to and fro over a panel, at constant speed, each one pitch beyond the last.
+
+    Attributes:
+        along: The axis of the lines.
+        across: The axis of the pitch.
+        width: Length of a line [m].
+        height: What the lines cover [m].
+        pitch: Between lines [m].
+        speed: Of the command [m/s].
+    """
+
+    along: str = "tangential"
+    across: str = "vertical"
+    width: Positive = msgspec.field(name="width_mm")
+    height: NotNegative = msgspec.field(name="height_mm")
+    pitch: Positive = msgspec.field(name="pitch_mm")
+    speed: Positive = msgspec.field(name="speed_m_s")
+
+    def __post_init__(self) -> None:
+        if self.along == self.across:
+            raise ConfigError(f"trajectory: along and across are both '{self.along}'")
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Along and across."""
+        return self.along, self.across
+
+    def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
+        """The corner points, joined at constant speed."""
+        ticks((self.height / self.pitch + 1.0) * self.width / self.speed, period)  # before it is laid out
+        lines = int(self.height / self.pitch + 1e-9) + 1
+        line = np.repeat(np.arange(lines), 2)
+        side = np.tile([0.0, 1.0, 1.0, 0.0], lines // 2 + 1)[: 2 * lines]
+        corners = {self.along: side * self.width, self.across: line * self.pitch}
+        length = np.cumsum(np.hypot(*(np.diff(path, prepend=0.0) for path in corners.values())))
+        way = ticks(float(length[-1]) / self.speed, period) * period * self.speed
+        return {axis: np.interp(way, length, path) for axis, path in corners.items()}
+
+
+class Steps(Trajectory, frozen=True, kw_only=True, tag="steps"):
+    """A campaign of step trials: each step is one command, up and down in turn, between rests.
+
+    Every size on every axis in both directions, ``replicates`` times, in random order, cut to ``trials``. The recorded
+    run goes on through all of them; ``trials.csv`` and ``samples.csv`` are cut from it.
+
+    Attributes:
+        axes: The axes that are stepped.
+        sizes: Of the steps [m].
+        replicates: Of each combination.
+        trials: How many to keep: an unbalanced campaign, as one that was cut short; None: all.
+        rest: Between steps [s].
+        window: How long a trial is sampled [s].
+        scope: The sensor that samples it.
+    """
+
+    axes: Names
+    sizes: Annotated[list[Positive], msgspec.Meta(min_length=1)] = msgspec.field(name="sizes_mm")
+    replicates: Count = 1
+    trials: Count | None = None
+    rest: Positive = msgspec.field(name="rest_s", default=1.0)
+    window: Positive = msgspec.field(name="window_s", default=0.33)
+    scope: str
+
+    def __post_init__(self) -> None:
+        if self.window > self.rest:
+            raise ConfigError("trajectory: window_s is longer than rest_s: a trial would see the next step")
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The stepped axes."""
+        return tuple(self.axes)
+
+    def plan(self, rng: np.random.Generator) -> list[tuple[str, float]]:
+        """Axis and signed step [m] of each trial, in order: a step down on an axis follows one up on it."""
+        pairs = [(axis, size) for axis in self.axes for size in self.sizes for _ in range(self.replicates)]
+        order: list[int] = rng.permutation(len(pairs)).tolist()
+        trials = [(axis, sign * size) for axis, size in (pairs[index] for index in order) for sign in (1.0, -1.0)]
+        return trials[: self.trials]
+
+    def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
+        """The sum of the steps so far."""
+        plan, pause = self.plan(rng), self.ticks_between(period)
+        ticks((len(plan) + 1) * pause * period, period)
+        found = {axis: np.zeros((len(plan) + 1) * pause) for axis in self.axes}
+        for number, (axis, step) in enumerate(plan, 1):
+            found[axis][number * pause :] += step
+        return found
+
+    def ticks_between(self, period: float) -> int:
+        """Ticks from one step to the next."""
+        return max(round(self.rest / period), 1)
+
+
+class WhiteNoise(Trajectory, frozen=True, kw_only=True, tag="white-noise"):
+    """The paper's binary white noise: between two levels, changing with probability 0.5 each period.
+
+    Attributes:
+        axes: The axes that move, each with a sequence of its own.
+        amplitude: From one level to the other [m].
+        duration: [s].
+    """
+
+    axes: Names
+    amplitude: Positive = msgspec.field(name="amplitude_mm")
+    duration: Positive = msgspec.field(name="duration_s")
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The moving axes."""
+        return tuple(self.axes)
+
+    def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
+        """0 or the amplitude; the first command is the start level."""
+        count = len(ticks(self.duration, period))
+        found: Offsets = {}
+        for axis in self.axes:
+            switches = rng.random(count) < 0.5
+            switches[0] = False
+            found[axis] = np.where(np.cumsum(switches) % 2 == 1, self.amplitude, 0.0)
+        return found
+
+
+class SineSweep(Trajectory, frozen=True, kw_only=True, tag="sine-sweep"):
+    """A sine whose frequency grows by the same factor each second.
+
+    Attributes:
+        axes: The axes that move.
+        amplitude: Of the sine [m].
+        start_frequency: [Hz].
+        end_frequency: [Hz].
+        duration: [s].
+    """
+
+    axes: Names
+    amplitude: Positive = msgspec.field(name="amplitude_mm")
+    start_frequency: Positive = msgspec.field(name="from_hz")
+    end_frequency: Positive = msgspec.field(name="to_hz")
+    duration: Positive = msgspec.field(name="duration_s")
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The moving axes."""
+        return tuple(self.axes)
+
+    def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
+        """A sin φ with φ = 2π ∫ f dt and f = f₀ (f₁/f₀)^(t/duration)."""
+        time = ticks(self.duration, period) * period
+        growth = float(np.log(self.end_frequency / self.start_frequency)) / self.duration
+        turns = time if growth == 0.0 else np.expm1(growth * time) / growth
+        sine = self.amplitude * np.sin(2.0 * np.pi * self.start_frequency * turns)
+        return {axis: sine.copy() for axis in self.axes}
+
+
+class Hold(Trajectory, frozen=True, kw_only=True, tag="hold"):
+    """Nothing moves for ``duration`` [s]."""
+
+    axes: Names
+    duration: Positive = msgspec.field(name="duration_s")
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The axes that are commanded."""
+        return tuple(self.axes)
+
+    def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
+        """Zeros."""
+        return {axis: np.zeros(len(ticks(self.duration, period))) for axis in self.axes}
+
+
+class PathFromFile(Trajectory, frozen=True, kw_only=True, tag="path"):
+    """A path from a table, linear between its rows, relative to its first row.
+
+    Attributes:
+        file: A CSV or Parquet table beside the scenario with ``time_s`` and ``<axis>_mm``.
+        axes: The axes to take from it.
+    """
+
+    file: str
+    axes: Names
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The axes taken."""
+        return tuple(self.axes)
+
+    def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
+        """The path on the ticks."""
+        table = tables.read(Path(self.file))
+        if table.notes:  # a row that is left out is a path of its own
+            raise ConfigError("; ".join(table.notes))
+        time = seconds(table.stamps("time_s")[0])
+        if not np.isfinite(time).all() or (np.diff(time) <= 0.0).any():
+            raise ConfigError(f"{self.file}: time_s must ascend from row to row")
+        at = ticks(float(time[-1] - time[0]), period) * period + time[0]
+        found: Offsets = {}
+        for axis in self.axes:
+            values, _ = table.numbers(f"{axis}_mm")
+            if not np.isfinite(values).all():
+                raise ConfigError(f"{self.file}: {axis}_mm has a cell without a number")
+            found[axis] = np.interp(at, time, values) - values[0]
+        return found
+
+
+TRAJECTORIES: TypeAlias = Raster | Steps | WhiteNoise | SineSweep | Hold | PathFromFile
+
+
+def ticks(duration: float, period: float) -> IntArray:
+    """Numbers of the ticks from 0 to ``duration`` [s], the last at or after it.
+
+    Raises:
+        ConfigError: There are too many to simulate at a time.
+    """
+    if not duration / period < _MOST_TICKS:
+        raise ConfigError(f"trajectory: {duration / period + 1.0:.6g} commands; at most {_MOST_TICKS} in one run")
+    return np.arange(int(np.ceil(duration / period - 1e-9)) + 1)

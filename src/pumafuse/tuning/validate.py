@@ -1,0 +1,191 @@
+"""Did it help? A configuration before and after tuning, on measurements that it was not tuned on."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+
+from ..arrays import FloatArray
+from ..errors import PumafuseWarning
+from ..fusion.config import FusionConfig
+from ..fusion.consistency import consistency, densities_of
+from ..fusion.estimates import Estimates
+from ..fusion.offline import fuse
+from ..fusion.outcome import Outcome
+from ..fusion.score import Z95, interpolated, score
+from ..fusion.track import AxisEstimate
+from ..logs.run import Run
+from ..units import MM
+
+_WORSE = 1.02  # RMSE after over before that is worse where it is beyond chance
+_FAR_WORSE = 1.2  # likewise, whatever chance would make of it
+_BATCHES = 20
+
+
+class SensorCheck(msgspec.Struct, frozen=True, kw_only=True):
+    """One sensor's innovations on one axis.
+
+    Attributes:
+        nis: Mean ν²/S; 1 for a consistent filter.
+        whiteness_p: Ljung-Box p-value; small: the innovations are not white.
+        correlation: Autocorrelation of the innovations at lag 1.
+    """
+
+    nis: float
+    whiteness_p: float
+    correlation: float
+
+
+class State(msgspec.Struct, frozen=True, kw_only=True):
+    """One axis under one configuration.
+
+    Attributes:
+        log_likelihood: Of its components, with positions in mm.
+        rejected: Components that were rejected.
+        sensors: By name.
+        rmse_mm: Root mean square error on the reference; null without one.
+        coverage: Share of errors within 1.96 standard deviations.
+    """
+
+    log_likelihood: float
+    rejected: int
+    sensors: dict[str, SensorCheck]
+    rmse_mm: float | None = None
+    coverage: float | None = None
+
+
+class Check(msgspec.Struct, frozen=True, kw_only=True):
+    """One axis of one run before and after.
+
+    Attributes:
+        run: The run's name.
+        axis: The axis.
+        since_s: From when on, where only a run's end was held back; else 0.
+        components: How many were met.
+        before: With the configuration as given.
+        after: As tuned.
+        worse: Whether it got worse.
+        verdict: In words.
+    """
+
+    run: str
+    axis: str
+    since_s: float
+    components: int
+    before: State
+    after: State
+    worse: bool
+    verdict: str
+
+
+def check(
+    run: Run, before: FusionConfig, after: FusionConfig, sensors: Sequence[str] | None = None, since: float = 0.0
+) -> list[Check]:
+    """Compare two configurations on a run.
+
+    Args:
+        run: Held back from tuning, at least from ``since`` on.
+        before: The configuration as given.
+        after: As tuned.
+        sensors: Which to use; all for None.
+        since: Count only from then on [s after the first command]; the filter runs from the beginning.
+    """
+    pair: list[Estimates] = []
+    for config in (before, after):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PumafuseWarning)  # they are the run's, and `fuse` says them
+            pair.append(_from(fuse(run, config, sensors=sensors), since))
+    return [_axis(run.name, axis, since, *pair) for axis in pair[0].axes if _heard(pair[0], axis)]
+
+
+def _from(est: Estimates, since: float) -> Estimates:
+    """Estimates and measurements from ``since`` [s] on; measurements by their stamps, which no latency changes."""
+    late = est.time >= since
+    axes: Mapping[str, AxisEstimate] = {
+        name: AxisEstimate(*(getattr(axis, field)[late] for field in AxisEstimate.FIELDS))
+        for name, axis in est.axes.items()
+    }
+    measurements = est.measurements.where(
+        (est.measurements.outcome <= Outcome.REACQUIRED) & (est.measurements.stamp >= since)
+    )
+    return replace(est, time=est.time[late], segment=est.segment[late], axes=axes, measurements=measurements)
+
+
+def _heard(est: Estimates, axis: str) -> bool:
+    return bool((est.measurements.axis == est.measurements.axes.index(axis)).any())
+
+
+def _axis(run: str, axis: str, since: float, before: Estimates, after: Estimates) -> Check:
+    old, new, gains = _state(before, axis), _state(after, axis), _gains(before, after, axis)
+    gained, chance = float(gains.sum()), Z95 * float(np.sqrt(np.sum(gains**2)))
+    closer = None if old.rmse_mm is None or new.rmse_mm is None else new.rmse_mm / max(old.rmse_mm, 1e-12)
+    farther = closer is not None and (
+        closer > _FAR_WORSE or (closer > _WORSE and _beyond_chance(_squares(after, axis) - _squares(before, axis)))
+    )
+    worse = gained < -chance or farther
+    said = f"log-likelihood {gained:+.1f} (chance: ± {chance:.1f})"
+    if closer is not None:
+        said += f", RMSE {100.0 * (closer - 1.0):+.1f} %"
+    verdict = f"{'worse' if worse else 'better' if gained > chance else 'no different'}: {said}"
+    return Check(
+        run=run,
+        axis=axis,
+        since_s=since,
+        components=len(gains),
+        before=old,
+        after=new,
+        worse=worse,
+        verdict=verdict,
+    )
+
+
+def _squares(est: Estimates, axis: str) -> FloatArray:
+    """Squared errors on the reference [m²], NaN where it says nothing, (n,)."""
+    if est.reference is None:
+        return np.zeros(len(est.time))
+    return (est[axis].position - interpolated(est.time, est.segment, est.reference, axis)) ** 2
+
+
+def _beyond_chance(growth: FloatArray) -> bool:
+    """Whether a mean is above 0 by more than chance; neighbours go together, so means of batches are compared."""
+    means = [float(batch.mean()) for batch in np.array_split(growth[np.isfinite(growth)], _BATCHES) if len(batch)]
+    if len(means) < 2:
+        return True
+    return bool(np.mean(means) > Z95 * np.std(means, ddof=1) / np.sqrt(len(means)))
+
+
+def _gains(before: Estimates, after: Estimates, axis: str) -> FloatArray:
+    """What each component's log density gained, of those that both met, (m,).
+
+    Were both as good, the sum would have a variance of about Σ gain² (Vuong, Econometrica 57, 1989).
+    """
+    found: list[dict[int, float]] = []
+    for est in (before, after):
+        mine = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
+        keys = np.rint(mine.stamp * 1e6).astype(np.int64) * len(mine.sensors) + mine.sensor
+        found.append(dict(zip(keys.tolist(), densities_of(mine, est.config.sensors).tolist(), strict=True)))
+    old, new = found
+    return np.array([new[key] - old[key] for key in old if key in new])
+
+
+def _state(est: Estimates, axis: str) -> State:
+    mine = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
+    found = None
+    if est.reference is not None and len(est.time):
+        found = score(est.time, est.segment, est[axis].position, est[axis].position_sd, est.reference, axis)
+    sensors: dict[str, SensorCheck] = {}
+    for name in mine.sensors:
+        one = consistency(est, name, axis)
+        if one is not None and len(one.correlation):
+            sensors[name] = SensorCheck(nis=one.nis, whiteness_p=one.whiteness, correlation=float(one.correlation[0]))
+    return State(
+        log_likelihood=float(densities_of(mine, est.config.sensors).sum()),
+        rejected=int(np.count_nonzero(mine.outcome == Outcome.REJECTED)),
+        sensors=sensors,
+        rmse_mm=None if found is None else found.rmse * MM,
+        coverage=None if found is None else found.coverage,
+    )

@@ -1,0 +1,278 @@
+"""What coefficients depend on: sums of squares by hand, confounded factors told apart, clean trials left in peace."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from pumafuse.identification.anova import (
+    Dependence,
+    dependences,
+    factors_of,
+    levels_of,
+    ordered,
+    outlying,
+    scatter,
+    speed_levels,
+    welch,
+)
+from pumafuse.identification.trials import Trial
+
+TIME = np.arange(10) * 0.01
+
+
+def trial(name: str, step: float = 0.008, speed: float = 0.3, axis: str = "radial", **factors: str) -> Trial:
+    return Trial(name, axis, step, speed, factors, TIME, np.zeros(10))
+
+
+def dependence(values: np.ndarray, cells: Sequence[str]) -> Dependence:
+    (found,) = dependences({"gain": values}, {"pose": list(cells)})
+    return found
+
+
+# ---- one factor -----------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(st.lists(st.integers(1, 7), min_size=2, max_size=5), st.integers(0, 10**6), st.floats(0.0, 3.0))
+def test_the_i_ratio_is_f_over_its_95_percent_point(sizes: list[int], seed: int, apart: float) -> None:
+    """Mean squares between and within, unbalanced groups too; scipy's `f_oneway` says the same."""
+    sizes = [max(sizes[0], 2), *sizes[1:]]
+    rng = np.random.default_rng(seed)
+    groups = [apart * k + rng.standard_normal(n) for k, n in enumerate(sizes)]
+    values, cells = np.concatenate(groups), np.repeat([f"level {k}" for k in range(len(sizes))], sizes)
+    shuffled = rng.permutation(len(values))
+    found = dependence(values[shuffled], cells[shuffled].tolist())
+    within = sum(float(np.sum((group - group.mean()) ** 2)) for group in groups)
+    total = float(np.sum((values - values.mean()) ** 2))
+    more, freedom = len(sizes) - 1, len(values) - len(sizes)
+    F = (total - within) / more / (within / freedom)
+    assert found.i_ratio == pytest.approx(F / stats.f.ppf(0.95, more, freedom), rel=1e-6)
+    assert found.p == pytest.approx(stats.f_oneway(*groups).pvalue, rel=1e-6)
+    assert found.adjusted_p == pytest.approx(found.p, rel=1e-6, abs=1e-12)
+    assert (found.i_ratio > 1.0) == (found.p < 0.05)
+
+
+def test_the_paper_asks_for_it_with_one_f() -> None:
+    """Two levels of three: F = 13.5 by hand, its 95 % point with 1 and 4 degrees of freedom is 7.71 in every table."""
+    found = dependence(np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), list("aaabbb"))
+    assert found.i_ratio == pytest.approx(13.5 / 7.7086, rel=1e-5)
+    assert found.verdict == "dependent"
+    assert [(one.level, one.trials, one.mean, one.sd) for one in found.levels] == [
+        ("a", 3, 2.0, 1.0),
+        ("b", 3, 5.0, 1.0),
+    ]
+
+
+def test_independent_noise_is_called_dependent_in_5_percent() -> None:
+    """400 balanced cases, 20 expected, 8 to 33 within three standard deviations; Welch's likewise; p is uniform."""
+    cells = list("aaaaabbbbbcccccddddd")
+    rng = np.random.default_rng(12)
+    found = [dependence(rng.standard_normal(20), cells) for _ in range(400)]
+    assert 8 <= sum(one.i_ratio > 1.0 for one in found) <= 33
+    assert 8 <= sum(one.welch_p < 0.05 for one in found) <= 36
+    assert stats.kstest([one.p for one in found], "uniform").pvalue > 0.001
+
+
+def test_welchs_test_is_welchs() -> None:
+    """His F, corrected, with his degrees of freedom (Biometrika 38, 1951), by hand; of two groups his t-test."""
+    rng = np.random.default_rng(3)
+    groups = [rng.normal(0.0, 1.0, 6), rng.normal(0.5, 4.0, 9), rng.normal(1.0, 0.3, 4)]
+    k = len(groups)
+    n, means = np.array([len(group) for group in groups]), np.array([group.mean() for group in groups])
+    weight = n / np.array([group.var(ddof=1) for group in groups])
+    share = weight / weight.sum()
+    tail = float(np.sum((1.0 - share) ** 2 / (n - 1)))
+    F = np.sum(weight * (means - share @ means) ** 2) / (k - 1) / (1.0 + 2.0 * (k - 2) / (k**2 - 1) * tail)
+    assert welch(groups) == pytest.approx(stats.f.sf(F, k - 1, (k**2 - 1) / (3.0 * tail)), rel=1e-9)
+    assert welch(groups[:2]) == pytest.approx(stats.ttest_ind(*groups[:2], equal_var=False).pvalue, rel=1e-9)
+    assert welch([groups[0], np.array([1.0])]) is None
+
+
+def test_unequal_variances_do_not_deceive_welchs_test() -> None:
+    """Two groups of 4 and 24 with one mean, the few ten times as scattered: F alone cries out, the verdict says so."""
+    rng = np.random.default_rng(5)
+    cells = ["few"] * 4 + ["many"] * 24
+    found = [dependence(np.append(10.0 * rng.standard_normal(4), rng.standard_normal(24)), cells) for _ in range(200)]
+    assert sum(one.i_ratio > 1.0 for one in found) > 60
+    assert sum(one.welch_p < 0.05 for one in found) < 22
+    loud = next(one for one in found if one.i_ratio > 1.0 and one.welch_p > 0.05)
+    assert loud.verdict == "dependent, but Welch's test does not confirm it"
+
+
+# ---- several factors ------------------------------------------------------------------------------------------------
+
+
+def test_a_factor_that_only_goes_along_with_another_is_told_by_its_adjusted_p() -> None:
+    """Table I's weakness: load was mostly heavy at high speed, only speed matters, and both look dependent."""
+    rng = np.random.default_rng(7)
+    speed = ["0.1"] * 12 + ["0.5"] * 12
+    load = ["light"] * 10 + ["heavy"] * 2 + ["heavy"] * 10 + ["light"] * 2
+    values = 1.0 + 0.1 * (np.array(speed) == "0.5") + 0.03 * rng.standard_normal(24)
+    by = {one.factor: one for one in dependences({"gain": values}, {"speed_m_s": speed, "load": load})}
+    assert by["speed_m_s"].i_ratio > 1.0 and by["load"].i_ratio > 1.0
+    assert by["speed_m_s"].adjusted_p < 1e-4 and by["load"].adjusted_p > 0.05
+    assert by["speed_m_s"].verdict == "dependent"
+    assert by["load"].verdict == "dependent; beside the other factors independent"
+
+
+def test_a_factor_that_is_another_by_another_name_cannot_be_told() -> None:
+    """Its levels are known when the other's are: there is no adjusted p."""
+    values = np.array([1.0, 1.1, 1.5, 1.6, 2.1, 2.2])
+    found = dependences({"gain": values}, {"speed": list("112233"), "load": list("xxyyzz")})
+    assert [one.adjusted_p for one in found] == [None, None]
+    assert all(one.verdict == "dependent; cannot be told from the other factors" for one in found)
+
+
+def test_a_factor_that_noise_of_another_hides_is_told_by_its_adjusted_p() -> None:
+    """In a balanced design sums of squares add up: two-way analysis of variance by hand."""
+    rng = np.random.default_rng(8)
+    pose, speed = np.tile(list("abc"), 8), np.repeat(["1", "2"], 12)
+    values = 3.0 * (pose == "b") + 0.6 * (speed == "2") + 0.3 * rng.standard_normal(24)
+    by = {one.factor: one for one in dependences({"gain": values}, {"pose": pose.tolist(), "speed": speed.tolist()})}
+    total = np.sum((values - values.mean()) ** 2)
+    between = {
+        name: sum(np.sum(cells == one) * (values[cells == one].mean() - values.mean()) ** 2 for one in set(cells))
+        for name, cells in (("pose", pose), ("speed", speed))
+    }
+    left = (total - sum(between.values())) / (24 - 4)
+    assert by["pose"].adjusted_p == pytest.approx(stats.f.sf(between["pose"] / 2 / left, 2, 20), rel=1e-6, abs=1e-15)
+    assert by["speed"].adjusted_p == pytest.approx(stats.f.sf(between["speed"] / left, 1, 20), rel=1e-6)
+    assert by["speed"].i_ratio < 1.0 and by["speed"].adjusted_p < 0.01
+    assert by["speed"].verdict == "independent; beside the other factors dependent"
+
+
+def test_every_coefficient_is_held_against_every_factor() -> None:
+    """In their order; what was never repeated is said to be untold."""
+    values = np.arange(4.0)
+    found = dependences({"delay_ms": values, "gain": -values}, {"a": list("1122"), "b": list("wxyz")})
+    assert [(one.coefficient, one.factor) for one in found] == [
+        ("delay_ms", "a"), ("delay_ms", "b"), ("gain", "a"), ("gain", "b"),
+    ]  # fmt: skip
+    assert (found[1].i_ratio, found[1].p, found[1].welch_p, found[1].adjusted_p) == (None, None, None, None)
+    assert found[1].verdict == "cannot be told: no scatter within any level"
+    assert [level.sd for level in found[1].levels] == [None] * 4
+
+
+def test_the_verdict_names_what_welchs_test_sees_and_f_does_not() -> None:
+    """A small group that hardly scatters, beside wide ones."""
+    values = np.concatenate(([1.0, 1.01, 0.99, 1.0], [3.0, -6.0, 9.0, 4.0], [1.3, 1.31, 1.29, 1.3]))
+    found = dependence(values, list("aaaabbbbcccc"))
+    assert found.i_ratio < 1.0 and found.welch_p < 0.05
+    assert found.verdict == "independent, but Welch's test says it is"
+
+
+# ---- scatter --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("far", [3.0, -3.0, 1e6])
+def test_an_outlying_trial_is_named(far: float) -> None:
+    """A delay of 60 ± 1 ms that is once far off; by its name, however many alike there are."""
+    values = 60.0 + np.random.default_rng(4).standard_normal(12)
+    values[7] = 60.0 + 5.0 * far
+    found = scatter("delay_ms", [trial(f"no. {k}") for k in range(12)], values, np.full(12, 0.1))
+    assert found.outlying == ["no. 7"]
+    assert found.normal_p < 0.001
+    assert (found.axis, found.coefficient, found.own_sd) == ("radial", "delay_ms", 0.1)
+    assert found.median == pytest.approx(60.0, abs=1.0)
+    unsure = np.full(12, 0.1)
+    unsure[7] = abs(far)  # its own noise explains it
+    assert not outlying(values, unsure).any() or abs(far) > 1e3
+
+
+def test_clean_trials_are_rarely_called_outlying() -> None:
+    """12 Gaussian values: in less than 3 % of 1,000 cases, even with no noise of their own."""
+    rng = np.random.default_rng(6)
+    named = sum(outlying(60.0 + 2.0 * rng.standard_normal(12), np.zeros(12)).any() for _ in range(1000))
+    assert named < 30
+
+
+def test_outlying_needs_five_values_and_half_a_percent() -> None:
+    """Of four none is told; where most agree to the last digit, 4 % of the median is still no outlier."""
+    assert not outlying(np.array([1.0, 1.0, 1.0, 9.0]), np.zeros(4)).any()
+    assert outlying(np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.05]), np.zeros(6)).tolist() == [False] * 5 + [True]
+    assert not outlying(np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.039]), np.zeros(6)).any()
+
+
+def test_replicates_scatter_within_their_settings() -> None:
+    """Pooled by hand over what has the same step and factors; `run` only counts; none repeated: none."""
+    trials = [
+        trial("1", 0.004, pose="a", run="1"),
+        trial("2", 0.004, pose="a", run="2"),
+        trial("3", 0.004, pose="a", run="3"),
+        trial("4", -0.004, pose="a", run="1"),
+        trial("5", -0.004, pose="a", run="2"),
+        trial("6", -0.004, pose="b", run="1"),
+    ]
+    values = np.array([1.0, 2.0, 6.0, 10.0, 14.0, 99.0])
+    found = scatter("gain", trials, values, np.full(6, 0.5))
+    squares = (2.0**2 + 1.0**2 + 3.0**2) + 2 * 2.0**2  # about 3 and about 12
+    assert found.replicate_sd == pytest.approx(np.sqrt(squares / 3), rel=1e-12)
+    assert scatter("gain", trials[2:4], values[2:4], np.full(2, 0.5)).replicate_sd is None
+
+
+def test_normal_values_look_normal() -> None:
+    """Shapiro and Wilk's p is uniform over 200 cases; of equal values, or two, there is none."""
+    rng = np.random.default_rng(9)
+    trials = [trial(str(k)) for k in range(15)]
+    p = [scatter("gain", trials, rng.standard_normal(15), np.ones(15)).normal_p for _ in range(200)]
+    assert stats.kstest(p, "uniform").pvalue > 0.001
+    assert scatter("gain", trials, np.ones(15), np.ones(15)).normal_p is None
+    assert scatter("gain", trials[:2], np.arange(2.0), np.ones(2)).normal_p is None
+
+
+# ---- factors --------------------------------------------------------------------------------------------------------
+
+
+def test_factors_are_what_varies_and_no_counter() -> None:
+    """Axis, speed, sense and columns of the list; what has one level, counts, or is new in every trial is none."""
+    trials = [
+        trial(
+            str(k), 0.008 * (1 if k % 2 else -1), 0.1 if k < 4 else 0.5, "radial" if k % 4 < 2 else "vertical",
+            pose="ab"[k // 4], tool="drill", run=str(k % 3), replicate=str(k % 2), remark=f"no. {k}",
+        )
+        for k in range(8)
+    ]  # fmt: skip
+    assert factors_of(trials, 0.028) == {
+        "axis": ["radial", "radial", "vertical", "vertical"] * 2,
+        "speed_m_s": ["0.1"] * 4 + ["0.5"] * 4,
+        "sense": ["-", "+"] * 4,
+        "pose": ["a"] * 4 + ["b"] * 4,
+    }
+
+
+def test_sense_is_a_factor_only_where_both_occur() -> None:
+    """Steps all up, or all down, have none; a speed that was not recorded is step over period."""
+    for sign in (1.0, -1.0):
+        trials = [trial(str(k), sign * 0.004 * (1 + k % 2), np.nan) for k in range(6)]
+        assert factors_of(trials, 0.028) == {"speed_m_s": ["0.14", "0.29"] * 3}
+        assert speed_levels(trials, 0.04) == ["0.1", "0.2"] * 3
+    assert "sense" in factors_of([*trials, trial("6", 0.004)], 0.028)
+
+
+def test_a_factor_of_many_numbers_is_cut_into_quarters() -> None:
+    """20 heights become four levels of five, named by their middles; 12 stay as they are, words too."""
+    rng = np.random.default_rng(2)
+    heights = rng.permutation(np.arange(20)) * 10.0
+    trials = [trial(str(k), height_mm=f"{height:g}", pose="ab"[k % 2]) for k, height in enumerate(heights)]
+    found = factors_of(trials, 0.028)["height_mm"]
+    assert ordered(set(found)) == ["20", "70", "120", "170"]
+    assert found == [f"{20 + 50 * int(height // 50):g}" for height in heights]
+    twelve = [trial(str(k), height_mm=str(k % 12)) for k in range(24)]
+    assert factors_of(twelve, 0.028)["height_mm"] == [str(k % 12) for k in range(24)]
+    words = [trial(str(k), height_mm=f"shelf {k % 13}") for k in range(26)]
+    assert factors_of(words, 0.028)["height_mm"] == [f"shelf {k % 13}" for k in range(26)]
+
+
+def test_levels_are_in_the_order_of_their_values() -> None:
+    """Numbers as numbers, with words among them as words; means stand beside the right level."""
+    assert ordered({"10", "9", "-1", "1e2", "0.5"}) == ["-1", "0.5", "9", "10", "1e2"]
+    assert ordered({"10", "9", "none"}) == ["10", "9", "none"]
+    found = levels_of(np.array([1.0, 2.0, 3.0, 5.0]), ["10", "9", "10", "9"])
+    assert [(one.level, one.trials, one.mean) for one in found] == [("9", 2, 3.5), ("10", 2, 2.0)]
+    assert [one.sd for one in found] == [pytest.approx(np.sqrt(4.5)), pytest.approx(np.sqrt(2.0))]

@@ -1,0 +1,190 @@
+"""Campaigns are balanced and random, tick by tick what they say, and warn of what will spoil them."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.folders import FolderError
+from pumafuse.identification.plan import Design, plan, write
+
+ARM = pf.ArmModel.load("puma560-internal")
+POSITIONS = ({"y_mm": "350", "z_mm": "-90"}, {"y_mm": "700", "z_mm": "210"}, {"y_mm": "525", "z_mm": "-400"})
+
+
+def design(**changes: Any) -> Design:
+    made: dict[str, Any] = {
+        "axes": ("radial", "tangential"),
+        "speeds": (0.1, 0.2, 0.4),
+        "period": 0.028,
+        "positions": POSITIONS,
+        "replicates": 3,
+        "hold": 0.5,
+        "rest": 0.5,
+        "amplitudes": (0.004, 0.008),
+        "noise_duration": 4.0,
+        "seed": 1,
+    }
+    return Design(**{**made, **changes})
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_block_holds_every_combination_once() -> None:
+    """So a campaign that is cut short after a block is balanced, and factors cannot be confounded."""
+    trials = plan(design()).trials
+    assert len(trials) == 3 * 2 * 3 * 3
+    for block in range(3):
+        part = trials[18 * block : 18 * (block + 1)]
+        assert {trial.replicate for trial in part} == {block + 1}
+        assert set(Counter((t.axis, t.speed, t.position["y_mm"]) for t in part).values()) == {1}
+
+
+def test_the_order_is_random_and_comes_again_with_its_seed() -> None:
+    """Blocks differ from one another; rank correlation of order and speed stays within chance over 200 seeds."""
+    one, again, other = (plan(design(seed=seed)).trials for seed in (1, 1, 2))
+    assert one == again != other
+    assert [t.speed for t in one[:18]] != [t.speed for t in one[18:36]]
+    correlations = [
+        np.corrcoef(np.arange(18), [t.speed for t in plan(design(seed=seed, replicates=1)).trials])[0, 1]
+        for seed in range(200)
+    ]
+    assert abs(np.mean(correlations)) < 3.0 / np.sqrt(17 * 200)
+    assert np.std(correlations) == pytest.approx(1.0 / np.sqrt(17), rel=0.2)
+
+
+def test_the_ticks_are_the_trials(tmp_path: Path) -> None:
+    """Rest, step, rest: on the axis, of the size and in the order that trials.csv lists; all else stays 0."""
+    write(plan(design()), tmp_path / "plan", False)
+    listed, ticks = table(tmp_path / "plan" / "trials.csv"), table(tmp_path / "plan" / "steps.csv")
+    count = len(ticks) // len(listed)
+    for number, trial in enumerate(listed):
+        part = ticks[count * number : count * (number + 1)]
+        assert {row["trial"] for row in part} == {trial["trial"]}
+        assert [int(row["tick"]) for row in part] == list(range(count))
+        np.testing.assert_allclose([float(row["time_s"]) for row in part], 0.028 * np.arange(count), atol=1e-9)
+        for axis in ("radial", "tangential"):
+            told = np.array([float(row[f"{axis}_mm"]) for row in part])
+            size = float(trial["step_mm"]) if axis == trial["axis"] else 0.0
+            expected = np.repeat([0.0, size, 0.0], [18, 18, 18])
+            np.testing.assert_array_equal(told, expected)
+        assert float(trial["step_mm"]) == pytest.approx(28.0 * float(trial["speed_m_s"]))
+        assert {"y_mm": trial["y_mm"], "z_mm": trial["z_mm"]} in POSITIONS
+
+
+def test_the_duration_is_that_of_all_sequences(tmp_path: Path) -> None:
+    """Rows of all files times the period."""
+    planned = plan(design())
+    write(planned, tmp_path / "plan", False)
+    rows = sum(len(table(path)) for path in (tmp_path / "plan").iterdir() if path.name != "trials.csv")
+    assert planned.duration == pytest.approx(0.028 * rows)
+
+
+def test_white_noise_switches_with_probability_one_half() -> None:
+    """Two levels, from rest to rest; over 200 sequences half the ticks are switches, each independent of the last."""
+    switches = []
+    for seed in range(200):
+        planned = plan(design(seed=seed, replicates=1, amplitudes=(0.008,), noise_duration=4.2))
+        for axis in ("radial", "tangential"):
+            sequence = planned.noise[axis, 0.008]
+            assert set(np.unique(sequence)) == {0.0, 0.008}
+            assert not sequence[:18].any() and not sequence[-18:].any()
+            switches.append(np.diff(sequence[18:-18]) != 0.0)
+    every = np.array(switches)
+    assert every.mean() == pytest.approx(0.5, abs=3.0 * 0.5 / np.sqrt(every.size))
+    again = np.mean(every[:, 1:] == every[:, :-1])
+    assert again == pytest.approx(0.5, abs=3.0 * 0.5 / np.sqrt(every[:, 1:].size))
+
+
+def test_a_planned_campaign_is_read_by_identify(tmp_path: Path) -> None:
+    """trials.csv is what StepTrials reads, the period comes out of it."""
+    write(plan(design()), tmp_path / "plan", False)
+    names = [row["trial"] for row in table(tmp_path / "plan" / "trials.csv")]
+    rows = [f"{name},{time:.4f},{min(time, 0.1) * 10:.3f}" for name in names for time in np.arange(20) * 0.01]
+    (tmp_path / "plan" / "samples.csv").write_text("trial,time_s,position_mm\n" + "\n".join(rows) + "\n")
+    read = pf.StepTrials.read(tmp_path / "plan")
+    assert (len(read.trials), read.notes, read.period()) == (54, (), pytest.approx(0.028))
+    assert set(read.trials[0].factors) == {"y_mm", "z_mm", "replicate"}
+    with pytest.raises(FolderError, match=r"samples\.csv"):
+        write(plan(design()), tmp_path / "plan", True)
+
+
+WARNED: dict[str, tuple[dict[str, Any], str]] = {
+    "window": ({"hold": 0.2}, "radial: the hold of 200 ms is too short to settle: 227 ms are needed"),
+    "rest": ({"rest": 0.05}, "radial: the rest of 100 ms between steps is too short to settle"),
+    "speed": ({"speeds": (0.1, 0.6)}, "commanded speeds reach 0.6 m/s, the limit is 0.5 m/s"),
+    "noise": ({"amplitudes": (0.02,)}, "commanded speeds reach 0.714 m/s, the limit is 0.5 m/s"),
+    "one speed": ({"speeds": (0.1,)}, "one speed only: how the gain depends on speed cannot be told"),
+    "no replicates": ({"replicates": 1}, "no replicates: what moves from trial to trial cannot be told from"),
+    "no noise": ({"amplitudes": ()}, "no white noise: there will be nothing to verify the model with"),
+}
+
+
+@pytest.mark.parametrize("case", WARNED)
+def test_what_will_spoil_a_campaign_is_said(case: str) -> None:
+    """Once for each axis it is true of, and nothing else; a good plan has no warning."""
+    changes, words = WARNED[case]
+    assert plan(design(), ARM).warnings == ()
+    said = plan(design(**changes), ARM).warnings
+    assert any(line.startswith(words) for line in said), said
+    topic = words.split(": ")[-1][:12]
+    assert all(topic in line for line in said), said
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"speeds": (100.0, 200.0)}, "steps are 5.6e+03 mm at most, 200 m/s at T; is a unit wrong?"),
+        ({"amplitudes": (4.0,)}, "steps are 4e+03 mm at most, 143 m/s at T; is a unit wrong?"),
+        ({"period": 28e-6, "amplitudes": ()}, "steps are 0.0112 mm at most, 0.4 m/s at T; is a unit wrong?"),
+        ({"speeds": (1e-3,), "amplitudes": ()}, "steps are 0.028 mm at most, 0.001 m/s at T; is a unit wrong?"),
+        ({"positions": (POSITIONS[0], POSITIONS[0])}, "positions: one is listed twice"),
+    ],
+)
+def test_a_slip_is_said_without_an_arm_too(changes: dict[str, Any], words: str) -> None:
+    """Speeds in mm/s, amplitudes in m, a period in s: steps that no arm makes, or that nobody would see."""
+    assert not any("unit" in line or "twice" in line for line in plan(design()).warnings)
+    assert any(line.startswith(words) for line in plan(design(**changes)).warnings)
+
+
+def test_the_settling_time_is_the_plants() -> None:
+    """Td + 2 % settling of τ = 42.5 ms is 60.45 + 166.3 ms: a hold just below it warns, just above does not."""
+    needed = 0.06045 - 0.0425 * np.log(0.02)
+    for hold, warned in ((needed - 0.001, True), (needed + 0.001, False)):
+        said = plan(design(axes=("radial",), hold=hold), ARM).warnings
+        assert any("too short" in line for line in said) == warned
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"axes": ()}, "at least one axis"),
+        ({"axes": ("radial", "radial")}, "each once"),
+        ({"axes": ("reach_mm",)}, "must not end in a unit"),
+        ({"speeds": ()}, "at least one speed"),
+        ({"speeds": (0.1, -0.1)}, "speeds must make steps of 0.001 mm to 10 m"),
+        ({"speeds": (1e-300,)}, "speeds must make steps"),
+        ({"speeds": (0.07, 0.07000000001)}, "two speeds make the same step"),
+        ({"amplitudes": (np.inf,)}, "amplitudes must make steps"),
+        ({"replicates": 100_000}, "at most 100000 of"),
+        ({"hold": 1e9}, "at most 100000 of 5e"),
+        ({"noise_duration": 1e9}, "at most 200000"),
+        ({"positions": ({"axis": "1"},)}, "cannot have a column 'axis'"),
+        ({"axes": ("a/b",)}, "cannot be called 'a/b'"),
+        ({"axes": ("tick",)}, "cannot be called 'tick'"),
+    ],
+)
+def test_a_design_that_cannot_be_carried_out_is_refused(changes: dict[str, Any], words: str) -> None:
+    """In one line."""
+    with pytest.raises(pf.ConfigError, match=words) as refused:
+        design(**changes)
+    assert len(str(refused.value).splitlines()) == 1

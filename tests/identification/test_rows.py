@@ -1,0 +1,359 @@
+"""Trials side by side: regression in each row, its slopes, its equations, its minima as one dense problem has."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from scipy.signal import lti
+
+from pumafuse.identification.rows import Rows, window
+from pumafuse.identification.trials import Trial
+from pumafuse.model.unit_response import unit_response
+
+STEPS = (0.008, -0.004, 0.002, 0.012)
+LENGTHS = (60, 41, 73, 25)
+WEIGHTS = (120.0, 250.0, 40.0, 900.0)
+DELAYS = np.array([0.0604, 0.0551, 0.0687, 0.0313])
+FIRST, SWINGING, DAMPED = (0.04, 0.0), (2 * 0.864 / 53.9, 53.9**-2), (0.06, 4e-4)
+KINKS = (
+    1e-5  # of the sum of squares: it has a kink wherever a delay passes a sample, and neither side's search sees all
+)
+PLANTS = [(1, FIRST), (2, SWINGING), (2, DAMPED)]
+
+
+def campaign(plant: tuple[float, float], noise: float, seed: int = 0, delays: np.ndarray = DELAYS) -> list[Trial]:
+    """Trials that differ in all: length, spacing, jittering stamps, samples before the command, step, gain, zero."""
+    rng = np.random.default_rng(seed)
+    trials = []
+    for place, (step, length, delay) in enumerate(zip(STEPS, LENGTHS, delays, strict=True)):
+        spacing = (0.00563, 0.008, 0.004, 0.011)[place]
+        time = spacing * (np.arange(length) - 3 * place + 0.3 * rng.random(length))
+        position = 0.001 * place + (1.0 + 0.02 * place) * step * unit_response(time - delay, *plant)
+        position = position + noise * abs(step) * rng.standard_normal(length)
+        trials.append(Trial(str(place), "radial", step, 0.1, {}, time, position))
+    return trials
+
+
+def shapes(plant: tuple[float, float], delays: np.ndarray = DELAYS) -> np.ndarray:
+    return np.column_stack((delays, np.tile(plant, (len(delays), 1))))
+
+
+def derivatives(time: np.ndarray, delay: float, q: float, p: float) -> np.ndarray:
+    """∂c/∂(delay, q, p) by Laplace transforms: −1/N, −1/N² and −s/N² of an impulse, N = p s² + q s + 1."""
+    after = np.maximum(time - delay, 0.0)
+    order = np.argsort(after)
+    square = np.trim_zeros(np.convolve([p, q, 1.0], [p, q, 1.0]), "f")
+    columns = []
+    for top, bottom in (([1.0], np.trim_zeros([p, q, 1.0], "f")), ([1.0], square), ([1.0, 0.0], square)):
+        if len(top) == len(bottom) or (p == 0.0 and top != [1.0]):
+            continue
+        system = lti(top, bottom).to_ss()
+        state = system.B[:, 0]
+        answer, last = np.empty(len(time)), 0.0
+        for place in order:
+            if after[place] > last:
+                state = exponential(system.A * (after[place] - last)) @ state
+                last = after[place]
+            answer[place] = (system.C @ state).item()
+        columns.append(-np.where(time > delay, answer, 0.0))
+    return np.column_stack(columns)
+
+
+def exponential(matrix: np.ndarray) -> np.ndarray:
+    from scipy.linalg import expm
+
+    return expm(matrix)
+
+
+def dense(trials: list[Trial], x: np.ndarray, order: int) -> np.ndarray:
+    """What all parameters leave: x is q, p (order 2), then delay, height and zero of each trial."""
+    q, p = x[0], x[1] if order == 2 else 0.0
+    left = []
+    for place, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
+        delay, height, zero = x[order + 3 * place : order + 3 * place + 3]
+        left.append(weight * (trial.position - zero - height * unit_response(trial.time - delay, q, p)))
+    return np.concatenate(left)
+
+
+def dense_jacobian(trials: list[Trial], x: np.ndarray, order: int) -> np.ndarray:
+    """Of the response, all parameters."""
+    q, p = x[0], x[1] if order == 2 else 0.0
+    J = np.zeros((sum(len(trial.time) for trial in trials), len(x)))
+    edges = np.cumsum([0, *(len(trial.time) for trial in trials)])
+    for place, (low, high) in enumerate(pairwise(edges)):
+        trial, weight, own = trials[place], WEIGHTS[place], order + 3 * place
+        delay, height, _ = x[own : own + 3]
+        slopes = weight * height * derivatives(trial.time, delay, q, p)
+        J[low:high, :order], J[low:high, own] = slopes[:, 1 : order + 1], slopes[:, 0]
+        J[low:high, own + 1] = weight * unit_response(trial.time - delay, q, p)
+        J[low:high, own + 2] = weight
+    return J
+
+
+def linear(trial: Trial, delay: float, plant: tuple[float, float]) -> tuple[float, float]:
+    """Height and zero by plain regression."""
+    design = np.column_stack((unit_response(trial.time - delay, *plant), np.ones(len(trial.time))))
+    height, zero = np.linalg.lstsq(design, trial.position, rcond=None)[0]
+    return float(height), float(zero)
+
+
+def unpacked(trials: list[Trial], plant: tuple[float, float], delays: np.ndarray, order: int) -> np.ndarray:
+    own = [(delay, *linear(trial, delay, plant)) for trial, delay in zip(trials, delays, strict=True)]
+    return np.concatenate((plant[:order], np.ravel(own)))
+
+
+# ---- one shape ------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.floats(0.005, 0.15), st.floats(0.0, 2.0), st.floats(0.0, 0.1), st.integers(0, 50))
+def test_a_point_is_plain_regression_in_each_row(q: float, ratio: float, delay: float, seed: int) -> None:
+    """Height and residuals as `lstsq` has them from the response and a one, weighted; the padding stays 0."""
+    trials, plant = campaign(SWINGING, 0.05, seed), (q, ratio * q * q)
+    delays = delay * np.array([1.0, 0.5, 0.2, 0.9])
+    found = Rows.of(trials, WEIGHTS, None).point(shapes(plant, delays))
+    for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
+        height, zero = linear(trial, delays[row], plant)
+        c = unit_response(trial.time - delays[row], *plant)
+        left, n = weight * (trial.position - zero - height * c), len(c)
+        assert found.amplitude[row] == pytest.approx(height, rel=1e-9)
+        np.testing.assert_allclose(found.left[row, :n], left, rtol=0.0, atol=1e-10)
+        np.testing.assert_allclose(found.unit[row, :n], weight * (c - c.mean()), rtol=0.0, atol=1e-10)
+        assert not found.left[row, n:].any() and not found.unit[row, n:].any()
+        assert found.cost[row] == pytest.approx(left @ left, rel=1e-9)
+
+
+def test_a_response_that_comes_after_the_last_sample_has_no_height() -> None:
+    """It explains nothing: what is left is the trial's own scatter, and its slopes are 0."""
+    trials = campaign(FIRST, 0.05)
+    rows = Rows.of(trials, WEIGHTS, None)
+    found = rows.point(shapes(FIRST, np.full(4, 9.0)))
+    assert not found.amplitude.any()
+    scatter = [np.sum((w * (one.position - one.position.mean())) ** 2) for one, w in zip(trials, WEIGHTS, strict=True)]
+    np.testing.assert_allclose(found.cost, scatter, rtol=1e-12)
+    slopes, heights = rows.slopes(found, 2)
+    assert not slopes.any() and not heights.any()
+    equations = rows.equations(found, slopes)
+    assert not any(part.any() for part in equations[:-1])
+    assert (equations.delay_sd == np.inf).all()
+
+
+@pytest.mark.parametrize(("order", "plant"), PLANTS)
+def test_slopes_are_those_of_the_fitted_curve(order: int, plant: tuple[float, float]) -> None:
+    """Regression done anew at each of two neighbouring shapes: the curve and its height move as the slopes say.
+
+    Exact where nothing is left, as here; 1e-5 of the largest slope, by differences over 2e-4 of q.
+    """
+    trials = campaign(plant, 0.0)
+    rows = Rows.of(trials, WEIGHTS, None)
+    slopes, heights = rows.slopes(rows.point(shapes(plant)), order)
+    q, p = plant
+    for parameter, size in enumerate((1e-4 * q, 1e-4 * q, 1e-4 * q * q)[: order + 1]):
+        for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
+            ends = []
+            for sign in (-1.0, 1.0):
+                shape = [DELAYS[row], q, p]
+                shape[parameter] += sign * size
+                height, zero = linear(trial, shape[0], (shape[1], shape[2]))
+                ends.append((height, zero + height * unit_response(trial.time - shape[0], shape[1], shape[2])))
+            curve = weight * (ends[1][1] - ends[0][1]) / (2.0 * size)
+            # a kink passes the sample next to the delay: what differences say there is no derivative
+            clear = np.abs(trial.time - DELAYS[row]) > 2.0 * size
+            got = slopes[parameter, row, : len(curve)]
+            np.testing.assert_allclose(got[clear], curve[clear], rtol=0.0, atol=1e-5 * np.abs(curve).max())
+            assert heights[parameter, row] == pytest.approx((ends[1][0] - ends[0][0]) / (2.0 * size), rel=1e-4)
+
+
+@pytest.mark.parametrize(("order", "plant"), [*PLANTS, (2, FIRST)])
+def test_slopes_are_the_analytic_ones_without_what_height_and_zero_explain(
+    order: int, plant: tuple[float, float]
+) -> None:
+    """Of noisy trials too, by Laplace transforms and an orthogonal projection."""
+    trials = campaign(plant, 0.05)
+    rows = Rows.of(trials, WEIGHTS, None)
+    at = rows.point(shapes(plant))
+    slopes, _ = rows.slopes(at, order)
+    for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
+        if plant[1] > 0.0 or order == 1:
+            exact = derivatives(trial.time, DELAYS[row], *plant)[:, : order + 1]
+        else:  # the limit p → 0 of −s/(1 + q s)²: −(1 − t/q) e^(−t/q) / q²
+            t = np.where(trial.time > DELAYS[row], (trial.time - DELAYS[row]) / plant[0], np.inf)
+            decay = np.exp(-t)
+            t = np.where(np.isfinite(t), t, 0.0)
+            exact = -np.column_stack((decay / plant[0], t * decay / plant[0], (1.0 - t) * decay / plant[0] ** 2))
+        basis = np.linalg.qr(np.column_stack((unit_response(trial.time - DELAYS[row], *plant), np.ones(len(exact)))))[0]
+        exact = weight * at.amplitude[row] * (exact - basis @ (basis.T @ exact))
+        got = slopes[:, row, : len(exact)].T
+        largest = np.abs(exact).max(axis=0)
+        np.testing.assert_allclose(got / largest, exact / largest, rtol=0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("order", "plant"), PLANTS)
+def test_equations_are_the_dense_ones_with_all_that_is_a_trials_own_eliminated(
+    order: int, plant: tuple[float, float]
+) -> None:
+    """A Gauss-Newton step in q, p and every delay, and the covariance of q and p, solved all at once."""
+    trials = campaign(plant, 0.05)
+    rows = Rows.of(trials, WEIGHTS, None)
+    at = rows.point(shapes(plant))
+    slopes, _ = rows.slopes(at, order)
+    found = rows.equations(at, slopes)
+    x = unpacked(trials, plant, DELAYS, order)
+    J, left = dense_jacobian(trials, x, order), dense(trials, x, order)
+    scale = np.linalg.norm(J, axis=0)
+    step = np.linalg.lstsq(J / scale, left, rcond=None)[0] / scale
+    information, score = found.information.sum(axis=0), found.score.sum(axis=0)
+    moved = np.linalg.solve(information, score)
+    np.testing.assert_allclose(moved, step[:order], rtol=1e-4)
+    np.testing.assert_allclose(found.shift - found.coupling @ moved, step[order::3], rtol=1e-3, atol=1e-7)
+    covariance = np.linalg.inv((J / scale).T @ (J / scale)) / np.outer(scale, scale)
+    np.testing.assert_allclose(np.linalg.inv(information), covariance[:order, :order], rtol=1e-4)
+
+
+# ---- minima ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.05])
+@pytest.mark.parametrize(("order", "plant"), PLANTS)
+def test_each_row_is_brought_to_a_minimum_of_its_own(order: int, plant: tuple[float, float], noise: float) -> None:
+    """From starts up to 30 % away; trust-region least squares in all five parameters finds nothing below it."""
+    trials = campaign(plant, noise, 3)
+    rows = Rows.of(trials, WEIGHTS, None)
+    start = shapes(plant) * np.array([0.95, 1.3, 1.2 if order == 2 else 0.0])
+    found = rows.each(start, order)
+    np.testing.assert_allclose(found.cost, rows.point(found.shape).cost, rtol=1e-12)
+    for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
+        delay, q, p = found.shape[row]
+
+        def left(x: np.ndarray, trial: Trial = trial, weight: float = weight) -> np.ndarray:
+            c = unit_response(trial.time - x[0], x[1], x[4] if order == 2 else 0.0)
+            return weight * (trial.position - x[3] - x[2] * c)
+
+        x = np.array([delay, q, *linear(trial, delay, (q, p)), p][: 3 + order])
+        low = np.array([0.0, 1e-6, -np.inf, -np.inf, 0.0][: 3 + order])
+        best = least_squares(
+            left, np.maximum(x, low + 1e-12), bounds=(low, np.inf), x_scale=np.abs(x) + 1e-6, xtol=1e-14
+        )
+        assert found.cost[row] == pytest.approx(np.sum(left(x) ** 2), rel=1e-9)
+        assert found.cost[row] <= 2.0 * best.cost * (1.0 + KINKS)
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.05])
+@pytest.mark.parametrize(("order", "plant"), PLANTS)
+def test_together_is_the_minimum_of_the_dense_problem(order: int, plant: tuple[float, float], noise: float) -> None:
+    """One plant, all delays, heights and zeros at once: the gradient is 0 there and least squares finds no better."""
+    trials = campaign(plant, noise, 4)
+    rows = Rows.of(trials, WEIGHTS, None)
+    found = rows.together(1.2 * plant[0], 0.8 * plant[1], DELAYS - 0.004, order)
+    assert (found.shape[:, 1:] == found.shape[0, 1:]).all()
+    assert order == 2 or not found.shape[:, 2].any()
+    x = unpacked(trials, (found.shape[0, 1], found.shape[0, 2]), found.shape[:, 0], order)
+    left, J = dense(trials, x, order), dense_jacobian(trials, x, order)
+    cosine = J.T @ left / np.linalg.norm(J, axis=0) / np.linalg.norm(left)
+    assert np.abs(cosine).max() < 1e-5
+    best = least_squares(lambda y: dense(trials, y, order), x, x_scale=np.abs(x), xtol=1e-14)
+    assert found.cost.sum() == pytest.approx(left @ left, rel=1e-9)
+    assert found.cost.sum() <= 2.0 * best.cost * (1.0 + KINKS)
+
+
+def test_second_order_of_a_first_order_arm_stops_at_its_bound() -> None:
+    """1/ω² is held at 0 where the noise would have it below; then the plant is the first-order one."""
+    held = 0
+    for seed in range(8):
+        rows = Rows.of(campaign(FIRST, 0.01, seed), WEIGHTS, None)
+        one, two = (rows.together(*plant, DELAYS, order) for order, plant in ((1, FIRST), (2, (0.04, 1e-4))))
+        assert two.cost.sum() <= one.cost.sum() * (1.0 + 1e-9)
+        if two.shape[0, 2] == 0.0:
+            held += 1
+            np.testing.assert_allclose(two.shape, one.shape, rtol=1e-5)
+    assert 0 < held < 8
+
+
+@pytest.mark.parametrize("delays", [DELAYS, np.array([0.0, 0.0551, 0.0, 0.0313])], ids=["late", "at once"])
+@pytest.mark.parametrize(("order", "plant"), PLANTS)
+def test_together_is_not_stopped_by_kinks_nor_by_delays_of_0(
+    order: int, plant: tuple[float, float], delays: np.ndarray
+) -> None:
+    """Bounded least squares goes on from where it ends and finds nothing better, in four noisy campaigns of each kind.
+
+    The first trial begins with its command: without delay it tells nothing of it (a delay is a gain there).
+    """
+    worst = 0.0
+    for seed in (0, 5, 10, 38):
+        trials = campaign(plant, 0.05, seed, delays)
+        found = Rows.of(trials, WEIGHTS, None).together(
+            1.2 * plant[0], 0.8 * plant[1], np.maximum(delays - 0.004, 0.0), order
+        )
+        assert found.shape[:, 0].min() >= 0.0
+        x = unpacked(trials, (found.shape[0, 1], found.shape[0, 2]), found.shape[:, 0], order)
+        low = np.concatenate(([1e-6, 0.0][:order], np.tile([0.0, -np.inf, -np.inf], 4)))
+        best = least_squares(
+            lambda y, trials=trials: dense(trials, y, order),
+            np.maximum(x, low + 1e-9),
+            bounds=(low, np.inf),
+            x_scale=np.abs(x) + 1e-6,
+            max_nfev=40,
+        )
+        worst = max(worst, found.cost.sum() / (2.0 * best.cost) - 1.0)
+    assert worst < KINKS
+
+
+# ---- stacking -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("order", "plant"), PLANTS)
+def test_padding_changes_no_number(order: int, plant: tuple[float, float]) -> None:
+    """A trial beside longer ones, with other stamps, is fitted as it is alone."""
+    trials = campaign(plant, 0.05)
+    rows = Rows.of(trials, WEIGHTS, None)
+    assert rows.time.shape == (4, max(LENGTHS)) and rows.count.tolist() == list(LENGTHS)
+    at = rows.point(shapes(plant))
+    slopes, heights = rows.slopes(at, order)
+    equations = rows.equations(at, slopes)
+    cost = rows.each(shapes(plant), order).cost
+    for row, trial in enumerate(trials):
+        alone = Rows.of([trial], WEIGHTS[row : row + 1], None)
+        one = alone.point(shapes(plant)[row : row + 1])
+        own, height = alone.slopes(one, order)
+        assert alone.time.shape == (1, LENGTHS[row])
+        assert (rows.span[row], rows.spacing[row]) == (alone.span[0], alone.spacing[0])
+        assert rows.spacing[row] == pytest.approx((trial.time[-1] - trial.time[0]) / (len(trial.time) - 1), rel=1e-12)
+        np.testing.assert_allclose(slopes[:, row, : LENGTHS[row]], own[:, 0], rtol=0.0, atol=1e-9 * np.abs(own).max())
+        assert not slopes[:, row, LENGTHS[row] :].any()
+        np.testing.assert_allclose(heights[:, row], height[:, 0], rtol=1e-9)
+        for whole, part in zip(equations, alone.equations(one, own), strict=True):
+            np.testing.assert_allclose(whole[row], part[0], rtol=1e-7)
+        assert cost[row] == pytest.approx(alone.each(shapes(plant)[row : row + 1], order).cost[0], rel=KINKS)
+
+
+def test_rows_are_taken_by_index_as_often_as_asked() -> None:
+    """Each with its own stamps, weight and count."""
+    rows = Rows.of(campaign(FIRST, 0.05), WEIGHTS, None)
+    asked = np.array([2, 0, 2])
+    taken = rows.taken(asked)
+    for name in ("time", "position", "weight", "count"):
+        np.testing.assert_array_equal(getattr(taken, name), getattr(rows, name)[asked])
+    np.testing.assert_array_equal(taken.point(shapes(FIRST)[asked]).cost, rows.point(shapes(FIRST)).cost[asked])
+
+
+def test_a_window_is_counted_from_the_step_on() -> None:
+    """All samples before it are kept, beside the first 20 after it."""
+    trials = campaign(FIRST, 0.05)
+    for trial in trials:
+        time, position = window(trial, 20)
+        assert ((time >= 0.0).sum(), (time < 0.0).sum()) == (
+            min(20, (trial.time >= 0.0).sum()),
+            (trial.time < 0.0).sum(),
+        )
+        np.testing.assert_array_equal(position, trial.position[: len(time)])
+        assert len(window(trial, None)[0]) == len(trial.time)
+    rows = Rows.of(trials, WEIGHTS, 20)
+    assert rows.count.tolist() == [len(window(trial, 20)[0]) for trial in trials]
+    assert [row[row > 0.0].tolist() for row in rows.weight] == [
+        [weight] * int(count) for weight, count in zip(WEIGHTS, rows.count, strict=True)
+    ]

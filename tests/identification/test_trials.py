@@ -1,0 +1,148 @@
+"""Step trials from files: units, factors, and every kind of broken trial named in one line while the rest is read."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as papq
+import pytest
+
+import pumafuse as pf
+from pumafuse.identification.trials import StepTrials, TrialsError
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+TIMES = np.round(np.arange(-2, 12) * 0.005, 6)
+
+
+def rows(name: str, times: np.ndarray = TIMES, value: float = 1.5) -> str:
+    return "".join(f"{name},{time},{value if time > 0.02 else 0.25}\n" for time in times)
+
+
+def written(folder: Path, listed: str, sampled: str) -> Path:
+    (folder / "trials.csv").write_text("trial,axis,step_mm,speed_m_s,height_mm,tool\n" + listed)
+    (folder / "samples.csv").write_text("trial,time_s,position_mm\n" + sampled)
+    return folder
+
+
+def test_trials_come_in_the_order_of_the_list(tmp_path: Path) -> None:
+    """Steps and positions in metres, factors as written, samples of each trial however the file mixes them."""
+    listed = "7,radial,8.0,0.2857,350,drill\n3,vertical,-2.0,0.0714,-90,\n"
+    pairs = zip(rows("3", value=-0.5).splitlines(), rows("7").splitlines(), strict=True)
+    sampled = "".join(f"{one}\n{other}\n" for one, other in pairs)
+    found = StepTrials.read(written(tmp_path, listed, sampled))
+    assert [trial.name for trial in found.trials] == ["7", "3"]
+    assert found.axes == ("radial", "vertical")
+    assert [trial.name for trial in found.of("vertical")] == ["3"]
+    first, second = found.trials
+    assert (first.step, first.speed, second.step) == (0.008, 0.2857, -0.002)
+    assert dict(first.factors) == {"height_mm": "350", "tool": "drill"}
+    assert dict(second.factors) == {"height_mm": "-90", "tool": ""}
+    np.testing.assert_allclose(first.time, TIMES, atol=1e-12)
+    np.testing.assert_array_equal(second.position, np.where(TIMES > 0.02, -0.0005, 0.00025))
+    assert found.notes == ()
+
+
+def test_other_units_names_and_formats(tmp_path: Path) -> None:
+    """Milliseconds, micrometres, names of trials that are words; gzip and Parquet."""
+    text = "trial,axis,step_um\nfirst one,tip,4000\n"
+    (tmp_path / "trials.csv.gz").write_bytes(gzip.compress(text.encode()))
+    table = {"trial": ["first one"] * 12, "time_ms": np.arange(12) * 4.0, "position_m": np.arange(12) / 1e4}
+    papq.write_table(pa.table(table), tmp_path / "samples.parquet")
+    (trial,) = StepTrials.read(tmp_path).trials
+    assert (trial.name, trial.axis, trial.step) == ("first one", "tip", 0.004)
+    assert np.isnan(trial.speed)
+    assert trial.factors == {}
+    np.testing.assert_allclose(trial.time, np.arange(12) * 0.004, atol=1e-12)
+    np.testing.assert_array_equal(trial.position, np.arange(12) / 1e4)
+
+
+WHOLE = "1,radial,8,0.2857,350,a\n"
+BROKEN: dict[str, tuple[str, str, str]] = {
+    "twice": ("2,radial,8,0.2857,350,a\n2,radial,4,0.1429,350,a\n", rows("2"), "trial '2': listed 2 times"),
+    "no step": ("2,radial,0,0.2857,350,a\n", rows("2"), "trial '2': its step is 0 or no number"),
+    "step that is a word": ("2,radial,big,0.2857,350,a\n", rows("2"), "trial '2': its step is 0 or no number"),
+    "no axis": ("2,,8,0.2857,350,a\n", rows("2"), "trial '2': it names no axis"),
+    "no samples": ("2,radial,8,0.2857,350,a\n", "", "trial '2': 0 samples from the step on"),
+    "one sample": ("2,radial,8,0.2857,350,a\n", "2,0.1,1.0\n", "trial '2': 1 samples from the step on"),
+    "only before": ("2,radial,8,0.2857,350,a\n", rows("2", TIMES - 1.0), "trial '2': 0 samples from the step on"),
+    "all NaN": ("2,radial,8,0.2857,350,a\n", rows("2", value=np.nan).replace("0.25", "nan"), "trial '2': 0 samples"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_a_broken_trial_costs_only_itself(case: str, tmp_path: Path) -> None:
+    """It is named once, with the reason."""
+    listed, sampled, reason = BROKEN[case]
+    found = StepTrials.read(written(tmp_path, WHOLE + listed, rows("1") + sampled))
+    assert [trial.name for trial in found.trials] == ["1"]
+    said = [note for note in found.notes if note.startswith("trial '2'")]
+    assert said
+    assert all(note.startswith(reason) and note.endswith(": left out") for note in said)
+
+
+def test_what_can_be_mended_is_mended_and_said(tmp_path: Path) -> None:
+    """Samples without a number are left out, samples out of order sorted, samples of no listed trial told."""
+    mixed = "1,0.061,1.0\n1,0.057,nan\n1,0.058,2.0\n"
+    found = StepTrials.read(written(tmp_path, WHOLE, rows("1") + mixed + rows("9")))
+    (trial,) = found.trials
+    assert (np.diff(trial.time) >= 0.0).all()
+    assert trial.position[-2:].tolist() == [0.002, 0.001]
+    assert found.notes == (
+        "samples.csv: 1 trials are not listed, first '9': left out",
+        "trial '1': 1 samples without a number: left out",
+        "trial '1': times step back: sorted",
+    )
+
+
+def test_nothing_to_use_is_one_line(tmp_path: Path) -> None:
+    """With every reason."""
+    with pytest.raises(TrialsError, match="no trial can be used; trial '1': its step is 0") as refused:
+        StepTrials.read(written(tmp_path, "1,radial,0,0.2857,350,a\n", rows("1")))
+    assert len(str(refused.value).splitlines()) == 1
+    (tmp_path / "samples.csv").unlink()
+    with pytest.raises(pf.RunError, match=r"no samples\.csv"):
+        StepTrials.read(tmp_path)
+
+
+def test_many_reasons_are_still_a_line_to_read(tmp_path: Path) -> None:
+    """The first few of them, and how many more."""
+    listed = "".join(f"{k},radial,10,0.357,0,a\n" for k in range(100))
+    with pytest.raises(TrialsError, match=r"trial '2': 0 samples .*; and 97 more$") as refused:
+        StepTrials.read(written(tmp_path, listed, rows("other")))
+    assert len(str(refused.value)) < 600
+
+
+def campaign(folder: Path, *steps: tuple[float, float]) -> StepTrials:
+    listed = "".join(f"{k},radial,{step},{speed},0,a\n" for k, (step, speed) in enumerate(steps))
+    return StepTrials.read(written(folder, listed, "".join(rows(str(k)) for k in range(len(steps)))))
+
+
+def test_the_update_period_is_step_over_speed_where_all_agree(tmp_path: Path) -> None:
+    """Within 3 %, as the paper's rounded speeds do; one that is given needs none of it."""
+    found = campaign(tmp_path, (2.0, 0.071), (4.0, 0.14), (-8.0, 0.28), (19.0, 0.68))
+    assert found.period() == pytest.approx(0.0283, abs=4e-4)
+    assert found.period(0.02) == 0.02
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [[(2.0, 0.07), (4.0, 0.10)], [(100.0, 0.1)], [(0.01, 0.1)], [(2.0, 0.0)]],
+    ids=["two", "a second", "too short", "none"],
+)
+def test_no_period_is_guessed(steps: list[tuple[float, float]], tmp_path: Path) -> None:
+    """Trials that disagree, a velocity step, a period below 1 ms, no speed."""
+    with pytest.raises(TrialsError, match="give --period"):
+        campaign(tmp_path, *steps).period()
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the recorded campaigns are not beside the project")
+def test_recorded_campaigns_are_read_whole() -> None:
+    """86 and 90 trials, nothing to remark; 52 of the robot's begin before their command."""
+    puma, robot = (StepTrials.read(SHARED / name) for name in ("puma-virtual/steps", "robot-steps"))
+    assert (len(puma.trials), puma.axes, puma.notes) == (86, ("tangential", "radial", "vertical"), ())
+    assert puma.period() == pytest.approx(0.028, rel=0.03)
+    assert (len(robot.trials), robot.notes) == (90, ())
+    assert sum(trial.time[0] < 0.0 for trial in robot.trials) == 52

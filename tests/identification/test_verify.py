@@ -1,0 +1,434 @@
+"""Verification against runs whose truth is known: superposed step responses plus noise, nothing of the package's own.
+
+Where the model is the truth, what is left is the noise itself, to the last digits; where it is not, the floor finds the
+truth from the run alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.arrays import FloatArray
+from pumafuse.identification.measured import Fit
+from pumafuse.identification.verify import Trace
+from pumafuse.logs.frames import Rotated
+from pumafuse.model.plants import PLANTS
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+PERIOD, DELAY, NOISE = 0.028, 0.0604, 5e-5  # s, s, m
+LOW, HIGH = 0.556, 0.564  # m, the levels of the white noise
+FIRST = pf.FirstOrder(time_constant=0.0425)
+SECOND = pf.SecondOrder(natural_frequency=53.9, damping=0.864)
+GAIN = pf.Gain(slope=0.1, intercept=0.9)
+RNG = np.random.default_rng(20240)
+TICKS = 400
+TIME = np.arange(TICKS) * PERIOD
+BINARY = RNG.choice([LOW, HIGH], TICKS)
+BINARY[:2] = HIGH, LOW  # the first command moves it
+SAMPLED = np.arange(0.0, TIME[-1] + 0.3, 0.0041)
+
+
+def arm(
+    plant: PLANTS = FIRST, gain: pf.Gain = GAIN, delay: float = DELAY, recovery: float | None = None, axis: str = "tip"
+) -> pf.ArmModel:
+    axes = {axis: pf.AxisModel(plant=plant, gain=gain, gain_recovery=recovery)}
+    return pf.ArmModel(name="known", update_period=PERIOD, delay=delay, axes=axes)
+
+
+def moved(known: pf.ArmModel, command: FloatArray = BINARY, start: float = LOW, held: int = 1) -> FloatArray:
+    """Where the arm is at SAMPLED: each change of its input a step response of its own, one command in ``held`` T.
+
+    The gain's error grows by (K − 1) times each step, decays with the recovery, and while a command is held the decay
+    reaches the input once in T.
+    """
+    (model,) = known.axes.values()
+    found, error, before, was = np.full(len(SAMPLED), start), 0.0, start, 0.0
+    for n, u in enumerate(command.tolist()):
+        error += (model.gain.slope * abs(u - before) / PERIOD + model.gain.intercept - 1.0) * (u - before)
+        before = u
+        for tick in range(held if n + 1 < len(command) else held + 20):  # after the last command it goes on decaying
+            value = u - start + error
+            found += (value - was) * model.plant.step_response(SAMPLED - (n * held + tick) * PERIOD - known.delay)
+            was = value
+            error *= 1.0 if model.gain_recovery is None else np.exp(-PERIOD / model.gain_recovery)
+    return found
+
+
+def noise(seed: int = 0) -> FloatArray:
+    return NOISE * np.random.default_rng(seed).standard_normal(len(SAMPLED))
+
+
+def run_of(
+    position: FloatArray, command: FloatArray = BINARY, held: int = 1, start: Mapping[str, float] | None = None
+) -> pf.Run:
+    time = np.arange(len(command)) * PERIOD * held
+    return pf.Run.from_arrays(time, {"tip": command}, {"scope": (SAMPLED, {"tip": position})}, start=start, name="r")
+
+
+def only(run: pf.Run, model: pf.ArmModel, start: Mapping[str, float] | None = None) -> pf.AxisVerification:
+    ((found, _),) = pf.verify(run, model, start=start)
+    return found
+
+
+# ---- the model is the truth -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("plant", [FIRST, SECOND], ids=["first", "second"])
+def test_the_truth_leaves_exactly_the_noise(plant: PLANTS) -> None:
+    """To nine digits; it is as good as any, and the floor lies at most four of a fit's degrees of freedom below it."""
+    found = only(run_of(moved(arm(plant)) + noise()), arm(plant))
+    assert found.model.rms == pytest.approx(np.std(noise()), rel=1e-9)
+    assert (found.measurements, found.run, found.axis, found.source) == (len(SAMPLED), "r", "tip", "scope")
+    assert found.verdict.startswith("as good as any")
+    assert found.amplitude == pytest.approx(HIGH - LOW, rel=1e-12)
+    assert found.without_recovery == found.model
+    # each of up to four parameters takes a share chi-squared/n of the squares: 25 in all is beyond one in 10 000
+    assert 1.0 - 25.0 / len(SAMPLED) < (found.floor.fit.rms / found.model.rms) ** 2 <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("held", [1, 5])
+@pytest.mark.parametrize("recovery", [0.05, 0.14])
+def test_a_gain_that_recovers_recovers_as_the_arm_says(recovery: float, held: int) -> None:
+    """With its own time constant the truth leaves the noise, also under held commands; without recovery far more."""
+    known, command = arm(recovery=recovery), BINARY[: TICKS // held]
+    found = only(run_of(moved(known, command, held=held) + noise(), command, held), known)
+    assert found.model.rms == pytest.approx(np.std(noise()), rel=1e-8)
+    assert (found.with_recovery, found.recovery) == (found.model, recovery)
+    bare = moved(arm(), command, held=held)
+    expected = np.std(moved(known, command, held=held) + noise() - bare)
+    assert found.without_recovery.rms == pytest.approx(expected, rel=1e-8)
+    assert expected > 1.5 * NOISE
+
+
+def test_a_recovery_is_tried_where_the_arm_states_none() -> None:
+    """With 100 ms; the model as it is stays without."""
+    found = only(run_of(moved(arm()) + noise()), arm())
+    assert found.recovery == 0.1
+    expected = np.std(moved(arm()) + noise() - moved(arm(recovery=0.1)))
+    assert found.with_recovery.rms == pytest.approx(expected, rel=1e-8)
+    assert found.model.rms == pytest.approx(np.std(noise()), rel=1e-9)
+
+
+def test_an_axis_has_its_own_delay() -> None:
+    """Where the arm file gives it one, the arm's is not used."""
+    known = arm()
+    own = {"tip": msgspec.structs.replace(known.axes["tip"], delay=DELAY)}
+    model = msgspec.structs.replace(known, delay=0.3, axes=own)
+    assert only(run_of(moved(known) + noise()), model).model.rms == pytest.approx(np.std(noise()), rel=1e-9)
+
+
+# ---- definitions ----------------------------------------------------------------------------------------------------
+
+
+def test_the_numbers_are_what_their_names_say() -> None:
+    """RMS without the mean, percent of the commands' amplitude, fit against the measured signal, from plain numpy."""
+    model = arm(pf.FirstOrder(time_constant=0.06), pf.Gain(intercept=1.1), 0.05)
+    measured, modelled = moved(arm()) + noise(), moved(model)
+    ((found, trace),) = pf.verify(run_of(measured), model)
+    left = (measured - measured.mean()) - (modelled - modelled.mean())
+    rms = np.sqrt(np.mean(left**2))
+    expected = Fit(
+        rms=rms,
+        percent=100.0 * rms / (HIGH - LOW),
+        fit=100.0 * (1.0 - np.linalg.norm(left) / np.linalg.norm(measured - measured.mean())),
+    )
+    np.testing.assert_allclose(msgspec.structs.astuple(found.model), msgspec.structs.astuple(expected), rtol=1e-8)
+    assert isinstance(trace, Trace)
+    np.testing.assert_allclose(trace.time, SAMPLED, atol=1e-9)
+    np.testing.assert_allclose(trace.measured, measured - measured.mean(), atol=1e-12)
+    np.testing.assert_allclose(trace.modelled, modelled - modelled.mean(), atol=1e-11)
+    # the floor's numbers follow from its own plant, gain and delay
+    floor = arm(found.floor.plant, pf.Gain(intercept=found.floor.gain), found.floor.delay)
+    left = measured - moved(floor)
+    assert found.floor.fit.rms == pytest.approx(np.std(left), rel=1e-6)
+    assert found.floor.fit.percent == pytest.approx(100.0 * np.std(left) / (HIGH - LOW), rel=1e-6)
+    assert found.floor.fit.fit == pytest.approx(100.0 * (1.0 - np.std(left) / np.std(measured)), rel=1e-6)
+
+
+def test_a_sensors_zero_does_not_count() -> None:
+    """A constant on all measurements changes nothing."""
+    plain, shifted = (only(run_of(moved(arm()) + noise() + zero), arm(SECOND)) for zero in (0.0, -0.45))
+    assert plain.verdict == shifted.verdict and plain.start == shifted.start
+    for key in ("model", "without_recovery", "with_recovery"):
+        one, other = (msgspec.structs.astuple(getattr(found, key)) for found in (plain, shifted))
+        np.testing.assert_allclose(one, other, rtol=1e-9)
+    assert plain.floor.fit.rms == pytest.approx(shifted.floor.fit.rms, rel=1e-9)
+    assert plain.floor.delay == pytest.approx(shifted.floor.delay, rel=1e-5)
+
+
+# ---- the floor ------------------------------------------------------------------------------------------------------
+
+TRUE_GAIN = 0.9 + 0.1 * (HIGH - LOW) / PERIOD
+
+
+def wrong(order: int, seed: int, delays: tuple[float, float]) -> pf.ArmModel:
+    """Any arm of an order: a lag of 10 to 120 ms, ζ of 0.4 to 2, a gain of 0.3 to 1.7."""
+    rng = np.random.default_rng(seed)
+    lag, damping = np.exp(rng.uniform(np.log([0.01, 0.4]), np.log([0.12, 2.0]))).tolist()
+    plant = (
+        pf.FirstOrder(time_constant=lag)
+        if order == 1
+        else pf.SecondOrder(natural_frequency=2.0 * damping / lag, damping=damping)
+    )
+    return arm(plant, pf.Gain(intercept=rng.uniform(0.3, 1.7)), rng.uniform(*delays))
+
+
+def check_floor(order: int, seed: int, delays: tuple[float, float]) -> None:
+    """Not above the model nor above the truth, and where the truth is."""
+    true, model = FIRST if order == 1 else SECOND, wrong(order, seed, delays)
+    found = only(run_of(moved(arm(true)) + noise(seed)), model, {"tip": LOW})
+    assert found.floor.fit.rms <= found.model.rms * (1.0 + 1e-9)
+    assert found.floor.fit.rms <= np.std(noise(seed)) * (1.0 + 1e-9)
+    np.testing.assert_allclose([found.floor.delay, found.floor.gain], [DELAY, TRUE_GAIN], rtol=0.01)
+    np.testing.assert_allclose(msgspec.structs.astuple(found.floor.plant)[:order], numbers_of(true), rtol=0.03)
+
+
+def numbers_of(plant: PLANTS) -> list[float]:
+    return [plant.time_constant] if isinstance(plant, pf.FirstOrder) else [plant.natural_frequency, plant.damping]
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_floor_is_found_from_a_wrong_arm(order: int, seed: int) -> None:
+    """Delay and gain of the truth within 1 %, its plant within 3 %, wherever the search begins."""
+    check_floor(order, seed, (0.03, 0.12))
+
+
+def test_the_verdict_tells_how_far_above_the_floor() -> None:
+    """How many times, by how many milliseconds the arm answers later or sooner; and where no arm's answer is seen."""
+    run = run_of(moved(arm()) + noise())
+    for tau, begins, word in (
+        (0.0465, "holds, with ", "sooner"),
+        (0.0385, "holds, with ", "later"),
+        (0.3000, "does not hold, with ", "sooner"),
+    ):
+        found = only(run, arm(pf.FirstOrder(time_constant=tau)))
+        ratio, plant = found.model.rms / found.floor.fit.rms, found.floor.plant
+        assert ratio > 1.5
+        assert isinstance(plant, pf.FirstOrder)
+        apart = abs(DELAY + tau - found.floor.delay - plant.time_constant)
+        assert apart == pytest.approx(abs(tau - FIRST.time_constant), abs=2e-4)
+        assert found.verdict.startswith(f"{begins}{ratio:.1f} times the error"), found.verdict
+        assert found.verdict.endswith(f"answers {1e3 * apart:.1f} ms {word}, with gain 0.93"), found.verdict
+    still = only(run_of(LOW + noise()), arm())
+    assert still.floor.fit.fit < 5.0
+    assert still.verdict == "no linear model of this order fits: look at the log"
+
+
+@pytest.mark.parametrize("seed", [11])
+def test_the_floor_is_found_from_an_arm_that_has_no_delay(seed: int) -> None:
+    """A second-order arm that is given as 1 to 10 ms late, where the truth is 60 ms: the plant must not run away."""
+    check_floor(2, seed, (0.0, 0.03))
+
+
+@pytest.mark.parametrize("held", [1, 5])
+def test_the_floor_is_not_above_an_arm_whose_gain_recovers(held: int) -> None:
+    """The presets' gains do: a floor above the model is none."""
+    known, command = arm(recovery=0.1), BINARY[: TICKS // held]
+    found = only(run_of(moved(known, command, held=held) + noise(), command, held), known)
+    assert found.floor.fit.rms <= found.model.rms * (1.0 + 1e-9)
+
+
+def test_the_floor_is_not_above_an_arm_whose_gain_rises_with_speed() -> None:
+    """On commands of several sizes one gain fits none: a perfect model must not be called no linear model."""
+    command = np.random.default_rng(3).choice([0.55, 0.556, 0.57, 0.58], TICKS)
+    known = arm(gain=pf.Gain(slope=0.3, intercept=0.8))
+    found = only(run_of(moved(known, command, 0.55) + noise(), command), known)
+    assert found.model.rms == pytest.approx(np.std(noise()), rel=1e-8)
+    assert found.floor.fit.rms <= found.model.rms * (1.0 + 1e-9)
+    assert found.verdict.startswith("as good as any")
+
+
+# ---- the start level ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", [LOW, HIGH])
+def test_the_start_level_is_found_among_the_runs(level: float) -> None:
+    """And that it was found, not known."""
+    found = only(run_of(moved(arm(), start=level) + noise()), arm())
+    assert found.start == level
+    assert found.start_from == "chosen among the run's 2 levels by RMS"
+    assert found.model.rms == pytest.approx(np.std(noise()), rel=1e-9)
+
+
+def test_a_start_level_that_is_given_is_believed() -> None:
+    """The run's, and before it the argument's, also where another fits better."""
+    position = moved(arm(), start=0.560) + noise()
+    told = only(run_of(position, start={"tip": 0.560}), arm())
+    argued = only(run_of(position, start={"tip": LOW}), arm(), {"tip": 0.560})
+    wrong = only(run_of(position, start={"tip": 0.560}), arm(), {"tip": HIGH})
+    assert (told.start, argued.start, wrong.start) == (0.560, 0.560, HIGH)
+    assert told.start_from == argued.start_from == wrong.start_from == "given"
+    assert told.model.rms == argued.model.rms == pytest.approx(np.std(noise()), rel=1e-9)
+    assert wrong.model.rms > 1.5 * told.model.rms
+
+
+def test_many_levels_are_not_searched() -> None:
+    """The arm rests at the first command then, and it is said."""
+    command = 0.560 + 0.004 * np.sin(np.arange(TICKS) / 3.0)
+    found = only(run_of(moved(arm(), command, command[0]) + noise(), command), arm())
+    assert (found.start, found.start_from) == (command[0], "the first command")
+    assert found.model.rms == pytest.approx(np.std(noise()), rel=1e-9)
+
+
+# ---- sources --------------------------------------------------------------------------------------------------------
+
+
+def two_sensors(reference: bool) -> pf.Run:
+    position = moved(arm())
+    sensors = {"near": (SAMPLED, {"tip": position + noise(1)}), "far": (SAMPLED, {"tip": position + 3.0 * noise(2)})}
+    truth = (SAMPLED, {"tip": position + 0.1 * noise(3)}) if reference else None
+    return pf.Run.from_arrays(TIME, {"tip": BINARY}, sensors, truth)
+
+
+def test_the_reference_is_compared_with_where_there_is_one() -> None:
+    """Else every sensor, in the order of the run; those that are chosen, where some are."""
+    rms = {"near": np.std(noise(1)), "far": 3.0 * np.std(noise(2)), "reference": 0.1 * np.std(noise(3))}
+    for reference, sensors, expected in (
+        (True, None, ["reference"]),
+        (False, None, ["near", "far"]),
+        (True, ["far"], ["far"]),
+        (True, ["far", "reference"], ["far", "reference"]),
+    ):
+        found = [one for one, _ in pf.verify(two_sensors(reference), arm(), sensors=sensors)]
+        assert [one.source for one in found] == expected
+        for one in found:
+            assert one.model.rms == pytest.approx(rms[one.source], rel=1e-7)
+
+
+def test_every_axis_is_verified_by_itself() -> None:
+    """Of a sensor that sees two, with a plant of its own for each."""
+    axes = {"radial": arm(FIRST).axes["tip"], "vertical": arm(SECOND).axes["tip"]}
+    model = pf.ArmModel(name="two", update_period=PERIOD, delay=DELAY, axes=axes)
+    other = BINARY[::-1].copy()
+    values = {"vertical": moved(arm(SECOND), other) + noise(1), "radial": moved(arm(FIRST)) + noise(2)}
+    run = pf.Run.from_arrays(TIME, {"vertical": other, "radial": BINARY}, {"scope": (SAMPLED, values)})
+    found = {one.axis: one for one, _ in pf.verify(run, model, start={"vertical": LOW, "radial": LOW})}
+    assert list(found) == ["radial", "vertical"]
+    assert found["radial"].model.rms == pytest.approx(np.std(noise(2)), rel=1e-9)
+    assert found["vertical"].model.rms == pytest.approx(np.std(noise(1)), rel=1e-9)
+
+
+def test_a_log_in_the_rooms_coordinates_is_verified_in_the_arms() -> None:
+    """A rotated frame, x and y instead of axes: the same numbers."""
+    along, across = moved(arm()) + noise(1), noise(2)
+    angle = np.deg2rad(30.0)
+    turned = {
+        "x": np.cos(angle) * along - np.sin(angle) * across,
+        "y": np.sin(angle) * along + np.cos(angle) * across,
+    }
+    commands = {"x": np.cos(angle) * BINARY, "y": np.sin(angle) * BINARY}
+    run = pf.Run.from_arrays(TIME, commands, {"scope": (SAMPLED, turned)}, frame=Rotated(azimuth=30.0))
+    axes = {axis: arm().axes["tip"] for axis in ("tangential", "radial")}
+    model = pf.ArmModel(name="turned", update_period=PERIOD, delay=DELAY, axes=axes)
+    found = {one.axis: one for one, _ in pf.verify(run, model)}
+    assert found["radial"].model.rms == pytest.approx(np.std(noise(1)), rel=1e-6)
+
+
+# ---- logs as they are -----------------------------------------------------------------------------------------------
+
+
+def test_a_messy_log_gives_what_the_clean_one_gives() -> None:
+    """Measurements without a number, before the first command, out of order, repeated; commands out of order, repeated."""
+    position = moved(arm()) + noise()
+    lost = np.zeros(len(SAMPLED), bool)
+    lost[RNG.choice(len(SAMPLED), 150, replace=False)] = True
+    kept = ~lost
+    clean = pf.Run.from_arrays(TIME, {"tip": BINARY}, {"scope": (SAMPLED[kept], {"tip": position[kept]})})
+    rows = np.arange(len(SAMPLED))
+    rows[100:130] = rows[100:130][::-1]
+    rows = np.concatenate((rows[:600], rows[590:600], rows[600:]))  # ten rows again
+    spoilt = np.where(lost, np.nan, position)
+    spoilt[np.flatnonzero(lost)[:3]] = [np.inf, -np.inf, 3.4e38]
+    stamp = np.concatenate(([-0.5, -0.1], SAMPLED[rows]))
+    values = np.concatenate(([9.0, 9.0], spoilt[rows]))
+    ticks = np.arange(TICKS)
+    ticks[50:53] = [52, 50, 51]
+    ticks = np.concatenate((ticks, ticks[-1:]))
+    messy = pf.Run.from_arrays(TIME[ticks], {"tip": BINARY[ticks]}, {"scope": (stamp, {"tip": values})})
+    expected, found = only(clean, arm()), only(messy, arm())
+    assert found.measurements == int(kept.sum())
+    assert found.notes and not expected.notes
+    assert msgspec.structs.replace(found, notes=[]) == expected
+    assert found.model.rms == pytest.approx(np.std(noise()[kept]), rel=1e-9)
+
+
+def refusal(run: pf.Run, model: pf.ArmModel, **options: object) -> str:
+    with pytest.raises(pf.PumafuseError) as refused:
+        pf.verify(run, model, **options)  # pyright: ignore[reportArgumentType]
+    said = str(refused.value)
+    assert len(said.splitlines()) == 1
+    return said
+
+
+def test_what_cannot_be_verified_is_refused_in_one_line() -> None:
+    """Too few measurements, no sensor at all, one that is unknown, an axis that the arm or the run has not."""
+    run = run_of(moved(arm()) + noise())
+    few = pf.Run.from_arrays(TIME, {"tip": BINARY}, {"scope": (SAMPLED[:19], {"tip": SAMPLED[:19]})}, name="r")
+    assert refusal(few, arm()).startswith("run 'r': no source has 20 measurements of a commanded axis")
+    early = pf.Run.from_arrays(TIME, {"tip": BINARY}, {"scope": (SAMPLED - 60.0, {"tip": SAMPLED})}, name="r")
+    assert "no source has 20 measurements" in refusal(early, arm())
+    assert "no source has 20 measurements" in refusal(pf.Run.from_arrays(TIME, {"tip": BINARY}), arm())
+    assert refusal(run, arm(), sensors=["eye"]) == "run 'r' has no sensor 'eye'; it has scope"
+    assert "'reference'" in refusal(run, arm(), sensors=["reference"])
+    assert "the arm 'known' has no such axis" in refusal(run, arm(axis="elbow"))
+    assert "elbow" in refusal(run, arm(), start={"elbow": 0.1})
+    assert "not finite" in refusal(run, arm(), start={"tip": np.nan})
+
+
+def test_twenty_measurements_are_enough() -> None:
+    """One fewer is refused."""
+    part = slice(0, 20)
+    run = pf.Run.from_arrays(TIME, {"tip": BINARY}, {"scope": (SAMPLED[part], {"tip": moved(arm())[part]})})
+    assert only(run, arm()).measurements == 20
+
+
+# ---- recorded -------------------------------------------------------------------------------------------------------
+
+LIMITS = {"preset": (0.66e-3, 0.28e-3, 0.31e-3), "identified": (1.02e-3, 0.40e-3, 0.35e-3)}
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="the recorded white-noise runs are not beside the project")
+def test_recorded_white_noise_is_met_as_well_as_promised() -> None:
+    """The preset and an arm from 86 trials at 8 mm, tangential, radial, vertical: RMS within LIMITS.
+
+    That arm states no recovery; where both are of one order the preset's floor is as low or, by its recovery, lower.
+    """
+    recorded = SHARED / "puma-virtual"
+    trials = pf.StepTrials.read(recorded / "steps")
+    arms = {"preset": pf.ArmModel.load("puma560-internal"), "identified": pf.identify(trials).arm}
+    for place, axis in enumerate(("tangential", "radial", "vertical")):
+        run = pf.Run.read(recorded / "white-noise" / f"{axis}_8mm_r1")
+        found = {name: only(run, model) for name, model in arms.items()}
+        for name, limits in LIMITS.items():
+            assert found[name].model.rms <= limits[place], (name, axis)
+            assert found[name].amplitude == pytest.approx(0.008)
+        assert arms["identified"].axes[axis].gain_recovery is None
+        floors = {name: one.floor for name, one in found.items()}
+        if isinstance(floors["preset"].plant, type(floors["identified"].plant)):
+            assert 0.95 < floors["preset"].fit.rms / floors["identified"].fit.rms < 1.0 + 1e-6
+
+
+def test_measurements_that_jump_are_left_out_and_counted_and_a_wrong_model_is_not_spared() -> None:
+    """2 % of the measurements 20 mm away change nothing; a second of a stuck arm stays in the error."""
+    rng = np.random.default_rng(12)
+    known = arm(FIRST)
+    clean = moved(known) + noise()
+    far = rng.random(len(clean)) < 0.02
+    far[1:] &= ~far[:-1]
+    spiked = clean + 0.02 * far * rng.choice([-1.0, 1.0], len(clean))
+    expected, found = only(run_of(clean), known), only(run_of(spiked), known)
+    assert expected.outlying == 0
+    assert found.outlying == int(far.sum())
+    assert found.model.rms == pytest.approx(expected.model.rms, rel=0.03)
+    stuck = clean.copy()
+    stuck[500:750] = stuck[500]
+    held = only(run_of(stuck), known)
+    assert held.outlying < 10
+    assert held.model.rms > 0.9 * float(np.std(stuck - moved(known)))

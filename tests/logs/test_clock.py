@@ -1,0 +1,309 @@
+"""Clocks that are set back cut a run."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pumafuse.arrays import NO_STAMP
+from pumafuse.errors import RunError
+from pumafuse.logs.clock import astray, segments, without_strays
+from pumafuse.logs.run import Reference, Run, Source
+from refusals import one_line
+
+SECOND = 1_000_000_000
+TICK = 28_000_000
+
+properties = settings(derandomize=True, deadline=None, max_examples=50)
+
+
+def source(stamp: Sequence[int], label: str) -> Source:
+    """A source whose values are the row numbers, so that a piece of it shows which rows it holds."""
+    return Source(np.array(stamp, dtype=np.int64), {"radial": np.arange(len(stamp), dtype=float)}, label)
+
+
+def recorded(command: Sequence[int], sensors: Mapping[str, Sequence[int]], truth: Sequence[int] | None = None) -> Run:
+    streams = {name: source(stamp, f"{name}.csv") for name, stamp in sensors.items()}
+    run = Run("run", source(command, "host.csv"), streams, start={"radial": 0.5}, notes=("torn",))
+    if truth is None:
+        return run
+    reference = source(truth, "truth.csv")
+    return replace(run, reference=Reference(reference.stamp, reference.values, reference.label, sd=1e-3))
+
+
+def rows(piece: Source | None) -> list[int]:
+    """Which rows of the original a piece holds."""
+    assert piece is not None
+    assert len(piece.stamp) == len(piece.values["radial"])
+    return piece.values["radial"].astype(int).tolist()
+
+
+refusal = partial(one_line, RunError)
+
+
+def cuts_by_hand(stamp: Sequence[int]) -> list[int]:
+    """Rows more than 1 s behind the latest stamp since the last cut, found one row at a time."""
+    cuts, latest = [], None
+    for row, value in enumerate(stamp):
+        if value == NO_STAMP:
+            continue
+        if latest is not None and latest - value > SECOND:
+            cuts.append(row)
+            latest = value
+        latest = value if latest is None else max(latest, value)
+    return cuts
+
+
+def pieces_by_hand(stamp: Sequence[int]) -> list[list[int]]:
+    edges = [0, *cuts_by_hand(stamp), len(stamp)]
+    return [list(range(*edge)) for edge in pairwise(edges)]
+
+
+def strays_by_hand(stamp: Sequence[int]) -> list[int]:
+    """The stray rows, one row after the other: each is held against the last that is none and the one that follows."""
+    rows = [row for row, value in enumerate(stamp) if value != NO_STAMP]
+    apart = [False] * len(rows)
+    believed: list[int] = []
+    at = 0
+    while at < len(rows):
+        count = next((count for count in (1, 2) if contradicted(stamp, believed, rows[at:], count)), 0)
+        apart[at : at + count] = [True] * count
+        believed += rows[at : at + 1] if count == 0 else []
+        at += max(count, 1)
+    groups = "".join("x" if stray else " " for stray in apart)
+    long = {place for group in re.finditer("xxx+", groups) for place in range(*group.span())}
+    return [row for place, row in enumerate(rows) if apart[place] and place not in long]
+
+
+def contradicted(stamp: Sequence[int], believed: Sequence[int], rows: Sequence[int], count: int) -> bool:
+    """Whether the first ``count`` of ``rows`` are, by the last row that is believed and by what comes after them."""
+    out, rest = [stamp[row] for row in rows[:count]], [stamp[row] for row in rows[count:]]
+    if len(out) < count or not (believed or rest):
+        return False
+    before = stamp[believed[-1]] if believed else None
+    if before is None:
+        return len(rest) >= 3 and all(value - rest[0] > SECOND for value in out)
+    if not rest:
+        return believed[-1] >= stamped_rows(stamp)[2] and all(before - value > SECOND for value in out)
+    ahead = [value - before > SECOND and value - rest[0] > SECOND for value in out]
+    return before - rest[0] <= SECOND and all(
+        over or before - value > SECOND for over, value in zip(ahead, out, strict=True)
+    )
+
+
+def stamped_rows(stamp: Sequence[int]) -> list[int]:
+    found = [row for row, value in enumerate(stamp) if value != NO_STAMP]
+    return [*found, *[len(stamp)] * 3]
+
+
+STRAYS: dict[str, tuple[list[float | None], list[int]]] = {
+    "one ahead": ([0, 1, 2, 50, 3, 4], [3]),
+    "two ahead": ([0, 1, 2, 50, 51, 3, 4], [3, 4]),
+    "two ahead, each elsewhere": ([0, 1, 2, 50, 40, 3, 4], [3, 4]),
+    "three ahead: the clock was set anew": ([0, 1, 2, 50, 51, 52, 3, 4, 5], []),
+    "three ahead, each elsewhere": ([0, 1, 2, 50, 40, 30, 3, 4, 5], []),
+    "one back": ([0, 1, 2, -50, 3, 4], [3]),
+    "two back": ([0, 1, 2, -50, -49, 3, 4], [3, 4]),
+    "three back: the clock was set anew": ([0, 1, 2, -50, -49, -48, 3, 4], []),
+    "one ahead, one back": ([0, 1, 2, 50, -50, 3, 4], [3, 4]),
+    "one ahead now and again": ([0, 1, 50, 2, 50, 3, 4], [2, 4]),
+    "the first row ahead": ([50, 0, 1, 2], [0]),
+    "the first two ahead": ([50, 51, 0, 1, 2], [0, 1]),
+    "the first row ahead of two only": ([50, 0, 1], []),
+    "the first row back: a pause follows": ([-50, 0, 1, 2], []),
+    "the last row back": ([0, 1, 2, -50], [3]),
+    "the last two back": ([0, 1, 2, -50, -49], [3, 4]),
+    "the last row behind two only": ([0, 1, -50], []),
+    "the last row ahead: a pause": ([0, 1, 2, 50], []),
+    "a pause": ([0, 1, 2, 50, 51, 52], []),
+    "one row between two pauses": ([0, 1, 2, 50, 100, 101], []),
+    "ahead of a pause": ([0, 1, 2, 50, 30, 31], [3]),
+    "the clock goes back behind where it was": ([0, 1, 2, 50, -50, -49, -48], []),
+    "ahead of what comes next by 1 s": ([0, 1, 3, 2, 3, 4], []),
+    "ahead of what comes next by more": ([0, 1, 3.001, 2, 3, 4], [2]),
+    "behind by 1 s": ([0, 1, 2, 1, 3, 4], []),
+    "behind by more": ([0, 1, 2, 0.999, 3, 4], [3]),
+    "what comes next is 1 s behind": ([0, 1, 2, 50, 1, 2], [3]),
+    "what comes next is farther behind": ([0, 1, 2, 50, 0.97, 0.98, 0.99, 2], []),
+    "rows without a stamp are passed over": ([None, 0, 1, 2, None, 50, None, 3, 4], [5]),
+}
+
+
+@pytest.mark.parametrize("case", STRAYS)
+def test_a_stray_stamp_is_one_that_the_rows_around_it_contradict(case: str) -> None:
+    """One row or two that are elsewhere before the log goes on where it was; a pause and a clock set anew are none."""
+    times, wanted = STRAYS[case]
+    stamp = [NO_STAMP if time is None else round(time * SECOND) for time in times]
+    assert np.flatnonzero(astray(np.array(stamp))).tolist() == wanted == strays_by_hand(stamp)
+
+
+def test_a_stray_stamp_is_apart_from_what_was_before_it_or_first_comes_after() -> None:
+    """By how far is counted from the time that the log was at, ahead or back."""
+    stamp = [time * SECOND for time in (70, 0, 1, 2, 50, 3, -4, 4, 5)]
+    assert (astray(np.array(stamp)) / SECOND).tolist() == [70, 0, 0, 0, 48, 0, -7, 0, 0]
+
+
+wild = st.builds(
+    lambda steps, gone: [NO_STAMP if lost else step * SECOND // 2 for step, lost in zip(steps, gone, strict=False)],
+    st.lists(st.sampled_from([0, 1, 2, 3, 4, 5, 6, 20, 40, 60]), min_size=1, max_size=14),
+    st.lists(st.sampled_from([False] * 9 + [True]), min_size=14, max_size=14),
+)
+
+
+@settings(derandomize=True, deadline=None, max_examples=1000)
+@given(wild)
+def test_any_stamps_are_stray_as_a_walk_from_row_to_row_finds_them(stamp: list[int]) -> None:
+    """Only rows near a step back are looked at; that misses none and finds no other."""
+    assert np.flatnonzero(astray(np.array(stamp, dtype=np.int64))).tolist() == strays_by_hand(stamp)
+
+
+def test_stray_stamps_are_taken_for_none_and_told() -> None:
+    """Commands astray either way lose their stamps, measurements and truth only ahead; no row goes, each source is told."""
+    stamp = [time * SECOND for time in (0, 1, 2, 50, 3, -50, 4, 60, 5)]
+    run = recorded(stamp, {"tracker": stamp}, stamp)
+    kept = without_strays(run)
+    assert kept.reference is not None
+    lost = [
+        np.flatnonzero(source.stamp == NO_STAMP).tolist()
+        for source in (kept.command, kept.sensors["tracker"], kept.reference)
+    ]
+    assert lost == [[3, 5, 7], [3, 7], [3, 7]]
+    assert rows(kept.command) == rows(kept.sensors["tracker"]) == rows(kept.reference) == list(range(9))
+    assert kept.notes == (
+        "torn",
+        "host.csv: 2 rows have a stray stamp, more than 1 s ahead of the rows around: taken for none"
+        " (first: row 4, by 48.000 s)",
+        "host.csv: 1 row has a stray stamp, more than 1 s behind the rows around: taken for none"
+        " (first: row 6, by 53.000 s)",
+        "tracker (tracker.csv): 2 rows have a stray stamp, more than 1 s ahead of the rows around: taken for none"
+        " (first: row 4, by 48.000 s)",
+        "truth.csv: 2 rows have a stray stamp, more than 1 s ahead of the rows around: taken for none"
+        " (first: row 4, by 48.000 s)",
+    )
+    assert without_strays(kept) is kept
+    assert run.command.stamp.tolist() == stamp
+
+
+def test_a_stray_command_cuts_nothing_and_a_clock_set_back_still_does() -> None:
+    """A run is cut where its clock was set back, not where a stamp of either part is stray."""
+    first, second = [100, 101, 900, 102, 103], [10, 11, -900, 12, 13]
+    stamp = [time * SECOND for time in (*first, *second)]
+    parts, said = segments(recorded(stamp, {"tracker": [time * SECOND for time in (100, 101, 10, 11)]}))
+    assert [rows(part.command) for part in parts] == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]]
+    assert [part.command.stamp[2] for part in parts] == [NO_STAMP, NO_STAMP]
+    assert len(said) == 1
+    assert "by 93.000 s in row 6" in said[0]
+
+
+def test_a_run_with_one_clock_is_one_segment() -> None:
+    """Without a jump the run itself comes back and nothing is said."""
+    run = recorded([0, TICK, 3600 * SECOND], {"tracker": [5, 4, 3]})
+    assert segments(run) == ([run], [])
+
+
+@pytest.mark.parametrize(("back", "count"), [(SECOND, 1), (SECOND + 1, 2)])
+def test_a_step_back_of_one_second_is_tolerated_and_a_nanosecond_more_is_a_jump(back: int, count: int) -> None:
+    """Up to 1 s rows are out of order; beyond it the clock was set back and a new segment begins."""
+    stamp = [10 * SECOND, 11 * SECOND, *[11 * SECOND - back] * 3, 12 * SECOND]
+    parts, said = segments(recorded(stamp, {"tracker": stamp}))
+    assert len(parts) == count
+    assert len(said) == count - 1
+
+
+def test_a_slow_slide_back_adds_up_to_a_jump() -> None:
+    """What counts is how far a row is behind the latest stamp, not behind the row before it."""
+    stamp = [10 * SECOND, *(10 * SECOND - step * SECOND // 2 for step in (1, 2, 3)), 20 * SECOND]
+    parts, _ = segments(recorded(stamp, {}))
+    assert [rows(part.command) for part in parts] == [[0, 1, 2], [3, 4]]
+
+
+def test_a_jump_cuts_every_source_where_its_own_clock_jumps() -> None:
+    """Each source is cut at its own row; the start level and the file's notes belong to the first segment."""
+    late, early = 100 * SECOND, 50 * SECOND
+    command = [late, late + TICK, early, early + TICK]
+    run = recorded(command, {"tracker": [late, early, early + 1], "vision": [late, late + 1, early]}, [late, early])
+    (first, second), (said,) = segments(run)
+    assert [rows(part.command) for part in (first, second)] == [[0, 1], [2, 3]]
+    assert [rows(part.sensors["tracker"]) for part in (first, second)] == [[0], [1, 2]]
+    assert [rows(part.sensors["vision"]) for part in (first, second)] == [[0, 1], [2]]
+    assert [rows(part.reference) for part in (first, second)] == [[0], [1]]
+    assert [part.reference.sd for part in (first, second) if part.reference] == [1e-3, 1e-3]
+    assert (first.start, second.start) == ({"radial": 0.5}, {})
+    assert (first.notes, second.notes) == (("torn",), ())
+    for words in ("host.csv", "50.028 s", "row 3", "new segment"):
+        assert words in said
+
+
+quarters = st.sampled_from([NO_STAMP, *(quarter * SECOND // 4 for quarter in range(13))])
+
+
+@properties
+@given(st.lists(quarters, min_size=2, max_size=20).filter(lambda stamp: max(stamp) >= 0))
+def test_segments_hold_every_row_once_and_none_jumps(stamp: list[int]) -> None:
+    """For any stamps the pieces are those of a walk from row to row, and together they are the whole log."""
+    kept = without_strays(recorded(stamp, {})).command.stamp.tolist()
+    run = replace(recorded(kept, {"tracker": kept}, kept), without_strays=True)
+    parts, said = segments(run)
+    wanted = pieces_by_hand(kept)
+    assert [rows(part.command) for part in parts] == wanted
+    assert [rows(part.sensors["tracker"]) for part in parts] == wanted
+    assert [rows(part.reference) for part in parts] == wanted
+    assert len(said) == len(wanted) - 1
+
+
+@pytest.mark.parametrize("truth", [None, [9 * SECOND, 0]])
+def test_a_clock_that_is_set_back_for_the_commands_only_is_refused(truth: list[int] | None) -> None:
+    """If a sensor's clock did not jump with the commands', nothing tells which measurements belong where."""
+    text = refusal(lambda: segments(recorded([9 * SECOND, 0, TICK], {"tracker": [9 * SECOND, 10 * SECOND]}, truth)))
+    for words in ("host.csv", "row 2", "tracker.csv", "cut the log"):
+        assert words in text
+
+
+def test_a_clock_that_is_set_back_for_the_commands_and_not_the_reference_is_refused() -> None:
+    """A reference counts as a source: it must jump with the commands, and is named by its file."""
+    text = refusal(lambda: segments(recorded([9 * SECOND, 0], {"tracker": [9 * SECOND, 0]}, [0, SECOND])))
+    for words in ("host.csv", "row 2", "truth.csv"):
+        assert words in text
+
+
+def test_a_sensor_may_be_called_reference() -> None:
+    """A sensor's name is its own affair: one called reference is cut like the others, with and without a truth."""
+    stamp = [100 * SECOND, 0]
+    for truth in (None, stamp):
+        parts, _ = segments(recorded(stamp, {"reference": stamp, "tracker": stamp}, truth))
+        for index, part in enumerate(parts):
+            assert {name: rows(piece) for name, piece in part.sensors.items()} == {
+                "reference": [index],
+                "tracker": [index],
+            }
+            assert (part.reference is None) == (truth is None)
+        assert len(parts) == 2
+
+
+def test_stamps_as_far_apart_as_they_may_be_are_a_jump() -> None:
+    """From one end of what is read to the other the clock is set back by 292 years: no difference overflows."""
+    last = 4_599_999_999 * SECOND
+    run = Run.from_arrays([last, -last], {"radial": [0.0, 1.0]})
+    parts, (said,) = segments(run)
+    assert [part.command.stamp.tolist() for part in parts] == [[last], [-last]]
+    assert "9199999998.000 s" in said
+
+
+def test_a_sensor_that_is_set_back_alone_cuts_nothing() -> None:
+    """A sensor whose clock jumps alone stays whole: the timeline calls its rows too late."""
+    run = recorded([0, TICK], {"tracker": [9 * SECOND, 0, SECOND]})
+    assert segments(run) == ([run], [])
+
+
+def test_stamps_that_are_no_clock_are_refused() -> None:
+    """Nonsense stamps would be a thousand segments: refused by the file's name instead."""
+    nonsense = np.random.default_rng(0).integers(0, 1000 * SECOND, 1000).tolist()
+    assert "host.csv" in refusal(lambda: segments(recorded(nonsense, {"tracker": nonsense})))

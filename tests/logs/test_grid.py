@@ -1,0 +1,316 @@
+"""A controller's own ticks are found behind jittered stamps."""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pumafuse.errors import RunError
+from pumafuse.logs.grid import regular_grid
+from pumafuse.logs.grid_kernels import CHOICES, MOST_LATE, cheapest_ticks
+from refusals import one_line
+
+SECOND = 1_000_000_000
+PERIOD = 0.028
+TICK = 28_000_000
+
+properties = settings(derandomize=True, deadline=None, max_examples=50)
+
+
+refusal = partial(one_line, RunError)
+
+
+def grid_of(ticks: np.ndarray, period_ns: float = TICK, origin: int = 1_700_000_000 * SECOND) -> np.ndarray:
+    return origin + np.rint(ticks * period_ns).astype(np.int64)
+
+
+@properties
+@given(st.sampled_from([PERIOD, 0.004, 1 / 30, 0.0281234567]), st.integers(200, 500), st.integers(0, 2**32 - 1))
+def test_the_grid_behind_jittered_stamps_is_even_to_a_nanosecond(period: float, count: int, seed: int) -> None:
+    """Stamps off by up to a fifth of a period, with commands missing, come back on ticks of exactly T."""
+    rng = np.random.default_rng(seed)
+    ticks = np.cumsum(rng.integers(1, 6, count))
+    jitter = rng.uniform(-0.2, 0.2, count) * period * SECOND
+    stamp = grid_of(ticks, period * SECOND) + np.rint(jitter).astype(np.int64)
+    got, note = regular_grid(stamp, period, "host")
+    assert note is None
+    np.testing.assert_allclose(got - got[0], (ticks - ticks[0]) * period * SECOND, rtol=0, atol=1.001)  # rounded twice
+    assert abs(float(np.median(stamp - got))) <= 1.0
+
+
+def test_the_grid_lies_where_the_ticks_were() -> None:
+    """With many commands the jitter averages out: the grid is within 4 standard errors of the true ticks."""
+    ticks = np.flatnonzero(np.random.default_rng(1).random(4000) < 0.8)
+    truth = grid_of(ticks)
+    sd = 1.5e6
+    stamp = truth + np.rint(np.random.default_rng(2).normal(0.0, sd, len(ticks))).astype(np.int64)
+    got, note = regular_grid(stamp, PERIOD, "host")
+    assert note is None
+    assert set(np.unique(np.diff(got) - np.diff(truth))) == {0}
+    assert abs(int(got[0] - truth[0])) < 4 * sd * np.sqrt(np.pi / 2 / len(ticks))  # of a median
+
+
+@pytest.mark.parametrize("ppm", [50.0, -50.0, 400.0])
+def test_a_drifting_clock_is_followed_and_told(ppm: float) -> None:
+    """50 ppm over an hour are 180 ms, six ticks: the grid stays on the true ticks, and the note tells the drift."""
+    ticks = np.flatnonzero(np.random.default_rng(3).random(130_000) < 0.9)
+    truth = grid_of(ticks, TICK * (1 + ppm * 1e-6))
+    jitter = np.random.default_rng(4).normal(0.0, 1e6, len(ticks))
+    got, note = regular_grid(truth + np.rint(jitter).astype(np.int64), PERIOD, "host")
+    assert np.abs(got - truth).max() < 4 * 1e6 * np.sqrt((4 + np.pi / 2) / len(ticks))  # slope and median together
+    assert note is not None
+    assert "host" in note
+    assert f"{ppm:+.1f} ppm" in note
+
+
+@pytest.mark.parametrize(("stamp", "wanted"), [([5], [5]), ([5, TICK + 1005], [505, TICK + 505])])
+def test_one_or_two_stamps_are_a_grid(stamp: list[int], wanted: list[int]) -> None:
+    """Stamps too few to fit a drift to keep T, and share the error."""
+    got, note = regular_grid(np.array(stamp), PERIOD, "host")
+    assert note is None
+    assert got.tolist() == wanted
+
+
+@pytest.mark.parametrize("count", [3, 5, 10, 20, 40])
+def test_a_short_run_with_jitter_has_a_grid(count: int) -> None:
+    """1 ms of jitter on a few commands is no wrong period: the slope's own error is allowed for."""
+    for seed in range(20):
+        jitter = np.rint(np.random.default_rng(seed).normal(0.0, 1e6, count)).astype(np.int64)
+        got, note = regular_grid(grid_of(np.arange(count)) + jitter, PERIOD, "host")
+        np.testing.assert_array_equal(np.diff(got), TICK)
+        assert note is None
+
+
+@pytest.mark.parametrize("first", [2000, 10, 3997])
+def test_a_late_stamp_moves_no_other_command(first: int) -> None:
+    """One stamp more than half a tick late, the next one less: every command is on its own tick."""
+    truth = grid_of(np.arange(4000))
+    stamp = truth.copy()
+    stamp[first] += 15_000_000
+    stamp[first + 1] += 3_000_000
+    got, note = regular_grid(stamp, PERIOD, "host")
+    assert note == "host: 1 commands are stamped more than half a period late: set back to their ticks"
+    np.testing.assert_allclose(got - truth, 0, atol=1)
+
+
+@pytest.mark.parametrize("mean", [2e6, 3e6])
+def test_stamps_that_are_only_ever_late_have_a_grid(mean: float) -> None:
+    """A logger's delay, exponential with 2 or 3 ms, is now and then over half a tick: the ticks are still clear."""
+    truth = grid_of(np.arange(4000))
+    late = np.random.default_rng(0).exponential(mean, len(truth)).astype(np.int64)
+    got, note = regular_grid(np.maximum.accumulate(truth + late), PERIOD, "host")
+    assert note is not None
+    assert "ppm" not in note
+    np.testing.assert_array_equal(np.diff(got), TICK)
+
+
+@pytest.mark.parametrize("ppm", [50.0, -50.0])
+def test_a_pause_does_not_hide_the_drift(ppm: float) -> None:
+    """50 ppm through a pause of 10 minutes are one tick: the grid is on the true ticks after it."""
+    truth = grid_of(np.concatenate([np.arange(20_000), np.arange(20_000) + 41_500]), TICK * (1 + ppm * 1e-6))
+    got, note = regular_grid(truth, PERIOD, "host")
+    assert note is not None
+    assert f"{ppm:+.1f} ppm" in note
+    assert np.abs(got - truth).max() < 1000
+
+
+@pytest.mark.parametrize("period", [0.056, 0.030, 0.0281, 0.0279, 0.027, 0.0200])
+def test_a_wrong_period_is_refused(period: float) -> None:
+    """Stamps 28 ms apart do not fit another period: refused with both periods and what to do."""
+    ticks = np.arange(500)
+    jitter = np.random.default_rng(5).uniform(-1e6, 1e6, len(ticks))
+    text = refusal(lambda: regular_grid(grid_of(ticks) + np.rint(jitter).astype(np.int64), period, "host"))
+    assert text.startswith("host: ")
+    for words in (f"ticks of {period * 1e3:g} ms", "median interval is 28.0", "clock = 'stamps'"):
+        assert words in text
+
+
+def test_two_commands_in_one_tick_are_refused() -> None:
+    """A command between two ticks cannot be on a grid: refused with the period and what to do."""
+    text = refusal(lambda: regular_grid(np.array([0, TICK, TICK + TICK // 3, 2 * TICK]), PERIOD, "host"))
+    assert text.startswith("host: ")
+    for words in ("ticks of 28 ms", "median interval is 18.6667 ms", "clock = 'stamps'"):
+        assert words in text
+
+
+@pytest.mark.parametrize("place", [50, 100, 190, 3900])
+def test_a_command_between_two_ticks_is_refused(place: int) -> None:
+    """Two commands on one tick are no regular clock; no other command is moved to make room for them."""
+    truth = grid_of(np.arange(4000))
+    stamp = np.sort(np.append(truth, truth[place] + TICK // 2))
+    with pytest.raises(RunError, match="do not come on ticks"):
+        regular_grid(stamp, PERIOD, "host")
+
+
+def logged(ticks: np.ndarray, period: float, sd: float, seed: int, ppm: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """True instants, and stamps with a Gaussian jitter of ``sd`` periods; a logger writes no two within 1 µs."""
+    truth = grid_of(ticks, period * SECOND * (1 + ppm * 1e-6))
+    jitter = np.random.default_rng(seed).normal(0.0, sd * period * SECOND, len(ticks))
+    return truth, in_order(truth + np.rint(jitter).astype(np.int64))
+
+
+def in_order(stamp: np.ndarray) -> np.ndarray:
+    apart = 1000 * np.arange(len(stamp))
+    return np.maximum.accumulate(stamp - apart) + apart
+
+
+def share_right(got: np.ndarray, truth: np.ndarray, period: float) -> float:
+    return float(np.mean(np.abs(got - truth) < 0.4 * period * SECOND))
+
+
+@pytest.mark.parametrize("sd", [0.05, 0.15, 0.2, 0.25])
+@pytest.mark.parametrize("period", [0.002, 0.004, PERIOD])
+@pytest.mark.parametrize("ppm", [0.0, 50.0])
+def test_jitter_of_a_quarter_of_a_period_is_fitted(sd: float, period: float, ppm: float) -> None:
+    """Of 0.25 T every twentieth stamp is nearer to another tick: with no tick missing order tells all but the ends'."""
+    for seed in range(3):
+        truth, stamp = logged(np.arange(5000), period, sd, seed, ppm)
+        got, _ = regular_grid(stamp, period, "host")
+        assert share_right(got, truth, period) >= 0.9995
+
+
+@pytest.mark.parametrize(("sd", "least"), [(0.1, 1.0), (0.15, 0.9995), (0.2, 0.999), (0.25, 0.998)])
+def test_where_a_few_ticks_are_missing_only_their_neighbours_may_be_a_tick_aside(sd: float, least: float) -> None:
+    """Each side of a missing tick a stamp is beyond half a period with Q(T / 2 sd): 1.2 % of these at 0.2 T."""
+    ticks = np.flatnonzero(np.random.default_rng(7).random(5000) >= 0.02)
+    for seed in range(3):
+        truth, stamp = logged(ticks, 0.002, sd, seed, 50.0)
+        got, _ = regular_grid(stamp, 0.002, "host")
+        assert share_right(got, truth, 0.002) >= least
+
+
+@pytest.mark.parametrize("sd", [0.0, 0.1, 0.2])
+@pytest.mark.parametrize("length", [1, 4, 8])
+def test_a_queue_behind_a_stalled_logger_is_set_back_to_its_ticks(sd: float, length: int) -> None:
+    """Up to 8 commands stamped when the logger goes on, then a tick missing soon after: all are on their own ticks."""
+    ticks = np.delete(np.arange(4000), [1020, 2020])
+    truth, stamp = logged(ticks, 0.002, sd, 5)
+    for first in (1000, 2000, 3000):
+        at = int(np.searchsorted(ticks, first))
+        stamp[at : at + length] = truth[at + length] - 20_000 + 1000 * np.arange(length)
+    got, note = regular_grid(in_order(stamp), 0.002, "host")
+    assert share_right(got, truth, 0.002) >= 0.9995
+    assert note is not None
+    assert "more than half a period" in note
+
+
+def test_a_long_log_with_jitter_is_fitted() -> None:
+    ticks = np.flatnonzero(np.random.default_rng(8).random(100_000) >= 0.001)
+    truth, stamp = logged(ticks, 0.002, 0.2, 0, 50.0)
+    got, note = regular_grid(stamp, 0.002, "host")
+    assert share_right(got, truth, 0.002) >= 0.9999
+    assert note is not None
+    assert "+50.0 ppm" in note
+
+
+@pytest.mark.parametrize("place", [100, 2000, 3900])
+def test_an_early_stamp_moves_no_other_command(place: int) -> None:
+    """With 0.15 T of jitter a stamp that is 0.6 T early is nearest to the tick before it, which is taken."""
+    truth, stamp = logged(np.arange(4000), 0.002, 0.15, 11)
+    stamp[place - 1 : place + 1] = truth[place] - [1_900_000, 1_200_000]
+    got, note = regular_grid(in_order(stamp), 0.002, "host")
+    np.testing.assert_allclose(got, truth, rtol=0, atol=30_000)  # 4 standard errors of a median
+    assert note is not None
+    assert "of them early: put on them" in note
+
+
+@properties
+@given(
+    st.sampled_from([0.002, PERIOD]), st.floats(0.0, 0.4), st.sampled_from([0.0, 0.02, 0.5]), st.integers(0, 2**32 - 1)
+)
+def test_a_grid_that_is_given_is_right(period: float, sd: float, missing: float, seed: int) -> None:
+    """Whatever the jitter: refused, or all but 3 % of the commands on their ticks, and those a tick beside."""
+    rng = np.random.default_rng(seed)
+    ticks = np.flatnonzero(rng.random(int(rng.integers(300, 2000))) >= missing)
+    truth, stamp = logged(ticks, period, sd, seed)
+    try:
+        got, _ = regular_grid(stamp, period, "host")
+    except RunError:
+        assert sd > (0.2 if missing < 0.1 else 0.15)
+        return
+    tick = period * SECOND
+    assert np.all(np.diff(got) > 0.99 * tick)
+    assert np.abs(got - truth).max() < 1.5 * tick
+    assert share_right(got, truth, period) > 0.97
+
+
+@properties
+@given(st.integers(40, 3000), st.floats(1.0, 5.0), st.integers(0, 2**32 - 1))
+def test_stamps_without_ticks_are_refused(count: int, apart: float, seed: int) -> None:
+    """Commands at any time lie within half a period of some tick: that is not taken for a jitter."""
+    gaps = np.random.default_rng(seed).uniform(0.5, 1.5, count) * apart * TICK
+    text = refusal(lambda: regular_grid(np.cumsum(gaps).astype(np.int64), PERIOD, "host"))
+    assert "do not come on ticks of 28 ms: " in text
+    assert text.endswith("; check update_period_ms, or use clock = 'stamps'")
+
+
+@properties
+@given(
+    st.sampled_from([64 / 65, 63 / 64, 2 / 3, 0.75, 4 / 3, 1.5, 1.01, 0.99]), st.integers(200, 3000), st.floats(0, 0.2)
+)
+def test_a_period_that_fits_now_and_then_is_refused(ratio: float, count: int, sd: float) -> None:
+    """Also one that fits as well at each 64th command, or at each second."""
+    _, stamp = logged(np.arange(count), PERIOD, sd, count)
+    refusal(lambda: regular_grid(stamp, PERIOD * ratio, "host"))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_much_jitter_beside_many_missing_ticks_is_refused(seed: int) -> None:
+    """Of 0.25 T, with every second tick missing, some 2 % lie nearer to a free tick: no order tells which."""
+    rng = np.random.default_rng(seed)
+    ticks = np.flatnonzero(rng.random(5000) < 0.5)
+    place = np.sort(ticks + rng.normal(0.0, 0.25, len(ticks)))
+    assert "beside missing ticks may be of those" in refusal(lambda: regular_grid(grid_of(place), PERIOD, "host"))
+
+
+def test_a_refusal_tells_how_many_stamps_are_off_and_what_to_do() -> None:
+    """Every seventh stamp is 0.7 T late: the ticks are clear, but that is no jitter about them."""
+    truth = grid_of(np.arange(1000))
+    late = np.where(np.arange(1000) % 7 == 3, 20_000_000, 0)
+    text = refusal(lambda: regular_grid(truth + late, PERIOD, "host"))
+    off = np.count_nonzero(late)
+    assert f"{off} of 1000 are stamped more than half a period off their ticks" in text
+    assert "median" not in text
+    assert text.endswith("; check update_period_ms, or use clock = 'stamps'")
+
+
+@pytest.mark.parametrize("place", [3990, 3995, 3998])
+def test_a_command_between_the_last_ticks_is_refused(place: int) -> None:
+    """The few commands after it are not taken to be stamped a period early."""
+    truth = grid_of(np.arange(4000))
+    text = refusal(lambda: regular_grid(np.sort(np.append(truth, truth[place] + TICK // 2)), PERIOD, "host"))
+    assert "of 4001 are stamped more than half a period off their ticks" in text
+
+
+def cost(off: np.ndarray) -> np.ndarray:
+    return np.where(off > np.sqrt(0.5), 0.5 + 0.01 * (off - np.sqrt(0.5)), off**2)
+
+
+@properties
+@given(st.lists(st.floats(0.0, 5.0), min_size=1, max_size=5))
+def test_of_all_rows_of_ticks_the_cheapest_is_found(places: list[float]) -> None:
+    """No other strictly ascending row of ticks costs less: all of them are tried."""
+    place = np.sort(np.array(places))
+    ticks = np.empty(len(place), dtype=np.int64)
+    first = np.floor(place).astype(np.int64) - MOST_LATE
+    room = np.empty(CHOICES), np.empty((len(place), CHOICES), dtype=np.uint8)
+    assert cheapest_ticks(place, first, *room, ticks)
+    assert np.all(np.diff(ticks) > 0)
+    rows = np.array(list(combinations(range(-5, 9), len(place))))
+    least = cost(place - rows).sum(axis=1).min()
+    assert cost(place - ticks).sum() == pytest.approx(least, abs=1e-9)
+
+
+def test_more_stamps_than_ticks_about_them_are_no_row() -> None:
+    """13 stamps at one place, which has 12 ticks to choose from."""
+    text = refusal(
+        lambda: regular_grid(
+            np.sort(np.append(grid_of(np.arange(300)), grid_of(np.arange(50, 51)) + np.arange(1, 13))), PERIOD, "host"
+        )
+    )
+    assert "of 312 are stamped nearest to the tick of the one before" in text

@@ -1,0 +1,160 @@
+"""A run that is saved is the run that is read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pumafuse import Run
+from pumafuse.arrays import NO_STAMP
+from pumafuse.errors import RunError
+from pumafuse.logs.frames import Cylindrical, Rotated
+from pumafuse.logs.run import Source
+from pumafuse.logs.save import save
+
+DAYS_26 = 26 * 86400 * 10**9
+stamps = st.lists(st.one_of(st.integers(-DAYS_26, DAYS_26), st.just(NO_STAMP)), min_size=1, max_size=8)
+nanometres = st.one_of(st.integers(-(10**12), 10**12), st.just(None))
+
+
+def source(stamp: list[int], values: Mapping[str, list[int | None]], label: str = "s") -> Source:
+    # Whole nanometres, as the nearest float that a file in mm gives.
+    columns = {
+        axis: np.array([np.nan if nm is None else float(f"{nm}e-6") / 1e3 for nm in value])
+        for axis, value in values.items()
+    }
+    return Source(np.array(stamp, dtype=np.int64), columns, label)
+
+
+def through(run: Run) -> Run:
+    with TemporaryDirectory() as folder:
+        save(run, Path(folder))
+        return Run.read(folder)
+
+
+def same(one: Source, other: Source) -> None:
+    assert (one.stamp == other.stamp).all()
+    assert list(one.values) == list(other.values)
+    for axis in one.values:
+        assert np.array_equal(one.values[axis], other.values[axis], equal_nan=True)
+
+
+@st.composite
+def sources(draw: st.DrawFn, axes: tuple[str, ...]) -> Source:
+    stamp = draw(stamps)
+    values = {axis: draw(st.lists(nanometres, min_size=len(stamp), max_size=len(stamp))) for axis in axes}
+    return source(stamp, values)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(sources(("radial", "vertical")), sources(("radial",)), sources(("vertical", "radial")))
+def test_any_rows_come_back_to_the_last_bit(command: Source, eye: Source, ear: Source) -> None:
+    """Stamps to the ns, lengths to the nm; missing stamps and values stay missing, order and axes stay."""
+    command.stamp[0] = 0
+    for value in command.values.values():
+        value[0] = 0.001
+    again = through(Run("any", command, {"eye": eye, "ear": ear}))
+    same(command, again.command)
+    assert list(again.sensors) == ["eye", "ear"]
+    same(eye, again.sensors["eye"])
+    same(ear, again.sensors["ear"])
+    assert again.reference is None
+
+
+def plain(**different: object) -> Run:
+    given = {"time": [0.0, 0.028], "command": {"radial": [0.5, 0.501]}, "name": "plain"}
+    return Run.from_arrays(**(given | different))  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("name", ["plain", 'seed 1, "quoted"', "ä\tb\\c", "a = [1]"])
+def test_the_name_comes_back(name: str) -> None:
+    """Whatever characters it has."""
+    assert through(plain(name=name)).name == name
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        None,
+        Cylindrical(),
+        Cylindrical(base=(0.0123456789, -1.1), positive="clockwise"),
+        Rotated(azimuth=37.25, positive="clockwise"),
+    ],
+)
+def test_frame_start_clock_and_reference_come_back(frame: Cylindrical | Rotated | None) -> None:
+    """Everything of a run but its notes."""
+    run = plain(
+        frame=frame,
+        clock="regular",
+        start={"radial": 0.123456789},
+        reference=([0.0, 0.01], {"radial": [0.5, 0.6]}),
+        reference_sd=0.00002,
+    )
+    again = through(run)
+    assert (again.frame, again.clock, again.start) == (run.frame, run.clock, run.start)
+    assert run.reference is not None and again.reference is not None
+    same(run.reference, again.reference)
+    assert again.reference.sd == 0.00002
+
+
+def test_a_run_in_x_y_z_comes_back() -> None:
+    """With sources in axes beside those in x, y, z."""
+    run = Run.from_arrays(
+        [0.0, 0.1],
+        {"x": [0.1, 0.2], "y": [0.5, 0.6], "z": [0.0, 0.0]},
+        {"eye": ([0.05], {"x": [0.1], "y": [0.2]}), "range": ([0.07], {"radial": [0.5]})},
+        frame=Cylindrical(),
+    )
+    again = through(run)
+    same(run.command, again.command)
+    for name in run.sensors:
+        same(run.sensors[name], again.sensors[name])
+
+
+@pytest.mark.parametrize("name", ["run", "fusion", "two words", "scenario", "arm", "Ä", "a.b", "_eye-2"])
+def test_no_sensors_name_can_spoil_another_file(name: str) -> None:
+    """Whatever a sensor is called, commands and reference are read back, and nothing is written outside the folder."""
+    run = plain(
+        sensors={name: ([0.01], {"radial": [0.7]})},
+        reference=([0.0, 0.01], {"radial": [0.5, 0.6]}),
+    )
+    with TemporaryDirectory() as outer:
+        folder = Path(outer) / "run"
+        folder.mkdir()
+        save(run, folder)
+        assert [path.name for path in Path(outer).iterdir()] == ["run"]
+        again = Run.read(folder)
+    same(run.command, again.command)
+    same(run.sensors[name], again.sensors[name])
+    assert run.reference is not None and again.reference is not None
+    same(run.reference, again.reference)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["commands", "truth", "trials", "samples", "../eye", "a/b", "/tmp/eye", "", ".", "..", ".eye", "a\0b", "a\nb"],
+)
+def test_a_sensor_whose_file_would_be_another_is_refused_before_anything_is_written(name: str) -> None:
+    """In one line that names it."""
+    run = plain(sensors={"eye": ([0.01], {"radial": [0.7]}), name: ([0.01], {"radial": [0.7]})})
+    with TemporaryDirectory() as outer:
+        folder = Path(outer) / "run"
+        folder.mkdir()
+        with pytest.raises(RunError, match="its rows go into a file of its name") as refused:
+            save(run, folder)
+        assert list(folder.iterdir()) == [] and [path.name for path in Path(outer).iterdir()] == ["run"]
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_saving_changes_nothing_in_the_run() -> None:
+    """Its arrays are the caller's."""
+    run = plain()
+    before = run.command.values["radial"].copy()
+    through(run)
+    assert (run.command.values["radial"] == before).all()

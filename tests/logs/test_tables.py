@@ -1,0 +1,471 @@
+"""Tables: columns in SI units to the last digit, and one clear line for whatever else a file may hold."""
+
+from __future__ import annotations
+
+import gzip
+import random
+from collections.abc import Callable
+from decimal import Decimal
+from fractions import Fraction
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as papq
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pumafuse.arrays import NO_STAMP
+from pumafuse.errors import PumafuseError, RunError, UnknownNameError
+from pumafuse.logs import tables
+from pumafuse.logs.tables import Table
+from refusals import one_line
+
+LENGTHS = {"_m": 0, "_mm": 3, "_um": 6}
+TIMES = {"_s": 9, "_ms": 6, "_us": 3, "_ns": 0}
+EPOCH_NS = 1_700_000_000_123_456_789  # int64 ns of today: float64 there has a grid of 256 ns
+LAST_S = 4_599_999_999  # the last whole second within reach
+FIRST_BLOCK = 1 << 20  # pyarrow guesses types from blocks of this size
+
+properties = settings(
+    derandomize=True, deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def csv(folder: Path, text: str | bytes, name: str = "log.csv") -> Table:
+    path = folder / name
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return tables.read(path)
+
+
+def column(folder: Path, name: str, cells: list[str]) -> Table:
+    """A table of one column and a second one, so that an empty cell is no empty line."""
+    return csv(folder, "".join(f"{cell},0\n" for cell in [name, *cells]))
+
+
+refusal = partial(one_line, PumafuseError)
+
+
+def written(folder: Path, **columns: object) -> Table:
+    papq.write_table(pa.table(columns), folder / "log.parquet")
+    return tables.read(folder / "log.parquet")
+
+
+@pytest.mark.parametrize("unit", LENGTHS)
+@properties
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20))
+def test_lengths_are_the_exact_quotient_by_their_unit(tmp_path: Path, unit: str, values: list[float]) -> None:
+    """A length is the number in the cell over the power of ten in the column's name, rounded once."""
+    got, note = column(tmp_path, f"x{unit}", [repr(value) for value in values]).numbers(f"x{unit}")
+    assert got.tolist() == [float(Fraction(value) / 10 ** LENGTHS[unit]) for value in values]
+    assert note is None
+
+
+@properties
+@given(st.lists(st.integers(-(2**63), 2**64), min_size=1, max_size=20))
+def test_whole_lengths_of_any_size_are_numbers(tmp_path: Path, values: list[int]) -> None:
+    """Integers beyond 2^53, and beyond int64, are lengths to a float's precision."""
+    got, note = column(tmp_path, "x_mm", [str(value) for value in values]).numbers("x_mm")
+    np.testing.assert_allclose(got, [value / 1000 for value in values], rtol=4e-16, atol=0)  # rounded twice
+    assert note is None
+
+
+@pytest.mark.parametrize("unit", TIMES)
+@properties
+@given(st.data())
+def test_whole_stamps_are_exact_in_every_unit(tmp_path: Path, unit: str, data: st.DataObject) -> None:
+    """Integer stamps come out in ns without a rounding, wherever within reach they lie."""
+    limit = LAST_S * 10 ** (9 - TIMES[unit])
+    stamps = data.draw(st.lists(st.integers(-limit, limit), min_size=1, max_size=20))
+    got, _ = column(tmp_path, f"t{unit}", [str(stamp) for stamp in stamps]).stamps(f"t{unit}")
+    assert got.tolist() == [stamp * 10 ** TIMES[unit] for stamp in stamps]
+
+
+@pytest.mark.parametrize("unit", ["_s", "_ms", "_us"])
+@properties
+@given(st.lists(st.integers(-(10**15), 10**15), min_size=1, max_size=20))
+def test_decimal_stamps_of_a_run_are_exact(tmp_path: Path, unit: str, stamps: list[int]) -> None:
+    """Stamps with decimals down to 1 ns are exact as long as a run lasts, here up to 11 days."""
+    cells = [f"{Decimal(stamp).scaleb(-TIMES[unit]):f}" for stamp in stamps]
+    assert column(tmp_path, f"t{unit}", [*cells, "0.5"]).stamps(f"t{unit}")[0].tolist()[:-1] == stamps
+
+
+@pytest.mark.parametrize("bad", ["", "NaN", " ", "word"])
+def test_epoch_stamps_in_nanoseconds_stay_exact_beside_a_bad_cell(tmp_path: Path, bad: str) -> None:
+    """int64 ns of today keep their last digit in a column with gaps or words."""
+    got, note = column(tmp_path, "t_ns", [str(EPOCH_NS), bad, str(EPOCH_NS + 1), str(-EPOCH_NS)]).stamps("t_ns")
+    assert got.tolist() == [EPOCH_NS, NO_STAMP, EPOCH_NS + 1, -EPOCH_NS]
+    assert (note is not None) == (bad == "word")
+
+
+@pytest.mark.parametrize("zone", ["", "Z"])
+def test_calendar_stamps_are_exact(tmp_path: Path, zone: str) -> None:
+    """Dates with a time are ns since 1970 in UTC, to the last digit."""
+    cells = [f"2023-11-14T22:13:20.123456789{zone}", "", f"1969-12-31T23:59:59.999999999{zone}"]
+    assert column(tmp_path, "t_s", cells).stamps("t_s")[0].tolist() == [EPOCH_NS, NO_STAMP, -1]
+
+
+@pytest.mark.parametrize("blank", ["", "NaN", "nan", "NA", "N/A", "NULL", "null", "None", '""'])
+@pytest.mark.parametrize("words", [[], ["word"]])
+def test_a_blank_cell_is_missing_and_no_word(tmp_path: Path, blank: str, words: list[str]) -> None:
+    """A cell that says "nothing here" is missing without a note, also in a column that holds words elsewhere."""
+    cells = ["1", blank, "3", *words]
+    values, note = column(tmp_path, "x_mm", cells).numbers("x_mm")
+    np.testing.assert_array_equal(values[:3], [1e-3, np.nan, 3e-3])
+    assert (note is None) == (not words)
+    stamps, _ = column(tmp_path, "t_s", cells).stamps("t_s")
+    assert stamps[:3].tolist() == [10**9, NO_STAMP, 3 * 10**9]
+
+
+@pytest.mark.parametrize(("cell", "value"), [("inf", np.inf), ("-inf", -np.inf), ("Inf", np.inf), ("1e400", np.inf)])
+@pytest.mark.parametrize("words", [[], ["word"]])
+def test_an_infinite_cell_stays_infinite_and_is_no_stamp(
+    tmp_path: Path, cell: str, value: float, words: list[str]
+) -> None:
+    """Infinity is kept for the timeline to call invalid; as a stamp it is missing."""
+    assert column(tmp_path, "x_mm", [cell, "1", *words]).numbers("x_mm")[0][0] == value
+    assert column(tmp_path, "t_s", [cell, "1", *words]).stamps("t_s")[0][0] == NO_STAMP
+
+
+@pytest.mark.parametrize("cell", ["+1.5", "1.5", " 1.5 ", '"1.5"', "15e-1", "1.5E+0", "0001.5"])
+@pytest.mark.parametrize("words", [[], ["word"]])
+def test_one_number_however_written(tmp_path: Path, cell: str, words: list[str]) -> None:
+    """Sign, blanks, quotes, exponent and leading zeros change nothing, also beside words."""
+    assert column(tmp_path, "x_mm", [cell, "2", *words]).numbers("x_mm")[0][0] == 1.5e-3
+
+
+@pytest.mark.parametrize("cell", ["bad", "1_000", "0x10", "1.5.2", "--1", "1e", "+", "−1.5", "1 5", "٣", '"1,5"'])
+def test_words_are_missing_and_told_once(tmp_path: Path, cell: str) -> None:
+    """Cells that are no number are missing; one note tells how many, the first of them and its row."""
+    values, note = column(tmp_path, "x_mm", ["1", cell, "3", "worse"]).numbers("x_mm")
+    np.testing.assert_array_equal(values, [1e-3, np.nan, 3e-3, np.nan])
+    assert note is not None
+    assert "2 cells" in note
+    assert "x_mm" in note
+    assert f"'{cell.strip(chr(34))}'" in note
+    assert "row 2" in note
+
+
+@pytest.mark.parametrize("cell", ["word" * 1000, '"2\n' + "2,3\n" * 1000 + '"'], ids=["long", "quote never closed"])
+def test_a_note_on_a_cell_is_one_short_line(tmp_path: Path, cell: str) -> None:
+    """However much text a cell holds, the note on it is fit for a screen."""
+    _, note = column(tmp_path, "x_mm", ["1", cell]).numbers("x_mm")
+    assert note is not None
+    assert len(note.splitlines()) == 1
+    assert len(note) < 300
+
+
+@pytest.mark.parametrize(
+    ("first", "far", "missing"),
+    [
+        ("1", "word", True),
+        ("1", "2.5", False),
+        ("", "2.5", False),
+        ("2024-01-01", "2.5", False),
+        ("true", "2.5", False),
+    ],
+)
+def test_a_cell_beyond_the_first_block_may_be_of_another_kind(
+    tmp_path: Path, first: str, far: str, missing: bool
+) -> None:
+    """What a column holds is not guessed from its beginning: a cell after the first MB counts as much."""
+    rows = FIRST_BLOCK // 20
+    lines = "".join(f"{EPOCH_NS + row},{first}\n" for row in range(rows))
+    table = csv(tmp_path, f"t_ns,x_mm\n{lines}{EPOCH_NS + rows},{far}\n")
+    assert (tmp_path / "log.csv").stat().st_size > FIRST_BLOCK
+    values, note = table.numbers("x_mm")
+    assert np.isnan(values[-1]) if missing else values[-1] == 2.5e-3
+    assert (note is not None) == (missing or first not in ("1", ""))
+    np.testing.assert_array_equal(table.stamps("t_ns")[0], EPOCH_NS + np.arange(rows + 1))
+
+
+@pytest.mark.parametrize(
+    ("body", "kept", "told"),
+    [
+        ("0,1,2\n1,2,3\n2,3", [0, 1], ("1 line", "2 cells", "has 3", "line 4")),  # torn in the middle of the last line
+        ("0,1,2\n1\n2,3,4\n3\n", [0, 2], ("2 lines", "1 cells", "has 3", "line 3")),
+        ("0,1,2\n1,2,3,4\n2,3,4\n", [0, 2], ("1 line", "4 cells", "has 3", "line 3")),
+    ],
+)
+def test_a_torn_line_is_left_out_and_told(tmp_path: Path, body: str, kept: list[int], told: tuple[str, ...]) -> None:
+    """A line of another length than the header is left out; one note tells how many and where the first is."""
+    table = csv(tmp_path, f"t_s,x_mm,y_mm\n{body}")
+    assert table.stamps("t_s")[0].tolist() == [10**9 * second for second in kept]
+    assert table.rows == len(kept)
+    (note,) = table.notes
+    for words in told:
+        assert words in note
+
+
+@pytest.mark.parametrize(
+    "encoded",
+    [
+        lambda text: text,
+        lambda text: "\ufeff" + text,
+        lambda text: text.replace("\n", "\r\n"),
+        lambda text: text.replace("\n", "\r"),
+        lambda text: text.rstrip("\n"),
+        lambda text: text.replace("\n", "\n\n"),
+        lambda text: "\n".join(",".join(f'"{cell}"' for cell in line.split(",")) for line in text.split()),
+    ],
+    ids=["plain", "byte-order mark", "CRLF", "CR", "no last newline", "blank lines", "quoted"],
+)
+def test_one_table_however_encoded(tmp_path: Path, encoded: Callable[[str], str]) -> None:
+    """Byte-order mark, line ends, blank lines and quotes are no part of the data."""
+    table = csv(tmp_path, encoded("t_s,x_mm\n0.5,1\n1.5,\n"))
+    assert list(table.columns) == ["t_s", "x_mm"]
+    assert table.stamps("t_s")[0].tolist() == [500_000_000, 1_500_000_000]
+    np.testing.assert_array_equal(table.numbers("x_mm")[0], [1e-3, np.nan])
+    assert table.notes == ()
+
+
+def test_gzip_and_parquet_say_what_the_csv_says(tmp_path: Path) -> None:
+    """The same log as CSV, gzipped CSV and Parquet gives the same columns."""
+    text = f"t_ns,x_mm,word_mm\n{EPOCH_NS},1.1,1\n,2.2,\n{EPOCH_NS + 1},,bad\n"
+    plain = csv(tmp_path, text)
+    zipped = csv(tmp_path, gzip.compress(text.encode()), "log.csv.gz")
+    stamps = pa.array([EPOCH_NS, None, EPOCH_NS + 1])
+    parquet = written(tmp_path, t_ns=stamps, x_mm=[1.1, 2.2, None], word_mm=["1", None, "bad"])
+    for other in (zipped, parquet):
+        assert other.rows == plain.rows
+        assert other.stamps("t_ns")[0].tolist() == plain.stamps("t_ns")[0].tolist()
+        for name in ("x_mm", "word_mm"):
+            np.testing.assert_array_equal(other.numbers(name)[0], plain.numbers(name)[0])
+        assert "'bad' in row 3" in str(other.numbers("word_mm")[1])
+
+
+def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+    """A written table has the same stamps and lengths when it is read."""
+    stamps, lengths = [EPOCH_NS, None, EPOCH_NS + 1], [0.1, -0.0, None]
+    tables.write(pa.table({"t_ns": stamps, "x_m": lengths}), tmp_path / "log.parquet")
+    table = tables.read(tmp_path / "log.parquet")
+    assert table.stamps("t_ns")[0].tolist() == [EPOCH_NS, NO_STAMP, EPOCH_NS + 1]
+    np.testing.assert_array_equal(table.numbers("x_m")[0], [0.1, -0.0, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        (pa.float16(), np.float16(2.0)),
+        (pa.float32(), 2.0),
+        (pa.uint8(), 2),
+        (pa.large_string(), "2"),
+        (pa.null(), None),
+    ],
+    ids=str,
+)
+def test_parquet_kinds_that_are_numbers(tmp_path: Path, kind: pa.DataType, value: object) -> None:
+    """Small floats and integers, long strings and a column of nothing are read like any number."""
+    table = written(tmp_path, t_s=pa.array([value], kind), x_mm=pa.array([value], kind))
+    np.testing.assert_array_equal(table.numbers("x_mm")[0], [np.nan if value is None else 2e-3])
+    assert table.stamps("t_s")[0].tolist() == [NO_STAMP if value is None else 2 * 10**9]
+
+
+GARBAGE = random.Random(0).randbytes(5000)
+
+UNREADABLE: dict[str, tuple[str, bytes | None, str]] = {
+    "absent": ("log.csv", None, "no such file"),
+    "absent Parquet": ("log.parquet", None, "no such file"),
+    "empty": ("log.csv", b"", "empty"),
+    "one newline": ("log.csv", b"\n", "Empty CSV"),
+    "header, no newline": ("log.csv", b"t_s,x_mm", "Empty CSV"),
+    "column twice": ("log.csv", b"t_s,x_mm,x_mm\n0,1,2\n", "two columns are named 'x_mm'"),
+    "columns without names": ("log.csv", b",\n0,1\n", "two columns"),
+    "one endless line": ("log.csv", b"t_s,x_mm\n0," + b"1" * 3 * FIRST_BLOCK, "not a table"),
+    "CSV called Parquet": ("log.parquet", b"t_s,x_mm\n0,1\n", "not a table"),
+    "garbage called Parquet": ("log.parquet", GARBAGE, "not a table"),
+    "empty Parquet": ("log.parquet", b"", "not a table"),
+    "CSV called gzip": ("log.csv.gz", b"t_s,x_mm\n0,1\n", "cannot be read"),
+    "gzip cut short": ("log.csv.gz", gzip.compress(b"t_s,x_mm\n" + b"0,1\n" * 1000)[:-20], "cannot be read"),
+    "gzip of nothing": ("log.csv.gz", gzip.compress(b""), "Empty CSV"),
+    "gzip called CSV": ("log.csv", gzip.compress(b"t_s,x_mm\n0,1\n"), "UTF-8"),
+    "UTF-16": ("log.csv", "t_s,x_mm\n0,1\n".encode("utf-16"), "UTF-8"),
+    "header in Latin-1": ("log.csv", "t_s,höhe_mm\n0,1\n".encode("latin-1"), "UTF-8"),
+    "torn line in Latin-1": ("log.csv", "t_s,x_mm,y_mm\n0,1,2\n1,hö\n2,3,4\n".encode("latin-1"), "UTF-8"),
+    "torn line beside Latin-1": ("log.csv", "t_s,x_mm,y_mm\n0,1,ö\n1,2\n2,3,4\n".encode("latin-1"), "UTF-8"),
+    "decimal commas": ("log.csv", b"t_s;x_mm\n0,5;1,5\n0,6;1,5\n", "2 lines left out: 3 cells where the header has 1"),
+}
+
+
+@pytest.mark.parametrize("case", UNREADABLE)
+def test_a_file_that_is_no_table_is_refused_in_one_line(
+    tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """What cannot be read is a one-line error with the file's path and the reason, and nothing is printed."""
+    name, content, reason = UNREADABLE[case]
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    text = refusal(lambda: tables.read(path))
+    assert text.startswith(f"{path}: ")
+    assert reason in text
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.csv.gz", "log.parquet"])
+def test_a_header_without_rows_is_a_table_of_no_rows(tmp_path: Path, name: str) -> None:
+    """Its columns are read as nothing, and a note says so with the file's name."""
+    text, path = b"t_s,x_mm\n", tmp_path / name
+    if name.endswith(".parquet"):
+        papq.write_table(pa.table({"t_s": pa.array([], pa.float64()), "x_mm": pa.array([], pa.float64())}), path)
+    else:
+        path.write_bytes(gzip.compress(text) if name.endswith(".gz") else text)
+    table = tables.read(path)
+    assert table.rows == 0
+    assert table.notes == (f"{name}: the table has no rows",)
+    stamp, values = table.stamps("t_s")[0], table.numbers("x_mm")[0]
+    assert (stamp.shape, stamp.dtype) == ((0,), np.int64)
+    assert (values.shape, values.dtype) == ((0,), np.float64)
+
+
+@pytest.mark.parametrize("name", ["a\0b", "a\0b.csv", "a\0b.csv.gz", "a\0b.parquet"])
+def test_a_name_with_a_null_character_is_no_file(tmp_path: Path, name: str) -> None:
+    """A name that no file can have is refused in one line with the path."""
+    assert str(tmp_path) in refusal(lambda: tables.read(tmp_path / name))
+
+
+@pytest.mark.parametrize("name", ["folder", "folder.csv", "folder.parquet"])
+def test_a_folder_is_no_table(tmp_path: Path, name: str) -> None:
+    """A folder where a table is expected is refused in one line."""
+    (tmp_path / name).mkdir()
+    assert name in refusal(lambda: tables.read(tmp_path / name))
+
+
+def test_a_column_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path) -> None:
+    """An unknown column is an error that lists the columns, the closest first, and carries the names as data."""
+    table = csv(tmp_path, "t_s,x_mm,y_mm\n0,1,2\n")
+    for call, name in ((table.numbers, "z_mm"), (table.stamps, "t_ms"), (table.numbers, "")):
+        with pytest.raises(UnknownNameError) as caught:
+            call(name)
+        assert caught.value.name == name
+        assert caught.value.accepted == ("t_s", "x_mm", "y_mm")
+        assert f"{table.path}: unknown column '{name}'" in str(caught.value)
+        assert "t_s, x_mm, y_mm" in str(caught.value)
+    assert "did you mean 't_s'?" in refusal(lambda: table.stamps("t_ms"))
+
+
+def test_a_column_without_its_unit_is_refused_with_the_accepted_ones(tmp_path: Path) -> None:
+    """A length needs an ending of length and a stamp one of time; the error names them and gives an example."""
+    table = csv(tmp_path, "t,t_s,x,x_mm,v_mm_s,x_MM\n0,0,0,0,0,0\n")
+    for name in ("x", "t_s", "v_mm_s", "x_MM"):
+        text = refusal(lambda name=name: table.numbers(name))
+        assert f"'{name}'" in text
+        assert "_m, _mm, _um" in text
+    for name in ("t", "x_mm"):
+        text = refusal(lambda name=name: table.stamps(name))
+        assert f"'{name}'" in text
+        assert "_s, _ms, _us, _ns" in text
+
+
+@pytest.mark.parametrize("cell", ["true", "2024-01-01", "10:00:00"])
+def test_a_column_of_another_kind_is_refused(tmp_path: Path, cell: str) -> None:
+    """Yes or no, days and times of day are no lengths and no stamps."""
+    assert "not numbers" in refusal(lambda: column(tmp_path, "x_mm", [cell, cell]).numbers("x_mm"))
+    assert "not numbers" in refusal(lambda: column(tmp_path, "t_s", [cell, cell]).stamps("t_s"))
+
+
+@pytest.mark.parametrize("kind", [pa.duration("s"), pa.list_(pa.int64()), pa.struct([("a", pa.int64())])], ids=str)
+def test_a_parquet_column_of_another_kind_is_refused(tmp_path: Path, kind: pa.DataType) -> None:
+    """Bytes, durations, lists and records are refused, whether they are asked for as lengths or as stamps."""
+    table = written(tmp_path, t_s=pa.array([None], kind), x_mm=pa.array([None], kind))
+    for call in (lambda: table.numbers("x_mm"), lambda: table.stamps("t_s")):
+        assert "not numbers" in refusal(call)
+
+
+@pytest.mark.parametrize("unit", ["_s", "_ms", "_us"])
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("ending", ["", ".0", "\nword"])
+def test_a_stamp_beyond_reach_is_refused_and_the_last_within_is_not(
+    tmp_path: Path, unit: str, sign: int, ending: str
+) -> None:
+    """Stamps below 4.6e18 ns, whose differences int64 can hold, are read; a second later they are refused by row."""
+    name = f"t{unit}"
+
+    def stamps(second: int) -> list[int]:
+        cell = f"{sign * second * 10 ** (9 - TIMES[unit])}{ending}"
+        return column(tmp_path, name, ["0", *cell.split()]).stamps(name)[0].tolist()
+
+    assert stamps(LAST_S)[1] == sign * LAST_S * 10**9
+    text = refusal(lambda: stamps(LAST_S + 1))
+    assert f"'{name}'" in text
+    assert "row 2" in text
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [
+        ["9000000000000000000", "-9000000000000000000"],
+        ["9223372036854775807"],
+        ["9223372036854775808"],
+        ["9999999999999999999", "word"],
+        ["1e300"],
+        ["2200-01-01T00:00:00"],
+        ["1800-01-01T00:00:00"],
+        ["9999-01-01T00:00:00"],
+    ],
+)
+def test_stamps_too_far_from_1970_are_refused_in_one_line(tmp_path: Path, cells: list[str]) -> None:
+    """Counts and dates that int64 ns cannot hold, or not the difference of, are refused by their column."""
+    assert "'t_ns'" in refusal(lambda: column(tmp_path, "t_ns", cells).stamps("t_ns"))
+
+
+@pytest.mark.parametrize("value", [2**64 - 1, 2**63, LAST_S * 10**9 + 10**9])
+def test_an_unsigned_stamp_beyond_reach_is_refused(tmp_path: Path, value: int) -> None:
+    """An unsigned column of Parquet does not wrap round to 1969."""
+    assert "'t_ns'" in refusal(lambda: written(tmp_path, t_ns=pa.array([value], pa.uint64())).stamps("t_ns"))
+
+
+@pytest.mark.long
+def test_only_pumafuse_errors_come_out_of_a_mangled_file(tmp_path: Path) -> None:
+    """Whatever happens to the text of a log on its way, reading it works or fails with one line."""
+    rng, sane = random.Random(1), "t_s,x_mm\n" + "".join(f"{row / 100},{row}\n" for row in range(30))
+    pieces = ['"', ",", "\n", "\r", "\0", "inf", "nan", "-", "true", "2024-01-01", "é", " ", "_mm", "word"]
+    outcomes = {RunError: 0, UnknownNameError: 0, None: 0}
+    for _ in range(1500):
+        mangled = list(sane)
+        for _ in range(rng.randint(1, 6)):
+            place = rng.randrange(len(mangled))
+            mangled[place : place + rng.randrange(2)] = rng.choice(pieces)
+        try:
+            table = csv(tmp_path, "".join(mangled)[: rng.choice((None, rng.randrange(1, 200)))])
+            table.numbers("x_mm")
+            table.stamps("t_s")
+            outcomes[None] += 1
+        except PumafuseError as error:
+            assert len(str(error).splitlines()) == 1
+            outcomes[type(error)] += 1
+    assert min(outcomes.values()) > 20
+
+
+def test_errors_of_tables_are_run_errors_or_unknown_names(tmp_path: Path) -> None:
+    """A caller can tell a file that cannot be read from a name that is not there."""
+    with pytest.raises(RunError):
+        tables.read(tmp_path / "absent.csv")
+    with pytest.raises(UnknownNameError):
+        csv(tmp_path, "t_s\n0\n").stamps("time_s")
+
+
+@given(cut=st.integers(0, 200), ends=st.sampled_from(["\n", "\r\n"]))
+def test_a_growing_file_read_at_any_moment(tmp_path_factory: pytest.TempPathFactory, cut: int, ends: str) -> None:
+    """Cut anywhere, a table that may be growing has whole rows only, and says so if a line was left out."""
+    rows = [(1000 + row, (569_700_001 + row) / 1e6) for row in range(12)]
+    text = ends.join(["t_ns,x_mm", *(f"{stamp},{x:.6f}" for stamp, x in rows)]) + ends
+    header, cut = text.index(ends) + len(ends), min(cut, len(text))
+    path = tmp_path_factory.mktemp("growing") / "log.csv"
+    path.write_bytes(text[: header + cut].encode())
+    table = tables.read(path, growing=True)
+    there = text[: header + cut].replace("\r\n", "\n").replace("\r", "\n")
+    whole = there.count("\n") - 1
+    assert table.stamps("t_ns")[0].tolist() == [stamp for stamp, _ in rows[:whole]]
+    np.testing.assert_array_equal(table.numbers("x_mm")[0], [x / 1e3 for _, x in rows[:whole]])
+    assert there.endswith("\n") != any("may be torn" in note for note in table.notes)
+
+
+def test_a_compressed_table_is_whole(tmp_path: Path) -> None:
+    """A gzip that was torn cannot be read at all; one that can has all it should."""
+    (tmp_path / "log.csv.gz").write_bytes(gzip.compress(b"t_ns,x_mm\n1,2\n3,4"))
+    table = tables.read(tmp_path / "log.csv.gz", growing=True)
+    assert table.rows == 2
+    assert table.notes == ()

@@ -1,0 +1,198 @@
+"""Every scenario of the repository through the real executable: simulate, fuse, compare.
+
+Bands are for any seed, platform and libm: each was derived from the seeds 1 to 20 of its scenario and ends four or a
+little more of their standard deviations from their mean, or where the figure itself ends; a filter without
+measurements, without model or with wrong error bars falls out of them.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.csv as pacsv
+import pyarrow.parquet as pq
+import pytest
+from numpy.typing import NDArray
+
+import pumafuse as pf
+
+EXECUTABLE = Path(sys.executable).parent / "pumafuse"
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+
+
+def pumafuse(*arguments: object) -> str:
+    words = [str(EXECUTABLE), *map(str, arguments)]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+class Worked:
+    """One scenario, simulated and fused."""
+
+    def __init__(self, name: str, folder: Path) -> None:
+        self.run, self.result = folder / "run", folder / "result"
+        said = pumafuse("simulate", SCENARIOS / f"{name}.toml", "-o", self.run)
+        assert f"{name}: " in said
+        assert f"next: pumafuse fuse {self.run} -c {self.run / 'fusion.toml'} -o result" in said
+        pumafuse("fuse", self.run, "-c", self.run / "fusion.toml", "-o", self.result)
+        self.scores = json.loads(pumafuse("compare", self.result, "--json"))[0]["axes"]
+        self.summary: dict[str, Any] = json.loads((self.result / "summary.json").read_text())
+
+    def check(self, axis: str, rmse_mm: tuple[float, float], coverage: tuple[float, float]) -> None:
+        score = self.scores[axis]
+        assert rmse_mm[0] < score["rmse_mm"] < rmse_mm[1], (axis, score)
+        assert coverage[0] < score["coverage"] < coverage[1], (axis, score)
+
+    def sensor(self, axis: str, name: str) -> dict[str, Any]:
+        return self.summary["axes"][axis]["sensors"][name]
+
+    def estimates(self, column: str) -> NDArray[np.float64]:
+        return pq.read_table(self.result / "estimates.parquet", columns=[column])[column].to_numpy()
+
+
+def test_every_scenario_is_covered_here() -> None:
+    """A new scenario needs figures of its own."""
+    found = {path.stem for path in SCENARIOS.glob("*.toml") if "[trajectory]" in path.read_text()}
+    assert found == {
+        "cylindrical-cartesian",
+        "fast-arm",
+        "mismatched-arm",
+        "panel-tracker-outage",
+        "panel-vision",
+        "step-campaign",
+        "white-noise",
+        "wrong-latency",
+    }
+
+
+@pytest.mark.long
+def test_a_camera_with_dropouts_and_outliers(tmp_path: Path) -> None:
+    """panel-vision: measurements of 0.5 mm noise give 0.21 mm, outliers are rejected, error bars hold."""
+    worked = Worked("panel-vision", tmp_path)
+    for axis in ("tangential", "vertical"):
+        worked.check(axis, (0.15, 0.25), (0.88, 1.0))
+        sensor = worked.sensor(axis, "vision")
+        assert 0.75 < sensor["nis_mean"] < 1.25
+        assert 865 < sensor["outcomes"]["fused"] < 922
+        assert 1 <= sensor["outcomes"]["rejected"] <= 22  # 1 % of the rows
+
+
+@pytest.mark.long
+def test_a_camera_that_is_later_than_the_filter_is_told(tmp_path: Path) -> None:
+    """wrong-latency: a verdict names the latency, 25 ms at 60 mm/s are missing, error bars are worth nothing."""
+    worked = Worked("wrong-latency", tmp_path)
+    verdicts = [worked.sensor(axis, "vision")["verdict"] for axis in ("tangential", "vertical")]
+    assert any("latency_ms" in verdict for verdict in verdicts)
+    assert not any(verdict.endswith(": consistent") for verdict in verdicts)
+    worked.check("tangential", (1.33, 1.53), (0.0, 0.056))
+    worked.check("vertical", (0.22, 0.36), (0.79, 0.925))
+    assert 64.0 < worked.scores["tangential"]["nees_mean"] < 85.0
+
+
+@pytest.mark.long
+def test_a_tracker_that_loses_its_target(tmp_path: Path) -> None:
+    """panel-tracker-outage: within the outage, and only there, the error bars grow to the camera's, and they hold."""
+    worked = Worked("panel-tracker-outage", tmp_path)
+    time = worked.estimates("time_s")
+    stamps = pacsv.read_csv(worked.run / "tracker.csv")["time_s"].to_numpy()
+    assert not ((stamps - 0.008 >= 9.0) & (stamps - 0.008 < 15.0)).any()
+    lost, seen = (time > 9.5) & (time < 15.0), ((time > 1.0) & (time < 9.0)) | (time > 15.2)
+    for axis in ("tangential", "vertical"):
+        worked.check(axis, (0.035, 0.25), (0.89, 1.0))
+        sd = worked.estimates(f"{axis}.position_sd_mm")
+        assert np.median(sd[lost]) > 2.3 * np.median(sd[seen])
+        assert np.median(sd[seen]) < 0.085  # the last measurement of 0.05 mm is up to 10 ms old
+        assert 0.2 < sd[lost].max() < 0.24  # model and camera together are better than one measurement of the camera
+
+
+@pytest.mark.long
+def test_a_cylindrical_arm_logged_in_x_y_z(tmp_path: Path) -> None:
+    """cylindrical-cartesian: x, y and z come back near the truth, and the range finder's 600 mm are found."""
+    worked = Worked("cylindrical-cartesian", tmp_path)
+    for axis, least, most in (("tangential", 0.145, 0.225), ("radial", 0.10, 0.175), ("vertical", 0.135, 0.245)):
+        worked.check(axis, (least, most), (0.875, 1.0))
+    truth, time = pf.Run.read(worked.run).reference, worked.estimates("time_s")
+    assert truth is not None and list(truth.values) == ["x", "y", "z"]
+    for name in ("x", "y", "z"):
+        error = worked.estimates(f"{name}_mm") - np.interp(time, truth.stamp / 1e9, truth.values[name] * 1e3)
+        assert 0.08 < np.sqrt(np.mean(error**2)) < 0.25
+    found = worked.sensor("radial", "range")
+    assert abs(found["bias_mm"] - 600.0) < 3.0 * found["bias_sd_mm"] < 0.1
+
+
+@pytest.mark.long
+def test_white_noise_finds_the_model_right(tmp_path: Path) -> None:
+    """white-noise: the model alone is right, so 7500 innovations are white and as large as expected."""
+    worked = Worked("white-noise", tmp_path)
+    assert list(worked.scores) == ["tangential"]
+    worked.check("tangential", (0.027, 0.044), (0.92, 0.98))
+    sensor = worked.sensor("tangential", "wheel")
+    assert sensor["outcomes"] == {"fused": pytest.approx(7500, abs=30)}
+    assert 0.93 < sensor["nis_mean"] < 1.07
+    assert abs(sensor["correlation"][0]) < 4.0 / 7500**0.5
+
+
+@pytest.mark.long
+def test_an_arm_that_is_not_as_modelled(tmp_path: Path) -> None:
+    """mismatched-arm: process noise keeps the estimate below the tracker's 0.1 mm; a verdict says what is amiss."""
+    worked = Worked("mismatched-arm", tmp_path)
+    worked.check("tangential", (0.064, 0.087), (0.76, 0.89))
+    worked.check("radial", (0.046, 0.069), (0.88, 0.944))
+    verdict = worked.sensor("tangential", "tracker")["verdict"]
+    assert "process noise too small" in verdict or "latency_ms" in verdict
+    assert worked.sensor("tangential", "tracker")["nis_mean"] > 1.18
+
+
+@pytest.mark.long
+def test_a_fast_arm_under_a_fast_sensor(tmp_path: Path) -> None:
+    """fast-arm: errors are those of a 0.02 mm measurement up to 1 ms old, stamps that jitter by 0.3 ms notwithstanding."""
+    worked = Worked("fast-arm", tmp_path)
+    for axis, least, most in (("x1", 0.012, 0.0195), ("x2", 0.0155, 0.037)):
+        worked.check(axis, (least, most), (0.932, 0.97))
+        assert 0.88 < worked.scores[axis]["nees_mean"] < 1.09
+        sensor = worked.sensor(axis, "interferometer")
+        assert sensor["outcomes"]["fused"] > 9900
+        assert 0.93 < sensor["nis_mean"] < 1.07
+
+
+@pytest.mark.long
+def test_a_campaign_of_steps(tmp_path: Path) -> None:
+    """step-campaign: 86 trials in the files of design.md, whose rises are those of the true model.
+
+    The mean of a trial's last 0.2 s less that of its rest is K times its step, to 4.5 of its standard errors: 0.04 mm
+    of noise and 0.05 mm of rounding over 36 and 9 samples, a walk of 0.02 mm/√s over 0.4 s, and 0.005 mm/√Hz of input
+    noise averaged over 0.2 and 0.05 s.
+    """
+    worked = Worked("step-campaign", tmp_path)
+    trials = pacsv.read_csv(worked.run / "trials.csv").to_pydict()
+    samples = {k: np.array(v) for k, v in pacsv.read_csv(worked.run / "samples.csv").to_pydict().items()}
+    assert list(trials) == ["trial", "axis", "step_mm", "speed_m_s", "direction"]
+    assert trials["trial"] == list(range(1, 87))
+    gains = {"tangential": (0.0518, 1.010), "radial": (0.0818, 0.933), "vertical": (0.134, 0.941)}
+    sensed = (0.04**2 + 0.05**2 / 12.0) * (1 / 9 + 1 / 36)
+    sd = (sensed + 0.02**2 * 0.4 + 0.005**2 * (1 / 0.2 + 1 / 0.05)) ** 0.5
+    off = []
+    for trial, axis, step, speed in _rows(trials):
+        mine = samples["trial"] == trial
+        time, position = samples["time_s"][mine], samples["position_mm"][mine]
+        slope, intercept = gains[axis]
+        assert speed == pytest.approx(abs(step) / 28.0, abs=1e-6)
+        risen = position[time > 0.3].mean() - position[time < 0.0].mean()
+        off.append((risen - (slope * speed + intercept) * step) / sd)
+    assert np.abs(off).max() < 4.5
+    assert 0.5 < np.std(off) < 1.3
+    for axis in gains:
+        worked.check(axis, (0.006, 0.033), (0.76, 1.0))  # one unknown zero for the whole run: errors go together
+        found = worked.sensor(axis, "scope")
+        assert abs(found["bias_mm"] - {"tangential": 0.3, "radial": -0.2, "vertical": 0.1}[axis]) < 0.06
+        assert 0.93 < found["nis_mean"] < 1.07
+
+
+def _rows(trials: dict[str, list[Any]]) -> list[tuple[int, str, float, float]]:
+    return list(zip(trials["trial"], trials["axis"], trials["step_mm"], trials["speed_m_s"], strict=True))

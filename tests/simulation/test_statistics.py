@@ -1,0 +1,199 @@
+"""A filter that is told the truth has error bars that are true: 200 simulated runs, fused, against chi-square.
+
+Simulator and filter share their declared parameters and no line of mathematics (poles against matrix exponentials), so
+that each is the other's oracle. Bands: the NEES summed over independent runs at one instant is chi-square; over all
+instants and axes the chance of a false alarm is 1 % (Bonferroni). Innovations of a right filter are independent, so the
+NIS summed over every fused component is chi-square too.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+import pumafuse as pf
+from pumafuse.fusion.offline import Engine
+
+pytestmark = pytest.mark.long
+
+RUNS = 200
+AXES = ("tangential", "radial")
+PRIOR = 3e-3  # m, of the camera's bias
+INSTANTS = (0.2, 1.0, 2.0, 3.0, 4.0, 5.0)  # s; far apart against the filter's memory of some 0.2 s
+SCENARIO = """
+name = "matched"
+arm = "puma560-internal"
+[trajectory]
+kind = "raster"
+along = "tangential"
+across = "radial"
+width_mm = 60.0
+height_mm = 40.0
+pitch_mm = 20.0
+speed_m_s = 0.04
+[start]
+offset_sd_mm = 2.0
+[process]
+input_noise_mm_rtHz = 0.03
+drift_mm_rts = 0.3
+maneuver_noise_mm_rtHz_per_m_s = 1.0
+maneuver_drift_mm_rts_per_m_s = 8.0
+[sensors.vision]
+rate_hz = 30.0
+rate_jitter_ms = 2.0
+sd_mm = { tangential = 0.4, radial = 0.3 }
+latency_ms = 45.0
+bias_sd_mm = 3.0
+dropouts = 0.1
+[sensors.range]
+rate_hz = 12.0
+axes = ["radial"]
+sd_mm = 0.2
+latency_ms = 4.0
+scale = -1.5
+[sensors.wheel]
+rate_hz = 7.0
+axes = ["tangential"]
+sd_mm = 0.15
+latency_ms = -3.0
+"""
+
+
+@dataclass(frozen=True)
+class Fused:
+    """Errors over sd (runs, axes, estimates), NIS by (sensor, axis), estimated biases over their sd."""
+
+    time: NDArray[np.float64]
+    error: NDArray[np.float64]
+    nis: dict[tuple[str, str], NDArray[np.float64]]
+    bias: NDArray[np.float64]
+
+
+def fused(scenario: pf.Scenario, runs: int = RUNS, engine: Engine = "compiled", **mode: bool) -> Fused:
+    errors, biases = [], []
+    nis: dict[tuple[str, str], list[float]] = {}
+    for seed in range(1, runs + 1):
+        simulated = pf.simulate(scenario, seed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", pf.PumafuseWarning)
+            est = pf.fuse(simulated.run, simulated.config, engine=engine, **mode)
+        truth = est.reference
+        assert truth is not None
+        there = np.searchsorted(truth.time, est.time - 1e-9)
+        assert np.abs(truth.time[there] - est.time).max() < 1e-9
+        errors.append([(est[a].position - truth.position[a][there]) / est[a].position_sd for a in AXES])
+        for sensor in est.measurements.sensors:
+            for axis in AXES:
+                mine = est.measurements.of(sensor, axis)
+                kept = mine.nis[mine.outcome == pf.Outcome.FUSED]
+                nis.setdefault((sensor, axis), []).extend(kept.tolist())
+        # The estimate of a bias b ~ N(0, prior²) has the variance prior² − posterior².
+        told = [est.biases["vision"][a] for a in AXES]
+        biases.append([bias.value / (PRIOR**2 - bias.sd**2) ** 0.5 for bias in told])
+    gathered = {key: np.array(value) for key, value in nis.items() if value}
+    return Fused(est.time, np.array(errors), gathered, np.array(biases))
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> pf.Scenario:
+    path: Path = tmp_path_factory.mktemp("matched") / "matched.toml"
+    path.write_text(SCENARIO)
+    return pf.Scenario.load(path)
+
+
+@pytest.fixture(scope="module")
+def filtered(scenario: pf.Scenario) -> Fused:
+    return fused(scenario)
+
+
+def at_instants(found: Fused) -> NDArray[np.float64]:
+    """Mean NEES over the runs, (axes, instants)."""
+    picked = np.searchsorted(found.time, INSTANTS)
+    return np.mean(found.error[:, :, picked] ** 2, axis=0)
+
+
+def band(count: int, tests: int = 1) -> tuple[float, float]:
+    """Where a mean of ``count`` squares lies in 99 % of cases, ``tests`` of them together."""
+    low, high = chi2.ppf([0.005 / tests, 1.0 - 0.005 / tests], count) / count
+    return float(low), float(high)
+
+
+def check_anees(found: Fused) -> None:
+    anees = at_instants(found)
+    low, high = band(len(found.error), anees.size)
+    assert low < anees.min(), anees
+    assert anees.max() < high, anees
+
+
+def check_coverage(found: Fused) -> None:
+    for axis in range(len(AXES)):
+        assert np.mean(np.abs(found.error[:, axis]) < 1.959964) == pytest.approx(0.95, abs=0.01)
+
+
+def test_errors_of_a_matched_filter_are_as_large_as_it_says(filtered: Fused) -> None:
+    """ANEES of 200 runs at 6 instants on a first- and a second-order axis: all inside the chi-square band."""
+    check_anees(filtered)
+
+
+def test_error_bars_of_a_matched_filter_cover_95_percent(filtered: Fused) -> None:
+    """Pooled over all estimates of 200 runs, ± 1 %."""
+    check_coverage(filtered)
+
+
+def test_errors_of_a_matched_filter_have_no_mean(filtered: Fused) -> None:
+    """At each instant and axis, within the two-sided 99 % band of the mean of 200 normal numbers (Bonferroni)."""
+    mean = filtered.error[:, :, np.searchsorted(filtered.time, INSTANTS)].mean(axis=0)
+    assert np.abs(mean).max() < 3.4 / np.sqrt(RUNS)
+
+
+def test_innovations_of_a_matched_filter_are_as_large_as_it_expects(filtered: Fused) -> None:
+    """Mean NIS of every fused component, all together and for each sensor and axis, inside the chi-square band."""
+    assert set(filtered.nis) == {
+        ("vision", "tangential"),
+        ("vision", "radial"),
+        ("range", "radial"),
+        ("wheel", "tangential"),
+    }
+    groups = [*filtered.nis.values(), np.concatenate(list(filtered.nis.values()))]
+    for nis in groups:
+        low, high = band(len(nis), len(groups))
+        assert low < nis.mean() < high
+
+
+def test_an_estimated_bias_is_as_large_as_its_prior_says(filtered: Fused) -> None:
+    """Over 200 runs its estimates spread by √(prior² − posterior²), inside the chi-square band."""
+    low, high = band(RUNS, len(AXES))
+    square = np.mean(filtered.bias**2, axis=0)
+    assert low < square.min() and square.max() < high
+
+
+@pytest.mark.parametrize("mode", ["smooth", "as_live"])
+def test_smoothed_and_live_estimates_are_consistent_too(scenario: pf.Scenario, mode: str) -> None:
+    """ANEES and coverage hold for estimates that know every measurement and for those that know what had arrived."""
+    found = fused(scenario, **{mode: True})
+    check_anees(found)
+    check_coverage(found)
+
+
+def test_the_other_engine_is_consistent_too(scenario: pf.Scenario) -> None:
+    """40 runs by filterpy: ANEES and the mean NIS of every group inside their bands."""
+    found = fused(scenario, runs=40, engine="filterpy")
+    check_anees(found)
+    for nis in found.nis.values():
+        low, high = band(len(nis), len(found.nis))
+        assert low < nis.mean() < high
+
+
+def test_a_filter_that_is_told_wrong_falls_out_of_the_bands(tmp_path: Path) -> None:
+    """Sensor noise 25 % too small or a latency 15 ms too short is seen at once: the bands have power."""
+    for number, told in enumerate(("sd_mm = { tangential = 0.3, radial = 0.225 }", "latency_ms = 30.0")):
+        path = tmp_path / f"wrong{number}.toml"
+        path.write_text(SCENARIO + f"[filter.sensors.vision]\n{told}\n")
+        nis = fused(pf.Scenario.load(path), runs=40).nis["vision", "tangential"]
+        assert nis.mean() > band(len(nis))[1]

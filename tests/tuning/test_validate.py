@@ -1,0 +1,159 @@
+"""Before and after on what was held back: with the numbers of `fuse` itself, and a verdict that chance is in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import msgspec
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.fusion.consistency import consistency, densities_of
+from pumafuse.tuning.validate import Check, check
+from tuning_runs import replaced, spoiled, with_outliers, with_process, with_sensors
+
+AXES = ("tangential", "vertical")
+
+
+@cache
+def run() -> pf.Simulated:
+    return with_outliers(11)
+
+
+def checks(before: pf.FusionConfig, after: pf.FusionConfig, since: float = 0.0) -> dict[str, Check]:
+    found = check(run().run, before, after, since=since)
+    assert [one.axis for one in found] == list(AXES)
+    return {one.axis: one for one in found}
+
+
+def test_the_same_twice_is_no_different() -> None:
+    """Gains of exactly 0, equal states, not worse: of the truth and of what is far from it."""
+    for config in (run().config, spoiled(run().config)):
+        for one in checks(config, config).values():
+            assert one.before == one.after and not one.worse
+            assert one.verdict == "no different: log-likelihood +0.0 (chance: ± 0.0), RMSE +0.0 %"
+
+
+def test_worse_and_better_are_said() -> None:
+    """Spoiled after the truth is worse, on every axis; the truth after it is better, by as much."""
+    truth, wrong = run().config, spoiled(run().config)
+    there, back = checks(truth, wrong), checks(wrong, truth)
+    for axis in AXES:
+        assert there[axis].worse and there[axis].verdict.startswith("worse: log-likelihood -")
+        assert not back[axis].worse and back[axis].verdict.startswith("better: log-likelihood +")
+        assert (there[axis].before, there[axis].after) == (back[axis].after, back[axis].before)
+
+
+@pytest.mark.parametrize("since", [0.0, 2.5])
+def test_numbers_are_those_of_a_fusion(since: float) -> None:
+    """Likelihood, rejections, NIS, whiteness, RMSE and coverage, from measurements and estimates since then only.
+
+    The filter runs from the beginning: estimates and innovations are those of the whole run.
+    """
+    config = with_sensors(run().config, gate=3.5)
+    found = checks(config, spoiled(config), since)
+    est = pf.fuse(run().run, config)
+    reference = est.reference
+    assert reference is not None
+    late = replace(est, measurements=est.measurements.where(est.measurements.stamp >= since))
+    for number, axis in enumerate(AXES):
+        state, mine = found[axis].before, late.measurements.where(late.measurements.axis == number)
+        assert state.log_likelihood == pytest.approx(densities_of(mine, config.sensors).sum(), rel=1e-12)
+        assert state.rejected == np.sum(mine.outcome == pf.Outcome.REJECTED)
+        assert (found[axis].components, found[axis].since_s) == (len(mine.value), since)
+        said = consistency(late, "vision", axis)
+        assert said is not None
+        sensor = state.sensors["vision"]
+        assert (sensor.nis, sensor.whiteness_p, sensor.correlation) == (said.nis, said.whiteness, said.correlation[0])
+        kept = est.time >= since
+        error = (est[axis].position - np.interp(est.time, reference.time, reference.position[axis]))[kept]
+        assert state.rmse_mm == pytest.approx(1e3 * np.sqrt(np.mean(error**2)), rel=1e-9)
+        assert state.coverage == pytest.approx(np.mean(np.abs(error) <= 1.96 * est[axis].position_sd[kept]), abs=1e-9)
+    assert sum(one.before.rejected for one in found.values()) > 0
+
+
+def test_measurements_count_by_their_stamps_whatever_their_latency() -> None:
+    """Two configurations that disagree by 30 ms on it compare the same measurements, those stamped since then."""
+    truth = run().config
+    found = checks(truth, with_sensors(truth, latency=0.015), since=2.0)
+    stamp = run().run.sensors["vision"].stamp
+    assert found["vertical"].components == np.sum(stamp - run().run.command.stamp[0] >= 2e9)
+
+
+def test_chance_is_the_scatter_of_what_each_measurement_gained() -> None:
+    """± 1.96 √Σ gain², and a gain within it is no difference (Vuong)."""
+    before, after = run().config, with_sensors(run().config, sd=0.53e-3)
+    densities: list[np.ndarray] = []
+    for config in (before, after):
+        measurements = pf.fuse(run().run, config).measurements
+        densities.append(densities_of(measurements.where(measurements.axis == 1), config.sensors))
+    gains = densities[1] - densities[0]
+    chance = 1.96 * np.sqrt(np.sum(gains**2))
+    verdict = checks(before, after)["vertical"].verdict
+    assert f"log-likelihood {gains.sum():+.1f} (chance: ± {chance:.1f})" in verdict
+    word = "better" if gains.sum() > chance else "worse" if gains.sum() < -chance else "no different"
+    assert verdict.startswith(f"{word}:")
+
+
+def noisy() -> pf.FusionConfig:
+    """Believes measurements ten times more than they deserve."""
+    return with_sensors(run().config, sd=0.05e-3, gate=0.0)
+
+
+def late() -> pf.FusionConfig:
+    """An arm 100 ms too late, without noise, and measurements that are hardly believed."""
+    arm = replaced(run().config.arm, delay=run().config.arm.delay + 0.1)
+    config = with_sensors(replaced(run().config, arm=arm), sd=5e-3)
+    return with_process(config, input_noise=0.0, drift=0.0, maneuver_drift=0.0)
+
+
+def test_a_better_likelihood_with_larger_errors_is_worse() -> None:
+    """Where the truth is known it has the last word: noise ten times too small, against an arm 100 ms too late.
+
+    The latter's wide error bars make all measurements likelier, while its estimates stay millimetres behind the
+    reference.
+    """
+    one = checks(noisy(), late())["tangential"]
+    assert one.before.rmse_mm is not None and one.after.rmse_mm is not None
+    assert one.after.log_likelihood > one.before.log_likelihood
+    closer = one.after.rmse_mm / one.before.rmse_mm
+    assert closer > 3.0
+    assert one.worse and one.verdict.startswith("worse:")
+    assert f"RMSE {100.0 * (closer - 1.0):+.1f} %" in one.verdict
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (lambda: run().config, lambda: spoiled(run().config)),
+        (lambda: spoiled(run().config), lambda: run().config),
+        (noisy, late),
+    ],
+    ids=["worse", "better", "farther"],
+)
+def test_a_check_can_be_written(before: Callable[[], pf.FusionConfig], after: Callable[[], pf.FusionConfig]) -> None:
+    """As JSON and back, whatever it says."""
+    found = check(run().run, before(), after())
+    assert msgspec.json.decode(msgspec.json.encode(found), type=list[Check]) == found
+
+
+def test_without_a_reference_measurements_alone_judge() -> None:
+    """No RMSE, no coverage, and none in the verdict; the likelihood says the same."""
+    truth, wrong = run().config, spoiled(run().config)
+    bare = replace(run().run, reference=None)
+    for one, known in zip(check(bare, truth, wrong), check(run().run, truth, wrong), strict=True):
+        assert one.before.rmse_mm is one.before.coverage is one.after.rmse_mm is None
+        assert "RMSE" not in one.verdict
+        assert one.before.log_likelihood == known.before.log_likelihood
+        assert one.worse
+
+
+def test_an_axis_that_nobody_hears_is_left_out() -> None:
+    """As is one whose measurements all lie before; chosen sensors are heard alone."""
+    camera = run().run.sensors["vision"]
+    half = replace(run().run, sensors={"vision": replace(camera, values={"vertical": camera.values["vertical"]})})
+    assert [one.axis for one in check(half, run().config, run().config)] == ["vertical"]
+    assert check(run().run, run().config, run().config, since=1e4) == []
