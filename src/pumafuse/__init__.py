@@ -11,11 +11,10 @@ if TYPE_CHECKING:
     from .fusion.config import FusionConfig, Process, Sensor, Start
     from .fusion.estimates import Estimates, Measurements
     from .fusion.offline import fuse
-    from .fusion.outcome import Outcome
+    from .filter.outcome import Outcome
     from .fusion.score import Score, score
     from .fusion.summary import Summary, summarise
-    from .fusion.ticks import TickEstimates, filter_ticks, smooth_ticks, tick_likelihood
-    from .fusion.track import AxisEstimate
+    from .fusion.estimates import AxisEstimate
     from .identification.identify import Identification, identify
     from .identification.trials import StepTrials, TrialsError
     from .identification.verify import AxisVerification, verify
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 
 _HOME = {
     "ArmModel": "model.arm",
-    "AxisEstimate": "fusion.track",
+    "AxisEstimate": "fusion.estimates",
     "AxisModel": "model.arm",
     "AxisNow": "live.answers",
     "AxisVerification": "identification.verify",
@@ -48,7 +47,7 @@ _HOME = {
     "Identification": "identification.identify",
     "LiveEstimate": "live.answers",
     "LiveEstimator": "live.estimator",
-    "Outcome": "fusion.outcome",
+    "Outcome": "filter.outcome",
     "Process": "fusion.config",
     "PumafuseError": "errors",
     "PumafuseWarning": "errors",
@@ -64,7 +63,6 @@ _HOME = {
     "Start": "fusion.config",
     "StepTrials": "identification.trials",
     "Summary": "fusion.summary",
-    "TickEstimates": "fusion.ticks",
     "UpdateResult": "live.answers",
     "TrialsError": "identification.trials",
     "TuneError": "tuning.learnable",
@@ -72,14 +70,11 @@ _HOME = {
     "UnknownNameError": "errors",
     "Validity": "model.arm",
     "discretize": "model.discrete",
-    "filter_ticks": "fusion.ticks",
     "fuse": "fusion.offline",
     "identify": "identification.identify",
     "score": "fusion.score",
     "simulate": "simulation.simulate",
-    "smooth_ticks": "fusion.ticks",
     "summarise": "fusion.summary",
-    "tick_likelihood": "fusion.ticks",
     "to_rerun": "views.rerun",
     "tune": "tuning.tune",
     "verify": "identification.verify",
@@ -117,7 +112,6 @@ __all__ = [
     "Start",
     "StepTrials",
     "Summary",
-    "TickEstimates",
     "TrialsError",
     "TuneError",
     "Tuning",
@@ -125,14 +119,11 @@ __all__ = [
     "UpdateResult",
     "Validity",
     "discretize",
-    "filter_ticks",
     "fuse",
     "identify",
     "score",
     "simulate",
-    "smooth_ticks",
     "summarise",
-    "tick_likelihood",
     "to_rerun",
     "tune",
     "verify",

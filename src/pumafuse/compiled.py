@@ -11,7 +11,11 @@ if TYPE_CHECKING:
     R = TypeVar("R")
 
     def compiled(function: Callable[P, R]) -> Callable[P, R]:
-        """A function compiled to machine code; called from Python or from another one."""
+        """A function compiled to machine code, a part of each that calls it."""
+        ...
+
+    def compiled_apart(function: Callable[P, R]) -> Callable[P, R]:
+        """A function compiled to machine code once; called from Python or from another one."""
         ...
 
 else:
@@ -20,8 +24,9 @@ else:
     import numba
     from numba.core import event
 
-    # Kernels own no arrays, so nothing in them is counted (`_nrt`), and all calls between them vanish (`forceinline`):
-    # together that is a factor of twenty. A division by zero gives an infinity, as in numpy.
+    # Kernels own no arrays, so nothing in them is counted (`_nrt`), and calls within the algebra vanish (`forceinline`):
+    # together that is a factor of twenty. What is called once a row is apart: compiled anew in each caller it would cost
+    # more time than it saves. A division by zero gives an infinity, as in numpy.
     # A product and a sum stay two roundings: contracted to one, variances of extreme priors fall below 0.
     def _kept() -> bool:
         """Whether there is a place on disk for what is compiled: a service without a home may have none."""
@@ -33,6 +38,7 @@ else:
 
     _KEPT = _kept()
     compiled = numba.njit(cache=_KEPT, nogil=True, error_model="numpy", forceinline=True, _nrt=False)
+    compiled_apart = numba.njit(cache=_KEPT, nogil=True, error_model="numpy", _nrt=False)
     _HOW_OFTEN = (
         "only this once (some 20 s)"
         if _KEPT

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from ..fusion.outcome import Outcome
+from ..filter.outcome import Outcome
 from ..live.health import Health
 from ..live.stream import Stream
 from ..units import MM, MS

@@ -17,9 +17,9 @@ from ..arrays import CodeArray, FloatArray
 from ..units import MM
 from .config import Sensor
 from .estimates import Estimates, Measurements, outcome_counts
-from .outcome import Outcome
+from ..filter.outcome import Outcome
 from .score import Z95
-from .timeline import LONGEST_TAIL_NS
+from .segments import LONGEST_TAIL_NS
 
 LAGS = 20
 _FEW = 30  # components below which nothing is said

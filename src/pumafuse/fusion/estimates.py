@@ -11,9 +11,8 @@ import numpy as np
 from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
 from ..errors import UnknownNameError
 from .config import FusionConfig
-from .outcome import Outcome
+from ..filter.outcome import Outcome
 from .reference import ReferenceTrack
-from .track import AxisEstimate, Bias
 
 Mode = Literal["filtered", "as-live", "smoothed"]
 
@@ -22,6 +21,37 @@ def outcome_counts(outcomes: CodeArray) -> dict[str, int]:
     """How many components had each outcome, those that occur."""
     found = {outcome.word: int(np.count_nonzero(outcomes == outcome)) for outcome in Outcome}
     return {word: count for word, count in found.items() if count}
+
+
+@dataclass(frozen=True)
+class AxisEstimate:
+    """Estimates of one axis in the log's coordinates, SI units, arrays (n,).
+
+    Attributes:
+        position: p [m].
+        position_sd: Its standard deviation [m].
+        velocity: Mean velocity over the coming update period [m/s]; NaN where smoothed.
+        velocity_sd: Its standard deviation [m/s].
+        offset: o [m], what the model cannot explain.
+        offset_sd: Its standard deviation [m].
+    """
+
+    position: FloatArray
+    position_sd: FloatArray
+    velocity: FloatArray
+    velocity_sd: FloatArray
+    offset: FloatArray
+    offset_sd: FloatArray
+
+    FIELDS = ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd")
+
+
+@dataclass(frozen=True)
+class Bias:
+    """A sensor's constant bias on one axis [m], in the log's coordinates, and its standard deviation [m]."""
+
+    value: float
+    sd: float
 
 
 @dataclass(frozen=True)

@@ -11,19 +11,20 @@ import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import PumafuseWarning
+from ..filter.events import COMMAND
+from ..filter.outcome import ABSENT
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run
 from ..units import seconds
-from . import timeline as timelines
 from .config import FusionConfig
 from .consistency import troubles
 from .estimates import Estimates, Measurements, Mode
 from .reference import joined_references, late_rows, reference_track
 from .score import interpolated
-from .timeline import Timeline
-from .track import AxisEstimate, Fused
+from .engine import Filtered, filter_segment
+from .segments import Segment, build, output_times
 
 Engine = Literal["compiled", "filterpy"]
 
@@ -73,8 +74,8 @@ def fuse(
     logged, said = segments(in_place)
     parts: list[Estimates] = []
     for number, part in enumerate(logged):
-        built = timelines.build(part, config, chosen)
-        times = timelines.output_times(built, rate)
+        built = build(part, config, chosen)
+        times = output_times(built, config, rate)
         share = None if progress is None else _share(progress, number, len(logged))
         parts.append(_fuse_segment(part, placed, built, times, config, mode, engine, share))
     joined = _joined(parts, said)
@@ -107,7 +108,7 @@ def _share(progress: Callable[[float], None], number: int, count: int) -> Callab
 def _fuse_segment(
     run: Run,
     placed: Placed | None,
-    timeline: Timeline,
+    segment: Segment,
     times: TimeArray,
     config: FusionConfig,
     mode: Mode,
@@ -115,31 +116,29 @@ def _fuse_segment(
     progress: Callable[[float], None] | None,
 ) -> Estimates:
     if engine == "filterpy":
-        from .filterpy_engine import fuse_filterpy
+        from .reference_engine import filter_segment_by_filterpy
 
-        fused = fuse_filterpy(timeline, config, times, mode, progress)
+        filtered = filter_segment_by_filterpy(segment, config, times, progress)
     else:
-        from .engine import fuse_compiled
-
-        fused = fuse_compiled(timeline, config, times, mode)
-    origin = timeline.origin
+        filtered = filter_segment(segment, config, times, mode)
+    origin = segment.origin
     return Estimates(
         run=run.name,
         time=seconds(times, origin),
-        axes=fused.axes,
-        cartesian=None if placed is None else _cartesian(placed, fused.axes),
-        measurements=_measurements(timeline, fused),
-        biases=fused.biases,
+        axes=filtered.axes,
+        cartesian=None if placed is None else _cartesian(placed, filtered.axes),
+        measurements=_measurements(segment, filtered),
+        biases=filtered.biases,
         reference=None if run.reference is None else reference_track(run.reference, origin),
         origin=origin,
-        last_command=(int(timeline.commands[-1]) - origin) / 1e9,
+        last_command=(int(segment.commands[-1]) - origin) / 1e9,
         segment=np.zeros(len(times), dtype=np.int64),
         mode=mode,
         engine=engine,
         config=config,
-        speed=timeline.speed,
+        speed=segment.highest_speed(config.arm.update_period),
         radius=_highest_radius(run, placed),
-        notes=timeline.notes,
+        notes=segment.notes,
     )
 
 
@@ -161,19 +160,21 @@ def _highest_radius(run: Run, placed: Placed | None) -> float | None:
     return float(np.max(radial[np.isfinite(radial) & (run.command.stamp != NO_STAMP)]))
 
 
-def _measurements(timeline: Timeline, fused: Fused) -> Measurements:
-    components = timeline.components
+def _measurements(segment: Segment, filtered: Filtered) -> Measurements:
+    """Every component of every measurement in the order of the filter."""
+    events, results = filtered.events, filtered.results
+    row, axis = np.nonzero((events.source != COMMAND)[:, None] & (events.known != ABSENT))
     return Measurements(
-        time=seconds(components.valid, timeline.origin),
-        stamp=seconds(components.stamp, timeline.origin),
-        sensor=components.sensor,
-        axis=components.axis,
-        value=components.value,
-        innovation=fused.innovation,
-        innovation_sd=fused.innovation_sd,
-        outcome=fused.outcome,
-        sensors=components.sensors,
-        axes=tuple(axis.name for axis in timeline.axes),
+        time=seconds(events.time[row], segment.origin),
+        stamp=seconds(events.stamp[row], segment.origin),
+        sensor=events.source[row],
+        axis=axis.astype(np.int16),
+        value=events.value[row, axis],
+        innovation=results.innovation[row, axis],
+        innovation_sd=results.innovation_sd[row, axis],
+        outcome=results.outcome[row, axis],
+        sensors=segment.sensors,
+        axes=segment.axes,
     )
 
 

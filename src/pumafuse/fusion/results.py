@@ -22,7 +22,7 @@ from ..logs.run import Run
 from ..logs.tables import Table
 from ..units import MM, seconds
 from .estimates import Estimates
-from .outcome import Outcome
+from ..filter.outcome import Outcome
 from .reference import ReferenceTrack, joined_references, reference_track
 from .score import Score, score
 from .summary import Summary, summarise

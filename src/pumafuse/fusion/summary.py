@@ -11,7 +11,7 @@ import numpy as np
 from ..units import MM
 from .consistency import chi_square_band, consistency, log_likelihood
 from .estimates import Estimates
-from .outcome import Outcome
+from ..filter.outcome import Outcome
 from .score import Score, score
 
 

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from ..errors import UnknownNameError
-from ..fusion.outcome import Outcome
+from ..filter.outcome import Outcome
 
 MET = frozenset({Outcome.FUSED, Outcome.REACQUIRED, Outcome.REJECTED})  # of what was compared with its prediction
 _BEST = (  # first

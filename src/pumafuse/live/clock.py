@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 
 from ..arrays import REACH_NS
-from ..fusion.timeline import LONGEST_TAIL_NS
+from ..fusion.segments import LONGEST_TAIL_NS
 
 Time: TypeAlias = float | int  # float seconds, or int nanoseconds
 

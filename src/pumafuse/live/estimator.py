@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, Protocol
 
 from ..errors import ConfigError, RunError, suggestion
 from ..fusion.config import FusionConfig
-from ..fusion.outcome import FARTHEST, Outcome
-from ..fusion.timeline import LONGEST_TAIL_NS
+from ..filter.outcome import FARTHEST, Outcome
+from ..fusion.segments import LONGEST_TAIL_NS
 from ..logs.frames import CARTESIAN, Cylindrical
 from ..model.arm import ordered_axes
 from .answers import AxisNow, LiveEstimate, UpdateResult, nowhere, told_of

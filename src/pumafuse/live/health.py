@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ..arrays import ALWAYS
-from ..fusion.outcome import Outcome
+from ..filter.outcome import Outcome
 from .tally_kernels import CAME, DROPOUTS, LATENESS, MOST_LATE, NIS, ROWS, SCALARS, SECONDS, Tally
 
 

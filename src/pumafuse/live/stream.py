@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 from ..errors import ConfigError
-from ..fusion.outcome import Outcome
+from ..filter.outcome import Outcome
 from .answers import MET, LiveEstimate, UpdateResult
 from .clock import nanoseconds
 from .estimator import LiveEstimator

@@ -22,6 +22,7 @@ _TERMS = 16  # of each series: the next would be below 1e-16 of the sum
 _TINY, _FEW = 0.1, 10  # rad, terms: enough for most intervals between measurements
 _SHORT = 0.5  # rad; fastest pole × interval up to which the series are used
 _HEAD = 6  # constants before the series
+_CLOSE = 0.05  # of what it would be with the signs alike: distance to the plant's poles, below which sums cancel
 _APART = 0.5  # difference of the poles over their sum, below which exponentials of the two cancel
 
 SIZE = _HEAD + 3 * _TERMS
@@ -58,18 +59,17 @@ def constants(plant: PLANTS) -> FloatArray:
 
 
 @compiled
-def advance_first(constants: FloatArray, axis: int, dt: float) -> tuple[float, float]:
-    """Φ − 1 and Q of a first-order plant over ``dt`` [s]; its constants are in row ``axis``."""
-    rate = constants[axis, 0]
-    lost = math.expm1(-rate * dt)
-    return lost, -0.5 * rate * lost * (2.0 + lost)
-
-
-@compiled
-def advance_second(
-    constants: FloatArray, axis: int, dt: float
+def transition(
+    order: int, constants: FloatArray, axis: int, dt: float
 ) -> tuple[float, float, float, float, float, float, float]:
-    """Φ11, Φ12, Φ21, Φ22, Q11, Q12, Q22 of a second-order plant over ``dt`` [s]; its constants are in row ``axis``."""
+    """Φ11, Φ12, Φ21, Φ22, Q11, Q12, Q22 of a plant over ``dt`` [s]; its constants are in row ``axis``.
+
+    A first-order plant has a rate, too, that is always 0: the filter's algebra is the same for both orders.
+    """
+    if order == 1:
+        rate = constants[axis, 0]
+        lost = math.expm1(-rate * dt)
+        return 1.0 + lost, 0.0, 0.0, 0.0, -0.5 * rate * lost * (2.0 + lost), 0.0, 0.0
     omega, sigma, square, fastest = constants[axis, 0], constants[axis, 1], constants[axis, 2], constants[axis, 3]
     u = fastest * dt
     if u <= _SHORT:
@@ -81,6 +81,56 @@ def advance_second(
     h, h_rate = w2 * g, w2 * rate
     q11, q12 = w2 * w2 * power, 0.5 * h * h
     return rate + 2.0 * sigma * g, g, -h, rate, q11, q12, w2 * q11 + 2.0 * sigma * q12 + h * h_rate
+
+
+@compiled
+def decaying_response(
+    order: int, constants: FloatArray, axis: int, decay: float, dt: float, f11: float, f12: float, f22: float
+) -> tuple[float, float, float]:
+    """Position and rate that an input e^(−decay·t) of 1 m makes in ``dt`` [s], and what is left of the input then.
+
+    Γ_e = ∫ e^(A s) B e^(−decay (dt − s)) ds: the divided differences of exp at the plant's poles and at −decay [1/s].
+    ``f11``, ``f12`` and ``f22`` are of Φ over ``dt``.
+    """
+    left = math.exp(-decay * dt)
+    if order == 1:
+        rate = constants[axis, 0]
+        apart = rate - decay
+        if abs(apart) > _CLOSE * (rate + decay):
+            return rate * (left - f11) / apart, 0.0, left
+        lasting = math.exp(-min(rate, decay) * dt)
+        return rate * lasting * (dt if apart == 0.0 else -math.expm1(-abs(apart) * dt) / abs(apart)), 0.0, left
+    omega, sigma, fastest = constants[axis, 0], constants[axis, 1], constants[axis, 3]
+    w2 = omega * omega
+    product = decay * decay - 2.0 * sigma * decay + w2  # of the distances between the input's pole and the plant's
+    if abs(product) > _CLOSE * (decay * decay + 2.0 * sigma * decay + w2):
+        h, g = (left - f22 - (2.0 * sigma - decay) * f12) / product, f12
+    else:
+        h, g = _close_poles(omega, sigma, max(fastest, decay), decay, dt)
+    return w2 * h, w2 * (g - decay * h), left
+
+
+@compiled
+def _close_poles(omega: float, sigma: float, fastest: float, decay: float, t: float) -> tuple[float, float]:
+    """h = ∫ g(s) e^(−decay (t − s)) ds and g where divided differences cancel: series of a short interval, doubled."""
+    doublings = max(math.ceil(math.log2(fastest * t / _SHORT)), 0) if t > 0.0 else 0
+    u, s, w, b = fastest * t / 2.0**doublings, sigma / fastest, (omega / fastest) ** 2, decay / fastest
+    g_k, g_next, h_k, power = 0.0, 1.0, 0.0, 1.0  # coefficients of u^k in g and h
+    g, rate, h = 0.0, 0.0, 0.0
+    for k in range(_TERMS + 2):
+        g, h = g + g_k * power, h + h_k * power
+        rate += (k + 1) * g_next * power
+        h_k = (g_k - b * h_k) / (k + 1)
+        g_k, g_next = g_next, -(2.0 * s * (k + 1) * g_next + w * g_k) / ((k + 1) * (k + 2))
+        power *= u
+    left = math.exp(-b * u)
+    for _ in range(doublings):
+        f11, f21 = rate + 2.0 * s * g, -w * g
+        h_rate = g - b * h
+        h = f11 * h + g * h_rate + left * h
+        g, rate = (f11 + rate) * g, f21 * g + rate * rate
+        left *= left
+    return h / (fastest * fastest), g / fastest
 
 
 @compiled

@@ -24,7 +24,7 @@ from ..arrays import CodeArray, FloatArray, IntArray
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations
-from ..fusion.outcome import Outcome
+from ..filter.outcome import Outcome
 from ..fusion.ticks import usable_cores
 from ..fusion.timeline import Timeline, build
 from ..logs.axes import in_axes

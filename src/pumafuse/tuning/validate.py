@@ -15,7 +15,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.consistency import consistency, densities_of
 from ..fusion.estimates import Estimates
 from ..fusion.offline import fuse
-from ..fusion.outcome import Outcome
+from ..filter.outcome import Outcome
 from ..fusion.score import Z95, interpolated, score
 from ..fusion.track import AxisEstimate
 from ..logs.run import Run

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from ..arrays import FloatArray
 from ..fusion.consistency import LAGS, consistency
 from ..fusion.estimates import Estimates
-from ..fusion.outcome import Outcome
+from ..filter.outcome import Outcome
 from ..fusion.score import Z95, interpolated
 from ..logs.axes import in_axes
 from ..logs.run import Run

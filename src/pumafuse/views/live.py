@@ -25,7 +25,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from ..errors import ConfigError
-from ..fusion.outcome import Outcome
+from ..filter.outcome import Outcome
 from ..live.answers import MET
 from ..logs.frames import CARTESIAN
 from ..model.arm import CANONICAL_AXES, ordered_axes

@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 
 from ..arrays import FloatArray
 from ..fusion.estimates import Estimates, Measurements
-from ..fusion.outcome import Outcome
+from ..filter.outcome import Outcome
 from ..logs.axes import in_axes
 from ..logs.frames import CARTESIAN
 from ..logs.run import Run

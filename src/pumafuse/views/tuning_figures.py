@@ -11,7 +11,7 @@ from matplotlib.ticker import FixedLocator, FormatStrFormatter, LogLocator, MaxN
 from ..arrays import FloatArray
 from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates
-from ..fusion.outcome import Outcome
+from ..filter.outcome import Outcome
 from ..fusion.score import Z95
 from ..tuning.profile import Profile
 from ..tuning.summary import Fitted

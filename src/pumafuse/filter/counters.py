@@ -1,4 +1,4 @@
-"""How each sensor does, counted row by row: how many came and how late, what is missing, the NIS of the last minute."""
+"""How each sensor of a stream does: how many rows came and how late, what is missing, the NIS of the last minute."""
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportReturnType=false, reportConstantRedefinition=false
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 from ..arrays import ALWAYS, FloatArray, IntArray, TimeArray
 from ..compiled import compiled
 
-SECONDS = 60  # of the past that a tally tells of
+SECONDS = 60  # of the past that a counters tells of
 ROWS, LATENESS, MOST_LATE, NIS, SCALARS = range(5)  # of each of them
 CAME, DROPOUTS, INTERVALS, IN_A_ROW = 8, 9, 10, 11  # of a sensor, after the outcomes
 
@@ -18,7 +18,7 @@ _GAP = 1.5  # usual intervals without a row: one is missing
 _SLOWER = 1.1  # by dropouts in a row the usual interval grows until a slower sensor has one again
 
 
-class Tally(NamedTuple):
+class Counters(NamedTuple):
     """What there was of each sensor.
 
     Attributes:
@@ -42,56 +42,56 @@ class Tally(NamedTuple):
 
 
 @compiled
-def unheard(tally: Tally, sensor: int, after: int) -> None:
-    """Let a sensor's tally not know of what is stamped after ``after`` [ns]."""
-    if tally.last[sensor] > after:
-        tally.last[sensor] = ALWAYS
+def forget_after(counters: Counters, sensor: int, after: int) -> None:
+    """Let a sensor's counters not know of what is stamped after ``after`` [ns]."""
+    if counters.last[sensor] > after:
+        counters.last[sensor] = ALWAYS
     for slot in range(SECONDS):
-        if tally.second[sensor, slot] > after // 1_000_000_000:
-            tally.second[sensor, slot] = ALWAYS
+        if counters.second[sensor, slot] > after // 1_000_000_000:
+            counters.second[sensor, slot] = ALWAYS
 
 
 @compiled
-def came(tally: Tally, sensor: int, stamp: int, newest: int) -> None:
+def count_row(counters: Counters, sensor: int, stamp: int, newest: int) -> None:
     """Count a row that has come."""
-    tally.number[sensor, CAME] += 1
-    tally.last[sensor] = max(tally.last[sensor], stamp)
-    slot = slot_of(tally, sensor, stamp)
+    counters.number[sensor, CAME] += 1
+    counters.last[sensor] = max(counters.last[sensor], stamp)
+    slot = slot_of(counters, sensor, stamp)
     if slot >= 0:
         lateness = max(newest - stamp, 0) / 1e9
-        tally.minute[sensor, slot, ROWS] += 1.0
-        tally.minute[sensor, slot, LATENESS] += lateness
-        tally.minute[sensor, slot, MOST_LATE] = max(tally.minute[sensor, slot, MOST_LATE], lateness)
+        counters.minute[sensor, slot, ROWS] += 1.0
+        counters.minute[sensor, slot, LATENESS] += lateness
+        counters.minute[sensor, slot, MOST_LATE] = max(counters.minute[sensor, slot, MOST_LATE], lateness)
 
 
 @compiled
-def followed(tally: Tally, sensor: int, stamp: int) -> None:
+def count_interval(counters: Counters, sensor: int, stamp: int) -> None:
     """Look at the interval from the row before; rows leave the window in order, when those that came late are in."""
-    number, before = tally.number, tally.left[sensor]
-    tally.left[sensor] = stamp
+    number, before = counters.number, counters.left[sensor]
+    counters.left[sensor] = stamp
     if before == ALWAYS:
         return
-    interval, usual = (stamp - before) / 1e9, tally.usual[sensor]
+    interval, usual = (stamp - before) / 1e9, counters.usual[sensor]
     number[sensor, INTERVALS] += 1
     if number[sensor, INTERVALS] > _FEW and interval > _GAP * usual:
         number[sensor, DROPOUTS] += 1
         number[sensor, IN_A_ROW] += 1
         if number[sensor, IN_A_ROW] > 1:  # not a row that is missing: the sensor is slower now
-            tally.usual[sensor] *= _SLOWER
+            counters.usual[sensor] *= _SLOWER
         return
     number[sensor, IN_A_ROW] = 0
-    tally.usual[sensor] = usual + (interval - usual) / min(number[sensor, INTERVALS], _MANY)
+    counters.usual[sensor] = usual + (interval - usual) / min(number[sensor, INTERVALS], _MANY)
 
 
 @compiled
-def slot_of(tally: Tally, sensor: int, stamp: int) -> int:
+def slot_of(counters: Counters, sensor: int, stamp: int) -> int:
     """Where the second of a stamp is tallied, −1 if it is over a minute old."""
     second = stamp // 1_000_000_000
     slot = second % SECONDS
-    if second < tally.second[sensor, slot]:
+    if second < counters.second[sensor, slot]:
         return -1
-    if second > tally.second[sensor, slot]:
-        tally.second[sensor, slot] = second
-        for kind in range(tally.minute.shape[2]):
-            tally.minute[sensor, slot, kind] = 0.0
+    if second > counters.second[sensor, slot]:
+        counters.second[sensor, slot] = second
+        for kind in range(counters.minute.shape[2]):
+            counters.minute[sensor, slot, kind] = 0.0
     return slot

@@ -1,4 +1,4 @@
-"""What may become of a component, and the limits that decide it."""
+"""What may become of a component of an event."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray
 
-REOPEN_AFTER = 10  # rejections in a row of one sensor …
-REOPEN_SPAN_NS = 500_000_000  # … the first of them at least 0.5 s ago
 FARTHEST = 1e6  # m; what is farther is a sentinel, no position
+ABSENT = 255  # in an array of outcomes: the row gives no value for this axis
 
 
 class Outcome(enum.IntEnum):

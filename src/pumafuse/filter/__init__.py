@@ -1,0 +1,1 @@
+"""The filter: events in one total order, one pass over them, and the smoother."""

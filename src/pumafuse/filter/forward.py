@@ -1,0 +1,430 @@
+"""The forward pass: events in their order through the filter of each axis, an estimate where one is asked for.
+
+Offline all events are there; as live they are fed in the order of arrival, and what comes late makes the pass go back
+to a checkpoint and run on from there, as in the window of a stream; for a likelihood outcomes may be given.
+"""
+
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportReturnType=false, reportConstantRedefinition=false
+# (an element of an array is a plain number here: numba compiles it, numpy's types do not know)
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import ALWAYS, NEVER, BoolArray, FloatArray, IntArray, TimeArray
+from ..compiled import compiled, compiled_apart
+from ..model.closed import transition
+from .axis import (
+    DRIFT,
+    NOISE,
+    OFFSET,
+    PERIOD,
+    POSITION,
+    RATE,
+    Model,
+    Sensors,
+    State,
+    apply_command,
+    copy_row,
+    innovation,
+    noise,
+    position_of,
+    predict,
+    update,
+)
+from .events import COMMAND, FUSED, Events, Results
+from .gate import NOBODY, agrees, contradicted, count_fused, count_reacquired, count_rejected
+from .outcome import Outcome
+
+REJECTED, REACQUIRED = int(Outcome.REJECTED), int(Outcome.REACQUIRED)
+INTERVAL = -1  # the row of an entry of the history that is no update
+
+
+class Outputs(NamedTuple):
+    """Estimates of each axis, relative to its start level; all (A, n).
+
+    Attributes:
+        position: p [m].
+        position_sd: [m].
+        velocity: Mean over the coming update period [m/s].
+        velocity_sd: [m/s].
+        offset: o [m].
+        offset_sd: [m].
+    """
+
+    position: FloatArray
+    position_sd: FloatArray
+    velocity: FloatArray
+    velocity_sd: FloatArray
+    offset: FloatArray
+    offset_sd: FloatArray
+
+
+class History(NamedTuple):
+    """What the smoother needs of the forward pass: intervals and updates of each axis, and states at estimates.
+
+    Attributes:
+        first: Where each axis's entries begin, (A + 1,); all 0 where nothing is to be kept.
+        used: How many each axis has, (A,).
+        time: The instant after each, int64 ns, (k,).
+        row: Which event's update it was, or ``INTERVAL``, (k,).
+        noise: Input noise density squared of an interval [m²·s], R of an update [m²], (k,).
+        drift: Drift density squared of an interval [m²/s]; of an update by how much the offset widened [m²], (k,).
+        gain: K of an update, (k, s).
+        x: Filtered mean at each estimate, (A, n, s).
+        P: Its covariance, (A, n, s, s).
+    """
+
+    first: IntArray
+    used: IntArray
+    time: TimeArray
+    row: IntArray
+    noise: FloatArray
+    drift: FloatArray
+    gain: FloatArray
+    x: FloatArray
+    P: FloatArray
+
+
+class Kept(NamedTuple):
+    """Checkpoints of a :class:`State` before each row, in a ring of places; none where nothing is taken back.
+
+    Attributes:
+        arrived: Which rows have arrived, (n,).
+        x: As in the state, with the places first; and so on.
+        P: See ``x``.
+        clock: See ``x``.
+        drive: See ``x``.
+        rejected: See ``x``.
+        gate_time: See ``x``.
+        gate_count: See ``x``.
+        unsettled: See ``x``.
+    """
+
+    arrived: BoolArray
+    x: FloatArray
+    P: FloatArray
+    clock: TimeArray
+    drive: FloatArray
+    rejected: FloatArray
+    gate_time: TimeArray
+    gate_count: IntArray
+    unsettled: TimeArray
+
+
+@compiled_apart
+def filter_events(
+    model: Model,
+    sensors: Sensors,
+    events: Events,
+    state: State,
+    given: bool,
+    times: TimeArray,
+    results: Results,
+    history: History,
+    kept: Kept,
+    outputs: Outputs,
+) -> None:
+    """Every event in its order, and an estimate at each of ``times`` (ascending) by all events until then.
+
+    With ``given`` the outcomes in ``results`` are repeated, whatever a gate would say now.
+    """
+    done, end = 0, len(events.time)
+    for n in range(len(times)):
+        begin = done
+        while done < end and events.time[done] <= times[n]:
+            done += 1
+        run_events(model, sensors, events, state, begin, done, given, results, history, kept)
+        estimate(model, events, state, done, end, times[n], history, outputs, n)
+    run_events(model, sensors, events, state, done, end, given, results, history, kept)
+
+
+@compiled_apart
+def filter_as_live(
+    model: Model,
+    sensors: Sensors,
+    events: Events,
+    state: State,
+    arrival: TimeArray,
+    queue: IntArray,
+    times: TimeArray,
+    results: Results,
+    history: History,
+    kept: Kept,
+    outputs: Outputs,
+) -> None:
+    """At each of ``times`` only the events that had arrived: late ones make the filter go back and run on.
+
+    ``queue`` lists the rows by ``arrival``; ``kept`` knows of none yet, and has room for more checkpoints than rows may
+    have to be taken back. Nothing is kept in ``history``.
+    """
+    due, done, end = 0, 0, len(events.time)
+    for n in range(len(times) + 1):
+        until = times[n] if n < len(times) else NEVER
+        begin = done
+        while due < len(queue) and arrival[queue[due]] <= until:
+            kept.arrived[queue[due]] = True
+            begin = min(begin, queue[due])
+            due += 1
+        if begin < done:
+            restore(state, kept, begin % len(kept.clock))
+        while done < end and events.time[done] <= until:
+            done += 1
+        run_events(model, sensors, events, state, begin, done, False, results, history, kept)
+        if n < len(times):
+            estimate(model, events, state, done, end, times[n], history, outputs, n)
+
+
+@compiled_apart
+def run_events(
+    model: Model,
+    sensors: Sensors,
+    events: Events,
+    state: State,
+    begin: int,
+    end: int,
+    given: bool,
+    results: Results,
+    history: History,
+    kept: Kept,
+) -> None:
+    """Rows ``begin`` to ``end`` that have arrived: apply commands, gate measurements, update with what passes."""
+    axes, places = len(model.order), len(kept.clock)
+    for row in range(begin, end):
+        if places > 0:
+            checkpoint(state, kept, row % places)
+            if not kept.arrived[row]:
+                continue
+        source = events.source[row]
+        first = 0
+        while first < axes:
+            last = axes if source != COMMAND and sensors.gate_rows[source] else first + 1
+            if source != COMMAND:
+                add_measurement(model, sensors, events, state, row, first, last, given, results, history)
+            elif events.known[row, first] == FUSED:
+                advance(model, state, first, events.time[row], history)
+                apply_command(model, state, first, first, events.value[row, first])
+            first = last
+
+
+@compiled
+def add_measurement(
+    model: Model,
+    sensors: Sensors,
+    events: Events,
+    state: State,
+    row: int,
+    first: int,
+    end: int,
+    given: bool,
+    results: Results,
+    history: History,
+) -> None:
+    """Axes ``first`` to ``end`` of one row, which pass the gate together or not at all."""
+    sensor, time, gate, beyond = events.source[row], events.time[row], sensors.gate[events.source[row]], False
+    for axis in range(first, end):
+        results.outcome[row, axis] = events.known[row, axis] if not given else results.outcome[row, axis]
+        if events.known[row, axis] != FUSED:
+            continue
+        advance(model, state, axis, time, history)
+        R = noise_of(model, sensors, events, state, row, axis)
+        nu, S = innovation(sensors, state, axis, sensor, events.value[row, axis], R)
+        results.innovation[row, axis], results.innovation_sd[row, axis] = nu, math.sqrt(S)
+        beyond |= gate > 0.0 and abs(nu) > gate * math.sqrt(S)
+    reacquires = False
+    if beyond and not given:
+        reacquires = decide(model, sensors, events, state, row, first, end, results)
+    for axis in range(first, end):
+        if events.known[row, axis] != FUSED:
+            continue
+        nu, sd = results.innovation[row, axis], results.innovation_sd[row, axis]
+        outcome = results.outcome[row, axis]
+        if not given:
+            outcome = FUSED if not beyond else REJECTED if not reacquires else FUSED
+            if reacquires and abs(nu) > gate * sd:
+                outcome = REACQUIRED
+            results.outcome[row, axis] = outcome
+        if outcome == REJECTED:
+            continue
+        R, widened = noise_of(model, sensors, events, state, row, axis), 0.0
+        if outcome == REACQUIRED:
+            widened = (nu / sensors.scale[sensor]) ** 2
+            count_reacquired(state, axis, sensor, widened, time)
+            _, S = innovation(sensors, state, axis, sensor, events.value[row, axis], R)
+            results.innovation_sd[row, axis] = math.sqrt(S)
+        update(model, sensors, state, axis, sensor, nu, R)
+        count_fused(state, axis, sensor, time)
+        write_history(history, axis, time, row, R, widened, state.work)
+
+
+@compiled
+def decide(
+    model: Model, sensors: Sensors, events: Events, state: State, row: int, first: int, end: int, results: Results
+) -> bool:
+    """Whether a row beyond its gate re-acquires; if not, it is remembered, and whom it contradicts noted."""
+    sensor, time = events.source[row], events.time[row]
+    all_agree, again, other = True, False, NOBODY
+    for axis in range(first, end):
+        nu, sd = results.innovation[row, axis], results.innovation_sd[row, axis]
+        if events.known[row, axis] == FUSED and abs(nu) > sensors.gate[sensor] * sd:
+            R = noise_of(model, sensors, events, state, row, axis)
+            agreement = agrees(model, sensors, state, axis, sensor, nu, R, time)
+            all_agree &= agreement == 1
+            again |= agreement < 0
+            other = max(other, contradicted(sensors, state, axis, sensor, time))
+    results.contradicts[row] = other if all_agree else NOBODY
+    if all_agree and other == NOBODY:
+        return True
+    for axis in range(first, end):
+        if events.known[row, axis] == FUSED:
+            R = noise_of(model, sensors, events, state, row, axis)
+            count_rejected(state, axis, sensor, results.innovation[row, axis], R, time, again)
+    return False
+
+
+@compiled
+def noise_of(model: Model, sensors: Sensors, events: Events, state: State, row: int, axis: int) -> float:
+    """R of a value of the table, here and now."""
+    spread = events.spread[row, axis] if len(events.spread) else 1.0
+    return noise(model, sensors, state, axis, events.source[row], spread)
+
+
+@compiled
+def advance(model: Model, state: State, axis: int, time: int, history: History) -> None:
+    """Predict one axis to ``time`` [ns], and keep the interval for the smoother."""
+    if time > state.clock[axis]:
+        write_history(history, axis, time, INTERVAL, state.drive[axis, NOISE], state.drive[axis, DRIFT], state.work)
+        predict(model, state, axis, axis, time)
+
+
+@compiled
+def write_history(
+    history: History, axis: int, time: int, row: int, noise: float, drift: float, work: FloatArray
+) -> None:
+    """Keep an entry, where entries are kept; the gain of an update is in ``work[1]``."""
+    at = history.first[axis] + history.used[axis]
+    if at < history.first[axis + 1]:
+        history.time[at], history.row[at], history.noise[at], history.drift[at] = time, row, noise, drift
+        if row != INTERVAL:
+            for i in range(history.gain.shape[1]):
+                history.gain[at, i] = work[1, i]
+        history.used[axis] += 1
+
+
+@compiled_apart
+def estimate(
+    model: Model,
+    events: Events,
+    state: State,
+    pending: int,
+    end: int,
+    time: int,
+    history: History,
+    outputs: Outputs,
+    n: int,
+) -> None:
+    """Every axis at ``time`` [ns], as estimate ``n``; the state stays as it is.
+
+    Args:
+        model: The axes.
+        events: Rows from ``pending`` to ``end`` are not in the state yet; of those until ``time`` only commands count.
+        state: After all rows before ``pending``.
+        pending: See ``events``.
+        end: See ``events``.
+        time: Asked for, int64 ns.
+        history: Gets the states, for the smoother.
+        outputs: Gets the estimates.
+        n: Their place.
+    """
+    here, there = len(model.order), len(model.order) + 1  # rows of the state for predictions aside
+    for axis in range(len(model.order)):
+        copy_row(state, axis, here)
+        follow_commands(model, events, state, axis, here, pending, end, ALWAYS, time, time)
+        position, variance = position_of(state, here)
+        outputs.position[axis, n], outputs.position_sd[axis, n] = position, math.sqrt(variance)
+        outputs.offset[axis, n] = state.x[here, OFFSET]
+        outputs.offset_sd[axis, n] = math.sqrt(max(state.P[here, OFFSET, OFFSET], 0.0))
+        if history.x.shape[1]:
+            for i in range(model.states[axis]):
+                history.x[axis, n, i] = state.x[here, i]
+                for j in range(model.states[axis]):
+                    history.P[axis, n, i, j] = state.P[here, i, j]
+            outputs.velocity[axis, n] = outputs.velocity_sd[axis, n] = math.nan
+            continue
+        # (p(t + T) − p(t)) / T: what the state contributes, and the noise that comes until then (from P = 0)
+        period = model.gain[axis, PERIOD]
+        copy_row(state, here, there)
+        for i in range(model.states[axis]):
+            for j in range(model.states[axis]):
+                state.P[there, i, j] = 0.0
+        until = time + int(np.rint(period * 1e9))
+        follow_commands(model, events, state, axis, there, pending, end, time, until, time)
+        later, noise = position_of(state, there)
+        f11, f12, _, _, _, _, _ = transition(model.order[axis], model.constants, axis, (until - time) / 1e9)
+        a, b, P = f11 - 1.0, f12, state.P
+        own = a * a * P[here, POSITION, POSITION] + 2.0 * a * b * P[here, POSITION, RATE] + b * b * P[here, RATE, RATE]
+        outputs.velocity[axis, n] = (later - position) / period
+        outputs.velocity_sd[axis, n] = math.sqrt(max(own, 0.0) + noise) / period
+
+
+@compiled
+def follow_commands(
+    model: Model,
+    events: Events,
+    state: State,
+    axis: int,
+    row: int,
+    pending: int,
+    end: int,
+    after: int,
+    until: int,
+    stamped: int,
+) -> None:
+    """Predict a row of the state to ``until`` [ns] by the commands that act ``after`` … ``until``, ``stamped`` by then."""
+    for event in range(pending, end):
+        if events.time[event] > until:
+            break
+        given = events.source[event] == COMMAND and events.known[event, axis] == FUSED
+        if given and events.time[event] > after and events.stamp[event] <= stamped:
+            predict(model, state, axis, row, events.time[event])
+            apply_command(model, state, axis, row, events.value[event, axis])
+    predict(model, state, axis, row, until)
+
+
+@compiled
+def checkpoint(state: State, kept: Kept, place: int) -> None:
+    """Copy a state to ``place`` among many."""
+    for axis in range(len(state.unsettled)):
+        kept.clock[place, axis], kept.unsettled[place, axis] = state.clock[axis], state.unsettled[axis]
+        for k in range(state.drive.shape[1]):
+            kept.drive[place, axis, k] = state.drive[axis, k]
+        for i in range(state.x.shape[1]):
+            kept.x[place, axis, i] = state.x[axis, i]
+            for j in range(state.x.shape[1]):
+                kept.P[place, axis, i, j] = state.P[axis, i, j]
+        for sensor in range(len(state.rejected)):
+            for k in range(2):
+                kept.rejected[place, sensor, axis, k] = state.rejected[sensor, axis, k]
+                kept.gate_time[place, sensor, axis, k] = state.gate_time[sensor, axis, k]
+                kept.gate_count[place, sensor, axis, k] = state.gate_count[sensor, axis, k]
+
+
+@compiled_apart
+def restore(state: State, kept: Kept, place: int) -> None:
+    """Undo everything since :func:`checkpoint`."""
+    for axis in range(len(state.unsettled)):
+        state.clock[axis], state.unsettled[axis] = kept.clock[place, axis], kept.unsettled[place, axis]
+        for k in range(state.drive.shape[1]):
+            state.drive[axis, k] = kept.drive[place, axis, k]
+        for i in range(state.x.shape[1]):
+            state.x[axis, i] = kept.x[place, axis, i]
+            for j in range(state.x.shape[1]):
+                state.P[axis, i, j] = kept.P[place, axis, i, j]
+        for sensor in range(len(state.rejected)):
+            for k in range(2):
+                state.rejected[sensor, axis, k] = kept.rejected[place, sensor, axis, k]
+                state.gate_time[sensor, axis, k] = kept.gate_time[place, sensor, axis, k]
+                state.gate_count[sensor, axis, k] = kept.gate_count[place, sensor, axis, k]

@@ -1,0 +1,225 @@
+"""The smoother: what all later measurements say of a state, carried backward over the history as information.
+
+In the deviation δ from the filter's own mean the inputs cancel, and the later measurements' likelihood is
+exp(−½ δᵀ N δ + ηᵀ δ). From the last event backward, N = 0 and η = 0 at first:
+
+    over an interval   η ← Fᵀ (I + N Q)⁻¹ η,            N ← Fᵀ (I + N Q)⁻¹ N F
+    over an update     η ← η + N K ν + Hᵀ ν / R,        N ← N + Hᵀ H / R
+
+and with the filter's covariance P the smoothed state is x + P_s η with P_s = (I + P N)⁻¹ P. No covariance is inverted
+(the predicted one is singular: some states are known), and nothing is subtracted, as P − P Λ P would be in the
+equivalent Bryson-Frazier form: with a wide prior that difference loses the error bars altogether. Each product with an
+inverse is a row of Joseph-form updates: noise enters N as measurements enter P.
+(Fraser & Potter, "The optimum linear smoother as a combination of two optimum linear filters", IEEE Trans. AC 14(4),
+1969.)
+"""
+
+# pyright: reportArgumentType=false, reportAssignmentType=false, reportReturnType=false, reportConstantRedefinition=false
+# (an element of an array is a plain number here: numba compiles it, numpy's types do not know)
+
+from __future__ import annotations
+
+import math
+
+from ..arrays import FloatArray, TimeArray
+from ..compiled import compiled, compiled_apart
+from ..model.closed import transition
+from .axis import OFFSET, POSITION, RATE, Model, Sensors, joseph, observation
+from .events import Events, Results
+from .forward import INTERVAL, History, Outputs
+
+_NOTHING = 1e-15  # of a pivot, below which it is rounding
+
+
+@compiled_apart
+def smooth(
+    model: Model,
+    sensors: Sensors,
+    events: Events,
+    results: Results,
+    history: History,
+    origin: int,
+    times: TimeArray,
+    room: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    outputs: Outputs,
+) -> None:
+    """Replace filtered estimates by those that know every measurement.
+
+    Args:
+        model: The axes.
+        sensors: The sensors.
+        events: What the filter was given.
+        results: Its innovations.
+        history: What it did, with the states at ``times``.
+        origin: Where it began, int64 ns.
+        times: Of the estimates, int64 ns, ascending.
+        room: η (2, s), N (2, s, s), vectors (4, s) and a factor (s + 1, s) to compute in.
+        outputs: Gets the estimates.
+    """
+    eta, N, work, factor = room
+    for axis in range(len(model.order)):
+        states, n = model.states[axis], len(times) - 1
+        for i in range(states):
+            eta[0, i] = 0.0
+            for j in range(states):
+                N[0, i, j] = 0.0
+        entry = history.first[axis] + history.used[axis] - 1
+        until = history.time[entry] if entry >= history.first[axis] else origin
+        while n >= 0 and times[n] >= until:
+            smoothed_estimate(states, axis, n, history, eta, N, 0, work, factor, outputs)
+            n -= 1
+        while entry >= history.first[axis]:
+            until = history.time[entry]
+            start = history.time[entry - 1] if entry > history.first[axis] else origin
+            if history.row[entry] == INTERVAL:
+                q, d = history.noise[entry], history.drift[entry]
+                while n >= 0 and times[n] >= start:
+                    for i in range(states):
+                        eta[1, i] = eta[0, i]
+                        for j in range(states):
+                            N[1, i, j] = N[0, i, j]
+                    over_interval(model, axis, eta, N, 1, until - times[n], q, d, work)
+                    smoothed_estimate(states, axis, n, history, eta, N, 1, work, factor, outputs)
+                    n -= 1
+                over_interval(model, axis, eta, N, 0, until - start, q, d, work)
+            else:
+                over_update(model, sensors, events, results, history, axis, entry, eta, N, work)
+            entry -= 1
+
+
+@compiled
+def over_update(
+    model: Model,
+    sensors: Sensors,
+    events: Events,
+    results: Results,
+    history: History,
+    axis: int,
+    entry: int,
+    eta: FloatArray,
+    N: FloatArray,
+    work: FloatArray,
+) -> None:
+    """η[0] and N[0] over an update, backward."""
+    states, row = model.states[axis], history.row[entry]
+    observation(sensors, axis, events.source[row], states, work)
+    nu, R = results.innovation[row, axis], history.noise[entry]
+    for i in range(states):
+        for j in range(states):
+            eta[0, i] += N[0, i, j] * history.gain[entry, j] * nu
+        eta[0, i] += work[0, i] * nu / R
+    for i in range(states):
+        for j in range(states):
+            N[0, i, j] += work[0, i] * work[0, j] / R
+    through_noise(eta, N, 0, states, OFFSET, math.sqrt(history.drift[entry]), 0.0, work)  # what re-acquiring added
+
+
+@compiled
+def over_interval(
+    model: Model, axis: int, eta: FloatArray, N: FloatArray, at: int, ns: int, q: float, d: float, work: FloatArray
+) -> None:
+    """η[at] and N[at] over an interval, backward: through its noise, one independent part at a time, then by Fᵀ."""
+    dt, states = ns / 1e9, model.states[axis]
+    f11, f12, f21, f22, q11, q12, q22 = transition(model.order[axis], model.constants, axis, dt)
+    first = math.sqrt(q * q11)
+    both = q * q12 / first if first > 0.0 else 0.0
+    through_noise(eta, N, at, states, POSITION, first, both, work)
+    through_noise(eta, N, at, states, RATE, math.sqrt(max(q * q22 - both * both, 0.0)), 0.0, work)
+    through_noise(eta, N, at, states, OFFSET, math.sqrt(d * dt), 0.0, work)
+    a, b = eta[at, 0], eta[at, 1]
+    eta[at, 0], eta[at, 1] = f11 * a + f21 * b, f12 * a + f22 * b
+    a, b, c = N[at, 0, 0], N[at, 0, 1], N[at, 1, 1]
+    u, w = f11 * a + f21 * b, f11 * b + f21 * c
+    N[at, 0, 0] = u * f11 + w * f21
+    N[at, 0, 1] = N[at, 1, 0] = u * f12 + w * f22
+    N[at, 1, 1] = (f12 * a + f22 * b) * f12 + (f12 * b + f22 * c) * f22
+    for j in range(OFFSET, states):
+        a, b = N[at, 0, j], N[at, 1, j]
+        N[at, 0, j] = N[at, j, 0] = f11 * a + f21 * b
+        N[at, 1, j] = N[at, j, 1] = f12 * a + f22 * b
+
+
+@compiled
+def through_noise(
+    eta: FloatArray, N: FloatArray, at: int, states: int, enters: int, first: float, second: float, work: FloatArray
+) -> None:
+    """η[at] and N[at] through unit noise that enters state ``enters`` by ``first`` and the next one by ``second``."""
+    if first == 0.0 and second == 0.0:
+        return
+    for i in range(states):
+        work[0, i] = 0.0
+    work[0, enters] = first
+    seen = first * eta[at, enters]
+    if second != 0.0:
+        work[0, enters + 1] = second
+        seen += second * eta[at, enters + 1]
+    joseph(N, at, states, 1.0, work)
+    for i in range(states):
+        eta[at, i] -= work[1, i] * seen
+
+
+@compiled
+def smoothed_estimate(
+    states: int,
+    axis: int,
+    n: int,
+    history: History,
+    eta: FloatArray,
+    N: FloatArray,
+    at: int,
+    work: FloatArray,
+    L: FloatArray,
+    outputs: Outputs,
+) -> None:
+    """P_s = (I + P N)⁻¹ P and x_s = x + P_s η, one column of N = L Lᵀ at a time: wide priors would cancel in P_s η."""
+    x, P = history.x[axis], history.P[axis]
+    root(N, eta, at, states, L, work[3])
+    for k in range(states):
+        nu = L[states, k]
+        for i in range(states):
+            work[0, i] = L[i, k]
+        joseph(P, n, states, 1.0, work)
+        for i in range(states):
+            x[n, i] += work[1, i] * nu
+        for m in range(k + 1, states):
+            for i in range(states):
+                L[states, m] -= L[i, m] * work[1, i] * nu
+    variance = P[n, POSITION, POSITION] + 2.0 * P[n, POSITION, OFFSET] + P[n, OFFSET, OFFSET]
+    outputs.position[axis, n] = x[n, POSITION] + x[n, OFFSET]
+    outputs.position_sd[axis, n] = math.sqrt(max(variance, 0.0))
+    outputs.offset[axis, n] = x[n, OFFSET]
+    outputs.offset_sd[axis, n] = math.sqrt(max(P[n, OFFSET, OFFSET], 0.0))
+
+
+@compiled
+def root(N: FloatArray, eta: FloatArray, at: int, states: int, L: FloatArray, left: FloatArray) -> None:
+    """N[at] = L Lᵀ and η[at] = L y: as columns, measurements with unit noise; y is the last row of L (s + 1, s).
+
+    The state with the largest share of its own information left comes first: N says nothing of some states, or of
+    their differences, and in another order a pivot of rounding would be divided by. ``left`` (s,) is room for what is
+    left of the diagonal.
+    """
+    for k in range(states):
+        left[k] = N[at, k, k]
+        for i in range(states + 1):
+            L[i, k] = 0.0
+    for k in range(states):
+        pivot, most = -1, _NOTHING
+        for i in range(states):
+            if left[i] > most * N[at, i, i]:
+                pivot, most = i, left[i] / N[at, i, i]
+        if pivot < 0:
+            return
+        L[pivot, k] = math.sqrt(left[pivot])
+        left[pivot] = 0.0
+        rest = eta[at, pivot]
+        for m in range(k):
+            rest -= L[states, m] * L[pivot, m]
+        L[states, k] = rest / L[pivot, k]
+        for i in range(states):
+            if left[i] > 0.0:
+                rest = N[at, i, pivot]
+                for m in range(k):
+                    rest -= L[i, m] * L[pivot, m]
+                L[i, k] = rest / L[pivot, k]
+                left[i] -= L[i, k] * L[i, k]

@@ -1,0 +1,277 @@
+"""One segment of a recorded run as events: which rows command the arm, and what each measurement is before filtering.
+
+Delays and latencies only say when events are, so another configuration's times need no new table
+(:meth:`Segment.events`); gains and noise are the filter's alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray
+from ..errors import RunError, UnknownNameError
+from ..filter.events import COMMAND, Events, classify_all, joined
+from ..filter.outcome import ABSENT, Outcome
+from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
+from ..logs.defects import said_before, tell
+from ..logs.frames import CARTESIAN
+from ..logs.grid import regular_grid
+from ..logs.run import Run, Source
+from ..model.arm import ArmModel
+from .config import FusionConfig
+from .setup import at_rest, filter_model, filter_sensors
+
+LONGEST_TAIL_NS = 3_600_000_000_000  # measurements this long after the last command no longer belong to the run
+_MOST_ESTIMATES = 10_000_000
+
+_REASONS: Mapping[Outcome, str] = {
+    Outcome.DUPLICATE: "the stamp and values of an earlier row",
+    Outcome.BEFORE_START: "a time before the first command",
+    Outcome.TOO_LATE: "a stamp more than 1 s behind an earlier one",
+}
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One segment of a run, ready to be filtered.
+
+    Attributes:
+        axes: The commanded axes.
+        sensors: The sensors, the configured ones first in their order.
+        origin: The first command, int ns: time 0 of the run.
+        start: The level u₀ [m] of each axis.
+        commands: When commands were given, int64 ns, ascending, (n,).
+        command_rows: Rows of the commands by stamp, with time = stamp.
+        measurement_rows: Rows of all sensors, one sensor after the other, each by stamp.
+        notes: Every anomaly once: how many, where first.
+    """
+
+    axes: tuple[str, ...]
+    sensors: tuple[str, ...]
+    origin: int
+    start: Mapping[str, float]
+    commands: TimeArray
+    command_rows: Events
+    measurement_rows: Events
+    notes: tuple[str, ...]
+
+    def events(self, config: FusionConfig) -> tuple[Events, IntArray]:
+        """The events in their total order, by the delays and latencies of ``config``.
+
+        Returns:
+            The events; and of each measurement, in this order, its place among ``measurement_rows``, −1 for a command.
+        """
+        parts = delayed(self.command_rows, [round(config.arm.delay_of(axis) * 1e9) for axis in self.axes])
+        commands = sum(len(part.time) for part in parts)
+        unordered = joined([*parts, self._measured(config)])
+        order = np.argsort(unordered.time, kind="stable")  # each source is in its order: commands, then the sensors'
+        return unordered.rows(order), np.where(order < commands, -1, order - commands)
+
+    def given(self, axis: str) -> tuple[TimeArray, FloatArray]:
+        """Stamps [int64 ns] and values [m] of the commands of one axis, (n,)."""
+        number, rows = self.axes.index(axis), self.command_rows
+        chosen = rows.known[:, number] == Outcome.FUSED
+        return rows.stamp[chosen], rows.value[chosen, number]
+
+    def highest_speed(self, period: float) -> float:
+        """Highest commanded speed on any axis [m/s]."""
+        steps = [np.diff(self.given(axis)[1], prepend=self.start[axis]) for axis in self.axes]
+        return max(float(np.abs(step).max(initial=0.0)) for step in steps) / period
+
+    def end(self, config: FusionConfig) -> int:
+        """Where an even grid of estimates ends, int ns: with the last command or measurement.
+
+        Measurements an hour after the last command are on another clock.
+        """
+        rows = self._measured(config)
+        valid = rows.time[(rows.known == Outcome.FUSED).any(axis=1)]
+        return int(valid[valid <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
+
+    def _measured(self, config: FusionConfig) -> Events:
+        rows = self.measurement_rows
+        latency = [config.sensors[name].latency if name in config.sensors else 0.0 for name in self.sensors]
+        return rows._replace(time=_valid(rows.stamp, np.rint(np.array(latency) * 1e9).astype(np.int64)[rows.source]))
+
+
+def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) -> Segment:
+    """Put a segment of a recorded run into a table of events.
+
+    Args:
+        run: One segment of a recorded run.
+        config: Arm and sensors.
+        sensors: Which of the configured sensors to use; all for None.
+
+    Raises:
+        PumafuseError: The run commands an axis that the arm has not, or a chosen sensor is not configured.
+    """
+    arm, notes = config.arm, list(run.notes)
+    for axis in run.axes:
+        if axis in CARTESIAN and axis not in arm.axes:
+            raise RunError(f"{run.command.label}: commands are in x, y, z; give a [frame] in run.toml or fusion.toml")
+        if axis not in arm.axes:
+            raise UnknownNameError(
+                f"{run.command.label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes
+            )
+    for name, source in run.sensors.items():
+        if any(axis in CARTESIAN and axis not in run.axes for axis in source.values):
+            raise RunError(
+                f"sensor '{name}' is in x, y, z, the commands are not; give a [frame], and them in x, y, z too"
+            )
+    rows = command_rows(run, arm, notes)
+    commands = np.unique(rows.stamp[(rows.known == Outcome.FUSED).any(axis=1)])
+    start = {axis: run.start.get(axis, _first_value(rows, number)) for number, axis in enumerate(run.axes)}
+    chosen = config.sensor_names(sensors)
+    named = tuple(name for name in chosen if name in run.sensors)
+    others = tuple(name for name in run.sensors if name not in config.sensors) if sensors is None else ()
+    silent = [name for name in chosen if name not in run.sensors]
+    notes.extend(f"sensor '{name}' of the configuration has no measurements in this run" for name in silent)
+    origin = int(commands[0])
+    parts = [_measurement_rows(run, config, name, number, origin, notes) for number, name in enumerate(named + others)]
+    measured = joined([Events.empty(len(run.axes)), *parts])
+    return Segment(run.axes, named + others, origin, start, commands, rows, measured, tuple(notes))
+
+
+def output_times(segment: Segment, config: FusionConfig, rate: float | None) -> TimeArray:
+    """When estimates are asked for: at each command, or on an even grid of ``rate`` [Hz] from the first command on."""
+    if rate is None:
+        return segment.commands
+    span = segment.end(config) - segment.origin
+    count = int(span / 1e9 * rate) + 2
+    if count > _MOST_ESTIMATES:
+        raise RunError(
+            f"{rate:g} estimates a second over {span / 86400e9:.1f} days are {count:.1e} estimates, more than"
+            f" {_MOST_ESTIMATES:.0e}: a lower --rate? Or are not all stamps on one clock?"
+        )
+    grid = np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
+    return segment.origin + grid[grid <= span]
+
+
+def command_rows(run: Run, arm: ArmModel, notes: list[str]) -> Events:
+    """The stamped command rows of a segment in order, each value classified.
+
+    Args:
+        run: One segment of a recorded run.
+        arm: Its period T says what a repetition is, and what grid the stamps follow where the run's clock is regular.
+        notes: Gets a sentence on everything that is wrong with the rows.
+
+    Raises:
+        RunError: The run's clock is regular and the stamps do not follow ticks of T.
+    """
+    source, period = run.command, arm.update_period
+    missing = source.stamp == NO_STAMP
+    tell(notes, source.label, missing, "no stamp: not used")
+    tell(notes, source.label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
+    kept = np.flatnonzero(~missing)
+    kept = kept[np.argsort(source.stamp[kept], kind="stable")]
+    rows = _table(source, run.axes, kept, COMMAND)._replace(time=source.stamp[kept])
+    rows = _classified(rows, FusionConfig(arm=arm), run.axes, (), int(rows.time[0]), np.zeros(len(kept), np.bool_))
+    tell(notes, source.label, said_before(source) & ~missing, "the stamp and values of an earlier row: duplicate")
+    for number, axis in enumerate(run.axes):
+        hollow = np.zeros(len(source.stamp), dtype=np.bool_)
+        hollow[kept] = rows.known[:, number] == Outcome.INVALID
+        tell(notes, source.label, hollow, f"no finite {axis} command: not used")
+    if run.clock == "stamps":
+        return rows
+    used = (rows.known == Outcome.FUSED).any(axis=1)
+    distinct, place = np.unique(rows.stamp[used], return_inverse=True)
+    grid, note = regular_grid(distinct, period, source.label)
+    notes.extend([] if note is None else [note])
+    rows = rows.rows(np.flatnonzero(used))
+    return rows._replace(time=grid[place], stamp=grid[place])
+
+
+def delayed(rows: Events, delay: list[int]) -> list[Events]:
+    """Commands by when they act: an event for each distinct delay.
+
+    Args:
+        rows: Commands by stamp.
+        delay: Td of each axis [ns].
+    """
+    found: list[Events] = []
+    for one in sorted(set(delay)):
+        known = np.where(np.array(delay) == one, rows.known, ABSENT).astype(np.uint8)
+        given = np.flatnonzero((known == Outcome.FUSED).any(axis=1))
+        found.append(rows._replace(time=rows.stamp + one, known=known).rows(given))
+    return found
+
+
+def as_commanded(run: Run, arm: ArmModel) -> Source:
+    """The rows of a run's commands as they are believed: as logged, or where the run says so on the grid of T.
+
+    Raises:
+        RunError: The stamps do not follow ticks of T.
+    """
+    if run.clock == "stamps":
+        return run.command
+    rows = command_rows(run, arm, [])
+    value = np.where(rows.known == Outcome.FUSED, rows.value, np.nan)
+    return Source(rows.stamp, dict(zip(run.axes, value.T, strict=True)), run.command.label)
+
+
+def _first_value(rows: Events, axis: int) -> float:
+    return float(rows.value[np.flatnonzero(rows.known[:, axis] == Outcome.FUSED)[0], axis])
+
+
+def _measurement_rows(
+    run: Run, config: FusionConfig, name: str, number: int, origin: int, notes: list[str]
+) -> Events:
+    """One sensor's rows by stamp, each value classified."""
+    source, sensor = run.sensors[name], config.sensors.get(name)
+    label, latency = source.told_as(name), 0 if sensor is None else round(sensor.latency * 1e9)
+    order = np.argsort(source.stamp, kind="stable")
+    rows = _table(source, run.axes, order, 0)
+    rows = rows._replace(time=_valid(rows.stamp, latency))
+    too_late = behind(source.stamp) > TOLERATED_STEP_BACK_NS
+    rows = _classified(rows, config, run.axes, (name,), origin, too_late[order])
+    rows = rows._replace(source=np.full_like(rows.source, number))
+    known = np.empty_like(rows.known)
+    known[order] = rows.known
+    tell(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
+    if sensor is None:
+        tell(notes, label, np.ones(len(known), np.bool_), "no sensor of this name in the configuration: unknown")
+        return rows
+    tell(notes, label, source.stamp == NO_STAMP, f"no stamp: {Outcome.INVALID.word}")
+    for kind, reason in _REASONS.items():
+        tell(notes, label, (known == kind).any(axis=1), f"{reason}: {kind.word}")
+    for number, axis in enumerate(run.axes):
+        if axis not in source.values:
+            continue
+        if sensor.sd_of(axis) is None:
+            notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
+            continue
+        hollow = (known[:, number] == Outcome.INVALID) & (source.stamp != NO_STAMP)
+        tell(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
+    return rows
+
+
+def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int) -> Events:
+    """Rows of a source in an order, everything that it gives for the filter to decide on."""
+    stamp, shape = source.stamp[order], (len(order), len(axes))
+    value, known = np.full(shape, np.nan), np.full(shape, ABSENT, dtype=np.uint8)
+    spread = np.ones(shape if source.spread else (0, len(axes)))
+    for axis, column in source.values.items():
+        at = axes.index(axis)
+        value[:, at], known[:, at] = column[order], Outcome.FUSED
+        if axis in source.spread:
+            spread[:, at] = source.spread[axis][order]
+    return Events(stamp, np.full(len(order), number, dtype=np.int16), stamp, value, spread, known)
+
+
+def _classified(
+    rows: Events, config: FusionConfig, axes: tuple[str, ...], sensors: tuple[str, ...], origin: int, too_late: BoolArray
+) -> Events:
+    """Rows of one source with every value classified."""
+    none = [()] * len(axes)
+    known, start = np.empty_like(rows.known), dict.fromkeys(axes, 0.0)
+    model, filtered = filter_model(config, axes, none), filter_sensors(config, sensors, axes, none)
+    state = at_rest(config, axes, len(sensors), none, origin, start)
+    classify_all(model, filtered, rows, state, origin, too_late, known)
+    return rows._replace(known=known)
+
+
+def _valid(stamp: TimeArray, latency: IntArray | int) -> TimeArray:
+    """When measurements are valid, int64 ns; ``NO_STAMP`` without a stamp."""
+    return np.where(stamp == NO_STAMP, NO_STAMP, stamp - latency)
