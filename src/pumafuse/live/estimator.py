@@ -275,7 +275,9 @@ class LiveEstimator:
             self._doubtful = 0
             who = "a command" if clock.ahead_of is None else f"sensor '{clock.ahead_of}'"
             ahead = (newest - stamp) / 1e9
-            self._log.write(who, f"{who} ran {ahead:.3f} s ahead of the others: taken back; are all stamps of one clock?")
+            self._log.write(
+                who, f"{who} ran {ahead:.3f} s ahead of the others: taken back; are all stamps of one clock?"
+            )
             if clock.low <= stamp <= clock.high:
                 clock.settle(max(stamp, clock.sure))
                 return None

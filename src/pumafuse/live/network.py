@@ -75,9 +75,9 @@ def source(address: Address, listen: str | None, allow: list[str], notify: Calla
         return TcpClient(address, notify)
     place, allowed = listener(address, listen, allow)
     if listen is not None:
+        accepted = f"accepts {', '.join(allow)} on {host_port(*place[1])}"
         notify(
-            f"{address.kind}: accepts {', '.join(allow)} on {host_port(*place[1])}, neither encrypted nor authenticated;"
-            " a tunnel should carry what leaves the cell"
+            f"{address.kind}: {accepted}, neither encrypted nor authenticated; a tunnel should carry what leaves the cell"
         )
     return (UdpListener if address.kind == "udp" else TcpListener)(place, allowed, notify)
 

@@ -17,7 +17,7 @@ class RateLimitedLog:
         self._counts: dict[str, int] = {}
 
     def write(self, kind: str, text: str) -> None:
-        """Count a message of a ``kind`` and pass it on if it is due, as plain text: it may hold what a stranger sent."""
+        """Count a message of a ``kind`` and pass it on if it is due; a sender's text in it is made harmless."""
         kind = kind if kind in self._counts or len(self._counts) < _MOST_KINDS else "others"
         count = self._counts[kind] = self._counts.get(kind, 0) + 1
         if count == 10 ** (len(str(count)) - 1):
