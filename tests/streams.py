@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.arrays import NO_STAMP
-from pumafuse.live.lines import Lines
 from pumafuse.live.stream import Stream
+from pumafuse.live.wire import Lines
 
 MS = 1_000_000
 T = 28 * MS

@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from .identification.identify import Identification, identify
     from .identification.trials import StepTrials, TrialsError
     from .identification.verify import AxisVerification, verify
-    from .live.answers import AxisNow, LiveEstimate, UpdateResult
     from .live.estimator import LiveEstimator
-    from .live.health import Health, SensorHealth
+    from .live.results import AxisNow, Health, LiveEstimate, SensorHealth, UpdateResult
     from .logs.run import Run
     from .model.arm import ArmModel, AxisModel, Gain, Validity
     from .model.discrete import DiscreteModel, discretize
@@ -35,7 +34,7 @@ _HOME = {
     "ArmModel": "model.arm",
     "AxisEstimate": "fusion.estimates",
     "AxisModel": "model.arm",
-    "AxisNow": "live.answers",
+    "AxisNow": "live.results",
     "AxisVerification": "identification.verify",
     "ConfigError": "errors",
     "DiscreteModel": "model.discrete",
@@ -43,9 +42,9 @@ _HOME = {
     "FirstOrder": "model.plants",
     "FusionConfig": "fusion.config",
     "Gain": "model.arm",
-    "Health": "live.health",
+    "Health": "live.results",
     "Identification": "identification.identify",
-    "LiveEstimate": "live.answers",
+    "LiveEstimate": "live.results",
     "LiveEstimator": "live.estimator",
     "Outcome": "filter.outcome",
     "Process": "fusion.config",
@@ -58,12 +57,12 @@ _HOME = {
     "Score": "fusion.score",
     "SecondOrder": "model.plants",
     "Sensor": "fusion.config",
-    "SensorHealth": "live.health",
+    "SensorHealth": "live.results",
     "Simulated": "simulation.simulate",
     "Start": "fusion.config",
     "StepTrials": "identification.trials",
     "Summary": "fusion.summary",
-    "UpdateResult": "live.answers",
+    "UpdateResult": "live.results",
     "TrialsError": "identification.trials",
     "TuneError": "tuning.learnable",
     "Tuning": "tuning.tune",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from pumafuse.live.address import Address, bound, receiver
+from pumafuse.live.address import Address, listener, receiver
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_receivers_have_a_host_and_a_port(text: str) -> None:
 @pytest.mark.parametrize("host", ["", "127.0.0.1", "127.9.9.9", "localhost", "[::1]"])
 def test_loopback_hears_everybody_there(host: str) -> None:
     """Without a word, a listener is on loopback, where nobody else can be."""
-    (_, (found, port)), allowed = bound(Address.parse(f"udp://{host}:5005"), None, [])
+    (_, (found, port)), allowed = listener(Address.parse(f"udp://{host}:5005"), None, [])
     assert found.startswith("127.") or found == "::1"
     assert port == 5005
     assert allowed("127.0.0.1")
@@ -75,17 +75,17 @@ def test_loopback_hears_everybody_there(host: str) -> None:
 def test_no_other_address_without_a_word(host: str) -> None:
     """What would open a machine to a network has to be said twice."""
     with pytest.raises(pf.ConfigError, match=r"--listen .* --allow"):
-        bound(Address.parse(f"tcp-listen://{host}:5005"), None, [])
+        listener(Address.parse(f"tcp-listen://{host}:5005"), None, [])
 
 
 def test_listening_elsewhere_hears_whom_it_was_told() -> None:
     """The networks that are named and nobody else; an IPv4 address within IPv6 is the IPv4 address."""
-    place, allowed = bound(Address.parse("udp://:5005"), "0.0.0.0", ["10.1.0.0/16", "192.168.7.7"])
+    place, allowed = listener(Address.parse("udp://:5005"), "0.0.0.0", ["10.1.0.0/16", "192.168.7.7"])
     assert place[1] == ("0.0.0.0", 5005)
     heard = ["10.1.2.3", "192.168.7.7", "::ffff:10.1.2.3"]
     refused = ["10.2.2.3", "192.168.7.8", "127.0.0.1", "::1", "::ffff:10.2.2.3", "fe80::1%eth0"]
     assert [allowed(host) for host in heard + refused] == [True] * 3 + [False] * 6
-    assert not bound(Address.parse("udp://:5005"), "0.0.0.0", [])[1]("127.0.0.1")
+    assert not listener(Address.parse("udp://:5005"), "0.0.0.0", [])[1]("127.0.0.1")
 
 
 @pytest.mark.parametrize(
@@ -100,4 +100,4 @@ def test_listening_elsewhere_hears_whom_it_was_told() -> None:
 def test_what_cannot_be_listened_on(source: str, listen: str, allow: str, said: str) -> None:
     """One line says what is wrong."""
     with pytest.raises(pf.ConfigError, match=said):
-        bound(Address.parse(source), listen, [allow])
+        listener(Address.parse(source), listen, [allow])

@@ -26,7 +26,7 @@ def test_a_stamp_within_the_window_is_here_and_one_before_it_is_behind() -> None
 def test_a_jump_ahead_is_believed_until_it_is_contradicted() -> None:
     """One stamp 30 s ahead, then the old time: back to it, and all after it in doubt is to be forgotten."""
     clock = at(10.0)
-    assert clock.judge(40 * SECOND, source="tracker") is Verdict.HERE
+    assert clock.judge(40 * SECOND, source="tracker") is Verdict.ACCEPTED
     assert (clock.newest, clock.sure) == (40 * SECOND, 10 * SECOND)
     assert clock.judge(10 * SECOND + T, source=None) is Verdict.CONTRADICTED
     assert (clock.newest, clock.sure, clock.bound) == (10 * SECOND, 10 * SECOND, 12 * SECOND)
@@ -36,13 +36,13 @@ def test_a_jump_ahead_is_believed_until_it_is_contradicted() -> None:
 def test_after_a_pause_of_all_time_goes_on(gap: int) -> None:
     """Two commands after a pause, or a second of measurements, end the doubt."""
     clock = at(0.0)
-    assert clock.judge(gap * SECOND, source=None) is Verdict.HERE
+    assert clock.judge(gap * SECOND, source=None) is Verdict.ACCEPTED
     assert clock.sure == 0
-    assert clock.judge(gap * SECOND + T, source=None) is Verdict.HERE
+    assert clock.judge(gap * SECOND + T, source=None) is Verdict.ACCEPTED
     assert clock.sure == gap * SECOND + T
     clock = at(0.0)
     for step in range(11):
-        assert clock.judge(gap * SECOND + step * SECOND // 10, source="tracker") is Verdict.HERE
+        assert clock.judge(gap * SECOND + step * SECOND // 10, source="tracker") is Verdict.ACCEPTED
     assert clock.sure == (gap + 1) * SECOND
 
 
@@ -50,7 +50,7 @@ def test_events_that_are_always_far_apart_are_all_believed() -> None:
     """A command every 10 s, and nothing between."""
     clock = at(0.0)
     for step in range(1, 20):
-        assert clock.judge(10 * step * SECOND, source=None) is Verdict.HERE
+        assert clock.judge(10 * step * SECOND, source=None) is Verdict.ACCEPTED
         assert clock.newest == 10 * step * SECOND
 
 
@@ -60,8 +60,8 @@ def test_three_commands_of_another_time_are_a_clock_set_anew(to: int) -> None:
     clock = at(100.0)
     stamps = [(100 + to) * SECOND + step * T for step in range(3)]
     verdicts = [clock.judge(stamp, source=None) for stamp in stamps]
-    away = Verdict.BEHIND if to < 0 else Verdict.BEYOND
-    assert verdicts == [away, away, Verdict.ANEW]
+    away = Verdict.BEHIND if to < 0 else Verdict.AHEAD
+    assert verdicts == [away, away, Verdict.RESET]
 
 
 def test_a_command_of_the_right_time_clears_what_was_said_against_it() -> None:
@@ -69,7 +69,7 @@ def test_a_command_of_the_right_time_clears_what_was_said_against_it() -> None:
     clock = at(100.0)
     for step in range(2):
         assert clock.judge(50 * SECOND + step * T, source=None) is Verdict.BEHIND
-    clock.here()
+    clock.confirm()
     for step in range(2, 4):
         assert clock.judge(50 * SECOND + step * T, source=None) is Verdict.BEHIND
 
@@ -79,7 +79,7 @@ def test_measurements_alone_never_set_the_clock() -> None:
     clock = at(100.0)
     for step in range(1000):
         assert clock.judge(50 * SECOND + step * T, source="tracker") is Verdict.BEHIND
-        assert clock.judge(31_536_000 * SECOND + step * T, source="tracker") is Verdict.BEYOND
+        assert clock.judge(31_536_000 * SECOND + step * T, source="tracker") is Verdict.AHEAD
 
 
 CONFIG = pf.FusionConfig(

@@ -10,11 +10,9 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 import pumafuse as pf
-from pumafuse.live import tcp, udp
+from pumafuse.live import network
 from pumafuse.live.address import Address
-from pumafuse.live.network import Source
-from pumafuse.live.tcp import Client, Server
-from pumafuse.live.udp import Out, Udp
+from pumafuse.live.network import Source, TcpClient, TcpListener, UdpListener, UdpSender
 
 LOOPBACK = (socket.AF_INET, ("127.0.0.1", 0))
 
@@ -59,7 +57,7 @@ class TestUdp:
     def test_datagrams_are_lines(self) -> None:
         """One line or several a datagram, in their order; silence is no lines."""
         said: list[str] = []
-        source = Udp(LOOPBACK, everybody, said.append)
+        source = UdpListener(LOOPBACK, everybody, said.append)
 
         async def work() -> None:
             assert await source.get() == []
@@ -70,13 +68,13 @@ class TestUdp:
             assert [float(line) for line in lines if line] == [half / 2 for half in range(200)]
 
         running(source, work)
-        assert "100 datagrams taken in, 0 lost" in source.told()
+        assert "100 datagrams taken in, 0 lost" in source.summary()
 
     def test_the_oldest_are_let_go_and_counted(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """When too many wait, what remains is the newest."""
-        monkeypatch.setattr(udp, "_MOST_WAITING", 10)
+        monkeypatch.setattr(network, "_MOST_DATAGRAMS", 10)
         said: list[str] = []
-        source = Udp(LOOPBACK, everybody, said.append)
+        source = UdpListener(LOOPBACK, everybody, said.append)
 
         async def work() -> None:
             with sender() as ours:
@@ -86,13 +84,13 @@ class TestUdp:
             assert [int(line) for line in lines] == list(range(40, 50))
 
         running(source, work)
-        assert "10 datagrams taken in, 40 lost" in source.told()
+        assert "10 datagrams taken in, 40 lost" in source.summary()
 
     def test_large_ones_wait_only_up_to_a_size(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Sixty datagrams of 10 kB where 50 kB may wait."""
-        monkeypatch.setattr(udp, "_MOST_BYTES", 50_000)
+        monkeypatch.setattr(network, "_MOST_BYTES", 50_000)
         said: list[str] = []
-        source = Udp(LOOPBACK, everybody, said.append)
+        source = UdpListener(LOOPBACK, everybody, said.append)
 
         async def work() -> None:
             with sender() as ours:
@@ -104,13 +102,13 @@ class TestUdp:
             assert len(source._waiting) == 5
 
         running(source, work)
-        assert "5 datagrams taken in, 55 lost" in source.told()
+        assert "5 datagrams taken in, 55 lost" in source.summary()
 
     @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not tell what they dropped")
     def test_what_the_system_drops_is_counted(self) -> None:
         """Many thousands while nobody takes them in: came and lost together are what was sent."""
         said: list[str] = []
-        source = Udp(LOOPBACK, everybody, said.append)
+        source = UdpListener(LOOPBACK, everybody, said.append)
         sent = 60_000
 
         async def work() -> None:
@@ -122,8 +120,8 @@ class TestUdp:
             while await source.get():
                 pass
             assert source._lost() > 0
-            assert source._came + source._lost() == sent  # nothing was let go here
-            source._next_look = 0.0
+            assert source._received + source._lost() == sent  # nothing was let go here
+            source._next_report = 0.0
             await source.get()
 
         running(source, work)
@@ -132,7 +130,7 @@ class TestUdp:
     def test_only_who_is_allowed_is_heard(self) -> None:
         """Others are counted, and said."""
         said: list[str] = []
-        source = Udp(LOOPBACK, lambda host: host == "127.0.0.2", said.append)
+        source = UdpListener(LOOPBACK, lambda host: host == "127.0.0.2", said.append)
 
         async def work() -> None:
             for host in ("127.0.0.1", "127.0.0.2"):
@@ -141,13 +139,13 @@ class TestUdp:
             assert await until(source, bool) == [b"127.0.0.2"]
 
         running(source, work)
-        assert "1 datagrams taken in, 0 lost, 1 refused" in source.told()
+        assert "1 datagrams taken in, 0 lost, 1 refused" in source.summary()
         assert any("127.0.0.1, which --allow does not name" in text for text in said)
 
     def test_a_place_that_is_taken_is_said(self) -> None:
         """Two cannot listen at one port."""
         with sender() as ours:
-            source = Udp((socket.AF_INET, ours.getsockname()), everybody, print)
+            source = UdpListener((socket.AF_INET, ours.getsockname()), everybody, print)
             with pytest.raises(pf.RunError, match="in use"):
                 asyncio.run(source.start())
 
@@ -156,7 +154,7 @@ class TestServer:
     def test_lines_of_several_connections(self) -> None:
         """Each connection's lines are whole and in order, however they are cut; a last one without its end counts."""
         said: list[str] = []
-        source = Server(LOOPBACK, everybody, said.append)
+        source = TcpListener(LOOPBACK, everybody, said.append)
 
         async def send(name: int) -> None:
             _, writer = await asyncio.open_connection("127.0.0.1", port_of(said))
@@ -178,12 +176,12 @@ class TestServer:
                 await source.get()
 
         running(source, work)
-        assert "connections: 3, 0 open" in source.told()
+        assert "connections: 3, 0 open" in source.summary()
 
     def test_many_short_connections_one_after_another(self) -> None:
         """Each gives a line and is closed at once: all lines come, none is refused."""
         said: list[str] = []
-        source = Server(LOOPBACK, everybody, said.append)
+        source = TcpListener(LOOPBACK, everybody, said.append)
 
         async def send() -> None:
             for number in range(1000):
@@ -198,12 +196,12 @@ class TestServer:
             await task
 
         running(source, work)
-        assert "refused" not in source.told()
+        assert "refused" not in source.summary()
 
     def test_a_fast_sender_waits(self) -> None:
         """Nobody takes lines in: the sender is stopped after some MB, the queue stays short; then nothing is lost."""
         said: list[str] = []
-        source = Server(LOOPBACK, everybody, said.append)
+        source = TcpListener(LOOPBACK, everybody, said.append)
         total, wide = 600_000, b"x" * 90
 
         async def work() -> None:
@@ -222,7 +220,7 @@ class TestServer:
                 before = sent[0]
                 await asyncio.sleep(0.5)
             assert before < total - 1
-            assert source._pieces.qsize() == tcp._MOST_PIECES
+            assert source._pieces.qsize() == network._MOST_PIECES
             expected = 0
             while expected < total:
                 for line in await source.get():
@@ -234,9 +232,9 @@ class TestServer:
 
     def test_who_is_not_allowed_or_too_many_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """The connection is closed at once, counted and said."""
-        monkeypatch.setattr(tcp, "_MOST_CONNECTIONS", 2)
+        monkeypatch.setattr(network, "_MOST_CONNECTIONS", 2)
         said: list[str] = []
-        source = Server(LOOPBACK, lambda host: host != "127.0.0.3", said.append)
+        source = TcpListener(LOOPBACK, lambda host: host != "127.0.0.3", said.append)
 
         async def work() -> None:
             ends = []
@@ -254,20 +252,20 @@ class TestServer:
                 writer.close()
 
         running(source, work)
-        assert "connections: 2" in source.told()
-        assert "2 refused" in source.told()
+        assert "connections: 2" in source.summary()
+        assert "2 refused" in source.summary()
 
 
 class TestClient:
     def test_it_connects_again(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Nobody there, then a server that ends each connection in the middle of a line: tried again, no line lost."""
-        monkeypatch.setattr(tcp, "_FIRST_WAIT", 0.01)
+        monkeypatch.setattr(network, "_FIRST_WAIT", 0.01)
         with sender() as place, socket.socket() as reserved:
             del place
             reserved.bind(("127.0.0.1", 0))
             port = reserved.getsockname()[1]
         said: list[str] = []
-        source = Client(Address.parse(f"tcp://127.0.0.1:{port}"), said.append)
+        source = TcpClient(Address.parse(f"tcp://127.0.0.1:{port}"), said.append)
         count = [0]
 
         async def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -284,7 +282,7 @@ class TestClient:
             server.close()
 
         running(source, work)
-        assert "connections made: " in source.told()
+        assert "connections made: " in source.summary()
 
     def test_it_waits_longer_and_longer(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Half a second, twice that, up to half a minute."""
@@ -298,23 +296,23 @@ class TestClient:
         async def nobody(*_: object, **__: object) -> None:
             raise ConnectionRefusedError(111, "Connection refused")
 
-        monkeypatch.setattr(tcp.asyncio, "sleep", sleep)
-        monkeypatch.setattr(tcp.asyncio, "open_connection", nobody)
-        source = Client(Address.parse("tcp://127.0.0.1:9"), lambda _: None)
+        monkeypatch.setattr(network.asyncio, "sleep", sleep)
+        monkeypatch.setattr(network.asyncio, "open_connection", nobody)
+        source = TcpClient(Address.parse("tcp://127.0.0.1:9"), lambda _: None)
         with pytest.raises(asyncio.CancelledError):
-            asyncio.run(source._keep_connected())
+            asyncio.run(source._stay_connected())
         assert waits == [0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 30.0, 30.0, 30.0]
 
 
 def test_estimates_are_datagrams() -> None:
     """A line each; to a place where nobody is they go all the same."""
     with sender() as ours:
-        out = Out(f"udp://127.0.0.1:{ours.getsockname()[1]}")
+        out = UdpSender(f"udp://127.0.0.1:{ours.getsockname()[1]}")
         out([b"one\n", b"two\n"])
         assert [ours.recv(100) for _ in range(2)] == [b"one\n", b"two\n"]
     for _ in range(100):
         out([b"three\n"])
-    assert out.told() == ""
+    assert out.summary() == ""
     out([b"x" * 100_000])
     out.close()
-    assert "1 estimates could not be sent" in out.told()
+    assert "1 estimates could not be sent" in out.summary()

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
-from pumafuse.live import record, writer
+from pumafuse.live import record
 from pumafuse.live.record import Recorder
 from pumafuse.live.stream import Stream
 from pumafuse.logs.frames import Cylindrical
@@ -33,7 +33,7 @@ class Recorded:
         self.said: list[str] = []
         self.folder = folder
         self.recorder = Recorder(folder, config, start or {}, self.said.append)
-        self.live = pf.LiveEstimator(config, on_notice=self.said.append, start=start, journal=self.recorder)
+        self.live = pf.LiveEstimator(config, on_notice=self.said.append, start=start, event_log=self.recorder)
 
     def command(self, stamp: int, **axes: float) -> None:
         self.live.command(stamp, **axes)
@@ -191,7 +191,7 @@ def test_an_axis_without_a_number_is_none_of_the_run(tmp_path: Path) -> None:
 
 def test_a_header_is_written_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that is full from the first byte on, and a folder removed before it has room again."""
-    monkeypatch.setattr(writer, "_TRIED_AGAIN", 0.01)
+    monkeypatch.setattr(record, "_TRIED_AGAIN", 0.01)
     recorded, write = Recorded(tmp_path / "record"), os.write
 
     def full(*_: object) -> int:
@@ -221,7 +221,7 @@ def test_rows_that_a_run_may_not_have_are_left_out_and_counted(tmp_path: Path) -
     recorded.command(99 * T - 1_500_000_000 - 5_000_000, radial=0.57)
     recorded.go(10, begin=100 * T)
     recorded.close()
-    assert "1 left out" in recorded.recorder.told()
+    assert "1 left out" in recorded.recorder.summary()
     pf.fuse(pf.Run.read(recorded.folder), TRACKED)
 
 
@@ -257,7 +257,7 @@ def test_a_full_disk_is_said_once_a_minute_and_nothing_is_written_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk takes a few bytes of a row and then nothing for a while; when it has room again all rows are there."""
-    monkeypatch.setattr(writer, "_TRIED_AGAIN", 0.01)
+    monkeypatch.setattr(record, "_TRIED_AGAIN", 0.01)
     recorded = Recorded(tmp_path / "record")
     recorded.go(10)
     recorded.tick_until(lambda: recorded.recorder._writer.rows == 20)
@@ -309,14 +309,14 @@ def test_a_trouble_that_lasts_is_said_every_minute(tmp_path: Path, monkeypatch: 
 
 def test_rows_beyond_what_may_wait_are_lost_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that is away for long costs rows, not memory."""
-    monkeypatch.setattr(writer, "_MOST_WAITING", 1000)
+    monkeypatch.setattr(record, "_MOST_WAITING", 1000)
     recorded = Recorded(tmp_path / "record")
     recorded.go(10)
     recorded.tick_until(lambda: recorded.recorder._writer.rows == 20)
     recorded.go(100, begin=10 * T)
     recorded.tick()
     recorded.close()
-    assert "20 rows written, 200 lost" in recorded.recorder.told()
+    assert "20 rows written, 200 lost" in recorded.recorder.summary()
 
 
 def test_a_folder_that_goes_is_made_anew(tmp_path: Path) -> None:
@@ -336,7 +336,7 @@ def test_a_folder_that_goes_is_made_anew(tmp_path: Path) -> None:
 
 def test_a_parent_that_goes_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that was unmounted is not replaced by a folder of the same name on another one."""
-    monkeypatch.setattr(writer, "_TRIED_AGAIN", 0.01)
+    monkeypatch.setattr(record, "_TRIED_AGAIN", 0.01)
     disk = tmp_path / "disk"
     recorded = Recorded(disk / "record")
     recorded.go(10)

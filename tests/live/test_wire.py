@@ -8,18 +8,18 @@ import math
 import pytest
 
 import pumafuse as pf
-from pumafuse.live.wire import BadLine, Event, Wire, encode
+from pumafuse.live.wire import BadLine, Event, LineDecoder, encode
 from pumafuse.logs.frames import Cylindrical
 
-WIRE = Wire(("radial", "vertical"), framed=True)
+DECODER = LineDecoder(("radial", "vertical"), framed=True)
 
 
 def test_the_lines_of_the_design() -> None:
     """A command and a measurement in mm and s are an event in m and s; whole ns stay whole."""
-    assert WIRE.decode(b'{"t": 12.345, "command": {"radial": 570.0}}') == Event(12.345, "", {"radial": 0.57})
+    assert DECODER.decode(b'{"t": 12.345, "command": {"radial": 570.0}}') == Event(12.345, "", {"radial": 0.57})
     line = b'{"t_ns": 1700000000123456789, "sensor": "tracker", "radial": 569.7, "vertical": -93.2}'
-    assert WIRE.decode(line) == Event(1700000000123456789, "tracker", {"radial": 569.7 / 1e3, "vertical": -93.2 / 1e3})
-    assert WIRE.decode(b'{"t": 1, "sensor": "tracker", "x": 1, "y": 2, "z": 3}').values == {
+    assert DECODER.decode(line) == Event(1700000000123456789, "tracker", {"radial": 569.7 / 1e3, "vertical": -93.2 / 1e3})
+    assert DECODER.decode(b'{"t": 1, "sensor": "tracker", "x": 1, "y": 2, "z": 3}').values == {
         "x": 0.001,
         "y": 0.002,
         "z": 0.003,
@@ -28,15 +28,15 @@ def test_the_lines_of_the_design() -> None:
 
 def test_null_is_no_number() -> None:
     """An axis that a sensor has lost is given, but not finite."""
-    assert math.isnan(WIRE.decode(b'{"t": 1, "sensor": "tracker", "radial": null}').values["radial"])
+    assert math.isnan(DECODER.decode(b'{"t": 1, "sensor": "tracker", "radial": null}').values["radial"])
 
 
 def test_unknown_names_are_kept_to_be_told() -> None:
     """A row with a further field is still a row; what the field is called comes with it."""
-    event = WIRE.decode(b'{"t": 1, "sensor": "tracker", "radial": 570, "quality": {"snr": [1, 2]}}')
+    event = DECODER.decode(b'{"t": 1, "sensor": "tracker", "radial": 570, "quality": {"snr": [1, 2]}}')
     assert (event.t, event.sensor) == (1.0, "tracker")
     assert set(event.values) == {"radial", "quality"}
-    event = WIRE.decode(b'{"t": 1, "command": {"radial": 570, "speed": 3}, "id": 7}')
+    event = DECODER.decode(b'{"t": 1, "command": {"radial": 570, "speed": 3}, "id": 7}')
     assert set(event.values) == {"radial", "speed", "id"}
 
 
@@ -71,13 +71,13 @@ def test_unknown_names_are_kept_to_be_told() -> None:
 def test_what_is_no_line_says_why(line: bytes, reason: str) -> None:
     """Each is refused with a reason, and nothing else is raised."""
     with pytest.raises(BadLine, match=reason):
-        WIRE.decode(line)
+        DECODER.decode(line)
 
 
 def test_an_axis_may_not_be_called_as_a_part_of_a_line() -> None:
     """An arm with an axis 't' cannot be told from a stamp."""
     with pytest.raises(pf.ConfigError, match="axis 't'"):
-        Wire(("t",), framed=False)
+        LineDecoder(("t",), framed=False)
 
 
 def test_an_estimate_is_one_line() -> None:
@@ -87,7 +87,7 @@ def test_an_estimate_is_one_line() -> None:
     )
     live.command(0.5, radial=0.57)
     estimate = live.estimate(3.5)
-    text = encode(estimate, whole=True)
+    text = encode(estimate, with_ns=True)
     assert text.endswith(b"}\n")
     assert json.loads(text) == {
         "t": 3.5,
@@ -99,7 +99,7 @@ def test_an_estimate_is_one_line() -> None:
         },
         "stale": ["radial"],
     }
-    assert "t_ns" not in json.loads(encode(estimate, whole=False))
+    assert "t_ns" not in json.loads(encode(estimate, with_ns=False))
 
 
 def test_velocity_and_x_y_z_are_in_mm_too() -> None:
@@ -110,7 +110,7 @@ def test_velocity_and_x_y_z_are_in_mm_too() -> None:
     live = pf.LiveEstimator(config)
     for step in range(40):
         live.command(0.028 * step, x=0.1 + 1e-3 * step, y=0.5, z=-0.1)
-    estimate, line = live.estimate(1.0), json.loads(encode(live.estimate(1.0), whole=False))
+    estimate, line = live.estimate(1.0), json.loads(encode(live.estimate(1.0), with_ns=False))
     assert estimate.cartesian is not None
     assert [line[f"{name}_mm"] / 1e3 for name in "xyz"] == pytest.approx(list(estimate.cartesian.values()))
     assert 0.11 < estimate.cartesian["x"] < 0.14  # not where z or y is

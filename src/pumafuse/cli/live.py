@@ -25,10 +25,10 @@ from ..fusion.config import FusionConfig
 from ..live import network
 from ..live.address import LISTENERS, NETWORK, Address
 from ..live.estimator import LiveEstimator
+from ..live.network import UdpSender
 from ..live.record import Recorder
 from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream
-from ..live.udp import Out
 from ..live.wire import Event
 from ..logs.run import Run
 from .live_status import Part, status, summarise
@@ -41,7 +41,7 @@ _REDRAWN = 0.25  # s between two pictures of the status
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What the command line asks of a stream, in s and Hz; see ``pumafuse live --help``."""
+    """Options of the command line, in s and Hz; see ``pumafuse live --help``."""
 
     config: Path
     rate: float | None
@@ -56,7 +56,7 @@ class Options:
 
 
 def run(source: str, options: Options) -> None:
-    """Estimate from a stream until it ends, or somebody ends it.
+    """Estimate from a stream until it ends, or a signal ends it.
 
     Raises:
         PumafuseError: The configuration, the source, the run or a folder is wrong.
@@ -68,67 +68,63 @@ def run(source: str, options: Options) -> None:
     if recorded is not None:
         start = dict(recorded.start)
         config = msgspec.structs.replace(config, frame=recorded.frame or config.frame)
-    errors = _log()
+    errors = _console()
 
-    def say(text: str) -> None:
+    def notify(text: str) -> None:
         with contextlib.suppress(OSError):  # a log that is full costs the log, not the estimates
             errors.print(text, markup=False, soft_wrap=True)
 
-    remote = network.source(address, options.listen, options.allow, say) if address.kind in NETWORK else None
+    remote = network.source(address, options.listen, options.allow, notify) if address.kind in NETWORK else None
     with contextlib.ExitStack() as stack:
-        ended = stack.enter_context(_ended_by_signals())
-        out = stack.enter_context(contextlib.closing(Out(options.out))) if options.out else None
+        signals = stack.enter_context(_caught_signals())
+        out = stack.enter_context(contextlib.closing(UdpSender(options.out))) if options.out else None
         estimator = partial(
-            LiveEstimator, config, window=options.window, stale_after=options.stale_after, start=start, on_notice=say
+            LiveEstimator, config, window=options.window, stale_after=options.stale_after, start=start, on_notice=notify
         )
         estimator().warm_up()  # before anything is made or listens: meanwhile datagrams would be lost
         gc.freeze()  # what is here stays: looking through it again and again would take longer than an estimate may
-        recorder = Recorder(options.record, config, start, say) if options.record else None
-        live = estimator(journal=recorder)
+        recorder = Recorder(options.record, config, start, notify) if options.record else None
+        live = estimator(event_log=recorder)
         if recorder is not None:
             stack.callback(lambda: recorder.close(live.sure))
         view = None
         if options.rerun:
             from ..views.live import LiveView
 
-            view = LiveView(options.rerun, config, say)
+            view = LiveView(options.rerun, config, notify)
             stack.callback(view.close)
-        stream = Stream(live, _way_out(out, options.status), say, options.rate, [] if view is None else [view])
+        stream = Stream(live, _output(out, options.status), notify, options.rate, [] if view is None else [view])
         parts = [part for part in (remote, recorder, out) if part is not None]
         screen = stack.enter_context(_screen(errors, options.status))
-        follower = _Follower(stream, parts, address.speed, recorder, view, screen)
+        feeder = _Feeder(stream, parts, address.speed, recorder, view, screen)
         if remote is not None:
             with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:  # Windows' own reads no datagrams
-                runner.get_loop().set_exception_handler(lambda _, context: say(f"network: {context['message']}"))
-                runner.run(_listen(remote, follower, ended))
+                runner.get_loop().set_exception_handler(lambda _, context: notify(f"network: {context['message']}"))
+                runner.run(_listen(remote, feeder, signals))
         else:
             for items in standard_input() if recorded is None else replayed(recorded, config, address.speed):
-                follower.take(items)
-                if ended:
+                feeder.take(items)
+                if signals:
                     break
         stream.end()
     with contextlib.suppress(OSError):
         summarise(stream, parts, errors)
 
 
-def _log() -> Console:
+def _console() -> Console:
     """Standard error, or nothing where it is closed."""
     there = sys.stderr is not None  # pyright: ignore[reportUnnecessaryComparison]
     file = sys.stderr if there else StringIO()
     return Console(file=file, highlight=False, width=None if file.isatty() else 120)
 
 
-def _way_out(out: Out | None, status: bool) -> Callable[[list[bytes]], None]:
-    """Where estimates go: not on the screen that shows the status, as both would write over each other."""
+def _output(out: UdpSender | None, status: bool) -> Callable[[list[bytes]], None]:
+    """Where estimates go: not to the screen that shows the status, as both would write over each other."""
     if out is not None:
         return out
     if sys.stdout is None:  # pyright: ignore[reportUnnecessaryComparison]
         raise RunError("standard output is closed; send the estimates elsewhere with --out udp://HOST:PORT")
-    return _to_nobody if status and sys.stdout.isatty() else _to_standard_output
-
-
-def _to_nobody(_: list[bytes]) -> None:
-    pass
+    return (lambda _: None) if status and sys.stdout.isatty() else _to_standard_output
 
 
 def _to_standard_output(lines: list[bytes]) -> None:
@@ -142,19 +138,19 @@ def _to_standard_output(lines: list[bytes]) -> None:
         raise RunError(f"standard output: cannot be written: {error.strerror}") from None
 
 
-async def _listen(remote: network.Source, follower: _Follower, ended: list[int]) -> None:
+async def _listen(remote: network.Source, feeder: _Feeder, signals: list[int]) -> None:
     """Feed what comes from the network until a signal ends it, and what has come until then."""
     await remote.start()
     try:
-        while not ended:
-            follower.take(await remote.get())
+        while not signals:
+            feeder.take(await remote.get())
     finally:
         left = await remote.stop()
-    follower.take(left)
+    feeder.take(left)
 
 
-class _Follower:
-    """Feeds a stream, and sees to what is due beside it."""
+class _Feeder:
+    """Feeds a stream, and gives the recorder, the view and the screen their turn."""
 
     def __init__(
         self,
@@ -171,7 +167,7 @@ class _Follower:
         self._moved = self._drawn = time.monotonic()
 
     def take(self, items: Sequence[bytes | Event]) -> None:
-        """Feed some items, or none: where the stream's time stands still it goes on by the wall's."""
+        """Feed some items, or none: where the stream's time stands still it goes on by the wall clock's."""
         stream, now = self._stream, time.monotonic()
         if items:
             stream.take(items)
@@ -190,7 +186,7 @@ class _Follower:
 
 
 @contextlib.contextmanager
-def _ended_by_signals() -> Generator[list[int]]:
+def _caught_signals() -> Generator[list[int]]:
     """The signals that have asked for an end: Ctrl-C and SIGTERM; a second one ends at once."""
     caught: list[int] = []
 

@@ -1,4 +1,4 @@
-"""How a stream stands, for people: one screen while it goes on, and the summary at its end."""
+"""Status screen of a live stream, and the summary at its end."""
 
 from __future__ import annotations
 
@@ -12,40 +12,48 @@ from rich.table import Table
 from rich.text import Text
 
 from ..filter.outcome import Outcome
-from ..live.health import Health
+from ..live.results import Health
 from ..live.stream import Stream
 from ..units import MM, MS
 
 
 class Part(Protocol):
-    """What goes on beside a stream: the source, the recording, the way out."""
+    """Part beside a stream: the source, the recorder, the sender of estimates."""
 
-    def told(self) -> str:
-        """What it has to say, in a sentence; empty for nothing."""
+    def summary(self) -> str:
+        """What there was, in a sentence; empty for nothing."""
         ...
 
 
 def status(stream: Stream, parts: Sequence[Part] = ()) -> Group:
-    """One picture of the stream: where the tool is, and how each sensor does."""
+    """One screen: the position of each axis, and how each sensor does."""
     live, health = stream.live, stream.live.health()
     estimate = live.estimate()
     axes = Table(box=box.SIMPLE_HEAD)
     for heading in ("axis", "position, mm", "± sd, mm", "velocity, mm/s", ""):
         axes.add_column(heading, justify="left" if heading in ("axis", "") else "right")
     for name, axis in estimate.axes.items():
-        stale = "[red]stale[/red]" if name in estimate.stale else ""
         axes.add_row(
             escape(name),
             f"{axis.position * MM:.3f}",
             f"{axis.position_sd * MM:.3f}",
             f"{axis.velocity * MM:.1f}",
-            stale,
+            "[red]stale[/red]" if name in estimate.stale else "",
         )
-    told = "no event yet" if live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
-    return Group(Text(told), axes, sensor_table(health), Text(counted(stream, health)), *map(Text, _told(parts)))
+    now = "no event yet" if live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
+    return Group(Text(now), axes, _sensor_table(health), *map(Text, _sentences(stream, health, parts)))
 
 
-def sensor_table(health: Health) -> Table:
+def summarise(stream: Stream, parts: Sequence[Part], errors: Console) -> None:
+    """Print the counts of a stream and of the parts beside it, and how each sensor did."""
+    health = stream.live.health()
+    for sentence in _sentences(stream, health, parts):
+        errors.print(sentence, markup=False, soft_wrap=True)
+    if any(sensor.rows for sensor in health.sensors.values()):
+        errors.print(_sensor_table(health))
+
+
+def _sensor_table(health: Health) -> Table:
     """Rate, lateness, dropouts and NIS of each sensor, and its components by outcome."""
     caption = "outcomes count components: each axis of a row by itself"
     table = Table(box=box.SIMPLE_HEAD, caption=caption, caption_justify="left")
@@ -56,7 +64,7 @@ def sensor_table(health: Health) -> Table:
     for heading in ("rows", "rate, Hz", "late, ms", "at most", "dropouts", "NIS", "silent, s", *words):
         table.add_column(heading, justify="right")
     for name, sensor in health.sensors.items():
-        silent = "never heard" if sensor.silent is None else f"{sensor.silent:.1f}"
+        silent = "no row yet" if sensor.silent is None else f"{sensor.silent:.1f}"
         table.add_row(
             escape(name),
             str(sensor.rows),
@@ -71,28 +79,11 @@ def sensor_table(health: Health) -> Table:
     return table
 
 
-def counted(stream: Stream, health: Health) -> str:
-    """Lines, commands, restarts and estimates in one sentence."""
-    parts = [f"{count} {word}" for word, count in health.commands.items() if count]
-    said = [f"commands: {', '.join(parts) or 'none'}", f"{stream.estimates} estimates"]
-    if stream.lines:
-        said.insert(0, f"{stream.lines} lines, {stream.bad} of them bad")
-    if health.unknown:
-        said.append(f"{health.unknown} rows of unknown sensors")
-    if health.segments > 1:
-        said.append(f"{health.segments} segments")
-    return "; ".join(said)
-
-
-def summarise(stream: Stream, parts: Sequence[Part], errors: Console) -> None:
-    """What there was, for people."""
-    health = stream.live.health()
-    for said in (counted(stream, health), *_told(parts)):
-        errors.print(said, markup=False, soft_wrap=True)
-    if any(sensor.rows for sensor in health.sensors.values()):
-        errors.print(sensor_table(health))
-
-
-def _told(parts: Sequence[Part]) -> list[str]:
-    """What the source, the recording and the way out have to say."""
-    return [said for said in (part.told() for part in parts) if said]
+def _sentences(stream: Stream, health: Health, parts: Sequence[Part]) -> list[str]:
+    """The counts of lines, commands, estimates and restarts; then the summary of each part beside the stream."""
+    commands = [f"{count} {word}" for word, count in health.commands.items() if count]
+    counts = [f"{stream.lines} lines, {stream.bad} of them bad"] if stream.lines else []
+    counts += [f"commands: {', '.join(commands) or 'none'}", f"{stream.estimates} estimates"]
+    counts += [f"{health.unknown} rows of unknown sensors"] if health.unknown else []
+    counts += [f"{health.segments} segments"] if health.segments > 1 else []
+    return ["; ".join(counts), *filter(None, (part.summary() for part in parts))]

@@ -18,7 +18,7 @@ from ..arrays import FloatArray
 from ..errors import ConfigError, RunError
 from ..fusion import timeline as timelines
 from ..fusion.config import FusionConfig, Sensor
-from ..fusion.timeline import AxisInput
+from ..fusion.segments import AxisInput
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import Run

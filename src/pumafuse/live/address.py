@@ -1,4 +1,4 @@
-"""What sources and receivers are called on the command line, and on which addresses a stream may be heard."""
+"""Addresses on the command line: sources, receivers, and which senders a listener accepts."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from urllib.parse import urlsplit
 
 from ..errors import ConfigError
 
-Place: TypeAlias = tuple[socket.AddressFamily, tuple[str, int]]
-Allowed: TypeAlias = Callable[[str], bool]  # whether a host may be heard
+SocketAddress: TypeAlias = tuple[socket.AddressFamily, tuple[str, int]]
+Allowed: TypeAlias = Callable[[str], bool]  # whether a sender's host is accepted
 
 LISTENERS = ("udp", "tcp-listen")
 NETWORK = (*LISTENERS, "tcp")
 _LOOPBACK = "127.0.0.1"
-_ACCEPTED = "stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, replay:RUN, replay:RUN?speed=4 (or max)"
+_SOURCES = "stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, replay:RUN, replay:RUN?speed=4 (or max)"
 
 
 @dataclass(frozen=True)
 class Address:
-    """What a source is called on the command line.
+    """A source as the command line names it.
 
     Attributes:
         kind: ``stdin``, ``replay``, ``udp``, ``tcp-listen`` or ``tcp``.
         path: Of the run to replay.
-        speed: How many seconds of the run go by in one; infinite: as fast as it can be.
+        speed: Seconds of the run in one second; infinite: as fast as it can be.
         host: Of a network source, empty where none is given.
         port: Of a network source.
     """
@@ -42,7 +42,7 @@ class Address:
 
     @staticmethod
     def parse(text: str) -> Address:
-        """Read what stands on the command line, as in ``udp://127.0.0.1:5005`` or ``replay:RUN?speed=4``.
+        """Parse a source, as in ``udp://127.0.0.1:5005`` or ``replay:RUN?speed=4``.
 
         Raises:
             ConfigError: It is no source; says what is accepted.
@@ -53,58 +53,58 @@ class Address:
         if kind == "replay" and colon:
             return _replay(text, rest)
         if kind in NETWORK and rest.startswith("//"):
-            return _remote(text, f"source '{text}'")
-        raise ConfigError(f"no source '{text}'; there are: {_ACCEPTED}")
+            return _network_address(text, f"source '{text}'")
+        raise ConfigError(f"no source '{text}'; there are: {_SOURCES}")
 
     @property
     def text(self) -> str:
         """A network source as it is written."""
-        return f"{self.kind}://{shown(self.host, self.port)}"
+        return f"{self.kind}://{host_port(self.host, self.port)}"
 
 
-def shown(host: str, port: int) -> str:
+def host_port(host: str, port: int) -> str:
     """A host and port as people write them."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-def receiver(text: str) -> Place:
-    """Where ``udp://HOST:PORT`` is, to send to.
+def receiver(text: str) -> SocketAddress:
+    """The socket address of ``udp://HOST:PORT``, to send to.
 
     Raises:
-        ConfigError: It is no such address, or nothing is known of the host.
+        ConfigError: It is no such address, or the host is unknown.
     """
-    if not text.startswith("udp://"):
-        raise ConfigError(f"--out '{text}': expected udp://HOST:PORT")
-    address = _remote(text, f"--out '{text}'")
-    if not address.host or not address.port:
-        raise ConfigError(f"--out '{text}': expected udp://HOST:PORT")
-    return resolved(address.host, address.port, f"--out '{text}'")
+    where = f"--out '{text}'"
+    address = _network_address(text, where) if text.startswith("udp://") else None
+    if address is None or not address.host or not address.port:
+        raise ConfigError(f"{where}: expected udp://HOST:PORT")
+    return _resolve(address.host, address.port, where)
 
 
-def bound(address: Address, listen: str | None, allow: Sequence[str]) -> tuple[Place, Allowed]:
-    """Where a listener is to be, and who may be heard there: on loopback everybody, elsewhere only who is allowed.
+def listener(address: Address, listen: str | None, allow: Sequence[str]) -> tuple[SocketAddress, Allowed]:
+    """Where a source listens, and which senders it accepts: on loopback all, elsewhere only those that are allowed.
 
     Args:
         address: The source.
-        listen: An address to listen on instead, which may be another than loopback.
-        allow: Networks that are heard then, as in ``192.168.1.0/24``, and nobody else.
+        listen: An address to listen on instead, which need not be loopback.
+        allow: Networks that are accepted then, as in ``192.168.1.0/24``, and nobody else.
 
     Raises:
         ConfigError: An address is none, or is not loopback without ``listen``.
     """
     networks = [_network(text) for text in allow]
-    family, place = resolved(listen or address.host or _LOOPBACK, address.port, f"source '{address.text}'")
+    where = f"source '{address.text}'"
+    family, place = _resolve(listen or address.host or _LOOPBACK, address.port, where)
     if listen is None:
         if not ip_address(place[0]).is_loopback:
             raise ConfigError(
-                f"source '{address.text}': is heard on loopback only; to be reached from elsewhere, give"
+                f"{where}: listens on loopback only; to be reached from elsewhere, give"
                 f" --listen {place[0]} --allow CIDR, as in --allow 192.168.1.0/24"
             )
         return (family, place), lambda _: True
     if address.host and address.host != listen:
-        host = resolved(address.host, 0, f"source '{address.text}'")[1][0]
+        host = _resolve(address.host, 0, where)[1][0]
         if host != place[0] and not ip_address(host).is_loopback:
-            raise ConfigError(f"source '{address.text}': names another address than --listen {listen}")
+            raise ConfigError(f"{where}: names another address than --listen {listen}")
 
     @lru_cache(maxsize=4096)
     def allowed(host: str) -> bool:
@@ -115,12 +115,7 @@ def bound(address: Address, listen: str | None, allow: Sequence[str]) -> tuple[P
     return (family, place), allowed
 
 
-def resolved(host: str, port: int, where: str) -> Place:
-    """The first address of a host.
-
-    Raises:
-        ConfigError: There is none.
-    """
+def _resolve(host: str, port: int, where: str) -> SocketAddress:
     try:
         family, _, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
     except (OSError, UnicodeError) as error:
@@ -130,9 +125,9 @@ def resolved(host: str, port: int, where: str) -> Place:
 
 
 def _replay(text: str, rest: str) -> Address:
-    path, asked, option = rest.rpartition("?") if "?" in rest else (rest, "", "")
-    if not asked:
-        return Address("replay", path)
+    path, question, option = rest.rpartition("?")
+    if not question:
+        return Address("replay", rest)
     name, _, value = option.partition("=")
     try:
         speed = math.inf if value == "max" else float(value)
@@ -143,14 +138,14 @@ def _replay(text: str, rest: str) -> Address:
     return Address("replay", path, speed)
 
 
-def _remote(text: str, where: str) -> Address:
+def _network_address(text: str, where: str) -> Address:
     kind = text.partition(":")[0]
     try:
         parts = urlsplit(text)
         host, port = parts.hostname or "", parts.port
     except ValueError:
         host, port = "", None
-    plain = port is not None and text == f"{kind}://{shown(host, port)}"
+    plain = port is not None and text == f"{kind}://{host_port(host, port)}"
     if port is None or not plain or (kind == "tcp" and not (host and port)):
         raise ConfigError(f"{where}: expected {kind}://HOST:PORT, as in {kind}://{_LOOPBACK}:5005")
     return Address(kind, host=host, port=port)

@@ -1,9 +1,9 @@
-"""Where the time of a stream is, told by stamps alone: late, ahead, on another clock, or set anew.
+"""Clock of a stream, from its stamps alone: which are late, ahead, of another clock, or of a clock that was reset.
 
 The commands are the master: their controller is what the arm obeys. A stamp within the window behind the newest one is
-late, one that is farther behind is too late. One that is ahead of all by more than usual is believed, since everything
+late, one that is farther behind is too late. One that is ahead of all by more than usual is accepted, since everything
 may have paused, and taken back if what comes next still has the old time: if one sensor ran ahead, anything that comes;
-if a command did, the next command. Commands that have another time again and again mean a clock that was set anew: the
+if a command did, the next command. Three commands in a row that have another time mean that the clock was reset: the
 filter starts again there.
 """
 
@@ -21,7 +21,7 @@ from ..fusion.segments import LONGEST_TAIL_NS
 Time: TypeAlias = float | int  # float seconds, or int nanoseconds
 
 AHEAD_NS = 1_000_000_000  # stamps may run ahead of all others by this much, or by the window, without a doubt
-AGREE_AFTER = 3  # commands in a row that have another time: the clock was set anew
+RESET_AFTER = 3  # commands in a row that have another time: the clock was reset
 
 
 def nanoseconds(t: Time) -> int:
@@ -47,34 +47,34 @@ def nanoseconds(t: Time) -> int:
 class Verdict(enum.Enum):
     """What a stamp means."""
 
-    HERE = enum.auto()
-    CONTRADICTED = enum.auto()  # what ran ahead was wrong and is to be forgotten
+    ACCEPTED = enum.auto()
+    CONTRADICTED = enum.auto()  # what ran ahead was wrong and is to be taken back
     BEHIND = enum.auto()
-    BEYOND = enum.auto()
-    ANEW = enum.auto()  # a new segment begins
+    AHEAD = enum.auto()
+    RESET = enum.auto()  # a new segment begins
 
 
 class Clock:
-    """The newest stamp of a stream, and whether it is sure.
+    """The newest stamp of a stream, and whether it is in doubt.
 
     Attributes:
         window: How late an event may be [ns].
-        newest: The newest stamp that is believed, int ns; None at first.
+        newest: The newest stamp that is accepted, int ns; None at first.
         low: Stamps from here …
         high: … to here are plainly right [ns]; none is while there is a doubt.
-        ahead_of: Who raised the latest doubt: a sensor's name, None for a command.
+        ahead_of: Whose stamp raised the latest doubt: a sensor's name, None for a command.
     """
 
     def __init__(self, window: int) -> None:
-        """At no time yet."""
+        """Begin without a time."""
         self.window = window
         self.newest: int | None = None
         self.low, self.high = 1, 0
         self.ahead_of: str | None = None
         self._ahead = max(window, AHEAD_NS)
-        self._sure: int | None = None  # what the newest stamp was before a jump ahead that is not certain yet
-        self._jumped, self._commands = 0, 0  # where it jumped to, and how many commands have been there
-        self._other: list[int] = []  # stamps of commands in a row that are not here
+        self._sure: int | None = None  # the newest stamp before a jump ahead that is still in doubt
+        self._jumped, self._commands = 0, 0  # where it jumped to, and how many commands have confirmed it
+        self._other: list[int] = []  # stamps of commands in a row that have another time
 
     @property
     def doubtful(self) -> bool:
@@ -89,37 +89,37 @@ class Clock:
 
     @property
     def now(self) -> int:
-        """The newest stamp that a command or no doubt stands for, int ns."""
+        """The newest stamp that is not one sensor's alone while that is in doubt, int ns."""
         assert self.newest is not None
         return self.newest if self._sure is None or self._commands else self._sure
 
     @property
-    def tries(self) -> int:
-        """How many commands in a row had another time."""
+    def strays(self) -> int:
+        """Number of commands in a row that had another time."""
         return len(self._other)
 
     @property
     def bound(self) -> int:
-        """What is stamped after it is in doubt [ns]."""
+        """Stamps after it are in doubt [ns]."""
         return self.sure + self._ahead
 
     def start(self, stamp: int) -> None:
-        """Be at ``stamp`` [ns], whatever was before."""
+        """Set the clock to ``stamp`` [ns], whatever was before."""
         self._other = []
         self.settle(stamp)
 
     def settle(self, newest: int) -> None:
-        """Be sure that ``newest`` [ns] is the newest stamp."""
+        """Set the newest stamp [ns], without a doubt."""
         self._sure, self._commands = None, 0
         self.newest = newest
         self.low, self.high = newest - self.window, newest + self._ahead
 
-    def here(self) -> None:
-        """A command that is plainly right has come: others that were not are no sign of a clock set anew."""
+    def confirm(self) -> None:
+        """Forget commands that had another time, as one has come that is plainly right."""
         self._other = []
 
     def judge(self, stamp: int, source: str | None) -> Verdict:
-        """What a stamp [ns] means that is not between ``low`` and ``high``, and move on to it if it is believed.
+        """Judge a stamp that is not between ``low`` and ``high``, and move on to it if it is accepted.
 
         Args:
             stamp: Int ns.
@@ -132,9 +132,9 @@ class Clock:
                 self.settle(self._sure)
                 return Verdict.CONTRADICTED
             if stamp > self.bound:
-                return Verdict.BEYOND
+                return Verdict.AHEAD
             self._sure = max(self._sure, stamp)
-            return Verdict.HERE
+            return Verdict.ACCEPTED
         if stamp < self.newest - self.window or stamp > self.newest + LONGEST_TAIL_NS:
             return self._elsewhere(stamp, command)
         self._other = [] if command else self._other
@@ -146,14 +146,14 @@ class Clock:
         agreed = self._commands >= 2 or (source == self.ahead_of and stamp - self._jumped >= AHEAD_NS)
         if agreed or self._sure is None:
             self.settle(self.newest)
-        return Verdict.HERE
+        return Verdict.ACCEPTED
 
     def _elsewhere(self, stamp: int, command: bool) -> Verdict:
-        """What a stamp means that no clock here can have: too late, too far ahead, or a command of a clock set anew."""
+        """Judge a stamp that is too late or too far ahead: wrong, or of a clock that was reset."""
         assert self.newest is not None
         if command:
             follows = self._other and self._other[-1] < stamp <= self._other[-1] + LONGEST_TAIL_NS
             self._other = [*self._other, stamp] if follows else [stamp]
-            if len(self._other) >= AGREE_AFTER:
-                return Verdict.ANEW
-        return Verdict.BEHIND if stamp < self.newest else Verdict.BEYOND
+            if len(self._other) >= RESET_AFTER:
+                return Verdict.RESET
+        return Verdict.BEHIND if stamp < self.newest else Verdict.AHEAD

@@ -13,12 +13,11 @@ from ..filter.outcome import FARTHEST, Outcome
 from ..fusion.segments import LONGEST_TAIL_NS
 from ..logs.frames import CARTESIAN, Cylindrical
 from ..model.arm import ordered_axes
-from .answers import AxisNow, LiveEstimate, UpdateResult, nowhere, told_of
 from .clock import Clock, Time, Verdict, nanoseconds
-from .health import Health, health_of
+from .frame_start import FrameStart
 from .memory import ABSENT
-from .placing import Placing
-from .sampler import Sampler
+from .rate_limit import RateLimitedLog
+from .results import AxisNow, Health, LiveEstimate, UpdateResult, health_of, no_estimate, update_result
 from .tally_kernels import Tally
 from .window import MOST_ROWS, Window
 
@@ -34,19 +33,19 @@ class _Event(NamedTuple):
     values: Mapping[str, Any]
 
 
-class Journal(Protocol):
-    """Who writes down what a live estimator believes."""
+class EventLog(Protocol):
+    """Log of the events that a live estimator accepts."""
 
-    def begin(self) -> None:
-        """What comes from here on is stamped by another clock."""
+    def begin_segment(self) -> None:
+        """Begin anew: what comes from here on is stamped by another clock."""
         ...
 
-    def taken(self, stamp: int, sensor: str | None, values: Mapping[str, Any], /) -> None:
-        """An event's stamp [ns] is believed; without a sensor it is a command, its values are in m."""
+    def append(self, stamp: int, sensor: str | None, values: Mapping[str, Any], /) -> None:
+        """Add an event, whose stamp [ns] is accepted; without a sensor it is a command; values in m."""
         ...
 
-    def forget(self, after: int, /) -> None:
-        """What is stamped after ``after`` [ns] was wrong."""
+    def discard(self, after: int, /) -> None:
+        """Remove the events stamped after ``after`` [ns]: that was wrong."""
         ...
 
 
@@ -73,7 +72,7 @@ class LiveEstimator:
         stale_after: float = 1.0,
         start: Mapping[str, float] | None = None,
         on_notice: Callable[[str], None] = lambda _: None,
-        journal: Journal | None = None,
+        event_log: EventLog | None = None,
     ) -> None:
         """Nothing heard yet.
 
@@ -84,7 +83,7 @@ class LiveEstimator:
             start: Level [m] of axes that do not rest at their first command before it; x and y with a frame.
             on_notice: Is told in one sentence what a user should know: a clock set anew, and the like; of what happens
                 again and again the first time, the tenth, the hundredth …
-            journal: Is told what is believed.
+            event_log: Receives the events that are accepted.
 
         Raises:
             PumafuseError: ``window`` or ``stale_after`` is not a time in reach, ``start`` is of no axis, or a model
@@ -102,7 +101,7 @@ class LiveEstimator:
         self._sensors = {name: number for number, name in enumerate(config.sensors)}
         self._bits = {name: number for number, name in enumerate(self.axes)}
         self._stale_ns = round(stale_after * 1e9)
-        self._log, self._journal = Sampler(on_notice), journal
+        self._log, self._event_log = RateLimitedLog(on_notice), event_log
         self._refused: dict[str, dict[Outcome, int]] = {name: dict.fromkeys(Outcome, 0) for name in config.sensors}
         self._strangers = self._refusals = 0
         self._doubtful = 0  # commands that may have to be taken back
@@ -156,16 +155,16 @@ class LiveEstimator:
         try:
             stamp = now if at is None else nanoseconds(at)
         except ValueError as error:
-            return nowhere(0, _INVALID, str(error))
+            return no_estimate(0, _INVALID, str(error))
         origin = self._window.origin
         if origin is None or newest is None:
-            return nowhere(stamp, Outcome.BEFORE_START, "no command yet")
+            return no_estimate(stamp, Outcome.BEFORE_START, "no command yet")
         if stamp < origin:
-            return nowhere(stamp, Outcome.BEFORE_START, "before the first command")
+            return no_estimate(stamp, Outcome.BEFORE_START, "before the first command")
         if stamp < self._oldest():
-            return nowhere(stamp, _TOO_LATE, f"{(newest - stamp) / 1e9:.3f} s ago, before the window")
+            return no_estimate(stamp, _TOO_LATE, f"{(newest - stamp) / 1e9:.3f} s ago, before the window")
         if stamp > newest + LONGEST_TAIL_NS:
-            return nowhere(stamp, _INVALID, "more than an hour ahead")
+            return no_estimate(stamp, _INVALID, "more than an hour ahead")
         axes: dict[str, AxisNow] = {}
         stale: list[str] = []
         for axis, found in zip(self.axes, self._window.estimate(stamp, self._oldest()), strict=True):
@@ -176,8 +175,8 @@ class LiveEstimator:
                     stale.append(axis)
         reason = "now" if stamp == now else "filtered" if stamp < now else "predicted, the last command held"
         placed = None
-        if self._placing.placed is not None:
-            placed = self._placing.in_log({axis: now.position for axis, now in axes.items()})
+        if self._frame_start.placed is not None:
+            placed = self._frame_start.in_log({axis: now.position for axis, now in axes.items()})
         return LiveEstimate(stamp, axes, placed, tuple(stale), _FUSED, reason)
 
     @property
@@ -221,11 +220,11 @@ class LiveEstimator:
     def _begin(self, tally: Tally | None) -> None:
         """An empty window, with what was counted before."""
         self._before = tally
-        self._placing = Placing(self.config.frame, self.axes)
-        self._window = Window(self.config, self.axes, self._placing.start(self._start), tally)
+        self._frame_start = FrameStart(self.config.frame, self.axes)
+        self._window = Window(self.config, self.axes, self._frame_start.start(self._start), tally)
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it.
         # With each goes its outcome, and whether it never came into the window.
-        self._early: list[tuple[_Event, Outcome, bool]] | None = [] if self._placing.waits else None
+        self._early: list[tuple[_Event, Outcome, bool]] | None = [] if self._frame_start.waits else None
 
     def _oldest(self) -> int:
         """No event stamped before is taken [ns]."""
@@ -247,10 +246,10 @@ class LiveEstimator:
         elif clock.newest is not None and stamp > clock.newest:
             clock.settle(stamp)
         if sensor is None and self._aside:
-            clock.here()
+            clock.confirm()
             self._aside = []
-        if self._journal is not None:
-            self._journal.taken(stamp, sensor, values)
+        if self._event_log is not None:
+            self._event_log.append(stamp, sensor, values)
         if self._early is not None:
             return self._take_early(_Event(stamp, sensor, dict(values)))
         return self._feed(stamp, sensor, values)
@@ -262,37 +261,39 @@ class LiveEstimator:
         if newest is None or (self._window.origin is None and (command or stamp > newest)):
             if newest is not None and command:
                 self._begin(self._window.tally())  # the commands' clock counts: what was heard before is of another
-                if self._journal is not None:
-                    self._journal.begin()
+                if self._event_log is not None:
+                    self._event_log.begin_segment()
             clock.start(stamp)
             return None
         verdict = clock.judge(stamp, sensor)
         while verdict is Verdict.CONTRADICTED:
             self._window.forget(clock.bound, self._oldest())
-            if self._journal is not None:
-                self._journal.forget(clock.bound)
+            if self._event_log is not None:
+                self._event_log.discard(clock.bound)
             self._commands[_FUSED] -= self._doubtful
             self._commands[_INVALID] += self._doubtful
             self._doubtful = 0
             who = "a command" if clock.ahead_of is None else f"sensor '{clock.ahead_of}'"
             ahead = (newest - stamp) / 1e9
-            self._log.say(who, f"{who} ran {ahead:.3f} s ahead of the others: taken back; are all stamps of one clock?")
+            self._log.write(
+                who, f"{who} ran {ahead:.3f} s ahead of the others: taken back; are all stamps of one clock?"
+            )
             if clock.low <= stamp <= clock.high:
                 clock.settle(max(stamp, clock.sure))
                 return None
             verdict = clock.judge(stamp, sensor)
         if not clock.doubtful:
             self._doubtful = 0
-        if verdict is Verdict.HERE:
+        if verdict is Verdict.ACCEPTED:
             return None
-        if verdict is Verdict.ANEW:
+        if verdict is Verdict.RESET:
             return self._start_anew(event, newest)
         outcome = _TOO_LATE if verdict is Verdict.BEHIND else _INVALID
-        if clock.tries == 1 and command:
+        if clock.strays == 1 and command:
             self._aside = []
-        if clock.tries and len(self._aside) < _MOST_ASIDE:
+        if clock.strays and len(self._aside) < _MOST_ASIDE:
             self._aside.append((event._replace(values=dict(values)), outcome))
-        if verdict is Verdict.BEYOND:
+        if verdict is Verdict.AHEAD:
             return self._refuse(sensor, values, outcome, f"stamped {(stamp - newest) / 1e9:.0f} s ahead of all others")
         return self._refuse(sensor, values, outcome, self._behind(stamp))
 
@@ -312,11 +313,11 @@ class LiveEstimator:
         self.segment += 1
         way = "back" if first < newest else "ahead"
         moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
-        self._log.say("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
+        self._log.write("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
         self._start = {}
         self._begin(self._window.tally())
-        if self._journal is not None:
-            self._journal.begin()
+        if self._event_log is not None:
+            self._event_log.begin_segment()
         self._clock.start(first)
         for other, _ in aside:
             self._take(*other)
@@ -325,15 +326,15 @@ class LiveEstimator:
     def _take_early(self, event: _Event) -> UpdateResult:
         """Take an event while the frame's place may still change; a command before all others moves it."""
         assert self._early is not None
-        oldest, origin, since = self._oldest(), self._window.origin, self._placing.since
+        oldest, origin, since = self._oldest(), self._window.origin, self._frame_start.since
         if origin is not None and self._clock.sure - origin > self._clock.window:
             self._early = None
             return self._feed(*event)
         x, y = (_number(event.values.get(name)) for name in ("x", "y"))
         if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
-            placing = Placing(self.config.frame, self.axes)
+            frame_start = FrameStart(self.config.frame, self.axes)
             try:
-                placing.place(event.stamp, x, y)
+                frame_start.place(event.stamp, x, y)
             except RunError as error:
                 return self._refuse(None, event.values, _INVALID, str(error))
             events = [one for one, _, _ in self._early if one.stamp >= oldest]
@@ -341,7 +342,7 @@ class LiveEstimator:
                 if sensor is None or refused:
                     self._count(sensor, values, outcome, -1)
             self._begin(self._before)
-            self._placing = placing
+            self._frame_start = frame_start
             for one in events:
                 self._feed_early(one)
         return self._feed_early(event)
@@ -405,12 +406,12 @@ class LiveEstimator:
         if isinstance(self.config.frame, Cylindrical) and (axis := self._bits.get("radial")) is not None:
             radius = self._window.latest_command(axis)
         for passed in validity.excess(speed, radius):
-            self._log.say(passed.split(" reach")[0], f"{passed}, at {stamp / 1e9:.3f} s")
+            self._log.write(passed.split(" reach")[0], f"{passed}, at {stamp / 1e9:.3f} s")
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
         window, given = self._window, 0
-        placed = self._placing.in_axes(
+        placed = self._frame_start.in_axes(
             {name: _number(values[name]) for name in CARTESIAN if name in values},
             None if sensor is None else window.commanded(self._bits.get("tangential", 0), stamp),
         )
@@ -429,7 +430,7 @@ class LiveEstimator:
     def _answer(self, codes: bytes, stranger: str) -> UpdateResult:
         """What is told of an event by the codes of its axes; the same for all alike, but for strangers."""
         outcomes = {axis: Outcome(code) for axis, code in zip(self.axes, codes, strict=True) if code != ABSENT}
-        told = told_of(outcomes)
+        told = update_result(outcomes)
         if stranger:
             axes = MappingProxyType({**outcomes, stranger: _UNKNOWN})
             return told._replace(axes=axes, reason=f"{told.reason}; {self._no_axis(stranger)}")

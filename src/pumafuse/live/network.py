@@ -1,20 +1,45 @@
-"""Where events come from on the network: one source of lines, whatever carries them."""
+"""Sources of lines on the network, over UDP and TCP, and estimates sent as datagrams.
+
+What waits is bounded. Of too many datagrams the oldest are dropped and counted, together with those that the system
+dropped before. A TCP sender that is too fast is slowed down: its connection is not read any more.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import os
+import socket
+import struct
+import sys
+import time
+from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
-from .address import Address, bound, shown
-from .tcp import Client, Server
-from .udp import Udp
+from ..errors import RunError
+from .address import Address, Allowed, SocketAddress, host_port, listener, receiver
+from .rate_limit import RateLimitedLog
+from .sources import QUIET
+from .wire import Lines
+
+_LARGEST = 65_536  # bytes of a datagram, or of a piece of a connection
+_MOST_DATAGRAMS = 65_536  # that wait
+_MOST_BYTES = 16 << 20  # of waiting datagrams
+_MOST_AT_ONCE = 64  # datagrams taken in before the socket is emptied again: about a ms of work
+_RECEIVE_BUFFER = 8 << 20  # bytes that the system is asked to keep for a socket; it may give less
+_SO_MEMINFO, _DROPS = 55, 8  # Linux: a socket's counters, and the place of the one of dropped datagrams
+_MOST_CONNECTIONS = 256
+_MOST_PIECES = 16  # of all connections that wait
+_FIRST_WAIT, _LONGEST_WAIT = 0.5, 30.0  # s until a connection is tried again
+_PATIENCE = 10.0  # s for a connection to be made
 
 
 class Source(Protocol):
     """Lines from the network."""
 
     async def start(self) -> None:
-        """Be there.
+        """Open it.
 
         Raises:
             RunError: The system refuses.
@@ -26,32 +51,326 @@ class Source(Protocol):
         ...
 
     async def stop(self) -> list[bytes]:
-        """Be gone; the lines that have come and were not given yet."""
+        """Close it, and return the lines that have come and were not given yet."""
         ...
 
-    def told(self) -> str:
-        """What there was, in a sentence."""
+    def summary(self) -> str:
+        """What has come, in a sentence."""
         ...
 
 
-def source(address: Address, listen: str | None, allow: list[str], say: Callable[[str], None]) -> Source:
+def source(address: Address, listen: str | None, allow: list[str], notify: Callable[[str], None]) -> Source:
     """The source of an address.
 
     Args:
         address: Of kind ``udp``, ``tcp-listen`` or ``tcp``.
-        listen: See :func:`pumafuse.live.address.bound`.
+        listen: See :func:`pumafuse.live.address.listener`.
         allow: As well.
-        say: Takes a sentence for the log.
+        notify: Takes a sentence for the log.
 
     Raises:
         ConfigError: The address may not be listened on.
     """
     if address.kind == "tcp":
-        return Client(address, say)
-    place, allowed = bound(address, listen, allow)
+        return TcpClient(address, notify)
+    place, allowed = listener(address, listen, allow)
     if listen is not None:
-        say(
-            f"{address.kind}: heard on {shown(*place[1])} from {', '.join(allow)}, neither encrypted nor authenticated;"
-            " a tunnel should carry what leaves the cell"
+        accepted = f"accepts {', '.join(allow)} on {host_port(*place[1])}"
+        notify(
+            f"{address.kind}: {accepted}, neither encrypted nor authenticated; a tunnel should carry what leaves the cell"
         )
-    return (Udp if address.kind == "udp" else Server)(place, allowed, say)
+    return (UdpListener if address.kind == "udp" else TcpListener)(place, allowed, notify)
+
+
+class UdpListener:
+    """Lines from datagrams of one or more lines."""
+
+    def __init__(self, place: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
+        """Prepare; :meth:`start` opens the socket."""
+        self._place, self._allowed = place, allowed
+        self._notify, self._log = notify, RateLimitedLog(notify)
+        self._waiting, self._bytes = deque[bytes](), 0
+        self._some = asyncio.Event()
+        self._received = self._dropped_here = self._dropped_before = self._refused = self._reported = 0
+        self._next_report = 0.0
+
+    async def start(self) -> None:
+        """Open the socket.
+
+        Raises:
+            RunError: The system refuses.
+        """
+        family, place = self._place
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        try:
+            self._socket.setblocking(False)
+            with contextlib.suppress(OSError):
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+            self._socket.bind(place)
+        except OSError as error:
+            self._socket.close()
+            raise RunError(f"udp://{host_port(*place)}: cannot be listened at: {error.strerror}") from None
+        self._name = f"udp://{host_port(*self._socket.getsockname()[:2])}"
+        self._notify(f"listening at {self._name}")
+        asyncio.get_running_loop().add_reader(self._socket, self._receive)
+
+    async def get(self) -> list[bytes]:
+        """The lines of some datagrams."""
+        if self._waiting:
+            await asyncio.sleep(0)  # the socket is emptied first
+        else:
+            self._some.clear()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(QUIET):
+                    await self._some.wait()
+        self._report_drops()
+        return self._lines(_MOST_AT_ONCE)
+
+    async def stop(self) -> list[bytes]:
+        """Close the socket, and return the lines that wait."""
+        asyncio.get_running_loop().remove_reader(self._socket)
+        self._receive()
+        self._lost()  # for the last time
+        self._socket.close()
+        return self._lines(_MOST_DATAGRAMS)
+
+    def summary(self) -> str:
+        """How many came, and how many were lost or refused."""
+        text = f"{self._name}: {self._received - self._dropped_here} datagrams taken in, {self._lost()} lost"
+        return f"{text}, {self._refused} refused" if self._refused else text
+
+    def _lines(self, most: int) -> list[bytes]:
+        """The lines of at most so many datagrams."""
+        lines: list[bytes] = []
+        for _ in range(min(len(self._waiting), most)):
+            datagram = self._waiting.popleft()
+            self._bytes -= len(datagram)
+            lines += datagram.split(b"\n")
+        return lines
+
+    def _receive(self) -> None:
+        """Read datagrams from the socket."""
+        for _ in range(1024):
+            try:
+                datagram, sender = self._socket.recvfrom(_LARGEST)
+            except OSError:  # there is no more
+                break
+            if not self._allowed(sender[0]):
+                self._refused += 1
+                self._log.write("refused", f"a datagram from {sender[0]}, which --allow does not name: refused")
+                continue
+            self._received += 1
+            self._waiting.append(datagram)
+            self._bytes += len(datagram)
+            while len(self._waiting) > _MOST_DATAGRAMS or self._bytes > _MOST_BYTES:
+                self._bytes -= len(self._waiting.popleft())
+                self._dropped_here += 1
+        self._some.set()
+
+    def _lost(self) -> int:
+        """How many datagrams were dropped, here or by the system."""
+        if sys.platform == "linux" and self._socket.fileno() >= 0:
+            with contextlib.suppress(OSError):
+                counters = struct.unpack("=9I", self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 36))
+                self._dropped_before = counters[_DROPS]
+        return self._dropped_here + self._dropped_before
+
+    def _report_drops(self) -> None:
+        """Report once a second at most that datagrams are lost."""
+        if (now := time.monotonic()) >= self._next_report:
+            self._next_report = now + 1.0
+            if (lost := self._lost()) > self._reported:
+                self._reported = lost
+                self._log.write("lost", f"{self._name}: {lost} datagrams came faster than they were taken in: lost")
+
+
+class _Tcp:
+    """Connections whose lines are put together in the order in which they come."""
+
+    def __init__(self, notify: Callable[[str], None]) -> None:
+        self._notify, self._log = notify, RateLimitedLog(notify)
+        self._pieces = asyncio.Queue[list[bytes]](_MOST_PIECES)
+
+    async def get(self) -> list[bytes]:
+        """Some lines of one connection."""
+        try:
+            return self._pieces.get_nowait()
+        except asyncio.QueueEmpty:
+            pass
+        try:
+            async with asyncio.timeout(QUIET):
+                return await self._pieces.get()
+        except TimeoutError:
+            return []
+
+    def _waiting_lines(self) -> list[bytes]:
+        """Lines that have come and were not given."""
+        lines: list[bytes] = []
+        while not self._pieces.empty():
+            lines += self._pieces.get_nowait()
+        return lines
+
+    async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+        """Read a connection to its end, a last line without its end, too; whether there was anything."""
+        lines, some = Lines(), False
+        try:
+            _keep_alive(writer.get_extra_info("socket"))
+            while piece := await reader.read(_LARGEST):
+                some = True
+                if whole := lines.cut(piece):
+                    await self._pieces.put(whole)
+        except OSError:
+            pass
+        finally:
+            writer.close()
+        if rest := lines.rest():
+            await self._pieces.put(rest)
+        return some
+
+
+class TcpListener(_Tcp):
+    """Lines from all who connect."""
+
+    def __init__(self, place: SocketAddress, allowed: Allowed, notify: Callable[[str], None]) -> None:
+        """Prepare; :meth:`start` listens."""
+        super().__init__(notify)
+        self._place, self._allowed = place, allowed
+        self._open = set[asyncio.Task[None]]()
+        self._accepted = self._refused = 0
+
+    async def start(self) -> None:
+        """Listen.
+
+        Raises:
+            RunError: The system refuses.
+        """
+        family, place = self._place
+        try:
+            self._server = await asyncio.start_server(self._accept, *place, family=family, limit=_LARGEST)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise RunError(f"tcp-listen://{host_port(*place)}: cannot be listened at: {reason}") from None
+        self._name = f"tcp-listen://{host_port(*self._server.sockets[0].getsockname()[:2])}"
+        self._notify(f"listening at {self._name}")
+
+    async def stop(self) -> list[bytes]:
+        """Close all connections, and return the lines that wait."""
+        self._server.close()
+        for task in self._open:
+            task.cancel()
+        await asyncio.gather(*self._open)
+        return self._waiting_lines()
+
+    def summary(self) -> str:
+        """How many connections there were and are."""
+        text = f"{self._name}: connections: {self._accepted}, {len(self._open)} open"
+        return f"{text}, {self._refused} refused" if self._refused else text
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Read a connection to its end, unless its sender is not allowed or too many are open."""
+        peer = str((writer.get_extra_info("peername") or ("somewhere",))[0])
+        why = "" if self._allowed(peer) else "--allow does not name it"
+        why = f"{_MOST_CONNECTIONS} are open" if not why and len(self._open) >= _MOST_CONNECTIONS else why
+        if why:
+            self._refused += 1
+            self._log.write("refused", f"a connection from {peer}: refused, {why}")
+            writer.transport.abort()
+            return
+        self._accepted += 1
+        self._log.write("connected", f"{peer} has connected")
+        task = asyncio.current_task()
+        assert task is not None
+        self._open.add(task)
+        try:
+            await self._read(reader, writer)
+        except asyncio.CancelledError:  # at the end; asyncio would log a task that was cancelled
+            return
+        finally:
+            self._open.discard(task)
+        self._log.write("gone", f"the connection from {peer} has ended")
+
+
+class TcpClient(_Tcp):
+    """Lines from a server, to which the connection is made again whenever it ends."""
+
+    def __init__(self, address: Address, notify: Callable[[str], None]) -> None:
+        """Prepare; :meth:`start` connects."""
+        super().__init__(notify)
+        self._address, self._name = address, address.text
+        self._made, self._connected = 0, False
+
+    async def start(self) -> None:
+        """Begin to connect."""
+        self._task = asyncio.create_task(self._stay_connected())
+
+    async def stop(self) -> list[bytes]:
+        """Close the connection, and return the lines that wait."""
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+        return self._waiting_lines()
+
+    def summary(self) -> str:
+        """How often the connection was made, and whether it is there."""
+        return f"{self._name}: connections made: {self._made}, {'open' if self._connected else 'none open'}"
+
+    async def _stay_connected(self) -> None:
+        """Connect and read, again and again, with waits that double as long as nothing comes."""
+        wait = _FIRST_WAIT
+        while True:
+            try:
+                async with asyncio.timeout(_PATIENCE):
+                    reader, writer = await asyncio.open_connection(
+                        self._address.host, self._address.port, limit=_LARGEST
+                    )
+            except (OSError, UnicodeError) as error:  # a TimeoutError is an OSError
+                reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else "no answer"
+                reason = error.strerror or reason if isinstance(error, socket.gaierror) else reason
+                self._log.write("unreachable", f"{self._name}: cannot be reached: {reason}; tried again in {wait:g} s")
+            else:
+                self._made, self._connected = self._made + 1, True
+                self._log.write("connected", f"{self._name}: connected")
+                if await self._read(reader, writer):
+                    wait = _FIRST_WAIT
+                self._connected = False
+                self._log.write("ended", f"{self._name}: the connection has ended; made again in {wait:g} s")
+            await asyncio.sleep(wait)
+            wait = min(2.0 * wait, _LONGEST_WAIT)
+
+
+def _keep_alive(connection: socket.socket) -> None:
+    """Find within half a minute that the other side is gone without a word."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 4)):
+        if hasattr(socket, name):
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+
+class UdpSender:
+    """Sender of estimates as datagrams of one line each, whether anybody receives them or not."""
+
+    def __init__(self, text: str) -> None:
+        """Open a socket to send to ``udp://HOST:PORT``.
+
+        Raises:
+            ConfigError: It is no such address.
+        """
+        family, self._place = receiver(text)
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._text, self._lost = text, 0
+
+    def __call__(self, lines: list[bytes]) -> None:
+        """Send lines; what the system does not take is counted."""
+        for line in lines:
+            try:
+                self._socket.sendto(line, self._place)
+            except OSError:  # no room, no way there, or too long: the next one may get through
+                self._lost += 1
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def summary(self) -> str:
+        """How many could not be sent; empty for none."""
+        return f"{self._text}: {self._lost} estimates could not be sent" if self._lost else ""

@@ -1,12 +1,16 @@
-"""A stream as a recorded run while it comes: a CSV file for each source beside ``run.toml``.
+"""Recorder of a live stream: a CSV file for each source beside ``run.toml``, while the stream goes on.
 
-Rows are handed over twice a second to a thread of their own (:mod:`pumafuse.live.writer`), as far as nothing will take
-them back any more. Nothing here makes the estimator wait.
+Twice a second :class:`Recorder` hands rows that nothing will take back to :class:`Writer`, a thread that waits for the
+disk so that the estimator need not. Whole lines go to the end of a file: whoever reads finds a run at any moment, with
+a torn last line at worst. A disk that refuses is tried again every second; meanwhile rows wait, up to a bound.
 """
 
 from __future__ import annotations
 
 import math
+import os
+import queue
+import threading
 import time
 from collections.abc import Callable, Container, Mapping
 from contextlib import suppress
@@ -14,49 +18,51 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .. import toml
-from ..folders import FolderError
+from ..folders import FolderError, write_file
 from ..fusion.config import FusionConfig
 from ..logs.clock import TOLERATED_STEP_BACK_NS
 from ..logs.frames import CARTESIAN
 from ..logs.save import check_axis, check_name
 from ..model.arm import ordered_axes
 from ..units import MM
-from .writer import Job, Writer
 
 _FLUSHED = 0.5  # s between two writes
-_SAID_AGAIN = 60.0  # s until a trouble that lasts is told again
+_REPORTED_AGAIN = 60.0  # s until a trouble that lasts is reported again
 _MOST_BEFORE = 65_536  # measurements that are kept until the first command
-_COMMANDS, _TIME = "commands.csv", "time_ns"
+_TRIED_AGAIN = 1.0  # s after the disk refused
+_MOST_WAITING = 64 << 20  # bytes that wait for a disk
+_PATIENCE = 5.0  # s for the disk at the end
+_COMMANDS, _MANIFEST, _TIME = "commands.csv", "run.toml", "time_ns"
 
 
 class _Row(NamedTuple):
     stamp: int
     sensor: str | None
-    given: list[str]
+    given: list[str]  # axes with a value
     line: bytes
 
 
 class Recorder:
-    """What a live estimator believes, written down; see :class:`pumafuse.live.estimator.Journal`.
+    """Event log of a live estimator that becomes a recorded run; see :class:`pumafuse.live.estimator.EventLog`.
 
-    A controller's clock that is set anew begins another run, beside the first: ``DIR.2``, ``DIR.3``, and so on.
+    A clock of the controller that was reset begins another run, beside the first: ``DIR.2``, ``DIR.3``, and so on.
 
     Attributes:
-        late: How many were left out, as they stood more than 1 s behind an earlier one of their source, which a
+        late: Rows that were left out, as they stood more than 1 s behind an earlier one of their source, which a
             recorded run's clock may not.
-        lost: How many were not recorded as the disk refused for too long.
+        lost: Rows that were not recorded as the disk refused for too long.
     """
 
     def __init__(
-        self, folder: Path, config: FusionConfig, start: Mapping[str, float], say: Callable[[str], None]
+        self, folder: Path, config: FusionConfig, start: Mapping[str, float], notify: Callable[[str], None]
     ) -> None:
         """Make the folder and wait for rows.
 
         Args:
             folder: New, or empty.
-            config: Says which sensors and axes there are, and the frame.
+            config: Gives the sensors, the axes, and the frame.
             start: Level [m] of axes that do not rest at their first command before it.
-            say: Takes a sentence for the log.
+            notify: Takes a sentence for the log.
 
         Raises:
             FolderError: The folder holds something, or cannot be made.
@@ -69,26 +75,26 @@ class Recorder:
             check_axis(axis)
         framed = CARTESIAN if config.frame is not None else ()
         self._columns = tuple(dict.fromkeys((*axes, *framed)))
-        self._frame, self._start, self._say = config.frame, dict(start), say
+        self._frame, self._start, self._notify = config.frame, dict(start), notify
         self._first = self._folder = folder = folder.absolute()
         self.late = self.lost = self._given = 0
         self._segment = 1
         _make(folder)
         self._writer = Writer(",".join((_TIME, *(f"{axis}_mm" for axis in self._columns))).encode() + b"\n")
-        self._due, self._said, self._troubled = 0.0, -math.inf, False
+        self._due, self._reported, self._troubled = 0.0, -math.inf, False
         self._clear()
 
-    def begin(self) -> None:
-        """What comes is on another clock: write what was before, and begin a new run if there was a command."""
+    def begin_segment(self) -> None:
+        """Write what was before, and begin a new run if there was a command: what comes is on another clock."""
         if self._commanded:
             self._flush(self._pending)
             self._folder = self._next_folder()
             self._start = {}
-            self._say(f"record: another clock, so it goes on in {self._folder}")
+            self._notify(f"record: another clock, so it goes on in {self._folder}")
         self._clear()
 
-    def taken(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> None:
-        """An event is believed.
+    def append(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> None:
+        """Add an event.
 
         Args:
             stamp: Int ns.
@@ -106,12 +112,12 @@ class Recorder:
         line = ",".join([cells.get(axis, "") for axis in self._columns])
         self._pending.append(_Row(stamp, sensor, given, f"{stamp},{line}\n".encode()))
 
-    def forget(self, after: int) -> None:
-        """What is stamped after ``after`` [ns] was wrong."""
+    def discard(self, after: int) -> None:
+        """Remove the events stamped after ``after`` [ns]."""
         self._pending = [row for row in self._pending if row.stamp <= after]
 
     def tick(self, sure: int | None) -> None:
-        """Hand over twice a second what is to be written, and say whether it can be.
+        """Hand over twice a second what is to be written, and report whether it can be.
 
         Args:
             sure: The newest stamp [ns] that nothing will take back; None before any.
@@ -119,7 +125,7 @@ class Recorder:
         if (now := time.monotonic()) < self._due:
             return
         self._due = now + _FLUSHED
-        self._tell(now)  # of what was handed over before
+        self._report(now)  # on what was handed over before
         self._flush_until(sure)
 
     def close(self, sure: int | None) -> None:
@@ -131,27 +137,27 @@ class Recorder:
         with suppress(OSError):  # nothing ever came
             self._first.rmdir()
 
-    def told(self) -> str:
+    def summary(self) -> str:
         """What was recorded, in a sentence."""
         return f"{self._first}: {self._state()}"
 
-    def _tell(self, now: float) -> None:
-        """Say once a minute what is wrong with the disk, and once that it is well again."""
+    def _report(self, now: float) -> None:
+        """Report once a minute what is wrong with the disk, and once that it is well again."""
         trouble = self._writer.trouble
-        if trouble and now - self._said >= _SAID_AGAIN:
-            self._say(f"record: cannot be written: {trouble}; {self._state()}; estimates go on")
-            self._said, self._troubled = now, True
+        if trouble and now - self._reported >= _REPORTED_AGAIN:
+            self._notify(f"record: cannot be written: {trouble}; {self._state()}; estimates go on")
+            self._reported, self._troubled = now, True
         elif not trouble and self._troubled:
-            self._say(f"record: is written again; {self._state()}")
+            self._notify(f"record: is written again; {self._state()}")
             self._troubled = False
 
     def _state(self) -> str:
         written = self._writer.rows
-        said = [f"{written} rows written"]
-        said += [f"{self._given - written} wait"] if self._writer.trouble and self._given > written else []
-        said += [f"{self.late} left out, more than 1 s behind their source's newest"] if self.late else []
-        said += [f"{self.lost} lost"] if self.lost else []
-        return ", ".join(said)
+        parts = [f"{written} rows written"]
+        parts += [f"{self._given - written} wait"] if self._writer.trouble and self._given > written else []
+        parts += [f"{self.late} left out, more than 1 s behind their source's newest"] if self.late else []
+        parts += [f"{self.lost} lost"] if self.lost else []
+        return ", ".join(parts)
 
     def _next_folder(self) -> Path:
         """The first of the numbered ones that is not there."""
@@ -162,11 +168,11 @@ class Recorder:
                 return folder
 
     def _clear(self) -> None:
-        """Nothing of this run yet."""
+        """Begin a run without rows."""
         self._pending: list[_Row] = []
-        self._newest: dict[str | None, int] = {}
-        self._seen: dict[str | None, set[str]] = {}
-        self._listed: set[str | None] = set()  # whose rows have been handed over
+        self._newest: dict[str | None, int] = {}  # stamp of each source
+        self._seen: dict[str | None, set[str]] = {}  # axes of each source
+        self._listed: set[str | None] = set()  # sources whose rows have been handed over
         self._commanded = False
 
     def _flush_until(self, sure: int | None) -> None:
@@ -202,7 +208,7 @@ class Recorder:
                 self.lost += number
 
     def _manifest(self, listed: Container[str | None]) -> str:
-        """``run.toml`` with the listed sources and the axes that there have been."""
+        """``run.toml`` with the listed sources and the axes that they have given."""
         entries = {
             sensor: {
                 "file": _file(sensor),
@@ -220,6 +226,127 @@ class Recorder:
         if self._frame is not None:
             tree["frame"] = toml.builtins(self._frame)
         return toml.text(tree)
+
+
+class Job(NamedTuple):
+    """Rows to be written.
+
+    Attributes:
+        folder: Where; made if it is not there.
+        rows: Whole lines for the end of each file, by its name; what is written is removed.
+        manifest: The text of ``run.toml``, written if it has changed.
+        number: How many rows these are.
+    """
+
+    folder: Path
+    rows: dict[str, bytes]
+    manifest: str
+    number: int
+
+
+class _File:
+    """An open file, and whether its last line is torn."""
+
+    def __init__(self, path: Path) -> None:
+        self.descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        self.torn = False
+
+    def is_at(self, path: Path) -> bool:
+        """Whether it still has its name."""
+        try:
+            return os.path.samestat(os.fstat(self.descriptor), path.stat())
+        except FileNotFoundError:
+            return False
+
+
+class Writer:
+    """Thread that writes a record, and waits for the disk.
+
+    Attributes:
+        trouble: Why the disk refuses, or that the folder had gone; empty while all is well.
+        rows: How many are written.
+    """
+
+    def __init__(self, header: bytes) -> None:
+        """Start to wait for jobs; ``header`` is the first line of every file."""
+        self.trouble, self.rows = "", 0
+        self._header = header
+        self._folder, self._manifest = Path(), ""
+        self._files: dict[str, _File] = {}
+        self._jobs = queue.SimpleQueue[Job | None]()
+        self._given = self._done = 0  # bytes; each is counted by one thread alone
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="record", daemon=True)  # a dead disk may hold it
+        self._thread.start()
+
+    def hand_over(self, job: Job) -> bool:
+        """Take a job in if there is room for it; whether there was."""
+        size = sum(map(len, job.rows.values()))
+        if self._given - self._done + size > _MOST_WAITING:
+            return False
+        self._given += size
+        self._jobs.put(job)
+        return True
+
+    def close(self) -> None:
+        """Write what waits and end; a disk that does not take it within five seconds does not get it."""
+        self._ended.set()
+        self._jobs.put(None)
+        self._thread.join(_PATIENCE)
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            size = sum(map(len, job.rows.values()))
+            while not self._tried(job):
+                if self._ended.wait(_TRIED_AGAIN) and not self._tried(job):
+                    return
+            self._done += size
+            self.rows += job.number
+        self._close_files()
+
+    def _tried(self, job: Job) -> bool:
+        """Write what is left of a job; whether all of it is written."""
+        trouble = ""
+        try:
+            if job.folder != self._folder:
+                self._close_files()
+                self._folder, self._manifest = job.folder, ""
+            elif not all(file.is_at(job.folder / name) for name, file in self._files.items()):
+                trouble = f"{job.folder} or a file in it had gone, and is begun anew"
+                for name in [name for name, file in self._files.items() if file.torn]:
+                    job.rows[name] = job.rows[name].partition(b"\n")[2]
+                self._close_files()
+            job.folder.mkdir(exist_ok=True)
+            for name in list(job.rows):
+                self._append(job, name)
+            if job.manifest != self._manifest or not (job.folder / _MANIFEST).exists():
+                write_file(job.folder / _MANIFEST, job.manifest)
+                self._manifest = job.manifest
+        except OSError as error:
+            self.trouble = f"{job.folder}: {error.strerror or error}"
+            return False
+        except FolderError as error:
+            self.trouble = str(error)
+            return False
+        self.trouble = trouble
+        return True
+
+    def _append(self, job: Job, name: str) -> None:
+        """Write a file's rows; what a full disk took of them is not written twice."""
+        file = self._files.get(name)
+        if file is None:
+            file = self._files[name] = _File(job.folder / name)
+            if not os.fstat(file.descriptor).st_size and not job.rows[name].startswith(self._header):
+                job.rows[name] = self._header + job.rows[name]
+        while rows := job.rows[name]:
+            written = os.write(file.descriptor, rows)
+            job.rows[name], file.torn = rows[written:], rows[written - 1 : written] != b"\n"
+        del job.rows[name]
+
+    def _close_files(self) -> None:
+        for file in self._files.values():
+            os.close(file.descriptor)
+        self._files = {}
 
 
 def _file(sensor: str | None) -> str:
@@ -241,7 +368,7 @@ def _make(folder: Path) -> None:
 
 
 def _cell(value: object) -> str:
-    """A length [m] in mm, with the digits that bring the same float back."""
+    """A length [m] in mm, with the digits that bring the same float back; empty for what is no finite number."""
     if not isinstance(value, float | int) or not math.isfinite(value):
         return ""
     mm = value * MM

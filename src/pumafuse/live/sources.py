@@ -1,4 +1,4 @@
-"""Where events come from on this machine: standard input, or a recorded run as it happened."""
+"""Sources of events on this machine: standard input, or the replay of a recorded run."""
 
 from __future__ import annotations
 
@@ -10,22 +10,21 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..arrays import NO_STAMP, TimeArray
 from ..errors import RunError
-from ..fusion.commands import as_commanded
+from ..fusion.segments import as_commanded
 from ..fusion.config import FusionConfig
 from ..logs.clock import segments
 from ..logs.run import Run, Source
-from .lines import Lines
-from .wire import Event
+from .wire import Event, Lines
 
-QUIET = 0.1  # s without an event after which a source says so
-_PIECE = 1 << 16
-_BATCH = 1000  # events that a replay hands over at once when nothing makes it wait
+QUIET = 0.1  # s without an event after which a source gives an empty list
+_PIECE = 1 << 16  # bytes
+_BATCH = 1000  # events that a replay hands over at once when it need not wait
 
 
 def standard_input(descriptor: int = 0) -> Iterator[list[bytes]]:
-    """Lines of standard input as they come; none whenever it is quiet.
+    """Lines of standard input as they come; an empty list after a tenth of a second without any.
 
     Raises:
         RunError: It cannot be read.
@@ -46,9 +45,9 @@ def standard_input(descriptor: int = 0) -> Iterator[list[bytes]]:
 
 
 def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Event]]:
-    """A run's events in the order of their arrival, at a multiple of its own pace; an empty list whenever it is quiet.
+    """A run's events in the order of their arrival, at ``speed`` times its own pace; an empty list while it is quiet.
 
-    A row has arrived when its stamp says, one that steps back with the row before it; measurements come before commands
+    A row arrives when its stamp says, one that steps back with the row before it; measurements come before commands
     of the same instant.
 
     Raises:
@@ -60,33 +59,25 @@ def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Even
 
 def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
     """When each event arrives [ns], ascending, (n,), and the events."""
-    arrival: list[TimeArray] = []
-    events: list[Event] = []
-    command = as_commanded(run, config.arm.update_period)
-    for name, source in [*run.sensors.items(), ("", command)]:
-        events += _events(name, source)
-        arrival.append(np.maximum.accumulate(source.stamp))
-    order = np.argsort(np.concatenate(arrival), kind="stable")
-    return np.concatenate(arrival)[order], [events[place] for place in order.tolist()]
+    sources = [*run.sensors.items(), ("", as_commanded(run, config.arm.update_period))]
+    arrival = np.concatenate([np.maximum.accumulate(source.stamp) for _, source in sources])
+    events = [event for name, source in sources for event in _events(name, source)]
+    order = np.argsort(arrival, kind="stable")
+    return arrival[order], [events[place] for place in order.tolist()]
 
 
-def _events(name: str, source: Source) -> list[Event]:
-    """The rows of a source in their order; without a name they are commands, of the axes that each has a value for."""
+def _events(name: str, source: Source) -> Iterator[Event]:
+    """The rows of a sensor, or of commands (no name), which give only the axes that they have a value for."""
     columns: list[list[float]] = [value.tolist() for value in source.values.values()]
-    stamps: list[float | int] = [math.nan if stamp == NO_STAMP else stamp for stamp in source.stamp.tolist()]
-    rows = zip(stamps, zip(*columns, strict=True), strict=True)
-    if name:
-        return [Event(stamp, name, dict(zip(source.values, row, strict=True))) for stamp, row in rows]
-    return [
-        Event(stamp, name, {axis: u for axis, u in zip(source.values, row, strict=True) if u == u})  # NaN: no command
-        for stamp, row in rows
-    ]
+    for stamp, *row in zip(source.stamp.tolist(), *columns, strict=True):
+        values = {axis: value for axis, value in zip(source.values, row, strict=True) if name or value == value}
+        yield Event(math.nan if stamp == NO_STAMP else stamp, name, values)
 
 
 def _paced(arrival: TimeArray, events: list[Event], speed: float) -> Iterator[list[Event]]:
-    """Events when their time has come by the wall's clock, given when each arrives, int64 ns, ascending, (n,)."""
+    """Events when they are due by the wall clock; ``arrival`` is when each arrives [ns], ascending, (n,)."""
     first = int(arrival[arrival != NO_STAMP].min(initial=np.iinfo(np.int64).max))
-    due: FloatArray = (np.maximum(arrival, first) - first) / 1e9 / speed  # rows without a stamp come at once
+    due = (np.maximum(arrival, first) - first) / 1e9 / speed  # rows without a stamp come at once
     begin, at = time.monotonic(), 0
     while at < len(events):
         gone = time.monotonic() - begin

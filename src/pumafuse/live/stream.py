@@ -1,4 +1,4 @@
-"""Events in, estimates out: what ``pumafuse live`` does with each line."""
+"""Stream of a live estimator: lines of events in, lines of estimates out."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Protocol
 
 from ..errors import ConfigError
 from ..filter.outcome import Outcome
-from .answers import MET, LiveEstimate, UpdateResult
 from .clock import nanoseconds
 from .estimator import LiveEstimator
-from .sampler import Sampler
-from .wire import BadLine, Event, Wire, encode
+from .rate_limit import RateLimitedLog
+from .results import COMPARED, LiveEstimate, UpdateResult
+from .wire import BadLine, Event, LineDecoder, encode
 
 _SHOWN = 60  # characters of a bad line in the log
 _MOST_AT_ONCE = 50_000  # estimates on the grid between two events
@@ -19,14 +19,14 @@ _FASTEST = 1e4  # Hz
 
 
 class Watcher(Protocol):
-    """Who is told what comes in and what goes out, at once: it must not take long."""
+    """Receiver of all events and estimates, called at once: it must not take long."""
 
-    def event(self, event: Event, told: UpdateResult) -> None:
-        """An event came, and this became of it."""
+    def event(self, event: Event, result: UpdateResult) -> None:
+        """Receive an event and what became of it."""
         ...
 
     def estimate(self, estimate: LiveEstimate) -> None:
-        """An estimate goes out."""
+        """Receive an estimate that goes out."""
         ...
 
 
@@ -44,18 +44,18 @@ class Stream:
         self,
         live: LiveEstimator,
         write: Callable[[list[bytes]], None],
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
         rate: float | None = None,
         watchers: Sequence[Watcher] = (),
     ) -> None:
-        """Nothing in, nothing out.
+        """Wait for lines.
 
         Args:
             live: The estimator.
             write: Takes lines of estimates with their ends, some at a time.
-            say: Takes a sentence for the log.
+            notify: Takes a sentence for the log.
             rate: Estimates on an even grid [Hz] from the first command on; one for each command for None.
-            watchers: Are told of everything.
+            watchers: Receive all events and estimates.
 
         Raises:
             ConfigError: The rate is not positive, or too high.
@@ -64,16 +64,16 @@ class Stream:
             raise ConfigError(f"rate: at most {_FASTEST:g} estimates a second, not {rate:g}")
         self.live, self.lines, self.bad, self.estimates = live, 0, 0, 0
         self._write, self._watchers = write, tuple(watchers)
-        self._wire = Wire(live.axes, live.config.frame is not None)
+        self._decoder = LineDecoder(live.axes, live.config.frame is not None)
         self._step = None if rate is None else 1e9 / rate
         self._grid: tuple[int, int] | None = None  # the segment, and where its grid begins [ns]
         self._due = 0
-        self._whole = False  # whether the stream tells its time in ns
+        self._with_ns = False  # whether the stream gives its time in ns
         self._out: list[bytes] = []
-        self._log = Sampler(say)
+        self._log = RateLimitedLog(notify)
 
     def take(self, items: Iterable[bytes | Event]) -> None:
-        """Take in lines and events, and write what is to be said after each."""
+        """Take in lines and events, and write the estimates that are due after each."""
         for item in items:
             self.line(item) if isinstance(item, bytes) else self.event(item)
             self.flush()
@@ -84,39 +84,39 @@ class Stream:
             return
         self.lines += 1
         try:
-            event = self._wire.decode(line)
+            event = self._decoder.decode(line)
         except BadLine as error:
             self.bad += 1
             shown = repr(line[:_SHOWN])[1:] + (" ..." if len(line) > _SHOWN else "")
             reason = str(error)
-            self._log.say(f"bad line, {reason.partition(':')[0]}", f"bad line {self.lines}: {reason[:200]}: {shown}")
+            self._log.write(f"bad line, {reason.partition(':')[0]}", f"bad line {self.lines}: {reason[:200]}: {shown}")
             return
         self.event(event)
 
     def event(self, event: Event) -> None:
         """Take in one event."""
         live, (t, sensor, values) = self.live, event
-        self._whole = isinstance(t, int)
+        self._with_ns = isinstance(t, int)
         if self._step is not None:
             self._on_grid(live.until(t))
-        told = live.measurement(t, sensor, **values) if sensor else live.command(t, **values)
+        result = live.measurement(t, sensor, **values) if sensor else live.command(t, **values)
         for watcher in self._watchers:
-            watcher.event(event, told)
-        if told.outcome not in MET or not MET.issuperset(told.axes.values()):
+            watcher.event(event, result)
+        if not COMPARED.issuperset((result.outcome, *result.axes.values())):
             who = sensor if sensor in live.config.sensors else "unknown sensor" if sensor else "command"
-            became = f"{told.reason} ({told.outcome.word})"
-            self._log.say(f"{who} {told.outcome.word}", f"{sensor[:40] or who}{_at(t)}: {became}")
-        if self._step is None and not sensor and told.outcome is Outcome.FUSED:
+            became = f"{result.reason} ({result.outcome.word})"
+            self._log.write(f"{who} {result.outcome.word}", f"{sensor[:40] or who}{_at(t)}: {became}")
+        if self._step is None and not sensor and result.outcome is Outcome.FUSED:
             self._estimate(nanoseconds(t))
 
     def idle(self, now: int) -> None:
-        """Nothing has come for a while, and by the stream's own time it is ``now`` [ns]: the grid goes on."""
+        """Go on with the grid until ``now`` [ns] of the stream's own time, as nothing has come for a while."""
         if self._step is not None:
             self._on_grid(now + 1)
             self.flush()
 
     def end(self) -> None:
-        """No more will come."""
+        """Write the estimates until the last event: no more will come."""
         if self._step is not None and self.live.sure is not None:
             self._on_grid(self.live.sure + 1)
         self.flush()
@@ -128,7 +128,7 @@ class Stream:
             self._write(lines)
 
     def _on_grid(self, before: int | None) -> None:
-        """An estimate at each point of the grid before an instant [ns]; a long pause is left out."""
+        """Estimate at each point of the grid before an instant [ns]; a long pause is left out."""
         origin = self.live.origin
         if origin is None or before is None or self._step is None:
             return
@@ -137,7 +137,7 @@ class Stream:
         missing = int((before - self._grid[1]) / self._step) - self._due
         if missing > _MOST_AT_ONCE:
             self._due += missing
-            self._log.say("pause", f"a pause of {missing * self._step / 1e9:.0f} s: no estimates on the grid over it")
+            self._log.write("pause", f"a pause of {missing * self._step / 1e9:.0f} s: no estimates on the grid over it")
         while (at := self._grid[1] + round(self._due * self._step)) < before:
             self._estimate(at)
             self._due += 1
@@ -146,13 +146,13 @@ class Stream:
         estimate = self.live.estimate(stamp)
         if estimate.outcome is Outcome.FUSED:
             self.estimates += 1
-            self._out.append(encode(estimate, self._whole))
+            self._out.append(encode(estimate, self._with_ns))
             for watcher in self._watchers:
                 watcher.estimate(estimate)
 
 
 def _at(t: float | int) -> str:
-    """When, for people; nothing where that is no time."""
+    """A stamp for people; empty where it is no time."""
     try:
         return f" at {nanoseconds(t) / 1e9:.3f} s"
     except ValueError:

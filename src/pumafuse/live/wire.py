@@ -1,4 +1,4 @@
-"""The wire format: one JSON object a line, in and out; mm, s and ns there, m and s or ns here."""
+"""The wire format: one JSON object a line, in and out; mm, s and ns on the wire, m and s or ns inside."""
 
 from __future__ import annotations
 
@@ -11,10 +11,41 @@ from msgspec import UNSET, UnsetType
 from ..errors import ConfigError
 from ..logs.frames import CARTESIAN
 from ..units import MM
-from .answers import LiveEstimate
-from .lines import LONGEST
+from .results import LiveEstimate
 
+_LONGEST = 64 * 1024  # bytes of a line
 _NAMES = ("t", "t_ns", "command", "sensor")
+
+
+class Lines:
+    """Splitter of a stream's pieces, of any length, into whole lines.
+
+    A line of more than 64 KiB is cut off, so that it needs no memory; :class:`LineDecoder` refuses what is left of it.
+    """
+
+    def __init__(self) -> None:
+        """Start at the beginning of a line."""
+        self._torn, self._too_long = b"", False
+
+    def cut(self, piece: bytes) -> list[bytes]:
+        """The lines that end in this piece."""
+        *lines, rest = piece.split(b"\n")
+        if lines:
+            lines[0] = self._torn + lines[0]
+            if self._too_long:
+                del lines[0]
+            self._torn, self._too_long = b"", False
+        if not self._too_long:
+            self._torn += rest
+        if len(self._torn) > _LONGEST:
+            lines.append(self._torn)
+            self._torn, self._too_long = b"", True
+        return lines
+
+    def rest(self) -> list[bytes]:
+        """The last line, if the stream ended without a line end."""
+        left, self._torn = self._torn, b""
+        return [left] if left else []
 
 
 class BadLine(Exception):  # noqa: N818 - it is what the line is called, and never leaves the stream
@@ -27,7 +58,7 @@ class Event(NamedTuple):
     Attributes:
         t: Float seconds or int nanoseconds.
         sensor: Its name, empty for a command.
-        values: By axis [m]; what a line gives under unknown names is in it as it stands.
+        values: By axis [m]; values under unknown names are passed on as they are.
     """
 
     t: float | int
@@ -35,8 +66,8 @@ class Event(NamedTuple):
     values: Mapping[str, Any]
 
 
-class Wire:
-    """Lines of a stream whose arm has certain axes."""
+class LineDecoder:
+    """Decoder of lines into events, for one arm's axes."""
 
     def __init__(self, axes: Sequence[str], framed: bool) -> None:
         """Prepare for the axes' names, and for x, y, z where there is a frame.
@@ -50,86 +81,70 @@ class Wire:
                 raise ConfigError(f"axis '{axis}': lines of a stream call something else so ({', '.join(_NAMES)})")
         fields = [(f"axis_{number}", float | UnsetType | None, UNSET) for number in range(len(self._axes))]
         names = {f"axis_{number}": axis for number, axis in enumerate(self._axes)}
-        command = msgspec.defstruct("Command", fields, rename=names, forbid_unknown_fields=True, gc=False)
-        line = msgspec.defstruct(
-            "Line",
-            [
-                ("t", float | None, None),
-                ("t_ns", int | None, None),
-                ("command", command | None, None),
-                ("sensor", str | None, None),
-                *fields,
-            ],
-            rename=names,
-            forbid_unknown_fields=True,
-            gc=False,
-        )
-        self._decoder = msgspec.json.Decoder(line)
+        options: dict[str, Any] = {"rename": names, "forbid_unknown_fields": True, "gc": False}
+        command = msgspec.defstruct("Command", fields, **options)
+        head = [
+            ("t", float | None, None),
+            ("t_ns", int | None, None),
+            ("command", command | None, None),
+            ("sensor", str | None, None),
+        ]
+        self._decoder = msgspec.json.Decoder(msgspec.defstruct("Line", [*head, *fields], **options))
 
     def decode(self, line: bytes) -> Event:
-        """The event that a line is.
+        """The event of a line.
 
         Raises:
             BadLine: It is none.
         """
-        if len(line) > LONGEST:
+        if len(line) > _LONGEST:
             raise BadLine("longer than 64 KiB")
         try:
-            found, strangers = self._decoder.decode(line), {}
+            try:
+                found, unknown = self._decoder.decode(line), {}
+            except msgspec.ValidationError as error:
+                if "unknown field" not in str(error):
+                    raise
+                found, unknown = self._without_unknown(line)
         except msgspec.ValidationError as error:
-            if "unknown field" not in str(error):
-                raise BadLine(str(error)) from None
-            found, strangers = self._with_strangers(line)
+            raise BadLine(str(error)) from None
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise BadLine(f"not JSON: {error}") from None
         t, t_ns, command, sensor, *values = msgspec.structs.astuple(found)
         if command is not None:
-            values, given = msgspec.structs.astuple(command), [value for value in values if value is not UNSET]
-            if sensor is not None or given:
+            if sensor is not None or any(value is not UNSET for value in values):
                 raise BadLine("gives a command and a measurement at once")
-            sensor = ""
-        elif sensor is None:
-            raise BadLine("gives neither 'command' nor 'sensor'")
+            sensor, values = "", msgspec.structs.astuple(command)
         elif not sensor:
-            raise BadLine("'sensor' is empty")
+            raise BadLine("gives neither 'command' nor 'sensor'" if sensor is None else "'sensor' is empty")
+        if (t is None) == (t_ns is None):
+            raise BadLine("needs one of 't' (s) and 't_ns' (ns)")
         by_axis: dict[str, Any] = {
             axis: float("nan") if value is None else cast(float, value) / MM
             for axis, value in zip(self._axes, values, strict=True)
             if value is not UNSET
         }
-        return Event(_time(t, t_ns), sensor, by_axis | strangers)
+        return Event(cast(float | int, t if t_ns is None else t_ns), sensor, by_axis | unknown)
 
-    def _with_strangers(self, line: bytes) -> tuple[msgspec.Struct, dict[str, Any]]:
-        """A line with unknown names: these apart, to be told, and the rest of it."""
-        try:
-            tree = cast(dict[str, Any], msgspec.json.decode(line))
-            known = {*_NAMES, *self._axes}
-            strangers = {name: tree.pop(name) for name in list(tree) if name not in known}
-            if isinstance(tree.get("command"), dict):
-                command = cast(dict[str, Any], tree["command"])
-                strangers |= {name: command.pop(name) for name in list(command) if name not in self._axes}
-            return self._decoder.decode(msgspec.json.encode(tree)), strangers
-        except msgspec.ValidationError as error:
-            raise BadLine(str(error)) from None
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise BadLine(f"not JSON: {error}") from None
+    def _without_unknown(self, line: bytes) -> tuple[msgspec.Struct, dict[str, Any]]:
+        """A line without its unknown names, and the values under those."""
+        tree = cast(dict[str, Any], msgspec.json.decode(line))
+        unknown = {name: tree.pop(name) for name in list(tree) if name not in _NAMES and name not in self._axes}
+        command = tree.get("command")
+        if isinstance(command, dict):
+            unknown |= {name: command.pop(name) for name in list(command) if name not in self._axes}
+        return self._decoder.decode(msgspec.json.encode(tree)), unknown
 
 
-def _time(t: float | None, t_ns: int | None) -> float | int:
-    if (t is None) == (t_ns is None):
-        raise BadLine("needs one of 't' (s) and 't_ns' (ns)")
-    return cast(float | int, t if t_ns is None else t_ns)
-
-
-def encode(estimate: LiveEstimate, whole: bool) -> bytes:
-    """An estimate as a line: position, its sd and velocity of each axis, x, y, z with a frame, and what is stale.
+def encode(estimate: LiveEstimate, with_ns: bool) -> bytes:
+    """The line of an estimate: position, its sd and velocity of each axis, x, y, z with a frame, and stale axes.
 
     Args:
         estimate: The estimate.
-        whole: Give the time as ``t_ns``, too.
+        with_ns: Give the time as ``t_ns``, too.
     """
     line: dict[str, Any] = {"t": estimate.time}
-    if whole:
+    if with_ns:
         line["t_ns"] = estimate.stamp
     for name, axis in estimate.axes.items():
         line[name] = {

@@ -26,7 +26,7 @@ from ..fusion.consistency import log_density
 from ..fusion.engine import innovations
 from ..filter.outcome import Outcome
 from ..fusion.ticks import usable_cores
-from ..fusion.timeline import Timeline, build
+from ..fusion.segments import Timeline, build
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import Run

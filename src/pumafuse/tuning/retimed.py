@@ -15,7 +15,7 @@ import numpy.typing as npt
 from ..arrays import IntArray
 from ..fusion.components import Components
 from ..fusion.config import FusionConfig
-from ..fusion.timeline import AxisInput, Timeline
+from ..fusion.segments import AxisInput, Timeline
 from ..model.drive import drive
 
 T = TypeVar("T", bound=np.generic)

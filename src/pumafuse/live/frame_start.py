@@ -1,4 +1,4 @@
-"""Where a stream's x, y and z are in the arm's axes."""
+"""Conversion between a stream's x, y, z and the arm's axes, once its start is known."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from ..logs.axes import placed_at
 from ..logs.frames import CARTESIAN, Frame, Placed, Rotated
 
 
-class Placing:
-    """A frame that gets its place from the start level, or from the first command.
+class FrameStart:
+    """A frame that starts at the start level, or at the first command.
 
     Attributes:
-        placed: The frame in its place; None as long as it has none.
-        since: Stamp of the command that placed it, int ns; None where none had to.
+        placed: The frame with its start; None until that is known.
+        since: Stamp of the command that gave the start, int ns; None where no command had to.
     """
 
     def __init__(self, frame: Frame | None, axes: tuple[str, ...]) -> None:
-        """Not placed yet, but for a rotated frame, which has no place."""
+        """Wait for a start, unless the frame is rotated: then it needs none."""
         self._frame, self._axes = frame, axes
         self.placed: Placed | None = placed_at(frame, 0.0, 0.0, "") if isinstance(frame, Rotated) else None
         self.since: int | None = None
@@ -29,11 +29,11 @@ class Placing:
 
     @property
     def waits(self) -> bool:
-        """Whether a command is needed to place the frame."""
+        """Whether a command is needed to know the start."""
         return self._frame is not None and self.placed is None
 
     def start(self, level: Mapping[str, float]) -> dict[str, float]:
-        """A start level by axes [m]; x and y in it place the frame.
+        """Convert a start level to axes [m]; its x and y start the frame.
 
         Raises:
             PumafuseError: It is of no axis, gives half a position, or one on the base's axis.
@@ -47,7 +47,7 @@ class Placing:
         return found | {axis: value for axis, (value, _) in self.in_axes(rest, None).items()}
 
     def place(self, stamp: int, x: float, y: float) -> None:
-        """Let a command's position say where the frame about the base is.
+        """Start the frame at a command's x and y [m].
 
         Raises:
             RunError: That is on the base's axis.
@@ -56,7 +56,7 @@ class Placing:
         self.placed, self.since = placed_at(self._frame, x, y, "command"), stamp
 
     def in_axes(self, values: Mapping[str, float], near: FloatArray | None) -> dict[str, tuple[float, float]]:
-        """The axes' positions [m] of values in x, y and z, and by what the noise of each is scaled.
+        """Convert x, y, z [m] to axes: for each its position [m], and the factor by which its noise grows.
 
         Args:
             values: x, y and z [m] as far as they are given; NaN on both axes for x without y.
@@ -72,10 +72,10 @@ class Placing:
             found["radial"] = float(radial[0]), 1.0
         if "z" in values:
             found["vertical"] = values["z"], 1.0
-        return {axis: given for axis, given in found.items() if axis in self._axes}
+        return {axis: component for axis, component in found.items() if axis in self._axes}
 
     def in_log(self, positions: Mapping[str, float]) -> dict[str, float] | None:
-        """The stream's x, y and z [m] of axis positions [m], as far as these give them; None without a place."""
+        """Convert axis positions [m] back to x, y, z [m], as far as they give these; None before the start is known."""
         if self.placed is None:
             return None
         found: dict[str, float] = {}
