@@ -16,7 +16,6 @@ give the same bits.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray

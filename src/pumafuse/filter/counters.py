@@ -6,6 +6,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from ..arrays import ALWAYS, FloatArray, IntArray, TimeArray
 from ..compiled import compiled
 
@@ -39,6 +41,18 @@ class Counters(NamedTuple):
     usual: FloatArray
     second: TimeArray
     minute: FloatArray
+
+    @staticmethod
+    def none(sensors: int) -> Counters:
+        """Nothing counted yet."""
+        return Counters(
+            number=np.zeros((sensors, IN_A_ROW + 1), dtype=np.int64),
+            last=np.full(sensors, ALWAYS),
+            left=np.full(sensors, ALWAYS),
+            usual=np.zeros(sensors),
+            second=np.full((sensors, SECONDS), ALWAYS),
+            minute=np.zeros((sensors, SECONDS, 5)),
+        )
 
 
 @compiled

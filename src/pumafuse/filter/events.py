@@ -96,7 +96,10 @@ def joined(parts: Sequence[Events]) -> Events:
     if any(len(one) for one in spread):
         spread = [part.spread if len(part.spread) else np.ones_like(part.value) for part in parts]
     names = ("time", "source", "stamp", "value", "known")
-    return Events(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}, spread=np.concatenate(spread))
+    return Events(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names},
+        spread=np.concatenate(spread),
+    )
 
 
 @compiled
@@ -183,7 +186,9 @@ def repeats(model: Model, events: Events, row: int, axis: int, begin: int, end: 
 @compiled
 def gives_command(events: Events, row: int, axis: int) -> bool:
     """Whether a row is a command with a possible value for an axis."""
-    return events.source[row] == COMMAND and events.known[row, axis] != ABSENT and abs(events.value[row, axis]) < FARTHEST
+    return (
+        events.source[row] == COMMAND and events.known[row, axis] != ABSENT and abs(events.value[row, axis]) < FARTHEST
+    )
 
 
 @compiled

@@ -89,6 +89,15 @@ class History(NamedTuple):
     P: FloatArray
 
 
+def no_history(state: State) -> History:
+    """A history in which nothing is kept."""
+    width, axes = state.x.shape[1], len(state.unsettled)
+    none, table = np.zeros(0, dtype=np.int64), np.zeros((0, width))
+    states = np.zeros((axes, 0, width)), np.zeros((axes, 0, width, width))
+    used = np.zeros(axes, dtype=np.int64)
+    return History(np.zeros(axes + 1, dtype=np.int64), used, none, none, np.zeros(0), np.zeros(0), table, *states)
+
+
 class Kept(NamedTuple):
     """Checkpoints of a :class:`State` before each row, in a ring of places; none where nothing is taken back.
 

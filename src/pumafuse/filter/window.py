@@ -22,7 +22,7 @@ from .counters import NIS, SCALARS, Counters, count_interval, count_row, forget_
 from .events import COMMAND, DUPLICATE, FUSED, INVALID, Events, Results, classify, said_before
 from .forward import REACQUIRED, History, Kept, Outputs, checkpoint, estimate, restore, run_events
 from .gate import FUSED_AT, NOBODY
-from .outcome import ABSENT, FARTHEST
+from .outcome import ABSENT
 
 MOST_ROWS = 65_536  # events; what is more shortens the window
 FIRST_ROWS = 4096  # at first
@@ -43,6 +43,7 @@ class Incoming(NamedTuple):
         value: Of the event that comes in [m], (A,).
         spread: By what the noise of each of its values is scaled, (A,).
         outcome: What became of them, ``ABSENT`` for an axis that it does not give, (A,).
+        innovation: ν of each value [m], (A,).
         contradicts: The sensor that a rejected measurement contradicts, ``NOBODY`` for none, (1,).
         fused: When the last measurement was valid that an estimate knows of, int64 ns, (A,).
         rest_P: P of the state at rest, (A, s, s).
@@ -57,6 +58,7 @@ class Incoming(NamedTuple):
     value: FloatArray
     spread: FloatArray
     outcome: CodeArray
+    innovation: FloatArray
     contradicts: IntArray
     fused: TimeArray
     rest_P: FloatArray
@@ -129,7 +131,7 @@ def add_measurement(flat: Flat, stamp: int, sensor: int, given: int, newest: int
     catch_up(m)
     incoming.contradicts[0] = m.results.contradicts[at]
     for axis in range(len(incoming.value)):
-        incoming.outcome[axis] = m.results.outcome[at, axis]
+        incoming.outcome[axis], incoming.innovation[axis] = m.results.outcome[at, axis], m.results.innovation[at, axis]
     return ACCEPTED
 
 
@@ -282,9 +284,7 @@ def catch_up(m: Memory) -> None:
     """Bring the state to where it is to be."""
     span = m.incoming.span
     if span[DONE] < span[RUN]:
-        run_events(
-            m.model, m.sensors, m.events, m.state, span[DONE], span[RUN], False, m.results, m.history, m.kept
-        )
+        run_events(m.model, m.sensors, m.events, m.state, span[DONE], span[RUN], False, m.results, m.history, m.kept)
         span[DONE] = span[RUN]
 
 
@@ -344,9 +344,7 @@ def move(events: Events, here: int, there: int) -> None:
 def classified(m: Memory, row: int, axis: int, whole: int) -> int:
     """What a value of the window is before the filter sees it."""
     span = m.incoming.span
-    return classify(
-        m.model, m.sensors, m.events, m.state, span[ORIGIN], row, axis, span[BEGIN], span[END], whole
-    )
+    return classify(m.model, m.sensors, m.events, m.state, span[ORIGIN], row, axis, span[BEGIN], span[END], whole)
 
 
 @compiled_apart
@@ -425,7 +423,9 @@ def count_outcome(m: Memory, row: int) -> None:
             continue
         counters.number[sensor, outcome] += 1
         if (outcome == FUSED or outcome == REACQUIRED) and slot >= 0:
-            counters.minute[sensor, slot, NIS] += (results.innovation[row, axis] / results.innovation_sd[row, axis]) ** 2
+            counters.minute[sensor, slot, NIS] += (
+                results.innovation[row, axis] / results.innovation_sd[row, axis]
+            ) ** 2
             counters.minute[sensor, slot, SCALARS] += 1.0
 
 
@@ -440,6 +440,8 @@ class Window:
         value: Of the event that comes in [m], (A,).
         spread: By what the noise of each of its values is scaled, 1 if nobody says otherwise, (A,).
         outcome: What became of its axes: codes of Outcome, or ``ABSENT`` for an axis that it does not give, (A,).
+        innovation: ν of each value of a measurement [m], (A,).
+        contradicts: The sensor that it contradicts where it is rejected time after time, ``NOBODY`` for none, (1,).
         floor: What is stamped before it [ns] can no longer be taken, because the stream was too dense for the window.
     """
 
@@ -536,7 +538,7 @@ class Window:
         self.memory, self._flat = memory, memory.flat()
         incoming = memory.incoming
         self.value, self.spread, self.outcome = incoming.value, incoming.spread, incoming.outcome
-        self.contradicts = incoming.contradicts
+        self.innovation, self.contradicts = incoming.innovation, incoming.contradicts
 
 
 def with_rows(memory: Memory, rows: int) -> Memory:

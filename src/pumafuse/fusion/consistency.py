@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray
+from ..filter.outcome import Outcome
 from ..units import MM
 from .config import Sensor
 from .estimates import Estimates, Measurements, outcome_counts
-from ..filter.outcome import Outcome
 from .score import Z95
 from .segments import LONGEST_TAIL_NS
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import CodeArray, FloatArray, IntArray, TimeArray
+from ..arrays import CodeArray, TimeArray
 from ..filter.axis import BIASES, Model, Sensors, State
 from ..filter.events import COMMAND, Events, Results
-from ..filter.forward import History, Outputs, filter_as_live, filter_events
-from ..filter.outcome import ABSENT, Outcome
+from ..filter.forward import History, Outputs, filter_as_live, filter_events, no_history
+from ..filter.outcome import Outcome
 from ..filter.smoother import smooth
 from .config import FusionConfig
 from .estimates import AxisEstimate, Bias, Mode
@@ -45,16 +45,14 @@ def filter_segment(segment: Segment, config: FusionConfig, times: TimeArray, mod
     results.outcome[:] = events.known
     outputs = Outputs(*np.empty((len(Outputs._fields), axes, len(times))))
     if mode == "as-live":
-        history = no_history(axes, state)
+        history = no_history(state)
         arrival = np.where(events.source == COMMAND, events.stamp, np.maximum(events.stamp, events.time))
         queue = np.argsort(arrival, kind="stable")
         kept = room_for(state, _most_taken_back(events.time, arrival, times) + 1, count)
         filter_as_live(model, sensors, events, state, arrival, queue, times, results, history, kept, outputs)
     else:
-        history = _history(events, state, len(times)) if mode == "smoothed" else no_history(axes, state)
-        filter_events(
-            model, sensors, events, state, False, times, results, history, room_for(state, 0), outputs
-        )
+        history = _history(events, state, len(times)) if mode == "smoothed" else no_history(state)
+        filter_events(model, sensors, events, state, False, times, results, history, room_for(state, 0), outputs)
     if mode == "smoothed":
         width = state.x.shape[1]
         room = np.empty((2, width)), np.empty((2, width, width)), np.empty((4, width)), np.empty((width + 1, width))
@@ -82,7 +80,7 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
     if outcome is not None:
         results.outcome[measured] = outcome[place[measured]]
     none, outputs = np.empty(0, dtype=np.int64), Outputs(*np.empty((len(Outputs._fields), axes, 0)))
-    given, history, kept = outcome is not None, no_history(axes, state), room_for(state, 0)
+    given, history, kept = outcome is not None, no_history(state), room_for(state, 0)
     filter_events(model, sensors, events, state, given, none, results, history, kept, outputs)
     found = Results.room(len(measured), axes)
     for part, whole in zip(found, results, strict=True):
@@ -90,9 +88,7 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
     return found
 
 
-def arranged(
-    segment: Segment, config: FusionConfig, biases: list[list[str]]
-) -> tuple[Model, Sensors, State]:
+def arranged(segment: Segment, config: FusionConfig, biases: list[list[str]]) -> tuple[Model, Sensors, State]:
     """The filter's arrays for a segment, and the state at rest."""
     return (
         filter_model(config, segment.axes, biases),
@@ -115,15 +111,6 @@ def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
         ]
         for axis in range(count)
     ]
-
-
-def no_history(axes: int, state: State) -> History:
-    """A history in which nothing is kept."""
-    width, none = state.x.shape[1], np.zeros(0, dtype=np.int64)
-    where = np.zeros(axes + 1, dtype=np.int64)
-    table = np.zeros((0, width))
-    states = np.zeros((axes, 0, width)), np.zeros((axes, 0, width, width))
-    return History(where, where[:axes].copy(), none, none, table[:, 0].copy(), table[:, 0].copy(), table, *states)
 
 
 def _history(events: Events, state: State, estimates: int) -> History:

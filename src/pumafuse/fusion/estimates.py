@@ -10,8 +10,8 @@ import numpy as np
 
 from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
 from ..errors import UnknownNameError
-from .config import FusionConfig
 from ..filter.outcome import Outcome
+from .config import FusionConfig
 from .reference import ReferenceTrack
 
 Mode = Literal["filtered", "as-live", "smoothed"]

@@ -20,10 +20,10 @@ from ..logs.run import Run
 from ..units import seconds
 from .config import FusionConfig
 from .consistency import troubles
+from .engine import Filtered, filter_segment
 from .estimates import Estimates, Measurements, Mode
 from .reference import joined_references, late_rows, reference_track
 from .score import interpolated
-from .engine import Filtered, filter_segment
 from .segments import Segment, build, output_times
 
 Engine = Literal["compiled", "filterpy"]

@@ -13,6 +13,7 @@ import pyarrow as pa
 from .. import folders
 from ..arrays import FloatArray, IntArray
 from ..errors import RunError
+from ..filter.outcome import Outcome
 from ..folders import FolderError
 from ..logs import tables
 from ..logs.axes import in_axes
@@ -22,7 +23,6 @@ from ..logs.run import Run
 from ..logs.tables import Table
 from ..units import MM, seconds
 from .estimates import Estimates
-from ..filter.outcome import Outcome
 from .reference import ReferenceTrack, joined_references, reference_track
 from .score import Score, score
 from .summary import Summary, summarise

@@ -215,9 +215,7 @@ def _first_value(rows: Events, axis: int) -> float:
     return float(rows.value[np.flatnonzero(rows.known[:, axis] == Outcome.FUSED)[0], axis])
 
 
-def _measurement_rows(
-    run: Run, config: FusionConfig, name: str, number: int, origin: int, notes: list[str]
-) -> Events:
+def _measurement_rows(run: Run, config: FusionConfig, name: str, number: int, origin: int, notes: list[str]) -> Events:
     """One sensor's rows by stamp, each value classified."""
     source, sensor = run.sensors[name], config.sensors.get(name)
     label, latency = source.told_as(name), 0 if sensor is None else round(sensor.latency * 1e9)
@@ -261,7 +259,12 @@ def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int) 
 
 
 def _classified(
-    rows: Events, config: FusionConfig, axes: tuple[str, ...], sensors: tuple[str, ...], origin: int, too_late: BoolArray
+    rows: Events,
+    config: FusionConfig,
+    axes: tuple[str, ...],
+    sensors: tuple[str, ...],
+    origin: int,
+    too_late: BoolArray,
 ) -> Events:
     """Rows of one source with every value classified."""
     none = [()] * len(axes)

@@ -8,10 +8,10 @@ from importlib.metadata import version
 import msgspec
 import numpy as np
 
+from ..filter.outcome import Outcome
 from ..units import MM
 from .consistency import chi_square_band, consistency, log_likelihood
 from .estimates import Estimates
-from ..filter.outcome import Outcome
 from .score import Score, score
 
 

@@ -7,19 +7,27 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
+
+from ..arrays import NEVER, FloatArray
 from ..errors import ConfigError, RunError, suggestion
+from ..filter.axis import START
+from ..filter.counters import Counters
+from ..filter.events import Events, Results
+from ..filter.forward import no_history
+from ..filter.gate import NOBODY
+from ..filter.outcome import ABSENT, FARTHEST, Outcome
+from ..filter.window import FIRST_ROWS, MOST_ROWS, Incoming, Memory, Window
 from ..fusion.config import FusionConfig
-from ..filter.outcome import FARTHEST, Outcome
 from ..fusion.segments import LONGEST_TAIL_NS
+from ..fusion.setup import at_rest, filter_model, filter_sensors, room_for
 from ..logs.frames import CARTESIAN, Cylindrical
 from ..model.arm import ordered_axes
+from ..units import MM
 from .clock import Clock, Time, Verdict, nanoseconds
 from .frame_start import FrameStart
-from .memory import ABSENT
 from .rate_limit import RateLimitedLog
 from .results import AxisNow, Health, LiveEstimate, UpdateResult, health_of, no_estimate, update_result
-from .tally_kernels import Tally
-from .window import MOST_ROWS, Window
 
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
@@ -108,6 +116,7 @@ class LiveEstimator:
         self._commands = dict.fromkeys(Outcome, 0)
         self._answers: dict[bytes, UpdateResult] = {}
         self._aside: list[tuple[_Event, Outcome]] = []
+        self._contradicting: dict[str, int] = {}  # since when [ns] sensors contradict others
         self._clock = Clock(round(window * 1e9))
         self._start, self._before = dict(start or {}), None
         self._begin(None)
@@ -121,7 +130,7 @@ class LiveEstimator:
             other.measurement(0, sensor, **place)
         other.estimate()
         other.health()
-        other._window.rehearse()
+        other._window.warm_up()
 
     def command(self, t: Time, /, **axes: float) -> UpdateResult:
         """The arm is told to go to a position [m] on each of ``axes``.
@@ -167,7 +176,7 @@ class LiveEstimator:
             return no_estimate(stamp, _INVALID, "more than an hour ahead")
         axes: dict[str, AxisNow] = {}
         stale: list[str] = []
-        for axis, found in zip(self.axes, self._window.estimate(stamp, self._oldest()), strict=True):
+        for axis, found in zip(self.axes, self._window.estimate(stamp), strict=True):
             if found is not None:
                 outputs, fused = found
                 axes[axis] = AxisNow(*outputs)
@@ -208,7 +217,7 @@ class LiveEstimator:
     def health(self) -> Health:
         """How each sensor does, and what became of everything so far."""
         return health_of(
-            self._window.tally(),
+            self._window.counters(),
             self._refused,
             self._commands,
             self._strangers,
@@ -217,11 +226,11 @@ class LiveEstimator:
             self._stale_ns,
         )
 
-    def _begin(self, tally: Tally | None) -> None:
+    def _begin(self, counters: Counters | None) -> None:
         """An empty window, with what was counted before."""
-        self._before = tally
+        self._before = counters
         self._frame_start = FrameStart(self.config.frame, self.axes)
-        self._window = Window(self.config, self.axes, self._frame_start.start(self._start), tally)
+        self._window = empty_window(self.config, self.axes, self._frame_start.start(self._start), counters)
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it.
         # With each goes its outcome, and whether it never came into the window.
         self._early: list[tuple[_Event, Outcome, bool]] | None = [] if self._frame_start.waits else None
@@ -260,14 +269,14 @@ class LiveEstimator:
         newest, command = clock.newest, sensor is None
         if newest is None or (self._window.origin is None and (command or stamp > newest)):
             if newest is not None and command:
-                self._begin(self._window.tally())  # the commands' clock counts: what was heard before is of another
+                self._begin(self._window.counters())  # the commands' clock counts: what was heard before is of another
                 if self._event_log is not None:
                     self._event_log.begin_segment()
             clock.start(stamp)
             return None
         verdict = clock.judge(stamp, sensor)
         while verdict is Verdict.CONTRADICTED:
-            self._window.forget(clock.bound, self._oldest())
+            self._window.forget(clock.bound)
             if self._event_log is not None:
                 self._event_log.discard(clock.bound)
             self._commands[_FUSED] -= self._doubtful
@@ -315,7 +324,7 @@ class LiveEstimator:
         moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
         self._log.write("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
         self._start = {}
-        self._begin(self._window.tally())
+        self._begin(self._window.counters())
         if self._event_log is not None:
             self._event_log.begin_segment()
         self._clock.start(first)
@@ -379,15 +388,16 @@ class LiveEstimator:
             why = "no command has said yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
             return self._refuse(sensor, values, Outcome.BEFORE_START if missing else _UNKNOWN, why)
         if sensor is None:
-            taken = window.command(stamp, given, oldest)
+            taken = window.add_command(stamp, given, oldest)
         else:
-            newest = self._clock.sure
-            taken = window.hear(stamp, self._sensors[sensor], given, newest, oldest)
+            taken = window.add_measurement(stamp, self._sensors[sensor], given, self._clock.sure, oldest)
         if self.config.frame is not None:
             window.spread[:] = 1.0
         if not taken:
             return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
-        codes = window.told.tobytes()
+        if sensor is not None:
+            self._say_contradiction(stamp, sensor)
+        codes = window.outcome.tobytes()
         told = self._answers.get(codes) if not stranger else None
         told = told or self._answer(codes, stranger)
         if sensor is None:
@@ -401,10 +411,10 @@ class LiveEstimator:
         validity = self.config.arm.validity
         if validity.max_speed is None and validity.max_radius is None:
             return
-        stamp, step = self._window.latest_step()
-        speed, radius = step / self.config.arm.update_period, None
-        if isinstance(self.config.frame, Cylindrical) and (axis := self._bits.get("radial")) is not None:
-            radius = self._window.latest_command(axis)
+        latest = {axis: found for axis in self.axes if (found := self._window.command_at(self._bits[axis])) is not None}
+        stamp = max(stamp for stamp, _, _ in latest.values())
+        speed = max(abs(step) for _, _, step in latest.values()) / self.config.arm.update_period
+        radius = latest["radial"][1] if isinstance(self.config.frame, Cylindrical) and "radial" in latest else None
         for passed in validity.excess(speed, radius):
             self._log.write(passed.split(" reach")[0], f"{passed}, at {stamp / 1e9:.3f} s")
 
@@ -413,13 +423,34 @@ class LiveEstimator:
         window, given = self._window, 0
         placed = self._frame_start.in_axes(
             {name: _number(values[name]) for name in CARTESIAN if name in values},
-            None if sensor is None else window.commanded(self._bits.get("tangential", 0), stamp),
+            None if sensor is None else self._commanded("tangential", stamp),
         )
         for name, component in placed.items():
             axis = self._bits[name]
             window.value[axis], window.spread[axis] = component
             given |= 1 << axis
         return given
+
+    def _commanded(self, axis: str, stamp: int) -> FloatArray:
+        """The position [m] commanded on an axis at ``stamp`` [ns], as far as is known, (1,)."""
+        found = self._window.command_at(self._bits[axis], stamp) if axis in self._bits else None
+        return np.array([0.0 if found is None else found[1]])
+
+    def _say_contradiction(self, stamp: int, sensor: str) -> None:
+        """Say which other sensor one contradicts, by how much, and since when."""
+        window = self._window
+        if window.contradicts[0] == NOBODY:
+            if self._contradicting and window.outcome.min() == _FUSED:
+                self._contradicting.pop(sensor, None)
+            return
+        other = tuple(self._sensors)[window.contradicts[0]]
+        since = self._contradicting.setdefault(sensor, stamp)
+        found = zip(self.axes, window.outcome.tolist(), window.innovation.tolist(), strict=True)
+        off = ", ".join(f"{axis} by {nu * MM:+.4g} mm" for axis, outcome, nu in found if outcome == Outcome.REJECTED)
+        self._log.write(
+            f"{sensor} contradicts {other}",
+            f"sensor '{sensor}' contradicts '{other}' since {since / 1e9:.3f} s ({off}): its measurements are rejected",
+        )
 
     def _no_axis(self, stranger: str) -> str:
         """Why what an event gives under a name is of no axis."""
@@ -450,6 +481,57 @@ class LiveEstimator:
             self._refused[sensor][outcome] += times * len(values)
         else:
             self._strangers += times
+
+
+def empty_window(
+    config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, float], counters: Counters | None
+) -> Window:
+    """A window with nothing in it.
+
+    Args:
+        config: Arm, noise and sensors.
+        axes: Every axis in its order.
+        start: The level u₀ [m] of axes that do not rest at their first command before it.
+        counters: What was counted before.
+    """
+    names, count = tuple(config.sensors), len(axes)
+    biases = [
+        [name for name, sensor in config.sensors.items() if sensor.bias_sd > 0.0 and sensor.sd_of(axis) is not None]
+        for axis in axes
+    ]
+    state = at_rest(config, axes, len(names), biases, NEVER, {})
+    kept = room_for(state, FIRST_ROWS + 1, FIRST_ROWS + 1)
+    kept.arrived[:] = True
+    counted = Counters.none(len(names))
+    if counters is not None:
+        counted.number[:], counted.usual[:] = counters.number, counters.usual
+    memory = Memory(
+        model=filter_model(config, axes, biases),
+        sensors=filter_sensors(config, names, axes, biases),
+        events=Events.empty(count, FIRST_ROWS)._replace(spread=np.ones((FIRST_ROWS, count))),
+        state=state,
+        results=Results.room(FIRST_ROWS, count),
+        history=no_history(state),
+        kept=kept,
+        counters=counted,
+        incoming=Incoming(
+            span=np.array([0, 0, 0, 0, NEVER]),
+            first=np.full(count, NEVER),
+            start=np.array([start.get(axis, np.nan) for axis in axes]),
+            delay=np.array([round(config.arm.delay_of(axis) * 1e9) for axis in axes]),
+            latency=np.array([round(sensor.latency * 1e9) for sensor in config.sensors.values()], dtype=np.int64),
+            value=np.zeros(count),
+            spread=np.ones(count),
+            outcome=np.zeros(count, dtype=np.uint8),
+            innovation=np.zeros(count),
+            contradicts=np.zeros(1, dtype=np.int64),
+            fused=np.zeros(count, dtype=np.int64),
+            rest_P=state.P[:count].copy(),
+            rest_drive=state.drive[:count].copy(),
+        ),
+    )
+    memory.state.drive[:count, START] = memory.incoming.start
+    return Window(memory)
 
 
 def _number(value: object) -> float:

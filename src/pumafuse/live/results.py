@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from ..arrays import ALWAYS
 from ..errors import UnknownNameError
+from ..filter.counters import CAME, DROPOUTS, LATENESS, MOST_LATE, NIS, ROWS, SCALARS, SECONDS, Counters
 from ..filter.outcome import Outcome
-from .tally_kernels import CAME, DROPOUTS, LATENESS, MOST_LATE, NIS, ROWS, SCALARS, SECONDS, Tally
 
 COMPARED = frozenset({Outcome.FUSED, Outcome.REACQUIRED, Outcome.REJECTED})  # with its prediction
 _REASONS: Mapping[Outcome, str] = {  # the best first
@@ -162,7 +162,7 @@ class Health:
 
 
 def health_of(
-    counters: Tally,
+    counters: Counters,
     refused: Mapping[str, Mapping[Outcome, int]],
     commands: Mapping[Outcome, int],
     unknown: int,

@@ -12,8 +12,8 @@ import numpy as np
 
 from ..arrays import NO_STAMP, TimeArray
 from ..errors import RunError
-from ..fusion.segments import as_commanded
 from ..fusion.config import FusionConfig
+from ..fusion.segments import as_commanded
 from ..logs.clock import segments
 from ..logs.run import Run, Source
 from .wire import Event, Lines
