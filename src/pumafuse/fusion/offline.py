@@ -18,7 +18,7 @@ from ..logs.run import Run
 from ..units import seconds
 from . import timeline as timelines
 from .config import FusionConfig
-from .consistency import troubles
+from .consistency import sensor_problems as troubles
 from .estimates import Estimates, Measurements, Mode
 from .reference import joined_references, late_rows, reference_track
 from .score import interpolated

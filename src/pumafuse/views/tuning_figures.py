@@ -15,8 +15,8 @@ from ..fusion.outcome import Outcome
 from ..fusion.score import Z95
 from ..tuning.profile import Profile
 from ..tuning.summary import Fitted
-from . import style
-from .sheet import drawing
+from . import colours as style
+from .canvas import drawing
 
 _COLUMNS = 5  # of profiles
 _WIDTH = 11.0  # inch; as wide as a page
