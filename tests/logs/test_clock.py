@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import RunError
-from pumafuse.logs.clock import astray, segments, without_strays
+from pumafuse.logs.clock import segments, stray_offsets, without_strays
 from pumafuse.logs.run import Reference, Run, Source
 from refusals import one_line
 
@@ -142,13 +142,13 @@ def test_a_stray_stamp_is_one_that_the_rows_around_it_contradict(case: str) -> N
     """One row or two that are elsewhere before the log goes on where it was; a pause and a clock set anew are none."""
     times, wanted = STRAYS[case]
     stamp = [NO_STAMP if time is None else round(time * SECOND) for time in times]
-    assert np.flatnonzero(astray(np.array(stamp))).tolist() == wanted == strays_by_hand(stamp)
+    assert np.flatnonzero(stray_offsets(np.array(stamp))).tolist() == wanted == strays_by_hand(stamp)
 
 
 def test_a_stray_stamp_is_apart_from_what_was_before_it_or_first_comes_after() -> None:
     """By how far is counted from the time that the log was at, ahead or back."""
     stamp = [time * SECOND for time in (70, 0, 1, 2, 50, 3, -4, 4, 5)]
-    assert (astray(np.array(stamp)) / SECOND).tolist() == [70, 0, 0, 0, 48, 0, -7, 0, 0]
+    assert (stray_offsets(np.array(stamp)) / SECOND).tolist() == [70, 0, 0, 0, 48, 0, -7, 0, 0]
 
 
 wild = st.builds(
@@ -162,7 +162,7 @@ wild = st.builds(
 @given(wild)
 def test_any_stamps_are_stray_as_a_walk_from_row_to_row_finds_them(stamp: list[int]) -> None:
     """Only rows near a step back are looked at; that misses none and finds no other."""
-    assert np.flatnonzero(astray(np.array(stamp, dtype=np.int64))).tolist() == strays_by_hand(stamp)
+    assert np.flatnonzero(stray_offsets(np.array(stamp, dtype=np.int64))).tolist() == strays_by_hand(stamp)
 
 
 def test_stray_stamps_are_taken_for_none_and_told() -> None:

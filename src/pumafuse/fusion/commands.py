@@ -8,9 +8,9 @@ import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray, IntArray, TimeArray
 from ..logs.clock import behind
-from ..logs.defects import said_before, tell
 from ..logs.grid import regular_grid
 from ..logs.run import Run, Source
+from ..logs.run import note_rows as tell
 from .outcome import plausible
 
 
@@ -66,7 +66,7 @@ def _sorted(source: Source, notes: list[str]) -> Source:
     missing = source.stamp == NO_STAMP
     tell(notes, source.label, missing, "no stamp: not used")
     tell(notes, source.label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
-    tell(notes, source.label, said_before(source) & ~missing, "the stamp and values of an earlier row: duplicate")
+    tell(notes, source.label, source.repeated() & ~missing, "the stamp and values of an earlier row: duplicate")
     for axis, value in source.values.items():
         tell(notes, source.label, ~plausible(value) & ~missing, f"no finite {axis} command: not used")
     kept = source.rows(~missing)

@@ -15,8 +15,8 @@ import numpy as np
 
 from ..arrays import NO_STAMP, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
-from ..logs.defects import said_before, tell
 from ..logs.run import Run, Source
+from ..logs.run import note_rows as tell
 from .config import FusionConfig, Sensor
 from .outcome import Outcome, plausible
 
@@ -118,7 +118,7 @@ class _Heard(NamedTuple):
 
 def _heard(run: Run, config: FusionConfig, name: str, origin: int, notes: list[str]) -> _Heard:
     source, sensor = run.sensors[name], config.sensors.get(name)
-    label = source.told_as(name)
+    label = source.label_for(name)
     latency = 0 if sensor is None else round(sensor.latency * 1e9)
     valid = np.where(source.stamp == NO_STAMP, NO_STAMP, source.stamp - latency)
     outcomes = _row_outcomes(source, sensor, valid, origin)
@@ -161,7 +161,7 @@ def _row_outcomes(source: Source, sensor: Sensor | None, valid: TimeArray, origi
     outcome = np.full(len(valid), Outcome.FUSED, dtype=np.uint8)
     outcome[valid < origin] = Outcome.BEFORE_START
     outcome[behind(source.stamp) > TOLERATED_STEP_BACK_NS] = Outcome.TOO_LATE
-    outcome[said_before(source)] = Outcome.DUPLICATE
+    outcome[source.repeated()] = Outcome.DUPLICATE
     outcome[source.stamp == NO_STAMP] = Outcome.INVALID
     if sensor is None:
         outcome[:] = Outcome.UNKNOWN
