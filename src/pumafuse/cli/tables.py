@@ -50,10 +50,9 @@ def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Ta
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column("result", overflow="fold")
     table.add_column("axis")
-    for heading in ("RMSE, mm", "bias, mm", "95 % coverage", "NEES", "scored", "left out"):
-        table.add_column(heading, justify="right")
-    for heading in ("velocity RMSE, mm/s", "95 % coverage") if moving else ():
-        table.add_column(heading, justify="right")
+    velocity = ("velocity RMSE, mm/s", "95 % coverage") if moving else ()
+    for heading in ("RMSE, mm", "bias, mm", "95 % coverage", "NEES", "scored", "left out", *velocity):
+        table.add_column(heading, justify="right", max_width=9)  # the result's name needs the width
     for name, scores in results:
         for axis, score in scores.items():
             table.add_row(
