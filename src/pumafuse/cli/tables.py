@@ -47,12 +47,12 @@ def outcome_table(summary: Summary) -> Table:
 def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Table:
     """Scores against the reference, for each result and axis; columns of the velocity where a result has one."""
     moving = any(score.velocity_rmse_mm_s is not None for _, scores in results for score in scores.values())
-    table = Table(box=box.SIMPLE_HEAD)
+    table = Table(box=box.SIMPLE_HEAD, collapse_padding=True)
     table.add_column("result", overflow="fold")
     table.add_column("axis")
     velocity = ("velocity RMSE, mm/s", "95 % coverage") if moving else ()
     for heading in ("RMSE, mm", "bias, mm", "95 % coverage", "NEES", "scored", "left out", *velocity):
-        table.add_column(heading, justify="right", max_width=9)  # the result's name needs the width
+        table.add_column(heading, justify="right", max_width=8)  # the result's name needs the width
     for name, scores in results:
         for axis, score in scores.items():
             table.add_row(
