@@ -17,7 +17,8 @@ from scipy.optimize import minimize_scalar
 
 import pumafuse as pf
 from pumafuse.fusion.score import interpolated
-from pumafuse.views import step_figures, style
+from pumafuse.views import colours as style
+from pumafuse.views import step_figures
 
 HERE = Path(__file__).parent
 DATA = Path(pf.__file__).parent / "data"

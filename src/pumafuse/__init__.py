@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .errors import ConfigError, PumafuseError, PumafuseWarning, RunError, UnknownNameError
-    from .fusion.config import FusionConfig, Process, Sensor, Start
-    from .fusion.estimates import Estimates, Measurements
-    from .fusion.offline import fuse
     from .filter.outcome import Outcome
+    from .fusion.config import FusionConfig, Process, Sensor, Start
+    from .fusion.estimates import AxisEstimate, Estimates, Measurements
+    from .fusion.offline import fuse
     from .fusion.score import Score, score
     from .fusion.summary import Summary, summarise
-    from .fusion.estimates import AxisEstimate
     from .identification.identify import Identification, identify
     from .identification.trials import StepTrials, TrialsError
     from .identification.verify import AxisVerification, verify

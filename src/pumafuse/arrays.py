@@ -1,4 +1,4 @@
-"""Names of the arrays that pumafuse passes around."""
+"""Array types, and the special stamps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What pumafuse raises and warns with: one line that says what is wrong, where, and what to do."""
+"""Errors and warnings: one line each that says what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class UnknownNameError(PumafuseError):
 
 
 class PumafuseWarning(UserWarning):
-    """Something in the data or the model that a user should know and that does not stop the work."""
+    """A fault of the data or the model that does not stop the work."""
 
 
 def suggestion(name: str, accepted: Iterable[str]) -> str:

@@ -1,4 +1,4 @@
-"""Output folders: written complete or not at all, and never in the place of what is not ours."""
+"""Output folders: written complete or not at all, and never over other people's files."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ class FolderError(PumafuseError):
 
 
 def check_writable(folder: Path, force: bool, markers: Iterable[str], ours: Callable[[str], bool]) -> None:
-    """Refuse early what :func:`replacing` would refuse late.
+    """Refuse an output folder that must not be replaced or cannot be written, before any work is done.
 
     Args:
-        folder: Where the output is to go.
+        folder: The output folder.
         force: Whether an earlier output may be replaced.
         markers: Files that every folder of this kind has.
         ours: Whether a file of this name may be in it; with any other it is never replaced.
 
     Raises:
-        FolderError: The folder exists and is not to be replaced, or holds something else than our output.
+        FolderError: It exists and is not to be replaced, holds something else than our output, or cannot be written.
     """
     if not folder.exists():
         above = next(parent for parent in folder.absolute().parents if parent.exists())
@@ -48,7 +48,7 @@ def check_writable(folder: Path, force: bool, markers: Iterable[str], ours: Call
 
 @contextmanager
 def replacing(folder: Path) -> Generator[Path]:
-    """A new folder to write into, which takes the place of ``folder`` when all is written.
+    """A new folder to write into, which replaces ``folder`` on leaving the block.
 
     Raises:
         FolderError: The disk refuses.
@@ -66,7 +66,7 @@ def replacing(folder: Path) -> Generator[Path]:
 
 
 def write_file(path: Path, text: str) -> None:
-    """Write a file whole or not at all; what was there before stays until then.
+    """Write a file whole or not at all, in the place of an earlier one.
 
     Raises:
         FolderError: The disk refuses.
@@ -85,14 +85,14 @@ def write_file(path: Path, text: str) -> None:
 
 
 def sweep(folders: Iterable[Path]) -> None:
-    """Remove what killed processes left beside the folders that they were writing."""
+    """Remove the temporary folders that killed processes left beside the folders they were writing."""
     for folder in folders:
         for left in folder.parent.glob(f".{glob.escape(folder.name)}.*"):
             shutil.rmtree(left, ignore_errors=True)
 
 
 def _swap(new: Path, folder: Path, aside: Path) -> None:
-    """Put ``new`` in the folder's place; if that fails the old one is back where it was."""
+    """Put ``new`` in the folder's place; if that fails, put the old one back."""
     if folder.exists():
         folder.replace(aside)
     try:

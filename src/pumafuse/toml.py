@@ -1,7 +1,4 @@
-"""TOML files as declared structs: the struct's fields are the schema, the units are in the names.
-
-A msgspec struct declares a file once: its field types are what is checked, its encoded names are the accepted keys.
-"""
+"""TOML files as msgspec structs: a struct's field types are what is checked, its encoded names the accepted keys."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ S = TypeVar("S", bound=msgspec.Struct)
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0)]
-Interval = tuple[float, float]  # its lower and its upper end
+Interval = tuple[float, float]  # lower and upper end
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -45,7 +42,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def parse(text: str, where: str) -> dict[str, Any]:
-    """The tables of a TOML text with every number in SI; ``where`` is what errors call it.
+    """The tables of a TOML text with every number in SI; ``where`` names it in errors.
 
     Raises:
         ConfigError: It is not TOML, or a number is not finite.
@@ -64,10 +61,10 @@ def struct(tree: Any, kind: type[S], where: str, path: str = "") -> S:
     """``tree`` (SI numbers) as a struct of ``kind``.
 
     Args:
-        tree: What :func:`read` returned, or a table of it.
+        tree: The result of :func:`read`, or a table of it.
         kind: The struct that declares the accepted keys.
-        where: The file, for the error's text.
-        path: The table's place in the file, such as ``axes.radial``.
+        where: The file, for errors.
+        path: The table's path in the file, such as ``axes.radial``.
 
     Raises:
         ConfigError: An unknown key, a missing one, a wrong type or a value out of range; names file, key and the
@@ -83,7 +80,7 @@ def struct(tree: Any, kind: type[S], where: str, path: str = "") -> S:
 
 
 def text(tree: Mapping[str, Any]) -> str:
-    """SI tables as the text of a TOML file, in the units that the names tell."""
+    """SI tables as the text of a TOML file, in the units of their names."""
     return tomli_w.dumps(from_si(tree))
 
 
@@ -108,14 +105,14 @@ def _tagged(kind: Any) -> dict[str, type[msgspec.Struct]]:
 
 
 def _words(kind: Any) -> tuple[str, ...]:
-    """The words that a Literal, alone or in a union without plain text, accepts."""
+    """The values that a Literal, alone or in a union without plain text, accepts."""
     parts = (kind,) if get_origin(kind) is Literal else get_args(kind)
     words = [word for part in parts if get_origin(part) is Literal for word in get_args(part)]
     return () if str in parts else tuple(words)
 
 
 def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
-    """What is wrong in ``tree``, deepest place first, each with its key."""
+    """The faults of ``tree``, the deepest first, each with its key."""
     prefix = f"{path}." if path else ""
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and isinstance(tree, Mapping):
         fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}

@@ -1,8 +1,8 @@
-"""The one place where units are converted: names carry the unit, Python carries SI.
+"""Conversion of units: names carry the unit, Python carries SI.
 
-Every number in a file, a column or on a screen has its unit as the ending of its name (``latency_ms``, ``x_mm``).
-All of them are powers of ten of an SI unit, so conversion moves the decimal point of the shortest decimal that
-stands for the number: 60.45 ms is exactly the float 0.06045 s, and comes back as 60.45.
+Every number in a file, a column or on a screen has its unit as the ending of its name (``latency_ms``, ``x_mm``). All
+units are powers of ten of an SI unit, so conversion moves the decimal point of the shortest decimal form of the number:
+60.45 ms is exactly the float 0.06045 s, and comes back as 60.45.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ LENGTHS = ("_m", "_mm", "_um")
 TIMES = ("_s", "_ms", "_us", "_ns")
 MM = 1e3  # mm in a metre: SI arrays times this are what files and screens show
 MS = 1e3  # ms in a second, likewise
-PROVENANCE = "provenance"  # a file's table of this name is nobody's numbers but its author's
+PROVENANCE = "provenance"  # a table of this name is kept as it is
 INTERVAL = "_ci95"  # `time_constant_ms_ci95` is in ms
 
 
 def ending(name: str) -> str | None:
-    """The unit at the end of ``name``, its longest known one; None without a unit."""
+    """The longest known unit at the end of ``name``; None without one."""
     stem = name.removesuffix(INTERVAL)
     return max((unit for unit in EXPONENTS if stem.endswith(unit)), key=len, default=None)
 
@@ -61,7 +61,7 @@ def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def from_si(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """The inverse of :func:`to_si`: SI numbers to the units that their names tell."""
+    """The inverse of :func:`to_si`: SI numbers in the units of their names."""
     return {key: value if key == PROVENANCE else _unscaled(value, _exponent(key, 0)) for key, value in tree.items()}
 
 

@@ -129,12 +129,6 @@ def test_runs_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> Non
     assert lines == ["before", "after", "all"]
 
 
-def test_the_module_is_the_command() -> None:
-    """`python -m pumafuse` says what `pumafuse` says."""
-    words = [sys.executable, "-m", "pumafuse", "--version"]
-    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == pumafuse("--version").stdout
-
-
 def test_an_existing_folder_is_replaced_only_with_force(demo: Path) -> None:
     """And nothing of it is lost when it is refused."""
     before = (demo / "summary.json").read_bytes()
@@ -213,13 +207,6 @@ def test_help_imports_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-def test_version() -> None:
-    """`--version` prints the installed version."""
-    from importlib.metadata import version
-
-    assert pumafuse("--version").stdout.strip() == f"pumafuse {version('pumafuse')}"
 
 
 def servo(name: str) -> Path:

@@ -163,13 +163,13 @@ def test_jobs_are_done_and_reported_in_the_order_given(capsys: pytest.CaptureFix
     """Whichever is ready first; a refusal and an unexpected exception are one line each, the rest is done."""
     jobs: dict[str, Callable[[], int]] = {f"job-{n}": partial(_square, n) for n in range(6)}
     jobs = {"bad": _refused, **jobs, "worse": _broken}
-    done, failed = many.each("testing", jobs, [tmp_path / name for name in jobs])
+    done, failed = many.run_jobs("testing", jobs, [tmp_path / name for name in jobs])
     assert done == {f"job-{n}": n**2 for n in range(6)} and list(done) == [f"job-{n}" for n in range(6)]
     assert list(failed) == ["bad", "worse"]
     assert failed["bad"] == "not so"
     assert failed["worse"] == "unexpected ValueError: several lines of it"
     with pytest.raises(many.SomeFailedError, match="2 of 8 runs failed"):
-        many.tell(failed, 8, "here")
+        many.report_failures(failed, 8, "here")
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and lines[0] == "pumafuse: bad: not so"
     assert lines[1].startswith("pumafuse: worse: ") and "several" in lines[1] and "of it" in lines[1]
@@ -177,7 +177,7 @@ def test_jobs_are_done_and_reported_in_the_order_given(capsys: pytest.CaptureFix
 
 def test_nothing_is_told_when_nothing_failed(capsys: pytest.CaptureFixture[str]) -> None:
     """And nothing raised."""
-    many.tell({}, 3, "here")
+    many.report_failures({}, 3, "here")
     assert capsys.readouterr().err == ""
 
 
@@ -194,7 +194,7 @@ def test_a_worker_that_dies_is_one_line(death: str, tmp_path: Path) -> None:
         "def die():\n    while not (out / 'a').exists():\n        time.sleep(0.01)\n"
         f"    with folders.replacing(out / 'b'):\n        {death}\n"
         "def app():\n    jobs = {'a': whole, 'b': die}\n"
-        "    many.tell(many.each('x', jobs, [out / name for name in jobs])[1], 2, 'here')\n"
+        "    many.report_failures(many.run_jobs('x', jobs, [out / name for name in jobs])[1], 2, 'here')\n"
         "if __name__ == '__main__':\n    main.app = app\n    main.main()\n"
     )
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False)

@@ -152,21 +152,6 @@ def test_a_saved_file_is_in_the_units_of_its_keys(tmp_path: Path) -> None:
         assert line in lines
 
 
-def test_whole_metres_and_seconds_are_saved_in_their_units(tmp_path: Path) -> None:
-    """An integer from Python is 1 m or 1 s, as 1.0 is, and saved as 1000 mm or ms."""
-    ranged = Sensor(sd=1, latency=1, latency_sd=1, bias_sd=1)
-    process = Process(input_noise=1, drift=2, maneuver_noise=3, maneuver_drift=4)
-    config = FusionConfig(
-        arm=ArmModel.load(PRESET),
-        start=Start(offset_sd=1),
-        process={"radial": process},
-        sensors={"range": ranged, "by axis": Sensor(sd={"radial": 1})},
-    )
-    config.save(tmp_path)
-    assert FusionConfig.load(tmp_path / "fusion.toml") == config
-    assert "latency_sd_ms = 1000.0" in (tmp_path / "fusion.toml").read_text(encoding="utf-8")
-
-
 def test_an_arm_is_a_file_beside_or_a_preset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The arm's path counts from the file that names it, wherever one stands; a preset needs no file."""
     (tmp_path / "arms").mkdir()
@@ -201,62 +186,33 @@ def test_a_wrong_arm_file_is_refused_by_its_own_name(tmp_path: Path, content: st
 REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     # what the file says: what the one line must name
     "no arm": ("", ("'arm'", "arm = 'arm.toml'")),
-    "arm is a number": ("arm = 3", ("'arm'",)),
     "arm is no file": ('arm = "nowhere.toml"', ("'nowhere.toml'", "puma560-internal, puma560-external")),
     "arm is no preset": ('arm = "puma560"', ("'puma560'", "puma560-internal, puma560-external")),
     "arm is a folder": ('arm = "."', ("'.'", "no such file")),
-    "arm is empty": ('arm = ""', ("''", "no such file")),
     "arm with a null character": ('arm = "a\\u0000b"', ("arm = ", "no such file")),
     "unknown key": (ARM + "sensor = 3", ("'sensor'", "did you mean 'sensors'", "arm, start, process")),
-    "start is a number": (ARM + "start = 3", ("start", "int")),
     "start without unit": (ARM + "[start]\noffset_sd = 1", ("'start.offset_sd'", "offset_sd_mm")),
     "start negative": (ARM + "[start]\noffset_sd_mm = -1", ("start.offset_sd_mm", ">= 0")),
-    "start infinite": (ARM + "[start]\noffset_sd_mm = inf", ("start.offset_sd_mm", "finite")),
-    "process is a number": (ARM + "process = 3", ("process", "int")),
     "process of an unknown axis": (
         ARM + "[process.radail]\ndrift_mm_rts = 1",
         ("process", "'radail'", "did you mean 'radial'", "tangential, radial, vertical"),
     ),
     "process with an unknown key": (ARM + "[process]\nnoise = 1", ("'process.noise'", PROCESS_KEYS)),
-    "process without unit": (ARM + "[process]\ndrift = 1", ("'process.drift'", PROCESS_KEYS)),
-    "override with an unknown key": (ARM + "[process.radial]\ndrift = 1", ("'process.radial.drift'", PROCESS_KEYS)),
     "drift negative": (ARM + "[process]\ndrift_mm_rts = -1", ("process.drift_mm_rts", ">= 0")),
-    "override negative": (ARM + "[process.radial]\ndrift_mm_rts = -1", ("process.radial.drift_mm_rts", ">= 0")),
     "drift nan": (ARM + "[process]\ndrift_mm_rts = nan", ("process.drift_mm_rts", "finite")),
-    "override nan": (ARM + "[process.radial]\ndrift_mm_rts = nan", ("process.radial.drift_mm_rts", "finite")),
-    "drift is a word": (ARM + '[process]\ndrift_mm_rts = "x"', ("process.drift_mm_rts", "float", "str")),
     "sensors is a number": (ARM + "sensors = 3", ("sensors", "int")),
-    "sensors is a list": (ARM + "sensors = []", ("sensors", "array")),
-    "sensor is a number": (ARM + "[sensors]\ntracker = 3", ("sensors.tracker", "int")),
     "sensor without sd": (ARM + "[sensors.tracker]", ("'sensors.tracker.sd_mm'", "missing")),
     "sensor with an unknown key": (ARM + TRACKER + "noise = 1", ("'sensors.tracker.noise'", SENSOR_KEYS)),
-    "latency without unit": (
-        ARM + TRACKER + "latency = 8",
-        ("'sensors.tracker.latency'", "did you mean 'latency_ms'", SENSOR_KEYS),
-    ),
     "sensor named like a length": (ARM + "[sensors.laser_mm]\nsd_mm = 1", ("'laser_mm'", "unit (_mm)")),
-    "sensor named like a time": (ARM + "[sensors.laser_s]\nsd_mm = 1", ("'laser_s'", "unit (_s)")),
-    "sensor named like a density": (ARM + "[sensors.a_mm_rts]\nsd_mm = 1", ("'a_mm_rts'", "unit (_mm_rts)")),
-    "sd negative": (ARM + TRACKER.replace("0.05", "-0.05"), ("sensors.tracker.sd_mm", "> 0")),
     "sd zero": (ARM + TRACKER.replace("0.05", "0"), ("sensors.tracker.sd_mm", "> 0")),
-    "sd nan": (ARM + TRACKER.replace("0.05", "nan"), ("sensors.tracker.sd_mm", "finite")),
-    "sd is a word": (ARM + TRACKER.replace("0.05", '"x"'), ("sensors.tracker.sd_mm", "str")),
     "sd of no axis": (ARM + TRACKER.replace("0.05", "{}"), ("sensors.tracker.sd_mm", ">= 1")),
     "sd of an unknown axis": (
         ARM + TRACKER.replace("0.05", "{ yaw = 1 }"),
         ("sensors.tracker.sd_mm", "'yaw'", "tangential, radial, vertical"),
     ),
-    "sd of an axis negative": (ARM + TRACKER.replace("0.05", "{ radial = -1 }"), ("sensors.tracker.sd_mm", "> 0")),
     "scale zero": (ARM + TRACKER + "scale = 0", ("sensors.tracker.scale", "0")),
-    "scale minus zero": (ARM + TRACKER + "scale = -0.0", ("sensors.tracker.scale", "0")),
-    "scale nan": (ARM + TRACKER + "scale = nan", ("sensors.tracker.scale", "finite")),
-    "latency is yes": (ARM + TRACKER + "latency_ms = true", ("sensors.tracker.latency_ms", "bool")),
     "latency infinite": (ARM + TRACKER + "latency_ms = -inf", ("sensors.tracker.latency_ms", "finite")),
     "latency beyond an hour": (ARM + TRACKER + "latency_ms = 3600001", ("sensors.tracker.latency_ms", "hour")),
-    "latency beyond minus an hour": (ARM + TRACKER + "latency_ms = -3600001", ("sensors.tracker.latency_ms", "hour")),
-    "latency beyond int64": (ARM + TRACKER + "latency_ms = 1e300", ("sensors.tracker.latency_ms", "hour")),
-    "latency sd negative": (ARM + TRACKER + "latency_sd_ms = -1", ("sensors.tracker.latency_sd_ms", ">= 0")),
-    "bias sd negative": (ARM + TRACKER + "bias_sd_mm = -1", ("sensors.tracker.bias_sd_mm", ">= 0")),
     "gate negative": (ARM + TRACKER + "gate = -1", ("sensors.tracker.gate", ">= 0")),
     "gate_rows is a number": (ARM + TRACKER + "gate_rows = 1", ("sensors.tracker.gate_rows", "bool")),
     "not TOML": ("arm puma", ("TOML",)),
@@ -280,11 +236,6 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path, content: bytes | 
     if content is not None:
         path.write_bytes(content)
     assert str(path) in refusal(lambda: FusionConfig.load(path))
-
-
-def test_a_folder_is_no_configuration(tmp_path: Path) -> None:
-    """A folder where the file is expected is refused in one line."""
-    assert str(tmp_path) in refusal(lambda: FusionConfig.load(tmp_path))
 
 
 def test_a_configuration_made_in_python_is_checked_like_a_file() -> None:

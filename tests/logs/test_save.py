@@ -150,11 +150,3 @@ def test_a_sensor_whose_file_would_be_another_is_refused_before_anything_is_writ
             save(run, folder)
         assert list(folder.iterdir()) == [] and [path.name for path in Path(outer).iterdir()] == ["run"]
     assert len(str(refused.value).splitlines()) == 1
-
-
-def test_saving_changes_nothing_in_the_run() -> None:
-    """Its arrays are the caller's."""
-    run = plain()
-    before = run.command.values["radial"].copy()
-    through(run)
-    assert (run.command.values["radial"] == before).all()

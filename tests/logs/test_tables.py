@@ -236,15 +236,6 @@ def test_gzip_and_parquet_say_what_the_csv_says(tmp_path: Path) -> None:
         assert "'bad' in row 3" in str(other.numbers("word_mm")[1])
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
-    """A written table has the same stamps and lengths when it is read."""
-    stamps, lengths = [EPOCH_NS, None, EPOCH_NS + 1], [0.1, -0.0, None]
-    tables.write(pa.table({"t_ns": stamps, "x_m": lengths}), tmp_path / "log.parquet")
-    table = tables.read(tmp_path / "log.parquet")
-    assert table.stamps("t_ns")[0].tolist() == [EPOCH_NS, NO_STAMP, EPOCH_NS + 1]
-    np.testing.assert_array_equal(table.numbers("x_m")[0], [0.1, -0.0, np.nan])
-
-
 @pytest.mark.parametrize(
     ("kind", "value"),
     [
@@ -267,24 +258,16 @@ GARBAGE = random.Random(0).randbytes(5000)
 
 UNREADABLE: dict[str, tuple[str, bytes | None, str]] = {
     "absent": ("log.csv", None, "no such file"),
-    "absent Parquet": ("log.parquet", None, "no such file"),
     "empty": ("log.csv", b"", "empty"),
-    "one newline": ("log.csv", b"\n", "Empty CSV"),
     "header, no newline": ("log.csv", b"t_s,x_mm", "Empty CSV"),
     "column twice": ("log.csv", b"t_s,x_mm,x_mm\n0,1,2\n", "two columns are named 'x_mm'"),
-    "columns without names": ("log.csv", b",\n0,1\n", "two columns"),
     "one endless line": ("log.csv", b"t_s,x_mm\n0," + b"1" * 3 * FIRST_BLOCK, "not a table"),
     "CSV called Parquet": ("log.parquet", b"t_s,x_mm\n0,1\n", "not a table"),
-    "garbage called Parquet": ("log.parquet", GARBAGE, "not a table"),
-    "empty Parquet": ("log.parquet", b"", "not a table"),
     "CSV called gzip": ("log.csv.gz", b"t_s,x_mm\n0,1\n", "cannot be read"),
     "gzip cut short": ("log.csv.gz", gzip.compress(b"t_s,x_mm\n" + b"0,1\n" * 1000)[:-20], "cannot be read"),
-    "gzip of nothing": ("log.csv.gz", gzip.compress(b""), "Empty CSV"),
-    "gzip called CSV": ("log.csv", gzip.compress(b"t_s,x_mm\n0,1\n"), "UTF-8"),
     "UTF-16": ("log.csv", "t_s,x_mm\n0,1\n".encode("utf-16"), "UTF-8"),
     "header in Latin-1": ("log.csv", "t_s,höhe_mm\n0,1\n".encode("latin-1"), "UTF-8"),
     "torn line in Latin-1": ("log.csv", "t_s,x_mm,y_mm\n0,1,2\n1,hö\n2,3,4\n".encode("latin-1"), "UTF-8"),
-    "torn line beside Latin-1": ("log.csv", "t_s,x_mm,y_mm\n0,1,ö\n1,2\n2,3,4\n".encode("latin-1"), "UTF-8"),
     "decimal commas": ("log.csv", b"t_s;x_mm\n0,5;1,5\n0,6;1,5\n", "2 lines left out: 3 cells where the header has 1"),
 }
 
@@ -437,14 +420,6 @@ def test_only_pumafuse_errors_come_out_of_a_mangled_file(tmp_path: Path) -> None
             assert len(str(error).splitlines()) == 1
             outcomes[type(error)] += 1
     assert min(outcomes.values()) > 20
-
-
-def test_errors_of_tables_are_run_errors_or_unknown_names(tmp_path: Path) -> None:
-    """A caller can tell a file that cannot be read from a name that is not there."""
-    with pytest.raises(RunError):
-        tables.read(tmp_path / "absent.csv")
-    with pytest.raises(UnknownNameError):
-        csv(tmp_path, "t_s\n0\n").stamps("time_s")
 
 
 @given(cut=st.integers(0, 200), ends=st.sampled_from(["\n", "\r\n"]))

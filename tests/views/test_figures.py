@@ -80,15 +80,11 @@ def case(
 
 CASES: dict[str, Callable[[], Case]] = {
     "three axes": case,
-    "one axis": lambda: case(axes=1),
     "no reference": lambda: case(axes=1, reference=False),
-    "no sensor": lambda: case(axes=2, sensors=()),
     "commands and nothing else": lambda: case(axes=1, sensors=(), reference=False),
-    "two sensors": lambda: case(axes=1, sensors=("camera", "tracker")),
     "a biased sensor": lambda: case(axes=1, bias=-0.3, scale=-1.0),
     "a frame": lambda: case(axes=2, frame=True),
     "an outlier": lambda: case(axes=1, outlier=True),
-    "two commands": lambda: case(axes=1, commands=2),
 }
 
 
@@ -228,11 +224,3 @@ def test_nothing_stays_open(tmp_path: Path) -> None:
     validation_figure(this.est, tmp_path / "validation.png")
     assert plt.get_fignums() == []
     assert in_memory() <= before
-
-
-def test_the_callers_look_is_left_alone(tmp_path: Path) -> None:
-    """Settings of matplotlib are what they were before."""
-    before = dict(plt.rcParams)
-    this = case(axes=1)
-    fused_figure(this.est, this.run, tmp_path / "fused.png")
-    assert dict(plt.rcParams) == before

@@ -121,7 +121,7 @@ def series(path: Path, entity: str) -> tuple[np.ndarray, np.ndarray]:
                 columns = dict(zip(batch.schema.names, batch.columns, strict=True))
                 moment = columns["time"].to_numpy(zero_copy_only=False).astype("m8[ns]")
                 times.append(moment / np.timedelta64(1, "s"))
-                values.append(columns["Components:components"].flatten().to_numpy())
+                values.append(columns["Scalars:scalars"].flatten().to_numpy())
     return np.concatenate(times), np.concatenate(values)
 
 

@@ -66,7 +66,7 @@ def moments(column: object) -> npt.NDArray[np.float64]:
 def series(path: Path, entity: str) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Times [s] and values of one entity."""
     found = columns(path, entity, static=False)
-    values = np.concatenate([chunk["Components:components"].flatten().to_numpy() for chunk in found])
+    values = np.concatenate([chunk["Scalars:scalars"].flatten().to_numpy() for chunk in found])
     return np.concatenate([moments(chunk["time"]) for chunk in found]), values
 
 

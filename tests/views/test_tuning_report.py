@@ -23,7 +23,8 @@ from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.climb import climb
 from pumafuse.tuning.profile import Profile, profiles
 from pumafuse.tuning.summary import Fitted
-from pumafuse.views import style, tuning_figures
+from pumafuse.views import colours as style
+from pumafuse.views import tuning_figures
 from pumafuse.views.tuning_report import page
 
 T, END = 0.02, 20.0

@@ -9,8 +9,7 @@ import msgspec
 
 from ..errors import RunError
 from ..fusion import results
-from ..fusion.config import FusionConfig
-from ..fusion.summary import ScoreSummary, score_summary
+from ..fusion.summary import ScoreSummary
 from .tables import console, score_table
 
 
@@ -32,16 +31,15 @@ def run(folders: Sequence[Path], reference: Path | None, json: bool) -> None:
     compared: list[Compared] = []
     for folder in folders:
         result = results.read(folder)
-        truth = result.reference
+        track = result.reference
         if reference is not None:
-            frame = FusionConfig.load(folder / "fusion.toml").frame
-            truth = results.read_reference(reference, result.summary.origin_ns, frame)
-        if truth is None:
+            track = results.read_reference(reference, result.summary.origin_ns, result.config.frame)
+        if track is None:
             raise RunError(f"{folder}: the run had no reference; give one with --reference")
-        scores = {axis: score_summary(score) for axis, score in result.scores(truth).items()}
+        scores = result.scores(track)
         if not scores:
             raise RunError(
-                f"{folder}: the reference covers no estimate on any axis; do its axes ({', '.join(truth.position)})"
+                f"{folder}: the reference covers no estimate on any axis; do its axes ({', '.join(track.position)})"
                 " and its clock fit the run?"
             )
         compared.append(Compared(folder=str(folder), run=result.summary.run, mode=result.summary.mode, axes=scores))

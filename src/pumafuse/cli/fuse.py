@@ -19,13 +19,13 @@ from ..fusion.estimates import Estimates
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
 from ..logs.run import Run
-from .many import each, tell
+from .many import report_failures, run_jobs
 from .tables import console, outcome_table, runs_table, score_table
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What the command line asks of a fusion; see ``pumafuse fuse --help``."""
+    """The options of ``pumafuse fuse``; see its ``--help``."""
 
     config: Path
     output: Path
@@ -40,7 +40,7 @@ class Options:
 
 
 def run(runs: Sequence[Path], options: Options) -> None:
-    """Fuse each run into a result folder; a run that fails is told and the others go on.
+    """Fuse each run into a result folder; a run that fails is reported and does not stop the others.
 
     Raises:
         PumafuseError: The configuration is wrong, or at least one run failed.
@@ -51,7 +51,7 @@ def run(runs: Sequence[Path], options: Options) -> None:
         results.check_writable(options.output, options.force)
         recorded = Run.read(runs[0])
         with progress_of(recorded.name) as progress:
-            summary = _one(recorded, options.output, config, options, progress)
+            summary = _fuse(recorded, options.output, config, options, progress)
         show(summary, options.output)
         return
     places = _folders(runs, options.output)
@@ -59,16 +59,16 @@ def run(runs: Sequence[Path], options: Options) -> None:
         str(path): partial(_read_and_fuse, path, folder, config, options)
         for path, folder in zip(runs, places, strict=True)
     }
-    done, failed = each("fusing", jobs, places)
+    done, failed = run_jobs("fusing", jobs, places)
     if done:
         names = dict(zip(jobs, (place.name for place in places), strict=True))
         console().print(runs_table({names[path]: summary for path, summary in done.items()}))
         console(soft_wrap=True).print(f"written to {options.output}", markup=False)
-    tell(failed, len(jobs), str(options.output))
+    report_failures(failed, len(jobs), str(options.output))
 
 
 def show(summary: Summary, folder: Path) -> None:
-    """Print what a person wants to know of a fusion."""
+    """Print the tables of a fusion."""
     out = console()
     out.print(
         f"[bold]{escape(summary.run)}[/bold]: {summary.estimates} estimates over {summary.duration_s:.1f} s,"
@@ -101,10 +101,10 @@ def record(est: Estimates, recorded: Run, folder: Path) -> None:
 
 def _read_and_fuse(path: Path, folder: Path, config: FusionConfig, options: Options) -> Summary:
     results.check_writable(folder, options.force)
-    return _one(Run.read(path), folder, config, options)
+    return _fuse(Run.read(path), folder, config, options)
 
 
-def _one(
+def _fuse(
     recorded: Run,
     folder: Path,
     config: FusionConfig,
@@ -132,7 +132,7 @@ def _one(
 
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:
-    """A folder for each run, named after its path; a number tells apart what has the same name."""
+    """A folder for each run, named after its path; equal names get a number."""
     names: list[str] = []
     for path in runs:
         resolved = path.resolve()
@@ -153,7 +153,7 @@ def _without_endings(name: str) -> str:
 
 @contextmanager
 def progress_of(name: str) -> Generator[Callable[[float], None]]:
-    """A bar on stderr for runs that take long; nothing where stderr is no terminal."""
+    """A progress bar on stderr, and the function that moves it; nothing where stderr is no terminal."""
     columns = (TextColumn(name), BarColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task(name, total=1.0)

@@ -19,7 +19,7 @@ from ..identification.trials import StepTrials
 from ..model.arm import ArmModel
 from ..model.plants import FirstOrder
 from ..units import MM, MS
-from ..views import words
+from ..views import formatting as words
 from .tables import console
 
 

@@ -1,4 +1,4 @@
-"""Parsing of the command line. Each command hands over to its own module, imported only when it runs."""
+"""Parsing of the command line. Each command is a module of its own, imported only when it runs."""
 
 from __future__ import annotations
 
@@ -6,24 +6,27 @@ import os
 import sys
 import warnings
 from pathlib import Path
-from typing import Annotated, Literal, overload
+from typing import Annotated, Literal, TypeVar, overload
 
 import typer
 
 from ..errors import PumafuseError, PumafuseWarning
 
-# Our matrices are 5 by 5: threads of a BLAS only wait for each other, ten times as long on a busy machine.
+# With matrices of 5 by 5 the threads of a BLAS only wait for each other, ten times as long on a busy machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+N = TypeVar("N", float, float | None)
 
 app = typer.Typer(
     name="pumafuse",
-    help="Blend a robot arm's commands with the measurements of an external sensor into the best estimate of its position.",
+    help="Fuse a robot arm's commands with measurements of external sensors into the best estimate of its position.",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace an earlier result.")]
 
@@ -47,7 +50,7 @@ def _root(  # pyright: ignore[reportUnusedFunction]
 
 @app.command()
 def fuse(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")],
+    runs: Runs,
     config: Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")],
     sensors: Annotated[
@@ -57,17 +60,17 @@ def fuse(
         float | None, typer.Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")
     ] = None,
     smooth: Annotated[
-        bool, typer.Option("--smooth", help="Use later measurements too: the best there is, afterwards.")
+        bool, typer.Option("--smooth", help="Use later measurements too: the best estimate afterwards, no velocity.")
     ] = False,
     as_live: Annotated[bool, typer.Option("--as-live", help="Use only measurements that had arrived by then.")] = False,
     rrd: Annotated[bool, typer.Option("--rrd", help="Also write fused.rrd for the Rerun viewer.")] = False,
     figures: Annotated[bool, typer.Option("--figures", help="Also draw the run and its validation.")] = False,
     engine: Annotated[
-        Literal["compiled", "filterpy"], typer.Option(help="Which engine computes; filterpy is the slow reference.")
+        Literal["compiled", "filterpy"], typer.Option(help="filterpy: the slow reference, only for filtered estimates.")
     ] = "compiled",
     force: Force = False,
 ) -> None:
-    """Fuse recorded runs: estimates, what became of each measurement, and a summary.
+    """Fuse recorded runs: estimates, the outcome of each measurement, and a summary.
 
     Several runs get a folder each inside DIR.
     """
@@ -94,11 +97,11 @@ def fuse(
 def compare(
     folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Result folders of `pumafuse fuse`.")],
     reference: Annotated[
-        Path | None, typer.Option(metavar="FILE_OR_RUN", help="A truth from elsewhere; default: each folder's own.")
+        Path | None, typer.Option(metavar="FILE_OR_RUN", help="A reference from elsewhere; default: each folder's own.")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Score results against a reference: RMSE, bias, 95 % coverage and mean NEES of each axis."""
+    """Score results against a reference: RMSE, 95 % coverage, bias and mean NEES of each axis, and of its velocity."""
     from . import compare as command
 
     command.run(folders, reference, json)
@@ -221,7 +224,7 @@ def identify(
 
 @app.command()
 def verify(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")],
+    runs: Runs,
     arm: Annotated[str, typer.Option("--arm", metavar="ARM", help="An arm.toml, or the name of a preset.")],
     sensors: Annotated[
         str | None, typer.Option(metavar="A,B", help="Compare with these; default: the reference, else every sensor.")
@@ -369,7 +372,7 @@ def main() -> None:
         typer.echo(f"pumafuse: {error}", err=True)
         sys.exit(1)
     except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output has gone, and Python would say so once more at exit
+        sys.stderr.close()  # the reader of our output has gone, and Python would report it once more at exit
         sys.exit(1)
 
 
@@ -407,16 +410,12 @@ def _si(value: float) -> float: ...
 def _si(value: None) -> None: ...
 def _si(value: float | None) -> float | None:
     """Milliseconds or millimetres of the command line in s or m, without a binary rounding in between."""
-    from ..units import shifted  # brings numpy, which no --help needs
+    from ..units import shifted  # imports numpy, which no --help needs
 
     return None if value is None else shifted(value, -3)
 
 
-@overload
-def _positive(value: float, name: str) -> float: ...
-@overload
-def _positive(value: float | None, name: str) -> float | None: ...
-def _positive(value: float | None, name: str) -> float | None:
+def _positive(value: N, name: str) -> N:
     if value is not None and not 0.0 < value < float("inf"):
         raise typer.BadParameter(f"must be a positive number, not {value}", param_hint=name)
     return value

@@ -1,6 +1,6 @@
-"""The same job on many runs, over all cores: one bar, failures at the end, finished work kept.
+"""The same job on many runs in parallel: one progress bar, failures at the end, finished work kept.
 
-joblib spreads the jobs; ``joblib.parallel_config`` around :func:`each` sends them to another backend, such as dask.
+joblib runs the jobs; ``joblib.parallel_config`` around :func:`run_jobs` chooses another backend, such as dask.
 """
 
 from __future__ import annotations
@@ -24,19 +24,21 @@ class SomeFailedError(PumafuseError):
     """Some of many jobs failed; the others are done."""
 
 
-def each(what: str, jobs: Mapping[str, Callable[[], R]], places: Iterable[Path]) -> tuple[dict[str, R], dict[str, str]]:
-    """Do every job, several at a time.
+def run_jobs(
+    what: str, jobs: Mapping[str, Callable[[], R]], places: Iterable[Path]
+) -> tuple[dict[str, R], dict[str, str]]:
+    """Run every job, several at a time.
 
     Args:
-        what: For the bar.
+        what: Label of the progress bar.
         jobs: By name; each can be pickled and leaves its work on disk when done.
         places: The folders that the jobs write; nothing half written is left beside them.
 
     Returns:
-        What each job returned, and what was wrong with those that failed, both in the order given.
+        The results of the jobs, and the errors of those that failed, both in the order given.
 
     Raises:
-        KeyboardInterrupt: As it came, after saying how many are done.
+        KeyboardInterrupt: Passed on, after printing how many are done.
         SomeFailedError: A worker process died.
     """
     from joblib import Parallel, delayed
@@ -64,14 +66,15 @@ def each(what: str, jobs: Mapping[str, Callable[[], R]], places: Iterable[Path])
             raise SomeFailedError(
                 f"a worker process died (out of memory?): {len(results)} of {len(jobs)} runs are done and kept"
             ) from None
-    return {name: results[name] for name in jobs if name in results}, {n: failed[n] for n in jobs if n in failed}
+    done = {name: results[name] for name in jobs if name in results}
+    return done, {name: failed[name] for name in jobs if name in failed}
 
 
-def tell(failed: Mapping[str, str], count: int, where: str) -> None:
-    """Say what failed.
+def report_failures(failed: Mapping[str, str], count: int, where: str) -> None:
+    """Print the error of each job that failed.
 
     Raises:
-        SomeFailedError: Something did.
+        SomeFailedError: There is one.
     """
     for name, problem in failed.items():
         print(f"pumafuse: {name}: {problem}", file=sys.stderr)
@@ -80,9 +83,9 @@ def tell(failed: Mapping[str, str], count: int, where: str) -> None:
 
 
 def _guarded(name: str, job: Callable[[], R]) -> tuple[str, R | None, str | None]:
-    """A job's result, or its error in one line: one bad run must not cost the others."""
+    """A job's name and its result, or its error in one line: one bad run must not stop the others."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PumafuseWarning)  # they are among the notes of each run's summary
+        warnings.simplefilter("ignore", PumafuseWarning)  # they are in the notes of each run's summary
         try:
             return name, job(), None
         except PumafuseError as error:

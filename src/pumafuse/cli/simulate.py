@@ -7,7 +7,8 @@ from pathlib import Path
 
 from ..simulation import simulate as simulation
 from ..simulation.scenario import Scenario
-from .many import each, tell
+from .many import report_failures as tell
+from .many import run_jobs as each
 from .tables import console
 
 

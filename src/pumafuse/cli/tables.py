@@ -13,17 +13,17 @@ from rich.table import Table
 from ..fusion.score import Z95
 from ..fusion.summary import ScoreSummary, Summary
 
-_FEW_RUNS = 20  # that get lines of their own
+_FEW_RUNS = 20  # up to so many runs get lines of their own
 
 
 def console(*, soft_wrap: bool = False) -> Console:
-    """Standard output for people; wide enough for our tables where it is no terminal."""
+    """Standard output for people; 120 columns wide where it is no terminal."""
     width = None if sys.stdout.isatty() else 120
     return Console(highlight=False, soft_wrap=soft_wrap, width=width)
 
 
 def outcome_table(summary: Summary) -> Table:
-    """Components by outcome, and innovations against what the filter expected, for each axis and sensor."""
+    """Components by outcome, innovations and their expected size, for each axis and sensor."""
     table = Table(box=box.SIMPLE_HEAD)
     biased = any(sensor.bias_mm is not None for axis in summary.axes.values() for sensor in axis.sensors.values())
     words = sorted(
@@ -45,12 +45,14 @@ def outcome_table(summary: Summary) -> Table:
 
 
 def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Table:
-    """Scores against the reference, for each result and axis."""
-    table = Table(box=box.SIMPLE_HEAD)
+    """Scores against the reference, for each result and axis; columns of the velocity where a result has one."""
+    moving = any(score.velocity_rmse_mm_s is not None for _, scores in results for score in scores.values())
+    table = Table(box=box.SIMPLE_HEAD, collapse_padding=True)
     table.add_column("result", overflow="fold")
     table.add_column("axis")
-    for heading in ("RMSE, mm", "bias, mm", "95 % cover", "NEES", "scored", "left out"):
-        table.add_column(heading, justify="right")
+    velocity = ("velocity RMSE, mm/s", "95 % coverage") if moving else ()
+    for heading in ("RMSE, mm", "bias, mm", "95 % coverage", "NEES", "scored", "left out", *velocity):
+        table.add_column(heading, justify="right", max_width=8)  # the result's name needs the width
     for name, scores in results:
         for axis, score in scores.items():
             table.add_row(
@@ -62,17 +64,18 @@ def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Ta
                 "–" if score.nees_mean is None else f"{score.nees_mean:.2f}",
                 str(score.rows),
                 str(score.left_out),
+                *([_mm(score.velocity_rmse_mm_s), _percent(score.velocity_coverage)] if moving else []),
             )
     return table
 
 
 def runs_table(results: Mapping[str, Summary]) -> Table:
-    """Many results by name: a line for each of a few and its axes, and for each axis all of them together."""
+    """Many results: lines for each of up to 20 by name, and for each axis all of them together."""
     summaries = list(results.values())
     table = Table(box=box.SIMPLE_HEAD)
     table.add_column("result", overflow="fold")
     table.add_column("axis")
-    for heading in ("RMSE, mm", "worst, mm", "95 % cover", "NEES", "NIS", "fused", "rejected", "notes"):
+    for heading in ("RMSE, mm", "worst, mm", "95 % coverage", "NEES", "NIS", "fused", "rejected", "notes"):
         table.add_column(heading, justify="right")
     if len(summaries) <= _FEW_RUNS:
         for name, summary in results.items():
@@ -86,7 +89,7 @@ def runs_table(results: Mapping[str, Summary]) -> Table:
 
 
 def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
-    """One axis over several runs: each estimate and each component counts once."""
+    """Cells of one axis over several runs; each estimate and each component counts once."""
     parts = [summary.axes[axis] for summary in summaries]
     scores = [part.score for part in parts if part.score is not None]
     sensors = [sensor for part in parts for sensor in part.sensors.values()]
@@ -96,9 +99,9 @@ def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
     cells = ["–"] * 4
     if rows:
         square = sum(score.rmse_mm**2 * score.rows for score in scores) / rows
-        cover = sum(score.coverage * score.rows for score in scores) / rows
+        coverage = sum(score.coverage * score.rows for score in scores) / rows
         nees = [(score.nees_mean, score.rows) for score in scores if score.nees_mean is not None]
-        cells = [_mm(square**0.5), _mm(max(score.rmse_mm for score in scores)), f"{cover:.1%}", _mean(nees)]
+        cells = [_mm(square**0.5), _mm(max(score.rmse_mm for score in scores)), f"{coverage:.1%}", _mean(nees)]
     notes = sum(len(summary.notes) for summary in summaries)
     return [*cells, _mean(nis), str(fused), str(rejected), str(notes)]
 
@@ -115,3 +118,7 @@ def _interval(value: float | None, sd: float | None) -> str:
 
 def _mm(value: float | None) -> str:
     return "–" if value is None else f"{value:.3f}"
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{share:.1%}"

@@ -24,7 +24,7 @@ from ..tuning.parameters import check_holds, kinds_of
 from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Tuning, tune
 from ..tuning.validate import Check
-from ..views import words
+from ..views import formatting as words
 from .tables import console
 
 SUMMARY = "tuning.json"

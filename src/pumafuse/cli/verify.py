@@ -17,7 +17,7 @@ from ..identification.verify import AxisVerification, verify
 from ..logs.run import Run
 from ..model.arm import ArmModel
 from ..units import MM, MS
-from ..views import words
+from ..views import formatting as words
 from .tables import console
 
 

@@ -1,4 +1,4 @@
-"""``fusion.toml``: the arm, how far it is trusted, and the sensors."""
+"""``fusion.toml``: the arm, the process noise, and the sensors."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
 
 
 class Start(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is uncertain before the first command: only the offset, by ``offset_sd`` [m]."""
+    """Prior uncertainty at the start: ``offset_sd`` is that of the offset [m]."""
 
     offset_sd: NotNegative = msgspec.field(name="offset_sd_mm", default=5e-3)
 
 
 class Process(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How one axis strays from its model; the two parts of each variance add up.
+    """Process noise of one axis; the variances of the two parts of each density add up.
 
     Attributes:
         input_noise: Density of the white noise at the plant's input [m/√Hz].
@@ -49,12 +49,12 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     Attributes:
         sd: Noise [m], one number or one for each axis.
-        latency: From the instant the measurement is true of to its stamp [s].
-        latency_sd: How far the latency wanders [s].
-        scale: Of the position in the measurement; −1 for a distance to a panel in front.
+        latency: From the instant at which the measurement is valid to its stamp [s].
+        latency_sd: Standard deviation of the latency from measurement to measurement [s].
+        scale: Factor on the position; −1 for a distance to a panel in front.
         bias_sd: Prior uncertainty of a constant bias [m]; 0: no bias is estimated.
         gate: A measurement beyond this many standard deviations is rejected; 0: never.
-        gate_rows: One axis rejected rejects the row.
+        gate_rows: Whether one rejected axis rejects the whole row.
     """
 
     sd: Positive | Annotated[dict[str, Positive], msgspec.Meta(min_length=1)] = msgspec.field(name="sd_mm")
@@ -66,19 +66,19 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     gate_rows: bool = True
 
     def sd_of(self, axis: str) -> float | None:
-        """The noise [m] on one axis; None where the sensor has none for it and so is not used on it."""
+        """The noise on one axis [m]; None where the sensor has none and so is not used."""
         return self.sd.get(axis) if isinstance(self.sd, dict) else self.sd
 
 
 class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What ``fusion.toml`` holds, in SI units.
+    """The content of ``fusion.toml`` in SI units.
 
     Attributes:
         arm: The arm model.
-        start: What is uncertain before the first command.
-        process: How each axis strays from its model; every axis of the arm is there.
-        frame: For streams and runs in x, y, z that bring no frame of their own.
-        sensors: By name, in the order that decides between measurements valid at the same instant.
+        start: Prior uncertainty at the start.
+        process: Process noise by axis; every axis of the arm is there.
+        frame: For streams and runs in x, y, z that have no frame of their own.
+        sensors: By name, in the order of processing of measurements valid at the same instant.
     """
 
     arm: ArmModel
@@ -91,7 +91,9 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         _known_axes("process", self.process, self.arm)
         for name, sensor in self.sensors.items():
             refuse_unit("sensor", name)
-            toml.struct(toml.builtins(sensor), Sensor, "configuration", f"sensors.{name}")  # made in Python: unchecked
+            toml.struct(
+                toml.builtins(sensor), Sensor, "configuration", f"sensors.{name}"
+            )  # if made in Python, unchecked
             if not math.isfinite(sensor.scale + sensor.latency + sensor.gate + sensor.bias_sd + sensor.latency_sd):
                 raise ConfigError(f"sensors.{name}: scale, latency, gate and sds must be finite")
             if isinstance(sensor.sd, dict):
@@ -139,7 +141,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
 
 def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
-    """The arm that the file ``path`` with the tables ``tree`` names: a file beside it, or a preset.
+    """The arm that the tables ``tree`` of the file ``path`` name: a file beside it, or a preset.
 
     Raises:
         ConfigError: It names none, or the arm is not as declared.
@@ -159,13 +161,13 @@ def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
 def by_axis(
     table: Mapping[str, Any], kind: type[msgspec.Struct], arm: ArmModel, where: str, path: str
 ) -> dict[str, dict[str, Any]]:
-    """A table for each axis of the arm: ``[process]`` holds for every axis, ``[process.radial]`` overrides it for one.
+    """A table for each axis of the arm: ``[process]`` is for all axes, ``[process.radial]`` overrides it for one.
 
     Args:
         table: The table with the tables in it, in SI.
         kind: The struct that declares the keys of both.
         arm: Its axes are the accepted names.
-        where: The file, for the error's text.
+        where: The file, for errors.
         path: The table's place in the file.
 
     Raises:

@@ -1,9 +1,8 @@
-"""Is the filter as good as it says? Innovations and errors against their predicted spread, with a verdict in words.
+"""Consistency of a filter: NIS, whiteness and log-likelihood of its innovations, with a verdict in words.
 
-NIS ν²/S averages 1 where the filter's S is right; its mean over n components lies in a chi-square band. Innovations of
-a
-right filter are white in the order of measurement: Ljung-Box over their autocorrelation tells. Rejected components are
-left out.
+The mean NIS ν²/S of n components is 1 where the filter's S is right, and lies in a chi-square band. Innovations of a
+right filter are white in the order of measurement, which a Ljung-Box test of their autocorrelation checks. Rejected
+components are left out.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from ..arrays import CodeArray, FloatArray
 from ..filter.outcome import Outcome
 from ..units import MM
 from .config import Sensor
-from .estimates import Estimates, Measurements, outcome_counts
+from .estimates import Estimates, Measurements
 from .score import Z95
 from .segments import LONGEST_TAIL_NS
 
 LAGS = 20
-_FEW = 30  # components below which nothing is said
+_FEW = 30  # fewer components get no verdict
 _FROZEN = 10  # equal values in a row of a sensor with noise
-_WIDEST = 1e6  # prior over noise up to which error bars are held to
-_NEVER = 1e-6  # expected number below which something does not happen by chance
+_WIDEST = 1e6  # largest ratio of prior to noise at which double precision keeps the error bars
+_NEVER = 1e-6  # expected number below which chance is no explanation
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
 _MANY_REJECTED = 0.1  # share of rejected components beyond which those that are left say little
 
@@ -57,26 +56,26 @@ class Consistency:
 
 
 def log_likelihood(measurements: Measurements, sensors: Mapping[str, Sensor]) -> float:
-    """Log-likelihood of the components that the filter met, with positions in mm."""
+    """Log-likelihood of the components that the filter used or rejected, with positions in mm."""
     return float(densities_of(measurements.where(measurements.outcome <= Outcome.REACQUIRED), sensors).sum())
 
 
-def densities_of(met: Measurements, sensors: Mapping[str, Sensor]) -> FloatArray:
-    """:func:`log_density` of components that the filter met, (m,)."""
-    gate = np.array([sensors[name].gate if name in sensors else 0.0 for name in met.sensors])
-    return log_density(met.innovation, met.innovation_sd, met.outcome, gate[met.sensor])
+def densities_of(components: Measurements, sensors: Mapping[str, Sensor]) -> FloatArray:
+    """:func:`log_density` of fused, rejected and re-acquired components, (m,)."""
+    gate = np.array([sensors[name].gate if name in sensors else 0.0 for name in components.sensors])
+    return log_density(components.innovation, components.innovation_sd, components.outcome, gate[components.sensor])
 
 
 def log_density(innovation: FloatArray, innovation_sd: FloatArray, outcome: CodeArray, gate: FloatArray) -> FloatArray:
     """Log of each component's predicted density with positions in mm, (m,).
 
-    −½(ln 2πS + ν²/S) where it was fused or reacquired the gate; −½(ln 2πS + gate²) where it was rejected, so that
-    rejecting a measurement never costs less than meeting the gate and a tuner cannot gain by rejecting.
+    −½(ln 2πS + ν²/S) where it was fused or re-acquired; −½(ln 2πS + gate²) where it was rejected, so that a rejected
+    measurement never costs less than one at the gate and a tuner cannot gain by rejecting.
 
     Args:
         innovation: ν [m], (m,).
         innovation_sd: √S [m], (m,).
-        outcome: Fused, rejected or reacquired, (m,).
+        outcome: Fused, rejected or re-acquired, (m,).
         gate: Of each component's sensor, (m,).
     """
     square = np.where(outcome == Outcome.REJECTED, gate**2, (innovation / innovation_sd) ** 2)
@@ -108,7 +107,7 @@ def ljung_box(values: FloatArray, lags: int = LAGS) -> tuple[FloatArray, float]:
 
 
 def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
-    """How one sensor's components on one axis fit what the filter expected; None where none were fused."""
+    """NIS, whiteness and verdict of one sensor's components on one axis; None where none were fused."""
     measurements = est.measurements.of(sensor, axis)
     fused = measurements.where(measurements.outcome == Outcome.FUSED)
     count = len(fused.value)
@@ -121,52 +120,50 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
     return Consistency(count, nis, band, correlation, whiteness, verdict)
 
 
-def troubles(est: Estimates) -> list[str]:
-    """What went wrong with whole sensors, a sentence each: gates that reacquired, measurements that all failed, clocks."""
+def sensor_problems(est: Estimates) -> list[str]:
+    """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows, other clocks, frozen."""
     found = _too_wide(est)
-    measurements = est.measurements
-    for name in measurements.sensors:
-        mine = measurements.sensor == measurements.sensors.index(name)
-        time, outcome = measurements.time[mine], measurements.outcome[mine]
-        total, counts = len(outcome), outcome_counts(outcome)
+    for name in est.measurements.sensors:
+        mine = est.measurements.where(est.measurements.sensor == est.measurements.sensors.index(name))
+        total, counts = len(mine.outcome), mine.counts()
         if not total:
             continue
-        reacquired = len(np.unique(time[outcome == Outcome.REACQUIRED]))
+        reacquired = len(np.unique(mine.time[mine.outcome == Outcome.REACQUIRED]))
         if reacquired:
             times = "once" if reacquired == 1 else f"{reacquired} times"
             found.append(
-                f"{name}: its gate reacquired {times} after half a second of rejections: it"
-                " contradicts the others or the model; if it is off by a constant, give it bias_sd_mm"
+                f"{name}: its gate reacquired {times}: it contradicts the others or the model; if it is off by a"
+                " constant, give it bias_sd_mm"
             )
         if counts.get(Outcome.BEFORE_START.word, 0) > 0.5 * total:
             found.append(f"{name}: most measurements lie before the first command: are both stamped by one clock?")
-        last = float(np.nanmax(time, initial=-np.inf))
+        last = float(np.nanmax(mine.time, initial=-np.inf))
         if last > est.last_command + LONGEST_TAIL_NS / 1e9:
+            hours = (last - est.last_command) / 3600.0
             found.append(
-                f"{name}: measurements go on for {(last - est.last_command) / 3600.0:.1f} hours after the last command: are"
-                " both stamped by one clock?"
+                f"{name}: measurements go on for {hours:.1f} hours after the last command: are both stamped by one"
+                " clock?"
             )
-        elif float(np.mean(time > est.last_command + 1.0)) > 0.5:
+        elif float(np.mean(mine.time > est.last_command + 1.0)) > 0.5:
             found.append(f"{name}: most measurements lie after the last command: are both stamped by one clock?")
-        if counts.get(Outcome.REJECTED.word, 0) > _MANY_REJECTED * total:
-            share = counts[Outcome.REJECTED.word] / total
+        rejected = counts.get(Outcome.REJECTED.word, 0) / total
+        if rejected > _MANY_REJECTED:
             found.append(
-                f"{name}: {share:.0%} of its components were rejected: sd_mm, latency_ms or the process noise too small"
+                f"{name}: {rejected:.0%} of its components were rejected: sd_mm, latency_ms or the process noise too"
+                " small"
             )
-        axis, value = measurements.axis[mine], measurements.value[mine]
-        for number, label in enumerate(measurements.axes):
-            if frozen := _frozen(value[axis == number]):
-                found.append(f"{name}: {frozen} {label} measurements in a row have the same value: it froze")
+        for number, axis in enumerate(mine.axes):
+            if frozen := _frozen(mine.value[mine.axis == number]):
+                found.append(f"{name}: {frozen} {axis} measurements in a row have the same value: it froze")
     return found
 
 
 def _too_wide(est: Estimates) -> list[str]:
-    """Priors so much wider than a sensor's noise that double precision blurs the error bars."""
+    """Notes on priors so much wider than a sensor's noise that double precision blurs the error bars."""
     found: list[str] = []
-    for name in est.measurements.sensors:
-        sensor = est.config.sensors.get(name)
-        sds = [] if sensor is None else [sd for axis in est.axes if (sd := sensor.sd_of(axis)) is not None]
-        if sensor is not None and sds:
+    for name, sensor in est.config.sensors.items():
+        sds = [sd for axis in est.axes if (sd := sensor.sd_of(axis)) is not None]
+        if sds and name in est.measurements.sensors:
             ratio = max(est.config.start.offset_sd, sensor.bias_sd) / min(sds)
             if ratio > _WIDEST:
                 found.append(
@@ -177,7 +174,7 @@ def _too_wide(est: Estimates) -> list[str]:
 
 
 def _frozen(values: FloatArray) -> int:
-    """How often in a row a sensor repeated a value to the last digit while others would scatter; 0 if it did not.
+    """Length of the longest row of equal values where a working sensor would scatter; 0 if it did not freeze.
 
     Coarse steps repeat by themselves: with a share p of repeats elsewhere, L equal values in a row come up n p^(L−1)
     times in n measurements.
@@ -204,36 +201,39 @@ def _verdict(
 ) -> str:
     if len(fused.value) < _FEW:
         return f"too few measurements ({len(fused.value)}) to tell"
-    said = f"NIS {nis:.2f}, expected {band[0]:.2f} to {band[1]:.2f}"
+    nis_text = f"NIS {nis:.2f}, expected {band[0]:.2f} to {band[1]:.2f}"
     if rejected > _MANY_REJECTED:  # what is left has been chosen to fit
-        return f"{said}, but {rejected:.0%} were rejected: sd_mm, latency_ms or the process noise too small"
+        return f"{nis_text}, but {rejected:.0%} were rejected: sd_mm, latency_ms or the process noise too small"
     first, strongest = float(correlation[0]), int(np.argmax(np.abs(correlation)))
     coloured = whiteness < 0.01 and abs(first) > _NOTABLE
     if nis > band[1]:
         if coloured and _follows_velocity(est, axis, fused):
-            return f"{said}, innovations follow the velocity: latency_ms is wrong"
+            return f"{nis_text}, innovations follow the velocity: latency_ms is wrong"
         if coloured and first > 0.0:
-            return f"{said}, one innovation like the next: the process noise too small, or latency_ms wrong"
+            return f"{nis_text}, innovations positively correlated: the process noise too small, or latency_ms wrong"
         if coloured:
-            return f"{said}, one innovation against the next: sd_mm too small"
-        return f"{said}: sd_mm or the process noise too small"
+            return f"{nis_text}, innovations negatively correlated: sd_mm too small"
+        return f"{nis_text}: sd_mm or the process noise too small"
     if nis < band[0]:
         if coloured and first < 0.0:
-            return f"{said}, one innovation against the next: the process noise too large"
-        return f"{said}: sd_mm or the process noise too large"
+            return f"{nis_text}, innovations negatively correlated: the process noise too large"
+        return f"{nis_text}: sd_mm or the process noise too large"
     if whiteness < 0.01 and abs(correlation[strongest]) > _NOTABLE:
-        return f"{said}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
-    return f"{said}: consistent"
+        return f"{nis_text}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
+    return f"{nis_text}: consistent"
 
 
 def _follows_velocity(est: Estimates, axis: str, fused: Measurements) -> bool:
-    """Whether innovations go with the velocity, as those of a measurement with the wrong valid time do.
+    """Whether innovations correlate with the velocity, as those of a measurement with the wrong valid time do.
 
-    Which way the latency is wrong they do not tell: the offset takes up most of the error, and what is left of an
-    accurate sensor's follows the acceleration.
+    The sign of the correlation does not show which way the latency is wrong: the offset absorbs most of the error, and
+    what is left of an accurate sensor's follows the acceleration.
     """
     inside = (fused.time >= est.time[0]) & (fused.time <= est.time[-1])
-    innovation = fused.innovation[inside]
-    velocity = np.interp(fused.time[inside], est.time, est[axis].velocity)
+    innovation, velocity = fused.innovation[inside], est[axis].velocity
+    if np.isnan(velocity).any():  # smoothed estimates have none
+        step = np.diff(est.time, append=np.nan)
+        velocity = np.divide(np.diff(est[axis].position, append=0.0), step, out=np.zeros(len(step)), where=step > 0.0)
+    velocity = np.interp(fused.time[inside], est.time, velocity)
     power = float(velocity @ velocity) * float(innovation @ innovation)
     return power > 0.0 and abs(float(innovation @ velocity)) > 0.3 * float(np.sqrt(power))

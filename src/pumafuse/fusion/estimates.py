@@ -1,4 +1,4 @@
-"""The result of a fusion: estimates in the log's coordinates, what became of each measurement, and what was noticed."""
+"""The result of a fusion: estimates in the log's coordinates, the outcome of every measurement, and notes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,6 @@ from .config import FusionConfig
 from .reference import ReferenceTrack
 
 Mode = Literal["filtered", "as-live", "smoothed"]
-
-
-def outcome_counts(outcomes: CodeArray) -> dict[str, int]:
-    """How many components had each outcome, those that occur."""
-    found = {outcome.word: int(np.count_nonzero(outcomes == outcome)) for outcome in Outcome}
-    return {word: count for word, count in found.items() if count}
 
 
 @dataclass(frozen=True)
@@ -59,13 +53,13 @@ class Measurements:
     """Every component of every sensor used, in the order of processing; arrays are (m,).
 
     Attributes:
-        time: The instant the measurement is true of [s since the first command], NaN without a stamp.
+        time: The instant at which the measurement is valid [s since the first command], NaN without a stamp.
         stamp: As logged [s since the first command], NaN without a stamp.
         sensor: Index into ``sensors``.
         axis: Index into ``axes``.
         value: As logged [m].
-        innovation: One step ahead [m], NaN where the filter never met the component.
-        innovation_sd: What the filter expected of it [m].
+        innovation: One step ahead [m], NaN where the filter did not use the component.
+        innovation_sd: Predicted standard deviation of the innovation, √S [m].
         outcome: An :class:`Outcome` each.
         sensors: Sensor names.
         axes: Axis names.
@@ -97,19 +91,16 @@ class Measurements:
         """The components that ``mask`` (m,) selects."""
         return replace(self, **{name: getattr(self, name)[mask] for name in self.ARRAYS})
 
-    def as_position(self, scale: float, bias: float) -> Measurements:
-        """The components with their values turned into positions [m]: (z − bias) / scale."""
-        return replace(self, value=(self.value - bias) / scale)
+    def counts(self) -> dict[str, int]:
+        """The number of components with each outcome, without those that do not occur."""
+        found = {outcome.word: int(np.count_nonzero(self.outcome == outcome)) for outcome in Outcome}
+        return {word: count for word, count in found.items() if count}
 
     @staticmethod
     def joined(parts: Sequence[Measurements]) -> Measurements:
         """The components of several segments, one after the other."""
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in Measurements.ARRAYS}
         return replace(parts[0], **arrays)
-
-    def counts(self) -> dict[str, int]:
-        """How many components had each outcome, those that occur."""
-        return outcome_counts(self.outcome)
 
 
 @dataclass(frozen=True)
@@ -121,19 +112,19 @@ class Estimates:
         time: [s since the run's first command].
         axes: Estimates by axis; ``est["radial"]`` is the short way.
         cartesian: With a frame, the estimates in the log's ``x``, ``y`` and ``z`` [m].
-        measurements: What became of every component.
-        biases: By sensor and axis, as all measurements together know them (of the last segment, if the clock jumped).
+        measurements: Every component with its innovation and outcome.
+        biases: By sensor and axis, estimated from all measurements (of the last segment, if there are several).
         reference: The run's reference, where it has one.
         origin: Stamp of the first command, int ns.
-        last_command: When the last command was given [s since the first].
+        last_command: Time of the last command [s since the first].
         segment: 0, and one more after each time the log's clock was set back.
-        mode: Which measurements an estimate knows: all that are valid by then (``filtered``), or only those that had
+        mode: Which measurements an estimate uses: all that are valid by then (``filtered``), only those that had
             arrived (``as-live``), or all of the run (``smoothed``).
         engine: Which engine computed it.
         config: The configuration as used.
         speed: Highest commanded speed [m/s].
-        radius: Farthest that commands are from the base's axis [m]; None without a cylindrical frame.
-        notes: Everything noticed, a sentence each.
+        radius: Greatest distance of a command from the base's axis [m]; None without a cylindrical frame.
+        notes: What was noticed, a sentence each.
     """
 
     run: str
@@ -162,3 +153,22 @@ class Estimates:
         if axis not in self.axes:
             raise UnknownNameError(f"run '{self.run}'", "axis", str(axis), self.axes)
         return self.axes[axis]
+
+    def measured_positions(self, sensor: str, axis: str) -> Measurements:
+        """A sensor's components with positions for values [m]: (z − estimated bias) / scale; none if not configured."""
+        measurements = self.measurements.of(sensor, axis)
+        if sensor not in self.config.sensors:
+            return measurements.where(np.zeros(len(measurements.value), dtype=bool))
+        bias = self.biases.get(sensor, {}).get(axis)
+        position = measurements.value if bias is None else measurements.value - bias.value
+        return replace(measurements, value=position / self.config.sensors[sensor].scale)
+
+    def busiest(self, length: float) -> tuple[float, float]:
+        """Start and end of the interval of ``length`` with the most motion [s]; every axis has the same weight."""
+        travelled = np.zeros(len(self.time))
+        for axis in self.axes.values():
+            steps = np.abs(np.diff(axis.position, prepend=axis.position[0]))
+            travelled += np.cumsum(steps) / max(float(steps.sum()), 1e-12)
+        ends = np.minimum(np.searchsorted(self.time, self.time + length), len(self.time) - 1)
+        start = float(self.time[np.argmax(travelled[ends] - travelled)])
+        return start, start + length

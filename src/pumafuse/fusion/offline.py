@@ -19,9 +19,9 @@ from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run
 from ..units import seconds
 from .config import FusionConfig
-from .consistency import troubles
+from .consistency import sensor_problems
 from .engine import Filtered, filter_segment
-from .estimates import Estimates, Measurements, Mode
+from .estimates import AxisEstimate, Estimates, Measurements, Mode
 from .reference import joined_references, late_rows, reference_track
 from .score import interpolated
 from .segments import Segment, build, output_times
@@ -80,7 +80,7 @@ def fuse(
         parts.append(_fuse_segment(part, placed, built, times, config, mode, engine, share))
     joined = _joined(parts, said)
     excess = config.arm.validity.excess(joined.speed, joined.radius)
-    joined = replace(joined, notes=(*joined.notes, *_reference_notes(joined, logged), *excess, *troubles(joined)))
+    joined = replace(joined, notes=(*joined.notes, *_reference_notes(joined, logged), *excess, *sensor_problems(joined)))
     for note in joined.notes:
         warnings.warn(f"run '{run.name}': {note}", PumafuseWarning, stacklevel=2)
     return joined

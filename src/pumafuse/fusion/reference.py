@@ -1,4 +1,4 @@
-"""A run's reference as estimates are scored against it: in order, and in the run's own time."""
+"""The reference of a run in order and in the run's own time, to score estimates against."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class ReferenceTrack:
 
 
 def late_rows(reference: Reference) -> BoolArray:
-    """Rows stamped more than 1 s behind an earlier one, which are not used, (rows,)."""
+    """Rows stamped more than 1 s behind an earlier one; they are not used, (rows,)."""
     return behind(reference.stamp) > TOLERATED_STEP_BACK_NS
 
 
 def reference_track(reference: Reference, origin: int) -> ReferenceTrack:
-    """A run's reference in order and in seconds since ``origin`` (int ns), without what lies behind a jump back."""
+    """A run's reference in order, in seconds since ``origin`` (int ns), without rows behind a jump back."""
     kept = reference.rows((reference.stamp != NO_STAMP) & ~late_rows(reference))
     order = np.argsort(kept.stamp, kind="stable")
     position = {axis: value[order] for axis, value in kept.values.items()}
@@ -45,7 +45,7 @@ def reference_track(reference: Reference, origin: int) -> ReferenceTrack:
 
 
 def joined_references(parts: Sequence[tuple[ReferenceTrack, float, int]]) -> ReferenceTrack:
-    """The references of several segments, each with what is added to its time [s] and its segment's number."""
+    """One reference of several segments; ``parts`` gives each with a shift of its time [s] and its segment's number."""
     first = parts[0][0]
     return ReferenceTrack(
         np.concatenate([track.time + shift for track, shift, _ in parts]),

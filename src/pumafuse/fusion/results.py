@@ -1,13 +1,15 @@
-"""Result folders: the tables that ``fuse`` leaves, and what ``compare`` reads of them. Files are in mm and s."""
+"""Result folders: the files that ``fuse`` writes and ``compare`` reads, in mm and s."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
 from .. import folders
@@ -22,10 +24,11 @@ from ..logs.frames import Frame
 from ..logs.run import Run
 from ..logs.tables import Table
 from ..units import MM, seconds
+from .config import FusionConfig
 from .estimates import Estimates
 from .reference import ReferenceTrack, joined_references, reference_track
-from .score import Score, score
-from .summary import Summary, summarise
+from .summary import ScoreSummary, Summary, score_axis, summarise
+from .track import AxisEstimate
 
 ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY = (
     "estimates.parquet",
@@ -33,7 +36,7 @@ ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY = (
     "reference.parquet",
     "summary.json",
 )
-OURS = frozenset(
+_FILES = frozenset(
     {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, "fusion.toml", "arm.toml"}
     | {"fused.rrd", "fused.png", "error.png", "validation.png"}
 )  # a folder with anything else in it is never replaced
@@ -42,31 +45,30 @@ _REFERENCE_PREFIX = "reference."
 
 @dataclass(frozen=True)
 class Result:
-    """What a comparison needs of a result folder.
+    """The parts of a result folder that a comparison needs.
 
     Attributes:
-        folder: Where it is.
         summary: Its ``summary.json``.
+        config: Its ``fusion.toml`` and ``arm.toml``.
         time: [s since the first command], (n,).
         segment: (n,).
-        position: For each axis [m], (n,).
-        position_sd: For each axis [m], (n,).
-        reference: What ``reference.parquet`` holds, if it is there.
+        axes: Estimates by axis.
+        reference: Its ``reference.parquet``, if there is one.
     """
 
-    folder: Path
     summary: Summary
+    config: FusionConfig
     time: FloatArray
     segment: IntArray
-    position: Mapping[str, FloatArray]
-    position_sd: Mapping[str, FloatArray]
+    axes: Mapping[str, AxisEstimate]
     reference: ReferenceTrack | None
 
-    def scores(self, reference: ReferenceTrack) -> dict[str, Score]:
-        """The score of each axis that the reference knows."""
+    def scores(self, reference: ReferenceTrack) -> dict[str, ScoreSummary]:
+        """The score of each axis that the reference has."""
+        period = self.config.arm.update_period
         found = {
-            axis: score(self.time, self.segment, position, self.position_sd[axis], reference, axis)
-            for axis, position in self.position.items()
+            axis: score_axis(self.time, self.segment, estimate, reference, axis, period)
+            for axis, estimate in self.axes.items()
         }
         return {axis: value for axis, value in found.items() if value is not None}
 
@@ -77,7 +79,7 @@ def check_writable(folder: Path, force: bool) -> None:
     Raises:
         FolderError: The folder exists and is not to be replaced, or holds something else than results.
     """
-    folders.check_writable(folder, force, [SUMMARY], OURS.__contains__)
+    folders.check_writable(folder, force, [SUMMARY], _FILES.__contains__)
 
 
 def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], None] | None = None) -> Summary:
@@ -121,14 +123,14 @@ def read(folder: Path) -> Result:
     except msgspec.MsgspecError as error:
         raise FolderError(f"{folder / SUMMARY}: not a summary of pumafuse: {error}") from None
     table = tables.read(folder / ESTIMATES)
+    axes = {axis: AxisEstimate(*(_lengths(table, axis, name) for name in AxisEstimate.FIELDS)) for axis in summary.axes}
     path = folder / REFERENCE
     return Result(
-        folder,
         summary,
+        FusionConfig.load(folder / "fusion.toml"),
         _seconds(table),
         _segment(table),
-        {axis: table.numbers(f"{axis}.position_mm")[0] for axis in summary.axes},
-        {axis: table.numbers(f"{axis}.position_sd_mm")[0] for axis in summary.axes},
+        axes,
         _own_reference(tables.read(path)) if path.exists() else None,
     )
 
@@ -162,14 +164,10 @@ def read_reference(path: Path, origin: int, frame: Frame | None = None) -> Refer
 
 
 def _estimates_table(est: Estimates) -> pa.Table:
-    columns: dict[str, FloatArray | IntArray] = {"time_s": est.time}
-    for name, axis in est.axes.items():
-        columns[f"{name}.position_mm"] = axis.position * MM
-        columns[f"{name}.position_sd_mm"] = axis.position_sd * MM
-        columns[f"{name}.velocity_mm_s"] = axis.velocity * MM
-        columns[f"{name}.velocity_sd_mm_s"] = axis.velocity_sd * MM
-        columns[f"{name}.offset_mm"] = axis.offset * MM
-        columns[f"{name}.offset_sd_mm"] = axis.offset_sd * MM
+    columns: dict[str, FloatArray | IntArray | pa.Array] = {"time_s": est.time}
+    for axis, estimate in est.axes.items():
+        for name in AxisEstimate.FIELDS:
+            columns[_column(axis, name)] = _nullable(getattr(estimate, name) * MM)
     columns |= {f"{name}_mm": position * MM for name, position in (est.cartesian or {}).items()}
     return pa.table({**columns, **_segment_column(est.segment)})
 
@@ -180,15 +178,13 @@ def _measurements_table(est: Estimates) -> pa.Table:
         {
             "time_s": _nullable(r.time),
             "stamp_s": _nullable(r.stamp),
-            "sensor": pa.DictionaryArray.from_arrays(r.sensor.astype(np.int32), list(r.sensors)).cast(pa.string()),
-            "axis": pa.DictionaryArray.from_arrays(r.axis.astype(np.int32), list(r.axes)).cast(pa.string()),
+            "sensor": _names(r.sensor, r.sensors),
+            "axis": _names(r.axis, r.axes),
             "value_mm": _nullable(r.value * MM),
             "innovation_mm": _nullable(r.innovation * MM),
             "innovation_sd_mm": _nullable(r.innovation_sd * MM),
             "nis": _nullable(r.nis),
-            "outcome": pa.DictionaryArray.from_arrays(
-                r.outcome.astype(np.int32), [outcome.word for outcome in Outcome]
-            ).cast(pa.string()),
+            "outcome": _names(r.outcome, [outcome.word for outcome in Outcome]),
         }
     )
 
@@ -216,6 +212,20 @@ def _own_reference(table: Table) -> ReferenceTrack:
     }
     position = {axis: table.numbers(f"{axis}{ending}")[0] for axis in axes}
     return ReferenceTrack(_seconds(table), position, noise, _segment(table))
+
+
+def _column(axis: str, name: str) -> str:
+    """The column of an :class:`AxisEstimate`'s array: ``radial.velocity_sd_mm_s``."""
+    return f"{axis}.{name}_mm_s" if name.startswith("velocity") else f"{axis}.{name}_mm"
+
+
+def _lengths(table: Table, axis: str, name: str) -> FloatArray:
+    return table.plain(_column(axis, name))[0] / MM
+
+
+def _names(index: npt.NDArray[np.integer[Any]], names: Sequence[str]) -> pa.Array:
+    """The name of each index as a column of text."""
+    return pa.DictionaryArray.from_arrays(index.astype(np.int32), list(names)).cast(pa.string())
 
 
 def _seconds(table: Table) -> FloatArray:

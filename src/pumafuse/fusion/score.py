@@ -1,4 +1,4 @@
-"""Scoring against a reference: error, coverage and NEES of the position."""
+"""Scores against a reference: error, coverage and NEES of position and velocity."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from .reference import ReferenceTrack
 
 Z95 = 1.959963984540054  # a normal variable lies within ± this in 95 % of cases
@@ -15,11 +15,11 @@ _SHORTEST_GAP = 0.050  # s; a reference is interpolated at least across this
 
 @dataclass(frozen=True)
 class Score:
-    """How one axis did against a reference.
+    """Errors of one axis against a reference, in m for positions and m/s for velocities.
 
     Attributes:
-        rmse: Root mean square error [m].
-        bias: Mean of estimate − reference [m].
+        rmse: Root mean square error.
+        bias: Mean of estimate − reference.
         coverage: Share of errors within 1.96 standard deviations.
         nees: Mean of error² / variance; 1 for a consistent filter. Estimates known exactly and right do not count.
         rows: Estimates scored.
@@ -37,39 +37,56 @@ class Score:
 def score(
     time: FloatArray, segment: IntArray, position: FloatArray, sd: FloatArray, reference: ReferenceTrack, axis: str
 ) -> Score | None:
-    """Score one axis at its estimate times; the reference's own noise adds to the variance.
+    """Score the positions of one axis; the variance of the reference's own noise is added to the estimates'.
 
     Args:
         time: Of the estimates [s], (n,).
         segment: Of the estimates, (n,).
         position: p [m], (n,).
         sd: Its standard deviation [m], (n,).
-        reference: The truth.
-        axis: Which axis of it.
+        reference: What is taken for the true positions.
+        axis: The axis of the reference.
 
     Returns:
-        The score; None where the reference says nothing about any estimate of this axis.
+        The score; None where no estimate of this axis has a reference.
     """
     if axis not in reference.position:
         return None
-    truth = interpolated(time, segment, reference, axis)
-    noise = np.interp(time, reference.time, reference.sd[axis]) if len(reference.time) else np.zeros(len(time))
-    scored = np.isfinite(truth)
-    if not scored.any():
+    true = interpolated(time, segment, reference, axis)
+    return _score(position - true, sd**2 + _noise_variance(time, reference, axis))
+
+
+def score_velocity(
+    time: FloatArray,
+    segment: IntArray,
+    velocity: FloatArray,
+    sd: FloatArray,
+    reference: ReferenceTrack,
+    axis: str,
+    period: float,
+) -> Score | None:
+    """Score the mean velocities over the coming ``period`` T of one axis against (p_ref(t + T) − p_ref(t)) / T.
+
+    The reference is interpolated at t and t + T; an estimate is left out where it has no value at one of the two within
+    the estimate's segment. The variance of both values' own noise, over T², is added to that of the estimates.
+
+    Args:
+        time: t of the estimates [s], (n,).
+        segment: Of the estimates, (n,).
+        velocity: (p(t + T) − p(t)) / T [m/s], (n,); NaN where there is none, as in smoothed estimates.
+        sd: Its standard deviation [m/s], (n,).
+        reference: What is taken for the true positions.
+        axis: The axis of the reference.
+        period: T [s].
+
+    Returns:
+        The score; None where no velocity of this axis has a reference.
+    """
+    if axis not in reference.position:
         return None
-    error = (position - truth)[scored]
-    variance = sd[scored] ** 2 + noise[scored] ** 2
-    telling = (variance > 0.0) | (error != 0.0)  # what is known exactly and is right says nothing of the error bars
-    with np.errstate(divide="ignore"):
-        nees = error[telling] ** 2 / variance[telling]
-    return Score(
-        rmse=float(np.sqrt(np.mean(error**2))),
-        bias=float(np.mean(error)),
-        coverage=float(np.mean(np.abs(error) <= Z95 * np.sqrt(variance))),
-        nees=float(np.mean(nees)) if len(nees) else 1.0,
-        rows=int(scored.sum()),
-        left_out=int((~scored).sum()),
-    )
+    before, after = (interpolated(t, segment, reference, axis) for t in (time, time + period))
+    noise = _noise_variance(time, reference, axis) + _noise_variance(time + period, reference, axis)
+    return _score(velocity - (after - before) / period, sd**2 + noise / period**2)
 
 
 def interpolated(time: FloatArray, segment: IntArray, reference: ReferenceTrack, axis: str) -> FloatArray:
@@ -77,12 +94,39 @@ def interpolated(time: FloatArray, segment: IntArray, reference: ReferenceTrack,
 
     A gap is an interval longer than twice the reference's median interval and longer than 50 ms.
     """
-    truth = np.full(len(time), np.nan)
+    found = np.full(len(time), np.nan)
     for number in np.unique(segment):
         here = segment == number
-        there = (reference.segment == number) & np.isfinite(reference.position[axis])
-        truth[here] = _between(time[here], reference.time[there], reference.position[axis][there])
-    return truth
+        rows = (reference.segment == number) & np.isfinite(reference.position[axis])
+        found[here] = _between(time[here], reference.time[rows], reference.position[axis][rows])
+    return found
+
+
+def _score(error: FloatArray, variance: FloatArray) -> Score | None:
+    """The score of errors, NaN where there is no reference, with the variance that they should have."""
+    known = np.isfinite(error)
+    if not known.any():
+        return None
+    left_out = int((~known).sum())
+    error, variance = error[known], variance[known]
+    counted = (variance > 0.0) | (error != 0.0)  # what is known exactly and right says nothing about the error bars
+    with np.errstate(divide="ignore"):
+        nees = error[counted] ** 2 / variance[counted]
+    return Score(
+        rmse=float(np.sqrt(np.mean(error**2))),
+        bias=float(np.mean(error)),
+        coverage=float(np.mean(np.abs(error) <= Z95 * np.sqrt(variance))),
+        nees=float(np.mean(nees)) if len(nees) else 1.0,
+        rows=len(error),
+        left_out=left_out,
+    )
+
+
+def _noise_variance(time: FloatArray, reference: ReferenceTrack, axis: str) -> FloatArray:
+    """Variance of the reference's own noise [m²] at ``time``, (n,)."""
+    if not len(reference.time):
+        return np.zeros(len(time))
+    return np.interp(time, reference.time, reference.sd[axis]) ** 2
 
 
 def _between(time: FloatArray, known: FloatArray, value: FloatArray) -> FloatArray:
@@ -90,8 +134,8 @@ def _between(time: FloatArray, known: FloatArray, value: FloatArray) -> FloatArr
         return np.full(len(time), np.nan)
     known, first = np.unique(known, return_index=True)
     longest = max(2.0 * float(np.median(np.diff(known))) if len(known) > 1 else 0.0, _SHORTEST_GAP)
-    right = np.minimum(np.searchsorted(known, time, side="right"), len(known) - 1)
-    left = np.maximum(np.searchsorted(known, time, side="right") - 1, 0)
-    inside: BoolArray = (time >= known[0]) & (time <= known[-1])
+    after = np.searchsorted(known, time, side="right")
+    right, left = np.minimum(after, len(known) - 1), np.maximum(after - 1, 0)
+    inside = (time >= known[0]) & (time <= known[-1])
     near = (known[right] - known[left] <= longest) | (known[left] == time)
     return np.where(inside & near, np.interp(time, known, value[first]), np.nan)

@@ -16,10 +16,9 @@ from ..errors import RunError, UnknownNameError
 from ..filter.events import COMMAND, Events, classify_all, joined
 from ..filter.outcome import ABSENT, Outcome
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
-from ..logs.defects import said_before, tell
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
-from ..logs.run import Run, Source
+from ..logs.run import Run, Source, note_rows
 from ..model.arm import ArmModel
 from .config import FusionConfig
 from .setup import at_rest, filter_model, filter_sensors
@@ -162,17 +161,17 @@ def command_rows(run: Run, arm: ArmModel, notes: list[str]) -> Events:
     """
     source, period = run.command, arm.update_period
     missing = source.stamp == NO_STAMP
-    tell(notes, source.label, missing, "no stamp: not used")
-    tell(notes, source.label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
+    note_rows(notes, source.label, missing, "no stamp: not used")
+    note_rows(notes, source.label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
     kept = np.flatnonzero(~missing)
     kept = kept[np.argsort(source.stamp[kept], kind="stable")]
     rows = _table(source, run.axes, kept, COMMAND)._replace(time=source.stamp[kept])
     rows = _classified(rows, FusionConfig(arm=arm), run.axes, (), int(rows.time[0]), np.zeros(len(kept), np.bool_))
-    tell(notes, source.label, said_before(source) & ~missing, "the stamp and values of an earlier row: duplicate")
+    note_rows(notes, source.label, source.repeated() & ~missing, "the stamp and values of an earlier row: duplicate")
     for number, axis in enumerate(run.axes):
         hollow = np.zeros(len(source.stamp), dtype=np.bool_)
         hollow[kept] = rows.known[:, number] == Outcome.INVALID
-        tell(notes, source.label, hollow, f"no finite {axis} command: not used")
+        note_rows(notes, source.label, hollow, f"no finite {axis} command: not used")
     if run.clock == "stamps":
         return rows
     used = (rows.known == Outcome.FUSED).any(axis=1)
@@ -218,7 +217,7 @@ def _first_value(rows: Events, axis: int) -> float:
 def _measurement_rows(run: Run, config: FusionConfig, name: str, number: int, origin: int, notes: list[str]) -> Events:
     """One sensor's rows by stamp, each value classified."""
     source, sensor = run.sensors[name], config.sensors.get(name)
-    label, latency = source.told_as(name), 0 if sensor is None else round(sensor.latency * 1e9)
+    label, latency = source.label_for(name), 0 if sensor is None else round(sensor.latency * 1e9)
     order = np.argsort(source.stamp, kind="stable")
     rows = _table(source, run.axes, order, 0)
     rows = rows._replace(time=_valid(rows.stamp, latency))
@@ -227,13 +226,13 @@ def _measurement_rows(run: Run, config: FusionConfig, name: str, number: int, or
     rows = rows._replace(source=np.full_like(rows.source, number))
     known = np.empty_like(rows.known)
     known[order] = rows.known
-    tell(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
+    note_rows(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
     if sensor is None:
-        tell(notes, label, np.ones(len(known), np.bool_), "no sensor of this name in the configuration: unknown")
+        note_rows(notes, label, np.ones(len(known), np.bool_), "no sensor of this name in the configuration: unknown")
         return rows
-    tell(notes, label, source.stamp == NO_STAMP, f"no stamp: {Outcome.INVALID.word}")
+    note_rows(notes, label, source.stamp == NO_STAMP, f"no stamp: {Outcome.INVALID.word}")
     for kind, reason in _REASONS.items():
-        tell(notes, label, (known == kind).any(axis=1), f"{reason}: {kind.word}")
+        note_rows(notes, label, (known == kind).any(axis=1), f"{reason}: {kind.word}")
     for number, axis in enumerate(run.axes):
         if axis not in source.values:
             continue
@@ -241,7 +240,7 @@ def _measurement_rows(run: Run, config: FusionConfig, name: str, number: int, or
             notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
             continue
         hollow = (known[:, number] == Outcome.INVALID) & (source.stamp != NO_STAMP)
-        tell(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
+        note_rows(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
     return rows
 
 

@@ -1,4 +1,4 @@
-"""``summary.json``: what happened in a fusion, in the units of screens (mm, s). The classes here are its schema."""
+"""``summary.json``: counts, consistency and scores of a fusion in mm and s. The classes here are its schema."""
 
 from __future__ import annotations
 
@@ -8,21 +8,23 @@ from importlib.metadata import version
 import msgspec
 import numpy as np
 
+from ..arrays import FloatArray, IntArray
 from ..filter.outcome import Outcome
 from ..units import MM
 from .consistency import chi_square_band, consistency, log_likelihood
-from .estimates import Estimates
-from .score import Score, score
+from .estimates import AxisEstimate, Estimates
+from .reference import ReferenceTrack
+from .score import score, score_velocity
 
 
 class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):
     """One sensor on one axis.
 
     Attributes:
-        outcomes: How many components met each outcome, those that occur.
-        innovation_rms_mm: Root mean square of the fused components' innovations; null without any. Of a sensor with a
-            bias the first is left out.
-        innovation_sd_mm: Root mean square of what the filter expected of them.
+        outcomes: Number of components with each outcome, without those that do not occur.
+        innovation_rms_mm: Root mean square of the fused components' innovations; null without any. Without the first of
+            a sensor with a bias, which determines the bias.
+        innovation_sd_mm: Root mean square of their predicted standard deviations.
         nis_mean: Mean ν²/S of the fused components; 1 for a consistent filter.
         nis_band: Where that mean lies in 95 % of cases for a consistent filter.
         correlation: Autocorrelation of the innovations at lags 1, 2, …
@@ -56,6 +58,9 @@ class ScoreSummary(msgspec.Struct, frozen=True, kw_only=True):
         nees_mean: Mean of error²/variance; 1 for a consistent filter; null where a variance is 0.
         rows: Estimates scored.
         left_out: Estimates with no reference near enough.
+        velocity_rmse_mm_s: Root mean square error of the mean velocity over the coming update period; null for smoothed
+            estimates, which have none.
+        velocity_coverage: Share of its errors within 1.96 standard deviations; null likewise.
     """
 
     rmse_mm: float
@@ -64,6 +69,8 @@ class ScoreSummary(msgspec.Struct, frozen=True, kw_only=True):
     nees_mean: float | None
     rows: int
     left_out: int
+    velocity_rmse_mm_s: float | None = None
+    velocity_coverage: float | None = None
 
 
 class AxisSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -99,7 +106,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         pumafuse: Version that wrote it.
         run: The run's name.
         arm: The arm's name.
-        mode: Which measurements an estimate knows: ``filtered`` (all valid by then), ``as-live`` (those that had
+        mode: Which measurements an estimate uses: ``filtered`` (all valid by then), ``as-live`` (those that had
             arrived) or ``smoothed`` (all of the run).
         engine: Which engine computed it.
         origin_ns: Stamp of the first command: time 0 of every table.
@@ -108,7 +115,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         segments: 1, and one more for each time the log's clock was set back.
         axes: By axis.
         validity: Commands against the arm model's limits.
-        notes: Everything noticed, a sentence each.
+        notes: What was noticed, a sentence each.
     """
 
     pumafuse: str
@@ -149,29 +156,45 @@ def summarise(est: Estimates) -> Summary:
     )
 
 
-def score_summary(found: Score) -> ScoreSummary:
-    """A score in mm."""
+def score_axis(
+    time: FloatArray, segment: IntArray, estimate: AxisEstimate, reference: ReferenceTrack, axis: str, period: float
+) -> ScoreSummary | None:
+    """Scores of position and velocity of one axis in mm and mm/s; None where no estimate has a reference.
+
+    Args:
+        time: Of the estimates [s], (n,).
+        segment: Of the estimates, (n,).
+        estimate: The axis.
+        reference: What is taken for the true positions.
+        axis: The axis of the reference.
+        period: Update period T [s] over which the velocity is a mean.
+    """
+    position = score(time, segment, estimate.position, estimate.position_sd, reference, axis)
+    if position is None:
+        return None
+    velocity = score_velocity(time, segment, estimate.velocity, estimate.velocity_sd, reference, axis, period)
     return ScoreSummary(
-        rmse_mm=found.rmse * MM,
-        bias_mm=found.bias * MM,
-        coverage=found.coverage,
-        nees_mean=found.nees if math.isfinite(found.nees) else None,
-        rows=found.rows,
-        left_out=found.left_out,
+        rmse_mm=position.rmse * MM,
+        bias_mm=position.bias * MM,
+        coverage=position.coverage,
+        nees_mean=position.nees if math.isfinite(position.nees) else None,
+        rows=position.rows,
+        left_out=position.left_out,
+        velocity_rmse_mm_s=None if velocity is None else velocity.rmse * MM,
+        velocity_coverage=None if velocity is None else velocity.coverage,
     )
 
 
 def _axis_summary(est: Estimates, axis: str) -> AxisSummary:
     mine = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
-    sensors = {name: _sensor_summary(est, name, axis) for name in mine.sensors if len(mine.of(name, axis).value)}
+    fused = int(np.sum(mine.outcome == Outcome.FUSED))
     found = None
     if est.reference is not None:
-        found = score(est.time, est.segment, est[axis].position, est[axis].position_sd, est.reference, axis)
-    fused = int(np.sum(mine.outcome == Outcome.FUSED))
+        found = score_axis(est.time, est.segment, est[axis], est.reference, axis, est.config.arm.update_period)
     return AxisSummary(
-        sensors=sensors,
+        sensors={name: _sensor_summary(est, name, axis) for name in mine.sensors if len(mine.of(name, axis).value)},
         log_likelihood=log_likelihood(mine, est.config.sensors),
-        score=None if found is None else score_summary(found),
+        score=found,
         nees_band=chi_square_band(fused) if fused else None,
     )
 
@@ -182,13 +205,11 @@ def _sensor_summary(est: Estimates, sensor: str, axis: str) -> SensorSummary:
         return SensorSummary(outcomes=measurements.counts())
     fused = measurements.where(measurements.outcome == Outcome.FUSED)
     bias = est.biases.get(sensor, {}).get(axis)
-    learnt = (
-        0 if bias is None or len(fused.value) == 1 else 1
-    )  # the first measurement of a biased sensor tells its bias
+    first = 1 if bias is not None and len(fused.value) > 1 else 0  # the first measurement determines the bias
     return SensorSummary(
         outcomes=measurements.counts(),
-        innovation_rms_mm=float(np.sqrt(np.mean(fused.innovation[learnt:] ** 2))) * MM,
-        innovation_sd_mm=float(np.sqrt(np.mean(fused.innovation_sd[learnt:] ** 2))) * MM,
+        innovation_rms_mm=float(np.sqrt(np.mean(fused.innovation[first:] ** 2))) * MM,
+        innovation_sd_mm=float(np.sqrt(np.mean(fused.innovation_sd[first:] ** 2))) * MM,
         nis_mean=found.nis,
         nis_band=found.nis_band,
         correlation=found.correlation.tolist(),

@@ -1,1 +1,1 @@
-"""Recorded runs: what was commanded and what the sensors said, as it stands in the log."""
+"""Recorded runs: reading logs, their clocks and their frames."""

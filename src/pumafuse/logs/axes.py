@@ -1,4 +1,4 @@
-"""Runs logged in x, y, z as runs in the arm's axes."""
+"""Conversion of runs logged in x, y, z into runs in the arm's axes."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ S = TypeVar("S", bound=Source)
 
 
 def in_axes(run: Run, frame: Frame | None) -> tuple[Run, Placed | None]:
-    """A run with every Cartesian source turned into axes; sources that name axes are taken as they are.
+    """The run with every source in x, y, z converted into axes; sources that name axes stay as they are.
 
-    Stray stamps are taken for none first (:func:`pumafuse.logs.clock.without_strays`): the start level and the turns
-    that x and y leave open must not come from them.
+    Stray stamps are removed first (:func:`pumafuse.logs.clock.without_strays`): the start level and the whole turns,
+    which x and y leave open, must not come from them.
 
     Args:
         run: The run as logged.
         frame: The frame to use where the run itself has none.
 
     Returns:
-        The run in axes, and the frame in its place; the run as it is and None without a frame.
+        The run in axes and the placed frame; without a frame the run as it is and None.
 
     Raises:
         RunError: A source gives x without y, or names an axis both ways; or the start is not known in x and y.
@@ -80,7 +80,7 @@ def _placed(run: Run, frame: Frame) -> Placed:
 
 
 def placed_at(frame: Frame, x: float, y: float, label: str) -> Placed:
-    """A frame whose start level is at x and y [m] of the log.
+    """The frame placed at a start level of x and y [m] in the log.
 
     Raises:
         RunError: That is on the base's axis, where there is no angle.
@@ -99,24 +99,22 @@ def _converted(source: S, placed: Placed, command: Source | None) -> S:
         return source
     if ("x" in given) != ("y" in given):
         raise RunError(f"{source.label}: gives {'x without y' if 'x' in given else 'y without x'}; a frame needs both")
-    values = {axis: value for axis, value in source.values.items() if axis not in CARTESIAN}
+    named = {axis: value for axis, value in source.values.items() if axis not in CARTESIAN}
     spread = dict(source.spread)
     found: dict[str, FloatArray] = {}
     if "x" in given:
         near = None if command is None or isinstance(placed.frame, Rotated) else _commanded(command, source)
-        found["tangential"], found["radial"], spread["tangential"] = placed.to_axes(
-            source.values["x"], source.values["y"], near
-        )
+        x, y = source.values["x"], source.values["y"]
+        found["tangential"], found["radial"], spread["tangential"] = placed.to_axes(x, y, near)
     if "z" in given:
         found["vertical"] = source.values["z"]
-    for axis in found:
-        if axis in values:
-            raise RunError(f"{source.label}: gives {axis} both by its name and by {', '.join(given)}; give one")
-    return replace(source, values={**values, **found}, spread=spread)
+    if twice := next((axis for axis in found if axis in named), None):
+        raise RunError(f"{source.label}: gives {twice} both by its name and by {', '.join(given)}; give one")
+    return replace(source, values={**named, **found}, spread=spread)
 
 
 def _commanded(command: Source, source: Source) -> FloatArray:
-    """The commanded tangential position [m] at each row of a source."""
+    """Commanded tangential position [m] at each row of a source, (rows,)."""
     if "tangential" not in command.values:
         raise RunError(f"{command.label}: {source.label} is in x and y, the commands are not; give them in x and y too")
     tangential = command.values["tangential"]

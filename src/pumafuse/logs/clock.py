@@ -1,4 +1,4 @@
-"""Stamps that step back: how far, which of them are stray, and where a clock was set back, which cuts a run."""
+"""Faults of a log's clock: stray stamps, and clocks set back, which cut a run into segments."""
 
 from __future__ import annotations
 
@@ -11,23 +11,22 @@ import numpy as np
 
 from ..arrays import NO_STAMP, IntArray, TimeArray
 from ..errors import RunError
-from .defects import tell
-from .run import Run, Source
+from .run import Run, Source, note_rows
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
-_BELIEVED = 3  # rows in a row that have another time: the clock was set anew; fewer are stray
+_NEW_CLOCK = 3  # so many rows in a row with another time: the clock was set anew; fewer are stray
 _MOST_JUMPS = 100
 
 S = TypeVar("S", bound=Source)
 
 
 def behind(stamp: TimeArray) -> TimeArray:
-    """How far each row is behind the latest stamp before it [ns], 0 for a row in order or without a stamp, (rows,)."""
+    """Lag of each row behind the latest stamp before it [ns], 0 for a row in order or without a stamp, (rows,)."""
     return np.where(stamp == NO_STAMP, 0, np.maximum.accumulate(stamp) - stamp)
 
 
-def astray(stamp: TimeArray) -> IntArray:
-    """How far each row's stamp is from the time that the rows around it agree on [ns], (rows,); 0 unless it is stray.
+def stray_offsets(stamp: TimeArray) -> IntArray:
+    """Offset of each stray stamp from the time that the rows around it agree on [ns]; 0 for all others, (rows,).
 
     One or two rows in a row are stray if the log goes on after them where it was before them. With the row before them
     that is not stray itself, the row after them, and 1 s for "far":
@@ -36,9 +35,9 @@ def astray(stamp: TimeArray) -> IntArray:
     - at the beginning of the log, where no row is before: each is far ahead of the row after;
     - at its end, where no row is after: each is far behind the row before.
 
-    At the beginning and the end the side that tells must have at least three rows. Of one row and two, one is tried
-    first. Three in a row or more are never stray: there the clock was set anew. What is ahead and never contradicted is
-    no stray stamp but a pause. Rows without a stamp are passed over.
+    At the beginning and the end the other side must have at least three rows. One row is tried before two. Three in a
+    row or more are never stray: there the clock was set anew. A row that is ahead and never contradicted is a pause.
+    Rows without a stamp are skipped.
     """
     found = np.zeros(len(stamp), dtype=np.int64)
     stamped = np.flatnonzero(stamp != NO_STAMP) if NO_STAMP in stamp else slice(None)
@@ -58,21 +57,21 @@ def astray(stamp: TimeArray) -> IntArray:
             apart[row:after] = known[row:after] - known[before if before >= 0 else after]
     edges = np.flatnonzero(np.diff(apart != 0, prepend=False, append=False))
     for first, end in edges.reshape(-1, 2).tolist():
-        if end - first >= _BELIEVED:
+        if end - first >= _NEW_CLOCK:
             apart[first:end] = 0
     found[stamped] = apart
     return found
 
 
 def _stray_from(stamp: Sequence[int], before: int, row: int) -> int:
-    """How many rows from ``row`` on are stray: 0, 1 or 2; ``before`` is the row before them, −1 for none."""
+    """Number of stray rows from ``row`` on, 0, 1 or 2; ``before`` is the last row before them that is not, −1: none."""
     far = TOLERATED_STEP_BACK_NS
-    for after in range(row + 1, min(row + _BELIEVED, len(stamp) + 1)):
+    for after in range(row + 1, min(row + _NEW_CLOCK, len(stamp) + 1)):
         out = stamp[row:after]
         if before < 0:
-            found = len(stamp) - after >= _BELIEVED and min(out) > stamp[after] + far
+            found = len(stamp) - after >= _NEW_CLOCK and min(out) > stamp[after] + far
         elif after == len(stamp):
-            found = before + 1 >= _BELIEVED and max(out) < stamp[before] - far
+            found = before + 1 >= _NEW_CLOCK and max(out) < stamp[before] - far
         else:
             low, high = stamp[before] - far, max(stamp[before], stamp[after]) + far
             found = stamp[after] >= low and all(one < low or one > high for one in out)
@@ -82,20 +81,19 @@ def _stray_from(stamp: Sequence[int], before: int, row: int) -> int:
 
 
 def without_strays(run: Run) -> Run:
-    """A run whose stray stamps (see :func:`astray`) are taken for none, with a note on each source that has any.
+    """The run with stray stamps (see :func:`stray_offsets`) removed, and a note on each source that has any.
 
-    Their rows stay where they are and are counted as rows without a stamp: commands are not used, measurements are
-    invalid,
-    and all other rows are met as if these were not there. Rows of sensors and of the reference that are far behind keep
-    their stamps, since they disturb no other: the timeline calls them too late. Done once: what is left of stamps that
-    make no sense may look stray again.
+    Their rows stay and count as rows without a stamp: commands are not used, measurements are invalid, and all other
+    rows are processed as if these were absent. Rows of sensors and of the reference that are far behind keep their
+    stamps, since they disturb no other: they become too late. This is done once, because what is left of nonsense
+    stamps may look stray again.
     """
     if run.without_strays:
         return run
     notes: list[str] = []
     command = _without_strays(run.command, run.command.label, ("ahead of", "behind"), notes)
     sensors = {
-        name: _without_strays(source, source.told_as(name), ("ahead of",), notes)
+        name: _without_strays(source, source.label_for(name), ("ahead of",), notes)
         for name, source in run.sensors.items()
     }
     reference = run.reference
@@ -108,12 +106,12 @@ def without_strays(run: Run) -> Run:
 
 
 def _without_strays(source: S, label: str, sides: Sequence[str], notes: list[str]) -> S:
-    apart = astray(source.stamp)
+    apart = stray_offsets(source.stamp)
     for side in sides:
         rows = apart > 0 if side == "ahead of" else apart < 0
         if rows.any():
             what = f"a stray stamp, more than 1 s {side} the rows around: taken for none"
-            tell(notes, label, rows, what, f", by {abs(apart[rows][0]) / 1e9:.3f} s")
+            note_rows(notes, label, rows, what, f", by {abs(apart[rows][0]) / 1e9:.3f} s")
             source = replace(source, stamp=np.where(rows, NO_STAMP, source.stamp))
     return source
 
@@ -121,9 +119,9 @@ def _without_strays(source: S, label: str, sides: Sequence[str], notes: list[str
 def segments(run: Run) -> tuple[list[Run], list[str]]:
     """Cut a run, without its stray stamps, where the commands' clock was set back by more than 1 s.
 
-    A segment is a run of its own: the arm is taken to rest at its first command again. The sensors and the reference
-    must have jumped as often as the commands; a sensor that jumped alone is left to the timeline, which calls its rows
-    too late.
+    A segment is a run of its own, at rest at its first command. The clocks of the sensors and the reference must have
+    been set back as often as that of the commands. A sensor whose clock was set back alone cuts nothing: its rows
+    become too late.
 
     Returns:
         The segments in order, and a sentence on each jump.
@@ -158,17 +156,16 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
         )
         for index, command in enumerate(pieces(run.command))
     ]
-    lag = behind(run.command.stamp)
-    said = [
-        f"{run.command.label}: the clock is set back by {lag[row] / 1e9:.3f} s in row {row + 1}: new segment, filter"
-        " restarted"
+    lag, label = behind(run.command.stamp) / 1e9, run.command.label
+    notes = [
+        f"{label}: the clock is set back by {lag[row]:.3f} s in row {row + 1}: new segment, filter restarted"
         for row in cuts
     ]
-    return parts, said
+    return parts, notes
 
 
 def _jumps(source: Source) -> list[int]:
-    """Rows at which the clock was set back by more than is tolerated."""
+    """Rows at which the clock was set back by more than 1 s."""
     stamped = np.flatnonzero(source.stamp != NO_STAMP)
     stamp, found, first = source.stamp[stamped], list[int](), 0
     while True:

@@ -1,4 +1,4 @@
-"""Cartesian logs as the arm's cylindrical axes, and back.
+"""Frames: positions in a log's x, y, z as positions of the arm's axes, and back.
 
 ``cylindrical``: radial = r, tangential = R0·(θ − θ0), vertical = z about the base's vertical axis, with R0 and θ0 from
 the start level. ``rotated``: a fixed rotation about z, for small motions.
@@ -52,7 +52,7 @@ Frame: TypeAlias = Cylindrical | Rotated
 
 @dataclass(frozen=True)
 class Placed:
-    """A frame in its place: with R0 and θ0 of a run's start.
+    """A frame placed at a run's start level, which gives R0 and θ0.
 
     Attributes:
         frame: The frame.
@@ -71,30 +71,31 @@ class Placed:
     def to_axes(
         self, x: FloatArray, y: FloatArray, near: FloatArray | None = None, last: float = 0.0
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Tangential and radial [m] of positions in the log's x and y [m], and how the noise of each is scaled.
+        """Tangential and radial position [m] of x and y [m] in the log, and the factor on the tangential noise.
 
         Args:
             x: (n,).
             y: (n,).
-            near: Tangential positions [m] near by, (n,), which say how often the arm has gone round; None: the
-                positions follow one another, each less than half a turn from the last.
-            last: The tangential position [m] that the first of those follows.
+            near: Tangential positions [m] near by, (n,), which decide on whole turns; None: each position is less than
+                half a turn from the one before.
+            last: The tangential position [m] before the first one.
 
         Returns:
-            Tangential (n,), radial (n,), and R0/r (n,), by which the noise of a tangential measurement is larger.
+            Tangential (n,), radial (n,), and R0/r (n,), the factor on the noise of a tangential measurement. NaN, NaN
+            and 1 for a row without x or y.
         """
-        from .frame_kernels import to_cylinder, to_plane
-
         x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-        tangential, radial, spread = np.empty(len(x)), np.empty(len(x)), np.ones(len(x))
         if isinstance(self.frame, Rotated):
-            to_plane(x, y, math.cos(self.angle), math.sin(self.angle), self._sign, tangential, radial)
-        else:
-            nearby = np.empty(0) if near is None else near
-            to_cylinder(
-                x, y, *self.frame.base, self.radius, self.angle, self._sign, nearby, last, tangential, radial, spread
-            )
-        return tangential, radial, spread
+            cos, sin = math.cos(self.angle), math.sin(self.angle)
+            finite = np.isfinite(x) & np.isfinite(y)
+            x, y = np.where(finite, x, np.nan), np.where(finite, y, np.nan)
+            return self._sign * (y * cos - x * sin), x * cos + y * sin, np.ones(len(x))
+        from .frame_kernels import to_cylinder
+
+        out = np.empty(len(x)), np.empty(len(x)), np.empty(len(x))
+        nearby = np.empty(0) if near is None else near
+        to_cylinder(x, y, *self.frame.base, self.radius, self.angle, self._sign, nearby, last, *out)
+        return out
 
     def to_log(self, tangential: FloatArray, radial: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The log's x and y [m] of axis positions [m]; the inverse of :meth:`to_axes`."""

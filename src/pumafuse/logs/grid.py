@@ -1,4 +1,4 @@
-"""The controller's own ticks behind stamps that jitter: an even grid of T."""
+"""Fit of a controller's even ticks of T to stamps that jitter."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ _MOST_ASIDE = 0.01  # share of commands that the jitter may put on a free tick b
 
 
 def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray, str | None]:
-    """The controller's own ticks behind jittered stamps: an even grid of T fitted to them.
+    """The stamps moved to the controller's even ticks of T, with a note on drift and stamps off their ticks.
 
-    Each command has a tick of its own, in the order of the stamps, and of all such rows of ticks the one is taken that
-    the stamps are nearest to in the sum of squares: for a Gaussian jitter that is the likeliest. Where all nearest
-    ticks differ they are it. Where two stamps are nearest to one tick, as a jitter of a fifth of T makes them every
-    hundred commands, one of them is off by little more than half a period; to move a whole row of others would cost
-    more. Late stamps beyond 0.7 T cost the same however late they are, since a logger that stalls stamps a queue of
-    commands at once: they too are set back between their neighbours and move no other.
+    Each command has a tick of its own, in the order of the stamps. Of all such assignments the one with the least sum
+    of squared distances is taken, which for a Gaussian jitter is the likeliest. Where all nearest ticks differ they are
+    the assignment. Where two stamps are nearest to one tick, as with a jitter of 0.2 T happens every hundred commands,
+    one of them is off by little more than half a period; moving a whole row of others would cost more. Stamps more than
+    0.7 T late cost the same however late they are, since a logger that stalls stamps a queue of commands at once: they
+    too are set back between their neighbours and move no other.
 
-    The grid's offset is the median of what is left. T is taken as exact unless the stamps' own slope differs from it by
-    more than 5 standard errors: then the two clocks drift apart, the slope is used and the drift told.
+    The grid's offset is the median of the residuals. T is exact unless the slope of the stamps differs from it by more
+    than 5 standard errors: then the two clocks drift apart, the slope is used and the drift is noted.
 
-    A wrong row of ticks shows in what is left, and is refused: too many stamps off their ticks, a row of them on one
-    side longer than a logger's queue, one earlier than the jitter explains, phases so spread that any period would do
-    as well, or so much jitter beside missing ticks that more than a hundredth of the commands may be a tick aside.
+    A wrong assignment shows in the residuals and is refused: too many stamps off their ticks, a row of them on one side
+    longer than a logger's queue, one earlier than the jitter explains, phases so spread that any period would fit as
+    well, or so much jitter beside missing ticks that more than 1 % of the commands may be a tick aside.
 
     Args:
         stamp: Strictly ascending stamps, int64 ns, (n,).
@@ -49,45 +49,46 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
     tick = period * 1e9
     since = (stamp - stamp[0]).astype(np.float64)
     place = _places(since, tick)
-    ticks = _ticks_of_their_own(place)
+    ticks = _assigned_ticks(place)
     if ticks is None:
         shared = int(np.sum(np.diff(np.rint(place)) <= 0))
-        seen = f"{shared} of {len(stamp)} are stamped nearest to the tick of the one before"
-        raise _refusal(seen, stamp, period, label)
+        fault = f"{shared} of {len(stamp)} are stamped nearest to the tick of the one before"
+        raise _refusal(fault, stamp, period, label)
     slope, error = _line(ticks, since)
     drift, note = slope / tick - 1.0, None
     if len(stamp) >= _BLOCK and abs(drift) * tick > 5.0 * error and abs(drift) * tick * np.ptp(ticks) > 1.0:
         if abs(drift) > _MOST_DRIFT:
-            raise _refusal(f"on the nearest ticks they are {slope / 1e6:.4f} ms a tick", stamp, period, label)
+            fault = f"on the nearest ticks they are {slope / 1e6:.4f} ms a tick"
+            raise _refusal(fault, stamp, period, label)
         tick = slope
         note = f"{label}: the log's clock runs {drift * 1e6:+.1f} ppm against the controller's; the grid follows it"
-    left = since - ticks * tick
-    offset = float(np.median(left))
-    off = (left - offset) / tick
-    doubt = _doubt(ticks, off)
+    residual = since - ticks * tick
+    offset = float(np.median(residual))
+    off = (residual - offset) / tick
     late, early = int(np.sum(off > 0.5)), int(np.sum(off < -0.5))
+    doubt = _doubt(ticks, off)
     if doubt is not None:
-        seen = f"{late + early} of {len(stamp)} are stamped more than half a period off their ticks, {doubt}"
-        raise _refusal(seen, stamp, period, label)
+        fault = f"{late + early} of {len(stamp)} are stamped more than half a period off their ticks, {doubt}"
+        raise _refusal(fault, stamp, period, label)
     if late or early:
         how = "late: set back to their ticks" if not early else f"off their ticks, {early} of them early: put on them"
-        astray = f"{label}: {late + early} commands are stamped more than half a period {how}"
-        note = astray if note is None else f"{note}; {astray}"
+        moved = f"{label}: {late + early} commands are stamped more than half a period {how}"
+        note = moved if note is None else f"{note}; {moved}"
     return stamp[0] + np.rint(ticks * tick + offset).astype(np.int64), note
 
 
-def _refusal(seen: str, stamp: TimeArray, period: float, label: str) -> RunError:
-    """What was seen, and what to do."""
-    usual = float(np.median(np.diff(stamp))) / 1e9
-    beside = f" (their median interval is {usual * 1e3:.4f} ms)" if f"{usual:.3g}" != f"{period:.3g}" else ""
+def _refusal(fault: str, stamp: TimeArray, period: float, label: str) -> RunError:
+    """The error with the fault and the fix."""
+    median = float(np.median(np.diff(stamp))) / 1e9
+    beside = f" (their median interval is {median * 1e3:.4f} ms)" if f"{median:.3g}" != f"{period:.3g}" else ""
     return RunError(
-        f"{label}: clock = 'regular', but the commands do not come on ticks of {period * 1e3:g} ms: {seen}{beside};"
+        f"{label}: clock = 'regular', but the commands do not come on ticks of {period * 1e3:g} ms: {fault}{beside};"
         " check update_period_ms, or use clock = 'stamps'"
     )
 
 
 def _doubt(ticks: IntArray, off: FloatArray) -> str | None:
-    """Why these may not be the ticks of stamps that are ``off`` them by so many periods, or None."""
+    """The reason why the assignment may be wrong, or None; ``off`` are the residuals in periods, (n,)."""
     if len(off) <= 2:
         return None
     late, early = off > 0.5, -float(off.min())
@@ -99,7 +100,7 @@ def _doubt(ticks: IntArray, off: FloatArray) -> str | None:
         return f"and more than {_MOST_ASTRAY:.0%} is too many"
     if row > _LONGEST_QUEUE:
         return f"{row} of them in a row"
-    if clear < max(_LEAST_CLEAR, 3.0 / math.sqrt(len(off) + 9)):  # without ticks by chance in one case of e⁹
+    if clear < max(_LEAST_CLEAR, 3.0 / math.sqrt(len(off) + 9)):  # of stamps without ticks one in e⁹ reaches this
         return "and the others lie about the ticks as they would about any"
     if early > max(0.5, _MOST_EARLY * spread):
         return f"one of them {early:.2f} periods early, where the jitter's standard deviation is {spread:.2f}"
@@ -109,38 +110,38 @@ def _doubt(ticks: IntArray, off: FloatArray) -> str | None:
 
 
 def _aside(ticks: IntArray, late: BoolArray, spread: float) -> float:
-    """How many commands may be a tick aside: by the jitter beside a free tick, or in a queue behind one."""
+    """Expected number of commands a tick aside: by the jitter beside a free tick, or in a queue behind one."""
     free = np.concatenate(([False], np.diff(ticks) > 1))
     order = np.arange(len(ticks))
-    queue = np.maximum.accumulate(np.where(late, 0, order + 1))  # where the row of late ones began
+    queue = np.maximum.accumulate(np.where(late, 0, order + 1))  # first row of each queue of late ones
     behind = late & (np.maximum.accumulate(np.where(free, order, -1)) >= queue)
     beside = math.erfc(0.5 / (spread * math.sqrt(2.0))) if spread > 0.0 else 0.0
     return float(behind.sum()) + beside * float(free.sum())
 
 
 def _longest(flag: BoolArray) -> int:
-    """The longest row of flags."""
+    """Length of the longest row of flags."""
     return int(np.diff(np.flatnonzero(np.concatenate(([True], ~flag, [True])))).max()) - 1
 
 
-def _ticks_of_their_own(place: FloatArray) -> IntArray | None:
-    """For stamps in periods the ascending ticks they are nearest to in all, (n,); None if there are too few ticks."""
+def _assigned_ticks(place: FloatArray) -> IntArray | None:
+    """Ascending ticks of least total cost for stamps in periods, (n,); None if there are too few ticks."""
     ticks = np.rint(place).astype(np.int64)
     if np.all(np.diff(ticks) > 0):
         return ticks
     from .grid_kernels import CHOICES, MOST_LATE, cheapest_ticks
 
     first = np.floor(place).astype(np.int64) - MOST_LATE
-    room = np.empty(CHOICES), np.empty((len(place), CHOICES), dtype=np.uint8)
-    return ticks if cheapest_ticks(place, first, *room, ticks) else None
+    workspace = np.empty(CHOICES), np.empty((len(place), CHOICES), dtype=np.uint8)
+    return ticks if cheapest_ticks(place, first, *workspace, ticks) else None
 
 
 def _places(since: FloatArray, tick: float) -> FloatArray:
-    """The stamps in periods from a tick, (n,): whole numbers where they do not jitter.
+    """The stamps in periods, (n,): whole numbers where they do not jitter.
 
-    They are seen from a phase that follows the clocks' slow drift, so that a late stamp moves no other. The phase is
-    the circular mean of the stamps over blocks, which no missing tick disturbs; over pauses it is carried on with the
-    drift seen between neighbouring blocks.
+    They are relative to a phase that follows the clocks' slow drift, so that a late stamp moves no other. The phase is
+    the circular mean of the stamps over blocks, which no missing tick disturbs; over pauses it is extrapolated with the
+    drift between neighbouring blocks.
     """
     pauses = np.flatnonzero(np.diff(since) > _BLOCK * tick) + 1
     edges = _blocks(np.concatenate(([0], pauses)), len(since))
@@ -158,7 +159,7 @@ def _places(since: FloatArray, tick: float) -> FloatArray:
 
 
 def _blocks(start: IntArray, end: int) -> IntArray:
-    """Where blocks begin: what is between two pauses is cut evenly, so that each has enough stamps to tell a phase."""
+    """First rows of blocks: what is between two pauses is cut evenly, so that each has enough stamps for a phase."""
     size = np.diff(np.append(start, end))
     count = -(-size // _BLOCK)
     number = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
@@ -172,5 +173,5 @@ def _line(ticks: IntArray, since: FloatArray) -> tuple[float, float]:
     centred = ticks - ticks.mean()
     weight = float(centred @ centred)
     slope = float(centred @ since) / weight
-    left = since - since.mean() - slope * centred
-    return slope, float(np.sqrt(left @ left / (len(ticks) - 2) / weight))
+    residual = since - since.mean() - slope * centred
+    return slope, float(np.sqrt(residual @ residual / (len(ticks) - 2) / weight))

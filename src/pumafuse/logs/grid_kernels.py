@@ -1,4 +1,4 @@
-"""Which tick each stamp is of: the cheapest row of ascending ticks, found in one pass."""
+"""Assignment of stamps to ticks by dynamic programming."""
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportReturnType=false
 
@@ -16,21 +16,21 @@ _LATE, _LATE_COST, _LATER_COST = math.sqrt(0.5), 0.5, 0.01
 
 @compiled
 def cheapest_ticks(place: FloatArray, first: IntArray, best: FloatArray, choice: CodeArray, ticks: IntArray) -> bool:
-    """Ticks, strictly ascending, of least cost in all; False if the stamps are too many for the ticks about them.
+    """Fill in the strictly ascending ticks of least total cost; False if there are too few ticks about the stamps.
 
-    A stamp's cost is the square of its distance from the tick in periods; beyond 0.7 late it grows by next to nothing.
+    A stamp's cost is the square of its distance from the tick in periods; beyond 0.7 late it hardly grows.
 
     Args:
-        place: Each stamp in periods, ticks being whole numbers, (n,).
-        first: The first of the CHOICES ticks that each stamp may have, (n,).
-        best: Room for the least cost so far if the last stamp has no later tick than this, (CHOICES,).
-        choice: Room for the tick that has this cost, counted from the first, (n, CHOICES).
-        ticks: Gets the ticks, (n,).
+        place: Each stamp in periods; ticks are whole numbers, (n,).
+        first: The first of the CHOICES ticks open to each stamp, (n,).
+        best: Workspace: the least cost so far if the last stamp has no later tick than this, (CHOICES,).
+        choice: Workspace: the tick of this cost, counted from the first, (n, CHOICES).
+        ticks: The ticks found, (n,).
     """
     for n in range(len(place)):
         ahead = first[n] - first[n - 1] - 1 if n else 0  # choice j comes after choice j + ahead of the row before
         for one in range(CHOICES):
-            j = one if ahead >= 0 else CHOICES - 1 - one  # no cost is overwritten that is still to be read
+            j = one if ahead >= 0 else CHOICES - 1 - one  # overwrite no cost that is still needed
             off = place[n] - (first[n] + j)
             cost = _LATE_COST + _LATER_COST * (off - _LATE) if off > _LATE else off * off
             if n:

@@ -17,7 +17,7 @@ Columns = str | list[str]
 
 
 class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
-    """One table of a run: ``file``, ``time``, and the column (or columns to add up) of each axis."""
+    """A source of a run: its ``file``, its ``time`` column, and the column (or columns to add up) of each axis."""
 
     file: str
     time: str
@@ -25,14 +25,14 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CommandEntry(SourceEntry, frozen=True, kw_only=True):
-    """The commands: which also say where the arm rests before the first one, and whose clock stamped them."""
+    """The commands, with the start level by axis [m] and how to use their stamps."""
 
     start: dict[str, float] = {}
     clock: Literal["stamps", "regular"] = "stamps"
 
 
 class ReferenceEntry(SourceEntry, frozen=True, kw_only=True):
-    """A truth for scoring, with the standard deviation [m] of its own noise."""
+    """A reference for scoring, with the standard deviation [m] of its own noise."""
 
     sd: NotNegative = msgspec.field(name="sd_mm", default=0.0)
 
@@ -69,7 +69,7 @@ def load(path: Path) -> Manifest:
 
 
 def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> SourceEntry | None:
-    """A source's table: every key that is not the source's own is an axis."""
+    """A source from its table; every key that is none of the source's fields is an axis. None without a table."""
     if table is None:
         return None
     if not isinstance(table, dict):

@@ -1,7 +1,7 @@
 """A recorded run: commands, measurements and a reference as the log has them, in SI units and file order.
 
-Nothing is mended here: stamps that repeat, step back, are stray or missing and values that are not finite stay where
-they are; the timeline gives each of them its outcome.
+Nothing is repaired here: stamps that repeat, step back, are stray or missing and values that are not finite stay where
+they are. Each measurement gets its outcome when the run is fused.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Source:
         stamp: When the logger stamped each row, int64 ns, ``NO_STAMP`` where it did not, (rows,).
         values: For each axis the value [m], NaN where the row has none, (rows,).
         label: What a person calls it: the file, or the column group of a single table.
-        spread: For an axis that a frame has made, by what the noise of each row is scaled, (rows,).
+        spread: For an axis computed by a frame, the factor on the noise of each row, (rows,).
     """
 
     stamp: TimeArray
@@ -42,12 +42,23 @@ class Source:
     label: str
     spread: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
 
-    def told_as(self, name: str) -> str:
-        """What notes call it as the source of ``name``."""
+    def label_for(self, name: str) -> str:
+        """The name of the source in notes, with its label where that is another one."""
         return name if name == self.label else f"{name} ({self.label})"
 
+    def repeated(self) -> BoolArray:
+        """Rows whose stamp and values are all those of an earlier row, (rows,)."""
+        found = np.zeros(len(self.stamp), dtype=bool)
+        if (np.diff(self.stamp) > 0).all():
+            return found
+        keys = [self.stamp, *(np.ascontiguousarray(value).view(np.int64) for value in self.values.values())]
+        order = np.lexsort(keys)
+        again = np.all([np.diff(key[order]) == 0 for key in keys], axis=0)
+        found[order[1:][again]] = True
+        return found
+
     def rows(self: S, chosen: BoolArray | IntArray | slice) -> S:
-        """The chosen rows, in the order in which they are chosen."""
+        """The chosen rows, in the order chosen."""
         values = {axis: value[chosen] for axis, value in self.values.items()}
         spread = {axis: value[chosen] for axis, value in self.spread.items()}
         return replace(self, stamp=self.stamp[chosen], values=values, spread=spread)
@@ -55,7 +66,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Reference(Source):
-    """A truth for scoring, never seen by a filter; ``sd`` [m] is the standard deviation of its own noise."""
+    """A reference for scoring, which no filter uses; ``sd`` [m] is the standard deviation of its own noise."""
 
     sd: float = 0.0
 
@@ -68,12 +79,12 @@ class Run:
         name: For people and for result folders.
         command: The commands u.
         sensors: The measurements by sensor.
-        reference: A truth, where there is one.
-        start: The level u₀ [m] of axes that do not rest at their first command before it.
-        clock: Whether the commands' stamps are believed (``stamps``) or fitted by a grid of T (``regular``).
-        frame: Where the log's x, y, z are in the arm's axes, for sources that give them.
+        reference: Positions to score against, where there are any.
+        start: The start level u₀ [m] of axes that rest elsewhere than at their first command.
+        clock: Whether the commands' stamps are used as they are (``stamps``) or replaced by a grid of T (``regular``).
+        frame: The arm's axes in the log's x, y, z, for sources that give these.
         notes: What was wrong with the files, a sentence each.
-        without_strays: Whether stray stamps are taken for none already, see :func:`pumafuse.logs.clock.without_strays`.
+        without_strays: Whether stray stamps are removed already, see :func:`pumafuse.logs.clock.without_strays`.
     """
 
     name: str
@@ -148,9 +159,9 @@ class Run:
             time: Stamps of the commands, float seconds or int64 ns, (n,).
             command: u [m] for each axis, (n,).
             sensors: For each sensor its stamps (m,) and its values [m] for each axis, (m,).
-            reference: Stamps (k,) and true positions [m] for each axis, (k,).
+            reference: Stamps (k,) and reference positions [m] for each axis, (k,).
             reference_sd: Standard deviation of the reference's own noise [m].
-            start: Level [m] of each axis before its first command, where it is another.
+            start: Start level [m] of axes that rest elsewhere than at their first command.
             clock: ``stamps`` or ``regular``.
             frame: For sources in x, y, z.
             name: For people.
@@ -159,11 +170,16 @@ class Run:
             RunError: Lengths differ, or there is no command.
         """
         streams = {sensor: _from_arrays(sensor, *arrays) for sensor, arrays in (sensors or {}).items()}
-        truth = None
-        if reference is not None:
-            source = _from_arrays("reference", *reference)
-            truth = _as_reference(source, reference_sd)
-        return Run(name, _from_arrays("command", time, command), streams, truth, dict(start or {}), clock, frame)
+        scored = None if reference is None else _as_reference(_from_arrays("reference", *reference), reference_sd)
+        return Run(name, _from_arrays("command", time, command), streams, scored, dict(start or {}), clock, frame)
+
+
+def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: str = "") -> None:
+    """Append a note: how many ``rows`` of a source have ``what``, and the first of them; nothing without any."""
+    found = np.flatnonzero(rows)
+    if len(found):
+        plural = "row has" if len(found) == 1 else "rows have"
+        notes.append(f"{label}: {len(found)} {plural} {what} (first: row {found[0] + 1}{first})")
 
 
 def _known_axes(where: str, named: Mapping[str, object], axes: Collection[str]) -> None:
@@ -191,7 +207,12 @@ def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.Array
 
 
 def _stamps(time: npt.NDArray[Any]) -> TimeArray:
-    """Int64 ns of datetime64, int ns or float seconds, all within reach."""
+    """Int64 ns of datetime64, int ns or float seconds.
+
+    Raises:
+        ValueError: A stamp is beyond reach of int64 ns.
+        TypeError: The stamps are of another type.
+    """
     if time.dtype.kind == "M":
         rough_s = time.astype("M8[s]").astype(np.float64)
         if (np.abs(rough_s[~np.isnat(time)]) >= REACH_NS / 1e9).any():
@@ -222,13 +243,13 @@ def _read_manifest(path: Path) -> Run:
             notes.extend(loaded[entry.file].notes)
         table = loaded[entry.file]
         stamp, note = table.stamps(entry.time)
-        told = [note]
+        found = [note]
         values: dict[str, FloatArray] = {}
         for axis, columns in entry.axes.items():
             parts = [table.numbers(column) for column in ([columns] if isinstance(columns, str) else columns)]
             values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
-            told.extend(note for _, note in parts)
-        notes.extend(note for note in told if note is not None and note not in notes)
+            found.extend(note for _, note in parts)
+        notes.extend(note for note in found if note is not None and note not in notes)
         return Source(stamp, values, entry.file)
 
     command = source(listed.command)
@@ -269,12 +290,10 @@ def _read_single(path: Path) -> Run:
         raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {', '.join(table.columns)}")
 
     def source_of(name: str) -> Source:
-        present = ~np.all([np.isnan(value) for value in groups[name].values()], axis=0)
-        return Source(stamp, groups[name], name).rows(present)
+        given = ~np.all([np.isnan(value) for value in groups[name].values()], axis=0)
+        return Source(stamp, groups[name], name).rows(given)
 
     sensors = {name: source_of(name) for name in groups if name not in ("command", "reference")}
-    reference = None
-    if "reference" in groups:
-        reference = _as_reference(source_of("reference"), 0.0)
+    reference = _as_reference(source_of("reference"), 0.0) if "reference" in groups else None
     name = path.name.split(".")[0]
     return Run(name, source_of("command"), sensors, reference, notes=tuple(notes))

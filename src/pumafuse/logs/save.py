@@ -1,4 +1,4 @@
-"""A recorded run as a folder: a CSV file for each source, and ``run.toml``."""
+"""Saving of a recorded run as a folder: a CSV file for each source, and ``run.toml``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..units import MM, seconds
 from . import tables
 from .run import Run, Source
 
-_KEYS = ("file", "time", "start", "clock")  # of run.toml, beside which an axis is a key
+_KEYS = ("file", "time", "start", "clock")  # keys of a source in run.toml; every other key is an axis
 _TAKEN = ("commands", "truth", "trials", "samples", "path")
 
 
@@ -22,7 +22,7 @@ def save(run: Run, folder: Path) -> None:
     """Write a run that :meth:`Run.read` reads back: stamps to the ns within 26 days of 0, lengths to the nm.
 
     Args:
-        run: What to write; its notes stay behind.
+        run: The run; its notes are not written.
         folder: An existing folder.
 
     Raises:
@@ -49,18 +49,13 @@ def save(run: Run, folder: Path) -> None:
 
 
 def check_name(sensor: str) -> None:
-    """Refuse a sensor whose name makes no file of its own.
+    """Refuse a sensor whose name cannot be that of its file.
 
     Raises:
         RunError: It has characters of a path, or is the name of another table.
     """
-    if (
-        not sensor
-        or sensor in _TAKEN
-        or Path(sensor).name != sensor
-        or sensor.startswith(".")
-        or not sensor.isprintable()
-    ):
+    plain = sensor.isprintable() and Path(sensor).name == sensor and not sensor.startswith(".")
+    if not plain or not sensor or sensor in _TAKEN:
         raise RunError(
             f"sensor '{sensor}': its rows go into a file of its name, which must not be a path or one of"
             f" {', '.join(_TAKEN)}"
@@ -68,17 +63,17 @@ def check_name(sensor: str) -> None:
 
 
 def check_axis(axis: str) -> None:
-    """Refuse an axis whose name run.toml needs for something else.
+    """Refuse an axis whose name is a key of run.toml.
 
     Raises:
-        RunError: It is a key of its own.
+        RunError: It is.
     """
     if axis in _KEYS:
         raise RunError(f"axis '{axis}': run.toml uses this word itself; no axis can be called {', '.join(_KEYS)}")
 
 
 def _entry(source: Source, file: str, folder: Path) -> dict[str, Any]:
-    """Write one source; returns its table of ``run.toml``."""
+    """Write one source and return its table of ``run.toml``."""
     columns = {
         f"{axis}_mm": pa.array(np.round(value * MM, 6), from_pandas=True) for axis, value in source.values.items()
     }

@@ -1,7 +1,7 @@
 """Tables on disk, CSV or Parquet: columns as SI arrays, whatever state the log is in.
 
 A cell that is empty or no number becomes NaN, a line that does not fit the header is left out; both are counted and
-told in one sentence each. Nothing here knows what a command or a sensor is.
+noted in one sentence each.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Table:
     Attributes:
         path: Where it was read from.
         columns: Its columns by name.
-        rows: How many rows it has.
+        rows: Number of rows.
         notes: What was wrong with the file as a whole, a sentence each.
     """
 
@@ -42,27 +42,26 @@ class Table:
     notes: tuple[str, ...]
 
     def numbers(self, name: str) -> tuple[FloatArray, str | None]:
-        """A length column in metres, NaN where a cell is empty or no number, and a note on cells that were text.
+        """A length column [m], NaN where a cell is empty or no number, and a note on cells that were text.
 
         Raises:
             RunError: The column is absent, its name ends in no unit of length, or it holds something else than numbers.
         """
         exponent = self._exponent(name, units.LENGTHS, "_mm")
-        column, note = self._numeric(name)
-        values = _to_numpy(column.cast(pa.float64(), safe=False))
+        values, note = self.plain(name)
         return (values / 10.0**-exponent if exponent < 0 else values), note  # a quotient is rounded once
 
     def plain(self, name: str) -> tuple[FloatArray, str | None]:
-        """A column of numbers as they stand, with the cells and the note of :meth:`numbers`.
+        """A column of numbers without conversion, with NaN and note as in :meth:`numbers`.
 
         Raises:
             RunError: The column is absent or holds something else than numbers.
         """
         column, note = self._numeric(name)
-        return _to_numpy(column.cast(pa.float64(), safe=False)), note
+        return _floats(column), note
 
     def texts(self, name: str) -> list[str]:
-        """A column as it is written, trimmed, empty where a cell is; whole numbers without a point.
+        """A column as trimmed text, empty where a cell is; whole numbers without a point.
 
         Raises:
             RunError: The column is absent or has no text.
@@ -76,7 +75,7 @@ class Table:
     def stamps(self, name: str) -> tuple[TimeArray, str | None]:
         """A time column in int64 ns, ``NO_STAMP`` where a cell is empty or no time, and a note on cells that were text.
 
-        Whole numbers are exact, also beside cells that are words.
+        Whole numbers are exact, also beside cells of text.
 
         Raises:
             RunError: The column is absent, its name ends in no unit of time, or a stamp is beyond reach of int64 ns.
@@ -84,12 +83,12 @@ class Table:
         column = self._column(name)
         if pa.types.is_timestamp(column.type):
             whole, note, per_unit = self._cast(name, column, pa.timestamp("ns")), None, 1
-            counted = _filled(whole.cast(pa.int64()))
+            counted = _copied(whole.cast(pa.int64()), np.int64, NO_STAMP)
             values = np.where(counted == NO_STAMP, np.nan, counted.astype(np.float64))
         else:
             per_unit = 10 ** (9 + self._exponent(name, units.TIMES, "_s"))
             column, note = self._numeric(name)
-            values = _to_numpy(column.cast(pa.float64(), safe=False))
+            values = _floats(column)
             counted = self._whole(name, column)
         rough = values * per_unit
         beyond = np.flatnonzero(np.isfinite(rough) & (np.abs(rough) >= REACH_NS))
@@ -108,7 +107,7 @@ class Table:
             column = pc.if_else(pc.match_substring_regex(column, _WHOLE), column, pa.scalar(None, pa.string()))
         elif not pa.types.is_integer(column.type):
             return np.full(self.rows, NO_STAMP)
-        return _filled(self._cast(name, column, pa.int64()))
+        return _copied(self._cast(name, column, pa.int64()), np.int64, NO_STAMP)
 
     def _cast(self, name: str, column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
         try:
@@ -132,7 +131,7 @@ class Table:
         return self.columns[name]
 
     def _numeric(self, name: str) -> tuple[pa.ChunkedArray, str | None]:
-        """A column of numbers, or of texts that are numbers: cells of other text are null, and told."""
+        """A column of numbers, or of text that is numbers; cells of other text are null, and counted in a note."""
         column, kind = self._column(name), self._column(name).type
         if pa.types.is_dictionary(kind):
             column = self._cast(name, column, kind.value_type)
@@ -171,8 +170,8 @@ def read(path: Path, *, growing: bool = False) -> Table:
 
     Args:
         path: The file.
-        growing: Whether it may be in the writing, or may have been when its writer died: then a last line of a CSV
-            without its end may be torn in the middle of a number, and is left out and told.
+        growing: Whether it may still be growing, or its writer may have been killed. A last line of a CSV without its
+            line break may then be torn within a number: it is left out, and noted.
 
     Raises:
         RunError: The file is absent, empty, or neither CSV nor Parquet inside.
@@ -210,7 +209,7 @@ def write(table: pa.Table, path: Path) -> None:
 
 
 def _read_csv(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
-    """A CSV file; lines with the wrong number of cells, and a torn last line, are left out and told."""
+    """Read a CSV file; lines with the wrong number of cells, and a torn last line, are left out and noted."""
     if path.stat().st_size == 0:
         raise RunError(f"{path}: the file is empty")
     text, notes = _without_torn_end(path) if growing else (None, [])
@@ -247,7 +246,7 @@ def _read_csv(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
 
 
 def _without_torn_end(path: Path) -> tuple[pa.Buffer | None, list[str]]:
-    """A file up to the end of its last whole line, and a note if that is not all; None for the file as it is."""
+    """The text up to the last line break, and a note on what is left out; None if nothing is."""
     with path.open("rb") as file:
         file.seek(-1, os.SEEK_END)
         if path.suffix in _COMPRESSED or file.read(1) in b"\n\r":
@@ -262,16 +261,12 @@ def _without_torn_end(path: Path) -> tuple[pa.Buffer | None, list[str]]:
     ]
 
 
-def _filled(column: pa.ChunkedArray) -> TimeArray:
-    return _copied(column, np.int64, NO_STAMP)
-
-
-def _to_numpy(column: pa.ChunkedArray) -> npt.NDArray[np.float64]:
-    return _copied(column, np.float64, np.nan)
+def _floats(column: pa.ChunkedArray) -> FloatArray:
+    return _copied(column.cast(pa.float64(), safe=False), np.float64, np.nan)
 
 
 def _copied(column: pa.ChunkedArray, kind: type[N], missing: float) -> npt.NDArray[N]:
-    """The numbers of a column of ``kind``, straight from memory: pyarrow's own way would import pandas (0.2 s)."""
+    """The numbers of a column of ``kind``, from its buffer: pyarrow's ``to_numpy`` would import pandas (0.2 s)."""
     whole = column.combine_chunks()
     if not len(whole):
         return np.empty(0, dtype=kind)

@@ -112,7 +112,7 @@ def decaying_response(
 
 @compiled
 def _close_poles(omega: float, sigma: float, fastest: float, decay: float, t: float) -> tuple[float, float]:
-    """h = ∫ g(s) e^(−decay (t − s)) ds and g where divided differences cancel: series of a short interval, doubled."""
+    """H = ∫ g(s) e^(−decay (t − s)) ds and g where divided differences cancel: series of a short interval, doubled."""
     doublings = max(math.ceil(math.log2(fastest * t / _SHORT)), 0) if t > 0.0 else 0
     u, s, w, b = fastest * t / 2.0**doublings, sigma / fastest, (omega / fastest) ** 2, decay / fastest
     g_k, g_next, h_k, power = 0.0, 1.0, 0.0, 1.0  # coefficients of u^k in g and h

@@ -21,12 +21,12 @@ import msgspec
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray, IntArray
+from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations
-from ..filter.outcome import Outcome
-from ..fusion.ticks import usable_cores
 from ..fusion.segments import Timeline, build
+from ..fusion.ticks import usable_cores
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import Run

@@ -11,11 +11,11 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import PumafuseWarning
+from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
 from ..fusion.consistency import consistency, densities_of
 from ..fusion.estimates import Estimates
 from ..fusion.offline import fuse
-from ..filter.outcome import Outcome
 from ..fusion.score import Z95, interpolated, score
 from ..fusion.track import AxisEstimate
 from ..logs.run import Run

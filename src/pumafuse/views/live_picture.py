@@ -13,7 +13,8 @@ import rerun.blueprint as rrb
 
 from ..arrays import FloatArray
 from ..units import MM
-from . import looks, style
+from . import colours as style
+from . import styles as looks
 from .live_frames import Band, Frame, Header, Met, Path, SensorHead, SensorsNow
 
 _SHOWN = 30.0  # s

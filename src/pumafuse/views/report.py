@@ -15,7 +15,8 @@ from ..identification.trials import StepTrials
 from ..identification.verify import AxisVerification, Trace
 from ..model.arm import ArmModel
 from ..units import MM, MS
-from . import step_figures, words
+from . import formatting as words
+from . import step_figures
 from .render import render
 
 PAGE = "report.html"

@@ -14,8 +14,8 @@ from ..identification.rows import Rows, window
 from ..identification.trials import StepTrials, Trial
 from ..identification.verify import AxisVerification, Trace
 from ..units import MM, MS
-from . import style
-from .sheet import drawing
+from . import colours as style
+from .canvas import drawing
 
 _SECONDS = 1.2  # of a white-noise run that is shown in detail
 _GRID = 40  # points each way of a contour plot

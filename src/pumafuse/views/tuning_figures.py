@@ -9,14 +9,14 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
 
 from ..arrays import FloatArray
+from ..filter.outcome import Outcome
 from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates
-from ..filter.outcome import Outcome
 from ..fusion.score import Z95
 from ..tuning.profile import Profile
 from ..tuning.summary import Fitted
-from . import style
-from .sheet import drawing
+from . import colours as style
+from .canvas import drawing
 
 _COLUMNS = 5  # of profiles
 _WIDTH = 11.0  # inch; as wide as a page

@@ -20,7 +20,8 @@ from ..tuning.profile import Profile, profiles
 from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Tuning
 from ..tuning.validate import Check
-from . import tuning_figures, words
+from . import formatting as words
+from . import tuning_figures
 from .render import render
 
 _Tests: TypeAlias = tuple[Consistency | None, Consistency | None]  # before and after

@@ -1,4 +1,4 @@
-"""Numbers with their intervals as tables and pages have them."""
+"""Numbers and their intervals as text for tables and pages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def with_interval(value: float, interval: Interval | None, unit: float = 1.0) -> str:
-    """A number times ``unit`` with half its interval, in as many digits as the interval is worth."""
+    """``value ± half the interval``, both times ``unit``, rounded to two digits of the interval."""
     if interval is None or not np.isfinite(interval).all():
         return f"{value * unit:.4g}"
     half = 0.5 * (interval[1] - interval[0]) * unit
@@ -29,23 +29,23 @@ def with_interval(value: float, interval: Interval | None, unit: float = 1.0) ->
 
 
 def milliseconds(estimate: Estimate | None) -> str:
-    """An estimate in seconds, shown in milliseconds."""
+    """An estimate [s] with its interval in milliseconds; a dash without one."""
     return "–" if estimate is None else with_interval(estimate.value, estimate.ci95, MS)
 
 
 def p_value(value: float | None) -> str:
-    """A p-value."""
+    """A p-value with three decimals; a dash without one."""
     return "–" if value is None else "< 0.001" if value < 1e-3 else f"{value:.3f}"
 
 
 def level(found: Level) -> str:
-    """A level of a factor with mean and standard deviation of the trials there."""
+    """A level of a factor with mean, standard deviation and number of its trials."""
     spread = "" if found.sd is None else f" ± {found.sd:.2g}"
     return f"{found.level}: {found.mean:.4g}{spread} ({found.trials})"
 
 
 def plant(found: PLANTS) -> str:
-    """A plant's parameters."""
+    """A plant's parameters with their intervals."""
     if isinstance(found, FirstOrder):
         return f"τ {with_interval(found.time_constant, found.time_constant_ci95, MS)} ms"
     omega = with_interval(found.natural_frequency, found.natural_frequency_ci95)
@@ -53,23 +53,23 @@ def plant(found: PLANTS) -> str:
 
 
 def gain(found: Gain) -> str:
-    """K against speed s."""
+    """The gain K as a line over the speed s."""
     line = with_interval(found.intercept, found.intercept_ci95)
     return f"{line} + ({with_interval(found.slope, found.slope_ci95)}) s" if found.slope else line
 
 
 def change(values: Sequence[float | None], form: str) -> str:
-    """Numbers before and after; ``form`` is a format specification."""
+    """Numbers before and after, joined by an arrow; ``form`` is a format specification."""
     return " → ".join("–" if value is None else format(value, form) for value in values)
 
 
 def together(pair: Correlation) -> str:
-    """Two numbers that the measurements tell only together."""
+    """Two correlated parameters, which the measurements identify only together."""
     return f"{pair.first} and {pair.second} go together: correlation {pair.correlation:+.2f}"
 
 
 def verification(one: AxisVerification) -> list[str]:
-    """Signal, RMS, its share of the signal, fit, without and with recovery, and the floor."""
+    """Cells of one axis: signal, RMS, its share, fit, RMS without and with recovery, RMS of the best in class."""
     return [
         f"{one.amplitude * MM:.4g}",
         f"{one.model.rms * MM:.3f}",

@@ -1,4 +1,4 @@
-"""How entities look in Rerun, and how their values get there; recordings and the live view share it."""
+"""Styles of Rerun entities, and sending of their values; recordings and the live view share them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import rerun as rr
 
 from ..arrays import FloatArray
-from . import style
+from . import colours
 
 TIMELINE = "time"
 Marker = Literal["Circle", "Cross"]
@@ -17,30 +17,30 @@ Marker = Literal["Circle", "Cross"]
 def line(colour: str, label: str, *, width: float = 1.5, step: bool = False) -> rr.SeriesLines:
     """A line, or a step line for what holds until the next value."""
     mode = "StepAfter" if step else "Linear"
-    return rr.SeriesLines(colors=[style.rgb(colour)], widths=[width], names=label, interpolation_mode=mode)
+    return rr.SeriesLines(colors=[colours.rgb(colour)], widths=[width], names=label, interpolation_mode=mode)
 
 
 def edge(label: str) -> rr.SeriesLines:
     """The upper or lower line of a band."""
-    return line(style.BAND, label, width=0.7)
+    return line(colours.BAND, label, width=0.7)
 
 
 def points(colour: str, label: str, marker: Marker = "Circle") -> rr.SeriesPoints:
     """Points; crosses are larger."""
     size = 3.0 if marker == "Cross" else 1.2
-    return rr.SeriesPoints(colors=[style.rgb(colour)], marker_sizes=[size], names=label, markers=[marker])
+    return rr.SeriesPoints(colors=[colours.rgb(colour)], marker_sizes=[size], names=label, markers=[marker])
 
 
 def send(stream: rr.RecordingStream, path: str, time: FloatArray, value: FloatArray) -> None:
-    """Send a series' values, those that are finite.
+    """Send the finite values of a series.
 
     Args:
         stream: Where to.
         path: The entity.
         time: [s], (n,).
-        value: As it is shown, so positions in mm, (n,).
+        value: In the unit of the screen, so positions in mm, (n,).
     """
-    there = np.isfinite(time) & np.isfinite(value)
-    if there.any():
-        columns = rr.Components.columns(components=value[there])
-        rr.send_columns(path, [rr.TimeColumn(TIMELINE, duration=time[there])], columns, recording=stream)
+    finite = np.isfinite(time) & np.isfinite(value)
+    if finite.any():
+        columns = rr.Scalars.columns(scalars=value[finite])
+        rr.send_columns(path, [rr.TimeColumn(TIMELINE, duration=time[finite])], columns, recording=stream)

@@ -1,4 +1,4 @@
-"""Axes to draw on that become SVG text for a page."""
+"""SVG pictures with matplotlib, for HTML pages."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-_EDGE = 0.12  # inch, right of all
+_EDGE = 0.12  # inch, right of the last column
 
 
-class Sheet:
-    """Axes to draw on; ``svg`` is the picture when the drawing is done."""
+class Canvas:
+    """Axes to draw on; ``svg`` is the picture as text once the drawing is done."""
 
     def __init__(self, axes: list[Axes]) -> None:
         self.axes = axes
@@ -30,17 +30,17 @@ def drawing(
     height: float = 2.9,
     ratios: Sequence[float] | None = None,
     room: tuple[float, float, float] | None = None,
-) -> Generator[Sheet]:
-    """Axes row by row, drawn to SVG when done.
+) -> Generator[Canvas]:
+    """A canvas of ``rows`` by ``columns`` axes, row by row, turned into SVG on leaving the block.
 
     Args:
-        columns: How many beside one another.
-        rows: How many below one another.
-        width: Of the whole [inch]; by the columns for None.
-        height: Of a row [inch].
-        ratios: Of the columns' widths; all alike for None.
-        room: Left of, below and above every axes [inch], which is fast and the same in every picture; for None as much
-            as what is written there takes.
+        columns: How many axes in a row.
+        rows: How many rows.
+        width: Width of the picture [inch]; None: 3.6 a column.
+        height: Height of a row [inch].
+        ratios: Relative widths of the columns; None: all alike.
+        room: Margins left of, below and above every axes [inch], the same in every picture and fast to lay out; None:
+            as much as the labels take.
     """
     with matplotlib.rc_context(
         {
@@ -55,16 +55,16 @@ def drawing(
         size = (width or 3.6 * columns, height * rows)
         figure = Figure(figsize=size, layout="constrained" if room is None else None)
         if room is not None:
-            _reserve(figure, columns, rows, *room)
+            _set_margins(figure, columns, rows, *room)
         grid = figure.subplots(rows, columns, squeeze=False, width_ratios=ratios)
-        sheet = Sheet(grid.ravel().tolist())
-        yield sheet
+        canvas = Canvas(grid.ravel().tolist())
+        yield canvas
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None})
-        sheet.svg = text.getvalue()[text.getvalue().index("<svg") :]
+        canvas.svg = text.getvalue()[text.getvalue().index("<svg") :]
 
 
-def _reserve(figure: Figure, columns: int, rows: int, left: float, below: float, above: float) -> None:
+def _set_margins(figure: Figure, columns: int, rows: int, left: float, below: float, above: float) -> None:
     width, height = figure.get_size_inches().tolist()
     figure.subplots_adjust(
         left=left / width,

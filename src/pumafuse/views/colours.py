@@ -1,0 +1,23 @@
+"""Colours that figures and recordings share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+COMMAND = "#8a8f98"
+ESTIMATE = "#0b6bcb"
+BAND = "#7fb2ea"
+REFERENCE = "#1a1c1f"
+REFERENCE_3D = "#c9ccd1"  # the viewer is dark
+REJECTED = "#d1242f"
+_SENSORS = ("#e8890c", "#2da44e", "#8250df", "#bf3989", "#1b7c83", "#9a6700")
+
+
+def sensor_colours(sensors: Sequence[str]) -> dict[str, str]:
+    """A colour for each sensor, by its place."""
+    return {name: _SENSORS[number % len(_SENSORS)] for number, name in enumerate(sensors)}
+
+
+def rgb(colour: str) -> tuple[int, int, int]:
+    """``#rrggbb`` as three bytes."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
