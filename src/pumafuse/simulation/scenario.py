@@ -18,7 +18,7 @@ from ..logs.manifest import axis_of
 from ..logs.run import Clock
 from ..model.arm import ArmModel
 from ..toml import NotNegative
-from .lattice import LATTICE
+from .grid import POINTS
 from .trajectory import TRAJECTORIES, PathFromFile, Steps
 from .true_arm import TrueArm, TrueAxis
 from .true_sensor import TrueSensor
@@ -47,7 +47,7 @@ class Truth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         sd: Noise of its own [m].
     """
 
-    rows_per_command: Annotated[int, msgspec.Meta(gt=0, le=LATTICE)] = 5
+    rows_per_command: Annotated[int, msgspec.Meta(gt=0, le=POINTS)] = 5
     sd: NotNegative = msgspec.field(name="sd_mm", default=0.0)
 
 
@@ -134,10 +134,10 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         seen = set(self.trajectory.named) if sensor.axes is None else set(sensor.axes) & set(self.trajectory.named)
         for axis in sorted(seen - set(sensor.sd)) if isinstance(sensor.sd, dict) else []:
             raise ConfigError(f"{where}.sd_mm: no entry for '{axis}', which it measures")
-        fastest = LATTICE / self.arm.update_period
+        fastest = POINTS / self.arm.update_period
         if sensor.rate > fastest:
             raise ConfigError(
-                f"{where}.rate_hz: at most {fastest:g} on this arm ({LATTICE} rows a command), got {sensor.rate:g}"
+                f"{where}.rate_hz: at most {fastest:g} on this arm ({POINTS} rows a command), got {sensor.rate:g}"
             )
         if sensor.outliers is not None and sensor.outliers.largest < sensor.outliers.smallest:
             raise ConfigError(f"{where}.outliers: to_mm is smaller than from_mm")

@@ -9,14 +9,14 @@ from ..logs.run import Source
 from .true_sensor import PerAxis, TrueSensor
 
 
-def valid_times(sensor: TrueSensor, lattice: TimeArray, rng: np.random.Generator) -> TimeArray:
-    """The instants of the lattice (int64 ns, even) at which the sensor measures, ascending, (rows,)."""
-    end = lattice[-1] / 1e9
+def valid_times(sensor: TrueSensor, grid: TimeArray, rng: np.random.Generator) -> TimeArray:
+    """The instants of the grid (int64 ns, even) at which the sensor measures, ascending, (rows,)."""
+    end = grid[-1] / 1e9
     count = int(end * sensor.rate) + 1
     jitter = sensor.rate_jitter * rng.standard_normal(count)
     instant = (rng.random() + np.arange(count)) / sensor.rate + jitter
-    nearest = np.unique(np.rint(instant * ((len(lattice) - 1) / end)).astype(np.int64))
-    return lattice[nearest[(nearest >= 0) & (nearest < len(lattice))]]
+    nearest = np.unique(np.rint(instant * ((len(grid) - 1) / end)).astype(np.int64))
+    return grid[nearest[(nearest >= 0) & (nearest < len(grid))]]
 
 
 def measure(

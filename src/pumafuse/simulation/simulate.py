@@ -21,8 +21,8 @@ from ..logs.run import Reference, Run, Source
 from ..model.arm import ordered_axes
 from ..units import MM
 from . import campaign, sensing
-from .lattice import LATTICE, lattice
-from .motion import Motion, move
+from .grid import POINTS, grid
+from .motion import Motion, simulate_axis
 from .scenario import Scenario
 from .trajectory import PathFromFile
 
@@ -67,7 +67,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
     seed = scenario.seed if seed is None else seed
     tick, told = _commands(scenario, seed)
     period = scenario.arm.update_period
-    instants = lattice(len(tick), period)
+    instants = grid(len(tick), period)
     axes, log = tuple(told), _Log(scenario, tuple(told))
     moved = _motions(scenario, seed, tick, told)
 
@@ -79,7 +79,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
             true = log.positions({axis: moved[axis].at(valid) for axis in seen}, in_axes=sensor.axes is not None)
             sensors[name] = _rounded(sensing.measure(sensor, name, valid, true, _stream(seed, "sensor", name)))
     parts = scenario.reference.rows_per_command
-    rows = instants[np.rint(np.arange(len(tick) * parts) * (LATTICE / parts)).astype(np.int64)]
+    rows = instants[np.rint(np.arange(len(tick) * parts) * (POINTS / parts)).astype(np.int64)]
     noise = _stream(seed, "reference")
     reference = {
         axis: true + scenario.reference.sd * noise.standard_normal(len(rows))
@@ -191,7 +191,7 @@ def _commands(scenario: Scenario, seed: int) -> tuple[TimeArray, dict[str, Float
 def _motions(scenario: Scenario, seed: int, tick: TimeArray, told: Mapping[str, FloatArray]) -> dict[str, Motion]:
     true_axes = scenario.true_axes
     return {
-        axis: move(
+        axis: simulate_axis(
             true_axes[axis],
             scenario.process.get(axis, Process()),
             scenario.start.offset_sd,
