@@ -14,7 +14,6 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -43,20 +42,7 @@ PLANTS = pytest.mark.parametrize("plant", [FIRST, WEAK, CRITICAL, STRONG], ids=[
 
 
 def true_axis(plant: FirstOrder | SecondOrder, **different: Any) -> TrueAxis:
-    plain = TrueAxis(
-        plant=plant,
-        gain=Gain(),
-        gain_curve=None,
-        gain_recovery=None,
-        delay=0.0,
-        delay_jitter=0.0,
-        extra_pole=None,
-        backlash=0.0,
-        stiction=0.0,
-        slow_drift=0.0,
-        slow_drift_period=600.0,
-    )
-    return msgspec.structs.replace(plain, **different)
+    return TrueAxis(**({"plant": plant, "gain": Gain(), "gain_recovery": None, "delay": 0.0} | different))
 
 
 def ticks(count: int) -> NDArray[np.int64]:

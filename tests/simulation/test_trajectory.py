@@ -64,7 +64,7 @@ def test_a_raster_covers_its_height(lines: int, pitch_mm: int) -> None:
 def test_a_raster_may_run_along_any_axes() -> None:
     """`along` and `across` name them."""
     found = Raster(along="radial", across="tangential", width=0.1, height=0.0, pitch=0.01, speed=0.1)
-    assert found.named == ("radial", "tangential")
+    assert found.moving == ("radial", "tangential")
     offsets = found.offsets(PERIOD, rng())
     assert offsets["radial"].max() == pytest.approx(0.1)
     assert not offsets["tangential"].any()

@@ -12,11 +12,11 @@ from ..model.discrete import DiscreteModel, discretize
 from ..units import shifted
 from .tables import console
 
-_LONGEST = 200  # ticks of step response that are shown at most
+_MOST_TICKS = 200  # of a step response
 
 
 class Discretized(msgspec.Struct, frozen=True, kw_only=True):
-    """One axis in what ``discretize --json`` prints. States are in mm, v and p in mm.
+    """One axis in the output of ``discretize --json``. States are in mm and mm/s, v and p in mm.
 
     Attributes:
         period_ms: T.
@@ -65,7 +65,7 @@ def _shown(model: DiscreteModel) -> Discretized:
     plant = [pole for pole in model.poles if abs(pole) > 1e-9]
     slowest = max((abs(pole) for pole in plant), default=0.0)
     settling = math.ceil(math.log(1e-3) / math.log(slowest)) if 0.0 < slowest < 1.0 else 1
-    ticks = min(math.ceil(model.delay / model.period) + settling + 2, _LONGEST)
+    ticks = min(math.ceil(model.delay / model.period) + settling + 2, _MOST_TICKS)
     return Discretized(
         period_ms=shifted(model.period, 3),
         delay_ms=shifted(model.delay, 3),
