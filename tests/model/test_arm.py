@@ -134,11 +134,6 @@ def test_file_is_in_file_units_and_python_in_si(load) -> None:
     )
 
 
-def test_whole_numbers_are_numbers(load) -> None:
-    """An integer in the file is converted like any other number."""
-    assert load(ARM.replace("28.0", "28").replace("100.0", "100")) == load(ARM)
-
-
 def test_intervals_are_in_the_unit_of_their_key(load) -> None:
     """A key ending in _ci95 takes the unit before it."""
     arm = load(
@@ -182,51 +177,45 @@ REFUSED = {
     "unknown table": ("[validity]", "[validty]", "'validty'; did you mean 'validity'", TOP),
     "unknown key below": ("max_speed_m_s", "speed_m_s", "'validity.speed_m_s'", "max_speed_m_s, max_radius_mm"),
     "unknown gain key": ("slope_s_m", "slope", "'axes.radial.gain.slope'; did you mean 'slope_s_m'", GAIN),
-    "missing unit": ("update_period_ms", "update_period", "'update_period'; did you mean 'update_period_ms'", TOP),
-    "missing unit below": ("max_radius_mm", "max_radius", "'validity.max_radius'", "max_speed_m_s, max_radius_mm"),
     "missing unit of a plant": ("natural_frequency_rad_s", "natural_frequency", "'axes.tangential.natural_frequency'",
                                 "natural_frequency_rad_s"),
     "unit of another kind": ("60.45", "60.45\ndelay_s = 0.06", "'delay_s'; did you mean 'delay_ms'", TOP),
     "key of the other plant": ("0.864", "0.864\ntime_constant_ms = 3.0", "'axes.tangential.time_constant_ms'",
                                "natural_frequency_rad_s, damping"),
     "text for a number": ("28.0", '"28"', "update_period_ms", "float"),
-    "truth for a number": ("0.864", "true", "axes.tangential.damping", "float"),
     "list for a number": ("42.5", "[42.5]", "axes.radial.time_constant_ms", "float"),
-    "number for a text": ('"bench"', "3", "name", "str"),
     "number for a table": ("{ slope_s_m = 0.0818, intercept = 0.933 }", "0.9", "axes.radial.gain", "object"),
     "number for an axis": ("[axes.tangential]", "[axes]\nvertical = 3\n[axes.tangential]", "axes.vertical", "table"),
     "interval of one": ("60.45", "60.45\ndelay_ms_ci95 = [60.0]", "delay_ms_ci95", "length 2"),
     "missing key": ("update_period_ms = 28.0", "", "'update_period_ms' is missing", ""),
     "missing key of a plant": ("damping = 0.864", "", "'axes.tangential.damping' is missing", ""),
-    "infinite": ("60.45", "inf", "delay_ms", "not a finite number"),
     "not a number": ("0.864", "nan", "damping", "not a finite number"),
     "beyond a float": ("0.933", "1e400", "intercept", "not a finite number"),
     "unknown plant": ('"first-order"', '"third-order"', "axes.radial.plant", "first-order, second-order"),
     "plant of a wrong type": ('"first-order"', '["first-order"]', "axes.radial.plant", "first-order, second-order"),
     "no plant": ('plant = "first-order"', "", "axes.radial.plant", "first-order, second-order"),
     "misspelled axis key": ("42.5", "42.5\ngain_recovry_ms = 9.0", "axes.radial.gain_recovry_ms", "gain_recovery_ms"),
-    "axis key without unit": ("42.5", "42.5\ngain_recovery = 9.0", "axes.radial.gain_recovery", "gain_recovery_ms"),
     "integer beyond a float": ("28.0", "1" + "0" * 400, "update_period_ms", "not a finite number"),
     "exponent beyond decimal": ("28.0", "1e99999999999999999999", "number", "out of range"),
     "key with a newline": ("42.5", '42.5\n"a\\nb" = 1', "axes.radial", ""),
-    "path of what is not finite": ("42.5", "inf", "axes.radial.time_constant_ms", "not a finite number"),
     "axis named like a unit": ("axes.radial", "axes.rail_mm", "axis 'rail_mm'", "must not end in a unit"),
     "zero": ("42.5", "0.0", "axes.radial.time_constant_ms", "> 0"),
     "negative": ("60.45", "-1.0", "delay_ms", ">= 0"),
+    "not TOML": ("name = ", "name = = ", "not valid TOML", ""),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(("old", "new", "key", "accepted"), REFUSED.values(), ids=REFUSED.keys())
-def test_what_is_wrong_in_a_file_is_said_in_one_line(load, tmp_path: Path, old: str, new: str, key: str, accepted: str):
+def test_a_wrong_file_is_refused_in_one_line(load, tmp_path: Path, old: str, new: str, key: str, accepted: str):
     """A wrong file is refused with one line that names the file, the key and what would be accepted."""
     assert old in ARM
     with pytest.raises(ConfigError) as caught:
         load(ARM.replace(old, new, 1))
-    said = str(caught.value)
-    assert said.startswith(f"{tmp_path / 'arm.toml'}: ")
-    assert key in said
-    assert accepted in said
-    assert len(said.splitlines()) == 1
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path / 'arm.toml'}: ")
+    assert key in message
+    assert accepted in message
+    assert len(message.splitlines()) == 1
 
 
 @pytest.mark.parametrize("axes", ["", "axes = {}", "axes = 3"])
@@ -236,31 +225,29 @@ def test_an_arm_has_an_axis(load, axes: str) -> None:
         load(f'name = "x"\nupdate_period_ms = 28.0\ndelay_ms = 0.0\n{axes}\n')
 
 
-@pytest.mark.parametrize("content", [b"name = ", b"\xff\xfe\x00", b'name = "a"\nname = "b"\n'])
-def test_what_is_not_toml_is_refused(tmp_path: Path, content: bytes) -> None:
-    """A file that is not TOML, or not text, is refused in one line with its name."""
-    path = tmp_path / "arm.toml"
-    path.write_bytes(content)
-    with pytest.raises(ConfigError) as caught:
-        ArmModel.load(path)
-    assert str(caught.value).startswith(f"{path}: ")
-    assert len(str(caught.value).splitlines()) == 1
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("puma650-internal", r"puma650-internal: .*puma560-internal, puma560-external"),
+        (".", r"\.: cannot be read"),
+        ("x" * 300, "no such arm file"),
+    ],
+    ids=["misspelled preset", "folder", "name too long for a file"],
+)
+def test_a_source_that_is_no_arm_is_refused(source: str, message: str) -> None:
+    """Neither a file nor a preset; the presets are named."""
+    with pytest.raises(ConfigError, match=message):
+        ArmModel.load(source)
 
 
-def test_a_misspelled_preset_is_told_the_presets() -> None:
-    """A name that is neither a file nor a preset is refused with the presets' names."""
-    with pytest.raises(ConfigError, match=r"puma650-internal: .*puma560-internal, puma560-external"):
-        ArmModel.load("puma650-internal")
+def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
+    """By its name."""
+    (tmp_path / "arm.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="not a text file"):
+        ArmModel.load(tmp_path / "arm.toml")
 
 
-def test_a_folder_is_not_an_arm(tmp_path: Path) -> None:
-    """A folder given as an arm is refused by name."""
-    with pytest.raises(ConfigError, match="cannot be read") as caught:
-        ArmModel.load(tmp_path)
-    assert str(tmp_path) in str(caught.value)
-
-
-def test_an_unknown_axis_is_told_the_axes(load) -> None:
+def test_an_unknown_axis_is_refused_with_the_known_ones(load) -> None:
     """Asking for an axis that the arm does not have names the ones it has."""
     with pytest.raises(
         UnknownNameError, match="bench: unknown axis 'vertical'; accepted: tangential, radial"
@@ -296,33 +283,21 @@ LIMITS = Validity(max_speed=0.5, max_radius=0.7)
 
 
 def test_validity_says_by_how_much() -> None:
-    """Each limit passed is one sentence with what was reached, the limit, and the excess."""
+    """Each limit exceeded is one sentence with what was reached, the limit, and the excess."""
     speed, radius = LIMITS.excess(0.68, 0.7321)
     assert speed.startswith("commanded speed reaches 0.68 m/s, 1.36 times the 0.5 m/s")
     assert radius.startswith("commands reach 732.1 mm from the base axis, 32.1 mm beyond the 700 mm")
 
 
 @pytest.mark.parametrize(
-    ("limits", "speed", "radius", "passed"),
-    [
-        (LIMITS, 0.5, 0.7, 0),
-        (LIMITS, 0.5001, 0.7, 0),
-        (LIMITS, 0.51, 0.7, 1),
-        (LIMITS, 0.5, 0.701, 1),
-        (LIMITS, 0.51, None, 1),
-        (Validity(max_speed=0.5), 0.1, 9.0, 0),
-        (Validity(), 9.0, 9.0, 0),
-    ],
+    ("limits", "speed", "radius", "exceeded"),
+    [(LIMITS, 0.5001, 0.7, 0), (LIMITS, 0.51, None, 1), (LIMITS, 0.5, 0.701, 1), (Validity(), 9.0, 9.0, 0)],
 )
-def test_validity_counts_only_what_is_passed(limits: Validity, speed: float, radius: float | None, passed: int) -> None:
-    """At a limit, or past it by less than is shown, is within it; absent limits and an unknown radius are no limits."""
-    assert len(limits.excess(speed, radius)) == passed
-
-
-def test_a_name_too_long_for_a_file_is_refused() -> None:
-    """A text that cannot be a path is a ConfigError, not an OSError."""
-    with pytest.raises(ConfigError):
-        ArmModel.load("x" * 300)
+def test_validity_counts_only_what_is_exceeded(
+    limits: Validity, speed: float, radius: float | None, exceeded: int
+) -> None:
+    """Beyond a limit by less than is shown is within it; absent limits and an unknown radius are no limits."""
+    assert len(limits.excess(speed, radius)) == exceeded
 
 
 def bench(**changed: object) -> ArmModel:
@@ -338,8 +313,9 @@ def bench(**changed: object) -> ArmModel:
         {"update_period": np.float64(0.028)},
         {"provenance": {"window_ms": 169}},
         {"provenance": {"date": datetime.date(2024, 5, 1)}},
+        {"delay_ci95": (0.05, np.inf)},
     ],
-    ids=["whole seconds", "whole time constant", "numpy float", "whole number in provenance", "date in provenance"],
+    ids=["whole seconds", "whole time constant", "numpy float", "whole number", "date", "open interval"],
 )
 def test_numbers_of_any_kind_and_dates_come_back(tmp_path: Path, changed: dict[str, object]) -> None:
     """Whole numbers, numpy numbers and dates come back as they were."""
@@ -352,15 +328,3 @@ def test_provenance_is_kept_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "arm.toml"
     path.write_text(ARM + "[provenance]\nwindow_ms = 169.0\n")
     assert ArmModel.load(path).provenance == {"window_ms": 169.0}
-
-
-def test_an_infinite_interval_comes_back(tmp_path: Path) -> None:
-    """An interval may be open: identification says so with inf."""
-    bench(delay_ci95=(0.05, np.inf)).save(tmp_path / "arm.toml")
-    assert ArmModel.load(tmp_path / "arm.toml").delay_ci95 == (0.05, np.inf)
-
-
-def test_a_preset_cannot_be_changed_for_others() -> None:
-    """What one caller does to a loaded preset's axes no other caller sees."""
-    ArmModel.load("puma560-internal").axes.clear()
-    assert ArmModel.load("puma560-internal").axes

@@ -48,10 +48,10 @@ def assert_transition(plant: Plant, interval: float, rtol: float = 1e-9) -> None
     found = transition(plant, interval)
     sd = np.sqrt(np.diag(Q))
     size = np.array([1.0, getattr(plant, "natural_frequency", 1.0)])[: len(Phi)]
-    held = np.minimum(np.sqrt(interval) * sd, size)  # |Γi| ≤ √(h Qii) by Cauchy-Schwarz
+    largest = np.minimum(np.sqrt(interval) * sd, size)  # |Γi| ≤ √(h Qii) by Cauchy-Schwarz
     assert (np.abs(found.Q - Q) <= rtol * np.outer(sd, sd)).all()
     assert (np.abs(found.Phi - Phi) <= rtol * np.outer(size, 1.0 / size)).all()
-    assert (np.abs(found.Gamma[:, 0] - Gamma[:, 0]) <= rtol * held).all()
+    assert (np.abs(found.Gamma[:, 0] - Gamma[:, 0]) <= rtol * largest).all()
 
 
 def delayed_response(plant: Plant, period: float, delay: float, inputs: np.ndarray) -> np.ndarray:
@@ -145,14 +145,12 @@ def test_as_many_past_inputs_as_are_needed(late: float, past: int) -> None:
     assert np.abs(np.sort_complex(model.poles)[:-2]).max(initial=0.0) <= 1e-12
 
 
-OMEGAS = [0.1, 53.9, 1e3, 1e5]
-DAMPINGS = [0.01, 0.864, 1 - 1e-9, 1.0, 1 + 1e-9, 2.0, 50.0, 1e3]
-INTERVALS = [MICROSECOND, 1e-4, 0.028, 1.0, DAY]
+INTERVALS = [MICROSECOND, 0.028, DAY]
 
 
 @pytest.mark.parametrize("interval", INTERVALS)
-@pytest.mark.parametrize("omega", OMEGAS)
-@pytest.mark.parametrize("damping", DAMPINGS)
+@pytest.mark.parametrize("omega", [0.1, 53.9, 1e5])
+@pytest.mark.parametrize("damping", [0.01, 1 - 1e-9, 1.0, 1 + 1e-9, 1e3])
 def test_second_order_transition_is_exact(omega: float, damping: float, interval: float) -> None:
     """Φ, Γ and Q hold for soft and stiff plants, from a microsecond to a day."""
     assert_transition(SecondOrder(natural_frequency=omega, damping=damping), interval)
@@ -172,21 +170,6 @@ def test_transition_is_exact_everywhere(omega: float, damping: float, interval: 
     assert_transition(SecondOrder(natural_frequency=10.0**omega, damping=10.0**damping), 10.0**interval)
 
 
-@pytest.mark.long
-@settings(derandomize=True, deadline=None, max_examples=100)
-@given(plant=plants, interval=st.floats(1e-6, 10.0), share=st.floats(0.0, 1.0))
-def test_splitting_an_interval_changes_nothing(plant: Plant, interval: float, share: float) -> None:
-    """Two partial steps are the whole step: for the state, for the input and for the noise."""
-    whole = transition(plant, interval)
-    first, second = transition(plant, interval * share), transition(plant, interval - interval * share)
-    size = np.array([1.0, getattr(plant, "natural_frequency", 1.0)])[: len(whole.Phi)]
-    sd = np.sqrt(np.diag(whole.Q))
-    assert (np.abs(second.Phi @ first.Phi - whole.Phi) <= 1e-11 * np.outer(size, 1.0 / size)).all()
-    assert (np.abs(second.Phi @ first.Gamma + second.Gamma - whole.Gamma)[:, 0] <= 1e-11 * size).all()
-    Q = second.Phi @ first.Q @ second.Phi.T + second.Q
-    assert (np.abs(Q - whole.Q) <= 1e-10 * np.outer(sd, sd)).all()
-
-
 @pytest.mark.parametrize("plant", [TANGENTIAL, RADIAL], ids=["second-order", "first-order"])
 def test_many_intervals_at_once_are_each_its_own(plant: Plant) -> None:
     """A table of intervals gives a table of transitions; an interval of zero changes nothing."""
@@ -201,8 +184,8 @@ def test_many_intervals_at_once_are_each_its_own(plant: Plant) -> None:
         assert (part == expected).all()
 
 
-@pytest.mark.parametrize("drift", [None, 0.0, 4e-4])
-@pytest.mark.parametrize("late", [0.0, 1.0, 2.16])
+@pytest.mark.parametrize("drift", [None, 4e-4])
+@pytest.mark.parametrize("late", [0.0, 2.16])
 @pytest.mark.parametrize("plant", [TANGENTIAL, RADIAL], ids=["second-order", "first-order"])
 def test_noise_grows_as_the_integral_of_the_impulse_response(plant: Plant, late: float, drift: float | None) -> None:
     """After n ticks the variance of p is q ∫ g² over n·T, not delayed, and drift²·n·T on top."""
@@ -214,26 +197,20 @@ def test_noise_grows_as_the_integral_of_the_impulse_response(plant: Plant, late:
         assert (model.H @ P @ model.H.T).item() == pytest.approx(noise, rel=1e-11)
 
 
-def test_an_offset_stays_and_is_seen() -> None:
-    """The offset adds to p as it is for ever, moves nothing else, and no input moves it."""
+def test_an_offset_stays_and_is_measured() -> None:
+    """The offset adds to p for ever, moves nothing else, and no input moves it. Past inputs carry no noise."""
     inputs = np.random.default_rng(3).normal(size=20)
-    plain, model = (discretize(TANGENTIAL, 0.028, 0.06045, drift=drift) for drift in (None, 4e-4))
+    plain = discretize(TANGENTIAL, 0.028, 0.06045)
+    model = discretize(TANGENTIAL, 0.028, 0.06045, input_noise=3e-5, drift=4e-4)
     offset = model.states.index("offset")
     assert model.states == ("position", "rate", "offset", "v[n-1]", "v[n-2]", "v[n-3]")
     assert "offset" not in plain.states
+    assert not model.Q[3:].any() and not model.Q[:, 3:].any()
     x = np.eye(len(model.F))[:, [offset]] * 0.7
     for v, p in zip(inputs, simulate(plain, inputs), strict=True):
         assert (model.H @ x).item() == pytest.approx(p + 0.7, abs=1e-14)
         assert x[offset] == 0.7
         x = model.F @ x + model.B * v
-
-
-def test_delay_states_carry_no_noise() -> None:
-    """Past inputs are known: their rows and columns of Q are zero."""
-    model = discretize(TANGENTIAL, 0.028, 0.06045, input_noise=3e-5, drift=4e-4)
-    past = [index for index, name in enumerate(model.states) if name.startswith("v")]
-    assert not model.Q[past].any()
-    assert not model.Q[:, past].any()
 
 
 def test_gain_and_delay_of_the_axis_are_left_out() -> None:
@@ -246,16 +223,14 @@ def test_gain_and_delay_of_the_axis_are_left_out() -> None:
     assert (by_axis.H @ settled).item() == pytest.approx(1.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("late", [0.0, 0.4, 2.0, 2.16])
-@pytest.mark.parametrize("plant", [TANGENTIAL, RADIAL], ids=["second-order", "first-order"])
+@pytest.mark.parametrize(("plant", "late"), [(TANGENTIAL, 0.4), (RADIAL, 2.0), (RADIAL, 2.16)])
 def test_step_response_is_the_delayed_equation(plant: Plant, late: float) -> None:
     """At every tick the model's step response is the paper's, one delay later."""
     response = discretize(plant, 0.028, late * 0.028).step_response(40)
     np.testing.assert_allclose(response, plant.step_response((np.arange(40) - late) * 0.028), rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("drift", [None, 4e-4])
-@pytest.mark.parametrize("late", [0.0, 1.0, 2.16])
+@pytest.mark.parametrize(("late", "drift"), [(0.0, None), (1.0, 4e-4), (2.16, None)])
 def test_control_answers_the_same(late: float, drift: float | None) -> None:
     """The `control` system has our period and our step response, offset or not."""
     model = discretize(TANGENTIAL, 0.028, late * 0.028, drift=drift)
@@ -277,26 +252,15 @@ def test_filterpy_predicts_the_same() -> None:
         assert (kf.H @ kf.x).item() == pytest.approx(p, abs=1e-9)
         assert (kf.H @ kf.P @ kf.H.T).item() == pytest.approx(noise, rel=1e-11)
         kf.predict(u=np.array([[v]]))
+    kf.F += 1.0
+    assert (model.F != kf.F).all()  # the filter's matrices are its own
 
 
-def test_filterpy_does_not_share_the_models_arrays() -> None:
-    """Changing the filter's matrices leaves the model as it was."""
-    model = discretize(TANGENTIAL, 0.028, 0.06045, input_noise=3e-5)
-    kf, kept = model.to_filterpy(), [m.copy() for m in (model.F, model.B, model.H, model.Q)]
-    for matrix in (kf.F, kf.B, kf.H, kf.Q):
-        matrix += 1.0
-    assert all((m == k).all() for m, k in zip((model.F, model.B, model.H, model.Q), kept, strict=True))
-
-
-@pytest.mark.parametrize("period", [0.0, -0.028, math.nan, math.inf, -math.inf])
-def test_an_impossible_period_is_refused(period: float) -> None:
-    """A period that is not a positive finite time is a ValueError that names both numbers."""
-    with pytest.raises(ValueError, match="period must be > 0"):
-        discretize(TANGENTIAL, period, 0.06)
-
-
-@pytest.mark.parametrize("delay", [-1e-12, -1.0, math.nan, math.inf])
-def test_an_impossible_delay_is_refused(delay: float) -> None:
-    """A delay that is not a finite time from zero on is a ValueError that names both numbers."""
-    with pytest.raises(ValueError, match="delay ≥ 0"):
-        discretize(TANGENTIAL, 0.028, delay)
+@pytest.mark.parametrize(
+    ("period", "delay"),
+    [(0.0, 0.06), (-0.028, 0.06), (math.inf, 0.06), (math.nan, 0.06), (0.028, -1e-12), (0.028, math.nan)],
+)
+def test_an_impossible_period_or_delay_is_refused(period: float, delay: float) -> None:
+    """Neither a positive finite period with a finite delay ≥ 0: a ValueError that names both numbers."""
+    with pytest.raises(ValueError, match="period must be > 0 and delay ≥ 0"):
+        discretize(TANGENTIAL, period, delay)

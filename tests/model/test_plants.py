@@ -110,8 +110,7 @@ def test_first_order_transfer_function_is_equation_3(tau: float) -> None:
     np.testing.assert_allclose(denominator, [0.0, 1.0, 1.0], atol=1e-13)
 
 
-@pytest.mark.parametrize("omega", [1e-2, OMEGA, 1e4])
-@pytest.mark.parametrize("damping", [0.1, 0.864, 1.0, 50.0])
+@pytest.mark.parametrize(("omega", "damping"), [(1e-2, 0.1), (OMEGA, 1.0), (1e4, 50.0)])
 def test_second_order_transfer_function_is_equation_5(omega: float, damping: float) -> None:
     """ω² / (s² + 2ζωs + ω²), coefficient by coefficient."""
     tf = SecondOrder(natural_frequency=omega, damping=damping).transfer_function()

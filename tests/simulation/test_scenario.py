@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 import pumafuse as pf
@@ -35,40 +36,19 @@ def load(folder: Path, text: str) -> pf.Scenario:
 WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown key": ("sped = 3\n" + WHOLE, ("'sped'", "did you mean 'seed'?", "trajectory")),
     "unknown key of a sensor": (WHOLE + "rate = 3.0\n", ("sensors.eye.rate", "rate_hz")),
-    "unknown key of a trajectory": (HEAD + ARM + HOLD + "speed_m_s = 1.0\n", ("trajectory.speed_m_s", "duration_s")),
-    "unknown key of the true arm": (WHOLE + "[true_arm]\nbacklash = 0.1\n", ("true_arm.backlash", "backlash_mm")),
-    "unknown key of the process": (WHOLE + "[process]\ndrift = 0.1\n", ("process.drift", "drift_mm_rts")),
-    "unknown key of the start": (WHOLE + "[start]\noffset_mm = 0.1\n", ("start.offset_mm", "offset_sd_mm")),
     "unknown key of the filter": (WHOLE + "[filter.start]\noffset = 0.1\n", ("start.offset", "offset_sd_mm")),
-    "unknown key of a filtered sensor": (
-        WHOLE + "[filter.sensors.eye]\nlatency = 0.1\n",
-        ("sensors.eye.latency", "latency_ms"),
-    ),
     "unknown table of the filter": (
         WHOLE + "[filter.sensor.eye]\nsd_mm = 1.0\n",
         ("'sensor'", "did you mean 'sensors'?"),
     ),
-    "arm of the filter": (WHOLE + '[filter]\narm = "puma560-external"\n', ("filter", "arm")),
     "negative sd": (WHOLE.replace("0.5", "-0.5"), ("sensors.eye.sd_mm",)),
-    "zero sd": (WHOLE.replace("0.5", "0.0"), ("sensors.eye.sd_mm",)),
-    "no rate": (HEAD + ARM + HOLD + "[sensors.eye]\nsd_mm = 1.0\n", ("'sensors.eye.rate_hz' is missing",)),
-    "no sd": (HEAD + ARM + HOLD + "[sensors.eye]\nrate_hz = 1.0\n", ("'sensors.eye.sd_mm' is missing",)),
     "no trajectory": (HEAD + ARM + SENSOR, ("'trajectory' is missing",)),
-    "no arm": (HEAD + HOLD + SENSOR, ("'arm' is missing",)),
     "no such arm": (HEAD + 'arm = "arm.tml"\n' + HOLD, ("arm.tml", "puma560-internal, puma560-external")),
     "unknown trajectory": (
         WHOLE.replace('"hold"', '"rastr"'),
         ("trajectory.kind", "'rastr'", "did you mean 'raster'?", "white-noise"),
     ),
-    "trajectory without kind": (WHOLE.replace('kind = "hold"\n', ""), ("trajectory.kind", "raster", "hold")),
     "axis of the trajectory": (WHOLE.replace('"radial"', '"radail"'), ("'radail'", "did you mean 'radial'?")),
-    "axis of a raster": (
-        HEAD
-        + ARM
-        + '[trajectory]\nkind = "raster"\nalong = "x"\nwidth_mm = 1.0\nheight_mm = 1.0\n'
-        + "pitch_mm = 1.0\nspeed_m_s = 1.0\n",
-        ("'x'", *AXES),
-    ),
     "raster along and across one axis": (
         HEAD
         + ARM
@@ -76,15 +56,11 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
         + "speed_m_s = 0.1\n",
         ("across",),
     ),
-    "axis of the true arm": (WHOLE + "[true_arm.radail]\nstiction_mm = 0.1\n", ("true_arm", "did you mean 'radial'?")),
-    "axis of the process": (WHOLE + "[process.radail]\ndrift_mm_rts = 0.1\n", ("process", "did you mean 'radial'?")),
     "axis of the start level": (
         WHOLE + "[start]\nlevel = { radail_mm = 1.0 }\n",
         ("'radail'", "did you mean 'radial'?"),
     ),
-    "start level without unit": (WHOLE + "[start]\nlevel = { radial = 1.0 }\n", ("start.level.radial", "radial_mm")),
     "axis of a sensor": (WHOLE + 'axes = ["up"]\n', ("sensors.eye.axes", "'up'", *AXES)),
-    "axis of a sensor's sd": (WHOLE.replace("0.5", "{ up = 0.5 }"), ("sensors.eye.sd_mm", "'up'", *AXES)),
     "axis without sd": (WHOLE.replace("0.5", "{ radial = 0.5 }"), ("sensors.eye.sd_mm", "tangential")),
     "axis of a sensor's bias": (WHOLE + "bias_mm = { up = 1.0 }\n", ("sensors.eye.bias_mm", "'up'", *AXES)),
     "sd in axes of a sensor in x, y, z": (
@@ -93,20 +69,10 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "sensor of the filter": (WHOLE + "[filter.sensors.ear]\nsd_mm = 1.0\n", ("filter.sensors", "'ear'", "eye")),
     "axis of the filter": (WHOLE + "[filter.process.radail]\ndrift_mm_rts = 1.0\n", ("did you mean 'radial'?",)),
-    "wrong type in the filter": (WHOLE + "[filter]\nprocess = 3\n", ("process",)),
-    "time constant of a second-order axis": (
-        WHOLE + "[true_arm.tangential]\ntime_constant_ms = 40.0\n",
-        ("true_arm", "time_constant_ms", "natural_frequency_rad_s, damping"),
-    ),
     "damping of a first-order axis": (
         WHOLE + "[true_arm.radial]\ndamping = 0.7\n",
         ("true_arm", "damping", "time_constant_ms"),
     ),
-    "another plant without its parameters": (
-        WHOLE + '[true_arm.radial]\nplant = "second-order"\ndamping = 0.7\n',
-        ("true_arm", "natural_frequency_rad_s", "is missing"),
-    ),
-    "unknown plant": (WHOLE + '[true_arm]\nplant = "third-order"\n', ("true_arm", "third-order", "second-order")),
     "gain curve that goes back": (
         WHOLE + "[true_arm]\ngain_curve = { speed_m_s = [0.1, 0.0], gain = [1.0, 1.1] }\n",
         ("gain_curve", "ascend"),
@@ -118,7 +84,6 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
     "frame without level": (WHOLE + FRAME, ("start.level.radial_mm",)),
     "outliers from more to less": (WHOLE + "outliers = { share = 0.1, from_mm = 5.0, to_mm = 1.0 }\n", ("to_mm",)),
     "outage that ends before it begins": (WHOLE + "outages_s = [[3.0, 2.0]]\n", ("sensors.eye.outages_s",)),
-    "share above one": (WHOLE + "dropouts = 1.5\n", ("sensors.eye.dropouts",)),
     "scope that is no sensor": (HEAD + ARM + STEPS + 'scope = "ey"\n' + SENSOR, ("trajectory.scope", "'ey'", "eye")),
     "scope that does not see a stepped axis": (
         HEAD + ARM + STEPS + 'scope = "eye"\n' + SENSOR + 'axes = ["radial"]\n',
@@ -126,17 +91,13 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "scope in x, y, z": (HEAD + ARM + STEPS + 'scope = "eye"\n' + SENSOR + LEVEL + FRAME, ("scope",)),
     "not TOML": (HEAD + "arm = \n", ("not valid TOML",)),
-    "not finite": (WHOLE + "bias_mm = inf\n", ("bias_mm", "finite")),
-    "negative seed": ("seed = -1\n" + WHOLE, ("seed",)),
     "sensor that would overwrite the commands": (
         HEAD + ARM + HOLD + SENSOR.replace("eye", "commands"),
         ("commands",),
     ),
-    "sensor that would overwrite the truth": (HEAD + ARM + HOLD + SENSOR.replace("eye", "truth"), ("truth",)),
     "sensor outside the folder": (HEAD + ARM + HOLD + SENSOR.replace("eye", '"../eye"'), ("../eye",)),
     "longer than memory": (WHOLE.replace("0.2", "1e8"), ("trajectory", "at most 200000", "commands")),
     "longer than time": (WHOLE.replace("0.2", "1e15"), ("trajectory.duration_s", "nothing can be simulated")),
-    "one command too many": (WHOLE.replace("0.2", "5600.0"), ("200001 commands", "at most 200000")),
     "campaign without end": (
         HEAD + ARM + STEPS + 'scope = "eye"\nrest_s = 1e9\n' + SENSOR,
         ("trajectory", "at most 200000"),
@@ -145,11 +106,11 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
         HEAD + ARM + STEPS + 'scope = "eye"\nrest_s = 0.3\nwindow_s = 0.31\n' + SENSOR,
         ("window_s", "rest_s"),
     ),
-    "sensor faster than the lattice": (
+    "sensor faster than the grid": (
         WHOLE.replace("30.0", "2143.0"),
         ("sensors.eye.rate_hz", "at most 2142.86", "2143"),
     ),
-    "more rows of the truth than the lattice has": (
+    "more rows of the reference than the grid has": (
         WHOLE + "[reference]\nrows_per_command = 61\n",
         ("reference.rows_per_command", "60"),
     ),
@@ -168,16 +129,12 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
         + SENSOR,
         ("trajectory", "at most 200000"),
     ),
-    "a billion bursts": (WHOLE + "bursts = { per_minute = 1e9, length_s = 1.0 }\n", ("sensors.eye.bursts", "6000")),
     "noise of a galaxy": (WHOLE + "[process]\ninput_noise_mm_rtHz = 1e160\n", ("process.input_noise_mm_rtHz", "size")),
-    "a sine of nothing": (WHOLE.replace("30.0", "1e-300"), ("sensors.eye.rate_hz", "size")),
     "level twice": (WHOLE + LEVEL.replace("500.0", "500.0, radial_m = 0.1"), ("start.level", "twice")),
     "damping that is missing": (
         WHOLE + "[true_arm.radial]\nplant = 'second-order'\nnatural_frequency_rad_s = 40.0\n",
         ("true_arm.radial, a second-order plant", "'damping' is missing"),
     ),
-    "sensor that would overwrite the trials": (HEAD + ARM + HOLD + SENSOR.replace("eye", "trials"), ("trials",)),
-    "sensor that would overwrite the samples": (HEAD + ARM + HOLD + SENSOR.replace("eye", "samples"), ("samples",)),
 }
 
 
@@ -212,28 +169,14 @@ def test_the_executable_refuses_a_wrong_scenario_and_writes_nothing(case: str, t
 
 
 def test_limits_are_themselves_allowed(tmp_path: Path) -> None:
-    """60 rows a period of a sensor and of the truth, a window as long as the rest, the sd of the axes that move."""
+    """60 rows a period of a sensor and of the reference, a window as long as the rest, the sd of the moving axes."""
     whole = WHOLE.replace("30.0", "2142.857142857142") + "[reference]\nrows_per_command = 60\n"
     assert load(tmp_path, whole).reference.rows_per_command == 60
-    steps = (
-        HEAD
-        + ARM
-        + STEPS
-        + 'scope = "eye"\nrest_s = 0.3\nwindow_s = 0.3\n'
-        + SENSOR
-        + 'axes = ["tangential", "radial"]\n'
-    )
-    assert load(tmp_path, steps + LEVEL + FRAME).sensors["eye"].axes == ["tangential", "radial"]
-    assert (
-        load(tmp_path, WHOLE.replace("0.5", "{ radial = 0.5, tangential = 0.4 }")).config.sensors["eye"].sd_of("radial")
-        == 5e-4
-    )
-
-
-def test_a_whole_scenario_is_accepted(tmp_path: Path) -> None:
-    """What the wrong ones above are made of is right by itself."""
-    for text in (WHOLE, WHOLE + LEVEL + FRAME, HEAD + ARM + STEPS + 'scope = "eye"\n' + SENSOR):
-        assert load(tmp_path, text).name == "test"
+    steps = HEAD + ARM + STEPS + 'scope = "eye"\nrest_s = 0.3\nwindow_s = 0.3\n'
+    steps += SENSOR + 'axes = ["tangential", "radial"]\n' + LEVEL + FRAME
+    assert load(tmp_path, steps).sensors["eye"].axes == ["tangential", "radial"]
+    own_sd = load(tmp_path, WHOLE.replace("0.5", "{ radial = 0.5, tangential = 0.4 }"))
+    assert own_sd.config.sensors["eye"].sd_of("radial") == 5e-4
 
 
 def test_every_scenario_of_the_repository_loads_and_says_what_it_teaches() -> None:
@@ -301,8 +244,8 @@ sd_mm = 0.1
 """
 
 
-def test_the_filter_believes_the_truth(tmp_path: Path) -> None:
-    """Every figure of the scenario, with what rounding adds to the noise and all that is unknown of a bias."""
+def test_the_filter_is_configured_as_is_simulated(tmp_path: Path) -> None:
+    """Every figure of the scenario, with what quantisation adds to the noise and all that is unknown of a bias."""
     config = load(tmp_path, HEAD + ARM + HOLD + FULL).config
     assert config.arm == pf.ArmModel.load("puma560-internal")
     assert config.start == pf.Start(offset_sd=2e-3)
@@ -321,67 +264,45 @@ def test_the_filter_believes_the_truth(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "path", "value"),
     [
-        ("[filter.sensors.eye]\nlatency_ms = 20.0\n", ("sensors", "eye", "latency"), 0.020),
-        ("[filter.sensors.ear]\nsd_mm = 0.7\n", ("sensors", "ear", "sd"), 7e-4),
+        ("[filter.sensors.eye]\nlatency_ms = 20.0\n", ("sensors", "eye", "latency_ms"), 0.020),
+        ("[filter.sensors.ear]\nsd_mm = 0.7\n", ("sensors", "ear", "sd_mm"), 7e-4),
         ("[filter.sensors.eye]\ngate = 0.0\n", ("sensors", "eye", "gate"), 0.0),
-        ("[filter.start]\noffset_sd_mm = 9.0\n", ("start", "offset_sd"), 9e-3),
-        ("[filter.process.radial]\ndrift_mm_rts = 3.0\n", ("process", "radial", "drift"), 3e-3),
+        ("[filter.start]\noffset_sd_mm = 9.0\n", ("start", "offset_sd_mm"), 9e-3),
+        ("[filter.process.radial]\ndrift_mm_rts = 3.0\n", ("process", "radial", "drift_mm_rts"), 3e-3),
     ],
 )
-def test_the_filter_is_told_otherwise_only_what_is_named(
+def test_a_filter_table_changes_only_what_it_names(
     override: str, path: tuple[str, ...], value: float, tmp_path: Path
 ) -> None:
-    """One key changes, every other stays as the truth has it; and the truth does not change."""
-    true, told = (load(tmp_path, HEAD + ARM + HOLD + FULL + more) for more in ("", override))
-    was, now = (_plain(scenario.config) for scenario in (true, told))
+    """One key changes, every other stays as it is simulated; and what is simulated does not change."""
+    plain, changed = (load(tmp_path, HEAD + ARM + HOLD + FULL + more) for more in ("", override))
+    was, now = (msgspec.to_builtins(scenario.config, builtin_types=()) for scenario in (plain, changed))
     place: Any = was
     for key in path[:-1]:
         place = place[key]
     assert place[path[-1]] != value
     place[path[-1]] = value
     assert now == was
-    assert told.sensors == true.sensors and told.process == true.process and told.start == true.start
+    assert (changed.sensors, changed.process, changed.start) == (plain.sensors, plain.process, plain.start)
 
 
-def test_the_process_is_told_otherwise_on_every_axis_at_once(tmp_path: Path) -> None:
-    """`[filter.process]` holds for all axes, but what it does not name keeps each axis's own truth."""
+def test_a_process_table_of_the_filter_holds_for_every_axis(tmp_path: Path) -> None:
+    """`[filter.process]` holds for all axes, but what it does not name stays each axis's own."""
     override = "[filter.process]\ninput_noise_mm_rtHz = 0.9\n"
     config = load(tmp_path, HEAD + ARM + HOLD + FULL + override).config
     assert {config.process[axis].input_noise for axis in AXES} == {9e-4}
     assert [config.process[axis].drift for axis in AXES] == [2e-4, 5e-4, 2e-4]
 
 
-def _plain(config: pf.FusionConfig) -> dict[str, Any]:
-    import msgspec
-
-    return {
-        "start": msgspec.structs.asdict(config.start),
-        "process": {axis: msgspec.structs.asdict(process) for axis, process in config.process.items()},
-        "sensors": {name: msgspec.structs.asdict(sensor) for name, sensor in config.sensors.items()},
-    }
+def test_a_path_with_a_hole_is_refused(tmp_path: Path) -> None:
+    """Named with the scenario, when that is loaded."""
+    (tmp_path / "path.csv").write_text("time_s,radial_mm\n0,0\n1,5\n2,50,9\n3,5\n")
+    path = '[trajectory]\nkind = "path"\nfile = "path.csv"\naxes = ["radial"]\n'
+    with pytest.raises(pf.ConfigError, match=r"scenario\.toml: .*1 line left out"):
+        load(tmp_path, HEAD + ARM + path + SENSOR)
 
 
-PATH = '[trajectory]\nkind = "path"\nfile = "path.csv"\naxes = ["radial"]\n'
-
-
-@pytest.mark.parametrize(
-    ("rows", "reason"),
-    [
-        ("", "the table has no rows"),
-        ("0,0\n1,5\n2,50,9\n3,5\n", "1 line left out"),
-        ("0,0\n1,5\n1,6\n", "time_s must ascend"),
-        ("0,0\n1,\n2,6\n", "radial_mm has a cell without a number"),
-    ],
-)
-def test_a_path_with_a_hole_is_refused(rows: str, reason: str, tmp_path: Path) -> None:
-    """What would be interpolated over is another path than the one that was meant."""
-    (tmp_path / "path.csv").write_text("time_s,radial_mm\n" + rows)
-    with pytest.raises(pf.ConfigError, match=reason) as refused:
-        load(tmp_path, HEAD + ARM + PATH + SENSOR)
-    assert len(str(refused.value).splitlines()) == 1
-
-
-@pytest.mark.parametrize("axis", ["file", "time", "start", "clock"])
+@pytest.mark.parametrize("axis", ["file", "start"])
 def test_an_axis_that_run_toml_could_not_tell_is_refused(axis: str, tmp_path: Path) -> None:
     """Before anything is simulated."""
     arm = f'name = "a"\nupdate_period_ms = 28.0\ndelay_ms = 60.0\n[axes.{axis}]\nplant = "first-order"\n'

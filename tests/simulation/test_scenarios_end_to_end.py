@@ -37,9 +37,9 @@ class Worked:
 
     def __init__(self, name: str, folder: Path) -> None:
         self.run, self.result = folder / "run", folder / "result"
-        said = pumafuse("simulate", SCENARIOS / f"{name}.toml", "-o", self.run)
-        assert f"{name}: " in said
-        assert f"next: pumafuse fuse {self.run} -c {self.run / 'fusion.toml'} -o result" in said
+        printed = pumafuse("simulate", SCENARIOS / f"{name}.toml", "-o", self.run)
+        assert f"{name}: " in printed
+        assert f"next: pumafuse fuse {self.run} -c {self.run / 'fusion.toml'} -o result" in printed
         pumafuse("fuse", self.run, "-c", self.run / "fusion.toml", "-o", self.result)
         self.scores = json.loads(pumafuse("compare", self.result, "--json"))[0]["axes"]
         self.summary: dict[str, Any] = json.loads((self.result / "summary.json").read_text())
@@ -84,7 +84,7 @@ def test_a_camera_with_dropouts_and_outliers(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_camera_that_is_later_than_the_filter_is_told(tmp_path: Path) -> None:
+def test_a_camera_that_is_later_than_its_configuration_says(tmp_path: Path) -> None:
     """wrong-latency: a verdict names the latency, 25 ms at 60 mm/s are missing, error bars are worth nothing."""
     worked = Worked("wrong-latency", tmp_path)
     verdicts = [worked.sensor(axis, "vision")["verdict"] for axis in ("tangential", "vertical")]
@@ -113,14 +113,14 @@ def test_a_tracker_that_loses_its_target(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_cylindrical_arm_logged_in_x_y_z(tmp_path: Path) -> None:
-    """cylindrical-cartesian: x, y and z come back near the truth, and the range finder's 600 mm are found."""
+    """cylindrical-cartesian: x, y and z come back near the reference, and the range finder's 600 mm are found."""
     worked = Worked("cylindrical-cartesian", tmp_path)
     for axis, least, most in (("tangential", 0.145, 0.225), ("radial", 0.10, 0.175), ("vertical", 0.135, 0.245)):
         worked.check(axis, (least, most), (0.875, 1.0))
-    truth, time = pf.Run.read(worked.run).reference, worked.estimates("time_s")
-    assert truth is not None and list(truth.values) == ["x", "y", "z"]
+    reference, time = pf.Run.read(worked.run).reference, worked.estimates("time_s")
+    assert reference is not None and list(reference.values) == ["x", "y", "z"]
     for name in ("x", "y", "z"):
-        error = worked.estimates(f"{name}_mm") - np.interp(time, truth.stamp / 1e9, truth.values[name] * 1e3)
+        error = worked.estimates(f"{name}_mm") - np.interp(time, reference.stamp / 1e9, reference.values[name] * 1e3)
         assert 0.08 < np.sqrt(np.mean(error**2)) < 0.25
     found = worked.sensor("radial", "range")
     assert abs(found["bias_mm"] - 600.0) < 3.0 * found["bias_sd_mm"] < 0.1
@@ -151,7 +151,7 @@ def test_an_arm_that_is_not_as_modelled(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_fast_arm_under_a_fast_sensor(tmp_path: Path) -> None:
-    """fast-arm: errors are those of a 0.02 mm measurement up to 1 ms old, stamps that jitter by 0.3 ms notwithstanding."""
+    """fast-arm: errors are those of a 0.02 mm measurement up to 1 ms old, although stamps jitter by 0.3 ms."""
     worked = Worked("fast-arm", tmp_path)
     for axis, least, most in (("x1", 0.012, 0.0195), ("x2", 0.0155, 0.037)):
         worked.check(axis, (least, most), (0.932, 0.97))

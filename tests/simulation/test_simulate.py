@@ -47,7 +47,7 @@ def load(folder: Path, text: str) -> pf.Scenario:
 
 
 def same_source(one: Source, other: Source) -> None:
-    assert (one.stamp == other.stamp).all()
+    assert np.array_equal(one.stamp, other.stamp)
     assert list(one.values) == list(other.values)
     for axis in one.values:
         assert np.array_equal(one.values[axis], other.values[axis]), axis  # to the last bit
@@ -55,24 +55,6 @@ def same_source(one: Source, other: Source) -> None:
 
 def digests(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_a_run_is_the_same_in_memory_and_read_back(name: str, tmp_path: Path) -> None:
-    """Stamps, values, start, clock, frame, sd of the reference and the filter's configuration, bit for bit."""
-    simulated = pf.simulate(pf.Scenario.load(SCENARIOS / f"{name}.toml"))
-    write(simulated, tmp_path / "run", force=False)
-    again, run = pf.Run.read(tmp_path / "run"), simulated.run
-    same_source(run.command, again.command)
-    assert list(run.sensors) == list(again.sensors)
-    for sensor in run.sensors:
-        same_source(run.sensors[sensor], again.sensors[sensor])
-    assert run.reference is not None and again.reference is not None
-    same_source(run.reference, again.reference)
-    assert again.reference.sd == run.reference.sd
-    assert (again.name, again.start, again.clock, again.frame) == (run.name, run.start, run.clock, run.frame)
-    assert again.notes == ()
-    assert pf.FusionConfig.load(tmp_path / "run" / "fusion.toml") == simulated.config
 
 
 def test_a_reference_with_noise_of_its_own_says_so(tmp_path: Path) -> None:
@@ -84,29 +66,7 @@ def test_a_reference_with_noise_of_its_own_says_so(tmp_path: Path) -> None:
     assert abs(np.mean(noise**2) - 1.0) < 4.0 * (2.0 / len(noise)) ** 0.5
 
 
-@pytest.mark.parametrize("name", ["panel-vision", "step-campaign"])
-def test_the_same_seed_gives_the_same_bytes(name: str, tmp_path: Path) -> None:
-    """All files of two writes; another seed gives other commands' noise and measurements."""
-    scenario = pf.Scenario.load(SCENARIOS / f"{name}.toml")
-    for folder, seed in (("a", None), ("b", scenario.seed), ("c", scenario.seed + 1)):
-        write(pf.simulate(scenario, seed), tmp_path / folder, force=False)
-    first, second, third = (digests(tmp_path / folder) for folder in "abc")
-    assert first == second
-    sensors = [f"{sensor}.csv" for sensor in scenario.sensors]
-    assert all(first[file] != third[file] for file in ["truth.csv", "run.toml", *sensors])
-    assert first["fusion.toml"] == third["fusion.toml"]
-
-
-def test_another_sensor_changes_no_other_measurement_and_no_motion(tmp_path: Path) -> None:
-    """Commands, truth and measurements of what was there are the same to the last bit."""
-    one, two = (pf.simulate(load(tmp_path, BASE + more)).run for more in ("", EAR))
-    same_source(one.command, two.command)
-    assert one.reference is not None and two.reference is not None
-    same_source(one.reference, two.reference)
-    same_source(one.sensors["eye"], two.sensors["eye"])
-
-
-@pytest.mark.parametrize("rate", ["1.0", "78.0", "1000.0", "2142.0"])
+@pytest.mark.parametrize("rate", ["1.0", "78.0", "2142.0"])
 def test_another_rate_changes_no_other_measurement_and_no_motion(rate: str, tmp_path: Path) -> None:
     """To the last bit, on an arm that strays, has play, and whose commands are late by chance."""
     loose = BASE + "[true_arm]\nbacklash_mm = 0.2\nstiction_mm = 0.1\ndelay_jitter_ms = 2.0\n" + EAR
@@ -121,13 +81,9 @@ def test_another_rate_changes_no_other_measurement_and_no_motion(rate: str, tmp_
 @pytest.mark.parametrize(
     "fault",
     [
-        "dropouts = 0.3",
-        "outliers = { share = 0.2, from_mm = 5.0, to_mm = 9.0 }",
         "bursts = { per_minute = 60.0, length_s = 0.1 }",
-        "bias_sd_mm = 4.0",
+        "outliers = { share = 0.2, from_mm = 5.0, to_mm = 9.0 }",
         "latency_sd_ms = 3.0",
-        "quantisation_mm = 0.3",
-        "clock_drift_ppm = 80.0",
     ],
 )
 def test_a_fault_of_one_sensor_changes_no_other_sensor_and_no_motion(fault: str, tmp_path: Path) -> None:
@@ -136,16 +92,12 @@ def test_a_fault_of_one_sensor_changes_no_other_sensor_and_no_motion(fault: str,
     assert one.reference is not None and two.reference is not None
     same_source(one.reference, two.reference)
     same_source(one.sensors["eye"], two.sensors["eye"])
-    ears = one.sensors["ear"], two.sensors["ear"]
-    assert (
-        len(ears[0].stamp) != len(ears[1].stamp)
-        or any(not np.array_equal(a, b) for a, b in zip(ears[0].values.values(), ears[1].values.values(), strict=True))
-        or (ears[0].stamp != ears[1].stamp).any()
-    )
+    with pytest.raises(AssertionError):
+        same_source(one.sensors["ear"], two.sensors["ear"])
 
 
 @pytest.mark.parametrize("rows", [2, 7, 60])
-def test_more_rows_of_the_truth_change_no_measurement_and_no_motion(rows: int, tmp_path: Path) -> None:
+def test_more_rows_of_the_reference_change_no_measurement_and_no_motion(rows: int, tmp_path: Path) -> None:
     """How the reference is recorded is no part of what happens; each period's first row is at its command."""
     one, two = (pf.simulate(load(tmp_path, BASE + f"[reference]\nrows_per_command = {n}\n")).run for n in (1, rows))
     same_source(one.sensors["eye"], two.sensors["eye"])
@@ -154,10 +106,10 @@ def test_more_rows_of_the_truth_change_no_measurement_and_no_motion(rows: int, t
     same_source(one.reference, two.reference.rows(slice(None, None, rows)))
     apart = np.diff(two.reference.stamp) / (28e6 / rows)
     assert len(two.reference.stamp) == rows * len(two.command.stamp)
-    assert np.abs(apart - 1.0).max() <= rows / 60 + 1e-6  # even, but for the lattice
+    assert np.abs(apart - 1.0).max() <= rows / 60 + 1e-6  # even, but for the grid
 
 
-def test_commands_are_told_at_their_ticks_and_logged_with_jitter(tmp_path: Path) -> None:
+def test_commands_are_given_at_their_ticks_and_logged_with_jitter(tmp_path: Path) -> None:
     """The motion keeps to the ticks; stamps scatter around them by the sd asked for (4 standard errors), in order."""
     plain, jittering = (
         pf.simulate(load(tmp_path, BASE + more)).run
@@ -183,12 +135,6 @@ def test_start_levels_are_in_the_run_and_in_every_measurement(tmp_path: Path) ->
     for one, two in ((low.command, high.command), (low.sensors["eye"], high.sensors["eye"])):
         assert two.values["radial"] - one.values["radial"] == pytest.approx(0.560, abs=1.1e-9)
         assert np.array_equal(one.values["tangential"], two.values["tangential"])
-
-
-def test_a_start_table_with_a_level_alone_leaves_the_offset_known(tmp_path: Path) -> None:
-    """As without the table: what is not named has one default."""
-    bare, level = (load(tmp_path, BASE + more) for more in ("", "[start]\nlevel = { radial_mm = 560.0 }\n"))
-    assert bare.config.start == level.config.start
 
 
 def test_a_sensor_that_was_silent_for_the_whole_run_can_be_read(tmp_path: Path) -> None:
@@ -288,31 +234,45 @@ latency_ms = 33.3
 
 
 @pytest.mark.parametrize("name", [*ALL, "odd"])
-def test_a_written_folder_makes_the_same_run_again(name: str, tmp_path: Path) -> None:
-    """Its scenario.toml, loaded where it lies, is the scenario that was simulated, and gives the same bytes."""
+def test_a_written_folder_is_the_run_and_makes_it_again(name: str, tmp_path: Path) -> None:
+    """Read back, it is the run in memory, bit for bit; its scenario.toml gives the same bytes again."""
     if name == "odd":
         (tmp_path / "arm.toml").write_text((SCENARIOS / "paper-arm.toml").read_text())
         scenario = load(tmp_path, ODD)
     else:
         scenario = pf.Scenario.load(SCENARIOS / f"{name}.toml")
-    first = pf.simulate(scenario, 77)
-    assert first.scenario == scenario and first.seed == 77
-    write(first, tmp_path / "one", force=False)
-    again = pf.Scenario.load(tmp_path / "one" / "scenario.toml")
-    assert again.true_axes == scenario.true_axes and again.config == scenario.config
+    simulated = pf.simulate(scenario, 77)
+    assert simulated.scenario == scenario and simulated.seed == 77
+    write(simulated, tmp_path / "one", force=False)
+
+    again, run = pf.Run.read(tmp_path / "one"), simulated.run
+    same_source(run.command, again.command)
+    assert list(run.sensors) == list(again.sensors)
+    for sensor in run.sensors:
+        same_source(run.sensors[sensor], again.sensors[sensor])
+    assert run.reference is not None and again.reference is not None
+    same_source(run.reference, again.reference)
+    assert again.reference.sd == run.reference.sd
+    assert (again.name, again.start, again.clock, again.frame) == (run.name, run.start, run.clock, run.frame)
+    assert again.notes == ()
+    assert pf.FusionConfig.load(tmp_path / "one" / "fusion.toml") == simulated.config
+
+    loaded = pf.Scenario.load(tmp_path / "one" / "scenario.toml")
+    assert loaded.true_axes == scenario.true_axes and loaded.config == scenario.config
     whole = {"seed": 77, "true_arm": {}, "process": {}}  # tables that all axes share are written for each
-    assert msgspec.structs.replace(again, **whole) == msgspec.structs.replace(scenario, **whole)
-    write(pf.simulate(again), tmp_path / "two", force=False)
-    assert digests(tmp_path / "one") == digests(tmp_path / "two")
-    assert {"scenario.toml", "run.toml", "fusion.toml", "arm.toml", "commands.csv", "truth.csv"} <= set(
-        digests(tmp_path / "one")
-    )
+    assert msgspec.structs.replace(loaded, **whole) == msgspec.structs.replace(scenario, **whole)
+    write(pf.simulate(loaded), tmp_path / "two", force=False)
+    write(pf.simulate(loaded, 78), tmp_path / "other", force=False)
+    one, two, other = (digests(tmp_path / folder) for folder in ("one", "two", "other"))
+    assert one == two
+    assert {"scenario.toml", "run.toml", "fusion.toml", "arm.toml", "commands.csv", "truth.csv"} <= set(one)
+    assert all(one[f"{sensor}.csv"] != other[f"{sensor}.csv"] for sensor in run.sensors)
 
 
 @pytest.mark.parametrize("kind", ['kind = "cylindrical"', 'kind = "rotated"\nazimuth_deg = 37.0'])
 @pytest.mark.parametrize("positive", ["clockwise", "counterclockwise"])
 def test_a_log_in_x_y_z_gives_the_axes_back(kind: str, positive: str, tmp_path: Path) -> None:
-    """Turned into axes, commands and truth are those of the same scenario without a frame, to rounding (2 nm)."""
+    """Turned into axes, commands and reference are those of the same scenario without a frame, to rounding (2 nm)."""
     level = "[start]\noffset_sd_mm = 0.0\nlevel = { radial_mm = 560.0, tangential_mm = 0.0, vertical_mm = -100.0 }\n"
     frame = f'[frame]\n{kind}\npositive = "{positive}"\n' + ("base_mm = [20.0, -30.0]\n" if "cyl" in kind else "")
     text = "start_azimuth_deg = 110.0\n" + BASE + level
@@ -383,14 +343,14 @@ def test_trials_are_cut_from_the_run_at_their_commands(tmp_path: Path) -> None:
     samples = {k: np.array(v) for k, v in pacsv.read_csv(tmp_path / "run" / "samples.csv").to_pydict().items()}
     command = simulated.run.command
     steps = {axis: np.diff(value, prepend=value[0]) for axis, value in command.values.items()}
-    told = sorted((t, axis, s) for axis in steps for t, s in zip(command.stamp, steps[axis], strict=True) if s)
+    given = sorted((t, axis, s) for axis in steps for t, s in zip(command.stamp, steps[axis], strict=True) if s)
     assert trials["trial"] == list(range(1, 8))
-    assert trials["axis"] == [axis for _, axis, _ in told]
-    assert trials["step_mm"] == pytest.approx([step * 1e3 for _, _, step in told], abs=1e-6)
-    assert trials["speed_m_s"] == pytest.approx([abs(step) / 0.028 for _, _, step in told], abs=1e-6)
-    assert trials["direction"] == ["up" if step > 0.0 else "down" for _, _, step in told]
+    assert trials["axis"] == [axis for _, axis, _ in given]
+    assert trials["step_mm"] == pytest.approx([step * 1e3 for _, _, step in given], abs=1e-6)
+    assert trials["speed_m_s"] == pytest.approx([abs(step) / 0.028 for _, _, step in given], abs=1e-6)
+    assert trials["direction"] == ["up" if step > 0.0 else "down" for _, _, step in given]
     scope = simulated.run.sensors["scope"]
-    for number, (at, axis, step) in enumerate(told, 1):
+    for number, (at, axis, step) in enumerate(given, 1):
         mine = samples["trial"] == number
         time, position = samples["time_s"][mine], samples["position_mm"][mine]
         assert -0.05 <= time[0] < -0.047 and 0.397 < time[-1] <= 0.4
@@ -416,12 +376,3 @@ def test_the_next_step_is_not_in_a_trials_samples(tmp_path: Path) -> None:
     trials = pf.simulate(load(tmp_path, STEPS.replace("window_s = 0.4", "window_s = 0.7"))).trials
     assert trials is not None
     assert 0.69 < max(trials.time) <= 0.7
-
-
-def test_scenarios_leave_the_callers_arrays_alone(tmp_path: Path) -> None:
-    """Two simulations of one scenario share nothing that the first could spoil."""
-    scenario = load(tmp_path, BASE)
-    first = pf.simulate(scenario)
-    first.run.command.values["radial"][:] = np.nan
-    second = pf.simulate(scenario)
-    assert np.isfinite(second.run.command.values["radial"]).all()

@@ -64,7 +64,7 @@ def test_a_raster_covers_its_height(lines: int, pitch_mm: int) -> None:
 def test_a_raster_may_run_along_any_axes() -> None:
     """`along` and `across` name them."""
     found = Raster(along="radial", across="tangential", width=0.1, height=0.0, pitch=0.01, speed=0.1)
-    assert found.named == ("radial", "tangential")
+    assert found.moving == ("radial", "tangential")
     offsets = found.offsets(PERIOD, rng())
     assert offsets["radial"].max() == pytest.approx(0.1)
     assert not offsets["tangential"].any()
@@ -85,17 +85,13 @@ def test_a_campaign_has_every_combination_as_often_as_asked() -> None:
         assert up[1] > 0.0 and down == (up[0], -up[1])
 
 
-def test_a_campaign_is_in_random_order() -> None:
-    """Another seed gives another order, the same seed the same."""
+def test_a_campaign_is_in_random_order_and_can_be_cut_short() -> None:
+    """Another seed gives another order, the same seed the same; `trials` keeps the first of them."""
     plans = [campaign().plan(rng(seed)) for seed in (1, 1, 2)]
     assert plans[0] == plans[1] != plans[2]
     assert plans[0] != sorted(plans[0]) and sorted(plans[0]) == sorted(plans[2])
-
-
-@pytest.mark.parametrize("kept", [1, 7, 36, 1000])
-def test_a_campaign_can_be_cut_short(kept: int) -> None:
-    """`trials` keeps the first of them."""
-    assert campaign(trials=kept).plan(rng()) == campaign().plan(rng())[:kept]
+    for kept in (1, 7, 36, 1000):
+        assert campaign(trials=kept).plan(rng()) == plans[0][:kept]
 
 
 def test_steps_are_one_command_each_after_a_rest() -> None:
@@ -113,20 +109,14 @@ def test_steps_are_one_command_each_after_a_rest() -> None:
     assert len(found["a"]) == (len(plan) + 1) * pause  # the last trial has its rest too
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_white_noise_begins_where_the_arm_rests(seed: int) -> None:
-    """The first command of every axis is the start level."""
-    found = WhiteNoise(axes=["a", "b"], amplitude=0.008, duration=1.0).offsets(PERIOD, rng(seed))
-    assert (found["a"][0], found["b"][0]) == (0.0, 0.0)
-
-
 def test_white_noise_has_two_levels_and_changes_with_probability_one_half() -> None:
-    """Switches are binomial(n, ½) within their 99.9 % interval, and neighbours' are uncorrelated within 4/√n."""
+    """It begins at the start level; switches are binomial(n, ½) to 99.9 %, those of neighbours uncorrelated."""
     noise = WhiteNoise(axes=["a", "b"], amplitude=0.008, duration=140.0)
+    for seed in range(12):
+        assert [command[0] for command in noise.offsets(PERIOD, rng(seed)).values()] == [0.0, 0.0]
     found = noise.offsets(PERIOD, rng())
     switched: dict[str, NDArray[np.bool_]] = {}
     for axis, command in found.items():
-        assert command[0] == 0.0
         assert set(command.tolist()) == {0.0, 0.008}
         switched[axis] = np.diff(command) != 0.0
         count = len(switched[axis])
@@ -175,7 +165,7 @@ def table(folder: Path, text: str) -> PathFromFile:
 
 
 def test_a_path_from_a_file_is_linear_between_its_rows_and_starts_at_zero(tmp_path: Path) -> None:
-    """Relative to the first row, and time too: a log that starts at 5 s is told from its first row on."""
+    """Relative to the first row, and time too: a log that starts at 5 s is played from its first row on."""
     path = table(tmp_path, "time_s,a_mm,b_mm,more\n5.0,100.0,7.0,x\n5.1,110.0,7.0,y\n5.3,90.0,8.0,z\n")
     found = path.offsets(0.02, rng())
     time = 5.0 + np.arange(16) * 0.02
@@ -187,9 +177,7 @@ def test_a_path_from_a_file_is_linear_between_its_rows_and_starts_at_zero(tmp_pa
     ("rows", "expected"),
     [
         ("0.0,1.0,1.0\n0.0,2.0,1.0\n", "time_s must ascend"),
-        ("0.0,1.0,1.0\n0.2,2.0,1.0\n0.1,2.0,1.0\n", "time_s must ascend"),
         ("0.0,1.0,1.0\n,2.0,1.0\n", "time_s must ascend"),
-        ("0.0,1.0,1.0\n0.2,,1.0\n", "a_mm has a cell without a number"),
         ("0.0,1.0,1.0\n0.2,2.0,lost\n", "b_mm has a cell without a number"),
     ],
 )

@@ -12,7 +12,7 @@ from ..logs.run import Run
 from .fuse import draw, progress_of, record, show
 from .tables import console
 
-_SENSOR = "vision"  # alone: what a camera and a model can do together shows best without the laser tracker
+_SENSOR = "vision"  # alone: without the laser tracker it shows best what a camera and a model do together
 
 
 def run(output: Path, force: bool) -> None:
@@ -26,7 +26,7 @@ def run(output: Path, force: bool) -> None:
     out.print(
         "A 60 s scan of a panel by a PUMA 560 (simulated with masses, friction, elastic joints and servos of which the"
         " filter knows\nnothing): a command every 28 ms, a camera (0.5 mm noise, 45 ms late, dropouts and outliers),"
-        " and a truth to score against\nthat the filter never sees.\n"
+        " and a reference to score\nagainst that the filter never sees.\n"
     )
     with as_file(files("pumafuse") / "data") as data:
         recorded, config = Run.read(data / "scan1"), FusionConfig.load(data / "fusion.toml")
@@ -42,7 +42,7 @@ def run(output: Path, force: bool) -> None:
         out.print(
             f"\nWhat to open next:\n"
             f"  {output / 'fused.png'}   the run: command, measurements, estimate with its band\n"
-            f"  {output / 'error.png'}   its error against the truth, and the error bars\n"
+            f"  {output / 'error.png'}   its error against the reference, and the error bars\n"
             f"  {output / 'validation.png'}   is the filter as good as it says?\n"
             f"  rerun {output / 'fused.rrd'}   the same in the Rerun viewer\n"
             f"  {output / 'summary.json'}   every number of it\n"

@@ -21,27 +21,26 @@ def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
     scenario, out = Scenario.load(path), console(soft_wrap=True)
     if scenario.teaches:
         out.print(f"{scenario.name}: {scenario.teaches}", markup=False)
+    failed: dict[str, str] = {}
     if runs is None:
-        made, runs_in = [_one(scenario, scenario.seed, output, force)], str(output)
-        failed: dict[str, str] = {}
+        written, folders = [_simulate(scenario, scenario.seed, output, force)], str(output)
     else:
         seeds = range(scenario.seed, scenario.seed + runs)
-        jobs = {f"seed-{seed}": partial(_one, scenario, seed, output / f"seed-{seed}", force) for seed in seeds}
+        jobs = {f"seed-{seed}": partial(_simulate, scenario, seed, output / f"seed-{seed}", force) for seed in seeds}
         done, failed = each("simulating", jobs, [output / name for name in jobs])
-        made, runs_in = list(done.values()), str(output / "seed-*")
-    if made:
-        commands, measurements, trials = (sum(counts) for counts in zip(*made, strict=True))
-        counted = f"{commands} commands, {measurements} rows of measurements" + (
-            f", {trials} step trials" if trials else ""
-        )
-        written = f"{'1 run' if len(made) == 1 else f'{len(made)} runs'}: {counted}, written to {output}"
+        written, folders = list(done.values()), str(output / "seed-*")
+    if written:
+        commands, rows, trials = (sum(counts) for counts in zip(*written, strict=True))
+        counted = f"{commands} commands, {rows} rows of measurements" + (f", {trials} step trials" if trials else "")
+        how_many = "1 run" if len(written) == 1 else f"{len(written)} runs"
         config = min(output.glob("**/fusion.toml"))
-        out.print(f"{written}\nnext: pumafuse fuse {runs_in} -c {config} -o result", markup=False)
-    tell(failed, len(made) + len(failed), str(output))
+        out.print(f"{how_many}: {counted}, written to {output}", markup=False)
+        out.print(f"next: pumafuse fuse {folders} -c {config} -o result", markup=False)
+    tell(failed, len(written) + len(failed), str(output))
 
 
-def _one(scenario: Scenario, seed: int, folder: Path, force: bool) -> tuple[int, int, int]:
-    """Simulate one run and write it; how many commands, rows of measurements and step trials it has."""
+def _simulate(scenario: Scenario, seed: int, folder: Path, force: bool) -> tuple[int, int, int]:
+    """Simulate one run and write it; return its numbers of commands, rows of measurements and step trials."""
     simulation.check_writable(folder, force)
     simulated = simulation.simulate(scenario, seed)
     simulation.write(simulated, folder, force)

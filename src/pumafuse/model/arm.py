@@ -18,16 +18,16 @@ from .plants import PLANTS, Delay
 from .presets import PRESETS
 
 CANONICAL_AXES = ("tangential", "radial", "vertical")
-_PASSED = 1.005  # share of a limit from which two decimals show that it is passed
+_EXCEEDED = 1.005  # share of a limit from which two decimals show that it is exceeded
 
 
 class Gain(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Steady-state gain K = slope · speed + intercept, equation 11.
+    """Gain K = slope · speed + intercept of a step, equation 11.
 
     Attributes:
         slope: a [s/m] (the paper's Table II prints m/s; K has no unit, so it is s/m).
         intercept: b, the gain of an infinitely slow step.
-        slope_ci95: 95 % interval of a [s/m], where it was identified.
+        slope_ci95: 95 % interval of a [s/m], if it was identified.
         intercept_ci95: 95 % interval of b.
     """
 
@@ -42,15 +42,15 @@ class Gain(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 
 class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How one axis answers to its commands.
+    """The model of one axis.
 
     Attributes:
         plant: The plant, of unit gain.
-        gain: The gain against speed that acts on the command before it.
-        gain_recovery: Time constant [s] with which the arm's integral action takes the gain's error back; None: never.
-        gain_recovery_ci95: Its 95 % interval [s], where it was fitted.
-        delay: Dead time [s] of this axis where it differs from the arm's.
-        delay_ci95: Its 95 % interval [s], where it was fitted.
+        gain: The gain over speed, which acts on the command before the plant.
+        gain_recovery: Time constant [s] with which the gain error decays, by the servo's integral action; None: never.
+        gain_recovery_ci95: Its 95 % interval [s], if it was fitted.
+        delay: Dead time [s] of this axis if it differs from the arm's.
+        delay_ci95: Its 95 % interval [s], if it was fitted.
     """
 
     plant: PLANTS
@@ -62,7 +62,7 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class Validity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where the model was found to hold; beyond it pumafuse warns and goes on.
+    """Limits within which the model was found to hold; beyond them pumafuse warns and goes on.
 
     Attributes:
         max_speed: Commanded speed [m/s].
@@ -73,30 +73,31 @@ class Validity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     max_radius: Positive | None = msgspec.field(name="max_radius_mm", default=None)
 
     def excess(self, speed: float, radius: float | None) -> list[str]:
-        """One sentence for each limit that the highest commanded ``speed`` [m/s] or ``radius`` [m] passes."""
-        found: list[str] = []
-        if self.max_speed is not None and speed > self.max_speed * _PASSED:
-            found.append(
+        """One sentence for each limit that the highest commanded ``speed`` [m/s] or ``radius`` [m] exceeds."""
+        sentences: list[str] = []
+        if self.max_speed is not None and speed > self.max_speed * _EXCEEDED:
+            sentences.append(
                 f"commanded speed reaches {speed:.3g} m/s, {speed / self.max_speed:.2f} times the"
                 f" {self.max_speed:g} m/s that the arm model is valid for"
             )
         if self.max_radius is not None and radius is not None and radius > self.max_radius:
             beyond = (radius - self.max_radius) * MM
-            found.append(
+            sentences.append(
                 f"commands reach {radius * MM:.1f} mm from the base axis, {beyond:.1f} mm beyond the"
                 f" {self.max_radius * MM:g} mm that the arm model is valid for"
             )
-        return found
+        return sentences
 
 
 class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A combined model: what ``arm.toml`` holds, in SI units.
+    """The model of an arm: what ``arm.toml`` holds, in SI units.
 
     Attributes:
         name: For people.
         update_period: T [s], the time between commands.
         delay: Td [s], from the command to the plant's input.
         axes: One model for each axis.
+        delay_ci95: Its 95 % interval [s], if it was fitted.
         validity: Limits beyond which the model was not tried.
         provenance: Where the numbers come from; kept as it is.
     """
@@ -160,7 +161,8 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 def ordered_axes(names: set[str]) -> tuple[str, ...]:
     """Axis names in the order tangential, radial, vertical, then any others by name."""
-    return tuple(sorted(names, key=lambda name: (_rank(name), name)))
+    known = [name for name in CANONICAL_AXES if name in names]
+    return (*known, *sorted(names - set(known)))
 
 
 def commanded_speed(step: FloatArray, period: float) -> FloatArray:
@@ -168,12 +170,8 @@ def commanded_speed(step: FloatArray, period: float) -> FloatArray:
     return np.abs(step) / period
 
 
-def _rank(name: str) -> int:
-    return CANONICAL_AXES.index(name) if name in CANONICAL_AXES else len(CANONICAL_AXES)
-
-
 def _axis(table: Any, where: str, path: str) -> AxisModel:
-    """An axis table: the plant's keys stand beside the axis's own in the file, apart from them in Python."""
+    """The model of an axis from its table, in which the plant's keys stand beside the axis's own."""
     if not isinstance(table, dict):
         raise ConfigError(f"{where}: {path}: expected a table")
     keys: dict[str, Any] = dict(table)  # pyright: ignore[reportUnknownArgumentType]

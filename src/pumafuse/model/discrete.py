@@ -1,4 +1,4 @@
-"""The exact discrete form: what the plant does over an interval, and the delay-augmented model at one period.
+"""Exact discretisation: a plant's transition over any interval, and the delay-augmented model at one period.
 
 Åström & Wittenmark, Computer-Controlled Systems, 3rd ed., pp. 38-41, for the delay; Van Loan, "Computing integrals
 involving the matrix exponential", IEEE Trans. AC 23(3), 1978, for the noise. No Padé approximation anywhere.
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Transition(NamedTuple):
-    """What a plant does over an interval h with its input held; leading axes follow the intervals asked for.
+    """A plant's transition over an interval h with constant input; leading axes are those of the intervals.
 
     Attributes:
         Phi: e^(Ah), (..., n, n).
@@ -52,9 +52,9 @@ def transition(plant: Plant, interval: npt.ArrayLike) -> Transition:
     fastest = np.abs(np.linalg.eigvals(A)).max()
     doublings = np.ceil(np.log2(np.maximum(dt * fastest, 1.0))).astype(np.int64)
     h = (dt / np.exp2(doublings))[..., None, None]
-    held = expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * h)
+    constant_input = expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * h)
     van_loan = expm(np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]]) * h)
-    Phi, Gamma = held[..., :n, :n].copy(), held[..., :n, n:].copy()
+    Phi, Gamma = constant_input[..., :n, :n].copy(), constant_input[..., :n, n:].copy()
     Q = Phi @ van_loan[..., :n, n:]
     for k in range(int(doublings.max(initial=0))):
         more = doublings > k
@@ -76,7 +76,7 @@ class DiscreteModel:
         Q: (m, m) [SI].
         period: T [s].
         delay: Td [s].
-        states: The m state names: the plant's, ``offset`` where asked for, and the past inputs ``v[n-1]`` … ``v[n-r]``.
+        states: The m state names: the plant's, ``offset`` if asked for, and the past inputs ``v[n-1]`` … ``v[n-r]``.
     """
 
     F: FloatArray
@@ -94,7 +94,7 @@ class DiscreteModel:
 
     @property
     def split(self) -> tuple[int, float]:
-        """The delay in whole ticks, and what is left of it [s]."""
+        """The delay in whole ticks, and the rest of it [s]."""
         return split_delay(self.delay, self.period)
 
     def step_response(self, ticks: int) -> FloatArray:
@@ -115,7 +115,7 @@ class DiscreteModel:
         return control.ss(F, B, H, 0.0, self.period, inputs=["v"], outputs=["p"])
 
     def to_filterpy(self) -> KalmanFilter:
-        """A `filterpy` filter with F, B, H and Q set, at rest and certain of it (x = 0, P = 0); R is the user's."""
+        """A `filterpy` filter with F, B, H and Q set, at rest without uncertainty (x = 0, P = 0); R is the user's."""
         from filterpy.kalman import KalmanFilter
 
         kf = KalmanFilter(dim_x=len(self.F), dim_z=1, dim_u=1)

@@ -1,4 +1,4 @@
-"""Plants: what the arm does to a command once gain and delay have had their say. All have unit gain.
+"""Plants: how an axis responds to its input, behind gain and delay. All have unit gain.
 
 Equations 3 to 9 of "A Practical Dynamic Model of a Puma 560 Manipulator for Aircraft Maintenance", without the gain K.
 A new plant is a class here with a tag and the methods of :class:`Plant`, added to ``PLANTS``.
@@ -39,7 +39,7 @@ class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid
 
     @property
     def lag(self) -> float:
-        """How far the plant is behind an input of constant velocity [s]."""
+        """The plant's lag behind an input of constant velocity [s]."""
         raise NotImplementedError
 
 
@@ -48,7 +48,7 @@ class FirstOrder(Plant, frozen=True, kw_only=True, tag="first-order", forbid_unk
 
     Attributes:
         time_constant: τ [s].
-        time_constant_ci95: Its 95 % interval [s], where it was identified.
+        time_constant_ci95: Its 95 % interval [s], if it was identified.
     """
 
     time_constant: Positive = msgspec.field(name="time_constant_ms")
@@ -82,7 +82,7 @@ class SecondOrder(Plant, frozen=True, kw_only=True, tag="second-order", forbid_u
     Attributes:
         natural_frequency: ω [rad/s].
         damping: ζ; below 1 under-damped, above 1 over-damped.
-        natural_frequency_ci95: 95 % interval of ω [rad/s], where it was identified.
+        natural_frequency_ci95: 95 % interval of ω [rad/s], if it was identified.
         damping_ci95: 95 % interval of ζ.
     """
 
@@ -110,7 +110,7 @@ class SecondOrder(Plant, frozen=True, kw_only=True, tag="second-order", forbid_u
         return 2.0 * self.damping / self.natural_frequency
 
     def step_response(self, time: npt.ArrayLike) -> FloatArray:
-        """Equations 6 and 9 and the ζ = 1 between them, see :func:`pumafuse.model.response.unit_response`."""
+        """Equations 6 and 9, and ζ = 1 between them; see :func:`.unit_response.unit_response`."""
         return unit_response(np.asarray(time, dtype=np.float64), self.lag, self.natural_frequency**-2)
 
 

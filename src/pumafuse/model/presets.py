@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 # The paper has no recovery; without one its gains would put a 300 mm scan 15 mm off. 100 ms is a compromise between
-# the axes, found on a simulated scan.
+# the axes, from a simulated scan.
 _PUMA560 = """\
 name = "PUMA 560, {mode} ALTER"
 update_period_ms = 28.0

@@ -1,4 +1,4 @@
-"""The unit step response in coordinates that stay finite: 1/(p s² + q s + 1) with q = 2ζ/ω (or τ) and p = 1/ω²."""
+"""The unit step response of 1/(p s² + q s + 1); q = 2ζ/ω (or τ) and p = 1/ω² stay finite for a first order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _TOGETHER = 0.3  # (T₁ − T₂)/(T₁ + T₂) of two poles below which their 
 
 
 def unit_response(time: FloatArray | float, q: FloatArray | float, p: FloatArray | float) -> FloatArray:
-    """c(t) of 1/(p s² + q s + 1), 0 before t = 0; all three broadcast, p ≥ 0 and q > 0.
+    """Unit step response c(t) of 1/(p s² + q s + 1), 0 before t = 0; all three broadcast, p ≥ 0 and q > 0.
 
     Equations 4, 6 and 9, joined at ζ = 1, where 6 and 9 divide by √|ζ² − 1| and lose all digits. Time constants T₁ ≥ T₂
     of an over-damped plant are q/2 ± √(q²/4 − p).

@@ -1,1 +1,1 @@
-"""Recorded runs on demand, with the truth in them."""
+"""Simulated recorded runs, with the true motion as their reference."""

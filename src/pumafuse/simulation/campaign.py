@@ -1,4 +1,4 @@
-"""The step trials of a simulated campaign, cut from the run that goes through all of them."""
+"""Cuts the step trials of a simulated campaign from the run that goes through all of them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Trials:
     """A campaign of step trials; arrays are (trials,) and (samples,).
 
     Attributes:
-        axis: Which axis is stepped.
-        step: By how much, signed [m].
-        speed: Of the step: its size over T [m/s].
-        trial: Of each sample, its trial's number.
-        time: Of each sample since its step's command [s].
-        position: Of each sample [m], as the scope has it.
+        axis: Axis of each trial.
+        step: Its step, signed [m].
+        speed: The step's size over T [m/s].
+        trial: Number of each sample's trial.
+        time: Time of each sample since its step's command [s].
+        position: Position of each sample [m], as the scope measured it.
     """
 
     axis: tuple[str, ...]
@@ -41,15 +41,15 @@ class Trials:
     position: FloatArray
 
 
-def cut(
-    scenario: Scenario, tick: TimeArray, told: Mapping[str, FloatArray], sensors: Mapping[str, Source]
+def cut_trials(
+    scenario: Scenario, tick: TimeArray, commands: Mapping[str, FloatArray], sensors: Mapping[str, Source]
 ) -> Trials | None:
     """The trials of a step campaign, cut from its run; None for another trajectory.
 
     Args:
         scenario: What was simulated.
         tick: When each command was given, int64 ns, (n,).
-        told: By axis the commands [m], relative to the start level, (n,).
+        commands: The commands by axis [m], (n,).
         sensors: The measurements of the run, among them the scope's.
     """
     campaign = scenario.trajectory
@@ -57,38 +57,41 @@ def cut(
         return None
     scope, period = sensors[campaign.scope], scenario.arm.update_period
     valid = scope.stamp / 1e9 - scenario.sensors[campaign.scope].latency
-    axis_of, step, samples = list[str](), list[float](), list[tuple[int, FloatArray, FloatArray]]()
-    for number in range(1, len(tick) // campaign.ticks_between(period)):
-        at = number * campaign.ticks_between(period)
-        axis = next(axis for axis, command in told.items() if command[at] != command[at - 1])
+    pause = campaign.ticks_between(period)
+    axes, step = list[str](), list[float]()
+    trial, time, position = list[IntArray](), list[FloatArray](), list[FloatArray]()
+    for number, at in enumerate(range(pause, len(tick), pause), 1):
+        axis = next(axis for axis, command in commands.items() if command[at] != command[at - 1])
         since = valid - tick[at] / 1e9
-        kept = (since >= -_BEFORE) & (since <= campaign.window)
-        axis_of.append(axis)
-        step.append(float(told[axis][at] - told[axis][at - 1]))
-        samples.append((number, since[kept], scope.values[axis][kept]))
+        inside = (since >= -_BEFORE) & (since <= campaign.window)
+        axes.append(axis)
+        step.append(float(commands[axis][at] - commands[axis][at - 1]))
+        trial.append(np.full(int(inside.sum()), number))
+        time.append(since[inside])
+        position.append(scope.values[axis][inside])
     return Trials(
-        tuple(axis_of),
-        np.array(step),
-        np.abs(step) / period,
-        np.concatenate([np.full(len(time), number) for number, time, _ in samples]),
-        np.concatenate([time for _, time, _ in samples]),
-        np.concatenate([position for _, _, position in samples]),
+        axis=tuple(axes),
+        step=np.array(step),
+        speed=np.abs(step) / period,
+        trial=np.concatenate(trial),
+        time=np.concatenate(time),
+        position=np.concatenate(position),
     )
 
 
-def write(trials: Trials, folder: Path) -> None:
+def write_trials(trials: Trials, folder: Path) -> None:
     """Write ``trials.csv`` and ``samples.csv`` as `identify` reads them."""
-    listed = {
+    of_trials = {
         "trial": np.arange(1, len(trials.axis) + 1),
         "axis": list(trials.axis),
         "step_mm": np.round(trials.step * MM, 6),
         "speed_m_s": np.round(trials.speed, 6),
-        "direction": ["up" if step > 0.0 else "down" for step in trials.step.tolist()],
+        "direction": np.where(trials.step > 0.0, "up", "down"),
     }
-    sampled = {
+    of_samples = {
         "trial": trials.trial,
         "time_s": np.round(trials.time, 9),
         "position_mm": np.round(trials.position * MM, 6),
     }
-    tables.write(pa.table(listed), folder / TRIALS)
-    tables.write(pa.table(sampled), folder / SAMPLES)
+    tables.write(pa.table(of_trials), folder / TRIALS)
+    tables.write(pa.table(of_samples), folder / SAMPLES)

@@ -1,8 +1,11 @@
-"""How the true arm moves: the plant as a sum of its poles' responses, integrated exactly from event to event.
+"""Simulates the motion of the true arm: the plant as a sum of its poles' responses, exact from event to event.
 
-H(s) = Σ r_i / (s − p_i): each pole is a component equation ż = p z + v + w, and over an interval Δ of constant v
-z⁺ = e^(pΔ) z + (e^(pΔ) − 1)/p · v + ∫ e^(p(Δ−s)) dW(s). Nothing of the filter's discretisation is used here: this is
-what it is tested against.
+H(s) = Σ r_i / (s − p_i): each pole is a scalar equation ż = p z + u + e + w. The command u is constant from event to
+event, the gain error e decays as exp(−bt) with b = 1 / recovery, so that over an interval Δ
+
+    z⁺ = e^(pΔ) z + (e^(pΔ) − 1)/p · u + (e^(pΔ) − e^(−bΔ))/(p + b) · e + ∫ e^(p(Δ−s)) dW(s).
+
+Nothing of the filter's discretisation is used here: the filter is tested against this.
 """
 
 from __future__ import annotations
@@ -17,23 +20,23 @@ from ..arrays import FloatArray, TimeArray
 from ..errors import ConfigError
 from ..fusion.config import Process
 from ..model.plants import FirstOrder
-from .lattice import lattice
+from .grid import grid
 from .true_arm import TrueAxis
 
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
 _APART = {2: 1e-5, 3: 1e-4}  # equal poles are set this far apart, relatively: it changes the response by its square
-_NODES = 3  # of the noise integral: exact to 1e-10 while |p|Δ ≤ 0.1
-_TURN = 0.1
+_NODES = 3  # of the noise integral: exact to 1e-10 while |p|Δ ≤ _LONGEST_TURN
+_LONGEST_TURN = 0.1
 _MOST_EVENTS = 20_000_000  # 2 GB of work
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Where the tool truly was on one axis.
+    """The true position of one axis.
 
     Attributes:
-        time: Int64 ns, ascending, (k,); among them the lattice.
+        time: Int64 ns, ascending, (k,); it contains the grid.
         position: [m] relative to the start level, (k,).
     """
 
@@ -41,11 +44,11 @@ class Motion:
     position: FloatArray
 
     def at(self, time: TimeArray) -> FloatArray:
-        """Positions [m] at instants of the lattice, (n,)."""
+        """Positions [m] at instants of the grid, (n,)."""
         return self.position[np.searchsorted(self.time, time)]
 
 
-def move(
+def simulate_axis(
     axis: TrueAxis,
     process: Process,
     offset_sd: float,
@@ -54,71 +57,95 @@ def move(
     period: float,
     rng: np.random.Generator,
 ) -> Motion:
-    """Move one axis through its commands.
+    """Simulate the motion of one axis through its commands.
 
     Args:
         axis: The true axis.
-        process: How it strays.
-        offset_sd: Of its offset at the start [m].
+        process: Its process noise.
+        offset_sd: Standard deviation of its offset at the start [m].
         issued: When each command is given, on the ticks of T, int64 ns, (n,).
         command: Relative to the start level [m], (n,).
         period: T [s].
         rng: Draws everything random of this axis.
 
     Returns:
-        The motion, exact on the lattice, until one period after the last command.
+        The motion, exact on the grid, until one period after the last command.
+
+    Raises:
+        ConfigError: A time constant is too short for so long a run.
     """
     noises = rng.spawn(4)  # so that one kind of noise changes no other
-    acting = issued + np.rint(_delays(axis, len(issued), noises[0]) * 1e9).astype(np.int64)
+    delay = np.maximum(axis.delay + axis.delay_jitter * noises[0].standard_normal(len(issued)), 0.0)
+    acting = issued + np.rint(delay * 1e9).astype(np.int64)
     acting = np.maximum.accumulate(acting)  # commands do not overtake one another
     poles, residues = _modes(axis)
-    time = _events(acting, lattice(len(issued), period), float(np.abs(poles).max()))
+    time = _events(acting, grid(len(issued), period), float(np.abs(poles).max()))
     interval = np.diff(time) / 1e9
-    entry = np.searchsorted(acting, time[:-1], side="right") - 1  # −1: the arm still rests
-    resting = entry < 0
-    v = np.where(resting, 0.0, _plant_input(axis, command, period)[entry])
-    maneuver = np.abs(np.diff(command, n=2, prepend=[0.0, 0.0])) / period
-    m = np.where(resting, 0.0, maneuver[entry])
-    q = process.input_noise**2 + (process.maneuver_noise * m) ** 2
-    drift = process.drift**2 + (process.maneuver_drift * m) ** 2
+    latest = np.searchsorted(acting, time[:-1], side="right")  # 0: the arm still rests, n: command n − 1 acts
 
-    smooth = np.zeros(len(time))
-    smooth[1:] = _response(poles, residues, interval, v, np.sqrt(q), noises[1])
-    position = _play(smooth, axis.backlash)
-    offset = np.cumsum(np.sqrt(drift * interval) * noises[2].standard_normal(len(interval)))
-    position[1:] += offset
+    decay_rate = 0.0 if axis.gain_recovery is None else 1.0 / axis.gain_recovery
+    level, error = _plant_input(axis, command, acting, period, decay_rate)
+    since = time[:-1] - np.insert(acting, 0, 0)[latest]
+    level, error = (np.insert(value, 0, 0.0)[latest] for value in (level, error))
+    maneuver = (np.abs(np.diff(command, n=2, prepend=[0.0, 0.0, 0.0])) / period)[latest]
+    q = process.input_noise**2 + (process.maneuver_noise * maneuver) ** 2
+    drift = process.drift**2 + (process.maneuver_drift * maneuver) ** 2
+
+    node, weight = np.polynomial.legendre.leggauss(_NODES)
+    white = noises[1].standard_normal((len(interval), _NODES)) * np.sqrt(0.5 * weight)
+    white *= np.sqrt(interval * q)[:, None]
+    error = error * np.exp(-decay_rate * since / 1e9)
+    distinct, place = np.unique(interval, return_inverse=True)
+    position = np.zeros(len(time))
+    for pole, residue in zip(poles, residues, strict=True):
+        if pole.imag < 0.0:
+            continue  # its conjugate stands for both
+        share = residue if pole.imag == 0.0 else 2.0 * residue
+        response = np.exp(pole * 0.5 * (node + 1.0) * distinct[:, None])[place]
+        forced = _response(pole, 0.0, distinct)[place] * level + _response(pole, -decay_rate, distinct)[place] * error
+        forced += np.einsum("ij,ij->i", response, white)
+        position[1:] += (share * _sum_of_decays(np.exp(pole * distinct)[place], forced)).real
+
+    position = _backlash(position, axis.backlash)
+    position[1:] += np.cumsum(np.sqrt(drift * interval) * noises[2].standard_normal(len(interval)))
     position += offset_sd * noises[3].standard_normal()
     if axis.slow_drift:
         position += axis.slow_drift * np.sin(2.0 * np.pi * (time - time[0]) / 1e9 / axis.slow_drift_period)
     return Motion(time, position)
 
 
-def _delays(axis: TrueAxis, count: int, rng: np.random.Generator) -> FloatArray:
-    """Td of each command [s], never negative."""
-    return np.maximum(axis.delay + axis.delay_jitter * rng.standard_normal(count), 0.0)
+def _plant_input(
+    axis: TrueAxis, command: FloatArray, acting: TimeArray, period: float, decay_rate: float
+) -> tuple[FloatArray, FloatArray]:
+    """The plant's input from each command on: its constant part and the gain error that decays from there [m], (n,).
 
-
-def _plant_input(axis: TrueAxis, command: FloatArray, period: float) -> FloatArray:
-    """Command, gain error that recovers from tick to tick, and what sticking lets through [m]."""
+    With stiction the drive decides when a command acts. It stays, or goes to its input of that instant, and holds
+    that until the next command: nothing of its input decays in between.
+    """
     step = np.diff(command, prepend=0.0)
-    kick = (axis.gain_at(np.abs(step) / period) - 1.0) * step
-    kept = 1.0 if axis.gain_recovery is None else float(np.exp(-period / axis.gain_recovery))
-    v = command + _sum_of_decays(np.full(len(kick), kept, dtype=np.complex128), kick.astype(np.complex128)).real
-    return _stick(v, axis.stiction) if axis.stiction else v
-
-
-def _stick(v: FloatArray, stiction: float) -> FloatArray:
-    """The drive stays where it is until its input is ``stiction`` [m] away, then goes all the way."""
-    found, held = np.empty_like(v), 0.0
-    for number, wanted in enumerate(v.tolist()):
-        if abs(wanted - held) > stiction:
+    jump = (axis.gain_at(np.abs(step) / period) - 1.0) * step
+    decay = np.exp(-decay_rate * np.diff(acting, prepend=acting[0]) / 1e9)
+    error = _sum_of_decays(decay.astype(np.complex128), jump.astype(np.complex128)).real
+    if not axis.stiction:
+        return command, error
+    held, level = 0.0, np.empty_like(command)
+    for number, wanted in enumerate((command + error).tolist()):
+        if abs(wanted - held) > axis.stiction:
             held = wanted
-        found[number] = held
-    return found
+        level[number] = held
+    return level, np.zeros_like(level)
+
+
+def _response(pole: complex, rate: float, interval: FloatArray) -> ComplexArray:
+    """∫ e^(pole (Δ − s)) e^(rate s) ds over each interval Δ [s]: what a pole makes of an input that grows so."""
+    slow, fast = (rate, pole) if pole.real < rate else (pole, rate)
+    apart = fast - slow
+    growth = np.expm1(apart * interval) / apart if apart else interval  # no digits lost where they nearly coincide
+    return np.asarray(np.exp(slow * interval) * growth, dtype=np.complex128)
 
 
 def _modes(axis: TrueAxis) -> tuple[ComplexArray, ComplexArray]:
-    """Poles p_i [rad/s] and residues r_i of the plant, and of the extra pole in series with it."""
+    """Poles p_i [rad/s] and residues r_i of the plant in series with its extra pole."""
     plant = axis.plant
     if isinstance(plant, FirstOrder):
         poles = [complex(-1.0 / plant.time_constant)]
@@ -137,59 +164,34 @@ def _modes(axis: TrueAxis) -> tuple[ComplexArray, ComplexArray]:
 
 def _set_apart(poles: ComplexArray) -> ComplexArray:
     """Poles that (nearly) coincide, spread evenly about their mean, so that each is a mode of its own."""
-    found = poles.copy()
+    separate = poles.copy()
     for pole in poles:
         together = np.abs(poles - pole) < max(_APART.values()) * np.abs(pole)
         count = int(together.sum())
         nearest = np.abs(poles[together][:, None] - poles[together][None, :])[np.triu_indices(count, 1)]
         if count > 1 and nearest.min() < _APART[count] * np.abs(pole):
             spread = (np.arange(count) - 0.5 * (count - 1)) * (2.0 * _APART[count])
-            found[together] = poles[together].mean().real * (1.0 + spread)
-    return found
+            separate[together] = poles[together].mean().real * (1.0 + spread)
+    return separate
 
 
-def _events(acting: TimeArray, lattice: TimeArray, fastest: float) -> TimeArray:
-    """Where something changes or may be looked at, and as many instants between as the noise integral needs."""
-    longest = max(int(_TURN * 1e9 / fastest), 1)
-    acting = acting[acting <= lattice[-1]]
-    if lattice[-1] / longest > _MOST_EVENTS:
-        shortest = lattice[-1] / 1e6 / _MOST_EVENTS / _TURN
+def _events(acting: TimeArray, instants: TimeArray, fastest: float) -> TimeArray:
+    """The grid's ``instants``, those at which a command acts, and as many between as the noise integral needs."""
+    longest = max(int(_LONGEST_TURN * 1e9 / fastest), 1)
+    end = instants[-1]
+    if end / longest > _MOST_EVENTS:
+        shortest = end / 1e6 / _MOST_EVENTS / _LONGEST_TURN
         raise ConfigError(
-            f"a lag or time constant of {1e3 / fastest:.3g} ms is too short to follow over {lattice[-1] / 1e9:.0f} s:"
+            f"a lag or time constant of {1e3 / fastest:.3g} ms is too short to follow over {end / 1e9:.0f} s:"
             f" at least {shortest:.2g} ms"
         )
-    finer = np.arange(0, lattice[-1] if longest < lattice[1] else 0, longest, dtype=np.int64)
-    return np.unique(np.concatenate((acting, lattice, finer)))
+    finer = np.arange(0, end if longest < instants[1] else 0, longest, dtype=np.int64)
+    return np.unique(np.concatenate((acting[acting <= end], instants, finer)))
 
 
-def _response(
-    poles: ComplexArray,
-    residues: ComplexArray,
-    interval: FloatArray,
-    v: FloatArray,
-    density: FloatArray,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """The plant's position after each interval [m], from rest, (intervals,)."""
-    node, weight = np.polynomial.legendre.leggauss(_NODES)
-    white = rng.standard_normal((len(interval), _NODES)) * np.sqrt(0.5 * weight)
-    white *= (np.sqrt(interval) * density)[:, None]
-    distinct, place = np.unique(interval, return_inverse=True)
-    position = np.zeros(len(interval))
-    for pole, residue in zip(poles, residues, strict=True):
-        if pole.imag < 0.0:
-            continue  # its conjugate stands for both
-        share = residue if pole.imag == 0.0 else 2.0 * residue
-        aged = np.exp(pole * 0.5 * (node + 1.0) * distinct[:, None])[place]
-        forced = (np.expm1(pole * distinct) / pole)[place] * v
-        kick = np.einsum("ij,ij->i", aged, white) + forced
-        position += (share * _sum_of_decays(np.exp(pole * distinct)[place], kick)).real
-    return position
-
-
-def _sum_of_decays(decay: ComplexArray, kick: ComplexArray) -> ComplexArray:
-    """z_n = decay_n · z_(n−1) + kick_n from z = 0, by doubling strides."""
-    factor, total, stride = decay.copy(), kick.copy(), 1
+def _sum_of_decays(decay: ComplexArray, added: ComplexArray) -> ComplexArray:
+    """z_n = decay_n · z_(n−1) + added_n from z = 0, by doubling strides."""
+    factor, total, stride = decay.copy(), added.copy(), 1
     while stride < len(total) and np.abs(factor[stride:]).max() > 1e-30:
         total[stride:] += factor[stride:] * total[:-stride].copy()
         factor[stride:] *= factor[:-stride].copy()
@@ -198,8 +200,8 @@ def _sum_of_decays(decay: ComplexArray, kick: ComplexArray) -> ComplexArray:
     return total
 
 
-def _play(position: FloatArray, width: float) -> FloatArray:
-    """What is left behind a gear with ``width`` [m] of backlash: y_n = clip(y_(n−1), x_n − width/2, x_n + width/2).
+def _backlash(position: FloatArray, width: float) -> FloatArray:
+    """The position behind a gear with ``width`` [m] of play: y_n = clip(y_(n−1), x_n − width/2, x_n + width/2).
 
     Clips chain into clips, so doubling strides do all of them.
     """

@@ -1,4 +1,4 @@
-"""``scenario.toml``: an arm, what differs in the true one, a trajectory, sensors, and what the filter believes."""
+"""``scenario.toml``: an arm model, the true arm, a trajectory, sensors, and the filter's configuration."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from ..logs.manifest import axis_of
 from ..logs.run import Clock
 from ..model.arm import ArmModel
 from ..toml import NotNegative
-from .lattice import LATTICE
+from .grid import POINTS
 from .trajectory import TRAJECTORIES, PathFromFile, Steps
 from .true_arm import TrueArm, TrueAxis
 from .true_sensor import TrueSensor
 
 _OVERRIDES = ("start", "process", "sensors")
-_LEAST, _FARTHEST, _LONGEST = 1e-12, 1e5, 4e9  # SI; 100 km, 127 years
+_SMALLEST, _LARGEST_LENGTH, _LARGEST = 1e-12, 1e5, 4e9  # SI; 100 km, 127 years
 
 
 class CommandLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -39,15 +39,15 @@ class CommandLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     clock: Clock = "stamps"
 
 
-class Truth(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class ReferenceLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """How the reference is recorded.
 
     Attributes:
         rows_per_command: Rows in each update period, the first at the command's own instant.
-        sd: Noise of its own [m].
+        sd: Standard deviation of its noise [m].
     """
 
-    rows_per_command: Annotated[int, msgspec.Meta(gt=0, le=LATTICE)] = 5
+    rows_per_command: Annotated[int, msgspec.Meta(gt=0, le=POINTS)] = 5
     sd: NotNegative = msgspec.field(name="sd_mm", default=0.0)
 
 
@@ -55,7 +55,7 @@ class TrueStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """Where the arm rests before the first command.
 
     Attributes:
-        offset_sd: Of the offset there, drawn for each run and axis [m].
+        offset_sd: Standard deviation of the offset there, drawn for each run and axis [m].
         level: By axis [m]; 0 where absent.
     """
 
@@ -69,18 +69,18 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     Attributes:
         name: For people and for the runs' names.
         teaches: A sentence on what it is good for.
-        seed: Of the first run.
-        arm: What the filter believes.
-        true_arm: What is different about the true arm, by axis.
-        trajectory: What the arm is told.
-        start: Where it rests before.
-        process: How each axis strays from its model.
+        seed: Seed of the first run.
+        arm: The arm model that the filter has.
+        true_arm: How the true arm differs from it, by axis.
+        trajectory: The commands.
+        start: Where the arm rests before the first command.
+        process: True process noise, by axis.
         command: How the commands are logged.
-        reference: How the truth is recorded.
-        sensors: What each sensor truly does.
+        reference: How the true motion is recorded.
+        sensors: How each sensor measures.
         frame: With one, commands, sensors and reference are logged in x, y, z.
         start_azimuth: Direction of the start level from the base, counterclockwise from x [degrees, as in the file].
-        filter: What the filter believes otherwise than it is: tables of ``fusion.toml`` that override.
+        filter: Tables of ``fusion.toml`` in which the filter's configuration differs from what is simulated.
     """
 
     name: str
@@ -92,22 +92,23 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     start: TrueStart = TrueStart()
     process: dict[str, Process] = {}
     command: CommandLog = CommandLog()
-    reference: Truth = Truth()
+    reference: ReferenceLog = ReferenceLog()
     sensors: dict[str, TrueSensor] = {}
     frame: Frame | None = None
     start_azimuth: float = msgspec.field(name="start_azimuth_deg", default=0.0)
     filter: dict[str, Any] = {}
 
     def __post_init__(self) -> None:
-        for name in (*self.trajectory.named, *self.start.level):
+        for name in (*self.trajectory.moving, *self.start.level):
             self.arm.axis(name)
         for name in self.arm.axes:
             save.check_axis(name)
         for name, sensor in self.sensors.items():
             save.check_name(name)
+            self._check_axes_of(f"sensors.{name}", sensor)
             self._check(f"sensors.{name}", sensor)
         if isinstance(self.trajectory, Steps):
-            self._check_steps(self.trajectory)
+            self._check_scope(self.trajectory)
         for key in self.filter:
             if key not in _OVERRIDES:
                 raise UnknownNameError("filter", "table", key, _OVERRIDES)
@@ -116,28 +117,29 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
                 raise ConfigError("frame: an arm in x, y, z needs the axes tangential and radial")
             if not self.start.level.get("radial", 0.0) > 0.0:
                 raise ConfigError("frame: start.level.radial_mm must say how far from the base's axis the arm starts")
-        _ = self.config, self.true_axes  # what does not fit together is said now
+        _ = self.config, self.true_axes  # raise now if something does not fit together
 
-    def _check(self, where: str, sensor: TrueSensor) -> None:
-        logged = CARTESIAN if self.frame is not None and sensor.axes is None else tuple(self.arm.axes)
-        named = {
-            "axes": sensor.axes or [],
-            "sd_mm": sensor.sd if isinstance(sensor.sd, dict) else [],
-            "bias_mm": sensor.bias if isinstance(sensor.bias, dict) else [],
-        }
-        for key, names in named.items():
-            for name in names:
+    def _check_axes_of(self, where: str, sensor: TrueSensor) -> None:
+        in_xyz = self.frame is not None and sensor.axes is None
+        logged = CARTESIAN if in_xyz else tuple(self.arm.axes)
+        for key, named in (("axes", sensor.axes), ("sd_mm", sensor.sd), ("bias_mm", sensor.bias)):
+            for name in named if isinstance(named, list | dict) else ():
                 if name not in logged:
                     raise UnknownNameError(f"{where}.{key}", "axis", name, logged)
-        if logged is CARTESIAN and isinstance(sensor.sd, dict):
+        if not isinstance(sensor.sd, dict):
+            return
+        if in_xyz:
             raise ConfigError(f"{where}.sd_mm: one number for a sensor in x, y, z")
-        seen = set(self.trajectory.named) if sensor.axes is None else set(sensor.axes) & set(self.trajectory.named)
-        for axis in sorted(seen - set(sensor.sd)) if isinstance(sensor.sd, dict) else []:
+        moving = set(self.trajectory.moving)
+        measured = moving if sensor.axes is None else moving & set(sensor.axes)
+        for axis in sorted(measured - set(sensor.sd)):
             raise ConfigError(f"{where}.sd_mm: no entry for '{axis}', which it measures")
-        fastest = LATTICE / self.arm.update_period
+
+    def _check(self, where: str, sensor: TrueSensor) -> None:
+        fastest = POINTS / self.arm.update_period
         if sensor.rate > fastest:
             raise ConfigError(
-                f"{where}.rate_hz: at most {fastest:g} on this arm ({LATTICE} rows a command), got {sensor.rate:g}"
+                f"{where}.rate_hz: at most {fastest:g} on this arm ({POINTS} rows a command), got {sensor.rate:g}"
             )
         if sensor.outliers is not None and sensor.outliers.largest < sensor.outliers.smallest:
             raise ConfigError(f"{where}.outliers: to_mm is smaller than from_mm")
@@ -145,34 +147,31 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             if end <= start:
                 raise ConfigError(f"{where}.outages_s: [{start:g}, {end:g}] ends before it begins")
 
-    def _check_steps(self, campaign: Steps) -> None:
+    def _check_scope(self, campaign: Steps) -> None:
         if campaign.scope not in self.sensors:
             raise UnknownNameError("trajectory.scope", "sensor", campaign.scope, self.sensors)
-        seen = self.sensors[campaign.scope].axes
-        if self.frame is not None and seen is None:
-            raise ConfigError(f"sensors.{campaign.scope}.axes: name the axes of a scope where the log is in x, y, z")
+        where, measured = f"sensors.{campaign.scope}.axes", self.sensors[campaign.scope].axes
+        if self.frame is not None and measured is None:
+            raise ConfigError(f"{where}: name the axes of a scope where the log is in x, y, z")
         for axis in campaign.axes:
-            if seen is not None and axis not in seen:
-                raise ConfigError(f"sensors.{campaign.scope}.axes: the scope does not see '{axis}', which is stepped")
+            if measured is not None and axis not in measured:
+                raise ConfigError(f"{where}: the scope does not see '{axis}', which is stepped")
 
     @property
     def true_axes(self) -> dict[str, TrueAxis]:
-        """The true arm, whole."""
-        delay = self.arm.delay_of
+        """The true arm, axis by axis."""
         return {
-            name: self.true_arm.get(name, TrueArm()).over(axis, delay(name), f"true_arm.{name}")
+            name: self.true_arm.get(name, TrueArm()).over(axis, self.arm.delay_of(name), f"true_arm.{name}")
             for name, axis in self.arm.axes.items()
         }
 
     @property
     def config(self) -> FusionConfig:
-        """What the filter believes: the truth, where ``filter`` says nothing else."""
-        sensors = {name: sensor.believed() for name, sensor in self.sensors.items()}
-        process = {axis: toml.builtins(self.process.get(axis, Process())) for axis in self.arm.axes}
-        tree: dict[str, Any] = {
+        """The filter's configuration: what is simulated, overridden by ``filter``."""
+        simulated: dict[str, Any] = {
             "start": {"offset_sd_mm": self.start.offset_sd},
-            "process": process,
-            "sensors": sensors,
+            "process": {axis: toml.builtins(self.process.get(axis, Process())) for axis in self.arm.axes},
+            "sensors": {name: sensor.to_config() for name, sensor in self.sensors.items()},
         }
         override = dict(self.filter)
         if isinstance(override.get("process"), dict):
@@ -181,7 +180,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             for name in override["sensors"]:
                 if name not in self.sensors:
                     raise UnknownNameError("filter.sensors", "sensor", name, self.sensors)
-        return toml.struct({**_merged(tree, override), "arm": self.arm}, FusionConfig, "filter")
+        return toml.struct({**_merged(simulated, override), "arm": self.arm}, FusionConfig, "filter")
 
     def to_toml(self, seed: int, arm: str) -> str:
         """The text of a ``scenario.toml`` with this ``seed``, and its arm in the file ``arm``."""
@@ -200,7 +199,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """
         path = Path(path)
         tree, where = toml.read(path), str(path)
-        _check_sizes({key: value for key, value in tree.items() if key != "seed"}, where)
+        _check_magnitudes({key: value for key, value in tree.items() if key != "seed"}, where)
         tree["arm"] = load_arm(tree, path)
         for key, kind in (("true_arm", TrueArm), ("process", Process)):
             if isinstance(tree.get(key), dict):
@@ -223,15 +222,15 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return scenario
 
 
-def _check_sizes(tree: Mapping[str, Any], where: str, path: str = "", inherited: str | None = None) -> None:
+def _check_magnitudes(tree: Mapping[str, Any], where: str, path: str = "", inherited: str | None = None) -> None:
     """Refuse numbers (SI) with which nothing could be computed."""
     for key, value in tree.items():
         unit = units.ending(key) or inherited
-        most = _FARTHEST if unit in units.LENGTHS else _LONGEST
+        largest = _LARGEST_LENGTH if unit in units.LENGTHS else _LARGEST
         if isinstance(value, Mapping):
-            _check_sizes(cast(Mapping[str, Any], value), where, f"{path}{key}.", unit)
+            _check_magnitudes(cast(Mapping[str, Any], value), where, f"{path}{key}.", unit)
         for number in cast(list[Any], value if isinstance(value, list) else [value]):
-            if isinstance(number, float | int) and number and not _LEAST <= abs(number) <= most:
+            if isinstance(number, float | int) and number and not _SMALLEST <= abs(number) <= largest:
                 raise ConfigError(f"{where}: {path}{key}: a size with which nothing can be simulated")
 
 

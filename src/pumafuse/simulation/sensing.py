@@ -1,4 +1,4 @@
-"""What a sensor makes of a motion: rows at its own rate, noisy, late, lost and wrong as its scenario says."""
+"""Simulates the rows that a sensor logs of a motion: at its own rate, noisy, late, lost and wrong."""
 
 from __future__ import annotations
 
@@ -6,72 +6,68 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, TimeArray
 from ..logs.run import Source
-from .true_sensor import PerAxis, TrueSensor
+from .true_sensor import TrueSensor
 
 
-def valid_times(sensor: TrueSensor, lattice: TimeArray, rng: np.random.Generator) -> TimeArray:
-    """The instants of the lattice (int64 ns, even) at which the sensor measures, ascending, (rows,)."""
-    end = lattice[-1] / 1e9
+def valid_times(sensor: TrueSensor, grid: TimeArray, rng: np.random.Generator) -> TimeArray:
+    """The instants of the even ``grid`` (int64 ns) at which the sensor measures, ascending, (rows,)."""
+    end = grid[-1] / 1e9
     count = int(end * sensor.rate) + 1
     jitter = sensor.rate_jitter * rng.standard_normal(count)
     instant = (rng.random() + np.arange(count)) / sensor.rate + jitter
-    nearest = np.unique(np.rint(instant * ((len(lattice) - 1) / end)).astype(np.int64))
-    return lattice[nearest[(nearest >= 0) & (nearest < len(lattice))]]
+    nearest = np.unique(np.rint(instant * ((len(grid) - 1) / end)).astype(np.int64))
+    return grid[nearest[(nearest >= 0) & (nearest < len(grid))]]
 
 
 def measure(
-    sensor: TrueSensor, name: str, valid: TimeArray, truth: dict[str, FloatArray], rng: np.random.Generator
+    sensor: TrueSensor, name: str, valid: TimeArray, position: dict[str, FloatArray], rng: np.random.Generator
 ) -> Source:
-    """The rows that the log gets, in the order of their stamps.
+    """The sensor's log, in the order of its stamps.
 
     Args:
-        sensor: What it does.
-        name: For people.
+        sensor: How it measures.
+        name: Its name.
         valid: When it measures, int64 ns, (rows,).
-        truth: Positions then, in the coordinates that the sensor is logged in [m], (rows,) each.
+        position: True positions then, in the coordinates in which the sensor is logged [m], (rows,) each.
         rng: Draws everything random of this sensor.
     """
     noises = rng.spawn(6)  # so that one kind of fault changes no other
     count, seconds = len(valid), valid / 1e9
-    wrong = _outliers(sensor, count, list(truth), noises[1])
+    outlier = _outliers(sensor, count, list(position), noises[1])
     values: dict[str, FloatArray] = {}
-    for axis, position in truth.items():
+    for axis, true in position.items():
         sd = sensor.sd[axis] if isinstance(sensor.sd, dict) else sensor.sd
-        bias = _of(sensor.bias, axis) + sensor.bias_sd * noises[2].standard_normal()
-        z = sensor.scale * position + bias + sd * noises[0].standard_normal(count) + wrong[axis]
+        bias = sensor.bias.get(axis, 0.0) if isinstance(sensor.bias, dict) else sensor.bias
+        bias += sensor.bias_sd * noises[2].standard_normal()
+        z = sensor.scale * true + bias + sd * noises[0].standard_normal(count) + outlier[axis]
         values[axis] = np.rint(z / sensor.quantisation) * sensor.quantisation if sensor.quantisation else z
     late = sensor.latency + sensor.latency_sd * noises[3].standard_normal(count)
     own_clock = (seconds + late) * (1.0 + sensor.clock_drift * 1e-6) + sensor.clock_offset
-    kept = (noises[4].random(count) >= sensor.dropouts) & ~_silent(sensor, seconds, noises[5])
-    stamp = np.rint(own_clock * 1e9).astype(np.int64)
-    source = Source(stamp, values, name).rows(kept)
+    logged = (noises[4].random(count) >= sensor.dropouts) & ~_lost(sensor, seconds, noises[5])
+    source = Source(np.rint(own_clock * 1e9).astype(np.int64), values, name).rows(logged)
     return source.rows(np.argsort(source.stamp, kind="stable").astype(np.int64))
 
 
-def _of(value: PerAxis, axis: str) -> float:
-    return value.get(axis, 0.0) if isinstance(value, dict) else value
-
-
 def _outliers(sensor: TrueSensor, count: int, axes: list[str], rng: np.random.Generator) -> dict[str, FloatArray]:
-    """What is added to each row [m], by axis: 0 for most."""
+    """The error that is added to each row [m], by axis: 0 for rows that are no outliers."""
     if sensor.outliers is None:
-        return {axis: np.zeros(count) for axis in axes}
-    wild = rng.random(count) < sensor.outliers.share
-    found: dict[str, FloatArray] = {}
+        return dict.fromkeys(axes, np.zeros(count))
+    chosen = rng.random(count) < sensor.outliers.share
+    errors: dict[str, FloatArray] = {}
     for axis in axes:
         size = rng.uniform(sensor.outliers.smallest, sensor.outliers.largest, count)
-        found[axis] = wild * size * rng.choice([-1.0, 1.0], count)
-    return found
+        errors[axis] = chosen * size * rng.choice([-1.0, 1.0], count)
+    return errors
 
 
-def _silent(sensor: TrueSensor, seconds: FloatArray, rng: np.random.Generator) -> BoolArray:
+def _lost(sensor: TrueSensor, seconds: FloatArray, rng: np.random.Generator) -> BoolArray:
     """Rows within an outage or a burst of losses."""
     spans = list(sensor.outages)
     if sensor.bursts is not None and len(seconds):
         length = float(seconds[-1])
         starts = rng.uniform(0.0, length, rng.poisson(sensor.bursts.per_minute * length / 60.0))
         spans += [(start, start + sensor.bursts.length) for start in starts.tolist()]
-    silent = np.zeros(len(seconds), dtype=np.bool_)
+    lost = np.zeros(len(seconds), dtype=np.bool_)
     for start, end in spans:
-        silent |= (seconds >= start) & (seconds < end)
-    return silent
+        lost |= (seconds >= start) & (seconds < end)
+    return lost

@@ -1,4 +1,4 @@
-"""What the arm is told to do: commands on the ticks of T, as offsets from the start level."""
+"""Trajectories: commands on the ticks of T, as offsets from the start level."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Count: TypeAlias = Annotated[int, msgspec.Meta(gt=0, le=10_000)]
 
 
 class Trajectory(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", forbid_unknown_fields=True):
-    """Base of the trajectories; axes that one does not name hold their start level."""
+    """Base of the trajectories; axes that one does not move hold their start level."""
 
     @property
-    def named(self) -> tuple[str, ...]:
+    def moving(self) -> tuple[str, ...]:
         """The axes that move."""
         raise NotImplementedError
 
@@ -34,8 +34,33 @@ class Trajectory(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", fo
         raise NotImplementedError
 
 
+class OnAxes(Trajectory, frozen=True, kw_only=True):
+    """Base of the trajectories that name their axes in a list.
+
+    Attributes:
+        axes: The axes that move.
+    """
+
+    axes: Names
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """The axes that move."""
+        return tuple(self.axes)
+
+
+class Timed(OnAxes, frozen=True, kw_only=True):
+    """Base of the trajectories that say how long they last.
+
+    Attributes:
+        duration: [s].
+    """
+
+    duration: Positive = msgspec.field(name="duration_s")
+
+
 class Raster(Trajectory, frozen=True, kw_only=True, tag="raster"):
-    """Lines to and fro over a panel, at constant speed, each one pitch beyond the last.
+    """Lines to and fro over a panel at constant speed, each one pitch beyond the last.
 
     Attributes:
         along: The axis of the lines.
@@ -58,13 +83,13 @@ class Raster(Trajectory, frozen=True, kw_only=True, tag="raster"):
             raise ConfigError(f"trajectory: along and across are both '{self.along}'")
 
     @property
-    def named(self) -> tuple[str, ...]:
+    def moving(self) -> tuple[str, ...]:
         """Along and across."""
         return self.along, self.across
 
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """The corner points, joined at constant speed."""
-        ticks((self.height / self.pitch + 1.0) * self.width / self.speed, period)  # before it is laid out
+        ticks((self.height / self.pitch + 1.0) * self.width / self.speed, period)  # refused before the lines are made
         lines = int(self.height / self.pitch + 1e-9) + 1
         line = np.repeat(np.arange(lines), 2)
         side = np.tile([0.0, 1.0, 1.0, 0.0], lines // 2 + 1)[: 2 * lines]
@@ -74,23 +99,21 @@ class Raster(Trajectory, frozen=True, kw_only=True, tag="raster"):
         return {axis: np.interp(way, length, path) for axis, path in corners.items()}
 
 
-class Steps(Trajectory, frozen=True, kw_only=True, tag="steps"):
-    """A campaign of step trials: each step is one command, up and down in turn, between rests.
+class Steps(OnAxes, frozen=True, kw_only=True, tag="steps"):
+    """A campaign of step trials: each step is one command, up and down in turn, with rests between.
 
-    Every size on every axis in both directions, ``replicates`` times, in random order, cut to ``trials``. The recorded
-    run goes on through all of them; ``trials.csv`` and ``samples.csv`` are cut from it.
+    Every size on every axis in both directions, ``replicates`` times, in random order, the first ``trials`` of them.
+    ``trials.csv`` and ``samples.csv`` are cut from the one run that goes through all of them.
 
     Attributes:
-        axes: The axes that are stepped.
         sizes: Of the steps [m].
         replicates: Of each combination.
-        trials: How many to keep: an unbalanced campaign, as one that was cut short; None: all.
+        trials: How many to keep, as of a campaign that was cut short; None: all.
         rest: Between steps [s].
         window: How long a trial is sampled [s].
         scope: The sensor that samples it.
     """
 
-    axes: Names
     sizes: Annotated[list[Positive], msgspec.Meta(min_length=1)] = msgspec.field(name="sizes_mm")
     replicates: Count = 1
     trials: Count | None = None
@@ -101,11 +124,6 @@ class Steps(Trajectory, frozen=True, kw_only=True, tag="steps"):
     def __post_init__(self) -> None:
         if self.window > self.rest:
             raise ConfigError("trajectory: window_s is longer than rest_s: a trial would see the next step")
-
-    @property
-    def named(self) -> tuple[str, ...]:
-        """The stepped axes."""
-        return tuple(self.axes)
 
     def plan(self, rng: np.random.Generator) -> list[tuple[str, float]]:
         """Axis and signed step [m] of each trial, in order: a step down on an axis follows one up on it."""
@@ -118,33 +136,24 @@ class Steps(Trajectory, frozen=True, kw_only=True, tag="steps"):
         """The sum of the steps so far."""
         plan, pause = self.plan(rng), self.ticks_between(period)
         ticks((len(plan) + 1) * pause * period, period)
-        found = {axis: np.zeros((len(plan) + 1) * pause) for axis in self.axes}
+        offsets = {axis: np.zeros((len(plan) + 1) * pause) for axis in self.axes}
         for number, (axis, step) in enumerate(plan, 1):
-            found[axis][number * pause :] += step
-        return found
+            offsets[axis][number * pause :] += step
+        return offsets
 
     def ticks_between(self, period: float) -> int:
         """Ticks from one step to the next."""
         return max(round(self.rest / period), 1)
 
 
-class WhiteNoise(Trajectory, frozen=True, kw_only=True, tag="white-noise"):
-    """The paper's binary white noise: between two levels, changing with probability 0.5 each period.
+class WhiteNoise(Timed, frozen=True, kw_only=True, tag="white-noise"):
+    """The paper's binary white noise on each axis: between two levels, changing with probability 0.5 each period.
 
     Attributes:
-        axes: The axes that move, each with a sequence of its own.
         amplitude: From one level to the other [m].
-        duration: [s].
     """
 
-    axes: Names
     amplitude: Positive = msgspec.field(name="amplitude_mm")
-    duration: Positive = msgspec.field(name="duration_s")
-
-    @property
-    def named(self) -> tuple[str, ...]:
-        """The moving axes."""
-        return tuple(self.axes)
 
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """0 or the amplitude; the first command is the start level."""
@@ -157,27 +166,18 @@ class WhiteNoise(Trajectory, frozen=True, kw_only=True, tag="white-noise"):
         return found
 
 
-class SineSweep(Trajectory, frozen=True, kw_only=True, tag="sine-sweep"):
+class SineSweep(Timed, frozen=True, kw_only=True, tag="sine-sweep"):
     """A sine whose frequency grows by the same factor each second.
 
     Attributes:
-        axes: The axes that move.
         amplitude: Of the sine [m].
         start_frequency: [Hz].
         end_frequency: [Hz].
-        duration: [s].
     """
 
-    axes: Names
     amplitude: Positive = msgspec.field(name="amplitude_mm")
     start_frequency: Positive = msgspec.field(name="from_hz")
     end_frequency: Positive = msgspec.field(name="to_hz")
-    duration: Positive = msgspec.field(name="duration_s")
-
-    @property
-    def named(self) -> tuple[str, ...]:
-        """The moving axes."""
-        return tuple(self.axes)
 
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """A sin φ with φ = 2π ∫ f dt and f = f₀ (f₁/f₀)^(t/duration)."""
@@ -188,37 +188,22 @@ class SineSweep(Trajectory, frozen=True, kw_only=True, tag="sine-sweep"):
         return {axis: sine.copy() for axis in self.axes}
 
 
-class Hold(Trajectory, frozen=True, kw_only=True, tag="hold"):
-    """Nothing moves for ``duration`` [s]."""
-
-    axes: Names
-    duration: Positive = msgspec.field(name="duration_s")
-
-    @property
-    def named(self) -> tuple[str, ...]:
-        """The axes that are commanded."""
-        return tuple(self.axes)
+class Hold(Timed, frozen=True, kw_only=True, tag="hold"):
+    """Nothing moves for ``duration``."""
 
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """Zeros."""
         return {axis: np.zeros(len(ticks(self.duration, period))) for axis in self.axes}
 
 
-class PathFromFile(Trajectory, frozen=True, kw_only=True, tag="path"):
+class PathFromFile(OnAxes, frozen=True, kw_only=True, tag="path"):
     """A path from a table, linear between its rows, relative to its first row.
 
     Attributes:
         file: A CSV or Parquet table beside the scenario with ``time_s`` and ``<axis>_mm``.
-        axes: The axes to take from it.
     """
 
     file: str
-    axes: Names
-
-    @property
-    def named(self) -> tuple[str, ...]:
-        """The axes taken."""
-        return tuple(self.axes)
 
     def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
         """The path on the ticks."""

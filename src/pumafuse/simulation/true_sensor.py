@@ -1,4 +1,4 @@
-"""What a sensor truly does, and what a filter believes of it that knows it."""
+"""How a simulated sensor measures, and the entry of ``fusion.toml`` that describes it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ PerAxis: TypeAlias = float | dict[str, float]
 
 
 class Bursts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Rows lost together.
+    """Spells in which all rows are lost.
 
     Attributes:
-        per_minute: How often, at random instants.
+        per_minute: How many, at random instants.
         length: How long each lasts [s].
     """
 
@@ -26,12 +26,12 @@ class Bursts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Outliers(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Measurements that are wildly wrong.
+    """Measurements with a large error.
 
     Attributes:
-        share: Of the rows.
-        smallest: How wrong at least [m].
-        largest: How wrong at most [m]; either sign.
+        share: Share of the rows.
+        smallest: Smallest error [m].
+        largest: Largest error [m]; either sign.
     """
 
     share: Share
@@ -40,23 +40,23 @@ class Outliers(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a sensor truly does: z = scale · p(stamp − latency) + bias + noise.
+    """How a sensor measures: z = scale · p(stamp − latency) + bias + noise.
 
     Attributes:
         rate: Rows a second [Hz].
         rate_jitter: Standard deviation of each row's instant around an even grid [s].
-        axes: What it measures; absent: everything, in x, y, z with a frame. With a frame, a sensor that names its
+        axes: What it measures. Absent: everything, in x, y, z if the scenario has a frame; a sensor that names its
             axes is logged in them.
-        sd: Noise [m], one number or one for each axis.
+        sd: Standard deviation of the noise [m], one number or one for each axis.
         latency: From the valid time to the stamp [s].
-        latency_sd: How far it wanders, from row to row [s].
-        scale: Of the position in the measurement.
+        latency_sd: Standard deviation of each row's own latency [s].
+        scale: Factor on the position.
         bias: Constant [m].
-        bias_sd: More bias, drawn for each run [m].
-        quantisation: Step between two values [m].
+        bias_sd: Standard deviation of one more bias, drawn for each run and axis [m].
+        quantisation: Step between two values [m]; 0: none.
         dropouts: Share of rows lost, one by one.
         bursts: Rows lost together.
-        outliers: Rows that are wildly wrong.
+        outliers: Rows with a large error.
         outages: From and to, since the first command [s].
         clock_offset: Of the sensor's clock against the commands' [s].
         clock_drift: Of the sensor's clock against the commands' [parts per million].
@@ -79,13 +79,13 @@ class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     clock_offset: float = msgspec.field(name="clock_offset_ms", default=0.0)
     clock_drift: float = msgspec.field(name="clock_drift_ppm", default=0.0)
 
-    def believed(self) -> dict[str, Any]:
-        """The keys of ``fusion.toml`` for a filter that knows this sensor, in SI."""
-        sd = self.sd if isinstance(self.sd, dict) else dict.fromkeys(self.axes or [""], self.sd)
-        with_steps = {axis: math.hypot(value, self.quantisation / math.sqrt(12.0)) for axis, value in sd.items()}
+    def to_config(self) -> dict[str, Any]:
+        """The sensor's keys of ``fusion.toml``, in SI: exactly what it does, the unknown biases as ``bias_sd_mm``."""
+        sds = self.sd if isinstance(self.sd, dict) else dict.fromkeys(self.axes or [""], self.sd)  # "": of any axis
+        sds = {axis: math.hypot(sd, self.quantisation / math.sqrt(12.0)) for axis, sd in sds.items()}
         biases = self.bias.values() if isinstance(self.bias, dict) else [self.bias]
         return {
-            "sd_mm": with_steps if self.axes or isinstance(self.sd, dict) else with_steps[""],
+            "sd_mm": sds.get("", sds),
             "latency_ms": self.latency,
             "latency_sd_ms": self.latency_sd,
             "scale": self.scale,
