@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console
@@ -13,6 +14,9 @@ from rich.table import Table
 from ..fusion.score import Z95
 from ..fusion.summary import ScoreSummary, Summary
 
+if TYPE_CHECKING:
+    from ..views.report import TextTable
+
 _FEW_RUNS = 20  # that get lines of their own
 
 
@@ -20,6 +24,16 @@ def console(*, soft_wrap: bool = False) -> Console:
     """Standard output for people; wide enough for our tables where it is no terminal."""
     width = None if sys.stdout.isatty() else 120
     return Console(highlight=False, soft_wrap=soft_wrap, width=width)
+
+
+def text_table(text: TextTable) -> Table:
+    """A table of text as it is; columns of numbers are right-justified."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading, is_text in text.columns:
+        table.add_column(heading, justify="left" if is_text else "right", overflow="fold")
+    for row in text.rows:
+        table.add_row(*map(escape, row))
+    return table
 
 
 def outcome_table(summary: Summary) -> Table:
