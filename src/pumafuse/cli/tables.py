@@ -27,10 +27,11 @@ def console(*, soft_wrap: bool = False) -> Console:
 
 
 def text_table(text: TextTable) -> Table:
-    """A table of text as it is; columns of numbers are right-justified."""
+    """A table of text as it is: numbers are right-justified, cells that have lines are not wrapped."""
     table = Table(box=box.SIMPLE_HEAD)
-    for heading, is_text in text.columns:
-        table.add_column(heading, justify="left" if is_text else "right", overflow="fold")
+    for place, (heading, is_text) in enumerate(text.columns):
+        lines = any("\n" in row[place] for row in text.rows)
+        table.add_column(heading, justify="left" if is_text else "right", overflow="fold", no_wrap=lines)
     for row in text.rows:
         table.add_row(*map(escape, row))
     return table

@@ -140,8 +140,8 @@ def best_in_class(measured: Measured, command: Commands, model: AxisModel, delay
         moved = [command.moved(axis, float(x[0]) ** 2, start, measured.time) for axis in axes]
         design = np.stack([moved[0], *(column - moved[0] for column in moved[1:])], axis=1)
         design -= design.mean(axis=0)
-        share = np.linalg.lstsq(design, z, rcond=None)[0]
-        return design @ share, np.asarray(share, dtype=np.float64)
+        share = np.asarray(np.linalg.lstsq(design, z, rcond=None)[0], dtype=np.float64)
+        return design @ share, share
 
     def residual(x: FloatArray) -> FloatArray:
         return z - linear(x)[0]

@@ -21,7 +21,7 @@ from .batch import Order
 from .estimate import Estimate, common, mean, regression, robust
 from .fit import HARDLY_MOVED, TOO_FEW, StepFit, flags, least_p
 from .joint import JointFit, fit_together, inverse_square
-from .paper import influences, minimise
+from .paper import minimise
 from .trials import Trial
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ def _outlying(fitted: Sequence[Fitted]) -> dict[str, str]:
     values = [(*one.first.shape[:2], one.first.gain) for one in fitted]
     sds = [(*one.first.sd[:2], one.first.sd.gain) for one in fitted]
     for word, column, sd in zip(("delay", "time constant", "gain"), np.array(values).T, np.array(sds).T, strict=True):
-        for place in np.flatnonzero(outlying(column, sd)):
+        for place in np.flatnonzero(outlying(column, sd)).tolist():
             shown = f"{column[place]:.2f}" if word == "gain" else f"{1e3 * column[place]:.0f} ms"
             found.setdefault(fitted[place].trial.name, f"outlying: its {word} is {shown}")
     return found
@@ -277,7 +277,8 @@ def _published(used: Sequence[Fitted]) -> Common:
         trials = [one.trial for one in used]
         q, p = minimise(trials, own, 2)
         p = max(p, least_p(q))
-        influence = influences(trials, own, q, p)
+        without = [minimise(trials[:k] + trials[k + 1 :], own[:k] + own[k + 1 :], 2) for k in range(len(own))]
+        influence = (len(own) - 1) * (np.array([q, p]) - without)  # jackknife
         lag = q + influence[:, 0]
         intervals = [mean(influence @ slope).ci95 for slope in _log_slopes(q, p)]
         plant = _second_order(q, p, *(0.5 * (high - low) for low, high in intervals))

@@ -19,7 +19,6 @@ from .trials import Trial
 _REST = 5  # samples of the rest level, at least
 _LAST = 3  # samples that the gain is read off
 _SIGMAS, _SHARE = 3.0, 0.02  # of the noise at rest, of the step: threshold of motion
-_REACH = 1e-3  # of q and q²: step of the second derivative
 _STARTS = ((1.0, 0.0), (1.0, 0.05), (1.2, 0.25), (0.8, 0.5), (0.8, 1.5))  # q over the mean lag, p/q²
 
 
@@ -66,31 +65,6 @@ def minimise(trials: Sequence[Trial], read: Sequence[StepFit], order: Order) -> 
         )
         found.append((float(best.cost), float(best.x[0]), float(best.x[1]) if order == 2 else 0.0))
     return min(found)[1:]
-
-
-def influences(trials: Sequence[Trial], read: Sequence[StepFit], q: float, p: float) -> FloatArray:
-    """Influence of each trial on q and p, times the number of trials, (n, 2).
-
-    With delay and gain as read off, the response is wrong for a while in every trial alike. So the whole second
-    derivative of the squares is needed, not its Gauss-Newton part alone.
-    """
-    since = [_since_onset([trial], [fit]) for trial, fit in zip(trials, read, strict=True)]
-
-    def scores(at: FloatArray) -> FloatArray:
-        q, p = at.tolist()
-        rows = [
-            (height[:, None] * sensitivity(t, Shape(0.0, q, p), 2)[:, 1:]).T @ (z - height * unit_response(t, q, p))
-            for t, z, height in since
-        ]
-        return np.array(rows)
-
-    at = np.array([q, p])
-    changes = np.minimum(_REACH * np.array([q, q * q]), 0.5 * at)
-    hessian = [
-        (scores(at - change).sum(axis=0) - scores(at + change).sum(axis=0)) / (2.0 * change.sum())
-        for change in np.diag(changes)
-    ]
-    return len(trials) * scores(at) @ np.linalg.pinv(np.array(hessian).T)
 
 
 def _rest(trial: Trial) -> tuple[float, float]:
