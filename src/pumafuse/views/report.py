@@ -157,7 +157,7 @@ def write_identification(found: Identification, trials: StepTrials, folder: Path
     """
     from . import step_figures
 
-    contour, names = step_figures.valleys(found, trials)
+    contour, contours = step_figures.valleys(found, trials)
     figures = {
         "responses": step_figures.responses(found, trials),
         "delays": step_figures.delays(found),
@@ -168,17 +168,20 @@ def write_identification(found: Identification, trials: StepTrials, folder: Path
         "performance": step_figures.performance(found),
     }
     content = {
-        "title": f"Identification: {found.arm.name}",
-        "summary": _summary(found),
         "found": found,
+        "rms_mm": _rms(found) * MM,
         "models": models(found),
         "sentences": sentences(found),
+        "jittering": [axis for axis, one in found.axes.items() if one.delay_spread > 2.0 * one.delay_noise > 0.0],
         "dependences": dependences(found),
+        "strongest": max(found.dependences, key=lambda row: row.i_ratio or 0.0, default=None),
         "scatter": scatter(found),
+        "outlying": sorted({name for row in found.scatter for name in row.outlying}),
+        "contours": contours,
+        "flat": sum("flat valley" in flag for one in found.trials for flag in one.second.flags),
         "trials": _trials(found),
         "flagged": sum(bool(one.first.flags or one.second.flags or one.left_out) for one in found.trials),
         "figures": {name: Markup(svg) for name, svg in figures.items()},
-        "captions": _captions(found, names),
         "arm": found.arm.to_toml(),
     }
     _write("identification.html", content, folder, force)
@@ -200,13 +203,12 @@ def write_verification(
     """
     from . import step_figures
 
-    worst = max((one for one, _ in verified), key=lambda one: one.model.rms / max(one.best_in_class.fit.rms, 1e-12))
+    every = [one for one, _ in verified]
     content = {
-        "title": f"Verification: {arm.name}",
-        "summary": (
-            f"The model was driven by the commands of {len({one.run for one, _ in verified})} runs and compared with"
-            f" the measurements, both without their means. Furthest from the best in class is {worst.run},"
-            f" {worst.axis}: {worst.verdict}."
+        "arm": arm,
+        "runs": {one.run for one in every},
+        "worst": max(
+            (one for one, _ in verified), key=lambda one: one.model.rms / max(one.best_in_class.fit.rms, 1e-12)
         ),
         "table_iii": verifications([one for one, _ in verified]),
         "figures": [(Markup(step_figures.verification(one, trace)), verdict(one)) for one, trace in verified],
@@ -218,62 +220,6 @@ def _rms(found: Identification, axis: str | None = None) -> float:
     """Of the combined model over the trials that it is made of [m]; of all axes for None."""
     used = [one for one in found.trials if one.left_out is None and axis in (None, one.axis)]
     return float(np.sqrt(np.mean([one.combined_rms**2 for one in used if one.combined_rms is not None])))
-
-
-def _summary(found: Identification) -> str:
-    used = sum(one.trials for one in found.axes.values())
-    how = "with delay and gain read off, as published" if found.method == "published" else "each fitted whole"
-    window = "all samples" if found.samples is None else f"{found.samples} samples from each step on"
-    return (
-        f"{len(found.trials)} step trials, {how} ({window}); {used} of them are in the combined model, whose RMS error"
-        f" is {_rms(found) * MM:.3g} mm (eq. 10)."
-    )
-
-
-def _captions(found: Identification, contours: Sequence[str]) -> dict[str, str]:
-    """A caption for each table and figure, on these data."""
-    jittering = [axis for axis, one in found.axes.items() if one.delay_spread > 2.0 * one.delay_noise > 0.0]
-    delays = "The delay does not move from trial to trial by more than the noise explains."
-    if jittering:
-        delays = (
-            f"The delay moves from trial to trial by more than the noise explains ({', '.join(jittering)}): a filter"
-            " should allow for it (latency_sd_ms of its sensors, or input noise)."
-        )
-    ratios = [(row.i_ratio, row) for row in found.dependences if row.i_ratio is not None]
-    strongest = ""
-    if ratios:
-        ratio, row = max(ratios, key=lambda pair: pair[0])
-        strongest = (
-            f" The strongest dependence is of {row.coefficient} on {row.factor} (i-ratio {ratio:.2f}, {row.verdict})."
-        )
-    outlying = sorted({name for row in found.scatter for name in row.outlying})
-    flat = [one for one in found.trials if any("flat valley" in flag for flag in one.second.flags)]
-    lower = [
-        f"{1.0 - one.choice.second_rms / one.choice.first_rms:.0%} less on {axis}" for axis, one in found.axes.items()
-    ]
-    return {
-        "responses": (
-            "Each thin line is a trial, divided by its own gain and set back by its own delay; the thick line is the"
-            " combined plant. Where thin lines leave it together, no single linear plant follows the arm there."
-        ),
-        "delays": f"{delays} Points are trials in the order of the list; the band is the 95 % interval of their common"
-        " value.",
-        "gains": " ".join(f"{axis}: {one.gain_words}." for axis, one in found.axes.items()),
-        "dependences": f"An i-ratio above 1: the means differ between levels.{strongest} Welch's test does not assume"
-        " equal variances; the adjusted p is of a factor beside all the others.",
-        "scatter": (f"Outlying trials: {', '.join(outlying)}." if outlying else "No trial is outlying.")
-        + " A small normal p: the coefficient is not normally distributed; read its mean and i-ratio with care.",
-        "fits": (
-            "Own fits of both orders with bars of two standard deviations. A common plant of second order leaves "
-            f"{', '.join(lower)} than one of first order."
-        ),
-        "valleys": (
-            f"RMS over ω and ζ of the trials whose ω is known worst ({', '.join(contours)}); crosses mark the fits."
-            f" {len(flat)} of {len(found.trials)} trials have a long flat valley: many ω and ζ fit them equally well,"
-            " and first order may do."
-        ),
-        "performance": " ".join(f"By {one.factor}: {one.verdict}." for one in found.performance),
-    }
 
 
 def _trials(found: Identification) -> TextTable:
