@@ -178,50 +178,6 @@ def test_an_arm_file_is_kept_unless_forced(
 
 
 @pytest.mark.long
-def test_broken_trials_cost_only_themselves(tmp_path: Path) -> None:
-    """Each is named in one line on stderr; the arm is that of the whole ones, and of the one that could be mended."""
-    good = TRUE["radial"]
-    whole = samples("back", good, 8.0, 90).splitlines()
-    whole[30:32] = whole[31], whole[30]
-    listed = "".join(
-        f"{name},{axis},{step},0.285714\n"
-        for name, axis, step in (
-            ("empty", "radial", 8.0), ("one", "radial", 8.0), ("none", "radial", 8.0), ("twice", "radial", 8.0),
-            ("twice", "radial", 8.0), ("zero", "radial", 0.0), ("back", "radial", 8.0), ("lost", "", 8.0),
-        )
-    )  # fmt: skip
-    sampled = "".join(
-        (
-            "".join(f"empty,{t:.6f},nan\n" for t in TIMES),
-            "one,0.1,1.0\n",
-            samples("twice", good, 8.0, 91),
-            samples("zero", good, 8.0, 92),
-            "\n".join(whole) + "\n",
-            samples("lost", good, 8.0, 93),
-            samples("strange", good, 8.0, 94),
-        )
-    )
-    done = pumafuse("identify", campaign(tmp_path / "bench", ("radial",), listed, sampled), "-o", tmp_path / "arm.toml")
-    lines = done.stderr.splitlines()
-    assert all(line.startswith("warning: ") for line in lines)
-    for name, reason in (
-        ("empty", "0 samples from the step on"),
-        ("one", "1 samples from the step on"),
-        ("none", "0 samples from the step on"),
-        ("twice", "listed 2 times"),
-        ("zero", "its step is 0 or no number"),
-        ("back", "times step back: sorted"),
-        ("lost", "it names no axis"),
-    ):
-        told = [line for line in lines if f"trial '{name}'" in line]
-        assert told and all(reason in line for line in told), (name, told)
-    assert [line for line in lines if "'strange'" in line] != []
-    arm = pf.ArmModel.load(tmp_path / "arm.toml")
-    assert arm.provenance["trials"] == {"radial": 13}
-    assert arm.axes["radial"].plant.time_constant == pytest.approx(0.0425, rel=0.01)
-
-
-@pytest.mark.long
 def test_an_axis_with_too_few_trials_gets_no_model(tmp_path: Path) -> None:
     """It is said, and the others are done."""
     few = "".join(f"{name},vertical,8.0,0.285714\n" for name in ("a", "b"))
@@ -273,25 +229,6 @@ def test_samples_and_the_papers_method_change_the_answer(
         assert arm.axes["radial"].gain.intercept == pytest.approx(INTERCEPT, abs=0.03), name
     assert abs(arms["fitted"].delay - DELAY) < 0.0005
     assert arms["paper"].delay != pytest.approx(arms["fitted"].delay, abs=1e-4)
-
-
-@pytest.mark.long
-def test_a_campaign_of_velocity_steps(tmp_path: Path) -> None:
-    """One step size and a speed column that is no period of it: --period, and a gain without a slope."""
-    plant = TRUE["radial"]
-    gain = SLOPE * 100.0 / 28.0 + INTERCEPT  # as `samples` makes it
-    folder = tmp_path / "robot"
-    folder.mkdir()
-    rows = [samples(str(n), plant, 100.0, n) for n in range(6)]
-    listed = "".join(f"{n},radial,100.0,0.1,{n % 2}\n" for n in range(6))
-    (folder / "trials.csv").write_text("trial,axis,step_mm,speed_m_s,pose\n" + listed)
-    (folder / "samples.csv").write_text("trial,time_s,position_mm\n" + "".join(rows))
-    pumafuse("identify", folder, "-o", tmp_path / "arm.toml", "--period", 8)
-    arm = pf.ArmModel.load(tmp_path / "arm.toml")
-    assert (arm.update_period, arm.axes["radial"].gain.slope) == (0.008, 0.0)
-    assert arm.axes["radial"].gain.intercept == pytest.approx(gain, rel=1e-4)
-    assert arm.axes["radial"].plant.time_constant == pytest.approx(0.0425, rel=1e-3)
-    assert "one speed only" in arm.provenance["gain"]["radial"]
 
 
 def test_what_is_not_there_is_one_line(trials: Path, tmp_path: Path) -> None:

@@ -66,14 +66,15 @@ def test_json_says_what_python_says(run: Path, found: list[dict[str, object]]) -
     for one, other in zip(found, expected, strict=True):
         assert set(one) == {
             *("run", "axis", "source", "measurements", "amplitude_mm", "start_mm", "start_from", "model"),
-            *("without_recovery", "with_recovery", "recovery_ms", "floor", "outlying", "verdict", "notes"),
+            *("without_recovery", "with_recovery", "recovery_ms", "best_in_class", "outlying", "verdict", "notes"),
         }
         assert set(one["model"]) == MEASURED
-        assert set(one["floor"]) == {"fit", "delay_ms", "gain", "plant"}
+        assert set(one["best_in_class"]) == {"fit", "delay_ms", "gain", "plant"}
         assert one["model"]["rms_mm"] == pytest.approx(1e3 * other.model.rms, rel=1e-9)
         assert one["model"]["rms_mm"] == pytest.approx({"scope": 0.05, "eye": 0.5}[one["source"]], rel=0.2)
-        assert one["floor"]["delay_ms"] == pytest.approx(1e3 * other.floor.delay, rel=1e-9)
-        assert one["floor"]["plant"]["time_constant_ms"] == pytest.approx(1e3 * other.floor.plant.time_constant)
+        best, expected_best = one["best_in_class"], other.best_in_class
+        assert best["delay_ms"] == pytest.approx(1e3 * expected_best.delay, rel=1e-9)
+        assert best["plant"]["time_constant_ms"] == pytest.approx(1e3 * expected_best.plant.time_constant)
         assert (one["recovery_ms"], one["verdict"]) == (pytest.approx(100.0), other.verdict)
         assert one["amplitude_mm"] == pytest.approx(8.0)
 
@@ -84,12 +85,13 @@ def test_the_table_shows_the_same_numbers(run: Path, found: list[dict[str, objec
     rows = [line for line in said.splitlines() if " scope " in line or " eye " in line]
     assert len(rows) == 4
     for row, one in zip(rows, found, strict=True):
-        for number in (one["model"]["rms_mm"], one["floor"]["fit"]["rms_mm"]):
+        for number in (one["model"]["rms_mm"], one["best_in_class"]["fit"]["rms_mm"]):
             assert f"{number:.3f}" in row.split()
     joined = " ".join(said.split())
     for one in found:
+        best = one["best_in_class"]
         assert f"start level {one['start_mm']:g} mm ({one['start_from']})" in joined
-        assert f"the floor is K {one['floor']['gain']:.3f}, Td {one['floor']['delay_ms']:.1f} ms" in joined
+        assert f"the best in class is K {best['gain']:.3f}, Td {best['delay_ms']:.1f} ms" in joined
 
 
 @pytest.mark.long

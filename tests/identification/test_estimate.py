@@ -35,18 +35,6 @@ def test_a_mean_has_the_textbooks_interval(values: np.ndarray) -> None:
     np.testing.assert_allclose([found.value, *found.ci95], [values.mean(), low, high], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("outlier", [1.3, 10.0, 1e6])
-def test_a_gross_outlier_moves_a_robust_mean_no_further_than_a_small_one(outlier: float) -> None:
-    """Huber's: 20 values about 1 and one far out give what they give with it at 1.3, and an interval not much wider."""
-    values = 1.0 + 0.05 * np.random.default_rng(2).standard_normal(20)
-    clean, near, found = (robust(one) for one in (values, np.append(values, 1.3), np.append(values, outlier)))
-    assert found.value == pytest.approx(near.value, abs=1e-6)
-    assert abs(found.value - clean.value) < 0.02
-    assert clean.value == pytest.approx(values.mean(), abs=0.01)
-    assert found.ci95[0] < 1.0 < found.ci95[1]
-    assert found.ci95[1] - found.ci95[0] < 2.0 * (clean.ci95[1] - clean.ci95[0])
-
-
 def test_a_robust_mean_solves_hubers_equation() -> None:
     """The clipped residuals, in units of 1.4826 times their median size, sum to 0; 1.345 is where they are clipped."""
     values = np.append(np.random.default_rng(3).standard_normal(15), [9.0, 14.0])
@@ -106,23 +94,6 @@ def test_the_variance_between_trials_is_paule_and_mandels(design: np.ndarray, be
     assert weight @ left**2 == pytest.approx(20 - design.shape[1], rel=1e-6)
     assert np.abs(design.T @ (weight * left)).max() < 1e-8 * np.abs(design.T @ (weight * np.abs(left))).max()
     assert 0.4 * between < np.sqrt(variance[0]) < 2.0 * between
-
-
-def test_a_trial_that_says_little_weighs_little() -> None:
-    """One with a hundredfold sd is as good as left out."""
-    values, sd = np.array([1.0, 1.02, 0.99, 1.01, 1.5]), np.array([0.01, 0.012, 0.009, 0.01, 1.0])
-    assert common(values, sd).value == pytest.approx(common(values[:4], sd[:4]).value, abs=1e-3)
-
-
-@settings(max_examples=30, deadline=None, derandomize=True)
-@given(st.floats(-10.0, 10.0), st.floats(1e-4, 1e4), st.integers(0, 10**6))
-def test_units_do_not_matter(shift: float, scale: float, seed: int) -> None:
-    """What is shifted and scaled gives what is shifted and scaled."""
-    sd = np.random.default_rng(seed).uniform(0.1, 1.0, 8)
-    values = scattered(seed + 1, 8, 0.5, sd)
-    found, moved = common(values, sd), common(scale * (values + shift), scale * sd)
-    expected = scale * (np.array([found.value, *found.ci95]) + shift)
-    np.testing.assert_allclose([moved.value, *moved.ci95], expected, rtol=1e-5, atol=1e-5 * scale)
 
 
 # ---- what is degenerate ---------------------------------------------------------------------------------------------

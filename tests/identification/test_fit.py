@@ -28,20 +28,10 @@ def trial(q: float, p: float, noise: float = 0.0, seed: int = 0, delay: float = 
 
 
 def fit_step(one: Trial, order: int, samples: int | None = None) -> StepFit:
-    return fit_steps([one], samples)[0][order - 1]
+    return fit_steps([one.cut(samples)])[0][order - 1]
 
 
 # ---- the response ---------------------------------------------------------------------------------------------------
-
-
-@settings(deadline=None, derandomize=True)
-@given(st.floats(5.0, 500.0), st.one_of(st.floats(0.05, 5.0), st.floats(-8, 8).map(lambda x: 1 + 10.0 ** -abs(x) * x)))
-def test_the_response_is_the_plants(omega: float, damping: float) -> None:
-    """In the coordinates 1/ω² and 2ζ/ω as in ω and ζ, also where equations 6 and 9 cancel."""
-    damping = max(damping, 0.05)
-    plant = SecondOrder(natural_frequency=omega, damping=damping)
-    found = unit_response(TIMES - 0.01, 2.0 * damping / omega, omega**-2)
-    np.testing.assert_allclose(found, plant.step_response(TIMES - 0.01), rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(("q", "p"), [(0.04, 3e-4), (0.04, 4e-4), (0.04, 4.0000001e-4), (0.04, 2e-3), (0.1, 1e-5)])
@@ -138,7 +128,7 @@ def test_intervals_hold(order: int, shape: tuple[float, float]) -> None:
         delay = DELAY + 0.002 * np.random.default_rng(1000 + seed).standard_normal()
         fit = fit_step(trial(*shape, 0.1e-3, seed, delay), order)
         truths = (delay, shape[0], shape[1], GAIN)
-        intervals = (fit.delay_ci95, fit.q_ci95, fit.p_ci95, fit.gain_ci95)
+        intervals = (fit.ci95.delay, fit.ci95.q, fit.ci95.p, fit.ci95.gain)
         inside += [low <= truth <= high for truth, (low, high) in zip(truths, intervals, strict=True)]
     share = inside / 300
     assert ((share > 0.90) & (share < 0.995))[[0, 1, 3]].all(), share
@@ -148,7 +138,7 @@ def test_intervals_hold(order: int, shape: tuple[float, float]) -> None:
 def test_intervals_of_a_second_order_plant_that_is_none_are_open() -> None:
     """A first-order response says how slow ω is at least, and no more; its 1/ω² may be 0."""
     fit = fit_step(trial(*SLOW, 0.1e-3, 3), 2)
-    assert fit.p_ci95[0] <= 0.0
+    assert fit.ci95.p[0] <= 0.0
     assert fit.natural_frequency_ci95[1] == np.inf and fit.damping_ci95[1] == np.inf
     assert "long flat valley: first order may do" in flags(fit)
     clear = fit_step(trial(*SWINGING, 0.02e-3, 1), 2)

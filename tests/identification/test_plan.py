@@ -50,21 +50,19 @@ def test_every_block_holds_every_combination_once() -> None:
 
 
 def test_the_order_is_random_and_comes_again_with_its_seed() -> None:
-    """Blocks differ from one another; rank correlation of order and speed stays within chance over 200 seeds."""
+    """Blocks differ from one another."""
     one, again, other = (plan(design(seed=seed)).trials for seed in (1, 1, 2))
     assert one == again != other
     assert [t.speed for t in one[:18]] != [t.speed for t in one[18:36]]
-    correlations = [
-        np.corrcoef(np.arange(18), [t.speed for t in plan(design(seed=seed, replicates=1)).trials])[0, 1]
-        for seed in range(200)
-    ]
-    assert abs(np.mean(correlations)) < 3.0 / np.sqrt(17 * 200)
-    assert np.std(correlations) == pytest.approx(1.0 / np.sqrt(17), rel=0.2)
 
 
 def test_the_ticks_are_the_trials(tmp_path: Path) -> None:
-    """Rest, step, rest: on the axis, of the size and in the order that trials.csv lists; all else stays 0."""
-    write(plan(design()), tmp_path / "plan", False)
+    """Rest, step, rest: on the axis, of the size and in the order that trials.csv lists; all else stays 0.
+
+    White noise has two levels and goes from rest to rest; the duration is that of all rows.
+    """
+    planned = plan(design())
+    write(planned, tmp_path / "plan", False)
     listed, ticks = table(tmp_path / "plan" / "trials.csv"), table(tmp_path / "plan" / "steps.csv")
     count = len(ticks) // len(listed)
     for number, trial in enumerate(listed):
@@ -73,36 +71,18 @@ def test_the_ticks_are_the_trials(tmp_path: Path) -> None:
         assert [int(row["tick"]) for row in part] == list(range(count))
         np.testing.assert_allclose([float(row["time_s"]) for row in part], 0.028 * np.arange(count), atol=1e-9)
         for axis in ("radial", "tangential"):
-            told = np.array([float(row[f"{axis}_mm"]) for row in part])
+            command = np.array([float(row[f"{axis}_mm"]) for row in part])
             size = float(trial["step_mm"]) if axis == trial["axis"] else 0.0
             expected = np.repeat([0.0, size, 0.0], [18, 18, 18])
-            np.testing.assert_array_equal(told, expected)
+            np.testing.assert_array_equal(command, expected)
         assert float(trial["step_mm"]) == pytest.approx(28.0 * float(trial["speed_m_s"]))
         assert {"y_mm": trial["y_mm"], "z_mm": trial["z_mm"]} in POSITIONS
-
-
-def test_the_duration_is_that_of_all_sequences(tmp_path: Path) -> None:
-    """Rows of all files times the period."""
-    planned = plan(design())
-    write(planned, tmp_path / "plan", False)
+    for path in (tmp_path / "plan").glob("white-noise-*"):
+        _, _, axis, size = path.stem.removesuffix("mm").rsplit("-", 3)
+        noise = np.array([float(row[f"{axis}_mm"]) for row in table(path)])
+        assert set(noise) == {0.0, float(size)} and not noise[:18].any() and not noise[-18:].any()
     rows = sum(len(table(path)) for path in (tmp_path / "plan").iterdir() if path.name != "trials.csv")
     assert planned.duration == pytest.approx(0.028 * rows)
-
-
-def test_white_noise_switches_with_probability_one_half() -> None:
-    """Two levels, from rest to rest; over 200 sequences half the ticks are switches, each independent of the last."""
-    switches = []
-    for seed in range(200):
-        planned = plan(design(seed=seed, replicates=1, amplitudes=(0.008,), noise_duration=4.2))
-        for axis in ("radial", "tangential"):
-            sequence = planned.noise[axis, 0.008]
-            assert set(np.unique(sequence)) == {0.0, 0.008}
-            assert not sequence[:18].any() and not sequence[-18:].any()
-            switches.append(np.diff(sequence[18:-18]) != 0.0)
-    every = np.array(switches)
-    assert every.mean() == pytest.approx(0.5, abs=3.0 * 0.5 / np.sqrt(every.size))
-    again = np.mean(every[:, 1:] == every[:, :-1])
-    assert again == pytest.approx(0.5, abs=3.0 * 0.5 / np.sqrt(every[:, 1:].size))
 
 
 def test_a_planned_campaign_is_read_by_identify(tmp_path: Path) -> None:
@@ -123,8 +103,8 @@ WARNED: dict[str, tuple[dict[str, Any], str]] = {
     "rest": ({"rest": 0.05}, "radial: the rest of 100 ms between steps is too short to settle"),
     "speed": ({"speeds": (0.1, 0.6)}, "commanded speeds reach 0.6 m/s, the limit is 0.5 m/s"),
     "noise": ({"amplitudes": (0.02,)}, "commanded speeds reach 0.714 m/s, the limit is 0.5 m/s"),
-    "one speed": ({"speeds": (0.1,)}, "one speed only: how the gain depends on speed cannot be told"),
-    "no replicates": ({"replicates": 1}, "no replicates: what moves from trial to trial cannot be told from"),
+    "one speed": ({"speeds": (0.1,)}, "one speed only: the gain's dependence on speed is not identifiable"),
+    "no replicates": ({"replicates": 1}, "no replicates: scatter from trial to trial cannot be separated"),
     "no noise": ({"amplitudes": ()}, "no white noise: there will be nothing to verify the model with"),
 }
 

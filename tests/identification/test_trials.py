@@ -43,6 +43,10 @@ def test_trials_come_in_the_order_of_the_list(tmp_path: Path) -> None:
     np.testing.assert_allclose(first.time, TIMES, atol=1e-12)
     np.testing.assert_array_equal(second.position, np.where(TIMES > 0.02, -0.0005, 0.00025))
     assert found.notes == ()
+    cut = first.cut(4)
+    assert ((cut.time < 0.0).sum(), (cut.time >= 0.0).sum()) == (2, 4)
+    np.testing.assert_array_equal(cut.position, first.position[:6])
+    assert len(first.cut(None).time) == len(TIMES)
 
 
 def test_other_units_names_and_formats(tmp_path: Path) -> None:
@@ -78,13 +82,13 @@ def test_a_broken_trial_costs_only_itself(case: str, tmp_path: Path) -> None:
     listed, sampled, reason = BROKEN[case]
     found = StepTrials.read(written(tmp_path, WHOLE + listed, rows("1") + sampled))
     assert [trial.name for trial in found.trials] == ["1"]
-    said = [note for note in found.notes if note.startswith("trial '2'")]
-    assert said
-    assert all(note.startswith(reason) and note.endswith(": left out") for note in said)
+    notes = [note for note in found.notes if note.startswith("trial '2'")]
+    assert notes
+    assert all(note.startswith(reason) and note.endswith(": left out") for note in notes)
 
 
-def test_what_can_be_mended_is_mended_and_said(tmp_path: Path) -> None:
-    """Samples without a number are left out, samples out of order sorted, samples of no listed trial told."""
+def test_what_can_be_mended_is_mended_and_reported(tmp_path: Path) -> None:
+    """Samples without a number are left out, samples out of order sorted, samples of no listed trial reported."""
     mixed = "1,0.061,1.0\n1,0.057,nan\n1,0.058,2.0\n"
     found = StepTrials.read(written(tmp_path, WHOLE, rows("1") + mixed + rows("9")))
     (trial,) = found.trials

@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ..errors import ConfigError, PumafuseWarning
 from ..identification import plan as plans
@@ -19,7 +20,7 @@ _PERIOD = 0.028  # s, the paper's
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the command line asks for, in s, m and m/s; axes and period as None are the arm's."""
+    """Options of the command line, in s, m and m/s; axes and period as None are the arm's."""
 
     axes: Sequence[str] | None
     speeds: tuple[float, ...]
@@ -34,19 +35,11 @@ class Wanted:
 
     def design(self, arm: ArmModel | None) -> Design:
         """The campaign, for an arm that may be known."""
-        axes = CANONICAL_AXES if arm is None else tuple(arm.axes)
-        return Design(
-            axes=axes if self.axes is None else tuple(self.axes),
-            speeds=self.speeds,
-            period=self.period or (_PERIOD if arm is None else arm.update_period),
-            positions=({},) if self.positions is None else _positions(self.positions),
-            replicates=self.replicates,
-            hold=self.hold,
-            rest=self.rest,
-            amplitudes=self.amplitudes,
-            noise_duration=self.noise_duration,
-            seed=self.seed,
-        )
+        axes = self.axes or (CANONICAL_AXES if arm is None else tuple(arm.axes))
+        period = self.period or (_PERIOD if arm is None else arm.update_period)
+        positions: tuple[Mapping[str, str], ...] = ({},) if self.positions is None else _positions(self.positions)
+        options: dict[str, Any] = {**vars(self), "axes": tuple(axes), "period": period, "positions": positions}
+        return Design(**options)
 
 
 def run(output: Path, wanted: Wanted, arm: str | None, max_speed: float | None, force: bool) -> None:
@@ -74,5 +67,5 @@ def _positions(path: Path) -> tuple[Mapping[str, str], ...]:
     table = tables.read(path)
     if not table.rows:
         raise ConfigError(f"{path}: lists no position")
-    cells = {name: table.texts(name) for name in table.columns}
-    return tuple(dict(zip(cells, row, strict=True)) for row in zip(*cells.values(), strict=True))
+    rows = zip(*(table.texts(name) for name in table.columns), strict=True)
+    return tuple(dict(zip(table.columns, row, strict=True)) for row in rows)

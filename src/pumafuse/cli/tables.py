@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console
@@ -13,13 +14,27 @@ from rich.table import Table
 from ..fusion.score import Z95
 from ..fusion.summary import ScoreSummary, Summary
 
-_FEW_RUNS = 20  # up to so many runs get lines of their own
+if TYPE_CHECKING:
+    from ..views.report import TextTable
+
+_FEW_RUNS = 20  # that get lines of their own
 
 
 def console(*, soft_wrap: bool = False) -> Console:
     """Standard output for people; 120 columns wide where it is no terminal."""
     width = None if sys.stdout.isatty() else 120
     return Console(highlight=False, soft_wrap=soft_wrap, width=width)
+
+
+def text_table(text: TextTable) -> Table:
+    """A table of text as it is: numbers are right-justified, cells that have lines are not wrapped."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for place, (heading, is_text) in enumerate(text.columns):
+        lines = any("\n" in row[place] for row in text.rows)
+        table.add_column(heading, justify="left" if is_text else "right", overflow="fold", no_wrap=lines)
+    for row in text.rows:
+        table.add_row(*map(escape, row))
+    return table
 
 
 def outcome_table(summary: Summary) -> Table:

@@ -1,8 +1,8 @@
-"""Do a model's coefficients depend on what was varied? The paper's Table I, and what it needs beside it.
+"""Dependence of coefficients and of the model's error on what was varied: the paper's Table I and Fig. 7.
 
 The i-ratio is F of a one-way analysis of variance over its 95 % point: above 1 the means differ. It assumes equal
-variances and looks at one factor alone; so Welch's test, which does not assume them, and an analysis with all factors
-at once, which an unbalanced design needs, stand beside it.
+variances and one factor at a time. Beside it stand Welch's test, which does not assume equal variances, and an analysis
+with all factors at once, which an unbalanced design needs.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from collections.abc import Mapping, Sequence
 import msgspec
 import numpy as np
 
+from .. import units
 from ..arrays import BoolArray, FloatArray
-from ..model.arm import ordered_axes
+from ..model.arm import Validity, ordered_axes
 from .trials import Trial
 
 _COUNTERS = frozenset({"replicate", "repetition", "repeat", "rep", "run", "observation"})  # columns that only count
 _MOST_LEVELS = 12  # a numeric factor with more is cut into quarters
 _OUTLYING = 8.0  # robust standard deviations from the median
-_LEAST_SD = 0.005  # of the median: a coefficient that is closer than this times `_OUTLYING` is no outlier
+_LEAST_SD = 0.005  # of the median: the smallest robust standard deviation that is believed
 _FEWEST = 5  # values among which one can be outlying
 
 
@@ -44,7 +45,7 @@ class Dependence(msgspec.Struct, frozen=True, kw_only=True):
         i_ratio: F over the 95 % point of its distribution; above 1 is dependent. Null where it cannot be computed.
         p: Of that F.
         welch_p: Of Welch's test, which does not assume equal variances.
-        adjusted_p: Of the factor beside all the others; null where the others already tell its level.
+        adjusted_p: Of the factor beside all the others; null where they are confounded.
         verdict: In words.
     """
 
@@ -59,16 +60,16 @@ class Dependence(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Scatter(msgspec.Struct, frozen=True, kw_only=True):
-    """How one coefficient scatters on one axis, in its unit.
+    """Scatter of one coefficient on one axis, in its unit.
 
     Attributes:
         coefficient: With its unit.
         axis: Of the trials.
         median: Over the trials.
-        normal_p: Of a Shapiro-Wilk test; small: not normally distributed, means and i-ratios are to be read with care.
+        normal_p: Of a Shapiro-Wilk test; small: not normally distributed, so do not trust means and i-ratios alone.
         outlying: Trials further from the median than eight robust standard deviations.
         replicate_sd: Between trials of the same settings; null where none were repeated.
-        own_sd: What the noise within a trial lets expect (median over the trials).
+        own_sd: By the noise within a trial (median over the trials).
     """
 
     coefficient: str
@@ -80,6 +81,22 @@ class Scatter(msgspec.Struct, frozen=True, kw_only=True):
     own_sd: float
 
 
+class Performance(msgspec.Struct, frozen=True, kw_only=True):
+    """Error of the combined model by one factor.
+
+    Attributes:
+        factor: What was varied.
+        levels: RMS [mm] of the trials at each level.
+        limit: Where the mean RMS passes the tolerance, in the factor's unit; null where it does not.
+        verdict: In words.
+    """
+
+    factor: str
+    levels: list[Level]
+    limit: float | None
+    verdict: str
+
+
 def factors_of(trials: Sequence[Trial], period: float) -> dict[str, list[str]]:
     """The level of each trial for every factor that varies and is no mere counter.
 
@@ -87,10 +104,7 @@ def factors_of(trials: Sequence[Trial], period: float) -> dict[str, list[str]]:
         trials: All that are analysed together.
         period: T [s], for a speed that is not recorded.
     """
-    columns: dict[str, list[str]] = {
-        "axis": [trial.axis for trial in trials],
-        "speed_m_s": speed_levels(trials, period),
-    }
+    columns = {"axis": [trial.axis for trial in trials], "speed_m_s": speed_levels(trials, period)}
     for name in trials[0].factors:
         if name not in _COUNTERS:
             columns[name] = _levels([trial.factors[name] for trial in trials])
@@ -116,11 +130,22 @@ def numbers(cells: Sequence[str]) -> list[float] | None:
 
 def ordered(levels: set[str]) -> list[str]:
     """Levels by number where they are numbers, else by name, axes in their own order."""
-    return (
-        list(ordered_axes(levels))
-        if numbers(list(levels)) is None
-        else sorted(levels, key=lambda level: (float(level), level))
-    )
+    if numbers(list(levels)) is None:
+        return list(ordered_axes(levels))
+    return sorted(levels, key=lambda level: (float(level), level))
+
+
+def levels_of(values: FloatArray, cells: Sequence[str]) -> list[Level]:
+    """Mean and scatter of (n,) values at each level named in ``cells`` (n,)."""
+    return [
+        Level(
+            level=level,
+            trials=len(group),
+            mean=float(group.mean()),
+            sd=float(group.std(ddof=1)) if len(group) > 1 else None,
+        )
+        for level, group in _groups(values, cells).items()
+    ]
 
 
 def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Sequence[str]]) -> list[Dependence]:
@@ -137,8 +162,16 @@ def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Se
     ]
 
 
+def welch(groups: Sequence[FloatArray]) -> float | None:
+    """P of the hypothesis that groups have one mean, whatever their variances; None where it cannot be tested."""
+    from statsmodels.stats.oneway import anova_oneway
+
+    usable = [group for group in groups if len(group) > 1 and np.ptp(group) > 0.0]
+    return float(anova_oneway(usable, use_var="unequal").pvalue) if len(usable) > 1 else None
+
+
 def scatter(coefficient: str, trials: Sequence[Trial], values: FloatArray, sd: FloatArray) -> Scatter:
-    """How a coefficient scatters among the trials of one axis.
+    """Scatter of a coefficient among the trials of one axis.
 
     Args:
         coefficient: Its name.
@@ -148,9 +181,7 @@ def scatter(coefficient: str, trials: Sequence[Trial], values: FloatArray, sd: F
     """
     from scipy.stats import shapiro
 
-    normal = None
-    if len(values) >= 3 and np.ptp(values) > 0.0:
-        normal = float(shapiro(values).pvalue)
+    normal = float(shapiro(values).pvalue) if len(values) >= 3 and np.ptp(values) > 0.0 else None
     return Scatter(
         coefficient=coefficient,
         axis=trials[0].axis,
@@ -167,15 +198,45 @@ def outlying(values: FloatArray, sd: FloatArray) -> BoolArray:
 
     Args:
         values: One of each trial, (n,).
-        sd: What the noise within each trial lets expect; it widens the limit, (n,).
+        sd: Standard deviation of each by the noise within its trial, which widens the limit, (n,).
     """
     from scipy.stats import median_abs_deviation
 
     if len(values) < _FEWEST:
         return np.zeros(len(values), dtype=bool)
     middle = float(np.median(values))
-    scatter = max(float(median_abs_deviation(values, scale="normal")), _LEAST_SD * abs(middle))
-    return np.abs(values - middle) > _OUTLYING * np.hypot(scatter, sd)
+    spread = max(float(median_abs_deviation(values, scale="normal")), _LEAST_SD * abs(middle))
+    return np.abs(values - middle) > _OUTLYING * np.hypot(spread, sd)
+
+
+def performances(factors: Mapping[str, Sequence[str]], rms: FloatArray, tolerance: float) -> list[Performance]:
+    """Error of a model by each factor.
+
+    Args:
+        factors: By name, the level of each trial, (n,).
+        rms: Of the model's residuals in each trial [m], (n,).
+        tolerance: RMS beyond which it is not called valid [m].
+    """
+    found: list[Performance] = []
+    for factor, cells in factors.items():
+        levels = levels_of(rms * units.MM, cells)
+        limit, verdict = _limit(levels, tolerance * units.MM)
+        found.append(Performance(factor=factor, levels=levels, limit=limit, verdict=verdict))
+    return found
+
+
+def validity(performance: Sequence[Performance], fastest: float) -> Validity:
+    """Limits that `fuse` can check: speed, and distance from the base where a factor is called radius_mm.
+
+    Args:
+        performance: By each factor.
+        fastest: Speed of the fastest trial [m/s], the limit where no factor gives one.
+    """
+    limits = {one.factor: one.limit for one in performance}
+    radius = limits.get("radius_mm")
+    return Validity(
+        max_speed=limits.get("speed_m_s") or fastest, max_radius=None if radius is None else radius / units.MM
+    )
 
 
 def _levels(cells: Sequence[str]) -> list[str]:
@@ -186,6 +247,12 @@ def _levels(cells: Sequence[str]) -> list[str]:
     quarter = np.searchsorted(np.quantile(values, [0.25, 0.5, 0.75]), values)
     middles = {part: f"{np.median(np.array(values)[quarter == part]):.4g}" for part in set(quarter.tolist())}
     return [middles[part] for part in quarter.tolist()]
+
+
+def _groups(values: FloatArray, cells: Sequence[str]) -> dict[str, FloatArray]:
+    """Values by level, in the order of the levels."""
+    named = np.array(cells)
+    return {level: values[named == level] for level in ordered(set(cells))}
 
 
 def _replicate_sd(trials: Sequence[Trial], values: FloatArray) -> float | None:
@@ -199,32 +266,8 @@ def _replicate_sd(trials: Sequence[Trial], values: FloatArray) -> float | None:
     return float(np.sqrt(squares / freedom)) if freedom else None
 
 
-def levels_of(values: FloatArray, cells: Sequence[str]) -> list[Level]:
-    """Mean and scatter of (n,) values at each level that ``cells`` (n,) names."""
-    named = np.array(cells)
-    groups = {level: values[named == level] for level in ordered(set(cells))}
-    return [
-        Level(
-            level=level,
-            trials=len(group),
-            mean=float(group.mean()),
-            sd=float(group.std(ddof=1)) if len(group) > 1 else None,
-        )
-        for level, group in groups.items()
-    ]
-
-
-def welch(groups: Sequence[FloatArray]) -> float | None:
-    """P of the hypothesis that groups have one mean, whatever their variances; None where it cannot be told."""
-    from statsmodels.stats.oneway import anova_oneway
-
-    usable = [group for group in groups if len(group) > 1 and np.ptp(group) > 0.0]
-    return float(anova_oneway(usable, use_var="unequal").pvalue) if len(usable) > 1 else None
-
-
 def _dependence(coefficient: str, values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> Dependence:
-    cells = np.array(factors[factor])
-    groups = [values[cells == level] for level in ordered(set(factors[factor]))]
+    groups = list(_groups(values, factors[factor]).values())
     ratio, p = _one_way(groups)
     by_welch, adjusted = welch(groups), _adjusted(values, factor, factors)
     return Dependence(
@@ -240,6 +283,7 @@ def _dependence(coefficient: str, values: FloatArray, factor: str, factors: Mapp
 
 
 def _one_way(groups: Sequence[FloatArray]) -> tuple[float | None, float | None]:
+    """The i-ratio and the p of a one-way analysis of variance."""
     from scipy.stats import f, f_oneway
 
     between, within = len(groups) - 1, sum(len(group) for group in groups) - len(groups)
@@ -255,7 +299,7 @@ def _adjusted(values: FloatArray, factor: str, factors: Mapping[str, Sequence[st
 
     rest = _design(len(values), [cells for name, cells in factors.items() if name != factor])
     whole = np.column_stack((rest, _design(len(values), [factors[factor]])[:, 1:]))
-    with warnings.catch_warnings():  # of columns that depend on one another: confounded factors, told by the rank
+    with warnings.catch_warnings():  # of dependent columns: the rank shows confounded factors
         warnings.simplefilter("ignore")
         full, reduced = OLS(values, whole).fit(), OLS(values, rest).fit()
     if full.df_resid < 1 or full.df_resid == reduced.df_resid or full.ssr <= 1e-24 * float(values @ values):
@@ -273,14 +317,32 @@ def _design(rows: int, factors: Sequence[Sequence[str]]) -> FloatArray:
 
 def _verdict(ratio: float | None, welch: float | None, adjusted: float | None, alone: bool) -> str:
     if ratio is None:
-        return "cannot be told: no scatter within any level"
-    said = "dependent" if ratio > 1.0 else "independent"
+        return "cannot be tested: no scatter within any level"
+    words = "dependent" if ratio > 1.0 else "independent"
     if welch is not None and (welch < 0.05) != (ratio > 1.0):
-        said += ", but Welch's test " + ("says it is" if welch < 0.05 else "does not confirm it")
+        words += ", but Welch's test " + ("says it is" if welch < 0.05 else "does not confirm it")
     if alone:
-        return said
+        return words
     if adjusted is None:
-        return said + "; cannot be told from the other factors"
+        return words + "; confounded with the other factors"
     if (adjusted < 0.05) != (ratio > 1.0):
-        said += "; beside the other factors " + ("dependent" if adjusted < 0.05 else "independent")
-    return said
+        words += "; beside the other factors " + ("dependent" if adjusted < 0.05 else "independent")
+    return words
+
+
+def _limit(levels: Sequence[Level], tolerance: float) -> tuple[float | None, str]:
+    """Where the mean RMS passes the tolerance, and in words. RMS and tolerance in mm."""
+    within = [level.mean <= tolerance for level in levels]
+    if all(within):
+        return None, f"within {tolerance:g} mm at every level tried"
+    if not any(within):
+        return None, f"beyond {tolerance:g} mm at every level tried"
+    first = within.index(False)
+    at = numbers([level.level for level in levels])
+    if at is None or not first or any(within[first:]):
+        good = ", ".join(level.level for level, fine in zip(levels, within, strict=True) if fine)
+        return None, f"within {tolerance:g} mm at {good} only"
+    low, high = levels[first - 1].mean, levels[first].mean
+    limit = at[first - 1] + (tolerance - low) / (high - low) * (at[first] - at[first - 1])
+    between = f"between the levels {levels[first - 1].level} and {levels[first].level}"
+    return limit, f"within {tolerance:g} mm up to {limit:.3g} ({between})"

@@ -1,8 +1,8 @@
-"""A campaign of step trials as a model of the arm: every trial fitted, all combined, the model judged against them."""
+"""A model of the arm from a campaign of step trials: fits of every trial, their combination, and how well it fits."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, cast
 
@@ -12,16 +12,14 @@ import numpy as np
 from .. import units
 from ..arrays import FloatArray
 from ..model.arm import ArmModel
-from ..model.plants import FirstOrder, SecondOrder
+from ..model.plants import FirstOrder
 from ..toml import Interval
 from . import anova
 from .combine import Combination, CombinedAxis, Fitted, combine, combined_rms, usual_gain
 from .estimate import common
 from .fit import StepFit, fit_steps, flags
 from .paper import fit_as_published, onset
-from .performance import Performance, performances, validity
-from .rows import window
-from .trials import StepTrials, Trial, TrialsError, several
+from .trials import StepTrials, Trial, TrialsError, first_few
 
 TOLERANCE = 1e-3  # m, the paper's
 _BATCH = 100  # trials a job
@@ -44,9 +42,9 @@ class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
         natural_frequency_ci95: Its interval.
         damping: ζ.
         damping_ci95: Its interval.
-        rms: Of what is left, eq. 10 [m].
+        rms: Of the residuals, eq. 10 [m].
         rms_percent: Of the step.
-        fit_percent: 100 (1 − ‖what is left‖ / ‖position without its mean‖).
+        fit_percent: 100 (1 − ‖residuals‖ / ‖position without its mean‖).
         flags: What to know before trusting it.
     """
 
@@ -80,7 +78,7 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
         second: Second-order fit.
         common_delay: Td under the plant that its axis's trials have in common [s]; null when left out.
         common_gain: K under it.
-        combined_rms: Of what the combined model leaves [m]; null without one.
+        combined_rms: Of the combined model's residuals [m]; null without one.
         left_out: Why it is not in the combined model; null when it is.
     """
 
@@ -99,16 +97,16 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Identification(msgspec.Struct, frozen=True, kw_only=True):
-    """What a campaign tells.
+    """The model of the arm, and all that it rests on.
 
     Attributes:
         arm: The combined model.
-        method: ``fitted``, or ``published`` with the paper's own measurements.
+        method: ``fitted``, or ``published`` as in the paper.
         samples: How many from the step on were used; null: all.
         tolerance: RMS up to which the model is called valid [m].
         trials: Every usable trial.
         axes: The combined model of each axis, with how it came about.
-        one_delay: Whether one delay does for all axes, in words.
+        one_delay: Whether all axes share one delay, in words.
         dependences: The paper's Table I.
         scatter: Normality, outlying trials and replicates of each coefficient.
         performance: The paper's Fig. 7.
@@ -124,11 +122,11 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True):
     one_delay: str
     dependences: list[anova.Dependence]
     scatter: list[anova.Scatter]
-    performance: list[Performance]
+    performance: list[anova.Performance]
     notes: list[str]
 
     def to_json(self) -> str:
-        """All of it, in the units that the names tell."""
+        """All of it as JSON, in the units of the names."""
         tree = units.from_si(msgspec.to_builtins(self, enc_hook=float))
         return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode()
 
@@ -156,40 +154,33 @@ def identify(
         TrialsError: The period is not known, or no axis has trials enough for a model.
     """
     period = trials.period(period)
-    fitted = _fitted(trials.trials, samples, paper)
+    fitted = _fit_all(trials.trials, samples, paper)
     by_axis = {axis: [one for one in fitted if one.trial.axis == axis] for axis in trials.axes}
     usual = {axis: usual_gain(of_axis) for axis, of_axis in by_axis.items()}
-    notes, combined = list(trials.notes), dict[str, Combination]()
-    read = len(notes)
+    notes, combined = list[str](), dict[str, Combination]()
     for axis, of_axis in by_axis.items():
-        found = combine(of_axis, period, samples, paper)
+        found = combine(of_axis, period, paper)
         if isinstance(found, str):
             notes.append(f"{axis}: no model: {found}")
         else:
             combined[axis] = found
-            if usual[axis] < 0.0:
-                notes.append(f"{axis}: the arm moves against its commands; is a sign wrong?")
-            if not _PLAUSIBLE[0] < abs(usual[axis]) < _PLAUSIBLE[1]:
-                notes.append(f"{axis}: the arm moves {usual[axis]:.3g} times as far as it is told; is a unit wrong?")
-            lag = found.axis.delays.lag.value
-            if not _PLAUSIBLE_LAG[0] < lag < _PLAUSIBLE_LAG[1]:
-                notes.append(f"{axis}: the arm is {lag:.3g} s behind its commands; is the unit of time wrong?")
+            notes.extend(f"{axis}: {doubt}" for doubt in _doubts(usual[axis], found.axis.delays.lag.value))
     if not combined:
-        raise TrialsError(
-            "; ".join(["no axis has trials enough for a model", *several([*notes[read:], *notes[:read]])])
-        )
+        reasons = first_few([*notes, *trials.notes])
+        raise TrialsError("; ".join(["no axis has trials enough for a model", *reasons]))
     arm, one_delay = _arm(combined, period, name)
     rms = {
-        one.trial.name: combined_rms(one.trial, arm.axes[one.trial.axis], arm.delay_of(one.trial.axis), period, samples)
+        one.trial.name: combined_rms(one.trial, arm.axes[one.trial.axis], arm.delay_of(one.trial.axis), period)
         for one in fitted
         if one.trial.axis in combined
     }
     left_out = {trial: why for found in combined.values() for trial, why in found.axis.left_out.items()}
-    used = [one for one in fitted if one.trial.name in rms and one.trial.name not in left_out]
     own = {trial: pair for found in combined.values() for trial, pair in found.own.items()}
+    used = [one for one in fitted if one.trial.name in own]
     factors = anova.factors_of([one.trial for one in used], period)
-    performance = performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance)
-    limited = validity(performance, max(one.trial.speed_at(period) for one in used))
+    performance = anova.performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance)
+    fastest = max(one.trial.speed_at(period) for one in used)
+    coefficients = {key: values for key, (values, _) in _coefficients(used).items()}
     provenance = {
         "made_by": f"pumafuse identify {version('pumafuse')}",
         "trials": {axis: found.axis.trials for axis, found in combined.items()},
@@ -202,60 +193,71 @@ def identify(
         "samples": "all" if samples is None else samples,
         "method": "delay and gain read off each trial (--paper)" if paper else "all parameters fitted",
     }
-    arm = _rounded(msgspec.structs.replace(arm, validity=limited, provenance=provenance))
+    arm = msgspec.structs.replace(arm, validity=anova.validity(performance, fastest), provenance=provenance)
     return Identification(
-        arm=arm,
+        arm=_rounded(arm),
         method="published" if paper else "fitted",
         samples=samples,
         tolerance=tolerance,
-        trials=[_result(one, period, samples, usual[one.trial.axis], own, rms, left_out) for one in fitted],
+        trials=[_result(one, period, usual[one.trial.axis], own, rms, left_out) for one in fitted],
         axes={axis: found.axis for axis, found in combined.items()},
         one_delay=one_delay,
-        dependences=anova.dependences(_coefficients(used), factors) if factors else [],
-        scatter=_scatters(by_axis),
+        dependences=anova.dependences(coefficients, factors) if factors else [],
+        scatter=[
+            anova.scatter(coefficient, [one.trial for one in of_axis], values, sd)
+            for of_axis in by_axis.values()
+            for coefficient, (values, sd) in _coefficients(of_axis).items()
+        ],
         performance=performance,
-        notes=notes,
+        notes=[*trials.notes, *notes],
     )
 
 
-def _fitted(trials: Sequence[Trial], samples: int | None, paper: bool) -> list[Fitted]:
-    """Every trial with its fits, over all cores where there are many."""
+def _fit_all(trials: Sequence[Trial], samples: int | None, paper: bool) -> list[Fitted]:
+    """Every trial with its fits, on all cores where there are many trials."""
     from joblib import Parallel, delayed
 
-    batches = [trials[first : first + _BATCH] for first in range(0, len(trials), _BATCH)]
-    fit = _published if paper else fit_steps
+    cut = [trial.cut(samples) for trial in trials]
+    batches = [cut[first : first + _BATCH] for first in range(0, len(cut), _BATCH)]
     parallel = Parallel(n_jobs=-1 if len(batches) > 1 else 1, return_as="generator")
-    fits = [pair for batch in parallel(delayed(fit)(batch, samples) for batch in batches) for pair in batch]
-    return [Fitted(trial, *pair, onset(trial)) for trial, pair in zip(trials, fits, strict=True)]
+    fits = [pair for batch in parallel(delayed(_fit_batch)(batch, paper) for batch in batches) for pair in batch]
+    return [Fitted(one, *pair, onset(trial)) for trial, one, pair in zip(trials, cut, fits, strict=True)]
 
 
-def _published(trials: Sequence[Trial], samples: int | None) -> list[tuple[StepFit, StepFit]]:
-    return [fit_as_published(trial, samples) for trial in trials]
+def _fit_batch(trials: Sequence[Trial], paper: bool) -> list[tuple[StepFit, StepFit]]:
+    return [fit_as_published(trial) for trial in trials] if paper else fit_steps(trials)
+
+
+def _doubts(gain: float, lag: float) -> Iterator[str]:
+    """What looks wrong about an axis's gain, or about its lag [s]."""
+    if gain < 0.0:
+        yield "the arm moves against its commands; is a sign wrong?"
+    if not _PLAUSIBLE[0] < abs(gain) < _PLAUSIBLE[1]:
+        yield f"the arm moves {gain:.3g} times as far as it is commanded; is a unit wrong?"
+    if not _PLAUSIBLE_LAG[0] < lag < _PLAUSIBLE_LAG[1]:
+        yield f"the arm is {lag:.3g} s behind its commands; is the unit of time wrong?"
 
 
 def _arm(combined: Mapping[str, Combination], period: float, name: str) -> tuple[ArmModel, str]:
-    """The arm with one delay, or one for each axis where the data ask for it, and which in words."""
+    """The arm with one delay, or one for each axis where they differ significantly, and which in words."""
     delays = [found.common.delay for found in combined.values()]
     every = common(np.concatenate(delays), np.concatenate([found.common.delay_sd for found in combined.values()]))
     p = anova.welch(delays) if len(delays) > 1 else None
-    apart = p is not None and p < 0.05
-    if len(delays) == 1:
-        words = "one axis, one delay"
-    elif p is None:
-        words = "one delay: whether axes differ cannot be told"
-    elif apart:
+    axes = {axis: found.axis.model for axis, found in combined.items()}
+    if p is not None and p < 0.05:
         words = f"a delay for each axis: they differ (Welch's test, p {'< 0.001' if p < 1e-3 else f'= {p:.2g}'})"
     else:
-        words = f"one delay: the axes do not differ (Welch's test, p = {p:.2g})"
-    own = {axis: found.axis.model for axis, found in combined.items()}
-    axes = (
-        own if apart else {axis: msgspec.structs.replace(one, delay=None, delay_ci95=None) for axis, one in own.items()}
-    )
+        axes = {axis: msgspec.structs.replace(one, delay=None, delay_ci95=None) for axis, one in axes.items()}
+        words = "one delay: whether axes differ cannot be tested"
+        if len(delays) == 1:
+            words = "one axis, one delay"
+        elif p is not None:
+            words = f"one delay: the axes do not differ (Welch's test, p = {p:.2g})"
     return ArmModel(name=name, update_period=period, delay=every.value, delay_ci95=every.ci95, axes=axes), words
 
 
 def _rounded(arm: ArmModel) -> ArmModel:
-    """The arm in six digits: more would only look exact."""
+    """The arm in six digits: more would suggest a precision that it has not."""
 
     def rounded(value: Any) -> Any:
         match value:
@@ -271,33 +273,17 @@ def _rounded(arm: ArmModel) -> ArmModel:
     return msgspec.convert(rounded(msgspec.to_builtins(arm)), ArmModel)
 
 
-def _coefficients(used: Sequence[Fitted]) -> dict[str, FloatArray]:
-    """The paper's three, of first-order fits, in the units that their names tell."""
-    return {
-        "delay_ms": np.array([one.first.shape.delay for one in used]) * units.MS,
-        "gain": np.array([one.first.gain for one in used]),
-        "time_constant_ms": np.array([one.first.shape.q for one in used]) * units.MS,
-    }
-
-
-def _scatters(by_axis: Mapping[str, Sequence[Fitted]]) -> list[anova.Scatter]:
-    """How each coefficient scatters on each axis."""
-    found: list[anova.Scatter] = []
-    for of_axis in by_axis.values():
-        sds = {
-            "delay_ms": np.array([one.first.delay_sd for one in of_axis]) * units.MS,
-            "gain": np.array([one.first.gain_sd for one in of_axis]),
-            "time_constant_ms": np.array([one.first.q_sd for one in of_axis]) * units.MS,
-        }
-        for coefficient, values in _coefficients(of_axis).items():
-            found.append(anova.scatter(coefficient, [one.trial for one in of_axis], values, sds[coefficient]))
-    return found
+def _coefficients(fitted: Sequence[Fitted]) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """The paper's three coefficients of first-order fits with their sds, in the units of their names."""
+    values = np.array([(*one.first.shape[:2], one.first.gain) for one in fitted])
+    sds = np.array([(*one.first.sd[:2], one.first.sd.gain) for one in fitted])
+    scales = {"delay_ms": (0, units.MS), "gain": (2, 1.0), "time_constant_ms": (1, units.MS)}
+    return {name: (values[:, place] * unit, sds[:, place] * unit) for name, (place, unit) in scales.items()}
 
 
 def _result(
     one: Fitted,
     period: float,
-    samples: int | None,
     usual: float,
     own: Mapping[str, tuple[float, float]],
     rms: Mapping[str, float],
@@ -312,8 +298,8 @@ def _result(
         speed=trial.speed_at(period),
         factors=trial.factors,
         onset=one.onset if np.isfinite(one.onset) else None,
-        first=_order_fit(one.first, trial, usual, samples),
-        second=_order_fit(one.second, trial, usual, samples),
+        first=_order_fit(one.first, trial, usual),
+        second=_order_fit(one.second, trial, usual),
         common_delay=delay,
         common_gain=gain,
         combined_rms=rms.get(trial.name),
@@ -321,20 +307,23 @@ def _result(
     )
 
 
-def _order_fit(fit: StepFit, trial: Trial, usual: float, samples: int | None) -> OrderFit:
-    moved = float(np.std(window(trial, samples)[1]))
-    plant = fit.plant
+def _order_fit(fit: StepFit, trial: Trial, usual: float) -> OrderFit:
+    moved, plant = float(np.std(trial.position)), fit.plant
+    if isinstance(plant, FirstOrder):
+        own: dict[str, Any] = {"time_constant": plant.time_constant, "time_constant_ci95": fit.ci95.q}
+    else:
+        own = {
+            "natural_frequency": plant.natural_frequency,
+            "natural_frequency_ci95": fit.natural_frequency_ci95,
+            "damping": plant.damping,
+            "damping_ci95": fit.damping_ci95,
+        }
     return OrderFit(
         gain=fit.gain,
-        gain_ci95=fit.gain_ci95,
+        gain_ci95=fit.ci95.gain,
         delay=fit.shape.delay,
-        delay_ci95=fit.delay_ci95,
-        time_constant=plant.time_constant if isinstance(plant, FirstOrder) else None,
-        time_constant_ci95=fit.q_ci95 if fit.order == 1 else None,
-        natural_frequency=plant.natural_frequency if isinstance(plant, SecondOrder) else None,
-        natural_frequency_ci95=fit.natural_frequency_ci95 if fit.order == 2 else None,
-        damping=plant.damping if isinstance(plant, SecondOrder) else None,
-        damping_ci95=fit.damping_ci95 if fit.order == 2 else None,
+        delay_ci95=fit.ci95.delay,
+        **own,
         rms=fit.rms,
         rms_percent=100.0 * fit.rms / abs(trial.step),
         fit_percent=100.0 * (1.0 - fit.rms / moved) if moved > 0.0 else 0.0,

@@ -1,7 +1,7 @@
-"""What to send to an arm: a randomised, balanced step campaign, and binary white noise to verify its model with.
+"""Plan of the commands to an arm: a randomised, balanced step campaign, and binary white noise for verification.
 
-Every block of the campaign holds every combination of position, axis and speed once, in an order of its own: what
-drifts during the day does not look like a factor, and a campaign that is cut short after a block is still balanced.
+Every block of the campaign has every combination of position, axis and speed once, in an order of its own. So a drift
+during the day does not look like a factor, and a campaign that is cut short after a block is still balanced.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
 from .. import folders
@@ -33,7 +35,7 @@ _TAKEN = frozenset({"trial", "axis", "step_mm", "speed_m_s", "replicate", "tick"
 
 @dataclass(frozen=True)
 class Design:
-    """What a campaign is to vary.
+    """Design of a campaign.
 
     Attributes:
         axes: To step, one at a time.
@@ -128,14 +130,12 @@ def plan(design: Design, arm: ArmModel | None = None, max_speed: float | None = 
         order: list[int] = rng.permutation(len(cells)).tolist()
         for position, axis, speed in (cells[index] for index in order):
             trials.append(PlannedTrial(axis, speed, position, block))
+    resting = np.zeros(_ticks(design.rest, design.period))
     noise: dict[tuple[str, float], FloatArray] = {}
-    for axis in design.axes:
-        for amplitude in design.amplitudes:
-            sequence = WhiteNoise(axes=[axis], amplitude=amplitude, duration=design.noise_duration)
-            resting = np.zeros(_ticks(design.rest, design.period))
-            noise[axis, amplitude] = np.concatenate((resting, sequence.offsets(design.period, rng)[axis], resting))
-    steps = len(trials) * len(_one_step(design))
-    count = steps + sum(len(sequence) for sequence in noise.values())
+    for axis, amplitude in product(design.axes, design.amplitudes):
+        sequence = WhiteNoise(axes=[axis], amplitude=amplitude, duration=design.noise_duration)
+        noise[axis, amplitude] = np.concatenate((resting, sequence.offsets(design.period, rng)[axis], resting))
+    count = len(trials) * len(_one_step(design)) + sum(map(len, noise.values()))
     return Plan(design, tuple(trials), noise, count * design.period, tuple(_warnings(design, arm, max_speed)))
 
 
@@ -157,31 +157,37 @@ def write(planned: Plan, folder: Path, force: bool) -> None:
         FolderError: See :func:`check_writable`, or the disk refuses.
     """
     check_writable(folder, force)
-    design, axes = planned.design, ordered_axes(set(planned.design.axes))
+    design, trials, step = planned.design, planned.trials, _one_step(planned.design)
+    number, sizes = np.arange(1, len(trials) + 1), np.array([trial.speed * design.period for trial in trials])
     listed: dict[str, Sequence[object]] = {
-        "trial": range(1, len(planned.trials) + 1),
-        "axis": [trial.axis for trial in planned.trials],
-        "step_mm": [round(trial.speed * design.period * MM, 6) for trial in planned.trials],
-        "speed_m_s": [trial.speed for trial in planned.trials],
-        **{name: [trial.position[name] for trial in planned.trials] for name in design.positions[0]},
-        "replicate": [trial.replicate for trial in planned.trials],
+        "trial": number.tolist(),
+        "axis": [trial.axis for trial in trials],
+        "step_mm": _millimetres(sizes).tolist(),
+        "speed_m_s": [trial.speed for trial in trials],
+        **{name: [trial.position[name] for trial in trials] for name in design.positions[0]},
+        "replicate": [trial.replicate for trial in trials],
     }
+    offsets = {
+        axis: np.outer([size * (trial.axis == axis) for trial, size in zip(trials, sizes, strict=True)], step).ravel()
+        for axis in ordered_axes(set(design.axes))
+    }
+    ticks = np.tile(np.arange(len(step)), len(trials))
     with folders.replacing(folder) as new:
-        tables.write(pa.table({name: list(cells) for name, cells in listed.items()}), new / TRIALS)
-        shape = _one_step(design)
-        number = np.repeat(np.arange(1, len(planned.trials) + 1), len(shape))
-        steps = {axis: np.concatenate([_offsets(design, trial, axis) for trial in planned.trials]) for axis in axes}
-        first = {"trial": number, **_clock(np.tile(np.arange(len(shape)), len(planned.trials)), design.period)}
-        tables.write(pa.table({**first, **_columns(steps)}), new / STEPS)
-        for (axis, amplitude), sequence in planned.noise.items():
+        tables.write(pa.table(listed), new / TRIALS)
+        steps = _sequence(ticks, design.period, offsets)
+        tables.write(pa.table({"trial": np.repeat(number, len(step)), **steps}), new / STEPS)
+        for (axis, amplitude), noise in planned.noise.items():
             file = new / f"{_NOISE}{axis}-{_written(amplitude)}mm.csv"
-            clock = _clock(np.arange(len(sequence)), design.period)
-            tables.write(pa.table({**clock, **_columns({axis: sequence})}), file)
+            tables.write(pa.table(_sequence(np.arange(len(noise)), design.period, {axis: noise})), file)
 
 
 def _written(length: float) -> str:
     """In mm, to the nanometre, as files have it."""
-    return f"{round(length * MM, 6):.10g}"
+    return f"{_millimetres(length):.10g}"
+
+
+def _millimetres(length: FloatArray | float) -> FloatArray:
+    return np.round(np.asarray(length) * MM, 6)
 
 
 def _ticks(duration: float, period: float) -> int:
@@ -191,28 +197,21 @@ def _ticks(duration: float, period: float) -> int:
 def _one_step(design: Design) -> FloatArray:
     """0, 1, 0: a step of size 1 with the rest before and after it, tick by tick."""
     rest, hold = _ticks(design.rest, design.period), _ticks(design.hold, design.period)
-    return np.concatenate((np.zeros(rest), np.ones(hold), np.zeros(rest)))
+    return np.repeat([0.0, 1.0, 0.0], [rest, hold, rest])
 
 
-def _offsets(design: Design, trial: PlannedTrial, axis: str) -> FloatArray:
-    """What one axis is told during one trial [m]."""
-    return _one_step(design) * (trial.speed * design.period if trial.axis == axis else 0.0)
-
-
-def _clock(tick: IntArray, period: float) -> dict[str, IntArray | FloatArray]:
-    return {"tick": tick, "time_s": np.asarray(np.round(tick * period, 9), dtype=np.float64)}
-
-
-def _columns(offsets: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    return {f"{axis}_mm": np.round(values * MM, 6) for axis, values in offsets.items()}
+def _sequence(tick: IntArray, period: float, offsets: Mapping[str, FloatArray]) -> dict[str, npt.NDArray[Any]]:
+    """Columns of a sequence of commands [m], tick by tick."""
+    columns = {f"{axis}_mm": _millimetres(values) for axis, values in offsets.items()}
+    return {"tick": tick, "time_s": np.round(tick * period, 9), **columns}
 
 
 def _warnings(design: Design, arm: ArmModel | None, max_speed: float | None) -> list[str]:
     found: list[str] = []
     if len(design.speeds) == 1:
-        found.append("one speed only: how the gain depends on speed cannot be told")
+        found.append("one speed only: the gain's dependence on speed is not identifiable")
     if design.replicates == 1:
-        found.append("no replicates: what moves from trial to trial cannot be told from what the factors do")
+        found.append("no replicates: scatter from trial to trial cannot be separated from the factors' effects")
     if not design.amplitudes:
         found.append("no white noise: there will be nothing to verify the model with")
     limit = arm.validity.max_speed if max_speed is None and arm is not None else max_speed

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,12 +17,12 @@ from ..model.arm import ordered_axes
 from ..units import ending, seconds
 
 _FEWEST = 8  # samples from the step on: a second-order fit with delay, gain and zero has five unknowns
-_AGREE = 0.03  # how far step over speed may differ between trials and still be one update period
-_PERIODS = (0.001, 0.2)  # s, that an update period can be
-_GIVEN = (1e-4, 10.0)  # s, that one can be given
+_AGREE = 0.03  # relative difference of step over speed between trials that is still one update period
+_PERIODS = (0.001, 0.2)  # s, range of an update period found from the trials
+_GIVEN = (1e-4, 10.0)  # s, range of an update period given by the user
 _LATEST, _FARTHEST = 3600.0, 1e6  # s and m that a sample can be away from its command and from 0
-_SAID = 4  # sentences in the line of an error
-_STEPS = (1e-9, 1e3)  # m, that a step can be
+_SHOWN = 4  # sentences in the line of an error
+_STEPS = (1e-9, 1e3)  # m, range of a step
 
 
 class TrialsError(PumafuseError):
@@ -35,7 +36,7 @@ class Trial:
     Attributes:
         name: Of the trial.
         axis: Which axis was stepped.
-        step: By how much, signed [m].
+        step: Signed size of the step [m].
         speed: Step size over the update period [m/s]; NaN where it is not recorded.
         factors: What else was varied, as written.
         time: Of each sample since the step's command [s], ascending.
@@ -53,6 +54,11 @@ class Trial:
     def speed_at(self, period: float) -> float:
         """The speed as recorded, or step over ``period`` [s] where it is not [m/s]."""
         return self.speed if self.speed > 0.0 else abs(self.step) / period
+
+    def cut(self, samples: int | None) -> Trial:
+        """The trial with only ``samples`` samples from the step on, and all before it; unchanged for None."""
+        end = None if samples is None else int(np.searchsorted(self.time, 0.0)) + samples
+        return replace(self, time=self.time[:end], position=self.position[:end])
 
 
 @dataclass(frozen=True)
@@ -86,9 +92,9 @@ class StepTrials:
             if not _GIVEN[0] <= given <= _GIVEN[1]:
                 raise TrialsError(f"an update period of {given * 1e3:g} ms: it must be 0.1 ms to 10 s")
             return given
-        told = [trial for trial in self.trials if trial.speed > 0.0]
-        step, speed = np.abs([trial.step for trial in told]), np.array([trial.speed for trial in told])
-        middle = float(np.median(step / speed)) if told else np.nan
+        timed = [trial for trial in self.trials if trial.speed > 0.0]
+        step, speed = np.abs([trial.step for trial in timed]), np.array([trial.speed for trial in timed])
+        middle = float(np.median(step / speed)) if timed else np.nan
         if not _PERIODS[0] <= middle <= _PERIODS[1] or (np.abs(step / speed / middle - 1.0) > _AGREE).any():
             raise TrialsError("step over speed is not one update period of 1 to 200 ms in all trials: give --period")
         # least squares through 0: speeds are rounded, the small ones the most for their size
@@ -110,19 +116,17 @@ class StepTrials:
         """
         listed, sampled = _table(Path(folder), "trials"), _table(Path(folder), "samples")
         notes = [*listed.notes, *sampled.notes]
-        step = _numbers(listed, "step", notes)
-        speed, remark = (
-            listed.plain("speed_m_s") if "speed_m_s" in listed.columns else (np.full(listed.rows, np.nan), None)
-        )
-        notes.extend([] if remark is None else [remark])
+        step = _noted(listed.numbers(_column(listed, "step")), notes)
+        speed = np.full(listed.rows, np.nan)
+        if "speed_m_s" in listed.columns:
+            speed = _noted(listed.plain("speed_m_s"), notes)
         names, axes = listed.texts("trial"), listed.texts("axis")
         own = {"trial", "axis", "speed_m_s", _column(listed, "step")}
         factors = {column: listed.texts(column) for column in listed.columns if column not in own}
         samples = _samples(sampled, notes)
-        known = Counter(names)
-        strange = [name for name in samples if name not in known]
-        if strange:
-            notes.append(f"{sampled.path.name}: {len(strange)} trials are not listed, first '{strange[0]}': left out")
+        listings = Counter(names)
+        if unlisted := [name for name in samples if name not in listings]:
+            notes.append(f"{sampled.path.name}: {len(unlisted)} trials are not listed, first '{unlisted[0]}': left out")
         trials: list[Trial] = []
         for row, name in enumerate(names):
             if not name:
@@ -130,7 +134,7 @@ class StepTrials:
                 continue
             time, position = samples.get(name, (np.zeros(0), np.zeros(0)))
             found = (np.abs(time) < _LATEST) & (np.abs(position) < _FARTHEST)
-            reason = _unusable(known[name], axes[row], float(step[row]), time[found])
+            reason = _unusable(listings[name], axes[row], float(step[row]), time[found])
             if reason is not None:
                 notes.append(f"trial '{name}': {reason}: left out")
                 continue
@@ -144,14 +148,14 @@ class StepTrials:
             of = {factor: cells[row] for factor, cells in factors.items()}
             trials.append(Trial(name, axes[row], float(step[row]), float(speed[row]), of, time, position))
         if not trials:
-            raise TrialsError("; ".join([f"{folder}: no trial can be used", *several(notes)]))
+            raise TrialsError("; ".join([f"{folder}: no trial can be used", *first_few(notes)]))
         return StepTrials(tuple(trials), tuple(notes))
 
 
-def several(notes: Sequence[str]) -> list[str]:
-    """The first few of many sentences, and how many more there are: an error is one line that can be read."""
-    more = len(notes) - _SAID
-    return [*notes[:_SAID], *([f"and {more} more"] if more > 0 else [])]
+def first_few(notes: Sequence[str]) -> list[str]:
+    """The first few of many sentences, and how many more there are, for an error of one readable line."""
+    more = len(notes) - _SHOWN
+    return [*notes[:_SHOWN], *([f"and {more} more"] if more > 0 else [])]
 
 
 def _unusable(times_listed: int, axis: str, step: float, time: FloatArray) -> str | None:
@@ -160,12 +164,10 @@ def _unusable(times_listed: int, axis: str, step: float, time: FloatArray) -> st
         return f"listed {times_listed} times"
     if not axis:
         return "it names no axis"
+    if step == 0.0 or not np.isfinite(step):
+        return "its step is 0 or no number"
     if not _STEPS[0] <= abs(step) <= _STEPS[1]:
-        return (
-            "its step is 0 or no number"
-            if step == 0.0 or not np.isfinite(step)
-            else "its step is of no size an arm has"
-        )
+        return "its step is of no size an arm has"
     after = len(np.unique(time[time >= 0.0]))
     return f"{after} samples from the step on, at least {_FEWEST} are needed" if after < _FEWEST else None
 
@@ -185,18 +187,17 @@ def _column(table: tables.Table, stem: str) -> str:
     raise RunError(f"{table.path}: no column '{stem}' with a unit in its name; it has {', '.join(table.columns)}")
 
 
-def _numbers(table: tables.Table, stem: str, notes: list[str]) -> FloatArray:
-    values, note = table.numbers(_column(table, stem))
+def _noted(column: tuple[Any, str | None], notes: list[str]) -> Any:
+    """The values of a column; its note goes to ``notes``."""
+    values, note = column
     notes.extend([] if note is None else [note])
     return values
 
 
 def _samples(table: tables.Table, notes: list[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Times [s] and positions [m] of each trial, in the order of the file."""
-    stamp, note = table.stamps(_column(table, "time"))
-    notes.extend([] if note is None else [note])
-    time = seconds(stamp)
-    position = _numbers(table, "position", notes)
+    time = seconds(_noted(table.stamps(_column(table, "time")), notes))
+    position = _noted(table.numbers(_column(table, "position")), notes)
     if not table.rows:
         return {}
     names, place = np.unique(np.array(table.texts("trial"), dtype=object), return_inverse=True)

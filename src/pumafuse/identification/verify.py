@@ -1,8 +1,8 @@
-"""Does a model hold on a run it was not made from? The paper's white-noise verification, Table III and Figs. 8 and 9.
+"""Verification of a model on a run that it was not made from: the paper's Table III and Figs. 8 and 9.
 
-The model is driven by the run's commands alone and compared with what was measured, both without their means, as in the
-paper. Beside it stands the floor: the best linear model of the same order, refitted on this very run; no model of that
-kind can do better, so what is left is noise, friction and everything else that is not linear.
+The model is driven by the run's commands alone and compared with the measurements, both without their means, as in the
+paper. Beside it stands the best in class: the best linear model of the same order, refitted on this very run. What that
+leaves is noise, friction and everything else that is not linear.
 """
 
 from __future__ import annotations
@@ -24,17 +24,16 @@ from ..logs.clock import segments
 from ..logs.run import Run
 from ..model.arm import ArmModel, AxisModel
 from ..model.plants import SecondOrder
-from .floor import Floor, best_of_order
-from .measured import Commands, Fit, Measured
+from .best_in_class import BestInClass, Commands, Fit, Measured, best_in_class
 
 RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
 REFERENCE = "reference"
 _FEWEST = 20  # measurements
-_MOST_LEVELS = 8  # of a run whose start level is looked for among them
-_AS_GOOD, _FAR = 1.2, 3.0  # times the floor
+_MOST_LEVELS = 8  # of a run whose start level is searched among them
+_AS_GOOD, _FAR = 1.2, 3.0  # times the error of the best in class
 _FARTHEST, _SLOWEST = 1e6, 1e4  # m, s: sizes beyond which nothing can be computed
 _HOLDS = 50.0  # % fit
-_BETTER = 0.8  # share of the error that is worth a word
+_BETTER = 0.8  # share of the error below which a recovery is recommended
 
 
 class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
@@ -47,14 +46,13 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
         measurements: How many were compared.
         amplitude: From the lowest to the highest command [m].
         start: Level at which the arm was taken to rest before the first command [m].
-        start_from: How that was known, in words.
+        start_from: Where that level comes from, in words.
         model: The model as it is.
         without_recovery: With a gain that never recovers.
         with_recovery: With a gain that recovers.
         recovery: Its time constant [s].
-        floor: The best that a linear model of this order can do on this run.
-        outlying: Measurements that jump eight robust standard deviations away from their neighbours, which are left
-            out.
+        best_in_class: The best linear model of this order on this run.
+        outlying: How many measurements were left out because they jump away from their neighbours.
         verdict: In words.
         notes: What was wrong with the run, a sentence each; with the first axis and source of each part of it.
     """
@@ -70,7 +68,7 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
     without_recovery: Fit
     with_recovery: Fit
     recovery: float = msgspec.field(name="recovery_ms")
-    floor: Floor
+    best_in_class: BestInClass
     outlying: int
     verdict: str
     notes: list[str]
@@ -78,7 +76,7 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Trace:
-    """What was compared, without means, for a picture. Arrays (n,).
+    """Measured and modelled position, without means, for a figure. Arrays (n,).
 
     Attributes:
         time: [s] since the first command.
@@ -94,17 +92,17 @@ class Trace:
 def verify(
     run: Run, arm: ArmModel, *, sensors: Iterable[str] | None = None, start: Mapping[str, float] | None = None
 ) -> list[tuple[AxisVerification, Trace]]:
-    """Simulate a run's commands and compare with what was measured.
+    """Simulate a run's commands and compare with the measurements.
 
     Args:
-        run: With measurements or a reference that are true at their stamps.
+        run: With measurements or a reference whose stamps are right.
         arm: The model.
         sensors: Which sensors, or ``reference``; None: the reference where there is one, else every sensor.
         start: Level [m] before the first command by axis; where it is not known from here or the run, it is chosen
             among the run's levels by RMS.
 
     Returns:
-        For each axis and source the verdict, and the traces it was made of.
+        The verification of each axis and source, and its traces.
 
     Raises:
         PumafuseError: The run has no such sensor, commands an axis that the arm has not, or nothing to compare with.
@@ -114,14 +112,14 @@ def verify(
             raise ConfigError(
                 f"start level of '{axis}': {level * units.MM:g} mm is not finite, or nowhere an arm can be"
             )
-    chosen = _with_reference(run, None if sensors is None else tuple(sensors))
+    chosen = _with_sources(run, None if sensors is None else tuple(sensors))
     config = FusionConfig(arm=arm, sensors={name: Sensor(sd=1e-3) for name in chosen.sensors})
-    parts, said = segments(in_axes(chosen, None)[0])
+    parts, jumps = segments(in_axes(chosen, None)[0])
     found: list[tuple[AxisVerification, Trace]] = []
     for number, part in enumerate(parts, 1):
         name = run.name if len(parts) == 1 else f"{run.name}, part {number}"
         part = replace(part, name=name, start={**part.start, **(start or {})})
-        found.extend(_part(part, config, said if number == 1 else ()))
+        found.extend(_part(part, config, jumps if number == 1 else ()))
     if not found:
         raise RunError(
             f"run '{run.name}': no source has {_FEWEST} measurements of a commanded axis after the first command"
@@ -129,7 +127,7 @@ def verify(
     return found
 
 
-def _part(run: Run, config: FusionConfig, said: Sequence[str]) -> list[tuple[AxisVerification, Trace]]:
+def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[AxisVerification, Trace]]:
     """Every axis and source of one segment of a run."""
     timeline = timelines.build(run, config)
     components, found = timeline.components, list[tuple[AxisVerification, Trace]]()
@@ -139,20 +137,20 @@ def _part(run: Run, config: FusionConfig, said: Sequence[str]) -> list[tuple[Axi
             here = components.candidates[(axis == number) & (sensor == index)]
             if len(here) >= _FEWEST and np.ptp(driven.command) > 0.0:
                 measured = Measured(run.name, source, components.valid[here], components.value[here])
-                notes = [*said, *timeline.notes] if not found else []
+                notes = [*jumps, *timeline.notes] if not found else []
                 found.append(_verified(measured, driven, config.arm, driven.name in run.start, notes))
     return found
 
 
-def _with_reference(run: Run, sensors: Sequence[str] | None) -> Run:
+def _with_sources(run: Run, sensors: Sequence[str] | None) -> Run:
     """The run with only the sources that it is verified against, as sensors."""
     sources = dict(run.sensors)
     if run.reference is not None:
         sources[REFERENCE] = run.reference
     if sensors is None:
         sensors = (REFERENCE,) if run.reference is not None else tuple(sources)
-    if strange := [name for name in sensors if name not in sources]:
-        raise RunError(f"run '{run.name}' has no sensor '{strange[0]}'; it has {', '.join(sources) or 'none'}")
+    if unknown := [name for name in sensors if name not in sources]:
+        raise RunError(f"run '{run.name}' has no sensor '{unknown[0]}'; it has {', '.join(sources) or 'none'}")
     return replace(run, sensors={name: sources[name] for name in sensors}, reference=None)
 
 
@@ -163,19 +161,17 @@ def _verified(
     _check_sizes(driven, model, delay)
     command = Commands(driven.given, driven.command, arm.update_period)
     recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
-    start, words = _start(measured, command, driven.start, model, delay, given)
-    every = len(measured.time)
+    start, start_from = _start(measured, command, driven.start, model, delay, given)
+    count = len(measured.time)
     measured = measured.without_spikes(command.moved(model, delay, start, measured.time))
 
-    def simulated(axis: AxisModel) -> FloatArray:
-        return command.moved(axis, delay, start, measured.time)
+    def fitted(gain_recovery: float | None) -> Fit:
+        axis = msgspec.structs.replace(model, gain_recovery=gain_recovery)
+        return measured.fit(command.moved(axis, delay, start, measured.time), command.amplitude)
 
-    fits = {
-        key: measured.fit(simulated(msgspec.structs.replace(model, gain_recovery=value)), command.amplitude)
-        for key, value in (("as it is", model.gain_recovery), ("never", None), ("recovering", recovery))
-    }
-    floor = best_of_order(measured, command, model, delay, start)
-    modelled = simulated(model)
+    as_it_is, recovering = fitted(model.gain_recovery), fitted(recovery)
+    best = best_in_class(measured, command, model, delay, start)
+    modelled = command.moved(model, delay, start, measured.time)
     trace = Trace(
         units.seconds(measured.time, int(command.time[0])),
         measured.position - measured.position.mean(),
@@ -188,15 +184,14 @@ def _verified(
         measurements=len(measured.time),
         amplitude=command.amplitude,
         start=start,
-        start_from=words,
-        model=fits["as it is"],
-        without_recovery=fits["never"],
-        with_recovery=fits["recovering"],
+        start_from=start_from,
+        model=as_it_is,
+        without_recovery=fitted(None),
+        with_recovery=recovering,
         recovery=recovery,
-        floor=floor,
-        outlying=every - len(measured.time),
-        verdict=_verdict(fits["as it is"], model, delay, floor)
-        + _recovers(fits["as it is"], fits["recovering"], recovery),
+        best_in_class=best,
+        outlying=count - len(measured.time),
+        verdict=_verdict(as_it_is, model, delay, best) + _recovers(as_it_is, recovering, recovery),
         notes=notes,
     )
     return verification, trace
@@ -207,16 +202,15 @@ def _check_sizes(driven: AxisInput, model: AxisModel, delay: float) -> None:
     rates = [model.plant.natural_frequency] if isinstance(model.plant, SecondOrder) else []
     if not all(1.0 / _SLOWEST <= rate <= _FARTHEST for rate in (*rates, 1.0 / max(model.plant.lag, 1e-300))):
         raise ConfigError(f"axis '{driven.name}': a plant of no speed that an arm has")
-    if not (
-        max(abs(driven.start), abs(model.gain.slope), abs(model.gain.intercept)) <= _FARTHEST and delay <= _SLOWEST
-    ):
+    sizes = (abs(driven.start), abs(model.gain.slope), abs(model.gain.intercept))
+    if not (max(sizes) <= _FARTHEST and delay <= _SLOWEST):
         raise ConfigError(f"axis '{driven.name}': a start level, gain or delay of no size that an arm has")
 
 
 def _start(
     measured: Measured, command: Commands, first: float, model: AxisModel, delay: float, given: bool
 ) -> tuple[float, str]:
-    """Where the arm rested before the first command [m], and how that is known."""
+    """Level before the first command [m], and where it comes from."""
     if given:
         return first, "given"
     levels = np.unique(command.value)
@@ -226,18 +220,19 @@ def _start(
     return float(levels[np.argmin(rms)]), f"chosen among the run's {len(levels)} levels by RMS"
 
 
-def _verdict(model: Fit, axis: AxisModel, delay: float, floor: Floor) -> str:
-    """How near the model is to the best of its order, and where the two differ."""
-    if max(floor.fit.fit, model.fit) < _HOLDS:
+def _verdict(model: Fit, axis: AxisModel, delay: float, best: BestInClass) -> str:
+    """The model's error beside that of the best of its order, and where the two differ."""
+    if max(best.fit.fit, model.fit) < _HOLDS:
         return "no linear model of this order fits: look at the log"
-    ratio = model.rms / floor.fit.rms if floor.fit.rms > 0.0 else 1.0 if model.rms == 0.0 else np.inf
+    ratio = model.rms / best.fit.rms if best.fit.rms > 0.0 else 1.0 if model.rms == 0.0 else np.inf
     if ratio < _AS_GOOD:
         return "as good as any model of its order"
-    later = (floor.delay + floor.plant.lag) - (delay + axis.plant.lag)
-    differ = f"here the arm answers {abs(later) * units.MS:.1f} ms {'later' if later > 0.0 else 'sooner'}"
-    held = "does not hold" if model.fit < _HOLDS else "follows the motion" if ratio > _FAR else "holds"
+    later = (best.delay + best.plant.lag) - (delay + axis.plant.lag)
+    difference = f"here the arm answers {abs(later) * units.MS:.1f} ms {'later' if later > 0.0 else 'sooner'}"
+    holds = "does not hold" if model.fit < _HOLDS else "follows the motion" if ratio > _FAR else "holds"
     return (
-        f"{held}, with {ratio:.1f} times the error of the best model of its order: {differ}, with gain {floor.gain:.2f}"
+        f"{holds}, with {ratio:.1f} times the error of the best model of its order: {difference}, with gain"
+        f" {best.gain:.2f}"
     )
 
 

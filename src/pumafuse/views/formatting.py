@@ -12,10 +12,9 @@ from ..identification.estimate import Estimate
 from ..model.arm import Gain
 from ..model.plants import PLANTS, FirstOrder
 from ..toml import Interval
-from ..units import MM, MS
+from ..units import MS
 
 if TYPE_CHECKING:
-    from ..identification.verify import AxisVerification
     from ..tuning.summary import Correlation
 
 
@@ -66,16 +65,3 @@ def change(values: Sequence[float | None], form: str) -> str:
 def together(pair: Correlation) -> str:
     """Two correlated parameters, which the measurements identify only together."""
     return f"{pair.first} and {pair.second} go together: correlation {pair.correlation:+.2f}"
-
-
-def verification(one: AxisVerification) -> list[str]:
-    """Cells of one axis: signal, RMS, its share, fit, RMS without and with recovery, RMS of the best in class."""
-    return [
-        f"{one.amplitude * MM:.4g}",
-        f"{one.model.rms * MM:.3f}",
-        f"{one.model.percent:.1f} %",
-        f"{one.model.fit:.1f} %" if np.isfinite(one.model.fit) else "–",
-        f"{one.without_recovery.rms * MM:.3f}",
-        f"{one.with_recovery.rms * MM:.3f}",
-        f"{one.floor.fit.rms * MM:.3f}",
-    ]

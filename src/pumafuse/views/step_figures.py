@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, MaxNLocator, NullLocator
 
-from ..identification.anova import Level, factors_of, levels_of, numbers
+from ..identification.anova import Level, Performance, factors_of, levels_of, numbers
+from ..identification.batch import Batch
 from ..identification.identify import Identification, TrialResult
-from ..identification.rows import Rows, window
 from ..identification.trials import StepTrials, Trial
 from ..identification.verify import AxisVerification, Trace
 from ..units import MM, MS
@@ -19,118 +20,114 @@ from .canvas import drawing
 
 _SECONDS = 1.2  # of a white-noise run that is shown in detail
 _GRID = 40  # points each way of a contour plot
-_SPREAD = 4.0  # how far it goes from ω and ζ, as a factor
+_SPREAD = 4.0  # factor by which it reaches above and below ω and ζ
+
+T = TypeVar("T")
 
 
 def responses(found: Identification, trials: StepTrials) -> str:
     """Every trial over its own gain, from its own delay on, beside the combined plant."""
-    measured = {trial.name: trial for trial in trials.trials}
-    with drawing(len(found.axes)) as sheet:
-        for axes, (axis, combined) in zip(sheet.axes, found.axes.items(), strict=True):
-            plant = combined.model.plant
-            longest = 0.0
-            for one in found.trials:
-                if one.axis != axis or one.common_delay is None or not one.common_gain:
-                    continue
-                time, position = window(measured[one.trial], found.samples)
-                t, height = time - one.common_delay, one.common_gain * one.step
-                zero = float(np.mean(position - height * plant.step_response(t)))
-                axes.plot(t * MS, (position - zero) / height, color=style.BAND, lw=0.6, alpha=0.7)
-                longest = max(longest, float(t[-1]))
-            t = np.linspace(-0.02, longest, 400)
-            axes.plot(t * MS, plant.step_response(t), color=style.REFERENCE, lw=1.4)
-            axes.set_title(axis, loc="left")
-            axes.set_xlabel("time since the trial's own delay [ms]")
-            axes.set_ylim(-0.15, 1.3)
-        sheet.axes[0].set_ylabel("share of the final value")
-    return sheet.svg
+    measured = {trial.name: trial.cut(found.samples) for trial in trials.trials}
+
+    def draw(axes: Axes, axis: str) -> None:
+        plant, longest = found.axes[axis].model.plant, 0.0
+        for one in found.trials:
+            if one.axis != axis or one.common_delay is None or not one.common_gain:
+                continue
+            t, height = measured[one.trial].time - one.common_delay, one.common_gain * one.step
+            position = measured[one.trial].position
+            zero = float(np.mean(position - height * plant.step_response(t)))
+            axes.plot(t * MS, (position - zero) / height, color=style.BAND, lw=0.6, alpha=0.7)
+            longest = max(longest, float(t[-1]))
+        t = np.linspace(-0.02, longest, 400)
+        axes.plot(t * MS, plant.step_response(t), color=style.REFERENCE, lw=1.4)
+        axes.set_title(axis, loc="left")
+        axes.set_xlabel("time since the trial's own delay [ms]")
+        axes.set_ylim(-0.15, 1.3)
+
+    return _panels(found.axes, draw, "share of the final value")
 
 
 def delays(found: Identification) -> str:
     """Td of each trial in the order of the campaign."""
-    with drawing(len(found.axes)) as sheet:
-        for axes, (axis, combined) in zip(sheet.axes, found.axes.items(), strict=True):
-            values = [one.common_delay for one in found.trials if one.axis == axis and one.common_delay is not None]
-            axes.plot(np.arange(1, len(values) + 1), np.array(values) * MS, ".", color=style.ESTIMATE, ms=4)
-            fitted = combined.delays.fitted
-            axes.axhline(fitted.value * MS, color=style.REFERENCE, lw=1.0)
-            axes.axhspan(fitted.ci95[0] * MS, fitted.ci95[1] * MS, color=style.ESTIMATE, alpha=0.2, lw=0)
-            axes.set_title(axis, loc="left")
-            axes.set_xlabel("trial, in the order of the list")
-        sheet.axes[0].set_ylabel("delay [ms]")
-    return sheet.svg
+
+    def draw(axes: Axes, axis: str) -> None:
+        values = [one.common_delay for one in found.trials if one.axis == axis and one.common_delay is not None]
+        axes.plot(np.arange(1, len(values) + 1), np.array(values) * MS, ".", color=style.ESTIMATE, ms=4)
+        fitted = found.axes[axis].delays.fitted
+        axes.axhline(fitted.value * MS, color=style.REFERENCE, lw=1.0)
+        axes.axhspan(fitted.ci95[0] * MS, fitted.ci95[1] * MS, color=style.ESTIMATE, alpha=0.2, lw=0)
+        axes.set_title(axis, loc="left")
+        axes.set_xlabel("trial, in the order of the list")
+
+    return _panels(found.axes, draw, "delay [ms]")
 
 
 def gains(found: Identification) -> str:
     """K of each trial against speed, with the line."""
-    with drawing(len(found.axes)) as sheet:
-        for axes, (axis, combined) in zip(sheet.axes, found.axes.items(), strict=True):
-            used = [one for one in found.trials if one.axis == axis]
-            pairs = [(one.speed, one.common_gain) for one in used if one.common_gain is not None]
-            speed, gain = np.array(pairs).T
-            axes.plot(speed, gain, ".", color=style.ESTIMATE, ms=4)
-            at = np.linspace(0.0, 1.05 * float(speed.max()), 50)
-            axes.plot(at, combined.model.gain.at(at), color=style.REFERENCE, lw=1.0)
-            axes.set_title(axis, loc="left")
-            axes.set_xlabel("speed [m/s]")
-        sheet.axes[0].set_ylabel("gain K")
-    return sheet.svg
+
+    def draw(axes: Axes, axis: str) -> None:
+        used = [one for one in found.trials if one.axis == axis and one.common_gain is not None]
+        speed = np.array([one.speed for one in used])
+        axes.plot(speed, [one.common_gain or np.nan for one in used], ".", color=style.ESTIMATE, ms=4)
+        at = np.linspace(0.0, 1.05 * float(speed.max()), 50)
+        axes.plot(at, found.axes[axis].model.gain.at(at), color=style.REFERENCE, lw=1.0)
+        axes.set_title(axis, loc="left")
+        axes.set_xlabel("speed [m/s]")
+
+    return _panels(found.axes, draw, "gain K")
 
 
 def histograms(found: Identification) -> str:
     """Delay, gain and τ of first-order fits (the paper's Fig. 5)."""
-    used = [one for one in found.trials if one.left_out is None]
+    used = [one.first for one in found.trials if one.left_out is None]
     columns = {
-        "delay [ms]": [one.first.delay * MS for one in used],
-        "gain": [one.first.gain for one in used],
-        "time constant [ms]": [(one.first.time_constant or 0.0) * MS for one in used],
+        "delay [ms]": [fit.delay * MS for fit in used],
+        "gain": [fit.gain for fit in used],
+        "time constant [ms]": [(fit.time_constant or 0.0) * MS for fit in used],
     }
-    with drawing(3) as sheet:
-        for axes, (name, values) in zip(sheet.axes, columns.items(), strict=True):
-            axes.hist(values, bins="auto", color=style.BAND, edgecolor="white")
-            axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-            axes.set_xlabel(name)
-        sheet.axes[0].set_ylabel("trials")
-    return sheet.svg
+
+    def draw(axes: Axes, name: str) -> None:
+        axes.hist(columns[name], bins="auto", color=style.BAND, edgecolor="white")
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set_xlabel(name)
+
+    return _panels(columns, draw, "trials")
 
 
 def fits_by_factor(found: Identification, trials: StepTrials) -> str:
-    """RMS of both orders by each factor, with two standard deviations (the paper's Fig. 6)."""
+    """RMS of both orders by each factor, with two standard deviations (the paper's Fig. 6); empty without factors."""
     used = [one for one in found.trials if one.left_out is None]
     names = {one.trial for one in used}
     factors = factors_of([trial for trial in trials.trials if trial.name in names], found.arm.update_period)
-    if not factors:
-        return ""
-    rms = {
-        order: np.array([(one.first if order == "first order" else one.second).rms for one in used]) * MM
-        for order in ("first order", "second order")
+    orders = {
+        "first order": (np.array([one.first.rms for one in used]) * MM, style.COMMAND, -0.15),
+        "second order": (np.array([one.second.rms for one in used]) * MM, style.ESTIMATE, 0.15),
     }
-    with drawing(len(factors)) as sheet:
-        for axes, (factor, cells) in zip(sheet.axes, factors.items(), strict=True):
-            for number, (order, values) in enumerate(rms.items()):
-                colour = (style.COMMAND, style.ESTIMATE)[number]
-                _levels(axes, levels_of(values, cells), colour, order, 0.15 * (2 * number - 1))
-            axes.set_xlabel(factor)
-            axes.set_ylim(bottom=0.0)
-        sheet.axes[0].set_ylabel("RMS of each trial's own fit [mm]")
-        sheet.axes[0].legend(frameon=False)
-    return sheet.svg
+
+    def draw(axes: Axes, factor: str) -> None:
+        for order, (rms, colour, aside) in orders.items():
+            _levels(axes, levels_of(rms, factors[factor]), colour, order, aside)
+        axes.set_xlabel(factor)
+        axes.set_ylim(bottom=0.0)
+        if factor == next(iter(factors)):
+            axes.legend(frameon=False)
+
+    return _panels(factors, draw, "RMS of each trial's own fit [mm]")
 
 
 def performance(found: Identification) -> str:
-    """RMS of the combined model by each factor (the paper's Fig. 7)."""
-    if not found.performance:
-        return ""
-    with drawing(len(found.performance)) as sheet:
-        for axes, one in zip(sheet.axes, found.performance, strict=True):
-            _levels(axes, one.levels, style.ESTIMATE, "combined model", 0.0)
-            top = max(level.mean + 2.0 * (level.sd or 0.0) for level in one.levels)
-            if found.tolerance * MM < 3.0 * top:
-                axes.axhline(found.tolerance * MM, color=style.REJECTED, lw=0.8, ls="--")
-            axes.set_xlabel(one.factor)
-            axes.set_ylim(bottom=0.0)
-        sheet.axes[0].set_ylabel("RMS of the combined model [mm]")
-    return sheet.svg
+    """RMS of the combined model by each factor (the paper's Fig. 7); empty without factors."""
+
+    def draw(axes: Axes, one: Performance) -> None:
+        _levels(axes, one.levels, style.ESTIMATE, "combined model", 0.0)
+        top = max(level.mean + 2.0 * (level.sd or 0.0) for level in one.levels)
+        if found.tolerance * MM < 3.0 * top:
+            axes.axhline(found.tolerance * MM, color=style.REJECTED, lw=0.8, ls="--")
+        axes.set_xlabel(one.factor)
+        axes.set_ylim(bottom=0.0)
+
+    return _panels(found.performance, draw, "RMS of the combined model [mm]")
 
 
 def valleys(found: Identification, trials: StepTrials) -> tuple[str, list[str]]:
@@ -138,21 +135,24 @@ def valleys(found: Identification, trials: StepTrials) -> tuple[str, list[str]]:
 
     The trial is the one whose ω is known worst, so that a long flat valley shows where there is any.
     """
-    measured = {trial.name: trial for trial in trials.trials}
+    measured = {trial.name: trial.cut(found.samples) for trial in trials.trials}
+
+    def width(one: TrialResult) -> float:
+        low, high = one.second.natural_frequency_ci95 or (1.0, np.inf)
+        return high / max(low, 1e-9)
+
     chosen = [
-        _flattest([one for one in found.trials if one.axis == axis and one.left_out is None]) for axis in found.axes
+        max((one for one in found.trials if one.axis == axis and one.left_out is None), key=width)
+        for axis in found.axes
     ]
-    with drawing(len(chosen)) as sheet:
-        for axes, one in zip(sheet.axes, chosen, strict=True):
-            _valley(axes, one, measured[one.trial], found.samples)
-        sheet.axes[0].set_ylabel("damping ζ")
-    return sheet.svg, [one.trial for one in chosen]
+    figure = _panels(chosen, lambda axes, one: _valley(axes, one, measured[one.trial]), "damping ζ")
+    return figure, [one.trial for one in chosen]
 
 
 def verification(verified: AxisVerification, trace: Trace) -> str:
     """Measured and modelled position, without means: the first second in detail (the paper's Figs. 8 and 9)."""
-    with drawing(1, width=9.0) as sheet:
-        axes = sheet.axes[0]
+    with drawing(1, width=9.0) as canvas:
+        axes = canvas.axes[0]
         shown = trace.time <= trace.time[0] + _SECONDS
         axes.plot(trace.time[shown], trace.measured[shown] * MM, color=style.REFERENCE, lw=1.0, label="measured")
         axes.plot(trace.time[shown], trace.modelled[shown] * MM, "--", color=style.ESTIMATE, lw=1.2, label="model")
@@ -160,18 +160,22 @@ def verification(verified: AxisVerification, trace: Trace) -> str:
         axes.set_xlabel("time since the first command [s]")
         axes.set_ylabel("position without its mean [mm]")
         axes.legend(frameon=False, ncols=2, loc="upper right")
-    return sheet.svg
+    return canvas.svg
 
 
-def _flattest(trials: Sequence[TrialResult]) -> TrialResult:
-    def openness(one: TrialResult) -> float:
-        low, high = one.second.natural_frequency_ci95 or (1.0, np.inf)
-        return high / max(low, 1e-9)
+def _panels(items: Iterable[T], draw: Callable[[Axes, T], None], ylabel: str) -> str:
+    """One panel for each item, side by side; empty without items."""
+    every = list(items)
+    if not every:
+        return ""
+    with drawing(len(every)) as canvas:
+        for axes, item in zip(canvas.axes, every, strict=True):
+            draw(axes, item)
+        canvas.axes[0].set_ylabel(ylabel)
+    return canvas.svg
 
-    return max(trials, key=openness)
 
-
-def _valley(axes: Axes, one: TrialResult, trial: Trial, samples: int | None) -> None:
+def _valley(axes: Axes, one: TrialResult, trial: Trial) -> None:
     fit = one.second
     omega, zeta = fit.natural_frequency or 1.0, fit.damping or 1.0
     omega, zeta = (omega, zeta) if zeta < 5.0 else (omega * 5.0 / zeta, 5.0)  # the valley runs off to infinity
@@ -179,10 +183,10 @@ def _valley(axes: Axes, one: TrialResult, trial: Trial, samples: int | None) -> 
     up = np.geomspace(zeta / _SPREAD, zeta * _SPREAD, _GRID)
     w, z = (grid.ravel() for grid in np.meshgrid(across, up))
     q, p = 2.0 * z / w, w**-2.0
-    # the delay follows so that the area over the response stays: what a trial tells best
+    # the delay follows so that the area over the response stays: a trial determines that best
     delay = np.maximum(fit.delay + 2.0 * zeta / omega - q, 0.0)
-    rows = Rows.of([trial], [1.0], samples).taken(np.zeros(len(w), dtype=np.int64))
-    rms = np.sqrt(rows.point(np.stack((delay, q, p), axis=1)).cost / rows.count) * MM
+    batch = Batch.of([trial], [1.0]).take(np.zeros(len(w), dtype=np.int64))
+    rms = np.sqrt(batch.point(np.stack((delay, q, p), axis=1)).cost / batch.count) * MM
     levels = np.geomspace(float(rms.min()) * 1.02, float(rms.max()), 12)
     axes.contour(across, up, rms.reshape(_GRID, _GRID), levels=levels, colors=style.ESTIMATE, linewidths=0.7)
     axes.plot(fit.natural_frequency or omega, fit.damping or zeta, "x", color=style.REJECTED)
@@ -202,9 +206,10 @@ def _valley(axes: Axes, one: TrialResult, trial: Trial, samples: int | None) -> 
 def _levels(axes: Axes, levels: Sequence[Level], colour: str, label: str, aside: float) -> None:
     """Means with bars of two standard deviations, one for each level."""
     at = np.arange(len(levels)) + aside
-    means = [level.mean for level in levels]
     bars = [2.0 * (level.sd or 0.0) for level in levels]
-    axes.errorbar(at, means, bars, fmt="o", ms=4, capsize=3, color=colour, lw=1.0, label=label)
+    axes.errorbar(
+        at, [level.mean for level in levels], bars, fmt="o", ms=4, capsize=3, color=colour, lw=1.0, label=label
+    )
     axes.set_xticks(np.arange(len(levels)), [level.level for level in levels])
     if numbers([level.level for level in levels]) is None:
         axes.tick_params(axis="x", rotation=20)

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
 from scipy.optimize import least_squares
 from scipy.signal import lti
 
-from pumafuse.identification.rows import Rows, window
+from pumafuse.identification.batch import Batch
 from pumafuse.identification.trials import Trial
 from pumafuse.model.unit_response import unit_response
 
@@ -57,17 +58,11 @@ def derivatives(time: np.ndarray, delay: float, q: float, p: float) -> np.ndarra
         answer, last = np.empty(len(time)), 0.0
         for place in order:
             if after[place] > last:
-                state = exponential(system.A * (after[place] - last)) @ state
+                state = expm(system.A * (after[place] - last)) @ state
                 last = after[place]
             answer[place] = (system.C @ state).item()
         columns.append(-np.where(time > delay, answer, 0.0))
     return np.column_stack(columns)
-
-
-def exponential(matrix: np.ndarray) -> np.ndarray:
-    from scipy.linalg import expm
-
-    return expm(matrix)
 
 
 def dense(trials: list[Trial], x: np.ndarray, order: int) -> np.ndarray:
@@ -116,57 +111,31 @@ def test_a_point_is_plain_regression_in_each_row(q: float, ratio: float, delay: 
     """Height and residuals as `lstsq` has them from the response and a one, weighted; the padding stays 0."""
     trials, plant = campaign(SWINGING, 0.05, seed), (q, ratio * q * q)
     delays = delay * np.array([1.0, 0.5, 0.2, 0.9])
-    found = Rows.of(trials, WEIGHTS, None).point(shapes(plant, delays))
+    found = Batch.of(trials, WEIGHTS).point(shapes(plant, delays))
     for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
         height, zero = linear(trial, delays[row], plant)
         c = unit_response(trial.time - delays[row], *plant)
         left, n = weight * (trial.position - zero - height * c), len(c)
         assert found.amplitude[row] == pytest.approx(height, rel=1e-9)
-        np.testing.assert_allclose(found.left[row, :n], left, rtol=0.0, atol=1e-10)
+        np.testing.assert_allclose(found.residual[row, :n], left, rtol=0.0, atol=1e-10)
         np.testing.assert_allclose(found.unit[row, :n], weight * (c - c.mean()), rtol=0.0, atol=1e-10)
-        assert not found.left[row, n:].any() and not found.unit[row, n:].any()
+        assert not found.residual[row, n:].any() and not found.unit[row, n:].any()
         assert found.cost[row] == pytest.approx(left @ left, rel=1e-9)
 
 
 def test_a_response_that_comes_after_the_last_sample_has_no_height() -> None:
     """It explains nothing: what is left is the trial's own scatter, and its slopes are 0."""
     trials = campaign(FIRST, 0.05)
-    rows = Rows.of(trials, WEIGHTS, None)
-    found = rows.point(shapes(FIRST, np.full(4, 9.0)))
+    batch = Batch.of(trials, WEIGHTS)
+    found = batch.point(shapes(FIRST, np.full(4, 9.0)))
     assert not found.amplitude.any()
     scatter = [np.sum((w * (one.position - one.position.mean())) ** 2) for one, w in zip(trials, WEIGHTS, strict=True)]
     np.testing.assert_allclose(found.cost, scatter, rtol=1e-12)
-    slopes, heights = rows.slopes(found, 2)
+    slopes, heights = batch.slopes(found, 2)
     assert not slopes.any() and not heights.any()
-    equations = rows.equations(found, slopes)
+    equations = batch.equations(found, slopes)
     assert not any(part.any() for part in equations[:-1])
     assert (equations.delay_sd == np.inf).all()
-
-
-@pytest.mark.parametrize(("order", "plant"), PLANTS)
-def test_slopes_are_those_of_the_fitted_curve(order: int, plant: tuple[float, float]) -> None:
-    """Regression done anew at each of two neighbouring shapes: the curve and its height move as the slopes say.
-
-    Exact where nothing is left, as here; 1e-5 of the largest slope, by differences over 2e-4 of q.
-    """
-    trials = campaign(plant, 0.0)
-    rows = Rows.of(trials, WEIGHTS, None)
-    slopes, heights = rows.slopes(rows.point(shapes(plant)), order)
-    q, p = plant
-    for parameter, size in enumerate((1e-4 * q, 1e-4 * q, 1e-4 * q * q)[: order + 1]):
-        for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
-            ends = []
-            for sign in (-1.0, 1.0):
-                shape = [DELAYS[row], q, p]
-                shape[parameter] += sign * size
-                height, zero = linear(trial, shape[0], (shape[1], shape[2]))
-                ends.append((height, zero + height * unit_response(trial.time - shape[0], shape[1], shape[2])))
-            curve = weight * (ends[1][1] - ends[0][1]) / (2.0 * size)
-            # a kink passes the sample next to the delay: what differences say there is no derivative
-            clear = np.abs(trial.time - DELAYS[row]) > 2.0 * size
-            got = slopes[parameter, row, : len(curve)]
-            np.testing.assert_allclose(got[clear], curve[clear], rtol=0.0, atol=1e-5 * np.abs(curve).max())
-            assert heights[parameter, row] == pytest.approx((ends[1][0] - ends[0][0]) / (2.0 * size), rel=1e-4)
 
 
 @pytest.mark.parametrize(("order", "plant"), [*PLANTS, (2, FIRST)])
@@ -175,9 +144,9 @@ def test_slopes_are_the_analytic_ones_without_what_height_and_zero_explain(
 ) -> None:
     """Of noisy trials too, by Laplace transforms and an orthogonal projection."""
     trials = campaign(plant, 0.05)
-    rows = Rows.of(trials, WEIGHTS, None)
-    at = rows.point(shapes(plant))
-    slopes, _ = rows.slopes(at, order)
+    batch = Batch.of(trials, WEIGHTS)
+    at = batch.point(shapes(plant))
+    slopes, _ = batch.slopes(at, order)
     for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
         if plant[1] > 0.0 or order == 1:
             exact = derivatives(trial.time, DELAYS[row], *plant)[:, : order + 1]
@@ -199,10 +168,10 @@ def test_equations_are_the_dense_ones_with_all_that_is_a_trials_own_eliminated(
 ) -> None:
     """A Gauss-Newton step in q, p and every delay, and the covariance of q and p, solved all at once."""
     trials = campaign(plant, 0.05)
-    rows = Rows.of(trials, WEIGHTS, None)
-    at = rows.point(shapes(plant))
-    slopes, _ = rows.slopes(at, order)
-    found = rows.equations(at, slopes)
+    batch = Batch.of(trials, WEIGHTS)
+    at = batch.point(shapes(plant))
+    slopes, _ = batch.slopes(at, order)
+    found = batch.equations(at, slopes)
     x = unpacked(trials, plant, DELAYS, order)
     J, left = dense_jacobian(trials, x, order), dense(trials, x, order)
     scale = np.linalg.norm(J, axis=0)
@@ -223,10 +192,10 @@ def test_equations_are_the_dense_ones_with_all_that_is_a_trials_own_eliminated(
 def test_each_row_is_brought_to_a_minimum_of_its_own(order: int, plant: tuple[float, float], noise: float) -> None:
     """From starts up to 30 % away; trust-region least squares in all five parameters finds nothing below it."""
     trials = campaign(plant, noise, 3)
-    rows = Rows.of(trials, WEIGHTS, None)
+    batch = Batch.of(trials, WEIGHTS)
     start = shapes(plant) * np.array([0.95, 1.3, 1.2 if order == 2 else 0.0])
-    found = rows.each(start, order)
-    np.testing.assert_allclose(found.cost, rows.point(found.shape).cost, rtol=1e-12)
+    found = batch.fit_each(start, order)
+    np.testing.assert_allclose(found.cost, batch.point(found.shape).cost, rtol=1e-12)
     for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
         delay, q, p = found.shape[row]
 
@@ -243,30 +212,12 @@ def test_each_row_is_brought_to_a_minimum_of_its_own(order: int, plant: tuple[fl
         assert found.cost[row] <= 2.0 * best.cost * (1.0 + KINKS)
 
 
-@pytest.mark.parametrize("noise", [0.005, 0.05])
-@pytest.mark.parametrize(("order", "plant"), PLANTS)
-def test_together_is_the_minimum_of_the_dense_problem(order: int, plant: tuple[float, float], noise: float) -> None:
-    """One plant, all delays, heights and zeros at once: the gradient is 0 there and least squares finds no better."""
-    trials = campaign(plant, noise, 4)
-    rows = Rows.of(trials, WEIGHTS, None)
-    found = rows.together(1.2 * plant[0], 0.8 * plant[1], DELAYS - 0.004, order)
-    assert (found.shape[:, 1:] == found.shape[0, 1:]).all()
-    assert order == 2 or not found.shape[:, 2].any()
-    x = unpacked(trials, (found.shape[0, 1], found.shape[0, 2]), found.shape[:, 0], order)
-    left, J = dense(trials, x, order), dense_jacobian(trials, x, order)
-    cosine = J.T @ left / np.linalg.norm(J, axis=0) / np.linalg.norm(left)
-    assert np.abs(cosine).max() < 1e-5
-    best = least_squares(lambda y: dense(trials, y, order), x, x_scale=np.abs(x), xtol=1e-14)
-    assert found.cost.sum() == pytest.approx(left @ left, rel=1e-9)
-    assert found.cost.sum() <= 2.0 * best.cost * (1.0 + KINKS)
-
-
 def test_second_order_of_a_first_order_arm_stops_at_its_bound() -> None:
     """1/ω² is held at 0 where the noise would have it below; then the plant is the first-order one."""
     held = 0
     for seed in range(8):
-        rows = Rows.of(campaign(FIRST, 0.01, seed), WEIGHTS, None)
-        one, two = (rows.together(*plant, DELAYS, order) for order, plant in ((1, FIRST), (2, (0.04, 1e-4))))
+        batch = Batch.of(campaign(FIRST, 0.01, seed), WEIGHTS)
+        one, two = (batch.fit_shared(*plant, DELAYS, order) for order, plant in ((1, FIRST), (2, (0.04, 1e-4))))
         assert two.cost.sum() <= one.cost.sum() * (1.0 + 1e-9)
         if two.shape[0, 2] == 0.0:
             held += 1
@@ -286,7 +237,7 @@ def test_together_is_not_stopped_by_kinks_nor_by_delays_of_0(
     worst = 0.0
     for seed in (0, 5, 10, 38):
         trials = campaign(plant, 0.05, seed, delays)
-        found = Rows.of(trials, WEIGHTS, None).together(
+        found = Batch.of(trials, WEIGHTS).fit_shared(
             1.2 * plant[0], 0.8 * plant[1], np.maximum(delays - 0.004, 0.0), order
         )
         assert found.shape[:, 0].min() >= 0.0
@@ -310,50 +261,22 @@ def test_together_is_not_stopped_by_kinks_nor_by_delays_of_0(
 def test_padding_changes_no_number(order: int, plant: tuple[float, float]) -> None:
     """A trial beside longer ones, with other stamps, is fitted as it is alone."""
     trials = campaign(plant, 0.05)
-    rows = Rows.of(trials, WEIGHTS, None)
-    assert rows.time.shape == (4, max(LENGTHS)) and rows.count.tolist() == list(LENGTHS)
-    at = rows.point(shapes(plant))
-    slopes, heights = rows.slopes(at, order)
-    equations = rows.equations(at, slopes)
-    cost = rows.each(shapes(plant), order).cost
+    batch = Batch.of(trials, WEIGHTS)
+    assert batch.time.shape == (4, max(LENGTHS)) and batch.count.tolist() == list(LENGTHS)
+    at = batch.point(shapes(plant))
+    slopes, heights = batch.slopes(at, order)
+    equations = batch.equations(at, slopes)
+    cost = batch.fit_each(shapes(plant), order).cost
     for row, trial in enumerate(trials):
-        alone = Rows.of([trial], WEIGHTS[row : row + 1], None)
+        alone = Batch.of([trial], WEIGHTS[row : row + 1])
         one = alone.point(shapes(plant)[row : row + 1])
         own, height = alone.slopes(one, order)
         assert alone.time.shape == (1, LENGTHS[row])
-        assert (rows.span[row], rows.spacing[row]) == (alone.span[0], alone.spacing[0])
-        assert rows.spacing[row] == pytest.approx((trial.time[-1] - trial.time[0]) / (len(trial.time) - 1), rel=1e-12)
+        assert (batch.span[row], batch.spacing[row]) == (alone.span[0], alone.spacing[0])
+        assert batch.spacing[row] == pytest.approx((trial.time[-1] - trial.time[0]) / (len(trial.time) - 1), rel=1e-12)
         np.testing.assert_allclose(slopes[:, row, : LENGTHS[row]], own[:, 0], rtol=0.0, atol=1e-9 * np.abs(own).max())
         assert not slopes[:, row, LENGTHS[row] :].any()
         np.testing.assert_allclose(heights[:, row], height[:, 0], rtol=1e-9)
         for whole, part in zip(equations, alone.equations(one, own), strict=True):
             np.testing.assert_allclose(whole[row], part[0], rtol=1e-7)
-        assert cost[row] == pytest.approx(alone.each(shapes(plant)[row : row + 1], order).cost[0], rel=KINKS)
-
-
-def test_rows_are_taken_by_index_as_often_as_asked() -> None:
-    """Each with its own stamps, weight and count."""
-    rows = Rows.of(campaign(FIRST, 0.05), WEIGHTS, None)
-    asked = np.array([2, 0, 2])
-    taken = rows.taken(asked)
-    for name in ("time", "position", "weight", "count"):
-        np.testing.assert_array_equal(getattr(taken, name), getattr(rows, name)[asked])
-    np.testing.assert_array_equal(taken.point(shapes(FIRST)[asked]).cost, rows.point(shapes(FIRST)).cost[asked])
-
-
-def test_a_window_is_counted_from_the_step_on() -> None:
-    """All samples before it are kept, beside the first 20 after it."""
-    trials = campaign(FIRST, 0.05)
-    for trial in trials:
-        time, position = window(trial, 20)
-        assert ((time >= 0.0).sum(), (time < 0.0).sum()) == (
-            min(20, (trial.time >= 0.0).sum()),
-            (trial.time < 0.0).sum(),
-        )
-        np.testing.assert_array_equal(position, trial.position[: len(time)])
-        assert len(window(trial, None)[0]) == len(trial.time)
-    rows = Rows.of(trials, WEIGHTS, 20)
-    assert rows.count.tolist() == [len(window(trial, 20)[0]) for trial in trials]
-    assert [row[row > 0.0].tolist() for row in rows.weight] == [
-        [weight] * int(count) for weight, count in zip(WEIGHTS, rows.count, strict=True)
-    ]
+        assert cost[row] == pytest.approx(alone.fit_each(shapes(plant)[row : row + 1], order).cost[0], rel=KINKS)

@@ -1,0 +1,235 @@
+"""Nonlinear least squares on many trials at once, one trial in a row.
+
+The unit response of a delay, q and p is compared with each row. Gain and zero are linear and always at their optimum
+(variable projection). Gauss-Newton steps with Levenberg's damping fit each row by itself (:meth:`Batch.fit_each`), or
+one plant to all rows (:meth:`Batch.fit_shared`). There each trial's own delay is eliminated from the normal equations,
+so that the work is proportional to the number of trials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from ..arrays import FloatArray, IntArray
+from ..model.unit_response import unit_response
+from .trials import Trial
+
+Order = Literal[1, 2]
+
+_ITERATIONS = 200
+_CONVERGED = 1e-13  # relative decrease of the sum of squares
+_MOST_DAMPING = 1e12  # no step helps
+_REACH = 1e-5  # of q: step of the numerical derivatives
+_RIDGE = 1e-12  # of the diagonal, where a parameter has no effect
+_NO_EFFECT = 1e-12  # of the largest effect that a delay could have: less is none
+
+
+class Point(NamedTuple):
+    """A response for each row: its shape (R, 3), residuals and response, projected (R, m), its amplitude (R,)."""
+
+    shape: FloatArray
+    residual: FloatArray
+    unit: FloatArray
+    amplitude: FloatArray
+
+    @property
+    def cost(self) -> FloatArray:
+        """Weighted sum of squared residuals of each row, (R,)."""
+        return np.einsum("ij,ij->i", self.residual, self.residual)
+
+
+class Equations(NamedTuple):
+    """Normal equations in q (and p) of each row with its delay eliminated.
+
+    Attributes:
+        shift: Gauss-Newton step of the delay when q and p stay [s], (R,).
+        coupling: −∂delay/∂(q, p), (R, k).
+        information: (R, k, k).
+        score: (R, k).
+        delay_sd: Of each delay under a given plant for unit noise, infinite where it has no effect, (R,).
+    """
+
+    shift: FloatArray
+    coupling: FloatArray
+    information: FloatArray
+    score: FloatArray
+    delay_sd: FloatArray
+
+
+@dataclass(frozen=True)
+class Batch:
+    """R trials, padded to one length m.
+
+    Attributes:
+        time: [s] since the command, (R, m).
+        position: [m], (R, m).
+        weight: 0 where a trial has no sample, else the same for all its samples, (R, m).
+        count: Samples of each, (R,).
+    """
+
+    time: FloatArray
+    position: FloatArray
+    weight: FloatArray
+    count: FloatArray
+
+    @staticmethod
+    def of(trials: Sequence[Trial], weights: Sequence[float]) -> Batch:
+        """Stack one or more trials, each with its weight."""
+        count = [len(trial.time) for trial in trials]
+        time, position, weight = (np.zeros((len(trials), max(count))) for _ in range(3))
+        for row, (trial, n) in enumerate(zip(trials, count, strict=True)):
+            time[row, :n], position[row, :n], weight[row, :n] = trial.time, trial.position, weights[row]
+        return Batch(time, position, weight, np.array(count, dtype=np.float64))
+
+    def take(self, rows: IntArray) -> Batch:
+        """Some of the rows, repeated where an index is repeated."""
+        return Batch(self.time[rows], self.position[rows], self.weight[rows], self.count[rows])
+
+    @property
+    def span(self) -> FloatArray:
+        """Time of each last sample [s], (R,)."""
+        return self.time.max(axis=1)
+
+    @property
+    def spacing(self) -> FloatArray:
+        """Mean time between samples [s], (R,)."""
+        return (self.span - self.time[:, 0]) / (self.count - 1.0)
+
+    def response(self, shape: FloatArray) -> FloatArray:
+        """The unit response of (delay, q, p) (R, 3) at every sample, (R, m)."""
+        return unit_response(self.time - shape[:, :1], shape[:, 1:2], shape[:, 2:])
+
+    def project(self, values: FloatArray) -> FloatArray:
+        """Weighted values (R, m) without what a free zero explains."""
+        mean = np.sum(np.where(self.weight > 0.0, values, 0.0), axis=1) / self.count
+        return self.weight * (values - mean[:, None])
+
+    def point(self, shape: FloatArray) -> Point:
+        """The response of (delay, q, p) (R, 3) with the best amplitude and zero in each row."""
+        c, z = self.project(self.response(shape)), self.project(self.position)
+        amplitude = np.einsum("ij,ij->i", c, z) / _power(c)
+        return Point(shape, z - amplitude[:, None] * c, c, amplitude)
+
+    def slopes(
+        self, at: Point, order: Order, chord: tuple[FloatArray, FloatArray] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Derivatives by (delay, q, p) of the fitted response (k, R, m) and of its amplitude (k, R).
+
+        Args:
+            at: Where.
+            order: 1 without p.
+            chord: How far below and above p its difference quotient reaches, (R,) each; None: a small step, one-sided
+                where p is 0.
+        """
+        q, p = at.shape[:, 1], at.shape[:, 2]
+        size = _REACH * q
+        ends = [(size, size), (size, size), chord or (np.minimum(size * q, p), size * q)][: order + 1]
+        quotients: list[FloatArray] = []
+        for place, (below, above) in enumerate(ends):
+            low, high = at.shape.copy(), at.shape.copy()
+            low[:, place] -= below
+            high[:, place] += above
+            quotients.append((self.response(high) - self.response(low)) / (above + below)[:, None])
+        raw = np.stack([self.project(quotient) for quotient in quotients]) * at.amplitude[:, None]
+        share = np.einsum("kij,ij->ki", raw, at.unit) / _power(at.unit)
+        return raw - share[:, :, None] * at.unit, -share
+
+    def equations(self, at: Point, slopes: FloatArray, damping: float = 0.0) -> Equations:
+        """Normal equations of q and p with the delays eliminated.
+
+        A delay takes no part where it has no effect, or where its bound 0 is active.
+
+        Args:
+            at: Where.
+            slopes: There, from :meth:`slopes`.
+            damping: Of the delays' own steps.
+        """
+        own = np.einsum("ij,ij->i", slopes[0], slopes[0])
+        gradient = np.einsum("ij,ij->i", slopes[0], at.residual)
+        largest = np.einsum("ij,ij->i", at.unit, at.unit) * (at.amplitude / at.shape[:, 1]) ** 2
+        effective = own > _NO_EFFECT * largest
+        delay_sd = np.where(effective, 1.0 / np.sqrt(np.where(effective, own, 1.0)), np.inf)
+        at_bound = (at.shape[:, 0] <= 0.0) & (gradient <= 0.0)
+        own = np.where(at_bound | ~effective, np.inf, own * (1.0 + damping))
+        cross = np.einsum("ij,kij->ik", slopes[0], slopes[1:])
+        coupling = cross / own[:, None]
+        information = np.einsum("kij,lij->ikl", slopes[1:], slopes[1:]) - cross[:, :, None] * coupling[:, None, :]
+        score = np.einsum("kij,ij->ik", slopes[1:], at.residual) - coupling * gradient[:, None]
+        return Equations(gradient / own, coupling, information, score, delay_sd)
+
+    def fit_each(self, shape: FloatArray, order: Order) -> Point:
+        """The nearest minimum of each row from its own start (R, 3)."""
+        found = self.point(self._bounded(shape))
+        rows, at = np.arange(len(shape)), found
+        damping = np.full(len(shape), 1e-3)
+        for _ in range(_ITERATIONS):
+            here = self.take(rows)
+            slopes, _ = here.slopes(at, order)
+            H = np.einsum("kij,lij->ikl", slopes, slopes)
+            g = np.einsum("kij,ij->ik", slopes, at.residual)
+            new = here.point(here._bounded(_damped_step(at.shape, H, g, damping)))
+            better, decrease = new.cost <= at.cost, at.cost - new.cost
+            damping = np.where(better, np.maximum(0.2 * damping, 1e-12), 8.0 * damping)
+            going = np.where(better, decrease > _CONVERGED * at.cost, damping < _MOST_DAMPING)
+            for whole, part in zip(found, new, strict=True):
+                whole[rows[better]] = part[better]
+            if not going.any():
+                break
+            rows, damping = rows[going], damping[going]
+            at = Point(*(whole[rows] for whole in found))
+        return found
+
+    def fit_shared(self, q: float, p: float, delay: FloatArray, order: Order) -> Point:
+        """The nearest minimum over all rows of one plant for all and a delay (R,) for each."""
+        at, damping = self.point(_shapes(delay, q, p)), 1e-3
+        for _ in range(_ITERATIONS):
+            slopes, _ = self.slopes(at, order)
+            cost = float(at.cost.sum())
+            while True:
+                found = self.equations(at, slopes, damping)
+                H, g = found.information.sum(axis=0)[None], found.score.sum(axis=0)[None]
+                plant = _damped_step(at.shape[:1, 1:], H, g, np.array([damping]))
+                plant = np.clip(plant, [[0.2 * at.shape[0, 1], 0.0]], np.inf)
+                delays = at.shape[:, 0] + found.shift - found.coupling @ (plant - at.shape[:1, 1:])[0, :order]
+                new = self.point(_shapes(np.maximum(delays, 0.0), *plant[0].tolist()))
+                decrease = cost - float(new.cost.sum())
+                if decrease >= 0.0 or damping > _MOST_DAMPING:
+                    break
+                damping *= 8.0
+            if decrease >= 0.0:
+                at = new
+            if decrease <= _CONVERGED * cost:
+                break
+            damping = max(0.2 * damping, 1e-12)
+        return at
+
+    def _bounded(self, shape: FloatArray) -> FloatArray:
+        span, least = self.span, 1e-3 * self.spacing
+        most = np.stack((span, 20.0 * span, (5.0 * span) ** 2), axis=1)
+        return np.clip(shape, np.stack((0.0 * least, least, 0.0 * least), axis=1), most)
+
+
+def _power(unit: FloatArray) -> FloatArray:
+    """Sum of squares of each row, infinite where it is 0, for a division, (R,)."""
+    power = np.einsum("ij,ij->i", unit, unit)
+    return np.where(power > 0.0, power, np.inf)
+
+
+def _shapes(delay: FloatArray, q: float, p: float) -> FloatArray:
+    return np.stack((delay, np.full(len(delay), q), np.full(len(delay), p)), axis=1)
+
+
+def _damped_step(shape: FloatArray, H: FloatArray, g: FloatArray, damping: FloatArray) -> FloatArray:
+    """Shapes after a damped Gauss-Newton step in each row; a parameter whose bound 0 is active stays."""
+    k = g.shape[1]
+    diagonal = np.einsum("ikk->ik", H)
+    free = (shape[:, :k] > 0.0) | (g > 0.0)
+    damped = H + np.where(diagonal > 0.0, (damping[:, None] + _RIDGE) * diagonal, 1.0)[:, :, None] * np.eye(k)
+    damped = damped * (free[:, :, None] & free[:, None, :]) + ~free[:, :, None] * np.eye(k)
+    stepped = shape.copy()
+    stepped[:, :k] += np.linalg.solve(damped, (g * free)[:, :, None])[:, :, 0]
+    return stepped

@@ -1,0 +1,201 @@
+"""The best linear model of an order on a run: no model of that order fits its measurements better."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from ..arrays import FloatArray, TimeArray
+from ..model.arm import AxisModel, Gain, commanded_speed
+from ..model.drive import drive
+from ..model.forced_response import forced_response
+from ..model.plants import PLANTS, FirstOrder, SecondOrder
+
+_SPIKE = 8.0  # robust standard deviations
+_DELAYS, _LATEST = 13, 9.0  # of the first grid: how many, up to how many periods
+_LAGS, _RATIOS = 5, (0.05, 0.25, 0.8)  # of 2ζ/ω; of 1/ω² over its square
+_STARTS = 3  # cells of it to search from
+
+
+class Fit(msgspec.Struct, frozen=True, kw_only=True):
+    """Error of a simulated position against the measured one.
+
+    Attributes:
+        rms: Of the difference, without its mean [m].
+        percent: Of the amplitude of the commands.
+        fit: 100 (1 − ‖difference‖ / ‖measured‖), both without their means.
+    """
+
+    rms: float = msgspec.field(name="rms_mm")
+    percent: float = msgspec.field(name="percent_of_signal")
+    fit: float = msgspec.field(name="fit_percent")
+
+
+class BestInClass(msgspec.Struct, frozen=True, kw_only=True):
+    """The best linear model of the order, refitted on the run.
+
+    Attributes:
+        fit: Its error.
+        delay: Td [s].
+        gain: K, at the commands' mean speed.
+        plant: Of unit gain.
+    """
+
+    fit: Fit
+    delay: float = msgspec.field(name="delay_ms")
+    gain: float
+    plant: PLANTS
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Measurements of one axis by one source; arrays (n,).
+
+    Attributes:
+        run: The run's name.
+        source: The sensor, or ``reference``.
+        time: Of each, int64 ns, ascending.
+        position: As logged [m].
+    """
+
+    run: str
+    source: str
+    time: TimeArray
+    position: FloatArray
+
+    def without_spikes(self, modelled: FloatArray) -> Measured:
+        """The measurements that do not jump away from their neighbours, whatever the model.
+
+        A model that is wrong for a while must not be spared: only eight robust standard deviations from the running
+        median of five count.
+        """
+        from scipy.ndimage import median_filter
+        from scipy.stats import median_abs_deviation
+
+        residual = self.position - modelled
+        jump = residual - median_filter(residual, size=5, mode="nearest")
+        kept = np.abs(jump) <= _SPIKE * max(float(median_abs_deviation(residual, scale="normal")), 1e-9)
+        return replace(self, time=self.time[kept], position=self.position[kept])
+
+    def fit(self, modelled: FloatArray, amplitude: float) -> Fit:
+        """Error of ``modelled`` [m] (n,) without its mean, beside the ``amplitude`` of the commands [m]."""
+        rms, signal = float(np.std(self.position - modelled)), float(np.std(self.position))
+        return Fit(
+            rms=rms,
+            percent=100.0 * rms / amplitude if amplitude > 0.0 else np.inf,
+            fit=100.0 * (1.0 - rms / signal) if signal > 0.0 else -np.inf,
+        )
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Commands of one axis; arrays (k,).
+
+    Attributes:
+        time: Of each, int64 ns, ascending.
+        value: u [m].
+        period: T [s].
+    """
+
+    time: TimeArray
+    value: FloatArray
+    period: float
+
+    @property
+    def amplitude(self) -> float:
+        """From the lowest to the highest [m]."""
+        return float(np.ptp(self.value))
+
+    @property
+    def speeds(self) -> FloatArray:
+        """Of the commands that move [m/s]."""
+        return commanded_speed(np.diff(self.value)[np.diff(self.value) != 0.0], self.period)
+
+    def moved(self, axis: AxisModel, delay: float, start: float, time: TimeArray) -> FloatArray:
+        """Where the axis is at ``time`` [ns], relative to ``start`` [m], (n,)."""
+        driven = drive(axis, self.time, self.value, start, self.period)
+        return forced_response(axis.plant, driven.time + round(delay * 1e9), driven.value, time)
+
+
+def best_in_class(measured: Measured, command: Commands, model: AxisModel, delay: float, start: float) -> BestInClass:
+    """The best gain, delay and plant of the model's order on this run.
+
+    Args:
+        measured: To be fitted.
+        command: Of the axis.
+        model: Its order and recovery stay; its plant is one start of the search.
+        delay: Its Td, also a start [s].
+        start: Level before the first command [m].
+    """
+    from scipy.optimize import least_squares
+
+    z = measured.position - measured.position.mean()
+    columns = _gain_columns(command, model)
+
+    def linear(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Simulated position without its mean (n,), and the coefficients of the gain columns, of the best gain."""
+        axes = [msgspec.structs.replace(axis, plant=_plant_at(x)) for axis in columns]
+        moved = [command.moved(axis, float(x[0]) ** 2, start, measured.time) for axis in axes]
+        design = np.stack([moved[0], *(column - moved[0] for column in moved[1:])], axis=1)
+        design -= design.mean(axis=0)
+        share = np.asarray(np.linalg.lstsq(design, z, rcond=None)[0], dtype=np.float64)
+        return design @ share, share
+
+    def residual(x: FloatArray) -> FloatArray:
+        return z - linear(x)[0]
+
+    def cost(x: FloatArray) -> float:
+        return float(np.sum(residual(x) ** 2))
+
+    plants = _plants(command.period, model.plant)
+    delays = np.linspace(0.0, _LATEST * command.period, _DELAYS).tolist()
+    cells = sorted((min((_coordinates(td, plant) for plant in plants), key=cost) for td in delays), key=cost)
+    found = [
+        least_squares(residual, x, x_scale="jac", xtol=1e-10, ftol=1e-12, gtol=1e-12, max_nfev=300)
+        for x in [_coordinates(delay, model.plant), *cells[:_STARTS]]
+    ]
+    best = min(found, key=lambda one: float(one.cost)).x
+    modelled, share = linear(best)
+    speed = np.array(command.speeds.mean())
+    return BestInClass(
+        fit=measured.fit(modelled, command.amplitude),
+        delay=float(best[0]) ** 2,
+        gain=float(share[0] + sum(share[k] * (columns[k].gain.at(speed) - 1.0) for k in range(1, len(columns)))),
+        plant=_plant_at(best),
+    )
+
+
+def _gain_columns(command: Commands, model: AxisModel) -> list[AxisModel]:
+    """Axes whose responses span those of all gains: K = 1; another K where it recovers; K that rises with speed."""
+    gains = [Gain()]
+    if model.gain_recovery is not None:
+        gains.append(Gain(intercept=2.0))
+    if np.ptp(command.speeds) > 1e-6 * command.speeds.max():
+        gains.append(Gain(slope=1.0))
+    return [msgspec.structs.replace(model, gain=gain) for gain in gains]
+
+
+def _plants(period: float, like: PLANTS) -> list[PLANTS]:
+    """Plants of one order on a grid of lags (and dampings)."""
+    lags = np.geomspace(0.2 * period, 10.0 * period, _LAGS).tolist()
+    if isinstance(like, FirstOrder):
+        return [FirstOrder(time_constant=lag) for lag in lags]
+    omegas = [(lag, (ratio * lag * lag) ** -0.5) for lag in lags for ratio in _RATIOS]
+    return [SecondOrder(natural_frequency=omega, damping=0.5 * lag * omega) for lag, omega in omegas]
+
+
+def _coordinates(delay: float, plant: PLANTS) -> FloatArray:
+    """√Td and log τ, or log 2ζ/ω and log 1/ω: free of bounds."""
+    if isinstance(plant, FirstOrder):
+        return np.array([np.sqrt(delay), np.log(plant.time_constant)])
+    return np.array([np.sqrt(delay), np.log(plant.lag), -np.log(plant.natural_frequency)])
+
+
+def _plant_at(x: FloatArray) -> PLANTS:
+    q = float(np.exp(np.clip(x[1], -12.0, 6.0)))
+    if len(x) == 2:
+        return FirstOrder(time_constant=q)
+    omega = float(np.exp(-np.clip(x[2], -12.0, 6.0)))
+    return SecondOrder(natural_frequency=omega, damping=0.5 * q * omega)
