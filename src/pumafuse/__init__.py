@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from .model.plants import FirstOrder, SecondOrder
     from .simulation.scenario import Scenario
     from .simulation.simulate import Simulated, simulate
-    from .tuning.learnable import TuneError
+    from .tuning.identifiability import TuneError
     from .tuning.tune import Tuning, tune
     from .views.rerun import to_rerun
 
@@ -67,7 +67,7 @@ _HOME = {
     "TickEstimates": "fusion.ticks",
     "UpdateResult": "live.answers",
     "TrialsError": "identification.trials",
-    "TuneError": "tuning.learnable",
+    "TuneError": "tuning.identifiability",
     "Tuning": "tuning.tune",
     "UnknownNameError": "errors",
     "Validity": "model.arm",

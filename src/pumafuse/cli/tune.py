@@ -19,11 +19,11 @@ from ..errors import ConfigError
 from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..logs.run import Run
-from ..tuning.climb import Point
-from ..tuning.parameters import check_holds, kinds_of
+from ..tuning.maximise import Point
+from ..tuning.parameters import check_fixed, kinds_of
 from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Tuning, tune
-from ..tuning.validate import Check
+from ..tuning.validation import Check
 from ..views import words
 from .tables import console
 
@@ -35,13 +35,13 @@ _WORSE, _INTERRUPTED = 3, 130
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What the command line asks of a tuning; see ``pumafuse tune --help``."""
+    """The options of the command; see ``pumafuse tune --help``."""
 
     config: Path
     output: Path
     fit: Sequence[str]
-    hold: Sequence[str]
-    teacher: str | None
+    fix: Sequence[str]
+    trust: str | None
     validate: Path | None
     report: bool
     json: bool
@@ -49,11 +49,11 @@ class Options:
 
 
 def run(paths: Sequence[Path], options: Options) -> None:
-    """Tune a configuration on recorded runs and write what was learnt.
+    """Tune a configuration on recorded runs and write the result.
 
     Raises:
-        PumafuseError: Nothing can be learnt, or what is to be written is in the way.
-        Exit: With 3 where what was learnt is worse on what was held back; with 130 after Ctrl-C.
+        PumafuseError: Nothing can be fitted, or the output folder must not be replaced.
+        Exit: With 3 where the result is worse on what it was validated on; with 130 after Ctrl-C.
     """
     folders.check_writable(options.output, options.force, [SUMMARY], OURS.__contains__)
     try:
@@ -61,7 +61,7 @@ def run(paths: Sequence[Path], options: Options) -> None:
     except ConfigError as error:
         raise typer.BadParameter(str(error)) from None
     config = FusionConfig.load(options.config)
-    check_holds(config, options.hold)
+    check_fixed(config, options.fix)
     runs = [Run.read(path) for path in paths]
     validate = None if options.validate is None else Run.read(options.validate)
     with _progress() as progress:
@@ -69,8 +69,8 @@ def run(paths: Sequence[Path], options: Options) -> None:
             runs,
             config,
             fit=kinds,
-            hold=options.hold,
-            teacher=options.teacher,
+            fix=options.fix,
+            trust=options.trust,
             validate=validate,
             progress=progress,
         )
@@ -93,16 +93,16 @@ def run(paths: Sequence[Path], options: Options) -> None:
 
 @contextmanager
 def _progress() -> Generator[Callable[[str, Point], None]]:
-    """One line on stderr that says how far the search is; nothing where stderr is no terminal."""
+    """Show the progress of the search in one line on stderr, if that is a terminal."""
     if not sys.stderr.isatty():
         yield lambda _, __: None
         return
-    with Console(stderr=True).status("reading") as status:
+    with Console(stderr=True).status("preparing") as status:
 
-        def tell(what: str, at: Point) -> None:
-            status.update(f"{what}: log-likelihood {at.value.total:.1f} (Ctrl-C keeps the best so far)")
+        def show(what: str, at: Point) -> None:
+            status.update(f"{what}: log-likelihood {at.log_likelihood.total:.1f} (Ctrl-C keeps the best so far)")
 
-        yield tell
+        yield show
 
 
 def _show(found: Tuning, options: Options) -> None:
@@ -110,7 +110,7 @@ def _show(found: Tuning, options: Options) -> None:
     out.print(_parameters(summary.parameters))
     for axis, why in summary.orders.items():
         out.print(f"{axis}: {why}", markup=False)
-    for one in summary.held:
+    for one in summary.not_identifiable:
         out.print(one, markup=False)
     for pair in summary.correlations:
         out.print(words.together(pair), markup=False)
@@ -136,13 +136,13 @@ def _parameters(fitted: Sequence[Fitted]) -> Table:
         low, high = ("" if end is None else f"{end:.4g}" for end in one.ci95)
         interval = "" if one.ci95 == (None, None) else f"{low or '…'} to {high or '…'}"
         before = "–" if one.before is None else f"{one.before:.4g}"
-        table.add_row(escape(one.key), before, f"{one.value:.4g}", interval, one.said)
+        table.add_row(escape(one.key), before, f"{one.value:.4g}", interval, one.notes)
     return table
 
 
 def _likelihoods(summary: TuningSummary) -> Table:
     table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("learnt from")
+    table.add_column("fitted on")
     for heading in ("measurements", "log-likelihood before", "after"):
         table.add_column(heading, justify="right")
     for axis, one in summary.likelihood.items():
@@ -151,9 +151,9 @@ def _likelihoods(summary: TuningSummary) -> Table:
 
 
 def _validation(checks: Sequence[Check]) -> Table:
-    """Before and after, on what was held back: a row for each sensor, an axis's score in its first."""
+    """Before and after, on what was validated on: a row for each sensor, an axis's score in its first."""
     table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("held back", overflow="fold")
+    table.add_column("validated on", overflow="fold")
     table.add_column("axis")
     for heading in ("RMSE, mm", "coverage"):
         table.add_column(heading, justify="right", no_wrap=True)
