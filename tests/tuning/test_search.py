@@ -12,7 +12,7 @@ from scipy.optimize import differential_evolution
 import pumafuse as pf
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import ignore, maximise_with_gates, point
-from pumafuse.tuning.parameters import Parameter, moved, with_axis, with_gates_of
+from pumafuse.tuning.parameters import Parameter, changed, moved, with_gates_of
 from pumafuse.tuning.search import search
 from tuning_runs import (
     fit_stage,
@@ -72,7 +72,7 @@ def test_delay_and_lag_are_identified(amplitude: float, fastest: float, seed: in
     path.write_text(SWEEP.format(amplitude, fastest))
     sim = pf.simulate(pf.Scenario.load(path), seed=seed)
     model = replaced(sim.config.arm.axes["radial"], delay=0.075, plant=pf.FirstOrder(time_constant=0.06))
-    truth = with_axis(sim.config, "radial", model)
+    truth = changed(sim.config, ("arm", "axes", "radial"), model)
     found = quietly(lambda: pf.tune([sim.run], sim.config, fit=["noise", "delay", "plant"])).config
     likelihood = Likelihood([sim.run], truth)
     assert likelihood.evaluate(found).total > likelihood.evaluate(truth).total - 0.5

@@ -270,18 +270,9 @@ def tune(
     """
     from . import tune as command
 
-    options = command.Options(
-        config=config,
-        output=output,
-        fit=_names(fit, "--fit"),
-        fix=[name for listed in fix or () for name in _names(listed, "--fix")],
-        trust=trust,
-        validate=validate,
-        report=report,
-        json=json,
-        force=force,
-    )
-    command.run(runs, options)
+    kinds = _names(fit, "--fit")
+    fixed = [name for listed in fix or () for name in _names(listed, "--fix")]
+    command.run(runs, config, output, kinds, fixed, trust, validate, report, json, force)
 
 
 @app.command()

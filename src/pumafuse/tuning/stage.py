@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -37,13 +37,13 @@ class Plan:
         fit: The kinds of parameters.
         fixed: Names of parameters to leave as they are.
         sensors: The sensors to use; None: all.
-        may_vary: Which of the remaining parameters may vary.
+        trusted: The sensor that the arm was fitted on: only parameters of other sensors are free; None: all.
     """
 
     fit: Sequence[Fit]
     fixed: Sequence[str]
     sensors: Sequence[str] | None = None
-    may_vary: Callable[[Parameter], bool] = lambda _: True
+    trusted: str | None = None
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,8 @@ def _free(
 
     def may_vary(one: Parameter) -> bool:
         at_rest = any(key in one.key.split(".") for key in _AT_REST)
-        return plan.may_vary(one) and (one.axis is None or one.axis in excited or at_rest)
+        of_others = plan.trusted is None or one.sensor not in (None, plan.trusted)
+        return of_others and (one.axis is None or one.axis in excited or at_rest)
 
     def free(at: FusionConfig) -> list[Parameter]:
         names = [*plan.fixed, *(one.fixed for one in fixed)]

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
-
 import msgspec
 
-from ..errors import PumafuseWarning
 from ..fusion.config import FusionConfig
-from ..fusion.offline import fuse
 from ..logs.run import Run
 from ..units import MM
-from .identifiability import correlations
 from .intervals import ConfidenceInterval
 from .parameters import Parameter
-from .stage import Stage
-from .validation import Check
+from .validation import Check, fused
 
 
 class Fitted(msgspec.Struct, frozen=True, kw_only=True):
@@ -152,17 +146,8 @@ def found_biases(run: Run, config: FusionConfig) -> list[FoundBias]:
     """The biases of the sensors in a run under a configuration."""
     if all(sensor.bias_sd == 0.0 for sensor in config.sensors.values()):
         return []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PumafuseWarning)  # of the run; `fuse` reports them
-        found = fuse(run, config).biases
     return [
         FoundBias(run=run.name, sensor=sensor, axis=axis, bias_mm=one.value * MM, sd_mm=one.sd * MM)
-        for sensor, by_axis in found.items()
+        for sensor, by_axis in fused(run, config).biases.items()
         for axis, one in by_axis.items()
     ]
-
-
-def correlated(stage: Stage) -> list[Correlation]:
-    """The highly correlated pairs of a stage."""
-    pairs = correlations(stage.likelihood, stage.best, stage.free)
-    return [Correlation(first=first, second=second, correlation=value) for first, second, value in pairs]

@@ -16,13 +16,13 @@ from ..errors import PumafuseWarning
 from ..fusion.config import FusionConfig
 from ..logs.clock import segments
 from ..logs.run import Run
-from .identifiability import TuneError, excited_axes
+from .identifiability import TuneError, correlations, excited_axes
 from .intervals import ConfidenceInterval, confidence_intervals
 from .likelihood import Likelihood
 from .maximise import Notify, Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates_of
 from .stage import Plan, Stage, likelihood_of, repeat_stage, reset_stage, run_stage
-from .summary import AxisLikelihood, TuningSummary, correlated, fitted, found_biases
+from .summary import AxisLikelihood, Correlation, TuningSummary, fitted, found_biases
 from .validation import Check, check
 
 _FITTED_ON = 2.0 / 3.0  # of a single run; the rest is for validation
@@ -134,7 +134,11 @@ def tune(
         likelihood=_likelihoods(pipeline.likelihood(), config, tuned),
         parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in free],
         biases=[one for run in runs for one in found_biases(run, tuned)],
-        correlations=[pair for stage in stages for pair in correlated(stage)],
+        correlations=[
+            Correlation(first=first, second=second, correlation=value)
+            for stage in stages
+            for first, second, value in correlations(stage.likelihood, stage.best, stage.free)
+        ],
         not_identifiable=[str(one) for stage in stages for one in stage.not_identifiable],
         orders={axis: why for stage in stages for axis, why in stage.orders.items()},
         validation=validation,
@@ -157,11 +161,7 @@ def plans(config: FusionConfig, kinds: Sequence[Fit], fixed: Sequence[str], trus
     config.sensor_names([trust])
     arm: list[Fit] = [kind for kind in kinds if kind != "latency"]
     others: list[Fit] = [kind for kind in kinds if kind in ("noise", "latency")]
-
-    def of_others(one: Parameter) -> bool:
-        return one.sensor not in (None, trust)
-
-    return [Plan(arm, fixed, [trust]), Plan(others, fixed, None, of_others)]
+    return [Plan(arm, fixed, [trust]), Plan(others, fixed, trusted=trust)]
 
 
 class Pipeline:

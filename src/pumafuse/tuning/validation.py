@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import msgspec
@@ -82,23 +82,23 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
     verdict: str
 
 
-def check(
-    run: Run, before: FusionConfig, after: FusionConfig, sensors: Sequence[str] | None = None, since: float = 0.0
-) -> list[Check]:
+def fused(run: Run, config: FusionConfig) -> Estimates:
+    """The estimates of a run without its warnings, which ``fuse`` reports."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PumafuseWarning)
+        return fuse(run, config)
+
+
+def check(run: Run, before: FusionConfig, after: FusionConfig, since: float = 0.0) -> list[Check]:
     """Compare two configurations on a run.
 
     Args:
         run: Not fitted on, at least not from ``since`` on.
         before: The configuration as given.
         after: The tuned one.
-        sensors: Which to use; all for None.
         since: Count only from then on [s after the first command]; the filter runs from the beginning.
     """
-    pair: list[Estimates] = []
-    for config in (before, after):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PumafuseWarning)  # of the run; `fuse` reports them
-            pair.append(_from(fuse(run, config, sensors=sensors), since))
+    pair = [_from(fused(run, config), since) for config in (before, after)]
     return [_check(run.name, axis, since, *pair) for axis in pair[0].axes if len(_of_axis(pair[0], axis).value)]
 
 

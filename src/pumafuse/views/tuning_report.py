@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -10,20 +9,22 @@ import numpy as np
 from markupsafe import Markup
 
 from .. import toml
-from ..errors import PumafuseWarning
-from ..fusion.config import ARM_FILE, FusionConfig
+from ..fusion.config import ARM_FILE
 from ..fusion.consistency import Consistency, consistency
 from ..fusion.estimates import Estimates
-from ..fusion.offline import fuse
 from ..logs.run import Run
 from ..tuning.intervals import Profile, profiles
 from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Tuning
-from ..tuning.validation import Check
+from ..tuning.validation import Check, fused
 from . import tuning_figures, words
 from .render import render
 
 _Pair: TypeAlias = tuple[Consistency | None, Consistency | None]  # before and after
+_PROFILES = (
+    "The log-likelihood along one parameter, the others fitted again. It has dropped by 1.92 (dashed) at the ends of"
+    " the 95 % interval (shaded); red is the value before, an arrow points to it where it is farther away."
+)
 _WHITE = 0.01  # p-value from which innovations count as white
 
 
@@ -37,7 +38,7 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
     summary = found.summary
     fitted = {one.key: one for one in summary.parameters}
     drawn = {} if summary.interrupted else _profiles(found)  # a search that did not end has no peak to look from
-    before, after = (_fused(runs[0], config) for config in (found.before, found.config))
+    before, after = (fused(runs[0], config) for config in (found.before, found.config))
     tests = _tests(before, after)
     content = {
         "title": f"Tuning: {', '.join(summary.runs)}",
@@ -55,7 +56,7 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
         ],
         "says": {
             "parameters": _says_parameters(summary),
-            "profiles": _says_profiles([one for some in drawn.values() for one in some], fitted),
+            "profiles": _PROFILES,
             "validation": _says_validation(summary.validation or ()),
             "innovations": _says_innovations(runs[0].name, list(tests.values())),
         },
@@ -73,12 +74,6 @@ def _profiles(found: Tuning) -> dict[str | None, list[Profile]]:
         for one in profiles(stage, intervals):
             drawn.setdefault(one.axis, []).append(one)
     return drawn
-
-
-def _fused(run: Run, config: FusionConfig) -> Estimates:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PumafuseWarning)  # of the run; `fuse` reports them
-        return fuse(run, config)
 
 
 def _tests(before: Estimates, after: Estimates) -> dict[tuple[str, str], _Pair]:
@@ -152,26 +147,6 @@ def _says_parameters(summary: TuningSummary) -> str:
 def _contains(interval: tuple[float | None, float | None], value: float) -> bool:
     low, high = interval
     return (low is None or low <= value) and (high is None or value <= high)
-
-
-def _says_profiles(drawn: Sequence[Profile], fitted: Mapping[str, Fitted]) -> str:
-    """A sentence on the curves, with the best and the worst known parameter."""
-    share: dict[str, float] = {}
-    for one in drawn:
-        low, high = fitted[one.key].ci95
-        if one.log and low is not None and high is not None:
-            share[one.key] = 0.5 * (high - low) / fitted[one.key].value
-    best, worst = (choose(share, key=share.__getitem__, default="") for choose in (min, max))
-    return (
-        "The log-likelihood along one parameter, the others fitted again. It has dropped by 1.92 (dashed) at the ends"
-        " of the 95 % interval (shaded); red is the value before, an arrow points to it where it is farther away."
-        + (
-            f" Of noises and plants, {best} is known best (± {share[best]:.0%}) and {worst} worst"
-            f" (± {share[worst]:.0%})."
-            if best != worst
-            else ""
-        )
-    )
 
 
 def _says_validation(checks: Sequence[Check]) -> str:
