@@ -80,28 +80,16 @@ def names(folder: Path) -> set[str]:
 def test_the_folder_holds_the_result(
     tuned: tuple[Path, subprocess.CompletedProcess[str]], run: Path, config: Path
 ) -> None:
-    """Two files for `fuse`, and the summary; they are those of `pf.tune`."""
-    out, _ = tuned
+    """Two files for `fuse` and the summary, as `pf.tune` has them; --json prints it. Only notes are on stderr."""
+    out, done = tuned
     assert names(out) == FILES
     wanted = quietly(lambda: pf.tune([pf.Run.read(run)], pf.FusionConfig.load(config)))
-    assert (out / "tuning.json").read_text() == wanted.to_json()
+    assert (out / "tuning.json").read_text() == done.stdout == wanted.to_json()
+    assert [line.removeprefix("warning: ") for line in done.stderr.splitlines()] == wanted.summary.notes
+    assert msgspec.json.decode(done.stdout, type=TuningSummary) == wanted.summary
     found = pf.FusionConfig.load(out / "fusion.toml")
     likelihood = Likelihood([pf.Run.read(run)], found)
     assert likelihood.evaluate(found).total == pytest.approx(likelihood.evaluate(wanted.config).total, abs=1e-6)
-
-
-def test_json_is_what_the_file_holds(tuned: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
-    """To the byte; its values are those of fusion.toml. Only notes are on stderr, as warnings; no progress."""
-    out, done = tuned
-    assert done.stdout == (out / "tuning.json").read_text()
-    summary = msgspec.json.decode(done.stdout, type=TuningSummary)
-    assert summary.runs == ["panel-vision, seed 4"] and summary.fit == ["noise"] and not summary.interrupted
-    assert [line.removeprefix("warning: ") for line in done.stderr.splitlines()] == summary.notes
-    found = pf.FusionConfig.load(out / "fusion.toml")
-    values = {one.key: one.value for one in summary.parameters}
-    for axis in ("tangential", "vertical"):
-        assert values[f"sensors.vision.sd_mm.{axis}"] == pytest.approx(1e3 * found.sensors["vision"].sd_of(axis))
-        assert values[f"process.{axis}.drift_mm_rts"] == pytest.approx(1e3 * found.process[axis].drift)
 
 
 def test_worse_on_the_validation_run_is_code_3(place: Place, run: Path) -> None:
@@ -146,17 +134,6 @@ def test_worse_on_the_validation_run_is_code_3(place: Place, run: Path) -> None:
     assert set(re.findall("^warning: (.*)$", done.stderr, re.MULTILINE)) == set(summary.notes)
 
 
-def test_a_result_is_kept_unless_forced(
-    tuned: tuple[Path, subprocess.CompletedProcess[str]], run: Path, config: Path
-) -> None:
-    """To the last byte, and its time too."""
-    out, _ = tuned
-    before = {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in out.iterdir()}
-    line = refused(run, "-c", config, "-o", out)
-    assert line == f"pumafuse: {out}: exists; --force replaces it, or choose another folder"
-    assert {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in out.iterdir()} == before
-
-
 @pytest.mark.parametrize(
     ("options", "line"),
     [
@@ -171,15 +148,6 @@ def test_a_wrong_option_is_one_line(
     """With what would have been accepted; nothing is written."""
     assert refused(run, "-c", config, "-o", tmp_path / "out", *options).startswith(line)
     assert names(tmp_path) == set()
-
-
-def test_a_broken_configuration_is_one_line(run: Path, tmp_path: Path) -> None:
-    """File and key are named."""
-    broken = tmp_path / "fusion.toml"
-    broken.write_text('arm = "puma560-internal"\n[sensors.vision]\nsd = 0.5\n')
-    line = refused(run, "-c", broken, "-o", tmp_path / "out")
-    assert line.startswith(f"pumafuse: {broken}: ") and "sd" in line
-    assert names(tmp_path) == {"fusion.toml"}
 
 
 @pytest.mark.parametrize(

@@ -179,15 +179,11 @@ def with_axis(config: pf.FusionConfig, axis: str, **changes: object) -> pf.Fusio
 
 
 OTHERS = {
-    "a latency": lambda config: with_sensors(config, "vision", latency=0.02),
     "both latencies, past each other": lambda config: with_sensors(
         with_sensors(config, "vision", latency=-0.03), "tracker", latency=0.0712345678
     ),
-    "the same latency for both": lambda config: with_sensors(config, latency=0.03),
     "a delay": lambda config: with_axis(config, "tangential", delay=0.0211),
-    "no delay": lambda config: with_axis(config, "vertical", delay=0.0),
     "a gain": lambda config: with_axis(config, "tangential", gain=pf.Gain(slope=0.0518, intercept=1.21)),
-    "a recovery": lambda config: with_axis(config, "vertical", gain_recovery=0.033),
     "a gain that stays": lambda config: with_axis(config, "tangential", gain_recovery=None),
     "another plant": lambda config: with_order(config, "vertical", 2),
     "everything": lambda config: with_process(
@@ -396,14 +392,3 @@ def test_the_response_of_the_noiseless_arm_is_that_of_the_oracle() -> None:
         position, _ = oracle.undisturbed(np.array([measurement.valid for measurement in mine]))
         np.testing.assert_allclose(expected, config.sensors[name].scale * position, atol=1e-12)
         assert measured.tolist() == [measurement.value for measurement in mine]
-
-
-def test_travel_is_how_far_commands_go() -> None:
-    """From the start level on, in the run where it is greatest."""
-    time = np.arange(5) * 0.028
-    runs = [
-        pf.Run.from_arrays(time, {"radial": 0.5 + 0.01 * np.arange(5)}, start={"radial": 0.45}),
-        pf.Run.from_arrays(time, {"radial": 0.5 - 0.015 * np.arange(5), "vertical": np.zeros(5)}),
-    ]
-    likelihood = Likelihood(runs, pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal")))
-    assert likelihood.travel == pytest.approx({"radial": 0.09, "vertical": 0.0})

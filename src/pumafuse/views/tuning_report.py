@@ -21,10 +21,6 @@ from . import tuning_figures, words
 from .render import render
 
 _Pair: TypeAlias = tuple[Consistency | None, Consistency | None]  # before and after
-_PROFILES = (
-    "The log-likelihood along one parameter, the others fitted again. It has dropped by 1.92 (dashed) at the ends of"
-    " the 95 % interval (shaded); red is the value before, an arrow points to it where it is farther away."
-)
 _WHITE = 0.01  # p-value from which innovations count as white
 
 
@@ -40,26 +36,32 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
     drawn = {} if summary.interrupted else _profiles(found)  # a search that did not end has no peak to look from
     before, after = (fused(runs[0], config) for config in (found.before, found.config))
     tests = _tests(before, after)
+    known = [one for one in summary.parameters if one.before is not None]
+    both = [pair for pair in tests.values() if all(pair)]
     content = {
         "title": f"Tuning: {', '.join(summary.runs)}",
-        "summary": _summary(summary),
+        "tuning": summary,
         "notes": _notes(summary),
         "parameters": [_parameter(one, summary.interrupted) for one in summary.parameters],
+        "known": len(known),
+        "outside": sum(not _contains(one.ci95, one.before) for one in known),
+        "zero": sum(one.value == 0.0 for one in summary.parameters),
+        "open": not summary.interrupted and any(None in one.ci95 for one in summary.parameters),
         "profiles": [Markup(tuning_figures.profiles(some, fitted)) for some in drawn.values()],
         "validation": [_check(one) for one in summary.validation or ()],
         "innovations": [
             {
                 "figure": Markup(tuning_figures.innovations(before, after, sensor, axis)),
-                "says": _says_tests(sensor, axis, pair),
+                "sentence": _sentence(sensor, axis, pair),
             }
             for (sensor, axis), pair in tests.items()
         ],
-        "says": {
-            "parameters": _says_parameters(summary),
-            "profiles": _PROFILES,
-            "validation": _says_validation(summary.validation or ()),
-            "innovations": _says_innovations(runs[0].name, list(tests.values())),
-        },
+        "nearer": sum(abs(np.log(new.nis)) < abs(np.log(old.nis)) for old, new in both if old and new),
+        "white": [
+            sum(one is not None and one.whiteness > _WHITE for one in some)
+            for some in zip(*tests.values(), strict=True)
+        ],
+        "white_p": _WHITE,
         "fusion": toml.text({**toml.builtins(found.config), "arm": ARM_FILE}),
         "arm": found.config.arm.to_toml(),
     }
@@ -81,17 +83,6 @@ def _tests(before: Estimates, after: Estimates) -> dict[tuple[str, str], _Pair]:
     pairs = [(sensor, axis) for axis in after.axes for sensor in after.measurements.sensors]
     tests = {pair: (consistency(before, *pair), consistency(after, *pair)) for pair in pairs}
     return {pair: both for pair, both in tests.items() if any(both)}
-
-
-def _summary(summary: TuningSummary) -> str:
-    runs = f"{len(summary.runs)} run{'s' if len(summary.runs) > 1 else ''} ({', '.join(summary.runs)})"
-    trusted = "" if summary.trusted is None else f", the arm to {summary.trusted} alone"
-    fixed = f"; fixed as asked: {', '.join(summary.fixed)}" if summary.fixed else ""
-    gains = "; ".join(
-        f"{axis} {one.before:.1f} → {one.after:.1f} ({one.components} measurements)"
-        for axis, one in summary.likelihood.items()
-    )
-    return f"Fitted to {runs}{trusted}: {', '.join(summary.fit)}{fixed}. Log-likelihood before → after: {gains}."
 
 
 def _notes(summary: TuningSummary) -> list[str]:
@@ -129,53 +120,15 @@ def _check(one: Check) -> Mapping[str, Any]:
     }
 
 
-def _says_parameters(summary: TuningSummary) -> str:
-    if not summary.parameters:
-        return "The search was interrupted before anything was fitted."
-    known = [one for one in summary.parameters if one.before is not None]
-    outside = sum(not _contains(one.ci95, one.before) for one in known if one.before is not None)
-    none = sum(one.value == 0.0 for one in summary.parameters)
-    limitless = not summary.interrupted and any(None in one.ci95 for one in summary.parameters)
-    return (
-        f"{len(summary.parameters)} numbers were fitted, each in the unit of its name. {outside} of the {len(known)}"
-        " that were configured before lay outside their 95 % interval"
-        + (f"; {none} turned out to be 0." if none else ".")
-        + (" An end marked … is not limited by the measurements." if limitless else "")
-    )
-
-
-def _contains(interval: tuple[float | None, float | None], value: float) -> bool:
+def _contains(interval: tuple[float | None, float | None], value: float | None) -> bool:
     low, high = interval
-    return (low is None or low <= value) and (high is None or value <= high)
+    return value is None or ((low is None or low <= value) and (high is None or value <= high))
 
 
-def _says_validation(checks: Sequence[Check]) -> str:
-    if not checks:
-        return ""
-    axes = ", ".join(f"{one.axis} is {one.verdict.partition(':')[0]}" for one in checks)
-    return (
-        f"On measurements that nothing had been fitted on, {axes}. NIS should be 1, the lag-1 correlation of"
-        " innovations 0, and coverage, the share of errors within the 95 % band, 0.95."
-        + (" After that these measurements were fitted on too." if any(one.since_s for one in checks) else "")
-    )
-
-
-def _says_tests(sensor: str, axis: str, tests: _Pair) -> str:
+def _sentence(sensor: str, axis: str, tests: _Pair) -> str:
+    """NIS and whiteness of one sensor on one axis, before and after."""
     nis = words.change([None if one is None else one.nis for one in tests], ".2f")
     white = " → ".join("–" if one is None else words.p_value(one.whiteness) for one in tests)
     after = tests[1]
     expected = "" if after is None else f" (expected {after.nis_band[0]:.2f} to {after.nis_band[1]:.2f})"
     return f"{axis}, {sensor}: NIS {nis}{expected}; whiteness p {white}."
-
-
-def _says_innovations(run: str, tests: Sequence[_Pair]) -> str:
-    both = [(before, after) for before, after in tests if before is not None and after is not None]
-    nearer = sum(abs(np.log(after.nis)) < abs(np.log(before.nis)) for before, after in both)
-    white = " → ".join(
-        f"{sum(one is not None and one.whiteness > _WHITE for one in some)}" for some in zip(*tests, strict=True)
-    )
-    return (
-        f"Normalised innovations of {run}: 95 % should lie in the band, and so should their autocorrelations (grey"
-        " before, coloured after). NIS, their mean square, should be 1 and came nearer to it for"
-        f" {nearer} of {len(tests)}; {white} of {len(tests)} are white (p above {_WHITE:g})."
-    )
