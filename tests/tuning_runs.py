@@ -1,4 +1,4 @@
-"""What the tests of tuning share: short simulated runs, and configurations that are wrong about them."""
+"""Shared by the tests of tuning: short simulated runs, and configurations that are wrong about them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import pytest
 import pumafuse as pf
 from pumafuse.simulation.true_sensor import Outliers
 from pumafuse.tuning.intervals import ConfidenceInterval, confidence_intervals
-from pumafuse.tuning.lesson import Lesson, Syllabus, learn
-from pumafuse.tuning.likelihood import Evidence
+from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.parameters import Fit, Parameter, parameters
+from pumafuse.tuning.stage import Plan, Stage, run_stage
 from pumafuse.tuning.summary import Fitted
 
 LONG = pytest.mark.long
@@ -85,41 +85,41 @@ def spoiled_arm(config: pf.FusionConfig) -> pf.FusionConfig:
     return replaced(config, arm=replaced(arm, axes=axes))
 
 
-def free_of(evidence: Evidence, config: pf.FusionConfig, fit: Sequence[Fit], *hold: str) -> list[Parameter]:
-    """What may move."""
-    return parameters(config, evidence.config, evidence.heard, fit, hold)
+def free_of(likelihood: Likelihood, config: pf.FusionConfig, fit: Sequence[Fit], *fixed: str) -> list[Parameter]:
+    """The free parameters of a configuration."""
+    return parameters(config, likelihood.config, likelihood.sensors, fit, fixed)
 
 
-def learnt(
-    run: pf.Run | Sequence[pf.Run], config: pf.FusionConfig, fit: Sequence[Fit] = ("noise",), *hold: str
-) -> Lesson:
-    """One lesson from whole runs."""
-    return learn([run] if isinstance(run, pf.Run) else run, config, Syllabus(fit, hold), None, lambda _: None)
+def fit_stage(
+    run: pf.Run | Sequence[pf.Run], config: pf.FusionConfig, fit: Sequence[Fit] = ("noise",), *fixed: str
+) -> Stage:
+    """The result of one stage on whole runs."""
+    return run_stage([run] if isinstance(run, pf.Run) else run, config, Plan(fit, fixed))
 
 
-def sure_of(lesson: Lesson) -> dict[str, ConfidenceInterval]:
-    """The intervals of a lesson."""
-    return confidence_intervals(lesson.evidence, lesson.best, lesson.free)
+def intervals_of(stage: Stage) -> dict[str, ConfidenceInterval]:
+    """The intervals of a stage."""
+    return confidence_intervals(stage.likelihood, stage.best, stage.free)
 
 
-def holds(one: Parameter, sure: ConfidenceInterval, truth: pf.FusionConfig) -> bool:
-    """Whether an interval has the truth in it; none is in one that is open below."""
-    low, high = sure.ci95
-    return (0.0 if sure.open[0] and one.vanishes else low) <= one.get(truth) <= high
+def contains(found: ConfidenceInterval, one: Parameter, truth: pf.FusionConfig) -> bool:
+    """Whether an interval contains the truth; one that is open below contains 0."""
+    low, high = found.ci95
+    return (0.0 if found.open[0] and one.vanishes else low) <= one.get(truth) <= high
 
 
 def quietly(work: Callable[[], T]) -> T:
-    """Do it without what it warns of."""
+    """The result of some work, without its warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", pf.PumafuseWarning)
         return work()
 
 
 def later(*values: object) -> object:
-    """A case of a test that only `make test-long` tries."""
+    """A case of a test that only `make test-long` runs."""
     return pytest.param(*values, marks=LONG)
 
 
 def fitted(found: pf.Tuning) -> dict[str, Fitted]:
-    """What was fitted, by its name."""
+    """The fitted parameters by key."""
     return {one.key: one for one in found.summary.parameters}

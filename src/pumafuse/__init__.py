@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .model.plants import FirstOrder, SecondOrder
     from .simulation.scenario import Scenario
     from .simulation.simulate import Simulated, simulate
-    from .tuning.learnable import TuneError
+    from .tuning.identifiability import TuneError
     from .tuning.tune import Tuning, tune
     from .views.rerun import to_rerun
 
@@ -63,7 +63,7 @@ _HOME = {
     "Summary": "fusion.summary",
     "UpdateResult": "live.results",
     "TrialsError": "identification.trials",
-    "TuneError": "tuning.learnable",
+    "TuneError": "tuning.identifiability",
     "Tuning": "tuning.tune",
     "UnknownNameError": "errors",
     "Validity": "model.arm",

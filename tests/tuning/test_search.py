@@ -1,4 +1,4 @@
-"""The search finds the highest maximum that an unhurried global search finds."""
+"""The search finds the highest maximum that a slow global search finds."""
 
 from __future__ import annotations
 
@@ -10,14 +10,13 @@ import pytest
 from scipy.optimize import differential_evolution
 
 import pumafuse as pf
-from pumafuse.tuning.climb import point, settle
-from pumafuse.tuning.likelihood import Evidence
-from pumafuse.tuning.parameters import Parameter, moved
+from pumafuse.tuning.likelihood import Likelihood
+from pumafuse.tuning.maximise import ignore, maximise_with_gates, point
+from pumafuse.tuning.parameters import Parameter, changed, moved, with_gates_of
 from pumafuse.tuning.search import search
-from pumafuse.tuning.variants import with_axis, with_gates_of
 from tuning_runs import (
+    fit_stage,
     free_of,
-    learnt,
     outage,
     quietly,
     replaced,
@@ -30,11 +29,11 @@ from tuning_runs import (
 
 
 def test_a_search_gives_back_the_gates_as_they_were() -> None:
-    """It widens them on its way and gates component by component; the result has each sensor's own."""
+    """It uses wider ones and gates component by component; the result has each sensor's own."""
     sim = outage(5)
     config = with_sensors(with_sensors(sim.config, "tracker", gate=6.5), "vision", gate=3.25, gate_rows=False)
-    evidence = Evidence([sim.run], config)
-    best, orders = search(evidence, config, lambda at: free_of(evidence, at, ("noise",)), lambda _: None)
+    likelihood = Likelihood([sim.run], config)
+    best, orders = search(likelihood, config, lambda at: free_of(likelihood, at, ("noise",)), ignore)
     assert orders == {}
     for name, sensor in best.config.sensors.items():
         assert (sensor.gate, sensor.gate_rows) == (config.sensors[name].gate, config.sensors[name].gate_rows)
@@ -49,7 +48,7 @@ def test_where_it_starts_does_not_matter() -> None:
         config = with_sensors(sim.config, sd=times * 0.5e-3)
         starts.append(with_process(config, input_noise=times * 3e-5, drift=times * 3e-4, maneuver_drift=0.0))
     starts.append(with_process(sim.config, input_noise=0.0, drift=0.0, maneuver_noise=0.0, maneuver_drift=0.0))
-    heights = [learnt(sim.run, config).best.height for config in starts]
+    heights = [fit_stage(sim.run, config).best.log_posterior for config in starts]
     assert max(heights) - min(heights) < 0.1
 
 
@@ -64,19 +63,19 @@ sensors.tracker = {{ rate_hz = 100.0, sd_mm = 0.1, latency_ms = 8.0 }}
 
 
 @pytest.mark.parametrize(("amplitude", "fastest", "seed"), [(20.0, 1.0, 2), (20.0, 1.0, 7), (5.0, 2.0, 2)])
-def test_a_delay_is_told_from_a_lag(amplitude: float, fastest: float, seed: int, tmp_path: Path) -> None:
+def test_delay_and_lag_are_identified(amplitude: float, fastest: float, seed: int, tmp_path: Path) -> None:
     """A sweep, from an arm 21 ms too early and 18 ms too fast: as likely as the truth at least, and within 5 ms of it.
 
-    The slow first two thirds hardly tell the two apart; and there are false peaks a tick of delay on either side.
+    The slow first two thirds hardly determine both; and there are false maxima a tick of delay on either side.
     """
     path = tmp_path / "sweep.toml"
     path.write_text(SWEEP.format(amplitude, fastest))
     sim = pf.simulate(pf.Scenario.load(path), seed=seed)
     model = replaced(sim.config.arm.axes["radial"], delay=0.075, plant=pf.FirstOrder(time_constant=0.06))
-    truth = with_axis(sim.config, "radial", model)
+    truth = changed(sim.config, ("arm", "axes", "radial"), model)
     found = quietly(lambda: pf.tune([sim.run], sim.config, fit=["noise", "delay", "plant"])).config
-    evidence = Evidence([sim.run], truth)
-    assert evidence.value(found).total > evidence.value(truth).total - 0.5
+    likelihood = Likelihood([sim.run], truth)
+    assert likelihood.evaluate(found).total > likelihood.evaluate(truth).total - 0.5
     assert found.arm.delay_of("radial") == pytest.approx(0.075, abs=0.005)
     assert found.arm.axes["radial"].plant.lag == pytest.approx(0.060, abs=0.005)
 
@@ -85,12 +84,12 @@ def test_a_delay_is_told_from_a_lag(amplitude: float, fastest: float, seed: int,
 
 
 def best_of_all(
-    evidence: Evidence, config: pf.FusionConfig, free: Sequence[Parameter], seed: int, generations: int
+    likelihood: Likelihood, config: pf.FusionConfig, free: Sequence[Parameter], seed: int, generations: int
 ) -> float:
     """Differential evolution under the gates themselves, and the nearest maximum to what it found."""
 
     def cost(coordinates: np.ndarray) -> float:
-        return -point(evidence, moved(config, free, coordinates), free).height
+        return -point(likelihood, moved(config, free, coordinates), free).log_posterior
 
     box = [
         (max(low, np.log(1e-6)), min(high, np.log(0.1))) if one.fit == "noise" else (low, high)
@@ -100,17 +99,17 @@ def best_of_all(
     found = differential_evolution(
         cost, box, popsize=5, maxiter=generations, rng=seed, polish=False, tol=1e-9, init="sobol"
     )
-    return max(-found.fun, settle(evidence, moved(config, free, found.x), free).height)
+    return max(-found.fun, maximise_with_gates(likelihood, moved(config, free, found.x), free).log_posterior)
 
 
 def test_nothing_higher_is_found_by_differential_evolution() -> None:
     """Noise of two axes with outliers in the measurements, from a poor start: within 0.1 of a global search's best."""
     sim = with_outliers(4)
     config = with_sensors(spoiled(sim.config), gate=4.0)
-    found = learnt(sim.run, config)
-    assert (np.concatenate(found.best.value.outcomes) == pf.Outcome.REJECTED).sum() >= 4
+    found = fit_stage(sim.run, config)
+    assert (np.concatenate(found.best.outcomes) == pf.Outcome.REJECTED).sum() >= 4
     assert len(found.free) == 10
-    assert found.best.height > best_of_all(found.evidence, config, found.free, 1, 25) - 0.1
+    assert found.best.log_posterior > best_of_all(found.likelihood, config, found.free, 1, 25) - 0.1
 
 
 @pytest.mark.long
@@ -120,8 +119,8 @@ def test_nothing_higher_is_found_by_long_differential_evolution(seed: int, gate_
     """Likewise with 6 % of outliers, narrower gates and 200 generations."""
     sim = with_outliers(seed, 0.06)
     config = with_sensors(spoiled(sim.config), gate=3.5, gate_rows=gate_rows)
-    found = learnt(sim.run, config)
-    assert found.best.height > best_of_all(found.evidence, config, found.free, seed, 200) - 0.1
+    found = fit_stage(sim.run, config)
+    assert found.best.log_posterior > best_of_all(found.likelihood, config, found.free, seed, 200) - 0.1
 
 
 @pytest.mark.long
@@ -130,6 +129,6 @@ def test_no_arm_is_likelier_to_differential_evolution(seed: int) -> None:
     """Noise, delay and plant of one axis, by a tracker and a camera; the plant of the order that was chosen."""
     sim = outage(seed)
     config = spoiled_arm(sim.config)
-    found = learnt(sim.run, config, ("noise", "delay", "plant"), "tangential")
+    found = fit_stage(sim.run, config, ("noise", "delay", "plant"), "tangential")
     assert len(found.free) >= 8
-    assert found.best.height > best_of_all(found.evidence, found.best.config, found.free, seed, 200) - 0.1
+    assert found.best.log_posterior > best_of_all(found.likelihood, found.best.config, found.free, seed, 200) - 0.1

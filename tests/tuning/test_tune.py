@@ -1,4 +1,4 @@
-"""Tuning as a whole: what comes out can be used, says where it is from, and is kept when it is interrupted."""
+"""Tuning as a whole: the result can be used, has its provenance, and is kept when interrupted."""
 
 from __future__ import annotations
 
@@ -15,15 +15,14 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.logs.run import Source
-from pumafuse.tuning.climb import Point
-from pumafuse.tuning.course import Course, syllabi
-from pumafuse.tuning.likelihood import Evidence
-from pumafuse.tuning.parameters import Fit
-from pumafuse.tuning.profile import profiles
+from pumafuse.tuning.intervals import profiles
+from pumafuse.tuning.likelihood import Likelihood
+from pumafuse.tuning.maximise import Point
+from pumafuse.tuning.parameters import Fit, with_order
 from pumafuse.tuning.summary import TuningSummary
 from pumafuse.tuning.summary import fitted as fitted_one
-from pumafuse.tuning.validate import check
-from pumafuse.tuning.variants import with_order
+from pumafuse.tuning.tune import Pipeline, plans
+from pumafuse.tuning.validation import check
 from tuning_runs import (
     fitted,
     later,
@@ -54,23 +53,23 @@ def tuned_noise() -> pf.Tuning:
 
 
 def total(run: pf.Run, config: pf.FusionConfig) -> float:
-    return Evidence([run], config).value(config).total
+    return Likelihood([run], config).evaluate(config).total
 
 
-# ---- what comes out -------------------------------------------------------------------------------------------------
+# ---- the result -----------------------------------------------------------------------------------------------------
 
 
-def test_the_result_is_likelier_and_says_by_how_much() -> None:
-    """By axis, before and after, as the measurements have it; numbers before and after are those of the configurations."""
+def test_the_result_is_likelier_and_reports_by_how_much() -> None:
+    """By axis, before and after; values before and after are those of the configurations."""
     found, run = tuned(), outage(1).run
     for config, name in ((found.before, "before"), (found.config, "after")):
-        evidence = Evidence([run], config)
-        axes = evidence.value(config).axes
-        told = found.summary.likelihood
-        assert [getattr(told[axis], name) for axis in AXES] == pytest.approx(axes.tolist(), rel=1e-9)
-        assert [told[axis].components for axis in AXES] == evidence.count.tolist()
+        likelihood = Likelihood([run], config)
+        axes = likelihood.evaluate(config).axes
+        reported = found.summary.likelihood
+        assert [getattr(reported[axis], name) for axis in AXES] == pytest.approx(axes.tolist(), rel=1e-9)
+        assert [reported[axis].components for axis in AXES] == likelihood.count.tolist()
     assert total(run, found.config) > total(run, found.before) + 200.0
-    keys = {one.key: one for lesson in found.lessons for one in lesson.free}
+    keys = {one.key: one for stage in found.stages for one in stage.free}
     assert keys.keys() == fitted(found).keys()
     for key, one in fitted(found).items():
         known = keys[key].given(found.before)
@@ -80,7 +79,7 @@ def test_the_result_is_likelier_and_says_by_how_much() -> None:
         assert (low is None or low <= one.value) and (high is None or one.value <= high), one
     assert found.summary.orders.keys() == set(AXES)
     assert (found.summary.pumafuse, found.summary.runs) == (version("pumafuse"), [run.name])
-    assert (found.summary.fit, found.summary.hold, found.summary.teacher) == (list(ARM), [], None)
+    assert (found.summary.fit, found.summary.fixed, found.summary.trusted) == (list(ARM), [], None)
     assert not found.summary.interrupted
 
 
@@ -102,14 +101,14 @@ def test_the_truth_is_near() -> None:
 
 
 def test_what_is_saved_loads_and_is_as_likely(tmp_path: Path) -> None:
-    """fusion.toml and arm.toml beside it: the same configuration to the digits written, of which there are six."""
+    """fusion.toml and arm.toml beside it: the same configuration to six digits, with intervals and provenance."""
     found, run = tuned(), outage(1).run
     found.config.save(tmp_path)
     again = pf.FusionConfig.load(tmp_path / "fusion.toml")
     assert total(run, again) == pytest.approx(total(run, found.config), abs=1e-6)
     for key, one in fitted(found).items():
         assert float(f"{one.value:.6g}") == pytest.approx(one.value, rel=1e-12), key
-    arm, said = tomllib.loads((tmp_path / "arm.toml").read_text()), fitted(found)
+    arm, numbers = tomllib.loads((tmp_path / "arm.toml").read_text()), fitted(found)
     for axis, keys in (
         ("tangential", ("delay_ms", "natural_frequency_rad_s", "damping")),
         ("vertical", ("delay_ms", "time_constant_ms")),
@@ -117,7 +116,7 @@ def test_what_is_saved_loads_and_is_as_likely(tmp_path: Path) -> None:
         for key in keys:
             table = arm["axes"][axis]
             table = table if key in table else table["plant"]
-            one = said[f"axes.{axis}.{key}"]
+            one = numbers[f"axes.{axis}.{key}"]
             assert table[key] == pytest.approx(one.value, rel=1e-9)
             assert table[f"{key}_ci95"] == pytest.approx(one.ci95, rel=1e-5)
     assert arm["provenance"]["tuned_on"] == [run.name]
@@ -125,41 +124,29 @@ def test_what_is_saved_loads_and_is_as_likely(tmp_path: Path) -> None:
     assert {key: arm["provenance"][key] for key in known} == known
 
 
-def test_an_arm_that_was_not_fitted_has_no_new_provenance() -> None:
-    """A fit of noise leaves it to the last bit."""
-    found = tuned_noise()
-    assert found.config.arm == found.before.arm
-
-
 def test_gain_intervals_are_in_the_arm_too() -> None:
     """Of intercept and recovery, where they are fitted."""
     noise = scenario("white-noise")
     sim = pf.simulate(replaced(noise, trajectory=replaced(noise.trajectory, duration=4.0)), 1)
     found = quietly(lambda: pf.tune([sim.run], sim.config, fit=["gain"]))
-    model, said = found.config.arm.axes["tangential"], fitted(found)
-    assert said.keys() == {"axes.tangential.gain.intercept", "axes.tangential.gain_recovery_ms"}
-    assert model.gain.intercept_ci95 == pytest.approx(said["axes.tangential.gain.intercept"].ci95, rel=1e-5)
+    model, numbers = found.config.arm.axes["tangential"], fitted(found)
+    assert numbers.keys() == {"axes.tangential.gain.intercept", "axes.tangential.gain_recovery_ms"}
+    assert model.gain.intercept_ci95 == pytest.approx(numbers["axes.tangential.gain.intercept"].ci95, rel=1e-5)
     recovery = np.array(model.gain_recovery_ci95)
-    assert 1e3 * recovery == pytest.approx(said["axes.tangential.gain_recovery_ms"].ci95, rel=1e-5)
+    assert 1e3 * recovery == pytest.approx(numbers["axes.tangential.gain_recovery_ms"].ci95, rel=1e-5)
 
 
 def test_the_summary_is_its_own_schema() -> None:
-    """Its text parses into what it was."""
+    """Its text parses into itself. A fit of noise leaves the arm as it is, provenance too."""
+    assert tuned_noise().config.arm == tuned_noise().before.arm
     for found in (tuned(), tuned_noise()):
         assert msgspec.json.decode(found.to_json(), type=TuningSummary) == found.summary
         assert found.to_json().endswith("}\n")
 
 
-def test_the_same_twice_is_the_same() -> None:
-    """To the last digit."""
-    again = quietly(lambda: pf.tune([outage(1).run], spoiled(outage(1).config)))
-    assert again.to_json() == tuned_noise().to_json()
-    assert again.config == tuned_noise().config
-
-
 def sds_alone(runs: Sequence[pf.Run], config: pf.FusionConfig, **more: object) -> pf.Tuning:
-    """The noise of the sensors, the process held: what takes least time."""
-    return quietly(lambda: pf.tune(runs, config, hold=["process"], **more))
+    """The noise of the sensors with the process fixed, which takes least time."""
+    return quietly(lambda: pf.tune(runs, config, fix=["process"], **more))
 
 
 def test_the_reference_plays_no_part() -> None:
@@ -174,21 +161,8 @@ def test_the_reference_plays_no_part() -> None:
         assert found.summary.parameters == wanted.summary.parameters
 
 
-def test_a_noise_worth_nothing_is_none() -> None:
-    """0 in the file, where the likelihood is as good without it."""
-    found = tuned()
-    none = [one for one in found.summary.parameters if one.value == 0.0]
-    fields = {"maneuver_noise_mm_rtHz_per_m_s": "maneuver_noise", "maneuver_drift_mm_rts_per_m_s": "maneuver_drift"}
-    assert none
-    for one in none:
-        _, axis, key = one.key.split(".")
-        tiny = replaced(found.config.process[axis], **{fields[key]: 1e-5})
-        config = replaced(found.config, process={**found.config.process, axis: tiny})
-        assert total(outage(1).run, config) < total(outage(1).run, found.config) + 0.02
-
-
-def test_a_delay_that_belongs_below_none_is_none(tmp_path: Path) -> None:
-    """Latencies told 90 ms too long: the arm seems to move before it is told to; what is saved loads all the same."""
+def test_a_delay_is_never_negative(tmp_path: Path) -> None:
+    """Latencies 90 ms too long: the arm seems to move before its commands; the result loads all the same."""
     sim = pf.simulate(scenario("panel-tracker-outage", 0.1, 0.06), 1)
     found = quietly(lambda: pf.tune([sim.run], with_sensors(sim.config, latency=0.1), fit=["delay"]))
     assert all(found.config.arm.delay_of(axis) >= 0.0 for axis in AXES)
@@ -196,7 +170,7 @@ def test_a_delay_that_belongs_below_none_is_none(tmp_path: Path) -> None:
     pf.FusionConfig.load(tmp_path / "fusion.toml")
 
 
-# ---- before and after -----------------------------------------------------------------------------------------------
+# ---- validation -----------------------------------------------------------------------------------------------------
 
 
 def cut(run: pf.Run, until: float, delay: dict[str, float]) -> pf.Run:
@@ -210,10 +184,10 @@ def cut(run: pf.Run, until: float, delay: dict[str, float]) -> pf.Run:
 
 
 @pytest.mark.long
-def test_the_last_third_is_held_back_and_learnt_from_after() -> None:
-    """What is compared there was learnt from the first two thirds: as from a run cut there, to the last digit.
+def test_the_last_third_is_validated_on_and_fitted_on_after() -> None:
+    """What is compared there was fitted on the first two thirds: as on a run cut there, to the last digit.
 
-    The result is learnt from the whole: as likely there as a search in the whole finds it.
+    The result is fitted on the whole: as likely there as a search in the whole finds it.
     """
     sim, config = with_outliers(4), spoiled(with_outliers(4).config)
     found = sds_alone([sim.run], config)
@@ -235,49 +209,33 @@ def test_a_run_to_validate_on_is_compared_whole() -> None:
     one, two = outage(1), outage(2)
     found = sds_alone([one.run], with_sensors(one.config, sd=1e-3), validate=two.run)
     assert found.summary.validation == check(two.run, found.before, found.config)
-    assert {(told.run, told.since_s) for told in found.summary.validation or []} == {(two.run.name, 0.0)}
+    assert {(part.run, part.since_s) for part in found.summary.validation or []} == {(two.run.name, 0.0)}
     assert not found.summary.worse
-    assert not [note for note in found.summary.notes if "learnt from" in note]
+    assert not [note for note in found.summary.notes if "fitted on" in note]
 
 
-def test_a_run_that_was_learnt_from_is_no_validation() -> None:
-    """It is compared as asked for, and a note says what that is worth."""
+def test_a_run_that_was_fitted_on_is_no_validation() -> None:
+    """It is compared as asked for, with a note."""
     one = outage(1)
     found = sds_alone([one.run], one.config, validate=replace(one.run, name="another name"))
-    (note,) = [note for note in found.summary.notes if note.startswith("validated on a run that was learnt from")]
+    (note,) = [note for note in found.summary.notes if note.startswith("validated on a run that was fitted on")]
     assert note.endswith("nothing says whether the numbers hold elsewhere") and found.summary.validation
 
 
-def test_what_got_worse_is_said_to_have() -> None:
-    """Tuned on a run and validated on one whose camera and arm are far noisier: worse, on each axis in a note."""
-    quiet = scenario("panel-vision", 0.1, 0.02)
-    noisy = replaced(
-        quiet,
-        sensors={"vision": replaced(quiet.sensors["vision"], sd=3e-3)},
-        process={axis: pf.Process(input_noise=1e-4, drift=3e-3) for axis in AXES},
-    )
-    one, two = pf.simulate(quiet, 1), pf.simulate(noisy, 2)
-    with pytest.warns(pf.PumafuseWarning, match="worse: log-likelihood -"):
-        found = pf.tune([one.run], two.config, validate=two.run)
-    assert found.summary.worse
-    for told in found.summary.validation or []:
-        assert told.worse and f"{two.run.name}, {told.axis}: {told.verdict}" in found.summary.notes
-
-
-def test_several_runs_have_nothing_held_back() -> None:
-    """A note says so; two runs tell more than one: the interval of an sd is narrower by about √2."""
+def test_of_several_runs_none_is_validated_on() -> None:
+    """With a note; the interval of an sd from two runs is narrower by about √2."""
     runs = [outage(seed).run for seed in (1, 2)]
     config = spoiled(outage(1).config)
     both = sds_alone(runs, config)
-    assert [note for note in both.summary.notes if "nothing was held back to validate on" in note]
+    assert [note for note in both.summary.notes if "no run was left to validate on" in note]
     assert both.summary.validation is None and both.summary.runs == [run.name for run in runs]
     key = "sensors.vision.sd_mm.vertical"
     widths = [np.ptp(fitted(found)[key].ci95) for found in (both, sds_alone(runs[:1], config))]
     assert widths[0] == pytest.approx(widths[1] / np.sqrt(2.0), rel=0.25)
 
 
-def test_a_run_whose_clock_was_set_back_has_nothing_held_back() -> None:
-    """Thirds of it mean nothing; it is learnt from all the same."""
+def test_a_run_whose_clock_was_set_back_is_fitted_on_whole() -> None:
+    """Without validation: thirds of it mean nothing."""
     sim = pf.simulate(scenario("panel-tracker-outage", 0.2, 0.0), 1)
 
     def back(source: Source) -> Source:
@@ -290,37 +248,25 @@ def test_a_run_whose_clock_was_set_back_has_nothing_held_back() -> None:
     assert found.summary.validation is None
     assert found.config.sensors["vision"].sd_of("tangential") == pytest.approx(5e-4, rel=0.4)
     assert found.summary.likelihood["tangential"].after == pytest.approx(
-        Evidence([run], found.config).value(found.config).axes[0], rel=1e-9
+        Likelihood([run], found.config).evaluate(found.config).axes[0], rel=1e-9
     )
 
 
-def test_every_note_is_a_warning() -> None:
-    """Once each: of the runs, of the search and of what is missing."""
-    sim = with_outliers(1)
-    config = with_sensors(sim.config, gate=0.0)
-    config = replaced(config, sensors={**config.sensors, "spare": pf.Sensor(sd=1e-3)})
-    with pytest.warns(pf.PumafuseWarning) as warned:
-        found = pf.tune([sim.run], config, hold=["process"])
-    said = [str(one.message) for one in warned if issubclass(one.category, pf.PumafuseWarning)]
-    assert sorted(set(said)) == sorted(found.summary.notes)
-    assert len(found.summary.notes) == len(set(found.summary.notes)) >= 2
-
-
-# ---- a teacher ------------------------------------------------------------------------------------------------------
+# ---- a trusted sensor -----------------------------------------------------------------------------------------------
 
 
 @cache
-def taught() -> pf.Tuning:
-    """By the tracker; the camera is told to be 10 ms late and is 45."""
+def trusting() -> pf.Tuning:
+    """Trusting the tracker; the camera is configured as 10 ms late and is 45."""
     sim = outage(1)
     config = with_sensors(spoiled(sim.config), "vision", latency=0.010)
-    return quietly(lambda: pf.tune([sim.run], config, fit=["noise", "delay", "latency"], teacher="tracker"))
+    return quietly(lambda: pf.tune([sim.run], config, fit=["noise", "delay", "latency"], trust="tracker"))
 
 
 @pytest.mark.long
-def test_a_teacher_teaches_the_arm_alone() -> None:
-    """Arm, noise of the process and its own are as from a run without the others, which tell nothing of them."""
-    found, sim = taught(), outage(1)
+def test_the_arm_is_fitted_on_the_trusted_sensor_alone() -> None:
+    """Arm, process noise and its own noise are as from a run without the others."""
+    found, sim = trusting(), outage(1)
     alone = replace(sim.run, sensors={"tracker": sim.run.sensors["tracker"]})
     lone = replaced(found.before, sensors={"tracker": found.before.sensors["tracker"]})
     other = quietly(lambda: pf.tune([alone], lone, fit=["noise", "delay"]))
@@ -330,78 +276,65 @@ def test_a_teacher_teaches_the_arm_alone() -> None:
         ours, theirs = found.config.arm.axes[axis], other.config.arm.axes[axis]
         assert (ours.plant.lag, ours.delay) == (theirs.plant.lag, theirs.delay)
     assert found.summary.orders == other.summary.orders
-    assert found.summary.teacher == "tracker" and len(found.lessons) == 2
+    assert found.summary.trusted == "tracker" and len(found.stages) == 2
 
 
-def test_the_others_learn_their_noise_and_latency_from_the_taught_arm() -> None:
-    """45 ms within 3 from 10, inside its interval; sds within 20 %. The teacher's own latency is believed."""
-    found = taught()
+def test_the_others_are_fitted_after_it() -> None:
+    """45 ms within 3 from 10, inside its interval; sds within 20 %. The trusted sensor's own latency stays."""
+    found = trusting()
     assert found.config.sensors["tracker"].latency == 0.008
     assert found.config.sensors["vision"].latency == pytest.approx(0.045, abs=0.003)
     low, high = fitted(found)["sensors.vision.latency_ms"].ci95
     assert low is not None and high is not None and low < 45.0 < high
     for axis in AXES:
         assert found.config.sensors["vision"].sd_of(axis) == pytest.approx(5e-4, rel=0.2)
-    second = {one.key for one in found.lessons[1].free}
+    second = {one.key for one in found.stages[1].free}
     assert second == {"sensors.vision.latency_ms", *(f"sensors.vision.sd_mm.{axis}" for axis in AXES)}
     assert "sensors.tracker.latency_ms" not in fitted(found)
 
 
-def test_a_teacher_must_be_a_sensor() -> None:
+def test_a_trusted_sensor_must_exist() -> None:
     """An unknown one is refused with the nearest."""
     with pytest.raises(pf.UnknownNameError, match="unknown sensor 'trakker'; did you mean 'tracker'"):
-        pf.tune([outage(1).run], outage(1).config, teacher="trakker")
-
-
-@pytest.mark.parametrize(
-    ("asked", "line"),
-    [
-        ({"fit": ["nois"]}, "--fit: unknown 'nois'; did you mean 'noise'"),
-        ({"hold": ["trakker"]}, "--hold: 'trakker' names nothing that can be fitted; parts of names: "),
-    ],
-)
-def test_what_is_asked_wrongly_is_refused(asked: dict[str, list[str]], line: str) -> None:
-    """In one line, before anything is read."""
-    with pytest.raises(pf.ConfigError, match=line):
-        pf.tune([outage(1).run], outage(1).config, **asked)
+        pf.tune([outage(1).run], outage(1).config, trust="trakker")
 
 
 # ---- Ctrl-C ---------------------------------------------------------------------------------------------------------
 
 
 class Stop:
-    """Ctrl-C at the n-th call of the progress; what was said until then."""
+    """Ctrl-C at the n-th call of the progress; with all calls until then."""
 
     def __init__(self, at: int) -> None:
-        self.at, self.said = at, list[tuple[str, Point]]()
+        self.at, self.calls = at, list[tuple[str, Point]]()
 
     def __call__(self, what: str, point: Point) -> None:
-        self.said.append((what, point))
-        if len(self.said) == self.at:
+        self.calls.append((what, point))
+        if len(self.calls) == self.at:
             raise KeyboardInterrupt
 
 
 @cache
-def calls(teacher: str | None) -> int:
+def calls(trust: str | None) -> int:
     counted = Stop(-1)
     sim = outage(1)
-    quietly(lambda: pf.tune([sim.run], spoiled(sim.config), teacher=teacher, progress=counted))
-    return len(counted.said)
+    quietly(lambda: pf.tune([sim.run], spoiled(sim.config), trust=trust, progress=counted))
+    return len(counted.calls)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
-@pytest.mark.parametrize("teacher", [None, later("tracker")])
-def test_interrupted_it_gives_the_best_so_far(share: float, teacher: str | None, tmp_path: Path) -> None:
-    """At any moment: a whole configuration with the gates as given, never less likely than what it began with.
+@pytest.mark.parametrize("trust", [None, later("tracker")])
+def test_interrupted_it_gives_the_best_so_far(share: float, trust: str | None, tmp_path: Path) -> None:
+    """At any moment: a whole configuration with the gates as given, never less likely than the start.
 
-    It says that it was interrupted, in the summary and a note, and can be saved, loaded and written as JSON.
+    The summary and a note report the interruption; it can be saved, loaded and written as JSON.
     """
     sim = outage(1)
     config = with_sensors(spoiled(sim.config), "vision", gate=3.5, gate_rows=False)
-    stop = Stop(1 + int(share * calls(teacher)))
+    stop = Stop(1 + int(share * calls(trust)))
     with pytest.warns(pf.PumafuseWarning, match="interrupted: these are the best numbers until then"):
-        found = pf.tune([sim.run], config, teacher=teacher, progress=stop)
-    assert found.summary.interrupted and len(stop.said) == stop.at
+        found = pf.tune([sim.run], config, trust=trust, progress=stop)
+    assert found.summary.interrupted and len(stop.calls) == stop.at
     assert total(sim.run, found.config) >= total(sim.run, config)
     for name, sensor in found.config.sensors.items():
         assert (sensor.gate, sensor.gate_rows) == (config.sensors[name].gate, config.sensors[name].gate_rows)
@@ -411,49 +344,29 @@ def test_interrupted_it_gives_the_best_so_far(share: float, teacher: str | None,
     assert total(sim.run, pf.FusionConfig.load(tmp_path / "fusion.toml")) == pytest.approx(
         total(sim.run, found.config), abs=1e-6
     )
-    if stop.said[-1][0] == "asking how sure it is":
-        assert total(sim.run, found.config) == pytest.approx(stop.said[-1][1].height, abs=0.05)
+    if stop.calls[-1][0] == "computing intervals":
+        assert total(sim.run, found.config) == pytest.approx(stop.calls[-1][1].log_posterior, abs=0.05)
 
 
-def test_interrupted_on_a_detour_it_gives_back_what_it_was_given() -> None:
-    """The first rough points of a search are no better than what is the most likely already: it is kept, and said."""
-    sim, best = outage(1), tuned_noise().config
-    found = quietly(lambda: pf.tune([sim.run], best, progress=Stop(1)))
-    assert found.config == best
-    assert [note for note in found.summary.notes if note.startswith("nothing more likely was found")]
-
-
-def test_what_is_kept_is_told_in_its_own_numbers() -> None:
-    """A search that chose other orders and ended lower: lessons have the plants' numbers as given, no order is told."""
+def test_what_is_kept_has_the_parameters_of_its_own_plants() -> None:
+    """A search that chose other orders and ended lower: stages have the given plants, and no orders are reported."""
     sim = outage(1)
     given = with_order(with_order(sim.config, "tangential", 1), "vertical", 2)
-    course = Course([sim.run], given, lambda _, __: None)
-    course.take(syllabi(given, ARM, [], None), None)
-    chosen = course.best.arm.axes
+    pipeline = Pipeline([sim.run], given, plans(given, ARM, [], None), lambda _, __: None)
+    pipeline.fit(None)
+    chosen = pipeline.best.arm.axes
     assert isinstance(chosen["tangential"].plant, pf.SecondOrder)
     assert isinstance(chosen["vertical"].plant, pf.FirstOrder)
-    course.best = with_sensors(course.best, sd=0.1)
-    course.keep_the_better()
-    assert course.kept
-    (lesson,) = course.lessons
-    assert lesson.orders == {} and lesson.best.config.arm == given.arm
-    found = {one.key: fitted_one(one, given, course.result(), None) for one in course.free(ARM, [])}
+    pipeline.best = with_sensors(pipeline.best, sd=0.1)
+    pipeline.keep_the_better()
+    assert pipeline.kept
+    (stage,) = pipeline.stages
+    assert stage.orders == {} and stage.best.config.arm == given.arm
+    found = {one.key: fitted_one(one, given, pipeline.result(), None) for one in stage.free}
     assert all(one.value == pytest.approx(one.before, rel=1e-5) for one in found.values())
     plants = ["axes.tangential.time_constant_ms", "axes.vertical.natural_frequency_rad_s", "axes.vertical.damping"]
     assert [key for key in found if key.startswith("axes") and not key.endswith("delay_ms")] == plants
-    assert profiles(lesson, list(found.values()))
-
-
-def test_an_interrupted_search_is_on_its_way() -> None:
-    """The later, the likelier, and the last is the uninterrupted result."""
-    sim = outage(1)
-    heights = []
-    for at in range(1, calls(None) + 1, 3):
-        found = quietly(lambda at=at: pf.tune([sim.run], spoiled(sim.config), progress=Stop(at)))
-        heights.append(total(sim.run, found.config))
-    assert heights[0] > total(sim.run, spoiled(sim.config)) + 100.0
-    assert heights[-1] > heights[0]
-    assert heights[-1] == pytest.approx(total(sim.run, tuned_noise().config), abs=0.1)
+    assert profiles(stage, {key: one.ci95 for key, one in found.items()})
 
 
 # ---- the shipped scan -----------------------------------------------------------------------------------------------
@@ -471,27 +384,15 @@ def test_the_shipped_scan_is_tuned_as_well_as_it_was_by_hand() -> None:
     config = with_sensors(config, gate=5.0)
     for axis in config.arm.axes:
         config = with_order(config, axis, 2)
-    found = quietly(lambda: pf.tune([run], config, fit=["noise", "delay", "plant", "gain"], teacher="tracker"))
+    found = quietly(lambda: pf.tune([run], config, fit=["noise", "delay", "plant", "gain"], trust="tracker"))
     axes = ("tangential", "radial", "vertical")
-    evidence = Evidence([run], found.config, ["tracker"])
-    heights = dict(zip(evidence.axes, evidence.value(found.config).axes.tolist(), strict=True))
+    likelihood = Likelihood([run], found.config, ["tracker"])
+    heights = dict(zip(likelihood.axes, likelihood.evaluate(found.config).axes.tolist(), strict=True))
     assert all(heights[axis] >= least for axis, least in zip(axes, (4800.0, 6600.0, 7150.0), strict=True)), heights
     for sensors, most in (
         (["tracker", "vision"], (0.076, 0.051, 0.050)),
         (["vision"], (0.355, 0.192, 0.160)),
     ):
-        errors = rmse(run, found.config, sensors)
+        est = quietly(lambda sensors=sensors: pf.fuse(run, found.config, sensors=sensors))
+        errors = {axis: one.score.rmse_mm for axis, one in pf.summarise(est).axes.items() if one.score}
         assert all(errors[axis] <= limit for axis, limit in zip(axes, most, strict=True)), (sensors, errors)
-
-
-def rmse(run: pf.Run, config: pf.FusionConfig, sensors: Sequence[str]) -> dict[str, float]:
-    """On the reference [mm]."""
-    est = quietly(lambda: pf.fuse(run, config, sensors=sensors))
-    assert est.reference is not None
-    found: dict[str, float] = {}
-    for axis in est.axes:
-        one = est[axis]
-        scored = pf.score(est.time, est.segment, one.position, one.position_sd, est.reference, axis)
-        assert scored is not None
-        found[axis] = 1e3 * scored.rmse
-    return found

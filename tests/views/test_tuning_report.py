@@ -1,4 +1,4 @@
-"""The page of a tuning stands alone, holds every number with its sentence, and draws the likelihood that it says."""
+"""The report of a tuning stands alone, has every number and sentence, and draws the right likelihood."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from pumafuse.fusion.consistency import consistency, densities_of
 from pumafuse.fusion.outcome import Outcome
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
-from pumafuse.tuning.climb import climb
-from pumafuse.tuning.profile import Profile, profiles
+from pumafuse.tuning.intervals import Profile, profiles
+from pumafuse.tuning.maximise import maximise
 from pumafuse.tuning.summary import Fitted
 from pumafuse.views import colours as style
 from pumafuse.views import tuning_figures
 from pumafuse.views.tuning_report import page
 
 T, END = 0.02, 20.0
-STEADY = ("maneuver_noise_mm_rtHz_per_m_s", "maneuver_drift_mm_rts_per_m_s")  # held: the arm strays alike at all times
+STEADY = ("maneuver_noise_mm_rtHz_per_m_s", "maneuver_drift_mm_rts_per_m_s")  # fixed: the process noise is constant
 
 
 def recorded(axis: str, sensor: str, name: str, seed: int = 1) -> pf.Run:
@@ -51,7 +51,7 @@ def recorded(axis: str, sensor: str, name: str, seed: int = 1) -> pf.Run:
 
 
 def known(axis: str, sensor: str) -> pf.FusionConfig:
-    """What is thought of it before: too slow, too noisy."""
+    """The configuration before: too slow, too noisy."""
     model = AxisModel(plant=FirstOrder(time_constant=0.06))
     arm = pf.ArmModel(name="an arm", update_period=T, delay=0.05, axes={axis: model})
     return pf.FusionConfig(arm=arm, sensors={sensor: pf.Sensor(sd=5e-4)})
@@ -60,12 +60,12 @@ def known(axis: str, sensor: str) -> pf.FusionConfig:
 @cache
 def tuned(axis: str = "tip", sensor: str = "camera", name: str = "a run", runs: int = 1) -> tuple[pf.Tuning, pf.Run]:
     made = [recorded(axis, sensor, name, seed) for seed in range(1, runs + 1)]
-    return quietly(made, known(axis, sensor), ["noise", "delay", "plant"], hold=STEADY), made[0]
+    return quietly(made, known(axis, sensor), ["noise", "delay", "plant"], fix=STEADY), made[0]
 
 
 @cache
 def shown() -> str:
-    """The page of what is tuned by default."""
+    """The page of the default tuning."""
     found, run = tuned()
     return page(found, [run])
 
@@ -81,7 +81,7 @@ def fitted(found: pf.Tuning) -> dict[str, Fitted]:
 
 
 def drawn(found: pf.Tuning) -> dict[str, Profile]:
-    return {one.key: one for one in profiles(found.lessons[0], found.summary.parameters)}
+    return {one.key: one for one in profiles(found.stages[0], {one.key: one.ci95 for one in found.summary.parameters})}
 
 
 def test_every_part_of_the_page_has_its_heading_and_sentence_and_nothing_is_loaded() -> None:
@@ -93,7 +93,7 @@ def test_every_part_of_the_page_has_its_heading_and_sentence_and_nothing_is_load
         "What to know first",
         "What was fitted",
         "How sure it is",
-        "Before and after on what was held back",
+        "Validation",
         "Innovations before and after",
     ]
     assert seen.headings == [*parts, "fusion.toml", "arm.toml"]
@@ -113,11 +113,11 @@ def test_the_table_has_every_number_with_its_interval() -> None:
         assert row is not None, one.key
         low, high = ("…" if end is None else f"{end:.4g}" for end in one.ci95)
         cells = re.findall(r"<td[^>]*>([^<]*)</td>", row[1])
-        assert cells == [f"{one.before:.4g}", f"{one.value:.4g}", f"{low} to {high}", one.said]
+        assert cells == [f"{one.before:.4g}", f"{one.value:.4g}", f"{low} to {high}", one.notes]
 
 
 def test_an_interval_ends_where_its_profile_has_dropped_by_half_a_chi_square() -> None:
-    """At each end that the measurements limit the curve is at −1.92, nowhere is it above 0, and 0 is where the best is."""
+    """At each closed end the curve is at −1.92, nowhere is it above 0, and it is 0 at the best value."""
     found, _ = tuned()
     curves, ends = drawn(found), 0
     assert curves.keys() == fitted(found).keys()
@@ -131,39 +131,31 @@ def test_an_interval_ends_where_its_profile_has_dropped_by_half_a_chi_square() -
                 ends += 1
                 assert np.interp(end, curve.values, curve.drop) == pytest.approx(-1.92, abs=0.25), key
     assert ends == 9
-
-
-def test_a_noise_that_may_be_none_is_drawn_from_none_on() -> None:
-    """On a linear scale, from 0, where the likelihood is as good as nowhere else, to beyond its greatest."""
-    found, _ = tuned()
-    one, curve = fitted(found)["process.tip.input_noise_mm_rtHz"], drawn(found)["process.tip.input_noise_mm_rtHz"]
-    assert one.value == 0.0 and one.ci95[1] is not None
-    assert not curve.log
-    assert curve.values[0] < 0.01 * one.ci95[1] < one.ci95[1] < curve.values[-1]
-    assert (np.diff(curve.drop) < 0.0).all()
+    noise = curves["process.tip.input_noise_mm_rtHz"]  # its interval includes 0: on a linear scale, from 0 on
+    assert not noise.log and noise.values[0] < 0.01 * noise.values[-1] and (np.diff(noise.drop) < 0.0).all()
 
 
 def test_the_others_follow_along_the_ridge() -> None:
-    """Nowhere more likely than the best that a climb finds with this number held, and hardly less."""
+    """Nowhere more likely than the maximum with this parameter fixed, and hardly less."""
     found, _ = tuned()
-    lesson = found.lessons[0]
-    (delay,) = [one for one in lesson.free if one.key == "axes.tip.delay_ms"]
-    others = [one for one in lesson.free if one is not delay]
-    best = climb(lesson.evidence, lesson.best.config, lesson.free, outcomes=lesson.best.value.outcomes)
+    stage = found.stages[0]
+    (delay,) = [one for one in stage.free if one.key == "axes.tip.delay_ms"]
+    others = [one for one in stage.free if one is not delay]
+    best = maximise(stage.likelihood, stage.best.config, stage.free, outcomes=stage.best.outcomes)
     curve = drawn(found)["axes.tip.delay_ms"]
     for value, drop in zip(curve.values, curve.drop, strict=True):
-        held = delay.put(best.config, value * delay.unit)
-        highest = climb(lesson.evidence, held, others, outcomes=best.value.outcomes).height - best.height
-        alone = lesson.evidence.value(held, best.value.outcomes).total - best.height
+        fixed = delay.put(best.config, value * delay.unit)
+        highest = maximise(stage.likelihood, fixed, others, outcomes=best.outcomes).log_posterior - best.log_posterior
+        alone = stage.likelihood.evaluate(fixed, best.outcomes).total - best.log_posterior
         assert highest - 0.3 < drop < highest + 0.01
         if abs(highest) > 1.0:
             assert alone < 1.3 * highest  # were they to stay, it would drop much faster
 
 
-def test_a_lone_number_is_drawn_with_the_likelihood_of_the_filter_itself() -> None:
-    """With all else held, the curve is the log density of what `fuse` reports, less the one at the best."""
+def test_the_profile_of_a_lone_parameter_is_the_likelihood_of_a_fusion() -> None:
+    """With all else fixed, the curve is the log density of what `fuse` reports, less the one at the best."""
     run, config = recorded("tip", "camera", "a run"), known("tip", "camera")
-    found = quietly([run], with_sd(config, 5e-4, gate=50.0), ["noise"], hold=("process",))
+    found = quietly([run], with_sd(config, 5e-4, gate=50.0), ["noise"], fix=("process",))
     (curve,) = drawn(found).values()
     assert curve.key == "sensors.camera.sd_mm.tip"
     assert curve.log
@@ -216,7 +208,7 @@ def test_panels_show_profile_interval_and_the_number_before(figures: list[Figure
 
 
 def test_innovations_are_shown_before_and_after_on_one_scale(figures: list[Figure]) -> None:
-    """Those that were fused, over what was expected of them; and the autocorrelations of both."""
+    """Those that were fused, over their standard deviations; and the autocorrelations of both."""
     found, run = tuned()
     pair = [pf.fuse(run, config) for config in (found.before, found.config)]
     tuning_figures.innovations(*pair, "camera", "tip")
@@ -232,15 +224,15 @@ def test_innovations_are_shown_before_and_after_on_one_scale(figures: list[Figur
     np.testing.assert_array_equal(bars, np.concatenate([one.correlation for one in tests if one is not None]))
 
 
-def test_what_is_said_of_innovations_is_what_the_filter_says() -> None:
+def test_the_sentence_on_innovations_has_the_numbers_of_a_fusion() -> None:
     """NIS and whiteness of the run before and after, as `fuse` has them."""
     found, run = tuned()
     tests = [consistency(pf.fuse(run, config), "camera", "tip") for config in (found.before, found.config)]
     before, after = (one for one in tests if one is not None)
     assert abs(after.nis - 1.0) < 0.1 < abs(before.nis - 1.0)
-    said = outline(shown()).sentences["Innovations before and after"]
-    assert f"tip, camera: NIS {before.nis:.2f} → {after.nis:.2f}" in said
-    assert "came nearer to it for 1 of 1; 0 → 1 of 1 pass for white" in said
+    sentence = outline(shown()).sentences["Innovations before and after"]
+    assert f"tip, camera: NIS {before.nis:.2f} → {after.nis:.2f}" in sentence
+    assert "came nearer to it for 1 of 1; 0 → 1 of 1 are white" in sentence
 
 
 def test_files_are_shown_as_they_are_written(tmp_path: Path) -> None:
@@ -250,7 +242,7 @@ def test_files_are_shown_as_they_are_written(tmp_path: Path) -> None:
     assert texts == [(tmp_path / name).read_text(encoding="utf-8") for name in ("fusion.toml", "arm.toml")]
 
 
-def test_what_was_held_back_is_there_before_and_after() -> None:
+def test_the_validation_is_there_before_and_after() -> None:
     """Numbers of the check in their row, and the sentence says which axis is better."""
     text = shown()
     (check,) = tuned()[0].summary.validation or ()
@@ -262,14 +254,14 @@ def test_what_was_held_back_is_there_before_and_after() -> None:
         check.verdict,
     ):
         assert part in text
-    assert "learnt from, tip is better." in outline(text).sentences["Before and after on what was held back"]
+    assert "fitted on, tip is better." in outline(text).sentences["Validation"]
 
 
 def test_without_a_run_to_validate_on_the_page_says_so() -> None:
-    """Two runs and none held back: no table, but the note."""
+    """Two runs, none of them validated on: no table, but the note."""
     found, run = tuned(runs=2)
     text = page(found, [run, run])
-    assert "Before and after on what was held back" not in outline(text).headings
+    assert "Validation" not in outline(text).headings
     assert "nothing says whether the numbers hold elsewhere" in text
 
 
@@ -283,15 +275,9 @@ def test_names_are_text_and_nothing_else() -> None:
     assert not re.search("<[biu]>", text)
 
 
-def test_the_same_tuning_gives_the_same_page() -> None:
-    """To the byte: a report can be kept under version control."""
-    found, run = tuned()
-    assert page(found, [run]) == shown()
-
-
-@pytest.mark.parametrize("after", ["searching", "learning from the whole run"])
+@pytest.mark.parametrize("after", ["searching", "fitting on the whole run"])
 def test_an_interrupted_tuning_has_a_page_too(after: str) -> None:
-    """With what was learnt until then, and without profiles of what is no peak."""
+    """With what was fitted until then, and without profiles, as it is no maximum."""
     run = recorded("tip", "camera", "a run")
 
     def interrupt(what: str, _: object) -> None:

@@ -19,7 +19,7 @@ N = TypeVar("N", float, float | None)
 
 app = typer.Typer(
     name="pumafuse",
-    help="Fuse a robot arm's commands with measurements of external sensors into the best estimate of its position.",
+    help="Blend a robot arm's commands with measurements of external sensors into the best estimate of its position.",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -249,42 +249,33 @@ def verify(
 @app.command()
 def tune(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")],
-    config: Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="What is known before.")],
+    config: Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="What to start from.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the tuned files go.")],
     fit: Annotated[str, typer.Option(metavar="A,B", help="What to fit: noise, delay, plant, gain, latency.")] = "noise",
-    hold: Annotated[
+    fix: Annotated[
         list[str] | None,
         typer.Option(metavar="KEY", help="Leave this as it is: a name or part of one, as sensors.tracker; repeatable."),
     ] = None,
-    teacher: Annotated[
+    trust: Annotated[
         str | None,
-        typer.Option(metavar="SENSOR", help="A good sensor that teaches the arm; the others learn after it."),
+        typer.Option(metavar="SENSOR", help="An accurate sensor to fit the arm on; the others are fitted after it."),
     ] = None,
     validate: Annotated[
-        Path | None, typer.Option(metavar="RUN", help="Did it help there? Default: a single run's last third.")
+        Path | None, typer.Option(metavar="RUN", help="Validate on this run. Default: a single run's last third.")
     ] = None,
     report: Annotated[bool, typer.Option("--report", help="Also write report.html into DIR.")] = False,
     json: Json = False,
     force: Force = False,
 ) -> None:
-    """Let recorded runs tell noise, delays, plant and latencies by maximum likelihood, and how sure they are.
+    """Fit noise, delays, plants and latencies to recorded runs by maximum likelihood, with 95 % intervals.
 
-    Exit code 3: done, but worse on what was held back.
+    Exit code 3: done, but worse on what it was validated on.
     """
     from . import tune as command
 
-    options = command.Options(
-        config=config,
-        output=output,
-        fit=_names(fit, "--fit"),
-        hold=[name for listed in hold or () for name in _names(listed, "--hold")],
-        teacher=teacher,
-        validate=validate,
-        report=report,
-        json=json,
-        force=force,
-    )
-    command.run(runs, options)
+    kinds = _names(fit, "--fit")
+    fixed = [name for listed in fix or () for name in _names(listed, "--fix")]
+    command.run(runs, config, output, kinds, fixed, trust, validate, report, json, force)
 
 
 @app.command()

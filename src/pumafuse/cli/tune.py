@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import typer
@@ -19,12 +18,13 @@ from ..errors import ConfigError
 from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..logs.run import Run
+from ..tuning.maximise import Point
+from ..tuning.parameters import check_fixed, kinds_of
+from ..tuning.summary import TuningSummary
+from ..tuning.tune import Progress, Tuning, tune
+from ..views import words
 from ..tuning.climb import Point
-from ..tuning.parameters import check_holds, kinds_of
-from ..tuning.summary import Fitted, TuningSummary
-from ..tuning.tune import Tuning, tune
 from ..tuning.validate import Check
-from ..views import formatting as words
 from .tables import console
 
 SUMMARY = "tuning.json"
@@ -33,58 +33,46 @@ OURS = frozenset({SUMMARY, PAGE, "fusion.toml", "arm.toml"})
 _WORSE, _INTERRUPTED = 3, 130
 
 
-@dataclass(frozen=True, kw_only=True)
-class Options:
-    """What the command line asks of a tuning; see ``pumafuse tune --help``."""
-
-    config: Path
-    output: Path
-    fit: Sequence[str]
-    hold: Sequence[str]
-    teacher: str | None
-    validate: Path | None
-    report: bool
-    json: bool
-    force: bool
-
-
-def run(paths: Sequence[Path], options: Options) -> None:
-    """Tune a configuration on recorded runs and write what was learnt.
+def run(
+    paths: Sequence[Path],
+    config: Path,
+    output: Path,
+    fit: Sequence[str],
+    fix: Sequence[str],
+    trust: str | None,
+    validate: Path | None,
+    report: bool,
+    json: bool,
+    force: bool,
+) -> None:
+    """Tune a configuration on recorded runs and write the result; the arguments are the options of the command.
 
     Raises:
-        PumafuseError: Nothing can be learnt, or what is to be written is in the way.
-        Exit: With 3 where what was learnt is worse on what was held back; with 130 after Ctrl-C.
+        PumafuseError: Nothing can be fitted, or the output folder must not be replaced.
+        Exit: With 3 where the result is worse on what it was validated on; with 130 after Ctrl-C.
     """
-    folders.check_writable(options.output, options.force, [SUMMARY], OURS.__contains__)
+    folders.check_writable(output, force, [SUMMARY], OURS.__contains__)
     try:
-        kinds = kinds_of(options.fit)
+        kinds = kinds_of(fit)
     except ConfigError as error:
         raise typer.BadParameter(str(error)) from None
-    config = FusionConfig.load(options.config)
-    check_holds(config, options.hold)
+    given = FusionConfig.load(config)
+    check_fixed(given, fix)
     runs = [Run.read(path) for path in paths]
-    validate = None if options.validate is None else Run.read(options.validate)
+    other = None if validate is None else Run.read(validate)
     with _progress() as progress:
-        found = tune(
-            runs,
-            config,
-            fit=kinds,
-            hold=options.hold,
-            teacher=options.teacher,
-            validate=validate,
-            progress=progress,
-        )
-    with folders.replacing(options.output) as new:
+        found = tune(runs, given, fit=kinds, fix=fix, trust=trust, validate=other, progress=progress)
+    with folders.replacing(output) as new:
         found.config.save(new)
         (new / SUMMARY).write_text(found.to_json(), encoding="utf-8")
-        if options.report:
+        if report:
             from ..views.tuning_report import page
 
             (new / PAGE).write_text(page(found, runs), encoding="utf-8")
-    if options.json:
+    if json:
         print(found.to_json(), end="")
     else:
-        _show(found, options)
+        _show(found, output)
     if found.summary.interrupted:
         raise typer.Exit(_INTERRUPTED)
     if found.summary.worse:
@@ -92,89 +80,75 @@ def run(paths: Sequence[Path], options: Options) -> None:
 
 
 @contextmanager
-def _progress() -> Generator[Callable[[str, Point], None]]:
-    """One line on stderr that says how far the search is; nothing where stderr is no terminal."""
+def _progress() -> Generator[Progress]:
+    """Show the progress of the search in one line on stderr, if that is a terminal."""
     if not sys.stderr.isatty():
         yield lambda _, __: None
         return
-    with Console(stderr=True).status("reading") as status:
+    with Console(stderr=True).status("preparing") as status:
 
-        def tell(what: str, at: Point) -> None:
-            status.update(f"{what}: log-likelihood {at.value.total:.1f} (Ctrl-C keeps the best so far)")
+        def show(what: str, at: Point) -> None:
+            status.update(f"{what}: log-likelihood {at.log_likelihood.total:.1f} (Ctrl-C keeps the best so far)")
 
-        yield tell
+        yield show
 
 
-def _show(found: Tuning, options: Options) -> None:
+def _show(found: Tuning, output: Path) -> None:
+    """Print the summary on stdout."""
     out, summary = console(), found.summary
-    out.print(_parameters(summary.parameters))
-    for axis, why in summary.orders.items():
-        out.print(f"{axis}: {why}", markup=False)
-    for one in summary.held:
-        out.print(one, markup=False)
-    for pair in summary.correlations:
-        out.print(words.together(pair), markup=False)
+    out.print(_parameters(summary))
+    lines = [f"{axis}: {why}" for axis, why in summary.orders.items()]
+    lines += summary.not_identifiable
+    lines += [words.together(pair) for pair in summary.correlations]
     for bias in summary.biases:
         off = f"{bias.bias_mm:.3f} ± {Z95 * bias.sd_mm:.3f} mm"
-        out.print(f"{bias.run}: {bias.sensor} is off by {off} on {bias.axis}", markup=False)
-    out.print(_likelihoods(summary))
-    if summary.validation:
-        out.print(_validation(summary.validation))
-        for one in summary.validation:
-            out.print(f"{one.run}, {one.axis}: {one.verdict}", markup=False, soft_wrap=True)
-    out.print(f"written to {options.output}", markup=False, soft_wrap=True)
-    out.print(f"next: pumafuse fuse RUN -c {options.output / 'fusion.toml'} -o DIR", markup=False, soft_wrap=True)
-
-
-def _parameters(fitted: Sequence[Fitted]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("parameter", no_wrap=True)
-    for heading in ("before", "fitted", "95 % interval"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("", overflow="fold")
-    for one in fitted:
-        low, high = ("" if end is None else f"{end:.4g}" for end in one.ci95)
-        interval = "" if one.ci95 == (None, None) else f"{low or '…'} to {high or '…'}"
-        before = "–" if one.before is None else f"{one.before:.4g}"
-        table.add_row(escape(one.key), before, f"{one.value:.4g}", interval, one.said)
-    return table
-
-
-def _likelihoods(summary: TuningSummary) -> Table:
-    table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("learnt from")
-    for heading in ("measurements", "log-likelihood before", "after"):
-        table.add_column(heading, justify="right")
+        lines.append(f"{bias.run}: {bias.sensor} is off by {off} on {bias.axis}")
+    for line in lines:
+        out.print(line, markup=False)
+    table = _table("fitted on", "measurements", "log-likelihood before", "after")
     for axis, one in summary.likelihood.items():
         table.add_row(escape(axis), str(one.components), f"{one.before:.1f}", f"{one.after:.1f}")
+    out.print(table)
+    if summary.validation:
+        out.print(_validation(summary))
+    lines = [f"{one.run}, {one.axis}: {one.verdict}" for one in summary.validation or ()]
+    lines += [f"written to {output}", f"next: pumafuse fuse RUN -c {output / 'fusion.toml'} -o DIR"]
+    for line in lines:
+        out.print(line, markup=False, soft_wrap=True)
+
+
+def _table(*headings: str, left: int = 1) -> Table:
+    """An empty table; the first columns are aligned left, the others right."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for number, heading in enumerate(headings):
+        table.add_column(heading, justify="left" if number < left else "right", no_wrap=number >= left)
     return table
 
 
-def _validation(checks: Sequence[Check]) -> Table:
-    """Before and after, on what was held back: a row for each sensor, an axis's score in its first."""
-    table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("held back", overflow="fold")
-    table.add_column("axis")
-    for heading in ("RMSE, mm", "coverage"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("sensor")
-    for heading in ("NIS", "correlation at lag 1"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for one in checks:
+def _parameters(summary: TuningSummary) -> Table:
+    """The parameters with their intervals."""
+    table = _table("parameter", "before", "fitted", "95 % interval")
+    table.columns[0].no_wrap = True
+    table.add_column("", overflow="fold")
+    for one in summary.parameters:
+        low, high = ("…" if end is None else f"{end:.4g}" for end in one.ci95)
+        interval = "" if one.ci95 == (None, None) else f"{low} to {high}"
+        before = "–" if one.before is None else f"{one.before:.4g}"
+        table.add_row(escape(one.key), before, f"{one.value:.4g}", interval, one.notes)
+    return table
+
+
+def _validation(summary: TuningSummary) -> Table:
+    """Before and after, on what was validated on: a row for each axis and sensor."""
+    table = _table("validated on", "axis", "sensor", "RMSE, mm", "coverage", "NIS", "correlation at lag 1", left=3)
+    for one in summary.validation or ():
         since = f" from {one.since_s:.1f} s" if one.since_s else ""
         pair = (one.before, one.after)
-        scores = (
-            escape(one.run) + since,
-            escape(one.axis),
-            words.change([state.rmse_mm for state in pair], ".3f"),
-            words.change([state.coverage for state in pair], ".3f"),
-        )
-        for number, name in enumerate(one.before.sensors):
-            found = [state.sensors.get(name) for state in pair]
-            table.add_row(
-                *(scores if number == 0 else ("", "", "", "")),
-                escape(name),
-                words.change([None if sensor is None else sensor.nis for sensor in found], ".2f"),
-                words.change([None if sensor is None else sensor.correlation for sensor in found], "+.2f"),
-            )
+        rmse = words.change([state.rmse_mm for state in pair], ".3f")
+        coverage = words.change([state.coverage for state in pair], ".3f")
+        for name in one.before.sensors:
+            sensors = [state.sensors.get(name) for state in pair]
+            nis = words.change([None if sensor is None else sensor.nis for sensor in sensors], ".2f")
+            correlation = words.change([None if sensor is None else sensor.correlation for sensor in sensors], "+.2f")
+            table.add_row(escape(one.run) + since, escape(one.axis), escape(name), rmse, coverage, nis, correlation)
     return table

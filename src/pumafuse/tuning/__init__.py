@@ -1,1 +1,1 @@
-"""From recorded runs to the noise, the delays and the plant that explain them best."""
+"""Tuning: noise, delays, plants, gains and latencies of recorded runs by maximum likelihood."""

@@ -1,29 +1,32 @@
-"""How sure each number is: 95 % intervals from the curvature, and from the profile where that is not enough."""
+"""95 % confidence intervals from the curvature and the profile of the likelihood, and profiles to draw."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray
 from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
-from ..fusion.ticks import usable_cores
 from ..toml import Interval
-from .climb import Point, climb, point, slopes
-from .diagnose import at_bound, covariance
-from .likelihood import Evidence
+from .identifiability import covariance, within_bounds
+from .likelihood import Likelihood, in_threads
+from .maximise import Point, derivatives, maximise, point
 from .parameters import Parameter, coordinates, moved, rounded
+from .stage import Stage
 
-_ENOUGH = 0.02  # log-likelihood to which a profile is followed
-_SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which the profile is followed
-_SKEWED_FOR_ALL = 0.2  # likewise of a number of all axes, whose profile takes ten times as long
+_TOLERANCE = 0.02  # log-likelihood to which a profile is maximised
+_DRAWN_TOLERANCE = 0.3  # likewise where it is only drawn
+_SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which the profile is computed
+_SKEWED_SHARED = 0.2  # likewise of a parameter of all axes, whose profile takes ten times as long
 _STEPS = 12  # of a profile towards its end
 _CLOSE = 0.03  # relative, of √(2 drop)
 _HALVINGS = 26
+_SHARES = np.array((0.3, 0.65, 1.0, 1.5))  # of the way from the best to an end of the interval: points that are drawn
 
 
 @dataclass(frozen=True)
@@ -32,189 +35,193 @@ class ConfidenceInterval:
 
     Attributes:
         ci95: The 95 % interval [SI]; an end at the parameter's bound is open.
-        profiled: Whether the likelihood's profile was followed, not only its curvature.
-        at: ``least`` or ``greatest`` where the value lies at that bound, else None.
+        profiled: Whether the profile of the likelihood was computed, not only its curvature.
+        at: The bound at which the value lies, else None.
         open: Which ends of the interval are open: the measurements do not limit them.
     """
 
     ci95: Interval
     profiled: bool
-    at: str | None
+    at: Literal["lower", "upper"] | None
     open: tuple[bool, bool]
 
 
 @dataclass(frozen=True)
 class View:
-    """What bears on the numbers of one axis, or of all.
+    """The likelihood that the parameters of one axis, or of all, depend on.
 
     Attributes:
-        evidence: The measurements.
-        outcomes: What became of them.
-        free: The numbers that may move and are not at a bound. Those of all axes have what the other axes say of them
-            as their prior.
+        likelihood: The likelihood.
+        outcomes: The outcomes of its components, which are repeated.
+        free: The free parameters that are not at a bound. The prior of a shared one is the information of other axes.
         covariance: Of their coordinates, (k, k).
     """
 
-    evidence: Evidence
+    likelihood: Likelihood
     outcomes: Sequence[CodeArray]
     free: Sequence[Parameter]
     covariance: FloatArray
 
+    def at(self, config: FusionConfig, more: Sequence[Parameter] = ()) -> float:
+        """The log-posterior of a configuration."""
+        return point(self.likelihood, config, [*self.free, *more], self.outcomes).log_posterior
 
-def confidence_intervals(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> dict[str, ConfidenceInterval]:
-    """The 95 % interval of each free parameter, by its name.
+    def without(self, one: Parameter) -> list[Parameter]:
+        """The free parameters but one."""
+        return [other for other in self.free if other.key != one.key]
 
-    From the curvature: 1.96 sd of the coordinate each way. Where the likelihood at an end, the others moved along, has
-    not dropped by what that says (1.92), the end is where the profile has (Cox & Hinkley, Theoretical Statistics, 9.3).
-    Gates make the likelihood jump; the intervals are those of the peak that it has while the outcomes stay as they are.
-    That peak is not what is told: at it the gates decide otherwise, and to a lower likelihood, or the search would have
-    gone there. What the search ended with is the likeliest that is known, so an interval beside it reaches to it.
+    def slope(self, one: Parameter) -> FloatArray:
+        """The change of all coordinates with that of one by regression, Cov(·, a) / Var a, (k,); 0 at a bound."""
+        keys = [other.key for other in self.free]
+        if one.key not in keys:
+            return np.zeros(len(keys))
+        place = keys.index(one.key)
+        return self.covariance[:, place] / self.covariance[place, place]
+
+    def maximum(self, start: FusionConfig, free: Sequence[Parameter], tolerance: float) -> Point:
+        """The nearest maximum, with the outcomes repeated."""
+        return maximise(self.likelihood, start, free, outcomes=self.outcomes, tolerance=tolerance)
+
+
+def confidence_intervals(
+    likelihood: Likelihood, best: Point, free: Sequence[Parameter]
+) -> dict[str, ConfidenceInterval]:
+    """Compute the 95 % interval of each free parameter, by its key.
+
+    From the curvature: 1.96 sd of the coordinate each way. Where the likelihood at an end, the other parameters moved
+    along, has not dropped by what that says (1.92), the end is where its profile has (Cox & Hinkley, Theoretical
+    Statistics, 9.3). Gates make the likelihood jump; the intervals are those of the maximum that it has while the
+    outcomes stay as they are. That maximum is not the result: there the gates decide otherwise, and for a lower
+    likelihood, or the search would have gone there. So an interval beside the result is extended to it.
     """
-    told = best.config
-    best = climb(evidence, told, free, outcomes=best.value.outcomes)
-    views = views_of(evidence, best, free)
+    result = best.config
+    best = maximise(likelihood, result, free, outcomes=best.outcomes)
+    views = views_of(likelihood, best, free)
 
     def of(one: Parameter) -> ConfidenceInterval:
         view = views[one.axis]
-        if at_bound(one, best.config) is not None:
-            return _reaching(_from_the_bound(view, best, one), one, told)
-        low, high = (_end(view, best, one, sign) for sign in (-1.0, 1.0))
-        ci95 = (one.value(low.coordinate), one.value(high.coordinate))
-        found = ConfidenceInterval(ci95, low.profiled or high.profiled, None, (low.open, high.open))
-        return _reaching(found, one, told)
+        if one.at_bound(best.config) is not None:
+            found = _from_the_bound(view, best, one)
+        else:
+            ends, profiled, unlimited = zip(*(_end(view, best, one, sign) for sign in (-1.0, 1.0)), strict=True)
+            found = ConfidenceInterval((one.value(ends[0]), one.value(ends[1])), any(profiled), None, unlimited)
+        value, at, (low, high) = one.clipped(rounded(one.get(result))), one.at_bound(result), found.ci95
+        unlimited = (found.open[0] or at == "lower", found.open[1] or at == "upper")
+        return replace(found, ci95=(min(low, value), max(high, value)), open=unlimited)
 
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        return dict(zip([one.key for one in free], pool.map(of, free), strict=True))
-
-
-def _reaching(found: ConfidenceInterval, one: Parameter, told: FusionConfig) -> ConfidenceInterval:
-    """The interval as far as to the value that is told, as it is written; open where that is at a bound."""
-    value, at, (low, high) = one.inside(rounded(one.get(told))), at_bound(one, told), found.ci95
-    ends = (found.open[0] or at == "least", found.open[1] or at == "greatest")
-    return replace(found, ci95=(min(low, value), max(high, value)), open=ends)
+    return dict(zip([one.key for one in free], in_threads(of, free), strict=True))
 
 
-def views_of(evidence: Evidence, best: Point, free: Sequence[Parameter]) -> Mapping[str | None, View]:
-    """For each axis what bears on it alone, and under None, where a number is of all axes, everything."""
-    inside = [one for one in free if at_bound(one, best.config) is None]
+def views_of(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> Mapping[str | None, View]:
+    """The view of each axis, and under None, where a parameter is shared by all axes, the view of everything."""
+    inside = within_bounds(free, best.config)
     shared = [one for one in inside if one.axis is None]
-    own = {axis: [one for one in inside if one.axis == axis] for axis in evidence.heard}
-    alone = {axis: (evidence.alone(axis), evidence.outcomes_of(axis, best.value.outcomes)) for axis in evidence.heard}
-    told = {
-        axis: _told_of_shared(part.slopes(best.config, [*own[axis], *shared], outcomes).information, len(own[axis]))
-        for axis, (part, outcomes) in (alone.items() if shared else ())
+    own = {axis: [one for one in inside if one.axis == axis] for axis in likelihood.sensors}
+    parts = {axis: (likelihood.of_axis(axis), likelihood.outcomes_of(axis, best.outcomes)) for axis in own}
+    informed = {
+        axis: _of_shared(part.derivatives(best.config, [*own[axis], *shared], outcomes).information, len(own[axis]))
+        for axis, (part, outcomes) in (parts.items() if shared else ())
     }
     views: dict[str | None, View] = {}
-    for axis, (part, outcomes) in alone.items():
-        elsewhere = sum((told[other] for other in told if other != axis), np.zeros(len(shared)))
+    for axis, (part, outcomes) in parts.items():
+        elsewhere = sum((informed[other] for other in informed if other != axis), np.zeros(len(shared)))
         priors = [
-            replace(one, prior=(one.at(best.config), 1.0 / np.sqrt(max(float(told_of), 1e-12))))
-            for one, told_of in zip(shared, elsewhere, strict=True)
+            replace(one, prior=(one.at(best.config), 1.0 / np.sqrt(max(float(information), 1e-12))))
+            for one, information in zip(shared, elsewhere, strict=True)
         ]
         views[axis] = _view(part, outcomes, best, [*own[axis], *priors])
     if any(one.axis is None for one in free):
-        views[None] = _view(evidence, best.value.outcomes, best, inside)
+        views[None] = _view(likelihood, best.outcomes, best, inside)
     return views
 
 
-def _told_of_shared(information: FloatArray, own: int) -> FloatArray:
-    """What an axis says of each shared number, its own being free: the Schur complement's diagonal."""
+def _of_shared(information: FloatArray, own: int) -> FloatArray:
+    """The information of an axis on each shared parameter, its own being free: the Schur complement's diagonal."""
     inner = np.linalg.pinv(information[:own, :own], hermitian=True)
     across = information[:own, own:]
     return np.diag(information[own:, own:] - across.T @ inner @ across)
 
 
-def _view(evidence: Evidence, outcomes: Sequence[CodeArray], best: Point, free: Sequence[Parameter]) -> View:
+def _view(likelihood: Likelihood, outcomes: Sequence[CodeArray], best: Point, free: Sequence[Parameter]) -> View:
     if not free:
-        return View(evidence, outcomes, free, np.zeros((0, 0)))
-    there = point(evidence, best.config, free, outcomes)
-    return View(evidence, outcomes, free, covariance(slopes(evidence, there, free).information, free))
+        return View(likelihood, outcomes, free, np.zeros((0, 0)))
+    there = point(likelihood, best.config, free, outcomes)
+    return View(likelihood, outcomes, free, covariance(derivatives(likelihood, there, free).information, free))
 
 
-@dataclass(frozen=True)
-class _End:
-    coordinate: float
-    profiled: bool
-    open: bool
-
-
-def _end(view: View, best: Point, one: Parameter, sign: float) -> _End:
-    """The lower (−1) or upper (+1) end of an interval."""
+def _end(view: View, best: Point, one: Parameter, sign: float) -> tuple[float, bool, bool]:
+    """The lower (−1) or upper (+1) end of an interval: its coordinate, whether it is profiled, whether it is open."""
     place = [other.key for other in view.free].index(one.key)
-    others = [other for other in view.free if other.key != one.key]
     at = coordinates(best.config, view.free)
-    along = sign * view.covariance[:, place] / np.sqrt(view.covariance[place, place])  # how all move for one sd of it
+    unit = sign * float(np.sqrt(view.covariance[place, place]))
+    along = unit * view.slope(one)  # of all coordinates, for one standard deviation of this one
     low, high = np.array([other.range for other in view.free]).T
-    top = point(view.evidence, best.config, view.free, view.outcomes).height
-    limit = float(((high if along[place] > 0.0 else low)[place] - at[place]) / along[place])
+    top = view.at(best.config)
+    limit = float(((high if sign > 0.0 else low)[place] - at[place]) / unit)
 
     def curvature(reach: float) -> float:
-        there = moved(best.config, view.free, np.clip(at + reach * along, low, high))
-        return _root(top - point(view.evidence, there, view.free, view.outcomes).height)
+        return _root(top - view.at(moved(best.config, view.free, np.clip(at + reach * along, low, high))))
 
     def profile(reach: float) -> float:
         nonlocal along
         there = moved(best.config, view.free, np.clip(at + reach * along, low, high))
-        peak = climb(view.evidence, there, others, outcomes=view.outcomes, enough=_ENOUGH)
+        peak = view.maximum(there, view.without(one), _TOLERANCE)
         along = (coordinates(peak.config, view.free) - at) / reach
-        return _root(top - peak.height - _prior_of(one, there))
+        return _root(top - peak.log_posterior - one.log_prior(there))
 
-    skewed = _SKEWED if one.axis else _SKEWED_FOR_ALL
+    skewed = _SKEWED if one.axis else _SKEWED_SHARED
     if limit > Z95 and abs((curvature(Z95) / Z95) ** 2 - 1.0) < skewed:
-        return _End(float(at[place] + Z95 * along[place]), profiled=False, open=False)
-    unit = float(along[place])
+        return float(at[place] + Z95 * unit), False, False
     reach, beyond = _crossing(profile, min(Z95, limit), limit)
-    return _End(float(at[place] + reach * unit), profiled=True, open=beyond)
+    return float(at[place] + reach * unit), True, beyond
 
 
 def _from_the_bound(view: View, best: Point, one: Parameter) -> ConfidenceInterval:
     """The interval of a parameter at a bound: from there to where the profile has dropped by 1.92.
 
-    It begins where the likelihood has dropped as far with the others held, which is too near.
+    The search begins where the likelihood has dropped as far with the other parameters fixed, which is too near.
     """
-    every = [*view.free, one]
-    bound, (low, high) = one.at(best.config), one.range
-    upwards, span = bound < 0.5 * (low + high), high - low
-    top, along = point(view.evidence, best.config, every, view.outcomes).height, best.config
+    low, high = one.range
+    bound, upwards, span = one.at(best.config), one.at_bound(best.config) == "lower", high - low
+    top, along = view.at(best.config, [one]), best.config
 
     def place(distance: float) -> float:
-        """The coordinate so far from the bound; of a noise that may be none, far in the noise itself."""
+        """The coordinate so far from the bound; of a noise that may be 0, so far in the noise itself."""
         if one.vanishes:
             return one.coordinate(one.bounds[0] + distance)
         return bound + (distance if upwards else -distance)
 
-    def held(distance: float) -> float:
-        there = point(view.evidence, one.move(best.config, place(distance)), every, view.outcomes)
-        return _root(top - there.height)
+    def others_fixed(distance: float) -> float:
+        return _root(top - view.at(one.move(best.config, place(distance)), [one]))
 
     def profile(distance: float) -> float:
         nonlocal along
-        peak = climb(view.evidence, one.move(along, place(distance)), view.free, outcomes=view.outcomes, enough=_ENOUGH)
+        peak = view.maximum(one.move(along, place(distance)), view.free, _TOLERANCE)
         along = peak.config
-        return _root(top - peak.height - _prior_of(one, along))
+        return _root(top - peak.log_posterior - one.log_prior(along))
 
     limit = one.bounds[1] - one.bounds[0] if one.vanishes else span
     first = limit
     for _ in range(_HALVINGS):
-        if held(first) < Z95:
+        if others_fixed(first) < Z95:
             break
         first *= 0.5
     distance, beyond = _crossing(profile, first, limit)
     end = one.value(place(distance))
     if upwards:
-        return ConfidenceInterval((one.bounds[0], end), True, "least", (True, beyond))
-    return ConfidenceInterval((end, one.bounds[1]), True, "greatest", (beyond, True))
+        return ConfidenceInterval((one.bounds[0], end), True, "lower", (True, beyond))
+    return ConfidenceInterval((end, one.bounds[1]), True, "upper", (beyond, True))
 
 
 def _root(drop: float) -> float:
-    """What a drop of the likelihood is in standard deviations, were it a parabola."""
+    """The standard deviations that a drop of a Gaussian log-likelihood stands for."""
     return float(np.sqrt(2.0 * max(drop, 1e-9)))
 
 
 def _crossing(root: Callable[[float], float], first: float, limit: float) -> tuple[float, bool]:
-    """How far a root of the drop is 1.96, and whether that is beyond the limit; ``first`` is where to begin.
+    """Solve root(distance) = 1.96 from ``first`` on; whether the solution is beyond the limit.
 
-    Bracketed, then by its logarithm, which is nearly a line over that of the distance.
+    Bracketed, then by the secant of its logarithm, which is nearly a line over that of the distance.
     """
     below, above, at = (0.0, 0.0), (np.inf, np.inf), first
     for _ in range(_STEPS):
@@ -237,7 +244,79 @@ def _crossing(root: Callable[[float], float], first: float, limit: float) -> tup
     return at, False
 
 
-def _prior_of(one: Parameter, config: FusionConfig) -> float:
-    if one.prior is None:
-        return 0.0
-    return -0.5 * ((one.at(config) - one.prior[0]) / one.prior[1]) ** 2
+# ---- profiles to draw -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The log-likelihood along one parameter.
+
+    Attributes:
+        key: The parameter's key.
+        axis: Its axis; None where it is shared.
+        log: Whether to draw it on a log scale. A noise whose interval includes 0 needs a linear one.
+        values: The parameter, in the unit of its key, ascending, (n,).
+        drop: The log-likelihood there less that of the maximum, (n,).
+    """
+
+    key: str
+    axis: str | None
+    log: bool
+    values: FloatArray
+    drop: FloatArray
+
+
+def profiles(stage: Stage, intervals: Mapping[str, tuple[float | None, float | None]]) -> list[Profile]:
+    """Compute the log-likelihood along each parameter of a stage, to one and a half times its interval each way.
+
+    The other parameters follow the line of their regression on it, bent to where they are most likely at the ends of
+    the interval. That is a lower bound of the profile likelihood, and close to it. As for the intervals, the outcomes
+    stay as they are at the best point, and the maximum is the one for these outcomes.
+
+    Args:
+        stage: The stage.
+        intervals: The 95 % intervals of its parameters, by key, in the units of their keys; None: an open end.
+
+    Returns:
+        One for each parameter but those whose interval has no width.
+    """
+    best = maximise(stage.likelihood, stage.best.config, stage.free, outcomes=stage.best.outcomes)
+    views = views_of(stage.likelihood, best, stage.free)
+    found = in_threads(lambda one: _profile(views[one.axis], best.config, one, intervals[one.key]), stage.free)
+    return [one for one in found if len(one.values) > 1]
+
+
+def _profile(view: View, best: FusionConfig, one: Parameter, ci95: tuple[float | None, float | None]) -> Profile:
+    others, start = view.without(one), one.at(best)
+    slope = np.array([slope for other, slope in zip(view.free, view.slope(one), strict=True) if other.key != one.key])
+    low, high = np.array([other.range for other in others]).reshape(-1, 2).T
+    at = coordinates(best, others)
+
+    def line(coordinate: float) -> FloatArray:
+        """The others' coordinates by regression, (k − 1,); where a noise shrinks, on its variance."""
+        change = coordinate - start
+        if one.fit == "noise" and change < 0.0:
+            change = 0.5 * math.expm1(2.0 * change)
+        return at + slope * change
+
+    def config(coordinate: float, others_at: FloatArray) -> FusionConfig:
+        return moved(one.move(best, one.coordinate(one.value(coordinate))), others, np.clip(others_at, low, high))
+
+    more = [] if one.key in [other.key for other in view.free] else [one]
+    ends = [bound if end is None else end * one.unit for end, bound in zip(ci95, one.bounds, strict=True)]
+    log = one.log and not (one.vanishes and ends[0] <= one.bounds[0])
+    value, top = one.value(start), view.at(best, more)
+    values, drop = [value], [0.0]
+    for end in (max(end, one.bounds[0]) for end in ends):
+        if math.isclose(end, value):
+            continue
+        to = one.coordinate(end)
+        bend = coordinates(view.maximum(config(to, line(to)), others, _DRAWN_TOLERANCE).config, others) - line(to)
+        along = value * (end / value) ** _SHARES if log else value + (end - value) * _SHARES
+        for share, there in zip(_SHARES.tolist(), along.tolist(), strict=True):
+            if one.bounds[0] <= there <= one.bounds[1] or share == 1.0:
+                place = one.coordinate(there)
+                values.append(there)
+                drop.append(view.at(config(place, line(place) + bend * share**2), more) - top)
+    order = np.argsort(values)
+    return Profile(one.key, one.axis, log, np.array(values)[order] / one.unit, np.array(drop)[order])

@@ -1,7 +1,8 @@
-"""What recorded runs say of a configuration: the log-likelihood of their measurements, and how it changes.
+"""The log-likelihood of recorded runs under a configuration, its score and its expected information.
 
-The likelihood is the one of :func:`pumafuse.fusion.consistency.log_density`, gates and all, on the compiled engine. Its
-slopes come from how innovations ν and their variances S move with each parameter while the outcomes stay as they are:
+The likelihood is the one of :func:`pumafuse.fusion.consistency.log_density`, gates included, on the compiled engine.
+Score and information come from how innovations ν and their variances S change with each parameter while the outcomes
+stay as they are:
 
     ∂L/∂a = Σ −ν ∂ν/S + ½ (ν²/S − 1) ∂S/S,    information = Σ ∂ν ∂ν′/S + ½ ∂S ∂S′/S²
 
@@ -11,11 +12,12 @@ slopes come from how innovations ν and their variances S move with each paramet
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -25,6 +27,7 @@ from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations
+from ..filter.outcome import Outcome
 from ..fusion.segments import Timeline, build
 from ..fusion.ticks import usable_cores
 from ..logs.axes import in_axes
@@ -34,18 +37,30 @@ from ..model.arm import ordered_axes
 from .parameters import Parameter
 from .retimed import retimed, subset
 
-_LOG_STEP = 1e-4  # of a logarithm, by which slopes are taken: their error is half of it, the rounding 1e-11
-_STEP = 2e-5  # s, or of a gain; both ways, as a measurement that passes a command bends the likelihood
+_LOG_STEP = 1e-4  # of a logarithm, one-sided: the truncation error is half of it, the rounding error 1e-11
+_STEP = 2e-5  # s, or of a gain; central, because the likelihood bends where a measurement passes a command
 _SMALLEST = 1e-6  # m; misfit of a simulated arm without any noise
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def in_threads(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
+    """The results of ``work`` for each item, on all usable cores."""
+    import joblib  # takes 0.1 s
+
+    cores = int(joblib.cpu_count())  # pyright: ignore
+    with ThreadPoolExecutor(cores) as pool:
+        return list(pool.map(work, items))
 
 
 @dataclass(frozen=True)
-class Value:
+class LogLikelihood:
     """The log-likelihood of a configuration.
 
     Attributes:
         axes: Of each axis's components, with positions in mm, (A,).
-        outcomes: What became of each component, for each segment, (m,).
+        outcomes: The outcome of each component, for each segment, (m,).
     """
 
     axes: FloatArray
@@ -53,13 +68,13 @@ class Value:
 
     @property
     def total(self) -> float:
-        """Of all axes."""
+        """The sum over all axes."""
         return float(self.axes.sum())
 
 
 @dataclass(frozen=True)
-class Slopes:
-    """How the log-likelihood changes with k parameters.
+class Derivatives:
+    """Score and information of k parameters.
 
     Attributes:
         score: ∂L/∂a, (k,).
@@ -71,13 +86,13 @@ class Slopes:
 
 
 @dataclass(frozen=True)
-class _Strand:
+class _AxisSegment:
     """One axis of one segment.
 
     Attributes:
-        number: The axis among those of the evidence.
-        timeline: Its components alone.
-        places: Where they are among the segment's, (m,).
+        number: The index of the axis in :attr:`Likelihood.axes`.
+        timeline: Only this axis and its components.
+        places: The indices of these components in the segment, (m,).
     """
 
     number: int
@@ -88,17 +103,17 @@ class _Strand:
 @dataclass(frozen=True)
 class _Segment:
     whole: Timeline
-    strands: tuple[_Strand, ...]
+    axes: tuple[_AxisSegment, ...]
 
 
-class Evidence:
-    """The measurements of runs, ready to be met again and again.
+class Likelihood:
+    """The likelihood of the measurements of runs, as a function of the configuration.
 
     Attributes:
-        config: Where the search starts; timelines are built with it.
+        config: The configuration that the timelines were built with.
         axes: All commanded axes, in their order.
-        heard: For each axis with measurements the sensors that have them.
-        count: How many components each axis has, (A,).
+        sensors: For each axis with measurements the sensors that have them.
+        count: The number of components of each axis, (A,).
         notes: Every anomaly of the runs, a sentence each.
     """
 
@@ -111,7 +126,7 @@ class Evidence:
         until: float | None = None,
         latest: float | None = None,
     ) -> None:
-        """Put the measurements of runs in order.
+        """Prepare the measurements of runs.
 
         Args:
             runs: Recorded runs.
@@ -132,67 +147,67 @@ class Evidence:
         ]
         self.config = config
         self.axes = ordered_axes({axis.name for timeline in built for axis in timeline.axes})
-        parts = [_kept(timeline, until, latest) for timeline in built]
-        self._segments = [_Segment(part, tuple(_strands(part, self.axes))) for part in parts]
-        told: set[tuple[str, str]] = {
-            (self.axes[strand.number], strand.timeline.components.sensors[sensor])
+        parts = [_decided(timeline, until, latest) for timeline in built]
+        self._segments = [_Segment(part, tuple(_axis_segments(part, self.axes))) for part in parts]
+        measured: set[tuple[str, str]] = {
+            (self.axes[one.number], one.timeline.components.sensors[sensor])
             for segment in self._segments
-            for strand in segment.strands
-            for sensor in np.unique(strand.timeline.components.sensor).tolist()
+            for one in segment.axes
+            for sensor in np.unique(one.timeline.components.sensor).tolist()
         }
-        self.heard: Mapping[str, Sequence[str]] = {
-            axis: [name for name in chosen if (axis, name) in told]
+        self.sensors: Mapping[str, Sequence[str]] = {
+            axis: [name for name in chosen if (axis, name) in measured]
             for axis in self.axes
-            if any((axis, name) in told for name in chosen)
+            if any((axis, name) in measured for name in chosen)
         }
         self.count = np.zeros(len(self.axes), dtype=np.int64)
         for segment in self._segments:
-            for strand in segment.strands:
-                self.count[strand.number] += len(strand.places)
+            for one in segment.axes:
+                self.count[one.number] += len(one.places)
 
-    def alone(self, axis: str) -> Evidence:
-        """The measurements of one axis; ``axes`` stay as they are."""
+    def of_axis(self, axis: str) -> Likelihood:
+        """The likelihood of the measurements of one axis; ``axes`` stay as they are."""
         number = self.axes.index(axis)
         found = copy(self)
         found._segments = [
-            _Segment(strand.timeline, (replace(strand, places=np.arange(len(strand.places))),))
+            _Segment(one.timeline, (replace(one, places=np.arange(len(one.places))),))
             for segment in self._segments
-            for strand in segment.strands
-            if strand.number == number
+            for one in segment.axes
+            if one.number == number
         ]
         return found
 
     def outcomes_of(self, axis: str, outcomes: Sequence[CodeArray]) -> list[CodeArray]:
-        """The outcomes of one axis's components among those of all, for each segment of :meth:`alone`."""
+        """Those outcomes that are of one axis's components, for each segment of :meth:`of_axis`."""
         number = self.axes.index(axis)
         return [
-            outcome[strand.places]
+            outcome[one.places]
             for segment, outcome in zip(self._segments, outcomes, strict=True)
-            for strand in segment.strands
-            if strand.number == number
+            for one in segment.axes
+            if one.number == number
         ]
 
     @cached_property
     def scatter(self) -> dict[str, float]:
-        """What each sensor's measurements scatter by from one to the next on each axis [m], by the name of its sd.
+        """Rough noise of each sensor on each axis [m], by the key of its sd.
 
-        From third differences, which smooth motion leaves alone: their variance is 20 times the noise's. Outliers
-        hardly move the median.
+        From third differences, which remove smooth motion: their variance is 20 times the noise's. Their median is
+        robust against outliers.
         """
         found: dict[str, list[float]] = {}
         for segment in self._segments:
-            for strand in segment.strands:
-                components = strand.timeline.components
+            for one in segment.axes:
+                components = one.timeline.components
                 for number, name in enumerate(components.sensors):
                     third = np.diff(components.value[components.sensor == number], 3)
                     if len(third):
                         sd = 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)
-                        found.setdefault(f"sensors.{name}.sd_mm.{self.axes[strand.number]}", []).append(sd)
+                        found.setdefault(f"sensors.{name}.sd_mm.{self.axes[one.number]}", []).append(sd)
         return {key: float(np.median(sds)) for key, sds in found.items() if min(sds) > 0.0}
 
     @cached_property
-    def afterwards(self) -> dict[str, float]:
-        """Which share of each sensor's measurements lies more than 1 s after the last command."""
+    def share_after_end(self) -> dict[str, float]:
+        """The share of each sensor's measurements that lies more than 1 s after the last command."""
         late, every = dict[str, int](), dict[str, int]()
         for segment in self._segments:
             components, end = segment.whole.components, int(segment.whole.commands[-1]) + 1_000_000_000
@@ -204,7 +219,7 @@ class Evidence:
 
     @cached_property
     def travel(self) -> dict[str, float]:
-        """How far each axis is commanded to move in a run, at most [m]."""
+        """The range of the commands of each axis, of the run where it is greatest [m]."""
         found = dict.fromkeys(self.axes, 0.0)
         for segment in self._segments:
             for axis in segment.whole.axes:
@@ -212,14 +227,17 @@ class Evidence:
                 found[axis.name] = max(found[axis.name], reached)
         return found
 
-    def answers(
+    def responses(
         self, config: FusionConfig, *, centred: bool = True
     ) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
-        """What the arm alone would show each sensor on each axis, and what was read, [m], (m,).
+        """The response of the noiseless arm as each sensor would measure it, and what it measured, [m], (m,).
 
         Args:
             config: The configuration.
-            centred: Both from their medians in each run.
+            centred: Whether to subtract the median of each run from both.
+
+        Returns:
+            Both, by sensor and axis.
         """
         certain = msgspec.structs.replace(
             config,
@@ -229,84 +247,82 @@ class Evidence:
         )
         found: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
         for segment in self._segments:
-            for strand in segment.strands:
-                components = strand.timeline.components
-                expected = components.value - innovations(strand.timeline, certain).innovation
+            for one in segment.axes:
+                components = one.timeline.components
+                predicted = components.value - innovations(one.timeline, certain).innovation
                 for number, name in enumerate(components.sensors):
                     mine = components.sensor == number
                     if mine.any():
-                        answer, seen = expected[mine], components.value[mine]
+                        expected, measured = predicted[mine], components.value[mine]
                         if centred:
-                            answer, seen = answer - np.median(answer), seen - np.median(seen)
-                        found.setdefault((name, self.axes[strand.number]), []).append((answer, seen))
+                            expected, measured = expected - np.median(expected), measured - np.median(measured)
+                        found.setdefault((name, self.axes[one.number]), []).append((expected, measured))
         return {
             key: (np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]))
             for key, pairs in found.items()
         }
 
     def misfit(self, config: FusionConfig) -> FloatArray:
-        """How far the arm alone is from the measurements of each axis [m], by the median of each sensor's, (A,)."""
+        """The median distance of the noiseless arm from the nearest sensor's measurements [m], by axis, (A,)."""
         found: list[list[float]] = [[0.0] for _ in self.axes]
-        for (name, axis), (answer, seen) in self.answers(config).items():
-            apart = 1.4826 * float(np.median(np.abs(seen - answer)))
+        for (name, axis), (expected, measured) in self.responses(config).items():
+            apart = 1.4826 * float(np.median(np.abs(measured - expected)))
             found[self.axes.index(axis)].append(apart / abs(config.sensors[name].scale))
         return np.array([max(min(apart[1:], default=0.0), _SMALLEST) for apart in found])
 
-    def value(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> Value:
+    def evaluate(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> LogLikelihood:
         """The log-likelihood of the measurements under a configuration.
 
         Args:
             config: The configuration.
-            outcomes: What became of each component, to be repeated; None: the configuration's gates decide.
+            outcomes: The outcome of each component, to be repeated; None: the configuration's gates decide.
         """
-        axes, found = np.zeros(len(self.axes)), list[CodeArray]()
+        axes, decided = np.zeros(len(self.axes)), list[CodeArray]()
         for number, segment in enumerate(self._segments):
             now = retimed(segment.whole, self.config, config)
-            met = innovations(now.timeline, config, None if outcomes is None else now.there(outcomes[number]))
+            found = innovations(now.timeline, config, None if outcomes is None else now.reordered(outcomes[number]))
             components = now.timeline.components
             gates = np.array([config.sensors[name].gate for name in components.sensors])
-            density = log_density(met.innovation, met.innovation_sd, met.outcome, gates[components.sensor])
-            density, outcome = now.back(density), now.back(met.outcome)
-            found.append(outcome)
-            for strand in segment.strands:
-                axes[strand.number] += float(density[strand.places].sum())
-        return Value(axes, found)
+            density = log_density(found.innovation, found.innovation_sd, found.outcome, gates[components.sensor])
+            density, outcome = now.restored(density), now.restored(found.outcome)
+            decided.append(outcome)
+            for one in segment.axes:
+                axes[one.number] += float(density[one.places].sum())
+        return LogLikelihood(axes, decided)
 
-    def slopes(self, config: FusionConfig, parameters: Sequence[Parameter], outcomes: Sequence[CodeArray]) -> Slopes:
-        """How the log-likelihood changes with parameters while each component's outcome stays as it is."""
+    def derivatives(
+        self, config: FusionConfig, parameters: Sequence[Parameter], outcomes: Sequence[CodeArray]
+    ) -> Derivatives:
+        """Score and information of parameters while each component's outcome stays as it is."""
         score, information = np.zeros(len(parameters)), np.zeros((len(parameters), len(parameters)))
         jobs = [
-            (strand, outcome[strand.places])
+            (one, outcome[one.places])
             for segment, outcome in zip(self._segments, outcomes, strict=True)
-            for strand in segment.strands
+            for one in segment.axes
         ]
+        found = in_threads(lambda job: self._axis_derivatives(*job, config, parameters), jobs)
+        for mine, part, square in found:
+            score[mine] += part
+            information[np.ix_(mine, mine)] += square
+        return Derivatives(score, information)
 
-        def one(job: tuple[_Strand, CodeArray]) -> tuple[list[int], FloatArray, FloatArray]:
-            return self._strand_slopes(job[0], job[1], config, parameters)
-
-        with ThreadPoolExecutor(min(usable_cores(), len(jobs))) as pool:
-            for mine, part, square in pool.map(one, jobs):
-                score[mine] += part
-                information[np.ix_(mine, mine)] += square
-        return Slopes(score, information)
-
-    def _strand_slopes(
-        self, strand: _Strand, outcome: CodeArray, config: FusionConfig, parameters: Sequence[Parameter]
+    def _axis_derivatives(
+        self, part: _AxisSegment, outcome: CodeArray, config: FusionConfig, parameters: Sequence[Parameter]
     ) -> tuple[list[int], FloatArray, FloatArray]:
-        axis = self.axes[strand.number]
+        axis = self.axes[part.number]
         mine = [number for number, one in enumerate(parameters) if one.axis in (None, axis)]
-        nu, S = self._met(strand, outcome, config)
+        nu, S = self._innovations(part, outcome, config)
         fused = outcome != Outcome.REJECTED
         d_nu, d_S = np.empty((len(mine), len(nu))), np.empty((len(mine), len(nu)))
         for place, number in enumerate(mine):
             one = parameters[number]
             at = one.at(config)
             if one.log:
-                nu_up, S_up = self._met(strand, outcome, one.move(config, at + _LOG_STEP))
+                nu_up, S_up = self._innovations(part, outcome, one.move(config, at + _LOG_STEP))
                 d_nu[place], d_S[place] = (nu_up - nu) / _LOG_STEP, (S_up - S) / _LOG_STEP
             else:
-                nu_up, S_up = self._met(strand, outcome, one.put(config, at + _STEP))
-                nu_down, S_down = self._met(strand, outcome, one.put(config, at - _STEP))
+                nu_up, S_up = self._innovations(part, outcome, one.put(config, at + _STEP))
+                nu_down, S_down = self._innovations(part, outcome, one.put(config, at - _STEP))
                 d_nu[place] = (nu_up - nu_down) / (2.0 * _STEP)
                 d_S[place] = (S_up - S_down) / (2.0 * _STEP)
         d_nu *= fused / np.sqrt(S)
@@ -316,14 +332,16 @@ class Evidence:
         score = -d_nu @ r + 0.5 * d_S @ excess
         return mine, score, d_nu @ d_nu.T + 0.5 * d_S @ d_S.T
 
-    def _met(self, strand: _Strand, outcome: CodeArray, config: FusionConfig) -> tuple[FloatArray, FloatArray]:
-        """ν and S of a strand's components, whose outcomes are known."""
-        now = retimed(strand.timeline, self.config, config)
-        met = innovations(now.timeline, config, now.there(outcome))
-        return now.back(met.innovation), now.back(met.innovation_sd**2)
+    def _innovations(
+        self, part: _AxisSegment, outcome: CodeArray, config: FusionConfig
+    ) -> tuple[FloatArray, FloatArray]:
+        """ν and S of the components of one axis, whose outcomes are known."""
+        now = retimed(part.timeline, self.config, config)
+        found = innovations(now.timeline, config, now.reordered(outcome))
+        return now.restored(found.innovation), now.restored(found.innovation_sd**2)
 
 
-def _kept(timeline: Timeline, until: float | None, latest: float | None) -> Timeline:
+def _decided(timeline: Timeline, until: float | None, latest: float | None) -> Timeline:
     """A timeline with only the components that a filter decides on."""
     components = timeline.components
     chosen = components.outcome == Outcome.FUSED
@@ -334,10 +352,10 @@ def _kept(timeline: Timeline, until: float | None, latest: float | None) -> Time
     return replace(timeline, components=subset(components, np.flatnonzero(chosen)))
 
 
-def _strands(timeline: Timeline, axes: Sequence[str]) -> Iterable[_Strand]:
+def _axis_segments(timeline: Timeline, axes: Sequence[str]) -> Iterable[_AxisSegment]:
     for number, axis in enumerate(timeline.axes):
         places = np.flatnonzero(timeline.components.axis == number)
         if len(places):
             components = subset(timeline.components, places)
             alone = replace(components, axis=np.zeros_like(components.axis))
-            yield _Strand(axes.index(axis.name), replace(timeline, axes=(axis,), components=alone), places)
+            yield _AxisSegment(axes.index(axis.name), replace(timeline, axes=(axis,), components=alone), places)

@@ -1,11 +1,11 @@
-"""What can be fitted: each number of a configuration by the name it has in its file, and a coordinate to search in."""
+"""The parameters that can be fitted, by their names in the files, and configurations with one thing changed."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, TypeAlias, TypeVar, cast, get_args
 
 import msgspec
 import numpy as np
@@ -13,88 +13,134 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import ConfigError, suggestion
 from ..fusion.config import FusionConfig, Process
-from ..model.arm import AxisModel
-from ..model.plants import FirstOrder
-from .variants import with_axis, with_order, with_process, with_recovery, with_sd, with_sensor
+from ..model.plants import FirstOrder, SecondOrder
 
 Fit = Literal["noise", "delay", "plant", "gain", "latency"]
 FITS: tuple[Fit, ...] = get_args(Fit)
 
+Path: TypeAlias = tuple[str, ...]
+T = TypeVar("T")
+
 _replace = msgspec.structs.replace
-_NOISES = {  # field of Process: the range it is looked for in, SI; the lower end stands for none
+_NOISES = {  # field of Process: bounds, SI; the lower bound stands for no noise
     "input_noise": (1e-7, 1.0),
     "drift": (1e-7, 10.0),
     "maneuver_noise": (1e-6, 30.0),
     "maneuver_drift": (1e-5, 300.0),
 }
+_PLANTS = {  # field of a plant: bounds, SI
+    "time_constant": (1e-4, 10.0),
+    "natural_frequency": (0.5, 5e3),
+    "damping": (0.05, 20.0),
+}
 _SDS = (1e-7, 1.0)  # m
-LATENCIES = (-0.1, 0.3)  # s; how far from the configured one a latency is looked for
-DELAYS = (-0.1, 0.2)  # s; likewise a delay, but never below 0
+LATENCIES = (-0.1, 0.3)  # s; bounds of a latency, relative to the configured one
+DELAYS = (-0.1, 0.2)  # s; likewise of a delay, which is never below 0
 _MM = _MS = 1e-3
-_TICK = 0.028  # s; what is a large change of a time, on any arm
+_TICK = 0.028  # s; a large change of a time, on any arm
 RECOVERY = ".gain_recovery_ms"
 _RECOVERY = (0.020, 0.500)  # s
-_RECOVERY_SD = math.log(_RECOVERY[1] / _RECOVERY[0]) / (2.0 * 1.96)  # 95 % of the prior lie in that range
+_RECOVERY_PRIOR = (  # mean and standard deviation of the logarithm; 95 % lie within the bounds
+    0.5 * math.log(_RECOVERY[0] * _RECOVERY[1]),
+    math.log(_RECOVERY[1] / _RECOVERY[0]) / (2.0 * 1.96),
+)
 _GAIN_SD = 0.1
 _DIGITS = 6  # of a number that is written
+_AT_BOUND = 1e-6  # of the range of coordinates
+
+
+def changed(config: T, path: Path, value: object) -> T:
+    """A configuration with another value at a path of fields and keys.
+
+    A confidence interval beside what changes is dropped. A sensor's ``sd`` of all axes becomes one for each.
+    """
+    return _changed(config, path, value, config)
+
+
+def _changed(node: Any, path: Path, value: object, root: Any) -> Any:
+    if not path:
+        return value
+    if isinstance(node, int | float):
+        node = dict.fromkeys(root.arm.axes, node)
+    name, rest = path[0], path[1:]
+    if isinstance(node, dict):
+        table = cast("dict[str, Any]", node)
+        return {**table, name: _changed(table.get(name), rest, value, root)}
+    changes = {name: _changed(getattr(node, name), rest, value, root)}
+    if not rest and hasattr(node, f"{name}_ci95"):
+        changes[f"{name}_ci95"] = None
+    return _replace(node, **changes)
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number to fit.
+    """A number that can be fitted.
 
     Attributes:
         key: Its name: table, axis or sensor, and key as in ``fusion.toml`` or ``arm.toml``.
         fit: Which kind of fitting it belongs to.
-        axis: The axis it is of; None where it is of all.
+        axis: Its axis; None where it belongs to all.
+        path: Where it is in a configuration: fields and keys.
+        bounds: Lower and upper bound [SI].
         log: Whether it is searched on a log scale: the coordinate is then the number's logarithm.
-        bounds: Least and greatest value [SI].
-        scale: What is a large change of the coordinate.
-        get: The number in a configuration [SI].
-        put: The configuration with another number [SI].
-        unit: What one unit of the key is in SI: 1e-3 for ``delay_ms``.
-        sensor: The sensor it is of, if it is of one.
-        prior: Mean and standard deviation of the coordinate before any measurement; None: any within the bounds.
+        scale: A large change of the coordinate.
+        unit: One unit of the key in SI: 1e-3 for ``delay_ms``.
+        sensor: Its sensor, if it has one.
+        prior: Mean and standard deviation of the coordinate a priori; None: uniform within the bounds.
     """
 
     key: str
     fit: Fit
     axis: str | None
-    log: bool
+    path: Path
     bounds: tuple[float, float]
-    scale: float
-    get: Callable[[FusionConfig], float]
-    put: Callable[[FusionConfig, float], FusionConfig]
+    log: bool = True
+    scale: float = 1.0
     unit: float = 1.0
     sensor: str | None = None
     prior: tuple[float, float] | None = None
 
     @property
     def vanishes(self) -> bool:
-        """Whether it may be 0, for which its least value stands."""
+        """Whether it may be 0, for which its lower bound stands."""
         return self.key.startswith("process.")
-
-    def given(self, config: FusionConfig) -> float | None:
-        """The number as configured [SI]; None where it is not: a recovery, or what a plant of the other order has."""
-        if self.axis is not None and self.key.endswith(RECOVERY) and config.arm.axes[self.axis].gain_recovery is None:
-            return None
-        try:
-            return self.get(config)
-        except AttributeError:
-            return None
 
     @property
     def range(self) -> tuple[float, float]:
         """The bounds as coordinates."""
         return self.coordinate(self.bounds[0]), self.coordinate(self.bounds[1])
 
-    def inside(self, value: float) -> float:
+    def given(self, config: FusionConfig) -> float | None:
+        """The number as configured [SI]; None where it is not: no recovery, or a plant of the other order."""
+        if self.fit == "delay" and self.axis is not None:
+            return config.arm.delay_of(self.axis)
+        node: Any = config
+        for name in self.path:
+            if isinstance(node, int | float):
+                break  # an sd of all axes
+            node = cast("dict[str, Any]", node).get(name) if isinstance(node, dict) else getattr(node, name, None)
+        return node
+
+    def get(self, config: FusionConfig) -> float:
+        """The number in a configuration [SI]; the prior's mean where it is not configured."""
+        value = self.given(config)
+        if value is not None:
+            return value
+        if self.prior is None:
+            raise AttributeError(f"{self.key}: the configuration has no such number")
+        return self.value(self.prior[0])
+
+    def put(self, config: FusionConfig, value: float) -> FusionConfig:
+        """The configuration with another number [SI]."""
+        return changed(config, self.path, value)
+
+    def clipped(self, value: float) -> float:
         """The nearest number within the bounds."""
         return min(max(value, self.bounds[0]), self.bounds[1])
 
     def coordinate(self, value: float) -> float:
-        """Of a number, which is moved into the bounds."""
-        return math.log(self.inside(value)) if self.log else self.inside(value)
+        """The coordinate of a number, which is clipped to the bounds."""
+        return math.log(self.clipped(value)) if self.log else self.clipped(value)
 
     def at(self, config: FusionConfig) -> float:
         """The coordinate of the number in a configuration."""
@@ -108,29 +154,79 @@ class Parameter:
         """The configuration with this number at ``coordinate``."""
         return self.put(config, self.value(coordinate))
 
+    def at_bound(self, config: FusionConfig) -> Literal["lower", "upper"] | None:
+        """The bound at which the number lies in a configuration, if any."""
+        low, high = self.range
+        at, margin = self.at(config), _AT_BOUND * (high - low)
+        return "lower" if at <= low + margin else "upper" if at >= high - margin else None
+
+    def log_prior(self, config: FusionConfig) -> float:
+        """Logarithm of the prior density, but for a constant."""
+        if self.prior is None:
+            return 0.0
+        return -0.5 * ((self.at(config) - self.prior[0]) / self.prior[1]) ** 2
+
 
 def parameters(
     config: FusionConfig,
     known: FusionConfig,
-    heard: Mapping[str, Sequence[str]],
+    sensors: Mapping[str, Sequence[str]],
     fit: Sequence[Fit],
-    hold: Iterable[str] = (),
+    fixed: Iterable[str] = (),
 ) -> list[Parameter]:
-    """The numbers to fit, those of each axis together.
+    """The parameters to fit, those of each axis together.
 
     Args:
         config: Its plants are of the orders to fit.
-        known: What is known before: priors and bounds are around its gains and latencies.
-        heard: For each axis the sensors with measurements of it.
+        known: The configuration as given: priors and bounds are around its gains and latencies.
+        sensors: For each axis the sensors that measure it.
         fit: Which kinds.
-        hold: Parts of names: what has all the parts of one, in their order, stays as it is.
+        fixed: Parts of names: a parameter whose name has all the parts of one, in their order, is left out.
     """
-    every = [*_of_axes(config, known, heard), *_latencies(known, heard)]
-    return [one for one in every if one.fit in fit and not is_held(one.key, hold)]
+    every = [one for axis, names in sensors.items() for one in _of_axis(axis, names, config, known)]
+    used = {name for names in sensors.values() for name in names}
+    for name in known.sensors:
+        if name in used:
+            path, bounds = ("sensors", name, "latency"), _around(known.sensors[name].latency, LATENCIES)
+            key = f"sensors.{name}.latency_ms"
+            every.append(Parameter(key, "latency", None, path, bounds, False, _TICK, _MS, name))
+    return [one for one in every if one.fit in fit and not is_fixed(one.key, fixed)]
+
+
+def _of_axis(axis: str, sensors: Sequence[str], config: FusionConfig, known: FusionConfig) -> list[Parameter]:
+    found: list[Parameter] = []
+    for field, bounds in _NOISES.items():
+        key = f"process.{axis}.{_key(Process, field)}"
+        found.append(Parameter(key, "noise", axis, ("process", axis, field), bounds, unit=_MM))
+    for name in sensors:
+        path = ("sensors", name, "sd", axis)
+        found.append(Parameter(f"sensors.{name}.sd_mm.{axis}", "noise", axis, path, _SDS, unit=_MM, sensor=name))
+    arm, key = ("arm", "axes", axis), f"axes.{axis}"
+    low, high = _around(known.arm.delay_of(axis), DELAYS)
+    bounds = (max(low, 0.0), high)
+    found.append(Parameter(f"{key}.delay_ms", "delay", axis, (*arm, "delay"), bounds, False, _TICK, _MS))
+    plant = config.arm.axes[axis].plant
+    for field in ("time_constant",) if isinstance(plant, FirstOrder) else ("natural_frequency", "damping"):
+        name, unit = f"{key}.{_key(type(plant), field)}", _MS if field == "time_constant" else 1.0
+        found.append(Parameter(name, "plant", axis, (*arm, "plant", field), _PLANTS[field], unit=unit))
+    gain = known.arm.axes[axis].gain.intercept
+    path, bounds, prior = (*arm, "gain", "intercept"), (gain - 0.5, gain + 0.5), (gain, _GAIN_SD)
+    found.append(Parameter(f"{key}.gain.intercept", "gain", axis, path, bounds, False, _GAIN_SD, prior=prior))
+    path = (*arm, "gain_recovery")
+    found.append(Parameter(f"{key}{RECOVERY}", "gain", axis, path, _RECOVERY, unit=_MS, prior=_RECOVERY_PRIOR))
+    return found
+
+
+def _around(middle: float, span: tuple[float, float]) -> tuple[float, float]:
+    return middle + span[0], middle + span[1]
+
+
+def _key(kind: type[msgspec.Struct], field: str) -> str:
+    return next(entry.encode_name for entry in msgspec.structs.fields(kind) if entry.name == field)
 
 
 def kinds_of(fit: Iterable[str]) -> list[Fit]:
-    """The kinds that are asked for, in their order.
+    """The kinds that are asked for, in the order of :data:`FITS`.
 
     Raises:
         ConfigError: One is unknown, or there is none.
@@ -144,26 +240,35 @@ def kinds_of(fit: Iterable[str]) -> list[Fit]:
     return [kind for kind in FITS if kind in asked]
 
 
-def check_holds(config: FusionConfig, hold: Iterable[str]) -> None:
-    """Refuse what names no number of a configuration, whichever the order of its plants.
+def check_fixed(config: FusionConfig, fixed: Iterable[str]) -> None:
+    """Refuse a name to fix that names no number of a configuration, whichever the order of its plants.
 
     Raises:
         ConfigError: It names none.
     """
-    heard = dict.fromkeys(config.arm.axes, tuple(config.sensors))
+    sensors = dict.fromkeys(config.arm.axes, tuple(config.sensors))
     keys = {f"sensors.{name}.bias_sd_mm" for name in config.sensors}
     for order in (1, 2):
-        for axis in heard:
+        for axis in sensors:
             config = with_order(config, axis, order)
-        keys |= {one.key for one in parameters(config, config, heard, FITS)}
-    for name in hold:
-        if not any(_named(name, key) for key in keys):
+        keys |= {one.key for one in parameters(config, config, sensors, FITS)}
+    for name in fixed:
+        if not any(is_fixed(key, [name]) for key in keys):
             parts = sorted({part for key in keys for part in key.split(".")})
-            raise ConfigError(f"--hold: '{name}' names nothing that can be fitted; parts of names: {', '.join(parts)}")
+            raise ConfigError(f"--fix: '{name}' names nothing that can be fitted; parts of names: {', '.join(parts)}")
 
 
-def least_sd(config: FusionConfig, name: str) -> float:
-    """The noise of a sensor [m], on the axis where it has least."""
+def is_fixed(key: str, fixed: Iterable[str]) -> bool:
+    """Whether all parts of any of the names to fix are parts of ``key``, in their order."""
+    for name in fixed:
+        parts = iter(key.split("."))
+        if all(part in parts for part in name.split(".")):
+            return True
+    return False
+
+
+def smallest_sd(config: FusionConfig, name: str) -> float:
+    """The noise of a sensor [m], on the axis where it is smallest."""
     sd = config.sensors[name].sd
     return min(sd.values()) if isinstance(sd, dict) else sd
 
@@ -185,113 +290,47 @@ def rounded(value: float) -> float:
     return float(f"{value:.{_DIGITS}g}")
 
 
-def _of_axes(config: FusionConfig, known: FusionConfig, heard: Mapping[str, Sequence[str]]) -> list[Parameter]:
-    found: list[Parameter] = []
-    for axis, sensors in heard.items():
-        found += [_noise(axis, field, bounds) for field, bounds in _NOISES.items()]
-        found += [_sd(axis, name) for name in sensors]
-        found.append(_delay(axis, known.arm.delay_of(axis)))
-        found += _plant(axis, config.arm.axes[axis])
-        found += _gain(axis, known.arm.axes[axis].gain.intercept)
-    return found
+def with_order(config: FusionConfig, axis: str, order: int) -> FusionConfig:
+    """The configuration with an axis's plant of this order and of the same lag."""
+    plant = config.arm.axes[axis].plant
+    if (1 if isinstance(plant, FirstOrder) else 2) == order:
+        return config
+    lag = plant.lag
+    plant = FirstOrder(time_constant=lag) if order == 1 else SecondOrder(natural_frequency=2.0 / lag, damping=1.0)
+    return changed(config, ("arm", "axes", axis, "plant"), plant)
 
 
-def is_held(key: str, hold: Iterable[str]) -> bool:
-    """Whether any of the names to hold is part of ``key``."""
-    return any(_named(name, key) for name in hold)
+def with_lag(config: FusionConfig, axis: str, lag: float) -> FusionConfig:
+    """The configuration with an axis's plant of another lag behind an input of constant velocity [s]."""
+    plant = config.arm.axes[axis].plant
+    if isinstance(plant, FirstOrder):
+        plant = FirstOrder(time_constant=lag)
+    else:
+        plant = _replace(plant, natural_frequency=2.0 * plant.damping / lag)
+    return changed(config, ("arm", "axes", axis, "plant"), plant)
 
 
-def _named(name: str, key: str) -> bool:
-    """Whether all parts of ``name`` are among those of ``key``, in their order."""
-    parts = iter(key.split("."))
-    return all(part in parts for part in name.split("."))
+def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> FusionConfig:
+    """The configuration with all numbers of one axis from another: its model, its process noise, its sensors' noise."""
+    config = changed(config, ("arm", "axes", axis), other.arm.axes[axis])
+    for name, sensor in other.sensors.items():
+        if isinstance(sensor.sd, dict) and axis in sensor.sd:
+            config = changed(config, ("sensors", name, "sd", axis), sensor.sd[axis])
+    return changed(config, ("process", axis), other.process[axis])
 
 
-def _key(kind: type[msgspec.Struct], field: str) -> str:
-    return next(entry.encode_name for entry in msgspec.structs.fields(kind) if entry.name == field)
+def with_gates(config: FusionConfig, times: float) -> FusionConfig:
+    """The configuration with gates so many times as wide, each component for itself."""
+    sensors = {
+        name: _replace(sensor, gate=times * sensor.gate, gate_rows=False) for name, sensor in config.sensors.items()
+    }
+    return _replace(config, sensors=sensors)
 
 
-def _noise(axis: str, field: str, bounds: tuple[float, float]) -> Parameter:
-    def put(config: FusionConfig, value: float) -> FusionConfig:
-        return with_process(config, axis, _replace(config.process[axis], **{field: value}))
-
-    key = f"process.{axis}.{_key(Process, field)}"
-    return Parameter(
-        key, "noise", axis, True, bounds, 1.0, lambda config: getattr(config.process[axis], field), put, _MM
-    )
-
-
-def _sd(axis: str, name: str) -> Parameter:
-    def get(config: FusionConfig) -> float:
-        return config.sensors[name].sd_of(axis) or 0.0
-
-    def put(config: FusionConfig, value: float) -> FusionConfig:
-        return with_sd(config, name, axis, value)
-
-    return Parameter(f"sensors.{name}.sd_mm.{axis}", "noise", axis, True, _SDS, 1.0, get, put, _MM, name)
-
-
-def _delay(axis: str, configured: float) -> Parameter:
-    def put(config: FusionConfig, value: float) -> FusionConfig:
-        return with_axis(config, axis, _replace(config.arm.axes[axis], delay=value, delay_ci95=None))
-
-    key, bounds = f"axes.{axis}.delay_ms", (max(configured + DELAYS[0], 0.0), configured + DELAYS[1])
-    return Parameter(key, "delay", axis, False, bounds, _TICK, lambda config: config.arm.delay_of(axis), put, _MS)
-
-
-def _plant(axis: str, model: AxisModel) -> list[Parameter]:
-    def of(field: str, bounds: tuple[float, float]) -> Parameter:
-        def get(config: FusionConfig) -> float:
-            return getattr(config.arm.axes[axis].plant, field)
-
-        def put(config: FusionConfig, value: float) -> FusionConfig:
-            plant = _replace(config.arm.axes[axis].plant, **{field: value, f"{field}_ci95": None})
-            return with_axis(config, axis, _replace(config.arm.axes[axis], plant=plant))
-
-        key, unit = _key(type(model.plant), field), _MS if field == "time_constant" else 1.0
-        return Parameter(f"axes.{axis}.{key}", "plant", axis, True, bounds, 1.0, get, put, unit)
-
-    if isinstance(model.plant, FirstOrder):
-        return [of("time_constant", (1e-4, 10.0))]
-    return [of("natural_frequency", (0.5, 5e3)), of("damping", (0.05, 20.0))]
-
-
-def _gain(axis: str, centre: float) -> list[Parameter]:
-    def intercept(config: FusionConfig) -> float:
-        return config.arm.axes[axis].gain.intercept
-
-    def put_intercept(config: FusionConfig, value: float) -> FusionConfig:
-        gain = _replace(config.arm.axes[axis].gain, intercept=value, intercept_ci95=None)
-        return with_axis(config, axis, _replace(config.arm.axes[axis], gain=gain))
-
-    def put_recovery(config: FusionConfig, value: float) -> FusionConfig:
-        return with_recovery(config, axis, value)
-
-    middle = 0.5 * math.log(_RECOVERY[0] * _RECOVERY[1])
-    return [
-        Parameter(
-            f"axes.{axis}.gain.intercept", "gain", axis, False, (centre - 0.5, centre + 0.5), _GAIN_SD,
-            intercept, put_intercept, prior=(centre, _GAIN_SD),
-        ),
-        Parameter(
-            f"axes.{axis}{RECOVERY}", "gain", axis, True, _RECOVERY, 1.0,
-            lambda config: config.arm.axes[axis].gain_recovery or math.exp(middle), put_recovery, _MS,
-            prior=(middle, _RECOVERY_SD),
-        ),
-    ]  # fmt: skip
-
-
-def _latencies(known: FusionConfig, heard: Mapping[str, Sequence[str]]) -> list[Parameter]:
-    used = {name for sensors in heard.values() for name in sensors}
-    return [_latency(name, sensor.latency) for name, sensor in known.sensors.items() if name in used]
-
-
-def _latency(name: str, configured: float) -> Parameter:
-    def put(config: FusionConfig, value: float) -> FusionConfig:
-        return with_sensor(config, name, _replace(config.sensors[name], latency=value))
-
-    key = f"sensors.{name}.latency_ms"
-    bounds = (configured + LATENCIES[0], configured + LATENCIES[1])
-    return Parameter(
-        key, "latency", None, False, bounds, _TICK, lambda config: config.sensors[name].latency, put, _MS, name
-    )
+def with_gates_of(config: FusionConfig, other: FusionConfig) -> FusionConfig:
+    """The configuration with the gates of another."""
+    sensors = {
+        name: _replace(sensor, gate=other.sensors[name].gate, gate_rows=other.sensors[name].gate_rows)
+        for name, sensor in config.sensors.items()
+    }
+    return _replace(config, sensors=sensors)

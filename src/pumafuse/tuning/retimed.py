@@ -1,7 +1,7 @@
 """A timeline with other delays, gains and latencies than it was built with.
 
 Building one anew for each configuration that a search tries would cost more than filtering. Delays and gains change
-what drives each axis; latencies change when measurements are valid, and so perhaps their order.
+the input of each axis; latencies change when measurements are valid, and so perhaps their order.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ T = TypeVar("T", bound=np.generic)
 
 @dataclass(frozen=True)
 class Retimed:
-    """A timeline as another configuration has it.
+    """A timeline under another configuration.
 
     Attributes:
         timeline: The timeline.
-        order: Where each of its components stood before, (m,); None where they stand as they did.
+        order: The index that each of its components had before, (m,); None where the order is the same.
     """
 
     timeline: Timeline
     order: IntArray | None
 
-    def there(self, values: npt.NDArray[T]) -> npt.NDArray[T]:
-        """Values of the components, from the order before to this one, (m,)."""
+    def reordered(self, values: npt.NDArray[T]) -> npt.NDArray[T]:
+        """Values of the components in this order, from the order before, (m,)."""
         return values if self.order is None else values[self.order]
 
-    def back(self, values: npt.NDArray[T]) -> npt.NDArray[T]:
-        """Values of the components, from this order to the one before, (m,)."""
+    def restored(self, values: npt.NDArray[T]) -> npt.NDArray[T]:
+        """Values of the components in the order before, from this one, (m,)."""
         if self.order is None:
             return values
         found = np.empty_like(values)
@@ -47,11 +47,11 @@ class Retimed:
 
 
 def retimed(timeline: Timeline, built: FusionConfig, config: FusionConfig) -> Retimed:
-    """A timeline that was built with one configuration as another has it.
+    """A timeline under another configuration than it was built with.
 
     Args:
         timeline: Only with components that a filter decides on.
-        built: What it was built with.
+        built: The configuration it was built with.
         config: The same arm and sensors with other numbers.
     """
     axes = tuple(_driven(axis, built, config) for axis in timeline.axes)
@@ -82,7 +82,7 @@ def subset(components: Components, places: IntArray) -> Components:
 
 
 def _driven(axis: AxisInput, built: FusionConfig, config: FusionConfig) -> AxisInput:
-    """What drives an axis under ``config``; the drive is made anew only where its gain differs."""
+    """The input of an axis under ``config``; made anew only where the gain differs."""
     before, now = built.arm.axes[axis.name], config.arm.axes[axis.name]
     delay = round(config.arm.delay_of(axis.name) * 1e9)
     if (before.gain, before.gain_recovery) == (now.gain, now.gain_recovery):

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
+from typing import TypeAlias
 
 import msgspec
 import numpy as np
@@ -15,37 +16,36 @@ from ..errors import PumafuseWarning
 from ..fusion.config import FusionConfig
 from ..logs.clock import segments
 from ..logs.run import Run
-from ..model.arm import AxisModel
-from .course import Course, Progress, syllabi
+from .identifiability import TuneError, correlations, excited_axes
 from .intervals import ConfidenceInterval, confidence_intervals
-from .learnable import TuneError, moving
-from .lesson import Lesson
-from .likelihood import Evidence
-from .parameters import Fit, check_holds, kinds_of, rounded
-from .summary import Likelihood, TuningSummary, biases, correlated, fitted, told
-from .validate import Check, check
-from .variants import with_gates_of
+from .likelihood import Likelihood
+from .maximise import Notify, Point
+from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates_of
+from .stage import Plan, Stage, likelihood_of, repeat_stage, reset_stage, run_stage
+from .summary import AxisLikelihood, Correlation, TuningSummary, fitted, found_biases
+from .validation import Check, check
 
-_LEARNT = 2.0 / 3.0  # of a single run; the rest is held back
+_FITTED_ON = 2.0 / 3.0  # of a single run; the rest is for validation
+_NOTHING = 0.01  # log-likelihood that a noise must gain, or it is 0
 
-_replace = msgspec.structs.replace
+Progress: TypeAlias = Callable[[str, Point], None]
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """What :func:`tune` returns.
+    """The result of :func:`tune`.
 
     Attributes:
-        config: The configuration with what was learnt, ready for :func:`pumafuse.fuse`.
+        config: The tuned configuration, ready for :func:`pumafuse.fuse`.
         before: The configuration as given.
-        summary: Everything said of it, in the units of files.
-        lessons: The searches behind it: one, or two with a teacher.
+        summary: What ``tuning.json`` holds, in the units of files.
+        stages: The stages of the fit: one, or two with a trusted sensor.
     """
 
     config: FusionConfig
     before: FusionConfig
     summary: TuningSummary
-    lessons: Sequence[Lesson]
+    stages: Sequence[Stage]
 
     def to_json(self) -> str:
         """The text of ``tuning.json``."""
@@ -57,95 +57,186 @@ def tune(
     config: FusionConfig,
     *,
     fit: Iterable[Fit] = ("noise",),
-    hold: Iterable[str] = (),
-    teacher: str | None = None,
+    fix: Iterable[str] = (),
+    trust: str | None = None,
     validate: Run | None = None,
     progress: Progress = lambda _, __: None,
 ) -> Tuning:
-    """Let recorded runs tell noise, delays, plant, gain and latencies by maximum likelihood; no truth is needed.
+    """Fit noise, delays, plants, gains and latencies to recorded runs by maximum likelihood; no reference is needed.
 
     Args:
-        runs: The recorded runs to learn from.
-        config: What is known before.
+        runs: The recorded runs to fit on.
+        config: The configuration to start from.
         fit: What to fit: any of ``noise``, ``delay``, ``plant``, ``gain``, ``latency``.
-        hold: What of that stays as it is: names as in the files, or parts of them (``sensors.tracker``,
+        fix: What of that stays as it is: names as in the files, or parts of them (``sensors.tracker``,
             ``drift_mm_rts``).
-        teacher: A good sensor that teaches the arm and its noise alone. Its latency is believed; of the others only
-            their own noise and latency are learnt then.
-        validate: A run to compare before and after on. For None the last third of a single run is held back for that,
-            and after it the numbers are learnt once more from the whole.
+        trust: An accurate sensor that arm and process noise are fitted on alone. Its latency is believed; of the others
+            only noise and latency are fitted then.
+        validate: A run to compare before and after on. For None a single run is fitted on its first two thirds,
+            validated on the last third, and then fitted once more as a whole.
         progress: Called with what is being done and the best point so far.
 
     Returns:
-        The tuned configuration and all that is to be said of it. Interrupted by Ctrl-C, the best until then.
+        The tuned configuration and its summary. Interrupted by Ctrl-C, the best until then.
 
     Warns:
         PumafuseWarning: For each note.
 
     Raises:
-        PumafuseError: Nothing can be learnt from the runs, or they and the configuration do not fit together.
+        PumafuseError: Nothing can be fitted to the runs, or they and the configuration do not fit together.
     """
     if not runs:
-        raise TuneError("no run to learn from")
-    _refuse_twice(runs)
-    kinds, names = kinds_of(fit), list(hold)
-    check_holds(config, names)
-    lessons = syllabi(config, kinds, names, teacher)
-    course = Course(runs, config, progress)
-    moving(course.evidence(), config)  # of the whole, before a part of it is asked
-    until = _held_back(runs[0]) if len(runs) == 1 and validate is None else None
+        raise TuneError("no run to fit on")
+    for number, run in enumerate(runs):
+        if any(_same(run, other) for other in runs[:number]):
+            raise TuneError(f"run '{run.name}' is given twice: its measurements would count twice")
+    kinds, fixed = kinds_of(fit), list(fix)
+    check_fixed(config, fixed)
+    pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust), progress)
+    excited_axes(pipeline.likelihood(), config)  # refuses the runs before a part of them is fitted on
+    until = _fitted_until(runs[0]) if len(runs) == 1 and validate is None else None
     intervals: dict[str, ConfidenceInterval] = {}
     validation: list[Check] | None = None
     interrupted = False
     try:
-        course.take(lessons, until)
+        pipeline.fit(until)
         if until is not None:
-            validation = check(runs[0], config, course.result(), since=until)
-            course.repeat()
-        course.keep_the_better()
+            validation = check(runs[0], config, pipeline.result(), since=until)
+            pipeline.repeat()
+        pipeline.keep_the_better()
         if validate is not None:
-            validation = check(validate, config, course.result())
-        for lesson in [] if course.kept else course.lessons:
-            progress("asking how sure it is", lesson.best)
-            intervals |= confidence_intervals(lesson.evidence, lesson.best, lesson.free)
+            validation = check(validate, config, pipeline.result())
+        for stage in [] if pipeline.kept else pipeline.stages:
+            progress("computing intervals", stage.best)
+            intervals |= confidence_intervals(stage.likelihood, stage.best, stage.free)
     except KeyboardInterrupt:
         interrupted = True
-        course.keep_the_better()
-    tuned = _with_provenance(course.result(), intervals, [run.name for run in runs])
+        pipeline.keep_the_better()
+    stages, names = pipeline.stages, [run.name for run in runs]
+    free = [one for stage in stages for one in stage.free]
+    if not stages:  # interrupted before the first was complete
+        free = parameters(pipeline.best, config, pipeline.likelihood().sensors, kinds, fixed)
+    tuned = _with_provenance(pipeline.result(), free, intervals, names)
+    notes = [note for stage in stages for note in (*stage.likelihood.notes, *stage.notes)]
+    if pipeline.kept:
+        notes.append("nothing more likely was found than the configuration as given, which is kept")
+    if interrupted:
+        notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
+    known = validate is not None and any(_same(validate, run) for run in runs)
+    notes += _validation_notes(validation, known, interrupted)
     summary = TuningSummary(
         pumafuse=version("pumafuse"),
-        runs=[run.name for run in runs],
+        runs=names,
         fit=list(kinds),
-        hold=names,
-        teacher=teacher,
+        fixed=fixed,
+        trusted=trust,
         interrupted=interrupted,
-        likelihood=_likelihoods(course.evidence(), config, tuned),
-        parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in course.free(kinds, names)],
-        biases=[one for run in runs for one in biases(run, tuned)],
-        correlations=[pair for lesson in course.lessons for pair in correlated(lesson)],
-        held=[told(tie) for lesson in course.lessons for tie in lesson.ties],
-        orders={axis: why for lesson in course.lessons for axis, why in lesson.orders.items()},
+        likelihood=_likelihoods(pipeline.likelihood(), config, tuned),
+        parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in free],
+        biases=[one for run in runs for one in found_biases(run, tuned)],
+        correlations=[
+            Correlation(first=first, second=second, correlation=value)
+            for stage in stages
+            for first, second, value in correlations(stage.likelihood, stage.best, stage.free)
+        ],
+        not_identifiable=[str(one) for stage in stages for one in stage.not_identifiable],
+        orders={axis: why for stage in stages for axis, why in stage.orders.items()},
         validation=validation,
         worse=any(one.worse for one in validation or ()),
-        notes=_notes(
-            course, validation, interrupted, known=validate is not None and any(_same(validate, run) for run in runs)
-        ),
+        notes=list(dict.fromkeys(notes)),
     )
     for note in summary.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=2)
-    return Tuning(tuned, config, summary, tuple(course.lessons))
+    return Tuning(tuned, config, summary, tuple(stages))
 
 
-def _refuse_twice(runs: Sequence[Run]) -> None:
-    """Measurements that count twice would make the intervals too narrow.
+def plans(config: FusionConfig, kinds: Sequence[Fit], fixed: Sequence[str], trust: str | None) -> list[Plan]:
+    """One plan for all sensors; with a trusted sensor one for it, then one for the others' noise and latency.
 
     Raises:
-        TuneError: A run is given twice.
+        UnknownNameError: The trusted sensor is not configured.
     """
-    for number, run in enumerate(runs):
-        for other in runs[:number]:
-            if _same(run, other):
-                raise TuneError(f"run '{run.name}' is given twice: its measurements would count twice")
+    if trust is None:
+        return [Plan(kinds, fixed)]
+    config.sensor_names([trust])
+    arm: list[Fit] = [kind for kind in kinds if kind != "latency"]
+    others: list[Fit] = [kind for kind in kinds if kind in ("noise", "latency")]
+    return [Plan(arm, fixed, [trust]), Plan(others, fixed, trusted=trust)]
+
+
+class Pipeline:
+    """Stages one after the other, each from where the last one ended; the best is there at any moment.
+
+    Attributes:
+        best: The best configuration so far, with the gates of the search and all digits.
+        stages: The stages that are complete.
+        kept: Whether the configuration as given is the result.
+    """
+
+    def __init__(self, runs: Sequence[Run], config: FusionConfig, plans: Sequence[Plan], progress: Progress) -> None:
+        self.runs, self.config, self.plans, self.progress = runs, config, plans, progress
+        self.best = config
+        self.stages: list[Stage] = []
+        self.kept = False
+
+    def fit(self, until: float | None) -> None:
+        """Run every stage on the measurements until then [s after the first command].
+
+        Raises:
+            TuneError: No stage has any free parameter.
+        """
+        for plan in self.plans:
+            self.stages.append(run_stage(self.runs, self.best, plan, until, self._notify("searching")))
+            self.best = self.stages[-1].best.config
+        if not any(stage.free for stage in self.stages):
+            raise TuneError("everything that could be fitted is fixed: nothing to fit")
+
+    def repeat(self) -> None:
+        """Run every stage once more, on all measurements."""
+        for number, stage in enumerate(self.stages):
+            more = repeat_stage(stage, self.runs, self.best, self._notify("fitting on the whole run"))
+            self.stages[number], self.best = more, more.best.config
+
+    def likelihood(self) -> Likelihood:
+        """The likelihood of the last stage's measurements, of whole runs."""
+        plan = self.stages[-1].plan if self.stages else Plan((), ())
+        return likelihood_of(self.runs, self.config, plan)
+
+    def keep_the_better(self) -> None:
+        """Go back to the configuration as given if it is more likely: with gates the search may pass worse points."""
+        likelihood = self.likelihood()
+        before, after = (
+            likelihood.evaluate(with_gates_of(config, likelihood.config)).total
+            for config in (self.config, self.result())
+        )
+        if after < before - _NOTHING:
+            self.best, self.kept = self.config, True
+            self.stages = [reset_stage(stage, self.config) for stage in self.stages]
+
+    def result(self) -> FusionConfig:
+        """The best configuration: gates as given, numbers rounded, noise that gains nothing set to 0."""
+        best = with_gates_of(self.best, self.config)
+        for stage in self.stages:
+            mine = [one for one in stage.free if one.given(best) is not None]
+            for one in mine:
+                best = one.put(best, one.clipped(rounded(one.get(best))))
+            for one in mine:
+                if one.vanishes and one.at_bound(best) == "lower":
+                    none = one.put(best, 0.0)
+                    with_it, without = (
+                        stage.likelihood.evaluate(with_gates_of(config, stage.likelihood.config)).total
+                        for config in (best, none)
+                    )
+                    if with_it - without < _NOTHING:
+                        best = none
+        return best
+
+    def _notify(self, what: str) -> Notify:
+        def notify(found: Point) -> None:
+            self.best = found.config
+            self.progress(what, found)
+
+        return notify
 
 
 def _same(run: Run, other: Run) -> bool:
@@ -161,68 +252,44 @@ def _same(run: Run, other: Run) -> bool:
     )
 
 
-def _held_back(run: Run) -> float | None:
-    """From when on a single run is held back [s after the first command]; None where its clock was set back."""
+def _fitted_until(run: Run) -> float | None:
+    """Where the part for validation begins [s after the first command]; None where the clock was set back."""
     if len(segments(run)[0]) > 1:
         return None
     stamp = run.command.stamp[run.command.stamp != NO_STAMP]
-    return _LEARNT * float(stamp.max() - stamp.min()) / 1e9
+    return _FITTED_ON * float(stamp.max() - stamp.min()) / 1e9
 
 
-def _likelihoods(evidence: Evidence, before: FusionConfig, after: FusionConfig) -> dict[str, Likelihood]:
-    old, new = (evidence.value(with_gates_of(config, evidence.config)).axes for config in (before, after))
+def _likelihoods(likelihood: Likelihood, before: FusionConfig, after: FusionConfig) -> dict[str, AxisLikelihood]:
+    old, new = (likelihood.evaluate(with_gates_of(config, likelihood.config)).axes for config in (before, after))
     return {
-        axis: Likelihood(components=int(evidence.count[n]), before=float(old[n]), after=float(new[n]))
-        for n, axis in enumerate(evidence.axes)
-        if evidence.count[n]
+        axis: AxisLikelihood(components=int(likelihood.count[n]), before=float(old[n]), after=float(new[n]))
+        for n, axis in enumerate(likelihood.axes)
+        if likelihood.count[n]
     }
 
 
 def _with_provenance(
-    config: FusionConfig, intervals: Mapping[str, ConfidenceInterval], runs: Sequence[str]
+    config: FusionConfig, free: Sequence[Parameter], intervals: Mapping[str, ConfidenceInterval], runs: list[str]
 ) -> FusionConfig:
-    """The arm with the intervals of what was fitted, and where it is from."""
-    axes: dict[str, AxisModel] = {}
-    for axis, model in config.arm.axes.items():
-        found = {
-            key.removeprefix(f"axes.{axis}."): one.ci95
-            for key, one in intervals.items()
-            if key.startswith(f"axes.{axis}.")
-        }
-        for key, ci95 in found.items():
-            interval = tuple(rounded(end) for end in ci95)
-            match key:
-                case "delay_ms":
-                    model = _replace(model, delay_ci95=interval)
-                case "gain.intercept":
-                    model = _replace(model, gain=_replace(model.gain, intercept_ci95=interval))
-                case "gain_recovery_ms":
-                    model = _replace(model, gain_recovery_ci95=interval)
-                case _:
-                    name = key.removesuffix("_ms").removesuffix("_rad_s")
-                    model = _replace(model, plant=_replace(model.plant, **{f"{name}_ci95": interval}))
-        axes[axis] = model
-    tuned = any(key.startswith("axes.") for key in intervals)
-    provenance = {**config.arm.provenance, "tuned_on": list(runs)} if tuned else config.arm.provenance
-    return _replace(config, arm=_replace(config.arm, axes=axes, provenance=provenance))
+    """The configuration with the intervals of the arm's parameters, and the runs they were fitted on."""
+    arm = [one for one in free if one.path[0] == "arm" and one.key in intervals]
+    for one in arm:
+        low, high = intervals[one.key].ci95
+        config = changed(config, (*one.path[:-1], f"{one.path[-1]}_ci95"), (rounded(low), rounded(high)))
+    return changed(config, ("arm", "provenance", "tuned_on"), runs) if arm else config
 
 
-def _notes(course: Course, validation: Sequence[Check] | None, interrupted: bool, known: bool) -> list[str]:
-    """Everything noticed, each once; ``known``: what was validated on had been learnt from."""
-    found = [note for lesson in course.lessons for note in (*lesson.evidence.notes, *lesson.notes)]
-    if course.kept:
-        found.append("nothing more likely was found than the configuration as given, which is kept")
-    if interrupted:
-        found.append(
-            "interrupted: these are the best numbers until then, and not all of them were asked how sure they are"
-        )
-    elif validation is None:
-        found.append(
-            "nothing was held back to validate on (--validate RUN): nothing says whether the numbers hold elsewhere"
-        )
+def _validation_notes(validation: Sequence[Check] | None, known: bool, interrupted: bool) -> list[str]:
+    """What to know of the validation; ``known``: it was on a run that was fitted on."""
+    unknown = "nothing says whether the numbers hold elsewhere"
+    notes = [f"{one.run}, {one.axis}: {one.verdict}" for one in validation or () if one.worse]
+    if validation is None and not interrupted:
+        notes.append(f"no run was left to validate on (--validate RUN): {unknown}")
     if known and validation:
-        found.append("validated on a run that was learnt from: nothing says whether the numbers hold elsewhere")
+        notes.append(f"validated on a run that was fitted on: {unknown}")
     if validation == []:
-        found.append("what was held back has no measurement of a sensor that is used: nothing says whether it helped")
-    found += [f"{one.run}, {one.axis}: {one.verdict}" for one in validation or () if one.worse]
-    return list(dict.fromkeys(found))
+        notes.append(
+            "the part to validate on has no measurement of a sensor that is used: nothing says whether it helped"
+        )
+    return notes

@@ -13,7 +13,7 @@ from ..filter.outcome import Outcome
 from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates
 from ..fusion.score import Z95
-from ..tuning.profile import Profile
+from ..tuning.intervals import Profile
 from ..tuning.summary import Fitted
 from . import colours as style
 from .canvas import drawing
@@ -28,7 +28,7 @@ _DEEPEST = -6.2  # of a profile; what lies below −5 has room for the number be
 
 
 def profiles(found: Sequence[Profile], fitted: Mapping[str, Fitted]) -> str:
-    """How the log-likelihood drops along each parameter, with its 95 % interval and where it was before."""
+    """Draw the log-likelihood along each parameter, with its 95 % interval and its value before, as SVG text."""
     rows = -(-len(found) // _COLUMNS)
     with drawing(_COLUMNS, rows, width=_WIDTH, height=1.95, room=(0.45, 0.3, 0.42)) as sheet:
         for axes, one in zip(sheet.axes, found, strict=False):
@@ -41,7 +41,7 @@ def profiles(found: Sequence[Profile], fitted: Mapping[str, Fitted]) -> str:
 
 
 def innovations(before: Estimates, after: Estimates, sensor: str, axis: str) -> str:
-    """One sensor's normalised innovations on one axis before and after, and their autocorrelations."""
+    """Draw a sensor's normalised innovations on an axis before and after, with autocorrelations, as SVG text."""
     colour = style.sensor_colours(after.measurements.sensors)[sensor]
     with drawing(3, width=_WIDTH, height=2.2, ratios=(2.2, 2.2, 1.0), room=(0.6, 0.45, 0.25)) as sheet:
         *series, correlation = sheet.axes
@@ -86,7 +86,7 @@ def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
 
 
 def _smooth(one: Profile) -> tuple[FloatArray, FloatArray]:
-    """A curve through a profile's points: the root of what it drops is nearly a straight line."""
+    """A curve through a profile's points: the root of its drop is nearly a straight line."""
     peak = int(np.argmax(one.drop))
     root: FloatArray = np.sqrt(one.drop[peak] - one.drop) * np.sign(np.arange(len(one.drop)) - peak)
     places: FloatArray = np.log(one.values) if one.log else one.values
@@ -95,7 +95,7 @@ def _smooth(one: Profile) -> tuple[FloatArray, FloatArray]:
 
 
 def _before(axes: Axes, before: float, low: float, high: float) -> None:
-    """A tick at the number before, or its value and the way to it where it lies outside."""
+    """Draw a tick at the value before, or an arrow and the value where it lies outside."""
     if low <= before <= high:
         axes.plot([before, before], [_DEEPEST, -5.0], color=style.REJECTED, lw=1.6)
         return
@@ -120,7 +120,7 @@ def _cut(text: str) -> str:
 
 
 def _correlations(axes: Axes, tests: Sequence[Consistency | None], colours: Sequence[str]) -> None:
-    """Autocorrelations before and after side by side, with the band of the better known."""
+    """Draw autocorrelations before and after side by side, with the narrower band of the two."""
     highest, band = 0.12, 1.0
     for number, (one, colour) in enumerate(zip(tests, colours, strict=True)):
         if one is not None:

@@ -1,9 +1,9 @@
-"""Did it help? A configuration before and after tuning, on measurements that it was not tuned on."""
+"""Validation: a configuration before and after tuning, on measurements that it was not fitted on."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import msgspec
@@ -14,7 +14,7 @@ from ..errors import PumafuseWarning
 from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
 from ..fusion.consistency import consistency, densities_of
-from ..fusion.estimates import Estimates
+from ..fusion.estimates import Estimates, Measurements
 from ..fusion.offline import fuse
 from ..fusion.score import Z95, interpolated, score
 from ..fusion.track import AxisEstimate
@@ -64,10 +64,10 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         run: The run's name.
         axis: The axis.
-        since_s: From when on, where only a run's end was held back; else 0.
-        components: How many were met.
-        before: With the configuration as given.
-        after: As tuned.
+        since_s: Where the part to validate on begins; 0: at the run's begin.
+        components: The number of components compared.
+        before: Under the configuration as given.
+        after: Under the tuned one.
         worse: Whether it got worse.
         verdict: In words.
     """
@@ -82,24 +82,24 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
     verdict: str
 
 
-def check(
-    run: Run, before: FusionConfig, after: FusionConfig, sensors: Sequence[str] | None = None, since: float = 0.0
-) -> list[Check]:
+def fused(run: Run, config: FusionConfig) -> Estimates:
+    """The estimates of a run without its warnings, which ``fuse`` reports."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PumafuseWarning)
+        return fuse(run, config)
+
+
+def check(run: Run, before: FusionConfig, after: FusionConfig, since: float = 0.0) -> list[Check]:
     """Compare two configurations on a run.
 
     Args:
-        run: Held back from tuning, at least from ``since`` on.
+        run: Not fitted on, at least not from ``since`` on.
         before: The configuration as given.
-        after: As tuned.
-        sensors: Which to use; all for None.
+        after: The tuned one.
         since: Count only from then on [s after the first command]; the filter runs from the beginning.
     """
-    pair: list[Estimates] = []
-    for config in (before, after):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PumafuseWarning)  # they are the run's, and `fuse` says them
-            pair.append(_from(fuse(run, config, sensors=sensors), since))
-    return [_axis(run.name, axis, since, *pair) for axis in pair[0].axes if _heard(pair[0], axis)]
+    pair = [_from(fused(run, config), since) for config in (before, after)]
+    return [_check(run.name, axis, since, *pair) for axis in pair[0].axes if len(_of_axis(pair[0], axis).value)]
 
 
 def _from(est: Estimates, since: float) -> Estimates:
@@ -115,11 +115,11 @@ def _from(est: Estimates, since: float) -> Estimates:
     return replace(est, time=est.time[late], segment=est.segment[late], axes=axes, measurements=measurements)
 
 
-def _heard(est: Estimates, axis: str) -> bool:
-    return bool((est.measurements.axis == est.measurements.axes.index(axis)).any())
+def _of_axis(est: Estimates, axis: str) -> Measurements:
+    return est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
 
 
-def _axis(run: str, axis: str, since: float, before: Estimates, after: Estimates) -> Check:
+def _check(run: str, axis: str, since: float, before: Estimates, after: Estimates) -> Check:
     old, new, gains = _state(before, axis), _state(after, axis), _gains(before, after, axis)
     gained, chance = float(gains.sum()), Z95 * float(np.sqrt(np.sum(gains**2)))
     closer = None if old.rmse_mm is None or new.rmse_mm is None else new.rmse_mm / max(old.rmse_mm, 1e-12)
@@ -127,31 +127,25 @@ def _axis(run: str, axis: str, since: float, before: Estimates, after: Estimates
         closer > _FAR_WORSE or (closer > _WORSE and _beyond_chance(_squares(after, axis) - _squares(before, axis)))
     )
     worse = gained < -chance or farther
-    said = f"log-likelihood {gained:+.1f} (chance: ± {chance:.1f})"
+    verdict = f"log-likelihood {gained:+.1f} (chance: ± {chance:.1f})"
     if closer is not None:
-        said += f", RMSE {100.0 * (closer - 1.0):+.1f} %"
-    verdict = f"{'worse' if worse else 'better' if gained > chance else 'no different'}: {said}"
+        verdict += f", RMSE {100.0 * (closer - 1.0):+.1f} %"
+    verdict = f"{'worse' if worse else 'better' if gained > chance else 'no different'}: {verdict}"
+    count = len(gains)
     return Check(
-        run=run,
-        axis=axis,
-        since_s=since,
-        components=len(gains),
-        before=old,
-        after=new,
-        worse=worse,
-        verdict=verdict,
+        run=run, axis=axis, since_s=since, components=count, before=old, after=new, worse=worse, verdict=verdict
     )
 
 
 def _squares(est: Estimates, axis: str) -> FloatArray:
-    """Squared errors on the reference [m²], NaN where it says nothing, (n,)."""
+    """Squared errors on the reference [m²], NaN where it has a gap, (n,)."""
     if est.reference is None:
         return np.zeros(len(est.time))
     return (est[axis].position - interpolated(est.time, est.segment, est.reference, axis)) ** 2
 
 
 def _beyond_chance(growth: FloatArray) -> bool:
-    """Whether a mean is above 0 by more than chance; neighbours go together, so means of batches are compared."""
+    """Whether a mean is above 0 by more than chance; neighbours are correlated, so means of batches are compared."""
     means = [float(batch.mean()) for batch in np.array_split(growth[np.isfinite(growth)], _BATCHES) if len(batch)]
     if len(means) < 2:
         return True
@@ -159,13 +153,13 @@ def _beyond_chance(growth: FloatArray) -> bool:
 
 
 def _gains(before: Estimates, after: Estimates, axis: str) -> FloatArray:
-    """What each component's log density gained, of those that both met, (m,).
+    """The gain in log density of each component that both configurations decided on, (m,).
 
-    Were both as good, the sum would have a variance of about Σ gain² (Vuong, Econometrica 57, 1989).
+    If both are equally good, the sum has a variance of about Σ gain² (Vuong, Econometrica 57, 1989).
     """
     found: list[dict[int, float]] = []
     for est in (before, after):
-        mine = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
+        mine = _of_axis(est, axis)
         keys = np.rint(mine.stamp * 1e6).astype(np.int64) * len(mine.sensors) + mine.sensor
         found.append(dict(zip(keys.tolist(), densities_of(mine, est.config.sensors).tolist(), strict=True)))
     old, new = found
@@ -173,7 +167,7 @@ def _gains(before: Estimates, after: Estimates, axis: str) -> FloatArray:
 
 
 def _state(est: Estimates, axis: str) -> State:
-    mine = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
+    mine = _of_axis(est, axis)
     found = None
     if est.reference is not None and len(est.time):
         found = score(est.time, est.segment, est[axis].position, est[axis].position_sd, est.reference, axis)

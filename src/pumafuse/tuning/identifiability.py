@@ -1,0 +1,210 @@
+"""Excitation and identifiability: whether runs can be fitted at all, and what their measurements do not determine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..errors import PumafuseError
+from ..fusion.config import FusionConfig
+from ..units import MM
+from .likelihood import Likelihood
+from .maximise import Point, derivatives
+from .parameters import Parameter, smallest_sd
+
+_FEWEST = 30  # components of an axis, or of a sensor whose correlation with the commands is tested
+_EXCITED = 3.0  # commanded motion over noise from which an axis moves
+_FOLLOWS = 0.5  # least correlation of measurements with the response to the commands
+_RATIO = (0.1, 10.0)  # bounds of a sensor's motion over the commanded one
+_TESTED = 10.0  # motion over scatter from which a sensor is tested
+_HIGH = 0.9  # a correlation worth reporting
+_MEMBER = 0.3  # share of the largest weight, from which a parameter belongs to a combination
+_FIXED_FIRST = ("latency", "gain", "plant", "delay")  # which kind of a combination is fixed before the next
+
+
+class TuneError(PumafuseError):
+    """Recorded runs that nothing can be fitted to."""
+
+
+@dataclass(frozen=True)
+class NotIdentifiable:
+    """A combination of parameters that the measurements do not determine.
+
+    Attributes:
+        members: Their keys, those that change most first.
+        fixed: Which of them was fixed for that reason.
+    """
+
+    members: tuple[str, ...]
+    fixed: str
+
+    def __str__(self) -> str:
+        """A sentence for notes."""
+        others = ", ".join(key for key in self.members if key != self.fixed)
+        return f"{self.fixed} is fixed: not identifiable" + (f" apart from {others}" if others else "")
+
+
+# ---- excitation -----------------------------------------------------------------------------------------------------
+
+
+def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
+    """The axes that are measured and commanded to move by more than the noise.
+
+    Raises:
+        TuneError: There are too few measurements, no axis moves, or a sensor does not follow the commands at all.
+    """
+    for axis, count in zip(likelihood.axes, likelihood.count.tolist(), strict=True):
+        if 0 < count < _FEWEST:
+            raise TuneError(f"{axis}: only {count} measurements; a fit needs at least {_FEWEST}")
+    if not likelihood.count.any():
+        raise TuneError("no measurement of a configured sensor lies within the runs: nothing to fit to")
+    found: list[str] = []
+    for axis, names in likelihood.sensors.items():
+        noise = min(likelihood.scatter.get(f"sensors.{name}.sd_mm.{axis}", 0.0) for name in names)
+        if likelihood.travel[axis] > _EXCITED * noise:
+            found.append(axis)
+    if not found:
+        widest = max(likelihood.travel.values()) * MM
+        raise TuneError(
+            f"no axis is commanded to move by more than its sensors' noise (at most {widest:.3g} mm): an arm at rest"
+            " cannot be identified; record a run with motion"
+        )
+    for name, share in likelihood.share_after_end.items():
+        if share > 0.5:
+            raise TuneError(
+                f"sensor '{name}': {share:.0%} of its measurements lie more than 1 s after the last command: are both"
+                " stamped by one clock?"
+            )
+    for (name, axis), (expected, measured) in likelihood.responses(config).items():
+        scatter = likelihood.scatter.get(f"sensors.{name}.sd_mm.{axis}", 0.0)
+        if axis in found and len(measured) >= _FEWEST and np.ptp(expected) >= _TESTED * scatter:
+            _check_follows(name, axis, expected, measured)
+    return found
+
+
+def _check_follows(name: str, axis: str, expected: FloatArray, measured: FloatArray) -> None:
+    """Refuse a sensor that does not follow the response to its commands, or moves much more or less, (m,)."""
+    distance = np.abs(measured - expected)
+    near = distance <= 10.0 * np.median(distance) + 1e-12  # without outliers
+    expected, measured = expected[near], measured[near]
+    power = float(np.sqrt(np.sum(expected**2) * np.sum(measured**2)))
+    correlation = float(np.sum(expected * measured)) / power if power > 0.0 else 0.0
+    if correlation < _FOLLOWS:
+        what = "moves against" if correlation < -_FOLLOWS else "does not follow"
+        raise TuneError(
+            f"sensor '{name}' {what} the commands of {axis} (correlation {correlation:+.2f}): is it that axis, is its"
+            " scale right (-1 for a distance that falls), are both stamped by one clock?"
+        )
+    ratio = correlation * float(np.sqrt(np.sum(measured**2) / np.sum(expected**2)))
+    if not _RATIO[0] < ratio < _RATIO[1]:
+        raise TuneError(
+            f"sensor '{name}' moves {ratio:.3g} times as far as the commands of {axis} and its scale say: is a unit"
+            " wrong?"
+        )
+
+
+# ---- identifiability ------------------------------------------------------------------------------------------------
+
+
+def covariance(information: FloatArray, free: Sequence[Parameter]) -> FloatArray:
+    """The covariance of the coordinates, (k, k), from the information (k, k); without information it is enormous."""
+    size = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12 / np.square([one.scale for one in free])))
+    values, vectors = np.linalg.eigh(information * np.outer(size, size))
+    return (vectors / np.maximum(values, 1e-12)) @ vectors.T * np.outer(size, size)
+
+
+def within_bounds(free: Sequence[Parameter], config: FusionConfig) -> list[Parameter]:
+    """The parameters that are at neither bound."""
+    return [one for one in free if one.at_bound(config) is None]
+
+
+def correlations(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> list[tuple[str, str, float]]:
+    """Pairs of parameters with a correlation beyond ± 0.9."""
+    inside = within_bounds(free, best.config)
+    if not inside:
+        return []
+    cov = covariance(derivatives(likelihood, best, inside).information, inside)
+    sd = np.sqrt(np.diag(cov))
+    matrix = cov / np.outer(sd, sd)
+    return [
+        (inside[i].key, inside[j].key, float(matrix[i, j]))
+        for i, j in zip(*np.tril_indices(len(inside), -1), strict=True)
+        if abs(matrix[i, j]) > _HIGH
+    ]
+
+
+def not_identifiable(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> NotIdentifiable | None:
+    """The least determined combination of delays, latencies, plants and gains, if it is not identifiable.
+
+    It is not where its standard deviation, without any prior, is more than a large change: a factor e, a tick of 28 ms,
+    a tenth of the gain. The one to fix is a latency first, that of the sensor with the least noise.
+    """
+    inside = within_bounds(free, best.config)
+    arm = [number for number, one in enumerate(inside) if one.fit != "noise"]
+    if not arm:
+        return None
+    found = likelihood.derivatives(best.config, inside, best.outcomes)
+    cov = covariance(found.information, inside)[np.ix_(arm, arm)]
+    scale = np.array([inside[number].scale for number in arm])
+    values, vectors = np.linalg.eigh(cov / np.outer(scale, scale))
+    if values[-1] < 1.0:
+        return None
+    weight = np.abs(vectors[:, -1])
+    order = [int(place) for place in np.argsort(-weight) if weight[place] > _MEMBER * weight.max()]
+    members = [inside[arm[place]] for place in order]
+    fixed = min(members, key=lambda one: (_FIXED_FIRST.index(one.fit), _noise_of(one, best.config), one.key))
+    return NotIdentifiable(tuple(one.key for one in members), fixed.key)
+
+
+def not_identifiable_noise(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> list[Parameter]:
+    """The noises of sensors that are uncertain by more than a factor of e, or at their lower bound."""
+    inside = within_bounds(free, best.config)
+    sd = np.sqrt(np.diag(covariance(derivatives(likelihood, best, inside).information, inside))) if inside else ()
+    wide = {one.key for one, spread in zip(inside, sd, strict=True) if spread > 1.0}
+    return [
+        one
+        for one in free
+        if one.fit == "noise" and not one.vanishes and (one.key in wide or one.at_bound(best.config) == "lower")
+    ]
+
+
+def shared_times(
+    sensors: Mapping[str, Sequence[str]], axes: Sequence[str], free: Sequence[Parameter], config: FusionConfig
+) -> list[NotIdentifiable]:
+    """The latencies to fix where delays are free too: all latencies less and all delays more by as much is the same.
+
+    One of each group of sensors and moving axes that are connected by measurements, unless a delay or a latency among
+    them is known; and that of each sensor which measures no axis that moves.
+
+    Args:
+        sensors: For each axis its sensors.
+        axes: Those that move.
+        free: The free parameters.
+        config: The latency of its most accurate sensor is fixed.
+    """
+    delays = {one.axis: one for one in free if one.fit == "delay"}
+    latencies = {one.sensor: one for one in free if one.fit == "latency"}
+    left = {axis: set(sensors[axis]) for axis in axes}
+    unmoved = [one.key for name, one in latencies.items() if not any(name in names for names in left.values())]
+    found = [NotIdentifiable((key,), key) for key in unmoved]
+    while left:
+        group = [next(iter(left))]
+        names = left.pop(group[0])
+        while joined := [axis for axis, others in left.items() if names & others]:
+            for axis in joined:
+                group.append(axis)
+                names |= left.pop(axis)
+        if all(axis in delays for axis in group) and all(name in latencies for name in names):
+            mine = [latencies[name] for name in sorted(names)]
+            fixed = min(mine, key=lambda one: _noise_of(one, config))
+            members = [*mine, *(delays[axis] for axis in group)]
+            found.append(NotIdentifiable(tuple(one.key for one in members), fixed.key))
+    return found
+
+
+def _noise_of(one: Parameter, config: FusionConfig) -> float:
+    """The least noise of the sensor of a parameter [m]; 0 where it has none."""
+    return 0.0 if one.sensor is None else smallest_sd(config, one.sensor)

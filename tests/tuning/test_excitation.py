@@ -1,0 +1,195 @@
+"""Runs that nothing can be fitted to are refused in one line that gives the reason and the remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.logs.run import Source
+from tuning_runs import fit_stage, later, outage, quietly, scenario, spoiled
+
+
+def changed(name: str, change: Callable[[Source], Source]) -> pf.Run:
+    """A run of tracker and camera with one of them changed."""
+    run = outage(1).run
+    return replace(run, sensors={**run.sensors, name: change(run.sensors[name])})
+
+
+def refused(runs: Sequence[pf.Run], **more: object) -> str:
+    """The message of the error."""
+    with pytest.raises(pf.PumafuseError) as error:
+        quietly(lambda: pf.tune(runs, outage(1).config, **more))
+    line = str(error.value)
+    assert len(line.splitlines()) == 1 and len(line) < 250
+    return line
+
+
+def scaled(factor: float) -> Callable[[Source], Source]:
+    return lambda one: replace(one, values={axis: factor * value for axis, value in one.values.items()})
+
+
+def delayed(seconds: float) -> Callable[[Source], Source]:
+    return lambda one: replace(one, stamp=one.stamp + round(seconds * 1e9))
+
+
+def exchanged(one: Source) -> Source:
+    """Its axes are mixed up."""
+    tangential, vertical = one.values.values()
+    return replace(one, values={"tangential": vertical, "vertical": tangential})
+
+
+# ---- too little -----------------------------------------------------------------------------------------------------
+
+
+def test_no_run_and_no_measurement() -> None:
+    """No run, or no measurement: none of a configured sensor, only gaps, all before the first command."""
+    run, camera = outage(1).run, outage(1).run.sensors["vision"]
+    assert refused([]) == "no run to fit on"
+    nothing = "no measurement of a configured sensor lies within the runs: nothing to fit to"
+    gaps = replace(camera, values={axis: np.full(len(value), np.nan) for axis, value in camera.values.items()})
+    for sensors in ({}, {"eye": camera}, {"vision": gaps}, {"vision": delayed(-3600.0)(camera)}):
+        assert refused([replace(run, sensors=sensors)]) == nothing
+
+
+def test_a_run_given_twice_and_nothing_free() -> None:
+    """Measurements must not count twice; fixing everything leaves nothing to fit."""
+    run = outage(1).run
+    assert refused([run, run]) == f"run '{run.name}' is given twice: its measurements would count twice"
+    assert refused([run], fit=["delay"], fix=["delay_ms"]) == "everything that could be fitted is fixed: nothing to fit"
+
+
+def test_too_few_measurements() -> None:
+    """Fewer than 30 of an axis are refused, counted over all runs."""
+    run, camera = outage(1).run, outage(1).run.sensors["vision"]
+    few = replace(run, sensors={"vision": camera.rows(slice(0, 29))})
+    assert refused([few], validate=run) == "tangential: only 29 measurements; a fit needs at least 30"
+    assert len(fit_stage([few, few], outage(1).config).free) > 0
+
+
+def test_no_motion() -> None:
+    """Commands that stay, or move by less than the noise, are refused with their range."""
+    run, rng = outage(1).run, np.random.default_rng(1)
+    camera = run.sensors["vision"]
+    noise = {axis: 5e-4 * rng.standard_normal(len(value)) for axis, value in camera.values.items()}
+    for far in (0.0, 1e-3):
+        values = {axis: far / np.ptp(value) * value for axis, value in run.command.values.items()}
+        still = replace(run, command=replace(run.command, values=values))
+        line = refused([replace(still, sensors={"vision": replace(camera, values=noise)})])
+        assert line.startswith("no axis is commanded to move by more than its sensors' noise")
+        assert f"(at most {1e3 * far:.3g} mm)" in line
+        assert line.endswith("record a run with motion")
+
+
+def test_of_an_axis_at_rest_only_the_noise_is_fitted() -> None:
+    """Beside a moving axis, with a note: no maneuver noise, no delay and no plant; its sds as good as the other's."""
+    sim = pf.simulate(scenario("panel-tracker-outage", 0.2, 0.0), 1)
+    found = fit_stage(sim.run, spoiled(sim.config), ("noise", "delay"))
+    assert list(found.notes) == ["vertical: does not move; only its noise at rest was fitted"]
+    keys = {one.key for one in found.free}
+    assert {key for key in keys if ".vertical" in key} == {
+        "process.vertical.input_noise_mm_rtHz",
+        "process.vertical.drift_mm_rts",
+        "sensors.tracker.sd_mm.vertical",
+        "sensors.vision.sd_mm.vertical",
+    }
+    assert {"axes.tangential.delay_ms", "process.tangential.maneuver_drift_mm_rts_per_m_s"} <= keys
+    best = found.best.config
+    assert best.arm.axes["vertical"] == sim.config.arm.axes["vertical"]
+    assert best.process["vertical"].maneuver_drift == spoiled(sim.config).process["vertical"].maneuver_drift
+    for name, sd in (("tracker", 5e-5), ("vision", 5e-4)):
+        assert best.sensors[name].sd_of("vertical") == pytest.approx(sd, rel=0.2)
+
+
+# ---- sensors that do not follow the commands ------------------------------------------------------------------------
+
+AGAINST = "moves against the commands of tangential (correlation -1.00): is it that axis, is its scale right (-1 for"
+FAULTS: dict[str, tuple[str, Callable[[Source], Source], str]] = {
+    "sign": ("vision", scaled(-1.0), AGAINST),
+    "sign of the better one": ("tracker", scaled(-1.0), AGAINST),
+    "metres as mm": ("tracker", scaled(1e-3), "moves 0.001 times as far as the commands of tangential"),
+    "cm as m": ("tracker", scaled(100.0), "moves 100 times as far as the commands of tangential"),
+    "axes exchanged": ("vision", exchanged, "does not follow the commands of"),
+    "frozen": ("vision", scaled(0.0), "does not follow the commands of tangential"),
+    "clock 2 s behind": ("vision", delayed(-2.0), "are both stamped by one clock?"),
+    "clock 1 s ahead": ("vision", delayed(1.0), "are both stamped by one clock?"),
+}
+
+
+@pytest.mark.parametrize(("name", "fault", "line"), FAULTS.values(), ids=FAULTS.keys())
+def test_a_sensor_that_does_not_follow_is_refused(name: str, fault: Callable[[Source], Source], line: str) -> None:
+    """Its name and the likely reason are in the message."""
+    message = refused([changed(name, fault)])
+    assert message.startswith(f"sensor '{name}' ") and line in message
+
+
+def test_a_sensor_with_a_configured_scale_is_not_refused() -> None:
+    """The same measurements with the scale in the configuration, and with a large constant."""
+    run = changed("vision", lambda one: replace(one, values={a: 0.7 - v for a, v in one.values.items()}))
+    config = outage(1).config
+    camera = pf.Sensor(sd=5e-4, latency=0.045, scale=-1.0, bias_sd=1.0)
+    found = fit_stage(run, pf.FusionConfig(arm=config.arm, sensors={**config.sensors, "vision": camera}))
+    assert found.best.config.sensors["vision"].sd_of("tangential") == pytest.approx(5e-4, rel=0.2)
+
+
+@pytest.mark.parametrize("seconds", [-10.0, 10.0, later(3600.0)])
+def test_a_sensor_whose_clock_is_far_off_is_named(seconds: float) -> None:
+    """All its measurements before the first or after the last command: refused, or a note with the reason."""
+    run = changed("vision", delayed(seconds))
+    try:
+        notes = quietly(lambda: pf.tune([run], outage(1).config, fix=["process"])).summary.notes
+    except pf.PumafuseError as error:
+        notes = [str(error)]
+    assert any("vision" in note and "command" in note for note in notes), notes
+
+
+def test_outliers_do_not_make_a_sensor_fail() -> None:
+    """A camera with a tenth of its measurements metres off still follows the commands."""
+    rng = np.random.default_rng(2)
+
+    def wild(one: Source) -> Source:
+        off = np.where(rng.random(len(one.stamp)) < 0.1, 5.0, 0.0)
+        return replace(one, values={axis: value + off for axis, value in one.values.items()})
+
+    found = fit_stage(changed("vision", wild), spoiled(outage(1).config))
+    assert found.best.config.sensors["vision"].sd_of("vertical") == pytest.approx(5e-4, rel=0.25)
+
+
+@pytest.mark.parametrize("share", [0.6, 0.9])
+def test_an_axis_that_rests_most_of_the_time_is_followed(share: float) -> None:
+    """A tracker that shows the simulated arm, which moves by 20 mm once: after 60 to 90 % of the run."""
+    count, rng = 400, np.random.default_rng(1)
+    command = np.clip(0.004 * (np.arange(count) - share * count), 0.0, 0.02)
+    time = 0.028 * np.arange(count)
+    arm = outage(1).config.arm
+    bare = pf.FusionConfig(arm=arm)
+    position = pf.fuse(pf.Run.from_arrays(time, {"radial": command}), bare, rate=100.0)["radial"].position
+    measured = position + 5e-5 * rng.standard_normal(len(position))
+    stamp = 0.01 * np.arange(len(measured))
+    run = pf.Run.from_arrays(time, {"radial": command}, {"tracker": (stamp, {"radial": measured})})
+    best = fit_stage(run, pf.FusionConfig(arm=arm, sensors={"tracker": pf.Sensor(sd=5e-5)})).best.config
+    assert best.sensors["tracker"].sd_of("radial") == pytest.approx(5e-5, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "fit", [("noise",), later(("noise", "latency")), later(("noise", "delay", "plant"))], ids="-".join
+)
+def test_an_axis_without_measurements_is_left_as_it_is(fit: Sequence[str]) -> None:
+    """Its numbers stay, those of the other axis are fitted as without it."""
+    run, config = outage(1).run, spoiled(outage(1).config)
+    sensors = {name: replace(one, values={"tangential": one.values["tangential"]}) for name, one in run.sensors.items()}
+    found = quietly(lambda: pf.tune([replace(run, sensors=sensors)], config, fit=fit))
+    assert not [one.key for one in found.summary.parameters if "vertical" in one.key]
+    assert found.config.process["vertical"] == config.process["vertical"]
+    assert found.config.arm.axes["vertical"] == config.arm.axes["vertical"]
+    command = replace(run.command, values={"tangential": run.command.values["tangential"]})
+    alone = replace(
+        run, command=command, sensors=sensors, reference=None, start={"tangential": run.start["tangential"]}
+    )
+    other = quietly(lambda: pf.tune([alone], config, fit=fit))
+    for one, same in zip(found.summary.parameters, other.summary.parameters, strict=True):
+        assert one.key == same.key
+        assert one.value == pytest.approx(same.value, rel=1e-4, abs=1e-9)

@@ -1,0 +1,153 @@
+"""Correlated and not identifiable parameters are named, and values at a bound are reported."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pumafuse as pf
+from pumafuse.tuning.identifiability import correlations, covariance, not_identifiable, shared_times
+from pumafuse.tuning.likelihood import Likelihood
+from pumafuse.tuning.maximise import point
+from pumafuse.tuning.parameters import Parameter, parameters
+from tuning_runs import fit_stage, free_of, outage, quietly, scenario, with_outliers, with_sensors
+
+ARM = pf.ArmModel.load("puma560-internal")
+CONFIG = pf.FusionConfig(arm=ARM, sensors={"tracker": pf.Sensor(sd=5e-5)})
+
+
+def free(count: int) -> list[Parameter]:
+    return parameters(CONFIG, CONFIG, {"radial": ["tracker"], "vertical": ["tracker"]}, ("noise",))[:count]
+
+
+@settings(derandomize=True, deadline=None)
+@given(st.integers(1, 6), st.integers(0, 2**32 - 1))
+def test_a_covariance_is_the_inverse_of_the_information(count: int, seed: int) -> None:
+    """However far its scales are apart: I C = 1 to 1e-6."""
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((count, count + 2))
+    scale = 10.0 ** rng.uniform(-2.0, 4.0, count)
+    information = root @ root.T * np.outer(scale, scale)
+    found = covariance(information, free(count))
+    unity = (information @ found) * np.outer(1.0 / scale, scale)
+    np.testing.assert_allclose(unity, np.eye(count), atol=1e-6)
+
+
+def test_without_information_the_variance_is_enormous() -> None:
+    """Of a parameter without information, and of the difference of two with information on their sum alone."""
+    found = covariance(np.diag([4.0, 0.0]), free(2))
+    assert found[0, 0] == pytest.approx(0.25) and found[1, 1] > 1e10
+    found = covariance(np.array([[1.0, 1.0], [1.0, 1.0]]), free(2))
+    together, apart = np.array([1.0, 1.0]), np.array([1.0, -1.0])
+    assert apart @ found @ apart > 1e10
+    assert together @ found @ together == pytest.approx(1.0, rel=1e-3)
+
+
+def test_a_parameter_at_a_bound_is_reported() -> None:
+    """A noise of 0 is not significant. A delay that belongs beyond its bound: the model does not fit."""
+    sim = outage(1)
+    still = [
+        f"process.{axis}.{key}"
+        for axis in ("tangential", "vertical")
+        for key in ("input_noise_mm_rtHz", "drift_mm_rts")
+    ]
+    found = quietly(lambda: pf.tune([sim.run], sim.config, fix=[*still, "sd_mm"]))
+    none = [one for one in found.summary.parameters if one.value == 0.0]
+    assert none and all(one.notes == "not significant" and one.ci95[0] == 0.0 for one in none)
+    assert all(one.ci95[1] is not None and one.ci95[1] > 0.0 for one in none)
+    sim = pf.simulate(scenario("panel-tracker-outage", 0.1, 0.06), 1)
+    early = with_sensors(sim.config, latency=0.12)  # by more than the arm is late
+    found = quietly(lambda: pf.tune([sim.run], early, fit=["delay"]))
+    for one in found.summary.parameters:
+        assert one.ci95[0] is None and one.notes.startswith("at its lower bound (0"), one
+
+
+def test_pairs_beyond_nine_tenths_are_named() -> None:
+    """Delay and time constant by a camera alone: the correlations of the inverted information, no others."""
+    sim = with_outliers(1)
+    found = fit_stage(sim.run, sim.config, ("noise", "delay", "plant"))
+    inside = [one for one in found.free if one.at_bound(found.best.config) is None]
+    information = found.likelihood.derivatives(found.best.config, inside, found.best.outcomes).information
+    inverse = np.linalg.inv(information)
+    sd = np.sqrt(np.diag(inverse))
+    matrix = inverse / np.outer(sd, sd)
+    wanted = {
+        frozenset((inside[i].key, inside[j].key)): matrix[i, j]
+        for i in range(len(inside))
+        for j in range(i)
+        if abs(matrix[i, j]) > 0.9
+    }
+    named = correlations(found.likelihood, found.best, found.free)
+    assert {frozenset((one, other)): value for one, other, value in named} == pytest.approx(wanted, rel=1e-6)
+    assert frozenset(("axes.vertical.time_constant_ms", "axes.vertical.delay_ms")) in wanted
+
+
+def test_only_the_sum_of_delay_and_latency_is_identifiable() -> None:
+    """All of them are members, a latency is fixed; with it fixed, everything is identifiable."""
+    sim = outage(1)
+    likelihood = Likelihood([sim.run], sim.config)
+    every = free_of(likelihood, sim.config, ("noise", "delay", "latency"))
+    found = not_identifiable(likelihood, point(likelihood, sim.config, every), every)
+    assert found is not None and found.fixed == "sensors.tracker.latency_ms"
+    assert set(found.members) == {one.key for one in every if one.fit != "noise"}
+    sentence = str(found)
+    assert sentence.startswith("sensors.tracker.latency_ms is fixed: not identifiable apart from ")
+    assert all(key in sentence for key in found.members)
+    fixed = [one for one in every if one.key != found.fixed]
+    assert not_identifiable(likelihood, point(likelihood, sim.config, fixed), fixed) is None
+
+
+Sensors = dict[str, list[str]]
+GROUPS: dict[str, tuple[Sensors, list[str], list[str], list[tuple[str, set[str]]]]] = {
+    "all measure all": (
+        {"tangential": ["good", "poor"], "vertical": ["good", "poor"]},
+        ["tangential", "vertical"],
+        [],
+        [("good", {"good", "poor", "tangential", "vertical"})],
+    ),
+    "no axis in common": (
+        {"tangential": ["good"], "vertical": ["poor"]},
+        ["tangential", "vertical"],
+        [],
+        [("good", {"good", "tangential"}), ("poor", {"poor", "vertical"})],
+    ),
+    "connected by a third": (
+        {"tangential": ["good", "third"], "vertical": ["poor", "third"]},
+        ["tangential", "vertical"],
+        [],
+        [("good", {"good", "poor", "third", "tangential", "vertical"})],
+    ),
+    "a delay that is known": (
+        {"tangential": ["good", "poor"], "vertical": ["good"]},
+        ["tangential", "vertical"],
+        ["axes.tangential"],
+        [],
+    ),
+    "a latency that is known": ({"tangential": ["good", "poor"]}, ["tangential"], ["good.latency_ms"], []),
+    "an axis at rest": (
+        {"tangential": ["good"], "vertical": ["poor"]},
+        ["tangential"],
+        [],
+        [("poor", {"poor"}), ("good", {"good", "tangential"})],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("sensors_of", "moving", "fixed", "wanted"), GROUPS.values(), ids=GROUPS.keys())
+def test_one_latency_is_fixed_of_each_connected_group(
+    sensors_of: Sensors, moving: list[str], fixed: list[str], wanted: list[tuple[str, set[str]]]
+) -> None:
+    """Groups of sensors and moving axes that measurements connect, with all times free; the most accurate sensor's.
+
+    The latency of a sensor which measures nothing that moves is fixed alone.
+    """
+    sensors = {name: pf.Sensor(sd=sd) for name, sd in (("poor", 1e-3), ("third", 2e-3), ("good", 1e-4))}
+    config = pf.FusionConfig(arm=ARM, sensors=sensors)
+    every = parameters(config, config, sensors_of, ("delay", "latency"), fixed)
+    founds = shared_times(sensors_of, moving, every, config)
+    names = {f"axes.{axis}.delay_ms": axis for axis in sensors_of} | {
+        f"sensors.{name}.latency_ms": name for name in sensors
+    }
+    assert [(names[found.fixed], {names[key] for key in found.members}) for found in founds] == wanted
