@@ -42,5 +42,5 @@ def send(stream: rr.RecordingStream, path: str, time: FloatArray, value: FloatAr
     """
     there = np.isfinite(time) & np.isfinite(value)
     if there.any():
-        columns = rr.Components.columns(components=value[there])
+        columns = rr.Scalars.columns(scalars=value[there])
         rr.send_columns(path, [rr.TimeColumn(TIMELINE, duration=time[there])], columns, recording=stream)
