@@ -1,4 +1,4 @@
-"""What goes through the pipe from a live estimator to the process that draws: one header, then frames.
+"""Messages through the pipe from a live estimator to the process that draws: one header, then frames.
 
 Each is msgpack with its length before it. Times are seconds since the first event, everything else is SI.
 """
@@ -6,9 +6,11 @@ Each is msgpack with its length before it. Times are seconds since the first eve
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import BinaryIO
+from typing import BinaryIO, TypeAlias
 
 import msgspec
+
+Rows: TypeAlias = dict[str, list[tuple[float, ...]]]
 
 _LENGTH = 4  # bytes
 _LARGEST = 1 << 26  # bytes of a frame
@@ -48,36 +50,6 @@ class Header(msgspec.Struct):
     web_port: int
 
 
-class Series(msgspec.Struct, array_like=True):
-    """Values [m] at times [s]."""
-
-    time: list[float] = []
-    value: list[float] = []
-
-
-class Met(msgspec.Struct, array_like=True):
-    """One sensor's components [m] on one axis at their stamps [s], and which of them were rejected."""
-
-    time: list[float] = []
-    value: list[float] = []
-    rejected: list[bool] = []
-
-
-class Band(msgspec.Struct, array_like=True):
-    """Positions [m] with their standard deviations [m]."""
-
-    time: list[float] = []
-    position: list[float] = []
-    sd: list[float] = []
-
-
-class Path(msgspec.Struct, array_like=True):
-    """Positions in space [m]."""
-
-    time: list[float] = []
-    position: list[tuple[float, float, float]] = []
-
-
 class SensorsNow(msgspec.Struct, array_like=True):
     """NIS and rate [Hz] of the sensors that have them, at one time [s]."""
 
@@ -87,43 +59,28 @@ class SensorsNow(msgspec.Struct, array_like=True):
 
 
 class Frame(msgspec.Struct):
-    """What has come since the frame before.
+    """Everything since the frame before, as rows that begin with their time [s].
 
     Attributes:
-        commands: By axis.
-        measurements: By sensor and axis.
-        estimates: By axis.
-        paths: Of ``command``, ``estimate`` and sensors in x, y, z.
+        commands: By axis, rows with u [m].
+        measurements: By ``axis/sensor``, rows with z [m] and whether it was rejected (0 or 1).
+        estimates: By axis, rows with position and sd [m].
+        paths: By ``command``, ``estimate`` and sensors in x, y, z, rows with a position in space [m].
         health: Now and then.
     """
 
-    commands: dict[str, Series] = {}
-    measurements: dict[str, dict[str, Met]] = {}
-    estimates: dict[str, Band] = {}
-    paths: dict[str, Path] = {}
+    commands: Rows = {}
+    measurements: Rows = {}
+    estimates: Rows = {}
+    paths: Rows = {}
     health: SensorsNow | None = None
 
     def add(self, later: Frame) -> None:
-        """Take in what came after."""
-        for axis, series in later.commands.items():
-            mine = self.commands.setdefault(axis, Series())
-            mine.time += series.time
-            mine.value += series.value
-        for sensor, axes in later.measurements.items():
-            for axis, met in axes.items():
-                mine = self.measurements.setdefault(sensor, {}).setdefault(axis, Met())
-                mine.time += met.time
-                mine.value += met.value
-                mine.rejected += met.rejected
-        for axis, band in later.estimates.items():
-            mine = self.estimates.setdefault(axis, Band())
-            mine.time += band.time
-            mine.position += band.position
-            mine.sd += band.sd
-        for name, path in later.paths.items():
-            mine = self.paths.setdefault(name, Path())
-            mine.time += path.time
-            mine.position += path.position
+        """Add the rows of a later frame."""
+        for kind in ("commands", "measurements", "estimates", "paths"):
+            mine: Rows = getattr(self, kind)
+            for name, rows in getattr(later, kind).items():
+                mine.setdefault(name, []).extend(rows)
         self.health = later.health or self.health
 
 

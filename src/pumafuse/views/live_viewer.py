@@ -1,89 +1,84 @@
-"""The viewer that a live view draws into: started here, or found running; on this machine's loopback only."""
+"""The viewer that a live view draws into: started here, or found running; on this machine's loopback only.
+
+The web viewer's page would send usage statistics, ask for newer versions, examples and fonts, and has no switch for it.
+The browser keeps it from that when the page's policy says so; hence the page passes through :func:`_serve`.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import http.client
 import importlib.util
 import os
+import shutil
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import quote
 
-from . import live_page
 from .live_frames import Header
-from .live_page import HOST
 
+HOST = "127.0.0.1"
 _VIEWER_MEMORY = "1GiB"
 _BEHIND_VIEWER = "64MiB"  # of its own server, which only hands on
 _SERVER_MEMORY = "32MiB"  # what a browser gets that is opened later: more than the seconds that are shown
 _OPENED_WITHIN = 30.0  # s
-_FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 5.0  # s between looks for a viewer
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 5.0  # s between two tries to find a viewer
+_PASSED_ON = ("Content-Type", "rerun-final-length")  # headers of the page
+_WAIT = 30.0  # s for Rerun's own server
 
 
 class Viewer:
-    """Where to draw.
+    """The viewer, or the server of its page.
 
     Attributes:
-        url: For rerun-sdk.
-        own: The process of a viewer or a server started here; None for one that was running.
+        url: Where rerun-sdk draws.
     """
 
-    def __init__(self, header: Header, say: Callable[[str], None]) -> None:
+    def __init__(self, header: Header, report: Callable[[str], None]) -> None:
         """Start a viewer or a server, unless one is there; on free ports where the usual ones are taken."""
-        self.own: subprocess.Popen[bytes] | None = None
-        self._header, self._say, self._told = header, say, False
-        self._opened = False
+        self._own: subprocess.Popen[bytes] | None = None
+        self._mode, self._report, self._opened = header.mode, report, False
         self._port = header.port
-        if header.mode != "connect":
+        if self._mode != "connect":
             self._port = _free(header.port)
             self._web_port, self._behind = _free(header.web_port), _free(0)
-            self.own = _start(_arguments(header.mode, self._port, self._behind), keep=header.mode == "spawn")
+            self._own = _start(_arguments(self._mode, self._port, self._behind), keep=self._mode == "spawn")
         self.url = f"rerun+http://{HOST}:{self._port}/proxy"
 
     def wait(self) -> bool:
-        """Wait until the viewer listens, and say where it is; whether it ever will."""
-        begin, pause = time.monotonic(), _FIRST_PAUSE
-        while not _listens(self._port) or (self._header.mode == "web" and not _listens(self._behind)):
-            if self.own is None:
-                self._once(f"Rerun: no viewer listens at {self.url}; it is drawn into as soon as one does")
-            elif self.gone or time.monotonic() - begin > _OPENED_WITHIN:
-                self._say(f"Rerun: {self._missing()}; nothing is drawn")
+        """Wait until the viewer listens, and report where it is; whether it ever will."""
+        begin, pause, reported = time.monotonic(), _FIRST_PAUSE, False
+        while not _listens(self._port) or (self._mode == "web" and not _listens(self._behind)):
+            if self._own is None:
+                if not reported:
+                    self._report(f"Rerun: no viewer listens at {self.url}; it is drawn into as soon as one does")
+                reported, pause = True, min(2.0 * pause, _LONGEST_PAUSE)
+            elif self._own.poll() is not None or time.monotonic() - begin > _OPENED_WITHIN:
+                screen = "; is there a screen? --rerun web needs none" if self._mode == "spawn" else ""
+                why = "was closed" if self._opened else f"cannot be started{screen}"
+                self._report(f"Rerun: the viewer {why}; nothing is drawn")
                 return False
             time.sleep(pause)
-            pause = pause if self.own else min(2.0 * pause, _LONGEST_PAUSE)
-        self._told = False
-        if self.own is None or not self._opened:
-            self._say(f"Rerun: {self._found()}")
+        if self._mode == "web" and not self._opened:
+            _serve(self._web_port, self._behind, self._port)
+            self._report(f"Rerun: open http://{HOST}:{self._web_port}/?url={quote(self.url, safe='')}")
+        elif self._own is None or not self._opened:
+            self._report(f"Rerun: drawing into the viewer at {self.url}")
         self._opened = True
         return True
 
-    def _missing(self) -> str:
-        if self._opened:
-            return "the viewer was closed"
-        screen = "; is there a screen? --rerun web needs none" if self._header.mode == "spawn" else ""
-        return f"the viewer cannot be started{screen}"
-
-    def _found(self) -> str:
-        if self._header.mode != "web":
-            return f"drawing into the viewer at {self.url}"
-        live_page.serve(self._web_port, self._behind, self._port)
-        return f"open http://{HOST}:{self._web_port}/?url={quote(self.url, safe='')}"
-
-    @property
-    def gone(self) -> bool:
-        """Whether the viewer was started here and has ended."""
-        return self.own is not None and self.own.poll() is not None
-
     def end(self) -> None:
         """End a server started here; a viewer's window stays open."""
-        if self.own is not None and self._header.mode == "web":
-            self.own.terminate()
+        if self._own is not None and self._mode == "web":
+            self._own.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self.own.wait(0.3)
-            self.own.kill()
+                self._own.wait(0.3)
+            self._own.kill()
 
     def _once(self, text: str) -> None:
         if not self._told:
@@ -138,3 +133,39 @@ def _listens(port: int) -> bool:
     with contextlib.suppress(OSError), socket.create_connection((HOST, port), 0.5):
         return True
     return False
+
+
+def _serve(port: int, behind: int, viewer: int) -> None:
+    """Serve the web viewer's page in the background, so that it speaks with nobody but its server on this machine.
+
+    Args:
+        port: Where the browser finds it.
+        behind: Where Rerun serves it.
+        viewer: Of the server that the page may speak with.
+    """
+    allowed = f"'self' http://{HOST}:{viewer}"
+    policy = f"default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; connect-src {allowed}"
+
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            behind_it = http.client.HTTPConnection(HOST, behind, timeout=_WAIT)
+            try:
+                behind_it.request("GET", self.path.partition("?")[0])
+                answer = behind_it.getresponse()
+                self.send_response(answer.status)
+                for name in _PASSED_ON:
+                    if value := answer.headers.get(name):
+                        self.send_header(name, value)
+                self.send_header("Content-Security-Policy", policy)
+                self.end_headers()
+                shutil.copyfileobj(answer, self.wfile)
+            except OSError:
+                self.close_connection = True  # the browser has gone, or the server
+            finally:
+                behind_it.close()
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Nothing: standard error is nobody's."""
+
+    server = ThreadingHTTPServer((HOST, port), Page)
+    threading.Thread(target=server.serve_forever, daemon=True).start()

@@ -40,7 +40,7 @@ def send(stream: rr.RecordingStream, path: str, time: FloatArray, value: FloatAr
         time: [s], (n,).
         value: In the unit of the screen, so positions in mm, (n,).
     """
-    finite = np.isfinite(time) & np.isfinite(value)
-    if finite.any():
-        columns = rr.Scalars.columns(scalars=value[finite])
-        rr.send_columns(path, [rr.TimeColumn(TIMELINE, duration=time[finite])], columns, recording=stream)
+    there = np.isfinite(time) & np.isfinite(value)
+    if there.any():
+        columns = rr.Scalars.columns(scalars=value[there])
+        rr.send_columns(path, [rr.TimeColumn(TIMELINE, duration=time[there])], columns, recording=stream)
