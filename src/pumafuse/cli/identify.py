@@ -13,8 +13,6 @@ from ..identification.trials import StepTrials
 from ..model.arm import ArmModel
 from ..views import report
 from .tables import console, text_table
-from ..model.plants import FirstOrder
-from ..units import MM, MS
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,7 @@ from ..tuning.maximise import Point
 from ..tuning.parameters import check_fixed, kinds_of
 from ..tuning.summary import TuningSummary
 from ..tuning.tune import Progress, Tuning, tune
-from ..views import words
-from ..tuning.climb import Point
-from ..tuning.validate import Check
+from ..views import formatting
 from .tables import console
 
 SUMMARY = "tuning.json"
@@ -99,7 +97,7 @@ def _show(found: Tuning, output: Path) -> None:
     out.print(_parameters(summary))
     lines = [f"{axis}: {why}" for axis, why in summary.orders.items()]
     lines += summary.not_identifiable
-    lines += [words.together(pair) for pair in summary.correlations]
+    lines += [formatting.together(pair) for pair in summary.correlations]
     for bias in summary.biases:
         off = f"{bias.bias_mm:.3f} ± {Z95 * bias.sd_mm:.3f} mm"
         lines.append(f"{bias.run}: {bias.sensor} is off by {off} on {bias.axis}")
@@ -144,11 +142,13 @@ def _validation(summary: TuningSummary) -> Table:
     for one in summary.validation or ():
         since = f" from {one.since_s:.1f} s" if one.since_s else ""
         pair = (one.before, one.after)
-        rmse = words.change([state.rmse_mm for state in pair], ".3f")
-        coverage = words.change([state.coverage for state in pair], ".3f")
+        rmse = formatting.change([state.rmse_mm for state in pair], ".3f")
+        coverage = formatting.change([state.coverage for state in pair], ".3f")
         for name in one.before.sensors:
             sensors = [state.sensors.get(name) for state in pair]
-            nis = words.change([None if sensor is None else sensor.nis for sensor in sensors], ".2f")
-            correlation = words.change([None if sensor is None else sensor.correlation for sensor in sensors], "+.2f")
+            nis = formatting.change([None if sensor is None else sensor.nis for sensor in sensors], ".2f")
+            correlation = formatting.change(
+                [None if sensor is None else sensor.correlation for sensor in sensors], "+.2f"
+            )
             table.add_row(escape(one.run) + since, escape(one.axis), escape(name), rmse, coverage, nis, correlation)
     return table

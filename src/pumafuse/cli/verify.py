@@ -15,7 +15,6 @@ from ..logs.run import Run
 from ..model.arm import ArmModel
 from ..views import report as reports
 from .tables import console, text_table
-from ..units import MM, MS
 
 
 def run(

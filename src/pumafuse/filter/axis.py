@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..compiled import compiled
-from ..model.closed import decaying_response, transition
+from ..model.closed import decaying_response, gain_error, transition
 
 POSITION, RATE, OFFSET, BIASES = range(4)  # of a state
 START, U, STEP, ERROR, NOISE, DRIFT = range(6)  # of a drive
@@ -131,8 +131,8 @@ def apply_command(model: Model, state: State, axis: int, row: int, command: floa
     drive, gain, process = state.drive, model.gain, model.process
     u = command - drive[row, START]
     step = u - drive[row, U]
-    speed, maneuver = abs(step) / gain[axis, PERIOD], abs(step - drive[row, STEP]) / gain[axis, PERIOD]
-    drive[row, ERROR] += ((gain[axis, SLOPE] * speed + gain[axis, INTERCEPT]) - 1.0) * step
+    maneuver = abs(step - drive[row, STEP]) / gain[axis, PERIOD]
+    drive[row, ERROR] += gain_error(step, gain[axis, SLOPE], gain[axis, INTERCEPT], gain[axis, PERIOD])
     drive[row, U], drive[row, STEP] = u, step
     noise, drift = process[axis, MANEUVER_NOISE] * maneuver, process[axis, MANEUVER_DRIFT] * maneuver
     drive[row, NOISE] = process[axis, INPUT_NOISE] * process[axis, INPUT_NOISE] + noise * noise

@@ -66,6 +66,11 @@ class Events(NamedTuple):
             self.known[chosen],
         )
 
+    def columns(self, axes: list[int]) -> Events:
+        """The events with the values of some axes alone."""
+        value, spread, known = (np.ascontiguousarray(part[:, axes]) for part in (self.value, self.spread, self.known))
+        return self._replace(value=value, spread=spread, known=known)
+
 
 class Results(NamedTuple):
     """What became of n events on A axes.

@@ -80,7 +80,9 @@ def fuse(
         parts.append(_fuse_segment(part, placed, built, times, config, mode, engine, share))
     joined = _joined(parts, said)
     excess = config.arm.validity.excess(joined.speed, joined.radius)
-    joined = replace(joined, notes=(*joined.notes, *_reference_notes(joined, logged), *excess, *sensor_problems(joined)))
+    joined = replace(
+        joined, notes=(*joined.notes, *_reference_notes(joined, logged), *excess, *sensor_problems(joined))
+    )
     for note in joined.notes:
         warnings.warn(f"run '{run.name}': {note}", PumafuseWarning, stacklevel=2)
     return joined

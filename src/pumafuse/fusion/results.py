@@ -25,10 +25,9 @@ from ..logs.run import Run
 from ..logs.tables import Table
 from ..units import MM, seconds
 from .config import FusionConfig
-from .estimates import Estimates
+from .estimates import AxisEstimate, Estimates
 from .reference import ReferenceTrack, joined_references, reference_track
 from .summary import ScoreSummary, Summary, score_axis, summarise
-from .track import AxisEstimate
 
 ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY = (
     "estimates.parquet",

@@ -7,7 +7,7 @@ Delays and latencies only say when events are, so another configuration's times 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -74,6 +74,23 @@ class Segment:
         number, rows = self.axes.index(axis), self.command_rows
         chosen = rows.known[:, number] == Outcome.FUSED
         return rows.stamp[chosen], rows.value[chosen, number]
+
+    def rows_by_sensor(self) -> dict[str, Events]:
+        """The rows of each sensor that has any, by stamp."""
+        rows = self.measurement_rows
+        found = {name: rows.rows(np.flatnonzero(rows.source == number)) for number, name in enumerate(self.sensors)}
+        return {name: part for name, part in found.items() if len(part.time)}
+
+    def of_axis(self, axis: str, rows: IntArray) -> Segment:
+        """The segment with one axis alone, and some of its measurements' ``rows``."""
+        column = [self.axes.index(axis)]
+        commands = np.flatnonzero(self.command_rows.known[:, column[0]] == Outcome.FUSED)
+        return replace(
+            self,
+            axes=(axis,),
+            command_rows=self.command_rows.rows(commands).columns(column),
+            measurement_rows=self.measurement_rows.rows(rows).columns(column),
+        )
 
     def highest_speed(self, period: float) -> float:
         """Highest commanded speed on any axis [m/s]."""

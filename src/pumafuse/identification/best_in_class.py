@@ -9,9 +9,8 @@ import numpy as np
 
 from ..arrays import FloatArray, TimeArray
 from ..model.arm import AxisModel, Gain, commanded_speed
-from ..model.drive import drive
-from ..model.forced_response import forced_response
 from ..model.plants import PLANTS, FirstOrder, SecondOrder
+from ..model.response import response
 
 _SPIKE = 8.0  # robust standard deviations
 _DELAYS, _LATEST = 13, 9.0  # of the first grid: how many, up to how many periods
@@ -115,8 +114,7 @@ class Commands:
 
     def moved(self, axis: AxisModel, delay: float, start: float, time: TimeArray) -> FloatArray:
         """Where the axis is at ``time`` [ns], relative to ``start`` [m], (n,)."""
-        driven = drive(axis, self.time, self.value, start, self.period)
-        return forced_response(axis.plant, driven.time + round(delay * 1e9), driven.value, time)
+        return response(axis, self.period, delay, self.time, self.value, start, time)
 
 
 def best_in_class(measured: Measured, command: Commands, model: AxisModel, delay: float, start: float) -> BestInClass:

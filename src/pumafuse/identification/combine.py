@@ -376,7 +376,13 @@ def _gain_line(speed: FloatArray, found: Common, levels: Sequence[str]) -> tuple
     (b_low, b_high), (a_low, a_high) = line.conf_int().tolist()
     b, a = line.params.tolist()
     gain = Gain(slope=a, intercept=b, slope_ci95=(a_low, a_high), intercept_ci95=(b_low, b_high))
-    words = "K rises with speed" if a_low > 0.0 else "K falls with speed" if a_high < 0.0 else "the slope is not significant"
+    words = (
+        "K rises with speed"
+        if a_low > 0.0
+        else "K falls with speed"
+        if a_high < 0.0
+        else "the slope is not significant"
+    )
     lack = None
     if 2 < len(distinct) < len(speed):
         lack = _lack_of_fit(line, levels)

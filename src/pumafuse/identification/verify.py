@@ -16,9 +16,9 @@ import numpy as np
 from .. import units
 from ..arrays import FloatArray
 from ..errors import ConfigError, RunError
-from ..fusion import timeline as timelines
+from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig, Sensor
-from ..fusion.segments import AxisInput
+from ..fusion.segments import build
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import Run
@@ -129,16 +129,17 @@ def verify(
 
 def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[AxisVerification, Trace]]:
     """Every axis and source of one segment of a run."""
-    timeline = timelines.build(run, config)
-    components, found = timeline.components, list[tuple[AxisVerification, Trace]]()
-    axis, sensor = components.axis[components.candidates], components.sensor[components.candidates]
-    for number, driven in enumerate(timeline.axes):
-        for index, source in enumerate(components.sensors):
-            here = components.candidates[(axis == number) & (sensor == index)]
-            if len(here) >= _FEWEST and np.ptp(driven.command) > 0.0:
-                measured = Measured(run.name, source, components.valid[here], components.value[here])
-                notes = [*jumps, *timeline.notes] if not found else []
-                found.append(_verified(measured, driven, config.arm, driven.name in run.start, notes))
+    segment = build(run, config)
+    rows, found = segment.measurement_rows, list[tuple[AxisVerification, Trace]]()
+    for number, axis in enumerate(segment.axes):
+        command = Commands(*segment.given(axis), config.arm.update_period)
+        for index, source in enumerate(segment.sensors):
+            here = (rows.source == index) & (rows.known[:, number] == Outcome.FUSED)
+            if np.count_nonzero(here) >= _FEWEST and command.amplitude > 0.0:
+                measured = Measured(run.name, source, rows.time[here], rows.value[here, number])
+                notes = [*jumps, *segment.notes] if not found else []
+                first = segment.start[axis]
+                found.append(_verified(measured, axis, command, first, config.arm, axis in run.start, notes))
     return found
 
 
@@ -155,19 +156,18 @@ def _with_sources(run: Run, sensors: Sequence[str] | None) -> Run:
 
 
 def _verified(
-    measured: Measured, driven: AxisInput, arm: ArmModel, given: bool, notes: list[str]
+    measured: Measured, axis: str, command: Commands, first: float, arm: ArmModel, given: bool, notes: list[str]
 ) -> tuple[AxisVerification, Trace]:
-    model, delay = arm.axes[driven.name], arm.delay_of(driven.name)
-    _check_sizes(driven, model, delay)
-    command = Commands(driven.given, driven.command, arm.update_period)
+    model, delay = arm.axes[axis], arm.delay_of(axis)
+    _check_sizes(axis, first, model, delay)
     recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
-    start, start_from = _start(measured, command, driven.start, model, delay, given)
+    start, start_from = _start(measured, command, first, model, delay, given)
     count = len(measured.time)
     measured = measured.without_spikes(command.moved(model, delay, start, measured.time))
 
     def fitted(gain_recovery: float | None) -> Fit:
-        axis = msgspec.structs.replace(model, gain_recovery=gain_recovery)
-        return measured.fit(command.moved(axis, delay, start, measured.time), command.amplitude)
+        other = msgspec.structs.replace(model, gain_recovery=gain_recovery)
+        return measured.fit(command.moved(other, delay, start, measured.time), command.amplitude)
 
     as_it_is, recovering = fitted(model.gain_recovery), fitted(recovery)
     best = best_in_class(measured, command, model, delay, start)
@@ -179,7 +179,7 @@ def _verified(
     )
     verification = AxisVerification(
         run=measured.run,
-        axis=driven.name,
+        axis=axis,
         source=measured.source,
         measurements=len(measured.time),
         amplitude=command.amplitude,
@@ -197,14 +197,14 @@ def _verified(
     return verification, trace
 
 
-def _check_sizes(driven: AxisInput, model: AxisModel, delay: float) -> None:
+def _check_sizes(axis: str, start: float, model: AxisModel, delay: float) -> None:
     """Refuse numbers with which nothing can be computed."""
     rates = [model.plant.natural_frequency] if isinstance(model.plant, SecondOrder) else []
     if not all(1.0 / _SLOWEST <= rate <= _FARTHEST for rate in (*rates, 1.0 / max(model.plant.lag, 1e-300))):
-        raise ConfigError(f"axis '{driven.name}': a plant of no speed that an arm has")
-    sizes = (abs(driven.start), abs(model.gain.slope), abs(model.gain.intercept))
+        raise ConfigError(f"axis '{axis}': a plant of no speed that an arm has")
+    sizes = (abs(start), abs(model.gain.slope), abs(model.gain.intercept))
     if not (max(sizes) <= _FARTHEST and delay <= _SLOWEST):
-        raise ConfigError(f"axis '{driven.name}': a start level, gain or delay of no size that an arm has")
+        raise ConfigError(f"axis '{axis}': a start level, gain or delay of no size that an arm has")
 
 
 def _start(

@@ -84,6 +84,12 @@ def transition(
 
 
 @compiled
+def gain_error(step: float, slope: float, intercept: float, period: float) -> float:
+    """What the gain adds to a step of the command [m]: (K(speed) − 1) · step with K = slope · |step| / T + intercept."""
+    return ((slope * (abs(step) / period) + intercept) - 1.0) * step
+
+
+@compiled
 def decaying_response(
     order: int, constants: FloatArray, axis: int, decay: float, dt: float, f11: float, f12: float, f22: float
 ) -> tuple[float, float, float]:

@@ -23,19 +23,16 @@ import msgspec
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray, IntArray
-from ..filter.outcome import Outcome
+from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations
-from ..filter.outcome import Outcome
-from ..fusion.segments import Timeline, build
-from ..fusion.ticks import usable_cores
+from ..fusion.segments import Segment, build
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import Run
 from ..model.arm import ordered_axes
 from .parameters import Parameter
-from .retimed import retimed, subset
 
 _LOG_STEP = 1e-4  # of a logarithm, one-sided: the truncation error is half of it, the rounding error 1e-11
 _STEP = 2e-5  # s, or of a gain; central, because the likelihood bends where a measurement passes a command
@@ -91,18 +88,20 @@ class _AxisSegment:
 
     Attributes:
         number: The index of the axis in :attr:`Likelihood.axes`.
-        timeline: Only this axis and its components.
-        places: The indices of these components in the segment, (m,).
+        segment: Only this axis and its measurements.
+        rows: The rows of these among the whole segment's measurements, (m,).
+        column: The column of the axis there.
     """
 
     number: int
-    timeline: Timeline
-    places: IntArray
+    segment: Segment
+    rows: IntArray
+    column: int
 
 
 @dataclass(frozen=True)
 class _Segment:
-    whole: Timeline
+    whole: Segment
     axes: tuple[_AxisSegment, ...]
 
 
@@ -143,17 +142,17 @@ class Likelihood:
         named = [(run.name, part) for run in runs for part in segments(in_axes(run, config.frame)[0])[0]]
         built = [build(part, config, chosen) for _, part in named]
         self.notes = [
-            f"run '{name}': {note}" for (name, _), timeline in zip(named, built, strict=True) for note in timeline.notes
+            f"run '{name}': {note}" for (name, _), segment in zip(named, built, strict=True) for note in segment.notes
         ]
         self.config = config
-        self.axes = ordered_axes({axis.name for timeline in built for axis in timeline.axes})
-        parts = [_decided(timeline, until, latest) for timeline in built]
+        self.axes = ordered_axes({axis for segment in built for axis in segment.axes})
+        parts = [_decided(segment, until, latest) for segment in built]
         self._segments = [_Segment(part, tuple(_axis_segments(part, self.axes))) for part in parts]
         measured: set[tuple[str, str]] = {
-            (self.axes[one.number], one.timeline.components.sensors[sensor])
+            (self.axes[one.number], one.segment.sensors[sensor])
             for segment in self._segments
             for one in segment.axes
-            for sensor in np.unique(one.timeline.components.sensor).tolist()
+            for sensor in np.unique(one.segment.measurement_rows.source).tolist()
         }
         self.sensors: Mapping[str, Sequence[str]] = {
             axis: [name for name in chosen if (axis, name) in measured]
@@ -163,14 +162,14 @@ class Likelihood:
         self.count = np.zeros(len(self.axes), dtype=np.int64)
         for segment in self._segments:
             for one in segment.axes:
-                self.count[one.number] += len(one.places)
+                self.count[one.number] += len(one.rows)
 
     def of_axis(self, axis: str) -> Likelihood:
         """The likelihood of the measurements of one axis; ``axes`` stay as they are."""
         number = self.axes.index(axis)
         found = copy(self)
         found._segments = [
-            _Segment(one.timeline, (replace(one, places=np.arange(len(one.places))),))
+            _Segment(one.segment, (replace(one, rows=np.arange(len(one.rows)), column=0),))
             for segment in self._segments
             for one in segment.axes
             if one.number == number
@@ -178,10 +177,10 @@ class Likelihood:
         return found
 
     def outcomes_of(self, axis: str, outcomes: Sequence[CodeArray]) -> list[CodeArray]:
-        """Those outcomes that are of one axis's components, for each segment of :meth:`of_axis`."""
+        """Those outcomes that are of one axis's measurements, for each segment of :meth:`of_axis`."""
         number = self.axes.index(axis)
         return [
-            outcome[one.places]
+            outcome[one.rows, one.column, None]
             for segment, outcome in zip(self._segments, outcomes, strict=True)
             for one in segment.axes
             if one.number == number
@@ -197,9 +196,8 @@ class Likelihood:
         found: dict[str, list[float]] = {}
         for segment in self._segments:
             for one in segment.axes:
-                components = one.timeline.components
-                for number, name in enumerate(components.sensors):
-                    third = np.diff(components.value[components.sensor == number], 3)
+                for name, rows in one.segment.rows_by_sensor().items():
+                    third = np.diff(rows.value[:, 0], 3)
                     if len(third):
                         sd = 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)
                         found.setdefault(f"sensors.{name}.sd_mm.{self.axes[one.number]}", []).append(sd)
@@ -210,11 +208,10 @@ class Likelihood:
         """The share of each sensor's measurements that lies more than 1 s after the last command."""
         late, every = dict[str, int](), dict[str, int]()
         for segment in self._segments:
-            components, end = segment.whole.components, int(segment.whole.commands[-1]) + 1_000_000_000
-            for number, name in enumerate(components.sensors):
-                mine = components.valid[components.sensor == number]
-                late[name] = late.get(name, 0) + int(np.count_nonzero(mine > end))
-                every[name] = every.get(name, 0) + len(mine)
+            end = int(segment.whole.commands[-1]) + 1_000_000_000
+            for name, rows in segment.whole.rows_by_sensor().items():
+                late[name] = late.get(name, 0) + int(np.count_nonzero(rows.time > end))
+                every[name] = every.get(name, 0) + len(rows.time)
         return {name: late[name] / count for name, count in every.items() if count}
 
     @cached_property
@@ -223,8 +220,8 @@ class Likelihood:
         found = dict.fromkeys(self.axes, 0.0)
         for segment in self._segments:
             for axis in segment.whole.axes:
-                reached = float(np.ptp(np.append(axis.command, axis.start)))
-                found[axis.name] = max(found[axis.name], reached)
+                reached = float(np.ptp(np.append(segment.whole.given(axis)[1], segment.whole.start[axis])))
+                found[axis] = max(found[axis], reached)
         return found
 
     def responses(
@@ -248,12 +245,12 @@ class Likelihood:
         found: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
         for segment in self._segments:
             for one in segment.axes:
-                components = one.timeline.components
-                predicted = components.value - innovations(one.timeline, certain).innovation
-                for number, name in enumerate(components.sensors):
-                    mine = components.sensor == number
+                value, source = one.segment.measurement_rows.value[:, 0], one.segment.measurement_rows.source
+                predicted = value - innovations(one.segment, certain).innovation[:, 0]
+                for number, name in enumerate(one.segment.sensors):
+                    mine = source == number
                     if mine.any():
-                        expected, measured = predicted[mine], components.value[mine]
+                        expected, measured = predicted[mine], value[mine]
                         if centred:
                             expected, measured = expected - np.median(expected), measured - np.median(measured)
                         found.setdefault((name, self.axes[one.number]), []).append((expected, measured))
@@ -279,15 +276,13 @@ class Likelihood:
         """
         axes, decided = np.zeros(len(self.axes)), list[CodeArray]()
         for number, segment in enumerate(self._segments):
-            now = retimed(segment.whole, self.config, config)
-            found = innovations(now.timeline, config, None if outcomes is None else now.reordered(outcomes[number]))
-            components = now.timeline.components
-            gates = np.array([config.sensors[name].gate for name in components.sensors])
-            density = log_density(found.innovation, found.innovation_sd, found.outcome, gates[components.sensor])
-            density, outcome = now.restored(density), now.restored(found.outcome)
-            decided.append(outcome)
+            rows = segment.whole.measurement_rows
+            found = innovations(segment.whole, config, None if outcomes is None else outcomes[number])
+            gates = np.array([config.sensors[name].gate for name in segment.whole.sensors])
+            density = log_density(found.innovation, found.innovation_sd, found.outcome, gates[rows.source][:, None])
+            decided.append(found.outcome)
             for one in segment.axes:
-                axes[one.number] += float(density[one.places].sum())
+                axes[one.number] += float(density[one.rows, one.column].sum())
         return LogLikelihood(axes, decided)
 
     def derivatives(
@@ -296,7 +291,7 @@ class Likelihood:
         """Score and information of parameters while each component's outcome stays as it is."""
         score, information = np.zeros(len(parameters)), np.zeros((len(parameters), len(parameters)))
         jobs = [
-            (one, outcome[one.places])
+            (one, outcome[one.rows, one.column])
             for segment, outcome in zip(self._segments, outcomes, strict=True)
             for one in segment.axes
         ]
@@ -335,27 +330,26 @@ class Likelihood:
     def _innovations(
         self, part: _AxisSegment, outcome: CodeArray, config: FusionConfig
     ) -> tuple[FloatArray, FloatArray]:
-        """ν and S of the components of one axis, whose outcomes are known."""
-        now = retimed(part.timeline, self.config, config)
-        found = innovations(now.timeline, config, now.reordered(outcome))
-        return now.restored(found.innovation), now.restored(found.innovation_sd**2)
+        """ν and S of the measurements of one axis, whose outcomes are known."""
+        found = innovations(part.segment, config, outcome[:, None])
+        return found.innovation[:, 0], found.innovation_sd[:, 0] ** 2
 
 
-def _decided(timeline: Timeline, until: float | None, latest: float | None) -> Timeline:
-    """A timeline with only the components that a filter decides on."""
-    components = timeline.components
-    chosen = components.outcome == Outcome.FUSED
+def _decided(segment: Segment, until: float | None, latest: float | None) -> Segment:
+    """A segment with only the measurements that a filter decides on."""
+    rows = segment.measurement_rows
+    chosen = np.ones(len(rows.time), dtype=np.bool_)
     if until is not None:
-        chosen &= components.valid <= timeline.origin + round(until * 1e9)
+        chosen &= rows.time <= segment.origin + round(until * 1e9)
     if latest is not None:
-        chosen &= components.stamp - round(latest * 1e9) >= timeline.origin
-    return replace(timeline, components=subset(components, np.flatnonzero(chosen)))
+        chosen &= rows.stamp - round(latest * 1e9) >= segment.origin
+    known = np.where((rows.known == Outcome.FUSED) & chosen[:, None], rows.known, ABSENT).astype(np.uint8)
+    kept = np.flatnonzero((known != ABSENT).any(axis=1))
+    return replace(segment, measurement_rows=rows._replace(known=known).rows(kept))
 
 
-def _axis_segments(timeline: Timeline, axes: Sequence[str]) -> Iterable[_AxisSegment]:
-    for number, axis in enumerate(timeline.axes):
-        places = np.flatnonzero(timeline.components.axis == number)
-        if len(places):
-            components = subset(timeline.components, places)
-            alone = replace(components, axis=np.zeros_like(components.axis))
-            yield _AxisSegment(axes.index(axis.name), replace(timeline, axes=(axis,), components=alone), places)
+def _axis_segments(segment: Segment, axes: Sequence[str]) -> Iterable[_AxisSegment]:
+    for column, axis in enumerate(segment.axes):
+        rows = np.flatnonzero(segment.measurement_rows.known[:, column] == Outcome.FUSED)
+        if len(rows):
+            yield _AxisSegment(axes.index(axis), segment.of_axis(axis, rows), rows, column)

@@ -14,10 +14,9 @@ from ..errors import PumafuseWarning
 from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
 from ..fusion.consistency import consistency, densities_of
-from ..fusion.estimates import Estimates, Measurements
+from ..fusion.estimates import AxisEstimate, Estimates, Measurements
 from ..fusion.offline import fuse
 from ..fusion.score import Z95, interpolated, score
-from ..fusion.track import AxisEstimate
 from ..logs.run import Run
 from ..units import MM
 

@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Any
 from ..errors import ConfigError
 from ..filter.outcome import Outcome
 from ..live.results import COMPARED
-from ..live.answers import MET
 from ..logs.frames import CARTESIAN
 from ..model.arm import CANONICAL_AXES, ordered_axes
 from .live_frames import Frame, Header, SensorHead, SensorsNow, packed

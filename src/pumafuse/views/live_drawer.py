@@ -23,7 +23,7 @@ import rerun.blueprint as rrb
 
 from ..arrays import FloatArray
 from ..units import MM
-from . import looks, style
+from . import colours, styles
 from .live_frames import Frame, Header, SensorHead, bodies
 from .live_viewer import Viewer
 
@@ -128,21 +128,21 @@ class Picture:
             for name, sensor in header.sensors.items()
         }
         stream.send_blueprint(_blueprint(header))
-        colours = style.sensor_colours(list(header.sensors))
+        of_sensors = colours.sensor_colours(list(header.sensors))
         for axis in header.axes:
-            self._look(f"{axis}/command", looks.line(style.COMMAND, "command", step=True))
-            self._look(f"{axis}/estimate", looks.line(style.ESTIMATE, "estimate"))
+            self._look(f"{axis}/command", styles.line(colours.COMMAND, "command", step=True))
+            self._look(f"{axis}/estimate", styles.line(colours.ESTIMATE, "estimate"))
             for path in (f"{axis}/estimate", f"residual/{axis}"):
-                self._look(f"{path}/upper", looks.edge("+2σ"))
-                self._look(f"{path}/lower", looks.edge("−2σ"))
-            for name, colour in colours.items():
-                self._look(f"{axis}/{name}", looks.points(colour, name))
-                self._look(f"{axis}/{name}/rejected", looks.points(style.REJECTED, "rejected", "Cross"))
-                self._look(f"residual/{axis}/{name}", looks.points(colour, name))
-        for name, colour in colours.items():
-            self._look(f"nis/{name}", looks.line(colour, name))
-            self._look(f"rate/{name}", looks.line(colour, name))
-        self._colours = {"command": style.COMMAND, "estimate": style.ESTIMATE, **colours}
+                self._look(f"{path}/upper", styles.edge("+2σ"))
+                self._look(f"{path}/lower", styles.edge("−2σ"))
+            for name, colour in of_sensors.items():
+                self._look(f"{axis}/{name}", styles.points(colour, name))
+                self._look(f"{axis}/{name}/rejected", styles.points(colours.REJECTED, "rejected", "Cross"))
+                self._look(f"residual/{axis}/{name}", styles.points(colour, name))
+        for name, colour in of_sensors.items():
+            self._look(f"nis/{name}", styles.line(colour, name))
+            self._look(f"rate/{name}", styles.line(colour, name))
+        self._colours = {"command": colours.COMMAND, "estimate": colours.ESTIMATE, **of_sensors}
 
     def draw(self, frame: Frame) -> None:
         """Send a frame."""
@@ -164,7 +164,7 @@ class Picture:
         if frame.health is not None:
             for kind, values in (("nis", frame.health.nis), ("rate", frame.health.rate)):
                 for name, value in values.items():
-                    looks.send(self._stream, f"{kind}/{name}", np.array([frame.health.time]), np.array([value]))
+                    styles.send(self._stream, f"{kind}/{name}", np.array([frame.health.time]), np.array([value]))
 
     def _draw_measurements(self, axis: str, name: str, residuals: _Residuals) -> None:
         time, position, residual, rejected = residuals.take()
@@ -183,19 +183,19 @@ class Picture:
             self._stream.send_blueprint(_blueprint(self._header, points[there][0]))
         path = self._paths.setdefault(name, _PathHistory())
         path.add(time[there], points[there])
-        strip, colour = path.points(), style.rgb(self._colours[name])
-        self._stream.set_time(looks.TIMELINE, duration=float(time[-1]))
+        strip, colour = path.points(), colours.rgb(self._colours[name])
+        self._stream.set_time(styles.TIMELINE, duration=float(time[-1]))
         if name in self._header.sensors:
             self._stream.log(f"path/{name}", rr.Points3D(strip, colors=[colour], radii=-1.0))
         else:
             width = -0.7 if name == "command" else -1.2
             self._stream.log(f"path/{name}", rr.LineStrips3D([strip], colors=[colour], radii=width))
         if name == "estimate":
-            tool = rr.Points3D(strip[-1:], colors=[style.rgb(style.REJECTED)], radii=-5.0)
+            tool = rr.Points3D(strip[-1:], colors=[colours.rgb(colours.REJECTED)], radii=-5.0)
             self._stream.log("path/tool", tool)
 
     def _plot(self, path: str, time: FloatArray, position: FloatArray) -> None:
-        looks.send(self._stream, path, time, position * MM)
+        styles.send(self._stream, path, time, position * MM)
 
     def _look(self, path: str, look: rr.SeriesLines | rr.SeriesPoints) -> None:
         self._stream.log(path, look, static=True)
@@ -314,7 +314,7 @@ def _blueprint(header: Header, first: FloatArray | None = None) -> rrb.Blueprint
         right = rrb.Vertical(path, right, row_shares=[3, 2])
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(*positions), rrb.Vertical(*residuals), right, column_shares=[4, 3, 3]),
-        rrb.TimePanel(state="collapsed", timeline=looks.TIMELINE, play_state="following"),
+        rrb.TimePanel(state="collapsed", timeline=styles.TIMELINE, play_state="following"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )
@@ -330,7 +330,7 @@ def _plot(origin: str, name: str, *, legend: bool, margin: float = 0.0) -> rrb.T
         name=name,
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
         axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(left, now)),
-        time_ranges=rrb.VisibleTimeRange(looks.TIMELINE, start=oldest, end=now),
+        time_ranges=rrb.VisibleTimeRange(styles.TIMELINE, start=oldest, end=now),
     )
 
 

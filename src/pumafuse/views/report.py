@@ -16,7 +16,7 @@ from ..identification.verify import AxisVerification, Trace
 from ..model.arm import ArmModel
 from ..model.plants import FirstOrder
 from ..units import MM, MS
-from . import words
+from . import formatting
 from .render import render
 
 PAGE = "report.html"
@@ -42,12 +42,12 @@ def models(found: Identification) -> TextTable:
     rows: list[list[str]] = []
     for axis, one in found.axes.items():
         delays, plant = one.delays, one.model.plant
-        described = words.plant(plant).replace(", ", "\n")
+        described = formatting.plant(plant).replace(", ", "\n")
         if isinstance(plant, FirstOrder):
-            own = words.milliseconds(one.time_constant_mean), words.milliseconds(one.time_constant_robust)
+            own = formatting.milliseconds(one.time_constant_mean), formatting.milliseconds(one.time_constant_robust)
             described += f"\ntrials' mean {own[0]},\nrobust {own[1]} ms"
-        gain = words.gain(one.model.gain).replace(" + ", "\n+ ")
-        times = [words.milliseconds(delay) for delay in (delays.fitted, delays.onset, delays.lag)]
+        gain = formatting.gain(one.model.gain).replace(" + ", "\n+ ")
+        times = [formatting.milliseconds(delay) for delay in (delays.fitted, delays.onset, delays.lag)]
         rows.append([axis, str(one.trials), described, gain, *times, f"{_rms(found, axis) * MM:.3f}"])
     headings = ("axis", "trials", "plant", "K at speed s [m/s]", "Td, ms", "onset, ms", "lag, ms", "RMS, mm")
     return TextTable(headings, rows)
@@ -59,10 +59,10 @@ def dependences(found: Identification) -> TextTable:
         [
             row.coefficient,
             row.factor,
-            "\n".join(words.level(level) for level in row.levels),
+            "\n".join(formatting.level(level) for level in row.levels),
             "–" if row.i_ratio is None else f"{row.i_ratio:.2f}",
-            words.p_value(row.welch_p),
-            words.p_value(row.adjusted_p),
+            formatting.p_value(row.welch_p),
+            formatting.p_value(row.adjusted_p),
             row.verdict,
         ]
         for row in found.dependences
@@ -78,7 +78,7 @@ def scatter(found: Identification) -> TextTable:
             row.coefficient,
             row.axis,
             f"{row.median:.4g}",
-            words.p_value(row.normal_p),
+            formatting.p_value(row.normal_p),
             "–" if row.replicate_sd is None else f"{row.replicate_sd:.2g}",
             f"{row.own_sd:.2g}",
             ", ".join(row.outlying) or "none",
@@ -130,7 +130,7 @@ def verdict(one: AxisVerification) -> str:
     return (
         f"{one.run}, {one.axis}: {one.verdict}; start level {one.start * MM:g} mm ({one.start_from}); gain recovery"
         f" tried with {one.recovery * MS:g} ms; the best in class is K {best.gain:.3f}, Td {best.delay * MS:.1f} ms,"
-        f" {words.plant(best.plant)}{left_out}"
+        f" {formatting.plant(best.plant)}{left_out}"
     )
 
 
@@ -254,7 +254,7 @@ def _coefficients(fit: OrderFit) -> list[str]:
     values = [(fit.gain, fit.gain_ci95, 1.0), (fit.delay, fit.delay_ci95, MS)]
     values += [(fit.time_constant, fit.time_constant_ci95, MS)]
     values += [(fit.natural_frequency, fit.natural_frequency_ci95, 1.0), (fit.damping, fit.damping_ci95, 1.0)]
-    found = [words.with_interval(value, ci95, unit) for value, ci95, unit in values if value is not None]
+    found = [formatting.with_interval(value, ci95, unit) for value, ci95, unit in values if value is not None]
     return [*found, f"{fit.rms * MM:.3f} ({fit.rms_percent:.1f} %)"]
 
 

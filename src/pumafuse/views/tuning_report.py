@@ -17,8 +17,7 @@ from ..tuning.intervals import Profile, profiles
 from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Tuning
 from ..tuning.validation import Check, fused
-from . import tuning_figures, words
-from ..tuning.validate import Check
+from . import formatting, tuning_figures
 from .render import render
 
 _Pair: TypeAlias = tuple[Consistency | None, Consistency | None]  # before and after
@@ -87,7 +86,7 @@ def _tests(before: Estimates, after: Estimates) -> dict[tuple[str, str], _Pair]:
 
 
 def _notes(summary: TuningSummary) -> list[str]:
-    together = [words.together(pair) for pair in summary.correlations]
+    together = [formatting.together(pair) for pair in summary.correlations]
     orders = [f"{axis}: {why}" for axis, why in summary.orders.items()]
     return [*summary.notes, *summary.not_identifiable, *together, *orders]
 
@@ -108,13 +107,16 @@ def _check(one: Check) -> Mapping[str, Any]:
         "axis": one.axis,
         "sensors": [
             names,
-            [words.change([None if check is None else check.nis for check in pair], ".2f") for pair in pairs],
-            [words.change([None if check is None else check.correlation for check in pair], "+z.2f") for pair in pairs],
+            [formatting.change([None if check is None else check.nis for check in pair], ".2f") for pair in pairs],
+            [
+                formatting.change([None if check is None else check.correlation for check in pair], "+z.2f")
+                for pair in pairs
+            ],
         ],
         "numbers": [
-            words.change([state.rejected for state in states], "d"),
-            words.change([state.rmse_mm for state in states], ".3f"),
-            words.change([state.coverage for state in states], ".3f"),
+            formatting.change([state.rejected for state in states], "d"),
+            formatting.change([state.rmse_mm for state in states], ".3f"),
+            formatting.change([state.coverage for state in states], ".3f"),
         ],
         "verdict": one.verdict,
         "worse": one.worse,
@@ -128,8 +130,8 @@ def _contains(interval: tuple[float | None, float | None], value: float | None) 
 
 def _sentence(sensor: str, axis: str, tests: _Pair) -> str:
     """NIS and whiteness of one sensor on one axis, before and after."""
-    nis = words.change([None if one is None else one.nis for one in tests], ".2f")
-    white = " → ".join("–" if one is None else words.p_value(one.whiteness) for one in tests)
+    nis = formatting.change([None if one is None else one.nis for one in tests], ".2f")
+    white = " → ".join("–" if one is None else formatting.p_value(one.whiteness) for one in tests)
     after = tests[1]
     expected = "" if after is None else f" (expected {after.nis_band[0]:.2f} to {after.nis_band[1]:.2f})"
     return f"{axis}, {sensor}: NIS {nis}{expected}; whiteness p {white}."

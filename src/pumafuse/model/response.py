@@ -1,0 +1,84 @@
+"""Where an axis goes when it is commanded, without noise: exact at any instant, compiled."""
+
+# pyright: reportArgumentType=false, reportConstantRedefinition=false
+# (an element of an array is a plain number here: numba compiles it, numpy's types do not know)
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..arrays import FloatArray, TimeArray
+from ..compiled import compiled_apart
+from .arm import AxisModel
+from .closed import constants, decaying_response, gain_error, transition
+from .plants import FirstOrder
+
+
+def response(
+    axis: AxisModel, period: float, delay: float, given: TimeArray, command: FloatArray, start: float, time: TimeArray
+) -> FloatArray:
+    """The position of an axis that rests until its first command.
+
+    Args:
+        axis: Plant and gain.
+        period: The update period T [s].
+        delay: Td [s].
+        given: When each command is given, int64 ns, ascending, (k,).
+        command: u [m], (k,).
+        start: The level u₀ [m] at which the axis rests.
+        time: Asked for, int64 ns, ascending, (n,).
+
+    Returns:
+        The position [m] relative to ``start``, (n,).
+    """
+    found, gain = np.empty(len(time)), axis.gain
+    order = 1 if isinstance(axis.plant, FirstOrder) else 2
+    decay = 0.0 if axis.gain_recovery is None else 1.0 / axis.gain_recovery
+    acting = given + round(delay * 1e9)
+    _respond(
+        order,
+        constants(axis.plant)[None],
+        gain.slope,
+        gain.intercept,
+        decay,
+        period,
+        acting,
+        command - start,
+        time,
+        found,
+    )
+    return found
+
+
+@compiled_apart
+def _respond(
+    order: int,
+    constants: FloatArray,
+    slope: float,
+    intercept: float,
+    decay: float,
+    period: float,
+    acting: TimeArray,
+    command: FloatArray,
+    time: TimeArray,
+    found: FloatArray,
+) -> None:
+    at, u, error, position, rate = 0, 0.0, 0.0, 0.0, 0.0
+    clock = min(time[0], acting[0]) if len(time) and len(acting) else 0
+    for n in range(len(time)):
+        while True:
+            due = at < len(acting) and acting[at] <= time[n]
+            until = acting[at] if due else time[n]
+            if until > clock:
+                dt, gap = (until - clock) * 1e-9, position - u
+                f11, f12, f21, f22, _, _, _ = transition(order, constants, 0, dt)
+                a, b, left = decaying_response(order, constants, 0, decay, dt, f11, f12, f22)
+                position, rate = u + f11 * gap + f12 * rate + a * error, f21 * gap + f22 * rate + b * error
+                error *= left
+            clock = until
+            if not due:
+                break
+            error += gain_error(command[at] - u, slope, intercept, period)
+            u = command[at]
+            at += 1
+        found[n] = position
