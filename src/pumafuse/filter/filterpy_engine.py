@@ -1,204 +1,324 @@
-"""The reference engine, `filterpy`: rows met in their total order by one augmented filter for each axis.
+"""The reference engine: a `filterpy.kalman.KalmanFilter` for each axis on the delay-augmented matrices.
 
-Plain and inspectable; the compiled engine is held to it.
+Fed with the same events, for filtered estimates. State of an axis: the plant's states, the offset, the biases, the gain
+error e, and a register of the inputs in flight, the newest first. Over an interval the plant follows the register's
+acting entry r_k and e, which decays; a command shifts the register when it is given and moves e when it acts:
+
+    x⁺ = Φ x + Γ r_k + Γ_e e,   o⁺ = o,   b⁺ = b,   e⁺ = e exp(−Δ / recovery),   r⁺ = (u, r_0, r_1, …)
+
+`discretize` is the same model where commands come every T. Plain and inspectable, hundreds of times slower; its
+transitions are matrix exponentials, so that it shares nothing with the closed forms of the compiled filter.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
+from filterpy.kalman import KalmanFilter
 
-from ..arrays import FloatArray, IntArray, TimeArray
-from .augmented import AxisFilter, AxisPoint, Held
-from .config import FusionConfig, Sensor
-from .estimates import Mode
-from .outcome import REOPEN_AFTER, REOPEN_SPAN_NS, Outcome
-from .smoother import hindsight, hindsight_at
-from .timeline import Timeline
-from .track import AxisEstimate, Bias, Filtered, Fused, Track, estimate
+from ..arrays import FloatArray, TimeArray
+from ..model.arm import AxisModel
+from ..model.discrete import transition
+from .axis import (
+    BIASES,
+    DECAY,
+    INPUT_NOISE,
+    INTERCEPT,
+    MANEUVER_DRIFT,
+    MANEUVER_NOISE,
+    OFFSET,
+    PERIOD,
+    RANDOM_WALK,
+    SLOPE,
+    START,
+    Model,
+    Sensors,
+    State,
+)
+from .events import COMMAND, Events, Results
+from .forward import Outputs
+from .gate import RECENT_NS, SETTLED_NS
+from .outcome import Outcome
 
-Progress = Callable[[float], None]
-
-_Checkpoint = tuple[tuple[AxisPoint, ...], dict[tuple[str, str], tuple[int, int]]]
+Matrices = tuple[FloatArray, FloatArray]  # F and Q
 
 
-@dataclass(frozen=True)
-class _Row:
-    """The components of one row that the filter is to decide on."""
+class _Axis:
+    """One axis: a filter that follows the commands of the table."""
 
-    sensor: str
-    components: IntArray
-    valid: int
-    stamp: int
-
-
-class FilterpyEngine:
-    """Filters one timeline on all axes together: rows in their total order, each axis catching up to them."""
-
-    def __init__(self, timeline: Timeline, config: FusionConfig) -> None:
-        self._components = components = timeline.components
-        self._sensors = config.sensors
-        self._names = [axis.name for axis in timeline.axes]
-        candidates = components.candidates
-        self._filters: list[AxisFilter] = []
-        self._biases: list[tuple[str, ...]] = []
-        for number, axis in enumerate(timeline.axes):
-            mine = candidates[components.axis[candidates] == number]
-            heard = [components.sensors[int(index)] for index in np.unique(components.sensor[mine])]
-            biases = [(name, self._sensors[name].bias_sd) for name in heard if self._sensors[name].bias_sd]
-            self._biases.append(tuple(name for name, _ in biases))
-            self._filters.append(
-                AxisFilter(
-                    config.arm.axes[axis.name].plant,
-                    axis,
-                    config.process[axis.name],
-                    config.start.offset_sd,
-                    biases,
-                    timeline.origin,
-                    np.unique(components.valid[mine]),
-                )
-            )
-        self._starts = [axis.start for axis in timeline.axes]
-        self._rows = self._gather(candidates)
-        self._streaks: dict[tuple[str, str], tuple[int, int]] = {}
-        self._innovation = np.full(len(components.value), np.nan)
-        self._innovation_sd = np.full(len(components.value), np.nan)
-        self._outcome = components.outcome.copy()
-
-    def filter(self, progress: Progress | None = None) -> Filtered:
-        """Every measurement at its valid time, whenever it arrived."""
-        for number, row in enumerate(self._rows):
-            self._meet(row)
-            if progress is not None and number % 1000 == 0:
-                progress(number / len(self._rows))
-        for axis in self._filters:
-            axis.advance(len(axis.time) - 1)
-        return self._filtered(tuple(axis.track(axis.held) for axis in self._filters))
-
-    def filter_as_live(self, times: TimeArray, progress: Progress | None = None) -> Filtered:
-        """At each of ``times`` only the measurements that had arrived: late ones make the filter go back and replay.
-
-        The tracks hold one state for each of ``times``.
-        """
-        arrival = np.array([max(row.stamp, row.valid) for row in self._rows], dtype=np.int64)
-        queue = np.argsort(arrival, kind="stable")
-        edges = np.searchsorted(arrival[queue], times, side="right")
-        due = np.split(queue, edges)  # due[k]: the rows that arrive by times[k]; the last part comes after all of them
-        arrived = np.zeros(len(self._rows), dtype=bool)
-        before = [self._checkpoint()]  # before[i]: as it was before row i; the rows until the last are dealt with
-        kept: list[list[Held]] = [[] for _ in self._filters]
-        reach = 0
-        for number, new in enumerate(due):
-            arrived[new] = True
-            if new.min(initial=len(before)) < len(before) - 1:
-                del before[new.min() + 1 :]
-                self._restore(before[-1])
-            reach = max(reach, int(new.max(initial=-1)) + 1)
-            for index in range(len(before) - 1, reach):
-                if arrived[index]:
-                    self._meet(self._rows[index])
-                before.append(self._checkpoint())
-            if number < len(times):
-                here = self._checkpoint()
-                for axis, states in zip(self._filters, kept, strict=True):
-                    axis.advance(axis.latest(int(times[number])))
-                    states.append(axis.held[-1])
-                self._restore(here)
-            if progress is not None and number % 1000 == 0:
-                progress(number / len(due))
-        return self._filtered(tuple(axis.track(states) for axis, states in zip(self._filters, kept, strict=True)))
-
-    def _meet(self, row: _Row) -> None:
-        """Gate a row and fuse what passes: whole rows or component by component, as the sensor says."""
-        sensor = self._sensors[row.sensor]
-        if sensor.gate_rows:
-            self._meet_together(row, sensor, row.components, "")
-        else:
-            for component in row.components:
-                self._meet_together(row, sensor, (component,), self._names[self._components.axis[component]])
-
-    def _meet_together(self, row: _Row, sensor: Sensor, components: Sequence[int] | IntArray, part: str) -> None:
-        """Components of one row that pass the gate together or not at all."""
-        met = [self._predicted(row, sensor, int(component)) for component in components]
-        beyond = [sensor.gate > 0.0 and abs(nu) > sensor.gate * np.sqrt(S) for _, _, _, _, nu, S in met]
-        key = (row.sensor, part)
-        if not any(beyond):
-            self._streaks.pop(key, None)
-        count, since = self._streaks.get(key, (0, row.valid))
-        reopens = count >= REOPEN_AFTER and row.valid - since >= REOPEN_SPAN_NS
-        if any(beyond) and not reopens:
-            self._streaks[key] = (count + 1, since)
-        for component, outside, (axis, z, H, R, nu, S) in zip(components, beyond, met, strict=True):
-            rejected, widened = any(beyond) and not reopens, nu**2 if outside and reopens else 0.0
-            if widened:
-                self._streaks.pop(key, None)
-            if not rejected:
-                axis.fuse(z, H, R, widened)
-            spread = S if rejected else float(axis.kf.S[0, 0])
-            self._innovation[component], self._innovation_sd[component] = nu, np.sqrt(spread)
-            self._outcome[component] = (
-                Outcome.REJECTED if rejected else Outcome.REACQUIRED if outside else Outcome.FUSED
-            )
-
-    def _predicted(
-        self, row: _Row, sensor: Sensor, component: int
-    ) -> tuple[AxisFilter, float, FloatArray, float, float, float]:
-        """The axis filter at the component's valid time with z, H, R, ν and S."""
-        number = int(self._components.axis[component])
-        axis = self._filters[number]
-        axis.advance(axis.latest(row.valid))
-        sd = sensor.sd_of(self._names[number])
-        assert sd is not None  # a component without one is `unknown` and never gets here
-        H, R = axis.observation(
-            row.sensor, sensor, sd if (spread := self._components.spread) is None else sd * float(spread[component])
+    def __init__(self, plant: AxisModel, model: Model, state: State, events: Events, axis: int) -> None:
+        self._plant, self._gain, self._process = plant.plant, model.gain[axis], model.process[axis]
+        self.period = float(self._gain[PERIOD])
+        mine = (events.source == COMMAND) & (events.known[:, axis] == Outcome.FUSED)
+        self._acts, self._given = events.time[mine], events.stamp[mine]
+        self._u = events.value[mine, axis] - state.drive[axis, START]
+        when = np.concatenate((self._given, self._acts))
+        order = np.argsort(when, kind="stable")  # at one instant a command is given before it acts
+        self._instants = list(
+            zip(when[order].tolist(), (order % len(self._u)).tolist(), (order >= len(self._u)).tolist(), strict=True)
         )
-        z = float(self._components.value[component]) - sensor.scale * self._starts[number]
-        return axis, z, H, R, *axis.innovation(z, H, R)
+        issued = np.searchsorted(self._given, self._acts, side="right")
+        in_flight = int((issued - np.arange(len(self._u))).max(initial=1))
+        A, _, C = self._plant.state_space()
+        self.n = len(A)
+        self.biases = self.n + 1
+        self.error = self.biases + int(model.states[axis]) - BIASES
+        size = self.error + 1 + in_flight + 1
+        self.position = np.zeros((1, size))
+        self.position[0, : self.n], self.position[0, self.n] = C[0], 1.0
+        self.kf = KalmanFilter(dim_x=size, dim_z=1, dim_u=size)
+        self.kf.P = np.zeros((size, size))
+        prior = [self.n, *range(self.biases, self.error)]
+        self.kf.P[prior, prior] = np.diagonal(state.P[axis])[OFFSET : OFFSET + len(prior)]
+        self.kf.B = np.eye(size)
+        self.clock = int(state.clock[axis])
+        self._next, self._acting, self._issued = 0, -1, 0
 
-    def _gather(self, candidates: IntArray) -> list[_Row]:
-        components = self._components
-        edges = np.flatnonzero(np.diff(components.row[candidates])) + 1
-        return [
-            _Row(
-                components.sensors[components.sensor[part[0]]],
-                part,
-                int(components.valid[part[0]]),
-                int(components.stamp[part[0]]),
-            )
-            for part in np.split(candidates, edges)
-            if len(part)
-        ]
+    @cached_property
+    def _shift(self) -> FloatArray:
+        """The register moved on by one."""
+        F, first = np.eye(len(self.position[0])), self.error + 1
+        F[first:, first:] = np.eye(len(F) - first, k=-1)
+        return F
 
-    def _checkpoint(self) -> _Checkpoint:
-        return tuple(axis.checkpoint() for axis in self._filters), self._streaks.copy()
+    @lru_cache(maxsize=10_000)  # noqa: B019 - lives as long as the axis
+    def _moves(self, ns: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float]:
+        """Φ, Γ, Q for unit noise, Γ_e and the decay of e over an interval."""
+        from scipy.linalg import expm
 
-    def _restore(self, point: _Checkpoint) -> None:
-        for axis, state in zip(self._filters, point[0], strict=True):
-            axis.restore(state)
-        self._streaks = point[1].copy()
+        n, dt = self.n, ns / 1e9
+        A, B, _ = self._plant.state_space()
+        driven = np.zeros((n + 2, n + 2))  # of the plant, an input that is held, and one that decays
+        driven[:n, :n], driven[:n, n : n + 1], driven[:n, n + 1 :] = A, B, B
+        driven[-1, -1] = -self._gain[DECAY]
+        moved = expm(driven * dt)
+        if dt < 0.5 / np.abs(A).sum():  # short: Van Loan's exponential, once; `transition` doubles it for longer ones
+            van_loan = expm(np.block([[-A, B @ B.T], [np.zeros((n, n)), A.T]]) * dt)
+            Q = van_loan[n:, n:].T @ van_loan[:n, n:]
+            Q = 0.5 * (Q + Q.T)
+        else:
+            Q = transition(self._plant, dt).Q
+        return moved[:n, :n], moved[:n, n], Q, moved[:n, n + 1], float(moved[-1, -1])
 
-    def _filtered(self, tracks: tuple[Track, ...]) -> Filtered:
-        final = tuple(axis.held[-1][1:3] for axis in self._filters)
-        return Filtered(tracks, self._innovation, self._innovation_sd, self._outcome, tuple(self._biases), final)
+    def matrices(self, ns: int) -> Matrices:
+        """F and Q over an interval of the state with the command that acts now."""
+        n, size = self.n, len(self.position[0])
+        Phi, Gamma, Q_unit, Gamma_e, left = self._moves(ns)
+        F, Q = np.eye(size), np.zeros((size, size))
+        F[:n, :n], F[:n, self.error], F[self.error, self.error] = Phi, Gamma_e, left
+        if self._acting >= 0:
+            F[:n, self.error + self._issued - self._acting] = Gamma
+        maneuver = self._maneuver(self._acting)
+        process = self._process
+        Q[:n, :n] = Q_unit * (process[INPUT_NOISE] ** 2 + (process[MANEUVER_NOISE] * maneuver) ** 2)
+        Q[n, n] = (process[RANDOM_WALK] ** 2 + (process[MANEUVER_DRIFT] * maneuver) ** 2) * (ns / 1e9)
+        return F, Q
+
+    def advance(self, time: int) -> None:
+        """Predict to ``time`` [ns], over everything that is given or acts until then."""
+        while self._next < len(self._instants) and self._instants[self._next][0] <= time:
+            when, command, acts = self._instants[self._next]
+            F, Q = self.matrices(when - self.clock)
+            control = np.zeros((len(F), 1))
+            if acts:
+                control[self.error] = self._kick(command)
+                self._acting = command
+            else:
+                F, control[self.error + 1] = self._shift @ F, self._u[command]
+                self._issued = command + 1
+            self.kf.predict(u=control, F=F, Q=Q)
+            self.clock, self._next = when, self._next + 1
+        F, Q = self.matrices(time - self.clock)
+        self.kf.predict(F=F, Q=Q)
+        self.clock = time
+
+    def later(self, time: int, until: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """F, Q and x at ``until`` [ns] by the commands given by ``time``, where the filter stands, without moving it."""
+        kept = self.clock, self._next, self._acting, self._issued
+        F_all, Q_all, x = np.eye(len(self.kf.x)), np.zeros_like(self.kf.P), self.kf.x.copy()
+        acting = [c for c in range(self._acting + 1, len(self._u)) if self._acts[c] <= until and self._given[c] <= time]
+        for when, command in [*((int(self._acts[c]), c) for c in acting), (until, None)]:
+            F, Q = self.matrices(when - self.clock)
+            F_all, Q_all, x = F @ F_all, F @ Q_all @ F.T + Q, F @ x
+            if command is not None:
+                x[self.error] += self._kick(command)
+                self._acting = command
+            self.clock = when
+        self.clock, self._next, self._acting, self._issued = kept
+        return F_all, Q_all, x
+
+    @property
+    def speed(self) -> float:
+        """C(A x + B (u + e)) [m/s]."""
+        A, B, C = self._plant.state_space()
+        u = self._u[self._acting] if self._acting >= 0 else 0.0
+        v = u + self.kf.x[self.error, 0]
+        return float((C @ (A @ self.kf.x[: self.n, 0] + B[:, 0] * v))[0])
+
+    def _step(self, command: int) -> float:
+        before = self._u[command - 1] if command > 0 else 0.0
+        return float(self._u[command] - before) if command >= 0 else 0.0
+
+    def _kick(self, command: int) -> float:
+        step = self._step(command)
+        return (self._gain[SLOPE] * abs(step) / self.period + self._gain[INTERCEPT] - 1.0) * step
+
+    def _maneuver(self, command: int) -> float:
+        if command < 0:
+            return 0.0
+        return abs(self._step(command) - self._step(command - 1)) / self.period
 
 
-def fuse_filterpy(
-    timeline: Timeline, config: FusionConfig, times: TimeArray, mode: Mode, progress: Progress | None = None
-) -> Fused:
-    """Filter or smooth one timeline by the filterpy engine, with estimates at ``times`` (int64 ns)."""
-    engine = FilterpyEngine(timeline, config)
-    filtered = engine.filter_as_live(times, progress) if mode == "as-live" else engine.filter(progress)
-    axes: dict[str, AxisEstimate] = {}
-    biases: dict[str, dict[str, Bias]] = {}
-    for number, (axis, track) in enumerate(zip(timeline.axes, filtered.tracks, strict=True)):
-        plant = config.arm.axes[axis.name].plant
-        entry = np.arange(len(times)) if mode == "as-live" else track.holding(times)
-        later = hindsight_at(track, hindsight(track, plant), entry, times, plant) if mode == "smoothed" else None
-        axes[axis.name] = estimate(track, entry, times, plant, axis.start, later)
-        (mean, covariance), names = filtered.final[number], filtered.biases[number]
-        for place, name in enumerate(names, len(mean) - len(names)):
-            sd = float(np.sqrt(covariance[place, place]))
-            biases.setdefault(name, {})[axis.name] = Bias(float(mean[place]), sd)
-    return Fused(axes, filtered.innovation, filtered.innovation_sd, filtered.outcome, biases)
+class _Gate:
+    """What :mod:`pumafuse.filter.gate` does, for one sensor and axis at a time."""
+
+    def __init__(self, sensors: int, axes: int) -> None:
+        self.rejected: dict[tuple[int, int], tuple[float, float, int]] = {}  # ν, R and time of the one to agree with
+        self.streak = dict.fromkeys(((s, a) for s in range(sensors) for a in range(axes)), 0)
+        self.reacquired = self.streak.copy()
+        self.fused: dict[tuple[int, int], int] = {}
+        self.unsettled: dict[int, int] = {}
+
+    def agreement(
+        self, key: tuple[int, int], nu: float, R: float, time: int, gate: float, axis: _Axis, scale: float
+    ) -> int:
+        """1 if a rejected measurement agrees with the one before, 0 if not, −1 if that is less than T ago."""
+        if key not in self.rejected:
+            return 0
+        nu_then, R_then, then = self.rejected[key]
+        if time - then < axis.period * 1e9:
+            return -1
+        F, Q = axis.matrices(time - then)
+        h = axis.position[0]
+        row = h @ (F - np.eye(len(F)))
+        row[axis.biases :] = 0.0
+        motion = row @ axis.kf.P @ row + h @ Q @ h
+        return int(abs(nu - nu_then) <= gate * np.sqrt(R_then + R + scale**2 * motion))
+
+    def contradicted(self, sensor: int, axis: int, time: int) -> int:
+        """The sensor that stands for what is believed; −1 for none."""
+        for (other, there), fused in sorted(self.fused.items()):
+            fewer = self.reacquired[other, axis] <= self.reacquired[sensor, axis]
+            if there == axis and other != sensor and time - fused <= RECENT_NS and fewer:
+                return other
+        return -1
+
+    def count_rejected(self, key: tuple[int, int], nu: float, R: float, time: int, again: bool) -> None:
+        if not again or key not in self.rejected:
+            self.rejected[key] = nu, R, time
+        self.streak[key] += 1
+        if self.streak[key] > 1 and key[1] in self.unsettled:
+            self.unsettled[key[1]] = time
+
+    def count_fused(self, key: tuple[int, int], time: int) -> None:
+        self.rejected.pop(key, None)
+        self.streak[key], self.fused[key] = 0, time
+        axis = key[1]
+        mine = [fused for (_, there), fused in self.fused.items() if there == axis]
+        settled = axis in self.unsettled and time - self.unsettled[axis] >= SETTLED_NS
+        if settled and all(time - fused <= SETTLED_NS for fused in mine):
+            del self.unsettled[axis]
+            self.reacquired.update({one: 0 for one in self.reacquired if one[1] == axis})
+
+
+def filter_events(
+    plants: Sequence[AxisModel],
+    model: Model,
+    sensors: Sensors,
+    events: Events,
+    state: State,
+    times: TimeArray,
+    results: Results,
+    outputs: Outputs,
+    progress: Callable[[float], None] | None = None,
+) -> None:
+    """What :func:`pumafuse.filter.forward.filter_events` does; ``state`` gets the final biases."""
+    axes = [_Axis(plant, model, state, events, number) for number, plant in enumerate(plants)]
+    gate = _Gate(len(sensors.scale), len(axes))
+    at = 0
+    for row in range(len(events.time)):
+        while at < len(times) and times[at] < events.time[row]:
+            _estimate(axes, int(times[at]), outputs, at)
+            at += 1
+        if events.source[row] != COMMAND:
+            together = sensors.gate_rows[events.source[row]]
+            decided = [number for number in range(len(axes)) if events.known[row, number] == Outcome.FUSED]
+            for part in [decided] if together else [[number] for number in decided]:
+                _add(axes, sensors, events, state, gate, row, part, results)
+        if progress is not None and row % 1000 == 0:
+            progress(row / len(events.time))
+    for number in range(at, len(times)):
+        _estimate(axes, int(times[number]), outputs, number)
+    for number, axis in enumerate(axes):
+        names = axis.error - axis.biases
+        state.x[number, BIASES : BIASES + names] = axis.kf.x[axis.biases : axis.error, 0]
+        block = axis.kf.P[axis.biases : axis.error, axis.biases : axis.error]
+        state.P[number, BIASES : BIASES + names, BIASES : BIASES + names] = block
+
+
+def _add(
+    axes: Sequence[_Axis],
+    sensors: Sensors,
+    events: Events,
+    state: State,
+    gate: _Gate,
+    row: int,
+    part: Sequence[int],
+    results: Results,
+) -> None:
+    """Axes of a row that pass the gate together or not at all."""
+    sensor, time, scale = int(events.source[row]), int(events.time[row]), float(sensors.scale[events.source[row]])
+    met: dict[int, tuple[float, FloatArray, float, float, float]] = {}
+    for number in part:
+        axis = axes[number]
+        axis.advance(time)
+        H = scale * axis.position
+        if (bias := sensors.bias[sensor, number]) >= 0:
+            H[0, axis.biases + bias - BIASES] = 1.0
+        sd = sensors.sd[sensor, number] * (events.spread[row, number] if len(events.spread) else 1.0)
+        R = float(sd**2 + (scale * axis.speed * sensors.latency_sd[sensor]) ** 2)
+        z = float(events.value[row, number] - scale * state.drive[number, START])
+        nu, S = z - (H @ axis.kf.x).item(), (H @ axis.kf.P @ H.T).item() + R
+        met[number] = z, H, R, nu, S
+        results.innovation[row, number], results.innovation_sd[row, number] = nu, np.sqrt(S)
+    limit = float(sensors.gate[sensor])
+    beyond = [n for n, (_, _, _, nu, S) in met.items() if limit > 0.0 and abs(nu) > limit * np.sqrt(S)]
+    agreements = [gate.agreement((sensor, n), met[n][3], met[n][2], time, limit, axes[n], scale) for n in beyond]
+    other = max((gate.contradicted(sensor, n, time) for n in beyond), default=-1)
+    agreed = all(one == 1 for one in agreements)
+    if beyond:
+        results.contradicts[row] = other if agreed else -1
+    if beyond and not (agreed and other < 0):
+        for number, (_, _, R, nu, _) in met.items():
+            results.outcome[row, number] = Outcome.REJECTED
+            gate.count_rejected((sensor, number), nu, R, time, -1 in agreements)
+        return
+    for number, (z, H, R, nu, _) in met.items():
+        axis = axes[number]
+        results.outcome[row, number] = Outcome.REACQUIRED if number in beyond else Outcome.FUSED
+        if number in beyond:
+            axis.kf.P = axis.kf.P.copy()
+            axis.kf.P[axis.n, axis.n] += (nu / scale) ** 2
+            gate.reacquired[sensor, number] += 1
+            gate.unsettled[number] = time
+        axis.kf.update(np.array([[z]]), R=np.array([[R]]), H=H)
+        # Rounding makes P drift from symmetry by an ulp a step, and that grows over a million steps.
+        axis.kf.P = 0.5 * (axis.kf.P + axis.kf.P.T)
+        results.innovation_sd[row, number] = float(np.sqrt(axis.kf.S[0, 0]))
+        gate.count_fused((sensor, number), time)
+
+
+def _estimate(axes: Sequence[_Axis], time: int, outputs: Outputs, n: int) -> None:
+    """Every axis at ``time`` [ns], as estimate ``n``; a filter that is brought there changes nothing by it."""
+    for number, axis in enumerate(axes):
+        axis.advance(time)
+        h, x, P, period = axis.position[0], axis.kf.x[:, 0], axis.kf.P, axis.period
+        outputs.position[number, n], outputs.position_sd[number, n] = h @ x, np.sqrt(max(h @ P @ h, 0.0))
+        outputs.offset[number, n], outputs.offset_sd[number, n] = x[axis.n], np.sqrt(max(P[axis.n, axis.n], 0.0))
+        F, Q, later = axis.later(time, time + round(period * 1e9))
+        row = h @ F - h
+        row[axis.biases :] = 0.0  # known: the inputs and e
+        outputs.velocity[number, n] = (h @ later[:, 0] - h @ x) / period
+        outputs.velocity_sd[number, n] = np.sqrt(max(row @ P @ row + h @ Q @ h, 0.0)) / period

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -16,6 +18,8 @@ from .config import FusionConfig
 from .estimates import AxisEstimate, Bias, Mode
 from .segments import Segment
 from .setup import at_rest, filter_model, filter_sensors, room_for
+
+Engine = Literal["compiled", "filterpy"]
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,24 @@ class Filtered:
     biases: dict[str, dict[str, Bias]]
 
 
-def filter_segment(segment: Segment, config: FusionConfig, times: TimeArray, mode: Mode) -> Filtered:
-    """Filter or smooth one segment, with estimates at ``times`` (int64 ns, ascending, none before the origin)."""
+def filter_segment(
+    segment: Segment,
+    config: FusionConfig,
+    times: TimeArray,
+    mode: Mode,
+    engine: Engine = "compiled",
+    progress: Callable[[float], None] | None = None,
+) -> Filtered:
+    """Filter or smooth one segment.
+
+    Args:
+        segment: The events.
+        config: Arm, noise and sensors.
+        times: Of the estimates, int64 ns, ascending, none before the origin.
+        mode: Which measurements an estimate knows.
+        engine: Which filter; ``filterpy`` only filters.
+        progress: Called now and then by the filterpy engine with the share done, 0 to 1.
+    """
     events, _ = segment.events(config)
     biases = biased_sensors(segment, config)
     model, sensors, state = arranged(segment, config, biases)
@@ -44,7 +64,12 @@ def filter_segment(segment: Segment, config: FusionConfig, times: TimeArray, mod
     results = Results.room(count, axes)
     results.outcome[:] = events.known
     outputs = Outputs(*np.empty((len(Outputs._fields), axes, len(times))))
-    if mode == "as-live":
+    if engine == "filterpy":
+        from ..filter import filterpy_engine
+
+        plants = [config.arm.axes[axis] for axis in segment.axes]
+        filterpy_engine.filter_events(plants, model, sensors, events, state, times, results, outputs, progress)
+    elif mode == "as-live":
         history = no_history(state)
         arrival = np.where(events.source == COMMAND, events.stamp, np.maximum(events.stamp, events.time))
         queue = np.argsort(arrival, kind="stable")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -20,13 +20,11 @@ from ..logs.run import Run
 from ..units import seconds
 from .config import FusionConfig
 from .consistency import sensor_problems
-from .engine import Filtered, filter_segment
+from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
 from .reference import joined_references, late_rows, reference_track
 from .score import interpolated
 from .segments import Segment, build, output_times
-
-Engine = Literal["compiled", "filterpy"]
 
 
 def fuse(
@@ -68,6 +66,8 @@ def fuse(
         raise ValueError(f"no engine '{engine}'; there are: {', '.join(get_args(Engine))}")
     if smooth and as_live:
         raise ValueError("smooth uses every measurement and as_live only those that had arrived; choose one")
+    if engine == "filterpy" and (smooth or as_live):
+        raise ValueError("the filterpy engine gives filtered estimates only; smooth and as_live need the compiled one")
     mode: Mode = "smoothed" if smooth else "as-live" if as_live else "filtered"
     chosen = None if sensors is None else tuple(sensors)
     in_place, placed = in_axes(run, config.frame)
@@ -117,12 +117,7 @@ def _fuse_segment(
     engine: Engine,
     progress: Callable[[float], None] | None,
 ) -> Estimates:
-    if engine == "filterpy":
-        from .reference_engine import filter_segment_by_filterpy
-
-        filtered = filter_segment_by_filterpy(segment, config, times, progress)
-    else:
-        filtered = filter_segment(segment, config, times, mode)
+    filtered = filter_segment(segment, config, times, mode, engine, progress)
     origin = segment.origin
     return Estimates(
         run=run.name,
