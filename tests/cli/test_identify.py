@@ -50,7 +50,7 @@ def samples(name: str, plant: pf.FirstOrder | pf.SecondOrder, step_mm: float, se
 def campaign(
     folder: Path, axes: tuple[str, ...] = ("radial", "vertical"), listed: str = "", sampled: str = "", header: str = ""
 ) -> Path:
-    """Two steps each of four sizes on each axis, up and down, and what more is asked for."""
+    """Two steps each of four sizes on each axis, up and down, and more."""
     folder.mkdir(parents=True, exist_ok=True)
     lines, rows, number = [], [], 0
     for axis in axes:
@@ -71,7 +71,7 @@ def trials(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def identified(trials: Path) -> tuple[Path, dict[str, object]]:
-    """The arm file, and what --json says."""
+    """The arm file, and the output of --json."""
     path = trials.parent / "new" / "arm.toml"
     done = pumafuse("identify", trials, "-o", path, "--json")
     assert done.stderr == ""
@@ -166,7 +166,7 @@ def test_an_arm_file_is_kept_unless_forced(
 
 @pytest.mark.long
 def test_an_axis_with_too_few_trials_gets_no_model(tmp_path: Path) -> None:
-    """It is said, and the others are done."""
+    """It is named, and the others are done."""
     few = "".join(f"{name},vertical,8.0,0.285714\n" for name in ("a", "b"))
     sampled = samples("a", TRUE["vertical"], 8.0, 1) + samples("b", TRUE["vertical"], 8.0, 2)
     trials = campaign(tmp_path / "bench", ("radial",), few, sampled)

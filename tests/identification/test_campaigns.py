@@ -1,4 +1,4 @@
-"""Whole campaigns with a known truth: intervals hold, orders are distinguished, broken arms are named.
+"""Whole campaigns of a known arm: intervals hold, orders are distinguished, broken arms are named.
 
 The campaigns are made here, from responses written down by hand: nothing of the simulator or of the fits is used.
 """
@@ -85,7 +85,7 @@ def test_intervals_hold_over_500_campaigns(order: int) -> None:
     """Each true value is in its 95 % interval in 92 to 98 % of 500 campaigns of 12 trials, together in 94 to 96.5 %.
 
     One standard deviation of a share of 95 % in 500 is 1.0 %. The bias of each is below 1 %. The right order is chosen
-    in at least 90 %; with a first-order truth 1/ω² may be 0 in as many, and the curve is within 0.1 % of K in as many.
+    in at least 90 %; with a first-order arm 1/ω² may be 0 in as many, and the curve is within 0.1 % of K in as many.
     """
     inside, values, right, open_ends = defaultdict[str, list[bool]](list), defaultdict[str, list[float]](list), 0, 0
     off: list[float] = []

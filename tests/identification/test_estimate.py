@@ -104,10 +104,10 @@ def test_the_variance_between_trials_is_paule_and_mandels(design: np.ndarray, be
 def test_degenerate_values_are_taken_without_a_warning(values: list[float], sd: float) -> None:
     """None or one: an open interval; equal ones: that value."""
     given = np.array(values)
-    with warnings.catch_warnings(record=True) as said:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         found = [mean(given), robust(given), common(given, np.full(len(values), sd))]
-    assert not [str(one.message) for one in said]
+    assert not [str(one.message) for one in caught]
     for one in found:
         if len(values) < 2:
             assert one.ci95 == (-np.inf, np.inf)

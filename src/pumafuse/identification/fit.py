@@ -23,7 +23,7 @@ from .estimate import t_quantile
 from .trials import Trial
 
 HARDLY_MOVED = "hardly moved (stiction?)"
-TOO_FEW = "too few samples tell anything: the gain may be 0"
+UNKNOWN_GAIN = "gain not identifiable: it may be 0"
 
 _STARTS = 4  # cells of the grid to search from
 _RATIOS = (0.0, 0.08, 0.16, 0.25, 0.4, 0.8, 2.0)  # p/q² = 1/(4ζ²): ζ from ∞ to 0.35
@@ -151,7 +151,7 @@ def flags(fit: StepFit, usual: float = 1.0) -> list[str]:
     if usual == 0.0 or moved / usual < _MOVES:
         found.append(f"{HARDLY_MOVED}: {max(moved, 0.0):.0%} of the step")
     elif not fit.ci95.gain[1] - fit.ci95.gain[0] < 2.0 * abs(fit.gain):
-        found.append(TOO_FEW)
+        found.append(UNKNOWN_GAIN)
     if fit.reached < _SETTLED:
         found.append(f"not settled: {fit.reached:.0%} reached")
     if fit.order == 2 and fit.ci95.p[0] <= 0.0:
