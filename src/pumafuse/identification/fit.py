@@ -94,10 +94,8 @@ class StepFit:
     @property
     def plant(self) -> PLANTS:
         """The plant; one of second order whose p is 0 gets the highest ω that q allows."""
-        if self.order == 1:
-            return FirstOrder(time_constant=self.shape.q)
-        omega = 1.0 / np.sqrt(max(self.shape.p, least_p(self.shape.q)))
-        return SecondOrder(natural_frequency=float(omega), damping=float(0.5 * self.shape.q * omega))
+        _, q, p = self.shape
+        return plant_of(q, 0.0 if self.order == 1 else max(p, least_p(q)))
 
     @cached_property
     def sd(self) -> Coefficients[float]:
@@ -243,6 +241,13 @@ def inverse(jacobian: FloatArray) -> FloatArray:
         return np.diag(np.full(len(length), np.inf))
     inverse = np.linalg.inv(np.linalg.qr(jacobian / length, mode="r"))
     return (inverse @ inverse.T) / np.outer(length, length)
+
+
+def plant_of(q: float, p: float) -> PLANTS:
+    """The plant 1/(p s² + q s + 1), of first order where p is 0."""
+    if p == 0.0:
+        return FirstOrder(time_constant=q)
+    return SecondOrder(natural_frequency=p**-0.5, damping=0.5 * q * p**-0.5)
 
 
 def least_p(q: float) -> float:
