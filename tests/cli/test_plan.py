@@ -16,12 +16,12 @@ def test_axes_and_period_are_the_arms(tmp_path: Path) -> None:
         "time_constant_ms = 30.0\n"
     )
     (tmp_path / "where.csv").write_text("pose,load_kg\nnear,0\nfar,2\n")
-    said = pumafuse(
+    done = pumafuse(
         *("plan", "-o", tmp_path / "plan", "--arm", tmp_path / "arm.toml", "--speeds", "0.1,0.2"),
         *("--positions", tmp_path / "where.csv", "--noise", "5"),
     )
-    assert said.stderr == ""
-    assert "8 step trials and 1 white-noise sequences" in said.stdout
+    assert done.stderr == ""
+    assert "8 step trials and 1 white-noise sequences" in done.stdout
     assert {path.name for path in (tmp_path / "plan").iterdir()} == {
         "trials.csv", "steps.csv", "white-noise-tip-5mm.csv",
     }  # fmt: skip
@@ -43,6 +43,6 @@ def test_axes_and_period_are_the_arms(tmp_path: Path) -> None:
 )
 def test_what_cannot_be_planned_is_one_line(arguments: tuple[str, ...], words: str, code: int, tmp_path: Path) -> None:
     """Nothing is written then."""
-    said = pumafuse("plan", "-o", tmp_path / "plan", *arguments, code=code)
-    assert words in said.stderr.splitlines()[-1]
+    done = pumafuse("plan", "-o", tmp_path / "plan", *arguments, code=code)
+    assert words in done.stderr.splitlines()[-1]
     assert not (tmp_path / "plan").exists()

@@ -56,7 +56,7 @@ def found(run: Path) -> list[dict[str, object]]:
     return json.loads(pumafuse("verify", run, "--arm", run / "arm.toml", *sensors, "--json").stdout)
 
 
-def test_json_says_what_python_says(run: Path, found: list[dict[str, object]]) -> None:
+def test_json_has_the_numbers_of_python(run: Path, found: list[dict[str, object]]) -> None:
     """Every number with its unit, in the order of the axes; of a run of the arm itself only the noise is left."""
     expected = [
         one for one, _ in pf.verify(pf.Run.read(run), pf.ArmModel.load(run / "arm.toml"), sensors=["scope", "eye"])
@@ -81,13 +81,13 @@ def test_json_says_what_python_says(run: Path, found: list[dict[str, object]]) -
 
 def test_the_table_shows_the_same_numbers(run: Path, found: list[dict[str, object]]) -> None:
     """One line a source with the RMS in three digits, then a sentence for each."""
-    said = pumafuse("verify", run, "--arm", run / "arm.toml", "--sensors", "scope,eye").stdout
-    rows = [line for line in said.splitlines() if " scope " in line or " eye " in line]
+    shown = pumafuse("verify", run, "--arm", run / "arm.toml", "--sensors", "scope,eye").stdout
+    rows = [line for line in shown.splitlines() if " scope " in line or " eye " in line]
     assert len(rows) == 4
     for row, one in zip(rows, found, strict=True):
         for number in (one["model"]["rms_mm"], one["best_in_class"]["fit"]["rms_mm"]):
             assert f"{number:.3f}" in row.split()
-    joined = " ".join(said.split())
+    joined = " ".join(shown.split())
     for one in found:
         best = one["best_in_class"]
         assert f"start level {one['start_mm']:g} mm ({one['start_from']})" in joined

@@ -156,7 +156,7 @@ def test_half_a_width_is_students_where_trials_are_alike() -> None:
 
 @pytest.mark.long
 def test_a_first_order_arm_is_rarely_called_second_order() -> None:
-    """In 10 of 12 campaigns the interval of 1/ω² by trials holds 0 and τ lies in its own."""
+    """In 10 of 12 campaigns the interval of 1/ω² by trials contains 0 and τ lies in its own."""
     covered = 0
     for seed in range(20, 32):
         axis = combined(campaign(FIRST, 0.02, seed)[0]).axis
@@ -174,7 +174,7 @@ def test_a_first_order_arm_is_rarely_called_second_order() -> None:
 def test_half_widths_hold(order: int, plant: tuple[float, float]) -> None:
     """Over 100 campaigns with jittering delays and unequal noise: they hold as often as they claim.
 
-    87 % of the truths of q (and p) or more lie inside (four standard deviations of a share); half over Student's
+    87 % of the true q (and p) or more lie inside (four standard deviations of a share); half over Student's
     97.5 % point of 7 is the standard deviation over the campaigns within −20 and +35 %.
     """
     noise = [0.02, 0.02, 0.01, 0.01, 0.03, 0.03, 0.01, 0.02]

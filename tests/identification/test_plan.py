@@ -1,4 +1,4 @@
-"""Campaigns are balanced and random, tick by tick what they say, and warn of what will spoil them."""
+"""Campaigns are balanced and random, their ticks are the listed trials, and they warn of what will spoil them."""
 
 from __future__ import annotations
 
@@ -110,14 +110,14 @@ WARNED: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", WARNED)
-def test_what_will_spoil_a_campaign_is_said(case: str) -> None:
+def test_what_will_spoil_a_campaign_is_warned_of(case: str) -> None:
     """Once for each axis it is true of, and nothing else; a good plan has no warning."""
     changes, words = WARNED[case]
     assert plan(design(), ARM).warnings == ()
-    said = plan(design(**changes), ARM).warnings
-    assert any(line.startswith(words) for line in said), said
+    warned = plan(design(**changes), ARM).warnings
+    assert any(line.startswith(words) for line in warned), warned
     topic = words.split(": ")[-1][:12]
-    assert all(topic in line for line in said), said
+    assert all(topic in line for line in warned), warned
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_what_will_spoil_a_campaign_is_said(case: str) -> None:
         ({"positions": (POSITIONS[0], POSITIONS[0])}, "positions: one is listed twice"),
     ],
 )
-def test_a_slip_is_said_without_an_arm_too(changes: dict[str, Any], words: str) -> None:
+def test_a_slip_is_warned_of_without_an_arm_too(changes: dict[str, Any], words: str) -> None:
     """Speeds in mm/s, amplitudes in m, a period in s: steps that no arm makes, or that nobody would see."""
     assert not any("unit" in line or "twice" in line for line in plan(design()).warnings)
     assert any(line.startswith(words) for line in plan(design(**changes)).warnings)
@@ -140,8 +140,8 @@ def test_the_settling_time_is_the_plants() -> None:
     """Td + 2 % settling of τ = 42.5 ms is 60.45 + 166.3 ms: a hold just below it warns, just above does not."""
     needed = 0.06045 - 0.0425 * np.log(0.02)
     for hold, warned in ((needed - 0.001, True), (needed + 0.001, False)):
-        said = plan(design(axes=("radial",), hold=hold), ARM).warnings
-        assert any("too short" in line for line in said) == warned
+        lines = plan(design(axes=("radial",), hold=hold), ARM).warnings
+        assert any("too short" in line for line in lines) == warned
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,9 @@ import numpy as np
 
 from ..arrays import FloatArray, TimeArray
 from ..model.arm import AxisModel, Gain, commanded_speed
-from ..model.plants import PLANTS, FirstOrder, SecondOrder
+from ..model.plants import PLANTS, SecondOrder
 from ..model.response import response
+from .fit import plant_of
 
 _SPIKE = 8.0  # robust standard deviations
 _DELAYS, _LATEST = 13, 9.0  # of the first grid: how many, up to how many periods
@@ -147,12 +148,15 @@ def best_in_class(measured: Measured, command: Commands, model: AxisModel, delay
     def cost(x: FloatArray) -> float:
         return float(np.sum(residual(x) ** 2))
 
-    plants = _plants(command.period, model.plant)
+    own = model.plant.natural_frequency**-2 if isinstance(model.plant, SecondOrder) else 0.0  # p
+    ratios = _RATIOS if own else (0.0,)
+    lags = np.geomspace(0.2 * command.period, 10.0 * command.period, _LAGS).tolist()
+    shapes = [(q, ratio * q * q) for q in lags for ratio in ratios]
     delays = np.linspace(0.0, _LATEST * command.period, _DELAYS).tolist()
-    cells = sorted((min((_coordinates(td, plant) for plant in plants), key=cost) for td in delays), key=cost)
+    cells = sorted((min((_coordinates(td, q, p) for q, p in shapes), key=cost) for td in delays), key=cost)
     found = [
         least_squares(residual, x, x_scale="jac", xtol=1e-10, ftol=1e-12, gtol=1e-12, max_nfev=300)
-        for x in [_coordinates(delay, model.plant), *cells[:_STARTS]]
+        for x in [_coordinates(delay, model.plant.lag, own), *cells[:_STARTS]]
     ]
     best = min(found, key=lambda one: float(one.cost)).x
     modelled, share = linear(best)
@@ -175,25 +179,11 @@ def _gain_columns(command: Commands, model: AxisModel) -> list[AxisModel]:
     return [msgspec.structs.replace(model, gain=gain) for gain in gains]
 
 
-def _plants(period: float, like: PLANTS) -> list[PLANTS]:
-    """Plants of one order on a grid of lags (and dampings)."""
-    lags = np.geomspace(0.2 * period, 10.0 * period, _LAGS).tolist()
-    if isinstance(like, FirstOrder):
-        return [FirstOrder(time_constant=lag) for lag in lags]
-    omegas = [(lag, (ratio * lag * lag) ** -0.5) for lag in lags for ratio in _RATIOS]
-    return [SecondOrder(natural_frequency=omega, damping=0.5 * lag * omega) for lag, omega in omegas]
-
-
-def _coordinates(delay: float, plant: PLANTS) -> FloatArray:
-    """√Td and log τ, or log 2ζ/ω and log 1/ω: free of bounds."""
-    if isinstance(plant, FirstOrder):
-        return np.array([np.sqrt(delay), np.log(plant.time_constant)])
-    return np.array([np.sqrt(delay), np.log(plant.lag), -np.log(plant.natural_frequency)])
+def _coordinates(delay: float, q: float, p: float) -> FloatArray:
+    """√Td, log q and, of second order, log √p: free of bounds."""
+    return np.array([np.sqrt(delay), np.log(q), *([0.5 * np.log(p)] if p > 0.0 else [])])
 
 
 def _plant_at(x: FloatArray) -> PLANTS:
-    q = float(np.exp(np.clip(x[1], -12.0, 6.0)))
-    if len(x) == 2:
-        return FirstOrder(time_constant=q)
-    omega = float(np.exp(-np.clip(x[2], -12.0, 6.0)))
-    return SecondOrder(natural_frequency=omega, damping=0.5 * q * omega)
+    bounded = np.clip(x, -12.0, 6.0)
+    return plant_of(float(np.exp(bounded[1])), float(np.exp(2.0 * bounded[2])) if len(x) == 3 else 0.0)

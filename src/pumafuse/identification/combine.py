@@ -19,7 +19,7 @@ from ..model.plants import PLANTS, FirstOrder, SecondOrder
 from .anova import ordered, outlying, speed_levels
 from .batch import Order
 from .estimate import Estimate, common, mean, regression, robust
-from .fit import HARDLY_MOVED, TOO_FEW, StepFit, flags, least_p
+from .fit import HARDLY_MOVED, UNKNOWN_GAIN, StepFit, flags, least_p
 from .joint import JointFit, fit_together, inverse_square
 from .paper import minimise
 from .trials import Trial
@@ -45,12 +45,12 @@ class OrderChoice(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         order: The choice.
-        first_rms_mm: Root mean square residual of first order over all trials.
-        second_rms_mm: Of second order.
+        first_rms: Root mean square residual of first order over all trials [m].
+        second_rms: Of second order [m].
         f: Of the F-test of the additional parameters of second order.
         p: Of that F.
         aicc_gain: By how much second order lowers AICc; negative: it raises it. Null: too few samples.
-        inverse_square_s2: 1/ω² [s²] with its interval by trials; 0 is first order.
+        inverse_square: 1/ω² [s²] with its interval by trials; 0 is first order.
         why: In words.
     """
 
@@ -205,7 +205,7 @@ def _still(fitted: Sequence[Fitted]) -> dict[str, str]:
     """Trials in which the arm hardly moved."""
     usual = usual_gain(fitted)
     found = {one.trial.name: flag for one in fitted for flag in flags(one.first, usual)[:1]}
-    return {name: flag for name, flag in found.items() if flag.startswith((HARDLY_MOVED, TOO_FEW))}
+    return {name: flag for name, flag in found.items() if flag.startswith((HARDLY_MOVED, UNKNOWN_GAIN))}
 
 
 def _unseen(fitted: Sequence[Fitted]) -> dict[str, str]:
@@ -334,7 +334,7 @@ def _choose(
     if gain is not None:
         aicc = f"AICc {abs(gain):.3g} {'lower' if gain > 0.0 else 'higher'}"
     numbers = (
-        f"first order leaves {1e3 * rms[0]:.3g} mm, second {1e3 * rms[1]:.3g} (each trial weighed by its noise:"
+        f"first order leaves {1e3 * rms[0]:.3g} mm, second {1e3 * rms[1]:.3g} (each trial weighted by its noise:"
         f" F({more}, {freedom}) = {F:.3g}, p {'< 0.001' if p < 1e-3 else f'= {p:.2g}'}; {aicc})"
     )
     preferred = p < 0.05 and gain is not None and gain > 0.0
@@ -376,13 +376,9 @@ def _gain_line(speed: FloatArray, found: Common, levels: Sequence[str]) -> tuple
     (b_low, b_high), (a_low, a_high) = line.conf_int().tolist()
     b, a = line.params.tolist()
     gain = Gain(slope=a, intercept=b, slope_ci95=(a_low, a_high), intercept_ci95=(b_low, b_high))
-    words = (
-        "K rises with speed"
-        if a_low > 0.0
-        else "K falls with speed"
-        if a_high < 0.0
-        else "the slope is not significant"
-    )
+    words = "the slope is not significant"
+    if a_low > 0.0 or a_high < 0.0:
+        words = "K rises with speed" if a > 0.0 else "K falls with speed"
     lack = None
     if 2 < len(distinct) < len(speed):
         lack = _lack_of_fit(line, levels)

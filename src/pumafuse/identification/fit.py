@@ -23,7 +23,7 @@ from .estimate import t_quantile
 from .trials import Trial
 
 HARDLY_MOVED = "hardly moved (stiction?)"
-TOO_FEW = "too few samples tell anything: the gain may be 0"
+UNKNOWN_GAIN = "gain not identifiable: it may be 0"
 
 _STARTS = 4  # cells of the grid to search from
 _RATIOS = (0.0, 0.08, 0.16, 0.25, 0.4, 0.8, 2.0)  # p/q² = 1/(4ζ²): ζ from ∞ to 0.35
@@ -94,10 +94,8 @@ class StepFit:
     @property
     def plant(self) -> PLANTS:
         """The plant; one of second order whose p is 0 gets the highest ω that q allows."""
-        if self.order == 1:
-            return FirstOrder(time_constant=self.shape.q)
-        omega = 1.0 / np.sqrt(max(self.shape.p, least_p(self.shape.q)))
-        return SecondOrder(natural_frequency=float(omega), damping=float(0.5 * self.shape.q * omega))
+        _, q, p = self.shape
+        return plant_of(q, 0.0 if self.order == 1 else max(p, least_p(q)))
 
     @cached_property
     def sd(self) -> Coefficients[float]:
@@ -151,7 +149,7 @@ def flags(fit: StepFit, usual: float = 1.0) -> list[str]:
     if usual == 0.0 or moved / usual < _MOVES:
         found.append(f"{HARDLY_MOVED}: {max(moved, 0.0):.0%} of the step")
     elif not fit.ci95.gain[1] - fit.ci95.gain[0] < 2.0 * abs(fit.gain):
-        found.append(TOO_FEW)
+        found.append(UNKNOWN_GAIN)
     if fit.reached < _SETTLED:
         found.append(f"not settled: {fit.reached:.0%} reached")
     if fit.order == 2 and fit.ci95.p[0] <= 0.0:
@@ -243,6 +241,13 @@ def inverse(jacobian: FloatArray) -> FloatArray:
         return np.diag(np.full(len(length), np.inf))
     inverse = np.linalg.inv(np.linalg.qr(jacobian / length, mode="r"))
     return (inverse @ inverse.T) / np.outer(length, length)
+
+
+def plant_of(q: float, p: float) -> PLANTS:
+    """The plant 1/(p s² + q s + 1), of first order where p is 0."""
+    if p == 0.0:
+        return FirstOrder(time_constant=q)
+    return SecondOrder(natural_frequency=p**-0.5, damping=0.5 * q * p**-0.5)
 
 
 def least_p(q: float) -> float:

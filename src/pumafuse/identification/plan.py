@@ -7,7 +7,7 @@ during the day does not look like a factor, and a campaign that is cut short aft
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ TRIALS, STEPS = "trials.csv", "steps.csv"
 _NOISE = "white-noise-"
 _SETTLED = 0.98  # share of the final value
 _MOST_TRIALS, _MOST_ROWS = 100_000, 5_000_000
-_FASTEST, _SHORTEST = 10.0, 50e-6  # m/s that no arm reaches; m that no arm's sensor tells from rest
+_FASTEST, _SHORTEST = 10.0, 50e-6  # m/s that no arm reaches; m that no sensor of an arm resolves
 _LEAST, _MOST = 1e-6, 10.0  # m, that a step can be
 _TAKEN = frozenset({"trial", "axis", "step_mm", "speed_m_s", "replicate", "tick", "time_s"})
 
@@ -105,18 +105,18 @@ class Plan:
         trials: In the order in which they are to be made.
         noise: White noise [m] by axis and amplitude, tick by tick, (n,).
         duration: Of all sequences [s], without the moves between positions.
-        warnings: What will spoil it, a sentence each.
+        warnings: What is wrong with it, a sentence each.
     """
 
     design: Design
     trials: tuple[PlannedTrial, ...]
     noise: Mapping[tuple[str, float], FloatArray]
     duration: float
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...]
 
 
 def plan(design: Design, arm: ArmModel | None = None, max_speed: float | None = None) -> Plan:
-    """Lay out a campaign.
+    """A campaign in random order, with its warnings.
 
     Args:
         design: What it is to vary.

@@ -1,8 +1,8 @@
 """Verification of a model on a run that it was not made from: the paper's Table III and Figs. 8 and 9.
 
 The model is driven by the run's commands alone and compared with the measurements, both without their means, as in the
-paper. Beside it stands the best in class: the best linear model of the same order, refitted on this very run. What that
-leaves is noise, friction and everything else that is not linear.
+paper. Beside it stands the best in class: the best linear model of the same order, refitted on this very run. Its
+error is noise, friction and everything else that is not linear.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ REFERENCE = "reference"
 _FEWEST = 20  # measurements
 _MOST_LEVELS = 8  # of a run whose start level is searched among them
 _AS_GOOD, _FAR = 1.2, 3.0  # times the error of the best in class
-_FARTHEST, _SLOWEST = 1e6, 1e4  # m, s: sizes beyond which nothing can be computed
+_FARTHEST, _SLOWEST = 1e6, 1e4  # m, s: sizes beyond which numbers overflow
 _HOLDS = 50.0  # % fit
 _BETTER = 0.8  # share of the error below which a recovery is recommended
 
@@ -198,7 +198,7 @@ def _verified(
 
 
 def _check_sizes(axis: str, start: float, model: AxisModel, delay: float) -> None:
-    """Refuse numbers with which nothing can be computed."""
+    """Refuse numbers that are too large or too small to compute with."""
     rates = [model.plant.natural_frequency] if isinstance(model.plant, SecondOrder) else []
     if not all(1.0 / _SLOWEST <= rate <= _FARTHEST for rate in (*rates, 1.0 / max(model.plant.lag, 1e-300))):
         raise ConfigError(f"axis '{axis}': a plant of no speed that an arm has")
