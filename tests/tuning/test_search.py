@@ -48,8 +48,8 @@ def test_where_it_starts_does_not_matter() -> None:
         config = with_sensors(sim.config, sd=times * 0.5e-3)
         starts.append(with_process(config, input_noise=times * 3e-5, drift=times * 3e-4, maneuver_drift=0.0))
     starts.append(with_process(sim.config, input_noise=0.0, drift=0.0, maneuver_noise=0.0, maneuver_drift=0.0))
-    heights = [fit_stage(sim.run, config).best.log_posterior for config in starts]
-    assert max(heights) - min(heights) < 0.1
+    totals = [fit_stage(sim.run, config).best.log_posterior for config in starts]
+    assert max(totals) - min(totals) < 0.1
 
 
 SWEEP = """

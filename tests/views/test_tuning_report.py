@@ -91,7 +91,7 @@ def test_every_part_of_the_page_has_its_heading_and_sentence_and_nothing_is_load
         "Tuning: a run",
         "What to know first",
         "What was fitted",
-        "How sure it is",
+        "Profiles of the likelihood",
         "Validation",
         "Innovations before and after",
     ]
@@ -261,7 +261,7 @@ def test_without_a_run_to_validate_on_the_page_says_so() -> None:
     found, run = tuned(runs=2)
     text = page(found, [run, run])
     assert "Validation" not in outline(text).headings
-    assert "nothing says whether the numbers hold elsewhere" in text
+    assert "whether the numbers hold elsewhere is not known" in text
 
 
 def test_names_are_text_and_nothing_else() -> None:
@@ -286,7 +286,7 @@ def test_an_interrupted_tuning_has_a_page_too(after: str) -> None:
     found = quietly([run], known("tip", "camera"), ["noise"], progress=interrupt)
     seen = outline(page(found, [run]))
     assert found.summary.interrupted
-    assert "How sure it is" not in seen.headings
+    assert "Profiles of the likelihood" not in seen.headings
     assert seen.pictures == ["Innovations before and after"]
 
 

@@ -94,7 +94,7 @@ def confidence_intervals(
     """Compute the 95 % interval of each free parameter, by its key.
 
     From the curvature: 1.96 sd of the coordinate each way. Where the likelihood at an end, the other parameters moved
-    along, has not dropped by what that says (1.92), the end is where its profile has (Cox & Hinkley, Theoretical
+    along, has not dropped by what that predicts (1.92), the end is where its profile has (Cox & Hinkley, Theoretical
     Statistics, 9.3). Gates make the likelihood jump; the intervals are those of the maximum that it has while the
     outcomes stay as they are. That maximum is not the result: there the gates decide otherwise, and for a lower
     likelihood, or the search would have gone there. So an interval beside the result is extended to it.
