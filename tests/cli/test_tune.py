@@ -19,7 +19,7 @@ from executable import EXECUTABLE, pumafuse
 from pumafuse.logs.save import save
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.summary import TuningSummary
-from tuning_runs import later, quietly, replaced, scenario, spoiled, spoiled_arm, with_outliers
+from tuning_runs import quietly, replaced, scenario, spoiled, spoiled_arm, with_outliers
 
 FILES = {"fusion.toml", "arm.toml", "tuning.json"}
 
@@ -63,14 +63,6 @@ def tuned(place: Place, run: Path, config: Path) -> tuple[Path, subprocess.Compl
     """The result folder, and the finished command with --json."""
     out = place.folder / "out"
     return out, pumafuse("tune", run, "-c", config, "-o", out, "--json")
-
-
-def refused(*arguments: object) -> str:
-    """The error message; nothing is on stdout."""
-    done = pumafuse("tune", *arguments, code=1)
-    assert done.stdout == ""
-    (line,) = done.stderr.splitlines()
-    return line
 
 
 def names(folder: Path) -> set[str]:
@@ -134,34 +126,26 @@ def test_worse_on_the_validation_run_is_code_3(place: Place, run: Path) -> None:
     assert set(re.findall("^warning: (.*)$", done.stderr, re.MULTILINE)) == set(summary.notes)
 
 
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        later(("--fix", "trakker"), "pumafuse: --fix: 'trakker' names nothing that can be fitted; parts of names: "),
-        later(("--trust", "tracker"), "pumafuse: sensors: unknown sensor 'tracker'; accepted: vision"),
-    ],
-    ids=lambda value: value[0] if isinstance(value, tuple) else "",
-)
-def test_a_wrong_option_is_one_line(
-    options: tuple[str, str], line: str, run: Path, config: Path, tmp_path: Path
+WRONG = {
+    "names nothing to fix": (
+        1,
+        ["--fix", "trakker"],
+        "pumafuse: --fix: 'trakker' names nothing that can be fitted; parts",
+    ),
+    "no such sensor": (1, ["--trust", "tracker"], "pumafuse: sensors: unknown sensor 'tracker'; accepted: vision"),
+    "no kind": (2, ["--fit", ","], ""),
+    "no such kind": (2, ["--fit", "delai"], ""),
+}
+
+
+@pytest.mark.parametrize(("code", "options", "line"), WRONG.values(), ids=WRONG.keys())
+def test_a_wrong_option_is_refused(
+    code: int, options: list[str], line: str, run: Path, config: Path, tmp_path: Path
 ) -> None:
-    """With what would have been accepted; nothing is written."""
-    assert refused(run, "-c", config, "-o", tmp_path / "out", *options).startswith(line)
+    """With exit code and reason; nothing is written."""
+    done = pumafuse("tune", run, "-c", config, "-o", tmp_path / "out", *options, code=code)
+    assert done.stdout == "" and done.stderr.startswith(line)
     assert names(tmp_path) == set()
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("-c", "fusion.toml"),
-        later(()),
-        later(("-c", "fusion.toml", "-o", "out", "--fit", ",")),
-        later(("-c", "fusion.toml", "-o", "out", "--fit", "delai")),
-    ],
-)
-def test_wrong_usage_is_code_2(words: tuple[str, ...], run: Path) -> None:
-    """No place for the result, no configuration, nothing to fit or an unknown kind."""
-    assert pumafuse("tune", run, *words, code=2).stdout == ""
 
 
 # ---- Ctrl-C ---------------------------------------------------------------------------------------------------------

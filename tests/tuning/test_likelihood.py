@@ -91,14 +91,14 @@ def test_it_is_the_log_likelihood_of_a_fusion(made: Callable[[], tuple[pf.Run, p
         assert len(outcomes) == likelihood.count.sum()
 
 
-SURE = {
+UNBIASED = {
     name: case
     for name, case in CASES.items()
     if case.heard and not any(heard.sensor.latency_sd or heard.sensor.bias_sd for heard in case.heard.values())
 }
 
 
-@pytest.mark.parametrize("case", SURE.values(), ids=SURE.keys())
+@pytest.mark.parametrize("case", UNBIASED.values(), ids=UNBIASED.keys())
 def test_without_gates_it_is_the_density_of_the_joint_gaussian(case: Case) -> None:
     """All measurements of an axis at once, with the mean and covariance of the oracle; lengths in mm."""
     run, config = case.made()
@@ -205,7 +205,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("other", OTHERS.values(), ids=OTHERS.keys())
 def test_another_configuration_is_as_if_built_with_it(other: Callable[[pf.FusionConfig], pf.FusionConfig]) -> None:
-    """Delays, gains and latencies moved after the measurements were put in order: value, outcomes and slopes as anew.
+    """Delays, gains and latencies moved after the measurements were put in order: as anew.
 
     Row by row where a row is rejected as a whole. Only measurements that no latency here puts before the first command.
     """

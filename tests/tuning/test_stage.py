@@ -20,7 +20,6 @@ from tuning_runs import (
     intervals_of,
     later,
     outage,
-    quietly,
     replaced,
     scenario,
     spoiled,
@@ -204,7 +203,7 @@ def camera(share: float, seed: int) -> tuple[pf.Run, pf.FusionConfig]:
 def test_outliers_do_not_count(seed: int) -> None:
     """1 % of measurements 5 to 20 mm off leave the fitted sd within 3 % of the same run's without them.
 
-    Also with the gate off in the configuration: it is fitted with one of 5, with a note, and it stays off.
+    Also with the gate off in the configuration: it is fitted with one of 5, with a note.
     """
     clean = fit_stage(*camera(0.0, seed))
     run, config = camera(0.01, seed)
@@ -216,10 +215,7 @@ def test_outliers_do_not_count(seed: int) -> None:
         for axis in AXES:
             sd, wanted = (stage.best.config.sensors["vision"].sd_of(axis) for stage in (found, clean))
             assert sd == pytest.approx(wanted, rel=0.03)
-        assert len(found.notes) == (gate == 0.0)
-    tuned = quietly(lambda: pf.tune([run], with_sensors(config, gate=0.0), fix=["process"]))
-    assert tuned.config.sensors["vision"].gate == 0.0
-    assert [note for note in tuned.summary.notes if note.startswith("vision: was fitted with a gate of 5, not of 0")]
+        assert [note[:46] for note in found.notes] == ["vision: was fitted with a gate of 5, not of 0:"] * (gate == 0.0)
 
 
 def test_a_noise_that_is_not_identifiable_is_fixed() -> None:

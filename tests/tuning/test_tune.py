@@ -219,7 +219,7 @@ def test_a_run_that_was_fitted_on_is_no_validation() -> None:
     one = outage(1)
     found = sds_alone([one.run], one.config, validate=replace(one.run, name="another name"))
     (note,) = [note for note in found.summary.notes if note.startswith("validated on a run that was fitted on")]
-    assert note.endswith("nothing says whether the numbers hold elsewhere") and found.summary.validation
+    assert note.endswith("whether the numbers hold elsewhere is not known") and found.summary.validation
 
 
 def test_of_several_runs_none_is_validated_on() -> None:
@@ -387,8 +387,8 @@ def test_the_shipped_scan_is_tuned_as_well_as_it_was_by_hand() -> None:
     found = quietly(lambda: pf.tune([run], config, fit=["noise", "delay", "plant", "gain"], trust="tracker"))
     axes = ("tangential", "radial", "vertical")
     likelihood = Likelihood([run], found.config, ["tracker"])
-    heights = dict(zip(likelihood.axes, likelihood.evaluate(found.config).axes.tolist(), strict=True))
-    assert all(heights[axis] >= least for axis, least in zip(axes, (4800.0, 6600.0, 7150.0), strict=True)), heights
+    totals = dict(zip(likelihood.axes, likelihood.evaluate(found.config).axes.tolist(), strict=True))
+    assert all(totals[axis] >= least for axis, least in zip(axes, (4800.0, 6600.0, 7150.0), strict=True)), totals
     for sensors, most in (
         (["tracker", "vision"], (0.076, 0.051, 0.050)),
         (["vision"], (0.355, 0.192, 0.160)),

@@ -19,7 +19,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..logs.run import Run
 from ..tuning.maximise import Point
-from ..tuning.parameters import check_fixed, kinds_of
+from ..tuning.parameters import kinds_of
 from ..tuning.summary import TuningSummary
 from ..tuning.tune import Progress, Tuning, tune
 from ..views import formatting
@@ -55,7 +55,6 @@ def run(
     except ConfigError as error:
         raise typer.BadParameter(str(error)) from None
     given = FusionConfig.load(config)
-    check_fixed(given, fix)
     runs = [Run.read(path) for path in paths]
     other = None if validate is None else Run.read(validate)
     with _progress() as progress:

@@ -67,16 +67,21 @@ class View:
         return point(self.likelihood, config, [*self.free, *more], self.outcomes).log_posterior
 
     def without(self, one: Parameter) -> list[Parameter]:
-        """The free parameters but one."""
+        """The other free parameters."""
         return [other for other in self.free if other.key != one.key]
 
+    def sd(self, one: Parameter) -> float:
+        """The standard deviation of the coordinate of a free parameter."""
+        place = [other.key for other in self.free].index(one.key)
+        return float(np.sqrt(self.covariance[place, place]))
+
     def slope(self, one: Parameter) -> FloatArray:
-        """The change of all coordinates with that of one by regression, Cov(·, a) / Var a, (k,); 0 at a bound."""
+        """The change of the other coordinates with this one by regression, Cov(·, a) / Var a; 0 if it is at a bound."""
         keys = [other.key for other in self.free]
         if one.key not in keys:
             return np.zeros(len(keys))
         place = keys.index(one.key)
-        return self.covariance[:, place] / self.covariance[place, place]
+        return np.delete(self.covariance[:, place] / self.covariance[place, place], place)
 
     def maximum(self, start: FusionConfig, free: Sequence[Parameter], tolerance: float) -> Point:
         """The nearest maximum, with the outcomes repeated."""
@@ -89,7 +94,7 @@ def confidence_intervals(
     """Compute the 95 % interval of each free parameter, by its key.
 
     From the curvature: 1.96 sd of the coordinate each way. Where the likelihood at an end, the other parameters moved
-    along, has not dropped by what that says (1.92), the end is where its profile has (Cox & Hinkley, Theoretical
+    along, has not dropped by what that predicts (1.92), the end is where its profile has (Cox & Hinkley, Theoretical
     Statistics, 9.3). Gates make the likelihood jump; the intervals are those of the maximum that it has while the
     outcomes stay as they are. That maximum is not the result: there the gates decide otherwise, and for a lower
     likelihood, or the search would have gone there. So an interval beside the result is extended to it.
@@ -99,15 +104,15 @@ def confidence_intervals(
     views = views_of(likelihood, best, free)
 
     def of(one: Parameter) -> ConfidenceInterval:
-        view = views[one.axis]
-        if one.at_bound(best.config) is not None:
-            found = _from_the_bound(view, best, one)
-        else:
-            ends, profiled, unlimited = zip(*(_end(view, best, one, sign) for sign in (-1.0, 1.0)), strict=True)
-            found = ConfidenceInterval((one.value(ends[0]), one.value(ends[1])), any(profiled), None, unlimited)
-        value, at, (low, high) = one.clipped(rounded(one.get(result))), one.at_bound(result), found.ci95
-        unlimited = (found.open[0] or at == "lower", found.open[1] or at == "upper")
-        return replace(found, ci95=(min(low, value), max(high, value)), open=unlimited)
+        ends = [_end(views[one.axis], best, one, sign) for sign in (-1.0, 1.0)]
+        low, high = (one.value(coordinate) for coordinate, _, _ in ends)
+        value, at = one.clipped(rounded(one.get(result))), one.at_bound(result)
+        return ConfidenceInterval(
+            ci95=(min(low, value), max(high, value)),
+            profiled=any(profiled for _, profiled, _ in ends),
+            at=one.at_bound(best.config),
+            open=(ends[0][2] or at == "lower", ends[1][2] or at == "upper"),
+        )
 
     return dict(zip([one.key for one in free], in_threads(of, free), strict=True))
 
@@ -150,67 +155,62 @@ def _view(likelihood: Likelihood, outcomes: Sequence[CodeArray], best: Point, fr
 
 
 def _end(view: View, best: Point, one: Parameter, sign: float) -> tuple[float, bool, bool]:
-    """The lower (−1) or upper (+1) end of an interval: its coordinate, whether it is profiled, whether it is open."""
-    place = [other.key for other in view.free].index(one.key)
-    at = coordinates(best.config, view.free)
-    unit = sign * float(np.sqrt(view.covariance[place, place]))
-    along = unit * view.slope(one)  # of all coordinates, for one standard deviation of this one
-    low, high = np.array([other.range for other in view.free]).T
-    top = view.at(best.config)
-    limit = float(((high if sign > 0.0 else low)[place] - at[place]) / unit)
+    """The lower (−1) or upper (+1) end of an interval: its coordinate, whether it is profiled, whether it is open.
 
-    def curvature(reach: float) -> float:
-        return _root(top - view.at(moved(best.config, view.free, np.clip(at + reach * along, low, high))))
-
-    def profile(reach: float) -> float:
-        nonlocal along
-        there = moved(best.config, view.free, np.clip(at + reach * along, low, high))
-        peak = view.maximum(there, view.without(one), _TOLERANCE)
-        along = (coordinates(peak.config, view.free) - at) / reach
-        return _root(top - peak.log_posterior - one.log_prior(there))
-
-    skewed = _SKEWED if one.axis else _SKEWED_SHARED
-    if limit > Z95 and abs((curvature(Z95) / Z95) ** 2 - 1.0) < skewed:
-        return float(at[place] + Z95 * unit), False, False
-    reach, beyond = _crossing(profile, min(Z95, limit), limit)
-    return float(at[place] + reach * unit), True, beyond
-
-
-def _from_the_bound(view: View, best: Point, one: Parameter) -> ConfidenceInterval:
-    """The interval of a parameter at a bound: from there to where the profile has dropped by 1.92.
-
-    The search begins where the likelihood has dropped as far with the other parameters fixed, which is too near.
+    Distances are in standard deviations of the coordinate. From a bound they are in the coordinate, from a noise of 0
+    in the noise itself.
     """
-    low, high = one.range
-    bound, upwards, span = one.at(best.config), one.at_bound(best.config) == "lower", high - low
-    top, along = view.at(best.config, [one]), best.config
+    bound, start = one.at_bound(best.config), one.at(best.config)
+    if bound == ("lower" if sign < 0.0 else "upper"):
+        return start, True, True
+    others = view.without(one)
+    at, (low, high) = coordinates(best.config, others), _ranges(others)
+    if bound is None:
+        unit = sign * view.sd(one)
+        limit = (one.range[0 if sign < 0.0 else 1] - start) / unit
+    else:
+        unit, limit = sign, one.range[1] - one.range[0]
+    vanishing = bound is not None and one.vanishes
+    if vanishing:
+        limit = one.bounds[1] - one.bounds[0]
+    direction = unit * view.slope(one)
+    top = view.at(best.config, [] if bound is None else [one])
 
     def place(distance: float) -> float:
-        """The coordinate so far from the bound; of a noise that may be 0, so far in the noise itself."""
-        if one.vanishes:
-            return one.coordinate(one.bounds[0] + distance)
-        return bound + (distance if upwards else -distance)
+        return one.coordinate(one.bounds[0] + distance) if vanishing else start + distance * unit
 
-    def others_fixed(distance: float) -> float:
-        return _root(top - view.at(one.move(best.config, place(distance)), [one]))
+    def along(distance: float) -> FusionConfig:
+        there = np.clip(at + distance * direction, low, high)
+        return moved(one.move(best.config, place(distance)), others, there)
+
+    def straight(distance: float) -> float:
+        return _root(top - view.at(along(distance), [] if bound is None else [one]))
 
     def profile(distance: float) -> float:
-        nonlocal along
-        peak = view.maximum(one.move(along, place(distance)), view.free, _TOLERANCE)
-        along = peak.config
-        return _root(top - peak.log_posterior - one.log_prior(along))
+        nonlocal direction
+        peak = view.maximum(along(distance), others, _TOLERANCE)
+        direction = (coordinates(peak.config, others) - at) / distance
+        return _root(top - peak.log_posterior - one.log_prior(peak.config))
 
-    limit = one.bounds[1] - one.bounds[0] if one.vanishes else span
-    first = limit
-    for _ in range(_HALVINGS):
-        if others_fixed(first) < Z95:
-            break
-        first *= 0.5
+    if bound is None:
+        first = min(Z95, limit)
+        skewed = _SKEWED if one.axis else _SKEWED_SHARED
+        if limit > Z95 and abs((straight(Z95) / Z95) ** 2 - 1.0) < skewed:
+            return place(Z95), False, False
+    else:
+        first = limit
+        for _ in range(_HALVINGS):
+            if straight(first) < Z95:
+                break
+            first *= 0.5
     distance, beyond = _crossing(profile, first, limit)
-    end = one.value(place(distance))
-    if upwards:
-        return ConfidenceInterval((one.bounds[0], end), True, "lower", (True, beyond))
-    return ConfidenceInterval((end, one.bounds[1]), True, "upper", (beyond, True))
+    return place(distance), True, beyond
+
+
+def _ranges(free: Sequence[Parameter]) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper bounds as coordinates, (k,)."""
+    low, high = np.array([one.range for one in free]).reshape(-1, 2).T
+    return low, high
 
 
 def _root(drop: float) -> float:
@@ -287,10 +287,8 @@ def profiles(stage: Stage, intervals: Mapping[str, tuple[float | None, float | N
 
 
 def _profile(view: View, best: FusionConfig, one: Parameter, ci95: tuple[float | None, float | None]) -> Profile:
-    others, start = view.without(one), one.at(best)
-    slope = np.array([slope for other, slope in zip(view.free, view.slope(one), strict=True) if other.key != one.key])
-    low, high = np.array([other.range for other in others]).reshape(-1, 2).T
-    at = coordinates(best, others)
+    others, start, slope = view.without(one), one.at(best), view.slope(one)
+    at, (low, high) = coordinates(best, others), _ranges(others)
 
     def line(coordinate: float) -> FloatArray:
         """The others' coordinates by regression, (k − 1,); where a noise shrinks, on its variance."""
@@ -302,7 +300,7 @@ def _profile(view: View, best: FusionConfig, one: Parameter, ci95: tuple[float |
     def config(coordinate: float, others_at: FloatArray) -> FusionConfig:
         return moved(one.move(best, one.coordinate(one.value(coordinate))), others, np.clip(others_at, low, high))
 
-    more = [] if one.key in [other.key for other in view.free] else [one]
+    more = [] if one.at_bound(best) is None else [one]
     ends = [bound if end is None else end * one.unit for end, bound in zip(ci95, one.bounds, strict=True)]
     log = one.log and not (one.vanishes and ends[0] <= one.bounds[0])
     value, top = one.value(start), view.at(best, more)

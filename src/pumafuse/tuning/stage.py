@@ -121,7 +121,7 @@ def run_stage(
 def repeat_stage(stage: Stage, runs: Sequence[Run], start: FusionConfig, notify: Notify = ignore) -> Stage:
     """Fit the same parameters to more measurements: the nearest maximum to ``start``, or what a new search finds.
 
-    Where fewer measurements do not tell a delay from a lag or from noise, the nearest maximum to their result is a
+    Where fewer measurements do not separate a delay from a lag or from noise, the nearest maximum to their result is a
     false one of more. So the search begins with the arm as it was given.
     """
     likelihood = likelihood_of(runs, stage.likelihood.config, stage.plan, None)

@@ -282,7 +282,7 @@ def _with_provenance(
 
 def _validation_notes(validation: Sequence[Check] | None, known: bool, interrupted: bool) -> list[str]:
     """What to know of the validation; ``known``: it was on a run that was fitted on."""
-    unknown = "nothing says whether the numbers hold elsewhere"
+    unknown = "whether the numbers hold elsewhere is not known"
     notes = [f"{one.run}, {one.axis}: {one.verdict}" for one in validation or () if one.worse]
     if validation is None and not interrupted:
         notes.append(f"no run was left to validate on (--validate RUN): {unknown}")
@@ -290,6 +290,6 @@ def _validation_notes(validation: Sequence[Check] | None, known: bool, interrupt
         notes.append(f"validated on a run that was fitted on: {unknown}")
     if validation == []:
         notes.append(
-            "the part to validate on has no measurement of a sensor that is used: nothing says whether it helped"
+            "the part to validate on has no measurement of a sensor that is used: whether it is better is not known"
         )
     return notes

@@ -156,13 +156,10 @@ def _gains(before: Estimates, after: Estimates, axis: str) -> FloatArray:
 
     If both are equally good, the sum has a variance of about Σ gain² (Vuong, Econometrica 57, 1989).
     """
-    found: list[dict[int, float]] = []
-    for est in (before, after):
-        mine = _of_axis(est, axis)
-        keys = np.rint(mine.stamp * 1e6).astype(np.int64) * len(mine.sensors) + mine.sensor
-        found.append(dict(zip(keys.tolist(), densities_of(mine, est.config.sensors).tolist(), strict=True)))
-    old, new = found
-    return np.array([new[key] - old[key] for key in old if key in new])
+    old, new = _of_axis(before, axis), _of_axis(after, axis)
+    keys = [np.rint(one.stamp * 1e6).astype(np.int64) * len(one.sensors) + one.sensor for one in (old, new)]
+    _, there, here = np.intersect1d(keys[0], keys[1], return_indices=True)
+    return densities_of(new, after.config.sensors)[here] - densities_of(old, before.config.sensors)[there]
 
 
 def _state(est: Estimates, axis: str) -> State:

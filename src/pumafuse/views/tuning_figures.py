@@ -23,6 +23,7 @@ _WIDTH = 11.0  # inch; as wide as a page
 _TITLE = 32  # letters over a panel
 _TICKS = 3
 _WITHIN_REACH = 4.0  # last over first of a log scale, up to which its ticks are evenly spaced
+_DECADES = 100.0  # likewise, beyond which only decades have ticks
 _SMOOTH = 100  # points of its curve
 _DEEPEST = -6.2  # of a profile; what lies below −5 has room for the number before
 
@@ -76,7 +77,9 @@ def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
     axes.plot(*_smooth(one), color=style.ESTIMATE, lw=1.2)
     if fitted.before is not None:
         _before(axes, fitted.before, low, high)
-    axes.xaxis.set_major_locator(FixedLocator(_ticks(low, high, one.log)))
+    wide = high / low if one.log else 1.0
+    subs = (1.0,) if wide > _DECADES else (1.0, 3.0)
+    axes.xaxis.set_major_locator(MaxNLocator(_TICKS) if wide < _WITHIN_REACH else LogLocator(subs=subs))
     axes.xaxis.set_major_formatter(FormatStrFormatter("%.4g"))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_locator(FixedLocator([-4.0, -2.0, 0.0]))
@@ -103,16 +106,6 @@ def _before(axes: Axes, before: float, low: float, high: float) -> None:
     text = f"← {before:.4g}" if left else f"{before:.4g} →"
     at, side = (0.02, "left") if left else (0.98, "right")
     axes.text(at, 0.02, text, transform=axes.transAxes, ha=side, va="bottom", fontsize=8, color=style.REJECTED)
-
-
-def _ticks(low: float, high: float, log: bool) -> list[float]:
-    """A few round numbers on a scale."""
-    if log and high > _WITHIN_REACH * low:
-        found = LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, high)
-    else:
-        found = MaxNLocator(_TICKS).tick_values(low, high)
-    within = [float(tick) for tick in found if low <= tick <= high]
-    return within[:: max(-(-len(within) // (_TICKS + 1)), 1)]
 
 
 def _cut(text: str) -> str:
