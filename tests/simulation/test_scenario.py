@@ -138,11 +138,11 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 
 
-def check(said: str, path: Path, expected: tuple[str, ...]) -> None:
-    assert len(said.splitlines()) == 1, said
-    assert path.name in said
+def check(message: str, path: Path, expected: tuple[str, ...]) -> None:
+    assert len(message.splitlines()) == 1, message
+    assert path.name in message
     for words in expected:
-        assert words in said
+        assert words in message
 
 
 @pytest.mark.parametrize("case", WRONG)
