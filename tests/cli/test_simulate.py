@@ -236,18 +236,6 @@ def test_an_interrupted_simulation_keeps_whole_runs_and_nothing_else(group: bool
         assert pf.Run.read(out / name).name.endswith(f"seed {name.removeprefix('seed-')}")
 
 
-@pytest.mark.long
-def test_an_interrupted_fusion_keeps_whole_results_and_nothing_else(scenario: Path, tmp_path: Path) -> None:
-    """As a simulation does."""
-    runs, out = tmp_path / "runs", tmp_path / "out"
-    scenario.write_text(SCENARIO.replace("30.0\nsd", "500.0\nsd").replace("= 2.0\n[", "= 20.0\n["))
-    pumafuse("simulate", scenario, "-o", runs, "--runs", 60)
-    options = ["-c", runs / "seed-3" / "fusion.toml", "-o", out, "--engine", "filterpy"]
-    left = interrupted(["fuse", *sorted(runs.iterdir()), *options], out, 2, group=True)
-    assert 2 <= len(left) < 60
-    assert all(name.startswith("seed-") and names(out / name) == RESULT for name in left)
-
-
 def ours(name: str) -> bool:
     return name in ("run.toml", "a.csv")
 
@@ -375,29 +363,23 @@ def test_a_run_along_a_path_is_simulated_anew_where_it_lies(scenario: Path, tmp_
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("file", ["eye.csv", "truth.csv"])
-def test_a_table_without_rows_is_a_note_and_the_run_is_fused(file: str, scenario: Path, tmp_path: Path) -> None:
-    """A sensor that was silent, a reference that was never recorded: exit code 0, and the summary says so."""
+def test_a_reference_without_rows_is_a_note_and_commands_without_rows_are_refused(
+    scenario: Path, tmp_path: Path
+) -> None:
+    """A reference that was never recorded: exit code 0, no score, and the summary says so. No run without commands."""
     run, result = tmp_path / "run", tmp_path / "result"
     pumafuse("simulate", scenario, "-o", run)
-    (run / file).write_text((run / file).read_text().splitlines()[0] + "\n")
+    (run / "truth.csv").write_text((run / "truth.csv").read_text().splitlines()[0] + "\n")
     done = pumafuse("fuse", run, "-c", run / "fusion.toml", "-o", result)
-    note = f"{file}: the table has no rows"
-    assert note in done.stderr
     summary = json.loads((result / "summary.json").read_text())
-    assert note in summary["notes"]
-    for axis in ("radial", "vertical"):
-        assert (summary["axes"][axis]["score"] is None) == (file == "truth.csv")
+    assert "truth.csv: the table has no rows" in done.stderr
+    assert "truth.csv: the table has no rows" in summary["notes"]
+    assert [summary["axes"][axis]["score"] for axis in ("radial", "vertical")] == [None, None]
 
-
-def test_commands_without_rows_are_refused_in_one_line(scenario: Path, tmp_path: Path) -> None:
-    """Named by their file: there is no run without them."""
-    run = tmp_path / "run"
-    pumafuse("simulate", scenario, "-o", run)
     (run / "commands.csv").write_text((run / "commands.csv").read_text().splitlines()[0] + "\n")
-    done = pumafuse("fuse", run, "-c", run / "fusion.toml", "-o", tmp_path / "result", code=1)
+    done = pumafuse("fuse", run, "-c", run / "fusion.toml", "-o", tmp_path / "none", code=1)
     assert len(done.stderr.splitlines()) == 1 and "commands.csv" in done.stderr
-    assert not (tmp_path / "result").exists()
+    assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.parametrize("arguments", [("--runs", "0"), ("--runs", "-1"), ("--runs", "two"), ()])
