@@ -184,12 +184,12 @@ def test_every_scenario_of_the_repository_loads_and_says_what_it_teaches() -> No
     assert len({scenario.name for scenario in found}) == len(found)
 
 
-def test_the_true_arm_is_the_believed_one_where_nothing_is_said(tmp_path: Path) -> None:
+def test_the_true_arm_is_the_model_by_default(tmp_path: Path) -> None:
     """Plant, gain, recovery and delay of each axis."""
     scenario = load(tmp_path, WHOLE)
-    for name, believed in scenario.arm.axes.items():
+    for name, model in scenario.arm.axes.items():
         true = scenario.true_axes[name]
-        assert (true.plant, true.gain, true.gain_recovery) == (believed.plant, believed.gain, believed.gain_recovery)
+        assert (true.plant, true.gain, true.gain_recovery) == (model.plant, model.gain, model.gain_recovery)
         assert true.delay == scenario.arm.delay_of(name)
         assert (true.delay_jitter, true.backlash, true.stiction, true.slow_drift) == (0.0, 0.0, 0.0, 0.0)
         assert true.extra_pole is None and true.gain_curve is None
@@ -210,12 +210,12 @@ def test_the_true_arm_differs_on_all_axes_or_on_one(tmp_path: Path) -> None:
     assert [true[axis].gain_recovery for axis in AXES] == [None, 0.140, None]
     assert [true[axis].backlash for axis in AXES] == [1e-4] * 3
     assert [true[axis].extra_pole for axis in AXES] == [0.006, None, None]
-    believed = scenario.arm.axes["tangential"].plant
-    assert isinstance(believed, pf.SecondOrder)
-    assert true["tangential"].plant == pf.SecondOrder(natural_frequency=46.0, damping=believed.damping)
+    model = scenario.arm.axes["tangential"].plant
+    assert isinstance(model, pf.SecondOrder)
+    assert true["tangential"].plant == pf.SecondOrder(natural_frequency=46.0, damping=model.damping)
     assert true["radial"].plant == pf.FirstOrder(time_constant=0.050)
     assert true["vertical"].plant == pf.SecondOrder(natural_frequency=40.0, damping=0.5)
-    assert scenario.arm == pf.ArmModel.load("puma560-internal")  # the filter goes on believing what it did
+    assert scenario.arm == pf.ArmModel.load("puma560-internal")  # the filter's model stays
 
 
 FULL = """
