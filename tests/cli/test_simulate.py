@@ -57,15 +57,13 @@ def names(folder: Path) -> set[str]:
 
 def test_a_run_is_written_whole_and_the_next_command_works(scenario: Path, tmp_path: Path) -> None:
     """What it teaches, what is in it, where it is; and the line that comes next can be typed as it stands."""
-    said = pumafuse("simulate", scenario, "-o", tmp_path / "run").stdout.splitlines()
-    assert said[0] == "short: Nothing much."
-    assert (
-        said[1]
-        == f"1 run: 73 commands, {len(pf.Run.read(tmp_path / 'run').sensors['eye'].stamp)} rows of measurements,"
-        f" written to {tmp_path / 'run'}"
-    )
-    assert names(tmp_path / "run") == FILES
-    words = said[2].removeprefix("next: ").split()
+    run = tmp_path / "run"
+    lines = pumafuse("simulate", scenario, "-o", run).stdout.splitlines()
+    rows = len(pf.Run.read(run).sensors["eye"].stamp)
+    assert lines[0] == "short: Nothing much."
+    assert lines[1] == f"1 run: 73 commands, {rows} rows of measurements, written to {run}"
+    assert names(run) == FILES
+    words = lines[2].removeprefix("next: ").split()
     assert words[:2] == ["pumafuse", "fuse"]
     pumafuse(*words[1:-1], tmp_path / "result")
     assert names(tmp_path / "result") == RESULT
@@ -74,8 +72,8 @@ def test_a_run_is_written_whole_and_the_next_command_works(scenario: Path, tmp_p
 def test_the_executable_gives_the_bytes_that_python_gives(scenario: Path, tmp_path: Path) -> None:
     """And `--runs` those of single runs with the seeds in a row, on however many cores."""
     pumafuse("simulate", scenario, "-o", tmp_path / "one")
-    said = pumafuse("simulate", scenario, "-o", tmp_path / "many", "--runs", 3).stdout
-    assert "3 runs: 219 commands" in said and f"next: pumafuse fuse {tmp_path / 'many' / 'seed-*'} -c " in said
+    printed = pumafuse("simulate", scenario, "-o", tmp_path / "many", "--runs", 3).stdout
+    assert "3 runs: 219 commands" in printed and f"next: pumafuse fuse {tmp_path / 'many' / 'seed-*'} -c " in printed
     assert names(tmp_path / "many") == {"seed-3", "seed-4", "seed-5"}
     for seed in (3, 4, 5):
         simulation.write(pf.simulate(pf.Scenario.load(scenario), seed), tmp_path / f"python-{seed}", force=False)
@@ -160,7 +158,9 @@ def _broken() -> int:
 
 
 def test_jobs_are_done_and_reported_in_the_order_given(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    """Whichever is ready first; a refusal and an unexpected exception are one line each, the rest is done."""
+    """Whichever is ready first; a refusal and an unexpected exception are one line each, no failure is no line."""
+    many.tell({}, 3, "here")
+    assert capsys.readouterr().err == ""
     jobs: dict[str, Callable[[], int]] = {f"job-{n}": partial(_square, n) for n in range(6)}
     jobs = {"bad": _refused, **jobs, "worse": _broken}
     done, failed = many.run_jobs("testing", jobs, [tmp_path / name for name in jobs])
@@ -173,12 +173,6 @@ def test_jobs_are_done_and_reported_in_the_order_given(capsys: pytest.CaptureFix
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and lines[0] == "pumafuse: bad: not so"
     assert lines[1].startswith("pumafuse: worse: ") and "several" in lines[1] and "of it" in lines[1]
-
-
-def test_nothing_is_told_when_nothing_failed(capsys: pytest.CaptureFixture[str]) -> None:
-    """And nothing raised."""
-    many.report_failures({}, 3, "here")
-    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.long
@@ -205,10 +199,13 @@ def test_a_worker_that_dies_is_one_line(death: str, tmp_path: Path) -> None:
     assert names(out) == {"a"} and names(out / "a") == {"x"}
 
 
-def interrupted(words: list[str], out: Path, finished: int, group: bool) -> tuple[int, str]:
-    """Start a command, interrupt it once it has ``finished`` some folders, and wait: exit code and stderr."""
+def interrupted(words: list[object], out: Path, finished: int, group: bool) -> set[str]:
+    """Interrupt a command once it has ``finished`` some folders; the folders that are left when it has ended."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what ignores it hands that on
-    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    command = [str(EXECUTABLE), *map(str, words)]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
     signal.signal(signal.SIGINT, before)
     give_up = time.monotonic() + 100.0
     while process.poll() is None and time.monotonic() < give_up:
@@ -220,8 +217,11 @@ def interrupted(words: list[str], out: Path, finished: int, group: bool) -> tupl
         os.killpg(process.pid, signal.SIGINT)  # Ctrl-C reaches every process of the terminal
     else:
         os.kill(process.pid, signal.SIGINT)
-    _, said = process.communicate(timeout=100)
-    return process.returncode, said
+    _, message = process.communicate(timeout=100)
+    assert process.returncode == 130
+    assert "Traceback" not in message and "interrupted: " in message
+    time.sleep(1.0)  # what is still running would still write
+    return names(out)
 
 
 @pytest.mark.long
@@ -229,57 +229,29 @@ def interrupted(words: list[str], out: Path, finished: int, group: bool) -> tupl
 def test_an_interrupted_simulation_keeps_whole_runs_and_nothing_else(group: bool, tmp_path: Path) -> None:
     """Exit code 130, a line that says how many are done; every folder is a whole run, and nothing hidden is left."""
     out = tmp_path / "out"
-    words = [str(EXECUTABLE), "simulate", str(SCENARIOS / "step-campaign.toml"), "-o", str(out), "--runs", "300"]
-    code, said = interrupted(words, out, 3, group)
-    assert code == 130
-    assert len(said.splitlines()) <= 2, said
-    assert "interrupted: " in said and "of 300 runs" in said
-    time.sleep(1.0)  # what is still running would still write
-    left = sorted(path.name for path in out.iterdir())
+    left = interrupted(["simulate", SCENARIOS / "step-campaign.toml", "-o", out, "--runs", 300], out, 3, group)
     assert 3 <= len(left) < 300
-    assert all(name.startswith("seed-") for name in left)
     for name in left:
         assert names(out / name) == (FILES - {"eye.csv"}) | {"scope.csv", "trials.csv", "samples.csv"}
         assert pf.Run.read(out / name).name.endswith(f"seed {name.removeprefix('seed-')}")
-
-
-@pytest.mark.long
-def test_an_interrupted_fusion_keeps_whole_results_and_nothing_else(scenario: Path, tmp_path: Path) -> None:
-    """As a simulation does."""
-    runs, out = tmp_path / "runs", tmp_path / "out"
-    scenario.write_text(SCENARIO.replace("30.0\nsd", "500.0\nsd").replace("= 2.0\n[", "= 20.0\n["))
-    pumafuse("simulate", scenario, "-o", runs, "--runs", 60)
-    paths = sorted(map(str, runs.iterdir()))
-    config = str(runs / "seed-3" / "fusion.toml")
-    words = [str(EXECUTABLE), "fuse", *paths, "-c", config, "-o", str(out), "--engine", "filterpy"]
-    code, said = interrupted(words, out, 2, group=True)
-    assert code == 130
-    assert "Traceback" not in said and "interrupted: " in said
-    time.sleep(1.0)
-    left = sorted(path.name for path in out.iterdir())
-    assert 2 <= len(left) < 60
-    assert all(name.startswith("seed-") for name in left)
-    assert all(names(out / name) == RESULT for name in left)
 
 
 def ours(name: str) -> bool:
     return name in ("run.toml", "a.csv")
 
 
-def test_a_folder_is_writable_when_it_is_absent_or_empty(tmp_path: Path) -> None:
-    """Neither needs --force."""
+def test_a_folder_is_writable_when_it_is_absent_empty_or_ours_with_force(tmp_path: Path) -> None:
+    """Only an earlier output needs --force."""
     (tmp_path / "empty").mkdir()
     for name in ("absent", "empty", "deep/er"):
         folders.check_writable(tmp_path / name, False, ["run.toml"], ours)
-
-
-def test_a_folder_of_ours_needs_force(tmp_path: Path) -> None:
-    """And with it is replaced."""
-    (tmp_path / "run.toml").write_text("")
-    (tmp_path / "a.csv").write_text("")
+    earlier = tmp_path / "earlier"
+    earlier.mkdir()
+    for name in ("run.toml", "a.csv"):
+        (earlier / name).write_text("")
     with pytest.raises(folders.FolderError, match="exists; --force replaces it"):
-        folders.check_writable(tmp_path, False, ["run.toml"], ours)
-    folders.check_writable(tmp_path, True, ["run.toml"], ours)
+        folders.check_writable(earlier, False, ["run.toml"], ours)
+    folders.check_writable(earlier, True, ["run.toml"], ours)
 
 
 @pytest.mark.parametrize("force", [False, True])
@@ -328,7 +300,7 @@ def test_an_output_that_fails_half_way_leaves_the_old_one_and_no_trace(tmp_path:
 
 
 def test_a_simulated_run_is_replaced_only_with_force(scenario: Path, tmp_path: Path) -> None:
-    """And what was there is untouched when it is refused."""
+    """What was there is untouched when it is refused, and a table of the user's own is never replaced."""
     run = tmp_path / "run"
     pumafuse("simulate", scenario, "-o", run)
     before = digests(run)
@@ -336,12 +308,15 @@ def test_a_simulated_run_is_replaced_only_with_force(scenario: Path, tmp_path: P
     assert "--force" in pumafuse("simulate", scenario, "-o", run, code=1).stderr
     assert digests(run) == before
     pumafuse("simulate", scenario, "-o", run, "--force")
-    assert digests(run) != before and names(run) == FILES
+    after = digests(run)
+    assert after != before and names(run) == FILES
+    (run / "mine.csv").write_text("time_s,note\n0.0,1\n")
+    assert "'mine.csv'" in pumafuse("simulate", scenario, "-o", run, "--force", code=1).stderr
+    assert {name: digest for name, digest in digests(run).items() if name != "mine.csv"} == after
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("more", [(), ("fusion.toml", "arm.toml")])
-@pytest.mark.parametrize("runs", [(), ("--runs", 1)])
+@pytest.mark.parametrize(("more", "runs"), [((), ()), (("fusion.toml", "arm.toml"), ("--runs", 1))])
 def test_a_run_that_was_recorded_is_not_replaced_even_with_force(
     more: tuple[str, ...], runs: tuple[object, ...], scenario: Path, tmp_path: Path
 ) -> None:
@@ -371,16 +346,6 @@ def test_a_folder_with_a_scenario_of_ones_own_is_not_replaced_even_with_force(tm
     assert digests(mine) == before
 
 
-def test_a_file_put_into_a_simulated_run_is_not_lost_even_with_force(scenario: Path, tmp_path: Path) -> None:
-    """A table of the user's own among ours: only what run.toml names is ours to replace."""
-    run = tmp_path / "run"
-    pumafuse("simulate", scenario, "-o", run)
-    (run / "mine.csv").write_text("time_s,note\n0.0,1\n")
-    before = digests(run)
-    assert "'mine.csv'" in pumafuse("simulate", scenario, "-o", run, "--force", code=1).stderr
-    assert digests(run) == before
-
-
 @pytest.mark.long
 def test_a_run_along_a_path_is_simulated_anew_where_it_lies(scenario: Path, tmp_path: Path) -> None:
     """Its table goes with it: the same bytes, also in its own place."""
@@ -398,37 +363,23 @@ def test_a_run_along_a_path_is_simulated_anew_where_it_lies(scenario: Path, tmp_
 
 
 @pytest.mark.long
-def test_a_written_run_is_simulated_anew_from_its_own_scenario(scenario: Path, tmp_path: Path) -> None:
-    """By the executable, from another folder and of a seed that is not the scenario's own: the same bytes."""
-    pumafuse("simulate", scenario, "-o", tmp_path / "many", "--runs", 2)
-    pumafuse("simulate", tmp_path / "many" / "seed-4" / "scenario.toml", "-o", tmp_path / "again")
-    assert digests(tmp_path / "again") == digests(tmp_path / "many" / "seed-4")
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("file", ["eye.csv", "truth.csv"])
-def test_a_table_without_rows_is_a_note_and_the_run_is_fused(file: str, scenario: Path, tmp_path: Path) -> None:
-    """A sensor that was silent, a reference that was never recorded: exit code 0, and the summary says so."""
+def test_a_reference_without_rows_is_a_note_and_commands_without_rows_are_refused(
+    scenario: Path, tmp_path: Path
+) -> None:
+    """A reference that was never recorded: exit code 0, no score, and the summary says so. No run without commands."""
     run, result = tmp_path / "run", tmp_path / "result"
     pumafuse("simulate", scenario, "-o", run)
-    (run / file).write_text((run / file).read_text().splitlines()[0] + "\n")
+    (run / "truth.csv").write_text((run / "truth.csv").read_text().splitlines()[0] + "\n")
     done = pumafuse("fuse", run, "-c", run / "fusion.toml", "-o", result)
-    note = f"{file}: the table has no rows"
-    assert note in done.stderr
     summary = json.loads((result / "summary.json").read_text())
-    assert note in summary["notes"]
-    for axis in ("radial", "vertical"):
-        assert (summary["axes"][axis]["score"] is None) == (file == "truth.csv")
+    assert "truth.csv: the table has no rows" in done.stderr
+    assert "truth.csv: the table has no rows" in summary["notes"]
+    assert [summary["axes"][axis]["score"] for axis in ("radial", "vertical")] == [None, None]
 
-
-def test_commands_without_rows_are_refused_in_one_line(scenario: Path, tmp_path: Path) -> None:
-    """Named by their file: there is no run without them."""
-    run = tmp_path / "run"
-    pumafuse("simulate", scenario, "-o", run)
     (run / "commands.csv").write_text((run / "commands.csv").read_text().splitlines()[0] + "\n")
-    done = pumafuse("fuse", run, "-c", run / "fusion.toml", "-o", tmp_path / "result", code=1)
+    done = pumafuse("fuse", run, "-c", run / "fusion.toml", "-o", tmp_path / "none", code=1)
     assert len(done.stderr.splitlines()) == 1 and "commands.csv" in done.stderr
-    assert not (tmp_path / "result").exists()
+    assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.parametrize("arguments", [("--runs", "0"), ("--runs", "-1"), ("--runs", "two"), ()])

@@ -49,10 +49,6 @@ def ticks(count: int) -> NDArray[np.int64]:
     return np.rint(np.arange(count) * PERIOD * 1e9).astype(np.int64)
 
 
-def ns(seconds: Any) -> NDArray[np.int64]:
-    return np.rint(np.asarray(seconds, dtype=np.float64) * 1e9).astype(np.int64)
-
-
 def near(seconds: Any) -> NDArray[np.int64]:
     """The instants of the grid nearest to ``seconds``."""
     number = np.rint(np.asarray(seconds, dtype=np.float64) / (PERIOD / POINTS))
@@ -69,19 +65,6 @@ def motion(
     u = np.asarray(command, dtype=np.float64)
     generator = np.random.default_rng(rng) if isinstance(rng, int) else rng
     return simulate_axis(axis, process, offset_sd, ticks(len(u)), u, PERIOD, generator)
-
-
-def moved(
-    axis: TrueAxis,
-    command: Sequence[float] | Floats,
-    wanted: NDArray[np.int64],
-    process: Process = QUIET,
-    offset_sd: float = 0.0,
-    seed: int = 0,
-) -> Floats:
-    found = motion(axis, command, process, offset_sd, seed)
-    assert np.isin(wanted, found.time).all()
-    return found.at(wanted)
 
 
 def state_space(axis: TrueAxis) -> tuple[Floats, Floats, Floats]:
@@ -236,7 +219,7 @@ def test_a_lag_as_slow_as_the_plant_is_a_limit_too(apart: float) -> None:
     assert off_exact(true_axis(FIRST, extra_pole=TAU * (1.0 + apart)), stride=1) <= 5e-10
 
 
-def test_the_gain_error_decays_from_when_each_command_acts() -> None:
+def test_each_command_has_a_delay_and_its_gain_error_decays_from_when_it_acts() -> None:
     """A command that is late by chance adds its error late; between two that act e has had just that time to decay."""
     axis = true_axis(FIRST, delay=0.0604, delay_jitter=0.01, gain=GAIN, gain_recovery=0.03)
     command, number = random_walk(40), 10
@@ -271,7 +254,7 @@ def test_a_gain_curve_is_linear_between_its_points_and_level_outside() -> None:
 def test_one_step_without_recovery_ends_at_gain_times_step() -> None:
     """The paper's K · u."""
     axis = true_axis(FIRST, gain=Gain(slope=0.0818, intercept=0.933))
-    end = moved(axis, np.full(80, 0.008), near([2.2]))[0]
+    end = motion(axis, np.full(80, 0.008)).at(near([2.2]))[0]
     assert end == pytest.approx((0.0818 * 0.008 / PERIOD + 0.933) * 0.008, rel=1e-12)
 
 
@@ -335,37 +318,8 @@ def test_slow_drift_is_a_sine_on_the_position() -> None:
     """A sin(2πt/P) from the first command on, whatever the plant does."""
     command, wanted = random_walk(40), grid(40, PERIOD)
     still, drifting = true_axis(FIRST), true_axis(FIRST, slow_drift=0.0007, slow_drift_period=0.9)
-    difference = moved(drifting, command, wanted) - moved(still, command, wanted)
+    difference = motion(drifting, command).at(wanted) - motion(still, command).at(wanted)
     assert difference == pytest.approx(0.0007 * np.sin(2.0 * np.pi * wanted / 1e9 / 0.9), abs=1e-14)
-
-
-def test_each_command_has_a_delay_of_its_own() -> None:
-    """From the rise after each of 300 steps comes its delay, exactly; their mean and spread are those asked for.
-
-    Mean within four standard errors, variance in the 99.9 % chi-square band of 300 delays. With the recovered delays
-    the whole motion agrees with superposed step responses to 1e-8.
-    """
-    tau, jitter, delay, hold, steps = 0.010, 0.004, 0.050, 12, 300
-    axis = true_axis(FirstOrder(time_constant=tau), delay=delay, delay_jitter=jitter)
-    sign = np.where(np.arange(steps) % 2 == 0, 0.01, -0.01)
-    command = np.cumsum(np.kron(sign, np.eye(hold)[0]))
-    issued = np.arange(steps) * hold * PERIOD
-    look = near(issued + delay + 5.0 * jitter) / 1e9
-    wanted = np.union1d(near(look), grid(len(command), PERIOD)[::107])
-    position = moved(axis, command, wanted, seed=4)
-    known: list[float] = []
-    for start, at, step in zip(issued, look, sign, strict=True):
-        before = sum(s * -np.expm1(-(at - a) / tau) for a, s in list(zip(known, sign, strict=False))[-40:])
-        settled = sum(sign[: max(len(known) - 40, 0)])
-        rise = (position[np.searchsorted(wanted, ns(at))] - before - settled) / step
-        known.append(at + tau * np.log1p(-rise))
-        assert abs(known[-1] - start - delay) < 5.0 * jitter
-    delays = np.array(known) - issued
-    assert abs(delays.mean() - delay) < 4.0 * jitter / np.sqrt(steps)
-    low, high = chi2.ppf([0.0005, 0.9995], steps - 1) / (steps - 1)
-    assert low < delays.var(ddof=1) / jitter**2 < high
-    since = np.maximum(wanted[:, None] / 1e9 - np.array(known), 0.0)
-    assert np.abs(position - (-np.expm1(-since / tau)) @ sign).max() < 1e-8 * 0.01
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -485,8 +439,8 @@ def test_what_a_motion_draws_is_standard_normal(plant: FirstOrder | SecondOrder)
     """Over 3000 seeds, start offset, input noise and walk together have the covariance of the two tests above."""
     process = Process(input_noise=0.0002, drift=0.0003, maneuver_noise=0.0005, maneuver_drift=0.0008)
     axis = true_axis(plant, delay=0.0061)
-    mean = moved(axis, RISING, FEW)
-    samples = np.array([moved(axis, RISING, FEW, process, 0.002, seed) for seed in range(3000)]) - mean
+    mean = motion(axis, RISING).at(FEW)
+    samples = np.array([motion(axis, RISING, process, 0.002, seed).at(FEW) for seed in range(3000)]) - mean
     check_normal(samples, drawn_covariance(axis, RISING, FEW, process, 0.002))
 
 
@@ -495,16 +449,10 @@ def test_kinds_of_noise_draw_from_streams_of_their_own() -> None:
     command, wanted = np.zeros(20), grid(20, PERIOD)
 
     def found(process: Process, offset_sd: float, jitter: float) -> Floats:
-        return moved(true_axis(FIRST, delay_jitter=jitter), command, wanted, process, offset_sd, seed=9)
+        return motion(true_axis(FIRST, delay_jitter=jitter), command, process, offset_sd, rng=9).at(wanted)
 
     alone = found(Process(input_noise=0.0, drift=0.001), 0.0, 0.0)
     noise = found(Process(input_noise=0.001, drift=0.0), 0.0, 0.0)
     start = found(QUIET, 0.003, 0.0)
     together = found(Process(input_noise=0.001, drift=0.001), 0.003, 0.0)
     assert together == pytest.approx(alone + noise + start, abs=1e-15)
-
-
-def test_a_motion_is_looked_up_exactly() -> None:
-    """`at` gives the position of the very instant, in any order."""
-    motion = Motion(np.array([0, 5, 9]), np.array([1.0, 2.0, 3.0]))
-    assert motion.at(np.array([9, 0, 5])).tolist() == [3.0, 1.0, 2.0]

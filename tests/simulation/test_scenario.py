@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +10,9 @@ import msgspec
 import pytest
 
 import pumafuse as pf
+from executable import pumafuse
 from pumafuse.simulation.true_arm import TrueAxis
 
-EXECUTABLE = Path(sys.executable).parent / "pumafuse"
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 HEAD = 'name = "test"\n'
 ARM = 'arm = "puma560-internal"\n'
@@ -138,11 +136,11 @@ WRONG: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 
 
-def check(said: str, path: Path, expected: tuple[str, ...]) -> None:
-    assert len(said.splitlines()) == 1, said
-    assert path.name in said
+def check(message: str, path: Path, expected: tuple[str, ...]) -> None:
+    assert len(message.splitlines()) == 1, message
+    assert path.name in message
     for words in expected:
-        assert words in said
+        assert words in message
 
 
 @pytest.mark.parametrize("case", WRONG)
@@ -154,22 +152,21 @@ def test_a_wrong_scenario_is_refused_in_one_line(case: str, tmp_path: Path) -> N
     check(str(refused.value), tmp_path / "scenario.toml", expected)
 
 
-@pytest.mark.parametrize("case", ["unknown key", "sensor outside the folder", "longer than memory", "not TOML"])
-def test_the_executable_refuses_a_wrong_scenario_and_writes_nothing(case: str, tmp_path: Path) -> None:
+def test_the_executable_refuses_a_wrong_scenario_and_writes_nothing(tmp_path: Path) -> None:
     """The same line, exit code 1, no traceback, and no folder is left behind."""
-    text, expected = WRONG[case]
+    text, expected = WRONG["longer than memory"]
     path = tmp_path / "scenario.toml"
     path.write_text(text)
-    words = [str(EXECUTABLE), "simulate", str(path), "-o", str(tmp_path / "out")]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
-    assert (done.returncode, done.stdout) == (1, ""), done.stderr
-    assert done.stderr.startswith("pumafuse: ")
+    done = pumafuse("simulate", path, "-o", tmp_path / "out", code=1)
+    assert done.stdout == "" and done.stderr.startswith("pumafuse: ")
     check(done.stderr, path, expected)
     assert [entry.name for entry in tmp_path.iterdir()] == ["scenario.toml"]
 
 
 def test_limits_are_themselves_allowed(tmp_path: Path) -> None:
     """60 rows a period of a sensor and of the reference, a window as long as the rest, the sd of the moving axes."""
+    for text in (WHOLE, WHOLE + LEVEL + FRAME, HEAD + ARM + STEPS + 'scope = "eye"\n' + SENSOR):
+        assert load(tmp_path, text).name == "test"  # what the wrong ones are made of is right
     whole = WHOLE.replace("30.0", "2142.857142857142") + "[reference]\nrows_per_command = 60\n"
     assert load(tmp_path, whole).reference.rows_per_command == 60
     steps = HEAD + ARM + STEPS + 'scope = "eye"\nrest_s = 0.3\nwindow_s = 0.3\n'
@@ -187,12 +184,12 @@ def test_every_scenario_of_the_repository_loads_and_says_what_it_teaches() -> No
     assert len({scenario.name for scenario in found}) == len(found)
 
 
-def test_the_true_arm_is_the_believed_one_where_nothing_is_said(tmp_path: Path) -> None:
+def test_the_true_arm_is_the_model_by_default(tmp_path: Path) -> None:
     """Plant, gain, recovery and delay of each axis."""
     scenario = load(tmp_path, WHOLE)
-    for name, believed in scenario.arm.axes.items():
+    for name, model in scenario.arm.axes.items():
         true = scenario.true_axes[name]
-        assert (true.plant, true.gain, true.gain_recovery) == (believed.plant, believed.gain, believed.gain_recovery)
+        assert (true.plant, true.gain, true.gain_recovery) == (model.plant, model.gain, model.gain_recovery)
         assert true.delay == scenario.arm.delay_of(name)
         assert (true.delay_jitter, true.backlash, true.stiction, true.slow_drift) == (0.0, 0.0, 0.0, 0.0)
         assert true.extra_pole is None and true.gain_curve is None
@@ -213,12 +210,12 @@ def test_the_true_arm_differs_on_all_axes_or_on_one(tmp_path: Path) -> None:
     assert [true[axis].gain_recovery for axis in AXES] == [None, 0.140, None]
     assert [true[axis].backlash for axis in AXES] == [1e-4] * 3
     assert [true[axis].extra_pole for axis in AXES] == [0.006, None, None]
-    believed = scenario.arm.axes["tangential"].plant
-    assert isinstance(believed, pf.SecondOrder)
-    assert true["tangential"].plant == pf.SecondOrder(natural_frequency=46.0, damping=believed.damping)
+    model = scenario.arm.axes["tangential"].plant
+    assert isinstance(model, pf.SecondOrder)
+    assert true["tangential"].plant == pf.SecondOrder(natural_frequency=46.0, damping=model.damping)
     assert true["radial"].plant == pf.FirstOrder(time_constant=0.050)
     assert true["vertical"].plant == pf.SecondOrder(natural_frequency=40.0, damping=0.5)
-    assert scenario.arm == pf.ArmModel.load("puma560-internal")  # the filter goes on believing what it did
+    assert scenario.arm == pf.ArmModel.load("puma560-internal")  # the filter's model stays
 
 
 FULL = """

@@ -8,8 +8,6 @@ measurements, without model or with wrong error bars falls out of them.
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +18,9 @@ import pytest
 from numpy.typing import NDArray
 
 import pumafuse as pf
+from executable import pumafuse
 
-EXECUTABLE = Path(sys.executable).parent / "pumafuse"
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
-
-
-def pumafuse(*arguments: object) -> str:
-    words = [str(EXECUTABLE), *map(str, arguments)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 class Worked:
@@ -37,11 +28,11 @@ class Worked:
 
     def __init__(self, name: str, folder: Path) -> None:
         self.run, self.result = folder / "run", folder / "result"
-        printed = pumafuse("simulate", SCENARIOS / f"{name}.toml", "-o", self.run)
+        printed = pumafuse("simulate", SCENARIOS / f"{name}.toml", "-o", self.run).stdout
         assert f"{name}: " in printed
         assert f"next: pumafuse fuse {self.run} -c {self.run / 'fusion.toml'} -o result" in printed
         pumafuse("fuse", self.run, "-c", self.run / "fusion.toml", "-o", self.result)
-        self.scores = json.loads(pumafuse("compare", self.result, "--json"))[0]["axes"]
+        self.scores = json.loads(pumafuse("compare", self.result, "--json").stdout)[0]["axes"]
         self.summary: dict[str, Any] = json.loads((self.result / "summary.json").read_text())
 
     def check(self, axis: str, rmse_mm: tuple[float, float], coverage: tuple[float, float]) -> None:

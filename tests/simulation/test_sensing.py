@@ -74,7 +74,7 @@ def test_latency_is_from_the_valid_time_to_the_stamp() -> None:
 
 
 def test_latency_wanders_from_row_to_row_and_stamps_stay_in_order() -> None:
-    """Each row's own latency, told by its position, has the sd asked for; rows are in the order of their stamps."""
+    """Each row's own latency, known from its position, has the sd asked for; rows are in the order of their stamps."""
     found = measured(sensor(latency=0.045, latency_sd=0.012))
     late = found.stamp / 1e9 - found.values["a"] / 0.01
     within(float(late.mean()), 0.045, 0.012 / ROWS**0.5)
@@ -131,7 +131,7 @@ def test_bursts_lose_rows_together() -> None:
         starts.append(len(runs))
         assert all(run >= length * 100.0 - 1 for run in runs[:-1])  # the last may be cut off by the end
     within(float(np.mean(shares)), np.exp(-rate * length), float(np.std(shares)) / 50**0.5)
-    # A burst is seen as one unless another began within its length before it.
+    # A burst counts as one unless another began within its length before it.
     within(float(np.mean(starts)), rate * seconds * np.exp(-rate * length), (rate * seconds / 50) ** 0.5)
 
 

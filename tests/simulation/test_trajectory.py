@@ -99,13 +99,13 @@ def test_steps_are_one_command_each_after_a_rest() -> None:
     steps, pause = campaign(), round(0.5 / PERIOD)
     plan, found = steps.plan(rng()), steps.offsets(PERIOD, rng())
     changes = {axis: np.diff(command, prepend=0.0) for axis, command in found.items()}
-    seen: list[tuple[str, float]] = []
+    steps_made: list[tuple[str, float]] = []
     for tick in range(len(found["a"])):
         moved = [(axis, step[tick]) for axis, step in changes.items() if step[tick] != 0.0]
         assert not moved or (len(moved) == 1 and tick % pause == 0)
-        seen.extend(moved)
-    assert [axis for axis, _ in seen] == [axis for axis, _ in plan]
-    assert [step for _, step in seen] == pytest.approx([step for _, step in plan], abs=1e-15)
+        steps_made.extend(moved)
+    assert [axis for axis, _ in steps_made] == [axis for axis, _ in plan]
+    assert [step for _, step in steps_made] == pytest.approx([step for _, step in plan], abs=1e-15)
     assert len(found["a"]) == (len(plan) + 1) * pause  # the last trial has its rest too
 
 

@@ -201,19 +201,11 @@ def _sum_of_decays(decay: ComplexArray, added: ComplexArray) -> ComplexArray:
 
 
 def _backlash(position: FloatArray, width: float) -> FloatArray:
-    """The position behind a gear with ``width`` [m] of play: y_n = clip(y_(n−1), x_n − width/2, x_n + width/2).
-
-    Clips chain into clips, so doubling strides do all of them.
-    """
+    """The position behind a gear with ``width`` [m] of play: y_n = clip(y_(n−1), x_n − width/2, x_n + width/2)."""
     if not width:
         return position
-    low, high = position - 0.5 * width, position + 0.5 * width
-    low[0] = high[0] = position[0]
-    stride = 1
-    while stride < len(low):
-        low[stride:], high[stride:] = (
-            np.clip(low[:-stride], low[stride:], high[stride:]),
-            np.clip(high[:-stride], low[stride:], high[stride:]),
-        )
-        stride *= 2
-    return low
+    behind, y = np.empty_like(position), float(position[0])
+    for number, x in enumerate(position.tolist()):
+        y = min(max(y, x - 0.5 * width), x + 0.5 * width)
+        behind[number] = y
+    return behind

@@ -120,15 +120,14 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         _ = self.config, self.true_axes  # raise now if something does not fit together
 
     def _check_axes_of(self, where: str, sensor: TrueSensor) -> None:
-        in_xyz = self.frame is not None and sensor.axes is None
-        logged = CARTESIAN if in_xyz else tuple(self.arm.axes)
+        logged = self._logged_axes(sensor)
         for key, named in (("axes", sensor.axes), ("sd_mm", sensor.sd), ("bias_mm", sensor.bias)):
             for name in named if isinstance(named, list | dict) else ():
                 if name not in logged:
                     raise UnknownNameError(f"{where}.{key}", "axis", name, logged)
         if not isinstance(sensor.sd, dict):
             return
-        if in_xyz:
+        if logged is CARTESIAN:
             raise ConfigError(f"{where}.sd_mm: one number for a sensor in x, y, z")
         moving = set(self.trajectory.moving)
         measured = moving if sensor.axes is None else moving & set(sensor.axes)
@@ -150,12 +149,14 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def _check_scope(self, campaign: Steps) -> None:
         if campaign.scope not in self.sensors:
             raise UnknownNameError("trajectory.scope", "sensor", campaign.scope, self.sensors)
-        where, measured = f"sensors.{campaign.scope}.axes", self.sensors[campaign.scope].axes
-        if self.frame is not None and measured is None:
-            raise ConfigError(f"{where}: name the axes of a scope where the log is in x, y, z")
+        measured = self.sensors[campaign.scope].axes or self._logged_axes(self.sensors[campaign.scope])
         for axis in campaign.axes:
-            if measured is not None and axis not in measured:
-                raise ConfigError(f"{where}: the scope does not see '{axis}', which is stepped")
+            if axis not in measured:
+                raise ConfigError(f"sensors.{campaign.scope}.axes: the scope must measure '{axis}', which is stepped")
+
+    def _logged_axes(self, sensor: TrueSensor) -> tuple[str, ...]:
+        """The axes in which a sensor can be logged."""
+        return CARTESIAN if self.frame is not None and sensor.axes is None else tuple(self.arm.axes)
 
     @property
     def true_axes(self) -> dict[str, TrueAxis]:
