@@ -73,7 +73,7 @@ def test_an_axis_may_not_be_called_as_a_part_of_a_line() -> None:
 
 
 def test_an_estimate_is_one_line() -> None:
-    """Position, its sd and velocity in mm and mm/s, x, y, z in a frame, stale axes, and ns where the stream has them."""
+    """Position, sd and velocity of each axis, x, y, z in a frame, stale axes, and ns where the stream has them."""
     config = pf.FusionConfig(
         arm=pf.ArmModel.load("puma560-internal"), sensors={"tracker": pf.Sensor(sd=1e-4)}, frame=Cylindrical()
     )
