@@ -40,11 +40,6 @@ def text_of(run: pf.Run, seconds: float) -> str:
     return "\n".join(found) + "\n"
 
 
-def from_input(data, text: str, *options: str) -> subprocess.CompletedProcess[str]:
-    command = [str(EXECUTABLE), "live", "stdin", "-c", str(data / "fusion.toml"), *options]
-    return subprocess.run(command, input=text, capture_output=True, text=True, timeout=60, check=True)
-
-
 def test_a_replay_gives_what_as_live_gives(data) -> None:
     """The demo's run, as fast as it can be: one line a command, the numbers of `fuse --as-live`, and a summary."""
     done = pumafuse("live", f"replay:{data / 'scan1'}?speed=max", "-c", data / "fusion.toml")
@@ -79,7 +74,9 @@ def test_the_status_shows_milliseconds_and_millimetres() -> None:
 def test_lines_from_standard_input(data) -> None:
     """Five seconds of the run with some nonsense between: estimates for each command, the nonsense counted."""
     good = text_of(pf.Run.read(data / "scan1"), 5.0).splitlines()
-    done = from_input(data, "\n".join([*good[:300], "nonsense", "{}", *good[300:]]) + "\n")
+    mixed = "\n".join([*good[:300], "nonsense", "{}", *good[300:]]) + "\n"
+    command = [str(EXECUTABLE), "live", "stdin", "-c", str(data / "fusion.toml")]
+    done = subprocess.run(command, input=mixed, capture_output=True, text=True, timeout=60, check=True)
     commands = sum('"command"' in line for line in good)
     assert len(done.stdout.splitlines()) == commands
     assert f"{len(good) + 2} lines, 2 of them bad; commands: {commands} fused" in done.stderr

@@ -97,15 +97,10 @@ def test_a_server_that_is_connected_to(data, scan) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        (["udp://0.0.0.0:5005"], 1, "--listen 0.0.0.0 --allow CIDR"),
         (["udp://:5005", "--listen", "0.0.0.0"], 2, "go together"),
         (["udp://:5005", "--allow", "10.0.0.0/8"], 2, "go together"),
         (["tcp://127.0.0.1:5005", "--listen", "0.0.0.0", "--allow", "10.0.0.0/8"], 1, "tcp-listen://HOST:PORT"),
-        (["stdin", "--listen", "0.0.0.0", "--allow", "10.0.0.0/8"], 1, "tcp-listen://HOST:PORT"),
-        (["udp://:5005", "--listen", "0.0.0.0", "--allow", "all"], 1, "expected a network"),
-        (["udp://127.0.0.1"], 1, "expected udp://HOST:PORT"),
         (["stdin", "--out", "tcp://127.0.0.1:5005"], 1, "expected udp://HOST:PORT"),
-        (["stdin", "--out", "udp://no.such.host.invalid:5005"], 1, "no address of host"),
         (["stdin", "--record", "/dev/null"], 1, "/dev/null"),
         (["stdin", "--rerun", "paper"], 1, "paper"),
     ],
@@ -278,24 +273,20 @@ def is_json(line: bytes) -> bool:
         return False
 
 
-def attacked(data: Path, count: int) -> None:
-    """Send ``count`` mutated datagrams among good ones, and see that nothing but events moves an estimate."""
+@pytest.mark.long
+def test_a_million_broken_datagrams(data) -> None:
+    """No crash, no hang, no memory; every estimate is, to the last bit, what it would be without the garbage."""
+    count = 1_000_000
     rng, written = random.Random(count), list[bytes]()
     shadow = Stream(pf.LiveEstimator(pf.FusionConfig.load(data / "fusion.toml")), written.extend, lambda _: None)
     garbage, least = 0, 0
     with live("udp://127.0.0.1:0", data / "fusion.toml") as process, socket.socket(type=socket.SOCK_DGRAM) as ours:
         place = ("127.0.0.1", process.port())
         for piece in range(count // 100):
-            t = piece * 0.028
-            good = [
-                line.encode()
-                for line in (
-                    json.dumps(
-                        {"t": t, "sensor": "tracker", "radial": 560.0 + rng.gauss(0.0, 0.05), "vertical": -90.0}
-                    ),
-                    json.dumps({"t": t, "command": {"radial": 560.0, "vertical": -90.0}}),
-                )
-            ]
+            t, radial = piece * 0.028, 560.0 + rng.gauss(0.0, 0.05)
+            measurement = {"t": t, "sensor": "tracker", "radial": radial, "vertical": -90.0}
+            command = {"t": t, "command": {"radial": 560.0, "vertical": -90.0}}
+            good = [json.dumps(body).encode() for body in (measurement, command)]
             for _ in range(100):
                 datagram = broken(rng, rng.choice(good), rng.choice(good))
                 ours.sendto(datagram, place)
@@ -313,9 +304,3 @@ def attacked(data: Path, count: int) -> None:
         log = process.end()
     assert garbage > 0.5 * count
     assert f"{count + 2 * (count // 100)} datagrams taken in, 0 lost" in log
-
-
-@pytest.mark.long
-def test_a_million_broken_datagrams(data) -> None:
-    """No crash, no hang, no memory; every estimate is, to the last bit, what it would be without the garbage."""
-    attacked(data, 1_000_000)
