@@ -112,15 +112,6 @@ def test_what_cannot_be_is_one_line(data, words: list[str], code: int, message: 
     assert code == 2 or len(done.stderr.splitlines()) == 1
 
 
-def test_a_port_that_is_taken(data) -> None:
-    """Two processes cannot be one robot's."""
-    with socket.socket(type=socket.SOCK_DGRAM) as ours, socket.create_server(("127.0.0.1", 0)) as server:
-        ours.bind(("127.0.0.1", 0))
-        for kind, taken in (("udp", ours), ("tcp-listen", server)):
-            done = pumafuse("live", f"{kind}://127.0.0.1:{taken.getsockname()[1]}", "-c", data / "fusion.toml", code=1)
-            assert "cannot be listened at: " in done.stderr.splitlines()[-1]
-
-
 def test_only_allowed_senders_are_accepted_elsewhere(data) -> None:
     """A sender that is not named is refused."""
     options = ("--listen", "0.0.0.0", "--allow", "127.0.0.2/32")
@@ -150,33 +141,6 @@ def test_a_record_holds_what_came(data, scan, tmp_path) -> None:
     assert "run" in done.stdout + done.stderr
     found = pf.Run.read(tmp_path / "run")
     assert len(found.command.stamp) + sum(len(source.stamp) for source in found.sensors.values()) == len(scan)
-
-
-@pytest.mark.long
-@pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
-def test_estimates_go_on_when_the_disk_is_full(data, tmp_path) -> None:
-    """No file may grow beyond 16 KiB: reported once, every estimate comes all the same, and what is there fuses."""
-    sent = lines(4000 * 0.014)
-    words = f"ulimit -f 16; exec {EXECUTABLE} live stdin -c {data / 'fusion.toml'} --record {tmp_path / 'run'}"
-    with subprocess.Popen(
-        ["bash", "-c", words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        for part in range(4):  # long enough for the recorder to see the disk refuse while rows still come
-            piece = b"".join(sent.splitlines(keepends=True)[part * 1000 : part * 1000 + 1000])
-            process.stdin.write(piece)
-            process.stdin.flush()
-            for _ in range(500):
-                assert process.stdout.readline()
-            time.sleep(0.7)
-        _, log = process.communicate(timeout=LONGEST)
-    assert process.returncode == 0
-    assert log.count(b"File too large") == 1
-    assert b"commands: 2000 fused; 2000 estimates" in log
-    found = pf.Run.read(tmp_path / "run")
-    pf.fuse(found, pf.FusionConfig.load(data / "fusion.toml"))
-    assert 500 < len(found.command.stamp) < 2000
 
 
 class Fed:

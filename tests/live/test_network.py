@@ -118,13 +118,6 @@ class TestUdpListener:
         assert "1 datagrams taken in, 0 lost, 1 refused" in self.source.summary()
         assert any("127.0.0.1, which --allow does not name" in text for text in self.notices)
 
-    def test_a_port_that_is_taken_is_reported(self) -> None:
-        """Two cannot listen at one port."""
-        with sender() as ours:
-            source = UdpListener((socket.AF_INET, ours.getsockname()), everybody, print)
-            with pytest.raises(pf.RunError, match="in use"):
-                asyncio.run(source.start())
-
 
 class TestTcpListener:
     def setup_method(self) -> None:
@@ -289,3 +282,12 @@ def test_estimates_are_datagrams() -> None:
     out([b"x" * 100_000])
     out.close()
     assert "1 estimates could not be sent" in out.summary()
+
+
+@pytest.mark.parametrize("kind", [UdpListener, TcpListener])
+def test_a_port_that_is_taken_is_reported(kind: type[UdpListener] | type[TcpListener]) -> None:
+    """Two cannot listen at one port."""
+    with sender() as ours, socket.create_server(("127.0.0.1", 0)) as server:
+        taken = (ours if kind is UdpListener else server).getsockname()
+        with pytest.raises(pf.RunError, match=r"cannot be listened at: .*in use"):
+            asyncio.run(kind((socket.AF_INET, taken), everybody, print).start())
