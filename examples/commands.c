@@ -1,9 +1,9 @@
-/* A robot controller's loop that tells pumafuse each command; to copy.
+/* A robot controller's loop that sends each command to pumafuse; to copy.
 
        cc -std=c11 -O2 -o commands examples/commands.c -lm && ./commands HOST PORT [SECONDS]
 
    Every 28 ms, by a clock that does not drift, a position goes to the arm and, as a datagram, to
-   `pumafuse live udp://...`. A datagram never makes the loop wait, whether anybody hears it or not. POSIX. */
+   `pumafuse live udp://...`. A datagram never makes the loop wait, whether anybody receives it or not. POSIX. */
 
 #define _POSIX_C_SOURCE 200809L
 #include <inttypes.h>
@@ -53,7 +53,7 @@ int main(int argc, char **argv)
     for (int64_t tick = 0; tick * PERIOD_NS / 1e9 < seconds; tick++) {
         sleep_until(begin + tick * PERIOD_NS);
         const int64_t stamp = now_ns(CLOCK_REALTIME); /* when the arm gets it, on the clock of the sensor's stamps */
-        /* What the arm is told: here 20 mm to and fro in 10 s. */
+        /* The command: here 20 mm to and fro in 10 s. */
         const double radial_mm = 560.0 + 20.0 * sin(0.2 * PI * stamp / 1e9);
         /* ... give the position to the arm here ... */
         char line[256];

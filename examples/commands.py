@@ -1,9 +1,9 @@
-"""A robot controller's loop that tells pumafuse each command; to copy.
+"""A robot controller's loop that sends each command to pumafuse; to copy.
 
     python examples/commands.py HOST PORT [SECONDS]
 
 Every 28 ms, by a clock that does not drift, a position goes to the arm and, as a datagram, to `pumafuse live udp://...`.
-A datagram never makes the loop wait, whether anybody hears it or not.
+A datagram never makes the loop wait, whether anybody receives it or not.
 """
 
 import contextlib
@@ -17,12 +17,12 @@ PERIOD = 0.028  # s
 
 
 def next_position(t: float) -> dict[str, float]:
-    """What the arm is told at a time [s], in mm by axis: here 20 mm to and fro in 10 s."""
+    """The command at a time [s], in mm by axis: here 20 mm to and fro in 10 s."""
     return {"tangential": 0.0, "radial": 560.0 + 20.0 * math.sin(0.2 * math.pi * t), "vertical": -100.0}
 
 
 def main() -> None:
-    """Send until the time is up, or for ever."""
+    """Send commands until the time is up, or for ever."""
     seconds = float(sys.argv[3]) if len(sys.argv) > 3 else math.inf
     family, _, _, _, place = socket.getaddrinfo(sys.argv[1], sys.argv[2], type=socket.SOCK_DGRAM)[0]
     link = socket.socket(family, socket.SOCK_DGRAM)

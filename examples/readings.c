@@ -1,9 +1,9 @@
-/* A sensor's loop that tells pumafuse each measurement; to copy.
+/* A sensor's loop that sends each measurement to pumafuse; to copy.
 
-       cc -std=c11 -O2 -o measurements examples/readings.c -lm && ./measurements HOST PORT [SECONDS]
+       cc -std=c11 -O2 -o readings examples/readings.c -lm && ./readings HOST PORT [SECONDS]
 
-   A hundred times a second the sensor is read, and goes as a datagram to `pumafuse live udp://...` under the name that
-   it has in fusion.toml. What it does not see is left out. POSIX. */
+   A hundred times a second the sensor is read. The measurement goes as a datagram to `pumafuse live udp://...`, under
+   the sensor's name in fusion.toml. Axes that it does not measure are left out. POSIX. */
 
 #define _POSIX_C_SOURCE 200809L
 #include <inttypes.h>
@@ -62,8 +62,8 @@ int main(int argc, char **argv)
     const int64_t begin = now_ns(CLOCK_MONOTONIC);
     for (int64_t row = 0; row * PERIOD_NS / 1e9 < seconds; row++) {
         sleep_until(begin + row * PERIOD_NS);
-        const int64_t stamp = now_ns(CLOCK_REALTIME); /* when it arrived; before, it took latency_ms of fusion.toml */
-        /* What the sensor sees: here where commands.c sent the arm 0.1 s ago, with noise. */
+        const int64_t stamp = now_ns(CLOCK_REALTIME); /* when it arrives; it is valid latency_ms of fusion.toml before */
+        /* The measurement: here where commands.c sent the arm 0.1 s ago, with noise. */
         const double radial_mm = 560.0 + 20.0 * sin(0.2 * PI * (stamp / 1e9 - 0.1)) + noise_mm();
         char line[256];
         const int length = snprintf(line, sizeof line,

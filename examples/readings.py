@@ -1,9 +1,9 @@
-"""A sensor's loop that tells pumafuse each measurement; to copy.
+"""A sensor's loop that sends each measurement to pumafuse; to copy.
 
     python examples/readings.py HOST PORT [SECONDS]
 
-A hundred times a second the sensor is read, and goes as a datagram to `pumafuse live udp://...` under the name that it
-has in fusion.toml. What it does not see is left out.
+A hundred times a second the sensor is read. The measurement goes as a datagram to `pumafuse live udp://...`, under the
+sensor's name in fusion.toml. Axes that it does not measure are left out.
 """
 
 import contextlib
@@ -18,13 +18,13 @@ SENSOR, PERIOD = "tracker", 0.01  # its name in fusion.toml, s
 
 
 def read_sensor(t: float) -> dict[str, float]:
-    """What the sensor sees at a time [s], in mm by axis: here where `commands` sent the arm 0.1 s ago, with noise."""
+    """The measurement at a time [s], in mm by axis: here where `commands` sent the arm 0.1 s ago, with noise."""
     place = {"tangential": 0.0, "radial": 560.0 + 20.0 * math.sin(0.2 * math.pi * (t - 0.1)), "vertical": -100.0}
     return {axis: position + random.gauss(0.0, 0.05) for axis, position in place.items()}
 
 
 def main() -> None:
-    """Send until the time is up, or for ever."""
+    """Send measurements until the time is up, or for ever."""
     seconds = float(sys.argv[3]) if len(sys.argv) > 3 else math.inf
     family, _, _, _, place = socket.getaddrinfo(sys.argv[1], sys.argv[2], type=socket.SOCK_DGRAM)[0]
     link = socket.socket(family, socket.SOCK_DGRAM)
@@ -33,7 +33,7 @@ def main() -> None:
     while row * PERIOD < seconds:
         time.sleep(max(begin + row * PERIOD - time.monotonic(), 0.0))
         measurement = read_sensor(time.time())
-        stamp = time.time_ns()  # when it arrived; until then it took the sensor's latency_ms of fusion.toml
+        stamp = time.time_ns()  # when it arrives; it is valid latency_ms of fusion.toml before
         line = json.dumps({"t_ns": stamp, "sensor": SENSOR, **measurement})
         with contextlib.suppress(OSError):  # the next one may get through
             link.sendto(line.encode(), place)

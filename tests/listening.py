@@ -28,9 +28,9 @@ class Live:
 
     def port(self) -> int:
         assert self.process.stderr is not None
-        for said in self.process.stderr:
-            if "listening at" in said:
-                return int(said.rsplit(":", 1)[1])
+        for notice in self.process.stderr:
+            if "listening at" in notice:
+                return int(notice.rsplit(":", 1)[1])
         raise AssertionError(self.process.wait())
 
     def received(self, count: int) -> list[bytes]:
@@ -42,13 +42,13 @@ class Live:
         return int(status.split("VmRSS:")[1].split()[0])
 
     def end(self, number: int = signal.SIGTERM) -> str:
-        """Ask for an end; what was said."""
+        """Ask for an end; what was logged."""
         self.process.send_signal(number)
-        out, told = self.process.communicate(timeout=LONGEST)
-        assert self.process.returncode == 0, told
-        assert "Traceback" not in told
+        out, log = self.process.communicate(timeout=LONGEST)
+        assert self.process.returncode == 0, log
+        assert "Traceback" not in log
         assert out == ""
-        return told
+        return log
 
 
 @contextlib.contextmanager

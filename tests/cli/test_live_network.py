@@ -1,4 +1,4 @@
-"""`pumafuse live` over the network and with a record: the real executable, real sockets, real kills."""
+"""`pumafuse live` over the network and with a record: the executable, sockets, kills."""
 
 from __future__ import annotations
 
@@ -57,9 +57,9 @@ def test_datagrams_in_and_out(data, scan) -> None:
             ours.sendto(line, place)
             if b'"command"' in line:
                 found += process.received(1)
-        told = process.end()
+        log = process.end()
     assert found == expected(data, scan)
-    assert f"{len(scan)} datagrams taken in, 0 lost" in told
+    assert f"{len(scan)} datagrams taken in, 0 lost" in log
 
 
 def test_twenty_thousand_rows_over_tcp(data) -> None:
@@ -71,8 +71,8 @@ def test_twenty_thousand_rows_over_tcp(data) -> None:
         last = json.loads(sent.splitlines()[-2])["t"]
         while json.loads(process.received(1)[0])["t"] < last:
             pass
-        told = process.end()
-    assert "20000 lines, 0 of them bad; commands: 10000 fused; 10000 estimates" in told
+        log = process.end()
+    assert "20000 lines, 0 of them bad; commands: 10000 fused; 10000 estimates" in log
 
 
 def test_a_server_that_is_connected_to(data, scan) -> None:
@@ -88,46 +88,32 @@ def test_a_server_that_is_connected_to(data, scan) -> None:
                 connection.close()
             want = expected(data, scan)
             assert process.received(len(want)) == want
-            told = process.end()
-    assert "connections made: 2" in told
-    assert "the connection has ended; made again in 0.5 s" in told
+            log = process.end()
+    assert "connections made: 2" in log
+    assert "the connection has ended; made again in 0.5 s" in log
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("words", "code", "said"),
+    ("words", "code", "message"),
     [
-        (["udp://0.0.0.0:5005"], 1, "--listen 0.0.0.0 --allow CIDR"),
         (["udp://:5005", "--listen", "0.0.0.0"], 2, "go together"),
         (["udp://:5005", "--allow", "10.0.0.0/8"], 2, "go together"),
         (["tcp://127.0.0.1:5005", "--listen", "0.0.0.0", "--allow", "10.0.0.0/8"], 1, "tcp-listen://HOST:PORT"),
-        (["stdin", "--listen", "0.0.0.0", "--allow", "10.0.0.0/8"], 1, "tcp-listen://HOST:PORT"),
-        (["udp://:5005", "--listen", "0.0.0.0", "--allow", "all"], 1, "expected a network"),
-        (["udp://127.0.0.1"], 1, "expected udp://HOST:PORT"),
         (["stdin", "--out", "tcp://127.0.0.1:5005"], 1, "expected udp://HOST:PORT"),
-        (["stdin", "--out", "udp://no.such.host.invalid:5005"], 1, "no address of host"),
         (["stdin", "--record", "/dev/null"], 1, "/dev/null"),
         (["stdin", "--rerun", "paper"], 1, "paper"),
     ],
 )
-def test_what_cannot_be_is_one_line(data, words: list[str], code: int, said: str) -> None:
+def test_what_cannot_be_is_one_line(data, words: list[str], code: int, message: str) -> None:
     """What, where, what to do."""
     done = pumafuse("live", *words, "-c", data / "fusion.toml", code=code)
-    assert said in done.stderr
+    assert message in done.stderr
     assert code == 2 or len(done.stderr.splitlines()) == 1
 
 
-def test_a_port_that_is_taken(data) -> None:
-    """Two processes cannot be one robot's."""
-    with socket.socket(type=socket.SOCK_DGRAM) as ours, socket.create_server(("127.0.0.1", 0)) as server:
-        ours.bind(("127.0.0.1", 0))
-        for kind, taken in (("udp", ours), ("tcp-listen", server)):
-            done = pumafuse("live", f"{kind}://127.0.0.1:{taken.getsockname()[1]}", "-c", data / "fusion.toml", code=1)
-            assert "cannot be listened at: " in done.stderr.splitlines()[-1]
-
-
-def test_elsewhere_only_who_is_allowed(data) -> None:
-    """Listening on all addresses is said; who is not named is not heard."""
+def test_only_allowed_senders_are_accepted_elsewhere(data) -> None:
+    """A sender that is not named is refused."""
     options = ("--listen", "0.0.0.0", "--allow", "127.0.0.2/32")
     with live("udp://:0", data / "fusion.toml", *options) as process:
         port = process.port()
@@ -136,8 +122,8 @@ def test_elsewhere_only_who_is_allowed(data) -> None:
                 ours.bind((host, 0))
                 ours.sendto(b'{"t": 1.0, "command": {"radial": %f}}' % radial, ("127.0.0.1", port))
         assert json.loads(process.received(1)[0])["radial"]["position_mm"] == 560.0
-        told = process.end()
-    assert "1 datagrams taken in, 0 lost, 1 refused" in told
+        log = process.end()
+    assert "1 datagrams taken in, 0 lost, 1 refused" in log
 
 
 def test_a_record_holds_what_came(data, scan, tmp_path) -> None:
@@ -149,39 +135,12 @@ def test_a_record_holds_what_came(data, scan, tmp_path) -> None:
                 ours.sendto(line, place)
                 if b'"command"' in line:
                     process.received(1)
-        told = process.end()
-    assert f"{tmp_path / 'run'}: {len(scan)} rows written" in told
+        log = process.end()
+    assert f"{tmp_path / 'run'}: {len(scan)} rows written" in log
     done = pumafuse("fuse", tmp_path / "run", "-c", data / "fusion.toml", "-o", tmp_path / "out")
     assert "run" in done.stdout + done.stderr
     found = pf.Run.read(tmp_path / "run")
     assert len(found.command.stamp) + sum(len(source.stamp) for source in found.sensors.values()) == len(scan)
-
-
-@pytest.mark.long
-@pytest.mark.skipif(os.name != "posix", reason="needs a limit on the size of files")
-def test_estimates_go_on_when_the_disk_is_full(data, tmp_path) -> None:
-    """No file may grow beyond 16 KiB: said once, every estimate comes all the same, and what is there fuses."""
-    sent = lines(4000 * 0.014)
-    words = f"ulimit -f 16; exec {EXECUTABLE} live stdin -c {data / 'fusion.toml'} --record {tmp_path / 'run'}"
-    with subprocess.Popen(
-        ["bash", "-c", words], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        for part in range(4):  # long enough for the recorder to see the disk refuse while rows still come
-            piece = b"".join(sent.splitlines(keepends=True)[part * 1000 : part * 1000 + 1000])
-            process.stdin.write(piece)
-            process.stdin.flush()
-            for _ in range(500):
-                assert process.stdout.readline()
-            time.sleep(0.7)
-        _, told = process.communicate(timeout=LONGEST)
-    assert process.returncode == 0
-    assert told.count(b"File too large") == 1
-    assert b"commands: 2000 fused; 2000 estimates" in told
-    found = pf.Run.read(tmp_path / "run")
-    pf.fuse(found, pf.FusionConfig.load(data / "fusion.toml"))
-    assert 500 < len(found.command.stamp) < 2000
 
 
 class Fed:
@@ -214,9 +173,9 @@ class Fed:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(10))
 def test_killed_at_any_moment(data, tmp_path, seed: int) -> None:
-    """A hundred kills at random moments: each record fuses, and lacks the last second at most."""
+    """Fifty kills at random moments: each record fuses, and lacks the last second at most."""
     rng, config = random.Random(seed), pf.FusionConfig.load(data / "fusion.toml")
     fed = [Fed(data, tmp_path / f"run{number}") for number in range(5)]
     answered, step = set[int](), 0
@@ -271,31 +230,27 @@ def broken(rng: random.Random, good: bytes, other: bytes) -> bytes:
 
 
 def is_json(line: bytes) -> bool:
-    """Whether a line may be an event by the standard library's opinion, which is not ours."""
+    """Whether the standard library reads a line as an object."""
     try:
         return isinstance(json.loads(line), dict)
     except (ValueError, RecursionError):
         return False
 
 
-def attacked(data: Path, count: int) -> None:
-    """Send ``count`` mutated datagrams among good ones, and see that nothing but events moves an estimate."""
+@pytest.mark.long
+def test_a_million_broken_datagrams(data) -> None:
+    """No crash, no hang, no memory; every estimate is, to the last bit, what it would be without the garbage."""
+    count = 1_000_000
     rng, written = random.Random(count), list[bytes]()
     shadow = Stream(pf.LiveEstimator(pf.FusionConfig.load(data / "fusion.toml")), written.extend, lambda _: None)
     garbage, least = 0, 0
     with live("udp://127.0.0.1:0", data / "fusion.toml") as process, socket.socket(type=socket.SOCK_DGRAM) as ours:
         place = ("127.0.0.1", process.port())
         for piece in range(count // 100):
-            t = piece * 0.028
-            good = [
-                line.encode()
-                for line in (
-                    json.dumps(
-                        {"t": t, "sensor": "tracker", "radial": 560.0 + rng.gauss(0.0, 0.05), "vertical": -90.0}
-                    ),
-                    json.dumps({"t": t, "command": {"radial": 560.0, "vertical": -90.0}}),
-                )
-            ]
+            t, radial = piece * 0.028, 560.0 + rng.gauss(0.0, 0.05)
+            measurement = {"t": t, "sensor": "tracker", "radial": radial, "vertical": -90.0}
+            command = {"t": t, "command": {"radial": 560.0, "vertical": -90.0}}
+            good = [json.dumps(body).encode() for body in (measurement, command)]
             for _ in range(100):
                 datagram = broken(rng, rng.choice(good), rng.choice(good))
                 ours.sendto(datagram, place)
@@ -310,12 +265,6 @@ def attacked(data: Path, count: int) -> None:
             if piece == count // 500:
                 least = process.memory()
         assert process.memory() < least + 4096, "memory grows"
-        told = process.end()
+        log = process.end()
     assert garbage > 0.5 * count
-    assert f"{count + 2 * (count // 100)} datagrams taken in, 0 lost" in told
-
-
-@pytest.mark.long
-def test_a_million_broken_datagrams(data) -> None:
-    """No crash, no hang, no memory; every estimate is, to the last bit, what it would be without the garbage."""
-    attacked(data, 1_000_000)
+    assert f"{count + 2 * (count // 100)} datagrams taken in, 0 lost" in log

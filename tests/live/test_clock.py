@@ -1,4 +1,4 @@
-"""Late, ahead, on another clock, set back: what stamps alone tell."""
+"""Late, ahead, of another clock, of a clock that was reset: what stamps alone tell."""
 
 import pytest
 
@@ -7,6 +7,9 @@ from pumafuse.live.clock import Clock, Verdict
 
 SECOND = 1_000_000_000
 T = 28_000_000
+CONFIG = pf.FusionConfig(
+    arm=pf.ArmModel.load("puma560-internal"), sensors={"tracker": pf.Sensor(sd=1e-4), "camera": pf.Sensor(sd=5e-4)}
+)
 
 
 def at(seconds: float) -> Clock:
@@ -15,7 +18,7 @@ def at(seconds: float) -> Clock:
     return clock
 
 
-def test_a_stamp_within_the_window_is_here_and_one_before_it_is_behind() -> None:
+def test_a_stamp_before_the_window_is_behind() -> None:
     """Late by exactly the window is in time."""
     clock = at(10.0)
     assert clock.low == 8 * SECOND
@@ -23,8 +26,8 @@ def test_a_stamp_within_the_window_is_here_and_one_before_it_is_behind() -> None
     assert clock.newest == 10 * SECOND
 
 
-def test_a_jump_ahead_is_believed_until_it_is_contradicted() -> None:
-    """One stamp 30 s ahead, then the old time: back to it, and all after it in doubt is to be forgotten."""
+def test_a_jump_ahead_is_accepted_until_it_is_contradicted() -> None:
+    """One stamp 30 s ahead, then the old time: back to it, and all after it is in doubt."""
     clock = at(10.0)
     assert clock.judge(40 * SECOND, source="tracker") is Verdict.ACCEPTED
     assert (clock.newest, clock.sure) == (40 * SECOND, 10 * SECOND)
@@ -32,8 +35,8 @@ def test_a_jump_ahead_is_believed_until_it_is_contradicted() -> None:
     assert (clock.newest, clock.sure, clock.bound) == (10 * SECOND, 10 * SECOND, 12 * SECOND)
 
 
-@pytest.mark.parametrize("gap", [5, 60, 3000])
-def test_after_a_pause_of_all_time_goes_on(gap: int) -> None:
+@pytest.mark.parametrize("gap", [5, 3000])
+def test_time_goes_on_after_a_pause_of_all(gap: int) -> None:
     """Two commands after a pause, or a second of measurements, end the doubt."""
     clock = at(0.0)
     assert clock.judge(gap * SECOND, source=None) is Verdict.ACCEPTED
@@ -46,7 +49,7 @@ def test_after_a_pause_of_all_time_goes_on(gap: int) -> None:
     assert clock.sure == (gap + 1) * SECOND
 
 
-def test_events_that_are_always_far_apart_are_all_believed() -> None:
+def test_events_that_are_always_far_apart_are_all_accepted() -> None:
     """A command every 10 s, and nothing between."""
     clock = at(0.0)
     for step in range(1, 20):
@@ -54,58 +57,44 @@ def test_events_that_are_always_far_apart_are_all_believed() -> None:
         assert clock.newest == 10 * step * SECOND
 
 
-@pytest.mark.parametrize("to", [-3600, -3, 4000, 31_536_000])
-def test_three_commands_of_another_time_are_a_clock_set_anew(to: int) -> None:
-    """Set back, or ahead by more than an hour."""
+@pytest.mark.parametrize(("to", "verdict"), [(-3, Verdict.BEHIND), (4000, Verdict.AHEAD)])
+def test_three_commands_of_another_time_are_a_reset(to: int, verdict: Verdict) -> None:
+    """Behind the window, or ahead by more than an hour."""
     clock = at(100.0)
-    stamps = [(100 + to) * SECOND + step * T for step in range(3)]
-    verdicts = [clock.judge(stamp, source=None) for stamp in stamps]
-    away = Verdict.BEHIND if to < 0 else Verdict.AHEAD
-    assert verdicts == [away, away, Verdict.RESET]
+    verdicts = [clock.judge((100 + to) * SECOND + step * T, source=None) for step in range(3)]
+    assert verdicts == [verdict, verdict, Verdict.RESET]
 
 
-def test_a_command_of_the_right_time_clears_what_was_said_against_it() -> None:
+def test_a_command_of_the_right_time_rules_out_a_reset() -> None:
     """Two stale commands, a current one, two stale ones: no restart."""
     clock = at(100.0)
-    for step in range(2):
+    for step in range(4):
         assert clock.judge(50 * SECOND + step * T, source=None) is Verdict.BEHIND
-    clock.confirm()
-    for step in range(2, 4):
-        assert clock.judge(50 * SECOND + step * T, source=None) is Verdict.BEHIND
+        if step == 1:
+            clock.confirm()
 
 
-def test_measurements_alone_never_set_the_clock() -> None:
-    """A sensor an hour behind or a year ahead is refused for as long as it goes on."""
-    clock = at(100.0)
-    for step in range(1000):
-        assert clock.judge(50 * SECOND + step * T, source="tracker") is Verdict.BEHIND
-        assert clock.judge(31_536_000 * SECOND + step * T, source="tracker") is Verdict.AHEAD
+def pair() -> tuple[pf.LiveEstimator, pf.LiveEstimator]:
+    """An estimator that gets wrong stamps, too, and one that does not."""
+    return pf.LiveEstimator(CONFIG), pf.LiveEstimator(CONFIG)
 
 
-CONFIG = pf.FusionConfig(
-    arm=pf.ArmModel.load("puma560-internal"), sensors={"tracker": pf.Sensor(sd=1e-4), "camera": pf.Sensor(sd=5e-4)}
-)
-
-
-@pytest.mark.parametrize("off", [30.0, -30.0, 5.0, 86_400.0 * 365])
+@pytest.mark.parametrize("off", [30.0, -30.0, 86_400.0 * 365])
 def test_one_sensor_of_another_clock_disturbs_nobody(off: float) -> None:
-    """A sensor whose clock is wrong, from the beginning on: the estimate is that without it, and the filter goes on."""
-    notices: list[str] = []
-    live, alone = pf.LiveEstimator(CONFIG, on_notice=notices.append), pf.LiveEstimator(CONFIG)
-    for step in range(500):
+    """A sensor whose clock is wrong from the beginning on: the estimate is that without it, and the filter goes on."""
+    live, alone = pair()
+    for step in range(501):
         t = 0.028 * step
         for one in (live, alone):
             one.command(t, radial=0.5 + 1e-4 * step)
             one.measurement(t + 0.01, "tracker", radial=0.5 + 1e-4 * step)
-        live.measurement(t + 0.012 + off, "camera", radial=0.9)
-    live.command(14.0, radial=0.55)
-    alone.command(14.0, radial=0.55)
+        if step < 500:
+            live.measurement(t + 0.012 + off, "camera", radial=0.9)
     assert live.estimate(14.0)["radial"] == alone.estimate(14.0)["radial"]
     assert live.segment == 0
     outcomes = live.health().sensors["camera"].outcomes
-    assert outcomes["fused"] == 0
     assert outcomes["too_late" if off < 0 else "invalid"] == 500
-    assert live.health().sensors["tracker"].outcomes["fused"] == 500
+    assert live.health().sensors["tracker"].outcomes["fused"] == 501
 
 
 def test_a_wild_command_is_taken_back() -> None:
@@ -120,7 +109,6 @@ def test_a_wild_command_is_taken_back() -> None:
         if step in (100, 150):
             assert live.command(t + 1800.0, radial=9.0, vertical=9.0).outcome is pf.Outcome.FUSED
     assert live.estimate(5.6) == clean.estimate(5.6)
-    assert live.health().commands["invalid"] == 2
     assert live.health().commands == {**clean.health().commands, "invalid": 2}
     assert len(notices) == 2  # its speed, and that it was taken back; the next of these will be the tenth
     assert "a command ran 1799.972 s ahead of the others: taken back" in notices[1]
@@ -142,17 +130,16 @@ def test_a_measurement_cannot_contradict_a_command() -> None:
     assert notices == []
 
 
-def test_two_sensors_that_are_wrong_do_not_make_each_other_right() -> None:
+def test_two_sensors_that_are_wrong_do_not_confirm_each_other() -> None:
     """One 30 s ahead, one 60 s ahead, and right commands: no restart, and the estimate is that of the commands."""
-    live, alone = pf.LiveEstimator(CONFIG), pf.LiveEstimator(CONFIG)
-    for step in range(500):
+    live, alone = pair()
+    for step in range(501):
         t = 0.028 * step
-        live.command(t, radial=0.5 + 1e-4 * step)
-        alone.command(t, radial=0.5 + 1e-4 * step)
-        live.measurement(t + 30.0, "tracker", radial=0.9)
-        live.measurement(t + 60.0, "camera", radial=0.1)
-    live.command(14.0, radial=0.55)
-    alone.command(14.0, radial=0.55)
+        for one in (live, alone):
+            one.command(t, radial=0.5 + 1e-4 * step)
+        if step < 500:
+            live.measurement(t + 30.0, "tracker", radial=0.9)
+            live.measurement(t + 60.0, "camera", radial=0.1)
     assert live.segment == 0
     assert live.estimate(14.0) == alone.estimate(14.0)
     assert live.health().sensors["camera"].outcomes["invalid"] == 500

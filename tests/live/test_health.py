@@ -18,17 +18,18 @@ CONFIG = pf.FusionConfig(
 
 
 def stream(seconds: float, sd: float = 1e-4) -> pf.Run:
+    """Commands that hold, and a tracker of 100 Hz."""
     rng = np.random.default_rng(7)
-    given, heard = np.arange(0.0, seconds, 0.028), np.arange(0.0, seconds, 0.01)
+    commands, rows = np.arange(0.0, seconds, 0.028), np.arange(0.0, seconds, 0.01)
     return pf.Run.from_arrays(
-        given,
-        {"radial": np.full(len(given), 0.57)},
-        {"tracker": (heard, {"radial": 0.57 + rng.normal(0.0, sd, len(heard))})},
+        commands,
+        {"radial": np.full(len(commands), 0.57)},
+        {"tracker": (rows, {"radial": 0.57 + rng.normal(0.0, sd, len(rows))})},
     )
 
 
-def test_a_right_sensor_has_its_rate_and_a_nis_of_one() -> None:
-    """100 Hz and noise as configured: rate 100 Hz, NIS within the 99.99 % band of 6000 components, nothing late."""
+def test_a_right_sensor_has_its_rate_and_a_nis_of_one_until_its_noise_doubles() -> None:
+    """100 Hz and noise as configured: NIS within the 99.99 % band of 6000 components. Then four, of the last minute."""
     live = pf.LiveEstimator(CONFIG)
     for event in events_of(stream(100.0)):
         feed(live, event)
@@ -38,33 +39,26 @@ def test_a_right_sensor_has_its_rate_and_a_nis_of_one() -> None:
     assert health.nis == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 6000.0))
     assert (health.dropouts, health.lateness_max, health.stale) == (0, 0.0, False)
     assert health.outcomes["fused"] + health.outcomes["rejected"] == 10_000
-
-
-def test_noise_twice_as_large_shows_as_a_nis_of_four() -> None:
-    """Of the last minute only: before it the noise was as configured."""
-    live = pf.LiveEstimator(CONFIG)
-    for event in events_of(stream(61.0)):
-        feed(live, event)
-    louder = [event._replace(stamp=event.stamp + round(61.04e9)) for event in events_of(stream(60.0, sd=2e-4))]
-    for event in louder:
-        feed(live, event)
+    for event in events_of(stream(60.0, sd=2e-4)):
+        feed(live, event._replace(stamp=event.stamp + round(100.04e9)))
     nis = live.health().sensors["tracker"].nis
     assert nis is not None
     assert 3.0 < nis < 4.5  # the gate takes the largest away
 
 
 def test_lateness_is_how_far_behind_the_newest_stamp_a_row_comes() -> None:
-    """Delays even between 0 and 0.5 s: the mean is a little below 0.25 s, as the newest was late too."""
+    """Delays even between 0 and 0.5 s: the mean is below 0.25 s, as the newest was late too. Late is no dropout."""
     live = pf.LiveEstimator(CONFIG)
     for event in delayed(events_of(stream(30.0)), 0.5, seed=1):
         feed(live, event)
     health = live.health().sensors["tracker"]
     assert 0.15 < health.lateness < 0.25
     assert 0.4 < health.lateness_max <= 0.5
+    assert health.dropouts == 0
 
 
 def test_gaps_are_dropouts_and_silence_is_stale() -> None:
-    """Two gaps of 50 ms and a missing row in a 100 Hz stream are three dropouts; who says nothing more is stale."""
+    """Two gaps of 50 ms and a missing row in a 100 Hz stream are three dropouts; a silent sensor is stale."""
     live = pf.LiveEstimator(CONFIG)
     live.command(0.0, radial=0.57)
     for row in range(1000):
@@ -80,7 +74,7 @@ def test_gaps_are_dropouts_and_silence_is_stale() -> None:
     assert health["never"].stale
 
 
-def test_reopenings_and_all_outcomes_are_counted() -> None:
+def test_all_outcomes_are_counted() -> None:
     """A sensor that jumps by 20 mm is rejected, then reacquired; unknown and refused rows are counted, too."""
     live = pf.LiveEstimator(CONFIG)
     for row in range(400):
@@ -103,22 +97,14 @@ def test_reopenings_and_all_outcomes_are_counted() -> None:
 def test_a_slower_sensor_has_a_new_usual_interval() -> None:
     """From 100 to 20 Hz: some dropouts until that is usual, then none; the first interval may be any."""
     live = pf.LiveEstimator(CONFIG)
-    live.command(0.0, radial=0.57)
     times = np.concatenate(([0.0], 1.9 + 0.01 * np.arange(1000), 11.9 + 0.05 * np.arange(1000)))
     dropouts = []
     for t in times.tolist():
         live.command(t, radial=0.57)
         live.measurement(t, "tracker", radial=0.57)
-        dropouts.append(live.health().sensors["tracker"].dropouts) if t in (11.85, times[1200]) else None
-    assert dropouts[-1] == live.health().sensors["tracker"].dropouts < 60
-
-
-def test_late_rows_are_no_dropouts() -> None:
-    """Rows in any order are no gaps once they are in, and every row of them is there."""
-    live = pf.LiveEstimator(CONFIG)
-    for event in delayed(events_of(stream(30.0)), 0.5, seed=1):
-        feed(live, event)
-    assert live.health().sensors["tracker"].dropouts == 0
+        dropouts.append(live.health().sensors["tracker"].dropouts) if t == times[1200] else None
+    assert dropouts == [live.health().sensors["tracker"].dropouts]
+    assert dropouts[0] < 60
 
 
 def test_the_cameras_dropouts_are_counted() -> None:

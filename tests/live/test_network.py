@@ -43,8 +43,8 @@ async def until(source: Source, enough: Callable[[list[bytes]], bool]) -> list[b
     return lines
 
 
-def port_of(said: list[str]) -> int:
-    return int(next(text for text in said if "listening at" in text).rsplit(":", 1)[1])
+def port_of(notices: list[str]) -> int:
+    return int(next(text for text in notices if "listening at" in text).rsplit(":", 1)[1])
 
 
 def sender(host: str = "127.0.0.1") -> socket.socket:
@@ -53,111 +53,82 @@ def sender(host: str = "127.0.0.1") -> socket.socket:
     return ours
 
 
-class TestUdp:
+class TestUdpListener:
+    def setup_method(self) -> None:
+        self.notices: list[str] = []
+        self.source = UdpListener(LOOPBACK, everybody, self.notices.append)
+
+    def send(self, datagrams: list[bytes], host: str = "127.0.0.1") -> None:
+        with sender(host) as ours:
+            for datagram in datagrams:
+                ours.sendto(datagram, ("127.0.0.1", port_of(self.notices)))
+
     def test_datagrams_are_lines(self) -> None:
         """One line or several a datagram, in their order; silence is no lines."""
-        said: list[str] = []
-        source = UdpListener(LOOPBACK, everybody, said.append)
 
         async def work() -> None:
-            assert await source.get() == []
-            with sender() as ours:
-                for number in range(100):
-                    ours.sendto(b"%d\n%d.5\n" % (number, number), ("127.0.0.1", port_of(said)))
-            lines = await until(source, lambda found: len([line for line in found if line]) == 200)
+            assert await self.source.get() == []
+            self.send([b"%d\n%d.5\n" % (number, number) for number in range(100)])
+            lines = await until(self.source, lambda found: len([line for line in found if line]) == 200)
             assert [float(line) for line in lines if line] == [half / 2 for half in range(200)]
 
-        running(source, work)
-        assert "100 datagrams taken in, 0 lost" in source.summary()
+        running(self.source, work)
+        assert "100 datagrams taken in, 0 lost" in self.source.summary()
 
-    def test_the_oldest_are_let_go_and_counted(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """When too many wait, what remains is the newest."""
-        monkeypatch.setattr(network, "_MOST_DATAGRAMS", 10)
-        said: list[str] = []
-        source = UdpListener(LOOPBACK, everybody, said.append)
+    @pytest.mark.parametrize(("bound", "most"), [("_MOST_DATAGRAMS", 10), ("_MOST_BYTES", 20)])
+    def test_the_oldest_are_dropped_and_counted(self, monkeypatch: pytest.MonkeyPatch, bound: str, most: int) -> None:
+        """When too many wait, or too many bytes, what remains is the newest."""
+        monkeypatch.setattr(network, bound, most)
 
         async def work() -> None:
-            with sender() as ours:
-                for number in range(50):
-                    ours.sendto(b"%d" % number, ("127.0.0.1", port_of(said)))
-            lines = await until(source, lambda found: b"49" in found)
+            self.send([b"%02d" % number for number in range(50)])
+            lines = await until(self.source, lambda found: b"49" in found)
             assert [int(line) for line in lines] == list(range(40, 50))
 
-        running(source, work)
-        assert "10 datagrams taken in, 40 lost" in source.summary()
-
-    def test_large_ones_wait_only_up_to_a_size(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Sixty datagrams of 10 kB where 50 kB may wait."""
-        monkeypatch.setattr(network, "_MOST_BYTES", 50_000)
-        said: list[str] = []
-        source = UdpListener(LOOPBACK, everybody, said.append)
-
-        async def work() -> None:
-            with sender() as ours:
-                for _ in range(6):
-                    for _ in range(10):
-                        ours.sendto(b"x" * 10_000, ("127.0.0.1", port_of(said)))
-                    await asyncio.sleep(0)
-            await asyncio.sleep(0.1)
-            assert len(source._waiting) == 5
-
-        running(source, work)
-        assert "5 datagrams taken in, 55 lost" in source.summary()
+        running(self.source, work)
+        assert "10 datagrams taken in, 40 lost" in self.source.summary()
 
     @pytest.mark.skipif(sys.platform != "linux", reason="other systems do not tell what they dropped")
     def test_what_the_system_drops_is_counted(self) -> None:
         """Many thousands while nobody takes them in: came and lost together are what was sent."""
-        said: list[str] = []
-        source = UdpListener(LOOPBACK, everybody, said.append)
         sent = 60_000
 
         async def work() -> None:
-            with sender() as ours:
-                for number in range(sent):
-                    ours.sendto(b"%d" % number, ("127.0.0.1", port_of(said)))
-                    if number == 0:
-                        assert await source.get() == [b"0"]
-            while await source.get():
+            self.send([b"0"])
+            assert await self.source.get() == [b"0"]
+            self.send([b"1"] * (sent - 1))
+            while await self.source.get():
                 pass
-            assert source._lost() > 0
-            assert source._received + source._lost() == sent  # nothing was let go here
-            source._next_report = 0.0
-            await source.get()
+            assert self.source._lost() > 0
+            assert self.source._received + self.source._lost() == sent  # nothing was dropped here
 
-        running(source, work)
-        assert any("lost" in text for text in said)
+        running(self.source, work)
+        assert any("lost" in text for text in self.notices)
 
-    def test_only_who_is_allowed_is_heard(self) -> None:
-        """Others are counted, and said."""
-        said: list[str] = []
-        source = UdpListener(LOOPBACK, lambda host: host == "127.0.0.2", said.append)
+    def test_only_allowed_senders_are_accepted(self) -> None:
+        """Others are counted and reported."""
+        self.source = UdpListener(LOOPBACK, lambda host: host == "127.0.0.2", self.notices.append)
 
         async def work() -> None:
             for host in ("127.0.0.1", "127.0.0.2"):
-                with sender(host) as ours:
-                    ours.sendto(host.encode(), ("127.0.0.1", port_of(said)))
-            assert await until(source, bool) == [b"127.0.0.2"]
+                self.send([host.encode()], host)
+            assert await until(self.source, bool) == [b"127.0.0.2"]
 
-        running(source, work)
-        assert "1 datagrams taken in, 0 lost, 1 refused" in source.summary()
-        assert any("127.0.0.1, which --allow does not name" in text for text in said)
-
-    def test_a_place_that_is_taken_is_said(self) -> None:
-        """Two cannot listen at one port."""
-        with sender() as ours:
-            source = UdpListener((socket.AF_INET, ours.getsockname()), everybody, print)
-            with pytest.raises(pf.RunError, match="in use"):
-                asyncio.run(source.start())
+        running(self.source, work)
+        assert "1 datagrams taken in, 0 lost, 1 refused" in self.source.summary()
+        assert any("127.0.0.1, which --allow does not name" in text for text in self.notices)
 
 
-class TestServer:
+class TestTcpListener:
+    def setup_method(self) -> None:
+        self.notices: list[str] = []
+        self.source = TcpListener(LOOPBACK, everybody, self.notices.append)
+
     def test_lines_of_several_connections(self) -> None:
         """Each connection's lines are whole and in order, however they are cut; a last one without its end counts."""
-        said: list[str] = []
-        source = TcpListener(LOOPBACK, everybody, said.append)
 
         async def send(name: int) -> None:
-            _, writer = await asyncio.open_connection("127.0.0.1", port_of(said))
+            _, writer = await asyncio.open_connection("127.0.0.1", port_of(self.notices))
             text = b"\n".join(b"%d %d" % (name, number) for number in range(1000))
             for begin in range(0, len(text), 777):
                 writer.write(text[begin : begin + 777])
@@ -167,45 +138,41 @@ class TestServer:
 
         async def work() -> None:
             tasks = [asyncio.create_task(send(name)) for name in range(3)]
-            lines = await until(source, lambda found: len(found) == 3000)
+            lines = await until(self.source, lambda found: len(found) == 3000)
             for name in range(3):
                 mine = [int(line.split()[1]) for line in lines if int(line.split()[0]) == name]
                 assert mine == list(range(1000))
             await asyncio.gather(*tasks)
-            while len(source._open):
-                await source.get()
+            while len(self.source._open):
+                await self.source.get()
 
-        running(source, work)
-        assert "connections: 3, 0 open" in source.summary()
+        running(self.source, work)
+        assert "connections: 3, 0 open" in self.source.summary()
 
     def test_many_short_connections_one_after_another(self) -> None:
         """Each gives a line and is closed at once: all lines come, none is refused."""
-        said: list[str] = []
-        source = TcpListener(LOOPBACK, everybody, said.append)
 
         async def send() -> None:
             for number in range(1000):
-                _, writer = await asyncio.open_connection("127.0.0.1", port_of(said))
+                _, writer = await asyncio.open_connection("127.0.0.1", port_of(self.notices))
                 writer.write(b"%d\n" % number)
                 writer.close()
 
         async def work() -> None:
             task = asyncio.create_task(send())
-            lines = await until(source, lambda found: len(found) == 1000)
+            lines = await until(self.source, lambda found: len(found) == 1000)
             assert sorted(map(int, lines)) == list(range(1000))
             await task
 
-        running(source, work)
-        assert "refused" not in source.summary()
+        running(self.source, work)
+        assert "refused" not in self.source.summary()
 
     def test_a_fast_sender_waits(self) -> None:
         """Nobody takes lines in: the sender is stopped after some MB, the queue stays short; then nothing is lost."""
-        said: list[str] = []
-        source = TcpListener(LOOPBACK, everybody, said.append)
         total, wide = 600_000, b"x" * 90
 
         async def work() -> None:
-            _, writer = await asyncio.open_connection("127.0.0.1", port_of(said))
+            _, writer = await asyncio.open_connection("127.0.0.1", port_of(self.notices))
             sent = [0]
 
             async def send() -> None:
@@ -220,26 +187,25 @@ class TestServer:
                 before = sent[0]
                 await asyncio.sleep(0.5)
             assert before < total - 1
-            assert source._pieces.qsize() == network._MOST_PIECES
+            assert self.source._pieces.qsize() == network._MOST_PIECES
             expected = 0
             while expected < total:
-                for line in await source.get():
+                for line in await self.source.get():
                     assert int(line.split()[0]) == expected
                     expected += 1
             await task
 
-        running(source, work)
+        running(self.source, work)
 
     def test_who_is_not_allowed_or_too_many_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """The connection is closed at once, counted and said."""
+        """The connection is closed at once, counted and notices."""
         monkeypatch.setattr(network, "_MOST_CONNECTIONS", 2)
-        said: list[str] = []
-        source = TcpListener(LOOPBACK, lambda host: host != "127.0.0.3", said.append)
+        self.source = TcpListener(LOOPBACK, lambda host: host != "127.0.0.3", self.notices.append)
 
         async def work() -> None:
             ends = []
             for host in ("127.0.0.3", "127.0.0.1", "127.0.0.2", "127.0.0.1"):
-                reader, writer = await asyncio.open_connection("127.0.0.1", port_of(said), local_addr=(host, 0))
+                reader, writer = await asyncio.open_connection("127.0.0.1", port_of(self.notices), local_addr=(host, 0))
                 ends.append(writer)
                 if host == "127.0.0.3" or len(ends) == 4:
                     with pytest.raises(ConnectionResetError):
@@ -247,16 +213,16 @@ class TestServer:
                             raise ConnectionResetError
                 else:
                     writer.write(host.encode() + b"\n")
-                    assert await until(source, bool) == [host.encode()]
+                    assert await until(self.source, bool) == [host.encode()]
             for writer in ends:
                 writer.close()
 
-        running(source, work)
-        assert "connections: 2" in source.summary()
-        assert "2 refused" in source.summary()
+        running(self.source, work)
+        assert "connections: 2" in self.source.summary()
+        assert "2 refused" in self.source.summary()
 
 
-class TestClient:
+class TestTcpClient:
     def test_it_connects_again(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Nobody there, then a server that ends each connection in the middle of a line: tried again, no line lost."""
         monkeypatch.setattr(network, "_FIRST_WAIT", 0.01)
@@ -264,8 +230,8 @@ class TestClient:
             del place
             reserved.bind(("127.0.0.1", 0))
             port = reserved.getsockname()[1]
-        said: list[str] = []
-        source = TcpClient(Address.parse(f"tcp://127.0.0.1:{port}"), said.append)
+        notices: list[str] = []
+        source = TcpClient(Address.parse(f"tcp://127.0.0.1:{port}"), notices.append)
         count = [0]
 
         async def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -274,7 +240,7 @@ class TestClient:
             writer.close()
 
         async def work() -> None:
-            while not any("cannot be reached" in text for text in said):
+            while not any("cannot be reached" in text for text in notices):
                 assert await source.get() == []
             server = await asyncio.start_server(answer, "127.0.0.1", port)
             lines = await until(source, lambda found: len(found) >= 6)
@@ -316,3 +282,12 @@ def test_estimates_are_datagrams() -> None:
     out([b"x" * 100_000])
     out.close()
     assert "1 estimates could not be sent" in out.summary()
+
+
+@pytest.mark.parametrize("kind", [UdpListener, TcpListener])
+def test_a_port_that_is_taken_is_reported(kind: type[UdpListener] | type[TcpListener]) -> None:
+    """Two cannot listen at one port."""
+    with sender() as ours, socket.create_server(("127.0.0.1", 0)) as server:
+        taken = (ours if kind is UdpListener else server).getsockname()
+        with pytest.raises(pf.RunError, match=r"cannot be listened at: .*in use"):
+            asyncio.run(kind((socket.AF_INET, taken), everybody, print).start())

@@ -1,4 +1,4 @@
-"""Lines in and out: the wire format, and what is no line of it."""
+"""The wire format: decoding of lines into events, encoding of estimates."""
 
 from __future__ import annotations
 
@@ -15,24 +15,18 @@ DECODER = LineDecoder(("radial", "vertical"), framed=True)
 
 
 def test_the_lines_of_the_design() -> None:
-    """A command and a measurement in mm and s are an event in m and s; whole ns stay whole."""
+    """A command and a measurement in mm and s are an event in m and s; whole ns stay whole; null is no number."""
     assert DECODER.decode(b'{"t": 12.345, "command": {"radial": 570.0}}') == Event(12.345, "", {"radial": 0.57})
     line = b'{"t_ns": 1700000000123456789, "sensor": "tracker", "radial": 569.7, "vertical": -93.2}'
-    assert DECODER.decode(line) == Event(1700000000123456789, "tracker", {"radial": 569.7 / 1e3, "vertical": -93.2 / 1e3})
-    assert DECODER.decode(b'{"t": 1, "sensor": "tracker", "x": 1, "y": 2, "z": 3}').values == {
-        "x": 0.001,
-        "y": 0.002,
-        "z": 0.003,
-    }
-
-
-def test_null_is_no_number() -> None:
-    """An axis that a sensor has lost is given, but not finite."""
+    values = {"radial": 569.7 / 1e3, "vertical": -93.2 / 1e3}
+    assert DECODER.decode(line) == Event(1700000000123456789, "tracker", values)
+    line = b'{"t": 1, "sensor": "tracker", "x": 1, "y": 2, "z": 3}'
+    assert DECODER.decode(line).values == {"x": 0.001, "y": 0.002, "z": 0.003}
     assert math.isnan(DECODER.decode(b'{"t": 1, "sensor": "tracker", "radial": null}').values["radial"])
 
 
-def test_unknown_names_are_kept_to_be_told() -> None:
-    """A row with a further field is still a row; what the field is called comes with it."""
+def test_values_under_unknown_names_are_passed_on() -> None:
+    """A row with a further field is still a row; the field comes with it, so that it can be reported."""
     event = DECODER.decode(b'{"t": 1, "sensor": "tracker", "radial": 570, "quality": {"snr": [1, 2]}}')
     assert (event.t, event.sensor) == (1.0, "tracker")
     assert set(event.values) == {"radial", "quality"}
@@ -43,13 +37,11 @@ def test_unknown_names_are_kept_to_be_told() -> None:
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        (b"hello", "not JSON"),
         (b'{"t": 1, "sensor": "tracker", "radial": ' + b"1" * 70_000 + b"}", "longer than 64 KiB"),
         (b"", "not JSON"),
         (b"\xff\xfe\x00\x01", "not JSON"),
         (b'{"t": 1, "sensor": "tracker", "radial": 5', "not JSON"),
         (b"[1, 2, 3]", "Expected `object`"),
-        (b"12", "Expected `object`"),
         (b'{"sensor": "tracker", "radial": 570}', "needs one of 't'"),
         (b'{"t": 1, "t_ns": 1, "sensor": "tracker", "radial": 570}', "needs one of 't'"),
         (b'{"t": "1", "sensor": "tracker", "radial": 570}', "Expected `float | null`"),
@@ -68,7 +60,7 @@ def test_unknown_names_are_kept_to_be_told() -> None:
         (b'{"t": 1, "sensor": "tracker", "a": ' + b"[" * 20_000 + b"]" * 20_000 + b"}", "not JSON|nest"),
     ],
 )
-def test_what_is_no_line_says_why(line: bytes, reason: str) -> None:
+def test_what_is_no_event_has_a_reason(line: bytes, reason: str) -> None:
     """Each is refused with a reason, and nothing else is raised."""
     with pytest.raises(BadLine, match=reason):
         DECODER.decode(line)
@@ -81,41 +73,24 @@ def test_an_axis_may_not_be_called_as_a_part_of_a_line() -> None:
 
 
 def test_an_estimate_is_one_line() -> None:
-    """Position, its sd and velocity in mm and mm/s, what is stale, and ns where the stream has them."""
-    live = pf.LiveEstimator(
-        pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal"), sensors={"tracker": pf.Sensor(sd=1e-4)})
-    )
-    live.command(0.5, radial=0.57)
-    estimate = live.estimate(3.5)
-    text = encode(estimate, with_ns=True)
-    assert text.endswith(b"}\n")
-    assert json.loads(text) == {
-        "t": 3.5,
-        "t_ns": 3_500_000_000,
-        "radial": {
-            "position_mm": 570.0,
-            "sd_mm": estimate["radial"].position_sd * 1e3,
-            "velocity_mm_s": 0.0,
-        },
-        "stale": ["radial"],
-    }
-    assert "t_ns" not in json.loads(encode(estimate, with_ns=False))
-
-
-def test_velocity_and_x_y_z_are_in_mm_too() -> None:
-    """An arm that moves, in a frame: what goes out is a thousand times what Python has, each under its own name."""
+    """Position, sd and velocity of each axis, x, y, z in a frame, stale axes, and ns where the stream has them."""
     config = pf.FusionConfig(
         arm=pf.ArmModel.load("puma560-internal"), sensors={"tracker": pf.Sensor(sd=1e-4)}, frame=Cylindrical()
     )
     live = pf.LiveEstimator(config)
     for step in range(40):
         live.command(0.028 * step, x=0.1 + 1e-3 * step, y=0.5, z=-0.1)
-    estimate, line = live.estimate(1.0), json.loads(encode(live.estimate(1.0), with_ns=False))
-    assert estimate.cartesian is not None
-    assert [line[f"{name}_mm"] / 1e3 for name in "xyz"] == pytest.approx(list(estimate.cartesian.values()))
-    assert 0.11 < estimate.cartesian["x"] < 0.14  # not where z or y is
-    assert estimate.cartesian["y"] == pytest.approx(0.5, abs=1e-3)
+    estimate = live.estimate(1.5)
+    text = encode(estimate, with_ns=True)
+    assert text.endswith(b"}\n")
+    line = json.loads(text)
+    assert (line["t"], line["t_ns"], set(line["stale"])) == (1.5, 1_500_000_000, {"tangential", "radial", "vertical"})
     for axis, now in estimate.axes.items():
-        assert line[axis]["velocity_mm_s"] == pytest.approx(now.velocity * 1e3)
-        assert line[axis]["position_mm"] == pytest.approx(now.position * 1e3)
-    assert abs(line["tangential"]["velocity_mm_s"]) == pytest.approx(1e3 * 1e-3 / 0.028, rel=0.1)
+        expected = [1e3 * now.position, 1e3 * now.position_sd, 1e3 * now.velocity]
+        assert [line[axis][name] for name in ("position_mm", "sd_mm", "velocity_mm_s")] == expected
+    assert estimate.cartesian is not None
+    assert {name: line[f"{name}_mm"] / 1e3 for name in "xyz"} == pytest.approx(estimate.cartesian)
+    assert 0.11 < estimate.cartesian["x"] < 0.14  # not where z or y is
+    moving = json.loads(encode(live.estimate(1.0), with_ns=False))
+    assert "t_ns" not in moving
+    assert abs(moving["tangential"]["velocity_mm_s"]) == pytest.approx(1e3 * 1e-3 / 0.028, rel=0.1)

@@ -1,4 +1,4 @@
-"""The live view: what its process draws into a real server, and that nothing which becomes of it holds up a stream."""
+"""The live view: what its process draws into a real server; whatever becomes of it, the stream goes on."""
 
 import contextlib
 import os
@@ -53,12 +53,12 @@ def until(there: Callable[[], object]) -> None:
 
 
 class Driven:
-    """A live estimator with a view of it, fed with an arm that is told to stay, or to move."""
+    """A live estimator with a view of it, fed with commands that hold."""
 
     def __init__(self, mode: str, config: pf.FusionConfig = CONFIG) -> None:
-        self.said: list[str] = []
+        self.notices: list[str] = []
         self.live = pf.LiveEstimator(config)
-        self.view = LiveView(mode, config, self.said.append)
+        self.view = LiveView(mode, config, self.notices.append)
         self.step = 0
 
     def event(self, event: Event) -> None:
@@ -73,15 +73,15 @@ class Driven:
             self.view.estimate(self.live.estimate(t))
             self.event(Event(t + 0.010, "tracker", dict.fromkeys(AXES, 0.5 if self.step != 20 else 0.6)))
             self.event(Event(t + 0.012, "range", {"radial": 0.8 - 0.5}))
-            self.view.tick(self.live.health)
+            self.tick()
             self.step += 1
 
-    def rest(self) -> None:
+    def tick(self) -> None:
         self.view.tick(self.live.health)
 
-    def heard(self, words: str) -> bool:
-        self.rest()
-        return any(words in line for line in self.said)
+    def noticed(self, words: str) -> bool:
+        self.tick()
+        return any(words in line for line in self.notices)
 
 
 @pytest.fixture
@@ -169,13 +169,13 @@ def test_the_estimators_process_does_not_load_rerun() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_what_is_heard_and_said_arrives(recorder: tuple[subprocess.Popen[bytes], Path]) -> None:
+def test_events_and_estimates_arrive(recorder: tuple[subprocess.Popen[bytes], Path]) -> None:
     """In mm, at seconds since the first event: commands, estimates, measurements at their valid times, one rejected."""
     driven, path = Driven("connect"), recorder[1]
-    until(lambda: driven.heard("drawing into the viewer"))
+    until(lambda: driven.noticed("drawing into the viewer"))
     driven.go(60)
     read = driven.view._health_read
-    until(lambda: driven.rest() or driven.view._health_read > read)
+    until(lambda: driven.tick() or driven.view._health_read > read)
     driven.view.close()
     until(lambda: len(series(path, "/radial/estimate")[0]) == 60)
     time_, value = series(path, "/radial/command")
@@ -216,7 +216,7 @@ def test_more_than_a_plot_can_show_is_thinned_out(monkeypatch: pytest.MonkeyPatc
     for _ in range(100_000):
         driven.view.estimate(now)
     monkeypatch.setattr(live_view, "_FRAME", 0.0)
-    driven.rest()
+    driven.tick()
     assert 100 < len(frames[0].estimates["radial"]) <= 500
     driven.view.close()
 
@@ -238,38 +238,38 @@ def test_a_drawing_process_that_stalls_holds_nothing_up() -> None:
     assert child.returncode == -signal.SIGKILL
 
 
-def test_a_drawing_process_that_dies_is_said_once() -> None:
+def test_a_drawing_process_that_dies_is_reported_once() -> None:
     """Once; after that events and estimates are ignored."""
     driven = Driven("connect")
     child = driven.view._child
     assert child is not None
     os.kill(child.pid, signal.SIGKILL)
-    until(lambda: driven.heard("the drawing process ended by itself (signal 9)"))
+    until(lambda: driven.noticed("the drawing process ended by itself (signal 9)"))
     driven.go(20)
     driven.view.close()
-    assert sum("ended" in line for line in driven.said) == 1
+    assert sum("ended" in line for line in driven.notices) == 1
 
 
-def test_without_a_viewer_it_is_said_once_and_waited_for(tmp_path: Path) -> None:
+def test_a_missing_viewer_is_reported_once_and_waited_for(tmp_path: Path) -> None:
     """The first viewer that opens is drawn into, with what is new then."""
     driven = Driven("connect")
-    until(lambda: driven.heard("no viewer listens at"))
+    until(lambda: driven.noticed("no viewer listens at"))
     driven.go(20)
     server = start_recorder(tmp_path / "late.rrd")
     try:
-        until(lambda: driven.heard("drawing into the viewer"))
+        until(lambda: driven.noticed("drawing into the viewer"))
         until(lambda: (driven.go(5), len(series(tmp_path / "late.rrd", "/radial/estimate")[0]))[1])
         driven.view.close()
     finally:
         server.kill()
         server.wait()
-    assert sum("no viewer" in line for line in driven.said) == 1
+    assert sum("no viewer" in line for line in driven.notices) == 1
 
 
-def test_the_page_is_for_this_machine_and_tells_nobody_else() -> None:
+def test_the_page_speaks_with_this_machine_only() -> None:
     """Server and page listen on loopback; the page's policy lets the viewer speak with its server only."""
     driven = Driven("web")
-    until(lambda: driven.heard("open http://127.0.0.1:"))
+    until(lambda: driven.noticed("open http://127.0.0.1:"))
     child = driven.view._child
     assert child is not None
     processes = [child.pid, *children(child.pid)]
@@ -286,12 +286,12 @@ def test_the_page_is_for_this_machine_and_tells_nobody_else() -> None:
     until(lambda: not any(alive(process) for process in processes))
 
 
-def test_taken_ports_are_not_insisted_on() -> None:
+def test_other_ports_are_used_where_these_are_taken() -> None:
     """Two views at once: the second one finds other ports."""
     with socket.create_server(("127.0.0.1", live_view.PORT)), socket.create_server(("127.0.0.1", live_view.WEB_PORT)):
         driven = Driven("web")
-        until(lambda: driven.heard("open http://127.0.0.1:"))
-        assert f":{live_view.WEB_PORT}/" not in driven.said[0]
+        until(lambda: driven.noticed("open http://127.0.0.1:"))
+        assert f":{live_view.WEB_PORT}/" not in driven.notices[0]
         driven.view.close()
 
 
@@ -300,9 +300,10 @@ def test_nothing_is_left_when_the_estimator_is_killed() -> None:
     code = (
         "import time, pumafuse as pf; from pumafuse.views import live as v\n"
         f"v.PORT, v.WEB_PORT = {live_view.PORT}, {live_view.WEB_PORT}\n"
-        "view = v.LiveView('web', pf.FusionConfig(arm=pf.ArmModel.load('puma560-internal')), print)\n"
-        "while True: time.sleep(0.05); view.tick(lambda: pf.LiveEstimator(view_config).health())\n"
-    ).replace("view_config", "pf.FusionConfig(arm=pf.ArmModel.load('puma560-internal'))")
+        "config = pf.FusionConfig(arm=pf.ArmModel.load('puma560-internal'))\n"
+        "view, live = v.LiveView('web', config, print), pf.LiveEstimator(config)\n"
+        "while True: time.sleep(0.05); view.tick(live.health)\n"
+    )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL)
     until(lambda: listens(live_view.WEB_PORT))
     (child,) = children(parent.pid)
@@ -318,14 +319,14 @@ def test_a_viewer_that_stalls_is_left_alone_until_it_goes_on(recorder: tuple[sub
     driven, (server, path) = Driven("connect"), recorder
     child = driven.view._child
     assert child is not None
-    until(lambda: driven.heard("drawing into the viewer"))
+    until(lambda: driven.noticed("drawing into the viewer"))
     driven.go(20)
     server.send_signal(signal.SIGSTOP)
 
     def stalled() -> bool:
         driven.go()
         time.sleep(0.02)
-        return driven.heard("does not take what is drawn")
+        return driven.noticed("does not take what is drawn")
 
     until(stalled)
     resident = Path(f"/proc/{child.pid}/statm")
@@ -336,7 +337,7 @@ def test_a_viewer_that_stalls_is_left_alone_until_it_goes_on(recorder: tuple[sub
         time.sleep(0.02)
     assert int(resident.read_text().split()[1]) - before < 5_000  # pages
     server.send_signal(signal.SIGCONT)
-    until(lambda: (driven.go(), time.sleep(0.02), driven.heard("the viewer draws again"))[2])
+    until(lambda: (driven.go(), time.sleep(0.02), driven.noticed("the viewer draws again"))[2])
     driven.go(5)
     driven.view.close()
     last = 0.028 * (driven.step - 1)

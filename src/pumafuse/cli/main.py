@@ -294,13 +294,13 @@ def live(
     ] = None,
     window: Annotated[float, typer.Option(metavar="S", help="How late an event may come.")] = 2.0,
     stale_after: Annotated[
-        float, typer.Option(metavar="S", help="Without a measurement for so long an axis is called stale.")
+        float, typer.Option(metavar="S", help="Without a measurement for so long an axis is stale.")
     ] = 1.0,
     out: Annotated[
         str | None, typer.Option(metavar="udp://HOST:PORT", help="Send the estimates there; default: standard output.")
     ] = None,
     record: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write what comes as a recorded run, into a new folder.")
+        Path | None, typer.Option(metavar="DIR", help="Record the stream as a run, into a new folder.")
     ] = None,
     rerun: Annotated[
         str | None, typer.Option(metavar="spawn|connect|web", help="Draw live: a new viewer, one that runs, a browser.")
@@ -310,7 +310,7 @@ def live(
         str | None, typer.Option(metavar="ADDR", help="Listen there instead of on loopback; needs --allow.")
     ] = None,
     allow: Annotated[
-        list[str] | None, typer.Option(metavar="CIDR", help="Who is heard with --listen; may be given again.")
+        list[str] | None, typer.Option(metavar="CIDR", help="Senders accepted with --listen; may be given again.")
     ] = None,
 ) -> None:
     """Estimate from a stream of commands and measurements, as they come.

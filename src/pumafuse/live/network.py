@@ -12,7 +12,6 @@ import os
 import socket
 import struct
 import sys
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Protocol
@@ -75,10 +74,8 @@ def source(address: Address, listen: str | None, allow: list[str], notify: Calla
         return TcpClient(address, notify)
     place, allowed = listener(address, listen, allow)
     if listen is not None:
-        accepted = f"accepts {', '.join(allow)} on {host_port(*place[1])}"
-        notify(
-            f"{address.kind}: {accepted}, neither encrypted nor authenticated; a tunnel should carry what leaves the cell"
-        )
+        accepted = f"{address.kind}: accepts {', '.join(allow)} on {host_port(*place[1])}"
+        notify(f"{accepted}, neither encrypted nor authenticated; a tunnel should carry what leaves the cell")
     return (UdpListener if address.kind == "udp" else TcpListener)(place, allowed, notify)
 
 
@@ -92,7 +89,6 @@ class UdpListener:
         self._waiting, self._bytes = deque[bytes](), 0
         self._some = asyncio.Event()
         self._received = self._dropped_here = self._dropped_before = self._refused = self._reported = 0
-        self._next_report = 0.0
 
     async def start(self) -> None:
         """Open the socket.
@@ -123,7 +119,9 @@ class UdpListener:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(QUIET):
                     await self._some.wait()
-        self._report_drops()
+        if (lost := self._lost()) > self._reported:
+            self._reported = lost
+            self._log.write("lost", f"{self._name}: {lost} datagrams came faster than they were taken in: lost")
         return self._lines(_MOST_AT_ONCE)
 
     async def stop(self) -> list[bytes]:
@@ -175,14 +173,6 @@ class UdpListener:
                 self._dropped_before = counters[_DROPS]
         return self._dropped_here + self._dropped_before
 
-    def _report_drops(self) -> None:
-        """Report once a second at most that datagrams are lost."""
-        if (now := time.monotonic()) >= self._next_report:
-            self._next_report = now + 1.0
-            if (lost := self._lost()) > self._reported:
-                self._reported = lost
-                self._log.write("lost", f"{self._name}: {lost} datagrams came faster than they were taken in: lost")
-
 
 class _Tcp:
     """Connections whose lines are put together in the order in which they come."""
@@ -193,10 +183,6 @@ class _Tcp:
 
     async def get(self) -> list[bytes]:
         """Some lines of one connection."""
-        try:
-            return self._pieces.get_nowait()
-        except asyncio.QueueEmpty:
-            pass
         try:
             async with asyncio.timeout(QUIET):
                 return await self._pieces.get()

@@ -244,21 +244,6 @@ class Job(NamedTuple):
     number: int
 
 
-class _File:
-    """An open file, and whether its last line is torn."""
-
-    def __init__(self, path: Path) -> None:
-        self.descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        self.torn = False
-
-    def is_at(self, path: Path) -> bool:
-        """Whether it still has its name."""
-        try:
-            return os.path.samestat(os.fstat(self.descriptor), path.stat())
-        except FileNotFoundError:
-            return False
-
-
 class Writer:
     """Thread that writes a record, and waits for the disk.
 
@@ -271,8 +256,7 @@ class Writer:
         """Start to wait for jobs; ``header`` is the first line of every file."""
         self.trouble, self.rows = "", 0
         self._header = header
-        self._folder, self._manifest = Path(), ""
-        self._files: dict[str, _File] = {}
+        self._begin(Path())
         self._jobs = queue.SimpleQueue[Job | None]()
         self._given = self._done = 0  # bytes; each is counted by one thread alone
         self._ended = threading.Event()
@@ -302,23 +286,19 @@ class Writer:
                     return
             self._done += size
             self.rows += job.number
-        self._close_files()
+
+    def _begin(self, folder: Path) -> None:
+        """Begin a run in a folder."""
+        self._folder, self._manifest = folder, ""
+        self._torn: dict[str, bool] = {}  # of each file that has rows, whether its last line is torn
 
     def _tried(self, job: Job) -> bool:
         """Write what is left of a job; whether all of it is written."""
-        trouble = ""
         try:
             if job.folder != self._folder:
-                self._close_files()
-                self._folder, self._manifest = job.folder, ""
-            elif not all(file.is_at(job.folder / name) for name, file in self._files.items()):
-                trouble = f"{job.folder} or a file in it had gone, and is begun anew"
-                for name in [name for name, file in self._files.items() if file.torn]:
-                    job.rows[name] = job.rows[name].partition(b"\n")[2]
-                self._close_files()
+                self._begin(job.folder)
             job.folder.mkdir(exist_ok=True)
-            for name in list(job.rows):
-                self._append(job, name)
+            gone = [self._append(job, name) for name in list(job.rows)]
             if job.manifest != self._manifest or not (job.folder / _MANIFEST).exists():
                 write_file(job.folder / _MANIFEST, job.manifest)
                 self._manifest = job.manifest
@@ -328,25 +308,27 @@ class Writer:
         except FolderError as error:
             self.trouble = str(error)
             return False
-        self.trouble = trouble
+        self.trouble = f"{job.folder} or a file in it had gone, and is begun anew" if any(gone) else ""
         return True
 
-    def _append(self, job: Job, name: str) -> None:
-        """Write a file's rows; what a full disk took of them is not written twice."""
-        file = self._files.get(name)
-        if file is None:
-            file = self._files[name] = _File(job.folder / name)
-            if not os.fstat(file.descriptor).st_size and not job.rows[name].startswith(self._header):
+    def _append(self, job: Job, name: str) -> bool:
+        """Write a file's rows, without what a full disk took of them before; whether the file had gone."""
+        descriptor = os.open(job.folder / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+        try:
+            empty = not os.fstat(descriptor).st_size
+            gone = empty and name in self._torn
+            if gone and self._torn[name]:  # the rest of a line whose beginning has gone
+                job.rows[name] = job.rows[name].partition(b"\n")[2]
+            if empty and not job.rows[name].startswith(self._header):
                 job.rows[name] = self._header + job.rows[name]
-        while rows := job.rows[name]:
-            written = os.write(file.descriptor, rows)
-            job.rows[name], file.torn = rows[written:], rows[written - 1 : written] != b"\n"
+            while rows := job.rows[name]:
+                written = os.write(descriptor, rows)
+                job.rows[name] = rows[written:]
+                self._torn[name] = rows[written - 1 : written] != b"\n"
+        finally:
+            os.close(descriptor)
         del job.rows[name]
-
-    def _close_files(self) -> None:
-        for file in self._files.values():
-            os.close(file.descriptor)
-        self._files = {}
+        return gone
 
 
 def _file(sensor: str | None) -> str:

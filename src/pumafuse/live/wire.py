@@ -130,8 +130,8 @@ class LineDecoder:
         """A line without its unknown names, and the values under those."""
         tree = cast(dict[str, Any], msgspec.json.decode(line))
         unknown = {name: tree.pop(name) for name in list(tree) if name not in _NAMES and name not in self._axes}
-        command = tree.get("command")
-        if isinstance(command, dict):
+        if isinstance(tree.get("command"), dict):
+            command = cast(dict[str, Any], tree["command"])
             unknown |= {name: command.pop(name) for name in list(command) if name not in self._axes}
         return self._decoder.decode(msgspec.json.encode(tree)), unknown
 

@@ -80,11 +80,6 @@ class Viewer:
                 self._own.wait(0.3)
             self._own.kill()
 
-    def _once(self, text: str) -> None:
-        if not self._told:
-            self._say(text)
-        self._told = True
-
 
 def _arguments(mode: str, port: int, web_port: int) -> list[str]:
     given = ["--bind", HOST, "--port", str(port)]
