@@ -26,7 +26,7 @@ _FROZEN = 10  # equal values in a row of a sensor with noise
 _WIDEST = 1e6  # largest ratio of prior to noise at which double precision keeps the error bars
 _NEVER = 1e-6  # expected number below which chance is no explanation
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
-_MANY_REJECTED = 0.1  # share of rejected components beyond which those that are left say little
+_MANY_REJECTED = 0.1  # share of rejected components beyond which the others are a selection
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _too_wide(est: Estimates) -> list[str]:
             if ratio > _WIDEST:
                 found.append(
                     f"{name}: its prior (offset_sd_mm, bias_sd_mm) is {ratio:.1e} times its noise: more than double"
-                    " precision resolves; a narrower prior says the same"
+                    " precision resolves; use a narrower prior"
                 )
     return found
 
@@ -202,7 +202,7 @@ def _verdict(
     if len(fused.value) < _FEW:
         return f"too few measurements ({len(fused.value)}) to tell"
     nis_text = f"NIS {nis:.2f}, expected {band[0]:.2f} to {band[1]:.2f}"
-    if rejected > _MANY_REJECTED:  # what is left has been chosen to fit
+    if rejected > _MANY_REJECTED:  # the others were selected to fit
         return f"{nis_text}, but {rejected:.0%} were rejected: sd_mm, latency_ms or the process noise too small"
     first, strongest = float(correlation[0]), int(np.argmax(np.abs(correlation)))
     coloured = whiteness < 0.01 and abs(first) > _NOTABLE
