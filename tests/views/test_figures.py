@@ -153,14 +153,6 @@ def test_the_fused_figure_shows_command_estimate_and_measurements(drawn: list[Fi
             np.testing.assert_allclose(value, this.run.sensors["camera"].values[name] * 1e3)
 
 
-def test_measurements_are_shown_where_they_put_the_tool(drawn: list[Figure], tmp_path: Path) -> None:
-    """A range sensor 300 mm off and upside down is shown on the path: scale and estimated bias are taken off."""
-    this = case(axes=1, bias=-0.3, scale=-1.0)
-    fused_figure(this.est, this.run, tmp_path / "none.png")
-    _, value = line(drawn[0].axes[0], "camera")
-    assert np.median(value) == pytest.approx(np.median(this.est["tangential"].position) * 1e3, abs=1.0)
-
-
 def test_a_rejected_measurement_is_crossed_out(drawn: list[Figure], tmp_path: Path) -> None:
     """The outlier alone carries the cross, and is not among the dots."""
     this = case(axes=1, outlier=True)
@@ -169,14 +161,6 @@ def test_a_rejected_measurement_is_crossed_out(drawn: list[Figure], tmp_path: Pa
     _, fused = line(drawn[0].axes[0], "camera")
     assert rejected == pytest.approx([400.0 + 200.0], abs=25.0)
     assert np.ptp(fused) < 30.0
-
-
-def test_commands_of_a_frame_are_shown_in_axes(drawn: list[Figure], tmp_path: Path) -> None:
-    """The radial panel holds the commands' distance from the base."""
-    this = case(frame=True)
-    fused_figure(this.est, this.run, tmp_path / "none.png")
-    x, y = (this.run.command.values[letter] for letter in "xy")
-    np.testing.assert_allclose(line(drawn[0].axes[2], "command")[1], np.hypot(x, y) * 1e3)
 
 
 def test_the_error_figure_draws_and_names_the_error(drawn: list[Figure], tmp_path: Path) -> None:
