@@ -272,3 +272,12 @@ def test_innovations_are_looked_at_beyond_the_next_one(moving: pf.Run) -> None:
     spoilt = replace(est, measurements=replace(est.measurements, innovation=innovation))
     found = [consistency(spoilt, "camera", axis) for axis in est.axes]
     assert found and all(re.search(r"not white \(lag 3: \+0\.[345]", one.verdict) for one in found if one)
+
+
+def test_the_verdict_on_smoothed_estimates_takes_the_velocity_from_their_positions(moving: pf.Run) -> None:
+    """They have no velocity of their own; a latency 30 ms too long is still found on every axis."""
+    est = pf.fuse(moving, World(latency=0.050).config(moving), smooth=True)
+    nothing = np.full(len(est.time), np.nan)
+    smoothed = replace(est, axes={name: replace(axis, velocity=nothing) for name, axis in est.axes.items()})
+    for axis in est.axes:
+        assert "latency_ms is wrong" in consistency(smoothed, "camera", axis).verdict

@@ -80,26 +80,18 @@ refusal = partial(one_line, pf.RunError)
 
 @settings(derandomize=True, deadline=None, max_examples=60)
 @given(paths(), directions)
-def test_cylindrical_and_back_is_exact(drawn: tuple[Path2D, Path2D], positive: str) -> None:
-    """x, y → axes → x, y returns within 1e-12 m, whatever the base, the direction and the turns already made."""
-    path, seen = drawn
-    run, placed = in_axes(logged(path, seen, Cylindrical(base=path.base, positive=positive)), None)
-    for source, wanted in ((run.command, path), (run.sensors["camera"], seen)):
-        x, y = placed.to_log(source.values["tangential"], source.values["radial"])
+def test_cylindrical_axes_are_radius_and_arc(drawn: tuple[Path2D, Path2D], positive: str) -> None:
+    """Radial = r, tangential = ±R0·(θ − θ0) over several turns, a sensor's turns those of the commands; and back."""
+    path, measured = drawn
+    run, placed = in_axes(logged(path, measured, Cylindrical(base=path.base, positive=positive)), None)
+    for source, wanted in ((run.command, path), (run.sensors["camera"], measured)):
+        tangential, radial = source.values["tangential"], source.values["radial"]
+        arc = SIGN[positive] * path.radius[0] * (wanted.angle - path.angle[0])
+        np.testing.assert_allclose(tangential, arc, rtol=0, atol=EXACT)
+        np.testing.assert_allclose(radial, wanted.radius, rtol=0, atol=EXACT)
+        x, y = placed.to_log(tangential, radial)
         np.testing.assert_allclose(x, wanted.x, rtol=0, atol=EXACT)
         np.testing.assert_allclose(y, wanted.y, rtol=0, atol=EXACT)
-
-
-@settings(derandomize=True, deadline=None, max_examples=60)
-@given(paths(), directions)
-def test_cylindrical_axes_are_radius_and_arc(drawn: tuple[Path2D, Path2D], positive: str) -> None:
-    """Radial = r, tangential = ±R0·(θ − θ0) over several turns; a sensor's turns are those of the commands near it."""
-    path, seen = drawn
-    run, _ = in_axes(logged(path, seen, Cylindrical(base=path.base, positive=positive)), None)
-    for source, wanted in ((run.command, path), (run.sensors["camera"], seen)):
-        arc = SIGN[positive] * path.radius[0] * (wanted.angle - path.angle[0])
-        np.testing.assert_allclose(source.values["tangential"], arc, rtol=0, atol=EXACT)
-        np.testing.assert_allclose(source.values["radial"], wanted.radius, rtol=0, atol=EXACT)
 
 
 @settings(derandomize=True, deadline=None, max_examples=60)

@@ -17,7 +17,7 @@ from ..model.arm import ArmModel
 from ..units import MM, MS
 from . import formatting as words
 from . import step_figures
-from .render import render
+from .canvas import render
 
 PAGE = "report.html"
 

@@ -22,7 +22,7 @@ from ..tuning.tune import Tuning
 from ..tuning.validate import Check
 from . import formatting as words
 from . import tuning_figures
-from .render import render
+from .canvas import render
 
 _Tests: TypeAlias = tuple[Consistency | None, Consistency | None]  # before and after
 _WHITE = 0.01  # p-value from which innovations pass for white
