@@ -64,7 +64,7 @@ class Block:
 
 
 def blocks(page: Path) -> list[Block]:
-    """The blocks of a page in order; of an indented one nobody knows what it is, its language is empty."""
+    """The blocks of a page in order; an indented one has an empty language."""
     tokens = MarkdownIt("commonmark").parse(page.read_text(encoding="utf-8"))
     return [
         _block(token, before)
@@ -86,7 +86,7 @@ class Reader:
 
     page: Path
     folder: Path
-    said: str = ""  # by the last block
+    printed_text: str = ""  # by the last block
     names: dict[str, object] = field(default_factory=dict)
     beside: list[tuple[subprocess.Popen[bytes], Path]] = field(default_factory=list)
 
@@ -113,7 +113,9 @@ class Reader:
         where = f"{self.page.name}:{block.line}"
         match block.language:
             case "text":
-                assert shows(self.said, block.text), f"{where}: expected\n{block.text}\nbut what came was\n{self.said}"
+                assert shows(self.printed_text, block.text), (
+                    f"{where}: expected\n{block.text}\nbut what came was\n{self.printed_text}"
+                )
             case "json":
                 assert all(isinstance(json.loads(line), dict) for line in block.text.splitlines()), where
             case "toml" | "python" if block.file:
@@ -121,7 +123,7 @@ class Reader:
                 Path(block.file).parent.mkdir(exist_ok=True)
                 Path(block.file).write_text(block.text, encoding="utf-8")
             case "python":
-                self.said = self._python(block.text, where)
+                self.printed_text = self._python(block.text, where)
             case "bash" if block.stays:
                 self._start(block.text, where)
             case "bash":
@@ -134,11 +136,11 @@ class Reader:
                     timeout=LONGEST,
                     check=False,
                 )
-                self.said = _plain(done.stdout)
-                assert done.returncode == 0, f"{where}: exit code {done.returncode}\n{self.said}"
-                assert "Traceback" not in self.said, f"{where}\n{self.said}"
+                self.printed_text = _plain(done.stdout)
+                assert done.returncode == 0, f"{where}: exit code {done.returncode}\n{self.printed_text}"
+                assert "Traceback" not in self.printed_text, f"{where}\n{self.printed_text}"
             case _:
-                raise AssertionError(f"{where}: nobody knows what to do with '{block.language}'")
+                raise AssertionError(f"{where}: unknown language '{block.language}'")
 
     def _python(self, text: str, where: str) -> str:
         printed = io.StringIO()
@@ -169,18 +171,18 @@ class Reader:
     def _stop(self, process: subprocess.Popen[bytes], log: Path) -> None:
         process.send_signal(signal.SIGINT)
         code = process.wait(LONGEST)
-        said = _plain(log.read_bytes())
-        assert code == 0, said
-        assert "Traceback" not in said, said
+        printed_text = _plain(log.read_bytes())
+        assert code == 0, printed_text
+        assert "Traceback" not in printed_text, printed_text
 
 
-def shows(said: str, expected: str) -> bool:
+def shows(printed_text: str, expected: str) -> bool:
     """Whether lines in a row of what was printed are the expected ones, white space aside."""
     lines = [" ".join(line.split()) for line in expected.strip("\n").splitlines()]
     pattern = "\n".join(
         "(?:.*\n)*?.*" if line == "…" else "[^\n]*?".join(map(re.escape, line.split("…"))) for line in lines
     )
-    squeezed = "\n".join(" ".join(line.split()) for line in said.splitlines())
+    squeezed = "\n".join(" ".join(line.split()) for line in printed_text.splitlines())
     return re.search(f"(?m)^{pattern}$", squeezed) is not None
 
 

@@ -1,4 +1,4 @@
-"""What is said where something is refused."""
+"""The message of a refusal."""
 
 from __future__ import annotations
 

@@ -40,13 +40,13 @@ def test_commands_and_measurements_are_fused(tmp_path: Path, language: str) -> N
         senders = [subprocess.Popen(one) for one in words]
         assert [sender.wait(LONGEST) for sender in senders] == [0, 0]
         estimates = [json.loads(line) for line in process.received(54)]
-        log = process.end()
-    assert "commands: 54 fused; 54 estimates" in log
-    assert "0 lost" in log
-    assert "0 of them bad" in log
+        report = process.end()
+    assert "commands: 54 fused; 54 estimates" in report
+    assert "0 lost" in report
+    assert "0 of them bad" in report
     periods = [after["t_ns"] - before["t_ns"] for before, after in itertools.pairwise(estimates)]
     assert sum(periods) / len(periods) == pytest.approx(28e6, rel=0.05)
-    for found in estimates[36:]:  # a measurement is valid 8 ms before its stamp
+    for found in estimates[36:]:  # the tracker measures what was 8 ms before its stamp
         seen = 560.0 + 20.0 * math.sin(0.2 * math.pi * (found["t_ns"] / 1e9 - 0.1 + 0.008))
         assert found["radial"]["position_mm"] == pytest.approx(seen, abs=0.5)
         assert "stale" not in found

@@ -8,7 +8,7 @@ units are powers of ten of an SI unit, so conversion moves the decimal point of 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from decimal import Decimal
 from typing import Any, cast
 
@@ -57,12 +57,12 @@ def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: A number outside an interval (``_ci95``) is not finite.
     """
-    return _scaled(tree, 0, "")
+    return _converted(tree, 0, "", _si)
 
 
 def from_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     """The inverse of :func:`to_si`: SI numbers in the units of their names."""
-    return {key: value if key == PROVENANCE else _unscaled(value, _exponent(key, 0)) for key, value in tree.items()}
+    return _converted(tree, 0, "", _in_unit)
 
 
 def refuse_unit(kind: str, name: str) -> None:
@@ -97,63 +97,38 @@ def nanoseconds(time: FloatArray) -> TimeArray:
     return np.where(finite, np.rint(np.where(finite, time, 0.0) * 1e9).astype(np.int64), NO_STAMP)
 
 
-def _exponent(key: str, inherited: int) -> int:
-    unit = ending(key)
-    return inherited if unit is None else EXPONENTS[unit]
-
-
-def _scaled(value: Any, exponent: int, path: str) -> Any:
+def _converted(value: Any, exponent: int | None, path: str, convert: Callable[[Any, int, str], Any]) -> Any:
+    """``value`` with every number in it converted; ``exponent`` is that of its unit, None within provenance."""
     match value:
         case bool() | str():
             return value
-        case int() if exponent == 0:
+        case int() if not exponent:
             return value
         case int() | float() | Decimal():
-            number = shifted(value, exponent)
-            if not math.isfinite(number) and not path.endswith(INTERVAL):
-                raise ConfigError(f"{path}: {str(value)[:24]} is not a finite number")
-            return number
-        case list():
-            return [_scaled(item, exponent, path) for item in cast(list[Any], value)]
-        case Mapping():
-            table = cast(Mapping[str, Any], value)
-            return {key: _scaled_entry(key, item, exponent, path) for key, item in table.items()}
-        case _:
-            return value
-
-
-def _scaled_entry(key: str, value: Any, exponent: int, path: str) -> Any:
-    place = f"{path}.{key}" if path else key
-    return _plain(value) if place == PROVENANCE else _scaled(value, _exponent(key, exponent), place)
-
-
-def _plain(value: Any) -> Any:
-    """Provenance as it is, with floats for decimals."""
-    match value:
-        case Decimal():
-            return float(value)
-        case list():
-            return [_plain(item) for item in cast(list[Any], value)]
-        case Mapping():
-            return {key: _plain(item) for key, item in cast(Mapping[str, Any], value).items()}
-        case _:
-            return value
-
-
-def _unscaled(value: Any, exponent: int) -> Any:
-    match value:
-        case bool() | str():
-            return value
-        case int() if exponent == 0:
-            return value
-        case int() | float():
-            decimal = Decimal(repr(float(value))).scaleb(-exponent)
-            plain = float(decimal)
-            return plain if Decimal(repr(plain)) == decimal else decimal  # the 17th digit would be lost in a float
+            return float(value) if exponent is None else convert(value, exponent, path)
         case list() | tuple():
-            return [_unscaled(item, exponent) for item in cast(list[Any], value)]
+            return [_converted(item, exponent, path, convert) for item in cast(list[Any], value)]
         case Mapping():
-            table = cast(Mapping[str, Any], value)
-            return {key: _unscaled(item, _exponent(key, exponent)) for key, item in table.items()}
+            found: dict[str, Any] = {}
+            for key, item in cast(Mapping[str, Any], value).items():
+                place = f"{path}.{key}" if path else key
+                unit = ending(key)
+                inner = exponent if unit is None else EXPONENTS[unit]
+                known = exponent is not None and place != PROVENANCE
+                found[key] = _converted(item, inner if known else None, place, convert)
+            return found
         case _:
             return value
+
+
+def _si(value: float | Decimal, exponent: int, path: str) -> float:
+    number = shifted(value, exponent)
+    if not math.isfinite(number) and not path.endswith(INTERVAL):
+        raise ConfigError(f"{path}: {str(value)[:24]} is not a finite number")
+    return number
+
+
+def _in_unit(value: float, exponent: int, _: str) -> float | Decimal:
+    decimal = Decimal(repr(float(value))).scaleb(-exponent)
+    plain = float(decimal)
+    return plain if Decimal(repr(plain)) == decimal else decimal  # the 17th digit would be lost in a float

@@ -1,7 +1,6 @@
 """The real executable on real files."""
 
 import json
-import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -101,7 +100,7 @@ def test_a_reference_from_elsewhere_scores_the_same(demo: Path) -> None:
             assert score == pytest.approx(own[0][axis], rel=1e-6)
 
 
-def test_as_live_knows_less(demo: Path, tmp_path: Path) -> None:
+def test_as_live_has_fewer_measurements(demo: Path, tmp_path: Path) -> None:
     """Vision is 45 ms late: an estimate that waits for it beats one that cannot, and the summary says which."""
     folder = tmp_path / "live"
     pumafuse("fuse", SCAN, "-c", FUSION, "-o", folder, "--sensors", "vision", "--rate", 200, "--as-live")
@@ -117,16 +116,6 @@ def test_several_runs_get_a_folder_each_and_a_failure_stops_no_other(tmp_path: P
     assert "none: no such file" in done.stderr
     assert "1 of 2 runs failed" in done.stderr
     assert (tmp_path / "out" / "scan1" / "summary.json").exists()
-
-
-def test_runs_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
-    """Two copies of a run that call themselves scan1: the table names where each result is."""
-    for name in ("before", "after"):
-        shutil.copytree(SCAN, tmp_path / name)
-    runs = (tmp_path / "before", tmp_path / "after")
-    done = pumafuse("fuse", *runs, "-c", FUSION, "-o", tmp_path / "out", "--sensors", "range")
-    lines = [line.split()[0] for line in done.stdout.splitlines() if " radial " in line]
-    assert lines == ["before", "after", "all"]
 
 
 def test_an_existing_folder_is_replaced_only_with_force(demo: Path) -> None:

@@ -163,20 +163,12 @@ def test_an_arm_is_a_file_beside_or_a_preset(tmp_path: Path, monkeypatch: pytest
         assert load(tmp_path, f'arm = "{name}"').arm == ArmModel.load(name)
 
 
-def test_an_arm_is_not_taken_from_where_one_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A path counts from fusion.toml only: another arm.toml in the working folder is not the one that is meant."""
-    (tmp_path / "here").mkdir()
-    ArmModel.load("puma560-external").save(tmp_path / "here" / "arm.toml")
-    monkeypatch.chdir(tmp_path / "here")
-    assert "arm = 'arm.toml'" in refusal(lambda: load(tmp_path, 'arm = "arm.toml"'))
-
-
 AXIS = '[axes.rail_mm]\nplant = "first-order"\ntime_constant_ms = 40\n'
 
 
 @pytest.mark.parametrize(("content", "key"), [("", "'delay_ms'"), (f"delay_ms = 60\n{AXIS}", "'rail_mm'")])
 def test_a_wrong_arm_file_is_refused_by_its_own_name(tmp_path: Path, content: str, key: str) -> None:
-    """What is wrong in the arm's file, also an axis named like a unit, is told with that file and its key."""
+    """What is wrong in the arm's file, also an axis named like a unit, is refused with that file and its key."""
     (tmp_path / "mine.toml").write_text(f'name = "x"\nupdate_period_ms = 28\n{content}', encoding="utf-8")
     text = refusal(lambda: load(tmp_path, 'arm = "mine.toml"'))
     assert text.startswith(f"{tmp_path / 'mine.toml'}: ")

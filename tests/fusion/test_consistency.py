@@ -1,8 +1,8 @@
 """Consistency: the statistics against scipy and by hand, the verdicts on data made exactly by the model.
 
 The simulation draws from section 2's model itself: a first-order plant with white noise at its input, an offset on a
-random walk, measurements with white noise and a latency. A filter told the truth must then be right; one told a lie
-must say which.
+random walk, measurements with white noise and a latency. A filter with the true configuration must then be
+consistent; of a wrong one the verdict must name the fault.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SEEDS = 120
 
 @dataclass(frozen=True)
 class World:
-    """What the simulation does and, field by field replaced, what the filter is told. SI units."""
+    """What the simulation does and, field by field replaced, what the filter is configured with. SI units."""
 
     input_noise: float = 0.05e-3
     drift: float = 0.3e-3
@@ -88,9 +88,9 @@ def swing(duration: float, period: float = 2.0) -> np.ndarray:
     return 0.05 * (1.0 - np.cos(2.0 * np.pi * time / period))
 
 
-def judged(run: pf.Run, told: World) -> Mapping[str, Consistency]:
-    """What the filter says of itself on each axis, when told this."""
-    est = pf.fuse(run, told.config(run))
+def judged(run: pf.Run, configured: World) -> Mapping[str, Consistency]:
+    """Consistency of each axis with this configuration."""
+    est = pf.fuse(run, configured.config(run))
     return {axis: consistency(est, "camera", axis) for axis in run.axes}
 
 
@@ -119,7 +119,7 @@ def test_ljung_box_against_loops(count: int, lags: int) -> None:
 
 @pytest.mark.parametrize("values", [[0.3], [0.3, 0.3, 0.3]])
 def test_ljung_box_of_what_does_not_vary_accuses_nobody(values: list[float]) -> None:
-    """One value, or equal ones, cannot be told from white: p = 1 and no correlation."""
+    """One value, or equal ones, cannot be distinguished from white: p = 1 and no correlation."""
     correlation, p = ljung_box(np.array(values))
     assert not correlation.any()
     assert p == 1.0
@@ -150,13 +150,13 @@ def test_rejected_components_leave_the_counts() -> None:
     """With blunders rejected, count, NIS, correlation and verdict are those of the run without these rows."""
     world = World(gate=6.0)
     run, good = outlying(world, range(10, 250, 20))
-    told = judged(run, world)["axis0"]
+    found = judged(run, world)["axis0"]
     clean = replace(run, sensors={"camera": run.sensors["camera"].rows(good)})
     wanted = judged(clean, world)["axis0"]
-    assert told.count == wanted.count == good.sum()
-    assert (told.nis, told.whiteness) == pytest.approx((wanted.nis, wanted.whiteness), rel=1e-9)
-    assert told.correlation == pytest.approx(wanted.correlation, abs=1e-9)
-    assert told.verdict == wanted.verdict
+    assert found.count == wanted.count == good.sum()
+    assert (found.nis, found.whiteness) == pytest.approx((wanted.nis, wanted.whiteness), rel=1e-9)
+    assert found.correlation == pytest.approx(wanted.correlation, abs=1e-9)
+    assert found.verdict == wanted.verdict
 
 
 def test_a_rejected_component_costs_as_much_as_one_at_the_gate() -> None:
@@ -164,14 +164,14 @@ def test_a_rejected_component_costs_as_much_as_one_at_the_gate() -> None:
     world = World(gate=6.0)
     run, good = outlying(world, range(10, 250, 20))
     est = pf.fuse(run, world.config(run))
-    met, sd = est.measurements, est.measurements.innovation_sd * 1e3
-    at = np.where(good, met.innovation * 1e3, 6.0 * sd)
-    assert log_likelihood(met, est.config.sensors) == pytest.approx(stats.norm.logpdf(at, 0.0, sd).sum(), rel=1e-9)
+    used, sd = est.measurements, est.measurements.innovation_sd * 1e3
+    at = np.where(good, used.innovation * 1e3, 6.0 * sd)
+    assert log_likelihood(used, est.config.sensors) == pytest.approx(stats.norm.logpdf(at, 0.0, sd).sum(), rel=1e-9)
 
 
 @pytest.fixture(scope="module")
 def matched() -> Mapping[str, Consistency]:
-    """What a filter that is told the truth says of itself, once for each of 120 seeds."""
+    """Consistency of a filter with the true configuration, for each of 120 seeds."""
     world = World()
     return judged(simulated(world, swing(5.0), 0.015, 300, SEEDS, 3), world)
 
@@ -197,7 +197,7 @@ def test_the_innovations_of_a_right_filter_are_white(matched: Mapping[str, Consi
 
 
 def test_a_right_filter_is_called_consistent(matched: Mapping[str, Consistency]) -> None:
-    """In at least nine seeds of ten; nobody is told of latency or colour who has none."""
+    """In at least nine seeds of ten; none is blamed on latency or colour."""
     verdicts = [found.verdict for found in matched.values()]
     assert sum(verdict.endswith(": consistent") for verdict in verdicts) >= 0.9 * SEEDS
     assert not any("latency_ms" in verdict for verdict in verdicts)
@@ -210,7 +210,7 @@ def moving() -> pf.Run:
 
 
 @pytest.mark.parametrize(
-    ("told", "said"),
+    ("configured", "verdict"),
     [
         (World(sd=1.0e-3), ": sd_mm or the process noise too large"),
         (World(latency=-0.010), "latency_ms is wrong"),
@@ -220,18 +220,18 @@ def moving() -> pf.Run:
         (World(input_noise=1e-3, drift=6e-3), "the process noise too large"),
     ],
 )
-def test_verdicts_name_the_key_that_is_wrong(moving: pf.Run, told: World, said: str) -> None:
+def test_verdicts_name_the_key_that_is_wrong(moving: pf.Run, configured: World, verdict: str) -> None:
     """Double the noise, 30 ms too early and too late, no process noise or far too much: on every axis."""
-    for axis, found in judged(moving, told).items():
-        assert said in found.verdict, (axis, found.verdict)
+    for axis, found in judged(moving, configured).items():
+        assert verdict in found.verdict, (axis, found.verdict)
 
 
-@pytest.mark.parametrize(("count", "told"), [(29, True), (30, False)])
-def test_few_measurements_are_not_judged(count: int, told: bool) -> None:
+@pytest.mark.parametrize(("count", "few"), [(29, True), (30, False)])
+def test_few_measurements_are_not_judged(count: int, few: bool) -> None:
     """Below 30 the verdict is that there are too few, and how many."""
     world = World()
     found = judged(simulated(world, swing(2.0), 0.033, count, 1, 5), world)["axis0"]
-    assert (found.verdict == f"too few measurements ({count}) to tell") == told
+    assert (found.verdict == f"too few measurements ({count}) to tell") == few
     assert found.count == count
 
 
@@ -255,7 +255,7 @@ def test_half_the_noise_blames_sd_first():
 
 @pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 def test_a_verdict_on_what_a_gate_has_left_says_so(moving: pf.Run) -> None:
-    """UpdateResult a third of the noise and a gate of 2, what is left fits by selection: how many were rejected is the verdict."""
+    """With a third of the noise and a gate of 2 the rest fits by selection: the verdict is how many were rejected."""
     for axis, found in judged(moving, World(sd=0.17e-3, gate=2.0)).items():
         assert re.search(r"but \d\d% were rejected", found.verdict), (axis, found.verdict)
 
@@ -272,3 +272,12 @@ def test_innovations_are_looked_at_beyond_the_next_one(moving: pf.Run) -> None:
     spoilt = replace(est, measurements=replace(est.measurements, innovation=innovation))
     found = [consistency(spoilt, "camera", axis) for axis in est.axes]
     assert found and all(re.search(r"not white \(lag 3: \+0\.[345]", one.verdict) for one in found if one)
+
+
+def test_the_verdict_on_smoothed_estimates_takes_the_velocity_from_their_positions(moving: pf.Run) -> None:
+    """They have no velocity of their own; a latency 30 ms too long is still found on every axis."""
+    est = pf.fuse(moving, World(latency=0.050).config(moving), smooth=True)
+    nothing = np.full(len(est.time), np.nan)
+    smoothed = replace(est, axes={name: replace(axis, velocity=nothing) for name, axis in est.axes.items()})
+    for axis in est.axes:
+        assert "latency_ms is wrong" in consistency(smoothed, "camera", axis).verdict

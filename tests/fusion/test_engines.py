@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from pumafuse.fusion.outcome import Outcome
 
 import pumafuse as pf
 from fusion.test_oracle import CASES, MS, NOISE, PAPER, UNDER, Case, Heard, T, cases, every, one, plants
 from fusion.test_oracle import sensor as ungated
 from fusion_oracle import AxisOracle, nanoseconds
 from pumafuse.fusion.estimates import Estimates, Measurements
-from pumafuse.fusion.outcome import Outcome
 from pumafuse.logs.run import Run
 from pumafuse.simulation.scenario import Scenario
 from pumafuse.simulation.simulate import simulate

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pumafuse.fusion.outcome import Outcome
 
 import pumafuse as pf
 from pumafuse.fusion.estimates import Estimates
-from pumafuse.fusion.outcome import Outcome
 from pumafuse.logs.run import Run
 from pumafuse.model.plants import Plant
 

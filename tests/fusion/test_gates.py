@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from pumafuse.fusion.outcome import Outcome
 
 from fusion_oracle import Belief, check_estimates, nanoseconds
 from pumafuse.errors import PumafuseWarning
@@ -22,7 +23,6 @@ from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.consistency import log_likelihood
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
-from pumafuse.fusion.outcome import Outcome
 from pumafuse.logs.run import Run
 from pumafuse.model.arm import ArmModel, AxisModel
 from pumafuse.model.plants import FirstOrder

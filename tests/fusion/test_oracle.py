@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pumafuse.fusion.augmented import AxisFilter
+from pumafuse.fusion.outcome import Outcome
+from pumafuse.fusion.timeline import Timeline, build
 from scipy.linalg import expm, solve_discrete_are
 
 from fusion_oracle import AxisOracle, Response, check_estimates, check_innovations, nanoseconds
 from pumafuse.errors import PumafuseWarning
-from pumafuse.fusion.augmented import AxisFilter
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
-from pumafuse.fusion.outcome import Outcome
-from pumafuse.fusion.timeline import Timeline, build
 from pumafuse.logs.run import Run
 from pumafuse.model.arm import ArmModel, AxisModel, Gain
 from pumafuse.model.plants import FirstOrder, Plant, SecondOrder

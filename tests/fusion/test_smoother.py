@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from pumafuse.fusion.outcome import Outcome
 
 import pumafuse as pf
 from fusion.test_oracle import (
@@ -39,7 +40,6 @@ from pumafuse.errors import PumafuseWarning
 from pumafuse.fusion.config import FusionConfig, Process, Sensor
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
-from pumafuse.fusion.outcome import Outcome
 from pumafuse.logs.run import Run, Source
 
 LATE = Heard(TRACKER.sensor, every(90, 20, 240 * MS))

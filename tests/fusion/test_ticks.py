@@ -13,11 +13,11 @@ import numpy.typing as npt
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from pumafuse.fusion.outcome import Outcome
 
 import pumafuse as pf
 from pumafuse.fusion import ticks
 from pumafuse.fusion.consistency import log_likelihood
-from pumafuse.fusion.outcome import Outcome
 from pumafuse.model.plants import Plant
 
 DIGITS = 50

@@ -30,12 +30,14 @@ def source(stamp: Sequence[int], label: str) -> Source:
     return Source(np.array(stamp, dtype=np.int64), {"radial": np.arange(len(stamp), dtype=float)}, label)
 
 
-def recorded(command: Sequence[int], sensors: Mapping[str, Sequence[int]], truth: Sequence[int] | None = None) -> Run:
+def recorded(
+    command: Sequence[int], sensors: Mapping[str, Sequence[int]], reference_stamp: Sequence[int] | None = None
+) -> Run:
     streams = {name: source(stamp, f"{name}.csv") for name, stamp in sensors.items()}
     run = Run("run", source(command, "host.csv"), streams, start={"radial": 0.5}, notes=("torn",))
-    if truth is None:
+    if reference_stamp is None:
         return run
-    reference = source(truth, "truth.csv")
+    reference = source(reference_stamp, "truth.csv")
     return replace(run, reference=Reference(reference.stamp, reference.values, reference.label, sd=1e-3))
 
 
@@ -71,28 +73,28 @@ def strays_by_hand(stamp: Sequence[int]) -> list[int]:
     """The stray rows, one row after the other: each is held against the last that is none and the one that follows."""
     rows = [row for row, value in enumerate(stamp) if value != NO_STAMP]
     apart = [False] * len(rows)
-    believed: list[int] = []
+    regular: list[int] = []
     at = 0
     while at < len(rows):
-        count = next((count for count in (1, 2) if contradicted(stamp, believed, rows[at:], count)), 0)
+        count = next((count for count in (1, 2) if contradicted(stamp, regular, rows[at:], count)), 0)
         apart[at : at + count] = [True] * count
-        believed += rows[at : at + 1] if count == 0 else []
+        regular += rows[at : at + 1] if count == 0 else []
         at += max(count, 1)
     groups = "".join("x" if stray else " " for stray in apart)
     long = {place for group in re.finditer("xxx+", groups) for place in range(*group.span())}
     return [row for place, row in enumerate(rows) if apart[place] and place not in long]
 
 
-def contradicted(stamp: Sequence[int], believed: Sequence[int], rows: Sequence[int], count: int) -> bool:
-    """Whether the first ``count`` of ``rows`` are, by the last row that is believed and by what comes after them."""
+def contradicted(stamp: Sequence[int], regular: Sequence[int], rows: Sequence[int], count: int) -> bool:
+    """Whether the first ``count`` of ``rows`` are, by the last regular row and by what comes after them."""
     out, rest = [stamp[row] for row in rows[:count]], [stamp[row] for row in rows[count:]]
-    if len(out) < count or not (believed or rest):
+    if len(out) < count or not (regular or rest):
         return False
-    before = stamp[believed[-1]] if believed else None
+    before = stamp[regular[-1]] if regular else None
     if before is None:
         return len(rest) >= 3 and all(value - rest[0] > SECOND for value in out)
     if not rest:
-        return believed[-1] >= stamped_rows(stamp)[2] and all(before - value > SECOND for value in out)
+        return regular[-1] >= stamped_rows(stamp)[2] and all(before - value > SECOND for value in out)
     ahead = [value - before > SECOND and value - rest[0] > SECOND for value in out]
     return before - rest[0] <= SECOND and all(
         over or before - value > SECOND for over, value in zip(ahead, out, strict=True)
@@ -152,8 +154,8 @@ def test_any_stamps_are_stray_as_a_walk_from_row_to_row_finds_them(stamp: list[i
     assert np.flatnonzero(stray_offsets(np.array(stamp, dtype=np.int64))).tolist() == strays_by_hand(stamp)
 
 
-def test_stray_stamps_are_taken_for_none_and_told() -> None:
-    """Commands astray either way lose their stamps, measurements and truth only ahead; no row goes, each source is told."""
+def test_stray_stamps_are_taken_for_none_and_noted() -> None:
+    """Stray commands lose their stamps, measurements and reference only ahead; no row is dropped, each source noted."""
     stamp = [time * SECOND for time in (0, 1, 2, 50, 3, -50, 4, 60, 5)]
     run = recorded(stamp, {"tracker": stamp}, stamp)
     kept = without_strays(run)
@@ -183,15 +185,15 @@ def test_a_stray_command_cuts_nothing_and_a_clock_set_back_still_does() -> None:
     """A run is cut where its clock was set back, not where a stamp of either part is stray."""
     first, second = [100, 101, 900, 102, 103], [10, 11, -900, 12, 13]
     stamp = [time * SECOND for time in (*first, *second)]
-    parts, said = segments(recorded(stamp, {"tracker": [time * SECOND for time in (100, 101, 10, 11)]}))
+    parts, notes = segments(recorded(stamp, {"tracker": [time * SECOND for time in (100, 101, 10, 11)]}))
     assert [rows(part.command) for part in parts] == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]]
     assert [part.command.stamp[2] for part in parts] == [NO_STAMP, NO_STAMP]
-    assert len(said) == 1
-    assert "by 93.000 s in row 6" in said[0]
+    assert len(notes) == 1
+    assert "by 93.000 s in row 6" in notes[0]
 
 
 def test_a_run_with_one_clock_is_one_segment() -> None:
-    """Without a jump the run itself comes back and nothing is said."""
+    """Without a jump the run itself comes back without a note."""
     run = recorded([0, TICK, 3600 * SECOND], {"tracker": [5, 4, 3]})
     assert segments(run) == ([run], [])
 
@@ -200,9 +202,9 @@ def test_a_run_with_one_clock_is_one_segment() -> None:
 def test_a_step_back_of_one_second_is_tolerated_and_a_nanosecond_more_is_a_jump(back: int, count: int) -> None:
     """Up to 1 s rows are out of order; beyond it the clock was set back and a new segment begins."""
     stamp = [10 * SECOND, 11 * SECOND, *[11 * SECOND - back] * 3, 12 * SECOND]
-    parts, said = segments(recorded(stamp, {"tracker": stamp}))
+    parts, notes = segments(recorded(stamp, {"tracker": stamp}))
     assert len(parts) == count
-    assert len(said) == count - 1
+    assert len(notes) == count - 1
 
 
 def test_a_jump_cuts_every_source_where_its_own_clock_jumps() -> None:
@@ -210,7 +212,7 @@ def test_a_jump_cuts_every_source_where_its_own_clock_jumps() -> None:
     late, early = 100 * SECOND, 50 * SECOND
     command = [late, late + TICK, early, early + TICK]
     run = recorded(command, {"tracker": [late, early, early + 1], "vision": [late, late + 1, early]}, [late, early])
-    (first, second), (said,) = segments(run)
+    (first, second), (note,) = segments(run)
     assert [rows(part.command) for part in (first, second)] == [[0, 1], [2, 3]]
     assert [rows(part.sensors["tracker"]) for part in (first, second)] == [[0], [1, 2]]
     assert [rows(part.sensors["vision"]) for part in (first, second)] == [[0, 1], [2]]
@@ -219,7 +221,7 @@ def test_a_jump_cuts_every_source_where_its_own_clock_jumps() -> None:
     assert (first.start, second.start) == ({"radial": 0.5}, {})
     assert (first.notes, second.notes) == (("torn",), ())
     for words in ("host.csv", "50.028 s", "row 3", "new segment"):
-        assert words in said
+        assert words in note
 
 
 quarters = st.sampled_from([NO_STAMP, *(quarter * SECOND // 4 for quarter in range(13))])
@@ -231,18 +233,20 @@ def test_segments_hold_every_row_once_and_none_jumps(stamp: list[int]) -> None:
     """For any stamps the pieces are those of a walk from row to row, and together they are the whole log."""
     kept = without_strays(recorded(stamp, {})).command.stamp.tolist()
     run = replace(recorded(kept, {"tracker": kept}, kept), without_strays=True)
-    parts, said = segments(run)
+    parts, notes = segments(run)
     wanted = pieces_by_hand(kept)
     assert [rows(part.command) for part in parts] == wanted
     assert [rows(part.sensors["tracker"]) for part in parts] == wanted
     assert [rows(part.reference) for part in parts] == wanted
-    assert len(said) == len(wanted) - 1
+    assert len(notes) == len(wanted) - 1
 
 
-@pytest.mark.parametrize("truth", [None, [9 * SECOND, 0]])
-def test_a_clock_that_is_set_back_for_the_commands_only_is_refused(truth: list[int] | None) -> None:
-    """If a sensor's clock did not jump with the commands', nothing tells which measurements belong where."""
-    text = refusal(lambda: segments(recorded([9 * SECOND, 0, TICK], {"tracker": [9 * SECOND, 10 * SECOND]}, truth)))
+@pytest.mark.parametrize("reference_stamp", [None, [9 * SECOND, 0]])
+def test_a_clock_that_is_set_back_for_the_commands_only_is_refused(reference_stamp: list[int] | None) -> None:
+    """If a sensor's clock did not jump with the commands', no rule says which measurements belong where."""
+    text = refusal(
+        lambda: segments(recorded([9 * SECOND, 0, TICK], {"tracker": [9 * SECOND, 10 * SECOND]}, reference_stamp))
+    )
     for words in ("host.csv", "row 2", "tracker.csv", "cut the log"):
         assert words in text
 
@@ -251,9 +255,9 @@ def test_stamps_as_far_apart_as_they_may_be_are_a_jump() -> None:
     """From one end of what is read to the other the clock is set back by 292 years: no difference overflows."""
     last = 4_599_999_999 * SECOND
     run = Run.from_arrays([last, -last], {"radial": [0.0, 1.0]})
-    parts, (said,) = segments(run)
+    parts, (note,) = segments(run)
     assert [part.command.stamp.tolist() for part in parts] == [[last], [-last]]
-    assert "9199999998.000 s" in said
+    assert "9199999998.000 s" in note
 
 
 def test_a_sensor_that_is_set_back_alone_cuts_nothing() -> None:

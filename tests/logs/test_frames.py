@@ -51,11 +51,11 @@ def paths(draw: st.DrawFn) -> tuple[Path2D, Path2D]:
     """Commands that turn by less than half a turn each, and what a sensor sees less than half a turn from them."""
     count = draw(st.integers(2, 30))
     turns = draw(st.lists(st.floats(-3.0, 3.0), min_size=count - 1, max_size=count - 1))
-    astray = np.array(draw(st.lists(st.floats(-3.0, 3.0), min_size=count, max_size=count)))
+    apart = np.array(draw(st.lists(st.floats(-3.0, 3.0), min_size=count, max_size=count)))
     base = draw(st.tuples(coordinates, coordinates))
     angle = np.cumsum([draw(st.floats(-math.pi, math.pi)), *turns])
     commanded, seen = (np.array(draw(st.lists(radii, min_size=count, max_size=count))) for _ in range(2))
-    return Path2D(base, angle, commanded), Path2D(base, angle + astray, seen)
+    return Path2D(base, angle, commanded), Path2D(base, angle + apart, seen)
 
 
 def stamps(count: int) -> np.ndarray:
@@ -80,26 +80,18 @@ refusal = partial(one_line, pf.RunError)
 
 @settings(derandomize=True, deadline=None, max_examples=60)
 @given(paths(), directions)
-def test_cylindrical_and_back_is_exact(drawn: tuple[Path2D, Path2D], positive: str) -> None:
-    """x, y → axes → x, y returns within 1e-12 m, whatever the base, the direction and the turns already made."""
-    path, seen = drawn
-    run, placed = in_axes(logged(path, seen, Cylindrical(base=path.base, positive=positive)), None)
-    for source, wanted in ((run.command, path), (run.sensors["camera"], seen)):
-        x, y = placed.to_log(source.values["tangential"], source.values["radial"])
+def test_cylindrical_axes_are_radius_and_arc(drawn: tuple[Path2D, Path2D], positive: str) -> None:
+    """Radial = r, tangential = ±R0·(θ − θ0) over several turns, a sensor's turns those of the commands; and back."""
+    path, measured = drawn
+    run, placed = in_axes(logged(path, measured, Cylindrical(base=path.base, positive=positive)), None)
+    for source, wanted in ((run.command, path), (run.sensors["camera"], measured)):
+        tangential, radial = source.values["tangential"], source.values["radial"]
+        arc = SIGN[positive] * path.radius[0] * (wanted.angle - path.angle[0])
+        np.testing.assert_allclose(tangential, arc, rtol=0, atol=EXACT)
+        np.testing.assert_allclose(radial, wanted.radius, rtol=0, atol=EXACT)
+        x, y = placed.to_log(tangential, radial)
         np.testing.assert_allclose(x, wanted.x, rtol=0, atol=EXACT)
         np.testing.assert_allclose(y, wanted.y, rtol=0, atol=EXACT)
-
-
-@settings(derandomize=True, deadline=None, max_examples=60)
-@given(paths(), directions)
-def test_cylindrical_axes_are_radius_and_arc(drawn: tuple[Path2D, Path2D], positive: str) -> None:
-    """Radial = r, tangential = ±R0·(θ − θ0) over several turns; a sensor's turns are those of the commands near it."""
-    path, seen = drawn
-    run, _ = in_axes(logged(path, seen, Cylindrical(base=path.base, positive=positive)), None)
-    for source, wanted in ((run.command, path), (run.sensors["camera"], seen)):
-        arc = SIGN[positive] * path.radius[0] * (wanted.angle - path.angle[0])
-        np.testing.assert_allclose(source.values["tangential"], arc, rtol=0, atol=EXACT)
-        np.testing.assert_allclose(source.values["radial"], wanted.radius, rtol=0, atol=EXACT)
 
 
 @settings(derandomize=True, deadline=None, max_examples=60)
@@ -129,7 +121,7 @@ def test_directions_are_seen_from_above(kind: str, positive: str, way: float) ->
 
 
 def test_the_turns_count_from_the_start_level() -> None:
-    """At rest at 179°, first told to go to −179°: that is 2° on, not 358° back."""
+    """At rest at 179°, first commanded to −179°: that is 2° on, not 358° back."""
     degree = math.pi / 180.0
     start = {"x": 0.5 * math.cos(179.0 * degree), "y": 0.5 * math.sin(179.0 * degree)}
     path = Path2D((0.0, 0.0), np.array([-179.0, -178.0]) * degree, np.full(2, 0.5))
@@ -190,7 +182,7 @@ X, Y, Z = [0.5, 0.6], [0.0, 0.1], [0.0, 0.0]
 
 
 @pytest.mark.parametrize(
-    ("command", "camera", "said"),
+    ("command", "camera", "message"),
     [
         ({"x": X, "y": Y}, {"x": X}, "camera: gives x without y"),
         ({"x": X, "y": Y}, {"y": X}, "camera: gives y without x"),
@@ -204,12 +196,12 @@ X, Y, Z = [0.5, 0.6], [0.0, 0.1], [0.0, 0.0]
     ],
 )
 def test_what_a_frame_cannot_place_is_refused(
-    command: dict[str, list[float]], camera: dict[str, list[float]] | None, said: str
+    command: dict[str, list[float]], camera: dict[str, list[float]] | None, message: str
 ) -> None:
     """Half a position, one axis twice, and a start without an angle: one line that names the source."""
     sensors = None if camera is None else {"camera": (stamps(2), camera)}
     run = pf.Run.from_arrays(stamps(2), command, sensors, frame=Cylindrical(base=(0.2, -0.1)))
-    assert said in refusal(lambda: in_axes(run, None))
+    assert message in refusal(lambda: in_axes(run, None))
 
 
 def test_a_row_without_x_or_y_is_invalid_but_its_z_is_fused() -> None:
@@ -228,11 +220,11 @@ def test_a_row_without_x_or_y_is_invalid_but_its_z_is_fused() -> None:
     assert all(np.isfinite(est[axis].position).all() for axis in est.axes)
 
 
-def test_commands_in_x_y_z_without_a_frame_are_told_what_is_missing() -> None:
+def test_commands_in_x_y_z_without_a_frame_are_refused_with_what_is_missing() -> None:
     """One line that names the file and says to give [frame]."""
     run = pf.Run.from_arrays(stamps(2), {"x": X, "y": Y, "z": Z})
-    said = refusal(lambda: pf.fuse(run, config()))
-    assert said == "command: commands are in x, y, z; give a [frame] in run.toml or fusion.toml"
+    message = refusal(lambda: pf.fuse(run, config()))
+    assert message == "command: commands are in x, y, z; give a [frame] in run.toml or fusion.toml"
 
 
 RUN_TOML = """

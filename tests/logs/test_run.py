@@ -98,19 +98,12 @@ def test_a_sum_with_an_empty_part_is_no_command(folder: Path) -> None:
 
 @pytest.mark.parametrize("key", ["radial_mm = 560.5", "radial_m = 0.5605", "radial_um = 560500"])
 def test_the_start_level_is_in_the_unit_of_its_key(folder: Path, key: str) -> None:
-    """`start` gives the level of an axis before its first command, in the unit its key tells."""
+    """`start` gives the level of an axis before its first command, in the unit of its key."""
     assert read(folder, COMMAND + f"start = {{ {key} }}\n").start == {"radial": 0.5605}
 
 
-def test_axes_come_in_canonical_order(folder: Path) -> None:
-    """tangential, radial, vertical, then others by name, whatever the order of the file."""
-    lines = "".join(f'{axis} = "z_m"\n' for axis in ("yaw", "vertical", "elbow", "radial", "tangential"))
-    run = read(folder, f'[command]\nfile = "host.csv"\ntime = "t_ms"\n{lines}')
-    assert run.axes == ("tangential", "radial", "vertical", "elbow", "yaw")
-
-
-def test_notes_of_a_table_are_told_once(folder: Path) -> None:
-    """A torn line and a word are told once each, though command and sensor read the same file and column."""
+def test_notes_of_a_table_are_noted_once(folder: Path) -> None:
+    """A torn line and a word are noted once each, though command and sensor read the same file and column."""
     (folder / "host.csv").write_text("t_ms,nominal_mm,correction_um,z_m\n0,560,500,0\n28,bad,0,1\n56,562\n")
     sensor = '[sensors.own]\nfile = "host.csv"\ntime = "t_ms"\nradial = "nominal_mm"\n'
     run = read(folder, COMMAND + sensor)
@@ -200,7 +193,7 @@ def test_a_single_parquet_table_says_what_the_csv_says(tmp_path: Path) -> None:
     check_source(run.sensors["tracker"], [origin + 10_000_000], radial=[0.5695])
 
 
-def test_columns_of_no_source_are_told(tmp_path: Path) -> None:
+def test_columns_of_no_source_are_noted(tmp_path: Path) -> None:
     """Columns that belong to no source are left out and named in one note."""
     run = single(tmp_path, "time_s,command.radial_mm,weather,speed_mm_s\n0,560,dry,1\n")
     (note,) = run.notes
@@ -234,17 +227,6 @@ def test_commands_without_one_that_has_both_stamp_and_value_are_refused(tmp_path
     """A run in which nothing was commanded is refused by the name of the axis."""
     text = refusal(lambda: single(tmp_path, f"time_s,command.radial_mm\n{rows}"), RunError)
     assert "'radial'" in text
-
-
-def test_arrays_and_files_are_one_run(tmp_path: Path) -> None:
-    """A run from arrays in SI units is the run that its table gives."""
-    read_run = single(tmp_path, "time_s,command.radial_mm,tracker.radial_mm\n0,560,\n0.01,,570\n0.028,561,571\n")
-    made = Run.from_arrays(
-        [0.0, 0.028], {"radial": [0.56, 0.561]}, {"tracker": ([0.01, 0.028], {"radial": [0.57, 0.571]})}
-    )
-    check_source(made.command, read_run.command.stamp.tolist(), radial=read_run.command.values["radial"].tolist())
-    tracker = read_run.sensors["tracker"]
-    check_source(made.sensors["tracker"], tracker.stamp.tolist(), radial=tracker.values["radial"].tolist())
 
 
 def test_arrays_are_copied() -> None:

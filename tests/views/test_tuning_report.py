@@ -12,12 +12,12 @@ import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from pumafuse.fusion.outcome import Outcome
 
 import pumafuse as pf
 from outline import outline
 from pumafuse.errors import PumafuseWarning
 from pumafuse.fusion.consistency import consistency, densities_of
-from pumafuse.fusion.outcome import Outcome
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.intervals import Profile, profiles

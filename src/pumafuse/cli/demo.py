@@ -9,7 +9,7 @@ from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.offline import fuse
 from ..logs.run import Run
-from .fuse import draw, progress_of, record, show
+from .fuse import progress_of, show, write
 from .tables import console
 
 _SENSOR = "vision"  # alone: without the laser tracker it shows best what a camera and a model do together
@@ -32,12 +32,7 @@ def run(output: Path, force: bool) -> None:
         recorded, config = Run.read(data / "scan1"), FusionConfig.load(data / "fusion.toml")
         with progress_of(recorded.name) as progress:
             est = fuse(recorded, config, sensors=[_SENSOR], rate=200.0, progress=progress)
-
-        def extras(folder: Path) -> None:
-            draw(est, recorded, folder)
-            record(est, recorded, folder)
-
-        summary = results.write(est, output, force, extras)
+        summary = write(est, recorded, output, rrd=True, figures=True, force=force)
         show(summary, output)
         out.print(
             f"\nWhat to open next:\n"

@@ -82,21 +82,27 @@ def show(summary: Summary, folder: Path) -> None:
     out.print(f"written to {folder}", soft_wrap=True, markup=False)
 
 
-def draw(est: Estimates, recorded: Run, folder: Path) -> None:
-    """Write the figures into a result folder."""
-    from ..views.figures import error_figure, fused_figure, validation_figure
+def write(est: Estimates, recorded: Run, folder: Path, *, rrd: bool, figures: bool, force: bool) -> Summary:
+    """Write a result folder, with ``fused.rrd`` and figures if wanted.
 
-    fused_figure(est, recorded, folder / "fused.png")
-    validation_figure(est, folder / "validation.png")
-    if est.reference is not None:
-        error_figure(est, folder / "error.png")
+    Raises:
+        FolderError: See :func:`pumafuse.fusion.results.write`.
+    """
 
+    def extras(new: Path) -> None:
+        if rrd:
+            from ..views.rerun import to_rerun
 
-def record(est: Estimates, recorded: Run, folder: Path) -> None:
-    """Write ``fused.rrd`` into a result folder."""
-    from ..views.rerun import to_rerun
+            to_rerun(est, recorded, new / "fused.rrd")
+        if figures:
+            from ..views.figures import error_figure, fused_figure, validation_figure
 
-    to_rerun(est, recorded, folder / "fused.rrd")
+            fused_figure(est, recorded, new / "fused.png")
+            validation_figure(est, new / "validation.png")
+            if est.reference is not None:
+                error_figure(est, new / "error.png")
+
+    return results.write(est, folder, force, extras)
 
 
 def _read_and_fuse(path: Path, folder: Path, config: FusionConfig, options: Options) -> Summary:
@@ -121,14 +127,7 @@ def _fuse(
         engine=options.engine,
         progress=progress,
     )
-
-    def extras(new: Path) -> None:
-        if options.rrd:
-            record(est, recorded, new)
-        if options.figures:
-            draw(est, recorded, new)
-
-    return results.write(est, folder, options.force, extras)
+    return write(est, recorded, folder, rrd=options.rrd, figures=options.figures, force=options.force)
 
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:

@@ -27,6 +27,9 @@ app = typer.Typer(
 )
 
 Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")]
+Config = Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")]
+Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")]
+Report = Annotated[Path | None, typer.Option(metavar="DIR", help="Also write tables and figures as one HTML page.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace an earlier result.")]
 
@@ -51,14 +54,12 @@ def _root(  # pyright: ignore[reportUnusedFunction]
 @app.command()
 def fuse(
     runs: Runs,
-    config: Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")],
+    config: Config,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")],
     sensors: Annotated[
         str | None, typer.Option(metavar="A,B", help="Which sensors to use; default: all configured.")
     ] = None,
-    rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")
-    ] = None,
+    rate: Rate = None,
     smooth: Annotated[
         bool, typer.Option("--smooth", help="Use later measurements too: the best estimate afterwards, no velocity.")
     ] = False,
@@ -122,7 +123,9 @@ def discretize(
 
 @app.command()
 def simulate(
-    scenario: Annotated[Path, typer.Argument(metavar="SCENARIO.TOML", help="What happens, and what the filter knows.")],
+    scenario: Annotated[
+        Path, typer.Argument(metavar="SCENARIO.TOML", help="The run to simulate, and the filter's configuration.")
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the recorded run goes.")],
     runs: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="N runs with seeds in a row, in DIR/seed-K.")
@@ -200,9 +203,7 @@ def identify(
     tolerance: Annotated[
         float, typer.Option(metavar="MM", help="RMS beyond which the model is not called valid.")
     ] = 1.0,
-    report: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Also write tables and figures as one HTML page.")
-    ] = None,
+    report: Report = None,
     json: Json = False,
     force: Force = False,
 ) -> None:
@@ -233,9 +234,7 @@ def verify(
         list[str] | None,
         typer.Option(metavar="AXIS=MM", help="Level before the first command; default: the run's, else chosen by RMS."),
     ] = None,
-    report: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Also write table and figures as one HTML page.")
-    ] = None,
+    report: Report = None,
     json: Json = False,
     force: Force = False,
 ) -> None:
@@ -288,10 +287,8 @@ def live(
             " as fast as it can be).",
         ),
     ],
-    config: Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")],
-    rate: Annotated[
-        float | None, typer.Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")
-    ] = None,
+    config: Config,
+    rate: Rate = None,
     window: Annotated[float, typer.Option(metavar="S", help="How late an event may come.")] = 2.0,
     stale_after: Annotated[
         float, typer.Option(metavar="S", help="Without a measurement for so long an axis is stale.")

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from ..simulation import simulate as simulation
 from ..simulation.scenario import Scenario
-from .many import report_failures as tell
-from .many import run_jobs as each
+from .many import report_failures, run_jobs
 from .tables import console
 
 
@@ -27,7 +26,7 @@ def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
     else:
         seeds = range(scenario.seed, scenario.seed + runs)
         jobs = {f"seed-{seed}": partial(_simulate, scenario, seed, output / f"seed-{seed}", force) for seed in seeds}
-        done, failed = each("simulating", jobs, [output / name for name in jobs])
+        done, failed = run_jobs("simulating", jobs, [output / name for name in jobs])
         written, folders = list(done.values()), str(output / "seed-*")
     if written:
         commands, rows, trials = (sum(counts) for counts in zip(*written, strict=True))
@@ -36,7 +35,7 @@ def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
         config = min(output.glob("**/fusion.toml"))
         out.print(f"{how_many}: {counted}, written to {output}", markup=False)
         out.print(f"next: pumafuse fuse {folders} -c {config} -o result", markup=False)
-    tell(failed, len(written) + len(failed), str(output))
+    report_failures(failed, len(written) + len(failed), str(output))
 
 
 def _simulate(scenario: Scenario, seed: int, folder: Path, force: bool) -> tuple[int, int, int]:

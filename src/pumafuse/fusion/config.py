@@ -101,7 +101,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             if abs(sensor.latency) > _LONGEST_LATENCY:
                 raise ConfigError(f"sensors.{name}.latency_ms: more than an hour; is it in ms?")
             if sensor.scale == 0.0:
-                raise ConfigError(f"sensors.{name}.scale: 0 would make the measurements say nothing of the position")
+                raise ConfigError(f"sensors.{name}.scale: must not be 0: measurements would not depend on the position")
         complete = {axis: self.process.get(axis, Process()) for axis in self.arm.axes}
         msgspec.structs.force_setattr(self, "process", complete)
 

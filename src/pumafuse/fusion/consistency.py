@@ -8,7 +8,7 @@ components are left out.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +26,7 @@ _FROZEN = 10  # equal values in a row of a sensor with noise
 _WIDEST = 1e6  # largest ratio of prior to noise at which double precision keeps the error bars
 _NEVER = 1e-6  # expected number below which chance is no explanation
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
-_MANY_REJECTED = 0.1  # share of rejected components beyond which those that are left say little
+_MANY_REJECTED = 0.1  # share of rejected components beyond which the others are a selection
 
 
 @dataclass(frozen=True)
@@ -113,11 +113,10 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
     count = len(fused.value)
     if not count:
         return None
-    correlation, whiteness = ljung_box(fused.innovation / fused.innovation_sd)
-    nis, band = float(np.mean(fused.nis)), chi_square_band(count)
+    whiteness = ljung_box(fused.innovation / fused.innovation_sd)
+    found = Consistency(count, float(np.mean(fused.nis)), chi_square_band(count), *whiteness, verdict="")
     rejected = 1.0 - count / np.count_nonzero(measurements.outcome <= Outcome.REACQUIRED)
-    verdict = _verdict(est, axis, fused, nis, band, correlation, whiteness, rejected)
-    return Consistency(count, nis, band, correlation, whiteness, verdict)
+    return replace(found, verdict=_verdict(est, axis, fused, found, rejected))
 
 
 def sensor_problems(est: Estimates) -> list[str]:
@@ -168,7 +167,7 @@ def _too_wide(est: Estimates) -> list[str]:
             if ratio > _WIDEST:
                 found.append(
                     f"{name}: its prior (offset_sd_mm, bias_sd_mm) is {ratio:.1e} times its noise: more than double"
-                    " precision resolves; a narrower prior says the same"
+                    " precision resolves; use a narrower prior"
                 )
     return found
 
@@ -189,38 +188,31 @@ def _frozen(values: FloatArray) -> int:
     return longest if longest >= _FROZEN and len(values) * elsewhere ** (longest - 1) < _NEVER else 0
 
 
-def _verdict(
-    est: Estimates,
-    axis: str,
-    fused: Measurements,
-    nis: float,
-    band: tuple[float, float],
-    correlation: FloatArray,
-    whiteness: float,
-    rejected: float,
-) -> str:
-    if len(fused.value) < _FEW:
-        return f"too few measurements ({len(fused.value)}) to tell"
-    nis_text = f"NIS {nis:.2f}, expected {band[0]:.2f} to {band[1]:.2f}"
-    if rejected > _MANY_REJECTED:  # what is left has been chosen to fit
-        return f"{nis_text}, but {rejected:.0%} were rejected: sd_mm, latency_ms or the process noise too small"
+def _verdict(est: Estimates, axis: str, fused: Measurements, found: Consistency, rejected: float) -> str:
+    if found.count < _FEW:
+        return f"too few measurements ({found.count}) to tell"
+    low, high = found.nis_band
+    nis = f"NIS {found.nis:.2f}, expected {low:.2f} to {high:.2f}"
+    if rejected > _MANY_REJECTED:  # the others were selected to fit
+        return f"{nis}, but {rejected:.0%} were rejected: sd_mm, latency_ms or the process noise too small"
+    correlation = found.correlation
     first, strongest = float(correlation[0]), int(np.argmax(np.abs(correlation)))
-    coloured = whiteness < 0.01 and abs(first) > _NOTABLE
-    if nis > band[1]:
+    coloured = found.whiteness < 0.01 and abs(first) > _NOTABLE
+    if found.nis > high:
         if coloured and _follows_velocity(est, axis, fused):
-            return f"{nis_text}, innovations follow the velocity: latency_ms is wrong"
+            return f"{nis}, innovations follow the velocity: latency_ms is wrong"
         if coloured and first > 0.0:
-            return f"{nis_text}, innovations positively correlated: the process noise too small, or latency_ms wrong"
+            return f"{nis}, innovations positively correlated: the process noise too small, or latency_ms wrong"
         if coloured:
-            return f"{nis_text}, innovations negatively correlated: sd_mm too small"
-        return f"{nis_text}: sd_mm or the process noise too small"
-    if nis < band[0]:
+            return f"{nis}, innovations negatively correlated: sd_mm too small"
+        return f"{nis}: sd_mm or the process noise too small"
+    if found.nis < low:
         if coloured and first < 0.0:
-            return f"{nis_text}, innovations negatively correlated: the process noise too large"
-        return f"{nis_text}: sd_mm or the process noise too large"
-    if whiteness < 0.01 and abs(correlation[strongest]) > _NOTABLE:
-        return f"{nis_text}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
-    return f"{nis_text}: consistent"
+            return f"{nis}, innovations negatively correlated: the process noise too large"
+        return f"{nis}: sd_mm or the process noise too large"
+    if found.whiteness < 0.01 and abs(correlation[strongest]) > _NOTABLE:
+        return f"{nis}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
+    return f"{nis}: consistent"
 
 
 def _follows_velocity(est: Estimates, axis: str, fused: Measurements) -> bool:

@@ -73,7 +73,7 @@ class Result:
 
 
 def check_writable(folder: Path, force: bool) -> None:
-    """Refuse early what :func:`write` would refuse late.
+    """Refuse a folder that :func:`write` must not replace, before any work is done.
 
     Raises:
         FolderError: The folder exists and is not to be replaced, or holds something else than results.

@@ -80,8 +80,8 @@ class AxisSummary(msgspec.Struct, frozen=True, kw_only=True):
         sensors: By name, those with components on this axis.
         log_likelihood: Of its components, with positions in mm.
         score: Against the reference; null without one.
-        nees_band: Where the mean NEES lies in 95 % of cases for a consistent filter that knows as many independent
-            errors as components; null without components.
+        nees_band: Where the mean NEES lies in 95 % of cases for a consistent filter with as many independent errors
+            as fused components; null without components.
     """
 
     sensors: dict[str, SensorSummary]

@@ -1,16 +1,24 @@
-"""SVG pictures with matplotlib, for HTML pages."""
+"""HTML pages from templates, and SVG pictures with matplotlib for them."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import matplotlib
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 _EDGE = 0.12  # inch, right of the last column
+
+
+def render(template: str, content: Mapping[str, Any]) -> str:
+    """The text of a page; ``content`` is escaped, except for its ``Markup``."""
+    pages = Environment(loader=PackageLoader("pumafuse.views", "pages"), autoescape=True, undefined=StrictUndefined)
+    return pages.get_template(template).render(content)
 
 
 class Canvas:

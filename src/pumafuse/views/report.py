@@ -16,8 +16,8 @@ from ..identification.verify import AxisVerification, Trace
 from ..model.arm import ArmModel
 from ..model.plants import FirstOrder
 from ..units import MM, MS
-from . import formatting
-from .render import render
+from . import formatting, step_figures
+from .canvas import render
 
 PAGE = "report.html"
 _TEXT = frozenset({"axis", "coefficient", "factor", "level: mean ± sd (trials)", "verdict", "outlying trials"}) | {
@@ -155,8 +155,6 @@ def write_identification(found: Identification, trials: StepTrials, folder: Path
     Raises:
         FolderError: See :func:`check_writable`, or the disk refuses.
     """
-    from . import step_figures
-
     contour, contours = step_figures.valleys(found, trials)
     figures = {
         "responses": step_figures.responses(found, trials),
@@ -201,8 +199,6 @@ def write_verification(
     Raises:
         FolderError: See :func:`check_writable`, or the disk refuses.
     """
-    from . import step_figures
-
     every = [one for one, _ in verified]
     content = {
         "arm": arm,

@@ -15,7 +15,7 @@ from ..identification.identify import Identification, TrialResult
 from ..identification.trials import StepTrials, Trial
 from ..identification.verify import AxisVerification, Trace
 from ..units import MM, MS
-from . import colours as style
+from . import colours
 from .canvas import drawing
 
 _SECONDS = 1.2  # of a white-noise run that is shown in detail
@@ -37,10 +37,10 @@ def responses(found: Identification, trials: StepTrials) -> str:
             t, height = measured[one.trial].time - one.common_delay, one.common_gain * one.step
             position = measured[one.trial].position
             zero = float(np.mean(position - height * plant.step_response(t)))
-            axes.plot(t * MS, (position - zero) / height, color=style.BAND, lw=0.6, alpha=0.7)
+            axes.plot(t * MS, (position - zero) / height, color=colours.BAND, lw=0.6, alpha=0.7)
             longest = max(longest, float(t[-1]))
         t = np.linspace(-0.02, longest, 400)
-        axes.plot(t * MS, plant.step_response(t), color=style.REFERENCE, lw=1.4)
+        axes.plot(t * MS, plant.step_response(t), color=colours.REFERENCE, lw=1.4)
         axes.set_title(axis, loc="left")
         axes.set_xlabel("time since the trial's own delay [ms]")
         axes.set_ylim(-0.15, 1.3)
@@ -53,10 +53,10 @@ def delays(found: Identification) -> str:
 
     def draw(axes: Axes, axis: str) -> None:
         values = [one.common_delay for one in found.trials if one.axis == axis and one.common_delay is not None]
-        axes.plot(np.arange(1, len(values) + 1), np.array(values) * MS, ".", color=style.ESTIMATE, ms=4)
+        axes.plot(np.arange(1, len(values) + 1), np.array(values) * MS, ".", color=colours.ESTIMATE, ms=4)
         fitted = found.axes[axis].delays.fitted
-        axes.axhline(fitted.value * MS, color=style.REFERENCE, lw=1.0)
-        axes.axhspan(fitted.ci95[0] * MS, fitted.ci95[1] * MS, color=style.ESTIMATE, alpha=0.2, lw=0)
+        axes.axhline(fitted.value * MS, color=colours.REFERENCE, lw=1.0)
+        axes.axhspan(fitted.ci95[0] * MS, fitted.ci95[1] * MS, color=colours.ESTIMATE, alpha=0.2, lw=0)
         axes.set_title(axis, loc="left")
         axes.set_xlabel("trial, in the order of the list")
 
@@ -69,9 +69,9 @@ def gains(found: Identification) -> str:
     def draw(axes: Axes, axis: str) -> None:
         used = [one for one in found.trials if one.axis == axis and one.common_gain is not None]
         speed = np.array([one.speed for one in used])
-        axes.plot(speed, [one.common_gain or np.nan for one in used], ".", color=style.ESTIMATE, ms=4)
+        axes.plot(speed, [one.common_gain or np.nan for one in used], ".", color=colours.ESTIMATE, ms=4)
         at = np.linspace(0.0, 1.05 * float(speed.max()), 50)
-        axes.plot(at, found.axes[axis].model.gain.at(at), color=style.REFERENCE, lw=1.0)
+        axes.plot(at, found.axes[axis].model.gain.at(at), color=colours.REFERENCE, lw=1.0)
         axes.set_title(axis, loc="left")
         axes.set_xlabel("speed [m/s]")
 
@@ -88,7 +88,7 @@ def histograms(found: Identification) -> str:
     }
 
     def draw(axes: Axes, name: str) -> None:
-        axes.hist(columns[name], bins="auto", color=style.BAND, edgecolor="white")
+        axes.hist(columns[name], bins="auto", color=colours.BAND, edgecolor="white")
         axes.yaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_xlabel(name)
 
@@ -101,8 +101,8 @@ def fits_by_factor(found: Identification, trials: StepTrials) -> str:
     names = {one.trial for one in used}
     factors = factors_of([trial for trial in trials.trials if trial.name in names], found.arm.update_period)
     orders = {
-        "first order": (np.array([one.first.rms for one in used]) * MM, style.COMMAND, -0.15),
-        "second order": (np.array([one.second.rms for one in used]) * MM, style.ESTIMATE, 0.15),
+        "first order": (np.array([one.first.rms for one in used]) * MM, colours.COMMAND, -0.15),
+        "second order": (np.array([one.second.rms for one in used]) * MM, colours.ESTIMATE, 0.15),
     }
 
     def draw(axes: Axes, factor: str) -> None:
@@ -120,10 +120,10 @@ def performance(found: Identification) -> str:
     """RMS of the combined model by each factor (the paper's Fig. 7); empty without factors."""
 
     def draw(axes: Axes, one: Performance) -> None:
-        _levels(axes, one.levels, style.ESTIMATE, "combined model", 0.0)
+        _levels(axes, one.levels, colours.ESTIMATE, "combined model", 0.0)
         top = max(level.mean + 2.0 * (level.sd or 0.0) for level in one.levels)
         if found.tolerance * MM < 3.0 * top:
-            axes.axhline(found.tolerance * MM, color=style.REJECTED, lw=0.8, ls="--")
+            axes.axhline(found.tolerance * MM, color=colours.REJECTED, lw=0.8, ls="--")
         axes.set_xlabel(one.factor)
         axes.set_ylim(bottom=0.0)
 
@@ -154,8 +154,8 @@ def verification(verified: AxisVerification, trace: Trace) -> str:
     with drawing(1, width=9.0) as canvas:
         axes = canvas.axes[0]
         shown = trace.time <= trace.time[0] + _SECONDS
-        axes.plot(trace.time[shown], trace.measured[shown] * MM, color=style.REFERENCE, lw=1.0, label="measured")
-        axes.plot(trace.time[shown], trace.modelled[shown] * MM, "--", color=style.ESTIMATE, lw=1.2, label="model")
+        axes.plot(trace.time[shown], trace.measured[shown] * MM, color=colours.REFERENCE, lw=1.0, label="measured")
+        axes.plot(trace.time[shown], trace.modelled[shown] * MM, "--", color=colours.ESTIMATE, lw=1.2, label="model")
         axes.set_title(f"{verified.run}: {verified.axis}, {verified.source}", loc="left")
         axes.set_xlabel("time since the first command [s]")
         axes.set_ylabel("position without its mean [mm]")
@@ -188,8 +188,8 @@ def _valley(axes: Axes, one: TrialResult, trial: Trial) -> None:
     batch = Batch.of([trial], [1.0]).take(np.zeros(len(w), dtype=np.int64))
     rms = np.sqrt(batch.point(np.stack((delay, q, p), axis=1)).cost / batch.count) * MM
     levels = np.geomspace(float(rms.min()) * 1.02, float(rms.max()), 12)
-    axes.contour(across, up, rms.reshape(_GRID, _GRID), levels=levels, colors=style.ESTIMATE, linewidths=0.7)
-    axes.plot(fit.natural_frequency or omega, fit.damping or zeta, "x", color=style.REJECTED)
+    axes.contour(across, up, rms.reshape(_GRID, _GRID), levels=levels, colors=colours.ESTIMATE, linewidths=0.7)
+    axes.plot(fit.natural_frequency or omega, fit.damping or zeta, "x", color=colours.REJECTED)
     axes.set_xscale("log")
     axes.set_yscale("log")
     for side, ends in ((axes.xaxis, across), (axes.yaxis, up)):

@@ -15,7 +15,7 @@ from ..fusion.estimates import Estimates
 from ..fusion.score import Z95
 from ..tuning.intervals import Profile
 from ..tuning.summary import Fitted
-from . import colours as style
+from . import colours
 from .canvas import drawing
 
 _COLUMNS = 5  # of profiles
@@ -43,7 +43,7 @@ def profiles(found: Sequence[Profile], fitted: Mapping[str, Fitted]) -> str:
 
 def innovations(before: Estimates, after: Estimates, sensor: str, axis: str) -> str:
     """Draw a sensor's normalised innovations on an axis before and after, with autocorrelations, as SVG text."""
-    colour = style.sensor_colours(after.measurements.sensors)[sensor]
+    colour = colours.sensor_colours(after.measurements.sensors)[sensor]
     with drawing(3, width=_WIDTH, height=2.2, ratios=(2.2, 2.2, 1.0), room=(0.6, 0.45, 0.25)) as sheet:
         *series, correlation = sheet.axes
         highest = 4.0
@@ -52,8 +52,8 @@ def innovations(before: Estimates, after: Estimates, sensor: str, axis: str) -> 
             fused = measurements.where(measurements.outcome == Outcome.FUSED)
             normalised = fused.innovation / fused.innovation_sd
             highest = max(highest, 1.05 * float(np.abs(normalised).max(initial=0.0)))
-            axes.plot(fused.time, normalised, ".", ms=1.5, color=(style.COMMAND, colour)[number], rasterized=True)
-            axes.axhspan(-Z95, Z95, color=style.ESTIMATE, alpha=0.15, lw=0)
+            axes.plot(fused.time, normalised, ".", ms=1.5, color=(colours.COMMAND, colour)[number], rasterized=True)
+            axes.axhspan(-Z95, Z95, color=colours.ESTIMATE, alpha=0.15, lw=0)
             axes.set_title(f"{('before', 'after')[number]}: {_cut(axis)}, {_cut(sensor)}", loc="left")
             axes.set_xlabel("time since the first command [s]")
         for axes in series:
@@ -61,7 +61,7 @@ def innovations(before: Estimates, after: Estimates, sensor: str, axis: str) -> 
             axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
         series[0].set_ylabel("innovation / sd")
         tests = [consistency(est, sensor, axis) for est in (before, after)]
-        _correlations(correlation, tests, (style.COMMAND, colour))
+        _correlations(correlation, tests, (colours.COMMAND, colour))
     return sheet.svg
 
 
@@ -72,9 +72,9 @@ def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
     axes.set_xlim(low, high)
     axes.set_ylim(_DEEPEST, max(0.5, 1.1 * float(one.drop.max())))
     ends = [edge if end is None else end for end, edge in zip(fitted.ci95, (low, high), strict=True)]
-    axes.axvspan(*ends, color=style.ESTIMATE, alpha=0.15, lw=0)
-    axes.axhline(-0.5 * Z95**2, color=style.COMMAND, lw=0.8, ls="--")
-    axes.plot(*_smooth(one), color=style.ESTIMATE, lw=1.2)
+    axes.axvspan(*ends, color=colours.ESTIMATE, alpha=0.15, lw=0)
+    axes.axhline(-0.5 * Z95**2, color=colours.COMMAND, lw=0.8, ls="--")
+    axes.plot(*_smooth(one), color=colours.ESTIMATE, lw=1.2)
     if fitted.before is not None:
         _before(axes, fitted.before, low, high)
     wide = high / low if one.log else 1.0
@@ -100,12 +100,12 @@ def _smooth(one: Profile) -> tuple[FloatArray, FloatArray]:
 def _before(axes: Axes, before: float, low: float, high: float) -> None:
     """Draw a tick at the value before, or an arrow and the value where it lies outside."""
     if low <= before <= high:
-        axes.plot([before, before], [_DEEPEST, -5.0], color=style.REJECTED, lw=1.6)
+        axes.plot([before, before], [_DEEPEST, -5.0], color=colours.REJECTED, lw=1.6)
         return
     left = before < low
     text = f"← {before:.4g}" if left else f"{before:.4g} →"
     at, side = (0.02, "left") if left else (0.98, "right")
-    axes.text(at, 0.02, text, transform=axes.transAxes, ha=side, va="bottom", fontsize=8, color=style.REJECTED)
+    axes.text(at, 0.02, text, transform=axes.transAxes, ha=side, va="bottom", fontsize=8, color=colours.REJECTED)
 
 
 def _cut(text: str) -> str:
@@ -121,7 +121,7 @@ def _correlations(axes: Axes, tests: Sequence[Consistency | None], colours: Sequ
             axes.bar(lags, one.correlation, color=colour, width=0.4)
             highest = max(highest, 1.1 * float(np.abs(one.correlation).max(initial=0.0)))
             band = min(band, one.correlation_band)
-    axes.axhspan(-band, band, color=style.ESTIMATE, alpha=0.15, lw=0)
+    axes.axhspan(-band, band, color=colours.ESTIMATE, alpha=0.15, lw=0)
     axes.set_title("autocorrelation", loc="left")
     axes.set_xlabel("lag [measurements]")
     axes.set_xlim(0, LAGS + 1)

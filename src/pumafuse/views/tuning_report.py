@@ -18,7 +18,7 @@ from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Tuning
 from ..tuning.validation import Check, fused
 from . import formatting, tuning_figures
-from .render import render
+from .canvas import render
 
 _Pair: TypeAlias = tuple[Consistency | None, Consistency | None]  # before and after
 _WHITE = 0.01  # p-value from which innovations count as white
