@@ -95,7 +95,9 @@ def run(source: str, options: Options) -> None:
             stack.callback(view.close)
         stream = Stream(live, _output(out, options.status), notify, options.rate, [] if view is None else [view])
         parts = [part for part in (remote, recorder, out) if part is not None]
-        screen = stack.enter_context(_screen(errors, options.status))
+        screen = None
+        if options.status and errors.is_terminal:
+            screen = stack.enter_context(Live(console=errors, auto_refresh=False, transient=True))
         feeder = _Feeder(stream, parts, address.speed, recorder, view, screen)
         if remote is not None:
             with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:  # Windows' own reads no datagrams
@@ -201,12 +203,3 @@ def _caught_signals() -> Generator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def _screen(errors: Console, wanted: bool) -> Generator[Live | None]:
-    if not wanted or not errors.is_terminal:
-        yield None
-        return
-    with Live(console=errors, auto_refresh=False, transient=True) as screen:
-        yield screen

@@ -57,9 +57,7 @@ def _sensor_table(health: Health) -> Table:
     """Rate, lateness, dropouts and NIS of each sensor, and its components by outcome."""
     caption = "outcomes count components: each axis of a row by itself"
     table = Table(box=box.SIMPLE_HEAD, caption=caption, caption_justify="left")
-    words = [
-        word for word in (o.word for o in Outcome) if any(sensor.outcomes[word] for sensor in health.sensors.values())
-    ]
+    words = [one.word for one in Outcome if any(sensor.outcomes[one.word] for sensor in health.sensors.values())]
     table.add_column("sensor")
     for heading in ("rows", "rate, Hz", "late, ms", "at most", "dropouts", "NIS", "silent, s", *words):
         table.add_column(heading, justify="right")

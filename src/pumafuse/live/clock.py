@@ -31,14 +31,11 @@ def nanoseconds(t: Time) -> int:
         ValueError: No finite number, or out of reach of int64 ns; says which.
     """
     try:
-        if type(t) is float:
-            stamp = round(t * 1e9)
-        else:
-            stamp = round(float(t) * 1e9) if isinstance(t, float | np.floating) else operator.index(t)
+        if isinstance(t, bool):
+            raise TypeError
+        stamp = round(float(t) * 1e9) if isinstance(t, (float, np.floating)) else operator.index(t)
     except (TypeError, ValueError, OverflowError):
         raise ValueError("no time: expected float seconds or int nanoseconds") from None
-    if isinstance(t, bool):
-        raise ValueError("no time: expected float seconds or int nanoseconds")
     if not -REACH_NS < stamp < REACH_NS:
         raise ValueError("a time out of reach: the years 1824 to 2115 are in ns since 1970")
     return stamp
