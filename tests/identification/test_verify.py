@@ -134,17 +134,6 @@ def test_the_numbers_are_what_their_names_say() -> None:
     assert best.fit.fit == pytest.approx(100.0 * (1.0 - np.std(left) / np.std(measured)), rel=1e-6)
 
 
-def test_a_sensors_zero_does_not_count() -> None:
-    """A constant on all measurements changes nothing."""
-    plain, shifted = (only(run_of(moved(arm()) + noise() + zero), arm(SECOND)) for zero in (0.0, -0.45))
-    assert plain.verdict == shifted.verdict and plain.start == shifted.start
-    for key in ("model", "without_recovery", "with_recovery"):
-        one, other = (msgspec.structs.astuple(getattr(found, key)) for found in (plain, shifted))
-        np.testing.assert_allclose(one, other, rtol=1e-9)
-    assert plain.best_in_class.fit.rms == pytest.approx(shifted.best_in_class.fit.rms, rel=1e-9)
-    assert plain.best_in_class.delay == pytest.approx(shifted.best_in_class.delay, rel=1e-5)
-
-
 # ---- the best in class ----------------------------------------------------------------------------------------------
 
 TRUE_GAIN = 0.9 + 0.1 * (HIGH - LOW) / PERIOD

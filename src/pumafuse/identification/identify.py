@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
-from typing import Any, cast
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -258,19 +259,8 @@ def _arm(combined: Mapping[str, Combination], period: float, name: str) -> tuple
 
 def _rounded(arm: ArmModel) -> ArmModel:
     """The arm in six digits: more would suggest a precision that it has not."""
-
-    def rounded(value: Any) -> Any:
-        match value:
-            case float():
-                return float(f"{value:.{_DIGITS}g}")
-            case dict():
-                return {key: rounded(item) for key, item in cast(dict[str, Any], value).items()}
-            case list() | tuple():
-                return [rounded(item) for item in cast(list[Any], value)]
-            case _:
-                return value
-
-    return msgspec.convert(rounded(msgspec.to_builtins(arm)), ArmModel)
+    text = json.dumps(msgspec.to_builtins(arm))
+    return msgspec.convert(json.loads(text, parse_float=lambda number: float(f"{float(number):.{_DIGITS}g}")), ArmModel)
 
 
 def _coefficients(fitted: Sequence[Fitted]) -> dict[str, tuple[FloatArray, FloatArray]]:
