@@ -24,9 +24,9 @@ else:
     import numba
     from numba.core import event
 
-    # Kernels own no arrays, so nothing in them is counted (`_nrt`), and calls within the algebra vanish (`forceinline`):
-    # together that is a factor of twenty. What is called once a row is apart: compiled anew in each caller it would cost
-    # more time than it saves. A division by zero gives an infinity, as in numpy.
+    # Kernels own no arrays, so nothing in them is counted (`_nrt`), and calls within the algebra vanish
+    # (`forceinline`): together that is a factor of twenty. What is called less often is compiled apart, once: a copy in
+    # each caller would cost more time than it saves. A division by zero gives an infinity, as in numpy.
     # A product and a sum stay two roundings: contracted to one, variances of extreme priors fall below 0.
     def _kept() -> bool:
         """Whether there is a place on disk for what is compiled: a service without a home may have none."""

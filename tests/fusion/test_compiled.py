@@ -10,9 +10,12 @@ from pathlib import Path
 import pytest
 
 CODE = """
-import numpy as np, pumafuse as pf
-model = pf.discretize(pf.FirstOrder(time_constant=0.02), 0.028, 0.0, input_noise=1e-4)
-print(pf.filter_ticks(model, np.zeros(3), np.ones(3), 1.0).log_likelihood)
+import numpy as np
+from pumafuse.model.arm import AxisModel
+from pumafuse.model.plants import FirstOrder
+from pumafuse.model.response import response
+axis, stamps = AxisModel(plant=FirstOrder(time_constant=0.02)), np.arange(3) * 28_000_000
+print(response(axis, 0.028, 0.0, stamps, np.ones(3), 0.0, stamps))
 """
 
 

@@ -4,9 +4,9 @@ State of an axis, in this order: the plant's position [m] and rate [m/s] (0 for 
 the bias of each sensor that has one. Beside it what the commands have left: the input u and the gain error e, both
 known, so that they move x and not P. All is relative to the start level at which the axis rested.
 
-    x⁺ = u + Φ (x − u) + Γ_e e,   P⁺ = Φ P Φᵀ + Q,   the offset's variance grows by drift² Δ,   e⁺ = e exp(−Δ / recovery)
+    x⁺ = u + Φ (x − u) + Γ_e e,   P⁺ = Φ P Φᵀ + Q,   var(offset)⁺ = var(offset) + drift² Δ,   e⁺ = e exp(−Δ / recovery)
 
-Another block of states (a disturbance) would have its place between offset and biases, and its transition in `predict`.
+Another block of states would have its place between offset and biases, and its transition in :func:`predict`.
 Each axis is a row of the arrays, which change in place: a copy of them is a checkpoint. No fast-math: the same events
 give the same bits.
 """
@@ -127,7 +127,7 @@ def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
 
 @compiled
 def apply_command(model: Model, state: State, axis: int, row: int, command: float) -> None:
-    """From now on u is ``command`` [m] as logged; e jumps by (K(speed) − 1) · step, the noise grows with the maneuver."""
+    """From now on u is ``command`` [m] as logged; e jumps by (K(speed) − 1) · step, noise follows the maneuver."""
     drive, gain, process = state.drive, model.gain, model.process
     u = command - drive[row, START]
     step = u - drive[row, U]
@@ -141,7 +141,7 @@ def apply_command(model: Model, state: State, axis: int, row: int, command: floa
 
 @compiled
 def noise(model: Model, sensors: Sensors, state: State, axis: int, sensor: int, spread: float) -> float:
-    """R = (spread · sd)² + (scale · speed · latency_sd)² [m²] here and now: it grows with speed where latency wanders."""
+    """R = (spread · sd)² + (scale · speed · latency_sd)² [m²] here and now: larger where latency wanders."""
     sd = sensors.sd[sensor, axis] * spread
     R = sd * sd
     if sensors.latency_sd[sensor] > 0.0:

@@ -156,7 +156,7 @@ def classify(
 def classify_all(
     model: Model, sensors: Sensors, events: Events, state: State, origin: int, too_late: BoolArray, known: CodeArray
 ) -> None:
-    """Classify every value of a table into ``known`` (n, A); ``too_late`` (n,) are rows behind a step of their clock."""
+    """Classify every value of a table into ``known`` (n, A); ``too_late`` (n,) are rows far behind earlier ones."""
     end = len(events.time)
     for row in range(end):
         whole = TOO_LATE if too_late[row] else FUSED

@@ -10,6 +10,9 @@ acting entry r_k and e, which decays; a command shifts the register when it is g
 transitions are matrix exponentials, so that it shares nothing with the closed forms of the compiled filter.
 """
 
+# pyright: reportConstantRedefinition=false
+# (F, H, Q and R are the field's letters)
+
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -135,8 +138,8 @@ class _Axis:
         self.clock = time
 
     def later(self, time: int, until: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """F, Q and x at ``until`` [ns] by the commands given by ``time``, where the filter stands, without moving it."""
-        kept = self.clock, self._next, self._acting, self._issued
+        """F, Q and x at ``until`` [ns] by the commands given by ``time``, where the filter stands; nothing moves."""
+        kept: tuple[int, int, int, int] = self.clock, self._next, self._acting, self._issued
         F_all, Q_all, x = np.eye(len(self.kf.x)), np.zeros_like(self.kf.P), self.kf.x.copy()
         acting = [c for c in range(self._acting + 1, len(self._u)) if self._acts[c] <= until and self._given[c] <= time]
         for when, command in [*((int(self._acts[c]), c) for c in acting), (until, None)]:

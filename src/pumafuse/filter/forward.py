@@ -392,7 +392,7 @@ def follow_commands(
     until: int,
     stamped: int,
 ) -> None:
-    """Predict a row of the state to ``until`` [ns] by the commands that act ``after`` … ``until``, ``stamped`` by then."""
+    """Predict a row of the state to ``until`` [ns] by the commands that act ``after`` it and are ``stamped`` by then."""
     for event in range(pending, end):
         if events.time[event] > until:
             break

@@ -46,7 +46,7 @@ class Incoming(NamedTuple):
         innovation: ν of each value [m], (A,).
         contradicts: The sensor that a rejected measurement contradicts, ``NOBODY`` for none, (1,).
         fused: When the last measurement was valid that an estimate knows of, int64 ns, (A,).
-        rest_P: P of the state at rest, (A, s, s).
+        rest_covariance: P of the state at rest, (A, s, s).
         rest_drive: Its drive, (A, 6).
     """
 
@@ -61,7 +61,7 @@ class Incoming(NamedTuple):
     innovation: FloatArray
     contradicts: IntArray
     fused: TimeArray
-    rest_P: FloatArray
+    rest_covariance: FloatArray
     rest_drive: FloatArray
 
 
@@ -400,7 +400,7 @@ def rest(state: State, incoming: Incoming, axis: int, level: float, origin: int)
     for i in range(state.x.shape[1]):
         state.x[axis, i] = 0.0
         for j in range(state.x.shape[1]):
-            state.P[axis, i, j] = incoming.rest_P[axis, i, j]
+            state.P[axis, i, j] = incoming.rest_covariance[axis, i, j]
     for k in range(state.drive.shape[1]):
         state.drive[axis, k] = incoming.rest_drive[axis, k]
     state.drive[axis, START], state.clock[axis], state.unsettled[axis] = level, origin, ALWAYS
@@ -422,7 +422,7 @@ def count_outcome(m: Memory, row: int) -> None:
         if outcome == ABSENT:
             continue
         counters.number[sensor, outcome] += 1
-        if (outcome == FUSED or outcome == REACQUIRED) and slot >= 0:
+        if outcome in (FUSED, REACQUIRED) and slot >= 0:
             counters.minute[sensor, slot, NIS] += (
                 results.innovation[row, axis] / results.innovation_sd[row, axis]
             ) ** 2

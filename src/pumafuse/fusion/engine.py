@@ -64,20 +64,20 @@ def filter_segment(
     results = Results.room(count, axes)
     results.outcome[:] = events.known
     outputs = Outputs(*np.empty((len(Outputs._fields), axes, len(times))))
+    history, kept = no_history(state), room_for(state, 0)
     if engine == "filterpy":
         from ..filter import filterpy_engine
 
         plants = [config.arm.axes[axis] for axis in segment.axes]
         filterpy_engine.filter_events(plants, model, sensors, events, state, times, results, outputs, progress)
     elif mode == "as-live":
-        history = no_history(state)
         arrival = np.where(events.source == COMMAND, events.stamp, np.maximum(events.stamp, events.time))
         queue = np.argsort(arrival, kind="stable")
         kept = room_for(state, _most_taken_back(events.time, arrival, times) + 1, count)
         filter_as_live(model, sensors, events, state, arrival, queue, times, results, history, kept, outputs)
     else:
-        history = _history(events, state, len(times)) if mode == "smoothed" else no_history(state)
-        filter_events(model, sensors, events, state, False, times, results, history, room_for(state, 0), outputs)
+        history = _history(events, state, len(times)) if mode == "smoothed" else history
+        filter_events(model, sensors, events, state, False, times, results, history, kept, outputs)
     if mode == "smoothed":
         width = state.x.shape[1]
         room = np.empty((2, width)), np.empty((2, width, width)), np.empty((4, width)), np.empty((width + 1, width))

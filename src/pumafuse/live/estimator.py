@@ -443,7 +443,7 @@ class LiveEstimator:
             if self._contradicting and window.outcome.min() == _FUSED:
                 self._contradicting.pop(sensor, None)
             return
-        other = tuple(self._sensors)[window.contradicts[0]]
+        other = tuple(self._sensors)[int(window.contradicts[0])]
         since = self._contradicting.setdefault(sensor, stamp)
         found = zip(self.axes, window.outcome.tolist(), window.innovation.tolist(), strict=True)
         off = ", ".join(f"{axis} by {nu * MM:+.4g} mm" for axis, outcome, nu in found if outcome == Outcome.REJECTED)
@@ -474,7 +474,7 @@ class LiveEstimator:
         return UpdateResult(outcome, MappingProxyType(dict.fromkeys(values, outcome)), reason)
 
     def _count(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, times: int) -> None:
-        """Count an event's outcome: a command once, a measurement for each of its components; ``times`` −1 takes it back."""
+        """Count an event's outcome, a measurement's for each of its components; ``times`` −1 takes it back."""
         if sensor is None:
             self._commands[outcome] += times
         elif sensor in self._refused:
@@ -526,7 +526,7 @@ def empty_window(
             innovation=np.zeros(count),
             contradicts=np.zeros(1, dtype=np.int64),
             fused=np.zeros(count, dtype=np.int64),
-            rest_P=state.P[:count].copy(),
+            rest_covariance=state.P[:count].copy(),
             rest_drive=state.drive[:count].copy(),
         ),
     )

@@ -85,7 +85,7 @@ def transition(
 
 @compiled
 def gain_error(step: float, slope: float, intercept: float, period: float) -> float:
-    """What the gain adds to a step of the command [m]: (K(speed) − 1) · step with K = slope · |step| / T + intercept."""
+    """What the gain adds to a step of the command [m]: (K(speed) − 1) · step, K = slope · |step| / T + intercept."""
     return ((slope * (abs(step) / period) + intercept) - 1.0) * step
 
 

@@ -112,10 +112,10 @@ def _cut(text: str) -> str:
     return text if len(text) <= _TITLE else f"{text[: _TITLE - 1]}…"
 
 
-def _correlations(axes: Axes, tests: Sequence[Consistency | None], colours: Sequence[str]) -> None:
+def _correlations(axes: Axes, tests: Sequence[Consistency | None], pair: Sequence[str]) -> None:
     """Draw autocorrelations before and after side by side, with the narrower band of the two."""
     highest, band = 0.12, 1.0
-    for number, (one, colour) in enumerate(zip(tests, colours, strict=True)):
+    for number, (one, colour) in enumerate(zip(tests, pair, strict=True)):
         if one is not None:
             lags = np.arange(1, len(one.correlation) + 1) + 0.2 * (2 * number - 1)
             axes.bar(lags, one.correlation, color=colour, width=0.4)
