@@ -59,7 +59,7 @@ class _Axis:
         self._u = events.value[mine, axis] - state.drive[axis, START]
         when = np.concatenate((self._given, self._acts))
         order = np.argsort(when, kind="stable")  # at one instant a command is given before it acts
-        self._instants = list(
+        self._instants: list[tuple[int, int, bool]] = list(
             zip(when[order].tolist(), (order % len(self._u)).tolist(), (order >= len(self._u)).tolist(), strict=True)
         )
         issued = np.searchsorted(self._given, self._acts, side="right")
@@ -76,7 +76,7 @@ class _Axis:
         prior = [self.n, *range(self.biases, self.error)]
         self.kf.P[prior, prior] = np.diagonal(state.P[axis])[OFFSET : OFFSET + len(prior)]
         self.kf.B = np.eye(size)
-        self.clock = int(state.clock[axis])
+        self.clock: int = int(state.clock[axis])
         self._next, self._acting, self._issued = 0, -1, 0
 
     @cached_property
@@ -139,7 +139,7 @@ class _Axis:
 
     def later(self, time: int, until: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """F, Q and x at ``until`` [ns] by the commands given by ``time``, where the filter stands; nothing moves."""
-        kept: tuple[int, int, int, int] = self.clock, self._next, self._acting, self._issued
+        kept = self.clock, self._next, self._acting, self._issued
         F_all, Q_all, x = np.eye(len(self.kf.x)), np.zeros_like(self.kf.P), self.kf.x.copy()
         acting = [c for c in range(self._acting + 1, len(self._u)) if self._acts[c] <= until and self._given[c] <= time]
         for when, command in [*((int(self._acts[c]), c) for c in acting), (until, None)]:

@@ -12,12 +12,12 @@ import numpy as np
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import PumafuseWarning
 from ..filter.events import COMMAND
-from ..filter.outcome import ABSENT
+from ..filter.outcome import ABSENT, Outcome
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run
-from ..units import seconds
+from ..units import MM, seconds
 from .config import FusionConfig
 from .consistency import sensor_problems
 from .engine import Engine, Filtered, filter_segment
@@ -135,7 +135,7 @@ def _fuse_segment(
         config=config,
         speed=segment.highest_speed(config.arm.update_period),
         radius=_highest_radius(run, placed),
-        notes=segment.notes,
+        notes=(*segment.notes, *_contradictions(segment, filtered)),
     )
 
 
@@ -155,6 +155,23 @@ def _highest_radius(run: Run, placed: Placed | None) -> float | None:
         return None
     radial = run.command.values["radial"]
     return float(np.max(radial[np.isfinite(radial) & (run.command.stamp != NO_STAMP)]))
+
+
+def _contradictions(segment: Segment, filtered: Filtered) -> list[str]:
+    """A sentence on each pair of sensors of which one contradicts the other time after time."""
+    events, results, found = filtered.events, filtered.results, list[str]()
+    rows = np.flatnonzero(results.contradicts >= 0)
+    for sensor, other in np.unique(np.stack((events.source[rows], results.contradicts[rows])), axis=1).T.tolist():
+        mine = rows[(events.source[rows] == sensor) & (results.contradicts[rows] == other)]
+        first, count = mine[0], len(mine)
+        rejected = np.flatnonzero(results.outcome[first] == Outcome.REJECTED)
+        off = [f"{segment.axes[axis]} by {results.innovation[first, axis] * MM:+.4g} mm" for axis in rejected.tolist()]
+        since = (int(events.time[first]) - segment.origin) / 1e9
+        found.append(
+            f"sensor '{segment.sensors[sensor]}' contradicts '{segment.sensors[other]}' since {since:.2f} s"
+            f" ({', '.join(off)}), {count} times: its measurements are rejected; which of the two is wrong?"
+        )
+    return found
 
 
 def _measurements(segment: Segment, filtered: Filtered) -> Measurements:
