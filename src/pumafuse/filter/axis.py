@@ -226,12 +226,12 @@ def position_of(state: State, row: int) -> tuple[float, float]:
 
 
 @compiled
-def copy_row(state: State, here: int, there: int) -> None:
-    """Copy one axis's row of the state to another."""
+def copy_row(state: State, here: int, there: int, uncertain: bool) -> None:
+    """Copy one axis's row of the state to another; with P = 0 there unless it is to be ``uncertain``."""
     state.clock[there] = state.clock[here]
     for k in range(state.drive.shape[1]):
         state.drive[there, k] = state.drive[here, k]
     for i in range(state.x.shape[1]):
         state.x[there, i] = state.x[here, i]
         for j in range(state.x.shape[1]):
-            state.P[there, i, j] = state.P[here, i, j]
+            state.P[there, i, j] = state.P[here, i, j] if uncertain else 0.0

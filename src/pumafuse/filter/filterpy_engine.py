@@ -139,7 +139,7 @@ class _Axis:
 
     def later(self, time: int, until: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """F, Q and x at ``until`` [ns] by the commands given by ``time``, where the filter stands; nothing moves."""
-        kept = self.clock, self._next, self._acting, self._issued
+        before = self.clock, self._acting
         F_all, Q_all, x = np.eye(len(self.kf.x)), np.zeros_like(self.kf.P), self.kf.x.copy()
         acting = [c for c in range(self._acting + 1, len(self._u)) if self._acts[c] <= until and self._given[c] <= time]
         for when, command in [*((int(self._acts[c]), c) for c in acting), (until, None)]:
@@ -149,7 +149,7 @@ class _Axis:
                 x[self.error] += self._kick(command)
                 self._acting = command
             self.clock = when
-        self.clock, self._next, self._acting, self._issued = kept
+        self.clock, self._acting = before
         return F_all, Q_all, x
 
     @property

@@ -350,7 +350,7 @@ def estimate(
     """
     here, there = len(model.order), len(model.order) + 1  # rows of the state for predictions aside
     for axis in range(len(model.order)):
-        copy_row(state, axis, here)
+        copy_row(state, axis, here, True)
         follow_commands(model, events, state, axis, here, pending, end, ALWAYS, time, time)
         position, variance = position_of(state, here)
         outputs.position[axis, n], outputs.position_sd[axis, n] = position, math.sqrt(variance)
@@ -365,10 +365,7 @@ def estimate(
             continue
         # (p(t + T) − p(t)) / T: what the state contributes, and the noise that comes until then (from P = 0)
         period = model.gain[axis, PERIOD]
-        copy_row(state, here, there)
-        for i in range(model.states[axis]):
-            for j in range(model.states[axis]):
-                state.P[there, i, j] = 0.0
+        copy_row(state, here, there, False)
         until = time + int(np.rint(period * 1e9))
         follow_commands(model, events, state, axis, there, pending, end, time, until, time)
         later, noise = position_of(state, there)
@@ -392,7 +389,7 @@ def follow_commands(
     until: int,
     stamped: int,
 ) -> None:
-    """Predict a row of the state to ``until`` [ns] by the commands that act ``after`` it and are ``stamped`` by then."""
+    """Predict a row of the state to ``until`` [ns] by commands that act ``after`` … and are ``stamped`` by …."""
     for event in range(pending, end):
         if events.time[event] > until:
             break

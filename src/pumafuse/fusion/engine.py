@@ -124,18 +124,14 @@ def arranged(segment: Segment, config: FusionConfig, biases: list[list[str]]) ->
 
 def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
     """For each axis the sensors whose bias is in its state: those that measure it, in their order."""
-    rows, count = segment.measurement_rows, len(segment.axes)
-    used = np.zeros((len(segment.sensors), count), dtype=np.bool_)
-    for number in range(len(segment.sensors)):
-        used[number] = (rows.known[rows.source == number] == Outcome.FUSED).any(axis=0)
-    return [
-        [
-            name
-            for number, name in enumerate(segment.sensors)
-            if used[number, axis] and name in config.sensors and config.sensors[name].bias_sd > 0.0
-        ]
-        for axis in range(count)
+    rows = segment.measurement_rows
+    biased = [
+        (number, name)
+        for number, name in enumerate(segment.sensors)
+        if name in config.sensors and config.sensors[name].bias_sd > 0.0
     ]
+    used = {number: (rows.known[rows.source == number] == Outcome.FUSED).any(axis=0) for number, _ in biased}
+    return [[name for number, name in biased if used[number][axis]] for axis in range(len(segment.axes))]
 
 
 def _history(events: Events, state: State, estimates: int) -> History:

@@ -161,6 +161,8 @@ def _contradictions(segment: Segment, filtered: Filtered) -> list[str]:
     """A sentence on each pair of sensors of which one contradicts the other time after time."""
     events, results, found = filtered.events, filtered.results, list[str]()
     rows = np.flatnonzero(results.contradicts >= 0)
+    if not len(rows):
+        return []
     for sensor, other in np.unique(np.stack((events.source[rows], results.contradicts[rows])), axis=1).T.tolist():
         mine = rows[(events.source[rows] == sensor) & (results.contradicts[rows] == other)]
         first, count = mine[0], len(mine)
@@ -177,16 +179,17 @@ def _contradictions(segment: Segment, filtered: Filtered) -> list[str]:
 def _measurements(segment: Segment, filtered: Filtered) -> Measurements:
     """Every component of every measurement in the order of the filter."""
     events, results = filtered.events, filtered.results
-    row, axis = np.nonzero((events.source != COMMAND)[:, None] & (events.known != ABSENT))
+    given = np.flatnonzero((events.source != COMMAND)[:, None] & (events.known != ABSENT))
+    row, axis = np.divmod(given, len(segment.axes))
     return Measurements(
         time=seconds(events.time[row], segment.origin),
         stamp=seconds(events.stamp[row], segment.origin),
         sensor=events.source[row],
         axis=axis.astype(np.int16),
-        value=events.value[row, axis],
-        innovation=results.innovation[row, axis],
-        innovation_sd=results.innovation_sd[row, axis],
-        outcome=results.outcome[row, axis],
+        value=events.value.ravel()[given],
+        innovation=results.innovation.ravel()[given],
+        innovation_sd=results.innovation_sd.ravel()[given],
+        outcome=results.outcome.ravel()[given],
         sensors=segment.sensors,
         axes=segment.axes,
     )

@@ -11,6 +11,7 @@ series: closed forms would lose all digits of Q11 ~ t³. Beyond it from exponent
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -28,8 +29,12 @@ _APART = 0.5  # difference of the poles over their sum, below which exponentials
 SIZE = _HEAD + 3 * _TERMS
 
 
+@lru_cache(maxsize=1024)
 def constants(plant: PLANTS) -> FloatArray:
-    """What the kernels need to know of a plant, (c,): of first order its rate; of second order ω, σ, β², r, series."""
+    """What the kernels need to know of a plant, (c,): of first order its rate; of second order ω, σ, β², r, series.
+
+    Kept for plants that come again: not to be changed.
+    """
     found = np.zeros(SIZE)
     if isinstance(plant, FirstOrder):
         found[0] = 1.0 / plant.time_constant
