@@ -19,7 +19,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
-from ..compiled import compiled
+from ..compiled import compiled, compiled_apart
 from ..model.closed import decaying_response, gain_error, transition
 
 POSITION, RATE, OFFSET, BIASES = range(4)  # of a state
@@ -68,19 +68,18 @@ class Sensors(NamedTuple):
 
 
 class State(NamedTuple):
-    """All that changes. Two more rows than axes have room for predictions aside.
+    """All that changes, one row for each axis; further rows have room for predictions aside and for checkpoints.
 
     Attributes:
-        x: Mean, (A + 2, s).
-        P: Covariance, (A + 2, s, s).
-        clock: The instant of x and P, int64 ns, (A + 2,).
+        x: Mean, (r, s).
+        P: Covariance, (r, s, s).
+        clock: The instant of x and P, int64 ns, (r,).
         drive: Start level u₀ (``START``, NaN before it is known), command in force ``U`` relative to it, its ``STEP``,
-            the gain ``ERROR`` e now [m], and the densities squared in force: ``NOISE`` [m²·s], ``DRIFT`` [m²/s],
-            (A + 2, 6).
-        rejected: Innovation and R of a rejected measurement that another may agree with, (S, A, 2).
-        gate_time: When that one was valid, and when the last one was fused, int64 ns, (S, A, 2).
-        gate_count: Rejections in a row, and re-acquisitions, (S, A, 2).
-        unsettled: When sensors last disagreed while re-acquisitions were counted, int64 ns, ``ALWAYS`` for never, (A,).
+            the gain ``ERROR`` e now [m], and densities squared in force: ``NOISE`` [m²·s], ``DRIFT`` [m²/s], (r, 6).
+        rejected: Of each sensor innovation and R of a rejected measurement that another may agree with, (r, S, 2).
+        gate_time: When that one was valid, and when the last one was fused, int64 ns, (r, S, 2).
+        gate_count: Rejections in a row, and re-acquisitions, (r, S, 2).
+        unsettled: When sensors last disagreed while re-acquisitions were counted, int64 ns, ``ALWAYS`` for never, (r,).
         work: Room for the vectors of an update: H, K, P Hᵀ and (I − K H) P Hᵀ, (4, s).
     """
 
@@ -225,13 +224,20 @@ def position_of(state: State, row: int) -> tuple[float, float]:
     return state.x[row, POSITION] + state.x[row, OFFSET], max(variance, 0.0)
 
 
-@compiled
-def copy_row(state: State, here: int, there: int, uncertain: bool) -> None:
-    """Copy one axis's row of the state to another; with P = 0 there unless it is to be ``uncertain``."""
-    state.clock[there] = state.clock[here]
-    for k in range(state.drive.shape[1]):
-        state.drive[there, k] = state.drive[here, k]
-    for i in range(state.x.shape[1]):
-        state.x[there, i] = state.x[here, i]
-        for j in range(state.x.shape[1]):
-            state.P[there, i, j] = state.P[here, i, j] if uncertain else 0.0
+@compiled_apart
+def copy_rows(state: State, here: int, there: int, count: int) -> None:
+    """Copy rows of the state to others."""
+    for row in range(count):
+        a, b = here + row, there + row
+        state.clock[b], state.unsettled[b] = state.clock[a], state.unsettled[a]
+        for k in range(state.drive.shape[1]):
+            state.drive[b, k] = state.drive[a, k]
+        for i in range(state.x.shape[1]):
+            state.x[b, i] = state.x[a, i]
+            for j in range(state.x.shape[1]):
+                state.P[b, i, j] = state.P[a, i, j]
+        for sensor in range(state.rejected.shape[1]):
+            for k in range(2):
+                state.rejected[b, sensor, k] = state.rejected[a, sensor, k]
+                state.gate_time[b, sensor, k] = state.gate_time[a, sensor, k]
+                state.gate_count[b, sensor, k] = state.gate_count[a, sensor, k]

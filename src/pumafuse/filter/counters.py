@@ -4,17 +4,19 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import ALWAYS, FloatArray, IntArray, TimeArray
-from ..compiled import compiled
+from ..arrays import ALWAYS, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
+from ..compiled import compiled, compiled_apart
+from .outcome import ABSENT, Outcome
 
 SECONDS = 60  # of the past that a counters tells of
 ROWS, LATENESS, MOST_LATE, NIS, SCALARS = range(5)  # of each of them
 CAME, DROPOUTS, INTERVALS, IN_A_ROW = 8, 9, 10, 11  # of a sensor, after the outcomes
 
+_FUSED, _REACQUIRED = int(Outcome.FUSED), int(Outcome.REACQUIRED)
 _FEW, _MANY = 20, 100  # intervals before a usual one is known, and those that it is a mean of
 _GAP = 1.5  # usual intervals without a row: one is missing
 _SLOWER = 1.1  # by dropouts in a row the usual interval grows until a slower sensor has one again
@@ -55,19 +57,30 @@ class Counters(NamedTuple):
         )
 
 
-@compiled
-def forget_after(counters: Counters, sensor: int, after: int) -> None:
-    """Let a sensor's counters not know of what is stamped after ``after`` [ns]."""
-    if counters.last[sensor] > after:
-        counters.last[sensor] = ALWAYS
-    for slot in range(SECONDS):
-        if counters.second[sensor, slot] > after // 1_000_000_000:
-            counters.second[sensor, slot] = ALWAYS
+@compiled_apart
+def count_rows(
+    flat: tuple[Any, ...],
+    source: IndexArray,
+    stamps: TimeArray,
+    outcome: CodeArray,
+    innovation: FloatArray,
+    innovation_sd: FloatArray,
+    first: int,
+    end: int,
+    sensor: int,
+    stamp: int,
+    newest: int,
+) -> None:
+    """Count what became of the rows ``first`` to ``end``, and a measurement of ``sensor`` (−1: none) that has come.
 
-
-@compiled
-def count_row(counters: Counters, sensor: int, stamp: int, newest: int) -> None:
-    """Count a row that has come."""
+    ``newest`` [ns] is the latest stamp of all when it came.
+    """
+    counters = Counters(*flat)
+    for row in range(first, end):
+        if source[row] >= 0:
+            count_outcome(counters, source[row], stamps[row], outcome, innovation, innovation_sd, row)
+    if sensor < 0:
+        return
     counters.number[sensor, CAME] += 1
     counters.last[sensor] = max(counters.last[sensor], stamp)
     slot = slot_of(counters, sensor, stamp)
@@ -76,6 +89,39 @@ def count_row(counters: Counters, sensor: int, stamp: int, newest: int) -> None:
         counters.minute[sensor, slot, ROWS] += 1.0
         counters.minute[sensor, slot, LATENESS] += lateness
         counters.minute[sensor, slot, MOST_LATE] = max(counters.minute[sensor, slot, MOST_LATE], lateness)
+
+
+@compiled
+def count_outcome(
+    counters: Counters,
+    sensor: int,
+    stamp: int,
+    outcome: CodeArray,
+    innovation: FloatArray,
+    innovation_sd: FloatArray,
+    row: int,
+) -> None:
+    """Count what became of a measurement, and look at the interval from the one before: rows leave in order."""
+    count_interval(counters, sensor, stamp)
+    slot = slot_of(counters, sensor, stamp)
+    for axis in range(outcome.shape[1]):
+        if outcome[row, axis] == ABSENT:
+            continue
+        counters.number[sensor, outcome[row, axis]] += 1
+        if outcome[row, axis] in (_FUSED, _REACQUIRED) and slot >= 0:
+            counters.minute[sensor, slot, NIS] += (innovation[row, axis] / innovation_sd[row, axis]) ** 2
+            counters.minute[sensor, slot, SCALARS] += 1.0
+
+
+def count_duplicate(counters: Counters, sensor: int, outcome: CodeArray) -> None:
+    """Count the values (A,) of a measurement that repeats another."""
+    counters.number[sensor] += np.bincount(outcome[outcome != ABSENT], minlength=counters.number.shape[1])
+
+
+def forget_after(counters: Counters, after: int) -> None:
+    """Let the counters not know of what is stamped after ``after`` [ns]."""
+    counters.last[counters.last > after] = ALWAYS
+    counters.second[counters.second > after // 1_000_000_000] = ALWAYS
 
 
 @compiled

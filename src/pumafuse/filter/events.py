@@ -22,9 +22,9 @@ from ..compiled import compiled
 from .axis import PERIOD, START, Model, Sensors, State
 from .outcome import ABSENT, FARTHEST, Outcome
 
-COMMAND = -1  # the source of a command
-FUSED, DUPLICATE, BEFORE_START = int(Outcome.FUSED), int(Outcome.DUPLICATE), int(Outcome.BEFORE_START)
-TOO_LATE, INVALID, UNKNOWN = int(Outcome.TOO_LATE), int(Outcome.INVALID), int(Outcome.UNKNOWN)
+COMMAND = np.int64(-1)  # the source of a command
+FUSED, DUPLICATE, BEFORE_START = (np.int64(one) for one in (Outcome.FUSED, Outcome.DUPLICATE, Outcome.BEFORE_START))
+TOO_LATE, INVALID, UNKNOWN = (np.int64(one) for one in (Outcome.TOO_LATE, Outcome.INVALID, Outcome.UNKNOWN))
 
 
 class Events(NamedTuple):
@@ -157,13 +157,13 @@ def classify_all(
     model: Model, sensors: Sensors, events: Events, state: State, origin: int, too_late: BoolArray, known: CodeArray
 ) -> None:
     """Classify every value of a table into ``known`` (n, A); ``too_late`` (n,) are rows far behind earlier ones."""
-    end = len(events.time)
+    first, end = np.int64(0), len(events.time)
     for row in range(end):
         whole = TOO_LATE if too_late[row] else FUSED
-        if events.source[row] != COMMAND and said_before(events, row, 0):
+        if events.source[row] != COMMAND and said_before(events, row, first):
             whole = DUPLICATE
         for axis in range(known.shape[1]):
-            known[row, axis] = classify(model, sensors, events, state, origin, row, axis, 0, end, whole)
+            known[row, axis] = classify(model, sensors, events, state, origin, row, axis, first, end, whole)
 
 
 @compiled

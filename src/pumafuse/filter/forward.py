@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import ALWAYS, NEVER, BoolArray, FloatArray, IntArray, TimeArray
+from ..arrays import NEVER, BoolArray, FloatArray, IntArray, TimeArray
 from ..compiled import compiled, compiled_apart
 from ..model.closed import transition
 from .axis import (
@@ -28,7 +28,7 @@ from .axis import (
     Sensors,
     State,
     apply_command,
-    copy_row,
+    copy_rows,
     innovation,
     noise,
     position_of,
@@ -39,8 +39,10 @@ from .events import COMMAND, FUSED, Events, Results
 from .gate import NOBODY, agrees, contradicted, count_fused, count_reacquired, count_rejected
 from .outcome import Outcome
 
-REJECTED, REACQUIRED = int(Outcome.REJECTED), int(Outcome.REACQUIRED)
-INTERVAL = -1  # the row of an entry of the history that is no update
+REJECTED, REACQUIRED = np.int64(Outcome.REJECTED), np.int64(Outcome.REACQUIRED)
+# Numbers of a type: a literal as an argument would compile what is called once more.
+ZERO, ONE, NO = np.int64(0), np.int64(1), np.bool_(False)
+INTERVAL = np.int64(-1)  # the row of an entry of the history that is no update
 
 
 class Outputs(NamedTuple):
@@ -89,39 +91,12 @@ class History(NamedTuple):
     P: FloatArray
 
 
-def no_history(state: State) -> History:
-    """A history in which nothing is kept."""
-    width, axes = state.x.shape[1], len(state.unsettled)
-    none, table = np.zeros(0, dtype=np.int64), np.zeros((0, width))
-    states = np.zeros((axes, 0, width)), np.zeros((axes, 0, width, width))
-    used = np.zeros(axes, dtype=np.int64)
-    return History(np.zeros(axes + 1, dtype=np.int64), used, none, none, np.zeros(0), np.zeros(0), table, *states)
-
-
-class Kept(NamedTuple):
-    """Checkpoints of a :class:`State` before each row, in a ring of places; none where nothing is taken back.
-
-    Attributes:
-        arrived: Which rows have arrived, (n,).
-        x: As in the state, with the places first; and so on.
-        P: See ``x``.
-        clock: See ``x``.
-        drive: See ``x``.
-        rejected: See ``x``.
-        gate_time: See ``x``.
-        gate_count: See ``x``.
-        unsettled: See ``x``.
-    """
-
-    arrived: BoolArray
-    x: FloatArray
-    P: FloatArray
-    clock: TimeArray
-    drive: FloatArray
-    rejected: FloatArray
-    gate_time: TimeArray
-    gate_count: IntArray
-    unsettled: TimeArray
+def no_history(axes: int, states: int) -> History:
+    """A history in which nothing is kept, of axes with so many states."""
+    none, table = np.zeros(0, dtype=np.int64), np.zeros((0, states))
+    estimates = np.zeros((axes, 0, states)), np.zeros((axes, 0, states, states))
+    first, used = np.zeros(axes + 1, dtype=np.int64), np.zeros(axes, dtype=np.int64)
+    return History(first, used, none, none, np.zeros(0), np.zeros(0), table, *estimates)
 
 
 @compiled_apart
@@ -134,21 +109,22 @@ def filter_events(
     times: TimeArray,
     results: Results,
     history: History,
-    kept: Kept,
+    arrived: BoolArray,
+    places: int,
     outputs: Outputs,
 ) -> None:
     """Every event in its order, and an estimate at each of ``times`` (ascending) by all events until then.
 
     With ``given`` the outcomes in ``results`` are repeated, whatever a gate would say now.
     """
-    done, end = 0, len(events.time)
+    done, end = ZERO, len(events.time)
     for n in range(len(times)):
         begin = done
         while done < end and events.time[done] <= times[n]:
             done += 1
-        run_events(model, sensors, events, state, begin, done, given, results, history, kept)
+        run_events(model, sensors, events, state, begin, done, given, results, history, arrived, places)
         estimate(model, events, state, done, end, times[n], history, outputs, n)
-    run_events(model, sensors, events, state, done, end, given, results, history, kept)
+    run_events(model, sensors, events, state, done, end, given, results, history, arrived, places)
 
 
 @compiled_apart
@@ -162,27 +138,28 @@ def filter_as_live(
     times: TimeArray,
     results: Results,
     history: History,
-    kept: Kept,
+    arrived: BoolArray,
+    places: int,
     outputs: Outputs,
 ) -> None:
     """At each of ``times`` only the events that had arrived: late ones make the filter go back and run on.
 
-    ``queue`` lists the rows by ``arrival``; ``kept`` knows of none yet, and has room for more checkpoints than rows may
-    have to be taken back. Nothing is kept in ``history``.
+    ``queue`` lists the rows by ``arrival``, ``arrived`` (n,) is all false; there are more ``places`` for checkpoints
+    than rows may have to be taken back. Nothing is kept in ``history``.
     """
-    due, done, end = 0, 0, len(events.time)
+    due, done, end = ZERO, ZERO, len(events.time)
     for n in range(len(times) + 1):
         until = times[n] if n < len(times) else NEVER
         begin = done
         while due < len(queue) and arrival[queue[due]] <= until:
-            kept.arrived[queue[due]] = True
+            arrived[queue[due]] = True
             begin = min(begin, queue[due])
             due += 1
         if begin < done:
-            restore(state, kept, begin % len(kept.clock))
+            copy_rows(state, checkpoint_of(model, begin, places), 0, len(model.order))
         while done < end and events.time[done] <= until:
             done += 1
-        run_events(model, sensors, events, state, begin, done, False, results, history, kept)
+        run_events(model, sensors, events, state, begin, done, NO, results, history, arrived, places)
         if n < len(times):
             estimate(model, events, state, done, end, times[n], history, outputs, n)
 
@@ -198,17 +175,21 @@ def run_events(
     given: bool,
     results: Results,
     history: History,
-    kept: Kept,
+    arrived: BoolArray,
+    places: int,
 ) -> None:
-    """Rows ``begin`` to ``end`` that have arrived: apply commands, gate measurements, update with what passes."""
-    axes, places = len(model.order), len(kept.clock)
+    """Rows ``begin`` to ``end`` that have arrived: apply commands, gate measurements, update with what passes.
+
+    Before each row the state is kept in one of its ``places``; with none, nothing can be taken back, all have arrived.
+    """
+    axes = len(model.order)
     for row in range(begin, end):
         if places > 0:
-            checkpoint(state, kept, row % places)
-            if not kept.arrived[row]:
+            copy_rows(state, 0, checkpoint_of(model, row, places), axes)
+            if not arrived[row]:
                 continue
         source = events.source[row]
-        first = 0
+        first = ZERO
         while first < axes:
             last = axes if source != COMMAND and sensors.gate_rows[source] else first + 1
             if source != COMMAND:
@@ -350,8 +331,8 @@ def estimate(
     """
     here, there = len(model.order), len(model.order) + 1  # rows of the state for predictions aside
     for axis in range(len(model.order)):
-        copy_row(state, axis, here, True)
-        follow_commands(model, events, state, axis, here, pending, end, ALWAYS, time, time)
+        copy_rows(state, axis, here, ONE)
+        follow_commands(model, events, state, axis, here, pending, end, state.clock[axis] - 1, time, time)
         position, variance = position_of(state, here)
         outputs.position[axis, n], outputs.position_sd[axis, n] = position, math.sqrt(variance)
         outputs.offset[axis, n] = state.x[here, OFFSET]
@@ -365,7 +346,10 @@ def estimate(
             continue
         # (p(t + T) − p(t)) / T: what the state contributes, and the noise that comes until then (from P = 0)
         period = model.gain[axis, PERIOD]
-        copy_row(state, here, there, False)
+        copy_rows(state, here, there, ONE)
+        for i in range(model.states[axis]):
+            for j in range(model.states[axis]):
+                state.P[there, i, j] = 0.0
         until = time + int(np.rint(period * 1e9))
         follow_commands(model, events, state, axis, there, pending, end, time, until, time)
         later, noise = position_of(state, there)
@@ -401,36 +385,7 @@ def follow_commands(
 
 
 @compiled
-def checkpoint(state: State, kept: Kept, place: int) -> None:
-    """Copy a state to ``place`` among many."""
-    for axis in range(len(state.unsettled)):
-        kept.clock[place, axis], kept.unsettled[place, axis] = state.clock[axis], state.unsettled[axis]
-        for k in range(state.drive.shape[1]):
-            kept.drive[place, axis, k] = state.drive[axis, k]
-        for i in range(state.x.shape[1]):
-            kept.x[place, axis, i] = state.x[axis, i]
-            for j in range(state.x.shape[1]):
-                kept.P[place, axis, i, j] = state.P[axis, i, j]
-        for sensor in range(len(state.rejected)):
-            for k in range(2):
-                kept.rejected[place, sensor, axis, k] = state.rejected[sensor, axis, k]
-                kept.gate_time[place, sensor, axis, k] = state.gate_time[sensor, axis, k]
-                kept.gate_count[place, sensor, axis, k] = state.gate_count[sensor, axis, k]
-
-
-@compiled_apart
-def restore(state: State, kept: Kept, place: int) -> None:
-    """Undo everything since :func:`checkpoint`."""
-    for axis in range(len(state.unsettled)):
-        state.clock[axis], state.unsettled[axis] = kept.clock[place, axis], kept.unsettled[place, axis]
-        for k in range(state.drive.shape[1]):
-            state.drive[axis, k] = kept.drive[place, axis, k]
-        for i in range(state.x.shape[1]):
-            state.x[axis, i] = kept.x[place, axis, i]
-            for j in range(state.x.shape[1]):
-                state.P[axis, i, j] = kept.P[place, axis, i, j]
-        for sensor in range(len(state.rejected)):
-            for k in range(2):
-                state.rejected[sensor, axis, k] = kept.rejected[place, sensor, axis, k]
-                state.gate_time[sensor, axis, k] = kept.gate_time[place, sensor, axis, k]
-                state.gate_count[sensor, axis, k] = kept.gate_count[place, sensor, axis, k]
+def checkpoint_of(model: Model, row: int, places: int) -> int:
+    """The first row of the state where it is kept as it was before an event ``row``, in a ring of places."""
+    axes = len(model.order)
+    return axes + 2 + axes * (row % places)

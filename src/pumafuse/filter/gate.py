@@ -33,9 +33,9 @@ def agrees(model: Model, sensors: Sensors, state: State, axis: int, sensor: int,
     |ν₂ − ν₁| ≤ gate · √(R₁ + R₂ + the variance of the motion between), both predicted from an estimate that did not
     follow them.
     """
-    if state.gate_count[sensor, axis, IN_A_ROW] == 0:
+    if state.gate_count[axis, sensor, IN_A_ROW] == 0:
         return 0
-    between = time - state.gate_time[sensor, axis, REJECTED_AT]
+    between = time - state.gate_time[axis, sensor, REJECTED_AT]
     if between < model.gain[axis, PERIOD] * 1e9:
         return -1
     dt, drive = between / 1e9, state.drive
@@ -44,17 +44,17 @@ def agrees(model: Model, sensors: Sensors, state: State, axis: int, sensor: int,
     motion = a * a * P[axis, POSITION, POSITION] + 2.0 * a * b * P[axis, POSITION, RATE] + b * b * P[axis, RATE, RATE]
     motion += drive[axis, NOISE] * q11 + drive[axis, DRIFT] * dt
     scale = sensors.scale[sensor]
-    variance = state.rejected[sensor, axis, R_THEN] + R + scale * scale * motion
-    return int(abs(nu - state.rejected[sensor, axis, NU]) <= sensors.gate[sensor] * math.sqrt(variance))
+    variance = state.rejected[axis, sensor, R_THEN] + R + scale * scale * motion
+    return int(abs(nu - state.rejected[axis, sensor, NU]) <= sensors.gate[sensor] * math.sqrt(variance))
 
 
 @compiled
 def contradicted(sensors: Sensors, state: State, axis: int, sensor: int, time: int) -> int:
     """The sensor that stands for what is believed on an axis and contradicts ``sensor``; ``NOBODY`` for none."""
     for other in range(len(sensors.scale)):
-        fused = state.gate_time[other, axis, FUSED_AT]
+        fused = state.gate_time[axis, other, FUSED_AT]
         recently = fused > ALWAYS and time - fused <= RECENT_NS
-        more_often = state.gate_count[other, axis, REACQUIRED] > state.gate_count[sensor, axis, REACQUIRED]
+        more_often = state.gate_count[axis, other, REACQUIRED] > state.gate_count[axis, sensor, REACQUIRED]
         if other != sensor and recently and not more_often:
             return other
     return NOBODY
@@ -63,11 +63,11 @@ def contradicted(sensors: Sensors, state: State, axis: int, sensor: int, time: i
 @compiled
 def count_rejected(state: State, axis: int, sensor: int, nu: float, R: float, time: int, again: bool) -> None:
     """Remember a rejected measurement; ``again`` if it comes less than T after the one that is remembered."""
-    if not again or state.gate_count[sensor, axis, IN_A_ROW] == 0:
-        state.rejected[sensor, axis, NU], state.rejected[sensor, axis, R_THEN] = nu, R
-        state.gate_time[sensor, axis, REJECTED_AT] = time
-    state.gate_count[sensor, axis, IN_A_ROW] += 1
-    if state.gate_count[sensor, axis, IN_A_ROW] > 1 and state.unsettled[axis] > ALWAYS:
+    if not again or state.gate_count[axis, sensor, IN_A_ROW] == 0:
+        state.rejected[axis, sensor, NU], state.rejected[axis, sensor, R_THEN] = nu, R
+        state.gate_time[axis, sensor, REJECTED_AT] = time
+    state.gate_count[axis, sensor, IN_A_ROW] += 1
+    if state.gate_count[axis, sensor, IN_A_ROW] > 1 and state.unsettled[axis] > ALWAYS:
         state.unsettled[axis] = time
 
 
@@ -75,21 +75,21 @@ def count_rejected(state: State, axis: int, sensor: int, nu: float, R: float, ti
 def count_reacquired(state: State, axis: int, sensor: int, widened: float, time: int) -> None:
     """The offset may have moved by ν: its variance is ``widened`` by ν² / scale² [m²]."""
     state.P[axis, OFFSET, OFFSET] += widened
-    state.gate_count[sensor, axis, REACQUIRED] += 1
+    state.gate_count[axis, sensor, REACQUIRED] += 1
     state.unsettled[axis] = time
 
 
 @compiled
 def count_fused(state: State, axis: int, sensor: int, time: int) -> None:
     """Forget what was rejected before; and re-acquisitions, once all sensors of the axis have agreed for long."""
-    state.gate_count[sensor, axis, IN_A_ROW] = 0
-    state.gate_time[sensor, axis, FUSED_AT] = time
+    state.gate_count[axis, sensor, IN_A_ROW] = 0
+    state.gate_time[axis, sensor, FUSED_AT] = time
     if state.unsettled[axis] == ALWAYS or time - state.unsettled[axis] < SETTLED_NS:
         return
-    for other in range(len(state.gate_time)):
-        fused = state.gate_time[other, axis, FUSED_AT]
+    for other in range(state.gate_time.shape[1]):
+        fused = state.gate_time[axis, other, FUSED_AT]
         if fused > ALWAYS and time - fused > SETTLED_NS:
             return
     state.unsettled[axis] = ALWAYS
-    for other in range(len(state.gate_time)):
-        state.gate_count[other, axis, REACQUIRED] = 0
+    for other in range(state.gate_time.shape[1]):
+        state.gate_count[axis, other, REACQUIRED] = 0

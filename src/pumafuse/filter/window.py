@@ -15,58 +15,47 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..arrays import ALWAYS, NEVER, CodeArray, FloatArray, IntArray, TimeArray
+from ..arrays import ALWAYS, NEVER, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
 from ..compiled import compiled, compiled_apart
-from .axis import PERIOD, START, STEP, Model, Sensors, State, U
-from .counters import NIS, SCALARS, Counters, count_interval, count_row, forget_after, slot_of
-from .events import COMMAND, DUPLICATE, FUSED, INVALID, Events, Results, classify, said_before
-from .forward import REACQUIRED, History, Kept, Outputs, checkpoint, estimate, restore, run_events
-from .gate import FUSED_AT, NOBODY
-from .outcome import ABSENT
+from .axis import PERIOD, START, STEP, Model, Sensors, State, U, copy_rows
+from .counters import Counters, count_duplicate, count_rows, forget_after
+from .events import COMMAND, DUPLICATE, FUSED, Events, Results, classify, said_before
+from .forward import NO, ONE, ZERO, History, Outputs, checkpoint_of, estimate, run_events
+from .gate import FUSED_AT
+from .outcome import ABSENT, Outcome
 
 MOST_ROWS = 65_536  # events; what is more shortens the window
 FIRST_ROWS = 4096  # at first
-BEGIN, END, DONE, RUN, ORIGIN = range(5)  # of a window's span
-ACCEPTED, NO_ROOM = range(2)
+BEGIN, END, DONE, RUN, ORIGIN, CONTRADICTS = range(6)  # of a window's span
+FIRST, DELAY, LAST_FUSED = range(3)  # of the times of an axis
+VALUE, SPREAD, KNOWN_START, INNOVATION = range(4)  # of the values of an axis
+ADDED, REPEATED, NO_ROOM = range(3)
 
 
 class Incoming(NamedTuple):
     """What goes in and comes out of a window, and where it stands.
 
     Attributes:
-        span: The first row (``BEGIN``), after the last one (``END``), after the last one in the state (``DONE``), after
-            the last one that is to be in it (``RUN``), the first command's stamp [ns] (``ORIGIN``), (5,).
-        first: The stamp of each axis's first command [ns] (``NEVER`` without one), (A,).
-        start: The level u₀ [m] of each axis at rest where it is known beforehand, else NaN, (A,).
-        delay: Td of each axis, int64 ns, (A,).
+        span: The first row (``BEGIN``), after the last one (``END``), after the last one in the state (``DONE``) and
+            after the last one that is to be in it (``RUN``), the first command's stamp [ns] (``ORIGIN``, ``NEVER`` without
+            one), and the sensor that a rejected measurement ``CONTRADICTS`` (−1 for none), (6,).
+        times: For each axis the stamp of its ``FIRST`` command (``NEVER`` without one), its ``DELAY`` Td, and when the
+            last measurement was valid that an estimate knows of (``LAST_FUSED``), int64 ns, (A, 3).
+        values: For each axis the ``VALUE`` [m] of the event that comes in, by what its noise is scaled (``SPREAD``), the
+            level u₀ [m] at rest where it is known beforehand (``KNOWN_START``), and the ``INNOVATION`` [m], (A, 4).
+        outcome: What became of the values, ``ABSENT`` for an axis that the event does not give, (A,).
         latency: Of each sensor, int64 ns, (S,).
-        value: Of the event that comes in [m], (A,).
-        spread: By what the noise of each of its values is scaled, (A,).
-        outcome: What became of them, ``ABSENT`` for an axis that it does not give, (A,).
-        innovation: ν of each value [m], (A,).
-        contradicts: The sensor that a rejected measurement contradicts, ``NOBODY`` for none, (1,).
-        fused: When the last measurement was valid that an estimate knows of, int64 ns, (A,).
-        rest_covariance: P of the state at rest, (A, s, s).
-        rest_drive: Its drive, (A, 6).
     """
 
     span: IntArray
-    first: TimeArray
-    start: FloatArray
-    delay: TimeArray
-    latency: TimeArray
-    value: FloatArray
-    spread: FloatArray
+    times: TimeArray
+    values: FloatArray
     outcome: CodeArray
-    innovation: FloatArray
-    contradicts: IntArray
-    fused: TimeArray
-    rest_covariance: FloatArray
-    rest_drive: FloatArray
+    latency: TimeArray
 
 
 class Memory(NamedTuple):
-    """All arrays of a window; ``kept`` has one place more than there are rows, to put the state aside."""
+    """All arrays of a window. Of the places for checkpoints the last two are for the state aside and at rest."""
 
     model: Model
     sensors: Sensors
@@ -74,16 +63,15 @@ class Memory(NamedTuple):
     state: State
     results: Results
     history: History
-    kept: Kept
-    counters: Counters
+    arrived: BoolArray
     incoming: Incoming
 
     def flat(self) -> Flat:
         """As plain tuples, which a kernel takes a hundred times faster from Python."""
-        return tuple(tuple(part) for part in self)
+        return tuple(tuple(part) if isinstance(part, tuple) else part for part in self)
 
 
-Flat: TypeAlias = tuple[tuple[Any, ...], ...]
+Flat: TypeAlias = tuple[Any, ...]
 
 
 @compiled
@@ -96,17 +84,16 @@ def opened(flat: Flat) -> Memory:
         State(*flat[3]),
         Results(*flat[4]),
         History(*flat[5]),
-        Kept(*flat[6]),
-        Counters(*flat[7]),
-        Incoming(*flat[8]),
+        flat[6],
+        Incoming(*flat[7]),
     )
 
 
 @compiled_apart
-def add_measurement(flat: Flat, stamp: int, sensor: int, given: int, newest: int, horizon: int) -> int:
-    """Take in the measurement in ``incoming.value``, of the axes that are bits of ``given``.
+def add_measurement(flat: Flat, stamp: int, sensor: int, given: int, horizon: int) -> int:
+    """Take in the measurement in ``incoming.values``, of the axes that are bits of ``given``.
 
-    Events before ``horizon`` [ns] leave the window; ``newest`` [ns] is the latest stamp of all.
+    Events before ``horizon`` [ns] leave the window. ``REPEATED``: its stamp and values are those of one before.
     """
     m = opened(flat)
     span, incoming, events = m.incoming.span, m.incoming, m.events
@@ -114,32 +101,29 @@ def add_measurement(flat: Flat, stamp: int, sensor: int, given: int, newest: int
     if span[END] == len(events.time):
         return NO_ROOM
     at = insert(m, stamp - incoming.latency[sensor], sensor, stamp, given)
-    count_row(m.counters, sensor, stamp, newest)
+    span[CONTRADICTS] = -1
     duplicate = said_before(events, at, span[BEGIN])
-    for axis in range(len(incoming.value)):
-        whole = DUPLICATE if duplicate else FUSED
+    whole = DUPLICATE if duplicate else FUSED
+    for axis in range(len(incoming.outcome)):
         incoming.outcome[axis] = events.known[at, axis] = classified(m, at, axis, whole)
-    incoming.contradicts[0] = NOBODY
     if duplicate:
-        remove(m, at)
+        remove(events, span, at)
         catch_up(m)
-        for axis in range(len(incoming.value)):
-            if incoming.outcome[axis] != ABSENT:
-                m.counters.number[sensor, incoming.outcome[axis]] += 1
-        return ACCEPTED
+        return REPEATED
     span[RUN] = max(span[RUN], at + 1)
     catch_up(m)
-    incoming.contradicts[0] = m.results.contradicts[at]
-    for axis in range(len(incoming.value)):
-        incoming.outcome[axis], incoming.innovation[axis] = m.results.outcome[at, axis], m.results.innovation[at, axis]
-    return ACCEPTED
+    span[CONTRADICTS] = m.results.contradicts[at]
+    for axis in range(len(incoming.outcome)):
+        incoming.outcome[axis] = m.results.outcome[at, axis]
+        incoming.values[axis, INNOVATION] = m.results.innovation[at, axis]
+    return ADDED
 
 
 @compiled_apart
 def add_command(flat: Flat, stamp: int, given: int, horizon: int) -> int:
-    """Take in the command in ``incoming.value``, of the axes that are bits of ``given``: an event for each delay."""
+    """Take in the command in ``incoming.values``, of the axes that are bits of ``given``: an event for each delay."""
     m = opened(flat)
-    span, incoming, events, axes = m.incoming.span, m.incoming, m.events, len(m.incoming.value)
+    span, incoming, events, axes = m.incoming.span, m.incoming, m.events, len(m.incoming.outcome)
     retire(m, horizon)
     if span[END] + axes > len(events.time):
         return NO_ROOM
@@ -147,151 +131,85 @@ def add_command(flat: Flat, stamp: int, given: int, horizon: int) -> int:
     for axis in range(axes):
         incoming.outcome[axis] = ABSENT
     for axis in range(axes):
-        together = 0  # the axes of this delay
+        together = ZERO  # the axes of this delay
         for other in range(axis, axes):
-            if left >> other & 1 and incoming.delay[other] == incoming.delay[axis]:
+            if left >> other & 1 and incoming.times[other, DELAY] == incoming.times[axis, DELAY]:
                 together |= 1 << other
         if not left >> axis & 1:
             continue
         left &= ~together
-        time = stamp + incoming.delay[axis]
+        time = stamp + incoming.times[axis, DELAY]
         at = insert(m, time, COMMAND, stamp, together)
-        if said_before(events, at, span[BEGIN]):
-            for other in range(axis, axes):
-                if together >> other & 1:
-                    incoming.outcome[other] = DUPLICATE
-            remove(m, at)
-            continue
+        duplicate = said_before(events, at, span[BEGIN])
+        if duplicate:
+            remove(events, span, at)
         for other in range(axis, axes):
-            if together >> other & 1:
-                reclassify(m, other, first_at(m, time), time + int(m.model.gain[other, PERIOD] * 0.5e9))
+            if together >> other & 1 and duplicate:
+                incoming.outcome[other] = DUPLICATE
+            elif together >> other & 1:
+                first = first_at(events, span, time)
+                reclassify(m, other, first, time + int(m.model.gain[other, PERIOD] * 0.5e9))
                 incoming.outcome[other] = events.known[at, other]
     for axis in range(axes):
-        if incoming.outcome[axis] == FUSED and stamp <= incoming.first[axis]:
+        if incoming.outcome[axis] == FUSED and stamp <= incoming.times[axis, FIRST]:
             begin(m, axis, stamp)
     catch_up(m)
-    return ACCEPTED
+    return ADDED
 
 
 @compiled_apart
 def estimate_at(flat: Flat, outputs: tuple[FloatArray, ...], time: int) -> None:
     """Every axis at ``time`` [ns] by all measurements valid until then, into ``outputs``; nothing changes."""
     m = opened(flat)
-    span, incoming, aside = m.incoming.span, m.incoming, len(m.kept.clock) - 1
-    pending = span[DONE]
+    span, incoming, axes = m.incoming.span, m.incoming, len(m.incoming.outcome)
+    pending, aside = span[DONE], checkpoint_of(m.model, len(m.events.time), len(m.events.time) + 1)
     while pending > span[BEGIN] and m.events.time[pending - 1] > time:
         pending -= 1
-    checkpoint(m.state, m.kept, aside)
+    copy_rows(m.state, ZERO, aside, axes)
     if pending < span[DONE]:
-        restore(m.state, m.kept, pending)
-    estimate(m.model, m.events, m.state, pending, span[END], time, m.history, Outputs(*outputs), 0)
-    for axis in range(len(incoming.value)):
-        incoming.fused[axis] = span[ORIGIN]
+        copy_rows(m.state, checkpoint_of(m.model, pending, len(m.events.time)), ZERO, axes)
+    estimate(m.model, m.events, m.state, pending, span[END], time, m.history, Outputs(*outputs), ZERO)
+    for axis in range(axes):
+        incoming.times[axis, LAST_FUSED] = span[ORIGIN]
         for sensor in range(len(incoming.latency)):
-            incoming.fused[axis] = max(incoming.fused[axis], m.state.gate_time[sensor, axis, FUSED_AT])
-    restore(m.state, m.kept, aside)
-
-
-@compiled_apart
-def forget(flat: Flat, after: int) -> None:
-    """Take back every event stamped after ``after`` [ns]: it was of another clock."""
-    m = opened(flat)
-    span, incoming, events = m.incoming.span, m.incoming, m.events
-    for sensor in range(len(incoming.latency)):
-        forget_after(m.counters, sensor, after)
-    first = span[BEGIN]
-    while first < span[END] and events.stamp[first] <= after:
-        first += 1
-    go_back(m, first)
-    kept_rows, run = first, span[RUN]
-    for row in range(first, span[END]):
-        if events.stamp[row] <= after:
-            move(events, row, kept_rows)
-            kept_rows += 1
-            continue
-        span[RUN] -= row < run
-        for axis in range(len(incoming.value)):
-            if events.source[row] != COMMAND and events.known[row, axis] != ABSENT:
-                m.counters.number[events.source[row], INVALID] += 1
-    span[END] = kept_rows
-    for row in range(span[BEGIN], span[END]):
-        if events.source[row] != COMMAND:
-            sensor = events.source[row]
-            m.counters.last[sensor] = max(m.counters.last[sensor], events.stamp[row])
-    if span[ORIGIN] > after:
-        span[ORIGIN] = NEVER
-    for axis in range(len(incoming.value)):
-        if NEVER > incoming.first[axis] > after:  # it had only just begun
-            begin(m, axis, NEVER)
-        reclassify(m, axis, span[BEGIN], NEVER)
-    catch_up(m)
-
-
-@compiled_apart
-def count_window(flat: Flat) -> None:
-    """Count the measurements that are still in the window."""
-    m = opened(flat)
-    for row in range(m.incoming.span[BEGIN], m.incoming.span[END]):
-        count_outcome(m, row)
-
-
-@compiled_apart
-def let_go(flat: Flat, horizon: int) -> None:
-    """Let go of the events before ``horizon`` [ns]."""
-    retire(opened(flat), horizon)
-
-
-@compiled_apart
-def command_at(flat: Flat, axis: int, stamp: int) -> tuple[int, float, float]:
-    """Stamp [ns] (``ALWAYS`` for none), value and step [m] of the last command of an axis stamped by ``stamp`` [ns]."""
-    m = opened(flat)
-    span, drive, last = m.incoming.span, m.state.drive, -1
-    for row in range(span[END] - 1, span[BEGIN] - 1, -1):
-        if m.events.source[row] == COMMAND and m.events.known[row, axis] == FUSED and m.events.stamp[row] <= stamp:
-            value = m.events.value[row, axis]
-            if last >= 0:
-                return m.events.stamp[last], m.events.value[last, axis], m.events.value[last, axis] - value
-            last = row
-    commanded = drive[axis, START] + drive[axis, U]  # those before have left the window
-    if last < 0:
-        return ALWAYS, commanded, drive[axis, STEP]
-    value = m.events.value[last, axis]
-    return m.events.stamp[last], value, drive[axis, STEP] if last < span[DONE] else value - commanded
+            fused = m.state.gate_time[axis, sensor, FUSED_AT]
+            incoming.times[axis, LAST_FUSED] = max(incoming.times[axis, LAST_FUSED], fused)
+    copy_rows(m.state, aside, ZERO, axes)
 
 
 @compiled
 def retire(m: Memory, horizon: int) -> None:
     """Let go of events that nothing can change any more."""
-    span = m.incoming.span
-    while span[RUN] < span[END] and m.events.time[span[RUN]] < horizon:
+    span, time = m.incoming.span, m.events.time
+    while span[RUN] < span[END] and time[span[RUN]] < horizon:
         span[RUN] += 1
     catch_up(m)
-    while span[BEGIN] < span[DONE] and m.events.time[span[BEGIN]] < horizon:
-        count_outcome(m, span[BEGIN])
+    while span[BEGIN] < span[DONE] and time[span[BEGIN]] < horizon:
         span[BEGIN] += 1
 
 
-@compiled_apart
+@compiled
 def go_back(m: Memory, row: int) -> None:
     """Bring the state to before a row, if it is past it."""
     if row < m.incoming.span[DONE]:
-        restore(m.state, m.kept, row)
+        copy_rows(m.state, checkpoint_of(m.model, row, len(m.events.time)), ZERO, len(m.incoming.outcome))
         m.incoming.span[DONE] = row
 
 
-@compiled_apart
+@compiled
 def catch_up(m: Memory) -> None:
     """Bring the state to where it is to be."""
-    span = m.incoming.span
+    span, places = m.incoming.span, len(m.events.time)
     if span[DONE] < span[RUN]:
-        run_events(m.model, m.sensors, m.events, m.state, span[DONE], span[RUN], False, m.results, m.history, m.kept)
+        first, end = span[DONE], span[RUN]
+        run_events(m.model, m.sensors, m.events, m.state, first, end, NO, m.results, m.history, m.arrived, places)
         span[DONE] = span[RUN]
 
 
 @compiled_apart
 def insert(m: Memory, time: int, source: int, stamp: int, given: int) -> int:
     """Put the axes of ``incoming`` that are bits of ``given`` in their place; returns the row."""
-    span, incoming, events = m.incoming.span, m.incoming, m.events
+    span, values, events = m.incoming.span, m.incoming.values, m.events
     at = span[END]
     while at > span[BEGIN] and comes_after(events, at - 1, time, source, stamp):
         at -= 1
@@ -301,20 +219,19 @@ def insert(m: Memory, time: int, source: int, stamp: int, given: int) -> int:
     span[END] += 1
     span[RUN] += at < span[RUN]
     events.time[at], events.source[at], events.stamp[at] = time, source, stamp
-    for axis in range(len(incoming.value)):
+    for axis in range(len(values)):
         events.known[at, axis] = FUSED if given >> axis & 1 else ABSENT
-        events.value[at, axis], events.spread[at, axis] = incoming.value[axis], incoming.spread[axis]
+        events.value[at, axis], events.spread[at, axis] = values[axis, VALUE], values[axis, SPREAD]
     return at
 
 
 @compiled
-def remove(m: Memory, at: int) -> None:
+def remove(events: Events, span: IntArray, at: int) -> None:
     """Take out a row that was just put in."""
-    span = m.incoming.span
     span[END] -= 1
     span[RUN] -= at < span[RUN]
     for row in range(at, span[END]):
-        move(m.events, row + 1, row)
+        move(events, row + 1, row)
 
 
 @compiled
@@ -362,71 +279,36 @@ def reclassify(m: Memory, axis: int, first: int, until: int) -> None:
 
 
 @compiled
-def first_at(m: Memory, time: int) -> int:
+def first_at(events: Events, span: IntArray, time: int) -> int:
     """The first row at ``time`` [ns] or later."""
-    at = m.incoming.span[END]
-    while at > m.incoming.span[BEGIN] and m.events.time[at - 1] >= time:
+    at = span[END]
+    while at > span[BEGIN] and events.time[at - 1] >= time:
         at -= 1
     return at
 
 
 @compiled_apart
 def begin(m: Memory, axis: int, stamp: int) -> None:
-    """Let an axis rest until its first command, which is that of ``stamp`` [ns] (``NEVER``: it has none)."""
+    """Let an axis rest until its first command, which is that of ``stamp`` [ns]; all of them if none was before it."""
     span, incoming, state, events = m.incoming.span, m.incoming, m.state, m.events
-    incoming.first[axis] = stamp
+    incoming.times[axis, FIRST] = stamp
     earlier = stamp < span[ORIGIN]
-    if earlier:
-        span[ORIGIN] = stamp
+    span[ORIGIN] = min(stamp, span[ORIGIN])
     go_back(m, span[BEGIN])
-    for other in range(len(incoming.value)):
+    for other in range(len(incoming.outcome)):
         if other != axis and not earlier:
             continue
-        level = incoming.start[other]
+        level = incoming.values[other, KNOWN_START]
         if math.isnan(level):
+            level = state.drive[other, START] if other != axis else level
             for row in range(span[BEGIN], span[END]):
                 commands = events.source[row] == COMMAND and events.known[row, other] == FUSED
-                if commands and events.stamp[row] == incoming.first[other]:
+                if commands and events.stamp[row] == incoming.times[other, FIRST]:
                     level = events.value[row, other]
-            if math.isnan(level) and other != axis:
-                level = state.drive[other, START]
-        rest(state, incoming, other, level, span[ORIGIN])
-        reclassify(m, other, span[BEGIN], NEVER)
-
-
-@compiled
-def rest(state: State, incoming: Incoming, axis: int, level: float, origin: int) -> None:
-    """Put an axis in equilibrium at its start level."""
-    for i in range(state.x.shape[1]):
-        state.x[axis, i] = 0.0
-        for j in range(state.x.shape[1]):
-            state.P[axis, i, j] = incoming.rest_covariance[axis, i, j]
-    for k in range(state.drive.shape[1]):
-        state.drive[axis, k] = incoming.rest_drive[axis, k]
-    state.drive[axis, START], state.clock[axis], state.unsettled[axis] = level, origin, ALWAYS
-    for sensor in range(len(state.rejected)):
-        for k in range(2):
-            state.gate_time[sensor, axis, k], state.gate_count[sensor, axis, k] = ALWAYS, 0
-
-
-@compiled
-def count_outcome(m: Memory, row: int) -> None:
-    """Count what became of a measurement."""
-    sensor, results, counters = m.events.source[row], m.results, m.counters
-    if sensor == COMMAND:
-        return
-    count_interval(counters, sensor, m.events.stamp[row])
-    slot = slot_of(counters, sensor, m.events.stamp[row])
-    for axis in range(len(m.incoming.value)):
-        outcome = results.outcome[row, axis]
-        if outcome == ABSENT:
-            continue
-        counters.number[sensor, outcome] += 1
-        if outcome in (FUSED, REACQUIRED) and slot >= 0:
-            counters.minute[sensor, slot, NIS] += (
-                results.innovation[row, axis] / results.innovation_sd[row, axis]
-            ) ** 2
-            counters.minute[sensor, slot, SCALARS] += 1.0
+        places = len(events.time) + 2
+        copy_rows(state, checkpoint_of(m.model, places - 1, places) + other, np.int64(other), ONE)
+        state.drive[other, START], state.clock[other] = level, span[ORIGIN]
+        reclassify(m, other, span[BEGIN], np.int64(NEVER))
 
 
 class Window:
@@ -441,31 +323,38 @@ class Window:
         spread: By what the noise of each of its values is scaled, 1 if nobody says otherwise, (A,).
         outcome: What became of its axes: codes of Outcome, or ``ABSENT`` for an axis that it does not give, (A,).
         innovation: ν of each value of a measurement [m], (A,).
-        contradicts: The sensor that it contradicts where it is rejected time after time, ``NOBODY`` for none, (1,).
         floor: What is stamped before it [ns] can no longer be taken, because the stream was too dense for the window.
     """
 
-    def __init__(self, memory: Memory) -> None:
-        """Empty; ``memory`` has room for ``FIRST_ROWS`` events."""
+    def __init__(self, memory: Memory, counters: Counters) -> None:
+        """Empty; ``memory`` has room for ``FIRST_ROWS`` events, ``counters`` what was counted before."""
         self.floor = ALWAYS
-        self._latency = int(memory.incoming.latency.max(initial=0))
-        self._behind = self._latency + int(memory.model.gain[:, PERIOD].max() * 1e9)
-        self._outputs = np.zeros((len(Outputs._fields), len(memory.incoming.value), 1))
+        self._counters, self._counted = counters, 0
+        self._behind = int(memory.incoming.latency.max(initial=0)) + int(memory.model.gain[:, PERIOD].max() * 1e9)
+        self._outputs = np.zeros((len(Outputs._fields), len(memory.incoming.outcome), 1))
         self._places = tuple(self._outputs)
         self._set(memory)
 
     @property
     def origin(self) -> int | None:
         """The first command's stamp, int ns; None before it."""
-        origin = int(self.memory.incoming.span[ORIGIN])
+        origin = self._span.item(ORIGIN)
         return None if origin == NEVER else origin
 
+    @property
+    def contradicts(self) -> int:
+        """The sensor that the measurement just added contradicts, where it is rejected time after time; −1 for none."""
+        return self._span.item(CONTRADICTS)
+
     def add_measurement(self, stamp: int, sensor: int, given: int, newest: int, oldest: int) -> bool:
-        """Take in a measurement; see :meth:`add_command`."""
-        while add_measurement(self._flat, stamp, sensor, given, newest, oldest - self._behind) == NO_ROOM:
+        """Take in a measurement; ``newest`` [ns] is the newest stamp of all. See :meth:`add_command`."""
+        while (added := add_measurement(self._flat, stamp, sensor, given, oldest - self._behind)) == NO_ROOM:
             self._make_room()
             if stamp < self.floor:
                 return False
+        self._count(sensor, stamp, newest)
+        if added == REPEATED:
+            count_duplicate(self._counters, sensor, self.outcome)
         return True
 
     def add_command(self, stamp: int, given: int, oldest: int) -> bool:
@@ -483,6 +372,8 @@ class Window:
             self._make_room()
             if stamp < self.floor:
                 return False
+        if self._span.item(BEGIN) > self._counted:
+            self._count(-1, 0, 0)
         return True
 
     def estimate(self, time: int) -> list[tuple[list[float], int] | None]:
@@ -494,7 +385,7 @@ class Window:
         """
         estimate_at(self._flat, self._places, time)
         found: list[tuple[list[float], int] | None] = []
-        levels, fused = self.memory.state.drive[:, START].tolist(), self.memory.incoming.fused.tolist()
+        levels, fused = self.memory.state.drive[:, START].tolist(), self.memory.incoming.times[:, LAST_FUSED].tolist()
         for number, outputs in enumerate(self._outputs[:, :, 0].T.tolist()):
             outputs[0] += levels[number]
             found.append(None if math.isnan(levels[number]) else (outputs, fused[number]))
@@ -502,13 +393,55 @@ class Window:
 
     def command_at(self, axis: int, stamp: int = NEVER) -> tuple[int, float, float] | None:
         """Stamp [ns], value and step [m] of an axis's last command stamped by ``stamp`` [ns]; None for none."""
-        if self.memory.incoming.first[axis] == NEVER:
+        if self.memory.incoming.times[axis, FIRST] == NEVER:
             return None
-        return command_at(self._flat, axis, stamp)
+        events, drive, first = self.memory.events, self.memory.state.drive[axis], self._span.item(BEGIN)
+        rows = slice(first, self._span.item(END))
+        commands = (events.source[rows] == COMMAND) & (events.known[rows, axis] == FUSED)
+        last = first + np.flatnonzero(commands & (events.stamp[rows] <= stamp))[-2:]
+        before = float(drive[START] + drive[U])  # those before have left the window
+        if not len(last):
+            return ALWAYS, before, float(drive[STEP])
+        value = events.value.item(int(last[-1]), axis)
+        if len(last) == 2:
+            return events.stamp.item(int(last[-1])), value, value - events.value.item(int(last[0]), axis)
+        step = float(drive[STEP]) if last[-1] < self._span[DONE] else value - before
+        return events.stamp.item(int(last[-1])), value, step
 
     def forget(self, after: int) -> None:
-        """Take back all that is stamped after ``after`` [ns]."""
-        forget(self._flat, after)
+        """Take back all that is stamped after ``after`` [ns]: it was of another clock. The rest is added again."""
+        forget_after(self._counters, after)
+        span, times, state = self._span, self.memory.incoming.times, self.memory.state
+        begin_row, end_row, axes = int(span[BEGIN]), int(span[END]), len(self.outcome)
+        rows = self.memory.events.rows(slice(begin_row, end_row))
+        rows = Events(*(part.copy() for part in rows))
+        if begin_row < span[DONE]:
+            here = checkpoint_of(self.memory.model, begin_row, len(self.memory.events.time))
+            for part in state[:-1]:
+                part[:axes] = part[here : here + axes]
+        span[[END, DONE, RUN]] = begin_row
+        span[ORIGIN] = NEVER if span[ORIGIN] > after else span[ORIGIN]
+        rest = checkpoint_of(self.memory.model, len(self.memory.events.time) + 1, len(self.memory.events.time) + 2)
+        for axis in np.flatnonzero((times[:, FIRST] > after) & (times[:, FIRST] < NEVER)).tolist():
+            times[axis, FIRST] = NEVER  # it had only just begun
+            for part in state[:-1]:
+                part[axis] = part[rest + axis]
+            state.drive[axis, START] = self.memory.incoming.values[axis, KNOWN_START]
+            state.clock[axis] = span[ORIGIN]
+        bits = 1 << np.arange(axes)
+        for row in range(len(rows.time)):
+            sensor, given = int(rows.source[row]), int(bits[rows.known[row] != ABSENT].sum())
+            if rows.stamp[row] > after:
+                if sensor != COMMAND:
+                    self._counters.number[sensor, Outcome.INVALID] += np.count_nonzero(rows.known[row] != ABSENT)
+                continue
+            self.value[:], self.spread[:] = rows.value[row], rows.spread[row]
+            if sensor == COMMAND:
+                add_command(self._flat, int(rows.stamp[row]), given, ALWAYS)
+            else:
+                add_measurement(self._flat, int(rows.stamp[row]), sensor, given, ALWAYS)
+                self._counters.last[sensor] = max(self._counters.last[sensor], rows.stamp[row])
+        self.spread[:] = 1.0
 
     def warm_up(self) -> None:
         """Have every kernel compiled and in memory; on a window that nobody needs."""
@@ -516,46 +449,65 @@ class Window:
         self.command_at(0)
         self.forget(0)
         self.counters()
-        let_go(self._flat, 0)
 
     def counters(self) -> Counters:
         """What there was of each sensor until now, with what is still in the window."""
-        now = Counters(*(part.copy() for part in self.memory.counters))
-        count_window(self.memory._replace(counters=now).flat())
+        now = Counters(*(part.copy() for part in self._counters))
+        count_rows(tuple(now), *self._rows(), self._counted, self._span.item(END), -1, 0, 0)
         return now
+
+    def _count(self, sensor: int, stamp: int, newest: int) -> None:
+        """Count a measurement that has come, and what has left the window."""
+        left = self._span.item(BEGIN)
+        count_rows(self._flat_counters, *self._counting, self._counted, left, sensor, stamp, newest)
+        self._counted = left
+
+    def _rows(self) -> tuple[Any, ...]:
+        events, results = self.memory.events, self.memory.results
+        return events.source, events.stamp, results.outcome, results.innovation, results.innovation_sd
 
     def _make_room(self) -> None:
         """Move what is in the window to the front, into more memory if it needs it; at the limit give up its oldest."""
-        span, rows = self.memory.incoming.span, len(self.memory.events.time)
-        used = int(span[END] - span[BEGIN])
-        crowded = used > rows // 2
-        if rows == MOST_ROWS and used > rows - rows // 8:
+        span, rows = self._span, len(self.memory.events.time)
+        crowded = span[END] - span[BEGIN] > rows // 2
+        if rows == MOST_ROWS and span[END] - span[BEGIN] > rows - rows // 8:
             self.floor = int(self.memory.events.time[span[BEGIN] + rows // 8]) + 1 + self._behind
-            let_go(self._flat, self.floor - self._behind)
+            add_command(self._flat, 0, 0, self.floor - self._behind)
+        self._count(-1, 0, 0)
         self._set(with_rows(self.memory, 2 * rows if crowded and rows < MOST_ROWS else rows))
+        self._counted = 0
 
     def _set(self, memory: Memory) -> None:
-        self.memory, self._flat = memory, memory.flat()
-        incoming = memory.incoming
-        self.value, self.spread, self.outcome = incoming.value, incoming.spread, incoming.outcome
-        self.innovation, self.contradicts = incoming.innovation, incoming.contradicts
+        self.memory, self._flat, self._span = memory, memory.flat(), memory.incoming.span
+        values = memory.incoming.values
+        self.value, self.spread, self.innovation = values[:, VALUE], values[:, SPREAD], values[:, INNOVATION]
+        self.outcome = memory.incoming.outcome
+        self._flat_counters, self._counting = tuple(self._counters), self._rows()
 
 
 def with_rows(memory: Memory, rows: int) -> Memory:
     """The same window at the front of room for ``rows`` events."""
-    begin_row, end_row = int(memory.incoming.span[BEGIN]), int(memory.incoming.span[END])
+    held, axes = len(memory.events.time), len(memory.incoming.outcome)
+    first, used = int(memory.incoming.span[BEGIN]), int(memory.incoming.span[END] - memory.incoming.span[BEGIN])
 
-    def moved(part: np.ndarray, extra: int = 0) -> np.ndarray:
-        found = np.zeros((rows + extra, *part.shape[1:]), dtype=part.dtype)
-        found[: end_row - begin_row] = part[begin_row:end_row]
+    def of_rows(part: np.ndarray) -> np.ndarray:
+        found = np.zeros((rows, *part.shape[1:]), dtype=part.dtype)
+        found[:used] = part[first : first + used]
+        return found
+
+    def of_state(part: np.ndarray) -> np.ndarray:
+        now, end = axes + 2, axes * 2
+        found = np.zeros((now + axes * (rows + 2), *part.shape[1:]), dtype=part.dtype)
+        found[:now], found[-end:] = part[:now], part[now + axes * held :]
+        found[now : now + axes * used] = part[now + axes * first : now + axes * (first + used)]
         return found
 
     span = memory.incoming.span.copy()
-    span[[BEGIN, END, DONE, RUN]] -= begin_row
-    kept = Kept(np.ones(rows + 1, dtype=np.bool_), *(moved(part, 1) for part in memory.kept[1:]))
+    span[[BEGIN, END, DONE, RUN]] -= first
     return memory._replace(
-        events=Events(*(moved(part) for part in memory.events)),
-        results=Results(*(moved(part) for part in memory.results)),
-        kept=kept,
+        events=Events(*(of_rows(part) for part in memory.events)),
+        results=Results(*(of_rows(part) for part in memory.results)),
+        state=State(*(of_state(part) for part in memory.state[:-1]), work=memory.state.work),
+        arrived=np.ones(rows, dtype=np.bool_),
         incoming=memory.incoming._replace(span=span),
     )

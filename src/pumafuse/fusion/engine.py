@@ -17,7 +17,7 @@ from ..filter.smoother import smooth
 from .config import FusionConfig
 from .estimates import AxisEstimate, Bias, Mode
 from .segments import Segment
-from .setup import at_rest, filter_model, filter_sensors, room_for
+from .setup import at_rest, filter_model, filter_sensors
 
 Engine = Literal["compiled", "filterpy"]
 
@@ -58,28 +58,26 @@ def filter_segment(
         progress: Called now and then by the filterpy engine with the share done, 0 to 1.
     """
     events, _ = segment.events(config)
-    biases = biased_sensors(segment, config)
-    model, sensors, state = arranged(segment, config, biases)
-    axes, count = len(segment.axes), len(events.time)
+    biases, axes, count = biased_sensors(segment, config), len(segment.axes), len(events.time)
+    arrival = np.where(events.source == COMMAND, events.stamp, np.maximum(events.stamp, events.time))
+    places = _most_taken_back(events.time, arrival, times) + 1 if mode == "as-live" else 0
+    model, sensors, state = arranged(segment, config, biases, places)
+    width, arrived = state.x.shape[1], np.zeros(count, dtype=np.bool_)
+    history = _history(events, state, len(times)) if mode == "smoothed" else no_history(axes, width)
     results = Results.room(count, axes)
     results.outcome[:] = events.known
     outputs = Outputs(*np.empty((len(Outputs._fields), axes, len(times))))
-    history, kept = no_history(state), room_for(state, 0)
     if engine == "filterpy":
         from ..filter import filterpy_engine
 
         plants = [config.arm.axes[axis] for axis in segment.axes]
         filterpy_engine.filter_events(plants, model, sensors, events, state, times, results, outputs, progress)
     elif mode == "as-live":
-        arrival = np.where(events.source == COMMAND, events.stamp, np.maximum(events.stamp, events.time))
         queue = np.argsort(arrival, kind="stable")
-        kept = room_for(state, _most_taken_back(events.time, arrival, times) + 1, count)
-        filter_as_live(model, sensors, events, state, arrival, queue, times, results, history, kept, outputs)
+        filter_as_live(model, sensors, events, state, arrival, queue, times, results, history, arrived, places, outputs)
     else:
-        history = _history(events, state, len(times)) if mode == "smoothed" else history
-        filter_events(model, sensors, events, state, False, times, results, history, kept, outputs)
+        filter_events(model, sensors, events, state, False, times, results, history, arrived, places, outputs)
     if mode == "smoothed":
-        width = state.x.shape[1]
         room = np.empty((2, width)), np.empty((2, width, width)), np.empty((4, width)), np.empty((width + 1, width))
         smooth(model, sensors, events, results, history, segment.origin, times, room, outputs)
     estimates = {
@@ -105,20 +103,22 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
     if outcome is not None:
         results.outcome[measured] = outcome[place[measured]]
     none, outputs = np.empty(0, dtype=np.int64), Outputs(*np.empty((len(Outputs._fields), axes, 0)))
-    given, history, kept = outcome is not None, no_history(state), room_for(state, 0)
-    filter_events(model, sensors, events, state, given, none, results, history, kept, outputs)
+    given, history, arrived = outcome is not None, no_history(axes, state.x.shape[1]), np.zeros(0, dtype=np.bool_)
+    filter_events(model, sensors, events, state, given, none, results, history, arrived, 0, outputs)
     found = Results.room(len(measured), axes)
     for part, whole in zip(found, results, strict=True):
         part[place[measured]] = whole[measured]
     return found
 
 
-def arranged(segment: Segment, config: FusionConfig, biases: list[list[str]]) -> tuple[Model, Sensors, State]:
+def arranged(
+    segment: Segment, config: FusionConfig, biases: list[list[str]], places: int = 0
+) -> tuple[Model, Sensors, State]:
     """The filter's arrays for a segment, and the state at rest."""
     return (
         filter_model(config, segment.axes, biases),
         filter_sensors(config, segment.sensors, segment.axes, biases),
-        at_rest(config, segment.axes, len(segment.sensors), biases, segment.origin, segment.start),
+        at_rest(config, segment.axes, len(segment.sensors), biases, segment.origin, segment.start, places),
     )
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from ..arrays import ALWAYS
 from ..filter.axis import BIASES, DRIFT, NOISE, OFFSET, START, Model, Sensors, State
-from ..filter.forward import Kept
 from ..model import closed
 from ..model.plants import FirstOrder
 from .config import FusionConfig
@@ -69,6 +67,7 @@ def at_rest(
     biases: Sequence[Sequence[str]],
     origin: int,
     start: Mapping[str, float],
+    places: int = 0,
 ) -> State:
     """The state before the first command: in equilibrium, certain of all but the offset and the biases.
 
@@ -79,9 +78,11 @@ def at_rest(
         biases: As in :func:`filter_model`.
         origin: The first command, int64 ns.
         start: The level u₀ [m] of each axis where it is known.
+        places: Room for how many checkpoints.
     """
     count, width = len(axes), BIASES + max((len(biased) for biased in biases), default=0)
-    P, drive = np.zeros((count + 2, width, width)), np.zeros((count + 2, 6))
+    rows = count * (1 + places) + 2
+    P, drive = np.zeros((rows, width, width)), np.zeros((rows, 6))
     for number, (axis, biased) in enumerate(zip(axes, biases, strict=True)):
         P[number, OFFSET, OFFSET] = config.start.offset_sd**2
         for place, name in enumerate(biased, BIASES):
@@ -89,21 +90,13 @@ def at_rest(
         process = config.process[axis]
         drive[number, [START, NOISE, DRIFT]] = start.get(axis, np.nan), process.input_noise**2, process.drift**2
     return State(
-        x=np.zeros((count + 2, width)),
+        x=np.zeros((rows, width)),
         P=P,
-        clock=np.full(count + 2, origin),
+        clock=np.full(rows, origin),
         drive=drive,
-        rejected=np.zeros((sensors, count, 2)),
-        gate_time=np.full((sensors, count, 2), ALWAYS),
-        gate_count=np.zeros((sensors, count, 2), dtype=np.int64),
-        unsettled=np.full(count, ALWAYS),
+        rejected=np.zeros((rows, sensors, 2)),
+        gate_time=np.full((rows, sensors, 2), ALWAYS),
+        gate_count=np.zeros((rows, sensors, 2), dtype=np.int64),
+        unsettled=np.full(rows, ALWAYS),
         work=np.zeros((4, width)),
     )
-
-
-def room_for(state: State, places: int, events: int = 0) -> Kept:
-    """Room for checkpoints of a state before ``places`` of some events, of which none has arrived."""
-    parts = state._asdict()
-    del parts["work"]
-    room: dict[str, Any] = {name: np.zeros((places, *part.shape), dtype=part.dtype) for name, part in parts.items()}
-    return Kept(np.zeros(events, dtype=np.bool_), **room)

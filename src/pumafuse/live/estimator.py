@@ -11,16 +11,14 @@ import numpy as np
 
 from ..arrays import NEVER, FloatArray
 from ..errors import ConfigError, RunError, suggestion
-from ..filter.axis import START
 from ..filter.counters import Counters
 from ..filter.events import Events, Results
 from ..filter.forward import no_history
-from ..filter.gate import NOBODY
 from ..filter.outcome import ABSENT, FARTHEST, Outcome
 from ..filter.window import FIRST_ROWS, MOST_ROWS, Incoming, Memory, Window
 from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS
-from ..fusion.setup import at_rest, filter_model, filter_sensors, room_for
+from ..fusion.setup import at_rest, filter_model, filter_sensors
 from ..logs.frames import CARTESIAN, Cylindrical
 from ..model.arm import ordered_axes
 from ..units import MM
@@ -395,7 +393,7 @@ class LiveEstimator:
             window.spread[:] = 1.0
         if not taken:
             return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
-        if sensor is not None:
+        if sensor is not None and (self._contradicting or window.contradicts >= 0):
             self._say_contradiction(stamp, sensor)
         codes = window.outcome.tobytes()
         told = self._answers.get(codes) if not stranger else None
@@ -439,11 +437,11 @@ class LiveEstimator:
     def _say_contradiction(self, stamp: int, sensor: str) -> None:
         """Say which other sensor one contradicts, by how much, and since when."""
         window = self._window
-        if window.contradicts[0] == NOBODY:
-            if self._contradicting and window.outcome.min() == _FUSED:
+        if window.contradicts < 0:
+            if window.outcome.min() == _FUSED:
                 self._contradicting.pop(sensor, None)
             return
-        other = tuple(self._sensors)[int(window.contradicts[0])]
+        other = tuple(self._sensors)[window.contradicts]
         since = self._contradicting.setdefault(sensor, stamp)
         found = zip(self.axes, window.outcome.tolist(), window.innovation.tolist(), strict=True)
         off = ", ".join(f"{axis} by {nu * MM:+.4g} mm" for axis, outcome, nu in found if outcome == Outcome.REJECTED)
@@ -499,39 +497,31 @@ def empty_window(
         [name for name, sensor in config.sensors.items() if sensor.bias_sd > 0.0 and sensor.sd_of(axis) is not None]
         for axis in axes
     ]
-    state = at_rest(config, axes, len(names), biases, NEVER, {})
-    kept = room_for(state, FIRST_ROWS + 1, FIRST_ROWS + 1)
-    kept.arrived[:] = True
+    state = at_rest(config, axes, len(names), biases, NEVER, start, FIRST_ROWS + 2)
+    for part in state[:-1]:
+        part[-count:] = part[:count]  # at rest
     counted = Counters.none(len(names))
     if counters is not None:
         counted.number[:], counted.usual[:] = counters.number, counters.usual
+    level = [start.get(axis, np.nan) for axis in axes]
+    delay = [round(config.arm.delay_of(axis) * 1e9) for axis in axes]
     memory = Memory(
         model=filter_model(config, axes, biases),
         sensors=filter_sensors(config, names, axes, biases),
         events=Events.empty(count, FIRST_ROWS)._replace(spread=np.ones((FIRST_ROWS, count))),
         state=state,
         results=Results.room(FIRST_ROWS, count),
-        history=no_history(state),
-        kept=kept,
-        counters=counted,
+        history=no_history(count, state.x.shape[1]),
+        arrived=np.ones(FIRST_ROWS, dtype=np.bool_),
         incoming=Incoming(
-            span=np.array([0, 0, 0, 0, NEVER]),
-            first=np.full(count, NEVER),
-            start=np.array([start.get(axis, np.nan) for axis in axes]),
-            delay=np.array([round(config.arm.delay_of(axis) * 1e9) for axis in axes]),
-            latency=np.array([round(sensor.latency * 1e9) for sensor in config.sensors.values()], dtype=np.int64),
-            value=np.zeros(count),
-            spread=np.ones(count),
+            span=np.array([0, 0, 0, 0, NEVER, -1]),
+            times=np.array([[NEVER, one, 0] for one in delay]),
+            values=np.array([[0.0, 1.0, one, 0.0] for one in level]),
             outcome=np.zeros(count, dtype=np.uint8),
-            innovation=np.zeros(count),
-            contradicts=np.zeros(1, dtype=np.int64),
-            fused=np.zeros(count, dtype=np.int64),
-            rest_covariance=state.P[:count].copy(),
-            rest_drive=state.drive[:count].copy(),
+            latency=np.array([round(sensor.latency * 1e9) for sensor in config.sensors.values()], dtype=np.int64),
         ),
     )
-    memory.state.drive[:count, START] = memory.incoming.start
-    return Window(memory)
+    return Window(memory, counted)
 
 
 def _number(value: object) -> float:
