@@ -1,8 +1,8 @@
 """The pictures and the numbers of the README, made anew from the shipped data: ``python docs/pictures.py``.
 
-Sets side by side, with the camera alone: its raw measurements, the measurements interpolated, a constant-velocity
-Kalman filter
-tuned by maximum likelihood, and pumafuse. All have the camera's latency removed; errors are against the truth.
+Side by side, with the camera alone: its raw measurements, the measurements interpolated, a constant-velocity Kalman
+filter tuned by maximum likelihood, and pumafuse. All have the camera's latency removed; errors are those on the
+reference.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ from scipy.optimize import minimize_scalar
 
 import pumafuse as pf
 from pumafuse.fusion.score import interpolated
-from pumafuse.views import colours as style
-from pumafuse.views import step_figures
+from pumafuse.views import colours, step_figures
 
 HERE = Path(__file__).parent
 DATA = Path(pf.__file__).parent / "data"
 SD, GATE = 0.5e-3, 4.0  # m, sigma: the camera's, the same for both filters
 STRETCH = (33.6, 36.2)  # s of the scan, with an outlier and dropouts
-COLOURS = ["#c2c6cc", "#8a8f98", "#e8890c", style.ESTIMATE, "#0a3d7a"]
+COLOURS = ["#c2c6cc", "#8a8f98", "#e8890c", colours.ESTIMATE, "#0a3d7a"]
 
 
 def constant_velocity(time, value, density, at):
@@ -66,11 +65,11 @@ def rows(est, axis):
     }
 
 
-def errors(axes, methods, truth):
+def errors(axes, methods, reference):
     """RMS error of each method on each axis as bars; prints them, too."""
     for place, (axis, positions) in enumerate(methods.items()):
         for number, (name, position) in enumerate(positions.items()):
-            rms = float(np.sqrt(np.nanmean((position - truth[axis]) ** 2))) * 1e3
+            rms = float(np.sqrt(np.nanmean((position - reference[axis]) ** 2))) * 1e3
             print(f"{axis:11} {name:42} {rms:.3f} mm")
             at = place + 0.17 * (number - 2)
             axes.bar(at, rms, 0.16, color=COLOURS[number], label=name if place == 0 else None)
@@ -81,12 +80,12 @@ def errors(axes, methods, truth):
     axes.legend(frameon=False, fontsize=8)
 
 
-def stretch(axes, est, methods, truth):
-    """A few seconds of the radial axis: what the camera says, what becomes of it, and the truth."""
+def stretch(axes, est, methods, reference):
+    """A few seconds of the radial axis: the camera's measurements, each filter's estimate, and the reference."""
     start, end = STRETCH
     shown = (est.time >= start) & (est.time <= end)
-    time, truth = est.time[shown], truth["radial"][shown] * 1e3
-    middle, span = np.median(truth), 1.9 * np.ptp(truth)
+    time, reference = est.time[shown], reference["radial"][shown] * 1e3
+    middle, span = np.median(reference), 1.9 * np.ptp(reference)
     low, high = middle - 0.5 * span, middle + 0.5 * span
     seen = est.measurements.of("vision", "radial")
     seen = seen.where((seen.time >= start) & (seen.time <= end))
@@ -94,24 +93,24 @@ def stretch(axes, est, methods, truth):
     axes.plot(seen.time[fused], value[fused], "o", ms=3.5, color=COLOURS[1], label="camera measurements")
     for when, far in zip(seen.time[~fused], value[~fused], strict=True):
         edge = np.clip(far, low + 0.04 * span, high - 0.04 * span)
-        axes.plot(when, edge, "x", ms=8, mew=2, color=style.REJECTED)
+        axes.plot(when, edge, "x", ms=8, mew=2, color=colours.REJECTED)
         axes.annotate(
-            f"outlier, {far - np.interp(when, time, truth):+.0f} mm: rejected",
+            f"outlier, {far - np.interp(when, time, reference):+.0f} mm: rejected",
             (when, edge),
             (7, -3),
             textcoords="offset points",
-            color=style.REJECTED,
+            color=colours.REJECTED,
             fontsize=8,
         )
     radial = methods["radial"]
     other = "constant-velocity filter, tuned"
     axes.plot(time, radial[other][shown] * 1e3, color=COLOURS[2], lw=1.2, label=other)
     position, sd = est["radial"].position[shown] * 1e3, est["radial"].position_sd[shown] * 1e3
-    axes.fill_between(time, position - 1.96 * sd, position + 1.96 * sd, color=style.ESTIMATE, alpha=0.22, lw=0)
-    axes.plot(time, position, color=style.ESTIMATE, lw=1.8, label="pumafuse, with its 95 % error bars")
-    axes.plot(time, truth, "k--", lw=1.1, label="truth, which no filter sees")
+    axes.fill_between(time, position - 1.96 * sd, position + 1.96 * sd, color=colours.ESTIMATE, alpha=0.22, lw=0)
+    axes.plot(time, position, color=colours.ESTIMATE, lw=1.8, label="pumafuse, with its 95 % error bars")
+    axes.plot(time, reference, "k--", lw=1.1, label="reference, used by no filter")
     axes.set(xlim=STRETCH, ylim=(low, high), xlabel="time [s]", ylabel="radial position [mm]")
-    axes.set_title("a camera of 0.5 mm noise, 45 ms late, and what is made of it", loc="left")
+    axes.set_title("a camera with 0.5 mm noise, 45 ms late, and two filters", loc="left")
     axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper right")
 
 
@@ -122,10 +121,10 @@ def main() -> None:
     est = pf.fuse(run, config, sensors=["vision"], rate=200.0)
     smooth = pf.fuse(run, config, sensors=["vision"], rate=200.0, smooth=True)
     methods = {axis: {**rows(est, axis), "pumafuse --smooth (afterwards)": smooth[axis].position} for axis in est.axes}
-    truth = {axis: interpolated(est.time, est.segment, est.reference, axis) for axis in est.axes}
+    reference = {axis: interpolated(est.time, est.segment, est.reference, axis) for axis in est.axes}
     figure, (left, right) = plt.subplots(1, 2, figsize=(13.0, 4.4), layout="constrained", width_ratios=[5, 4])
-    stretch(left, est, methods, truth)
-    errors(right, methods, truth)
+    stretch(left, est, methods, reference)
+    errors(right, methods, reference)
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(HERE / "images" / "comparison.png", dpi=110)

@@ -37,7 +37,7 @@ def test_the_wheel_works_in_an_empty_environment(built: tuple[Path, Path], tmp_p
     place = tmp_path / "empty" / "bin"
     run(place / "python", "-m", "pip", "install", "--quiet", "--constraint", versions, built[0])
     assert run(place / "pumafuse", "--version") == f"pumafuse {version('pumafuse')}\n"
-    assert "0.364" in run(place / "pumafuse", "demo", "--output", tmp_path / "demo")
+    assert "0.365" in run(place / "pumafuse", "demo", "--output", tmp_path / "demo")
     assert {"fused.png", "fused.rrd", "summary.json"} <= {path.name for path in (tmp_path / "demo").iterdir()}
     assert "_PUMAFUSE_COMPLETE" in run(place / "pumafuse", "--show-completion", "bash")
 

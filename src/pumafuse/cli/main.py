@@ -79,6 +79,8 @@ def fuse(
 
     if smooth and as_live:
         raise typer.BadParameter("choose one of --smooth and --as-live")
+    if engine == "filterpy" and (smooth or as_live):
+        raise typer.BadParameter("--engine filterpy gives filtered estimates only: without --smooth and --as-live")
     options = command.Options(
         config=config,
         output=output,
