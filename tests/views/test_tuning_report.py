@@ -12,11 +12,11 @@ import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from pumafuse.fusion.outcome import Outcome
 
 import pumafuse as pf
 from outline import outline
 from pumafuse.errors import PumafuseWarning
+from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.consistency import consistency, densities_of
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
