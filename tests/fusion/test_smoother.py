@@ -164,6 +164,12 @@ def test_smoothing_changes_no_innovation_outcome_or_bias() -> None:
     assert after.biases == before.biases
 
 
+def test_smoothed_as_live_is_refused() -> None:
+    """All measurements, and only those that had arrived: a contradiction."""
+    with pytest.raises(ValueError, match="as_live"):
+        fuse(*Case().made(), smooth=True, as_live=True)
+
+
 def test_smoothing_does_not_reach_across_a_clock_that_was_set_back() -> None:
     """Each side is smoothed as if it were a run of its own."""
     parts = [Case(one(UNDER), seed=seed).made() for seed in (1, 2)]
