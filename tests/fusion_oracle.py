@@ -232,7 +232,7 @@ class AxisOracle:
         leave_out: Collection[tuple[str, int]] = (),
         reacquired: Collection[tuple[str, int]] = (),
     ) -> None:
-        """Collect what ``run`` says of ``axis``.
+        """Collect the commands and measurements of ``axis``.
 
         Args:
             run: Commands and measurements.

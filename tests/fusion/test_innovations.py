@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from fusion.test_oracle import CASES, LAG, MS, NOISE, UNDER, VISION, Case, Heard, cases, every, sensor
+from fusion.test_oracle import CASES, LAG, MS, NOISE, UNDER, VISION, Case, Seen, cases, every, sensor
 from fusion_oracle import AxisOracle
 from pumafuse.errors import PumafuseWarning
 from pumafuse.filter.events import Results
@@ -77,10 +77,10 @@ def test_innovations_of_any_run_are_those_of_its_fusion(case: Case) -> None:
 
 def contradicting() -> tuple[Run, FusionConfig]:
     """A camera of two axes that jumps by 50 mm after a second, when the tracker has ended: it is rejected, then not."""
-    camera = Heard(sensor(0.4e-3, latency=0.03), every(30, 60))
-    tracker = Heard(sensor(0.3e-3, latency=0.004), every(11, 10, 3 * MS))
+    camera = Seen(sensor(0.4e-3, latency=0.03), every(30, 60))
+    tracker = Seen(sensor(0.3e-3, latency=0.004), every(11, 10, 3 * MS))
     axes = {"radial": AxisModel(plant=LAG), "vertical": AxisModel(plant=UNDER)}
-    run, config = Case(axes, times=np.arange(75) * 28 * MS, heard={"camera": camera, "tracker": tracker}).made()
+    run, config = Case(axes, times=np.arange(75) * 28 * MS, seen={"camera": camera, "tracker": tracker}).made()
     for value in run.sensors["camera"].values.values():
         value[30:] += 0.05
     return run, gated(config, 5.0)
@@ -141,7 +141,7 @@ def test_a_rejected_component_has_its_innovation_and_no_influence() -> None:
 
 def test_to_give_all_as_fused_is_to_have_no_gate() -> None:
     """All outcomes given as fused under narrow gates: the innovations of a fusion whose gates are off."""
-    case = replace(CASES["axes and missing values"], process=NOISE, heard={"vision": VISION})
+    case = replace(CASES["axes and missing values"], process=NOISE, seen={"vision": VISION})
     run, config = case.made()
     segment = build(run, config)
     repeated = innovations(segment, gated(config), segment.measurement_rows.known)

@@ -22,7 +22,6 @@ from pumafuse.filter.forward import Outputs, filter_events, no_history
 from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.engine import arranged, biased_sensors
-from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
 from pumafuse.fusion.segments import build
 from pumafuse.fusion.setup import room_for
@@ -39,8 +38,8 @@ PAPER = Gain(slope=0.0818, intercept=0.933)
 
 
 @dataclass(frozen=True)
-class Heard:
-    """A sensor and the instants it reads [ns since the first command], on ``axes`` (all for None)."""
+class Seen:
+    """A sensor and when its measurements are valid [ns since the first command], on ``axes`` (all for None)."""
 
     sensor: Sensor
     valid: np.ndarray
@@ -66,7 +65,7 @@ class Case:
     times: np.ndarray = field(default_factory=lambda: GRID)
     process: Process | Mapping[str, Process] = NOISE
     offset_sd: float = 5e-3
-    heard: Mapping[str, Heard] = field(default_factory=lambda: {"tracker": TRACKER})
+    seen: Mapping[str, Seen] = field(default_factory=lambda: {"tracker": TRACKER})
     start: Mapping[str, float] = field(default_factory=dict)
     origin: int | float = 0  # stamp of the first command: int ns, or float seconds
     rate: float | None = None
@@ -83,9 +82,9 @@ class Case:
             arm=ArmModel(name="an arm", update_period=self.period, delay=self.delay, axes=dict(self.axes)),
             start=Start(offset_sd=self.offset_sd),
             process=dict(process),
-            sensors={name: heard.sensor for name, heard in self.heard.items()},
+            sensors={name: seen.sensor for name, seen in self.seen.items()},
         )
-        sensors = {name: self._measurements(heard, command, rng) for name, heard in self.heard.items()}
+        sensors = {name: self._measurements(seen, command, rng) for name, seen in self.seen.items()}
         shuffled = dict(reversed(sensors.items()))  # the order that counts is the configuration's
         return Run.from_arrays(self._stamps(self.times), command, shuffled, start=self.start), config
 
@@ -93,19 +92,19 @@ class Case:
         return self.origin + (ns if isinstance(self.origin, int) else ns * 1e-9)
 
     def _measurements(
-        self, heard: Heard, command: Mapping[str, np.ndarray], rng: np.random.Generator
+        self, seen: Seen, command: Mapping[str, np.ndarray], rng: np.random.Generator
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         values: dict[str, np.ndarray] = {}
-        bias = rng.normal(0.0, heard.sensor.bias_sd)
-        for axis in heard.axes or command:
-            near = np.interp(heard.valid, self.times, command[axis]) + rng.normal(0.0, 1e-3, len(heard.valid))
-            values[axis] = heard.sensor.scale * near + bias
-            values[axis][rng.random(len(heard.valid)) < heard.missing] = np.nan
-        return self._stamps(heard.valid + round(heard.sensor.latency * 1e9)), values
+        bias = rng.normal(0.0, seen.sensor.bias_sd)
+        for axis in seen.axes or command:
+            near = np.interp(seen.valid, self.times, command[axis]) + rng.normal(0.0, 1e-3, len(seen.valid))
+            values[axis] = seen.sensor.scale * near + bias
+            values[axis][rng.random(len(seen.valid)) < seen.missing] = np.nan
+        return self._stamps(seen.valid + round(seen.sensor.latency * 1e9)), values
 
 
 def anomalous(run: Run, config: FusionConfig) -> bool:
-    """Some component is not finite or valid before the first command: pumafuse has to say so."""
+    """Some component is not finite or valid before the first command, so that a warning is due."""
     origin = run.command.stamp.min()
     return any(
         (source.stamp - round(config.sensors[name].latency * 1e9) < origin).any()
@@ -114,15 +113,19 @@ def anomalous(run: Run, config: FusionConfig) -> bool:
     )
 
 
-def told(run: Run, config: FusionConfig) -> AbstractContextManager[object]:
+def warned(run: Run, config: FusionConfig) -> AbstractContextManager[object]:
+    """Expects the warning that is due."""
     return pytest.warns(PumafuseWarning) if anomalous(run, config) else nullcontext()
 
 
-def check(case: Case, *, as_live: bool = False) -> Estimates:
-    """Everything :func:`fuse` says of a case agrees with the oracle."""
+MODES = {"filtered": {}, "as_live": {"as_live": True}, "smoothed": {"smooth": True}}
+
+
+def check(case: Case, mode: str = "filtered") -> None:
+    """Estimates and innovations of a case agree with the oracle."""
     run, config = case.made()
-    with told(run, config):
-        estimates = fuse(run, config, rate=case.rate, as_live=as_live)
+    with warned(run, config):
+        estimates = fuse(run, config, rate=case.rate, **MODES[mode])
     times = nanoseconds(estimates)
     grid = case.times if case.rate is None else every(case.rate, len(times))
     assert times.tolist() == grid.tolist()
@@ -131,8 +134,7 @@ def check(case: Case, *, as_live: bool = False) -> Estimates:
     for number, axis in enumerate(estimates.axes):
         oracle = AxisOracle(run, config, axis)
         check_innovations(fused.where(fused.axis == number), oracle)
-        check_estimates(estimates[axis], oracle.as_live(times) if as_live else oracle.filtered(times))
-    return estimates
+        check_estimates(estimates[axis], getattr(oracle, mode)(times))
 
 
 # ---- the oracle itself ----------------------------------------------------------------------------------------------
@@ -150,7 +152,7 @@ def companion(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("recovery", [None, 0.3, 0.0425, 1.0 / 45.0, 1.0 / 45.0 + 1e-10, 2e-3])
 @pytest.mark.parametrize("plant", [LAG, UNDER, CRITICAL, NEARLY, OVER])
 def test_the_oracles_responses_are_those_of_the_plants(plant: Plant, recovery: float | None) -> None:
-    """By matrix exponentials: g = C e^(At) B, g' = C A e^(At) B, c and k of the plant with a decaying input beside it."""
+    """By matrix exponentials: g = C e^(At) B, g' = C A e^(At) B, and c and k with the input as one more state."""
     A, B, C = companion(plant)
     response = Response(AxisModel(plant=plant, gain_recovery=recovery))
     fed = np.zeros((2, len(A) + 1, len(A) + 1))
@@ -167,7 +169,7 @@ def test_the_oracles_responses_are_those_of_the_plants(plant: Plant, recovery: f
 def test_the_oracle_settles_to_the_stationary_variances(plant: Plant) -> None:
     """Without measurements: Lyapunov's Σ, of the velocity 2 C (1 − e^(AT)) Σ Cᵀ / T², and an offset that walks."""
     process = Process(input_noise=0.3e-3, drift=0.8e-3)
-    case = Case({"radial": AxisModel(plant=plant)}, times=np.array([0, 3000 * MS]), process=process, heard={})
+    case = Case({"radial": AxisModel(plant=plant)}, times=np.array([0, 3000 * MS]), process=process, seen={})
     belief = AxisOracle(*case.made(), "radial").filtered(case.times)
     A, B, C = companion(plant)
     settled = solve_continuous_lyapunov(A, -(process.input_noise**2) * np.outer(B, B))
@@ -184,10 +186,10 @@ def test_the_oracle_settles_to_the_stationary_variances(plant: Plant) -> None:
 def test_the_oracle_conditions_like_a_dense_solve() -> None:
     """Mean and variance given three measurements, as mpmath solves the 3 by 3 system from integrals of its own.
 
-    The command at 70 ms acts at 90 ms: before the velocity's interval from 65 ms to 93 ms ends, but nobody knows of it.
+    The command at 70 ms acts at 90 ms, before the velocity's interval from 65 to 93 ms ends, but is not known at 65 ms.
     """
-    heard = {"tracker": Heard(sensor(latency=0.0), np.array([10, 35, 61]) * MS)}
-    case = Case(delay=0.02, times=np.array([0, 28, 70]) * MS, heard=heard)
+    seen = {"tracker": Seen(sensor(latency=0.0), np.array([10, 35, 61]) * MS)}
+    case = Case(delay=0.02, times=np.array([0, 28, 70]) * MS, seen=seen)
     run, config = case.made()
     belief = AxisOracle(run, config, "radial").filtered(np.array([65 * MS]))
     u, z = run.command.values["radial"], run.sensors["tracker"].values["radial"]
@@ -238,11 +240,11 @@ def test_the_oracle_conditions_like_a_dense_solve() -> None:
 
 GRID = np.arange(16) * T
 IRREGULAR = np.cumsum([0, 28, 31, 20, 28, 3, 28, 400, 28, 28, 5, 28, 90, 28]) * MS
-TRACKER = Heard(sensor(latency=0.008), every(90, 36))
-VISION = Heard(sensor(0.4e-3, latency=0.090), every(25, 10, 7 * MS))
-SLOW = Heard(sensor(0.2e-3, latency=0.240), every(12.5, 5, 3 * MS))
-PANEL = Heard(sensor(0.3e-3, latency=0.004, scale=-1.0, bias_sd=1.0), every(40, 16, 2 * MS))
-AHEAD = Heard(sensor(0.3e-3, latency=-0.050), every(15, 6, 61 * MS))  # stamped before it is true
+TRACKER = Seen(sensor(latency=0.008), every(90, 36))
+VISION = Seen(sensor(0.4e-3, latency=0.090), every(25, 10, 7 * MS))
+SLOW = Seen(sensor(0.2e-3, latency=0.240), every(12.5, 5, 3 * MS))
+PANEL = Seen(sensor(0.3e-3, latency=0.004, scale=-1.0, bias_sd=1.0), every(40, 16, 2 * MS))
+AHEAD = Seen(sensor(0.3e-3, latency=-0.050), every(15, 6, 61 * MS))  # stamped before it is true
 THREE = {
     "tangential": AxisModel(
         plant=SecondOrder(natural_frequency=53.9, damping=0.864), gain=Gain(slope=0.05, intercept=1.01)
@@ -288,30 +290,30 @@ CASES = {
     "no drift": Case(process=Process(input_noise=0.3e-3, drift=0.0)),
     "nothing but offset": Case(one(UNDER), process=Process(input_noise=0.0, drift=0.0)),
     "maneuver alone": Case(process=Process(input_noise=0.0, drift=0.0, maneuver_noise=1e-3, maneuver_drift=1e-2)),
-    "read as commands act": Case(delay=0.0565, heard={"tracker": Heard(sensor(latency=0.0033), GRID + 56_500_000)}),
-    "read as commands act, at once": Case(one(UNDER), delay=0.0, heard={"tracker": Heard(sensor(), GRID)}),
+    "measured as commands act": Case(delay=0.0565, seen={"tracker": Seen(sensor(latency=0.0033), GRID + 56_500_000)}),
+    "measured as commands act, at once": Case(one(UNDER), delay=0.0, seen={"tracker": Seen(sensor(), GRID)}),
     "two at the same instants": Case(
-        heard={"vision": replace(VISION, valid=GRID), "tracker": replace(TRACKER, valid=GRID)}
+        seen={"vision": replace(VISION, valid=GRID), "tracker": replace(TRACKER, valid=GRID)}
     ),
-    "rates and latencies": Case(one(UNDER), heard={"vision": VISION, "slow": SLOW, "ahead": AHEAD, "tracker": TRACKER}),
-    "panel": Case(one(UNDER), heard={"panel": PANEL, "tracker": Heard(sensor(latency=0.05), every(20, 8, 150 * MS))}),
-    "panel alone": Case(heard={"panel": PANEL}),
-    "two panels": Case(heard={"panel": PANEL, "other": Heard(PANEL.sensor, every(40, 16, 2 * MS))}),
-    "a factor": Case(heard={"tracker": Heard(sensor(scale=2.5), every(60, 20))}),
-    "without measurements": Case(one(UNDER), heard={}),
-    "rows before the first command": Case(heard={"tracker": Heard(TRACKER.sensor, every(90, 20, -30 * MS))}),
+    "rates and latencies": Case(one(UNDER), seen={"vision": VISION, "slow": SLOW, "ahead": AHEAD, "tracker": TRACKER}),
+    "panel": Case(one(UNDER), seen={"panel": PANEL, "tracker": Seen(sensor(latency=0.05), every(20, 8, 150 * MS))}),
+    "panel alone": Case(seen={"panel": PANEL}),
+    "two panels": Case(seen={"panel": PANEL, "other": Seen(PANEL.sensor, every(40, 16, 2 * MS))}),
+    "a factor": Case(seen={"tracker": Seen(sensor(scale=2.5), every(60, 20))}),
+    "without measurements": Case(one(UNDER), seen={}),
+    "rows before the first command": Case(seen={"tracker": Seen(TRACKER.sensor, every(90, 20, -30 * MS))}),
     "grid": Case(one(UNDER), rate=170.0),
-    "sparse grid": Case(rate=7.0, heard={"tracker": TRACKER, "vision": VISION}),
+    "sparse grid": Case(rate=7.0, seen={"tracker": TRACKER, "vision": VISION}),
     "nanosecond stamps": Case(origin=1_700_000_000_123_456_789, rate=100.0),
     "absolute seconds": Case(one(UNDER), origin=1.7e9),
     "negative stamps": Case(origin=-5_000_000_001),
     "axes and missing values": Case(
         THREE,
         process={"tangential": NOISE, "radial": Process(input_noise=1e-3), "vertical": Process(drift=0.0)},
-        heard={
-            "vision": Heard(VISION.sensor, VISION.valid, missing=0.4),
-            "panel": Heard(PANEL.sensor, PANEL.valid, axes=("vertical",)),
-            "tracker": Heard(
+        seen={
+            "vision": Seen(VISION.sensor, VISION.valid, missing=0.4),
+            "panel": Seen(PANEL.sensor, PANEL.valid, axes=("vertical",)),
+            "tracker": Seen(
                 sensor({"radial": 0.05e-3, "tangential": 0.08e-3}), every(60, 12), ("radial", "tangential"), missing=0.2
             ),
         },
@@ -321,18 +323,18 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("as_live", [False, True], ids=["filtered", "as-live"])
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
-def test_estimates_are_conditional_means(case: Case, as_live: bool) -> None:
+def test_estimates_are_conditional_means(case: Case, mode: str) -> None:
     """Every estimate, error bar and innovation is that of the joint Gaussian given the measurements it may know."""
-    check(case, as_live=as_live)
+    check(case, mode)
 
 
 @pytest.mark.parametrize("case", [Case(delay=0.0), Case(one(UNDER))], ids=["first order", "second order"])
 def test_wandering_latency_counts_with_speed(case: Case) -> None:
-    """A measurement's variance grows by (scale · predicted velocity · latency_sd)²; a command acts before it is read."""
-    wanders = Heard(sensor(latency=0.02, latency_sd=0.004, scale=-1.5), np.union1d(case.times, every(70, 28)))
-    check(replace(case, heard={"wandering": wanders, "vision": VISION}))
+    """A measurement's variance grows by (scale · predicted speed · latency_sd)²; a command acts before it."""
+    wanders = Seen(sensor(latency=0.02, latency_sd=0.004, scale=-1.5), np.union1d(case.times, every(70, 28)))
+    check(replace(case, seen={"wandering": wanders, "vision": VISION}))
 
 
 def plants() -> st.SearchStrategy[Plant]:
@@ -341,7 +343,7 @@ def plants() -> st.SearchStrategy[Plant]:
     return st.one_of(first, st.builds(SecondOrder, natural_frequency=st.floats(8.0, 70.0), damping=damping))
 
 
-def sensors(first: int, bias_sd: float) -> st.SearchStrategy[Heard]:
+def sensors(first: int, bias_sd: float) -> st.SearchStrategy[Seen]:
     """A sensor of up to 13 measurements; latencies, so the order of arrival, are anything."""
     ms = st.integers(0, 300).map(lambda latency: latency * 1e-3)
     read = st.builds(
@@ -354,7 +356,7 @@ def sensors(first: int, bias_sd: float) -> st.SearchStrategy[Heard]:
     valid = st.builds(
         every, st.floats(8.0, 150.0), st.integers(3, 13), st.integers(0, 200).map(lambda t: t * MS + first)
     )
-    return st.builds(Heard, read, valid, missing=st.sampled_from([0.0, 0.2]))
+    return st.builds(Seen, read, valid, missing=st.sampled_from([0.0, 0.2]))
 
 
 @st.composite
@@ -385,7 +387,7 @@ def cases(draw: st.DrawFn) -> Case:
         times=np.cumsum([0, *gaps]),
         process=draw(process),
         offset_sd=draw(st.sampled_from([0.0, 1e-3, 0.02])),
-        heard={name: draw(sensors(fraction, bias_sd=float(name == "panel"))) for name in names},
+        seen={name: draw(sensors(fraction, bias_sd=float(name == "panel"))) for name in names},
         start=draw(st.sampled_from([{}, {"radial": 0.512}])),
         rate=draw(st.none() | st.floats(20.0, 60.0)),
         seed=draw(st.integers(0, 2**32 - 1)),
@@ -393,10 +395,10 @@ def cases(draw: st.DrawFn) -> Case:
 
 
 @settings(derandomize=True, deadline=None, max_examples=150)
-@given(cases(), st.booleans())
-def test_any_run_is_fused_like_the_conditional_gaussian(case: Case, as_live: bool) -> None:
+@given(cases(), st.sampled_from(["filtered", "as_live"]))
+def test_any_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -> None:
     """Random plants, delays, gains, noise and sensors: nothing deviates from the joint Gaussian."""
-    check(case, as_live=as_live)
+    check(case, mode)
 
 
 # ---- the gate -------------------------------------------------------------------------------------------------------
@@ -406,14 +408,14 @@ OUTLIER = 13  # the row of the tracker that goes wrong
 
 def on_model(gate: float, gate_rows: bool = True) -> tuple[Run, FusionConfig]:
     """Two axes whose measurements are what the model expects, so that every innovation is 0."""
-    tracker = Heard(Sensor(sd=0.2e-3, latency=0.008, gate=gate, gate_rows=gate_rows), every(60, 20))
-    prompt = Heard(sensor(0.4e-3), VISION.valid)  # nothing arrives late, so the gate decides alike live
+    tracker = Seen(Sensor(sd=0.2e-3, latency=0.008, gate=gate, gate_rows=gate_rows), every(60, 20))
+    prompt = Seen(sensor(0.4e-3), VISION.valid)  # nothing arrives late, so the gate decides alike live
     axes = {"radial": AxisModel(plant=LAG), "vertical": AxisModel(plant=UNDER)}
-    run, config = Case(axes, heard={"tracker": tracker, "prompt": prompt}).made()
-    for name, heard in {"tracker": tracker, "prompt": prompt}.items():
+    run, config = Case(axes, seen={"tracker": tracker, "prompt": prompt}).made()
+    for name, seen in {"tracker": tracker, "prompt": prompt}.items():
         for axis, values in run.sensors[name].values.items():
             silent = replace(run, sensors={})
-            values[:] = AxisOracle(silent, config, axis).filtered(heard.valid).position
+            values[:] = AxisOracle(silent, config, axis).filtered(seen.valid).position
     return run, config
 
 
@@ -429,7 +431,7 @@ def with_outlier(gate: float, sigmas: float, gate_rows: bool = True) -> tuple[Ru
     return run, config, sd[row]
 
 
-@pytest.mark.parametrize("as_live", [False, True], ids=["filtered", "as-live"])
+@pytest.mark.parametrize("mode", ["filtered", "as_live"])
 @pytest.mark.parametrize(
     ("gate", "sigmas", "passes"),
     [
@@ -442,26 +444,26 @@ def with_outlier(gate: float, sigmas: float, gate_rows: bool = True) -> tuple[Ru
         (0.0, 1e4, True),
     ],
 )
-def test_the_gate_rejects_beyond_so_many_sigma(gate: float, sigmas: float, passes: bool, as_live: bool) -> None:
-    """A measurement beyond gate · √S leaves the estimates as if it had never been; one within is fused; gate 0 is none."""
+def test_the_gate_rejects_beyond_so_many_sigma(gate: float, sigmas: float, passes: bool, mode: str) -> None:
+    """A measurement beyond gate · √S leaves the estimates as if it had not been; one within is fused; 0 is no gate."""
     run, config, sd = with_outlier(gate, sigmas)
-    estimates = fuse(run, config, as_live=as_live)
-    met = estimates.measurements.of("tracker", "radial")
-    outcomes = [Outcome.FUSED] * len(met.value)
+    estimates = fuse(run, config, **MODES[mode])
+    found = estimates.measurements.of("tracker", "radial")
+    outcomes = [Outcome.FUSED] * len(found.value)
     outcomes[OUTLIER] = Outcome.FUSED if passes else Outcome.REJECTED
-    assert met.outcome.tolist() == outcomes
-    assert met.innovation_sd[OUTLIER] == pytest.approx(sd, rel=1e-9)
-    assert met.innovation[OUTLIER] == pytest.approx(sigmas * sd, rel=1e-9)
+    assert found.outcome.tolist() == outcomes
+    assert found.innovation_sd[OUTLIER] == pytest.approx(sd, rel=1e-9)
+    assert found.innovation[OUTLIER] == pytest.approx(sigmas * sd, rel=1e-9)
     oracle = AxisOracle(run, config, "radial", leave_out=() if passes else {("tracker", OUTLIER)})
     times = nanoseconds(estimates)
-    check_estimates(estimates["radial"], oracle.as_live(times) if as_live else oracle.filtered(times))
+    check_estimates(estimates["radial"], getattr(oracle, mode)(times))
     radial = estimates.measurements.where(estimates.measurements.axis == estimates.measurements.axes.index("radial"))
     check_innovations(radial.where(radial.outcome == Outcome.FUSED), oracle)
 
 
 @pytest.mark.parametrize("gate_rows", [True, False])
 def test_a_rejected_axis_gates_its_row_where_asked(gate_rows: bool) -> None:
-    """With gate_rows the other axis of the row is rejected too and its estimates do without it; otherwise it is fused."""
+    """With gate_rows the other axis of the row is rejected too and its estimates do without it; else it is fused."""
     run, config, _ = with_outlier(5.0, 7.0, gate_rows)
     estimates = fuse(run, config)
     outcome = {axis: estimates.measurements.of("tracker", axis).outcome[OUTLIER] for axis in estimates.axes}
@@ -493,8 +495,8 @@ def filtered(model: Model, sensors: Sensors, state: State, events: Events) -> No
 def test_the_covariance_settles_where_riccatis_equation_says(plant: Plant) -> None:
     """One measurement each period, forever: P after a measurement, from the discrete algebraic Riccati equation."""
     process = Process(input_noise=0.3e-3, drift=0.8e-3)
-    read = Heard(sensor(0.1e-3), np.arange(400) * T + 5 * MS)
-    case = Case(one(plant), times=np.arange(400) * T, delay=0.0, process=process, heard={"tracker": read})
+    read = Seen(sensor(0.1e-3), np.arange(400) * T + 5 * MS)
+    case = Case(one(plant), times=np.arange(400) * T, delay=0.0, process=process, seen={"tracker": read})
     *axis, state, events = arranged_for(case)
     filtered(*axis, state, events)
     A, B, C = companion(plant)
@@ -516,11 +518,11 @@ def test_a_million_steps_leave_the_covariance_symmetric_and_positive() -> None:
     """P of plant, offset and a bias of 1 m stays symmetric to the last bit and positive."""
     count = 700_000
     process = Process(input_noise=0.03e-3, drift=0.4e-3, maneuver_noise=0.5e-3, maneuver_drift=5e-3)
-    heard = {
-        "panel": Heard(sensor(0.3e-3, scale=-1.0, bias_sd=1.0), every(12.0, count // 3, 2 * MS)),
-        "tracker": Heard(sensor(0.05e-3, latency=0.008), every(36.0, count, 5 * MS)),
+    seen = {
+        "panel": Seen(sensor(0.3e-3, scale=-1.0, bias_sd=1.0), every(12.0, count // 3, 2 * MS)),
+        "tracker": Seen(sensor(0.05e-3, latency=0.008), every(36.0, count, 5 * MS)),
     }
-    *axis, state, events = arranged_for(Case(one(UNDER), times=np.arange(count) * T, process=process, heard=heard))
+    *axis, state, events = arranged_for(Case(one(UNDER), times=np.arange(count) * T, process=process, seen=seen))
     assert len(events.time) > 1_000_000
     for begin in range(0, len(events.time), 500):
         filtered(*axis, state, events.rows(slice(begin, begin + 500)))

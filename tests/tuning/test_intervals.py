@@ -156,7 +156,8 @@ def of_one_axis(run: pf.Run, axis: str) -> pf.Run:
 def test_a_shared_parameter_has_the_profile_of_all_measurements() -> None:
     """A camera's latency, two axes, their noises following by Nelder and Mead: dropped by 1.92 (± 25 %) at both ends.
 
-    An end is that of the curvature where that is right to 20 % on its own path. The information adds up: one over its square, the width is the sum of those from each axis's measurements (± 25 %).
+    An end is that of the curvature where that is right to 20 % on its own path. The information adds up: one over its
+    square, the width is the sum of those from each axis's measurements (± 25 %).
     """
     sim = outage(2)
     names = ["sensors.vision.latency_ms", "sensors.vision.sd_mm.tangential", "sensors.vision.sd_mm.vertical"]

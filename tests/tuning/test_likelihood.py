@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import pumafuse as pf
-from fusion.test_oracle import CASES, MS, UNDER, Case, Heard, anomalous, every, sensor
+from fusion.test_oracle import CASES, MS, UNDER, Case, Seen, anomalous, every, sensor
 from fusion_oracle import AxisOracle
 from pumafuse.filter.outcome import ABSENT
 from pumafuse.fusion.consistency import densities_of, log_likelihood
@@ -95,7 +95,7 @@ def test_it_is_the_log_likelihood_of_a_fusion(made: Callable[[], tuple[pf.Run, p
 UNBIASED = {
     name: case
     for name, case in CASES.items()
-    if case.heard and not any(heard.sensor.latency_sd or heard.sensor.bias_sd for heard in case.heard.values())
+    if case.seen and not any(seen.sensor.latency_sd or seen.sensor.bias_sd for seen in case.seen.values())
 }
 
 
@@ -308,9 +308,9 @@ def test_the_score_is_the_derivative_of_the_log_likelihood(order: int) -> None:
 WITH_NOISE = Case(
     {"radial": AxisModel(plant=UNDER, gain=pf.Gain(slope=0.05, intercept=1.1), gain_recovery=0.06)},
     process=pf.Process(input_noise=3e-4, drift=2e-3, maneuver_noise=2e-3, maneuver_drift=1e-2),
-    heard={
-        "tracker": Heard(sensor(4e-4, latency=0.008), every(50, 20, 30 * MS)),
-        "vision": Heard(sensor(1e-3, latency=0.07), every(25, 10, 47 * MS)),
+    seen={
+        "tracker": Seen(sensor(4e-4, latency=0.008), every(50, 20, 30 * MS)),
+        "vision": Seen(sensor(1e-3, latency=0.07), every(25, 10, 47 * MS)),
     },
 )
 
@@ -386,7 +386,7 @@ def test_the_response_of_the_noiseless_arm_is_that_of_the_oracle() -> None:
     run, config = case.made()
     likelihood = Likelihood([run], config)
     responses = likelihood.responses(config, centred=False)
-    assert {name for name, _ in responses} == set(case.heard)
+    assert {name for name, _ in responses} == set(case.seen)
     for (name, axis), (expected, measured) in responses.items():
         oracle = AxisOracle(run, config, axis)
         mine = [measurement for measurement in oracle.measurements if measurement.sensor == name]
