@@ -36,7 +36,7 @@ _decimal = np.frompyfunc(Decimal, 1, 1)
 
 
 def check_estimates(estimate: object, belief: Belief) -> None:
-    """Estimates of an axis agree with the oracle: means to 1e-9 sd + 1e-12 m, variances to 1e-9. Smoothed: no velocity."""
+    """Estimates of an axis agree with the oracle's: means to 1e-9 sd + 1e-12 m, variances to 1e-9."""
     for field in FIELDS:
         (mean, sd), (wanted, wanted_sd) = (
             (getattr(of, field), getattr(of, f"{field}_sd")) for of in (estimate, belief)

@@ -11,12 +11,14 @@ import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import pumafuse as pf
 from fusion.test_oracle import (
     CASES,
     GRID,
     IRREGULAR,
+    MODES,
     MS,
     OUTLIER,
     PANEL,
@@ -199,7 +201,7 @@ def bumped() -> tuple[Run, FusionConfig]:
     rng = np.random.default_rng(3)
     seen = {
         "vision": Seen(sensor(0.4e-3), every(12, 7)),
-        "tracker": Seen(Sensor(sd=0.2e-3, latency=0.008, scale=-1.0, gate=5.0), every(25, 56)),
+        "tracker": Seen(Sensor(sd=0.2e-3, latency=0.008, scale=-1.5, gate=5.0), every(25, 56)),
     }
     run, config = Case(one(UNDER), times=np.arange(85) * T, seen=seen).made()
     oracle = AxisOracle(run, config, "radial")
@@ -210,25 +212,48 @@ def bumped() -> tuple[Run, FusionConfig]:
     return run, config
 
 
-@pytest.mark.parametrize("smooth", [False, True], ids=["filtered", "smoothed"])
-def test_a_reacquired_gate_is_a_jump_of_the_offset(smooth: bool) -> None:
-    """Estimates are those of the Gaussian with ν² added to the offset's variance there: smoothed ones before it too.
+def check_gated(run: Run, config: FusionConfig, estimates: Estimates, mode: str) -> dict[Outcome, set[tuple[str, int]]]:
+    """Estimates are those of the Gaussian without what was rejected; what re-acquired adds (ν/scale)² to the offset's.
+
+    Returns:
+        The rows with each outcome.
+    """
+    found = estimates.measurements
+    stamps = np.rint(found.stamp * 1e9).astype(np.int64) + estimates.origin
+    sources = [(found.sensors[number], run.sensors[found.sensors[number]].stamp) for number in found.sensor]
+    rows = [(name, int(np.searchsorted(of, stamp))) for (name, of), stamp in zip(sources, stamps, strict=True)]
+    by = {kind: {row for row, outcome in zip(rows, found.outcome, strict=True) if outcome == kind} for kind in Outcome}
+    oracle = AxisOracle(run, config, "radial", leave_out=by[Outcome.REJECTED], reacquired=by[Outcome.REACQUIRED])
+    check_innovations(found.where(np.isin(found.outcome, [Outcome.FUSED, Outcome.REACQUIRED])), oracle)
+    check_estimates(estimates["radial"], getattr(oracle, mode)(nanoseconds(estimates)))
+    return by
+
+
+@pytest.mark.parametrize("mode", ["filtered", "smoothed"])
+def test_a_reacquired_gate_is_a_jump_of_the_offset(mode: str) -> None:
+    """Smoothed estimates know of it before.
 
     The camera saw the arm at 0.5 s and stands against the tracker until 1.0 s. The second time nobody does.
     """
     run, config = bumped()
     with pytest.warns(PumafuseWarning):
-        estimates = fuse(run, config, rate=30.0, smooth=smooth)
-    outcome = estimates.measurements.of("tracker", "radial").outcome
-    rows = {kind: {("tracker", int(row)) for row in np.flatnonzero(outcome == kind)} for kind in Outcome}
+        estimates = fuse(run, config, rate=30.0, **MODES[mode])
+    rows = check_gated(run, config, estimates, mode)
     assert rows[Outcome.REJECTED] == {("tracker", row) for row in (*range(16, 26), 35)}
     assert rows[Outcome.REACQUIRED] == {("tracker", 26), ("tracker", 36)}
-    oracle = AxisOracle(run, config, "radial", leave_out=rows[Outcome.REJECTED], reacquired=rows[Outcome.REACQUIRED])
-    check_innovations(
-        estimates.measurements.where(~np.isin(estimates.measurements.outcome, [Outcome.REJECTED])), oracle
+
+
+@settings(derandomize=True, deadline=None, max_examples=50)
+@given(cases(), st.sampled_from(["filtered", "smoothed"]))
+def test_any_gated_run_is_fused_like_the_conditional_gaussian(case: Case, mode: str) -> None:
+    """Gates narrow enough to reject and to re-acquire."""
+    run, config = tame(case).made()
+    config = msgspec.structs.replace(
+        config, sensors={name: msgspec.structs.replace(each, gate=1.0) for name, each in config.sensors.items()}
     )
-    times = nanoseconds(estimates)
-    check_estimates(estimates["radial"], oracle.smoothed(times) if smooth else oracle.filtered(times))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PumafuseWarning)
+        check_gated(run, config, fuse(run, config, rate=case.rate, **MODES[mode]), mode)
 
 
 # ---- the shipped scan -----------------------------------------------------------------------------------------------
