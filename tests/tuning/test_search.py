@@ -53,7 +53,7 @@ sensors.tracker = {{ rate_hz = 100.0, sd_mm = 0.1, latency_ms = 8.0 }}
 def test_delay_and_lag_are_identified(amplitude: float, fastest: float, seed: int, tmp_path: Path) -> None:
     """A sweep, from an arm 21 ms too early and 18 ms too fast: as likely as the truth at least, and within 5 ms of it.
 
-    The slow first two thirds hardly determine both; and there are false maxima a tick of delay on either side.
+    The slow first two thirds hardly determine both; and there are false maxima a period of delay on either side.
     """
     path = tmp_path / "sweep.toml"
     path.write_text(SWEEP.format(amplitude, fastest))

@@ -162,15 +162,6 @@ def test_the_reference_plays_no_part() -> None:
         assert found.summary.parameters == wanted.summary.parameters
 
 
-def test_a_delay_is_never_negative(tmp_path: Path) -> None:
-    """Latencies 90 ms too long: the arm seems to move before its commands; the result loads all the same."""
-    sim = pf.simulate(scenario("panel-tracker-outage", 0.1, 0.06), 1)
-    found = quietly(lambda: pf.tune([sim.run], with_sensors(sim.config, latency=0.1), fit=["delay"]))
-    assert all(found.config.arm.delay_of(axis) >= 0.0 for axis in AXES)
-    found.config.save(tmp_path)
-    pf.FusionConfig.load(tmp_path / "fusion.toml")
-
-
 # ---- validation -----------------------------------------------------------------------------------------------------
 
 
