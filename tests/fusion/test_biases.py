@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from scipy.stats import chi2
 
 import pumafuse as pf
-from fusion.test_oracle import CASES, LAG, MS, PANEL, TRACKER, UNDER, Case, Heard, cases, every, one, sensor, told
+from fusion.test_oracle import CASES, LAG, MS, PANEL, TRACKER, UNDER, Case, Seen, cases, every, one, sensor, warned
 from fusion_oracle import AxisOracle
 from pumafuse.errors import PumafuseWarning
 from pumafuse.fusion.config import FusionConfig, Process
@@ -27,7 +27,7 @@ from pumafuse.model.arm import AxisModel
 def check(case: Case, *, smooth: bool = False) -> None:
     """The biases are those of the joint Gaussian: means to 1e-9 sd + 1e-12 m, variances to 1e-9."""
     run, config = case.made()
-    with told(run, config):
+    with warned(run, config):
         estimates = fuse(run, config, rate=case.rate, smooth=smooth)
     wanted = {axis: AxisOracle(run, config, axis).biases() for axis in estimates.axes}
     named = {(name, axis) for axis, found in wanted.items() for name in found}
@@ -38,18 +38,21 @@ def check(case: Case, *, smooth: bool = False) -> None:
         assert bias.sd**2 == pytest.approx(sd**2, rel=1e-9)
 
 
-BIASED = {name: case for name, case in CASES.items() if any(ear.sensor.bias_sd for ear in case.heard.values())} | {
+BIASED = {name: case for name, case in CASES.items() if any(each.sensor.bias_sd for each in case.seen.values())} | {
     "two axes": Case(
-        {"radial": AxisModel(plant=LAG), "vertical": AxisModel(plant=UNDER)}, heard={"panel": PANEL, "tracker": TRACKER}
+        {"radial": AxisModel(plant=LAG), "vertical": AxisModel(plant=UNDER)},
+        seen={"panel": PANEL, "tracker": TRACKER},
     ),
     "a panel that sees one axis": Case(
         {"radial": AxisModel(plant=LAG), "vertical": AxisModel(plant=UNDER)},
-        heard={"panel": replace(PANEL, axes=("vertical",)), "tracker": TRACKER},
+        seen={"panel": replace(PANEL, axes=("vertical",)), "tracker": TRACKER},
     ),
-    "a panel read once": Case(heard={"tracker": TRACKER, "panel": replace(PANEL, valid=np.array([250 * MS]))}),
+    "a panel with one measurement": Case(
+        seen={"tracker": TRACKER, "panel": replace(PANEL, valid=np.array([250 * MS]))}
+    ),
     "every scale": Case(
-        heard={
-            str(scale): Heard(sensor(0.3e-3, scale=scale, bias_sd=bias_sd), every(30, 9, 40 * MS))
+        seen={
+            str(scale): Seen(sensor(0.3e-3, scale=scale, bias_sd=bias_sd), every(30, 9, 40 * MS))
             for scale, bias_sd in ((1.0, 0.0), (-1.0, 0.5), (2.5, 1e-3), (-0.2, 0.02))
         },
         start={"radial": 0.51},
@@ -60,7 +63,7 @@ BIASED = {name: case for name, case in CASES.items() if any(ear.sensor.bias_sd f
 @pytest.mark.parametrize("smooth", [False, True], ids=["filtered", "smoothed"])
 @pytest.mark.parametrize("case", BIASED.values(), ids=BIASED.keys())
 def test_biases_are_conditional_means(case: Case, smooth: bool) -> None:
-    """Each sensor that may have one has its bias on each axis it reads, given all measurements; smoothed or not."""
+    """Each sensor with a bias_sd has its bias on each axis it measures, given all measurements; smoothed or not."""
     check(case, smooth=smooth)
 
 
@@ -68,23 +71,25 @@ def test_biases_are_conditional_means(case: Case, smooth: bool) -> None:
 @given(cases())
 def test_any_bias_is_estimated_like_the_conditional_gaussian(case: Case) -> None:
     """Random plants, noise and sensors, most with a bias: nothing deviates from the joint Gaussian."""
-    heard = {
-        name: replace(ear, sensor=msgspec.structs.replace(ear.sensor, bias_sd=bias_sd, sd=max(ear.sensor.sd, 0.2e-3)))
-        for (name, ear), bias_sd in zip(case.heard.items(), (1.0, 0.05, 0.0), strict=False)
+    seen = {
+        name: replace(
+            each, sensor=msgspec.structs.replace(each.sensor, bias_sd=bias_sd, sd=max(each.sensor.sd, 0.2e-3))
+        )
+        for (name, each), bias_sd in zip(case.seen.items(), (1.0, 0.05, 0.0), strict=False)
     }
-    check(replace(case, heard=heard))
+    check(replace(case, seen=seen))
 
 
 @pytest.mark.parametrize("level", [-2.0, 0.0, 0.56, 3.0])
 @pytest.mark.parametrize("start", [None, 5e-3])
 def test_a_bias_is_in_the_coordinates_of_the_log(level: float, start: float | None) -> None:
-    """Measurements 600.4 mm − p have a bias of 600.4 mm wherever the arm starts, be it said or the first command."""
-    case = Case(heard={"panel": PANEL, "tracker": TRACKER}, start={} if start is None else {"radial": 0.5 + start})
+    """Measurements 600.4 mm − p have a bias of 600.4 mm wherever the arm starts, configured or by its first command."""
+    case = Case(seen={"panel": PANEL, "tracker": TRACKER}, start={} if start is None else {"radial": 0.5 + start})
     run, config = case.made()
     shift = level - 0.5
     for name, bias in (("panel", 0.6004), ("tracker", 0.0)):
         of, values = config.sensors[name], run.sensors[name].values["radial"]
-        values[:] = of.scale * (AxisOracle(run, config, "radial").undisturbed(case.heard[name].valid)[0] + shift) + bias
+        values[:] = of.scale * (AxisOracle(run, config, "radial").undisturbed(case.seen[name].valid)[0] + shift) + bias
     run.command.values["radial"][:] += shift
     moved = replace(run, start={axis: u + shift for axis, u in run.start.items()})
     bias = fuse(moved, config).biases["panel"]["radial"]
@@ -92,9 +97,9 @@ def test_a_bias_is_in_the_coordinates_of_the_log(level: float, start: float | No
     assert bias.sd < 0.5e-3
 
 
-def test_a_bias_that_cannot_be_told_from_the_offset_stays_as_uncertain() -> None:
+def test_a_bias_not_identifiable_apart_from_the_offset_stays_as_uncertain() -> None:
     """A panel alone: their sum is known to its noise, neither is better known than the other's prior."""
-    case = Case(heard={"panel": PANEL}, process=Process(input_noise=0.0, drift=0.0))
+    case = Case(seen={"panel": PANEL}, process=Process(input_noise=0.0, drift=0.0))
     estimates = fuse(*case.made())
     bias = estimates.biases["panel"]["radial"]
     together = (1.0**-2 + case.offset_sd**-2) ** -0.5  # bias given bias − offset = 0
@@ -107,7 +112,7 @@ def test_the_scans_range_finder_tells_its_bias() -> None:
     data = Path(pf.__file__).parent / "data"
     run, config = pf.Run.read(data / "scan1"), pf.FusionConfig.load(data / "fusion.toml")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PumafuseWarning)  # the scan's own faults are told elsewhere
+        warnings.simplefilter("ignore", PumafuseWarning)  # of the scan's own faults
         estimates = pf.fuse(run, config, sensors=["vision", "range"])
     radial = estimates["radial"]
     assert estimates.reference is not None
@@ -125,11 +130,11 @@ def test_the_scans_range_finder_tells_its_bias() -> None:
 SCALE, JITTER, DRIFT = -1.5, 0.004, 0.3e-3
 
 
-def moving(heard: Heard, process: Process, seed: int = 1) -> tuple[Run, FusionConfig]:
+def moving(seen: Seen, process: Process, seed: int = 1) -> tuple[Run, FusionConfig]:
     """Three seconds of swinging to and fro by 60 mm at up to 0.11 m/s, commands every 10 ms."""
     times = np.arange(300) * 10 * MS
     case = Case(
-        one(UNDER), times=times, period=0.01, process=process, offset_sd=1e-3, heard={"tracker": heard}, seed=seed
+        one(UNDER), times=times, period=0.01, process=process, offset_sd=1e-3, seen={"tracker": seen}, seed=seed
     )
     run, config = case.made()
     run.command.values["radial"][:] = 0.5 + 0.03 * np.sin(2.0 * np.pi * 0.6e-9 * times)
@@ -142,7 +147,7 @@ def test_a_measurements_variance_grows_with_the_square_of_the_speed(at: int) -> 
     spread = []
     for latency_sd in (0.0, JITTER):
         of = sensor(0.1e-3, latency=0.02, scale=SCALE, latency_sd=latency_sd)
-        run, config = moving(Heard(of, np.array([at * MS])), Process(input_noise=0.2e-3, drift=0.5e-3))
+        run, config = moving(Seen(of, np.array([at * MS])), Process(input_noise=0.2e-3, drift=0.5e-3))
         spread.append(fuse(run, config).measurements.innovation_sd.item() ** 2)
     speed = AxisOracle(run, config, "radial").undisturbed(np.array([at * MS]))[1].item()
     assert spread[1] - spread[0] == pytest.approx((SCALE * speed * JITTER) ** 2, rel=1e-9, abs=1e-18)
@@ -153,7 +158,7 @@ def jittering_nis(latency_sd: float, seed: int) -> np.ndarray:
     """NIS of 150 measurements whose latency really wanders, of an arm whose offset really walks."""
     rng, valid = np.random.default_rng(seed), every(50, 150)
     of = sensor(0.1e-3, latency=0.02, scale=SCALE, latency_sd=latency_sd)
-    run, config = moving(Heard(of, valid), Process(input_noise=0.0, drift=DRIFT))
+    run, config = moving(Seen(of, valid), Process(input_noise=0.0, drift=DRIFT))
     actual = np.maximum(valid + np.rint(rng.normal(0.0, JITTER * 1e9, len(valid))).astype(np.int64), 0)
     order = np.argsort(actual)
     offset = np.empty(len(valid))
@@ -166,7 +171,7 @@ def jittering_nis(latency_sd: float, seed: int) -> np.ndarray:
 
 def test_measurements_whose_latency_wanders_are_consistent_where_latency_sd_says_so() -> None:
     """Mean NIS over many runs is 1 within the 99.9 % band of χ²; without latency_sd the errors look far too large."""
-    told_of, untold = (np.concatenate([jittering_nis(sd, seed) for seed in range(25)]) for sd in (JITTER, 0.0))
-    low, high = chi2.ppf([0.0005, 0.9995], len(told_of)) / len(told_of)
-    assert low < told_of.mean() < high
-    assert untold.mean() > 3.0
+    right, wrong = (np.concatenate([jittering_nis(sd, seed) for seed in range(25)]) for sd in (JITTER, 0.0))
+    low, high = chi2.ppf([0.0005, 0.9995], len(right)) / len(right)
+    assert low < right.mean() < high
+    assert wrong.mean() > 3.0

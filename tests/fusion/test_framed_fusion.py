@@ -145,11 +145,10 @@ def test_every_kind_of_estimate_has_its_x_y_z(how: dict[str, bool | float]) -> N
     np.testing.assert_array_equal(est.cartesian["z"], est["vertical"].position)
 
 
-def test_commands_beyond_the_arm_s_radius_are_told_once(recwarn: pytest.WarningsRecorder) -> None:
-    """720 mm from the base where the model holds to 700: one sentence that says both and the 20 mm between."""
+def test_commands_beyond_the_arm_s_radius_are_reported_once(recwarn: pytest.WarningsRecorder) -> None:
+    """720 mm from the base where the model holds to 700: one sentence with both and the 20 mm between."""
     est = pf.fuse(circle(0.72), about_the_base())
-    said = [str(warning.message) for warning in recwarn]
-    assert said == [
+    assert [str(warning.message) for warning in recwarn] == [
         "run 'run': commands reach 720.0 mm from the base axis, 20.0 mm beyond the 700 mm that the arm model is valid"
         " for"
     ]
@@ -157,15 +156,15 @@ def test_commands_beyond_the_arm_s_radius_are_told_once(recwarn: pytest.Warnings
     assert (validity.max_radius_mm, validity.commanded_radius_mm) == pytest.approx((700.0, 720.0))
 
 
-@pytest.mark.parametrize(("reach", "said"), [(0.701, ["701.0 mm"]), (0.699, [])])
+@pytest.mark.parametrize(("reach", "reported"), [(0.701, ["701.0 mm"]), (0.699, [])])
 def test_the_radius_is_the_largest_of_the_run_and_not_that_of_its_start(
-    reach: float, said: list[str], recwarn: pytest.WarningsRecorder
+    reach: float, reported: list[str], recwarn: pytest.WarningsRecorder
 ) -> None:
-    """A stroke outward from 500 to 701 mm is told although it starts well inside; up to 699 mm nothing is."""
+    """A stroke outward from 500 to 701 mm is reported although it starts well inside; up to 699 mm nothing is."""
     values = {"x": 0.1 + np.linspace(0.5, reach, 60), "y": np.full(60, -0.2), "z": np.zeros(60)}
     est = pf.fuse(pf.Run.from_arrays(0.028 * np.arange(60), values), about_the_base())
     assert est.radius == pytest.approx(reach)
-    assert [str(warning.message).split(" reach ")[1][:8] for warning in recwarn] == said
+    assert [str(warning.message).split(" reach ")[1][:8] for warning in recwarn] == reported
 
 
 def test_a_run_that_names_axes_has_no_radius_to_check() -> None:

@@ -67,16 +67,20 @@ latency_ms = -3.0
 
 @dataclass(frozen=True)
 class Fused:
-    """Errors over sd (runs, axes, estimates), NIS by (sensor, axis), estimated biases over their sd."""
+    """Errors over sd (runs, axes, estimates), NIS by (sensor, axis), estimated biases over their sd.
+
+    Velocities have one estimate less: the truth of one is the distance to the next estimate, a period later.
+    """
 
     time: NDArray[np.float64]
     error: NDArray[np.float64]
+    velocity: NDArray[np.float64]
     nis: dict[tuple[str, str], NDArray[np.float64]]
     bias: NDArray[np.float64]
 
 
 def fused(scenario: pf.Scenario, runs: int = RUNS, engine: Engine = "compiled", **mode: bool) -> Fused:
-    errors, biases = [], []
+    errors, velocities, biases = [], [], []
     nis: dict[tuple[str, str], list[float]] = {}
     for seed in range(1, runs + 1):
         simulated = pf.simulate(scenario, seed)
@@ -88,6 +92,10 @@ def fused(scenario: pf.Scenario, runs: int = RUNS, engine: Engine = "compiled", 
         there = np.searchsorted(reference.time, est.time - 1e-9)
         assert np.abs(reference.time[there] - est.time).max() < 1e-9
         errors.append([(est[a].position - reference.position[a][there]) / est[a].position_sd for a in AXES])
+        now, period = slice(None, -1), est.config.arm.update_period
+        assert np.abs(np.diff(est.time) - period).max() < 1e-9
+        moved = {a: np.diff(reference.position[a][there]) / period for a in AXES}
+        velocities.append([(est[a].velocity[now] - moved[a]) / est[a].velocity_sd[now] for a in AXES])
         for sensor in est.measurements.sensors:
             for axis in AXES:
                 mine = est.measurements.of(sensor, axis)
@@ -97,7 +105,7 @@ def fused(scenario: pf.Scenario, runs: int = RUNS, engine: Engine = "compiled", 
         vision = est.biases["vision"]
         biases.append([vision[a].value / (PRIOR**2 - vision[a].sd ** 2) ** 0.5 for a in AXES])
     gathered = {key: np.array(value) for key, value in nis.items() if value}
-    return Fused(est.time, np.array(errors), gathered, np.array(biases))
+    return Fused(est.time, np.array(errors), np.array(velocities), gathered, np.array(biases))
 
 
 @pytest.fixture(scope="module")
@@ -131,15 +139,28 @@ def check_anees(found: Fused) -> None:
     assert anees.max() < high, anees
 
 
-def check_coverage(found: Fused) -> None:
+def check_coverage(error: NDArray[np.float64]) -> None:
     for axis in range(len(AXES)):
-        assert np.mean(np.abs(found.error[:, axis]) < 1.959964) == pytest.approx(0.95, abs=0.01)
+        assert np.mean(np.abs(error[:, axis]) < 1.959964) == pytest.approx(0.95, abs=0.01)
 
 
 def test_errors_of_a_matched_filter_are_as_large_as_it_says(filtered: Fused) -> None:
     """ANEES at 6 instants on a first- and a second-order axis is in its band; 95 ± 1 % of all errors are covered."""
     check_anees(filtered)
-    check_coverage(filtered)
+    check_coverage(filtered.error)
+
+
+def test_the_velocity_s_error_bar_holds(tmp_path: Path) -> None:
+    """95 ± 1 % of the true mean velocities lie in the 95 % band, on an axis of each order, over 1,000 runs of 1 s."""
+    path = tmp_path / "short.toml"
+    path.write_text(
+        SCENARIO.replace("width_mm = 60.0", "width_mm = 15.0").replace("height_mm = 40.0", "height_mm = 20.0")
+    )
+    found = fused(pf.Scenario.load(path), runs=1000)
+    assert 0.8 < found.time[-1] < 2.0
+    assert len(found.velocity) == 1000
+    check_coverage(found.velocity)
+    assert np.abs(found.velocity.mean(axis=(0, 2))).max() < 0.02
 
 
 def test_errors_of_a_matched_filter_have_no_mean(filtered: Fused) -> None:
@@ -174,7 +195,7 @@ def test_smoothed_and_live_estimates_are_consistent_too(scenario: pf.Scenario, m
     """ANEES and coverage hold for estimates that know every measurement and for those that know what had arrived."""
     found = fused(scenario, **{mode: True})
     check_anees(found)
-    check_coverage(found)
+    check_coverage(found.error)
 
 
 def test_the_other_engine_is_consistent_too(scenario: pf.Scenario) -> None:

@@ -57,7 +57,7 @@ def test_a_parameter_at_a_bound_is_reported() -> None:
     none = [one for one in found.summary.parameters if one.value == 0.0]
     assert none and all(one.notes == "not significant" and one.ci95[0] == 0.0 for one in none)
     assert all(one.ci95[1] is not None and one.ci95[1] > 0.0 for one in none)
-    sim = pf.simulate(scenario("panel-tracker-outage", 0.1, 0.06), 1)
+    sim = pf.simulate(scenario("panel-vision", 0.1, 0.06), 1)
     early = with_sensors(sim.config, latency=0.12)  # by more than the arm is late
     found = quietly(lambda: pf.tune([sim.run], early, fit=["delay"]))
     for one in found.summary.parameters:

@@ -12,8 +12,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import pumafuse as pf
-from fusion.test_oracle import CASES, MS, UNDER, Case, Heard, anomalous, every, sensor
+from fusion.test_oracle import CASES, MS, UNDER, Case, Seen, anomalous, every, sensor
 from fusion_oracle import AxisOracle
+from pumafuse.filter.outcome import ABSENT
 from pumafuse.fusion.consistency import densities_of, log_likelihood
 from pumafuse.logs.run import Source
 from pumafuse.model.arm import AxisModel
@@ -88,13 +89,13 @@ def test_it_is_the_log_likelihood_of_a_fusion(made: Callable[[], tuple[pf.Run, p
         assert by_axis(likelihood, here) == pytest.approx(of_the_filter(run, here), rel=1e-11)
         outcomes = np.concatenate(likelihood.evaluate(here).outcomes)
         assert (outcomes == pf.Outcome.REJECTED).any()
-        assert len(outcomes) == likelihood.count.sum()
+        assert (outcomes != ABSENT).sum() == likelihood.count.sum()
 
 
 UNBIASED = {
     name: case
     for name, case in CASES.items()
-    if case.heard and not any(heard.sensor.latency_sd or heard.sensor.bias_sd for heard in case.heard.values())
+    if case.seen and not any(seen.sensor.latency_sd or seen.sensor.bias_sd for seen in case.seen.values())
 }
 
 
@@ -182,9 +183,6 @@ OTHERS = {
     "both latencies, past each other": lambda config: with_sensors(
         with_sensors(config, "vision", latency=-0.03), "tracker", latency=0.0712345678
     ),
-    "a delay": lambda config: with_axis(config, "tangential", delay=0.0211),
-    "a gain": lambda config: with_axis(config, "tangential", gain=pf.Gain(slope=0.0518, intercept=1.21)),
-    "a gain that stays": lambda config: with_axis(config, "tangential", gain_recovery=None),
     "another plant": lambda config: with_order(config, "vertical", 2),
     "everything": lambda config: with_process(
         with_sensors(
@@ -205,7 +203,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("other", OTHERS.values(), ids=OTHERS.keys())
 def test_another_configuration_is_as_if_built_with_it(other: Callable[[pf.FusionConfig], pf.FusionConfig]) -> None:
-    """Delays, gains and latencies moved after the measurements were put in order: as anew.
+    """Delays, gains and latencies moved afterwards: as anew.
 
     Row by row where a row is rejected as a whole. Only measurements that no latency here puts before the first command.
     """
@@ -227,21 +225,6 @@ def test_another_configuration_is_as_if_built_with_it(other: Callable[[pf.Fusion
     np.testing.assert_allclose(found.information, wanted.information, rtol=1e-6, atol=1e-4)
 
 
-def test_measurements_valid_at_one_instant_are_in_the_order_of_the_sensors() -> None:
-    """Two sensors with latencies by which they measure at once: as built with these."""
-    run, config = CASES["two at the same instants"].made()
-    other = with_sensors(config, "vision", latency=config.sensors["vision"].latency - 0.0131)
-    likelihood = Likelihood([run], other, latest=0.1)
-    built = Likelihood([run], config, latest=0.1)
-    there, anew = likelihood.evaluate(config), built.evaluate(config)
-    assert there.total == pytest.approx(anew.total, rel=1e-15 * built.count.sum())  # the same terms in another order
-    np.testing.assert_allclose(
-        likelihood.derivatives(config, free_of(built, config, ALL), there.outcomes).score,
-        built.derivatives(config, free_of(built, config, ALL), anew.outcomes).score,
-        rtol=1e-12,
-    )
-
-
 def test_measurements_that_a_latency_could_put_before_the_run_are_left_out() -> None:
     """With ``latest`` 0.5 s those stamped in the first half second; the others count at any latency up to it."""
     sim = two_sensors()
@@ -254,7 +237,7 @@ def test_measurements_that_a_latency_could_put_before_the_run_are_left_out() -> 
     assert likelihood.count.sum() == kept
     late = with_sensors(sim.config, latency=0.5)
     values = likelihood.evaluate(late)
-    assert np.isfinite(values.axes).all() and len(values.outcomes[0]) == kept
+    assert np.isfinite(values.axes).all() and (values.outcomes[0] != ABSENT).sum() == kept
 
 
 # ---- score and information ------------------------------------------------------------------------------------------
@@ -307,9 +290,9 @@ def test_the_score_is_the_derivative_of_the_log_likelihood(order: int) -> None:
 WITH_NOISE = Case(
     {"radial": AxisModel(plant=UNDER, gain=pf.Gain(slope=0.05, intercept=1.1), gain_recovery=0.06)},
     process=pf.Process(input_noise=3e-4, drift=2e-3, maneuver_noise=2e-3, maneuver_drift=1e-2),
-    heard={
-        "tracker": Heard(sensor(4e-4, latency=0.008), every(50, 20, 30 * MS)),
-        "vision": Heard(sensor(1e-3, latency=0.07), every(25, 10, 47 * MS)),
+    seen={
+        "tracker": Seen(sensor(4e-4, latency=0.008), every(50, 20, 30 * MS)),
+        "vision": Seen(sensor(1e-3, latency=0.07), every(25, 10, 47 * MS)),
     },
 )
 
@@ -385,7 +368,7 @@ def test_the_response_of_the_noiseless_arm_is_that_of_the_oracle() -> None:
     run, config = case.made()
     likelihood = Likelihood([run], config)
     responses = likelihood.responses(config, centred=False)
-    assert {name for name, _ in responses} == set(case.heard)
+    assert {name for name, _ in responses} == set(case.seen)
     for (name, axis), (expected, measured) in responses.items():
         oracle = AxisOracle(run, config, axis)
         mine = [measurement for measurement in oracle.measurements if measurement.sensor == name]

@@ -95,9 +95,10 @@ def test_the_truth_is_near() -> None:
     assert found.arm.axes["radial"] == before.arm.axes["radial"]
     assert found.process["radial"] == before.process["radial"]
     assert found.start == before.start
-    assert {name: (one.latency, one.gate, one.scale) for name, one in found.sensors.items()} == {
-        name: (one.latency, one.gate, one.scale) for name, one in before.sensors.items()
-    }
+    for name, one in found.sensors.items():
+        given = before.sensors[name]
+        assert (one.latency, one.scale) == (given.latency, given.scale)
+        assert (one.gate, one.gate_rows) == (given.gate, given.gate_rows)  # a search uses others
 
 
 def test_what_is_saved_loads_and_is_as_likely(tmp_path: Path) -> None:
@@ -159,15 +160,6 @@ def test_the_reference_plays_no_part() -> None:
         found = sds_alone([replace(run, reference=reference)], config)
         assert found.config == wanted.config
         assert found.summary.parameters == wanted.summary.parameters
-
-
-def test_a_delay_is_never_negative(tmp_path: Path) -> None:
-    """Latencies 90 ms too long: the arm seems to move before its commands; the result loads all the same."""
-    sim = pf.simulate(scenario("panel-tracker-outage", 0.1, 0.06), 1)
-    found = quietly(lambda: pf.tune([sim.run], with_sensors(sim.config, latency=0.1), fit=["delay"]))
-    assert all(found.config.arm.delay_of(axis) >= 0.0 for axis in AXES)
-    found.config.save(tmp_path)
-    pf.FusionConfig.load(tmp_path / "fusion.toml")
 
 
 # ---- validation -----------------------------------------------------------------------------------------------------
@@ -377,7 +369,7 @@ def test_the_shipped_scan_is_tuned_as_well_as_it_was_by_hand() -> None:
     """By the tracker, with everything free but latencies and all plants of second order to begin with.
 
     Log-likelihoods at least 4800, 6600 and 7150; errors on the reference, which played no part, at most 0.076, 0.051
-    and 0.050 mm by tracker and camera, 0.355, 0.192 and 0.160 mm by the camera alone.
+    and 0.050 mm by tracker and camera, 0.300, 0.192 and 0.165 mm by the camera alone.
     """
     data = Path(pf.__file__).parent / "data"
     run, config = pf.Run.read(data / "scan1"), pf.FusionConfig.load(data / "fusion.toml")
@@ -391,7 +383,7 @@ def test_the_shipped_scan_is_tuned_as_well_as_it_was_by_hand() -> None:
     assert all(totals[axis] >= least for axis, least in zip(axes, (4800.0, 6600.0, 7150.0), strict=True)), totals
     for sensors, most in (
         (["tracker", "vision"], (0.076, 0.051, 0.050)),
-        (["vision"], (0.355, 0.192, 0.160)),
+        (["vision"], (0.300, 0.192, 0.165)),
     ):
         est = quietly(lambda sensors=sensors: pf.fuse(run, found.config, sensors=sensors))
         errors = {axis: one.score.rmse_mm for axis, one in pf.summarise(est).axes.items() if one.score}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import re
-import warnings
 from functools import cache
 from pathlib import Path
 
@@ -12,20 +11,19 @@ import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from pumafuse.fusion.outcome import Outcome
 
 import pumafuse as pf
 from outline import outline
-from pumafuse.errors import PumafuseWarning
+from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.consistency import consistency, densities_of
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.intervals import Profile, profiles
 from pumafuse.tuning.maximise import maximise
-from pumafuse.tuning.summary import Fitted
 from pumafuse.views import colours as style
 from pumafuse.views import tuning_figures
 from pumafuse.views.tuning_report import page
+from tuning_runs import fitted, quietly
 
 T, END = 0.02, 20.0
 STEADY = ("maneuver_noise_mm_rtHz_per_m_s", "maneuver_drift_mm_rts_per_m_s")  # fixed: the process noise is constant
@@ -60,7 +58,7 @@ def known(axis: str, sensor: str) -> pf.FusionConfig:
 @cache
 def tuned(axis: str = "tip", sensor: str = "camera", name: str = "a run") -> tuple[pf.Tuning, pf.Run]:
     run = recorded(axis, sensor, name)
-    return quietly([run], known(axis, sensor), ["noise", "delay", "plant"], fix=STEADY), run
+    return quietly(lambda: pf.tune([run], known(axis, sensor), fit=["noise", "delay", "plant"], fix=STEADY)), run
 
 
 @cache
@@ -68,16 +66,6 @@ def shown() -> str:
     """The page of the default tuning."""
     found, run = tuned()
     return page(found, [run])
-
-
-def quietly(runs: list[pf.Run], config: pf.FusionConfig, fit: list[str], **more: object) -> pf.Tuning:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PumafuseWarning)
-        return pf.tune(runs, config, fit=fit, **more)
-
-
-def fitted(found: pf.Tuning) -> dict[str, Fitted]:
-    return {one.key: one for one in found.summary.parameters}
 
 
 def drawn(found: pf.Tuning) -> dict[str, Profile]:
@@ -155,7 +143,7 @@ def test_the_others_follow_along_the_ridge() -> None:
 def test_the_profile_of_a_lone_parameter_is_the_likelihood_of_a_fusion() -> None:
     """With all else fixed, the curve is the log density of what `fuse` reports, less the one at the best."""
     run, config = recorded("tip", "camera", "a run"), known("tip", "camera")
-    found = quietly([run], with_sd(config, 5e-4, gate=50.0), ["noise"], fix=("process",))
+    found = quietly(lambda: pf.tune([run], with_sd(config, 5e-4, gate=50.0), fit=["noise"], fix=["process"]))
     (curve,) = drawn(found).values()
     assert curve.key == "sensors.camera.sd_mm.tip"
     assert curve.log
@@ -276,7 +264,7 @@ def test_an_interrupted_tuning_has_a_page_too(after: str) -> None:
         if what == after:
             raise KeyboardInterrupt
 
-    found = quietly([run], known("tip", "camera"), ["noise"], progress=interrupt)
+    found = quietly(lambda: pf.tune([run], known("tip", "camera"), fit=["noise"], progress=interrupt))
     seen = outline(page(found, [run]))
     assert found.summary.interrupted
     assert "Profiles of the likelihood" not in seen.headings

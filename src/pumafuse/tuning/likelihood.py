@@ -57,7 +57,7 @@ class LogLikelihood:
 
     Attributes:
         axes: Of each axis's components, with positions in mm, (A,).
-        outcomes: The outcome of each component, for each segment, (m,).
+        outcomes: The outcome of each measurement on each axis, for each segment, (m, A).
     """
 
     axes: FloatArray
@@ -109,7 +109,7 @@ class Likelihood:
     """The likelihood of the measurements of runs, as a function of the configuration.
 
     Attributes:
-        config: The configuration that the timelines were built with.
+        config: The configuration that the segments were built with.
         axes: All commanded axes, in their order.
         sensors: For each axis with measurements the sensors that have them.
         count: The number of components of each axis, (A,).
