@@ -37,11 +37,11 @@ class Incoming(NamedTuple):
 
     Attributes:
         span: The first row (``BEGIN``), after the last one (``END``), after the last one in the state (``DONE``) and
-            after the last one that is to be in it (``RUN``), the first command's stamp [ns] (``ORIGIN``, ``NEVER`` without
-            one), and the sensor that a rejected measurement ``CONTRADICTS`` (−1 for none), (6,).
+            after the last one that is to be in it (``RUN``), the first command's stamp [ns] (``ORIGIN``, or
+            ``NEVER``), and the sensor that a rejected measurement ``CONTRADICTS`` (−1 for none), (6,).
         times: For each axis the stamp of its ``FIRST`` command (``NEVER`` without one), its ``DELAY`` Td, and when the
             last measurement was valid that an estimate knows of (``LAST_FUSED``), int64 ns, (A, 3).
-        values: For each axis the ``VALUE`` [m] of the event that comes in, by what its noise is scaled (``SPREAD``), the
+        values: For each axis the ``VALUE`` [m] of the event that comes in, the ``SPREAD`` that scales its noise, the
             level u₀ [m] at rest where it is known beforehand (``KNOWN_START``), and the ``INNOVATION`` [m], (A, 4).
         outcome: What became of the values, ``ABSENT`` for an axis that the event does not give, (A,).
         latency: Of each sensor, int64 ns, (S,).

@@ -261,7 +261,7 @@ def _measurement_rows(run: Run, config: FusionConfig, name: str, number: int, or
     return rows
 
 
-def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int) -> Events:
+def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int | np.int64) -> Events:
     """Rows of a source in an order, everything that it gives for the filter to decide on."""
     stamp, shape = source.stamp[order], (len(order), len(axes))
     value, known = np.full(shape, np.nan), np.full(shape, ABSENT, dtype=np.uint8)
