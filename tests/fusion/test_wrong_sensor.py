@@ -145,7 +145,7 @@ def test_a_sensor_alone_follows_a_slip_at_once() -> None:
 def test_the_harm_of_an_outage_ends_with_it(order: tuple[str, ...]) -> None:
     """A tracker silent from 9 to 15 s beside a wrong camera: the camera alone is believed meanwhile."""
     error = error_of(order, camera=50e-3, silent=True)
-    assert np.abs(error[:950]).max() < 0.5
+    assert np.abs(error[:950]).max() < 1.0
     assert np.abs(error[960:1500]).min() > 40.0
     assert rms(error, 15.2) < 1.05 * rms(error_of(), 15.2)
 
