@@ -5,6 +5,7 @@ Errors are against the true motion, which the simulation here follows by the fil
 
 from __future__ import annotations
 
+import re
 import warnings
 from functools import cache
 from typing import Any
@@ -42,7 +43,14 @@ def simulated() -> tuple[FloatArray, FloatArray, FloatArray]:
     return true, true + 0.05e-3 * noise[0], true + 0.5e-3 * noise[1] + outliers
 
 
-def error_of(
+def error_of(*args: Any, **kwargs: Any) -> FloatArray:
+    """Errors [mm] at every 10 ms of what :func:`fused` makes of a run."""
+    est, true = fused(*args, **kwargs)
+    count = (SECONDS - 1) * 100
+    return 1e3 * (est["radial"].position[:count] - true[: 10 * count : 10])
+
+
+def fused(
     order: tuple[str, ...] = ORDERS[0],
     *,
     tracker: float = 0.0,
@@ -54,8 +62,8 @@ def error_of(
     slip: bool = False,
     silent: bool = False,
     **kwargs: Any,
-) -> FloatArray:
-    """Errors [mm] at every 10 ms.
+) -> tuple[pf.Estimates, FloatArray]:
+    """A run with a fault, fused, and the true position at every millisecond [m].
 
     Args:
         order: Of the sensors in fusion.toml.
@@ -90,8 +98,7 @@ def error_of(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", pf.PumafuseWarning)
         est = pf.fuse(pf.Run.from_arrays(COMMANDS, {"radial": U}, streams), config, rate=100.0, **kwargs)
-    count = (SECONDS - 1) * 100
-    return 1e3 * (est["radial"].position[:count] - (true + slipped)[: 10 * count : 10])
+    return est, true + slipped
 
 
 def rms(error: FloatArray, since: float = 0.0) -> float:
@@ -117,6 +124,18 @@ def test_a_wrong_camera_beside_a_good_tracker_does_no_harm(fault: str, order: tu
     """At most 1.2 times the error without the fault, as live, too."""
     for mode in ({}, {"as_live": True}):
         assert rms(error_of(order, **FAULTS[fault], **mode)) < 1.2 * rms(error_of(**mode))
+
+
+@pytest.mark.parametrize("order", ORDERS, ids="+".join)
+def test_who_contradicts_whom_is_said_with_the_time(order: tuple[str, ...]) -> None:
+    """One note each, nothing without a fault; a drift shows when it is 5 sd, 2.5 s later."""
+    assert not [note for note in fused(order)[0].notes if "contradicts" in note]
+    faults = {name: fault for name, fault in FAULTS.items() if "from the start" not in name}
+    for wrong in ({"tracker": 50e-3}, *faults.values()):
+        names = ("'tracker'", "'camera'") if "tracker" in wrong else ("'camera'", "'tracker'")
+        (note,) = [note for note in fused(order, **wrong)[0].notes if " contradicts ".join(names) in note]
+        assert "radial" in note
+        assert any(5.0 <= float(number) < 8.5 for number in re.findall(r"(\d+\.\d+) s", note)), note
 
 
 @pytest.mark.parametrize("order", ORDERS, ids="+".join)
