@@ -318,4 +318,4 @@ def test_both_engines_make_the_same_of_the_scan(sensors: list[str]) -> None:
     """The shipped scan with its own configuration: a camera's outliers, a tracker, a panel 1 m of bias away."""
     run, config = Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
     config = msgspec.structs.replace(config, sensors={name: config.sensors[name] for name in sensors})
-    agree(*both(replace(run, sensors={name: run.sensors[name] for name in sensors}), config, 200.0))
+    agree(*both(replace(run, sensors={name: run.sensors[name] for name in sensors}), config))
