@@ -514,6 +514,14 @@ def test_a_regular_clock_with_another_period_is_refused() -> None:
         build(run, config())
 
 
+@pytest.mark.parametrize("clock", ["stamps", "regular"])
+def test_commands_that_are_no_positions_are_refused(clock: Clock) -> None:
+    """An axis with nothing but sentinels has no start level."""
+    run = Run.from_arrays([ORIGIN, ORIGIN + TICK], {"radial": [0.5, 0.5], "vertical": [1e7, 3.4e38]}, clock=clock)
+    with pytest.raises(RunError, match="'vertical'"):
+        build(run, config())
+
+
 def test_the_speed_is_the_fastest_step_of_any_axis() -> None:
     """Highest commanded speed: the largest step over the period, the one from the start level included."""
     stamp = [ORIGIN, ORIGIN + TICK, ORIGIN + 10 * TICK]
