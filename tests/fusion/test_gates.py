@@ -242,10 +242,16 @@ def test_an_outlier_contradicts_nobody() -> None:
     assert contradictions(rows, BOTH) == []
 
 
-@pytest.mark.parametrize(("settled", "wanted"), [(4.5, REACQUIRED), (5.5, REJECTED)])
-def test_re_acquisitions_are_forgotten_after_five_seconds_of_agreement(settled: float, wanted: Outcome) -> None:
+@pytest.mark.parametrize(
+    ("settled", "quarrel", "wanted"),
+    [(4.5, [], REACQUIRED), (5.5, [], REJECTED), (5.5, [3 * OFF, 5 * OFF], REACQUIRED)],
+)
+def test_re_acquisitions_are_forgotten_after_five_seconds_of_agreement(
+    settled: float, quarrel: list[float], wanted: Outcome
+) -> None:
     """Until then a sensor that followed the arm by itself does not stand against one that did not."""
     seen = [0.0] * 4 + [OFF] * round(10 * settled + 5)
+    seen[30 : 30 + len(quarrel)] = quarrel
     rows = every(100, [0.0, *seen, *[OFF] * 10]) + every(100, [*seen, 2 * OFF, 2 * OFF], 30, "camera")
     estimates = fused(rows, BOTH)
     assert outcomes(estimates)[4:10] == [FUSED, *[REJECTED] * 4, REACQUIRED]
