@@ -78,15 +78,16 @@ def check_same(est: pf.Estimates, wanted: pf.Estimates) -> None:
         np.testing.assert_allclose(est[axis].position_sd, wanted[axis].position_sd, rtol=1e-9)
 
 
-def test_a_sensor_that_is_always_wrong_is_named(scan: pf.Run, config: pf.FusionConfig) -> None:
-    """50 mm off beside a good one: its gate reopens, which is said with the key to give; the camera's does too."""
-    _, summary = fused(scan, config, lambda source: changed(source, lambda value: value + 0.05))
-    assert said(summary, "gate reacquired", "contradicts the others", "bias_sd_mm")
+def test_a_sensor_that_is_always_wrong_is_named(
+    scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
+) -> None:
+    """50 mm off beside a good one: rejected throughout, said with both names, and no estimate is the worse for it."""
+    est, summary = fused(scan, config, lambda source: changed(source, lambda value: value + 0.05))
+    check_same(est, camera_alone)
+    assert any("'tracker' contradicts 'vision'" in note for note in summary.notes)
     assert said(summary, "of its components were rejected")
     for axis in AXES:
-        outcomes = summary.axes[axis].sensors["tracker"].outcomes
-        assert outcomes["reacquired"] > 10
-        assert outcomes["rejected"] > 0.3 * sum(outcomes.values())
+        assert set(summary.axes[axis].sensors["tracker"].outcomes) == {"rejected"}
 
 
 def test_a_constant_error_is_found_where_a_bias_is_expected(
@@ -94,8 +95,8 @@ def test_a_constant_error_is_found_where_a_bias_is_expected(
 ) -> None:
     """With bias_sd_mm the 50 mm are estimated on each axis within 3 sd, and the estimate is no worse than without."""
     tracker = msgspec.structs.replace(config.sensors["tracker"], bias_sd=1.0)
-    told = msgspec.structs.replace(config, sensors={**config.sensors, "tracker": tracker})
-    est, summary = fused(scan, told, lambda source: changed(source, lambda value: value + 0.05))
+    biased = msgspec.structs.replace(config, sensors={**config.sensors, "tracker": tracker})
+    est, summary = fused(scan, biased, lambda source: changed(source, lambda value: value + 0.05))
     for axis in AXES:
         bias = est.biases["tracker"][axis]
         assert abs(bias.value - 0.05) < 3.0 * bias.sd
@@ -177,7 +178,7 @@ def test_a_sensor_on_a_clock_since_boot_is_asked_about(
     assert summary.axes["radial"].sensors["tracker"].outcomes == {"before_start": 5999}
 
 
-def test_measurements_long_after_the_run_are_told(
+def test_measurements_long_after_the_run_are_noted(
     scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
 ) -> None:
     """Two hours late, the tracker says nothing of the run: its estimates are the camera's, and the hours are named."""

@@ -1,12 +1,11 @@
-"""The compiled engine against the reference engine: the same outcomes, estimates, error bars, innovations, biases.
+"""The compiled engine against the filterpy engine: the same outcomes, estimates, error bars, innovations, biases.
 
-A measurement whose innovation is within rounding of its gate may be judged either way; none of those here comes that
+A measurement whose innovation is within rounding of its gate may be decided either way; none of those here comes that
 near.
 """
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import replace
@@ -15,125 +14,81 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from pumafuse.fusion.outcome import Outcome
 
 import pumafuse as pf
-from fusion.test_oracle import CASES, MS, NOISE, PAPER, UNDER, Case, Heard, T, cases, every, one, plants
-from fusion.test_oracle import sensor as ungated
 from fusion_oracle import AxisOracle, nanoseconds
-from pumafuse.fusion.estimates import Estimates, Measurements
+from pumafuse.filter.outcome import Outcome
+from pumafuse.fusion.engine import Filtered, filter_segment
+from pumafuse.fusion.segments import build, output_times
+from pumafuse.logs.axes import in_axes
+from pumafuse.logs.clock import segments
 from pumafuse.logs.run import Run
+from pumafuse.model.plants import Plant
 from pumafuse.simulation.scenario import Scenario
 from pumafuse.simulation.simulate import simulate
 
-MODES = {"filtered": {}, "smoothed": {"smooth": True}, "as-live": {"as_live": True}}
+MS = 1_000_000  # ns
 FIELDS = ("position", "velocity", "offset")
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 DATA = Path(pf.__file__).parent / "data"
-mode_names = st.sampled_from(list(MODES))
+PAPER = pf.Gain(slope=0.0818, intercept=0.933)
 
 
-def both(run: Run, config: pf.FusionConfig, mode: str, rate: float | None = None) -> tuple[Estimates, Estimates]:
-    """What the compiled and the reference engine make of a run."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)  # what is said of these runs is tested elsewhere
-        compiled = pf.fuse(run, config, rate=rate, engine="compiled", **MODES[mode])
-        return compiled, pf.fuse(run, config, rate=rate, engine="filterpy", **MODES[mode])
+def both(run: Run, config: pf.FusionConfig, rate: float | None = None) -> tuple[Filtered, Filtered]:
+    """What the compiled and the filterpy engine make of a run."""
+    segment = build(run, config)
+    times = output_times(segment, config, rate)
+    compiled = filter_segment(segment, config, times, "filtered")
+    return compiled, filter_segment(segment, config, times, "filtered", "filterpy")
 
 
-def margin(measurements: Measurements, config: pf.FusionConfig) -> float:
-    """By how much any |ν|/√S misses its gate; a component that reacquired its gate has another √S by now."""
-    gates = np.array([config.sensors[name].gate if name in config.sensors else 0.0 for name in measurements.sensors])
-    judged = (measurements.outcome <= Outcome.REJECTED) & (gates[measurements.sensor] > 0.0)
-    ratio = np.abs(measurements.innovation[judged]) / measurements.innovation_sd[judged]
-    return float(np.abs(ratio - gates[measurements.sensor][judged]).min(initial=math.inf))
-
-
-def agree(got: Estimates, wanted: Estimates, tolerance: float = 1e-9) -> None:
+def agree(got: Filtered, wanted: Filtered, tolerance: float = 1e-9) -> None:
     """Outcomes are equal, means agree to ``tolerance`` sd + 1e-12 (m, m/s), variances to ``tolerance``."""
-    assert got.engine == "compiled"
-    assert wanted.engine == "filterpy"
-    for name in ("time", "stamp", "sensor", "axis", "value", "outcome"):
-        np.testing.assert_array_equal(getattr(got.measurements, name), getattr(wanted.measurements, name), err_msg=name)
-    _close("innovation", got.measurements.innovation, got.measurements.innovation_sd,
-           wanted.measurements.innovation, wanted.measurements.innovation_sd, tolerance)  # fmt: skip
-    np.testing.assert_array_equal(got.time, wanted.time)
-    np.testing.assert_array_equal(got.segment, wanted.segment)
+    np.testing.assert_array_equal(got.results.outcome, wanted.results.outcome)
+    np.testing.assert_array_equal(got.results.contradicts, wanted.results.contradicts)
+    pairs = [(part.results.innovation, part.results.innovation_sd) for part in (got, wanted)]
+    _close("innovation", *pairs[0], *pairs[1], tolerance)
     assert tuple(got.axes) == tuple(wanted.axes)
     for axis in wanted.axes:
         for field in FIELDS:
-            mine, theirs = ((getattr(e[axis], field), getattr(e[axis], f"{field}_sd")) for e in (got, wanted))
+            mine, theirs = ((getattr(e.axes[axis], field), getattr(e.axes[axis], f"{field}_sd")) for e in (got, wanted))
+            assert not np.isnan(theirs).any()
             _close(f"{axis} {field}", *mine, *theirs, tolerance)
-    assert [(name, tuple(of)) for name, of in got.biases.items()] == [
-        (name, tuple(of)) for name, of in wanted.biases.items()
-    ]
+    assert got.biases.keys() == wanted.biases.keys()
     for name, of in wanted.biases.items():
+        assert got.biases[name].keys() == of.keys()
         for axis, bias in of.items():
             mine = got.biases[name][axis]
             _close(f"bias of {name} on {axis}", *map(np.array, (mine.value, mine.sd, bias.value, bias.sd)), tolerance)
-    for name in wanted.cartesian or ():
-        np.testing.assert_allclose(got.cartesian[name], wanted.cartesian[name], rtol=0.0, atol=tolerance)
-    assert (got.cartesian is None) == (wanted.cartesian is None)
-    assert got.notes == wanted.notes
 
 
 def _close(
     what: str, mean: np.ndarray, sd: np.ndarray, right: np.ndarray, right_sd: np.ndarray, tolerance: float
 ) -> None:
     np.testing.assert_array_equal(np.isnan(mean), np.isnan(right), err_msg=what)
-    np.testing.assert_array_equal(np.isnan(sd), np.isnan(right), err_msg=what)
-    met = ~np.isnan(right)
-    np.testing.assert_array_less(np.abs(mean - right)[met] - tolerance * right_sd[met], 1e-12, err_msg=what)
-    np.testing.assert_allclose(sd[met] ** 2, right_sd[met] ** 2, rtol=tolerance, atol=0.0, err_msg=f"{what}, sd")
+    known = ~np.isnan(right)
+    np.testing.assert_array_less(np.abs(mean - right)[known] - tolerance * right_sd[known], 1e-12, err_msg=what)
+    np.testing.assert_allclose(sd[known] ** 2, right_sd[known] ** 2, rtol=tolerance, atol=0.0, err_msg=f"{what}, sd")
 
 
-# ---- runs of the oracle's tests -------------------------------------------------------------------------------------
-
-
-WANDERING = Case(
-    one(UNDER),
-    delay=0.02,
-    heard={"tracker": Heard(ungated(0.05e-3, latency=0.02, latency_sd=0.004, scale=-1.5), every(70, 28))},
-)
-EVERY = CASES | {"a latency that wanders": WANDERING}
-
-
-@pytest.mark.parametrize(
-    "mode",
-    ["filtered", pytest.param("smoothed", marks=pytest.mark.long), pytest.param("as-live", marks=pytest.mark.long)],
-)
-@pytest.mark.parametrize("case", EVERY.values(), ids=EVERY.keys())
-def test_both_engines_make_the_same_of_a_run(case: Case, mode: str) -> None:
-    """Plants, delays, gains, clocks, sensors, axes: wherever the oracle is asked, either engine gives its answer."""
-    run, config = case.made()
-    agree(*both(run, config, mode, case.rate))
-
-
-@pytest.mark.long
-@settings(derandomize=True, deadline=None, max_examples=40)
-@given(cases(), mode_names)
-def test_both_engines_make_the_same_of_any_run_of_the_oracle(case: Case, mode: str) -> None:
-    """Random plants, delays, gains, gaps, noise and sensors, smoothed with priors that leave the reference digits."""
-    run, config = (tame(case) if mode == "smoothed" else case).made()
-    agree(*both(run, config, mode, case.rate))
-
-
-def tame(case: Case) -> Case:
-    """Priors of at most 30 times a measurement's noise."""
-    heard = {
-        name: replace(ear, sensor=msgspec.structs.replace(
-            ear.sensor, sd=max(ear.sensor.sd, 0.3e-3), bias_sd=min(ear.sensor.bias_sd, 9e-3)))
-        for name, ear in case.heard.items()
-    }  # fmt: skip
-    return replace(case, heard=heard, offset_sd=min(case.offset_sd, 5e-3))
-
-
-# ---- whole logs: several axes and sensors, gates that reject and reopen, everything a logger does --------------------
+# ---- whole logs: several axes and sensors, gates that reject and re-acquire, all a logger does --------------------
 
 AXES = ("tangential", "radial", "vertical")
 OFF = 0.05  # m
+
+
+def every(rate: float, count: int, first: int = 0) -> np.ndarray:
+    return first + np.rint(np.arange(count) * 1e9 / rate).astype(np.int64)
+
+
+@st.composite
+def plants(draw: st.DrawFn) -> Plant:
+    if draw(st.booleans()):
+        return pf.FirstOrder(time_constant=draw(st.floats(0.01, 0.1)))
+    damping = st.floats(0.3, 3.0) | st.sampled_from([1.0, 1.0 + 1e-9, 1.0 - 1e-7])
+    return pf.SecondOrder(natural_frequency=draw(st.floats(15.0, 90.0)), damping=draw(damping))
 
 
 def some(draw: st.DrawFn, *values: object) -> object:
@@ -189,8 +144,8 @@ def logs(draw: st.DrawFn) -> tuple[Run, pf.FusionConfig, float | None]:
     model = {
         axis: pf.AxisModel(
             plant=draw(plants()),
-            gain=some(draw, pf.Gain(slope=0.0, intercept=1.0), PAPER),
-            gain_recovery=some(draw, None, 0.1),
+            gain=some(draw, pf.Gain(slope=0.0, intercept=1.0), pf.Gain(slope=0.0, intercept=0.8), PAPER),
+            gain_recovery=some(draw, None, 0.1, 0.004, 3.0),
             delay=some(draw, None, 0.0, 0.033),
         )
         for axis in axes
@@ -208,8 +163,8 @@ def logs(draw: st.DrawFn) -> tuple[Run, pf.FusionConfig, float | None]:
         command[axis][rng.random(len(time)) < 0.1] = np.nan
         command[axis][rng.random(len(time)) < 0.1] = 0.5  # there and back: a maneuver
         command[axis][0] = 0.5
-        told = np.isfinite(command[axis])
-        near[axis] = time[told], command[axis][told]
+        given = np.isfinite(command[axis])
+        near[axis] = time[given], command[axis][given]
     names = draw(st.permutations(["tracker", "vision", "panel", "probe"]))[: draw(st.integers(1, 4))]
     known, streams = {}, {}
     for name in names:
@@ -227,90 +182,116 @@ def logs(draw: st.DrawFn) -> tuple[Run, pf.FusionConfig, float | None]:
     )
     order = rng.permutation(len(time)) if draw(st.booleans()) else np.arange(len(time))
     order = np.argsort(np.arange(len(time)) + 3.0 * rng.random(len(time)) * (order > len(time) // 2), kind="stable")
-    told = {axis: value[order] for axis, value in command.items()}
+    shuffled = {axis: value[order] for axis, value in command.items()}
     start = some(draw, {}, {axes[0]: 0.505})
-    run = Run.from_arrays(time[order], told, {**streams, "stranger": streams[names[0]]}, start=start)
+    run = Run.from_arrays(time[order], shuffled, {**streams, "stranger": streams[names[0]]}, start=start)
     return run, config, some(draw, None, 70.0)
 
 
-# Where an unknown bias and a gate that reacquired leave only sums known, a backward pass loses digits in either engine:
-# of 400 logs the two smoothers differ by more than 1e-9 sd in 18, by at most 2.4e-8 sd; the filters never by 5e-11.
-SAME = {"filtered": 1e-9, "as-live": 1e-9, "smoothed": 1e-6}
-
-
-def check_logs(count: int, mode: str) -> None:
-    """``count`` logs, of which some have each outcome that a filter decides on or is told."""
+def check_logs(count: int) -> None:
+    """``count`` logs, of which some have each outcome there is."""
     seen = dict.fromkeys(Outcome, 0)
 
     @settings(derandomize=True, deadline=None, max_examples=count)
     @given(logs())
     def check(log: tuple[Run, pf.FusionConfig, float | None]) -> None:
-        run, config, rate = log
-        got, wanted = both(run, config, mode, rate)
-        assume(margin(wanted.measurements, config) > 1e-6)
-        agree(got, wanted, SAME[mode])
+        got, wanted = both(*log)
+        agree(got, wanted)
         for outcome in Outcome:
-            seen[outcome] += bool((wanted.measurements.outcome == outcome).any())
+            seen[outcome] += bool((wanted.results.outcome == outcome).any())
 
     check()
     for outcome in set(Outcome) - {Outcome.TOO_LATE}:
         assert seen[outcome] > count / 20, outcome
 
 
-@pytest.mark.parametrize(
-    "mode",
-    ["filtered", pytest.param("smoothed", marks=pytest.mark.long), pytest.param("as-live", marks=pytest.mark.long)],
-)
-def test_both_engines_make_the_same_of_any_log(mode: str) -> None:
-    """Random axes, sensors, gates, outliers, gaps, latencies: every component's fate and every estimate are the same."""
-    check_logs(30, mode)
+def test_both_engines_make_the_same_of_any_log() -> None:
+    """Random axes, delays, gains, sensors, gates, outliers, gaps, latencies: every fate and estimate is the same."""
+    check_logs(30)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("mode", MODES)
-def test_both_engines_make_the_same_of_many_logs(mode: str) -> None:
+def test_both_engines_make_the_same_of_many_logs() -> None:
     """As above, of two hundred."""
-    check_logs(200, mode)
+    check_logs(200)
+
+
+def test_fuse_by_filterpy_says_the_same() -> None:
+    """Measurements, notes and estimates of `fuse` by either engine; progress goes up; other modes are refused."""
+    scan, config = Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
+    until = scan.command.stamp[0] + 3_000_000_000
+    run = replace(
+        scan,
+        command=scan.command.rows(scan.command.stamp < until),
+        sensors={name: source.rows(source.stamp < until) for name, source in scan.sensors.items()},
+    )
+    done: list[float] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        got = pf.fuse(run, config)
+        wanted = pf.fuse(run, config, engine="filterpy", progress=done.append)
+    assert (got.engine, wanted.engine) == ("compiled", "filterpy")
+    assert got.notes == wanted.notes
+    for name in ("time", "stamp", "sensor", "axis", "value", "outcome"):
+        np.testing.assert_array_equal(getattr(got.measurements, name), getattr(wanted.measurements, name))
+    for axis in wanted.axes:
+        np.testing.assert_allclose(got[axis].position, wanted[axis].position, rtol=0.0, atol=1e-11)
+    assert done == sorted(done)
+    for mode in ({"smooth": True}, {"as_live": True}):
+        with pytest.raises(ValueError, match="filterpy"):
+            pf.fuse(run, config, engine="filterpy", **mode)
 
 
 # ---- wide priors ----------------------------------------------------------------------------------------------------
 
-WIDE = {"offset": (1.0, {}), "bias": (5e-3, {"bias_sd": 1.0}), "both": (1.0, {"bias_sd": 1.0})}
+WIDE = {"offset": (1.0, 0.0), "bias": (5e-3, 1.0), "both": (1.0, 1.0)}  # offset_sd and bias_sd, m
 
 
-def wide(kind: str, ratio: float) -> Case:
+def wide(kind: str, ratio: float) -> tuple[Run, pf.FusionConfig]:
     """A panel and a tracker, with priors of 1 m that are ``ratio`` times a measurement's noise."""
-    offset_sd, panel = WIDE[kind]
-    heard = {
-        "panel": Heard(ungated(1.0 / ratio, latency=0.004, scale=-1.0, **panel), every(40, 24, 2 * MS)),
-        "tracker": Heard(ungated(1.0 / ratio, latency=0.008), every(90, 30, 240 * MS)),
+    offset_sd, bias_sd = WIDE[kind]
+    rng, commands = np.random.default_rng(1), 28 * MS * np.arange(24)
+    u, panel, tracker = 0.5 + rng.uniform(-0.005, 0.005, 24), every(40, 24, 2 * MS), every(90, 30, 240 * MS)
+    panel_value = -np.interp(panel, commands, u) + rng.normal(0.0, 1e-3, 24) + bias_sd * 0.7
+    tracker_value = np.interp(tracker, commands, u) + rng.normal(0.0, 1e-3, 30)
+    streams = {
+        "panel": (panel + 4 * MS, {"radial": panel_value}),
+        "tracker": (tracker + 8 * MS, {"radial": tracker_value}),
     }
-    return Case(one(UNDER), times=np.arange(24) * T, process=NOISE, offset_sd=offset_sd, heard=heard, rate=110.0)
+    plant = pf.SecondOrder(natural_frequency=45.0, damping=0.4)
+    config = pf.FusionConfig(
+        arm=pf.ArmModel(name="an arm", update_period=0.028, delay=0.06045, axes={"radial": pf.AxisModel(plant=plant)}),
+        start=pf.Start(offset_sd=offset_sd),
+        process={"radial": pf.Process(input_noise=0.3e-3, drift=0.8e-3, maneuver_noise=0.5e-3, maneuver_drift=5e-3)},
+        sensors={
+            "panel": pf.Sensor(sd=1.0 / ratio, latency=0.004, scale=-1.0, bias_sd=bias_sd, gate=0.0),
+            "tracker": pf.Sensor(sd=1.0 / ratio, latency=0.008, gate=0.0),
+        },
+    )
+    return Run.from_arrays(commands, {"radial": u}, streams), config
 
 
 # Offset and bias both unknown, one measurement tells their sum alone: what is left of it costs as many digits again.
 RATIOS = [
-    *((kind, ratio, 1e-9) for kind in ("offset", "bias") for ratio in (1e3, 1e4, 1e5)),
+    *((kind, ratio, 1e-9) for kind in ("offset", "bias") for ratio in (1e3, 1e5)),
     *((kind, 1e6, 1e-6) for kind in ("offset", "bias")),
-    *(("both", ratio, 1e-9) for ratio in (1e2, 1e3)),
-    *(("both", ratio, 1e-6) for ratio in (1e4, 1e5, 1e6)),
+    *(("both", ratio, tolerance) for ratio, tolerance in ((1e3, 1e-9), (1e4, 1e-6), (1e6, 1e-6))),
 ]
 
 
-@pytest.mark.parametrize("mode", ["filtered", "as-live"])
 @pytest.mark.parametrize(("kind", "ratio", "tolerance"), RATIOS)
-def test_engines_agree_while_priors_are_wide(kind: str, ratio: float, tolerance: float, mode: str) -> None:
+def test_engines_agree_while_priors_are_wide(kind: str, ratio: float, tolerance: float) -> None:
     """To 1e-9 while a prior is up to 1e5 times a measurement's noise, to 1e-6 up to 1e6 times."""
-    agree(*both(*wide(kind, ratio).made(), mode, 110.0), tolerance)
+    agree(*both(*wide(kind, ratio), 110.0), tolerance)
 
 
 @pytest.mark.parametrize(("kind", "ratio", "tolerance"), RATIOS)
 def test_smoothed_estimates_are_right_while_priors_are_wide(kind: str, ratio: float, tolerance: float) -> None:
-    """Means and error bars of the compiled smoother are the joint Gaussian's, worked out with 50 digits."""
-    run, config = wide(kind, ratio).made()
+    """Means and error bars of the smoother are the joint Gaussian's, worked out with 50 digits."""
+    run, config = wide(kind, ratio)
     estimates = pf.fuse(run, config, rate=110.0, smooth=True)
     belief = AxisOracle(run, config, "radial").smoothed(nanoseconds(estimates))
-    for field in FIELDS:
+    for field in ("position", "offset"):
         mean, sd, right, right_sd = (
             getattr(e, name) for e in (estimates["radial"], belief) for name in (field, f"{field}_sd")
         )
@@ -323,25 +304,18 @@ STORIES = sorted(path.stem for path in SCENARIOS.glob("*.toml") if "[trajectory]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("name", STORIES)
-def test_both_engines_make_the_same_of_a_scenario(name: str, mode: str) -> None:
+def test_both_engines_make_the_same_of_a_scenario(name: str) -> None:
     """Every scenario of the repository, whole: the same fates, estimates and error bars."""
     made = simulate(Scenario.load(SCENARIOS / f"{name}.toml"))
-    got, wanted = both(made.run, made.config, mode)
-    assert margin(wanted.measurements, made.config) > 1e-8
-    agree(got, wanted)
+    for part in segments(in_axes(made.run, made.config.frame)[0])[0]:
+        agree(*both(part, made.config))
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("sensors", [["tracker", "vision"], ["vision"], ["range", "vision"]], ids="+".join)
-def test_both_engines_make_the_same_of_the_scan(sensors: list[str], mode: str) -> None:
+def test_both_engines_make_the_same_of_the_scan(sensors: list[str]) -> None:
     """The shipped scan with its own configuration: a camera's outliers, a tracker, a panel 1 m of bias away."""
     run, config = Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
-    known = {name: config.sensors[name] for name in sensors}
-    config = msgspec.structs.replace(config, sensors=known)
-    run = replace(run, sensors={name: run.sensors[name] for name in sensors})
-    got, wanted = both(run, config, mode, 200.0)
-    assert margin(wanted.measurements, config) > 1e-8
-    agree(got, wanted)
+    config = msgspec.structs.replace(config, sensors={name: config.sensors[name] for name in sensors})
+    agree(*both(replace(run, sensors={name: run.sensors[name] for name in sensors}), config))

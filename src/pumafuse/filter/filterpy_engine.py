@@ -291,8 +291,8 @@ def _add(
     agreements = [gate.agreement((sensor, n), met[n][3], met[n][2], time, limit, axes[n], scale) for n in beyond]
     other = max((gate.contradicted(sensor, n, time) for n in beyond), default=-1)
     agreed = all(one == 1 for one in agreements)
-    if beyond:
-        results.contradicts[row] = other if agreed else -1
+    if beyond and agreed and other >= 0:
+        results.contradicts[row] = other
     if beyond and not (agreed and other < 0):
         for number, (_, _, R, nu, _) in met.items():
             results.outcome[row, number] = Outcome.REJECTED

@@ -189,6 +189,7 @@ def run_events(
             if not arrived[row]:
                 continue
         source = events.source[row]
+        results.contradicts[row] = NOBODY
         first = ZERO
         while first < axes:
             last = axes if source != COMMAND and sensors.gate_rows[source] else first + 1
@@ -265,9 +266,10 @@ def decide(
             all_agree &= agreement == 1
             again |= agreement < 0
             other = max(other, contradicted(sensors, state, axis, sensor, time))
-    results.contradicts[row] = other if all_agree else NOBODY
     if all_agree and other == NOBODY:
         return True
+    if all_agree:
+        results.contradicts[row] = other
     for axis in range(first, end):
         if events.known[row, axis] == FUSED:
             R = noise_of(model, sensors, events, state, row, axis)

@@ -174,7 +174,8 @@ def command_rows(run: Run, arm: ArmModel, notes: list[str]) -> Events:
         notes: Gets a sentence on everything that is wrong with the rows.
 
     Raises:
-        RunError: The run's clock is regular and the stamps do not follow ticks of T.
+        RunError: No command of an axis is possible, or the run's clock is regular and the stamps do not follow ticks
+            of T.
     """
     source, period = run.command, arm.update_period
     missing = source.stamp == NO_STAMP
@@ -189,6 +190,8 @@ def command_rows(run: Run, arm: ArmModel, notes: list[str]) -> Events:
         hollow = np.zeros(len(source.stamp), dtype=np.bool_)
         hollow[kept] = rows.known[:, number] == Outcome.INVALID
         note_rows(notes, source.label, hollow, f"no finite {axis} command: not used")
+        if not (rows.known[:, number] == Outcome.FUSED).any():
+            raise RunError(f"{source.label}: no command for axis '{axis}' is a position within 1000 km")
     if run.clock == "stamps":
         return rows
     used = (rows.known == Outcome.FUSED).any(axis=1)
