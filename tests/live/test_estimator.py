@@ -253,7 +253,7 @@ def test_a_command_on_the_bases_axis_costs_nothing_but_itself() -> None:
 
 
 def test_an_axis_with_a_start_level_is_there_before_its_first_command() -> None:
-    """Measurements of an axis that is commanded late are fused from the first command of all on, if its level is known."""
+    """An axis that is commanded late, and whose level is known, is measured from the first command of all on."""
     told, untold = pf.LiveEstimator(CONFIG, start={"vertical": 0.1}), pf.LiveEstimator(CONFIG)
     for live in (told, untold):
         for step in range(200):
