@@ -124,6 +124,20 @@ def test_any_stream_in_any_order(stream: tuple[pf.FusionConfig, pf.Run, int]) ->
     assert differences(live, arrivals, offline, 1e9) == []
 
 
+def test_an_axis_of_known_start_level_that_is_commanded_late_keeps_what_was_measured() -> None:
+    """Its first command comes when its first measurements have long left the window: as offline."""
+    config, start = recorded("panel-vision")[1], {"radial": 0.5, "vertical": 0.1}
+    given, seen = np.arange(300) * 28_000_000, np.arange(400) * 20_000_000
+    vertical = np.where(np.arange(300) < 200, np.nan, 0.1 + 1e-4 * np.arange(300))
+    values = {axis: level + 1e-3 + 1e-4 * np.sin(np.arange(400)) for axis, level in start.items()}
+    values["vertical"][50:] = np.nan
+    run = pf.Run.from_arrays(
+        given, {"radial": np.full(300, 0.5), "vertical": vertical}, {"vision": (seen, values)}, start=start
+    )
+    live = pf.LiveEstimator(config, start=start)
+    assert differences(live, events_of(run), pf.fuse(run, config), 0.25) == []
+
+
 def test_a_measurement_before_the_first_command_waits_for_it() -> None:
     """Measurements that come before the commands are fused once these are there, if they are valid after the first."""
     config = msgspec.structs.replace(recorded("panel-vision")[1])

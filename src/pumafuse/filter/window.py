@@ -380,9 +380,9 @@ def begin(m: Memory, axis: int, stamp: int) -> None:
         span[ORIGIN] = stamp
     go_back(m, span[BEGIN])
     for other in range(len(incoming.value)):
-        if other != axis and not earlier:
-            continue
         level = incoming.start[other]
+        if not earlier and (other != axis or not math.isnan(level)):  # where it rested was known before
+            continue
         if math.isnan(level):
             for row in range(span[BEGIN], span[END]):
                 commands = events.source[row] == COMMAND and events.known[row, other] == FUSED
