@@ -101,6 +101,12 @@ def outcomes_of(offline: pf.Estimates) -> dict[str, dict[str, int]]:
     }
 
 
+def counted(live: pf.LiveEstimator, *without: str) -> dict[str, dict[str, int]]:
+    """The same of a live estimator, of the sensors that gave anything."""
+    sensors = live.health().sensors.items()
+    return {name: {o: n for o, n in one.outcomes.items() if o not in without} for name, one in sensors if one.rows}
+
+
 def axes_of(draw: st.DrawFn) -> pf.ArmModel:
     def one() -> pf.AxisModel:
         plant = draw(
@@ -139,14 +145,14 @@ def any_stream(draw: st.DrawFn) -> tuple[pf.FusionConfig, pf.Run, int]:
     levels = np.array([0.5, 0.501, 0.51])
     command = {axis: rng.choice(levels, commands) for axis in ("radial", "vertical")}
     command["vertical"][: draw(st.integers(0, commands - 1))] = np.nan
-    heard = {}
+    measured = {}
     for name in sensors:
         rows = draw(st.integers(1, 60))
         when = np.sort(rng.integers(stamp[0] - 200 * MS, stamp[-1] + 500 * MS, rows))
         value = (-0.5 if name == "range" else 0.5) + rng.normal(0.0, 3e-3, rows)
         value[rng.random(rows) < 0.05] = np.nan
-        heard[name] = (when, {"radial": value, "vertical": value[::-1].copy()})
-    return config, pf.Run.from_arrays(stamp, command, heard), draw(st.integers(0, 2**32))
+        measured[name] = (when, {"radial": value, "vertical": value[::-1].copy()})
+    return config, pf.Run.from_arrays(stamp, command, measured), draw(st.integers(0, 2**32))
 
 
 TRACKED = pf.FusionConfig(
@@ -155,7 +161,7 @@ TRACKED = pf.FusionConfig(
 
 
 class Both:
-    """A stream whose output is kept."""
+    """A live estimator and its stream, whose notices and output are kept."""
 
     def __init__(self, config: pf.FusionConfig = TRACKED, rate: float | None = None, **options: float) -> None:
         self.said: list[str] = []

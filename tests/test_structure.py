@@ -8,17 +8,10 @@ import pytest
 import pumafuse as pf
 
 SOURCE = Path(pf.__file__).parent
-ROOMS = [
-    "model",
-    "logs",
-    "fusion",
-    "simulation",
-    "identification",
-    "tuning",
-    "live",
-    "views",
-    "cli",
-]  # each imports itself and those before it
+# each imports itself and those before it
+ROOMS = ["model", "logs", "filter", "fusion", "simulation", "identification", "tuning", "live", "views", "cli"]
+MOST_FILES = 12
+CROWDED = {"views": 14, "cli": 14}  # a file for each figure, screen or command
 GROUND = {"arrays", "errors", "units", "toml", "folders", "compiled"}
 
 
@@ -44,6 +37,18 @@ def test_imports_run_one_way(room: str) -> None:
 def test_every_room_is_known() -> None:
     """A new room must take its place in the order above."""
     assert {path.name for path in SOURCE.iterdir() if (path / "__init__.py").exists()} == set(ROOMS)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_no_room_is_crowded(room: str) -> None:
+    """Who looks for something in a room has a dozen files to choose from."""
+    files = [path for path in (SOURCE / room).glob("*.py") if path.name != "__init__.py"]
+    assert len(files) <= CROWDED.get(room, MOST_FILES)
+
+
+def test_no_room_hides_a_public_name() -> None:
+    """A module that is imported becomes an attribute of the package: none is called what a function or class is."""
+    assert {path.stem for path in SOURCE.iterdir()}.isdisjoint(pf.__all__)
 
 
 def test_the_ground_floor_imports_no_room() -> None:

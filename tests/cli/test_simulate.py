@@ -159,7 +159,7 @@ def _broken() -> int:
 
 def test_jobs_are_done_and_reported_in_the_order_given(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Whichever is ready first; a refusal and an unexpected exception are one line each, no failure is no line."""
-    many.tell({}, 3, "here")
+    many.report_failures({}, 3, "here")
     assert capsys.readouterr().err == ""
     jobs: dict[str, Callable[[], int]] = {f"job-{n}": partial(_square, n) for n in range(6)}
     jobs = {"bad": _refused, **jobs, "worse": _broken}

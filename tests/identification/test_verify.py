@@ -42,21 +42,21 @@ def arm(
 
 
 def moved(known: pf.ArmModel, command: FloatArray = BINARY, start: float = LOW, held: int = 1) -> FloatArray:
-    """Where the arm is at SAMPLED: each change of its input a step response of its own, one command in ``held`` T.
+    """Where the arm is at SAMPLED: each command a step response of its own and a gain error, one in ``held`` T.
 
-    The gain's error grows by (K − 1) times each step, decays with the recovery, and while a command is held the decay
-    reaches the input once in T.
+    The error, (K − 1) times the step, is an input that stays, or decays with the recovery, of a first-order plant only.
     """
     (model,) = known.axes.values()
-    found, error, before, was = np.full(len(SAMPLED), start), 0.0, start, 0.0
-    for n, u in enumerate(command.tolist()):
-        error += (model.gain.slope * abs(u - before) / PERIOD + model.gain.intercept - 1.0) * (u - before)
-        before = u
-        for tick in range(held if n + 1 < len(command) else held + 20):  # after the last command it goes on decaying
-            value = u - start + error
-            found += (value - was) * model.plant.step_response(SAMPLED - (n * held + tick) * PERIOD - known.delay)
-            was = value
-            error *= 1.0 if model.gain_recovery is None else np.exp(-PERIOD / model.gain_recovery)
+    found = np.full(len(SAMPLED), start)
+    for n, step in enumerate(np.diff(command, prepend=start)):
+        since = np.maximum(SAMPLED - n * held * PERIOD - known.delay, 0.0)
+        error = (model.gain.slope * abs(step) / PERIOD + model.gain.intercept - 1.0) * step
+        lasting = model.plant.step_response(since)
+        found += step * lasting
+        if model.gain_recovery is not None:
+            tau, recovery = model.plant.time_constant, model.gain_recovery
+            lasting = (np.exp(-since / recovery) - np.exp(-since / tau)) / (1.0 - tau / recovery)
+        found += error * lasting
     return found
 
 

@@ -209,8 +209,8 @@ def test_a_cylindrical_stream_is_recorded_with_its_frame(tmp_path: Path) -> None
     config = pf.FusionConfig(arm=TRACKED.arm, sensors=TRACKED.sensors, frame=frame)
     recorded = Recorded(tmp_path / "record", config)
     for step in range(50):
-        recorded.live.command(step * T, x=0.66, y=0.001 * step, z=-0.1)
-        recorded.live.measurement(step * T + 1, "tracker", x=0.66, y=0.001 * step, z=-0.1)
+        recorded.live.command(step * T, x=0.66, y=step / 1e3, z=-0.1)
+        recorded.live.measurement(step * T + 1, "tracker", x=0.66, y=step / 1e3, z=-0.1)
     found = recorded.close()
     assert found.frame == frame
     offline = pf.fuse(found, config)

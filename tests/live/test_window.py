@@ -1,159 +1,126 @@
-"""The window's memory: it grows with a dense stream, within a bound, and nothing in it is lost or left behind."""
+"""The window: it grows with a dense stream, within a bound, and nothing in it is lost."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import pumafuse as pf
-from pumafuse.live import window
-from streams import differences, events_of
+from pumafuse.arrays import FloatArray
+from pumafuse.filter import window
+from streams import MS, Event, T, counted, delayed, differences, events_of, feed, outcomes_of
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
-MS = 1_000_000
 GAIN = pf.Gain(slope=0.05, intercept=0.98)
+FIRST, SECOND = pf.FirstOrder(time_constant=0.05), pf.SecondOrder(natural_frequency=50.0, damping=0.8)
 
 
-def config_of(recovery: float | None = 0.1, period: float = 0.028) -> pf.FusionConfig:
-    axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05), gain=GAIN, gain_recovery=recovery)
-    arm = pf.ArmModel(name="one", update_period=period, delay=0.06, axes={"radial": axis})
+def config_of(recovery: float | None = 0.1, period: float = 0.028, delay: float = 0.06) -> pf.FusionConfig:
+    axis = pf.AxisModel(plant=FIRST, gain=GAIN, gain_recovery=recovery)
+    arm = pf.ArmModel(name="one", update_period=period, delay=delay, axes={"radial": axis})
     return pf.FusionConfig(arm=arm, sensors={"fast": pf.Sensor(sd=1e-4, latency=0.01), "slow": pf.Sensor(sd=1e-3)})
 
 
 def run_of(seconds: float, command_hz: float, measurement_hz: float) -> pf.Run:
     rng = np.random.default_rng(3)
     given = np.arange(0, seconds, 1.0 / command_hz)
-    heard = np.arange(0, seconds, 1.0 / measurement_hz)
-    measurements = (heard, {"radial": 0.5 + rng.normal(0.0, 1e-4, len(heard))})
+    measured = np.arange(0, seconds, 1.0 / measurement_hz)
+    measurements = (measured, {"radial": 0.5 + rng.normal(0.0, 1e-4, len(measured))})
     return pf.Run.from_arrays(given, {"radial": 0.5 + 0.01 * np.sin(given)}, {"fast": measurements})
 
 
-@pytest.mark.parametrize(("command_hz", "measurement_hz"), [(36.0, 6000.0), (1000.0, 100.0), (3000.0, 3000.0)])
-def test_more_than_the_first_arrays_hold(command_hz: float, measurement_hz: float) -> None:
-    """Thousands of rows and commands in the window: the arrays grow, and the estimates are the offline ones."""
+def rows(live: pf.LiveEstimator) -> int:
+    """How many events the window has room for."""
+    return len(live._window.memory.events.time)
+
+
+def held(live: pf.LiveEstimator) -> int:
+    """How many events are in it."""
+    span = live._window.memory.incoming.span
+    return int(span[window.END] - span[window.BEGIN])
+
+
+# ---- room -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("command_hz", "measurement_hz"), [(36.0, 6000.0), (3000.0, 1000.0)])
+def test_a_dense_stream_has_more_room(command_hz: float, measurement_hz: float) -> None:
+    """Thousands of measurements or commands in the window: its arrays grow, and the estimates are the offline ones."""
     run, config = run_of(3.0, command_hz, measurement_hz), config_of(period=1.0 / command_hz)
     live = pf.LiveEstimator(config)
     assert differences(live, events_of(run), pf.fuse(run, config), 1.5) == []
-    memory = live._window.memory
-    assert max(len(memory.heard.stamp) - 4096, memory.commands.time.shape[1] - 512) > 0
+    assert rows(live) > window.FIRST_ROWS
+    assert live._window.floor < 0  # nothing had to be let go
 
 
-def test_the_first_arrays_serve_for_ever() -> None:
-    """A usual stream is kept in the arrays that were there at first, however long it is."""
+def test_the_first_room_serves_for_ever() -> None:
+    """A usual stream stays in the arrays that were there at first, however long it is; what is old leaves them."""
     run, config = run_of(120.0, 36.0, 200.0), config_of()
     live = pf.LiveEstimator(config)
     assert differences(live, events_of(run), pf.fuse(run, config), 0.1) == []
-    memory = live._window.memory
-    assert len(memory.heard.stamp) == 4096
-    assert memory.commands.time.shape[1] == 512
-    assert memory.axes.first[-1] == 1024
+    assert rows(live) == window.FIRST_ROWS
+    assert held(live) < 2.2 * 236.0
 
 
-def test_long_decays_and_long_silence() -> None:
-    """A gain error that recovers slowly is carried on over a minute of silence, and far ahead, as offline does."""
-    config = config_of(recovery=20.0)
-    given = np.concatenate((np.arange(0.0, 2.0, 0.028), [60.0, 60.028, 60.5]))
-    run = pf.Run.from_arrays(
-        given, {"radial": 0.5 + 0.001 * given}, {"fast": ([0.5, 30.0, 61.0], {"radial": [0.5] * 3})}
-    )
-    live, offline = pf.LiveEstimator(config, window=100.0), pf.fuse(run, config)
-    assert live.estimate(90.0).outcome is pf.Outcome.BEFORE_START
-    events = events_of(run)
-    for event in events[:50]:
-        live.command(event.stamp, **event.values) if not event.sensor else live.measurement(
-            event.stamp, "fast", radial=0.5
-        )
-        live.estimate(event.stamp + 120_000_000_000)
-    assert differences(live, events[50:], offline, 1e9) == []
+def flood(live: pf.LiveEstimator, values: FloatArray) -> None:
+    """A measurement each 50 µs, of two sensors in turn."""
+    for row, value in enumerate(values.tolist()):
+        told = live.measurement(row * MS // 20, "fast" if row % 2 else "slow", radial=value)
+        assert told.outcome is not pf.Outcome.TOO_LATE
 
 
-def test_a_flood_shortens_the_window_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    """More rows than are ever kept: the oldest are let go, what is late beyond them is refused, estimates go on."""
+def test_a_flood_of_measurements_shortens_the_window_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More rows than are ever kept: the oldest are let go, what is later than them is refused, no estimate changes."""
+    values = 0.5 + np.random.default_rng(1).normal(0.0, 1e-4, 20_000)
+    whole = pf.LiveEstimator(config_of())
+    whole.command(0, radial=0.5)
+    flood(whole, values)
+    assert rows(whole) > len(values)
     monkeypatch.setattr(window, "MOST_ROWS", 4096)
-    live, config = pf.LiveEstimator(config_of()), config_of()
+    live = pf.LiveEstimator(config_of())
     live.command(0, radial=0.5)
-    rng = np.random.default_rng(1)
-    values = (0.5 + rng.normal(0.0, 1e-4, 20_000)).tolist()
-    for row, value in enumerate(values):
-        assert (
-            live.measurement(row * MS // 20, "fast" if row % 2 else "slow", radial=value).outcome
-            is not pf.Outcome.TOO_LATE
-        )
-    assert len(live._window.memory.heard.stamp) == 4096
+    flood(live, values)
+    assert rows(live) == 4096
     newest = live.newest
-    assert live.measurement(newest - 300 * MS, "slow", radial=0.5).outcome is pf.Outcome.TOO_LATE
+    assert newest is not None
+    for time in (newest - 100 * MS, newest, newest + 100 * MS):
+        assert live.estimate(time) == whole.estimate(time)
+    told = live.measurement(newest - 300 * MS, "slow", radial=0.5)
+    assert told.outcome is pf.Outcome.TOO_LATE
+    assert "the window holds no more" in told.reason
     assert live.estimate(newest - 300 * MS).outcome is pf.Outcome.TOO_LATE
     assert live.measurement(newest - 50 * MS, "slow", radial=0.5).outcome is pf.Outcome.FUSED
     assert sum(sum(sensor.outcomes.values()) for sensor in live.health().sensors.values()) == 20_002
-    run = pf.Run.from_arrays(
-        np.array([0]),
-        {"radial": np.array([0.5])},
-        {
-            name: (np.arange(start, 20_000, 2) * MS // 20, {"radial": np.array(values[start::2])})
-            for name, start in (("fast", 1), ("slow", 0))
-        },
-    )
-    untouched = pf.LiveEstimator(config)
-    for event in events_of(run):
-        untouched.measurement(event.stamp, event.sensor, **event.values) if event.sensor else untouched.command(
-            event.stamp, **event.values
-        )
-    expected = pf.fuse(run, config, rate=1000.0)
-    assert untouched.estimate(round(expected.time[-1] * 1e9))["radial"].position == expected["radial"].position[-1]
 
 
 def test_a_flood_of_commands_shortens_the_window(monkeypatch: pytest.MonkeyPatch) -> None:
     """More commands than are ever kept: the oldest are let go, and the estimate is still the offline one."""
-    monkeypatch.setattr(window, "MOST_ROWS", 1024)
+    monkeypatch.setattr(window, "MOST_ROWS", 4096)
     config = config_of(recovery=None)
-    given = np.arange(5000) * MS // 4
-    run = pf.Run.from_arrays(given, {"radial": 0.5 + 1e-6 * np.arange(5000)}, {"fast": ([0], {"radial": [0.5]})})
+    given = np.arange(9000) * MS // 8
+    run = pf.Run.from_arrays(given, {"radial": 0.5 + 1e-6 * np.arange(9000)}, {"fast": ([0], {"radial": [0.5]})})
     live = pf.LiveEstimator(config)
     for event in events_of(run):
-        live.command(event.stamp, **event.values) if not event.sensor else live.measurement(
-            event.stamp, "fast", radial=0.5
-        )
-    assert live._window.memory.commands.time.shape[1] == 1024
-    offline = pf.fuse(run, config)
-    assert live.estimate(int(given[-1]))["radial"].position == offline["radial"].position[-1]
+        feed(live, event)
+    assert rows(live) == 4096
+    assert live.estimate(int(given[-1]))["radial"].position == pf.fuse(run, config)["radial"].position[-1]
     assert live.command(int(given[0]) + 1, radial=0.4).outcome is pf.Outcome.TOO_LATE
 
 
-def test_what_the_window_lets_go_for_an_event_is_gone_for_that_event_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Room for a late event costs the oldest eighth of the window: an event that is older still is too late."""
-    monkeypatch.setattr(window, "MOST_ROWS", 1024)
+def test_room_for_a_late_event_may_cost_that_event(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a full window the oldest eighth goes: an event that is older still is too late, and changes nothing."""
+    monkeypatch.setattr(window, "MOST_ROWS", 4096)
     live, clean = (pf.LiveEstimator(config_of(recovery=None), window=600.0) for _ in range(2))
-    for step in range(1024):
+    for step in range(2048):
         for one in (live, clean):
-            one.command(step * 28 * MS, radial=0.5 + 1e-5 * step)
-            one.measurement(step * 28 * MS, "fast", radial=0.5 + 1e-5 * step)
+            one.command(step * T, radial=0.5 + 1e-5 * step)
+            one.measurement(step * T, "fast", radial=0.5 + 1e-5 * step)
     told = live.command(14 * MS, radial=0.4)
     assert told.outcome is pf.Outcome.TOO_LATE
     assert "the window holds no more" in told.reason
-    assert live.estimate(1023 * 28 * MS) == clean.estimate(1023 * 28 * MS)
-
-
-def test_a_repeated_command_before_a_long_silence() -> None:
-    """The last command is said again at once, then only measurements come: its error decays on as it does offline."""
-    config = config_of(recovery=5.0)
-    heard = np.arange(0.0, 80.0, 0.1)
-    run = pf.Run.from_arrays(
-        [0.0, 1.0, 1.01], {"radial": [0.5, 0.51, 0.51]}, {"fast": (heard, {"radial": np.full(len(heard), 0.51)})}
-    )
-    offline = pf.fuse(run, config, rate=50.0)
-    live = pf.LiveEstimator(config)
-    assert differences(live, events_of(run), offline, 0.5) == []
-
-
-def test_an_hour_ahead_with_a_long_recovery() -> None:
-    """The farthest estimate there is, of an arm with a tick each ms: memory is bounded, the command table as it was."""
-    live = pf.LiveEstimator(config_of(recovery=9.9, period=0.001))
-    live.command(0, radial=0.5)
-    live.command(MS, radial=0.51)
-    assert live.estimate(3600 * 1000 * MS).outcome is pf.Outcome.FUSED
-    memory = live._window.memory
-    assert memory.axes.first[1] <= 2**20
-    assert memory.commands.time.shape[1] == 512
+    assert live.estimate(2047 * T) == clean.estimate(2047 * T)
 
 
 def test_a_frozen_stamp_ends_in_a_shorter_window(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,4 +132,140 @@ def test_a_frozen_stamp_ends_in_a_shorter_window(monkeypatch: pytest.MonkeyPatch
     assert told[4000].outcome is pf.Outcome.FUSED
     assert told[-1].outcome is pf.Outcome.TOO_LATE
     assert "the window holds no more" in told[-1].reason
-    assert live.command(128 * MS, radial=0.5).outcome is pf.Outcome.FUSED
+    assert live.command(100 * MS + 10 * MS + T + 1, radial=0.5).outcome is pf.Outcome.FUSED  # after latency and T
+
+
+# ---- time -----------------------------------------------------------------------------------------------------------
+
+
+def test_long_decays_and_long_silence() -> None:
+    """A gain error that recovers slowly decays on over a minute of silence, and far ahead, as it does offline."""
+    config = config_of(recovery=20.0)
+    given = np.concatenate((np.arange(0.0, 2.0, 0.028), [60.0, 60.028, 60.5]))
+    run = pf.Run.from_arrays(
+        given, {"radial": 0.5 + 0.001 * given}, {"fast": ([0.5, 30.0, 61.0], {"radial": [0.5] * 3})}
+    )
+    live, events = pf.LiveEstimator(config, window=100.0), events_of(run)
+    assert live.estimate(90.0).outcome is pf.Outcome.BEFORE_START
+    for event in events[:50]:
+        feed(live, event)
+        assert live.estimate(event.stamp + 120_000 * MS).outcome is pf.Outcome.FUSED
+    assert live.estimate(events[49].stamp + 3600 * 1000 * MS).outcome is pf.Outcome.FUSED
+    assert differences(live, events[50:], pf.fuse(run, config), 1e9) == []
+
+
+def test_a_repeated_command_before_a_long_silence() -> None:
+    """The last command is said again at once, then only measurements come: its error decays on as it does offline."""
+    config = config_of(recovery=5.0)
+    measured = np.arange(0.0, 80.0, 0.1)
+    run = pf.Run.from_arrays(
+        [0.0, 1.0, 1.01], {"radial": [0.5, 0.51, 0.51]}, {"fast": (measured, {"radial": np.full(len(measured), 0.51)})}
+    )
+    live = pf.LiveEstimator(config)
+    assert differences(live, events_of(run), pf.fuse(run, config, rate=50.0), 0.5) == []
+
+
+@pytest.mark.parametrize("stamp", [10**18, -(10**18), 4_599_990_000 * 10**9, -4_599_990_000 * 10**9])
+def test_any_clock_gives_the_same_estimates(stamp: int) -> None:
+    """Stamps from 1824 to 2115, and a window of an hour: only differences count, and they are exact."""
+
+    def estimates(origin: int) -> list[object]:
+        live = pf.LiveEstimator(config_of(), window=3600.0)
+        for step in range(20):
+            live.command(origin + step * T, radial=0.5 + 1e-3 * step)
+            live.measurement(origin + step * T + 10 * MS, "fast", radial=0.5)
+        return [live.estimate(origin + time)["radial"] for time in (0, 300 * MS, 600 * MS)]
+
+    assert estimates(stamp) == estimates(0)
+
+
+# ---- any stream -----------------------------------------------------------------------------------------------------
+
+
+@st.composite
+def odd_streams(draw: st.DrawFn) -> tuple[pf.FusionConfig, list[Event], dict[str, float], int]:
+    """Commands of some axes only, several of one stamp, corrected, repeated or far apart; sensors of any latency."""
+    delay, latency = draw(st.sampled_from([0.0, 0.06, 0.5])), draw(st.sampled_from([-0.7, 0.0, 0.4]))
+    plants, names = [FIRST, SECOND, FIRST], ("tangential", "radial", "vertical")
+    recovery = draw(st.sampled_from([None, 0.05, 2.0]))
+    axes = {
+        name: pf.AxisModel(plant=plant, gain=GAIN, gain_recovery=recovery, delay=None if name != "vertical" else 0.1)
+        for name, plant in zip(names, plants, strict=True)
+    }
+    sensors = {
+        "early": pf.Sensor(sd=1e-3, latency=latency, gate=3.0),
+        "late": pf.Sensor(sd=2e-3, latency=0.3, latency_sd=0.01, gate_rows=False, bias_sd=1e-3),
+    }
+    arm = pf.ArmModel(name="odd", update_period=0.028, delay=delay, axes=axes)
+    config = pf.FusionConfig(arm=arm, sensors=sensors, process={"radial": pf.Process(drift=1e-3, maneuver_drift=1e-2)})
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    grid = draw(st.sampled_from([1, 5 * MS, 28 * MS]))  # a coarse grid makes many events of one instant
+    span = draw(st.sampled_from([0, 300 * MS, 1500 * MS])) // grid + 1
+    commanded = names[: draw(st.integers(1, 3))]
+    events = []
+    for _ in range(draw(st.integers(1, 60))):
+        values = {name: float(rng.choice([0.5, 0.505, np.nan], p=[0.5, 0.4, 0.1])) for name in names}
+        sensor = str(rng.choice(["", "", "early", "late"]))
+        given = commanded if not sensor else names
+        kept = {name: values[name] for name in given if rng.random() < 0.6}
+        if kept:
+            events.append(Event(int(rng.integers(span)) * grid, sensor, kept))
+    start = draw(st.sampled_from([{}, {"radial": 0.5}, dict.fromkeys(names, 0.49)]))
+    return config, events, start, draw(st.integers(0, 2**32))
+
+
+@settings(derandomize=True, deadline=None, max_examples=150)
+@given(odd_streams())
+def test_any_order_of_arrival_gives_the_same_window(
+    drawn: tuple[pf.FusionConfig, list[Event], dict[str, float], int],
+) -> None:
+    """Estimates and counts are those of the events by stamp; only of one stamp and source the order counts."""
+    config, events, start, seed = drawn
+    in_order, shuffled = (pf.LiveEstimator(config, window=10.0, start=start) for _ in range(2))
+    for event in sorted(events, key=lambda event: event.stamp):
+        feed(in_order, event)
+    queues: dict[tuple[int, str], list[Event]] = {}
+    for event in events:
+        queues.setdefault((event.stamp, event.sensor), []).append(event)
+    for event in delayed(events, 5.0, seed):  # ties keep their order: whoever comes, the first of its queue goes
+        feed(shuffled, queues[event.stamp, event.sensor].pop(0))
+    assert counted(shuffled) == counted(in_order)
+    for time in range(0, 2000 * MS, 130 * MS):
+        assert shuffled.estimate(time) == in_order.estimate(time)
+
+
+@settings(derandomize=True, deadline=None, max_examples=100)
+@given(odd_streams())
+def test_any_stream_is_fused_as_offline(
+    drawn: tuple[pf.FusionConfig, list[Event], dict[str, float], int],
+) -> None:
+    """The run with a row for each event: the same outcomes and, at every command, the same bits."""
+    config, events, start, seed = drawn
+    events = sorted(events, key=lambda event: event.stamp)
+    tables = {sensor: [event for event in events if event.sensor == sensor] for sensor in ("", "early", "late")}
+    columns = {}
+    for sensor, table in tables.items():
+        names = [name for name in config.arm.axes if any(name in event.values for event in table)]
+        stamp = np.array([event.stamp for event in table], dtype=np.int64)
+        columns[sensor] = stamp, {n: np.array([event.values.get(n, np.nan) for event in table]) for n in names}
+    stamp, command = columns.pop("")
+    commanded = [name for name, column in command.items() if np.isfinite(column).any()]
+    if not commanded:
+        return
+    sensors = {
+        sensor: (when, {name: column for name, column in values.items() if name in commanded})
+        for sensor, (when, values) in columns.items()
+    }
+    sensors = {sensor: source for sensor, source in sensors.items() if source[1]}
+    level = {name: start[name] for name in commanded if name in start}
+    run = pf.Run.from_arrays(stamp, {name: command[name] for name in commanded}, sensors, start=level)
+    offline = pf.fuse(run, config)
+    live = pf.LiveEstimator(config, window=10.0, start=level)
+    arrivals = events_of(run)
+    if len({(event.stamp, event.sensor) for event in arrivals}) == len(arrivals):
+        arrivals = delayed(arrivals, 5.0, seed)
+    assert differences(live, arrivals, offline, 1e9) == []
+    expected, found = outcomes_of(offline), counted(live)
+    for sensor, counts in found.items():  # live an empty cell is no value, offline one that is invalid or too early
+        for word in ("fused", "rejected", "reacquired"):
+            assert counts[word] == expected[sensor][word]

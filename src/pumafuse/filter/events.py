@@ -208,6 +208,6 @@ def said_before(events: Events, row: int, begin: int) -> bool:
                 a, b = events.value[before, axis], events.value[row, axis]
                 absent, other = events.known[before, axis] == ABSENT, events.known[row, axis] == ABSENT
                 same &= absent == other and (absent or a == b or (math.isnan(a) and math.isnan(b)))
-            if same:
-                return True
+            if same or events.source[row] == COMMAND:  # of one stamp the last command counts
+                return same
     return False

@@ -296,9 +296,9 @@ def begin(m: Memory, axis: int, stamp: int) -> None:
     span[ORIGIN] = min(stamp, span[ORIGIN])
     go_back(m, span[BEGIN])
     for other in range(len(incoming.outcome)):
-        if other != axis and not earlier:
-            continue
         level = incoming.values[other, KNOWN_START]
+        if not earlier and (other != axis or not math.isnan(level)):  # where it rested was known before
+            continue
         if math.isnan(level):
             level = state.drive[other, START] if other != axis else level
             for row in range(span[BEGIN], span[END]):

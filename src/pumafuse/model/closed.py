@@ -106,19 +106,27 @@ def decaying_response(
     left = math.exp(-decay * dt)
     if order == 1:
         rate = constants[axis, 0]
-        apart = rate - decay
-        if abs(apart) > _CLOSE * (rate + decay):
-            return rate * (left - f11) / apart, 0.0, left
-        lasting = math.exp(-min(rate, decay) * dt)
-        return rate * lasting * (dt if apart == 0.0 else -math.expm1(-abs(apart) * dt) / abs(apart)), 0.0, left
-    omega, sigma, fastest = constants[axis, 0], constants[axis, 1], constants[axis, 3]
+        if abs(rate - decay) > _CLOSE * (rate + decay):
+            return rate * (left - f11) / (rate - decay), 0.0, left
+        return rate * _divided_difference(rate, decay, dt), 0.0, left
+    omega, sigma, square, fastest = constants[axis, 0], constants[axis, 1], constants[axis, 2], constants[axis, 3]
     w2 = omega * omega
     product = decay * decay - 2.0 * sigma * decay + w2  # of the distances between the input's pole and the plant's
     if abs(product) > _CLOSE * (decay * decay + 2.0 * sigma * decay + w2):
         h, g = (left - f22 - (2.0 * sigma - decay) * f12) / product, f12
+    elif square > (_APART * sigma) ** 2 and fastest * dt > _SHORT:
+        slow = w2 / fastest
+        h, g = (_divided_difference(slow, decay, dt) - _divided_difference(fastest, decay, dt)) / (fastest - slow), f12
     else:
         h, g = _close_poles(omega, sigma, max(fastest, decay), decay, dt)
     return w2 * h, w2 * (g - decay * h), left
+
+
+@compiled
+def _divided_difference(a: float, b: float, t: float) -> float:
+    """∫ e^(−a s) e^(−b (t − s)) ds = (e^(−b t) − e^(−a t)) / (a − b), in the form that does not cancel."""
+    apart = abs(a - b)
+    return math.exp(-min(a, b) * t) * (t if apart == 0.0 else -math.expm1(-apart * t) / apart)
 
 
 @compiled

@@ -1,0 +1,157 @@
+"""The position that a sequence of commands makes: superposed steps, the differential equation, and the edges."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+import pumafuse as pf
+from pumafuse import AxisModel, FirstOrder, Gain, SecondOrder
+from pumafuse.arrays import FloatArray, TimeArray
+from pumafuse.model.plants import PLANTS
+from pumafuse.model.response import response
+
+EPOCH = 1_790_000_000_000_000_000  # ns: stamps of a logger in 2026, too large for a float to hold
+PERIOD, DELAY, START = 0.028, 0.06, 0.5
+KNOWN: dict[str, PLANTS] = {
+    "first order": FirstOrder(time_constant=0.0425),
+    "under-damped": SecondOrder(natural_frequency=53.9, damping=0.2),
+    "nearly critical": SecondOrder(natural_frequency=60.0, damping=1.0 + 1e-9),
+    "over-damped": SecondOrder(natural_frequency=60.0, damping=2.5),
+}
+PLANT = st.one_of(
+    st.builds(lambda tau: FirstOrder(time_constant=tau), st.floats(1e-3, 1.0)),
+    st.builds(
+        lambda omega, damping: SecondOrder(natural_frequency=omega, damping=damping),
+        st.floats(2.0, 500.0),
+        st.one_of(st.floats(0.05, 0.95), st.floats(0.95, 1.05), st.just(1.0), st.floats(1.05, 8.0)),
+    ),
+)
+plants = pytest.mark.parametrize("plant", KNOWN.values(), ids=KNOWN)
+
+
+def moved(plant: PLANTS, acting: TimeArray, value: FloatArray, time: TimeArray, gain: float = 1.0) -> FloatArray:
+    """The response from a level of 0 to inputs that act at once."""
+    return response(AxisModel(plant=plant, gain=Gain(intercept=gain)), PERIOD, 0.0, acting, value, 0.0, time)
+
+
+def superposed(plant: PLANTS, acting: TimeArray, value: FloatArray, time: TimeArray) -> FloatArray:
+    """Every change of the input as a step of its own, each from rest."""
+    since = (time[:, None] - acting[None]) * 1e-9
+    return plant.step_response(since) @ np.diff(value, prepend=0.0)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(PLANT, st.sampled_from([1.0, 0.9]), st.integers(0, 10**6), st.integers(0, 40), st.integers(0, 60))
+def test_commands_superpose(plant: PLANTS, gain: float, seed: int, commands: int, times: int) -> None:
+    """Any commands at irregular times, asked for at any times, also one instant twice, in stamps of a real clock."""
+    rng = np.random.default_rng(seed)
+    acting = EPOCH + np.sort(rng.integers(0, 2 * 10**9, commands))
+    time = EPOCH + np.sort(rng.integers(-(10**8), 3 * 10**9, times))
+    value = rng.normal(0.0, 0.01, commands)
+    found = moved(plant, acting, value, time, gain)
+    assert found.shape == (times,)
+    np.testing.assert_allclose(found, gain * superposed(plant, acting, value, time), rtol=0.0, atol=1e-14)
+
+
+@pytest.mark.parametrize("recovery", [None, 0.005, 0.0425, 1.0 / 60.0, 0.3])
+@plants
+def test_the_differential_equation_is_solved(plant: PLANTS, recovery: float | None) -> None:
+    """ẋ = A x + B (u + e), e jumps by (K − 1) times each step and decays: a Runge-Kutta method, command by command."""
+    A, B, C = plant.state_space()
+    rng, gain = np.random.default_rng(5), Gain(slope=0.1, intercept=0.9)
+    given = EPOCH + np.cumsum(rng.integers(2 * 10**6, 90 * 10**6, 12))
+    command = START + rng.normal(0.0, 0.1, 12)
+    time = EPOCH + np.sort(rng.integers(0, int(given[-1]) - EPOCH + 3 * 10**8, 80))
+    acting = given + round(DELAY * 1e9)
+    state, error, u, expected = np.zeros(len(A)), 0.0, 0.0, np.zeros(80)
+    for k, begin in enumerate(acting):
+        step, u = command[k] - START - u, command[k] - START
+        error += (gain.slope * abs(step) / PERIOD + gain.intercept - 1.0) * step
+        end = acting[k + 1] if k + 1 < len(acting) else time[-1] + 1
+        here = np.flatnonzero((time >= begin) & (time < end))
+        asked = (np.append(time[here], end) - begin) * 1e-9
+        decay = 0.0 if recovery is None else 1.0 / recovery
+        solved = solve_ivp(
+            lambda t, x, u=u, e=error, rate=decay: A @ x + B[:, 0] * (u + e * np.exp(-rate * t)),
+            (0.0, asked[-1]), state, "DOP853", asked, rtol=1e-12, atol=1e-13,
+        )  # fmt: skip
+        expected[here] = (C @ solved.y)[0, :-1]
+        state, error = solved.y[:, -1], error * np.exp(-decay * asked[-1])
+    axis = AxisModel(plant=plant, gain=gain, gain_recovery=recovery)
+    found = response(axis, PERIOD, DELAY, given, command, START, time)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+
+
+@plants
+def test_at_the_instant_of_a_command_it_has_moved_nothing_yet(plant: PLANTS) -> None:
+    """Positions are continuous: what acts at an instant shows only after it, the command before it is whole."""
+    acting = np.array([0, 30, 70], dtype=np.int64) * 10**6
+    value = np.array([1.0, -2.0, 0.5])
+    for at in (0, 1, 2):
+        found = moved(plant, acting, value, acting[at : at + 1])
+        without = superposed(plant, acting[:at], value[:at], acting[at : at + 1])
+        np.testing.assert_allclose(found, without, rtol=0.0, atol=1e-14)
+    soon = moved(plant, acting, value, np.array([10**5]))[0]
+    assert soon == pytest.approx(float(plant.step_response(1e-4)), abs=1e-15)
+    assert soon > 0.0
+
+
+@plants
+def test_of_two_commands_at_one_instant_the_later_one_counts(plant: PLANTS) -> None:
+    """As if the first had not been."""
+    time = np.arange(0, 200, 7) * 10**6
+    twice = moved(plant, np.array([10, 10, 50]) * 10**6, np.array([9.0, 1.0, 2.0]), time)
+    once = moved(plant, np.array([10, 50]) * 10**6, np.array([1.0, 2.0]), time)
+    np.testing.assert_array_equal(twice, once)
+
+
+def test_nothing_moves_before_the_first_command_or_without_one() -> None:
+    """Exactly 0, not nearly; and no times give no positions."""
+    plant, acting, value = KNOWN["first order"], np.array([EPOCH]), np.array([3.0])
+    before = EPOCH + np.array([-(10**12), -1, 0])
+    np.testing.assert_array_equal(moved(plant, acting, value, before), 0.0)
+    np.testing.assert_array_equal(moved(plant, acting[:0], value[:0], before), 0.0)
+    assert moved(plant, acting, value, before[:0]).shape == (0,)
+    assert moved(plant, acting[:0], value[:0], before[:0]).shape == (0,)
+
+
+@plants
+def test_what_is_asked_for_changes_no_answer(plant: PLANTS) -> None:
+    """More times between and the position at the others stays, but for rounding; arguments are left as they were."""
+    rng = np.random.default_rng(1)
+    acting = np.sort(rng.integers(0, 10**9, 30))
+    value = rng.normal(0.0, 1.0, 30)
+    time = np.sort(rng.integers(0, 10**9, 400))
+    kept = acting.copy(), value.copy(), time.copy()
+    dense = moved(plant, acting, value, time)
+    np.testing.assert_allclose(moved(plant, acting, value, time[::13]), dense[::13], rtol=0.0, atol=1e-13)
+    for now, then in zip((acting, value, time), kept, strict=True):
+        np.testing.assert_array_equal(now, then)
+
+
+@pytest.mark.parametrize("recovery", [None, 0.14, 1.0 / 60.0])
+@plants
+def test_it_settles_however_long_it_rests(plant: PLANTS, recovery: float | None) -> None:
+    """An hour later it is where it was sent, to the last bits; where the gain does not recover, at K times that."""
+    hour, axis = 3600 * 10**9, AxisModel(plant=plant, gain=Gain(intercept=0.9), gain_recovery=recovery)
+    given, command = np.array([0, hour]), np.array([0.56, 0.57])
+    found = response(axis, PERIOD, DELAY, given, command, 0.0, np.array([hour, 2 * hour]))
+    np.testing.assert_allclose(found, command * (0.9 if recovery is None else 1.0), rtol=1e-14)
+
+
+@plants
+def test_the_filter_predicts_the_same(plant: PLANTS) -> None:
+    """Without measurements the estimates are the response, from the start level on."""
+    axis = AxisModel(plant=plant, gain=Gain(slope=0.1, intercept=0.9), gain_recovery=0.14)
+    rng, given = np.random.default_rng(2), np.arange(50) * 28_000_000
+    command = START + rng.normal(0.0, 0.01, 50)
+    arm = pf.ArmModel(name="one", update_period=PERIOD, delay=DELAY, axes={"radial": axis})
+    run = pf.Run.from_arrays(given, {"radial": command}, start={"radial": START})
+    estimates = pf.fuse(run, pf.FusionConfig(arm=arm), rate=100.0)
+    time = np.rint(estimates.time * 1e9).astype(np.int64)
+    expected = START + response(axis, PERIOD, DELAY, given, command, START, time)
+    np.testing.assert_allclose(estimates["radial"].position, expected, rtol=0.0, atol=1e-14)
