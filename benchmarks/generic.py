@@ -123,9 +123,9 @@ def measure(case: Case) -> Iterator[Row]:
             numbers[name] = {kind: [best, axis.closest(ORDERS[kind], best)] for kind, best in likeliest.items()}
     for name, run, since in case.scored:
         estimates = {fit: pf.fuse(run, config) for fit, config in tuned.items()}
-        est, heard = estimates["noise"], axes_of(run, case.config)
+        est, measured = estimates["noise"], axes_of(run, case.config)
         for axis, found in numbers.items():
-            here = heard[axis]
+            here = measured[axis]
             generic = {
                 kind: [error(est, axis, since, here.follow(order, one)[0]) for one in found[kind]]
                 for kind, order in ORDERS.items()

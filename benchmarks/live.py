@@ -1,4 +1,4 @@
-"""How fast the live estimator is: one call, one rewind, and whole processes on lines from standard input.
+"""How fast the live estimator is: one call, one late measurement, and whole processes on lines from standard input.
 
     python benchmarks/live.py [--rows N]
 
@@ -119,7 +119,7 @@ def main() -> None:
     ]
     table = [
         ("`measurement()` in order, three axes", measurement),
-        ("`measurement()` 100 ms late: 100 rows of 1 kHz met again", percentiles(late)),
+        ("`measurement()` 100 ms late: 100 rows of 1 kHz updated again", percentiles(late)),
         ("`command()`", percentiles([lambda n=n: live.command(newest + n, **START) for n in range(2000)])),
         ("`estimate()` now", percentiles([live.estimate] * 2000)),
         ("a `filterpy` loop, three axes, two states each", theirs),

@@ -1,9 +1,9 @@
 """The scan through other programs: a loop in C++ on the table of events, and general filters with matrices per event.
 
-    python benchmarks/peers.py NAME REPEATS    prints the rows of one of CASES as JSON; run.py calls it
+    python benchmarks/peers.py NAME REPEATS    prints the rows of one of PEERS as JSON; run.py calls it
 
-Each first has to give the numbers of `pumafuse` on the shipped scan, to `TOLERANCE` of a standard deviation. What a user
-makes once (tables, matrices, a compiled program) is made before the clock starts.
+Each first has to give the numbers of `pumafuse` on the shipped scan, to `TOLERANCE` of a standard deviation. What is
+made once (tables, matrices, a compiled program) is made before the clock starts.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pumafuse.filter.axis import OFFSET, POSITION, RATE, START
 from pumafuse.filter.events import COMMAND, Events
 from pumafuse.fusion.engine import Filtered, arranged, biased_sensors, filter_segment, innovations
 from pumafuse.fusion.segments import Segment, build
-from pumafuse.model.closed import constants, decaying_response, gain_error, transition
+from pumafuse.model.closed import decaying_response, gain_error, transition
 
 Array = npt.NDArray[np.float64]
 Answer = Mapping[str, Array]  # outputs (axes, estimates), innovations (events, axes), or the log_likelihood
@@ -110,7 +110,9 @@ def cpp(problem: Problem, estimates: bool = True) -> Callable[[], Answer]:
         model, process = config.arm.axes[axis], config.process[axis]
         plant, gain = model.plant, model.gain
         first = isinstance(plant, pf.FirstOrder)
-        shape = [1.0, 1.0 / plant.time_constant, 0.0, 0.0] if first else [2.0, 0.0, plant.natural_frequency, plant.damping]
+        shape = (
+            [1.0, 1.0 / plant.time_constant, 0.0, 0.0] if first else [2.0, 0.0, plant.natural_frequency, plant.damping]
+        )
         decay = 0.0 if model.gain_recovery is None else 1.0 / model.gain_recovery
         noise = [process.input_noise, process.drift, process.maneuver_noise, process.maneuver_drift]
         prior = [segment.start[axis], config.start.offset_sd, 3.0 + len(biased)]
@@ -123,7 +125,18 @@ def cpp(problem: Problem, estimates: bool = True) -> Callable[[], Answer]:
     command = (events.source == COMMAND)[:, None]
     outcome = np.where(command, events.known, problem.filtered.results.outcome).astype(np.uint8)
     times = problem.times if estimates else problem.times[:0]
-    given = [np.array(packed), scale, sd, biased, events.time, events.source, events.stamp, events.value, outcome, times]
+    given = [
+        np.array(packed),
+        scale,
+        sd,
+        biased,
+        events.time,
+        events.source,
+        events.stamp,
+        events.value,
+        outcome,
+        times,
+    ]
     axes, constants, places = len(segment.axes), given[:4], given[4:9]
 
     def run() -> Answer:
@@ -131,10 +144,10 @@ def cpp(problem: Problem, estimates: bool = True) -> Callable[[], Answer]:
         outputs = np.empty((len(FIELDS), axes, len(times)))
         library().filter_events(
             axes,
-            *map(pointer, constants),
+            *map(pointer, numbers),
             ctypes.c_int64(segment.origin),
             ctypes.c_int64(len(events.time)),
-            *map(pointer, (*places, innovation, innovation_sd)),
+            *map(pointer, (*table, innovation, innovation_sd)),
             ctypes.c_int64(len(times)),
             *map(pointer, (times, outputs)),
         )
@@ -382,7 +395,9 @@ def measure(name: str, repeats: int) -> list[Row]:
         sys.exit(f"disagrees by {apart:.0e}")
     problem = Problem.of(peer.rows) if peer.rows else scan
     seconds = project.timed(peer.adapter(problem), repeats)
-    return [project.row(peer.job, name, "ns", [1e9 * s / problem.values for s in seconds], peer.note) | {"error": apart}]
+    return [
+        project.row(peer.job, name, "ns", [1e9 * s / problem.values for s in seconds], peer.note) | {"error": apart}
+    ]
 
 
 if __name__ == "__main__":

@@ -173,7 +173,7 @@ def lines(rows: int) -> str:
 def stdin(repeats: int) -> list[Row]:
     """Lines through a whole process, start and all."""
     found: list[Row] = []
-    rows, text = 200_000, lines(200_000)
+    rows, text = 50_000, lines(50_000)
     for name, options in (("an estimate a command", ()), ("--rate 100", ("--rate", "100"))):
         seconds = [seconds_of(live_command(*options), text) for _ in range(min(repeats, 3) + 1)][1:]
         note = f"{rows / min(seconds):,.0f} rows a second, the process's start included"
