@@ -125,19 +125,8 @@ def cpp(problem: Problem, estimates: bool = True) -> Callable[[], Answer]:
     command = (events.source == COMMAND)[:, None]
     outcome = np.where(command, events.known, problem.filtered.results.outcome).astype(np.uint8)
     times = problem.times if estimates else problem.times[:0]
-    given = [
-        np.array(packed),
-        scale,
-        sd,
-        biased,
-        events.time,
-        events.source,
-        events.stamp,
-        events.value,
-        outcome,
-        times,
-    ]
-    axes, constants, places = len(segment.axes), given[:4], given[4:9]
+    axes, numbers = len(segment.axes), (np.array(packed), scale, sd, biased)
+    table = (events.time, events.source, events.stamp, events.value, outcome)
 
     def run() -> Answer:
         innovation, innovation_sd = np.full((2, *events.value.shape), np.nan)
