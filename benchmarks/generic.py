@@ -1,14 +1,13 @@
 """What the commands are worth: position errors of pumafuse and of filters that know nothing of them, in mm.
 
-    python benchmarks/generic.py [--only TEXT] [--json FILE]
+    python benchmarks/generic.py [--only TEXT] [--servo DIR] [--json FILE]
 
 All filters see the same measurements, are tuned by maximum likelihood on the same run and are scored by one function at
 the same instants, those of the commands; an estimate knows every measurement that is valid by then.
 
 The columns: measurements held (the best sensor's); constant velocity; constant acceleration; the best that those two
-can do
-if the truth tunes them (``oracle``); pumafuse with more and more of its numbers fitted, and in brackets the error over
-that of the better generic filter, and over the oracle's.
+can do if the reference tunes them (``oracle``); pumafuse with more and more of its numbers fitted, and in brackets the
+error over that of the better generic filter, and over the oracle's.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ Row = dict[str, Any]
 
 DATA = Path(pf.__file__).parent / "data"
 REPOSITORY = Path(__file__).resolve().parents[1]
-SERVO = REPOSITORY.parent / "shared" / "data" / "servo"  # recordings of a real one, not part of this repository
 SCENARIOS = ("panel-vision", "panel-tracker-outage", "mismatched-arm", "fast-arm", "wrong-latency")
 SEED = 1
 LEARNT = 40.0  # s of the scan, where its end is kept back
@@ -76,7 +74,7 @@ def beginning(run: pf.Run, config: pf.FusionConfig, until: float) -> pf.Run:
     return replace(run, command=run.command.rows(run.command.stamp <= end), sensors=kept)
 
 
-def cases() -> Iterator[Case]:
+def cases(servo: Path | None) -> Iterator[Case]:
     """All of them, each made when its turn comes."""
     scan, config = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
     for kept_back in (False, True):
@@ -96,8 +94,8 @@ def cases() -> Iterator[Case]:
             yield Case(run, chosen, [(title, run, 0.0)])
             if name == "wrong-latency":
                 yield Case(run, chosen, [(f"{title}, its latency fitted too", run, 0.0)], also=["latency"])
-    if SERVO.is_dir():
-        runs = {name: pf.Run.read(SERVO / name) for name in ("sin_time_square", "sin_sin")}
+    if servo is not None:
+        runs = {name: pf.Run.read(servo / name) for name in ("sin_time_square", "sin_sin")}
         tip = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.030))
         arm = pf.ArmModel(name="servo", update_period=0.020, delay=0.020, axes={"tip": tip})
         config = pf.FusionConfig(arm=arm, sensors={"encoder": pf.Sensor(sd=1e-4)})
@@ -123,9 +121,9 @@ def measure(case: Case) -> Iterator[Row]:
             numbers[name] = {kind: [best, axis.closest(ORDERS[kind], best)] for kind, best in likeliest.items()}
     for name, run, since in case.scored:
         estimates = {fit: pf.fuse(run, config) for fit, config in tuned.items()}
-        est, heard = estimates["noise"], axes_of(run, case.config)
+        est, measured = estimates["noise"], axes_of(run, case.config)
         for axis, found in numbers.items():
-            here = heard[axis]
+            here = measured[axis]
             generic = {
                 kind: [error(est, axis, since, here.follow(order, one)[0]) for one in found[kind]]
                 for kind, order in ORDERS.items()
@@ -150,13 +148,14 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", metavar="TEXT", help="what has this in its name")
+    parser.add_argument("--servo", type=Path, metavar="DIR", help="recordings of a real servo, not in this repository")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all numbers there")
     given = parser.parse_args()
     warnings.simplefilter("ignore", pf.PumafuseWarning)  # what is odd in the runs, and what fits cannot tell
     rows: list[Row] = []
     for line in (HEAD, ["---", "---", *["---:"] * (len(HEAD) - 2)]):
         print(f"| {' | '.join(line)} |")
-    for case in cases():
+    for case in cases(given.servo):
         if any(given.only in name for name, _, _ in case.scored):
             for row in measure(case):
                 rows.append(row)

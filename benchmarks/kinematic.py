@@ -18,15 +18,15 @@ import numpy.typing as npt
 from scipy.optimize import differential_evolution, minimize
 
 import pumafuse as pf
-from pumafuse.fusion.outcome import REOPEN_AFTER, REOPEN_SPAN_NS
+from pumafuse.filter.gate import RECENT_NS
 from pumafuse.fusion.score import interpolated
-from pumafuse.fusion.timeline import build
+from pumafuse.fusion.segments import build
 
 Array = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.int64]
 
 GATE = 5.0  # standard deviations
-REOPEN_SPAN = REOPEN_SPAN_NS / 1e9
+RECENT = RECENT_NS / 1e9
 REST = (0.01, 0.1)  # m/s and m/s²: how well they know that the arm begins at rest; wider priors cost them up to 0.5 %
 ORDERS = {"velocity": 2, "acceleration": 3}  # what is constant, and how many states the motion takes
 
@@ -38,7 +38,7 @@ REACH = 50.0  # the oracle's sds are at most so many times smaller or greater th
 
 
 class Known(NamedTuple):
-    """What a filter is told of one axis.
+    """What a filter is given of one axis.
 
     Attributes:
         scale: Of the position in each sensor's measurements.
@@ -47,6 +47,7 @@ class Known(NamedTuple):
         bias_sd: Of each bias before any measurement [m].
         start: Where the arm rests before the first command [m].
         start_sd: How well that is known [m].
+        period: Two rejected measurements that agree are at least so far apart [s].
     """
 
     scale: Array
@@ -55,10 +56,11 @@ class Known(NamedTuple):
     bias_sd: Array
     start: float
     start_sd: float
+    period: float
 
 
-class Heard(NamedTuple):
-    """The measurements of one axis in order: when each is valid [s since the first command], which sensor's, value [m]."""
+class Measured(NamedTuple):
+    """Measurements of one axis in order: when each is valid [s since the first command], which sensor's, value [m]."""
 
     time: Array
     sensor: Whole
@@ -66,7 +68,7 @@ class Heard(NamedTuple):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def follow(order: int, numbers: Array, known: Known, heard: Heard, times: Array, position: Array) -> float:
+def follow(order: int, numbers: Array, known: Known, measured: Measured, times: Array, position: Array) -> float:
     """Filter all measurements; write the position at each of ``times`` [m] and return the log-likelihood, m in mm.
 
     ``numbers`` are logarithms: of the density of the random walk, then of each sensor's sd [m]. The state is the
@@ -75,36 +77,49 @@ def follow(order: int, numbers: Array, known: Known, heard: Heard, times: Array,
     """
     size, density, sds = order + len(known.bias_sd), math.exp(2.0 * numbers[0]), np.exp(numbers[1:])
     x, P, H, K = np.zeros(size), np.zeros((size, size)), np.zeros(size), np.zeros(size)
-    rejected, since = np.zeros(len(sds)), np.zeros(len(sds))
+    rejected, reacquired, fused = np.zeros((len(sds), 3)), np.zeros(len(sds)), np.full(len(sds), -np.inf)
     x[0], P[0, 0] = known.start, known.start_sd**2
     for i in range(1, order):
         P[i, i] = REST[i - 1] ** 2
     for i in range(order, size):
         P[i, i] = known.bias_sd[i - order] ** 2
     now, total, n = 0.0, 0.0, 0
-    for k in range(len(heard.time)):
-        while n < len(times) and times[n] < heard.time[k]:
+    for k in range(len(measured.time)):
+        while n < len(times) and times[n] < measured.time[k]:
             position[n] = ahead(x, order, times[n] - now)
             n += 1
-        move(x, P, order, density, heard.time[k] - now)
-        now, s = heard.time[k], heard.sensor[k]
+        move(x, P, order, density, measured.time[k] - now)
+        now, s = measured.time[k], measured.sensor[k]
         H[:] = 0.0
         H[0] = known.scale[s]
         if known.bias[s] >= 0:
             H[order + known.bias[s]] = 1.0
         R = sds[s] ** 2 + (known.scale[s] * x[1] * known.latency_sd[s]) ** 2
-        nu, S = heard.value[k], R + spread(P, H, K)
+        nu, S = measured.value[k], R + spread(P, H, K)
         for i in range(size):
             nu -= H[i] * x[i]
-        beyond = abs(nu) > GATE * math.sqrt(S)
-        if rejected[s] == 0:
-            since[s] = now
-        reopens = beyond and rejected[s] >= REOPEN_AFTER and now - since[s] >= REOPEN_SPAN
-        rejected[s] = rejected[s] + 1 if beyond and not reopens else 0
-        if reopens:
-            P[0, 0] += nu * nu
+        beyond, believed, again = abs(nu) > GATE * math.sqrt(S), False, False
+        if beyond:
+            nu_then, R_then, then = rejected[s]  # R is 0 where there is none
+            dt = now - then
+            again = R_then > 0.0 and dt < known.period
+            motion = dt**2 * P[1, 1] + (density * dt**3 / 3.0 if order == 2 else density * dt**5 / 20.0)
+            if order == 3:
+                motion += dt**3 * P[1, 2] + 0.25 * dt**4 * P[2, 2]
+            spread_between = R_then + R + known.scale[s] ** 2 * motion
+            believed = R_then > 0.0 and not again and abs(nu - nu_then) <= GATE * math.sqrt(spread_between)
+            for other in range(len(sds)):
+                if other != s and now - fused[other] <= RECENT and reacquired[other] <= reacquired[s]:
+                    believed = False
+        if believed:
+            P[0, 0] += (nu / known.scale[s]) ** 2
+            reacquired[s] += 1
             S = R + spread(P, H, K)
-        taken = reopens or not beyond
+        elif beyond and not again:
+            rejected[s] = nu, R, now
+        taken = believed or not beyond
+        if taken:
+            rejected[s, 1], fused[s] = 0.0, now
         total -= 0.5 * (math.log(2.0e6 * math.pi * S) + (nu * nu / S if taken else GATE**2))
         for i in range(size if taken else 0):
             x[i] += K[i] / S * nu
@@ -163,7 +178,7 @@ class Axis:
         times: Of estimates [s since the first command].
         truth: The reference then [m], NaN where there is none.
         known: What they know.
-        heard: The measurements that pumafuse meets.
+        measured: The measurements that pumafuse gets.
         sds: Of the sensors as configured [m].
     """
 
@@ -171,19 +186,19 @@ class Axis:
     times: Array
     truth: Array
     known: Known
-    heard: Heard
+    measured: Measured
     sds: Array
 
     def follow(self, order: int, numbers: Array) -> tuple[Array, float]:
         """Positions [m] and the log-likelihood."""
         position = np.empty(len(self.times))
-        return position, follow(order, numbers, self.known, self.heard, self.times, position)
+        return position, follow(order, numbers, self.known, self.measured, self.times, position)
 
     def held(self) -> list[Array]:
-        """Each sensor's last measurement as a position [m], with the start before the first; a bias is the first one's."""
+        """Each sensor's last measurement as a position [m], the start before the first; a bias is the first one's."""
         found: list[Array] = []
         for s, scale in enumerate(self.known.scale):
-            valid, value = (values[self.heard.sensor == s] for values in (self.heard.time, self.heard.value))
+            valid, value = (values[self.measured.sensor == s] for values in (self.measured.time, self.measured.value))
             level = value[0] - scale * self.known.start if self.known.bias[s] >= 0 else 0.0
             values = np.append(self.known.start, (value - level) / scale)
             found.append(values[np.searchsorted(valid, self.times, side="right")])
@@ -223,8 +238,8 @@ def descend(cost: Callable[[Array], float], start: Array) -> Array:
 
 
 def axes_of(run: pf.Run, config: pf.FusionConfig) -> dict[str, Axis]:
-    """The axes of a run that are heard and have a truth."""
-    est, starts = pf.fuse(run, config), {axis.name: axis.start for axis in build(run, config).axes}
+    """The axes of a run that are measured and have a reference."""
+    est, starts, period = pf.fuse(run, config), build(run, config).start, config.arm.update_period
     assert est.reference is not None
     found: dict[str, Axis] = {}
     for number, name in enumerate(est.measurements.axes):
@@ -234,12 +249,12 @@ def axes_of(run: pf.Run, config: pf.FusionConfig) -> dict[str, Axis]:
         used = np.unique(mine.sensor)
         if len(used) and name in est.reference.position:
             sensors = [config.sensors[est.measurements.sensors[s]] for s in used]
-            told = [(s.scale, s.latency_sd, s.bias_sd, s.sd_of(name)) for s in sensors]
-            scale, latency_sd, bias_sd, sds = np.array(told, dtype=np.float64).T.copy()
+            numbers = [(s.scale, s.latency_sd, s.bias_sd, s.sd_of(name)) for s in sensors]
+            scale, latency_sd, bias_sd, sds = np.array(numbers, dtype=np.float64).T.copy()
             biased = bias_sd > 0.0
             bias = np.where(biased, np.cumsum(biased) - 1, -1)
-            known = Known(scale, latency_sd, bias, bias_sd[biased], starts[name], config.start.offset_sd)
-            heard = Heard(mine.time, np.searchsorted(used, mine.sensor), mine.value)
+            known = Known(scale, latency_sd, bias, bias_sd[biased], starts[name], config.start.offset_sd, period)
+            measured = Measured(mine.time, np.searchsorted(used, mine.sensor), mine.value)
             truth = interpolated(est.time, est.segment, est.reference, name)
-            found[name] = Axis(name, est.time, truth, known, heard, sds)
+            found[name] = Axis(name, est.time, truth, known, measured, sds)
     return found

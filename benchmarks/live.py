@@ -1,4 +1,4 @@
-"""How fast the live estimator is: one call, one rewind, and whole processes on lines from standard input.
+"""How fast the live estimator is: one call, one late measurement, and whole processes on lines from standard input.
 
     python benchmarks/live.py [--rows N]
 
@@ -9,25 +9,20 @@ predicted and updated at each measurement, in order, without delay, latency, gat
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
-from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
+from project import CONFIG, START, lines, live_command
 
 import pumafuse as pf
 
-DATA = Path(str(files("pumafuse") / "data"))
 MS = 1_000_000
-START = {"tangential": 0.0, "radial": 0.56, "vertical": -0.1}
 
 
 def percentiles(calls: list[Callable[[], object]]) -> tuple[float, float]:
@@ -75,27 +70,15 @@ def textbook(rows: int) -> list[Callable[[], object]]:
     return [lambda row=row: step(row) for row in range(rows)]
 
 
-def lines(rows: int) -> str:
-    """Rows of a tracker at 1 kHz with a command every 28 ms."""
-    found = []
-    for row in range(rows):
-        if row % 28 == 0:
-            found.append(json.dumps({"t": row / 1000, "command": {axis: u * 1e3 for axis, u in START.items()}}))
-        found.append(json.dumps({"t": row / 1000, "sensor": "tracker", **{axis: u * 1e3 for axis, u in START.items()}}))
-    return "\n".join(found) + "\n"
-
-
 def rows_a_second(rows: int, *options: str) -> float:
     """Rows a second of the whole process on one core, start and all, after one short run that finds the kernels."""
-    command = [sys.executable, "-c", "from pumafuse.cli.main import main; main()", "live", "stdin"]
-    command += ["-c", str(DATA / "fusion.toml"), *options]
     seconds = 0.0
     for count in (1000, rows):
         with tempfile.TemporaryFile("w+") as file:
             file.write(lines(count))
             file.seek(0)
             begin = time.perf_counter()
-            subprocess.run(command, stdin=file, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=True)
+            subprocess.run(live_command(*options), stdin=file, capture_output=True, check=True)
             seconds = time.perf_counter() - begin
     return rows / seconds
 
@@ -107,7 +90,7 @@ def main() -> None:
     rows = parser.parse_args().rows
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    live = pf.LiveEstimator(pf.FusionConfig.load(DATA / "fusion.toml"))
+    live = pf.LiveEstimator(pf.FusionConfig.load(CONFIG))
     live.command(0, **START)
     measurements = thousand_hertz(live, 30_000)
     percentiles(measurements[:5000])
@@ -119,8 +102,8 @@ def main() -> None:
     ]
     table = [
         ("`measurement()` in order, three axes", measurement),
-        ("`measurement()` 100 ms late: 100 rows of 1 kHz met again", percentiles(late)),
-        ("`command()`", percentiles([lambda n=n: live.command(newest + n, **START) for n in range(2000)])),
+        ("`measurement()` 100 ms late: 100 rows of 1 kHz updated again", percentiles(late)),
+        ("`command()`", percentiles([lambda n=n: live.command(newest + 28 * n * MS, **START) for n in range(1, 2000)])),
         ("`estimate()` now", percentiles([live.estimate] * 2000)),
         ("a `filterpy` loop, three axes, two states each", theirs),
     ]

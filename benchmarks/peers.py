@@ -1,481 +1,393 @@
-"""One adapter per peer and job.
+"""The scan through other programs: a loop in C++ on the table of events, and general filters with matrices per event.
 
-An adapter takes the problem, does what a user would do once (build a filter, compile), and returns the call that is
-timed: it takes the commands and samples in and gives the whole result out in arrays of its own.
+    python benchmarks/peers.py NAME REPEATS    prints the rows of one of PEERS as JSON; run.py calls it
 
-Peers are imported inside their adapters, so that each is timed in a process that has loaded no other.
+Each first has to give the numbers of `pumafuse` on the shipped scan, to `TOLERANCE` of a standard deviation. What is
+made once (tables, matrices, a compiled program) is made before the clock starts.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
+import ctypes
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import native
 import numpy as np
+import numpy.typing as npt
+import project
+from project import Row
 
-from model import PLANT, Array, Filtered, Problem, Smoothed, response
+import pumafuse as pf
+from pumafuse.filter.axis import OFFSET, POSITION, RATE, START
+from pumafuse.filter.events import COMMAND, Events
+from pumafuse.fusion.engine import Filtered, arranged, biased_sensors, filter_segment, innovations
+from pumafuse.fusion.segments import Segment, build
+from pumafuse.model.closed import decaying_response, gain_error, transition
 
-Job = Literal["filter", "batch", "likelihood", "grid", "smooth"]
-Result = Filtered | Smoothed | Array
-Adapter = Callable[[Problem], Callable[[], Any]]
-
-
-def as_it_is(result: Any) -> Any:
-    """For peers whose call gives a `Result`."""
-    return result
+Array = npt.NDArray[np.float64]
+Answer = Mapping[str, Array]  # outputs (axes, estimates), innovations (events, axes), or the log_likelihood
+TOLERANCE = 1e-9  # of a standard deviation
+FUSED = pf.Outcome.FUSED
+FIELDS = pf.AxisEstimate.FIELDS
+SOURCE = Path(__file__).with_name("loop.cpp")
+LIBRARY = SOURCE.parent / ".build" / "loop.so"
+MICRO = 1e6  # dynamax adds 1e-9 to the diagonal of what it inverts: too much in m², nothing in µm²
 
 
 @dataclass(frozen=True)
-class Peer:
-    """An adapter and how to time it.
+class Problem:
+    """A run, ready for any filter: its events, when estimates are wanted, and what pumafuse makes of it."""
 
-    Attributes:
-        name: Shown in the table.
-        job: What it does.
-        adapter: How.
-        note: What the reader of the table has to know.
-        steps: Steps of the one run when the job's own number takes too long; the time is per step either way.
-        gaps: False where the peer cannot miss a sample; it is then given all of them.
-        result: Makes a `Result` of what the call gives, to be compared; not timed.
-    """
+    config: pf.FusionConfig
+    segment: Segment
+    events: Events
+    times: npt.NDArray[np.int64]
+    filtered: Filtered
+    values: int
 
-    name: str
-    job: Job
-    adapter: Adapter
-    note: str = ""
-    steps: int | None = None
-    gaps: bool = True
-    result: Callable[[Any], Result] = as_it_is
+    @staticmethod
+    def of(rows: int) -> Problem:
+        """The scan repeated to so many rows; the shipped one for 0."""
+        run = project.repeated(rows) if rows else pf.Run.read(project.SCAN)
+        config = pf.FusionConfig.load(project.CONFIG)
+        segment = build(run, config)
+        filtered = filter_segment(segment, config, segment.commands, "filtered")
+        return Problem(config, segment, filtered.events, segment.commands, filtered, project.values_of(run))
+
+    def answer(self, job: str) -> Answer:
+        """What pumafuse gives."""
+        if job == "likelihood":
+            found = innovations(self.segment, self.config)
+            fused = found.outcome == FUSED
+            nu, S = found.innovation[fused], found.innovation_sd[fused] ** 2
+            return {"log_likelihood": np.array(-0.5 * np.sum(np.log(2.0 * np.pi * S) + nu**2 / S))}
+        mode = "smoothed" if job == "smooth" else "filtered"
+        filtered = filter_segment(self.segment, self.config, self.times, mode)
+        own = {name: np.array([getattr(axis, name) for axis in filtered.axes.values()]) for name in FIELDS}
+        return own | {name: getattr(filtered.results, name) for name in ("innovation", "innovation_sd")}
 
 
-def with_innovations(problem: Problem, mean: Array, cov: Array, log_likelihood: Array | None = None) -> Filtered:
-    """The whole result from a peer's filtered means and covariances; the likelihood too where the peer has none."""
-    m, z = problem.model, problem.z
-    into = m.H @ m.F
-    innovation, variance = z.copy(), np.full(z.shape, m.H @ m.start @ m.H + m.R)
-    innovation[..., 1:] -= mean[..., :-1, :] @ into + (m.H @ m.B) * problem.u[..., :-1]
-    variance[..., 1:] = cov[..., :-1, :, :] @ into @ into + (m.H @ m.Q @ m.H + m.R)
-    if log_likelihood is None:
-        terms = np.log(2.0 * np.pi * variance) + innovation**2 / variance
-        log_likelihood = -0.5 * np.nansum(terms, axis=-1)
-    return Filtered(mean, cov, innovation, variance, np.asarray(log_likelihood))
+def error(found: Answer, wanted: Answer) -> float:
+    """The largest difference in standard deviations; of a log-likelihood per unit of itself."""
+    if "log_likelihood" in found:
+        return float(np.max(np.abs(found["log_likelihood"] / wanted["log_likelihood"] - 1.0)))
+    sizes = {name: wanted[name.removesuffix("_sd") + "_sd"] for name in found}
+    return max(float(np.nanmax(np.abs(found[name] - wanted[name]) / sizes[name])) for name in found)
+
+
+# pumafuse itself, the segment ready
+
+
+def ours(job: str) -> Callable[[Problem], Callable[[], Any]]:
+    """The filter alone, without classifying rows and listing what became of them."""
+    return lambda problem: lambda: problem.answer(job)
 
 
 # C++
 
 
-def cpp_fresh(size: int, threads: int = 1) -> Adapter:
-    """The plain loop with covariances of ``size`` states, into new arrays."""
-
-    def adapter(problem: Problem) -> Callable[[], Result]:
-        model = native.pack(problem.model)
-        return lambda: native.filter_into(native.empty_filtered(problem, size), model, problem, threads)
-
-    return adapter
-
-
-def cpp_reused(size: int) -> Adapter:
-    """The same into the arrays of the call before."""
-
-    def adapter(problem: Problem) -> Callable[[], Result]:
-        model, out = native.pack(problem.model), native.empty_filtered(problem, size)
-        return lambda: native.filter_into(out, model, problem)
-
-    return adapter
+@cache
+def library() -> ctypes.CDLL:
+    """The loop, built anew when its source is younger."""
+    if not LIBRARY.exists() or LIBRARY.stat().st_mtime < SOURCE.stat().st_mtime:
+        LIBRARY.parent.mkdir(exist_ok=True)
+        subprocess.run(["g++", "-O3", "-march=native", "-shared", "-fPIC", SOURCE, "-o", LIBRARY], check=True)
+    return ctypes.CDLL(str(LIBRARY))
 
 
-def cpp_one_by_one(block: bool) -> Adapter:
-    """One call per model."""
+def cpp(problem: Problem, estimates: bool = True) -> Callable[[], Answer]:
+    """What the gates decided is given: it calculates every innovation and fuses what pumafuse fused."""
+    config, segment, events = problem.config, problem.segment, problem.events
+    biases, period = biased_sensors(segment, config), config.arm.update_period
+    packed: list[list[float]] = []
+    for axis, biased in zip(segment.axes, biases, strict=True):
+        model, process = config.arm.axes[axis], config.process[axis]
+        plant, gain = model.plant, model.gain
+        first = isinstance(plant, pf.FirstOrder)
+        shape = (
+            [1.0, 1.0 / plant.time_constant, 0.0, 0.0] if first else [2.0, 0.0, plant.natural_frequency, plant.damping]
+        )
+        decay = 0.0 if model.gain_recovery is None else 1.0 / model.gain_recovery
+        noise = [process.input_noise, process.drift, process.maneuver_noise, process.maneuver_drift]
+        prior = [segment.start[axis], config.start.offset_sd, 3.0 + len(biased)]
+        prior.append(config.sensors[biased[0]].bias_sd if biased else 0.0)
+        packed.append([*shape, gain.slope, gain.intercept, decay, period, *noise, *prior])
+    sensors = [config.sensors[name] for name in segment.sensors]
+    scale = np.array([sensor.scale for sensor in sensors])
+    sd = np.array([[sensor.sd_of(axis) for axis in segment.axes] for sensor in sensors], dtype=np.float64)
+    biased = np.array([[int(name in biased) for biased in biases] for name in segment.sensors])
+    command = (events.source == COMMAND)[:, None]
+    outcome = np.where(command, events.known, problem.filtered.results.outcome).astype(np.uint8)
+    times = problem.times if estimates else problem.times[:0]
+    axes, numbers = len(segment.axes), (np.array(packed), scale, sd, biased)
+    table = (events.time, events.source, events.stamp, events.value, outcome)
 
-    def adapter(problem: Problem) -> Callable[[], Result]:
-        models = [native.pack(m) for m in problem.grid]
-        return lambda: np.concatenate([native.likelihoods(model, problem, block) for model in models])
-
-    return adapter
-
-
-def cpp_grid(block: bool, threads: int) -> Adapter:
-    """One call for all models."""
-
-    def adapter(problem: Problem) -> Callable[[], Result]:
-        models = native.pack(*problem.grid)
-        return lambda: native.likelihoods(models, problem, block, threads)
-
-    return adapter
-
-
-def cpp_smooth(problem: Problem) -> Callable[[], Result]:
-    """Bryson-Frazier."""
-    model = native.pack(problem.model)
-    return lambda: native.smooth(model, problem)
-
-
-# filterpy
-
-
-def _filterpy(problem: Problem) -> Any:
-    from filterpy.kalman import KalmanFilter
-
-    m = problem.model
-    kf: Any = KalmanFilter(dim_x=len(m.F), dim_z=1, dim_u=1)
-    kf.P, kf.F, kf.B, kf.H, kf.Q, kf.R = m.start, m.F, m.B[:, None], m.H[None], m.Q, np.array([[m.R]])
-    return kf
-
-
-def _or_none(z: Array) -> list[float | None]:
-    return [None if np.isnan(sample) else sample for sample in z]
-
-
-def filterpy_filter(problem: Problem) -> Callable[[], Result]:
-    """``batch_filter``; its own likelihood calls scipy at every step, so it is taken from the innovations instead."""
-
-    def run() -> Result:
-        kf = _filterpy(problem)
-        mean, cov, _, _ = kf.batch_filter(_or_none(problem.z), us=problem.u, update_first=True)
-        return with_innovations(problem, mean[..., 0], cov)
+    def run() -> Answer:
+        innovation, innovation_sd = np.full((2, *events.value.shape), np.nan)
+        outputs = np.empty((len(FIELDS), axes, len(times)))
+        library().filter_events(
+            axes,
+            *map(pointer, numbers),
+            ctypes.c_int64(segment.origin),
+            ctypes.c_int64(len(events.time)),
+            *map(pointer, (*table, innovation, innovation_sd)),
+            ctypes.c_int64(len(times)),
+            *map(pointer, (times, outputs)),
+        )
+        found = {"innovation": innovation, "innovation_sd": innovation_sd}
+        return found | dict(zip(FIELDS, outputs, strict=True)) if estimates else found
 
     return run
 
 
-def filterpy_smooth(problem: Problem) -> Callable[[], Result]:
-    """``rts_smoother``, which forgets the input.
+def cpp_likelihood(problem: Problem) -> Callable[[], Answer]:
+    """Without estimates, and the sum."""
+    run = cpp(problem, estimates=False)
+    fused = (problem.filtered.results.outcome == FUSED) & (problem.events.source != COMMAND)[:, None]
 
-    That does no harm here: the input acts on a state without variance, where the gain by ``pinv`` is 0.
+    def likelihood() -> Answer:
+        found = run()
+        nu, S = found["innovation"][fused], found["innovation_sd"][fused] ** 2
+        return {"log_likelihood": np.array(-0.5 * np.sum(np.log(2.0 * np.pi * S) + nu**2 / S))}
+
+    return likelihood
+
+
+def pointer(array: npt.NDArray[Any]) -> ctypes.c_void_p:
+    """Its place in memory."""
+    assert array.flags.c_contiguous
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+# General filters: x[k] = F[k] x[k-1] + B[k] v[k] + w, z[k] = H[k] x[k] + e
+
+
+class Steps(NamedTuple):
+    """One axis as a linear model: a step for each command, fused measurement and estimate.
+
+    Attributes:
+        F: Into each step, (m, n, n).
+        B: (m, n, 2).
+        v: Input and gain error [m], (m, 2).
+        Q: (m, n, n).
+        H: (m, n).
+        R: (m,).
+        z: NaN where nothing was fused, (m,).
+        P0: Before the first step, where the mean is 0, (n, n).
+        start: The level that all is relative to [m].
+        position: What of the state is the position, (n,).
+        estimate: Which steps are estimates, (m,).
     """
 
-    def run() -> Result:
-        kf = _filterpy(problem)
-        mean, cov, _, _ = kf.batch_filter(_or_none(problem.z), us=problem.u, update_first=True)
-        mean, cov, _, _ = kf.rts_smoother(mean, cov, inv=np.linalg.pinv)
-        return Smoothed(mean[..., 0], cov)
+    F: Array
+    B: Array
+    v: Array
+    Q: Array
+    H: Array
+    R: Array
+    z: Array
+    P0: Array
+    start: float
+    position: Array
+    estimate: npt.NDArray[np.bool_]
+
+    def outputs(self, mean: Array, cov: Array) -> tuple[Array, Array]:
+        """Position and its sd at the estimates, of means (m, n) and covariances (m, n, n)."""
+        mean, cov = mean[self.estimate], cov[self.estimate]
+        return self.start + mean @ self.position, np.sqrt(cov @ self.position @ self.position)
+
+
+def steps_of(problem: Problem) -> list[Steps]:
+    """Every axis as matrices, by the transitions of pumafuse: only the filters are compared."""
+    biases = biased_sensors(problem.segment, problem.config)
+    model, sensors, state = arranged(problem.segment, problem.config, biases)
+    found: list[Steps] = []
+    for axis in range(len(problem.segment.axes)):
+        events, outcome = problem.events, problem.filtered.results.outcome[:, axis]
+        command = (events.source == COMMAND) & (events.known[:, axis] == FUSED)
+        rows = np.flatnonzero(command | ((events.source != COMMAND) & (outcome == FUSED)))
+        time = np.concatenate((events.time[rows], problem.times))
+        row = np.concatenate((rows, np.full(len(problem.times), -1)))
+        order = np.argsort(time, kind="stable")  # at one instant the estimate is the last
+        row, dt = row[order], np.diff(time[order], prepend=problem.segment.origin) / 1e9
+        start, m, size = state.drive[axis, START], len(row), int(model.states[axis])
+        F, Q, B = np.zeros((m, size, size)), np.zeros((m, size, size)), np.zeros((m, size, 2))
+        v, H, R, z = np.zeros((m, 2)), np.zeros((m, size)), np.ones(m), np.full(m, np.nan)
+        F[:] = np.eye(size)
+        kind, plant, (slope, intercept, decay, period) = model.order[axis], model.constants, model.gain[axis]
+        u, step, e, noise, drift = 0.0, 0.0, 0.0, model.process[axis, 0] ** 2, model.process[axis, 1] ** 2
+        for k in range(m):
+            f11, f12, f21, f22, q11, q12, q22 = transition(kind, plant, axis, dt[k])
+            a, b, left = decaying_response(kind, plant, axis, decay, dt[k], f11, f12, f22)
+            F[k, :2, :2] = [[f11, f12], [f21, f22]]
+            B[k, :2], v[k], e = [[1.0 - f11, a], [-f21, b]], [u, e], e * left
+            Q[k, :2, :2], Q[k, OFFSET, OFFSET] = [[noise * q11, noise * q12], [noise * q12, noise * q22]], drift * dt[k]
+            if row[k] < 0:
+                continue
+            value, sensor = events.value[row[k], axis] - start, events.source[row[k]]
+            if sensor != COMMAND:
+                z[k] = value + start * (1.0 - sensors.scale[sensor])
+                H[k, [POSITION, OFFSET]], R[k] = sensors.scale[sensor], sensors.sd[sensor, axis] ** 2
+                if sensors.bias[sensor, axis] >= 0:
+                    H[k, sensors.bias[sensor, axis]] = 1.0
+                continue
+            maneuver = abs(value - u - step) / period
+            u, step = value, value - u
+            e += gain_error(step, slope, intercept, period)
+            noise, drift = (model.process[axis, :2] ** 2 + (model.process[axis, 2:] * maneuver) ** 2).tolist()
+        used = [i for i in range(size) if i != RATE or kind == 2]
+        position = np.zeros(size)
+        position[[POSITION, OFFSET]] = 1.0
+        F, Q, P0 = F[:, used][:, :, used], Q[:, used][:, :, used], state.P[axis][np.ix_(used, used)]
+        found.append(Steps(F, B[:, used], v, Q, H[:, used], R, z, P0, float(start), position[used], row < 0))
+    return found
+
+
+def joined(parts: Sequence[tuple[Array, Array]]) -> Answer:
+    """Positions and sds of all axes."""
+    return dict(zip(("position", "position_sd"), map(np.array, zip(*parts, strict=True)), strict=True))
+
+
+def filterpy(problem: Problem) -> Callable[[], Answer]:
+    """``batch_filter`` with lists of matrices; its own likelihood calls scipy at every step and is left off."""
+    from filterpy.kalman import KalmanFilter
+
+    axes = [(s, [None if np.isnan(z) else z for z in s.z], s.H[:, None], s.R[:, None, None]) for s in steps_of(problem)]
+
+    def run() -> Answer:
+        found: list[tuple[Array, Array]] = []
+        for s, z, H, R in axes:
+            kf: Any = KalmanFilter(dim_x=s.F.shape[1], dim_z=1, dim_u=2)
+            kf.P = s.P0
+            mean, cov, _, _ = kf.batch_filter(z, Fs=s.F, Qs=s.Q, Hs=H, Rs=R, Bs=s.B, us=s.v[..., None])
+            found.append(s.outputs(mean[..., 0], cov))
+        return joined(found)
 
     return run
 
 
-# simdkalman
+def statsmodels(job: str) -> Callable[[Problem], Callable[[], Answer]]:
+    """Its representation with all matrices time-varying; the input as ``state_intercept``."""
+
+    def adapter(problem: Problem) -> Callable[[], Answer]:
+        from statsmodels.tsa.statespace import kalman_filter as kf
+        from statsmodels.tsa.statespace.kalman_smoother import SMOOTHER_STATE, SMOOTHER_STATE_COV, KalmanSmoother
+
+        unwanted = kf.MEMORY_NO_PREDICTED | kf.MEMORY_NO_GAIN | kf.MEMORY_NO_SMOOTHING | kf.MEMORY_NO_STD_FORECAST
+        axes = steps_of(problem)
+        models: list[Any] = []
+        for s in axes:
+            n, moved = s.F.shape[1], (s.B @ s.v[..., None])[..., 0]
+            ssm = KalmanSmoother(k_endog=1, k_states=n)
+            ssm.bind(s.z[:, None])
+            into = [np.append(part[1:], np.zeros_like(part[:1]), axis=0) for part in (s.F, s.Q, moved)]  # of the next
+            ssm["transition"], ssm["state_cov"], ssm["state_intercept"] = (np.moveaxis(part, 0, -1) for part in into)
+            ssm["design"], ssm["obs_cov"], ssm["selection"] = s.H.T[None], s.R[None, None], np.eye(n)
+            ssm.initialize_known(moved[0], s.F[0] @ s.P0 @ s.F[0].T + s.Q[0])
+            models.append(ssm)
+
+        def one(s: Steps, ssm: Any) -> tuple[Array, Array]:
+            if job == "smooth":
+                out = ssm.smooth(SMOOTHER_STATE | SMOOTHER_STATE_COV, update_filter=False)
+                return s.outputs(out.smoothed_state.T, np.moveaxis(out.smoothed_state_cov, -1, 0))
+            out = ssm.filter(conserve_memory=unwanted)
+            return s.outputs(out.filtered_state.T, np.moveaxis(out.filtered_state_cov, -1, 0))
+
+        if job == "likelihood":
+            return lambda: {"log_likelihood": np.array(sum(ssm.loglike() for ssm in models))}
+        return lambda: joined([one(s, ssm) for s, ssm in zip(axes, models, strict=True)])
+
+    return adapter
 
 
-def simdkalman_filter(problem: Problem) -> Callable[[], Result]:
-    """One run or many."""
-    from simdkalman import KalmanFilter
+def dynamax(job: str) -> Callable[[Problem], Callable[[], Answer]]:
+    """Time-varying matrices, compiled; a missing measurement is a 0 measured through H = 0."""
 
-    m = problem.model
-    kf = KalmanFilter(m.F, m.Q, m.H[None], m.R)
-
-    def run() -> Result:
-        known = response(m, problem.u)
-        out = kf.compute(
-            problem.z - known @ m.H,
-            n_test=0,
-            initial_value=np.zeros(len(m.F)),
-            initial_covariance=m.start,
-            smoothed=False,
-            filtered=True,
-            observations=False,
-            log_likelihood=True,
-        )
-        # Its likelihood leaves out the 2π.
-        samples = np.count_nonzero(~np.isnan(problem.z), axis=-1)
-        total = out.log_likelihood.reshape(samples.shape) - 0.5 * samples * np.log(2.0 * np.pi)
-        return with_innovations(problem, out.filtered.states.mean + known, out.filtered.states.cov, total)
-
-    return run
-
-
-# kalman-py
-
-
-def kalman_py_batch(backend: Literal["numpy", "jax"]) -> Adapter:
-    """``filter``, which knows neither inputs nor missing samples."""
-
-    def adapter(problem: Problem) -> Callable[[], Result]:
+    def adapter(problem: Problem) -> Callable[[], Answer]:
         import jax
-        from kalman_py import KalmanFilter
 
         jax.config.update("jax_enable_x64", True)
-        m = problem.model
-        at_rest = np.zeros_like(m.F)  # one period before the first sample: it predicts before it updates
-        kf = KalmanFilter(m.F, m.H[None], m.Q, [[m.R]], np.zeros(len(m.F)), at_rest)
+        import jax.numpy as jnp
+        from dynamax.linear_gaussian_ssm import inference
 
-        def run() -> Result:
-            known = response(m, problem.u)
-            out = kf.filter(problem.z - known @ m.H, backend=backend)
-            mean = np.asarray(out.means) + known
-            return with_innovations(problem, mean, np.asarray(out.covs), np.asarray(out.log_likelihood))
+        axes, given, short = steps_of(problem), [], 0.0
+        for s in axes:
+            missing, R = np.isnan(s.z), s.R * MICRO**2
+            params = inference.make_lgssm_params(
+                jnp.asarray(s.B[0] @ s.v[0] * MICRO),
+                jnp.asarray((s.F[0] @ s.P0 @ s.F[0].T + s.Q[0]) * MICRO**2),
+                jnp.asarray(s.F),
+                jnp.asarray(s.Q * MICRO**2),
+                jnp.asarray(s.H[:, None]),
+                jnp.asarray(R[:, None, None]),
+                dynamics_input_weights=jnp.asarray(s.B),
+                emissions_input_weights=jnp.zeros((1, 2)),
+            )
+            z = jnp.asarray(np.nan_to_num(s.z * MICRO)[:, None])
+            given.append((params, z, jnp.asarray(s.v * MICRO)))
+            short += 0.5 * np.sum(np.log(2.0 * np.pi * R[missing])) + np.sum(~missing) * np.log(MICRO)
+        call = inference.lgssm_smoother if job == "smooth" else inference.lgssm_filter
+        names = {"likelihood": ("marginal_loglik",), "smooth": ("smoothed_means", "smoothed_covariances")}
+        wanted = names.get(job, ("filtered_means", "filtered_covariances"))
+        compiled = jax.jit(lambda *one: [getattr(call(*one), name) for name in wanted])
+
+        def run() -> Answer:
+            found = [[np.asarray(part) for part in jax.block_until_ready(compiled(*one))] for one in given]
+            if job == "likelihood":
+                return {"log_likelihood": np.array(sum(part for (part,) in found) + short)}
+            return joined([s.outputs(x / MICRO, P / MICRO**2) for s, (x, P) in zip(axes, found, strict=True)])
 
         return run
 
     return adapter
 
 
-def kalman_py_steps(problem: Problem) -> Callable[[], Result]:
-    """``predict`` and ``update`` in the user's own loop, which can leave an update out and add an input."""
-    from kalman_py import KalmanFilter
-
-    m = problem.model
-
-    def run() -> Result:
-        kf = KalmanFilter(m.F, m.H[None], m.Q, [[m.R]], np.zeros(len(m.F)), m.start)
-        mean, cov = np.empty((len(problem.z), len(m.F))), np.empty((len(problem.z), *m.F.shape))
-        for k, (u, z) in enumerate(zip(problem.u, problem.z, strict=True)):
-            if not np.isnan(z):
-                kf.update(z)
-            mean[k], cov[k] = kf.x, kf.P
-            kf.predict()
-            kf.x = kf.x + m.B * u
-        return with_innovations(problem, mean, cov)
-
-    return run
-
-
-# statsmodels
-
-
-def _statsmodels(problem: Problem) -> Any:
-    from statsmodels.tsa.statespace.kalman_smoother import KalmanSmoother
-
-    m = problem.model
-    ssm = KalmanSmoother(k_endog=1, k_states=len(m.F), k_posdef=PLANT)
-    ssm.bind(problem.z[:, None])
-    ssm["transition"], ssm["design"], ssm["selection"] = m.F, m.H[None], np.eye(len(m.F), PLANT)
-    ssm["state_intercept"] = m.B[:, None] * problem.u
-    ssm["state_cov"], ssm["obs_cov"] = m.Q[:PLANT, :PLANT], np.array([[m.R]])
-    ssm.initialize_known(np.zeros(len(m.F)), m.start)
-    return ssm
-
-
-def statsmodels_filter(problem: Problem) -> Callable[[], Result]:
-    """Results come with the time axis last; they are turned, not copied.
-
-    Innovations are taken from the filtered states: its own would be mended in a loop of Python over all steps.
-    """
-    from statsmodels.tsa.statespace import kalman_filter as kf
-
-    unwanted = kf.MEMORY_NO_PREDICTED | kf.MEMORY_NO_GAIN | kf.MEMORY_NO_SMOOTHING | kf.MEMORY_NO_STD_FORECAST
-
-    def run() -> Result:
-        out = _statsmodels(problem).filter(conserve_memory=unwanted)
-        cov = out.filtered_state_cov.transpose(2, 0, 1)
-        return with_innovations(problem, out.filtered_state.T, cov, out.llf)
-
-    return run
-
-
-def statsmodels_likelihood(problem: Problem) -> Callable[[], Result]:
-    """One filter, its covariances exchanged, as in its own estimation."""
-    ssm = _statsmodels(problem)
-
-    def run() -> Result:
-        out = np.empty(len(problem.grid))
-        for index, m in enumerate(problem.grid):
-            ssm["state_cov"], ssm["obs_cov"] = m.Q[:PLANT, :PLANT], np.array([[m.R]])
-            ssm.initialize_known(np.zeros(len(m.F)), m.start)
-            out[index] = ssm.loglike()
-        return out
-
-    return run
-
-
-def statsmodels_smooth(problem: Problem) -> Callable[[], Result]:
-    """States and their covariances only, by its default method, which inverts no covariance of a state.
-
-    The filter's own results are not copied out: that takes a loop of Python over all steps.
-    """
-    from statsmodels.tsa.statespace.kalman_smoother import SMOOTHER_STATE, SMOOTHER_STATE_COV
-
-    def run() -> Result:
-        out = _statsmodels(problem).smooth(SMOOTHER_STATE | SMOOTHER_STATE_COV, update_filter=False)
-        return Smoothed(out.smoothed_state.T, out.smoothed_state_cov.transpose(2, 0, 1))
-
-    return run
-
-
-# dynamax
-
-# dynamax adds 1e-9 to the diagonal of what it inverts, 0.4 % of R in m². In µm² that is lost in rounding.
-MICRO = 1e6
-
-
-def _dynamax(m: Any, u: Any, z: Any) -> tuple[Any, Any, Any, Any]:
-    """Parameters, samples and inputs for dynamax, and what its likelihood is short of; all traced.
-
-    It knows no missing sample: one is given as a 0 measured through H = 0, which teaches it nothing and adds a
-    constant to the likelihood. Its input n acts on the way into step n, not out of it.
-    """
-    import jax.numpy as jnp
-    from dynamax.linear_gaussian_ssm.inference import make_lgssm_params
-
-    F, B, H, Q, r, P0 = m
-    missing = jnp.isnan(z)
-    R = r[None, None] * MICRO**2
-    params = make_lgssm_params(
-        jnp.zeros(len(F)),
-        P0 * MICRO**2,
-        F,
-        Q * MICRO**2,
-        jnp.where(missing[:, None, None], 0.0, H),
-        R,
-        dynamics_input_weights=B[:, None],
-        emissions_input_weights=jnp.zeros((1, 1)),
-    )
-    constant = 0.5 * missing.sum() * jnp.log(2.0 * jnp.pi * R[0, 0]) + (~missing).sum() * jnp.log(MICRO)
-    inputs = jnp.concatenate([jnp.zeros(1), u[:-1]]) * MICRO
-    return params, jnp.where(missing, 0.0, z * MICRO)[:, None], inputs[:, None], constant
-
-
-def _dynamax_filter(m: Any, u: Any, z: Any) -> tuple[Any, ...]:
-    import jax.numpy as jnp
-    from dynamax.linear_gaussian_ssm.inference import lgssm_filter
-
-    F, B, H, Q, r, P0 = m
-    params, samples, inputs, constant = _dynamax(m, u, z)
-    out: Any = lgssm_filter(params, samples, inputs)
-    mean, cov = out.filtered_means / MICRO, out.filtered_covariances / MICRO**2
-    into = H @ F
-    innovation = z - jnp.concatenate([jnp.zeros(1), mean[:-1] @ into + (H @ B) * u[:-1]])
-    variance = jnp.concatenate([(H @ P0 @ H)[None], cov[:-1] @ into @ into + H @ Q @ H]) + r
-    return mean, cov, innovation, variance, out.marginal_loglik + constant
-
-
-def _dynamax_likelihood(m: Any, u: Any, z: Any) -> Any:
-    from dynamax.linear_gaussian_ssm.inference import lgssm_filter
-
-    params, samples, inputs, constant = _dynamax(m, u, z)
-    return lgssm_filter(params, samples, inputs).marginal_loglik + constant
-
-
-def _dynamax_smooth(m: Any, u: Any, z: Any) -> tuple[Any, Any]:
-    from dynamax.linear_gaussian_ssm.inference import lgssm_smoother
-
-    params, samples, inputs, _ = _dynamax(m, u, z)
-    out: Any = lgssm_smoother(params, samples, inputs)
-    return out.smoothed_means / MICRO, out.smoothed_covariances / MICRO**2
-
-
-def _jax() -> Any:
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    return jax
-
-
-def _matrices(problem: Problem) -> list[tuple[Array, ...]]:
-    models = problem.grid or (problem.model,)
-    return [(m.F, m.B, m.H, m.Q, np.array(m.R), m.start) for m in models]
-
-
-def dynamax_filter(problem: Problem) -> Callable[[], Result]:
-    """One run, or many by ``vmap``."""
-    jax = _jax()
-    compiled = jax.jit(_dynamax_filter if problem.z.ndim == 1 else jax.vmap(_dynamax_filter, in_axes=(None, 0, 0)))
-    (model,) = _matrices(problem)
-
-    def run() -> Result:
-        return Filtered(*map(np.asarray, jax.block_until_ready(compiled(model, problem.u, problem.z))))
-
-    return run
-
-
-def dynamax_one_by_one(problem: Problem) -> Callable[[], Result]:
-    """One compiled call per model."""
-    jax = _jax()
-    compiled = jax.jit(_dynamax_likelihood)
-    models = _matrices(problem)
-
-    def run() -> Result:
-        return np.array(jax.block_until_ready([compiled(model, problem.u, problem.z) for model in models]))
-
-    return run
-
-
-def dynamax_grid(problem: Problem) -> Callable[[], Result]:
-    """All models in one call, by ``vmap``."""
-    jax = _jax()
-    compiled = jax.jit(jax.vmap(_dynamax_likelihood, in_axes=(0, None, None)))
-    models = tuple(map(np.stack, zip(*_matrices(problem), strict=True)))
-    return lambda: np.asarray(jax.block_until_ready(compiled(models, problem.u, problem.z)))
-
-
-def dynamax_smooth(problem: Problem) -> Callable[[], Result]:
-    """Its RTS smoother; what it adds to the diagonal is what lets it solve with a singular covariance."""
-    jax = _jax()
-    compiled = jax.jit(_dynamax_smooth)
-    (model,) = _matrices(problem)
-    return lambda: Smoothed(*map(np.asarray, jax.block_until_ready(compiled(model, problem.u, problem.z))))
-
-
-# torch-kf
-
-
-def torch_kf_batch(problem: Problem) -> Callable[[], Result]:
-    """Many runs; it keeps time on the first axis, which is turned back, not copied."""
-    import torch
-    from torch_kf import GaussianState, KalmanFilter
-
-    m, runs = problem.model, len(problem.z)
-    kf = KalmanFilter(*map(torch.from_numpy, (m.F, m.H[None], m.Q, np.array([[m.R]]))))
-
-    def run() -> Result:
-        known = response(m, problem.u)
-        start = GaussianState(torch.zeros(runs, len(m.F), 1).double(), torch.from_numpy(m.start).repeat(runs, 1, 1))
-        out = kf.filter(start, torch.from_numpy((problem.z - known @ m.H).T[..., None, None]), return_all=True)
-        mean = out.mean[..., 0].numpy().swapaxes(0, 1) + known
-        return with_innovations(problem, mean, out.covariance.numpy().swapaxes(0, 1))
-
-    return run
-
-
-SUBTRACTED = "no input: on z less the known response"
-MICRONS = "missing as H = 0; in µm"
-DENSE, BLOCK, POSITION = 5, PLANT, 1
-BLOCK_NOTE = "covariance of the 2 plant states only"
-POSITION_NOTE = "the same, and gives out no more than pumafuse"
-CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-PEERS: tuple[Peer, ...] = (
-    Peer("C++, fresh arrays", "filter", cpp_fresh(DENSE)),
-    Peer("C++, reused arrays", "filter", cpp_reused(DENSE)),
-    Peer("C++ 2x2, fresh arrays", "filter", cpp_fresh(BLOCK), BLOCK_NOTE),
-    Peer("C++ 2x2, reused arrays", "filter", cpp_reused(BLOCK), BLOCK_NOTE),
-    Peer("C++ position, fresh arrays", "filter", cpp_fresh(POSITION), POSITION_NOTE),
-    Peer("statsmodels", "filter", statsmodels_filter, "input as state_intercept"),
-    Peer("dynamax", "filter", dynamax_filter, MICRONS),
-    Peer(
-        "kalman-py, jax",
-        "filter",
-        kalman_py_batch("jax"),
-        f"{SUBTRACTED}; cannot miss a sample: given all",
-        gaps=False,
-    ),
-    Peer(
-        "kalman-py, numpy",
-        "filter",
-        kalman_py_batch("numpy"),
-        f"{SUBTRACTED}; cannot miss a sample: given all, and so may freeze its gain",
-        steps=100_000,
-        gaps=False,
-    ),
-    Peer("kalman-py, own loop", "filter", kalman_py_steps, "the user's loop of predict and update", steps=20_000),
-    Peer("filterpy", "filter", filterpy_filter, "likelihood from its innovations", steps=20_000),
-    Peer("simdkalman", "filter", simdkalman_filter, SUBTRACTED, steps=20_000),
-    Peer("C++, all cores", "batch", cpp_fresh(DENSE, CORES)),
-    Peer("C++ 2x2, all cores", "batch", cpp_fresh(BLOCK, CORES), BLOCK_NOTE),
-    Peer("C++ position, all cores", "batch", cpp_fresh(POSITION, CORES), POSITION_NOTE),
-    Peer("dynamax, vmap", "batch", dynamax_filter, MICRONS),
-    Peer("simdkalman", "batch", simdkalman_filter, SUBTRACTED),
-    Peer("torch-kf", "batch", torch_kf_batch, f"{SUBTRACTED}; likelihood from its innovations"),
-    Peer("C++", "likelihood", cpp_one_by_one(block=False)),
-    Peer("C++ 2x2", "likelihood", cpp_one_by_one(block=True), BLOCK_NOTE),
-    Peer("statsmodels", "likelihood", statsmodels_likelihood, "input as state_intercept"),
-    Peer("dynamax", "likelihood", dynamax_one_by_one, MICRONS),
-    Peer("C++, all cores", "grid", cpp_grid(block=False, threads=CORES)),
-    Peer("C++ 2x2, all cores", "grid", cpp_grid(block=True, threads=CORES), BLOCK_NOTE),
-    Peer("dynamax, vmap", "grid", dynamax_grid, MICRONS),
-    Peer("C++", "smooth", cpp_smooth, "Bryson-Frazier"),
-    Peer("statsmodels", "smooth", statsmodels_smooth, "input as state_intercept"),
-    Peer("dynamax", "smooth", dynamax_smooth, MICRONS),
-    Peer("filterpy", "smooth", filterpy_smooth, "RTS with pinv", steps=10_000),
-)
+# What is timed
+
+
+class Peer(NamedTuple):
+    """An adapter and how to time it: on the scan repeated to ``rows``, 0 for the shipped one."""
+
+    job: str
+    adapter: Callable[[Problem], Callable[[], Any]]
+    rows: int
+    note: str = ""
+
+
+MATRICES = "position and sd alone, of what was fused; on one scan"
+PEERS: dict[str, Peer] = {
+    "pumafuse, table ready": Peer("filter", ours("filter"), project.ROWS, "a table of rows in, arrays of numbers out"),
+    "C++ loop, table ready": Peer("filter", cpp, project.ROWS, "the same out; what gates decided is given"),
+    "statsmodels": Peer("filter", statsmodels("filter"), 0, MATRICES),
+    "dynamax": Peer("filter", dynamax("filter"), 0, MATRICES),
+    "filterpy": Peer("filter", filterpy, 0, MATRICES),
+    "statsmodels, smoother": Peer("smooth", statsmodels("smooth"), 0, MATRICES),
+    "dynamax, smoother": Peer("smooth", dynamax("smooth"), 0, MATRICES),
+    "C++ loop, likelihood": Peer("likelihood", cpp_likelihood, project.ROWS, "what gates decided is given"),
+    "statsmodels, likelihood": Peer("likelihood", statsmodels("likelihood"), 0, "of what was fused; on one scan"),
+    "dynamax, likelihood": Peer("likelihood", dynamax("likelihood"), 0, "of what was fused; on one scan"),
+}
+
+
+def measure(name: str, repeats: int) -> list[Row]:
+    """The rows of one peer."""
+    peer = PEERS[name]
+    scan = Problem.of(0)
+    apart = error(peer.adapter(scan)(), scan.answer(peer.job))
+    if not apart <= TOLERANCE:
+        sys.exit(f"disagrees by {apart:.0e}")
+    problem = Problem.of(peer.rows) if peer.rows else scan
+    seconds = project.timed(peer.adapter(problem), repeats)
+    return [
+        project.row(peer.job, name, "ns", [1e9 * s / problem.values for s in seconds], peer.note) | {"error": apart}
+    ]
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure(sys.argv[1], int(sys.argv[2]))))

@@ -1,198 +1,140 @@
-"""Jobs that no peer has: the whole of `pumafuse.fuse`, whole processes, memory."""
+"""What pumafuse itself takes: `fuse` on the scan, its likelihood, the live estimator, whole processes, memory.
+
+    python benchmarks/project.py NAME REPEATS    prints the rows of one of CASES as JSON; run.py calls it
+
+It measures the pumafuse that Python finds, of version 0.1, too: `run.py --against` puts another on PYTHONPATH.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
 import warnings
 from collections.abc import Callable
-from functools import cache
+from functools import partial
+from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 import pumafuse as pf
 
 Row = dict[str, Any]
-Mode = Literal["filtered", "smoothed", "as live"]
 
-DATA = Path(pf.__file__).parent / "data"
+DATA = Path(str(files("pumafuse") / "data"))
 SCAN, CONFIG = DATA / "scan1", DATA / "fusion.toml"
 AXES = ("tangential", "radial", "vertical")
+START = {"tangential": 0.0, "radial": 0.56, "vertical": -0.1}  # m
+ROWS = 1_000_000
 LENGTH = 60_200_000_000  # ns, from one repetition of the scan to the next
 JITTER = 0.2e-3  # s, so that no repetition has the intervals of another
+PUMAFUSE = (sys.executable, "-c", "from pumafuse.cli.main import main; main()")
 
 
-def repeated(rows: int, axes: tuple[str, ...] = AXES) -> pf.Run:
+def repeated(rows: int) -> pf.Run:
     """The shipped scan, over and over, until its sensors have ``rows`` rows; stamps jitter anew each time."""
     scan, rng = pf.Run.read(SCAN), np.random.default_rng(1)
-    sensors = {name: source for name, source in scan.sensors.items() if set(axes) & set(source.values)}
-    per_scan = sum(len(source.stamp) for source in sensors.values())
+    per_scan = sum(len(source.stamp) for source in scan.sensors.values())
     times = -(-rows // per_scan)
 
-    def repeat(source: Any, jitter: float, wanted: float = 1.0) -> tuple[Any, dict[str, Any]]:
-        count = round(wanted * times * len(source.stamp))
+    def repeat(source: Any, jitter: float) -> tuple[Any, dict[str, Any]]:
+        count = round(rows / per_scan * len(source.stamp))
         stamp = (source.stamp + LENGTH * np.arange(times)[:, None]).ravel()
         stamp = np.sort(stamp + np.rint(rng.normal(0.0, 1e9 * jitter, len(stamp))).astype(np.int64))
-        values = {axis: np.tile(value, times)[:count] for axis, value in source.values.items() if axis in axes}
-        return stamp[:count], values
+        return stamp[:count], {axis: np.tile(value, times)[:count] for axis, value in source.values.items()}
 
-    share = rows / (times * per_scan)
-    command = repeat(scan.command, 0.0, share)
-    return pf.Run.from_arrays(*command, {name: repeat(source, JITTER, share) for name, source in sensors.items()})
+    command = repeat(scan.command, 0.0)
+    return pf.Run.from_arrays(*command, {name: repeat(source, JITTER) for name, source in scan.sensors.items()})
 
 
-def rows_of(run: pf.Run) -> int:
-    """Of all sensors."""
-    return sum(len(source.stamp) for source in run.sensors.values())
+def values_of(run: pf.Run) -> int:
+    """How many numbers the sensors of a run measured: a row has one for each axis that it gives."""
+    return sum(len(source.stamp) * len(source.values) for source in run.sensors.values())
 
 
-def fuse(run: pf.Run, mode: Mode = "filtered") -> pf.Estimates:
-    """The shipped configuration, with the sensors that the run has."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)  # the arm jumps home between repetitions
-        config = pf.FusionConfig.load(CONFIG)
-        return pf.fuse(run, config, sensors=run.sensors, smooth=mode == "smoothed", as_live=mode == "as live")
+def timed(call: Callable[[], Any], repeats: int) -> list[float]:
+    """CPU seconds of each call, after one that is not counted; letting go of what it gives is not, either."""
+    call()
+    found: list[float] = []
+    for _ in range(repeats):
+        begin = time.process_time()
+        result = call()
+        found.append(time.process_time() - begin)
+        del result
+    return found
 
 
-def scan(mode: Mode) -> Callable[[int], list[Row]]:
+def row(job: str, name: str, unit: str, values: list[float], note: str = "") -> Row:
+    """One row of a table."""
+    return {"job": job, "name": name, "unit": unit, "values": values, "note": note}
+
+
+# In one process
+
+
+def fuse(job: str, repeats: int, **options: bool) -> list[Row]:
     """One million rows of three axes."""
-
-    def measure(repeats: int) -> list[Row]:
-        run = repeated(1_000_000)
-        fuse(pf.Run.read(SCAN), mode)
-        seconds: list[float] = []
-        for _ in range(repeats):
-            start = time.perf_counter()
-            est = fuse(run, mode)
-            seconds.append(time.perf_counter() - start)
-            del est
-        rows, components = rows_of(run), sum(len(s.stamp) * len(s.values) for s in run.sensors.values())
-        each = f"{min(seconds):.2f} s in all, {1e9 * min(seconds) / components:,.0f} ns a value"
-        return [row("scan", f"pumafuse.fuse, {mode}", "ns", [1e9 * s / rows / len(AXES) for s in seconds], rows, each)]
-
-    return measure
+    run, config = repeated(ROWS), pf.FusionConfig.load(CONFIG)
+    seconds = timed(lambda: pf.fuse(run, config, **options), repeats)
+    given = "".join(f", {name}=True" for name in options)
+    note = f"everything, from the run to its estimates: {min(seconds):.2f} s for a million rows"
+    return [row(job, f"pumafuse.fuse{given}", "ns", [1e9 * s / values_of(run) for s in seconds], note)]
 
 
-def row(job: str, name: str, unit: str, values: list[float], steps: int | None = None, note: str = "") -> Row:
-    """One row of the table."""
-    found = {"job": job, "peer": name, "unit": unit, "minimum": min(values), "median": statistics.median(values)}
-    return found | {"steps": steps, "note": note}
+def likelihood(repeats: int) -> list[Row]:
+    """What one step of a search by likelihood takes."""
+    from pumafuse.fusion.engine import innovations
 
-
-# Whole processes
-
-LISTING = """
-import sys
-from pumafuse.cli.main import main
-try:
-    main()
-finally:
-    here = sys.stdlib_module_names | {"pumafuse", "__main__"}
-    with open(FILE, "w") as file:
-        file.writelines(f"{name}\\n" for name in list(sys.modules) if name.split(".")[0] not in here)
-"""
-SURVIVORS = """
-import importlib, sys
-lines = []
-for name in open(sys.argv[1]).read().split():
-    if not name.replace(".", "_").isidentifier():
-        continue
     try:
-        importlib.import_module(name)
-    except Exception:  # made by an extension at run time
-        continue
-    lines.append(f"import {name}\\n")
-open(sys.argv[2], "w").writelines(lines)
-"""
+        from pumafuse.fusion.segments import build
+    except ImportError:  # version 0.1
+        from pumafuse.fusion.timeline import build
+    run, config = repeated(ROWS), pf.FusionConfig.load(CONFIG)
+    segment = build(run, config)
+    seconds = timed(lambda: innovations(segment, config), repeats)
+    name, note = "pumafuse, innovations", "the run's table ready"
+    return [row("likelihood", name, "ns", [1e9 * s / values_of(run) for s in seconds], note)]
 
 
-def imports(folder: Path, name: str, arguments: list[str]) -> list[str]:
-    """A command that imports, and does no more, the modules of libraries that ``pumafuse`` has when it is through."""
-    listed, module = folder / f"{name}.txt", folder / f"{name}.py"
-    code = LISTING.replace("FILE", repr(str(listed)))
-    run([sys.executable, "-c", code, *arguments])
-    run([sys.executable, "-c", SURVIVORS, str(listed), str(module)])
-    return [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(folder)!r}); import {name}"]
+def live(repeats: int) -> list[Row]:
+    """One call with three axes, rows at 1 kHz, a command and an estimate every 28 ms: medians, so often."""
+    found: dict[str, list[float]] = {"measurement": [], "command": [], "estimate": []}
+    values = np.random.default_rng(0).normal(list(START.values()), 5e-5, (6000, 3)).tolist()
+    for _ in range(repeats):
+        estimator = pf.LiveEstimator(pf.FusionConfig.load(CONFIG))
+        add = getattr(estimator, "measurement", None) or estimator.reading  # version 0.1
+        spent: dict[str, list[int]] = {name: [] for name in found}
+        for n, (x, y, z) in enumerate(values):
+            place = {"tangential": x, "radial": y, "vertical": z}
+            begin = time.perf_counter_ns()
+            if n % 28 == 0:
+                estimator.command(n * 1_000_000, **place)
+                then = time.perf_counter_ns()
+                estimator.estimate()
+                spent["command"].append(then - begin)
+                spent["estimate"].append(time.perf_counter_ns() - then)
+                begin = time.perf_counter_ns()
+            add(n * 1_000_000 + 500_000, "tracker", **place)
+            spent["measurement"].append(time.perf_counter_ns() - begin)
+        for name, times in spent.items():
+            found[name].append(float(np.median(times[len(times) // 6 :])) / 1e3)
+    return [row("live", f"LiveEstimator.{name}, median", "µs", times) for name, times in found.items()]
 
 
-def run(command: list[str]) -> float:
-    """Seconds that a process takes, from start to end."""
-    start = time.perf_counter()
-    subprocess.run(command, check=True, capture_output=True)
-    return time.perf_counter() - start
-
-
-def processes(repeats: int) -> list[Row]:
-    """Warm processes, in turn, so that a busy spell of the machine meets all of them."""
-    executable = str(Path(sys.executable).with_name("pumafuse"))
-    with tempfile.TemporaryDirectory() as made:
-        folder = Path(made)
-        fuse = ["fuse", str(SCAN), "--config", str(CONFIG), "--output", str(folder / "result"), "--force"]
-        commands = {
-            "pumafuse fuse": [executable, *fuse],
-            "  its libraries' imports": imports(folder, "plain_imports", fuse),
-            "pumafuse fuse --rrd": [executable, *fuse, "--rrd"],
-            "  its libraries' imports ": imports(folder, "rrd_imports", [*fuse, "--rrd"]),
-            "pumafuse --help": [executable, "--help"],
-            "import pumafuse": [sys.executable, "-c", "import pumafuse"],
-            "python": [sys.executable, "-c", "pass"],
-        }
-        for command in commands.values():
-            run(command)
-        found: dict[str, list[float]] = {name: [] for name in commands}
-        for _ in range(repeats):
-            for name, command in commands.items():
-                found[name].append(run(command))
-    rows = {name: row("process", name.rstrip(), "s", seconds) for name, seconds in found.items()}
-    for whole, part, words in (
-        ("pumafuse fuse", "  its libraries' imports", "its imports"),
-        ("pumafuse fuse --rrd", "  its libraries' imports ", "its imports"),
-        ("pumafuse --help", "python", "a bare Python"),
-        ("import pumafuse", "python", "a bare Python"),
-    ):
-        more = {key: rows[whole][key] - rows[part][key] for key in ("minimum", "median")}
-        rows[whole]["note"] = f"{more['minimum']:.3f} more than {words}; by medians {more['median']:.3f}"
-    return list(rows.values())
-
-
-# Memory
-
-
-def memory(rows: int, axes: tuple[str, ...]) -> Callable[[int], list[Row]]:
-    """The highest that the process's memory has been, of one call, whatever the repeats."""
-
-    def measure(_repeats: int) -> list[Row]:
-        resource.setrlimit(resource.RLIMIT_AS, (_free(), resource.RLIM_INFINITY))
-        fuse(pf.Run.read(SCAN))
-        run = repeated(rows, axes)
-        before = _peak()
-        sources = [run.command, *run.sensors.values()]
-        given = sum(s.stamp.nbytes + sum(value.nbytes for value in s.values.values()) for s in sources) / 1e9
-        start = time.perf_counter()
-        est = fuse(run)
-        seconds = time.perf_counter() - start
-        kept = sum(getattr(est[axis], name).nbytes for axis in est.axes for name in pf.AxisEstimate.FIELDS) / 1e9
-        note = f"the run {given:.2f}, estimates {kept:.2f}, {before:.2f} before the call; took {seconds:.1f} s"
-        return [row("memory", _named(rows, axes), "GB", [_peak()], rows, note)]
-
-    return measure
-
-
-def _named(rows: int, axes: tuple[str, ...]) -> str:
-    return f"{rows:,} rows, {len(axes)} {'axis' if len(axes) == 1 else 'axes'}"
-
-
-@cache
-def _free() -> int:
-    """Bytes that the system can give; with more it would begin to swap, or end other processes."""
-    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+def memory(_repeats: int) -> list[Row]:
+    """The highest that the process's memory has been, of one call."""
+    pf.fuse(pf.Run.read(SCAN), pf.FusionConfig.load(CONFIG))
+    run = repeated(10 * ROWS)
+    before = _peak()
+    est = pf.fuse(run, pf.FusionConfig.load(CONFIG))
+    note = f"{before:.2f} before the call, with the run"
+    return [row("memory", f"pumafuse.fuse, {10 * ROWS:,} rows of three axes", "GB", [_peak()], note)] if est else []
 
 
 def _peak() -> float:
@@ -200,11 +142,97 @@ def _peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
 
 
-JOBS: tuple[tuple[str, str, Callable[[int], list[Row]]], ...] = (
-    ("scan", "pumafuse.fuse, filtered", scan("filtered")),
-    ("scan", "pumafuse.fuse, smoothed", scan("smoothed")),
-    ("scan", "pumafuse.fuse, as live", scan("as live")),
-    ("process", "processes", processes),
-    ("memory", _named(10_000_000, AXES[:1]), memory(10_000_000, AXES[:1])),
-    ("memory", _named(10_000_000, AXES), memory(10_000_000, AXES)),
-)
+# Whole processes
+
+
+def seconds_of(command: list[str], stdin: str = "", cache: str | None = None) -> float:
+    """CPU seconds that a process takes, from start to end; what it compiles goes to ``cache``."""
+    environment = os.environ | ({} if cache is None else {"NUMBA_CACHE_DIR": cache})
+    with tempfile.TemporaryFile("w+") as file:
+        file.write(stdin)
+        file.seek(0)
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run(command, stdin=file, capture_output=True, check=True, env=environment)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def fuse_command(folder: str) -> list[str]:
+    """``pumafuse fuse`` on the shipped scan."""
+    return [*PUMAFUSE, "fuse", str(SCAN), "--config", str(CONFIG), "--output", f"{folder}/result", "--force"]
+
+
+def live_command(*options: str) -> list[str]:
+    """``pumafuse live stdin`` with the shipped configuration."""
+    return [*PUMAFUSE, "live", "stdin", "-c", str(CONFIG), *options]
+
+
+def lines(rows: int) -> str:
+    """Rows of a tracker at 1 kHz with a command every 28 ms."""
+    place = {axis: u * 1e3 for axis, u in START.items()}
+    found: list[str] = []
+    for n in range(rows):
+        if n % 28 == 0:
+            found.append(json.dumps({"t": n / 1000, "command": place}))
+        found.append(json.dumps({"t": n / 1000, "sensor": "tracker", **place}))
+    return "\n".join(found) + "\n"
+
+
+def stdin(repeats: int) -> list[Row]:
+    """Lines through a whole process: what more of them take."""
+    found: list[Row] = []
+    few, many = lines(1000), lines(101_000)
+    for name, options in (("an estimate a command", ()), ("--rate 100", ("--rate", "100"))):
+        command = live_command(*options)
+        seconds_of(command, few)
+        each = [10.0 * (seconds_of(command, many) - seconds_of(command, few)) for _ in range(min(repeats, 3))]
+        note = f"{1e6 / min(each):,.0f} rows a second, beside the process's start"
+        found.append(row("live", f"pumafuse live stdin, {name}", "µs", each, note))
+    return found
+
+
+def processes(repeats: int) -> list[Row]:
+    """Warm processes, in turn, so that a busy spell of the machine meets all of them."""
+    with tempfile.TemporaryDirectory() as folder:
+        commands = {
+            "pumafuse fuse": fuse_command(folder),
+            "pumafuse --help": [*PUMAFUSE, "--help"],
+            "import pumafuse": [sys.executable, "-c", "import pumafuse"],
+            "python": [sys.executable, "-c", "pass"],
+        }
+        found: dict[str, list[float]] = {name: [] for name in commands}
+        for _ in range(repeats + 1):
+            for name, command in commands.items():
+                found[name].append(seconds_of(command))
+    return [row("process", name, "s", seconds[1:]) for name, seconds in found.items()]
+
+
+def first_use(_repeats: int) -> list[Row]:
+    """What compiling takes: a process on a machine that has nothing compiled, less the same once more."""
+    found: list[Row] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, command, text in (
+            ("pumafuse fuse", fuse_command(folder), ""),
+            ("pumafuse live stdin", live_command(), lines(100)),
+        ):
+            cache = f"{folder}/{name}"
+            cold, warm = (seconds_of(command, text, cache) for _ in range(2))
+            found.append(row("compile", f"{name}, compiled for the first time", "s", [cold - warm]))
+    return found
+
+
+CASES: dict[str, Callable[[int], list[Row]]] = {
+    "pumafuse.fuse": partial(fuse, "filter"),
+    "pumafuse.fuse, as_live": partial(fuse, "as live", as_live=True),
+    "pumafuse.fuse, smooth": partial(fuse, "smooth", smooth=True),
+    "pumafuse, likelihood": likelihood,
+    "LiveEstimator.measurement": live,
+    "pumafuse live stdin": stdin,
+    "processes": processes,
+    "first use": first_use,
+    "memory": memory,
+}
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore", pf.PumafuseWarning)  # the arm jumps home between repetitions
+    print(json.dumps(CASES[sys.argv[1]](int(sys.argv[2]))))

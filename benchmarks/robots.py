@@ -91,8 +91,8 @@ def followed(number: int, seconds: float, folder: Path) -> str:
     lost = 0
     for robot in robots:
         robot.process.send_signal(signal.SIGTERM)
-        told = robot.process.communicate()[1]
-        lost += int(told.split(" taken in, ")[1].split()[0])
+        report = robot.process.communicate()[1]
+        lost += int(report.split(" taken in, ")[1].split()[0])
     half, most = np.percentile(found, [50, 99])
     return f"| {number} | {cpu:.2f} | {memory:.0f} | {half:.2f} | {most:.2f} | {lost} |"
 
