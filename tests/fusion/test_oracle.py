@@ -24,7 +24,6 @@ from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.engine import arranged, biased_sensors
 from pumafuse.fusion.offline import fuse
 from pumafuse.fusion.segments import build
-from pumafuse.fusion.setup import room_for
 from pumafuse.logs.run import Run
 from pumafuse.model.arm import ArmModel, AxisModel, Gain
 from pumafuse.model.plants import FirstOrder, Plant, SecondOrder
@@ -487,8 +486,9 @@ def arranged_for(case: Case) -> tuple[Model, Sensors, State, Events]:
 def filtered(model: Model, sensors: Sensors, state: State, events: Events) -> None:
     """The state after the events."""
     none, results = np.zeros(0, dtype=np.int64), Results.room(len(events.time), 1)
-    outputs, kept = Outputs(*np.empty((len(Outputs._fields), 1, 0))), room_for(state, 0)
-    filter_events(model, sensors, events, state, False, none, results, no_history(state), kept, outputs)
+    outputs, arrived = Outputs(*np.empty((len(Outputs._fields), 1, 0))), np.zeros(0, dtype=np.bool_)
+    history = no_history(1, state.x.shape[1])
+    filter_events(model, sensors, events, state, False, none, results, history, arrived, 0, outputs)
 
 
 @pytest.mark.parametrize("plant", [LAG, UNDER])
