@@ -269,3 +269,19 @@ def test_any_stream_is_fused_as_offline(
     for sensor, counts in found.items():  # live an empty cell is no value, offline one that is invalid or too early
         for word in ("fused", "rejected", "reacquired"):
             assert counts[word] == expected[sensor][word]
+
+
+@settings(derandomize=True, deadline=None, max_examples=100)
+@given(odd_streams())
+def test_a_window_of_a_millisecond_is_enough_for_a_stream_in_order(
+    drawn: tuple[pf.FusionConfig, list[Event], dict[str, float], int],
+) -> None:
+    """What leaves the window is not lost: answers, counts and estimates are those of a window of 10 s."""
+    config, events, _, _ = drawn
+    start = dict.fromkeys(config.arm.axes, 0.49)  # else a first command makes earlier measurements of its axis usable
+    wide, narrow = (pf.LiveEstimator(config, window=window, start=start) for window in (10.0, 1e-3))
+    for event in sorted(events, key=lambda event: event.stamp):
+        assert feed(narrow, event) == feed(wide, event)
+        for ahead in (0, 50 * MS):
+            assert narrow.estimate(event.stamp + ahead).axes == wide.estimate(event.stamp + ahead).axes
+    assert counted(narrow) == counted(wide)
