@@ -291,7 +291,7 @@ from pumafuse.filter import window
 arm, sensors = pf.ArmModel.load("puma560-internal"), {"tracker": pf.Sensor(sd=1e-4)}
 live = pf.LiveEstimator(pf.FusionConfig(arm=arm, sensors=sensors))
 live.warm_up()
-called = "add_measurement", "add_command", "estimate_at", "command_at", "forget", "count_window", "let_go"
+called = "add_measurement", "add_command", "estimate_at", "last_commands"
 assert all(len(getattr(window, name).signatures) == 1 for name in called)
 for row in range(70_000):
     live.measurement(row, "tracker", radial=0.5) if row else live.command(0, radial=0.5)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..arrays import ALWAYS, NEVER, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
+from ..arrays import ALWAYS, NEVER, BoolArray, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
 from ..compiled import compiled, compiled_apart
 from .axis import PERIOD, START, STEP, Model, Sensors, State, U, copy_rows
 from .counters import Counters, count_duplicate, count_rows, forget_after
@@ -311,6 +311,20 @@ def begin(m: Memory, axis: int, stamp: int) -> None:
         reclassify(m, other, span[BEGIN], np.int64(NEVER))
 
 
+@compiled_apart
+def last_commands(
+    source: IndexArray, stamps: TimeArray, known: CodeArray, first: int, end: int, axis: int, stamp: int
+) -> tuple[int, int]:
+    """The rows of the last two commands of an axis that are stamped by ``stamp`` [ns], −1 for none."""
+    last = -1
+    for row in range(end - 1, first - 1, -1):
+        if source[row] == COMMAND and known[row, axis] == FUSED and stamps[row] <= stamp:
+            if last >= 0:
+                return last, row
+            last = row
+    return last, -1
+
+
 class Window:
     """The last seconds of a stream, and the filter at every one of their events.
 
@@ -395,18 +409,14 @@ class Window:
         """Stamp [ns], value and step [m] of an axis's last command stamped by ``stamp`` [ns]; None for none."""
         if self.memory.incoming.times[axis, FIRST] == NEVER:
             return None
-        events, drive, first = self.memory.events, self.memory.state.drive[axis], self._span.item(BEGIN)
-        rows = slice(first, self._span.item(END))
-        commands = (events.source[rows] == COMMAND) & (events.known[rows, axis] == FUSED)
-        last = first + np.flatnonzero(commands & (events.stamp[rows] <= stamp))[-2:]
-        before = float(drive[START] + drive[U])  # those before have left the window
-        if not len(last):
-            return ALWAYS, before, float(drive[STEP])
-        value = events.value.item(int(last[-1]), axis)
-        if len(last) == 2:
-            return events.stamp.item(int(last[-1])), value, value - events.value.item(int(last[0]), axis)
-        step = float(drive[STEP]) if last[-1] < self._span[DONE] else value - before
-        return events.stamp.item(int(last[-1])), value, step
+        events, drive, span = self.memory.events, self.memory.state.drive[axis], self._span
+        last, before = last_commands(events.source, events.stamp, events.known, span[BEGIN], span[END], axis, stamp)
+        earlier = float(drive[START] + drive[U])  # of those that have left the window
+        if last < 0:
+            return ALWAYS, earlier, float(drive[STEP])
+        value = events.value.item(last, axis)
+        step = float(drive[STEP]) if last < span[DONE] else value - earlier
+        return events.stamp.item(last), value, step if before < 0 else value - events.value.item(before, axis)
 
     def forget(self, after: int) -> None:
         """Take back all that is stamped after ``after`` [ns]: it was of another clock. The rest is added again."""
@@ -428,6 +438,8 @@ class Window:
                 part[axis] = part[rest + axis]
             state.drive[axis, START] = self.memory.incoming.values[axis, KNOWN_START]
             state.clock[axis] = span[ORIGIN]
+        first = times[:, FIRST].copy()
+        times[first < NEVER, FIRST] = ALWAYS  # it has begun: what left the window since then stays
         bits = 1 << np.arange(axes)
         for row in range(len(rows.time)):
             sensor, given = int(rows.source[row]), int(bits[rows.known[row] != ABSENT].sum())
@@ -441,11 +453,13 @@ class Window:
             else:
                 add_measurement(self._flat, int(rows.stamp[row]), sensor, given, ALWAYS)
                 self._counters.last[sensor] = max(self._counters.last[sensor], rows.stamp[row])
+        times[first < NEVER, FIRST] = first[first < NEVER]
         self.spread[:] = 1.0
 
     def warm_up(self) -> None:
         """Have every kernel compiled and in memory; on a window that nobody needs."""
         self.estimate(0)
+        self.memory.incoming.times[0, FIRST] = 0
         self.command_at(0)
         self.forget(0)
         self.counters()

@@ -179,17 +179,17 @@ def _contradictions(segment: Segment, filtered: Filtered) -> list[str]:
 def _measurements(segment: Segment, filtered: Filtered) -> Measurements:
     """Every component of every measurement in the order of the filter."""
     events, results = filtered.events, filtered.results
-    given = np.flatnonzero((events.source != COMMAND)[:, None] & (events.known != ABSENT))
-    row, axis = np.divmod(given, len(segment.axes))
+    given = (events.source != COMMAND)[:, None] & (events.known != ABSENT)
+    row, axis = np.nonzero(given)
     return Measurements(
-        time=seconds(events.time[row], segment.origin),
-        stamp=seconds(events.stamp[row], segment.origin),
+        time=seconds(events.time, segment.origin)[row],
+        stamp=seconds(events.stamp, segment.origin)[row],
         sensor=events.source[row],
         axis=axis.astype(np.int16),
-        value=events.value.ravel()[given],
-        innovation=results.innovation.ravel()[given],
-        innovation_sd=results.innovation_sd.ravel()[given],
-        outcome=results.outcome.ravel()[given],
+        value=events.value[given],
+        innovation=results.innovation[given],
+        innovation_sd=results.innovation_sd[given],
+        outcome=results.outcome[given],
         sensors=segment.sensors,
         axes=segment.axes,
     )

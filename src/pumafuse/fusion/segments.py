@@ -137,7 +137,8 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
                 f"sensor '{name}' is in x, y, z, the commands are not; give a [frame], and them in x, y, z too"
             )
     rows = command_rows(run, arm, notes)
-    commands = np.unique(rows.stamp[(rows.known == Outcome.FUSED).any(axis=1)])
+    commands = rows.stamp[(rows.known == Outcome.FUSED).any(axis=1)]
+    commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
     start = {axis: run.start.get(axis, _first_value(rows, number)) for number, axis in enumerate(run.axes)}
     chosen = config.sensor_names(sensors)
     named = tuple(name for name in chosen if name in run.sensors)

@@ -27,6 +27,7 @@ from .frame_start import FrameStart
 from .rate_limit import RateLimitedLog
 from .results import AxisNow, Health, LiveEstimate, UpdateResult, health_of, no_estimate, update_result
 
+_MOST_AXES = 62  # what an event gives is told to a kernel as bits
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
 
@@ -95,6 +96,8 @@ class LiveEstimator:
             PumafuseError: ``window`` or ``stale_after`` is not a time in reach, ``start`` is of no axis, or a model
                 cannot be followed live.
         """
+        if len(config.arm.axes) > _MOST_AXES:
+            raise ConfigError(f"arm '{config.arm.name}': a stream is followed on at most {_MOST_AXES} axes")
         for name, value in {"window": window, "stale_after": stale_after}.items():
             if not 0.0 < _number(value) <= LONGEST_TAIL_NS / 1e9:
                 raise ConfigError(f"{name}: must be more than 0 s and at most an hour, not {value!r:.40}")
