@@ -224,18 +224,25 @@ def position_of(state: State, row: int) -> tuple[float, float]:
     return state.x[row, POSITION] + state.x[row, OFFSET], max(variance, 0.0)
 
 
+@compiled
+def copy_estimate(state: State, here: int, there: int) -> None:
+    """Copy a row of the state to another, but for what the gate remembers."""
+    state.clock[there] = state.clock[here]
+    for k in range(state.drive.shape[1]):
+        state.drive[there, k] = state.drive[here, k]
+    for i in range(state.x.shape[1]):
+        state.x[there, i] = state.x[here, i]
+        for j in range(state.x.shape[1]):
+            state.P[there, i, j] = state.P[here, i, j]
+
+
 @compiled_apart
 def copy_rows(state: State, here: int, there: int, count: int) -> None:
     """Copy rows of the state to others."""
     for row in range(count):
         a, b = here + row, there + row
-        state.clock[b], state.unsettled[b] = state.clock[a], state.unsettled[a]
-        for k in range(state.drive.shape[1]):
-            state.drive[b, k] = state.drive[a, k]
-        for i in range(state.x.shape[1]):
-            state.x[b, i] = state.x[a, i]
-            for j in range(state.x.shape[1]):
-                state.P[b, i, j] = state.P[a, i, j]
+        copy_estimate(state, a, b)
+        state.unsettled[b] = state.unsettled[a]
         for sensor in range(state.rejected.shape[1]):
             for k in range(2):
                 state.rejected[b, sensor, k] = state.rejected[a, sensor, k]

@@ -28,6 +28,7 @@ from .axis import (
     Sensors,
     State,
     apply_command,
+    copy_estimate,
     copy_rows,
     innovation,
     noise,
@@ -333,7 +334,7 @@ def estimate(
     """
     here, there = len(model.order), len(model.order) + 1  # rows of the state for predictions aside
     for axis in range(len(model.order)):
-        copy_rows(state, axis, here, ONE)
+        copy_estimate(state, axis, here)
         follow_commands(model, events, state, axis, here, pending, end, state.clock[axis] - 1, time, time)
         position, variance = position_of(state, here)
         outputs.position[axis, n], outputs.position_sd[axis, n] = position, math.sqrt(variance)
@@ -348,7 +349,7 @@ def estimate(
             continue
         # (p(t + T) − p(t)) / T: what the state contributes, and the noise that comes until then (from P = 0)
         period = model.gain[axis, PERIOD]
-        copy_rows(state, here, there, ONE)
+        copy_estimate(state, here, there)
         for i in range(model.states[axis]):
             for j in range(model.states[axis]):
                 state.P[there, i, j] = 0.0

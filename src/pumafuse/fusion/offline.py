@@ -163,8 +163,10 @@ def _contradictions(segment: Segment, filtered: Filtered) -> list[str]:
     rows = np.flatnonzero(results.contradicts >= 0)
     if not len(rows):
         return []
-    for sensor, other in np.unique(np.stack((events.source[rows], results.contradicts[rows])), axis=1).T.tolist():
-        mine = rows[(events.source[rows] == sensor) & (results.contradicts[rows] == other)]
+    pair = events.source[rows].astype(np.int64) * len(segment.sensors) + results.contradicts[rows]
+    for one in np.unique(pair).tolist():
+        sensor, other = divmod(one, len(segment.sensors))
+        mine = rows[pair == one]
         first, count = mine[0], len(mine)
         rejected = np.flatnonzero(results.outcome[first] == Outcome.REJECTED)
         off = [f"{segment.axes[axis]} by {results.innovation[first, axis] * MM:+.4g} mm" for axis in rejected.tolist()]

@@ -117,7 +117,7 @@ class LiveEstimator:
         self._commands = dict.fromkeys(Outcome, 0)
         self._answers: dict[bytes, UpdateResult] = {}
         self._aside: list[tuple[_Event, Outcome]] = []
-        self._contradicting: dict[str, int] = {}  # since when [ns] sensors contradict others
+        self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
         self._clock = Clock(round(window * 1e9))
         self._start, self._before = dict(start or {}), None
         self._begin(None)
@@ -396,8 +396,6 @@ class LiveEstimator:
             window.spread[:] = 1.0
         if not taken:
             return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
-        if sensor is not None and (self._contradicting or window.contradicts >= 0):
-            self._say_contradiction(stamp, sensor)
         codes = window.outcome.tobytes()
         told = self._answers.get(codes) if not stranger else None
         told = told or self._answer(codes, stranger)
@@ -405,6 +403,10 @@ class LiveEstimator:
             self._commands[told.outcome] += 1
             self._doubtful += self._clock.doubtful and told.outcome is _FUSED
             self._watch_limits()
+        elif window.contradicts >= 0:
+            self._say_contradiction(stamp, sensor)
+        elif sensor in self._contradicting and told.outcome is _FUSED:
+            del self._contradicting[sensor]
         return told
 
     def _watch_limits(self) -> None:
@@ -440,17 +442,15 @@ class LiveEstimator:
     def _say_contradiction(self, stamp: int, sensor: str) -> None:
         """Say which other sensor one contradicts, by how much, and since when."""
         window = self._window
-        if window.contradicts < 0:
-            if window.outcome.min() == _FUSED:
-                self._contradicting.pop(sensor, None)
-            return
         other = tuple(self._sensors)[window.contradicts]
-        since = self._contradicting.setdefault(sensor, stamp)
+        if self._contradicting.get(sensor) == other:
+            return
+        self._contradicting[sensor] = other
         found = zip(self.axes, window.outcome.tolist(), window.innovation.tolist(), strict=True)
         off = ", ".join(f"{axis} by {nu * MM:+.4g} mm" for axis, outcome, nu in found if outcome == Outcome.REJECTED)
         self._log.write(
             f"{sensor} contradicts {other}",
-            f"sensor '{sensor}' contradicts '{other}' since {since / 1e9:.3f} s ({off}): its measurements are rejected",
+            f"sensor '{sensor}' contradicts '{other}' since {stamp / 1e9:.3f} s ({off}): its measurements are rejected",
         )
 
     def _no_axis(self, stranger: str) -> str:
