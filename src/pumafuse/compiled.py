@@ -11,11 +11,15 @@ if TYPE_CHECKING:
     R = TypeVar("R")
 
     def compiled(function: Callable[P, R]) -> Callable[P, R]:
-        """A function compiled to machine code, a part of each that calls it."""
+        """A function compiled to machine code, a part of each kernel that calls it. Not to be called from Python."""
         ...
 
     def compiled_apart(function: Callable[P, R]) -> Callable[P, R]:
-        """A function compiled to machine code once; called from Python or from another one."""
+        """A function compiled to machine code once, for all kernels that call it. Not to be called from Python."""
+        ...
+
+    def kernel(function: Callable[P, R]) -> Callable[P, R]:
+        """A function compiled to machine code that is called from Python."""
         ...
 
 else:
@@ -26,7 +30,9 @@ else:
 
     # Kernels own no arrays, so nothing in them is counted (`_nrt`), and calls within the algebra vanish
     # (`forceinline`): together that is a factor of twenty. What is called less often is compiled apart, once: a copy in
-    # each caller would cost more time than it saves. A division by zero gives an infinity, as in numpy.
+    # each caller would cost more time than it saves. Only kernels can be called from Python (`no_cpython_wrapper`):
+    # to take so many arrays out of Python's objects takes longer to compile than most of them. A division by zero gives
+    # an infinity, as in numpy.
     # A product and a sum stay two roundings: contracted to one, variances of extreme priors fall below 0.
     def _kept() -> bool:
         """Whether there is a place on disk for what is compiled: a service without a home may have none."""
@@ -37,8 +43,10 @@ else:
         return True
 
     _KEPT = _kept()
-    compiled = numba.njit(cache=_KEPT, nogil=True, error_model="numpy", forceinline=True, _nrt=False)
-    compiled_apart = numba.njit(cache=_KEPT, nogil=True, error_model="numpy", _nrt=False)
+    _OPTIONS = {"cache": _KEPT, "nogil": True, "error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
+    compiled = numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)
+    compiled_apart = numba.njit(no_cpython_wrapper=True, **_OPTIONS)
+    kernel = numba.njit(**_OPTIONS)
     _HOW_OFTEN = (
         "only this once (some 20 s)"
         if _KEPT

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from kernels import callable_kernel
 from pumafuse.arrays import FloatArray
+from pumafuse.filter import axis as algebra
+from pumafuse.filter import forward
 from pumafuse.filter.axis import (
     BIASES,
     DRIFT,
@@ -18,19 +21,21 @@ from pumafuse.filter.axis import (
     Sensors,
     State,
     U,
-    apply_command,
-    copy_rows,
-    innovation,
-    noise,
-    position_of,
-    predict,
-    update,
 )
-from pumafuse.filter.forward import checkpoint_of
 from pumafuse.fusion.config import FusionConfig, Process, Sensor
 from pumafuse.fusion.setup import at_rest, filter_model, filter_sensors
 from pumafuse.model.arm import ArmModel, AxisModel, Gain
 from pumafuse.model.plants import FirstOrder, SecondOrder
+
+apply_command = callable_kernel(algebra.apply_command)
+copy_rows = callable_kernel(algebra.copy_rows)
+innovation = callable_kernel(algebra.innovation)
+noise = callable_kernel(algebra.noise)
+position_of = callable_kernel(algebra.position_of)
+predict = callable_kernel(algebra.predict)
+update = callable_kernel(algebra.update)
+checkpoint_of = callable_kernel(forward.checkpoint_of)
+
 
 T, DECAY = 0.028, 1.0 / 0.15
 AXES = ("lag", "turning", "slow")

@@ -13,7 +13,7 @@ import pumafuse as pf
 from pumafuse.arrays import CodeArray, TimeArray
 from pumafuse.filter.axis import Model, Sensors, State
 from pumafuse.filter.events import COMMAND, Events, Results, joined
-from pumafuse.filter.forward import Outputs, filter_as_live, filter_events, no_history
+from pumafuse.filter.forward import Outputs, filter_events, no_history
 from pumafuse.filter.outcome import ABSENT, Outcome
 from pumafuse.fusion.engine import arranged, biased_sensors
 from pumafuse.fusion.segments import Segment, build
@@ -74,7 +74,8 @@ class Pass:
             results.outcome[:] = outcome
         history, arrived = no_history(len(AXES), self.state.x.shape[1]), np.zeros(0, dtype=np.bool_)
         given, known = outcome is not None, (self.model, self.sensors, events, self.state)
-        filter_events(*known, given, times, results, history, arrived, 0, outputs)
+        none = np.zeros(0, dtype=np.int64)
+        filter_events(*known, given, none, none, times, results, history, arrived, 0, outputs)
         self.results.append(results)
         self.outputs.append(outputs)
 
@@ -151,7 +152,7 @@ def test_late_events_end_as_events_in_time(seed: int) -> None:
     arrived, history = np.zeros(count, dtype=np.bool_), no_history(len(AXES), live.state.x.shape[1])
     queue = np.argsort(arrival, kind="stable")
     known = live.model, live.sensors, events, live.state
-    filter_as_live(*known, arrival, queue, times, results, history, arrived, count + 1, outputs)
+    filter_events(*known, False, arrival, queue, times, results, history, arrived, count + 1, outputs)
     live.results.append(results)
     live.outputs.append(Outputs(*(part[:, -1:] for part in outputs)))
     whole.run(events, times[-1:])

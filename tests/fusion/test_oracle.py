@@ -488,7 +488,7 @@ def filtered(model: Model, sensors: Sensors, state: State, events: Events) -> No
     none, results = np.zeros(0, dtype=np.int64), Results.room(len(events.time), 1)
     outputs, arrived = Outputs(*np.empty((len(Outputs._fields), 1, 0))), np.zeros(0, dtype=np.bool_)
     history = no_history(1, state.x.shape[1])
-    filter_events(model, sensors, events, state, False, none, results, history, arrived, 0, outputs)
+    filter_events(model, sensors, events, state, False, none, none, none, results, history, arrived, 0, outputs)
 
 
 @pytest.mark.parametrize("plant", [LAG, UNDER])

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import ALWAYS, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
-from ..compiled import compiled, compiled_apart
+from ..compiled import compiled, kernel
 from .outcome import ABSENT, Outcome
 
 SECONDS = 60  # of the past that a counters tells of
@@ -57,7 +57,7 @@ class Counters(NamedTuple):
         )
 
 
-@compiled_apart
+@kernel
 def count_rows(
     flat: tuple[Any, ...],
     source: IndexArray,

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import NO_STAMP, BoolArray, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
-from ..compiled import compiled
+from ..compiled import compiled, kernel
 from .axis import PERIOD, START, Model, Sensors, State
 from .outcome import ABSENT, FARTHEST, Outcome
 
@@ -152,7 +152,7 @@ def classify(
     return FUSED if possible else INVALID
 
 
-@compiled
+@kernel
 def classify_all(
     model: Model, sensors: Sensors, events: Events, state: State, origin: int, too_late: BoolArray, known: CodeArray
 ) -> None:

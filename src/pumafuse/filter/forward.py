@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import NEVER, BoolArray, FloatArray, IntArray, TimeArray
-from ..compiled import compiled, compiled_apart
+from ..compiled import compiled, compiled_apart, kernel
 from ..model.closed import transition
 from .axis import (
     DRIFT,
@@ -100,40 +100,13 @@ def no_history(axes: int, states: int) -> History:
     return History(first, used, none, none, np.zeros(0), np.zeros(0), table, *estimates)
 
 
-@compiled_apart
+@kernel
 def filter_events(
     model: Model,
     sensors: Sensors,
     events: Events,
     state: State,
     given: bool,
-    times: TimeArray,
-    results: Results,
-    history: History,
-    arrived: BoolArray,
-    places: int,
-    outputs: Outputs,
-) -> None:
-    """Every event in its order, and an estimate at each of ``times`` (ascending) by all events until then.
-
-    With ``given`` the outcomes in ``results`` are repeated, whatever a gate would say now.
-    """
-    done, end = ZERO, len(events.time)
-    for n in range(len(times)):
-        begin = done
-        while done < end and events.time[done] <= times[n]:
-            done += 1
-        run_events(model, sensors, events, state, begin, done, given, results, history, arrived, places)
-        estimate(model, events, state, done, end, times[n], history, outputs, n)
-    run_events(model, sensors, events, state, done, end, given, results, history, arrived, places)
-
-
-@compiled_apart
-def filter_as_live(
-    model: Model,
-    sensors: Sensors,
-    events: Events,
-    state: State,
     arrival: TimeArray,
     queue: IntArray,
     times: TimeArray,
@@ -143,10 +116,22 @@ def filter_as_live(
     places: int,
     outputs: Outputs,
 ) -> None:
-    """At each of ``times`` only the events that had arrived: late ones make the filter go back and run on.
+    """Every event in its order, and an estimate at each of ``times`` (ascending) by the events until then.
 
-    ``queue`` lists the rows by ``arrival``, ``arrived`` (n,) is all false; there are more ``places`` for checkpoints
-    than rows may have to be taken back. Nothing is kept in ``history``.
+    Args:
+        model: The axes.
+        sensors: The sensors.
+        events: In their order.
+        state: Before them; after them in the end.
+        given: Whether the outcomes in ``results`` are repeated, whatever a gate would say now.
+        arrival: When each event arrives, int64 ns, (n,); (0,) where all are there from the beginning.
+        queue: The rows by ``arrival``; (0,) likewise. What comes late makes the filter go back and run on.
+        times: Of the estimates, int64 ns.
+        results: Gets what became of the events.
+        history: Gets what the smoother needs; not where events arrive late.
+        arrived: All false, (n,); (0,) where all are there from the beginning.
+        places: For checkpoints: more than rows may have to be taken back; 0 where none may.
+        outputs: Gets the estimates.
     """
     due, done, end = ZERO, ZERO, len(events.time)
     for n in range(len(times) + 1):
@@ -157,10 +142,10 @@ def filter_as_live(
             begin = min(begin, queue[due])
             due += 1
         if begin < done:
-            copy_rows(state, checkpoint_of(model, begin, places), 0, len(model.order))
+            copy_rows(state, checkpoint_of(model, begin, places), ZERO, len(model.order))
         while done < end and events.time[done] <= until:
             done += 1
-        run_events(model, sensors, events, state, begin, done, NO, results, history, arrived, places)
+        run_events(model, sensors, events, state, begin, done, given, results, history, arrived, places)
         if n < len(times):
             estimate(model, events, state, done, end, times[n], history, outputs, n)
 
@@ -186,7 +171,7 @@ def run_events(
     axes = len(model.order)
     for row in range(begin, end):
         if places > 0:
-            copy_rows(state, 0, checkpoint_of(model, row, places), axes)
+            copy_rows(state, ZERO, checkpoint_of(model, row, places), axes)
             if not arrived[row]:
                 continue
         source = events.source[row]

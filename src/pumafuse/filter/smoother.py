@@ -21,17 +21,20 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ..arrays import FloatArray, TimeArray
-from ..compiled import compiled, compiled_apart
+from ..compiled import compiled, kernel
 from ..model.closed import transition
 from .axis import OFFSET, POSITION, RATE, Model, Sensors, joseph, observation
 from .events import Events, Results
-from .forward import INTERVAL, History, Outputs
+from .forward import INTERVAL, ONE, ZERO, History, Outputs
 
+_POSITION, _RATE, _OFFSET = np.int64(POSITION), np.int64(RATE), np.int64(OFFSET)  # as arguments: see forward.ZERO
 _NOTHING = 1e-15  # of a pivot, below which it is rounding
 
 
-@compiled_apart
+@kernel
 def smooth(
     model: Model,
     sensors: Sensors,
@@ -66,7 +69,7 @@ def smooth(
         entry = history.first[axis] + history.used[axis] - 1
         until = history.time[entry] if entry >= history.first[axis] else origin
         while n >= 0 and times[n] >= until:
-            smoothed_estimate(states, axis, n, history, eta, N, 0, work, factor, outputs)
+            smoothed_estimate(states, axis, n, history, eta, N, ZERO, work, factor, outputs)
             n -= 1
         while entry >= history.first[axis]:
             until = history.time[entry]
@@ -78,10 +81,10 @@ def smooth(
                         eta[1, i] = eta[0, i]
                         for j in range(states):
                             N[1, i, j] = N[0, i, j]
-                    over_interval(model, axis, eta, N, 1, until - times[n], q, d, work)
-                    smoothed_estimate(states, axis, n, history, eta, N, 1, work, factor, outputs)
+                    over_interval(model, axis, eta, N, ONE, until - times[n], q, d, work)
+                    smoothed_estimate(states, axis, n, history, eta, N, ONE, work, factor, outputs)
                     n -= 1
-                over_interval(model, axis, eta, N, 0, until - start, q, d, work)
+                over_interval(model, axis, eta, N, ZERO, until - start, q, d, work)
             else:
                 over_update(model, sensors, events, results, history, axis, entry, eta, N, work)
             entry -= 1
@@ -111,7 +114,7 @@ def over_update(
     for i in range(states):
         for j in range(states):
             N[0, i, j] += work[0, i] * work[0, j] / R
-    through_noise(eta, N, 0, states, OFFSET, math.sqrt(history.drift[entry]), 0.0, work)  # what re-acquiring added
+    through_noise(eta, N, ZERO, states, _OFFSET, math.sqrt(history.drift[entry]), 0.0, work)  # what re-acquiring added
 
 
 @compiled
@@ -123,9 +126,9 @@ def over_interval(
     f11, f12, f21, f22, q11, q12, q22 = transition(model.order[axis], model.constants, axis, dt)
     first = math.sqrt(q * q11)
     both = q * q12 / first if first > 0.0 else 0.0
-    through_noise(eta, N, at, states, POSITION, first, both, work)
-    through_noise(eta, N, at, states, RATE, math.sqrt(max(q * q22 - both * both, 0.0)), 0.0, work)
-    through_noise(eta, N, at, states, OFFSET, math.sqrt(d * dt), 0.0, work)
+    through_noise(eta, N, at, states, _POSITION, first, both, work)
+    through_noise(eta, N, at, states, _RATE, math.sqrt(max(q * q22 - both * both, 0.0)), 0.0, work)
+    through_noise(eta, N, at, states, _OFFSET, math.sqrt(d * dt), 0.0, work)
     a, b = eta[at, 0], eta[at, 1]
     eta[at, 0], eta[at, 1] = f11 * a + f21 * b, f12 * a + f22 * b
     a, b, c = N[at, 0, 0], N[at, 0, 1], N[at, 1, 1]

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ..arrays import ALWAYS, NEVER, BoolArray, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
-from ..compiled import compiled, compiled_apart
+from ..compiled import compiled, compiled_apart, kernel
 from .axis import PERIOD, START, STEP, Model, Sensors, State, U, copy_rows
 from .counters import Counters, count_duplicate, count_rows, forget_after
 from .events import COMMAND, DUPLICATE, FUSED, Events, Results, classify, said_before
@@ -89,7 +89,7 @@ def opened(flat: Flat) -> Memory:
     )
 
 
-@compiled_apart
+@kernel
 def add_measurement(flat: Flat, stamp: int, sensor: int, given: int, horizon: int) -> int:
     """Take in the measurement in ``incoming.values``, of the axes that are bits of ``given``.
 
@@ -119,7 +119,7 @@ def add_measurement(flat: Flat, stamp: int, sensor: int, given: int, horizon: in
     return ADDED
 
 
-@compiled_apart
+@kernel
 def add_command(flat: Flat, stamp: int, given: int, horizon: int) -> int:
     """Take in the command in ``incoming.values``, of the axes that are bits of ``given``: an event for each delay."""
     m = opened(flat)
@@ -157,7 +157,7 @@ def add_command(flat: Flat, stamp: int, given: int, horizon: int) -> int:
     return ADDED
 
 
-@compiled_apart
+@kernel
 def estimate_at(flat: Flat, outputs: tuple[FloatArray, ...], time: int) -> None:
     """Every axis at ``time`` [ns] by all measurements valid until then, into ``outputs``; nothing changes."""
     m = opened(flat)
@@ -311,7 +311,7 @@ def begin(m: Memory, axis: int, stamp: int) -> None:
         reclassify(m, other, span[BEGIN], np.int64(NEVER))
 
 
-@compiled_apart
+@kernel
 def last_commands(
     source: IndexArray, stamps: TimeArray, known: CodeArray, first: int, end: int, axis: int, stamp: int
 ) -> tuple[int, int]:
@@ -426,12 +426,12 @@ class Window:
         rows = self.memory.events.rows(slice(begin_row, end_row))
         rows = Events(*(part.copy() for part in rows))
         if begin_row < span[DONE]:
-            here = checkpoint_of(self.memory.model, begin_row, len(self.memory.events.time))
+            here = axes + 2 + axes * begin_row
             for part in state[:-1]:
                 part[:axes] = part[here : here + axes]
         span[[END, DONE, RUN]] = begin_row
         span[ORIGIN] = NEVER if span[ORIGIN] > after else span[ORIGIN]
-        rest = checkpoint_of(self.memory.model, len(self.memory.events.time) + 1, len(self.memory.events.time) + 2)
+        rest = len(state.clock) - axes
         for axis in np.flatnonzero((times[:, FIRST] > after) & (times[:, FIRST] < NEVER)).tolist():
             times[axis, FIRST] = NEVER  # it had only just begun
             for part in state[:-1]:

@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import CodeArray, TimeArray
 from ..filter.axis import BIASES, Model, Sensors, State
 from ..filter.events import COMMAND, Events, Results
-from ..filter.forward import History, Outputs, filter_as_live, filter_events, no_history
+from ..filter.forward import History, Outputs, filter_events, no_history
 from ..filter.outcome import Outcome
 from ..filter.smoother import smooth
 from .config import FusionConfig
@@ -59,24 +59,25 @@ def filter_segment(
     """
     events, _ = segment.events(config)
     biases, axes, count = biased_sensors(segment, config), len(segment.axes), len(events.time)
-    arrival = np.where(events.source == COMMAND, events.stamp, np.maximum(events.stamp, events.time))
-    places = _most_taken_back(events.time, arrival, times) + 1 if mode == "as-live" else 0
+    arrival, queue, places = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), 0
+    if mode == "as-live":
+        arrival = np.where(events.source == COMMAND, events.stamp, np.maximum(events.stamp, events.time))
+        queue = np.argsort(arrival, kind="stable")
+        places = _most_taken_back(events.time, arrival, times) + 1
     model, sensors, state = arranged(segment, config, biases, places)
-    width, arrived = state.x.shape[1], np.zeros(count, dtype=np.bool_)
+    width, arrived = state.x.shape[1], np.zeros(len(queue), dtype=np.bool_)
     history = _history(events, state, len(times)) if mode == "smoothed" else no_history(axes, width)
     results = Results.room(count, axes)
     results.outcome[:] = events.known
     outputs = Outputs(*np.empty((len(Outputs._fields), axes, len(times))))
+    known = model, sensors, events, state
     if engine == "filterpy":
         from ..filter import filterpy_engine
 
         plants = [config.arm.axes[axis] for axis in segment.axes]
-        filterpy_engine.filter_events(plants, model, sensors, events, state, times, results, outputs, progress)
-    elif mode == "as-live":
-        queue = np.argsort(arrival, kind="stable")
-        filter_as_live(model, sensors, events, state, arrival, queue, times, results, history, arrived, places, outputs)
+        filterpy_engine.filter_events(plants, *known, times, results, outputs, progress)
     else:
-        filter_events(model, sensors, events, state, False, times, results, history, arrived, places, outputs)
+        filter_events(*known, False, arrival, queue, times, results, history, arrived, places, outputs)
     if mode == "smoothed":
         room = np.empty((2, width)), np.empty((2, width, width)), np.empty((4, width)), np.empty((width + 1, width))
         smooth(model, sensors, events, results, history, segment.origin, times, room, outputs)
@@ -104,7 +105,7 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
         results.outcome[measured] = outcome[place[measured]]
     none, outputs = np.empty(0, dtype=np.int64), Outputs(*np.empty((len(Outputs._fields), axes, 0)))
     given, history, arrived = outcome is not None, no_history(axes, state.x.shape[1]), np.zeros(0, dtype=np.bool_)
-    filter_events(model, sensors, events, state, given, none, results, history, arrived, 0, outputs)
+    filter_events(model, sensors, events, state, given, none, none, none, results, history, arrived, 0, outputs)
     found = Results.room(len(measured), axes)
     for part, whole in zip(found, results, strict=True):
         part[place[measured]] = whole[measured]

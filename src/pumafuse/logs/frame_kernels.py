@@ -9,12 +9,12 @@ import math
 import numpy as np
 
 from ..arrays import FloatArray
-from ..compiled import compiled
+from ..compiled import kernel
 
 _TURN = 2.0 * math.pi
 
 
-@compiled
+@kernel
 def to_cylinder(
     x: FloatArray,
     y: FloatArray,
@@ -49,7 +49,7 @@ def to_cylinder(
         tangential[n], radial[n], spread[n] = sign * radius * turn, r, radius / r
 
 
-@compiled
+@kernel
 def from_cylinder(
     tangential: FloatArray,
     radial: FloatArray,

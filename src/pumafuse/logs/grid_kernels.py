@@ -7,14 +7,14 @@ from __future__ import annotations
 import math
 
 from ..arrays import CodeArray, FloatArray, IntArray
-from ..compiled import compiled
+from ..compiled import kernel
 
 MOST_LATE = 9  # a stamp's ticks are sought from this many before it ...
 CHOICES = MOST_LATE + 3  # ... to two after it
 _LATE, _LATE_COST, _LATER_COST = math.sqrt(0.5), 0.5, 0.01
 
 
-@compiled
+@kernel
 def cheapest_ticks(place: FloatArray, first: IntArray, best: FloatArray, choice: CodeArray, ticks: IntArray) -> bool:
     """Fill in the strictly ascending ticks of least total cost; False if there are too few ticks about the stamps.
 

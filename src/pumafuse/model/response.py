@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import FloatArray, TimeArray
-from ..compiled import compiled_apart
+from ..compiled import kernel
 from .arm import AxisModel
 from .closed import constants, decaying_response, gain_error, transition
 from .plants import FirstOrder
@@ -50,7 +50,7 @@ def response(
     return found
 
 
-@compiled_apart
+@kernel
 def _respond(
     order: int,
     constants: FloatArray,
