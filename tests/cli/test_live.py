@@ -17,7 +17,7 @@ from rich.console import Console
 
 import pumafuse as pf
 from executable import EXECUTABLE, pumafuse
-from pumafuse.cli.live_status import status
+from pumafuse.cli.live import status
 from streams import Both, events_of, line
 
 pytestmark = pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")

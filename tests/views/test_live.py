@@ -19,8 +19,7 @@ import pumafuse as pf
 from pumafuse.live.wire import Event
 from pumafuse.views import live as live_view
 from pumafuse.views import live_drawer
-from pumafuse.views.live import LiveView
-from pumafuse.views.live_frames import Frame, SensorHead
+from pumafuse.views.live import Frame, LiveView, SensorHead
 from pumafuse.views.live_viewer import _program
 
 AXES = ("tangential", "radial", "vertical")

@@ -21,7 +21,7 @@ from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.intervals import Profile, profiles
 from pumafuse.tuning.maximise import maximise
 from pumafuse.views import colours as style
-from pumafuse.views import tuning_figures
+from pumafuse.views import tuning_report
 from pumafuse.views.tuning_report import page
 from tuning_runs import fitted, quietly
 
@@ -178,7 +178,7 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 def test_panels_show_profile_interval_and_the_number_before(figures: list[Figure]) -> None:
     """A panel for each: a curve through the profile, the interval shaded, a tick at what it was or an arrow to it."""
     found, _ = tuned()
-    tuning_figures.profiles(list(drawn(found).values()), fitted(found))
+    tuning_report.profile_figure(list(drawn(found).values()), fitted(found))
     panels = {axes.get_title(loc="left").replace("\n", "."): axes for axes in figures[0].axes if axes.get_visible()}
     assert panels.keys() == fitted(found).keys()
     for key, axes in panels.items():
@@ -199,7 +199,7 @@ def test_innovations_are_shown_before_and_after_on_one_scale(figures: list[Figur
     """Those that were fused, over their standard deviations; and the autocorrelations of both."""
     found, run = tuned()
     pair = [pf.fuse(run, config) for config in (found.before, found.config)]
-    tuning_figures.innovations(*pair, "camera", "tip")
+    tuning_report.innovation_figure(*pair, "camera", "tip")
     *series, correlation = figures[0].axes
     for axes, est in zip(series, pair, strict=True):
         fused = est.measurements.where(est.measurements.outcome == Outcome.FUSED)

@@ -14,24 +14,30 @@ from dataclasses import dataclass
 from functools import partial
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import msgspec
-from rich.console import Console
+from rich import box
+from rich.console import Console, Group
 from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
 
 from ..errors import ConfigError, RunError
+from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
 from ..live import network
 from ..live.address import LISTENERS, NETWORK, Address
 from ..live.estimator import LiveEstimator
 from ..live.network import UdpSender
 from ..live.record import Recorder
+from ..live.results import Health
 from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream
 from ..live.wire import Event
 from ..logs.run import Run
-from .live_status import Part, status, summarise
+from ..units import MM, MS
 
 if TYPE_CHECKING:
     from ..views.live import LiveView
@@ -203,3 +209,73 @@ def _caught_signals() -> Generator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+class Part(Protocol):
+    """Part beside a stream: the source, the recorder, the sender of estimates."""
+
+    def summary(self) -> str:
+        """What there was, in a sentence; empty for nothing."""
+        ...
+
+
+def status(stream: Stream, parts: Sequence[Part] = ()) -> Group:
+    """One screen: the position of each axis, and how each sensor does."""
+    live, health = stream.live, stream.live.health()
+    estimate = live.estimate()
+    axes = Table(box=box.SIMPLE_HEAD)
+    for heading in ("axis", "position, mm", "± sd, mm", "velocity, mm/s", ""):
+        axes.add_column(heading, justify="left" if heading in ("axis", "") else "right")
+    for name, axis in estimate.axes.items():
+        axes.add_row(
+            escape(name),
+            f"{axis.position * MM:.3f}",
+            f"{axis.position_sd * MM:.3f}",
+            f"{axis.velocity * MM:.1f}",
+            "[red]stale[/red]" if name in estimate.stale else "",
+        )
+    now = "no event yet" if live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
+    return Group(Text(now), axes, _sensor_table(health), *map(Text, _sentences(stream, health, parts)))
+
+
+def summarise(stream: Stream, parts: Sequence[Part], errors: Console) -> None:
+    """Print the counts of a stream and of the parts beside it, and how each sensor did."""
+    health = stream.live.health()
+    for sentence in _sentences(stream, health, parts):
+        errors.print(sentence, markup=False, soft_wrap=True)
+    if any(sensor.rows for sensor in health.sensors.values()):
+        errors.print(_sensor_table(health))
+
+
+def _sensor_table(health: Health) -> Table:
+    """Rate, lateness, dropouts and NIS of each sensor, and its components by outcome."""
+    caption = "outcomes count components: each axis of a row by itself"
+    table = Table(box=box.SIMPLE_HEAD, caption=caption, caption_justify="left")
+    words = [one.word for one in Outcome if any(sensor.outcomes[one.word] for sensor in health.sensors.values())]
+    table.add_column("sensor")
+    for heading in ("rows", "rate, Hz", "late, ms", "at most", "dropouts", "NIS", "silent, s", *words):
+        table.add_column(heading, justify="right")
+    for name, sensor in health.sensors.items():
+        silent = "no row yet" if sensor.silent is None else f"{sensor.silent:.1f}"
+        table.add_row(
+            escape(name),
+            str(sensor.rows),
+            f"{sensor.rate:.1f}",
+            f"{sensor.lateness * MS:.1f}",
+            f"{sensor.lateness_max * MS:.1f}",
+            str(sensor.dropouts),
+            "" if sensor.nis is None else f"{sensor.nis:.2f}",
+            f"[red]{silent}[/red]" if sensor.stale else silent,
+            *(str(sensor.outcomes[word]) for word in words),
+        )
+    return table
+
+
+def _sentences(stream: Stream, health: Health, parts: Sequence[Part]) -> list[str]:
+    """The counts of lines, commands, estimates and restarts; then the summary of each part beside the stream."""
+    commands = [f"{count} {word}" for word, count in health.commands.items() if count]
+    counts = [f"{stream.lines} lines, {stream.bad} of them bad"] if stream.lines else []
+    counts += [f"commands: {', '.join(commands) or 'none'}", f"{stream.estimates} estimates"]
+    counts += [f"{health.unknown} rows of unknown sensors"] if health.unknown else []
+    counts += [f"{health.segments} segments"] if health.segments > 1 else []
+    return ["; ".join(counts), *filter(None, (part.summary() for part in parts))]

@@ -344,9 +344,9 @@ def demo(
     force: Force = False,
 ) -> None:
     """Fuse a recorded run that comes with pumafuse, score it against its reference, and draw it."""
-    from . import demo as command
+    from . import fuse as command
 
-    command.run(output, force)
+    command.demo(output, force)
 
 
 def main() -> None:

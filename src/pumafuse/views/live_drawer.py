@@ -24,7 +24,7 @@ import rerun.blueprint as rrb
 from ..arrays import FloatArray
 from ..units import MM
 from . import colours, styles
-from .live_frames import Frame, Header, SensorHead, bodies
+from .live import Frame, Header, SensorHead, bodies
 from .live_viewer import Viewer
 
 _WAITING = 20  # frames

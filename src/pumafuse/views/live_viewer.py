@@ -20,7 +20,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import quote
 
-from .live_frames import Header
+from .live import Header
 
 HOST = "127.0.0.1"
 _VIEWER_MEMORY = "1GiB"
