@@ -1,4 +1,4 @@
-"""How kernels are compiled: by numba, kept on disk, without fast-math, and with a word to who waits the first time."""
+"""How kernels are compiled: by numba, kept on disk, without fast-math, and announced to who waits the first time."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ else:
     class _Announcer(event.Listener):
         """Says once in a process that kernels are compiled; those found on disk are no event."""
 
-        said = False
+        announced = False
 
         def on_start(self, event: event.Event) -> None:
             ours = event.data["dispatcher"].py_func.__module__.startswith(__package__)
-            if ours and not self.said:
-                self.said = True
+            if ours and not self.announced:
+                self.announced = True
                 print(f"compiling the filter for this machine, {_HOW_OFTEN} ...", file=sys.stderr, flush=True)
 
         def on_end(self, event: event.Event) -> None:

@@ -12,7 +12,7 @@ from ..arrays import ALWAYS, CodeArray, FloatArray, IndexArray, IntArray, TimeAr
 from ..compiled import compiled, kernel
 from .outcome import ABSENT, Outcome
 
-SECONDS = 60  # of the past that a counters tells of
+SECONDS = 60  # of the past that are counted
 ROWS, LATENESS, MOST_LATE, NIS, SCALARS = range(5)  # of each of them
 CAME, DROPOUTS, INTERVALS, IN_A_ROW = 8, 9, 10, 11  # of a sensor, after the outcomes
 
@@ -27,7 +27,7 @@ class Counters(NamedTuple):
 
     Attributes:
         number: Of components that have left the window by their outcome, rows that ``CAME``, ``DROPOUTS``: intervals
-            over one and a half times the usual one, of how many ``INTERVALS`` that was learnt, and dropouts
+            over one and a half times the usual one, of how many ``INTERVALS`` the usual one is a mean, and dropouts
             ``IN_A_ROW``, (S, 12).
         last: Latest stamp, int64 ns, ``ALWAYS`` without one, (S,).
         left: Stamp of the latest row that has left the window, int64 ns, ``ALWAYS`` without one, (S,).

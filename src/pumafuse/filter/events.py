@@ -160,7 +160,7 @@ def classify_all(
     first, end = np.int64(0), len(events.time)
     for row in range(end):
         whole = TOO_LATE if too_late[row] else FUSED
-        if events.source[row] != COMMAND and said_before(events, row, first):
+        if events.source[row] != COMMAND and repeats_earlier(events, row, first):
             whole = DUPLICATE
         for axis in range(known.shape[1]):
             known[row, axis] = classify(model, sensors, events, state, origin, row, axis, first, end, whole)
@@ -197,7 +197,7 @@ def gives_command(events: Events, row: int, axis: int) -> bool:
 
 
 @compiled
-def said_before(events: Events, row: int, begin: int) -> bool:
+def repeats_earlier(events: Events, row: int, begin: int) -> bool:
     """Whether an earlier row of the same source has the same stamp and the same values."""
     for before in range(row - 1, begin - 1, -1):
         if events.time[before] < events.time[row]:

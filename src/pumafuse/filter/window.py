@@ -19,7 +19,7 @@ from ..arrays import ALWAYS, NEVER, BoolArray, CodeArray, FloatArray, IndexArray
 from ..compiled import compiled, compiled_apart, kernel
 from .axis import PERIOD, START, STEP, Model, Sensors, State, U, copy_rows
 from .counters import Counters, count_duplicate, count_rows, forget_after
-from .events import COMMAND, DUPLICATE, FUSED, Events, Results, classify, said_before
+from .events import COMMAND, DUPLICATE, FUSED, Events, Results, classify, repeats_earlier
 from .forward import NO, ONE, ZERO, History, Outputs, checkpoint_of, estimate, run_events
 from .gate import FUSED_AT
 from .outcome import ABSENT, Outcome
@@ -102,7 +102,7 @@ def add_measurement(flat: Flat, stamp: int, sensor: int, given: int, horizon: in
         return NO_ROOM
     at = insert(m, stamp - incoming.latency[sensor], sensor, stamp, given)
     span[CONTRADICTS] = -1
-    duplicate = said_before(events, at, span[BEGIN])
+    duplicate = repeats_earlier(events, at, span[BEGIN])
     whole = DUPLICATE if duplicate else FUSED
     for axis in range(len(incoming.outcome)):
         incoming.outcome[axis] = events.known[at, axis] = classified(m, at, axis, whole)
@@ -140,7 +140,7 @@ def add_command(flat: Flat, stamp: int, given: int, horizon: int) -> int:
         left &= ~together
         time = stamp + incoming.times[axis, DELAY]
         at = insert(m, time, COMMAND, stamp, together)
-        duplicate = said_before(events, at, span[BEGIN])
+        duplicate = repeats_earlier(events, at, span[BEGIN])
         if duplicate:
             remove(events, span, at)
         for other in range(axis, axes):

@@ -89,7 +89,7 @@ def filter_segment(
 
 
 def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | None = None) -> Results:
-    """What each measurement tells the filter, without any estimate; by the segment's ``measurement_rows``.
+    """Innovations and outcomes of a segment, without any estimate; by its ``measurement_rows``.
 
     Args:
         segment: The events.

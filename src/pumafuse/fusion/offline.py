@@ -71,14 +71,14 @@ def fuse(
     mode: Mode = "smoothed" if smooth else "as-live" if as_live else "filtered"
     chosen = None if sensors is None else tuple(sensors)
     in_place, placed = in_axes(run, config.frame)
-    logged, said = segments(in_place)
+    logged, jumps = segments(in_place)
     parts: list[Estimates] = []
     for number, part in enumerate(logged):
         built = build(part, config, chosen)
         times = output_times(built, config, rate)
         share = None if progress is None else _share(progress, number, len(logged))
         parts.append(_fuse_segment(part, placed, built, times, config, mode, engine, share))
-    joined = _joined(parts, said)
+    joined = _joined(parts, jumps)
     excess = config.arm.validity.excess(joined.speed, joined.radius)
     joined = replace(
         joined, notes=(*joined.notes, *_reference_notes(joined, logged), *excess, *sensor_problems(joined))
@@ -197,7 +197,7 @@ def _measurements(segment: Segment, filtered: Filtered) -> Measurements:
     )
 
 
-def _joined(parts: Sequence[Estimates], said: Sequence[str]) -> Estimates:
+def _joined(parts: Sequence[Estimates], jumps: Sequence[str]) -> Estimates:
     """Segments one after the other, all in seconds since the run's first command."""
     first = parts[0]
     if len(parts) == 1:
@@ -232,5 +232,5 @@ def _joined(parts: Sequence[Estimates], said: Sequence[str]) -> Estimates:
         segment=np.concatenate([np.full(len(part.time), number) for part, _, number in numbers]),
         speed=max(part.speed for part in parts),
         radius=max((part.radius for part in parts if part.radius is not None), default=None),
-        notes=(*(note for part in parts for note in part.notes), *said),
+        notes=(*(note for part in parts for note in part.notes), *jumps),
     )

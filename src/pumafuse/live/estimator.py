@@ -27,7 +27,7 @@ from .frame_start import FrameStart
 from .rate_limit import RateLimitedLog
 from .results import AxisNow, Health, LiveEstimate, UpdateResult, health_of, no_estimate, update_result
 
-_MOST_AXES = 62  # what an event gives is told to a kernel as bits
+_MOST_AXES = 62  # a kernel takes the axes of an event as bits
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
 
@@ -81,14 +81,14 @@ class LiveEstimator:
         on_notice: Callable[[str], None] = lambda _: None,
         event_log: EventLog | None = None,
     ) -> None:
-        """Nothing heard yet.
+        """Make an estimator without any event.
 
         Args:
             config: Arm, noise, sensors, and the frame for sources in x, y, z.
             window: How late an event may be [s].
             stale_after: For how long [s] an axis may go without a fused measurement until it is called stale.
             start: Level [m] of axes that do not rest at their first command before it; x and y with a frame.
-            on_notice: Is told in one sentence what a user should know: a clock set anew, and the like; of what happens
+            on_notice: Is result in one sentence what a user should know: a clock set anew, and the like; of what happens
                 again and again the first time, the tenth, the hundredth …
             event_log: Receives the events that are accepted.
 
@@ -134,7 +134,7 @@ class LiveEstimator:
         other._window.warm_up()
 
     def command(self, t: Time, /, **axes: float) -> UpdateResult:
-        """The arm is told to go to a position [m] on each of ``axes``.
+        """Add a command: the arm is to go to a position [m] on each of ``axes``.
 
         Args:
             t: When, float seconds or int nanoseconds.
@@ -143,7 +143,7 @@ class LiveEstimator:
         return self._take(t, None, axes)
 
     def measurement(self, t: Time, sensor: str, /, **axes: float) -> UpdateResult:
-        """A sensor says where the tool was.
+        """Add a measurement of where the tool was.
 
         Args:
             t: Its stamp, float seconds or int nanoseconds; its latency is in the configuration.
@@ -270,7 +270,7 @@ class LiveEstimator:
         newest, command = clock.newest, sensor is None
         if newest is None or (self._window.origin is None and (command or stamp > newest)):
             if newest is not None and command:
-                self._begin(self._window.counters())  # the commands' clock counts: what was heard before is of another
+                self._begin(self._window.counters())  # the commands' clock counts: what came before is of another
                 if self._event_log is not None:
                     self._event_log.begin_segment()
             clock.start(stamp)
@@ -361,11 +361,11 @@ class LiveEstimator:
         """Feed an event, and keep it for when the frame's place changes."""
         assert self._early is not None
         before = self._refusals
-        told = self._feed(*event)
+        result = self._feed(*event)
         if len(self._early) >= _MOST_ASIDE:
             del self._early[: _MOST_ASIDE // 2]
-        self._early.append((event, told.outcome, self._refusals > before))
-        return told
+        self._early.append((event, result.outcome, self._refusals > before))
+        return result
 
     def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
         """Give an event that is in time to the window."""
@@ -386,7 +386,7 @@ class LiveEstimator:
             return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
         if not given:
             missing = not stranger and len(values) > 0
-            why = "no command has said yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
+            why = "no command has placed x and y in the arm's axes yet" if missing else self._no_axis(stranger)
             return self._refuse(sensor, values, Outcome.BEFORE_START if missing else _UNKNOWN, why)
         if sensor is None:
             taken = window.add_command(stamp, given, oldest)
@@ -397,17 +397,17 @@ class LiveEstimator:
         if not taken:
             return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
         codes = window.outcome.tobytes()
-        told = self._answers.get(codes) if not stranger else None
-        told = told or self._answer(codes, stranger)
+        result = self._answers.get(codes) if not stranger else None
+        result = result or self._answer(codes, stranger)
         if sensor is None:
-            self._commands[told.outcome] += 1
-            self._doubtful += self._clock.doubtful and told.outcome is _FUSED
+            self._commands[result.outcome] += 1
+            self._doubtful += self._clock.doubtful and result.outcome is _FUSED
             self._watch_limits()
         elif window.contradicts >= 0:
             self._say_contradiction(stamp, sensor)
-        elif sensor in self._contradicting and told.outcome is _FUSED:
+        elif sensor in self._contradicting and result.outcome is _FUSED:
             del self._contradicting[sensor]
-        return told
+        return result
 
     def _watch_limits(self) -> None:
         """Say when a command leaves what the arm model is valid for."""
@@ -460,13 +460,13 @@ class LiveEstimator:
         return f"unknown axis '{stranger:.40}'; {suggestion(stranger, self.axes)}" if stranger else "gives no axis"
 
     def _answer(self, codes: bytes, stranger: str) -> UpdateResult:
-        """What is told of an event by the codes of its axes; the same for all alike, but for strangers."""
+        """The result of an event by the codes of its axes; the same object for equal codes, but for unknown names."""
         outcomes = {axis: Outcome(code) for axis, code in zip(self.axes, codes, strict=True) if code != ABSENT}
-        told = update_result(outcomes)
+        result = update_result(outcomes)
         if stranger:
             axes = MappingProxyType({**outcomes, stranger: _UNKNOWN})
-            return told._replace(axes=axes, reason=f"{told.reason}; {self._no_axis(stranger)}")
-        return self._answers.setdefault(codes, told)
+            return result._replace(axes=axes, reason=f"{result.reason}; {self._no_axis(stranger)}")
+        return self._answers.setdefault(codes, result)
 
     def _refuse(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str) -> UpdateResult:
         """Count an event that never comes into the window."""

@@ -2,7 +2,7 @@
 
 Gates make the likelihood jump: from a poor start good measurements are rejected, from a generous one outliers are
 explained by noise. So some starts have gates three times as wide, others the configuration's own; at first each
-component is gated for itself, whole rows are rejected only at the end.
+component is rejected for itself, whole rows are rejected only at the end.
 """
 
 from __future__ import annotations
@@ -121,10 +121,10 @@ def _noise(likelihood: Likelihood, config: FusionConfig, free: Sequence[Paramete
         return config
     peaks: list[Point] = []
     for times in (_WIDER, 1.0):
-        gated = with_gates(config, times)
+        one_by_one = with_gates(config, times)
         starts = [
-            point(likelihood, _with_noise(gated, process, sds, noise), noise)
-            for process in (gated.process, *_processes(likelihood, gated))
+            point(likelihood, _with_noise(one_by_one, process, sds, noise), noise)
+            for process in (one_by_one.process, *_processes(likelihood, one_by_one))
             for sds in ({}, likelihood.scatter)
         ]
         start = _best_by_axis(likelihood, starts)

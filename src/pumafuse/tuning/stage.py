@@ -152,14 +152,14 @@ def reset_stage(stage: Stage, config: FusionConfig) -> Stage:
 
 def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float | None = None) -> Likelihood:
     """The likelihood of the runs; where latencies vary, without what one could put before the first command."""
-    gated = {
+    sensors = {
         name: sensor if sensor.gate >= _NARROWEST else msgspec.structs.replace(sensor, gate=_GATE)
         for name, sensor in config.sensors.items()
     }
     latest = None
     if "latency" in plan.fit:
         latest = LATENCIES[1] + max((sensor.latency for sensor in config.sensors.values()), default=0.0)
-    return Likelihood(runs, msgspec.structs.replace(config, sensors=gated), plan.sensors, until=until, latest=latest)
+    return Likelihood(runs, msgspec.structs.replace(config, sensors=sensors), plan.sensors, until=until, latest=latest)
 
 
 def _free(
