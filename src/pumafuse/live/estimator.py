@@ -88,8 +88,8 @@ class LiveEstimator:
             window: How late an event may be [s].
             stale_after: For how long [s] an axis may go without a fused measurement until it is called stale.
             start: Level [m] of axes that do not rest at their first command before it; x and y with a frame.
-            on_notice: Is result in one sentence what a user should know: a clock set anew, and the like; of what happens
-                again and again the first time, the tenth, the hundredth …
+            on_notice: Called with a sentence that a user should know: a clock set anew, and the like. Of what happens
+                again and again it gets the first, the tenth, the hundredth …
             event_log: Receives the events that are accepted.
 
         Raises:
