@@ -7,7 +7,7 @@ Delays and latencies only say when events are, so another configuration's times 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -56,6 +56,9 @@ class Segment:
     command_rows: Events
     measurement_rows: Events
     notes: tuple[str, ...]
+    _latest: dict[tuple[int, ...], tuple[Events, IntArray]] = field(
+        default_factory=dict[tuple[int, ...], tuple[Events, IntArray]], init=False, repr=False, compare=False
+    )
 
     def events(self, config: FusionConfig) -> tuple[Events, IntArray]:
         """The events in their total order, by the delays and latencies of ``config``.
@@ -63,9 +66,19 @@ class Segment:
         Returns:
             The events; and of each measurement, in this order, its place among ``measurement_rows``, −1 for a command.
         """
-        parts = delayed(self.command_rows, [round(config.arm.delay_of(axis) * 1e9) for axis in self.axes])
+        delay, latency = [round(config.arm.delay_of(axis) * 1e9) for axis in self.axes], self._latency(config)
+        times = (*delay, *latency.tolist())  # a search asks for many configurations of the same times
+        found = self._latest.get(times)
+        if found is None:
+            found = self._ordered(delay, latency)
+            self._latest.clear()
+            self._latest[times] = found
+        return found
+
+    def _ordered(self, delay: list[int], latency: IntArray) -> tuple[Events, IntArray]:
+        parts = delayed(self.command_rows, delay)
         commands = sum(len(part.time) for part in parts)
-        unordered = joined([*parts, self._measured(config)])
+        unordered = joined([*parts, self._measured(latency)])
         order = np.argsort(unordered.time, kind="stable")  # each source is in its order: commands, then the sensors'
         return unordered.rows(order), np.where(order < commands, -1, order - commands)
 
@@ -102,14 +115,18 @@ class Segment:
 
         Measurements an hour after the last command are on another clock.
         """
-        rows = self._measured(config)
+        rows = self._measured(self._latency(config))
         valid = rows.time[(rows.known == Outcome.FUSED).any(axis=1)]
         return int(valid[valid <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
 
-    def _measured(self, config: FusionConfig) -> Events:
-        rows = self.measurement_rows
+    def _latency(self, config: FusionConfig) -> IntArray:
+        """Of each sensor, int ns."""
         latency = [config.sensors[name].latency if name in config.sensors else 0.0 for name in self.sensors]
-        return rows._replace(time=_valid(rows.stamp, np.rint(np.array(latency) * 1e9).astype(np.int64)[rows.source]))
+        return np.rint(np.array(latency) * 1e9).astype(np.int64)
+
+    def _measured(self, latency: IntArray) -> Events:
+        rows = self.measurement_rows
+        return rows._replace(time=_valid(rows.stamp, latency[rows.source]))
 
 
 def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) -> Segment:
