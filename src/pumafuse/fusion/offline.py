@@ -181,17 +181,18 @@ def _contradictions(segment: Segment, filtered: Filtered) -> list[str]:
 def _measurements(segment: Segment, filtered: Filtered) -> Measurements:
     """Every component of every measurement in the order of the filter."""
     events, results = filtered.events, filtered.results
-    given = (events.source != COMMAND)[:, None] & (events.known != ABSENT)
-    row, axis = np.nonzero(given)
+    given = np.flatnonzero((events.source != COMMAND)[:, None] & (events.known != ABSENT))
+    row = given // len(segment.axes)
+    axis = given - row * len(segment.axes)
     return Measurements(
         time=seconds(events.time, segment.origin)[row],
         stamp=seconds(events.stamp, segment.origin)[row],
         sensor=events.source[row],
         axis=axis.astype(np.int16),
-        value=events.value[given],
-        innovation=results.innovation[given],
-        innovation_sd=results.innovation_sd[given],
-        outcome=results.outcome[given],
+        value=events.value.take(given),
+        innovation=results.innovation.take(given),
+        innovation_sd=results.innovation_sd.take(given),
+        outcome=results.outcome.take(given),
         sensors=segment.sensors,
         axes=segment.axes,
     )
