@@ -30,11 +30,12 @@ def code(notebook: nbformat.NotebookNode) -> list[Any]:
 def texts(cell: Any) -> list[tuple[str, str]]:
     """What a cell says; a stream comes in as many pieces as the kernel happened to send."""
     said: list[tuple[str, str]] = []
-    for output in cell.outputs:
-        if output.output_type == "stream":
-            said += [(output.name, line) for line in output.text.splitlines() if not line.startswith(ANNOUNCED)]
+    for kind, outputs in itertools.groupby(cell.outputs, lambda one: one.get("name", one.output_type)):
+        if kind in ("stdout", "stderr"):
+            lines = "".join(output.text for output in outputs).splitlines()
+            said += [(kind, line) for line in lines if not line.startswith(ANNOUNCED)]
         else:
-            said.append((output.output_type, output.data["text/plain"]))
+            said += [(kind, output.data["text/plain"]) for output in outputs]
     return said
 
 

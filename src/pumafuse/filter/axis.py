@@ -214,6 +214,10 @@ def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> N
         for j in range(i + 1):
             left = P[at, i, j] - work[3, i] * work[1, j] + P[at, j, i] - work[3, j] * work[1, i]
             P[at, i, j] = P[at, j, i] = 0.5 * left + work[1, i] * R * work[1, j]
+    for i in range(states):  # rounding beside a prior 1e16 times as wide: known, as far as doubles go
+        if P[at, i, i] < 0.0:
+            for j in range(states):
+                P[at, i, j] = P[at, j, i] = 0.0
 
 
 @compiled
