@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import enum
 
-import numpy as np
-
-from ..arrays import BoolArray, FloatArray
-
 FARTHEST = 1e6  # m; what is farther is a sentinel, no position
 ABSENT = 255  # in an array of outcomes: the row gives no value for this axis
 
@@ -28,8 +24,3 @@ class Outcome(enum.IntEnum):
     def word(self) -> str:
         """As files and screens have it."""
         return self.name.lower()
-
-
-def plausible(value: FloatArray) -> BoolArray:
-    """Finite and no sentinel such as 3.4e38: within a thousand kilometres."""
-    return np.abs(value) < FARTHEST

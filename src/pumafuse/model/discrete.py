@@ -92,11 +92,6 @@ class DiscreteModel:
         """Eigenvalues of F, (m,)."""
         return np.linalg.eigvals(self.F).astype(np.complex128)
 
-    @property
-    def split(self) -> tuple[int, float]:
-        """The delay in whole ticks, and the rest of it [s]."""
-        return split_delay(self.delay, self.period)
-
     def step_response(self, ticks: int) -> FloatArray:
         """Position [m] at ticks 0 … ticks − 1 after v stepped to 1 m at tick 0, (ticks,)."""
         x = np.zeros((len(self.F), 1))
