@@ -386,7 +386,7 @@ class LiveEstimator:
             return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
         if not given:
             missing = not stranger and len(values) > 0
-            why = "no command has placed x and y in the arm's axes yet" if missing else self._no_axis(stranger)
+            why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
             return self._refuse(sensor, values, Outcome.BEFORE_START if missing else _UNKNOWN, why)
         if sensor is None:
             taken = window.add_command(stamp, given, oldest)
