@@ -301,3 +301,13 @@ assert live.newest is not None
 assert all(len(getattr(window, name).signatures) == 1 for name in called)
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=100)
+
+
+def test_a_first_command_that_is_no_position_is_invalid() -> None:
+    """An arm with limits, and nothing commanded yet: the command is refused, the stream goes on."""
+    live = pf.LiveEstimator(pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal")))
+    assert live.config.arm.validity.max_speed is not None
+    assert live.command(0, radial=1e300).outcome is pf.Outcome.INVALID
+    assert live.command(1, radial=float("nan")).outcome is pf.Outcome.INVALID
+    assert live.command(28_000_000, radial=0.5).outcome is pf.Outcome.FUSED
+    assert live.estimate(28_000_000)["radial"].position == 0.5

@@ -415,6 +415,8 @@ class LiveEstimator:
         if validity.max_speed is None and validity.max_radius is None:
             return
         latest = {axis: found for axis in self.axes if (found := self._window.command_at(self._bits[axis])) is not None}
+        if not latest:
+            return
         stamp = max(stamp for stamp, _, _ in latest.values())
         speed = max(abs(step) for _, _, step in latest.values()) / self.config.arm.update_period
         radius = latest["radial"][1] if isinstance(self.config.frame, Cylindrical) and "radial" in latest else None
