@@ -48,9 +48,9 @@ else:
     compiled_apart = numba.njit(no_cpython_wrapper=True, **_OPTIONS)
     kernel = numba.njit(**_OPTIONS)
     _HOW_OFTEN = (
-        "only this once (some 20 s)"
+        "only this once (some 10 s)"
         if _KEPT
-        else "at each start (some 20 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
+        else "at each start (some 10 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
     )
 
     class _Announcer(event.Listener):

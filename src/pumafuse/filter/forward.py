@@ -15,22 +15,21 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import NEVER, BoolArray, FloatArray, IntArray, TimeArray
-from ..compiled import compiled, compiled_apart, kernel
-from ..model.closed import transition
+from ..compiled import compiled, kernel
 from .axis import (
     DRIFT,
     NOISE,
     OFFSET,
     PERIOD,
-    POSITION,
-    RATE,
     Model,
     Sensors,
     State,
     apply_command,
+    clone_position,
     copy_estimate,
     copy_rows,
     innovation,
+    motion_since_clone,
     noise,
     position_of,
     predict,
@@ -150,7 +149,7 @@ def filter_events(
             estimate(model, events, state, done, end, times[n], history, outputs, n)
 
 
-@compiled_apart
+@compiled
 def run_events(
     model: Model,
     sensors: Sensors,
@@ -292,7 +291,7 @@ def write_history(
         history.used[axis] += 1
 
 
-@compiled_apart
+@compiled
 def estimate(
     model: Model,
     events: Events,
@@ -317,7 +316,7 @@ def estimate(
         outputs: Gets the estimates.
         n: Their place.
     """
-    here, there = len(model.order), len(model.order) + 1  # rows of the state for predictions aside
+    here = len(model.order)  # a row of the state for predictions aside
     for axis in range(len(model.order)):
         copy_estimate(state, axis, here)
         follow_commands(model, events, state, axis, here, pending, end, state.clock[axis] - 1, time, time)
@@ -332,20 +331,12 @@ def estimate(
                     history.P[axis, n, i, j] = state.P[here, i, j]
             outputs.velocity[axis, n] = outputs.velocity_sd[axis, n] = math.nan
             continue
-        # (p(t + T) − p(t)) / T: what the state contributes, and the noise that comes until then (from P = 0)
         period = model.gain[axis, PERIOD]
-        copy_estimate(state, here, there)
-        for i in range(model.states[axis]):
-            for j in range(model.states[axis]):
-                state.P[there, i, j] = 0.0
+        clone_position(model, state, axis, here)
         until = time + int(np.rint(period * 1e9))
-        follow_commands(model, events, state, axis, there, pending, end, time, until, time)
-        later, noise = position_of(state, there)
-        f11, f12, _, _, _, _, _ = transition(model.order[axis], model.constants, axis, (until - time) / 1e9)
-        a, b, P = f11 - 1.0, f12, state.P
-        own = a * a * P[here, POSITION, POSITION] + 2.0 * a * b * P[here, POSITION, RATE] + b * b * P[here, RATE, RATE]
-        outputs.velocity[axis, n] = (later - position) / period
-        outputs.velocity_sd[axis, n] = math.sqrt(max(own, 0.0) + noise) / period
+        follow_commands(model, events, state, axis, here, pending, end, time, until, time)
+        motion, variance = motion_since_clone(state, here)
+        outputs.velocity[axis, n], outputs.velocity_sd[axis, n] = motion / period, math.sqrt(variance) / period
 
 
 @compiled
@@ -376,4 +367,4 @@ def follow_commands(
 def checkpoint_of(model: Model, row: int, places: int) -> int:
     """The first row of the state where it is kept as it was before an event ``row``, in a ring of places."""
     axes = len(model.order)
-    return axes + 2 + axes * (row % places)
+    return axes + 1 + axes * (row % places)

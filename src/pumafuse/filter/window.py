@@ -196,7 +196,7 @@ def go_back(m: Memory, row: int) -> None:
         m.incoming.span[DONE] = row
 
 
-@compiled
+@compiled_apart
 def catch_up(m: Memory) -> None:
     """Bring the state to where it is to be."""
     span, places = m.incoming.span, len(m.events.time)
@@ -426,7 +426,7 @@ class Window:
         rows = self.memory.events.rows(slice(begin_row, end_row))
         rows = Events(*(part.copy() for part in rows))
         if begin_row < span[DONE]:
-            here = axes + 2 + axes * begin_row
+            here = axes + 1 + axes * begin_row
             for part in state[:-1]:
                 part[:axes] = part[here : here + axes]
         span[[END, DONE, RUN]] = begin_row
@@ -510,7 +510,7 @@ def with_rows(memory: Memory, rows: int) -> Memory:
         return found
 
     def of_state(part: np.ndarray) -> np.ndarray:
-        now, end = axes + 2, axes * 2
+        now, end = axes + 1, axes * 2
         found = np.zeros((now + axes * (rows + 2), *part.shape[1:]), dtype=part.dtype)
         found[:now], found[-end:] = part[:now], part[now + axes * held :]
         found[now : now + axes * used] = part[now + axes * first : now + axes * (first + used)]
