@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import RunError
 from pumafuse.logs.clock import segments, stray_offsets, without_strays
-from pumafuse.logs.run import Reference, Run, Source
+from pumafuse.logs.run import Run, Source
 from refusals import one_line
 
 SECOND = 1_000_000_000
@@ -37,8 +37,7 @@ def recorded(
     run = Run("run", source(command, "host.csv"), streams, start={"radial": 0.5}, notes=("torn",))
     if reference_stamp is None:
         return run
-    reference = source(reference_stamp, "truth.csv")
-    return replace(run, reference=Reference(reference.stamp, reference.values, reference.label, sd=1e-3))
+    return replace(run, reference=replace(source(reference_stamp, "truth.csv"), sd=1e-3))
 
 
 def rows(piece: Source | None) -> list[int]:

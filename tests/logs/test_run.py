@@ -13,7 +13,7 @@ import pytest
 
 from pumafuse.arrays import NO_STAMP
 from pumafuse.errors import ConfigError, PumafuseError, RunError, UnknownNameError
-from pumafuse.logs.run import Reference, Run, Source
+from pumafuse.logs.run import Run, Source
 from refusals import one_line
 
 HOST = "t_ms,nominal_mm,correction_um,z_m,note\n0,560,500,0.1,a\n28,561,-500,0.2,b\n"
@@ -84,7 +84,7 @@ def test_a_manifest_says_where_everything_stands(folder: Path) -> None:
     assert run.axes == ("radial", "vertical")
     check_source(run.command, [0, 28_000_000], radial=[0.5605, 0.5605], vertical=[0.1, 0.2])
     check_source(run.sensors["tracker"], [5_000_000, 15_000_000], radial=[0.5695, np.nan], vertical=[np.nan, -0.093])
-    assert isinstance(run.reference, Reference)
+    assert run.reference is not None
     check_source(run.reference, [0, 100_000_000], radial=[0.56025, 0.56125])
     assert run.reference.sd == 2e-5
     assert (run.start, run.clock, run.notes) == ({}, "stamps", ())
@@ -118,7 +118,7 @@ MANIFEST_REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "command is a number": ("command = 3", ("run.toml", "command", "table")),
     "command without file": ('[command]\ntime = "t_ms"\nradial = "z_m"', ("run.toml", "'command.file'")),
     "file is absent": (COMMAND.replace("host", "absent"), ("absent.csv", "no such file")),
-    "file with a null character": (COMMAND.replace("host.csv", "a\\u0000b"), ("no such file",)),
+    "file with a null character": (COMMAND.replace("host.csv", "a\\u0000b"), ("NUL",)),
     "time is absent": (COMMAND.replace("t_ms", "t_s"), ("host.csv", "'t_s'", "did you mean 't_ms'", COLUMNS)),
     "time is a length": (COMMAND.replace("t_ms", "z_m"), ("host.csv", "'z_m'", "_s, _ms, _us, _ns")),
     "column is a number": (COMMAND.replace('"z_m"', "3"), ("run.toml", "command.vertical", "column")),
@@ -159,7 +159,7 @@ def test_a_manifest_that_is_no_text_is_refused(folder: Path) -> None:
 
 def test_a_path_without_a_run_is_refused(tmp_path: Path) -> None:
     """An absent file, and a folder without run.toml, are refused with what to do."""
-    for name in ("absent", "absent.toml", "null\0character", "null\0character.csv"):
+    for name in ("absent", "absent.toml", "absent.csv"):
         assert "no such file" in refusal(lambda name=name: Run.read(tmp_path / name))
     text = refusal(lambda: Run.read(tmp_path), RunError)
     assert str(tmp_path) in text
