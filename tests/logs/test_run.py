@@ -161,9 +161,7 @@ def test_a_path_without_a_run_is_refused(tmp_path: Path) -> None:
     """An absent file, and a folder without run.toml, are refused with what to do."""
     for name in ("absent", "absent.toml", "absent.csv"):
         assert "no such file" in refusal(lambda name=name: Run.read(tmp_path / name))
-    text = refusal(lambda: Run.read(tmp_path), RunError)
-    assert str(tmp_path) in text
-    assert "run.toml" in text
+    assert "run.toml: no such file" in refusal(lambda: Run.read(tmp_path))
 
 
 def test_a_single_table_holds_every_source(tmp_path: Path) -> None:

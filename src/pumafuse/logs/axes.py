@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray
 from ..errors import RunError
-from .clock import TOLERATED_STEP_BACK_NS, behind, without_strays
+from .clock import segments, without_strays
 from .frames import CARTESIAN, Frame, Placed, Rotated
 from .run import Run, Source
 
@@ -43,23 +43,22 @@ def in_axes(run: Run, frame: Frame | None) -> tuple[Run, Placed | None]:
 
 
 def _placed(run: Run, frame: Frame) -> Placed:
-    where, command = f"run '{run.name}'", run.command
+    where = f"run '{run.name}'"
     if isinstance(frame, Rotated):
         return placed_at(frame, 0.0, 0.0, where)
     if "x" in run.start and "y" in run.start:
         return placed_at(frame, run.start["x"], run.start["y"], where)
-    if "x" not in command.values or "y" not in command.values:
+    if "x" not in run.command.values or "y" not in run.command.values:
         raise RunError(
             f"{where}: a cylindrical frame takes its radius and angle from the start level; give the commands, or"
             " start, in x and y"
         )
+    command = segments(run)[0][0].command
     x, y = command.values["x"], command.values["y"]
     usable = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & (command.stamp != NO_STAMP))
     if not len(usable):
         raise RunError(f"{command.label}: no command has both x and y")
-    jumps = np.flatnonzero(behind(command.stamp) > TOLERATED_STEP_BACK_NS)
-    segment = usable[usable < jumps[0]] if len(jumps) and usable[0] < jumps[0] else usable
-    first = segment[np.argmin(command.stamp[segment])]
+    first = usable[np.argmin(command.stamp[usable])]
     return placed_at(frame, float(x[first]), float(y[first]), where)
 
 

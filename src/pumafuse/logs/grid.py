@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import cast
 
 import numpy as np
 
@@ -64,7 +64,7 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
         raise _refusal(fault, stamp, period, label)
     note = None
     if len(stamp) >= _BLOCK:
-        fit: Any = np.polyfit(ticks, since, 1, cov=True)
+        fit = cast(tuple[FloatArray, FloatArray], np.polyfit(ticks, since, 1, cov=True))
         slope, error = float(fit[0][0]), math.sqrt(fit[1][0, 0])
         drift = slope / tick - 1.0
         if abs(slope - tick) > max(5.0 * error, 1.0 / np.ptp(ticks)):

@@ -135,11 +135,7 @@ class Run:
         path = Path(path)
         if os.path.isdir(path):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
             path = path / "run.toml"
-            if not path.exists():
-                raise RunError(f"{path.parent}: a folder without run.toml; write one, or give a single table")
-        if path.suffix == ".toml":
-            return _read_manifest(path)
-        return _read_single(path)
+        return _read_manifest(path) if path.suffix == ".toml" else _read_single(path)
 
     @staticmethod
     def from_arrays(

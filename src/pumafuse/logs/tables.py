@@ -52,7 +52,7 @@ class Table:
         """
         exponent = self._exponent(name, units.LENGTHS, "_mm")
         values, note = self.plain(name)
-        return (values / 10.0**-exponent if exponent < 0 else values), note  # a quotient is rounded once
+        return values / 10.0**-exponent, note  # a quotient is rounded once
 
     def plain(self, name: str) -> tuple[FloatArray, str | None]:
         """A column of numbers without conversion, with NaN and note as in :meth:`numbers`.
