@@ -159,17 +159,6 @@ def test_stray_stamps_are_taken_for_none_and_noted() -> None:
     assert run.command.stamp.tolist() == stamp
 
 
-def test_a_stray_command_cuts_nothing_and_a_clock_set_back_still_does() -> None:
-    """A run is cut where its clock was set back, not where a stamp of either part is stray."""
-    first, second = [100, 101, 900, 102, 103], [10, 11, -900, 12, 13]
-    stamp = [time * SECOND for time in (*first, *second)]
-    parts, notes = segments(recorded(stamp, {"tracker": [time * SECOND for time in (100, 101, 10, 11)]}))
-    assert [rows(part.command) for part in parts] == [[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]]
-    assert [part.command.stamp[2] for part in parts] == [NO_STAMP, NO_STAMP]
-    assert len(notes) == 1
-    assert "by 93.000 s in row 6" in notes[0]
-
-
 @pytest.mark.parametrize(
     ("command", "tracker"), [([0, TICK, 3600 * SECOND], [5, 4, 3]), ([0, TICK], [9 * SECOND, 0, SECOND])]
 )

@@ -63,18 +63,6 @@ def test_one_or_two_stamps_are_a_grid(stamp: list[int], wanted: list[int]) -> No
     assert got.tolist() == wanted
 
 
-@pytest.mark.parametrize("first", [2000, 10, 3997])
-def test_a_late_stamp_moves_no_other_command(first: int) -> None:
-    """One stamp more than half a tick late, the next one less: every command is on its own tick."""
-    true = grid_of(np.arange(4000))
-    stamp = true.copy()
-    stamp[first] += 15_000_000
-    stamp[first + 1] += 3_000_000
-    got, note = regular_grid(stamp, PERIOD, "host")
-    assert note == "host: 1 commands are stamped more than half a period late: set back to their ticks"
-    np.testing.assert_allclose(got - true, 0, atol=1)
-
-
 @pytest.mark.parametrize("ppm", [50.0, -50.0])
 def test_a_pause_does_not_hide_the_drift(ppm: float) -> None:
     """50 ppm through a pause of 10 minutes are one tick: the grid is on the true ticks after it."""
