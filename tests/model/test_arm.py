@@ -41,7 +41,6 @@ date = 2024-05-01
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
 positive = st.floats(min_value=0.0, exclude_min=True, allow_nan=False, allow_infinity=False)
-not_negative = st.just(0.0) | positive
 interval = st.none() | st.tuples(finite, finite)
 word = st.text(max_size=8)
 
