@@ -92,10 +92,8 @@ def _tagged(kind: Any) -> dict[str, type[msgspec.Struct]]:
 
 
 def _words(kind: Any) -> tuple[str, ...]:
-    """The values that a Literal, alone or in a union without plain text, accepts."""
-    parts = (kind,) if get_origin(kind) is Literal else get_args(kind)
-    words = [word for part in parts if get_origin(part) is Literal for word in get_args(part)]
-    return () if str in parts else tuple(words)
+    """The values that a Literal, alone or in a union, accepts."""
+    return tuple(word for part in (kind, *get_args(kind)) if get_origin(part) is Literal for word in get_args(part))
 
 
 def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:

@@ -153,14 +153,13 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
 
 def _jumps(source: Source) -> list[int]:
     """Rows at which the clock was set back by more than 1 s."""
-    stamped = np.flatnonzero(source.stamp != NO_STAMP)
-    stamp, found, first = source.stamp[stamped], list[int](), 0
+    found: list[int] = []
     while True:
-        back = np.flatnonzero(behind(stamp[first:]) > TOLERATED_STEP_BACK_NS)
+        first = found[-1] if found else 0
+        back = np.flatnonzero(behind(source.stamp[first:]) > TOLERATED_STEP_BACK_NS)
         if not len(back):
             return found
-        first += int(back[0])
-        found.append(int(stamped[first]))
+        found.append(first + int(back[0]))
         if len(found) > _MOST_JUMPS:
             raise RunError(
                 f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock"

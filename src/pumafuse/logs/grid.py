@@ -62,7 +62,7 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
         shared = int(np.sum(np.diff(np.rint(place)) <= 0))
         fault = f"{shared} of {len(stamp)} are stamped nearest to the tick of the one before"
         raise _refusal(fault, stamp, period, label)
-    note = None
+    notes: list[str] = []
     if len(stamp) >= _BLOCK:
         fit = cast(tuple[FloatArray, FloatArray], np.polyfit(ticks, since, 1, cov=True))
         slope, error = float(fit[0][0]), math.sqrt(fit[1][0, 0])
@@ -71,7 +71,7 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
             if abs(drift) > _MOST_DRIFT:
                 raise _refusal(f"on the nearest ticks they are {slope / 1e6:.4f} ms a tick", stamp, period, label)
             tick = slope
-            note = f"{label}: the log's clock runs {drift * 1e6:+.1f} ppm against the controller's; the grid follows it"
+            notes.append(f"the log's clock runs {drift * 1e6:+.1f} ppm against the controller's; the grid follows it")
     residual = since - ticks * tick
     offset = float(np.median(residual))
     off = (residual - offset) / tick
@@ -81,8 +81,8 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
         raise _refusal(fault, stamp, period, label)
     if late or early:
         how = "late: set back to their ticks" if not early else f"off their ticks, {early} of them early: put on them"
-        moved = f"{label}: {late + early} commands are stamped more than half a period {how}"
-        note = moved if note is None else f"{note}; {moved}"
+        notes.append(f"{late + early} commands are stamped more than half a period {how}")
+    note = f"{label}: {'; '.join(notes)}" if notes else None
     return stamp[0] + np.rint(ticks * tick + offset).astype(np.int64), note
 
 

@@ -107,7 +107,7 @@ class Table:
     def _cast(self, name: str, column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
         try:
             return column.cast(kind)
-        except pa.ArrowInvalid as error:
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
             raise RunError(f"{self.path}: column '{name}': {str(error).splitlines()[0]}") from None
 
     def _exponent(self, name: str, accepted: tuple[str, ...], example: str) -> int:
