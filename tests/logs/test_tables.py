@@ -146,21 +146,18 @@ def test_a_cell_beyond_the_first_block_may_be_of_another_kind(
 
 
 @pytest.mark.parametrize(
-    ("body", "kept", "words"),
+    ("body", "kept", "said"),
     [
-        ("0,1,2\n1,2,3\n2,3", [0, 1], ("1 line", "2 cells", "has 3", "line 4")),  # torn in the middle of the last line
-        ("0,1,2\n1\n2,3,4\n3\n", [0, 2], ("2 lines", "1 cells", "has 3", "line 3")),
-        ("0,1,2\n1,2,3,4\n2,3,4\n", [0, 2], ("1 line", "4 cells", "has 3", "line 3")),
+        ("0,1,2\n1,2,3\n2,3", [0, 1], "1 line left out: 2 cells where the header has 3, first in line 4"),
+        ("0,1,2\n1\n2,3,4\n3\n", [0, 2], "2 lines left out: 1 cells where the header has 3, first in line 3"),
+        ("0,1,2\n1,2,3,4\n2,3,4\n", [0, 2], "1 line left out: 4 cells where the header has 3, first in line 3"),
     ],
 )
-def test_a_torn_line_is_left_out_and_noted(tmp_path: Path, body: str, kept: list[int], words: tuple[str, ...]) -> None:
+def test_a_torn_line_is_left_out_and_noted(tmp_path: Path, body: str, kept: list[int], said: str) -> None:
     """A line of another length than the header is left out; one note has how many and where the first is."""
     table = csv(tmp_path, f"t_s,x_mm,y_mm\n{body}")
     assert table.stamps("t_s")[0].tolist() == [10**9 * second for second in kept]
-    assert table.rows == len(kept)
-    (note,) = table.notes
-    for part in words:
-        assert part in note
+    assert table.notes == (f"log.csv: {said}",)
 
 
 @pytest.mark.parametrize(
@@ -295,7 +292,6 @@ def test_a_column_of_another_kind_is_refused(tmp_path: Path, cell: str) -> None:
         ["1e300"],
         ["2200-01-01T00:00:00"],
         ["1800-01-01T00:00:00"],
-        ["9999-01-01T00:00:00"],
     ],
 )
 def test_stamps_too_far_from_1970_are_refused_in_one_line(tmp_path: Path, cells: list[str]) -> None:
