@@ -7,7 +7,7 @@ they are. Each measurement gets its outcome when the run is fused.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -228,15 +228,7 @@ def _read_manifest(path: Path) -> Run:
         return table
 
     def source(entry: manifest.SourceEntry) -> Source:
-        table = table_of(entry.file)
-        stamp, note = table.stamps(entry.time)
-        values, found = dict[str, FloatArray](), [note]
-        for axis, columns in entry.axes.items():
-            parts = [table.numbers(column) for column in columns]
-            values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
-            found.extend(note for _, note in parts)
-        notes.extend(note for note in found if note is not None and note not in notes)
-        return Source(stamp, values, entry.file)
+        return _source(table_of(entry.file), entry.time, entry.axes, entry.file, notes)
 
     command = source(listed.command)
     sensors = {name: source(entry) for name, entry in listed.sensors.items()}
@@ -253,24 +245,33 @@ def _read_single(path: Path) -> Run:
     clocks = [name for name in table.columns if name.startswith("time_")]
     if len(clocks) != 1:
         raise RunError(f"{path}: a single table needs one time column, 'time_s'; it has: {listed}")
-    stamp, note = table.stamps(clocks[0])
-    groups, found = dict[str, dict[str, FloatArray]](), [*table.notes, note]
+    groups: dict[str, dict[str, list[str]]] = {}
     for column in table.columns:
         source, dot, rest = column.partition(".")
         if dot:
-            values, note = table.numbers(column)
-            axis = rest[: rest.rindex("_")]
+            axis = rest.rpartition("_")[0]
             if axis in groups.setdefault(source, {}):
                 raise RunError(f"{path}: two columns for {source}.{axis}; give one")
-            groups[source][axis] = values
-            found.append(note)
-    if left := [column for column in table.columns if "." not in column and column != clocks[0]]:
-        found.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
+            groups[source][axis] = [column]
     if "command" not in groups:
         raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {listed}")
-    sources: dict[str, Source] = {}
-    for name, group in groups.items():
-        sources[name] = Source(stamp, group, name).rows(np.any(~np.isnan(list(group.values())), axis=0))
+    notes, sources = list(table.notes), dict[str, Source]()
+    for name, axes in groups.items():
+        source = _source(table, clocks[0], axes, name, notes)
+        sources[name] = source.rows(np.any(~np.isnan(list(source.values.values())), axis=0))
+    if left := [column for column in table.columns if "." not in column and column != clocks[0]]:
+        notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
     command, reference = sources.pop("command"), sources.pop("reference", None)
-    notes = tuple(note for note in found if note is not None)
-    return Run(path.name.split(".")[0], command, sources, reference, notes=notes)
+    return Run(path.name.split(".")[0], command, sources, reference, notes=tuple(notes))
+
+
+def _source(table: tables.Table, time: str, axes: Mapping[str, Sequence[str]], label: str, notes: list[str]) -> Source:
+    """A source from its columns, those of an axis added up; new notes on them are appended."""
+    stamp, note = table.stamps(time)
+    values, found = dict[str, FloatArray](), [note]
+    for axis, columns in axes.items():
+        parts = [table.numbers(column) for column in columns]
+        values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
+        found.extend(note for _, note in parts)
+    notes.extend(note for note in found if note is not None and note not in notes)
+    return Source(stamp, values, label)
