@@ -183,6 +183,7 @@ def test_nothing_jumps_where_one_form_takes_over_from_another(zeta: float, turn:
     middle = turn / fastest(omega, zeta)
     below, above = (found(omega, zeta, middle * (1.0 + by)) for by in (-1e-15, 1e-15))
     check(below, above, 4e-15, 1e-13)
+    check(below, wanted(omega, zeta, middle * (1.0 - 1e-15)), 2e-15, 1e-13)
 
 
 def test_nothing_happens_in_no_time() -> None:
