@@ -228,21 +228,21 @@ def test_a_result_that_cannot_be_swapped_in_leaves_the_old_one(tmp_path: Path, m
     """If the last rename fails, what stood there before stands there still."""
     from pumafuse import folders
 
-    new, old = tmp_path / "new", tmp_path / "result"
-    for folder in (new, old):
-        folder.mkdir()
-        (folder / "summary.json").write_text(folder.name)
+    folder = tmp_path / "result"
+    folder.mkdir()
+    (folder / "summary.json").write_text("old")
     rename = Path.replace
 
     def broken(self: Path, target: Path) -> Path:
-        if self == new:
-            raise OSError("disk gone")
+        if self.name == "new":
+            raise OSError(5, "disk gone")
         return rename(self, target)
 
     monkeypatch.setattr(Path, "replace", broken)
-    with pytest.raises(OSError, match="disk gone"):
-        folders._swap(new, old, tmp_path / "aside")
-    assert (old / "summary.json").read_text() == "result"
+    with pytest.raises(folders.FolderError, match="disk gone"), folders.replacing(folder) as new:
+        (new / "summary.json").write_text("new")
+    assert (folder / "summary.json").read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["result"]
 
 
 def test_folders_of_runs_that_share_a_name_do_not_meet(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
-from ..logs.run import Reference
+from ..logs.run import Source
 from ..units import seconds
 
 
@@ -30,12 +30,12 @@ class ReferenceTrack:
     segment: IntArray
 
 
-def late_rows(reference: Reference) -> BoolArray:
+def late_rows(reference: Source) -> BoolArray:
     """Rows stamped more than 1 s behind an earlier one; they are not used, (rows,)."""
     return behind(reference.stamp) > TOLERATED_STEP_BACK_NS
 
 
-def reference_track(reference: Reference, origin: int) -> ReferenceTrack:
+def reference_track(reference: Source, origin: int) -> ReferenceTrack:
     """A run's reference in order, in seconds since ``origin`` (int ns), without rows behind a jump back."""
     kept = reference.rows((reference.stamp != NO_STAMP) & ~late_rows(reference))
     order = np.argsort(kept.stamp, kind="stable")

@@ -8,7 +8,6 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -19,7 +18,7 @@ from ..errors import ConfigError
 from ..fusion.config import ARM_FILE, FusionConfig, Process
 from ..logs import save
 from ..logs.frames import Cylindrical, Placed
-from ..logs.run import Reference, Run, Source
+from ..logs.run import Run, Source
 from ..model.arm import ordered_axes
 from ..units import MM
 from . import campaign, sensing
@@ -27,8 +26,6 @@ from .grid import POINTS, grid
 from .motion import simulate_axis
 from .scenario import Scenario
 from .trajectory import PathFromFile
-
-SourceT = TypeVar("SourceT", bound=Source)
 
 SCENARIO = "scenario.toml"
 MANIFEST = "run.toml"
@@ -108,7 +105,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
         name=f"{scenario.name}, seed {seed}",
         command=_rounded(Source(stamp, _logged(scenario, commands), "command")),
         sensors=sensors,
-        reference=_rounded(Reference(rows, reference, "reference", sd=scenario.reference.sd)),
+        reference=_rounded(Source(rows, reference, "reference", sd=scenario.reference.sd)),
         start={axis: float(_nanometres(level)[0]) for axis, level in start.items()},
         clock=scenario.command.clock,
         frame=scenario.frame,
@@ -199,5 +196,5 @@ def _nanometres(value: FloatArray) -> FloatArray:
     return np.round(value * MM, 6) / MM
 
 
-def _rounded(source: SourceT) -> SourceT:
+def _rounded(source: Source) -> Source:
     return replace(source, values={axis: _nanometres(value) for axis, value in source.values.items()})
