@@ -168,7 +168,7 @@ def test_jobs_are_done_and_reported_in_the_order_given(capsys: pytest.CaptureFix
     assert list(failed) == ["bad", "worse"]
     assert failed["bad"] == "not so"
     assert failed["worse"] == "unexpected ValueError: several lines of it"
-    with pytest.raises(many.SomeFailedError, match="2 of 8 runs failed"):
+    with pytest.raises(pf.PumafuseError, match="2 of 8 runs failed"):
         many.report_failures(failed, 8, "here")
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 2 and lines[0] == "pumafuse: bad: not so"
