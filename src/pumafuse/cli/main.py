@@ -122,7 +122,7 @@ def plan(
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the sequences go.")],
     axes: Annotated[str | None, Option(metavar="A,B", help="Default: the arm's, or the paper's three.")] = None,
     speeds: Annotated[
-        str, Option(metavar="M_S,...", help="A step is its speed times the period.")
+        str, Option(metavar="M_S,...", help="Speeds of the steps; a step is its speed times the period.")
     ] = "0.071,0.14,0.28,0.68",
     positions: Annotated[Path | None, Option(metavar="TABLE", help="Where to step, a position a row.")] = None,
     replicates: Annotated[int, Option(metavar="N", min=1, help="How often each combination is tried.")] = 2,
@@ -140,22 +140,10 @@ def plan(
     from . import plan as command
 
     _check_positive(period=period, hold=hold, rest=rest, noise_duration=noise_duration, max_speed=max_speed)
-    command.run(
-        output,
-        axes=_names(axes, "--axes"),
-        period=period and _si(period),
-        positions=positions,
-        arm=arm,
-        max_speed=max_speed,
-        force=force,
-        speeds=_numbers(speeds, "--speeds"),
-        replicates=replicates,
-        hold=hold,
-        rest=rest,
-        amplitudes=tuple(map(_si, _numbers(noise, "--noise"))),
-        noise_duration=noise_duration,
-        seed=seed,
-    )
+    steps = {"speeds": _numbers(speeds, "--speeds"), "replicates": replicates, "hold": hold, "rest": rest, "seed": seed}
+    white = {"amplitudes": tuple(map(_si, _numbers(noise, "--noise"))), "noise_duration": noise_duration}
+    named, period_s = _names(axes, "--axes"), period and _si(period)
+    command.run(output, named, period_s, positions, arm, max_speed, force, **steps, **white)
 
 
 @app.command()
@@ -163,7 +151,9 @@ def identify(
     trials: Annotated[Path, Argument(metavar="TRIALS", help="Folder with trials.csv and samples.csv.")],
     output: Annotated[Path, Option("--output", "-o", metavar="ARM.TOML", help="Where the model goes.")],
     period: Annotated[float | None, Option(metavar="MS", help="Update period; default: step over speed.")] = None,
-    samples: Annotated[int | None, Option(metavar="N", min=8, help="Use only N samples from each step on.")] = None,
+    samples: Annotated[
+        int | None, Option(metavar="N", min=8, help="Samples used from each step; default: all.")
+    ] = None,
     paper: Annotated[bool, Option("--paper", help="Read delay and gain off each trial, as published.")] = False,
     tolerance: Annotated[float, Option(metavar="MM", help="RMS beyond which the model is not called valid.")] = 1.0,
     report: Report = None,
@@ -183,7 +173,7 @@ def verify(
     arm: Annotated[str, Option("--arm", metavar="ARM", help="An arm.toml, or the name of a preset.")],
     sensors: Annotated[str | None, Option(metavar="A,B", help="Default: the reference, else every sensor.")] = None,
     start: Annotated[
-        list[str] | None, Option(metavar="AXIS=MM", help="Start level; default: the run's, or by RMS.")
+        list[str] | None, Option(metavar="AXIS=MM", help="Start level; default: the run's, else chosen by RMS.")
     ] = None,
     report: Report = None,
     json: Json = False,
@@ -203,7 +193,7 @@ def tune(
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the tuned files go.")],
     fit: Annotated[str, Option(metavar="A,B", help="What to fit: noise, delay, plant, gain, latency.")] = "noise",
     fix: Annotated[
-        list[str] | None, Option(metavar="KEY", help="Do not fit this: a name, or part of one; repeatable.")
+        list[str] | None, Option(metavar="KEY", help="Leave as it is: a name or part, as sensors.tracker; repeatable.")
     ] = None,
     trust: Annotated[str | None, Option(metavar="SENSOR", help="Fit the arm on this accurate sensor first.")] = None,
     validate: Annotated[Path | None, Option(metavar="RUN", help="Default: a single run's last third.")] = None,
