@@ -25,7 +25,7 @@ _SCORE: Columns = {
     "95 %\ncoverage": ("coverage", ".1%", 1.0),
     "NEES": ("nees_mean", ".2f", 1.0),
     "scored": ("rows", ".0f", 1.0),
-    "left out": ("left_out", ".0f", 1.0),
+    "left\nout": ("left_out", ".0f", 1.0),
     "velocity\nRMSE, mm/s": ("velocity_rmse_mm_s", ".3f", 1.0),
     "velocity\n95 % cov.": ("velocity_coverage", ".1%", 1.0),
 }
