@@ -39,6 +39,17 @@ def events_of(run: pf.Run) -> list[Event]:
     return sorted(found, key=lambda event: (event.stamp, event.sensor == ""))
 
 
+def wired(run: pf.Run, seconds: float) -> list[bytes]:
+    """A run's first seconds on the wire."""
+    found = []
+    for event in events_of(run):
+        if event.stamp < seconds * 1e9:
+            values = {axis: value * 1e3 for axis, value in event.values.items()}
+            body = {"sensor": event.sensor, **values} if event.sensor else {"command": values}
+            found.append(json.dumps({"t_ns": event.stamp, **body}).encode())
+    return found
+
+
 def delayed(events: Sequence[Event], longest: float, seed: int, *, twice: float = 0.0) -> list[Event]:
     """The events as they arrive, each up to ``longest`` s late; a share of them comes ``twice``."""
     rng = np.random.default_rng(seed)
