@@ -127,7 +127,7 @@ def test_fit_each_finds_a_minimum_of_each_row(order: int, plant: tuple[float, fl
     trials = campaign(plant, noise, 3)
     batch = Batch.of(trials, WEIGHTS)
     start = shapes(plant) * np.array([0.95, 1.3, 1.2 if order == 2 else 0.0])
-    found = batch.fit_each(start, order)
+    found = batch.fit(start, order)
     np.testing.assert_allclose(found.cost, batch.point(found.shape).cost, rtol=1e-12)
     for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
         delay, q, p = found.shape[row]
@@ -150,7 +150,7 @@ def test_second_order_of_a_first_order_arm_stops_at_its_bound() -> None:
     bounded = 0
     for seed in range(8):
         batch = Batch.of(campaign(FIRST, 0.01, seed), WEIGHTS)
-        one, two = (batch.fit_shared(*plant, DELAYS, order) for order, plant in ((1, FIRST), (2, (0.04, 1e-4))))
+        one, two = (batch.fit(shapes(plant), order, together=True) for order, plant in ((1, FIRST), (2, (0.04, 1e-4))))
         assert two.cost.sum() <= one.cost.sum() * (1.0 + 1e-9)
         if two.shape[0, 2] == 0.0:
             bounded += 1
@@ -170,9 +170,8 @@ def test_fit_shared_finds_the_minimum_of_the_dense_problem(
     worst = 0.0
     for seed in (0, 5, 10, 38):
         trials = campaign(plant, 0.05, seed, delays)
-        found = Batch.of(trials, WEIGHTS).fit_shared(
-            1.2 * plant[0], 0.8 * plant[1], np.maximum(delays - 0.004, 0.0), order
-        )
+        start = shapes((1.2 * plant[0], 0.8 * plant[1]), np.maximum(delays - 0.004, 0.0))
+        found = Batch.of(trials, WEIGHTS).fit(start, order, together=True)
         assert found.shape[:, 0].min() >= 0.0
         x = unpacked(trials, (found.shape[0, 1], found.shape[0, 2]), found.shape[:, 0], order)
         low = np.concatenate(([1e-6, 0.0][:order], np.tile([0.0, -np.inf, -np.inf], 4)))
@@ -199,7 +198,7 @@ def test_padding_changes_no_number(order: int, plant: tuple[float, float]) -> No
     at = batch.point(shapes(plant))
     slopes, heights = batch.slopes(at, order)
     equations = batch.equations(at, slopes)
-    cost = batch.fit_each(shapes(plant), order).cost
+    cost = batch.fit(shapes(plant), order).cost
     for row, trial in enumerate(trials):
         alone = Batch.of([trial], WEIGHTS[row : row + 1])
         one = alone.point(shapes(plant)[row : row + 1])
@@ -212,4 +211,4 @@ def test_padding_changes_no_number(order: int, plant: tuple[float, float]) -> No
         np.testing.assert_allclose(heights[:, row], height[:, 0], rtol=1e-9)
         for whole, part in zip(equations, alone.equations(one, own), strict=True):
             np.testing.assert_allclose(whole[row], part[0], rtol=1e-7)
-        assert cost[row] == pytest.approx(alone.fit_each(shapes(plant)[row : row + 1], order).cost[0], rel=KINKS)
+        assert cost[row] == pytest.approx(alone.fit(shapes(plant)[row : row + 1], order).cost[0], rel=KINKS)

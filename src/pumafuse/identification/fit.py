@@ -164,7 +164,7 @@ def _search(batch: Batch, order: Order, more: list[FloatArray]) -> FloatArray:
     count = len(batch.time)
     grid = np.stack([_starts(batch, row, order) for row in range(count)], axis=1)
     starts = np.concatenate([grid, *(shape[None] for shape in more)])
-    found = batch.take(np.tile(np.arange(count), len(starts))).fit_each(starts.reshape(-1, 3), order)
+    found = batch.take(np.tile(np.arange(count), len(starts))).fit(starts.reshape(-1, 3), order)
     shapes, cost = found.shape.reshape(starts.shape), found.cost.reshape(len(starts), count)
     for shape in more:  # the search begins inside its bounds; a start on them may have been better
         shapes, cost = np.concatenate((shapes, shape[None])), np.concatenate((cost, batch.point(shape).cost[None]))

@@ -82,7 +82,8 @@ def fit_together(trials: Sequence[Trial], own: Sequence[StepFit], order: Order) 
     found: list[Point] = []
     for ratio in _STARTS[: 1 if order == 1 else None]:
         q = middle if ratio == 0.0 else 1.3 * middle
-        found.append(batch.fit_shared(q, ratio * q * q, np.maximum(lag - q, 0.0), order))
+        start = np.stack(np.broadcast_arrays(np.maximum(lag - q, 0.0), q, ratio * q * q), axis=1)
+        found.append(batch.fit(start, order, together=True))
     at = min(found, key=lambda point: float(point.cost.sum()))
     n, p = len(step), at.shape[:, 2]
     slopes, amplitude_slopes = batch.slopes(at, order)
