@@ -139,12 +139,12 @@ def test_intervals_of_a_second_order_plant_that_is_none_are_open() -> None:
     """A first-order response says how slow ω is at least, and no more; its 1/ω² may be 0."""
     fit = fit_step(trial(*SLOW, 0.1e-3, 3), 2)
     assert fit.ci95.p[0] <= 0.0
-    assert fit.natural_frequency_ci95[1] == np.inf and fit.damping_ci95[1] == np.inf
+    assert fit.plant.natural_frequency_ci95[1] == np.inf and fit.plant.damping_ci95[1] == np.inf
     assert "long flat valley: first order may do" in flags(fit)
     clear = fit_step(trial(*SWINGING, 0.02e-3, 1), 2)
-    low, high = clear.natural_frequency_ci95
+    low, high = clear.plant.natural_frequency_ci95
     assert low < 53.9 < high < 60.0
-    assert clear.damping_ci95[0] < 0.864 < clear.damping_ci95[1] < 1.0
+    assert clear.plant.damping_ci95[0] < 0.864 < clear.plant.damping_ci95[1] < 1.0
     assert flags(clear) == []
 
 

@@ -114,25 +114,17 @@ class Batch:
         amplitude = np.einsum("ij,ij->i", c, z) / _power(c)
         return Point(shape, z - amplitude[:, None] * c, c, amplitude)
 
-    def slopes(
-        self, at: Point, order: Order, chord: tuple[FloatArray, FloatArray] | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Derivatives by (delay, q, p) of the fitted response (k, R, m) and of its amplitude (k, R).
+    def slopes(self, at: Point, order: Order) -> tuple[FloatArray, FloatArray]:
+        """Derivatives by (delay, q, p) of the fitted response (k, R, m) and of its amplitude (k, R); order 1 without p.
 
-        Args:
-            at: Where.
-            order: 1 without p.
-            chord: How far below and above p its difference quotient reaches, (R,) each; None: a small step, one-sided
-                where p is 0.
+        The difference quotient of p is one-sided where p is 0.
         """
         q, p = at.shape[:, 1], at.shape[:, 2]
         size = _REACH * q
-        ends = [(size, size), (size, size), chord or (np.minimum(size * q, p), size * q)][: order + 1]
+        ends = [(size, size), (size, size), (np.minimum(size * q, p), size * q)][: order + 1]
         quotients: list[FloatArray] = []
-        for place, (below, above) in enumerate(ends):
-            low, high = at.shape.copy(), at.shape.copy()
-            low[:, place] -= below
-            high[:, place] += above
+        for unit, (below, above) in zip(np.eye(3), ends, strict=False):
+            low, high = at.shape - below[:, None] * unit, at.shape + above[:, None] * unit
             quotients.append((self.response(high) - self.response(low)) / (above + below)[:, None])
         raw = np.stack([self.project(quotient) for quotient in quotients]) * at.amplitude[:, None]
         share = np.einsum("kij,ij->ki", raw, at.unit) / _power(at.unit)
