@@ -145,19 +145,6 @@ def test_fit_each_finds_a_minimum_of_each_row(order: int, plant: tuple[float, fl
         assert found.cost[row] <= 2.0 * best.cost * (1.0 + KINKS)
 
 
-def test_second_order_of_a_first_order_arm_stops_at_its_bound() -> None:
-    """1/ω² stays at 0 where the noise would move it below; then the plant is the first-order one."""
-    bounded = 0
-    for seed in range(8):
-        batch = Batch.of(campaign(FIRST, 0.01, seed), WEIGHTS)
-        one, two = (batch.fit(shapes(plant), order, together=True) for order, plant in ((1, FIRST), (2, (0.04, 1e-4))))
-        assert two.cost.sum() <= one.cost.sum() * (1.0 + 1e-9)
-        if two.shape[0, 2] == 0.0:
-            bounded += 1
-            np.testing.assert_allclose(two.shape, one.shape, rtol=1e-5)
-    assert 0 < bounded < 8
-
-
 @pytest.mark.parametrize("delays", [DELAYS, np.array([0.0, 0.0551, 0.0, 0.0313])], ids=["late", "at once"])
 @pytest.mark.parametrize(("order", "plant"), PLANTS)
 def test_fit_shared_finds_the_minimum_of_the_dense_problem(
@@ -187,28 +174,3 @@ def test_fit_shared_finds_the_minimum_of_the_dense_problem(
 
 
 # ---- stacking -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("order", "plant"), PLANTS)
-def test_padding_changes_no_number(order: int, plant: tuple[float, float]) -> None:
-    """A trial beside longer ones, with other stamps, is fitted as it is alone."""
-    trials = campaign(plant, 0.05)
-    batch = Batch.of(trials, WEIGHTS)
-    assert batch.time.shape == (4, max(LENGTHS)) and batch.count.tolist() == list(LENGTHS)
-    at = batch.point(shapes(plant))
-    slopes, heights = batch.slopes(at, order)
-    equations = batch.equations(at, slopes)
-    cost = batch.fit(shapes(plant), order).cost
-    for row, trial in enumerate(trials):
-        alone = Batch.of([trial], WEIGHTS[row : row + 1])
-        one = alone.point(shapes(plant)[row : row + 1])
-        own, height = alone.slopes(one, order)
-        assert alone.time.shape == (1, LENGTHS[row])
-        assert (batch.span[row], batch.spacing[row]) == (alone.span[0], alone.spacing[0])
-        assert batch.spacing[row] == pytest.approx((trial.time[-1] - trial.time[0]) / (len(trial.time) - 1), rel=1e-12)
-        np.testing.assert_allclose(slopes[:, row, : LENGTHS[row]], own[:, 0], rtol=0.0, atol=1e-9 * np.abs(own).max())
-        assert not slopes[:, row, LENGTHS[row] :].any()
-        np.testing.assert_allclose(heights[:, row], height[:, 0], rtol=1e-9)
-        for whole, part in zip(equations, alone.equations(one, own), strict=True):
-            np.testing.assert_allclose(whole[row], part[0], rtol=1e-7)
-        assert cost[row] == pytest.approx(alone.fit(shapes(plant)[row : row + 1], order).cost[0], rel=KINKS)

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from scipy.optimize import minimize_scalar
 
-from pumafuse import FirstOrder, SecondOrder
+from pumafuse import SecondOrder
 from pumafuse.identification.combine import CombinedAxis, Fitted, combine
 from pumafuse.identification.fit import fit_steps
 from pumafuse.identification.joint import JointFit, fit_together
@@ -141,31 +141,6 @@ def test_sds_of_delays_and_gains_are_those_of_regression(order: int, plant: tupl
         sd = pair[order - 1].rms * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
         assert found.delay_sd[place] == pytest.approx(sd[0], rel=1e-4)
         assert found.gain_sd[place] == pytest.approx(sd[1], rel=1e-4)
-
-
-def test_half_a_width_is_students_where_trials_are_alike() -> None:
-    """Trials of one design, n of them: the scatter of their parts over √n, n − 1 degrees of freedom."""
-    n = 10
-    trials, _, _ = campaign(FIRST, 0.01, 11, jitter=0.0, n=n)
-    found = joined(trials, 1)
-    spread = float(np.sqrt(np.sum(found.influence[:, 0] ** 2)) / n)
-    assert found.half_width([1.0, 0.0]) == pytest.approx(stats.t.ppf(0.975, n - 1) * spread, rel=0.02)
-    assert found.half_width([-3.0, 0.0]) == pytest.approx(3.0 * found.half_width([1.0, 0.0]), rel=1e-12)
-
-
-@pytest.mark.long
-def test_a_first_order_arm_is_rarely_called_second_order() -> None:
-    """In 10 of 12 campaigns the interval of 1/ω² by trials contains 0 and τ lies in its own."""
-    covered = 0
-    for seed in range(20, 32):
-        axis = combined(campaign(FIRST, 0.02, seed)[0])
-        low, high = axis.choice.inverse_square.ci95
-        assert high > 0.0
-        if low <= 0.0:
-            assert isinstance(axis.model.plant, FirstOrder)
-            early, late = axis.model.plant.time_constant_ci95
-            covered += early < FIRST[0] < late
-    assert covered >= 10
 
 
 @pytest.mark.long

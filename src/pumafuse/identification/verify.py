@@ -154,12 +154,13 @@ def _verified(
 ) -> tuple[AxisVerification, Trace]:
     model, delay = arm.axes[axis], arm.delay_of(axis)
     recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
+    farthest = np.abs(command.moved(model, delay, first, measured.time)).max()
+    if not abs(first) + farthest <= _FARTHEST:  # also where it is not a number
+        raise ConfigError(f"axis '{axis}': a start level, gain or plant of no size that an arm has")
     start, start_from = _start(measured, command, first, model, delay, given)
     count = len(measured.time)
     measured = measured.without_spikes(command.moved(model, delay, start, measured.time))
     modelled = command.moved(model, delay, start, measured.time)
-    if not np.abs(modelled).max() <= _FARTHEST:
-        raise ConfigError(f"axis '{axis}': start level, gain or plant is not finite, or of no size that an arm has")
 
     def fitted(gain_recovery: float | None) -> Fit:
         other = msgspec.structs.replace(model, gain_recovery=gain_recovery)
