@@ -120,31 +120,6 @@ def test_equations_are_the_dense_ones_with_delays_eliminated(order: int, plant: 
 # ---- minima ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("noise", [0.005, 0.05])
-@pytest.mark.parametrize(("order", "plant"), PLANTS)
-def test_fit_each_finds_a_minimum_of_each_row(order: int, plant: tuple[float, float], noise: float) -> None:
-    """From starts up to 30 % away; trust-region least squares in all five parameters finds nothing below it."""
-    trials = campaign(plant, noise, 3)
-    batch = Batch.of(trials, WEIGHTS)
-    start = shapes(plant) * np.array([0.95, 1.3, 1.2 if order == 2 else 0.0])
-    found = batch.fit(start, order)
-    np.testing.assert_allclose(found.cost, batch.point(found.shape).cost, rtol=1e-12)
-    for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
-        delay, q, p = found.shape[row]
-
-        def left(x: np.ndarray, trial: Trial = trial, weight: float = weight) -> np.ndarray:
-            c = unit_response(trial.time - x[0], x[1], x[4] if order == 2 else 0.0)
-            return weight * (trial.position - x[3] - x[2] * c)
-
-        x = np.array([delay, q, *linear(trial, delay, (q, p)), p][: 3 + order])
-        low = np.array([0.0, 1e-6, -np.inf, -np.inf, 0.0][: 3 + order])
-        best = least_squares(
-            left, np.maximum(x, low + 1e-12), bounds=(low, np.inf), x_scale=np.abs(x) + 1e-6, xtol=1e-14
-        )
-        assert found.cost[row] == pytest.approx(np.sum(left(x) ** 2), rel=1e-9)
-        assert found.cost[row] <= 2.0 * best.cost * (1.0 + KINKS)
-
-
 @pytest.mark.parametrize("delays", [DELAYS, np.array([0.0, 0.0551, 0.0, 0.0313])], ids=["late", "at once"])
 @pytest.mark.parametrize(("order", "plant"), PLANTS)
 def test_fit_shared_finds_the_minimum_of_the_dense_problem(

@@ -16,7 +16,6 @@ from pumafuse.logs.run import Source
 from pumafuse.simulation.simulate import write
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
-ALL = sorted(path.stem for path in SCENARIOS.glob("*.toml") if "[trajectory]" in path.read_text())
 BASE = """
 name = "test"
 arm = "puma560-internal"
@@ -65,29 +64,20 @@ def test_a_reference_with_noise_of_its_own_says_so(tmp_path: Path) -> None:
     assert abs(np.mean(noise**2) - 1.0) < 4.0 * (2.0 / len(noise)) ** 0.5
 
 
-@pytest.mark.parametrize("rate", ["1.0", "78.0", "2142.0"])
-def test_another_rate_changes_no_other_measurement_and_no_motion(rate: str, tmp_path: Path) -> None:
+CHANGES = (
+    ("77.0", "2142.0"),
+    ("77.0", "77.0\nbursts = { per_minute = 60.0, length_s = 0.1 }"),
+    ("77.0", "77.0\noutliers = { share = 0.2, from_mm = 5.0, to_mm = 9.0 }"),
+    ("77.0", "77.0\nlatency_sd_ms = 3.0"),
+)
+
+
+@pytest.mark.parametrize(("was", "now"), CHANGES)
+def test_a_sensor_changes_no_other_measurement_and_no_motion(was: str, now: str, tmp_path: Path) -> None:
     """To the last bit, on an arm that strays, has play, and whose commands are late by chance."""
     loose = BASE + "[true_arm]\nbacklash_mm = 0.2\nstiction_mm = 0.1\ndelay_jitter_ms = 2.0\n" + EAR
-    one, two = (pf.simulate(load(tmp_path, text)).run for text in (loose, loose.replace("77.0", rate)))
+    one, two = (pf.simulate(load(tmp_path, text)).run for text in (loose, loose.replace(was, now)))
     same_source(one.command, two.command)
-    assert one.reference is not None and two.reference is not None
-    same_source(one.reference, two.reference)
-    same_source(one.sensors["eye"], two.sensors["eye"])
-    assert len(one.sensors["ear"].stamp) != len(two.sensors["ear"].stamp)
-
-
-@pytest.mark.parametrize(
-    "fault",
-    [
-        "bursts = { per_minute = 60.0, length_s = 0.1 }",
-        "outliers = { share = 0.2, from_mm = 5.0, to_mm = 9.0 }",
-        "latency_sd_ms = 3.0",
-    ],
-)
-def test_a_fault_of_one_sensor_changes_no_other_sensor_and_no_motion(fault: str, tmp_path: Path) -> None:
-    """To the last bit."""
-    one, two = (pf.simulate(load(tmp_path, BASE + EAR + more)).run for more in ("", fault + "\n"))
     assert one.reference is not None and two.reference is not None
     same_source(one.reference, two.reference)
     same_source(one.sensors["eye"], two.sensors["eye"])
@@ -203,7 +193,7 @@ latency_ms = 33.3
 """
 
 
-@pytest.mark.parametrize("name", [*ALL, "odd"])
+@pytest.mark.parametrize("name", ["panel-vision", "odd"])
 def test_a_written_folder_is_the_run_and_makes_it_again(name: str, tmp_path: Path) -> None:
     """Read back, it is the run in memory, bit for bit; its scenario.toml gives the same bytes again."""
     if name == "odd":
