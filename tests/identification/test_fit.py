@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pumafuse import FirstOrder, SecondOrder
 from pumafuse.identification.fit import StepFit, fit_steps, flags
-from pumafuse.identification.trials import Trial
+from pumafuse.identification.trials import StepTrials, Trial
 from pumafuse.model.unit_response import unit_response
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -130,3 +130,15 @@ def test_flags_name_what_spoils_a_trial() -> None:
 
 
 # ---- recorded -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not SHARED.exists(), reason="the recorded campaigns are not beside the project")
+def test_recorded_trials_of_a_robot_are_read_whole_and_fitted() -> None:
+    """90 of an industrial robot, 52 of which begin before their command, at 98 %."""
+    robot = StepTrials.read(SHARED / "robot-steps")
+    assert (len(robot.trials), robot.notes) == (90, ())
+    assert sum(trial.time[0] < 0.0 for trial in robot.trials) == 52
+    fits = [first for first, _ in fit_steps(robot.trials)]
+    shares = [1.0 - fit.rms / np.std(one.position) for fit, one in zip(fits, robot.trials, strict=True)]
+    assert np.median(shares) > 0.98

@@ -13,7 +13,6 @@ import pytest
 from pumafuse.identification.trials import StepTrials, TrialsError
 from refusals import one_line
 
-SHARED = Path(__file__).parents[3] / "shared" / "data"
 TIMES = np.round(np.arange(-2, 12) * 0.005, 6)
 
 

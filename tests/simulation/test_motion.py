@@ -32,7 +32,6 @@ FIRST = FirstOrder(time_constant=0.0425)
 WEAK = SecondOrder(natural_frequency=40.0, damping=0.2)
 CRITICAL = SecondOrder(natural_frequency=53.9, damping=1.0)
 STRONG = SecondOrder(natural_frequency=53.9, damping=3.0)
-SLOW_POLE_OF_STRONG = 53.9 * (3.0 - 8.0**0.5)  # rad/s
 PLANTS = pytest.mark.parametrize("plant", [FIRST, WEAK, CRITICAL, STRONG], ids=["first", "weak", "critical", "strong"])
 
 
@@ -100,7 +99,6 @@ def random_walk(count: int, size: float = 0.004, seed: int = 5) -> Floats:
 
 
 GAIN = Gain(slope=0.134, intercept=0.941)
-TAU = FIRST.time_constant
 
 
 def exact(axis: TrueAxis, level: Floats, jump: Floats, acting: Floats, wanted: Floats) -> Floats:
