@@ -8,6 +8,7 @@ from pathlib import Path
 import typer
 
 from ..simulation import simulate as simulation
+from ..simulation.campaign import TRIALS
 from ..simulation.scenario import Scenario
 from .many import report_failures, run_jobs
 
@@ -43,4 +44,5 @@ def _simulate(scenario: Scenario, seed: int, folder: Path, force: bool) -> tuple
     simulated = simulation.simulate(scenario, seed)
     simulation.write(simulated, folder, force)
     rows = sum(len(source.stamp) for source in simulated.run.sensors.values())
-    return len(simulated.run.command.stamp), rows, 0 if simulated.trials is None else len(simulated.trials.axis)
+    trials = simulated.trials.get(TRIALS, ())
+    return len(simulated.run.command.stamp), rows, len(trials)
