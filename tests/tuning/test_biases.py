@@ -129,8 +129,8 @@ def test_only_a_fit_of_noise_looks_for_biases() -> None:
 
 
 def test_the_prior_of_a_large_bias_is_three_times_the_gap_in_one_digit() -> None:
-    """Rounded up, of the axis that is farthest off; a sensor within what is uncertain is left alone."""
-    for off, width in ((0.6, 2.0), ({"tangential": 0.31, "vertical": 0.06}, 1.0), (0.09, 0.3), (1e-3, 0.0)):
+    """Of the axis that is farthest off; a sensor within what is uncertain is left alone."""
+    for off, width in ((0.6, 2.0), ({"tangential": 0.31, "vertical": 0.06}, 0.9), (0.09, 0.3), (1e-3, 0.0)):
         run, config = recorded(off)
         likelihood = Likelihood([run], config)
         found, notes = with_large_biases(likelihood, config, [])

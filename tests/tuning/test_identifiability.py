@@ -80,7 +80,7 @@ def test_pairs_beyond_nine_tenths_are_named() -> None:
         if abs(matrix[i, j]) > 0.9
     }
     named = correlations(found.likelihood, found.best, found.free)
-    assert {frozenset((one, other)): value for one, other, value in named} == pytest.approx(wanted, rel=1e-6)
+    assert {frozenset((one.first, one.second)): one.correlation for one in named} == pytest.approx(wanted, rel=1e-6)
     assert frozenset(("axes.vertical.time_constant_ms", "axes.vertical.delay_ms")) in wanted
 
 

@@ -11,9 +11,8 @@ import pytest
 import pumafuse as pf
 from pumafuse.simulation.true_sensor import Outliers, TrueSensor
 from pumafuse.tuning.intervals import ConfidenceInterval
-from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.parameters import with_order
-from pumafuse.tuning.stage import Plan, Stage, repeat_stage, run_stage
+from pumafuse.tuning.stage import Stage
 from tuning_runs import (
     SCENARIOS,
     fit_stage,
@@ -248,16 +247,3 @@ def test_what_is_fixed_stays_to_the_last_bit_and_the_rest_moves() -> None:
     for one in found.free:
         assert one.get(best) != one.get(config), one.key
     assert "axes.tangential.damping" in numbers(found) and "axes.vertical.delay_ms" in numbers(found)
-
-
-def test_a_repeated_stage_ends_at_the_maximum_of_all_measurements() -> None:
-    """From two thirds to the whole: what was fixed stays fixed, and it is as likely as a new search finds it."""
-    sim = outage(1)
-    config = spoiled(sim.config)
-    early = run_stage([sim.run], config, Plan(("noise",), ["tracker.sd_mm"]), 2.4)
-    assert early.likelihood.count.sum() < Likelihood([sim.run], config).count.sum()
-    more = repeat_stage(early, [sim.run], early.best.config)
-    whole = fit_stage(sim.run, config, ("noise",), "tracker.sd_mm")
-    assert [one.key for one in more.free] == [one.key for one in early.free] == [one.key for one in whole.free]
-    assert more.best.log_posterior == pytest.approx(whole.best.log_posterior, abs=0.1)
-    assert more.best.config.sensors["tracker"] == config.sensors["tracker"]

@@ -20,11 +20,9 @@ from .maximise import Notify, Point, maximise, maximise_by_axis, maximise_with_g
 from .parameters import (
     DELAYS,
     LATENCIES,
-    RECOVERY,
     Parameter,
     with_axis_of,
     with_gates,
-    with_gates_of,
     with_lag,
     with_order,
 )
@@ -35,12 +33,9 @@ _GRID_STEP = 0.010  # s, between delays and latencies that are tried: their maxi
 _LAGS = (1.0, 1.8)  # starts, times the configured; a delay can be taken for a lag and a lag for a delay
 _LEAST_SHARE = 0.2  # of a lag that is left where a tick less of it is tried
 _GAINS = ((0.0, 0.1), (0.0, 0.4), (0.3, 0.025))  # starts: gain above the configured one, and recovery [s]
-_PROCESSES = (  # starts, in units of the distance between the noiseless arm and the measurements
-    Process(input_noise=0.1, drift=1.0, maneuver_noise=1.0, maneuver_drift=10.0),
-    Process(input_noise=0.01, drift=0.1, maneuver_noise=0.1, maneuver_drift=1.0),
-    Process(input_noise=1.0, drift=10.0, maneuver_noise=10.0, maneuver_drift=100.0),
-    Process(input_noise=0.01, drift=1.0, maneuver_noise=0.1, maneuver_drift=10.0),
-    Process(input_noise=1.0, drift=0.1, maneuver_noise=10.0, maneuver_drift=1.0),
+_PROCESSES = tuple(  # starts, in units of the distance between the noiseless arm and the measurements
+    {"input_noise": noise, "drift": drift, "maneuver_noise": 10.0 * noise, "maneuver_drift": 10.0 * drift}
+    for noise, drift in ((0.1, 1.0), (0.01, 0.1), (1.0, 10.0), (0.01, 1.0), (1.0, 0.1))
 )
 
 FreeOf: TypeAlias = Callable[[FusionConfig], list[Parameter]]
@@ -62,15 +57,15 @@ def search(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: N
     def own(at: FusionConfig) -> list[Parameter]:
         return [one for one in free(at) if one.axis is not None]
 
-    best = _times(likelihood, with_gates(config, _WIDER), free(config))
-    best = _noise(likelihood, with_gates(with_gates_of(best, config), 1.0), own(config), notify)
+    best = _times(likelihood, with_gates(config, config, _WIDER), free(config))
+    best = _noise(likelihood, with_gates(best, config, 1.0), own(config), notify)
     shared = [one for one in free(best) if one.axis is None]
     if shared:
         best = maximise(likelihood, best, shared, notify, tolerance=_ROUGHLY).config
     orders: dict[str, str] = {}
     if any(one.fit != "noise" for one in own(best)):
         best, orders = _arm(likelihood, best, own, notify)
-    return maximise_with_gates(likelihood, with_gates_of(best, config), free(best), notify), orders
+    return maximise_with_gates(likelihood, with_gates(best, config), free(best), notify), orders
 
 
 def penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter]) -> FloatArray:
@@ -121,7 +116,7 @@ def _noise(likelihood: Likelihood, config: FusionConfig, free: Sequence[Paramete
         return config
     peaks: list[Point] = []
     for times in (_WIDER, 1.0):
-        one_by_one = with_gates(config, times)
+        one_by_one = with_gates(config, config, times)
         starts = [
             point(likelihood, _with_noise(one_by_one, process, sds, noise), noise)
             for process in (one_by_one.process, *_processes(likelihood, one_by_one))
@@ -129,18 +124,15 @@ def _noise(likelihood: Likelihood, config: FusionConfig, free: Sequence[Paramete
         ]
         start = _best_by_axis(likelihood, starts)
         rough = maximise_by_axis(likelihood, start, noise, notify, _ROUGHLY).config
-        peaks.append(maximise_by_axis(likelihood, with_gates_of(rough, config), noise, notify, _ROUGHLY))
+        peaks.append(maximise_by_axis(likelihood, with_gates(rough, config), noise, notify, _ROUGHLY))
     return _best_by_axis(likelihood, peaks)
 
 
 def _processes(likelihood: Likelihood, config: FusionConfig) -> list[dict[str, Process]]:
     """Starts for each axis's process noise, in proportion to the misfit of the noiseless arm."""
-    misfit = dict(zip(likelihood.axes, likelihood.misfit(config).tolist(), strict=True))
+    misfit = likelihood.misfit(config)
     return [
-        {
-            axis: Process(**{name: getattr(one, name) * metres for name in Process.__struct_fields__})
-            for axis, metres in misfit.items()
-        }
+        {axis: Process(**{key: value * metres for key, value in one.items()}) for axis, metres in misfit.items()}
         for one in _PROCESSES
     ]
 
@@ -166,7 +158,7 @@ def _arm(
     whole = [axis for axis in likelihood.axes if _plant_is_free(free(config), axis)]
     second = _with_orders(config, whole, 2)
     starts = [_with_lag(second, whole, free(second), times) for times in _LAGS]
-    if any(one.key.endswith(RECOVERY) for one in free(second)):
+    if any(one.path[-1] == "gain_recovery" for one in free(second)):
         starts += [_with_gain(second, free(second), more, recovery) for more, recovery in _GAINS]
     best = _best_by_axis(likelihood, maxima(starts))
     if not whole:
@@ -223,7 +215,7 @@ def _lagging_more(config: FusionConfig, axes: Sequence[str], free: Sequence[Para
 def _with_gain(config: FusionConfig, free: Sequence[Parameter], more: float, recovery: float) -> FusionConfig:
     """The configuration with every free gain greater by ``more`` and every free recovery at ``recovery`` [s]."""
     for one in free:
-        if one.key.endswith(RECOVERY):
+        if one.path[-1] == "gain_recovery":
             config = one.put(config, recovery)
         elif one.fit == "gain":
             config = one.put(config, one.get(config) + more)
