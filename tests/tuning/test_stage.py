@@ -38,17 +38,17 @@ def numbers(stage: Stage) -> dict[str, float]:
 # ---- latencies ------------------------------------------------------------------------------------------------------
 
 
-def wrong_latency(seed: int, *size: float) -> tuple[Stage, ConfidenceInterval]:
-    """A camera that is 45 ms late and configured as 9; noise as wrong as elsewhere."""
+def wrong_latency(seed: int, believed: float, *size: float) -> tuple[Stage, ConfidenceInterval]:
+    """A camera that is 45 ms late and configured otherwise; noise as wrong as elsewhere."""
     sim = pf.simulate(scenario("wrong-latency", *size), seed)
-    found = fit_stage(sim.run, with_sensors(spoiled(sim.config), latency=0.009), ("noise", "latency"))
+    found = fit_stage(sim.run, with_sensors(spoiled(sim.config), latency=believed), ("noise", "latency"))
     return found, intervals_of(found)["sensors.vision.latency_ms"]
 
 
-@pytest.mark.parametrize("seed", [1, later(2), later(3)])
-def test_a_wrong_latency_is_found(seed: int) -> None:
-    """45 ms within 4 ms from 9, by some 105 rows; its 95 % interval contains it and is at most 16 ms wide."""
-    found, interval = wrong_latency(seed, 0.1, 0.02)
+@pytest.mark.parametrize("believed", [0.009, 0.135])
+def test_a_wrong_latency_is_found(believed: float) -> None:
+    """45 ms within 4 ms by some 105 rows, from far beyond a tick too; the 95 % interval is at most 16 ms wide."""
+    found, interval = wrong_latency(1, believed, 0.1, 0.02)
     assert list(found.not_identifiable) == []
     assert found.best.config.sensors["vision"].latency == pytest.approx(0.045, abs=0.004)
     low, high = interval.ci95
@@ -63,21 +63,11 @@ def test_intervals_of_latencies_over_60_runs() -> None:
     """
     inside, off = [], []
     for seed in range(60):
-        found, interval = wrong_latency(seed)
+        found, interval = wrong_latency(seed, 0.009)
         inside.append(interval.ci95[0] < 0.045 < interval.ci95[1])
         off.append(found.best.config.sensors["vision"].latency - 0.045)
     assert np.mean(inside) >= 0.88
     assert abs(np.mean(off)) < 5e-4
-
-
-def test_latencies_far_beyond_a_tick_are_found() -> None:
-    """90 ms too long and 250 ms too short: the likelihood has other maxima between."""
-    sim = outage(2)
-    for believed in (0.135, -0.205):
-        found = fit_stage(
-            sim.run, with_sensors(spoiled(sim.config), "vision", latency=believed), ("noise", "latency"), "tracker"
-        )
-        assert found.best.config.sensors["vision"].latency == pytest.approx(0.045, abs=0.004)
 
 
 @pytest.mark.parametrize("believed", [0.020, later(0.008), later(-0.004)])

@@ -85,7 +85,7 @@ def _progress() -> Generator[Progress]:
     with Console(stderr=True).status("preparing") as status:
 
         def show(what: str, at: Point) -> None:
-            status.update(f"{what}: log-likelihood {at.log_likelihood.total:.1f} (Ctrl-C keeps the best so far)")
+            status.update(f"{what}: log-likelihood {at.log_likelihood:.1f} (Ctrl-C keeps the best so far)")
 
         yield show
 

@@ -64,8 +64,7 @@ class ConfidenceInterval:
     profile: Profile
 
 
-@dataclass(frozen=True)
-class View:
+class _View(NamedTuple):
     """The likelihood that the parameters of one axis, or of all, depend on.
 
     Attributes:
@@ -79,31 +78,6 @@ class View:
     outcomes: Sequence[CodeArray]
     free: Sequence[Parameter]
     covariance: FloatArray
-
-    def at(self, config: FusionConfig, more: Sequence[Parameter] = ()) -> float:
-        """The log-posterior of a configuration."""
-        return point(self.likelihood, config, [*self.free, *more], self.outcomes).log_posterior
-
-    def without(self, one: Parameter) -> list[Parameter]:
-        """The other free parameters."""
-        return [other for other in self.free if other.key != one.key]
-
-    def sd(self, one: Parameter) -> float:
-        """The standard deviation of the coordinate of a free parameter."""
-        place = [other.key for other in self.free].index(one.key)
-        return float(np.sqrt(self.covariance[place, place]))
-
-    def slope(self, one: Parameter) -> FloatArray:
-        """The change of the other coordinates with this one by regression, Cov(·, a) / Var a; 0 if it is at a bound."""
-        keys = [other.key for other in self.free]
-        if one.key not in keys:
-            return np.zeros(len(keys))
-        place = keys.index(one.key)
-        return np.delete(self.covariance[:, place] / self.covariance[place, place], place)
-
-    def maximum(self, start: FusionConfig, free: Sequence[Parameter], tolerance: float) -> Point:
-        """The nearest maximum, with the outcomes repeated."""
-        return maximise(self.likelihood, start, free, outcomes=self.outcomes, tolerance=tolerance)
 
 
 def confidence_intervals(
@@ -119,7 +93,7 @@ def confidence_intervals(
     """
     result = best.config
     best = maximise(likelihood, result, free, outcomes=best.outcomes)
-    views = views_of(likelihood, best, free)
+    views = _views(likelihood, best, free)
 
     def of(one: Parameter) -> ConfidenceInterval:
         low, high = (_end(views[one.axis], best, one, sign) for sign in (-1.0, 1.0))
@@ -137,7 +111,7 @@ def confidence_intervals(
     return dict(zip([one.key for one in free], in_threads(of, free), strict=True))
 
 
-def views_of(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> Mapping[str | None, View]:
+def _views(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> Mapping[str | None, _View]:
     """The view of each axis, and under None, where a parameter is shared by all axes, the view of everything."""
     inside = within_bounds(free, best.config)
     shared = [one for one in inside if one.axis is None]
@@ -147,7 +121,7 @@ def views_of(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> 
         axis: _of_shared(part.derivatives(best.config, [*own[axis], *shared], outcomes).information, len(own[axis]))
         for axis, (part, outcomes) in (parts.items() if shared else ())
     }
-    views: dict[str | None, View] = {}
+    views: dict[str | None, _View] = {}
     for axis, (part, outcomes) in parts.items():
         elsewhere = sum((informed[other] for other in informed if other != axis), np.zeros(len(shared)))
         priors = [
@@ -167,11 +141,9 @@ def _of_shared(information: FloatArray, own: int) -> FloatArray:
     return np.diag(information[own:, own:] - across.T @ inner @ across)
 
 
-def _view(likelihood: Likelihood, outcomes: Sequence[CodeArray], best: Point, free: Sequence[Parameter]) -> View:
-    if not free:
-        return View(likelihood, outcomes, free, np.zeros((0, 0)))
+def _view(likelihood: Likelihood, outcomes: Sequence[CodeArray], best: Point, free: Sequence[Parameter]) -> _View:
     there = point(likelihood, best.config, free, outcomes)
-    return View(likelihood, outcomes, free, covariance(derivatives(likelihood, there, free).information, free))
+    return _View(likelihood, outcomes, free, covariance(derivatives(likelihood, there, free).information, free))
 
 
 class _End(NamedTuple):
@@ -183,7 +155,7 @@ class _End(NamedTuple):
     curve: list[tuple[float, float]]
 
 
-def _end(view: View, best: Point, one: Parameter, sign: float) -> _End:
+def _end(view: _View, best: Point, one: Parameter, sign: float) -> _End:
     """The lower (−1) or upper (+1) end of an interval.
 
     Distances are in standard deviations of the coordinate. From a bound they are in the coordinate, from a noise of 0
@@ -194,14 +166,17 @@ def _end(view: View, best: Point, one: Parameter, sign: float) -> _End:
     bound, start = one.at_bound(best.config), one.at(best.config)
     if bound == ("lower" if sign < 0.0 else "upper"):
         return _End(one.value(start), True, True, [])
-    others, more = view.without(one), [] if bound is None else [one]
-    at = coordinates(best.config, others)
+    others, more = [other for other in view.free if other.key != one.key], [] if bound is None else [one]
+    at, slope, sd = coordinates(best.config, others), np.zeros(len(others)), 1.0
+    for place, other in enumerate(view.free):
+        if other.key == one.key:  # by regression, Cov(·, a) / Var a
+            slope = np.delete(view.covariance[:, place] / view.covariance[place, place], place)
+            sd = float(np.sqrt(view.covariance[place, place]))
     low, high = np.array([other.range for other in others]).reshape(-1, 2).T
     vanishing = bound is not None and one.vanishes
-    unit = sign * (view.sd(one) if bound is None else 1.0)
-    edge = one.bounds[0 if sign < 0.0 else 1]
-    direction = unit * view.slope(one)
-    top = view.at(best.config, more)
+    unit = sign * sd
+    direction = unit * slope
+    top = point(view.likelihood, best.config, [*view.free, *more], view.outcomes).log_posterior
 
     def distance_to(value: float) -> float:
         return value - one.bounds[0] if vanishing else (one.coordinate(value) - start) / unit
@@ -214,7 +189,7 @@ def _end(view: View, best: Point, one: Parameter, sign: float) -> _End:
         return moved(one.put(best.config, one.clipped(value_at(distance))), others, there)
 
     def drop(distance: float) -> float:
-        return top - view.at(along(distance), more)
+        return top - point(view.likelihood, along(distance), [*view.free, *more], view.outcomes).log_posterior
 
     @cache
     def missing(distance: float) -> float:
@@ -222,12 +197,12 @@ def _end(view: View, best: Point, one: Parameter, sign: float) -> _End:
         nonlocal direction
         if distance == 0.0:
             return -Z95
-        peak = view.maximum(along(distance), others, _TOLERANCE)
+        peak = maximise(view.likelihood, along(distance), others, outcomes=view.outcomes, tolerance=_TOLERANCE)
         direction = (coordinates(peak.config, others) - at) / distance
         root = _root(top - peak.log_posterior - one.log_prior(peak.config))
         return 0.0 if abs(root / Z95 - 1.0) < _CLOSE else root - Z95
 
-    limit = distance_to(edge)
+    limit = distance_to(one.bounds[0 if sign < 0.0 else 1])
     end, profiled, beyond = min(Z95, limit), True, False
     if bound is not None:
         end = limit
@@ -242,7 +217,7 @@ def _end(view: View, best: Point, one: Parameter, sign: float) -> _End:
         while missing(end) < 0.0 and not beyond:
             inner, end, beyond = end, min(_FARTHER * end, limit), end >= limit
         if not beyond and missing(end) > 0.0:
-            end = float(brentq(missing, inner, end, rtol=_CLOSE))
+            end = brentq(missing, inner, end, rtol=_CLOSE)
     value, middle = value_at(end), one.value(start)
     linear = not one.log or (one.vanishes and (vanishing or value <= one.bounds[0]))
     points = middle + (value - middle) * _SHARES if linear else middle * (value / middle) ** _SHARES

@@ -232,12 +232,14 @@ class Likelihood:
         for part in self._parts:
             rows = part.segment.measurement_rows
             predicted = rows.value[:, 0] - innovations(part.segment, certain).innovation[:, 0]
-            for number in np.unique(rows.source).tolist():
-                expected, measured = predicted[rows.source == number], rows.value[rows.source == number, 0]
+            for number, name in enumerate(part.segment.sensors):
+                mine = rows.source == number
+                if not mine.any():
+                    continue
+                expected, measured = predicted[mine], rows.value[mine, 0]
                 if centred:
                     expected, measured = expected - np.median(expected), measured - np.median(measured)
-                key = part.segment.sensors[number], self.axes[part.axis]
-                found.setdefault(key, []).append((expected, measured))
+                found.setdefault((name, self.axes[part.axis]), []).append((expected, measured))
         return {
             key: (np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]))
             for key, pairs in found.items()

@@ -68,7 +68,7 @@ def search(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: N
     return maximise_with_gates(likelihood, with_gates(best, config), free(best), notify), orders
 
 
-def penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter]) -> FloatArray:
+def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter]) -> FloatArray:
     """The log-posterior of each axis less the Bayesian information criterion's penalty for its parameters, (A,)."""
     count = np.array([sum(one.axis == axis for one in free) for axis in likelihood.axes])
     return peak.axes - 0.5 * count * np.log(np.maximum(likelihood.count, 2))
@@ -87,14 +87,13 @@ def _times(likelihood: Likelihood, config: FusionConfig, free: Sequence[Paramete
         shifts: list[float] = np.linspace(*span, 1 + round((span[1] - span[0]) / _GRID_STEP)).tolist()
         return [(shift, point(likelihood, _shifted(at, times, shift), free)) for shift in shifts for at in levels]
 
-    best: list[tuple[Parameter, float]] = []
     delays = [one for one in free if one.fit == "delay"]
     if delays:
         tried = on_grid(delays, DELAYS)
-        highest = np.argmax([found.axes for _, found in tried], axis=0)
-        best = [(one, tried[highest[likelihood.axes.index(str(one.axis))]][0]) for one in delays]
-    for one, shift in best:
-        config, *levels = (_shifted(at, [one], shift) for at in (config, *levels))
+        highest: list[int] = np.argmax([found.axes for _, found in tried], axis=0).tolist()
+        for one in delays:
+            shift, _ = tried[highest[likelihood.axes.index(str(one.axis))]]
+            config, *levels = (_shifted(at, [one], shift) for at in (config, *levels))
     for one in free:
         if one.fit == "latency":
             shift, _ = max(on_grid([one], LATENCIES), key=lambda found: found[1].log_posterior)
@@ -157,17 +156,18 @@ def _arm(
 
     whole = [axis for axis in likelihood.axes if _plant_is_free(free(config), axis)]
     second = _with_orders(config, whole, 2)
-    starts = [_with_lag(second, whole, free(second), times) for times in _LAGS]
+    starts = [_lagging(second, whole, free(second), times=times) for times in _LAGS]
     if any(one.path[-1] == "gain_recovery" for one in free(second)):
         starts += [_with_gain(second, free(second), more, recovery) for more, recovery in _GAINS]
     best = _best_by_axis(likelihood, maxima(starts))
     if not whole:
         return best, {}
-    beside = [_lagging_more(best, whole, free(best), ticks) for ticks in (-1.0, 1.0)]
+    # the arm gets one command a tick: the likelihood has a false maximum a tick of delay on either side
+    beside = [_lagging(best, whole, free(best), ticks=ticks) for ticks in (-1.0, 1.0)]
     best = _best_by_axis(likelihood, [point(likelihood, best, free(best)), *maxima(beside)])
     pair = maxima([best, _with_orders(best, whole, 1)])
     gains = pair[0].axes - pair[1].axes
-    lowered = [penalised(likelihood, peak, free(peak.config)) for peak in pair]
+    lowered = [_penalised(likelihood, peak, free(peak.config)) for peak in pair]
     orders: dict[str, str] = {}
     for number, axis in enumerate(likelihood.axes):
         if axis in whole:
@@ -191,24 +191,16 @@ def _with_orders(config: FusionConfig, axes: Sequence[str], order: int) -> Fusio
     return config
 
 
-def _with_lag(config: FusionConfig, axes: Sequence[str], free: Sequence[Parameter], times: float) -> FusionConfig:
-    """The configuration with plants that lag so many times as long, and delays that make up for it where free."""
+def _lagging(
+    config: FusionConfig, axes: Sequence[str], free: Sequence[Parameter], times: float = 1.0, ticks: float = 0.0
+) -> FusionConfig:
+    """The configuration with plants that lag so many times or ticks more, and delays that make up for it where free."""
     for axis in axes:
         lag = config.arm.axes[axis].plant.lag
-        config = with_lag(config, axis, times * lag)
+        longer = max(times * lag + ticks * config.arm.update_period, _LEAST_SHARE * lag)
+        config = with_lag(config, axis, longer)
         delays = [one for one in free if one.axis == axis and one.fit == "delay"]
-        config = _shifted(config, delays, (1.0 - times) * lag)
-    return config
-
-
-def _lagging_more(config: FusionConfig, axes: Sequence[str], free: Sequence[Parameter], ticks: float) -> FusionConfig:
-    """The configuration with plants that lag so many ticks more, and delays that are shorter by as much where free.
-
-    The arm gets one command a tick: the likelihood has a false maximum a tick of delay on either side.
-    """
-    for axis in axes:
-        more = ticks * config.arm.update_period / config.arm.axes[axis].plant.lag
-        config = _with_lag(config, [axis], free, max(1.0 + more, _LEAST_SHARE))
+        config = _shifted(config, delays, lag - longer)
     return config
 
 
