@@ -8,11 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
-from pumafuse.tuning.identifiability import correlations, covariance, not_identifiable, shared_times
-from pumafuse.tuning.likelihood import Likelihood
-from pumafuse.tuning.maximise import point
+from pumafuse.tuning.identifiability import correlations, covariance, shared_times
 from pumafuse.tuning.parameters import Parameter, parameters
-from tuning_runs import fit_stage, free_of, outage, quietly, replaced, scenario, with_outliers, with_sensors
+from tuning_runs import fit_stage, outage, quietly, replaced, scenario, with_outliers, with_sensors
 
 ARM = pf.ArmModel.load("puma560-internal")
 CONFIG = pf.FusionConfig(arm=ARM, sensors={"tracker": pf.Sensor(sd=5e-5)})
@@ -72,21 +70,6 @@ def test_pairs_beyond_nine_tenths_are_named() -> None:
     named = correlations(found.likelihood, found.best, found.free)
     assert {frozenset((one.first, one.second)): one.correlation for one in named} == pytest.approx(wanted, rel=1e-6)
     assert frozenset(("axes.vertical.time_constant_ms", "axes.vertical.delay_ms")) in wanted
-
-
-def test_only_the_sum_of_delay_and_latency_is_identifiable() -> None:
-    """All of them are members, a latency is fixed; with it fixed, everything is identifiable."""
-    sim = outage(1)
-    likelihood = Likelihood([sim.run], sim.config)
-    every = free_of(likelihood, sim.config, ("noise", "delay", "latency"))
-    found = not_identifiable(likelihood, point(likelihood, sim.config, every), every)
-    assert found is not None and found.fixed == "sensors.tracker.latency_ms"
-    assert set(found.members) == {one.key for one in every if one.fit != "noise"}
-    sentence = str(found)
-    assert sentence.startswith("sensors.tracker.latency_ms is fixed: not identifiable apart from ")
-    assert all(key in sentence for key in found.members)
-    fixed = [one for one in every if one.key != found.fixed]
-    assert not_identifiable(likelihood, point(likelihood, sim.config, fixed), fixed) is None
 
 
 GROUPS = {  # sensors of both axes, axes that move, what is fixed as asked; for each latency that is fixed its group

@@ -11,15 +11,12 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.tuning.likelihood import Derivatives, Likelihood
-from pumafuse.tuning.maximise import Point, _step, derivatives, maximise, maximise_with_gates, point
+from pumafuse.tuning.maximise import Point, _step, derivatives, maximise, point
 from pumafuse.tuning.parameters import Fit, Parameter, moved
 from tuning_runs import (
     free_of,
     outage,
-    spoiled,
     spoiled_arm,
-    with_outliers,
-    with_sensors,
 )
 
 
@@ -39,9 +36,6 @@ def still_to_gain(likelihood: Likelihood, at: Point, free: Sequence[Parameter]) 
     g, information = found.score[known], found.information[np.ix_(known, known)]
     room = np.where(found.score > 0.0, high - where, where - low)[inside & ~known]
     return 0.5 * float(g @ np.linalg.solve(information, g)) + float(np.abs(found.score[inside & ~known]) @ room)
-
-
-# ---- with fixed outcomes --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -106,24 +100,3 @@ def test_a_step_is_the_best_there_is_in_its_box(
     close = 1e-6 * (1.0 + np.abs(size * found.score).max())
     assert (slope[step > low + tiny] > -close).all()
     assert (slope[step < high - tiny] < close).all()
-
-
-# ---- with gates -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("gate_rows", [True, False], ids=["rows", "components"])
-def test_a_search_under_the_gates_ends_at_its_own_maximum(gate_rows: bool) -> None:
-    """The outcomes are those of the gates at the end, and a second search stays there."""
-    sim = with_outliers(4, 0.06)
-    config = with_sensors(spoiled(sim.config), gate=3.0, gate_rows=gate_rows)
-    likelihood = Likelihood([sim.run], config)
-    free = free_of(likelihood, config, ("noise",))
-    best = maximise_with_gates(likelihood, config, free)
-    assert best.log_posterior > point(likelihood, config, free).log_posterior + 5.0
-    alone = likelihood.evaluate(best.config)
-    assert alone.total == best.log_likelihood
-    assert [part.tolist() for part in alone.outcomes] == [part.tolist() for part in best.outcomes]
-    assert (np.concatenate(alone.outcomes) == pf.Outcome.REJECTED).any()
-    assert still_to_gain(likelihood, best, free) < 0.5
-    again = maximise_with_gates(likelihood, best.config, free)
-    assert best.log_posterior <= again.log_posterior < best.log_posterior + 0.1
