@@ -218,11 +218,13 @@ def _end(view: _View, best: Point, one: Parameter, sign: float) -> _End:
             inner, end, beyond = end, min(_FARTHER * end, limit), end >= limit
         if not beyond and missing(end) > 0.0:
             end = brentq(missing, inner, end, rtol=_CLOSE)
-    value, middle = value_at(end), one.value(start)
+    value, middle = one.clipped(value_at(end)), one.value(start)
     linear = not one.log or (one.vanishes and (vanishing or value <= one.bounds[0]))
     points = middle + (value - middle) * _SHARES if linear else middle * (value / middle) ** _SHARES
-    inside = [there for there in points.tolist() if one.bounds[0] <= there <= one.bounds[1]]
-    return _End(value, profiled, beyond, [(there, -drop(distance_to(there))) for there in inside])
+    drawn = [one.clipped(there) for there in points[:-1].tolist()]
+    if one.bounds[0] <= points[-1] <= one.bounds[1]:  # it lies beyond the end
+        drawn.append(float(points[-1]))
+    return _End(value, profiled, beyond, [(there, -drop(distance_to(there))) for there in drawn])
 
 
 def _root(drop: float) -> float:
