@@ -18,7 +18,7 @@ from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.consistency import consistency, densities_of
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
-from pumafuse.tuning.intervals import Profile, profiles
+from pumafuse.tuning.intervals import Profile
 from pumafuse.tuning.maximise import maximise
 from pumafuse.views import colours as style
 from pumafuse.views import tuning_report
@@ -69,7 +69,7 @@ def shown() -> str:
 
 
 def drawn(found: pf.Tuning) -> dict[str, Profile]:
-    return {one.key: one for one in profiles(found.stages[0], {one.key: one.ci95 for one in found.summary.parameters})}
+    return {one.key: one for one in found.profiles}
 
 
 def test_every_part_of_the_page_has_its_heading_and_sentence_and_nothing_is_loaded() -> None:

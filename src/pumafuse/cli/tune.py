@@ -56,7 +56,7 @@ def run(
     with Console(stderr=True).status("preparing") as status:
 
         def progress(what: str, at: Point) -> None:
-            status.update(f"{what}: log-likelihood {at.log_likelihood.total:.1f} (Ctrl-C keeps the best so far)")
+            status.update(f"{what}: log-likelihood {at.log_likelihood:.1f} (Ctrl-C keeps the best so far)")
 
         found = tune(runs, given, fit=kinds, fix=fix, trust=trust, validate=other, progress=progress)
     with folders.replacing(output) as new:

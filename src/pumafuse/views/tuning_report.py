@@ -18,7 +18,7 @@ from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates
 from ..fusion.score import Z95
 from ..logs.run import Run
-from ..tuning.intervals import Profile, profiles
+from ..tuning.intervals import Profile
 from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Tuning
 from ..tuning.validation import Check, fused
@@ -38,7 +38,8 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
     """
     summary = found.summary
     fitted = {one.key: one for one in summary.parameters}
-    drawn = {} if summary.interrupted else _profiles(found)  # a search that did not end has no peak to look from
+    axes = dict.fromkeys(one.axis for one in found.profiles)  # None: shared by all
+    drawn = [[one for one in found.profiles if one.axis == axis] for axis in axes]
     before, after = (fused(runs[0], config) for config in (found.before, found.config))
     tests = _tests(before, after)
     known = [one for one in summary.parameters if one.before is not None]
@@ -52,7 +53,7 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
         "outside": sum(not _contains(one.ci95, one.before) for one in known),
         "zero": sum(one.value == 0.0 for one in summary.parameters),
         "open": not summary.interrupted and any(None in one.ci95 for one in summary.parameters),
-        "profiles": [Markup(profile_figure(some, fitted)) for some in drawn.values()],
+        "profiles": [Markup(profile_figure(some, fitted)) for some in drawn],
         "validation": [_check(one) for one in summary.validation or ()],
         "innovations": [
             {
@@ -71,16 +72,6 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
         "arm": found.config.arm.to_toml(),
     }
     return render("tuning.html", content)
-
-
-def _profiles(found: Tuning) -> dict[str | None, list[Profile]]:
-    """The profiles of each axis, and under None those of shared parameters."""
-    drawn: dict[str | None, list[Profile]] = {}
-    intervals = {one.key: one.ci95 for one in found.summary.parameters}
-    for stage in found.stages:
-        for one in profiles(stage, intervals):
-            drawn.setdefault(one.axis, []).append(one)
-    return drawn
 
 
 def _tests(before: Estimates, after: Estimates) -> dict[tuple[str, str], _Pair]:
