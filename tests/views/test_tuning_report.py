@@ -199,7 +199,8 @@ def test_innovations_are_shown_before_and_after_on_one_scale(figures: list[Figur
     """Those that were fused, over their standard deviations; and the autocorrelations of both."""
     found, run = tuned()
     pair = [pf.fuse(run, config) for config in (found.before, found.config)]
-    tuning_report.innovation_figure(*pair, "camera", "tip")
+    tests = tuple(consistency(est, "camera", "tip") for est in pair)
+    tuning_report.innovation_figure(*pair, "camera", "tip", tests)
     *series, correlation = figures[0].axes
     for axes, est in zip(series, pair, strict=True):
         fused = est.measurements.where(est.measurements.outcome == Outcome.FUSED)
@@ -208,7 +209,6 @@ def test_innovations_are_shown_before_and_after_on_one_scale(figures: list[Figur
         np.testing.assert_array_equal(dots.get_ydata(), fused.innovation / fused.innovation_sd)
     assert series[0].get_ylim() == series[1].get_ylim()
     bars = [bar.get_height() for bars in correlation.containers for bar in bars]
-    tests = [consistency(est, "camera", "tip") for est in pair]
     np.testing.assert_array_equal(bars, np.concatenate([one.correlation for one in tests if one is not None]))
 
 

@@ -15,7 +15,6 @@ the estimate.
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 import signal
 import subprocess
@@ -109,8 +108,6 @@ class LiveView:
             raise ConfigError(f"--rerun: no mode '{mode}'; there are: {', '.join(MODES)}")
         if os.name != "posix":
             raise ConfigError("--rerun: the live view needs Linux or macOS; a result folder can be drawn everywhere")
-        if importlib.util.find_spec("rerun") is None or importlib.util.find_spec("rerun_cli") is None:
-            raise ConfigError("--rerun: rerun-sdk is not installed; pip install rerun-sdk")
         self.dropped = 0
         self._notify = notify
         self._framed = config.frame is not None

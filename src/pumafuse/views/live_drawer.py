@@ -56,45 +56,39 @@ class Picture:
         }
         self._paths: dict[str, Recent] = {}
         stream.send_blueprint(_blueprint(header))
-        of_sensors = colours.sensor_colours(list(header.sensors))
-        self._colours = {"command": colours.COMMAND, "estimate": colours.ESTIMATE, **of_sensors}
-        for axis in header.axes:
-            self._look(f"{axis}/command", styles.line(colours.COMMAND, "command", step=True))
-            self._look(f"{axis}/estimate", styles.line(colours.ESTIMATE, "estimate"))
-            for path in (f"{axis}/estimate", f"residual/{axis}"):
-                self._look(f"{path}/upper", styles.edge("+2σ"))
-                self._look(f"{path}/lower", styles.edge("−2σ"))
-            for name, colour in of_sensors.items():
-                self._look(f"{axis}/{name}", styles.points(colour, name))
-                self._look(f"{axis}/{name}/rejected", styles.points(colours.REJECTED, "rejected", "Cross"))
-                self._look(f"residual/{axis}/{name}", styles.points(colour, name))
-        for name, colour in of_sensors.items():
-            self._look(f"nis/{name}", styles.line(colour, name))
-            self._look(f"rate/{name}", styles.line(colour, name))
+        self._of_sensors = colours.sensor_colours(list(header.sensors))
+        self._colours = {"command": colours.COMMAND, "estimate": colours.ESTIMATE, **self._of_sensors}
+        self._styled: set[str] = set()
 
     def draw(self, frame: Frame) -> None:
         """Send a frame."""
         for axis, known in self._estimates.items():
-            self._plot(f"{axis}/command", *_columns(frame, f"command/{axis}", 2))
+            time, command = _columns(frame, f"command/{axis}", 2)
+            self._plot(f"{axis}/command", styles.line(colours.COMMAND, "command", step=True), time, command * MM)
             time, position, sd = estimates = _columns(frame, f"estimate/{axis}", 3)
             known.add(estimates)
-            self._plot(f"{axis}/estimate", time, position)
-            for edge, half in (("upper", 2.0 * sd), ("lower", -2.0 * sd)):
-                self._plot(f"{axis}/estimate/{edge}", time, position + half)
-                self._plot(f"residual/{axis}/{edge}", time, half)
+            self._plot(f"{axis}/estimate", styles.line(colours.ESTIMATE, "estimate"), time, position * MM)
+            for edge, label, half in (("upper", "+2σ", 2.0 * sd), ("lower", "−2σ", -2.0 * sd)):
+                self._plot(f"{axis}/estimate/{edge}", styles.edge(label), time, (position + half) * MM)
+                self._plot(f"residual/{axis}/{edge}", styles.edge(label), time, half * MM)
         for (axis, name), residuals in self._residuals.items():
             residuals.add(_columns(frame, f"measurement/{axis}/{name}", 3))
             time, position, residual, rejected = residuals.take()
             fused, shown = ~rejected, self._estimates[axis].clip(position)
-            self._plot(f"{axis}/{name}", time[fused], position[fused])
-            self._plot(f"{axis}/{name}/rejected", time[rejected], shown[rejected])
-            self._plot(f"residual/{axis}/{name}", time[fused], residual[fused])
-        for name in self._colours:
-            self._draw_path(name, _columns(frame, f"path/{name}", 4))
-            for kind in ("nis", "rate"):
-                styles.send(self._stream, f"{kind}/{name}", *_columns(frame, f"{kind}/{name}", 2))
+            points, crosses = (
+                styles.points(self._colours[name], name),
+                styles.points(colours.REJECTED, "rejected", "Cross"),
+            )
+            self._plot(f"{axis}/{name}", points, time[fused], position[fused] * MM)
+            self._plot(f"{axis}/{name}/rejected", crosses, time[rejected], shown[rejected] * MM)
+            self._plot(f"residual/{axis}/{name}", points, time[fused], residual[fused] * MM)
+        for name, colour in self._of_sensors.items():
+            for path in (f"nis/{name}", f"rate/{name}"):
+                self._plot(path, styles.line(colour, name), *_columns(frame, path, 2))
+        for name, colour in self._colours.items():
+            self._draw_path(name, colour, _columns(frame, f"path/{name}", 4))
 
-    def _draw_path(self, name: str, rows: FloatArray) -> None:
+    def _draw_path(self, name: str, colour: str, rows: FloatArray) -> None:
         """The last seconds of a path; measurements as points. A negative radius is in points of the screen."""
         rows = rows[:, np.isfinite(rows).all(axis=0)]
         if not rows.size:
@@ -103,23 +97,24 @@ class Picture:
             self._stream.send_blueprint(_blueprint(self._header, rows[1:, 0] * MM))
         path = self._paths.setdefault(name, Recent(4))
         path.add(rows)
-        strip, colour = path.rows[1:].T * MM, colours.rgb(self._colours[name])
+        strip, rgb = path.rows[1:].T * MM, colours.rgb(colour)
         thinned = strip[:: -(1 + len(strip) // _PATH_POINTS)]  # the newest is among them
         self._stream.set_time(styles.TIMELINE, duration=float(rows[0, -1]))
         if name in self._header.sensors:
-            self._stream.log(f"path/{name}", rr.Points3D(thinned, colors=[colour], radii=-1.0))
+            self._stream.log(f"path/{name}", rr.Points3D(thinned, colors=[rgb], radii=-1.0))
         else:
             width = -0.7 if name == "command" else -1.2
-            self._stream.log(f"path/{name}", rr.LineStrips3D([thinned], colors=[colour], radii=width))
+            self._stream.log(f"path/{name}", rr.LineStrips3D([thinned], colors=[rgb], radii=width))
         if name == "estimate":
             tool = rr.Points3D(strip[-1:], colors=[colours.rgb(colours.REJECTED)], radii=-5.0)
             self._stream.log("path/tool", tool)
 
-    def _plot(self, path: str, time: FloatArray, position: FloatArray) -> None:
-        styles.send(self._stream, path, time, position * MM)
-
-    def _look(self, path: str, look: rr.SeriesLines | rr.SeriesPoints) -> None:
-        self._stream.log(path, look, static=True)
+    def _plot(self, path: str, style: styles.Style, time: FloatArray, value: FloatArray) -> None:
+        """Send the values of an entity, with the first of them its style."""
+        if path not in self._styled and len(time):
+            self._styled.add(path)
+            self._stream.log(path, style, static=True)
+        styles.send(self._stream, path, time, value)
 
 
 class Recent:
@@ -141,10 +136,11 @@ class Recent:
 
     def at(self, time: FloatArray) -> FloatArray:
         """The second column between two rows, of which there are two; NaN before the first one and in a gap."""
-        times = self.rows[0]
+        times: FloatArray = self.rows[0]
+        values: FloatArray = self.rows[1]
         after = np.clip(np.searchsorted(times, time), 1, len(times) - 1)
-        gap = times[after] - times[after - 1] > _LONGEST_GAP
-        return np.where(gap, np.nan, np.interp(time, times, self.rows[1], left=np.nan))
+        known = (time >= times[0]) & (times[after] - times[after - 1] <= _LONGEST_GAP)
+        return np.where(known, np.interp(time, times, values), np.nan)
 
     def clip(self, position: FloatArray) -> FloatArray:
         """Positions [m] with those far off moved to the edge: one wild measurement would flatten the plot."""
