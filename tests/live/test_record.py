@@ -251,9 +251,7 @@ def test_a_full_disk_is_reported_and_nothing_is_written_twice(
         recorded.go(10, begin=begin * 10)
         recorded.tick()
     recorded.noticed("No space left on device")
-    torn = pf.Run.read(recorded.folder)
-    assert any("may be torn" in note for note in torn.notes)
-    pf.fuse(torn, TRACKED)
+    pf.fuse(pf.Run.read(recorded.folder), TRACKED)
     for _ in range(20):
         recorded.tick()
     monkeypatch.setattr(os, "write", write)

@@ -290,7 +290,7 @@ class Writer:
     def _begin(self, folder: Path) -> None:
         """Begin a run in a folder."""
         self._folder, self._manifest = folder, ""
-        self._torn: dict[str, bool] = {}  # of each file that has rows, whether its last line is torn
+        self._sizes: dict[str, int] = {}  # of each file, as far as its rows are complete
 
     def _tried(self, job: Job) -> bool:
         """Write what is left of a job; whether all of it is written."""
@@ -312,19 +312,17 @@ class Writer:
         return True
 
     def _append(self, job: Job, name: str) -> bool:
-        """Write a file's rows, without what a full disk took of them before; whether the file had gone."""
+        """Write a file's rows, in the place of what a full disk took of them before; whether the file had gone."""
         descriptor = os.open(job.folder / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         try:
-            empty = not os.fstat(descriptor).st_size
-            gone = empty and name in self._torn
-            if gone and self._torn[name]:  # the rest of a line whose beginning has gone
-                job.rows[name] = job.rows[name].partition(b"\n")[2]
-            if empty and not job.rows[name].startswith(self._header):
-                job.rows[name] = self._header + job.rows[name]
-            while rows := job.rows[name]:
-                written = os.write(descriptor, rows)
-                job.rows[name] = rows[written:]
-                self._torn[name] = rows[written - 1 : written] != b"\n"
+            known = self._sizes.get(name, 0)
+            gone = os.fstat(descriptor).st_size < known
+            self._sizes[name] = known = 0 if gone else known
+            os.ftruncate(descriptor, known)
+            rows = job.rows[name] if known else self._header + job.rows[name]
+            while rows:
+                rows = rows[os.write(descriptor, rows) :]
+            self._sizes[name] = os.fstat(descriptor).st_size
         finally:
             os.close(descriptor)
         del job.rows[name]
@@ -354,8 +352,5 @@ def _cell(value: object) -> str:
     if not isinstance(value, float | int) or not math.isfinite(value):
         return ""
     mm = value * MM
-    short = f"{mm:.12g}"
-    if float(short) / MM == value:
-        return short
-    around = (mm, math.nextafter(mm, -math.inf), math.nextafter(mm, math.inf))
+    around = (float(f"{mm:.12g}"), mm, math.nextafter(mm, -math.inf), math.nextafter(mm, math.inf))
     return repr(next((one for one in around if one / MM == value), mm))
