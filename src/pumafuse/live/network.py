@@ -212,9 +212,9 @@ class TcpListener(_Tcp):
             why = "" if self._allowed(peer) else "--allow does not name it"
             why = f"{_MOST_CONNECTIONS} are open" if not why and len(self._open) >= _MOST_CONNECTIONS else why
             if why:
-                connection.close()
                 self._refused += 1
                 self._log.write("refused", f"a connection from {peer}: refused, {why}")
+                connection.close()
                 continue
             self._accepted += 1
             self._log.write("connected", f"{peer} has connected")
