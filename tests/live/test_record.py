@@ -316,7 +316,7 @@ def test_a_parent_that_goes_is_waited_for(tmp_path: Path, monkeypatch: pytest.Mo
 def test_only_an_empty_folder_is_recorded_into(tmp_path: Path) -> None:
     """What is there already is never mixed with what comes."""
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(pf.PumafuseError, match="not empty"):
+    with pytest.raises(pf.PumafuseError, match="which is not ours"):
         Recorder(tmp_path, TRACKED, {}, print)
     sensors = {"../tracker": pf.Sensor(sd=1e-4)}
     with pytest.raises(pf.RunError, match=r"\.\./tracker"):

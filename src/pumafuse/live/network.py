@@ -155,6 +155,7 @@ class _Tcp:
 
     def stop(self) -> list[bytes]:
         """The lines that have come and were not given yet; the connections end with the process."""
+        self._log = RateLimitedLog(lambda _: None)  # a thread that writes while the process ends would stop it
         lines: list[bytes] = []
         while not self._pieces.empty():
             lines += self._pieces.get()

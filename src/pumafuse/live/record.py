@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .. import toml
-from ..folders import FolderError, write_file
+from ..folders import FolderError, check_writable, write_file
 from ..fusion.config import FusionConfig
 from ..logs.clock import TOLERATED_STEP_BACK_NS
 from ..logs.frames import CARTESIAN
@@ -79,7 +79,8 @@ class Recorder:
         self._first = self._folder = folder = folder.absolute()
         self.late = self.lost = self._given = 0
         self._segment = 1
-        _make(folder)
+        check_writable(folder, force=False, markers=(), ours=lambda _: False)
+        folder.mkdir(parents=True, exist_ok=True)
         self._writer = Writer(",".join((_TIME, *(f"{axis}_mm" for axis in self._columns))).encode() + b"\n")
         self._due, self._reported, self._troubled = 0.0, -math.inf, False
         self._clear()
@@ -302,11 +303,8 @@ class Writer:
             if job.manifest != self._manifest or not (job.folder / _MANIFEST).exists():
                 write_file(job.folder / _MANIFEST, job.manifest)
                 self._manifest = job.manifest
-        except OSError as error:
-            self.trouble = f"{job.folder}: {error.strerror or error}"
-            return False
-        except FolderError as error:
-            self.trouble = str(error)
+        except (OSError, FolderError) as error:
+            self.trouble = f"{job.folder}: {getattr(error, 'strerror', None) or error}"
             return False
         self.trouble = f"{job.folder} or a file in it had gone, and is begun anew" if any(gone) else ""
         return True
@@ -331,20 +329,6 @@ class Writer:
 
 def _file(sensor: str | None) -> str:
     return _COMMANDS if sensor is None else f"{sensor}.csv"
-
-
-def _make(folder: Path) -> None:
-    """Make a folder.
-
-    Raises:
-        FolderError: It holds something, or cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise FolderError(f"{folder}: is not empty; a recording needs a folder of its own")
-    except OSError as error:
-        raise FolderError(f"{folder}: cannot be written: {error.strerror}") from None
 
 
 def _cell(value: object) -> str:
