@@ -141,6 +141,12 @@ def test_a_long_pause_is_not_filled() -> None:
     assert times == sorted(times)
 
 
+def test_a_rate_beyond_reason_is_refused() -> None:
+    """More than 10 kHz."""
+    with pytest.raises(pf.ConfigError, match="10000"):
+        Both(rate=1e6)
+
+
 def test_a_line_without_end_is_not_kept() -> None:
     """A megabyte without a line end is one bad line, held nowhere."""
     both = Both()
