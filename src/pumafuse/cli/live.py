@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import gc
 import math
@@ -111,9 +110,7 @@ def run(
         summaries = [part.summary for part in (remote, recorder, sender) if part is not None]
         feeder = _Feeder(stream, summaries, address.speed, recorder, view, screen)
         if remote is not None:
-            with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:  # Windows' own reads no datagrams
-                runner.get_loop().set_exception_handler(lambda _, context: notify(f"network: {context['message']}"))
-                runner.run(_listen(remote, feeder, signals))
+            _listen(remote, feeder, signals)
         else:
             for items in standard_input() if recorded is None else replayed(recorded, known, address.speed):
                 feeder.take(items)
@@ -146,14 +143,14 @@ def _to_standard_output(lines: list[bytes]) -> None:
         raise RunError(f"standard output: cannot be written: {error.strerror}") from None
 
 
-async def _listen(remote: network.Source, feeder: _Feeder, signals: list[int]) -> None:
+def _listen(remote: network.Source, feeder: _Feeder, signals: list[int]) -> None:
     """Feed what comes from the network until a signal ends it, and what has come until then."""
-    await remote.start()
+    remote.start()
     try:
         while not signals:
-            feeder.take(await remote.get())
+            feeder.take(remote.get())
     finally:
-        left = await remote.stop()
+        left = remote.stop()
     feeder.take(left)
 
 
