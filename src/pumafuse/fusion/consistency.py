@@ -121,55 +121,52 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
 
 def sensor_problems(est: Estimates) -> list[str]:
     """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows, other clocks, frozen."""
-    found = _too_wide(est)
-    for name in est.measurements.sensors:
-        mine = est.measurements.where(est.measurements.sensor == est.measurements.sensors.index(name))
-        total, counts = len(mine.outcome), mine.counts()
-        if not total:
-            continue
-        reacquired = len(np.unique(mine.time[mine.outcome == Outcome.REACQUIRED]))
-        if reacquired:
-            times = "once" if reacquired == 1 else f"{reacquired} times"
-            found.append(
-                f"{name}: its gate reacquired {times}: it contradicts the others or the model; if it is off by a"
-                " constant, give it bias_sd_mm"
-            )
-        if counts.get(Outcome.BEFORE_START.word, 0) > 0.5 * total:
-            found.append(f"{name}: most measurements lie before the first command: are both stamped by one clock?")
-        last = float(np.nanmax(mine.time, initial=-np.inf))
-        if last > est.last_command + LONGEST_TAIL_NS / 1e9:
-            hours = (last - est.last_command) / 3600.0
-            found.append(
-                f"{name}: measurements go on for {hours:.1f} hours after the last command: are both stamped by one"
-                " clock?"
-            )
-        elif float(np.mean(mine.time > est.last_command + 1.0)) > 0.5:
-            found.append(f"{name}: most measurements lie after the last command: are both stamped by one clock?")
-        rejected = counts.get(Outcome.REJECTED.word, 0) / total
-        if rejected > _MANY_REJECTED:
-            found.append(
-                f"{name}: {rejected:.0%} of its components were rejected: sd_mm, latency_ms or the process noise too"
-                " small"
-            )
-        for number, axis in enumerate(mine.axes):
-            if frozen := _frozen(mine.value[mine.axis == number]):
-                found.append(f"{name}: {frozen} {axis} measurements in a row have the same value: it froze")
-    return found
-
-
-def _too_wide(est: Estimates) -> list[str]:
-    """Notes on priors so much wider than a sensor's noise that double precision blurs the error bars."""
     found: list[str] = []
-    for name, sensor in est.config.sensors.items():
-        sds = [sd for axis in est.axes if (sd := sensor.sd_of(axis)) is not None]
-        if sds and name in est.measurements.sensors:
-            ratio = max(est.config.start.offset_sd, sensor.bias_sd) / min(sds)
-            if ratio > _WIDEST:
-                found.append(
-                    f"{name}: its prior (offset_sd_mm, bias_sd_mm) is {ratio:.1e} times its noise: more than double"
-                    " precision resolves; use a narrower prior"
-                )
+    all_of, end = est.measurements, est.last_command
+    for number, name in enumerate(all_of.sensors):
+        mine = np.flatnonzero(all_of.sensor == number)
+        if not len(mine):
+            continue
+        outcome, time = all_of.outcome[mine], all_of.time[mine]
+        share = np.bincount(outcome, minlength=len(Outcome)) / len(mine)
+        problems: list[str] = []
+        sensor = est.config.sensors.get(name)
+        if sensor is not None and (ratio := _width_of_prior(est, sensor)) > _WIDEST:
+            problems.append(
+                f"its prior (offset_sd_mm, bias_sd_mm) is {ratio:.1e} times its noise: more than double precision"
+                " resolves; use a narrower prior"
+            )
+        if share[Outcome.REACQUIRED]:
+            count = len(np.unique(time[outcome == Outcome.REACQUIRED]))
+            problems.append(
+                f"its gate reacquired {'once' if count == 1 else f'{count} times'}: it contradicts the others or the"
+                " model; if it is off by a constant, give it bias_sd_mm"
+            )
+        if share[Outcome.BEFORE_START] > 0.5:
+            problems.append("most measurements lie before the first command: are both stamped by one clock?")
+        last = float(np.fmax.reduce(time))
+        if last > end + LONGEST_TAIL_NS / 1e9:
+            hours = f"{(last - end) / 3600.0:.1f} hours"
+            problems.append(f"measurements go on for {hours} after the last command: are both stamped by one clock?")
+        elif np.count_nonzero(time > end + 1.0) > 0.5 * len(mine):
+            problems.append("most measurements lie after the last command: are both stamped by one clock?")
+        if share[Outcome.REJECTED] > _MANY_REJECTED:
+            problems.append(
+                f"{share[Outcome.REJECTED]:.0%} of its components were rejected: sd_mm, latency_ms or the process noise"
+                " too small"
+            )
+        axis, value = all_of.axis[mine], all_of.value[mine]
+        for column, axis_name in enumerate(all_of.axes):
+            if frozen := _frozen(value[axis == column]):
+                problems.append(f"{frozen} {axis_name} measurements in a row have the same value: it froze")
+        found.extend(f"{name}: {problem}" for problem in problems)
     return found
+
+
+def _width_of_prior(est: Estimates, sensor: Sensor) -> float:
+    """How many times the prior is as wide as a sensor's noise: beyond 1e6 double precision blurs the error bars."""
+    sds = [sd for axis in est.axes if (sd := sensor.sd_of(axis)) is not None]
+    return max(est.config.start.offset_sd, sensor.bias_sd) / min(sds, default=np.inf)
 
 
 def _frozen(values: FloatArray) -> int:

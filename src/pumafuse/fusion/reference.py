@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray
+from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
 from ..logs.run import Reference
 from ..units import seconds
@@ -30,26 +30,19 @@ class ReferenceTrack:
     segment: IntArray
 
 
-def late_rows(reference: Reference) -> BoolArray:
+def late_rows(stamp: TimeArray) -> BoolArray:
     """Rows stamped more than 1 s behind an earlier one; they are not used, (rows,)."""
-    return behind(reference.stamp) > TOLERATED_STEP_BACK_NS
+    return behind(stamp) > TOLERATED_STEP_BACK_NS
 
 
-def reference_track(reference: Reference, origin: int) -> ReferenceTrack:
-    """A run's reference in order, in seconds since ``origin`` (int ns), without rows behind a jump back."""
-    kept = reference.rows((reference.stamp != NO_STAMP) & ~late_rows(reference))
-    order = np.argsort(kept.stamp, kind="stable")
-    position = {axis: value[order] for axis, value in kept.values.items()}
-    sd = {axis: reference.sd * kept.spread.get(axis, np.ones(len(order)))[order] for axis in position}
-    return ReferenceTrack(seconds(kept.stamp[order], origin), position, sd, np.zeros(len(order), dtype=np.int64))
-
-
-def joined_references(parts: Sequence[tuple[ReferenceTrack, float, int]]) -> ReferenceTrack:
-    """One reference of several segments; ``parts`` gives each with a shift of its time [s] and its segment's number."""
-    first = parts[0][0]
+def reference_track(parts: Sequence[Reference], origin: int) -> ReferenceTrack:
+    """The reference of a run's segments in order, in seconds since ``origin`` (int ns), without late rows."""
+    used = [part.rows((part.stamp != NO_STAMP) & ~late_rows(part.stamp)) for part in parts]
+    used = [part.rows(np.argsort(part.stamp, kind="stable")) for part in used]
+    noise = [{axis: part.sd * part.spread.get(axis, np.ones(len(part.stamp))) for axis in part.values} for part in used]
     return ReferenceTrack(
-        np.concatenate([track.time + shift for track, shift, _ in parts]),
-        {axis: np.concatenate([track.position[axis] for track, _, _ in parts]) for axis in first.position},
-        {axis: np.concatenate([track.sd[axis] for track, _, _ in parts]) for axis in first.position},
-        np.concatenate([np.full(len(track.time), number) for track, _, number in parts]),
+        seconds(np.concatenate([part.stamp for part in used]), origin),
+        {axis: np.concatenate([part.values[axis] for part in used]) for axis in used[0].values},
+        {axis: np.concatenate([sd[axis] for sd in noise]) for axis in noise[0]},
+        np.repeat(np.arange(len(used)), [len(part.stamp) for part in used]),
     )

@@ -26,7 +26,7 @@ from ..logs.tables import Table
 from ..units import MM, seconds
 from .config import FusionConfig
 from .estimates import AxisEstimate, Estimates
-from .reference import ReferenceTrack, joined_references, reference_track
+from .reference import ReferenceTrack, reference_track
 from .summary import ScoreSummary, Summary, score_axis, summarise
 
 ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY = (
@@ -148,10 +148,10 @@ def read_reference(path: Path, origin: int, frame: Frame | None = None) -> Refer
     """
     if path.is_dir() or path.suffix == ".toml":
         run, _ = in_axes(Run.read(path), frame)
-        tracks = [reference_track(part.reference, origin) for part in segments(run)[0] if part.reference is not None]
-        if not tracks:
+        parts = [part.reference for part in segments(run)[0] if part.reference is not None]
+        if not parts:
             raise RunError(f"{path}: the run has no reference")
-        return joined_references(list(zip(tracks, [0.0] * len(tracks), range(len(tracks)), strict=True)))
+        return reference_track(parts, origin)
     table = tables.read(path)
     logged = [name for name in table.columns if name.startswith(_REFERENCE_PREFIX)]
     if not logged:
