@@ -12,7 +12,7 @@ from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
 from ..errors import UnknownNameError
 from ..filter.outcome import Outcome
 from .config import FusionConfig
-from .reference import ReferenceTrack
+from .score import ReferenceTrack
 
 Mode = Literal["filtered", "as-live", "smoothed"]
 

@@ -23,7 +23,7 @@ from .config import FusionConfig
 from .consistency import sensor_problems
 from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
-from .reference import late_rows, reference_track
+from .score import late_rows, reference_track
 from .segments import Segment, build, output_times
 
 S = TypeVar("S", bound=np.generic)
