@@ -134,15 +134,6 @@ def test_a_sensor_of_nothing_but_nan_is_left_out(
         assert found.nis_mean is None
 
 
-def test_an_infinite_measurement_is_as_good_as_none(
-    scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
-) -> None:
-    """A minute of ±∞ is a minute of invalid measurements."""
-    est, summary = fused(scan, config, lambda source: changed(source, lambda value: np.copysign(np.inf, value)))
-    check_same(est, camera_alone)
-    assert summary.axes["radial"].sensors["tracker"].outcomes == {"invalid": 5999}
-
-
 def shifted(seconds: float) -> Callable[[Source], Source]:
     return lambda source: replace(source, stamp=source.stamp + int(seconds * 1e9))
 
@@ -154,14 +145,6 @@ def test_a_sensor_on_the_epoch_s_clock_is_asked_about(
     est, summary = fused(scan, config, shifted(1.7e9))
     check_same(est, camera_alone)
     assert said(summary, "after the last command", "one clock")
-
-
-def test_a_clock_of_another_era_does_not_stretch_the_grid(scan: pf.Run, config: pf.FusionConfig) -> None:
-    """Estimates at 20 Hz end with the run, not with a sensor's stamps of 2023."""
-    est, summary = fused(scan, config, shifted(1.7e9), rate=20.0)
-    end = (scan.command.stamp.max() - scan.command.stamp.min()) / 1e9
-    assert abs(est.time[-1] - end) < 1.0
-    assert said(summary, "one clock")
 
 
 def test_a_sensor_on_a_clock_since_boot_is_asked_about(
@@ -176,12 +159,3 @@ def test_a_sensor_on_a_clock_since_boot_is_asked_about(
     assert said(summary, "5999 rows have a time before the first command", "before_start")
     assert said(summary, "before the first command", "one clock")
     assert summary.axes["radial"].sensors["tracker"].outcomes == {"before_start": 5999}
-
-
-def test_measurements_long_after_the_run_are_noted(
-    scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
-) -> None:
-    """Two hours late, the tracker says nothing of the run: its estimates are the camera's, and the hours are named."""
-    est, summary = fused(scan, config, shifted(7200.0))
-    check_same(est, camera_alone)
-    assert said(summary, "2.0 hours after the last command")

@@ -235,24 +235,6 @@ def test_few_measurements_are_not_judged(count: int, few: bool) -> None:
     assert found.count == count
 
 
-def test_nothing_fused_is_nothing_judged() -> None:
-    """Only values that are not finite: no numbers, and no division by nothing."""
-    run = pf.Run.from_arrays([0.0, 0.028], {"axis0": [0.0, 0.0]}, {"camera": ([0.03, 0.04], {"axis0": [np.nan] * 2})})
-    with pytest.warns(pf.PumafuseWarning, match="invalid"):
-        est = pf.fuse(run, World().config(run))
-    assert consistency(est, "camera", "axis0") is None
-
-
-def test_half_the_noise_blames_sd_first():
-    """Each innovation pulls against the last: that is sd_mm, and not the process noise."""
-    world = World(sd=0.3e-3, drift=0.5e-3)
-    run = simulated(world, swing(11.0), 0.01, 1000, 6, 3)
-    for found in judged(run, replace(world, sd=0.15e-3)).values():
-        assert found.correlation[0] < 0.0
-        assert "the process noise too small" not in found.verdict
-        assert "sd_mm" in found.verdict
-
-
 @pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
 def test_a_verdict_on_what_a_gate_has_left_says_so(moving: pf.Run) -> None:
     """With a third of the noise and a gate of 2 the rest fits by selection: the verdict is how many were rejected."""

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from pumafuse.errors import PumafuseWarning
 from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
-from pumafuse.fusion.consistency import log_likelihood
 from pumafuse.fusion.engine import innovations
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
@@ -106,15 +105,6 @@ def contradictions(rows: Sequence[Row], sensors: Mapping[str, Sensor]) -> list[t
 # ---- a sensor alone -------------------------------------------------------------------------------------------------
 
 
-def test_a_single_outlier_is_rejected_and_nothing_moves() -> None:
-    """The estimates are those without the row."""
-    good = every(100, [0.1e-3] * 10)
-    found, wanted = fused([*good[:5], *rows_at([450], [OFF]), *good[5:]]), fused(good)
-    assert outcomes(found) == [FUSED] * 5 + [REJECTED] + [FUSED] * 5
-    for name in ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd"):
-        np.testing.assert_allclose(getattr(found["radial"], name), getattr(wanted["radial"], name), rtol=1e-10)
-
-
 @pytest.mark.parametrize(("apart", "second"), [(T, REACQUIRED), (T - 1, REJECTED), (20 * T, REACQUIRED)])
 def test_two_that_agree_a_period_apart_are_believed(apart: int, second: Outcome) -> None:
     """Nearer than T the second may be the same glitch seen twice."""
@@ -129,12 +119,6 @@ def test_a_step_is_followed_after_a_period(interval: float, rejected: int) -> No
     assert got == [FUSED] * 5 + [REJECTED] * rejected + [REACQUIRED] + [FUSED] * 4
 
 
-def test_two_that_disagree_are_not_believed() -> None:
-    """Each is compared with the one before: outliers that jump about stay rejected, until two agree."""
-    off = [0.0] * 5 + [OFF, 2 * OFF, -OFF, OFF, -2 * OFF, -2 * OFF]
-    assert outcomes(fused(every(100, off))) == [FUSED] * 5 + [REJECTED] * 5 + [REACQUIRED]
-
-
 def test_how_near_two_must_be_to_agree() -> None:
     """Within gate · √(R₁ + R₂ + the variance of the motion between)."""
     xx = INPUT_NOISE**2 / (2.0 * TAU)  # at rest for long
@@ -144,18 +128,6 @@ def test_how_near_two_must_be_to_agree() -> None:
     for share, outcome in ((0.9, REACQUIRED), (1.1, REJECTED)):
         rows = every(100, [0.0] * 20 + [OFF, OFF + share * limit])
         assert outcomes(fused(rows))[-1] == outcome
-
-
-def test_a_measurement_that_passes_ends_the_wait() -> None:
-    """Every second one off by the same is an outlier every time."""
-    assert outcomes(fused(every(50, [0.0, OFF] * 10))) == [FUSED, REJECTED] * 10
-
-
-def test_a_gate_of_zero_rejects_nothing() -> None:
-    """Measurements off by thousands of standard deviations are fused at once and plainly."""
-    estimates = fused(every(10, [0.0] * 5 + [OFF, -OFF] * 40), {"tracker": sensor(0.0)})
-    assert set(outcomes(estimates)) == {FUSED}
-    assert np.abs(estimates.measurements.innovation / estimates.measurements.innovation_sd).max() > 100.0
 
 
 @pytest.mark.parametrize("scale", [1.0, -2.0, 0.1])
@@ -196,16 +168,6 @@ def test_a_row_re_acquires_only_if_all_its_rejected_axes_agree(gate_rows: bool) 
     assert outcomes(estimates, axis="vertical")[-5:] == [REJECTED] * 5
 
 
-@pytest.mark.parametrize("gate_rows", [True, False])
-def test_an_axis_that_is_off_takes_its_row_along(gate_rows: bool) -> None:
-    """By rows the good axis is rejected and comes back, as fused, with the other."""
-    off = [0.0, 0.0, OFF, OFF, OFF]
-    rows = [Row(100 * k * MS, "tracker", {"radial": one, "vertical": 0.0}) for k, one in enumerate(off)]
-    estimates = fused(rows, {"tracker": sensor(gate_rows=gate_rows)})
-    assert outcomes(estimates) == [FUSED, FUSED, REJECTED, REACQUIRED, FUSED]
-    assert outcomes(estimates, axis="vertical") == [FUSED, FUSED, REJECTED if gate_rows else FUSED, FUSED, FUSED]
-
-
 # ---- two sensors ----------------------------------------------------------------------------------------------------
 
 
@@ -227,21 +189,6 @@ def test_a_sensor_stands_for_what_is_believed_for_half_a_second(since: float, wa
     assert outcomes(fused(rows, BOTH), "camera") == [REJECTED, wanted]
 
 
-def test_a_sensor_on_another_axis_does_not_count() -> None:
-    """Who has seen nothing of an axis cannot stand for what is believed of it."""
-    rows = rows_at(range(0, 1000, 100), [0.0] * 10, "camera", ["vertical"])
-    rows += every(100, [0.0] * 3 + [OFF] * 4, 3, "tracker")
-    assert outcomes(fused(rows, BOTH)) == [FUSED] * 3 + [REJECTED, REACQUIRED, FUSED, FUSED]
-    assert contradictions(rows, BOTH) == []
-
-
-def test_an_outlier_contradicts_nobody() -> None:
-    """One that disagrees with the one before is rejected, and no contradiction is said."""
-    rows = every(100, [0.0] * 10, name="tracker") + every(100, [0.0, *ERRATIC, 0.0], 5, "camera")
-    assert outcomes(fused(rows, BOTH), "camera") == [FUSED, *[REJECTED] * 5, FUSED]
-    assert contradictions(rows, BOTH) == []
-
-
 @pytest.mark.parametrize(
     ("settled", "quarrel", "wanted"),
     [(4.5, [], REACQUIRED), (5.5, [], REJECTED), (5.5, [3 * OFF, 5 * OFF], REACQUIRED)],
@@ -256,14 +203,6 @@ def test_re_acquisitions_are_forgotten_after_five_seconds_of_agreement(
     estimates = fused(rows, BOTH)
     assert outcomes(estimates)[4:10] == [FUSED, *[REJECTED] * 4, REACQUIRED]
     assert outcomes(estimates, "camera")[-2:] == [REJECTED, wanted]
-
-
-def test_the_contradiction_is_in_the_notes() -> None:
-    """Both names, the axis and since when."""
-    rows = every(100, [0.0] * 30, name="tracker") + every(100, [0.0] * 3 + [OFF] * 20, 5, "camera")
-    (note,) = [note for note in fused(rows, BOTH).notes if "'camera' contradicts 'tracker'" in note]
-    for word in ("radial", "mm", " s"):
-        assert word in note
 
 
 # ---- the rule, by hand ----------------------------------------------------------------------------------------------
@@ -481,47 +420,11 @@ def check_log(rows: list[Row], sensors: dict[str, Sensor], as_live: bool) -> Non
     check_estimates(estimates, rows, sensors, as_live)
 
 
-@settings(derandomize=True, deadline=None, max_examples=40)
+@settings(derandomize=True, deadline=None, max_examples=60)
 @given(logs(), st.booleans())
 def test_any_log_is_decided_as_the_rule_says(log: tuple[list[Row], dict[str, Sensor]], as_live: bool) -> None:
     """Outcomes, innovations, estimates and error bars are those worked out by hand, with all that had arrived."""
     check_log(*log, as_live)
 
 
-@pytest.mark.long
-@settings(derandomize=True, deadline=None, max_examples=200)
-@given(logs(), st.booleans())
-def test_many_logs_are_decided_as_the_rule_says(log: tuple[list[Row], dict[str, Sensor]], as_live: bool) -> None:
-    """As above, many more."""
-    check_log(*log, as_live)
-
-
 # ---- the likelihood -------------------------------------------------------------------------------------------------
-
-
-def test_the_log_likelihood_is_the_sum_over_all_components_decided_on() -> None:
-    """−½(ln 2πS + ν²/S) each, in mm, and −½(ln 2πS + gate²) for a rejected one, whether or not its own axis failed."""
-    off = [{"radial": 0.1e-3 * k, "vertical": OFF * (4 <= k < 40)} for k in range(-5, 50)]
-    rows = [Row(k * 30 * MS, "tracker", one) for k, one in enumerate(off)]
-    rows += every(143, [1e-3, -1e-3, OFF, 0.0, 2e-3, OFF], 3, "camera")
-    sensors = {"tracker": sensor(4.0), "camera": sensor(0.0, 1e-3)}
-    estimates, total = fused(rows, sensors), 0.0
-    judge = judged(rows, sensors)
-    for name, outcome, nu, S in judge.components:
-        square = sensors[name].gate ** 2 if outcome == REJECTED else nu**2 / S
-        total -= 0.5 * (math.log(2.0 * math.pi * S * 1e6) + square)
-    assert {outcome for _, outcome, _, _ in judge.components} == {FUSED, REJECTED, REACQUIRED}
-    assert log_likelihood(estimates.measurements, sensors) == pytest.approx(total, rel=1e-9)
-
-
-def test_components_that_were_never_decided_on_do_not_count_in_the_likelihood() -> None:
-    """Neither a duplicate, nor a row before the first command, nor a missing value, nor an unknown sensor."""
-    rows = every(50, [0.1e-3] * 6)
-    more = [*rows[2:4], Row(-100 * MS, "tracker", {"radial": 0.0}), Row(75 * MS, "tracker", {"radial": math.nan})]
-    more.append(Row(0, "other", {"radial": 0.0}))
-    run, _ = recorded([*rows, *more], {**TRACKER, "other": sensor()})
-    plain = fused(rows)
-    with pytest.warns(PumafuseWarning):
-        estimates = fuse(run, plain.config)
-    assert len(estimates.measurements.value) == len(rows) + 5
-    assert log_likelihood(estimates.measurements, TRACKER) == log_likelihood(plain.measurements, TRACKER)

@@ -15,12 +15,10 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from fusion.test_oracle import (
-    CASES,
     GRID,
     IRREGULAR,
     MODES,
     MS,
-    OUTLIER,
     PANEL,
     PAPER,
     TRACKER,
@@ -34,28 +32,17 @@ from fusion.test_oracle import (
     every,
     one,
     sensor,
-    warned,
-    with_outlier,
 )
 from fusion_oracle import AxisOracle, check_estimates, check_innovations, nanoseconds
 from pumafuse.errors import PumafuseWarning
 from pumafuse.filter.outcome import Outcome
-from pumafuse.fusion.config import FusionConfig, Process, Sensor
+from pumafuse.fusion.config import FusionConfig, Sensor
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
 from pumafuse.logs.run import Run, Source
 
 LATE = Seen(TRACKER.sensor, every(90, 20, 240 * MS))
 EARLY = Seen(TRACKER.sensor, every(90, 15))
-FIELDS = ("position", "offset")  # a smoothed velocity is not known
-
-
-def smoothed(case: Case, rate: float | None = None) -> tuple[Estimates, Run, FusionConfig]:
-    run, config = case.made()
-    with warned(run, config):
-        return fuse(run, config, rate=rate or case.rate, smooth=True), run, config
-
-
 # ---- against the oracle ---------------------------------------------------------------------------------------------
 
 MORE = {
@@ -100,62 +87,7 @@ def test_any_run_is_smoothed_like_the_conditional_gaussian(case: Case) -> None:
     check(tame(case), "smoothed")
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
-@given(cases())
-def test_smoothing_never_widens(case: Case) -> None:
-    """To know more measurements never makes anything less certain, whatever their values."""
-    after, run, config = smoothed(case)
-    with warned(run, config):
-        before = fuse(run, config, rate=case.rate)
-    for field in FIELDS:
-        wide, narrow = (getattr(each["radial"], f"{field}_sd") for each in (before, after))
-        assert (narrow <= wide * (1.0 + 1e-9)).all(), field
-
-
 # ---- without the oracle ------------------------------------------------------------------------
-
-
-def test_after_the_last_measurement_smoothed_is_filtered() -> None:
-    """Nothing is known of the future there; before it nearly everything is."""
-    after, run, config = smoothed(MORE["measurements that end early"], 200.0)
-    before = fuse(run, config, rate=200.0)
-    over = nanoseconds(after) >= EARLY.valid[-1]
-    assert over.any()
-    for field in (*FIELDS, *(f"{name}_sd" for name in FIELDS)):
-        wanted, got = getattr(before["radial"], field), getattr(after["radial"], field)
-        np.testing.assert_allclose(got[over], wanted[over], rtol=1e-13, err_msg=field)
-    assert (after["radial"].position_sd[~over] < 0.999 * before["radial"].position_sd[~over]).all()
-
-
-def test_before_anything_acts_the_arm_rests_and_only_the_offset_is_estimated() -> None:
-    """There the position is the start level and the offset that later measurements tell."""
-    case = Case(one(UNDER), delay=0.2, start={"radial": 0.507}, seen={"tracker": LATE}, rate=100.0,
-                process=Process(input_noise=0.0, drift=0.8e-3, maneuver_noise=2e-3))  # fmt: skip
-    radial = smoothed(case)[0]["radial"]
-    resting = slice(0, 20)
-    np.testing.assert_allclose(radial.position[resting], 0.507 + radial.offset[resting], rtol=1e-15)
-    np.testing.assert_allclose(radial.position_sd[resting], radial.offset_sd[resting], rtol=1e-15)
-    assert (radial.offset_sd[resting] < 0.25 * case.offset_sd).all()
-
-
-def test_an_offset_that_does_not_drift_is_smoothed_to_one_number() -> None:
-    """Given the whole run a constant is the same at every instant, and as certain: what the filter ends up with."""
-    case = Case(one(UNDER), process=Process(input_noise=0.3e-3, drift=0.0),
-                seen={"vision": VISION, "tracker": Seen(TRACKER.sensor, every(50, 20, 240 * MS))})  # fmt: skip
-    after, run, config = smoothed(case)
-    end = fuse(run, config, rate=50.0)["radial"]  # its last estimate is at the last measurement
-    np.testing.assert_allclose(after["radial"].offset, end.offset[-1], rtol=0.0, atol=1e-9 * end.offset_sd[-1])
-    np.testing.assert_allclose(after["radial"].offset_sd, end.offset_sd[-1], rtol=1e-9)
-
-
-def test_smoothing_changes_no_innovation_outcome_or_bias() -> None:
-    """Innovations, outcomes and biases of a smoothed run are those of the filtered one."""
-    run, config = CASES["panel"].made()
-    before, after = (fuse(run, config, smooth=smooth) for smooth in (False, True))
-    assert (before.mode, after.mode) == ("filtered", "smoothed")
-    for field in ("innovation", "innovation_sd", "outcome"):
-        np.testing.assert_array_equal(getattr(after.measurements, field), getattr(before.measurements, field))
-    assert after.biases == before.biases
 
 
 def test_smoothed_as_live_is_refused() -> None:
@@ -184,16 +116,6 @@ def test_smoothing_does_not_reach_across_a_clock_that_was_set_back() -> None:
 
 
 # ---- gates ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("sigmas", [6.0, -1e4])
-def test_rejected_measurements_stay_out(sigmas: float) -> None:
-    """A measurement beyond the gate leaves the smoothed estimates as if it had never been."""
-    run, config, _ = with_outlier(5.0, sigmas)
-    estimates = fuse(run, config, smooth=True)
-    for axis in estimates.axes:
-        oracle = AxisOracle(run, config, axis, leave_out={("tracker", OUTLIER)})
-        check_estimates(estimates[axis], oracle.smoothed(nanoseconds(estimates)))
 
 
 def bumped() -> tuple[Run, FusionConfig]:
@@ -303,17 +225,3 @@ def test_smoothed_error_bars_on_the_scan_are_right(scan: tuple[Run, FusionConfig
     )  # fmt: skip
     assert found is not None
     assert 0.90 <= found.coverage <= 0.99
-
-
-def test_error_bars_hold_with_a_prior_as_wide_as_a_metre() -> None:
-    """An offset and a panel's bias unknown to 1 m, beside a tracker of 0.05 mm: the smoothed error bars are right."""
-    case = MORE["a panel before the tracker"]
-    seen = {
-        **case.seen,
-        "tracker": replace(LATE, sensor=msgspec.structs.replace(LATE.sensor, sd=5e-5, bias_sd=0.0)),
-    }
-    estimates, run, config = smoothed(replace(case, seen=seen, offset_sd=1.0))
-    expected = AxisOracle(run, config, "radial").smoothed(nanoseconds(estimates))
-    for field in ("position", "offset"):
-        found = getattr(estimates["radial"], f"{field}_sd")
-        np.testing.assert_allclose(found, getattr(expected, f"{field}_sd"), rtol=1e-7)
