@@ -78,18 +78,6 @@ def check_same(est: pf.Estimates, wanted: pf.Estimates) -> None:
         np.testing.assert_allclose(est[axis].position_sd, wanted[axis].position_sd, rtol=1e-9)
 
 
-def test_a_sensor_that_is_always_wrong_is_named(
-    scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
-) -> None:
-    """50 mm off beside a good one: rejected throughout, said with both names, and no estimate is the worse for it."""
-    est, summary = fused(scan, config, lambda source: changed(source, lambda value: value + 0.05))
-    check_same(est, camera_alone)
-    assert any("'tracker' contradicts 'vision'" in note for note in summary.notes)
-    assert said(summary, "of its components were rejected")
-    for axis in AXES:
-        assert set(summary.axes[axis].sensors["tracker"].outcomes) == {"rejected"}
-
-
 def test_a_constant_error_is_found_where_a_bias_is_expected(
     scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
 ) -> None:

@@ -77,13 +77,6 @@ def test_an_axis_overrides_what_holds_for_all(tmp_path: Path) -> None:
     assert process == {"tangential": common, "radial": own, "vertical": common}
 
 
-def test_noise_is_one_number_or_one_for_each_axis(tmp_path: Path) -> None:
-    """A sensor without noise for an axis has none there: it is not used on that axis."""
-    sensors = load(tmp_path, DESIGN).sensors
-    assert [sensors["tracker"].sd_of(axis) for axis in AXES] == [None, 5e-5, 8e-5]
-    assert [sensors["range"].sd_of(axis) for axis in AXES] == [3e-4, 3e-4, 3e-4]
-
-
 def test_sensors_keep_the_order_of_the_file(tmp_path: Path) -> None:
     """The order of the file decides between measurements valid at one instant, also for a choice of sensors."""
     names = ("zeta", "alpha", "mu")
@@ -91,14 +84,6 @@ def test_sensors_keep_the_order_of_the_file(tmp_path: Path) -> None:
     assert config.sensor_names(None) == names
     assert config.sensor_names(["mu", "zeta", "mu"]) == ("zeta", "mu")
     assert config.sensor_names([]) == ()
-
-
-def test_a_sensor_that_is_not_configured_cannot_be_chosen(tmp_path: Path) -> None:
-    """Choosing an unknown sensor is refused with those that are configured."""
-    config = load(tmp_path, DESIGN)
-    with pytest.raises(UnknownNameError) as caught:
-        config.sensor_names(["tracker", "trakcer"])
-    assert (caught.value.name, caught.value.accepted) == ("trakcer", ("tracker", "range"))
 
 
 not_negative = st.floats(0.0, 1e6)

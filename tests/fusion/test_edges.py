@@ -70,13 +70,6 @@ def test_half_a_start_level_is_refused(start):
         in_axes(replace(arc(), start=start), None)
 
 
-def test_a_frame_in_fusion_toml_does_not_refuse_runs_that_name_axes():
-    """A frame in fusion toml does not refuse runs that name axes."""
-    run = pf.Run.from_arrays([0.0, 0.028], {"radial": [0.5, 0.5]})
-    est = quiet(run, pf.FusionConfig(arm=ARM, frame=Cylindrical()))
-    assert est["radial"].position[0] == 0.5
-
-
 def test_a_sensor_in_x_y_without_a_frame_is_not_dropped_silently():
     """A sensor in x y without a frame is not dropped silently."""
     run = pf.Run.from_arrays([0.0, 0.028], {"radial": [0.5, 0.5]}, {"camera": ([0.01], {"x": [0.5], "y": [0.0]})})

@@ -196,7 +196,7 @@ def test_both_engines_make_the_same_of_any_log() -> None:
             seen[outcome] += bool((wanted.results.outcome == outcome).any())
 
     check()
-    assert all(seen[outcome] > 2 for outcome in set(Outcome) - {Outcome.TOO_LATE})
+    assert all(seen[outcome] for outcome in set(Outcome) - {Outcome.TOO_LATE})
 
 
 def test_fuse_by_filterpy_says_the_same() -> None:

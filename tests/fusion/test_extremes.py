@@ -187,20 +187,6 @@ def test_a_day_of_rest_forgets_the_plant_and_widens_the_offset(plant: Plant) -> 
         assert radial.position_sd[-1] ** 2 - walked == pytest.approx(0.03e-3**2 * stationary, rel=1e-3)
 
 
-@pytest.mark.parametrize("gate", [0.0, 5.0])
-@pytest.mark.parametrize("bias_sd", [0.0, 1e-3])
-def test_a_hundred_sensors_may_measure_at_one_instant(bias_sd: float, gate: float) -> None:
-    """One after the other; without biases they are one measurement of a tenth of their noise."""
-    known = {
-        f"s{number}": pf.Sensor(sd=1e-3, bias_sd=bias_sd if number < 20 else 0.0, gate=gate) for number in range(100)
-    }
-    edge = Edge(offset_sd=1.0, process=PROCESSES["none"], sensors=known, rows=grid(3, 50 * MS, 50 * MS))
-    last = check(edge)["filtered"]["radial"].position_sd[-1]
-    assert last >= 1e-3 / np.sqrt(300) * 0.999
-    if not bias_sd and not gate:
-        assert last == pytest.approx(1e-3 / np.sqrt(300), rel=1e-6)
-
-
 def test_no_measurements_is_a_run() -> None:
     """No sensor at all, a sensor without rows, and one with rows only before the first command."""
     plain = check(Edge(sensors={}))

@@ -119,30 +119,6 @@ def test_a_step_is_followed_after_a_period(interval: float, rejected: int) -> No
     assert got == [FUSED] * 5 + [REJECTED] * rejected + [REACQUIRED] + [FUSED] * 4
 
 
-def test_how_near_two_must_be_to_agree() -> None:
-    """Within gate · √(R₁ + R₂ + the variance of the motion between)."""
-    xx = INPUT_NOISE**2 / (2.0 * TAU)  # at rest for long
-    a = math.exp(-0.1 / TAU)
-    motion = (a - 1.0) ** 2 * xx + (1.0 - a * a) * xx + DRIFT**2 * 0.1
-    limit = 5.0 * math.sqrt(2 * 0.2e-3**2 + motion)
-    for share, outcome in ((0.9, REACQUIRED), (1.1, REJECTED)):
-        rows = every(100, [0.0] * 20 + [OFF, OFF + share * limit])
-        assert outcomes(fused(rows))[-1] == outcome
-
-
-@pytest.mark.parametrize("scale", [1.0, -2.0, 0.1])
-def test_re_acquiring_takes_the_offset_to_the_measurement(scale: float) -> None:
-    """ν² / scale² more variance: the offset moves by nearly ν / scale, and is as uncertain as that measurement."""
-    # S becomes S + ν², as a position off by ν / scale explains all of ν
-    estimates = fused(every(100, [0.0] * 6 + [OFF, OFF]), {"tracker": sensor(scale=scale)})
-    radial, measurements = estimates["radial"], estimates.measurements
-    S_before = measurements.innovation_sd[-2] ** 2
-    assert measurements.innovation_sd[-1] ** 2 == pytest.approx(S_before + measurements.innovation[-1] ** 2, rel=1e-2)
-    assert measurements.innovation[-1] == pytest.approx(scale * OFF, rel=0.02)
-    assert radial.offset[-1] == pytest.approx(OFF, rel=1e-2)
-    assert radial.position_sd[-1] == pytest.approx(0.2e-3 / abs(scale), rel=1e-2)
-
-
 def test_a_re_acquisition_is_counted_and_said() -> None:
     """The outcome is in the counts, and a warning names the sensor."""
     run, config = recorded(every(50, [0.0] * 5 + [OFF] * 5), TRACKER)
@@ -152,34 +128,7 @@ def test_a_re_acquisition_is_counted_and_said() -> None:
     assert any("tracker" in str(one.message) and "reacquired" in str(one.message) for one in said)
 
 
-# ---- rows -----------------------------------------------------------------------------------------------------------
-
-ERRATIC = [OFF, -OFF, 2 * OFF, -2 * OFF, 3 * OFF]
-
-
-@pytest.mark.parametrize("gate_rows", [True, False])
-def test_a_row_re_acquires_only_if_all_its_rejected_axes_agree(gate_rows: bool) -> None:
-    """Off by the same on one axis and about at random on the other: the first re-acquires where axes are apart."""
-    rows = every(100, [0.0] * 3)
-    rows += [Row((300 + 100 * k) * MS, "tracker", {"radial": OFF, "vertical": off}) for k, off in enumerate(ERRATIC)]
-    estimates = fused(rows, {"tracker": sensor(gate_rows=gate_rows)})
-    off_radial = [REJECTED] * 5 if gate_rows else [REJECTED, REACQUIRED, FUSED, FUSED, FUSED]
-    assert outcomes(estimates)[-5:] == off_radial
-    assert outcomes(estimates, axis="vertical")[-5:] == [REJECTED] * 5
-
-
 # ---- two sensors ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("order", [("tracker", "camera"), ("camera", "tracker")])
-def test_what_another_sensor_contradicts_stays_rejected_and_is_named(order: tuple[str, str]) -> None:
-    """The sensor that was fused all along stands for what is believed."""
-    rows = every(100, [0.0] * 30, name="tracker") + every(70, [0.0] * 3 + [OFF] * 30, 5, "camera")
-    sensors = {name: BOTH[name] for name in order}
-    estimates = fused(rows, sensors)
-    assert outcomes(estimates, "tracker") == [FUSED] * 30
-    assert outcomes(estimates, "camera") == [FUSED] * 3 + [REJECTED] * 30
-    assert contradictions(rows, sensors) == [("camera", "tracker")] * 29
 
 
 @pytest.mark.parametrize(("since", "wanted"), [(500.0, REJECTED), (500.000001, REACQUIRED)])
