@@ -137,9 +137,11 @@ def sensor_problems(est: Estimates) -> list[str]:
         if not len(mine):
             continue
         outcome, time, axis, value = given.outcome[mine], given.time[mine], given.axis[mine], given.value[mine]
-        share = np.bincount(outcome, minlength=len(Outcome)) / len(mine)
+        early, rejected = (
+            np.count_nonzero(outcome == int(kind)) / len(mine) for kind in (Outcome.BEFORE_START, Outcome.REJECTED)
+        )
         reacquired = len(np.unique(time[outcome == Outcome.REACQUIRED]))
-        rejected, times = share[Outcome.REJECTED], "once" if reacquired == 1 else f"{reacquired} times"
+        times = "once" if reacquired == 1 else f"{reacquired} times"
         width, tail = _width_of_prior(est, name), float(np.fmax.reduce(time)) - end
         hours_later = tail > LONGEST_TAIL_NS / 1e9
         later = np.count_nonzero(time > end + 1.0) > 0.5 * len(mine)
@@ -155,7 +157,7 @@ def sensor_problems(est: Estimates) -> list[str]:
                 f"its gate reacquired {times}: it contradicts the others or the model; if it is off by a constant, give"
                 " it bias_sd_mm",
             ),
-            (share[Outcome.BEFORE_START] > 0.5, f"most measurements lie before the first command: {_ONE_CLOCK}"),
+            (early > 0.5, f"most measurements lie before the first command: {_ONE_CLOCK}"),
             (hours_later, f"measurements go on for {tail / 3600.0:.1f} hours after the last command: {_ONE_CLOCK}"),
             (later and not hours_later, f"most measurements lie after the last command: {_ONE_CLOCK}"),
             (rejected > _MANY_REJECTED, f"{rejected:.0%} of its components were {_TOO_SMALL}"),

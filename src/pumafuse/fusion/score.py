@@ -40,8 +40,9 @@ def late_rows(stamp: TimeArray) -> BoolArray:
 
 def reference_track(parts: Sequence[Reference], origin: int) -> ReferenceTrack:
     """The reference of a run's segments in order, in seconds since ``origin`` (int ns), without late rows."""
-    used = [part.rows((part.stamp != NO_STAMP) & ~late_rows(part.stamp)) for part in parts]
-    used = [part.rows(np.argsort(part.stamp, kind="stable")) for part in used]
+    late = [(part.stamp == NO_STAMP) | late_rows(part.stamp) for part in parts]
+    orders = [np.argsort(part.stamp, kind="stable") for part in parts]
+    used = [part.rows(order[~not_used[order]]) for part, order, not_used in zip(parts, orders, late, strict=True)]
     noise = [{axis: part.sd * part.spread.get(axis, np.ones(len(part.stamp))) for axis in part.values} for part in used]
     return ReferenceTrack(
         seconds(np.concatenate([part.stamp for part in used]), origin),

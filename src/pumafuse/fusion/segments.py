@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import TypeAlias
 
 import numpy as np
 
-from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray
+from ..arrays import NO_STAMP, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
 from ..filter.axis import Model, Sensors, State
 from ..filter.events import COMMAND, Events, classify_all, joined
@@ -79,7 +80,7 @@ class Segment:
         rows, parts = self.command_rows, list[Events]()
         for one in sorted(set(delay.tolist())):  # a command is one event for each distinct delay
             known = np.where(delay == one, rows.known, np.uint8(ABSENT))
-            given = np.flatnonzero((known == Outcome.FUSED).any(axis=1))
+            given = np.flatnonzero(_on_any_axis(known, Outcome.FUSED))
             parts.append(rows._replace(time=rows.stamp + one, known=known).rows(given))
         commands = sum(len(part.time) for part in parts)
         unordered = joined([*parts, self._measured(latency)])
@@ -120,7 +121,7 @@ class Segment:
         Measurements an hour after the last command are on another clock.
         """
         rows = self._measured(self._latency(config))
-        valid = rows.time[(rows.known == Outcome.FUSED).any(axis=1)]
+        valid = rows.time[_on_any_axis(rows.known, Outcome.FUSED)]
         return int(valid[valid <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
 
     def _latency(self, config: FusionConfig) -> IntArray:
@@ -162,10 +163,10 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     rows = _command_rows(run, config, policy, notes)
     silent = [name for name in chosen if name not in run.sensors]
     notes.extend(f"sensor '{name}' of the configuration has no measurements in this run" for name in silent)
-    fused = rows.known == Outcome.FUSED
-    commands = rows.stamp[fused.any(axis=1)]
+    commands = rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)]
     commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
-    first = {axis: float(rows.value[fused[:, number].argmax(), number]) for number, axis in enumerate(run.axes)}
+    given = {axis: (rows.known[:, number] == Outcome.FUSED).argmax() for number, axis in enumerate(run.axes)}
+    first = {axis: float(rows.value[row, number]) for number, (axis, row) in enumerate(given.items())}
     origin = int(commands[0])
     parts = [_measurement_rows(run, config, number, used, policy, origin, notes) for number in range(len(used))]
     measured = joined([Events.empty(len(run.axes)), *parts])
@@ -234,7 +235,7 @@ def _command_rows(run: Run, config: FusionConfig, policy: _Policy, notes: list[s
             raise RunError(f"{label}: no command for axis '{axis}' is a position within 1000 km")
     if run.clock == "stamps":
         return rows
-    rows = rows.rows(np.flatnonzero((rows.known == Outcome.FUSED).any(axis=1)))
+    rows = rows.rows(np.flatnonzero(_on_any_axis(rows.known, Outcome.FUSED)))
     distinct, place = np.unique(rows.stamp, return_inverse=True)
     grid, note = regular_grid(distinct, config.arm.update_period, label)
     notes.extend([] if note is None else [note])
@@ -256,13 +257,12 @@ def _measurement_rows(
         note_rows(notes, label, missing | True, "no sensor of this name in the configuration: unknown")
         return rows
     note_rows(notes, label, missing, f"no stamp: {Outcome.INVALID.word}")
-    kinds = np.flatnonzero(np.bincount(rows.known.ravel(), minlength=ABSENT)[:ABSENT])
-    if kinds.tolist() == [Outcome.FUSED]:
+    if ((rows.known == int(Outcome.FUSED)) | (rows.known == ABSENT)).all():
         return rows
     known = np.empty_like(rows.known)
     known[order] = rows.known
     for kind, reason in _REASONS.items():
-        note_rows(notes, label, (known == kind).any(axis=1), f"{reason}: {kind.word}")
+        note_rows(notes, label, _on_any_axis(known, kind), f"{reason}: {kind.word}")
     for column, axis in enumerate(run.axes):
         if axis in source.values and sensor.sd_of(axis) is None:
             notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
@@ -290,6 +290,11 @@ def _classified(rows: Events, policy: _Policy, origin: int, too_late: BoolArray)
     known = np.empty_like(rows.known)
     classify_all(model, sensors, rows, state, origin, too_late, known)
     return rows._replace(known=known)
+
+
+def _on_any_axis(known: CodeArray, kind: Outcome) -> BoolArray:
+    """Rows of which a value is of a kind, (n,); ``any(axis=1)`` takes twenty times as long for few axes."""
+    return reduce(np.logical_or, (known == int(kind)).T)
 
 
 def _valid(stamp: TimeArray, latency: IntArray | int) -> TimeArray:
