@@ -9,10 +9,9 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 
 import pumafuse as pf
-from streams import Both, any_stream, delayed, differences, events_of, line, lines
+from streams import Both, line, lines
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")]
 HOUR_NS = 3_600_000_000_000
@@ -148,16 +147,3 @@ def test_random_bytes_change_no_bit() -> None:
         both.feed(noise.tobytes() + b"\n" + good)
     assert both.stream.bad > 450_000
     assert both.written == clean.written
-
-
-@settings(derandomize=True, deadline=None, max_examples=3000)
-@given(any_stream())
-def test_very_many_streams_in_any_order(stream: tuple[pf.FusionConfig, pf.Run, int]) -> None:
-    """The property of the short tests, over many more streams."""
-    config, run, seed = stream
-    events = events_of(run)
-    longest = events[-1].stamp - events[0].stamp
-    live = pf.LiveEstimator(config, window=max(longest / 1e9 + 1.0, 2.0))
-    tied = {(event.stamp, event.sensor) for event in events}
-    given = delayed(events, 1.9, seed) if len(tied) == len(events) else events
-    assert differences(live, given, pf.fuse(run, config), 1e9) == []

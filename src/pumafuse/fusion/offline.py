@@ -182,7 +182,7 @@ def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measu
         given = np.flatnonzero((events.source != COMMAND)[:, None] & (events.known != ABSENT))
         row = given // len(first.axes)
         axis = (given - row * len(first.axes)).astype(np.int16)
-        time, stamp = (seconds(part[row], first.origin) for part in (events.time, events.stamp))
+        time, stamp = (seconds(part, first.origin)[row] for part in (events.time, events.stamp))
         of_filter = (part.take(given) for part in (results.innovation, results.innovation_sd, results.outcome))
         columns.append((time, stamp, events.source[row], axis, events.value.take(given), *of_filter))
     return Measurements(*map(_joined, zip(*columns, strict=True)), sensors=first.sensors, axes=first.axes)
