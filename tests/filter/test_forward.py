@@ -14,7 +14,7 @@ from pumafuse.arrays import CodeArray, TimeArray
 from pumafuse.filter.axis import Model, Sensors, State
 from pumafuse.filter.events import COMMAND, Events, Results, joined
 from pumafuse.filter.forward import Outputs, filter_events, no_history
-from pumafuse.filter.outcome import ABSENT, Outcome
+from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.engine import arranged, biased_sensors
 from pumafuse.fusion.segments import Segment, build
 
@@ -119,22 +119,6 @@ def test_estimates_leave_no_trace() -> None:
     np.testing.assert_array_equal(dense.state.x[:2], without.state.x[:2])
     for part, other in zip(dense.outputs[0], sparse.outputs[0], strict=True):
         np.testing.assert_array_equal(part[:, ::7], other)
-
-
-def test_given_outcomes_are_repeated() -> None:
-    """Those of the gates give the same bits again; without rejections everything is fused, whatever the gates say."""
-    segment = segment_of(2)
-    events, _ = segment.events(CONFIG)
-    decided, repeated, fused = (Pass.over(segment) for _ in range(3))
-    decided.run(events, GRID)
-    outcome = decided.results[0].outcome
-    repeated.run(events, GRID, outcome)
-    for name in ("innovation", "innovation_sd", "outcome"):
-        np.testing.assert_array_equal(getattr(repeated.results[0], name), getattr(decided.results[0], name))
-    np.testing.assert_array_equal(repeated.outputs[0].position, decided.outputs[0].position)
-    fused.run(events, GRID, np.where(outcome == ABSENT, outcome, np.uint8(Outcome.FUSED)))
-    assert np.nanmax(np.abs(fused.results[0].innovation / fused.results[0].innovation_sd)) > 10.0
-    assert not (fused.results[0].outcome == Outcome.REJECTED).any()
 
 
 @settings(derandomize=True, deadline=None, max_examples=20)

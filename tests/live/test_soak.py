@@ -7,10 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 
 import pumafuse as pf
-from streams import Both, any_stream, check_in_any_order, lines
+from streams import Both, lines
 
 pytestmark = [pytest.mark.long, pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")]
 HOUR_NS = 3_600_000_000_000
@@ -102,10 +101,3 @@ def test_random_bytes_change_no_bit() -> None:
         both.feed(noise.tobytes() + b"\n" + good)
     assert both.stream.bad > 450_000
     assert both.written == clean.written
-
-
-@settings(derandomize=True, deadline=None, max_examples=3000)
-@given(any_stream())
-def test_very_many_streams_in_any_order(stream: tuple[pf.FusionConfig, pf.Run, int]) -> None:
-    """The property of the short tests, over many more streams."""
-    check_in_any_order(*stream)
