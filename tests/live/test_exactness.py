@@ -62,6 +62,18 @@ def test_estimates_at_the_time_are_as_live(name: str) -> None:
         assert [estimate[axis].position_sd for estimate in found] == track.position_sd.tolist()
 
 
+def test_the_frame_is_where_the_first_command_is_however_late_it_comes() -> None:
+    """A frame about the base without a start level, its first commands in any order: as if they had come in order."""
+    run, config = recorded("cylindrical-cartesian")
+    run = replace(run, start={})
+    offline = pf.fuse(run, config)
+    for seed in range(4):
+        live = pf.LiveEstimator(config)
+        assert differences(live, delayed(events_of(run), 1.2, seed), offline, 1.45) == []
+        assert counted(live) == outcomes_of(offline)
+        assert live.health().commands["fused"] == len(run.command.stamp)
+
+
 def test_a_clock_set_back_begins_a_segment_as_offline() -> None:
     """After the clock of all sources is set back the filter starts anew, and both have the same estimates after it."""
     run, config = recorded("panel-vision")

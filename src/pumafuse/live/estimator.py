@@ -45,12 +45,15 @@ class EventLog(Protocol):
 
     def begin_segment(self) -> None:
         """Begin anew: what comes from here on is stamped by another clock."""
+        ...
 
     def append(self, stamp: int, sensor: str | None, values: Mapping[str, Any], /) -> None:
         """Add an event, whose stamp [ns] is accepted; without a sensor it is a command; values in m."""
+        ...
 
     def discard(self, after: int, /) -> None:
         """Remove the events stamped after ``after`` [ns]: that was wrong."""
+        ...
 
 
 class LiveEstimator:
@@ -109,14 +112,14 @@ class LiveEstimator:
         self._stale_ns = round(stale_after * 1e9)
         self._log, self._event_log = RateLimitedLog(on_notice), event_log
         self._refused: dict[str, dict[Outcome, int]] = {name: dict.fromkeys(Outcome, 0) for name in config.sensors}
-        self._strangers = 0
+        self._strangers = self._refusals = 0
         self._doubtful = 0  # commands that may have to be taken back
         self._commands = dict.fromkeys(Outcome, 0)
         self._answers: dict[bytes, UpdateResult] = {}
         self._aside: list[tuple[_Event, Outcome]] = []
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
         self._clock = Clock(round(window * 1e9))
-        self._start = dict(start or {})
+        self._start, self._before = dict(start or {}), None
         self._begin(None)
 
     def warm_up(self) -> None:
@@ -226,8 +229,12 @@ class LiveEstimator:
 
     def _begin(self, counters: Counters | None) -> None:
         """An empty window, with what was counted before."""
+        self._before = counters
         self._frame_start = FrameStart(self.config.frame, self.axes)
         self._window = empty_window(self.config, self.axes, self._frame_start.start(self._start), counters)
+        # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it.
+        # With each goes its outcome, and whether it never came into the window.
+        self._early: list[tuple[_Event, Outcome, bool]] | None = [] if self._frame_start.waits else None
 
     def _oldest(self) -> int:
         """No event stamped before is taken [ns]."""
@@ -253,6 +260,8 @@ class LiveEstimator:
             self._aside = []
         if self._event_log is not None:
             self._event_log.append(stamp, sensor, values)
+        if self._early is not None:
+            return self._take_early(_Event(stamp, sensor, dict(values)))
         return self._feed(stamp, sensor, values)
 
     def _judged(self, event: _Event) -> UpdateResult | None:
@@ -324,6 +333,40 @@ class LiveEstimator:
             self._take(*other)
         return self._take(*event)
 
+    def _take_early(self, event: _Event) -> UpdateResult:
+        """Take an event while the frame's place may still change; a command before all others moves it."""
+        assert self._early is not None
+        oldest, origin, since = self._oldest(), self._window.origin, self._frame_start.since
+        if origin is not None and self._clock.sure - origin > self._clock.window:
+            self._early = None
+            return self._feed(*event)
+        x, y = (_number(event.values.get(name)) for name in ("x", "y"))
+        if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
+            frame_start = FrameStart(self.config.frame, self.axes)
+            try:
+                frame_start.place(event.stamp, x, y)
+            except RunError as error:
+                return self._refuse(None, event.values, _INVALID, str(error))
+            events = [one for one, _, _ in self._early if one.stamp >= oldest]
+            for (_, sensor, values), outcome, refused in self._early:
+                if sensor is None or refused:
+                    self._count(sensor, values, outcome, -1)
+            self._begin(self._before)
+            self._frame_start = frame_start
+            for one in events:
+                self._feed_early(one)
+        return self._feed_early(event)
+
+    def _feed_early(self, event: _Event) -> UpdateResult:
+        """Feed an event, and keep it for when the frame's place changes."""
+        assert self._early is not None
+        before = self._refusals
+        result = self._feed(*event)
+        if len(self._early) >= _MOST_ASIDE:
+            del self._early[: _MOST_ASIDE // 2]
+        self._early.append((event, result.outcome, self._refusals > before))
+        return result
+
     def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
         """Give an event that is in time to the window."""
         window, given, stranger = self._window, 0, ""
@@ -336,11 +379,6 @@ class LiveEstimator:
             new[axis] = value if type(value) is float else _number(value)
             given |= 1 << axis
         if stranger and self.config.frame is not None:
-            try:
-                if sensor is None:
-                    self._frame_start.place(*(_number(values.get(name)) for name in ("x", "y")))
-            except RunError as error:
-                return self._refuse(None, values, _INVALID, str(error))
             given |= self._turned(stamp, sensor, values)
             stranger = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
         oldest = self._oldest()
@@ -434,6 +472,7 @@ class LiveEstimator:
 
     def _refuse(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str) -> UpdateResult:
         """Count an event that never comes into the window."""
+        self._refusals += 1
         self._count(sensor, values, outcome, 1)
         return UpdateResult(outcome, MappingProxyType(dict.fromkeys(values, outcome)), reason)
 

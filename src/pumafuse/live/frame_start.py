@@ -17,13 +17,20 @@ class FrameStart:
 
     Attributes:
         placed: The frame with its start; None until that is known.
+        since: Stamp of the command that gave the start, int ns; None where no command had to.
     """
 
     def __init__(self, frame: Frame | None, axes: tuple[str, ...]) -> None:
         """Wait for a start, unless the frame is rotated: then it needs none."""
         self._frame, self._axes = frame, axes
         self.placed: Placed | None = placed_at(frame, 0.0, 0.0, "") if isinstance(frame, Rotated) else None
+        self.since: int | None = None
         self._last = 0.0  # tangential position of the command before [m]
+
+    @property
+    def waits(self) -> bool:
+        """Whether a command is needed to know the start."""
+        return self._frame is not None and self.placed is None
 
     def start(self, level: Mapping[str, float]) -> dict[str, float]:
         """Convert a start level to axes [m]; its x and y start the frame.
@@ -39,14 +46,14 @@ class FrameStart:
             self.placed = self.placed or placed_at(self._frame, rest["x"], rest["y"], "start")
         return found | {axis: value for axis, (value, _) in self.in_axes(rest, None).items()}
 
-    def place(self, x: float, y: float) -> None:
-        """Start the frame at a command's x and y [m], if it has no start and both are numbers.
+    def place(self, stamp: int, x: float, y: float) -> None:
+        """Start the frame at a command's x and y [m].
 
         Raises:
             RunError: That is on the base's axis.
         """
-        if self._frame is not None and self.placed is None and np.isfinite(x + y):
-            self.placed = placed_at(self._frame, x, y, "command")
+        assert self._frame is not None
+        self.placed, self.since = placed_at(self._frame, x, y, "command"), stamp
 
     def in_axes(self, values: Mapping[str, float], near: FloatArray | None) -> dict[str, tuple[float, float]]:
         """Convert x, y, z [m] to axes: for each its position [m], and the factor by which its noise grows.

@@ -16,7 +16,6 @@ import numpy as np
 from ..arrays import FloatArray
 
 CARTESIAN = ("x", "y", "z")
-_TURN = 2.0 * math.pi
 Direction = Literal["counterclockwise", "clockwise"]
 
 
@@ -86,23 +85,17 @@ class Placed:
             and 1 for a row without x or y.
         """
         x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-        whole = np.isfinite(x) & np.isfinite(y)
-        x, y = np.where(whole, x, np.nan), np.where(whole, y, np.nan)
         if isinstance(self.frame, Rotated):
             cos, sin = math.cos(self.angle), math.sin(self.angle)
+            finite = np.isfinite(x) & np.isfinite(y)
+            x, y = np.where(finite, x, np.nan), np.where(finite, y, np.nan)
             return self._sign * (y * cos - x * sin), x * cos + y * sin, np.ones(len(x))
-        dx, dy = x - self.frame.base[0], y - self.frame.base[1]
-        radial = np.hypot(dx, dy)
-        known = radial > 0.0  # some sensors that lost their target report the base's axis, which has no angle
-        turn = np.arctan2(dy, dx)[known] - self.angle
-        if near is None:
-            turns = np.cumsum(np.rint(np.diff(turn, prepend=self._sign * last / self.radius) / _TURN))
-        else:
-            turns = np.rint((turn - self._sign * near[known] / self.radius) / _TURN)
-        tangential, spread = np.full(len(x), np.nan), np.ones(len(x))
-        tangential[known] = self._sign * self.radius * (turn - _TURN * turns)
-        spread[known] = self.radius / radial[known]
-        return tangential, np.where(known, radial, np.nan), spread
+        from .frame_kernels import to_cylinder
+
+        out = np.empty(len(x)), np.empty(len(x)), np.empty(len(x))
+        nearby = np.empty(0) if near is None else near
+        to_cylinder(x, y, *self.frame.base, self.radius, self.angle, self._sign, nearby, last, *out)
+        return out
 
     def to_log(self, tangential: FloatArray, radial: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The log's x and y [m] of axis positions [m]; the inverse of :meth:`to_axes`."""
@@ -110,5 +103,8 @@ class Placed:
             across = self._sign * tangential
             cos, sin = math.cos(self.angle), math.sin(self.angle)
             return radial * cos - across * sin, radial * sin + across * cos
-        theta = self.angle + self._sign * tangential / self.radius
-        return self.frame.base[0] + radial * np.cos(theta), self.frame.base[1] + radial * np.sin(theta)
+        from .frame_kernels import from_cylinder
+
+        x, y = np.empty(len(tangential)), np.empty(len(tangential))
+        from_cylinder(tangential, radial, *self.frame.base, self.radius, self.angle, self._sign, x, y)
+        return x, y
