@@ -17,8 +17,9 @@ from .units import from_si, to_si
 
 S = TypeVar("S", bound=msgspec.Struct)
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+MOST = 1e9  # in SI, of any number: what is larger is no size of an arm, and would overflow
+Positive = Annotated[float, msgspec.Meta(gt=0, le=MOST)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0, le=MOST)]
 Interval = tuple[float, float]  # lower and upper end
 
 

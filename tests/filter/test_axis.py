@@ -70,7 +70,6 @@ def arranged(places: int = 0) -> tuple[Model, Sensors, State]:
         state.x[axis] = rng.normal(0.0, 1e-3, len(root))
         if isinstance(plant, FirstOrder):
             root[1] = state.x[axis, 1] = 0.0
-        root[-1] = state.x[axis, -1] = 0.0  # no clone
         state.P[axis] = root @ root.T
         state.drive[axis, 1:] = rng.normal(0.0, 1e-2, 5) ** 2
     return filter_model(config, AXES, biases), filter_sensors(config, list(SENSORS), AXES, biases), state

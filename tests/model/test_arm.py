@@ -39,8 +39,8 @@ window_ms = 169
 date = 2024-05-01
 """
 
-finite = st.floats(allow_nan=False, allow_infinity=False)
-positive = st.floats(min_value=0.0, exclude_min=True, allow_nan=False, allow_infinity=False)
+finite = st.floats(-1e9, 1e9)
+positive = st.floats(0.0, 1e9, exclude_min=True)
 interval = st.none() | st.tuples(finite, finite)
 word = st.text(max_size=8)
 
@@ -58,7 +58,7 @@ axis_models = st.builds(
     plant=first_order | second_order,
     gain=gains,
     gain_recovery=st.none() | positive,
-    delay=st.none() | st.floats(0.0, 1e6),
+    delay=st.none() | st.floats(0.0, 1e4),
     delay_ci95=interval,
 )
 provenance = st.fixed_dictionaries(
@@ -77,7 +77,7 @@ arms = st.builds(
     ArmModel,
     name=word,
     update_period=positive,
-    delay=st.floats(0.0, 1e6),
+    delay=st.floats(0.0, 1e4),
     delay_ci95=interval,
     validity=st.builds(Validity, max_speed=st.none() | positive, max_radius=st.none() | positive),
     axes=st.dictionaries(axis_names, axis_models, min_size=1, max_size=4),

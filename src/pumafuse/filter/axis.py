@@ -71,7 +71,7 @@ class State(NamedTuple):
     """All that changes, one row for each axis; further rows have room for predictions aside and for checkpoints.
 
     Attributes:
-        x: Mean; the last entry is 0, or a clone of the position, see :func:`clone_position`, (r, s).
+        x: Mean, (r, s).
         P: Covariance, (r, s, s).
         clock: The instant of x and P, int64 ns, (r,).
         drive: Start level u₀ (``START``, NaN before it is known), command in force ``U`` relative to it, its ``STEP``,
@@ -116,7 +116,7 @@ def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
     P[row, 0, 0] = d * f11 + e * f12 + q * q11
     P[row, 0, 1] = P[row, 1, 0] = d * f21 + e * f22 + q * q12
     P[row, 1, 1] = (f21 * a + f22 * b) * f21 + (f21 * b + f22 * c) * f22 + q * q22
-    for j in range(OFFSET, P.shape[2]):
+    for j in range(OFFSET, model.states[axis]):
         a, b = P[row, 0, j], P[row, 1, j]
         P[row, 0, j] = P[row, j, 0] = f11 * a + f12 * b
         P[row, 1, j] = P[row, j, 1] = f21 * a + f22 * b
@@ -229,21 +229,12 @@ def position_of(state: State, row: int) -> tuple[float, float]:
 
 
 @compiled
-def clone_position(model: Model, state: State, axis: int, row: int) -> None:
-    """Add the position as it is now to the state of a row, to be compared with a later one (stochastic cloning)."""
-    P, clone = state.P, state.P.shape[2] - 1
-    for i in range(model.states[axis]):
-        P[row, i, clone] = P[row, clone, i] = P[row, i, POSITION] + P[row, i, OFFSET]
-    state.x[row, clone], P[row, clone, clone] = position_of(state, row)
-
-
-@compiled
-def motion_since_clone(state: State, row: int) -> tuple[float, float]:
-    """How far the position has moved since it was cloned [m], and the variance of that [m²]."""
-    P, clone = state.P, state.P.shape[2] - 1
-    position, variance = position_of(state, row)
-    across = P[row, POSITION, clone] + P[row, OFFSET, clone]
-    return position - state.x[row, clone], max(variance - 2.0 * across + P[row, clone, clone], 0.0)
+def variance_of_motion(model: Model, state: State, axis: int, row: int, dt: float) -> float:
+    """H (Φ − I) P (Φ − I)ᵀ hᵀ over ``dt`` [s]: of the motion that the state as it is leads to; h makes p of it."""
+    P = state.P
+    f11, f12, _, _, _, _, _ = transition(model.order[axis], model.constants, axis, dt)
+    a, b = f11 - 1.0, f12
+    return a * a * P[row, POSITION, POSITION] + 2.0 * a * b * P[row, POSITION, RATE] + b * b * P[row, RATE, RATE]
 
 
 @compiled

@@ -16,7 +16,7 @@ import math
 from ..arrays import ALWAYS
 from ..compiled import compiled
 from ..model.closed import transition
-from .axis import DRIFT, NOISE, OFFSET, PERIOD, POSITION, RATE, Model, Sensors, State
+from .axis import DRIFT, NOISE, OFFSET, PERIOD, Model, Sensors, State, variance_of_motion
 
 NU, R_THEN = range(2)  # of State.rejected
 REJECTED_AT, FUSED_AT = range(2)  # of State.gate_time
@@ -39,10 +39,8 @@ def agrees(model: Model, sensors: Sensors, state: State, axis: int, sensor: int,
     if between < model.gain[axis, PERIOD] * 1e9:
         return -1
     dt, drive = between / 1e9, state.drive
-    f11, f12, _, _, q11, _, _ = transition(model.order[axis], model.constants, axis, dt)
-    a, b, P = f11 - 1.0, f12, state.P
-    motion = a * a * P[axis, POSITION, POSITION] + 2.0 * a * b * P[axis, POSITION, RATE] + b * b * P[axis, RATE, RATE]
-    motion += drive[axis, NOISE] * q11 + drive[axis, DRIFT] * dt
+    _, _, _, _, q11, _, _ = transition(model.order[axis], model.constants, axis, dt)
+    motion = variance_of_motion(model, state, axis, axis, dt) + drive[axis, NOISE] * q11 + drive[axis, DRIFT] * dt
     scale = sensors.scale[sensor]
     variance = state.rejected[axis, sensor, R_THEN] + R + scale * scale * motion
     return int(abs(nu - state.rejected[axis, sensor, NU]) <= sensors.gate[sensor] * math.sqrt(variance))

@@ -80,7 +80,7 @@ def at_rest(
         start: The level u₀ [m] of each axis where it is known.
         places: Room for how many checkpoints.
     """
-    count, width = len(axes), BIASES + max((len(biased) for biased in biases), default=0) + 1  # and the clone
+    count, width = len(axes), BIASES + max((len(biased) for biased in biases), default=0)
     rows = count * (1 + places) + 1
     P, drive = np.zeros((rows, width, width)), np.zeros((rows, 6))
     for number, (axis, biased) in enumerate(zip(axes, biases, strict=True)):

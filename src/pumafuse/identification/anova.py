@@ -24,6 +24,7 @@ _COUNTERS = frozenset({"replicate", "repetition", "repeat", "rep", "run", "obser
 _OUTLYING = 8.0  # robust standard deviations from the median
 _LEAST_SD = 0.005  # of the median: the smallest robust standard deviation that is believed
 _FEWEST = 5  # values among which one can be outlying
+_MOST_LEVELS = 12  # a numeric factor with more is cut into quarters
 
 
 class Level(msgspec.Struct, frozen=True, kw_only=True):
@@ -107,7 +108,7 @@ def factors_of(trials: Sequence[Trial], period: float) -> dict[str, list[str]]:
     columns = {"axis": [trial.axis for trial in trials], "speed_m_s": speed_levels(trials, period)}
     for name in trials[0].factors:
         if name not in _COUNTERS:
-            columns[name] = [trial.factors[name] for trial in trials]
+            columns[name] = _levels([trial.factors[name] for trial in trials])
     sense = ["+" if trial.step > 0.0 else "-" for trial in trials]
     if not any(len(set(zip(cells, sense, strict=True))) == len(set(cells)) == 2 for cells in columns.values()):
         columns["sense"] = sense
@@ -220,6 +221,16 @@ def performances(factors: Mapping[str, Sequence[str]], rms: FloatArray, toleranc
         Performance(factor=factor, levels=every[factor], limit=limit, verdict=verdict)
         for factor, (limit, verdict) in limits.items()
     ]
+
+
+def _levels(cells: Sequence[str]) -> list[str]:
+    """A factor's levels; a numeric one with many is cut into quarters."""
+    values = numbers(cells)
+    if values is None or len(set(cells)) <= _MOST_LEVELS:
+        return list(cells)
+    quarter = np.searchsorted(np.quantile(values, [0.25, 0.5, 0.75]), values)
+    middles = {part: f"{np.median(np.array(values)[quarter == part]):.4g}" for part in set(quarter.tolist())}
+    return [middles[part] for part in quarter.tolist()]
 
 
 def validity(performance: Sequence[Performance], fastest: float) -> Validity:

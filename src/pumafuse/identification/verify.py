@@ -30,7 +30,7 @@ REFERENCE = "reference"
 _FEWEST = 20  # measurements
 _MOST_LEVELS = 8  # of a run whose start level is searched among them
 _AS_GOOD, _FAR = 1.2, 3.0  # times the error of the best in class
-_FARTHEST = 1e6  # m, from the start level
+_FARTHEST, _SLOWEST = 1e6, 1e4  # m, from the start level; s
 _HOLDS = 50.0  # % fit
 _BETTER = 0.8  # share of the error below which a recovery is recommended
 
@@ -155,7 +155,7 @@ def _verified(
     model, delay = arm.axes[axis], arm.delay_of(axis)
     recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
     farthest = np.abs(command.moved(model, delay, first, measured.time)).max()
-    if not abs(first) + farthest <= _FARTHEST:  # also where it is not a number
+    if not (abs(first) + farthest <= _FARTHEST and model.plant.lag <= _SLOWEST):  # also where it is not a number
         raise ConfigError(f"axis '{axis}': a start level, gain or plant of no size that an arm has")
     start, start_from = _start(measured, command, first, model, delay, given)
     count = len(measured.time)

@@ -19,7 +19,7 @@ from .unit_response import unit_response
 if TYPE_CHECKING:
     import control
 
-Delay = Annotated[float, msgspec.Meta(ge=0, le=1e6)]  # s
+Delay = Annotated[float, msgspec.Meta(ge=0, le=1e4)]  # s
 
 
 class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid_unknown_fields=True):
