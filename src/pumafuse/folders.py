@@ -82,18 +82,21 @@ def write_file(path: Path, text: str) -> None:
 
 
 def sweep(folders: Iterable[Path]) -> None:
-    """Remove the temporary folders that killed processes left beside the folders they were writing."""
+    """Remove the temporary folders that killed workers of this process left beside the folders they were writing."""
     for folder in folders:
-        for left in folder.parent.glob(f".{glob.escape(folder.name)}.*"):
+        for left in folder.parent.glob(f".{glob.escape(folder.name)}.{os.getpid()}-*"):
             shutil.rmtree(left, ignore_errors=True)
 
 
 @contextmanager
 def _beside(path: Path) -> Generator[Path]:
-    """A temporary folder beside ``path``, on the same disk; what the disk refuses is a FolderError."""
+    """A temporary folder beside ``path``, on the same disk; what the disk refuses is a FolderError.
+
+    Its name has the number of the process above, by which that one can sweep up after its own workers, and no others.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as place:
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.{os.getppid()}-", dir=path.parent) as place:
             yield Path(place)
     except OSError as error:
         raise FolderError(f"{path}: cannot be written: {error.strerror}") from None

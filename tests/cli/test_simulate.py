@@ -139,6 +139,19 @@ def test_jobs_are_done_and_reported_in_the_order_given(capsys: pytest.CaptureFix
     assert capsys.readouterr().err.splitlines() == [f"pumafuse: {name}: {what}" for name, what in expected]
 
 
+def test_sweeping_up_takes_nothing_of_others(tmp_path: Path) -> None:
+    """Neither a hidden folder of the user's nor what another process is writing beside, whatever a batch ends like."""
+    users = tmp_path / ".scan.backup"
+    users.mkdir()
+    (users / "notes.txt").write_text("mine")
+    with folders.replacing(tmp_path / "scan") as new:  # this process is no worker of its own
+        (new / "x").write_text("")
+        many.run_jobs("testing", {"scan": partial(_square, 2)}, [tmp_path / "scan"])
+    assert names(tmp_path) == {".scan.backup", "scan"}
+    assert (users / "notes.txt").read_text() == "mine"
+    assert names(tmp_path / "scan") == {"x"}
+
+
 @pytest.mark.long
 def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
     """As when memory runs out: the command says so and ends; what was half written is swept, what is whole is kept."""
