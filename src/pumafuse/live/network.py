@@ -34,6 +34,7 @@ _RECEIVE_BUFFER = 8 << 20  # bytes that the system is asked to keep for a socket
 _SO_MEMINFO, _DROPS = 55, 8  # Linux: a socket's counters, and the place of the one of dropped datagrams
 _MOST_CONNECTIONS = 256
 _MOST_PIECES = 16  # of all connections that wait
+_HANDED_OVER = 0.02  # s in which a thread that waited for room hands over its piece
 _FIRST_WAIT, _LONGEST_WAIT = 0.5, 30.0  # s until a connection is tried again
 _PATIENCE = 10.0  # s for a connection to be made
 
@@ -157,8 +158,9 @@ class _Tcp:
         """The lines that have come and were not given yet; the connections end with the process."""
         self._log = RateLimitedLog(lambda _: None)  # a thread that writes while the process ends would stop it
         lines: list[bytes] = []
-        while not self._pieces.empty():
-            lines += self._pieces.get()
+        with contextlib.suppress(queue.Empty):
+            for _ in range(_MOST_PIECES + _MOST_CONNECTIONS):  # and one that each thread holds; a flood has no end
+                lines += self._pieces.get(timeout=_HANDED_OVER)
         return lines
 
     def _read(self, connection: socket.socket) -> bool:
