@@ -230,7 +230,7 @@ def position_of(state: State, row: int) -> tuple[float, float]:
 
 @compiled
 def variance_of_motion(model: Model, state: State, axis: int, row: int, dt: float) -> float:
-    """H (Φ − I) P (Φ − I)ᵀ hᵀ over ``dt`` [s]: of the motion that the state as it is leads to; h makes p of it."""
+    """Variance [m²] of the motion over ``dt`` [s] that the state leads to: h (Φ − I) P (Φ − I)ᵀ hᵀ; h makes p of it."""
     P = state.P
     f11, f12, _, _, _, _, _ = transition(model.order[axis], model.constants, axis, dt)
     a, b = f11 - 1.0, f12
