@@ -28,6 +28,8 @@ class AxisEstimate:
         velocity_sd: Its standard deviation [m/s].
         offset: o [m], what the model cannot explain.
         offset_sd: Its standard deviation [m].
+        disturbance: d [m], which reverts to 0; 0 where the model has none.
+        disturbance_sd: Its standard deviation [m].
     """
 
     position: FloatArray
@@ -36,8 +38,19 @@ class AxisEstimate:
     velocity_sd: FloatArray
     offset: FloatArray
     offset_sd: FloatArray
+    disturbance: FloatArray
+    disturbance_sd: FloatArray
 
-    FIELDS = ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd")
+    FIELDS = (
+        "position",
+        "position_sd",
+        "velocity",
+        "velocity_sd",
+        "offset",
+        "offset_sd",
+        "disturbance",
+        "disturbance_sd",
+    )
 
 
 @dataclass(frozen=True)
