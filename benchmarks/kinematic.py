@@ -1,7 +1,9 @@
 """Kalman filters that know nothing of the commands: constant velocity or constant acceleration, disturbed by noise.
 
 What is constant is a random walk, exactly integrated between the irregular instants at which measurements are valid. Of
-the sensors and of the start they know what pumafuse knows; their gate and their likelihood are pumafuse's, too.
+the sensors and of the start they know what pumafuse knows; their gate and their likelihood are pumafuse's, too, but for
+this: a re-acquisition makes not the position alone uncertain but all of the motion, as it was before the first
+measurement.
 """
 
 from __future__ import annotations
@@ -113,6 +115,8 @@ def follow(order: int, numbers: Array, known: Known, measured: Measured, times: 
                     believed = False
         if believed:
             P[0, 0] += (nu / known.scale[s]) ** 2
+            for i in range(1, order):  # without commands the motion is as much in doubt as the position
+                P[i, i] += REST[i - 1] ** 2
             reacquired[s] += 1
             S = R + spread(P, H, K)
         elif beyond and not again:

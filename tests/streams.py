@@ -39,6 +39,17 @@ def events_of(run: pf.Run) -> list[Event]:
     return sorted(found, key=lambda event: (event.stamp, event.sensor == ""))
 
 
+def wired(run: pf.Run, seconds: float) -> list[bytes]:
+    """A run's first seconds on the wire."""
+    found = []
+    for event in events_of(run):
+        if event.stamp < seconds * 1e9:
+            values = {axis: value * 1e3 for axis, value in event.values.items()}
+            body = {"sensor": event.sensor, **values} if event.sensor else {"command": values}
+            found.append(json.dumps({"t_ns": event.stamp, **body}).encode())
+    return found
+
+
 def delayed(events: Sequence[Event], longest: float, seed: int, *, twice: float = 0.0) -> list[Event]:
     """The events as they arrive, each up to ``longest`` s late; a share of them comes ``twice``."""
     rng = np.random.default_rng(seed)
@@ -127,7 +138,11 @@ def axes_of(draw: st.DrawFn) -> pf.ArmModel:
 
 @st.composite
 def any_stream(draw: st.DrawFn) -> tuple[pf.FusionConfig, pf.Run, int]:
-    """A configuration, a run of commands and measurements at any times, and a seed for the order in which they come."""
+    """A configuration, a run of commands and measurements at any times, and a seed for the order in which they come.
+
+    Commands repeat, share a stamp, begin late; gates reject and re-acquire; on a coarse grid many events are of one
+    instant; sensors see the past, or the future.
+    """
     arm = axes_of(draw)
     sensors = {
         "tracker": pf.Sensor(sd=1e-4, latency=draw(st.sampled_from([0.008, -0.02])), gate=3.0),
@@ -145,14 +160,29 @@ def any_stream(draw: st.DrawFn) -> tuple[pf.FusionConfig, pf.Run, int]:
     levels = np.array([0.5, 0.501, 0.51])
     command = {axis: rng.choice(levels, commands) for axis in ("radial", "vertical")}
     command["vertical"][: draw(st.integers(0, commands - 1))] = np.nan
-    measured = {}
+    measured, grid = {}, draw(st.sampled_from([1, 4 * MS]))
     for name in sensors:
         rows = draw(st.integers(1, 60))
-        when = np.sort(rng.integers(stamp[0] - 200 * MS, stamp[-1] + 500 * MS, rows))
+        when = np.sort(rng.integers(stamp[0] - 200 * MS, stamp[-1] + 500 * MS, rows)) // grid * grid
         value = (-0.5 if name == "range" else 0.5) + rng.normal(0.0, 3e-3, rows)
         value[rng.random(rows) < 0.05] = np.nan
         measured[name] = (when, {"radial": value, "vertical": value[::-1].copy()})
-    return config, pf.Run.from_arrays(stamp, command, measured), draw(st.integers(0, 2**32))
+    start = draw(st.sampled_from([{}, {"radial": 0.5}, dict.fromkeys(command, 0.49)]))
+    return config, pf.Run.from_arrays(stamp, command, measured, start=start), draw(st.integers(0, 2**32))
+
+
+def check_in_any_order(config: pf.FusionConfig, run: pf.Run, seed: int) -> None:
+    """Compare estimates and outcomes of a stream that comes in any order with those of the run."""
+    offline, events = pf.fuse(run, config), events_of(run)
+    longest = events[-1].stamp - events[0].stamp
+    live = pf.LiveEstimator(config, window=max(longest / 1e9 + 1.0, 2.0), start=run.start)
+    tied = {(event.stamp, event.sensor) for event in events}
+    arrivals = delayed(events, 1.9, seed) if len(tied) == len(events) else events  # of one stamp the last counts
+    assert differences(live, arrivals, offline, 1e9) == []
+    expected = outcomes_of(offline)
+    for sensor, counts in counted(live).items():  # live an empty cell is no value, offline an invalid one
+        for word in ("fused", "rejected", "reacquired"):
+            assert counts[word] == expected[sensor][word]
 
 
 TRACKED = pf.FusionConfig(

@@ -45,3 +45,8 @@ def suggestion(name: str, accepted: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, names, n=1)
     listed = f"accepted: {', '.join(names)}" if names else "nothing is accepted here"
     return f"did you mean '{close[0]}'? {listed}" if close else listed
+
+
+def counted(number: int, what: str) -> str:
+    """``1 cell``, ``2 cells``."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"

@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from .errors import PumafuseError
@@ -54,15 +54,18 @@ def replacing(folder: Path) -> Generator[Path]:
         FolderError: The disk refuses.
     """
     folder = folder.resolve()  # a link stays a link, its target is replaced
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as place:
-            new = Path(place) / "new"
-            new.mkdir()
-            yield new
-            _swap(new, folder, Path(place) / "old")
-    except OSError as error:
-        raise FolderError(f"{folder}: cannot be written: {error.strerror}") from None
+    with _beside(folder) as place:
+        new, old = place / "new", place / "old"
+        new.mkdir()
+        yield new
+        if folder.exists():
+            folder.replace(old)
+        try:
+            new.replace(folder)
+        except BaseException:
+            if old.exists():
+                old.replace(folder)
+            raise
 
 
 def write_file(path: Path, text: str) -> None:
@@ -72,16 +75,10 @@ def write_file(path: Path, text: str) -> None:
         FolderError: The disk refuses.
     """
     path = path.resolve()
-    new = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with _beside(path) as place:
+        new = place / "new"
         new.write_text(text, encoding="utf-8")
         new.replace(path)
-    except OSError as error:
-        raise FolderError(f"{path}: cannot be written: {error.strerror}") from None
-    finally:
-        with suppress(OSError):
-            new.unlink()
 
 
 def sweep(folders: Iterable[Path]) -> None:
@@ -91,13 +88,12 @@ def sweep(folders: Iterable[Path]) -> None:
             shutil.rmtree(left, ignore_errors=True)
 
 
-def _swap(new: Path, folder: Path, aside: Path) -> None:
-    """Put ``new`` in the folder's place; if that fails, put the old one back."""
-    if folder.exists():
-        folder.replace(aside)
+@contextmanager
+def _beside(path: Path) -> Generator[Path]:
+    """A temporary folder beside ``path``, on the same disk; what the disk refuses is a FolderError."""
     try:
-        new.replace(folder)
-    except BaseException:
-        if aside.exists():
-            aside.replace(folder)
-        raise
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as place:
+            yield Path(place)
+    except OSError as error:
+        raise FolderError(f"{path}: cannot be written: {error.strerror}") from None

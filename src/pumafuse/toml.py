@@ -17,8 +17,9 @@ from .units import from_si, to_si
 
 S = TypeVar("S", bound=msgspec.Struct)
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+MOST = 1e9  # in SI, of any number: what is larger is no size of an arm, and would overflow
+Positive = Annotated[float, msgspec.Meta(gt=0, le=MOST)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0, le=MOST)]
 Interval = tuple[float, float]  # lower and upper end
 
 
@@ -26,35 +27,22 @@ def read(path: Path) -> dict[str, Any]:
     """The tables of a TOML file with every number in SI.
 
     Raises:
-        ConfigError: The file is absent, is not text, or is not TOML.
+        ConfigError: The file is absent, is not text, is not TOML, or has a number that is not finite.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        return to_si(tomllib.loads(path.read_text(encoding="utf-8"), parse_float=Decimal))
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: not a text file in UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from None
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: not a text file in UTF-8") from None
-    except ValueError:  # a null character in the path
-        raise ConfigError(f"{str(path)!r}: no such file") from None
-    return parse(text, str(path))
-
-
-def parse(text: str, where: str) -> dict[str, Any]:
-    """The tables of a TOML text with every number in SI; ``where`` names it in errors.
-
-    Raises:
-        ConfigError: It is not TOML, or a number is not finite.
-    """
-    try:
-        return to_si(tomllib.loads(text, parse_float=Decimal))
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{where}: not valid TOML: {error}") from None
     except (ArithmeticError, ValueError, RecursionError):
-        raise ConfigError(f"{where}: not valid TOML: a number is out of range, or tables nest too deeply") from None
+        raise ConfigError(f"{path}: not valid TOML: a number is out of range, or it nests too deeply") from None
     except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def struct(tree: Any, kind: type[S], where: str, path: str = "") -> S:
@@ -105,10 +93,8 @@ def _tagged(kind: Any) -> dict[str, type[msgspec.Struct]]:
 
 
 def _words(kind: Any) -> tuple[str, ...]:
-    """The values that a Literal, alone or in a union without plain text, accepts."""
-    parts = (kind,) if get_origin(kind) is Literal else get_args(kind)
-    words = [word for part in parts if get_origin(part) is Literal for word in get_args(part)]
-    return () if str in parts else tuple(words)
+    """The values that a Literal, alone or in a union, accepts."""
+    return tuple(word for part in (kind, *get_args(kind)) if get_origin(part) is Literal for word in get_args(part))
 
 
 def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:

@@ -17,24 +17,13 @@ import numpy as np
 from .arrays import NO_STAMP, FloatArray, TimeArray
 from .errors import ConfigError
 
-# Name ending -> power of ten to SI. The longest ending wins, so `max_speed_m_s` is m/s and not seconds.
-EXPONENTS: Mapping[str, int] = {
-    "_m": 0,
-    "_mm": -3,
-    "_um": -6,
-    "_s": 0,
-    "_ms": -3,
-    "_us": -6,
-    "_ns": -9,
-    "_m_s": 0,
-    "_mm_s": -3,
-    "_rad_s": 0,
-    "_s_m": 0,
-    "_mm_rtHz": -3,
-    "_mm_rts": -3,
-    "_mm_rtHz_per_m_s": -3,
-    "_mm_rts_per_m_s": -3,
+_ENDINGS = {  # power of ten to SI -> endings of names
+    0: ("_m", "_s", "_m_s", "_rad_s", "_s_m"),
+    -3: ("_mm", "_ms", "_mm_s", "_mm_rtHz", "_mm_rts", "_mm_rtHz_per_m_s", "_mm_rts_per_m_s"),
+    -6: ("_um", "_us"),
+    -9: ("_ns",),
 }
+EXPONENTS = {ending: exponent for exponent, endings in _ENDINGS.items() for ending in endings}
 LENGTHS = ("_m", "_mm", "_um")
 TIMES = ("_s", "_ms", "_us", "_ns")
 MM = 1e3  # mm in a metre: SI arrays times this are what files and screens show
@@ -44,7 +33,7 @@ INTERVAL = "_ci95"  # `time_constant_ms_ci95` is in ms
 
 
 def ending(name: str) -> str | None:
-    """The longest known unit at the end of ``name``; None without one."""
+    """The longest known unit at the end of ``name``, so that ``max_speed_m_s`` is in m/s; None without one."""
     stem = name.removesuffix(INTERVAL)
     return max((unit for unit in EXPONENTS if stem.endswith(unit)), key=len, default=None)
 
@@ -99,26 +88,19 @@ def nanoseconds(time: FloatArray) -> TimeArray:
 
 def _converted(value: Any, exponent: int | None, path: str, convert: Callable[[Any, int, str], Any]) -> Any:
     """``value`` with every number in it converted; ``exponent`` is that of its unit, None within provenance."""
-    match value:
-        case bool() | str():
-            return value
-        case int() if not exponent:
-            return value
-        case int() | float() | Decimal():
-            return float(value) if exponent is None else convert(value, exponent, path)
-        case list() | tuple():
-            return [_converted(item, exponent, path, convert) for item in cast(list[Any], value)]
-        case Mapping():
-            found: dict[str, Any] = {}
-            for key, item in cast(Mapping[str, Any], value).items():
-                place = f"{path}.{key}" if path else key
-                unit = ending(key)
-                inner = exponent if unit is None else EXPONENTS[unit]
-                known = exponent is not None and place != PROVENANCE
-                found[key] = _converted(item, inner if known else None, place, convert)
-            return found
-        case _:
-            return value
+    if isinstance(value, Mapping):
+        found: dict[str, Any] = {}
+        for key, item in cast(Mapping[str, Any], value).items():
+            place, unit = f"{path}.{key}" if path else key, ending(key)
+            known = exponent is not None and place != PROVENANCE
+            inner = exponent if unit is None else EXPONENTS[unit]
+            found[key] = _converted(item, inner if known else None, place, convert)
+        return found
+    if isinstance(value, list | tuple):
+        return [_converted(item, exponent, path, convert) for item in cast(list[Any], value)]
+    if isinstance(value, float | Decimal) or (type(value) is int and exponent):
+        return float(value) if exponent is None else convert(value, exponent, path)
+    return value
 
 
 def _si(value: float | Decimal, exponent: int, path: str) -> float:

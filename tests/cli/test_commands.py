@@ -1,26 +1,21 @@
-"""The real executable on real files."""
+"""The real executable on real files: `demo`, `fuse`, `compare`, `discretize`, and refusals of every command."""
 
 import json
 import subprocess
 import sys
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from executable import pumafuse
+import pumafuse as pf
+from executable import FUSION, SCAN, names, pumafuse, refused
+from pumafuse.cli.fuse import _folders
 
-DATA = Path(str(files("pumafuse") / "data"))
-SCAN, FUSION = DATA / "scan1", DATA / "fusion.toml"
-
-
-def refused(*arguments: object) -> str:
-    """The one line that a refusal prints."""
-    lines = [line for line in pumafuse(*arguments, code=1).stderr.splitlines() if not line.startswith("warning: ")]
-    assert len(lines) == 1, lines
-    return lines[0]
+AXES = ("tangential", "radial", "vertical")
+FUSE_SCAN = ("fuse", SCAN, "-c", FUSION, "--rate", 200)
 
 
 def scores(folders: Sequence[Path], *more: object) -> list[dict[str, dict[str, float]]]:
@@ -31,24 +26,22 @@ def scores(folders: Sequence[Path], *more: object) -> list[dict[str, dict[str, f
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo") / "result"
     out = pumafuse("demo", "-o", folder).stdout
-    for name in ("fused.png", "fused.rrd", "summary.json"):
-        assert f"{folder / name}" in out.replace("\n", "")
+    assert all(f"{folder / name}" in out for name in ("fused.png", "fused.rrd", "summary.json"))
     return folder
 
 
 @pytest.fixture(scope="module")
 def with_tracker(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("tracker") / "result"
-    pumafuse("fuse", SCAN, "-c", FUSION, "-o", folder, "--sensors", "tracker,vision", "--rate", 200)
+    pumafuse(*FUSE_SCAN, "-o", folder, "--sensors", "tracker,vision")
     return folder
 
 
 def test_the_demo_leaves_everything_it_promises(demo: Path) -> None:
-    """Tables, the configuration as used, a picture and a recording that rerun accepts."""
-    names = {path.name for path in demo.iterdir()}
+    """Tables, the configuration as used, pictures and a recording that rerun accepts."""
     tables = {"estimates.parquet", "measurements.parquet", "reference.parquet"}
     figures = {"fused.png", "error.png", "validation.png"}
-    assert names == tables | figures | {"summary.json", "fusion.toml", "arm.toml", "fused.rrd"}
+    assert names(demo) == tables | figures | {"summary.json", "fusion.toml", "arm.toml", "fused.rrd"}
     assert all((demo / name).read_bytes().startswith(b"\x89PNG") for name in figures)
     rerun = Path(sys.executable).parent / "rerun"
     assert subprocess.run([str(rerun), "rrd", "verify", str(demo / "fused.rrd")], check=False).returncode == 0
@@ -56,9 +49,8 @@ def test_the_demo_leaves_everything_it_promises(demo: Path) -> None:
 
 def test_the_scan_is_fused_as_well_as_promised(demo: Path, with_tracker: Path) -> None:
     """Vision alone within 0.40 / 0.23 / 0.20 mm, with the tracker within 0.090 / 0.056 / 0.066, coverage 90 to 99 %."""
-    axes = ("tangential", "radial", "vertical")
     for found, limits in zip(scores([demo, with_tracker]), ((0.40, 0.23, 0.20), (0.090, 0.056, 0.066)), strict=True):
-        for axis, limit in zip(axes, limits, strict=True):
+        for axis, limit in zip(AXES, limits, strict=True):
             assert found[axis]["rmse_mm"] <= limit
             assert 0.90 <= found[axis]["coverage"] <= 0.99
 
@@ -67,81 +59,47 @@ def test_result_tables_have_the_documented_columns(with_tracker: Path) -> None:
     """Names and row counts of design and README: an even grid, every component of both sensors with its outcome."""
     estimates = pq.read_table(with_tracker / "estimates.parquet")
     kinds = ("position_mm", "position_sd_mm", "velocity_mm_s", "velocity_sd_mm_s", "offset_mm", "offset_sd_mm")
-    expected = [f"{axis}.{kind}" for axis in ("tangential", "radial", "vertical") for kind in kinds]
-    assert estimates.column_names == ["time_s", *expected]
+    assert estimates.column_names == ["time_s", *(f"{axis}.{kind}" for axis in AXES for kind in kinds)]
     assert estimates["time_s"].to_pylist()[:3] == [0.0, 0.005, 0.01]
     measurements = pq.read_table(with_tracker / "measurements.parquet")
     assert measurements.column_names == [
         *("time_s", "stamp_s", "sensor", "axis", "value_mm"),
         *("innovation_mm", "innovation_sd_mm", "nis", "outcome"),
     ]
-    assert measurements.num_rows == 3 * (5999 + 1704)
-    summary = json.loads((with_tracker / "summary.json").read_text())
-    counted = sum(
-        n for axis in summary["axes"].values() for s in axis["sensors"].values() for n in s["outcomes"].values()
-    )
-    assert counted == measurements.num_rows
+    axes = json.loads((with_tracker / "summary.json").read_text())["axes"].values()
+    counted = sum(n for axis in axes for sensor in axis["sensors"].values() for n in sensor["outcomes"].values())
+    assert counted == measurements.num_rows == 3 * (5999 + 1704)
 
 
 @pytest.mark.long
-def test_the_configuration_as_used_gives_the_same_result(demo: Path, tmp_path: Path) -> None:
-    """fusion.toml and arm.toml of a result folder reproduce it to the last bit."""
+def test_a_result_is_reproduced_and_scored_by_any_reference(demo: Path, tmp_path: Path) -> None:
+    """Its fusion.toml and arm.toml give it to the last bit; the run or a reference table score it as its own does."""
     again = tmp_path / "again"
     pumafuse("fuse", SCAN, "-c", demo / "fusion.toml", "-o", again, "--sensors", "vision", "--rate", 200)
     assert pq.read_table(again / "estimates.parquet").equals(pq.read_table(demo / "estimates.parquet"))
-
-
-@pytest.mark.long
-def test_a_reference_from_elsewhere_scores_the_same(demo: Path) -> None:
-    """The run itself, or the reference table of a result, gives the scores of the folder's own reference."""
-    own = scores([demo])
+    own = scores([demo])[0]
     for elsewhere in (SCAN, demo / "reference.parquet"):
         for axis, score in scores([demo], "--reference", elsewhere)[0].items():
-            assert score == pytest.approx(own[0][axis], rel=1e-6)
+            assert score == pytest.approx(own[axis], rel=1e-6)
 
 
 def test_as_live_has_fewer_measurements(demo: Path, tmp_path: Path) -> None:
     """Vision is 45 ms late: an estimate that waits for it beats one that cannot, and the summary says which."""
-    folder = tmp_path / "live"
-    pumafuse("fuse", SCAN, "-c", FUSION, "-o", folder, "--sensors", "vision", "--rate", 200, "--as-live")
-    live, waited = scores([folder, demo])
+    pumafuse(*FUSE_SCAN, "-o", tmp_path / "live", "--sensors", "vision", "--as-live")
+    live, waited = scores([tmp_path / "live", demo])
     assert live["tangential"]["rmse_mm"] > 1.1 * waited["tangential"]["rmse_mm"]
-    assert json.loads((folder / "summary.json").read_text())["mode"] == "as-live"
+    assert json.loads((tmp_path / "live" / "summary.json").read_text())["mode"] == "as-live"
 
 
-@pytest.mark.long
-def test_several_runs_get_a_folder_each_and_a_failure_stops_no_other(tmp_path: Path) -> None:
-    """The good runs are there, the bad one is named, the exit code says that something failed."""
-    done = pumafuse("fuse", tmp_path / "none", SCAN, "-c", FUSION, "-o", tmp_path / "out", "--sensors", "range", code=1)
-    assert "none: no such file" in done.stderr
-    assert "1 of 2 runs failed" in done.stderr
-    assert (tmp_path / "out" / "scan1" / "summary.json").exists()
-
-
-def test_an_existing_folder_is_replaced_only_with_force(demo: Path) -> None:
-    """And nothing of it is lost when it is refused."""
-    before = (demo / "summary.json").read_bytes()
-    assert "--force" in refused("fuse", SCAN, "-c", FUSION, "-o", demo)
-    assert (demo / "summary.json").read_bytes() == before
-
-
-def test_force_never_replaces_a_folder_that_holds_something_else(tmp_path: Path) -> None:
-    """A folder of somebody's files is not a result."""
-    (tmp_path / "thesis.tex").write_text("…")
-    assert "holds 'thesis.tex'" in refused("fuse", SCAN, "-c", FUSION, "-o", tmp_path, "--force")
-    (tmp_path / "summary.json").write_text("{}")
-    assert "holds 'thesis.tex'" in refused("fuse", SCAN, "-c", FUSION, "-o", tmp_path, "--force")
-    assert (tmp_path / "thesis.tex").exists()
-
-
-@pytest.mark.long
-def test_force_replaces_an_earlier_result(tmp_path: Path) -> None:
-    """The new result takes the old one's place whole."""
-    folder = tmp_path / "result"
-    pumafuse("fuse", SCAN, "-c", FUSION, "-o", folder, "--sensors", "range")
-    pumafuse("fuse", SCAN, "-c", FUSION, "-o", folder, "--sensors", "vision", "--force")
-    assert list(json.loads((folder / "summary.json").read_text())["axes"]["radial"]["sensors"]) == ["vision"]
-    assert [path.name for path in tmp_path.iterdir()] == ["result"]
+def test_only_an_earlier_result_is_replaced_and_only_with_force(with_tracker: Path, tmp_path: Path) -> None:
+    """Nothing of it is lost when it is refused; a folder of somebody's files is not a result."""
+    before = (with_tracker / "summary.json").read_bytes()
+    assert "--force" in refused(*FUSE_SCAN, "-o", with_tracker)
+    assert (with_tracker / "summary.json").read_bytes() == before
+    for name in ("thesis.tex", "summary.json"):
+        (tmp_path / name).write_text("{}")
+        assert "holds 'thesis.tex'" in refused(*FUSE_SCAN, "-o", tmp_path, "--force")
+    assert names(tmp_path) == {"thesis.tex", "summary.json"}
 
 
 @pytest.mark.parametrize(
@@ -149,7 +107,7 @@ def test_force_replaces_an_earlier_result(tmp_path: Path) -> None:
     [
         (("fuse", "none", "-c", FUSION, "-o", "out"), "none: no such file"),
         (("fuse", SCAN, "-c", "none.toml", "-o", "out"), "none.toml: no such file"),
-        (("fuse", SCAN, "-c", FUSION, "-o", "out", "--sensors", "trackr"), "did you mean 'tracker'?"),
+        ((*FUSE_SCAN, "-o", "out", "--sensors", "trackr"), "did you mean 'tracker'?"),
         (("compare", SCAN), "no result folder"),
         (("discretize", "puma761"), "not a preset (puma560-internal, puma560-external)"),
         (("discretize", "puma560-internal", "--axis", "radail"), "did you mean 'radial'?"),
@@ -161,26 +119,35 @@ def test_bad_input_is_one_line_that_says_what_to_do(arguments: tuple[object, ...
 
 
 @pytest.mark.parametrize(
-    "arguments", [("fuse",), ("fuse", SCAN, "-c", FUSION, "-o", "out", "--rate", "-5"), ("nonsense",), ("compare",)]
+    "arguments",
+    [
+        ("fuse",),
+        (*FUSE_SCAN, "-o", "out", "--rate", "-5"),
+        (*FUSE_SCAN, "-o", "out", "--smooth", "--as-live"),
+        ("nonsense",),
+        ("compare",),
+        ("simulate", "short.toml"),
+        ("simulate", "short.toml", "-o", "out", "--runs", "0"),
+        ("identify", "none", "-o", "out", "--period", "nan"),
+        ("identify", "none", "-o", "out", "--samples", 3),
+        ("live", "stdin", "-c", FUSION, "--stale-after", "0"),
+        ("live", "udp://:5005", "-c", FUSION, "--listen", "0.0.0.0"),
+        ("live", "udp://:5005", "-c", FUSION, "--allow", "10.0.0.0/8"),
+    ],
 )
 def test_wrong_usage_exits_with_2(arguments: tuple[object, ...]) -> None:
     """Missing arguments and impossible options are usage errors."""
-    pumafuse(*arguments, code=2)
+    assert pumafuse(*arguments, code=2).stdout == ""
 
 
 def test_discretize_prints_the_model_it_names() -> None:
     """The JSON is the matrices of `pumafuse.discretize`, and its step response settles at 1."""
-    import numpy as np
-
-    import pumafuse as pf
-
     shown = json.loads(pumafuse("discretize", "puma560-internal", "--json").stdout)
     arm = pf.ArmModel.load("puma560-internal")
-    assert list(shown["axes"]) == ["tangential", "radial", "vertical"]
+    assert tuple(shown["axes"]) == AXES
     for name, axis in shown["axes"].items():
         model = pf.discretize(arm.axes[name], 0.028, 0.06045, input_noise=1.0)
-        for letter in "FBHQ":
-            assert np.array_equal(axis[letter], getattr(model, letter))
+        assert all(np.array_equal(axis[letter], getattr(model, letter)) for letter in "FBHQ")
         assert axis["delay_ms"] == 60.45
         assert axis["step_response_mm"][-1] == pytest.approx(1.0, abs=2e-3)
 
@@ -198,13 +165,6 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def servo(name: str) -> Path:
-    folder = Path(__file__).parents[2] / "../shared/data/servo" / name
-    if not folder.exists():
-        pytest.skip("the recordings of the real servo are not part of this repository")
-    return folder
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "limit"), [("sin_sin", 1.4), ("sin_time_square", 5.4)])
 def test_a_real_servo_is_followed_between_rare_measurements(name: str, limit: float, tmp_path: Path) -> None:
@@ -212,6 +172,9 @@ def test_a_real_servo_is_followed_between_rare_measurements(name: str, limit: fl
 
     Commands come every 20 ± 3 ms, the encoder is read once in 100 ms, and arm.toml is written by hand.
     """
+    run = Path(__file__).parents[2] / "../shared/data/servo" / name
+    if not run.exists():
+        pytest.skip("the recordings of the real servo are not part of this repository")
     (tmp_path / "arm.toml").write_text(
         'name = "STS3250"\nupdate_period_ms = 20.0\ndelay_ms = 5.0\n'
         '[axes.tip]\nplant = "first-order"\ntime_constant_ms = 30.0\ngain = { intercept = 0.98 }\n'
@@ -220,42 +183,14 @@ def test_a_real_servo_is_followed_between_rare_measurements(name: str, limit: fl
         'arm = "arm.toml"\n[process]\ninput_noise_mm_rtHz = 0.5\ndrift_mm_rts = 5.0\n'
         "[sensors.encoder]\nsd_mm = 0.1\ngate = 0\n"
     )
-    pumafuse("fuse", servo(name), "-c", tmp_path / "fusion.toml", "-o", tmp_path / "out", "--rate", 200)
+    pumafuse("fuse", run, "-c", tmp_path / "fusion.toml", "-o", tmp_path / "out", "--rate", 200)
     assert scores([tmp_path / "out"])[0]["tip"]["rmse_mm"] <= limit
 
 
-def test_a_result_that_cannot_be_swapped_in_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the last rename fails, what stood there before stands there still."""
-    from pumafuse import folders
-
-    new, old = tmp_path / "new", tmp_path / "result"
-    for folder in (new, old):
-        folder.mkdir()
-        (folder / "summary.json").write_text(folder.name)
-    rename = Path.replace
-
-    def broken(self: Path, target: Path) -> Path:
-        if self == new:
-            raise OSError("disk gone")
-        return rename(self, target)
-
-    monkeypatch.setattr(Path, "replace", broken)
-    with pytest.raises(OSError, match="disk gone"):
-        folders._swap(new, old, tmp_path / "aside")
-    assert (old / "summary.json").read_text() == "result"
-
-
 def test_folders_of_runs_that_share_a_name_do_not_meet(tmp_path: Path) -> None:
-    """`a/scan`, `b/scan` and `scan_2` get a folder each, and dots in a folder's name stay."""
-    from pumafuse.cli.fuse import _folders
-
+    """`a/scan`, `b/scan` and `scan_2` get a folder each; dots in a folder's name stay, endings of a table go."""
     runs = [tmp_path / name for name in ("scan_2", "a/scan", "b/scan", "scan_0.5mm", "scan_0.8mm")]
     for run in runs:
         run.mkdir(parents=True)
-    assert [folder.name for folder in _folders(runs, tmp_path)] == [
-        "scan_2",
-        "scan",
-        "scan_3",
-        "scan_0.5mm",
-        "scan_0.8mm",
-    ]
+    places = _folders([*runs, tmp_path / "one.csv.gz"], tmp_path)
+    assert [folder.name for folder in places] == ["scan_2", "scan", "scan_3", "scan_0.5mm", "scan_0.8mm", "one"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import signal
 import subprocess
@@ -16,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import pumafuse as pf
-from executable import EXECUTABLE, pumafuse
+from executable import EXECUTABLE, names, pumafuse
 from pumafuse import folders
 from pumafuse.cli import many
 from pumafuse.simulation import simulate as simulation
@@ -27,14 +26,8 @@ name = "short"
 teaches = "Nothing much."
 seed = 3
 arm = "puma560-internal"
-[trajectory]
-kind = "white-noise"
-axes = ["radial", "vertical"]
-amplitude_mm = 5.0
-duration_s = 2.0
-[sensors.eye]
-rate_hz = 30.0
-sd_mm = 0.5
+trajectory = { kind = "white-noise", axes = ["radial", "vertical"], amplitude_mm = 5.0, duration_s = 2.0 }
+sensors.eye = { rate_hz = 30.0, sd_mm = 0.5 }
 """
 FILES = {"scenario.toml", "run.toml", "fusion.toml", "arm.toml", "commands.csv", "eye.csv", "truth.csv"}
 RESULT = {"estimates.parquet", "measurements.parquet", "reference.parquet", "summary.json", "fusion.toml", "arm.toml"}
@@ -51,54 +44,57 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()}
 
 
-def names(folder: Path) -> set[str]:
-    return {path.name for path in folder.iterdir()}
-
-
 def test_a_run_is_written_whole_and_the_next_command_works(scenario: Path, tmp_path: Path) -> None:
     """What it teaches, what is in it, where it is; and the line that comes next can be typed as it stands."""
     run = tmp_path / "run"
     lines = pumafuse("simulate", scenario, "-o", run).stdout.splitlines()
     rows = len(pf.Run.read(run).sensors["eye"].stamp)
-    assert lines[0] == "short: Nothing much."
-    assert lines[1] == f"1 run: 73 commands, {rows} rows of measurements, written to {run}"
+    assert lines[:2] == [
+        "short: Nothing much.",
+        f"1 run: 73 commands, {rows} rows of measurements, written to {run}",
+    ]
     assert names(run) == FILES
-    words = lines[2].removeprefix("next: ").split()
-    assert words[:2] == ["pumafuse", "fuse"]
-    pumafuse(*words[1:-1], tmp_path / "result")
+    words = lines[2].removeprefix("next: pumafuse ").split()
+    pumafuse(*words[:-1], tmp_path / "result")
     assert names(tmp_path / "result") == RESULT
 
 
 def test_the_executable_gives_the_bytes_that_python_gives(scenario: Path, tmp_path: Path) -> None:
     """And `--runs` those of single runs with the seeds in a row, on however many cores."""
-    pumafuse("simulate", scenario, "-o", tmp_path / "one")
     printed = pumafuse("simulate", scenario, "-o", tmp_path / "many", "--runs", 3).stdout
     assert "3 runs: 219 commands" in printed and f"next: pumafuse fuse {tmp_path / 'many' / 'seed-*'} -c " in printed
     assert names(tmp_path / "many") == {"seed-3", "seed-4", "seed-5"}
+    found = [digests(tmp_path / "many" / f"seed-{seed}") for seed in (3, 4, 5)]
     for seed in (3, 4, 5):
         simulation.write(pf.simulate(pf.Scenario.load(scenario), seed), tmp_path / f"python-{seed}", force=False)
-        assert digests(tmp_path / "many" / f"seed-{seed}") == digests(tmp_path / f"python-{seed}")
-    assert digests(tmp_path / "one") == digests(tmp_path / "python-3")
-    assert digests(tmp_path / "one") != digests(tmp_path / "python-4")
+        assert found[seed - 3] == digests(tmp_path / f"python-{seed}")
+    assert found[0] != found[1]
 
 
 @pytest.mark.long
 def test_many_runs_are_fused_into_one_table(scenario: Path, tmp_path: Path) -> None:
-    """A line for each run and axis, then one for each axis over all of them; a result folder for each run."""
-    pumafuse("simulate", scenario, "-o", tmp_path / "runs", "--runs", 4)
-    runs = sorted((tmp_path / "runs").iterdir())
-    config = tmp_path / "runs" / "seed-3" / "fusion.toml"
-    table = pumafuse("fuse", *runs, "-c", config, "-o", tmp_path / "out").stdout.splitlines()
-    own = [line.split() for line in table if line.strip().startswith("seed-")]
-    assert [(line[0], line[1]) for line in own] == [(f"seed-{s}", a) for s in "3456" for a in ("radial", "vertical")]
-    pooled = [line.split() for line in table if line.strip().startswith("all 4")]
-    assert [line[2] for line in pooled] == ["radial", "vertical"]
-    assert names(tmp_path / "out") == {run.name for run in runs}
-    assert all(names(folder) == RESULT for folder in (tmp_path / "out").iterdir())
-    for axis, number in (("radial", 0), ("vertical", 1)):
-        squares = [float(line[2]) ** 2 for line in own if line[1] == axis]
-        assert float(pooled[number][3]) == pytest.approx((sum(squares) / 4) ** 0.5, abs=0.001)
-        assert float(pooled[number][4]) == pytest.approx(max(squares) ** 0.5, abs=0.001)
+    """A line for each run and axis, then one for each axis over all of them; a result folder for each run.
+
+    Torn tables and missing runs are listed in the order given, and stop no other.
+    """
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    pumafuse("simulate", scenario, "-o", runs, "--runs", 5)
+    (runs / "seed-5" / "eye.csv").write_text("time_s,radial_mm\n")
+    given = [runs / "none", *(runs / f"seed-{seed}" for seed in range(3, 8))]
+    done = pumafuse("fuse", *given, "-c", runs / "seed-3" / "fusion.toml", "-o", out, code=1)
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("warning: ")]
+    assert [line.split(": ")[1] for line in lines[:2]] == [str(runs / "none"), str(runs / "seed-5")]
+    assert lines[2:] == [f"pumafuse: 2 of 6 runs failed (see above); the others are in {out}"]
+    rows = [line.split() for line in done.stdout.splitlines()]
+    own = [row for row in rows if row and row[0].startswith("seed-")]
+    assert [(row[0], row[1]) for row in own] == [(f"seed-{s}", a) for s in "3467" for a in ("radial", "vertical")]
+    assert names(out) == {"seed-3", "seed-4", "seed-6", "seed-7"}
+    assert all(names(folder) == RESULT for folder in out.iterdir())
+    pooled = {row[2]: row for row in rows if row[:2] == ["all", "4"]}
+    for axis in ("radial", "vertical"):
+        squares = [float(row[2]) ** 2 for row in own if row[1] == axis]
+        assert float(pooled[axis][3]) == pytest.approx((sum(squares) / 4) ** 0.5, abs=0.001)
+        assert float(pooled[axis][4]) == pytest.approx(max(squares) ** 0.5, abs=0.001)
 
 
 def test_one_run_that_fails_stops_no_other(scenario: Path, tmp_path: Path) -> None:
@@ -116,35 +112,6 @@ def test_one_run_that_fails_stops_no_other(scenario: Path, tmp_path: Path) -> No
     assert (out / "seed-4").read_text() == "in the way"
 
 
-@pytest.mark.long
-def test_fusing_goes_on_past_a_run_that_cannot_be_read(scenario: Path, tmp_path: Path) -> None:
-    """Torn tables, strange folders and missing runs are listed in the order given."""
-    runs = tmp_path / "runs"
-    pumafuse("simulate", scenario, "-o", runs, "--runs", 3)
-    (runs / "seed-4" / "eye.csv").write_text("time_s,radial_mm\n")
-    arguments = [runs / "none", runs / "seed-3", runs / "seed-4", runs / "seed-5"]
-    done = pumafuse("fuse", *arguments, "-c", runs / "seed-3" / "fusion.toml", "-o", tmp_path / "out", code=1)
-    lines = [line for line in done.stderr.splitlines() if not line.startswith("warning: ")]
-    assert [line.split(": ")[1] for line in lines[:2]] == [str(runs / "none"), str(runs / "seed-4")]
-    assert lines[2:] == [f"pumafuse: 2 of 4 runs failed (see above); the others are in {tmp_path / 'out'}"]
-    assert names(tmp_path / "out") == {"seed-3", "seed-5"}
-    assert "all 2" in done.stdout
-
-
-@pytest.mark.long
-def test_when_every_run_fails_nothing_is_promised(scenario: Path, tmp_path: Path) -> None:
-    """No table and no next step, only what was wrong."""
-    done = pumafuse("fuse", tmp_path / "a", tmp_path / "b", "-c", SCENARIOS / "none.toml", "-o", tmp_path / "o", code=1)
-    assert done.stdout == ""
-    out = tmp_path / "many"
-    out.mkdir()
-    for seed in (3, 4):
-        (out / f"seed-{seed}").write_text("in the way")
-    done = pumafuse("simulate", scenario, "-o", out, "--runs", 2, code=1)
-    assert done.stdout.splitlines() == ["short: Nothing much."]
-    assert len(done.stderr.splitlines()) == 3
-
-
 def _square(number: int) -> int:
     return number**2
 
@@ -159,144 +126,126 @@ def _broken() -> int:
 
 def test_jobs_are_done_and_reported_in_the_order_given(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """Whichever is ready first; a refusal and an unexpected exception are one line each, no failure is no line."""
-    many.report_failures({}, 3, "here")
-    assert capsys.readouterr().err == ""
+    many.report_failures({}, 3, tmp_path)
     jobs: dict[str, Callable[[], int]] = {f"job-{n}": partial(_square, n) for n in range(6)}
     jobs = {"bad": _refused, **jobs, "worse": _broken}
     done, failed = many.run_jobs("testing", jobs, [tmp_path / name for name in jobs])
-    assert done == {f"job-{n}": n**2 for n in range(6)} and list(done) == [f"job-{n}" for n in range(6)]
-    assert list(failed) == ["bad", "worse"]
-    assert failed["bad"] == "not so"
-    assert failed["worse"] == "unexpected ValueError: several lines of it"
-    with pytest.raises(many.SomeFailedError, match="2 of 8 runs failed"):
-        many.report_failures(failed, 8, "here")
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2 and lines[0] == "pumafuse: bad: not so"
-    assert lines[1].startswith("pumafuse: worse: ") and "several" in lines[1] and "of it" in lines[1]
+    assert list(done.items()) == [(f"job-{n}", n**2) for n in range(6)]
+    expected = [("bad", "not so"), ("worse", "unexpected ValueError: several lines of it")]
+    assert list(failed.items()) == expected
+    assert capsys.readouterr().err == ""
+    with pytest.raises(pf.PumafuseError, match="2 of 8 runs failed"):
+        many.report_failures(failed, 8, tmp_path)
+    assert capsys.readouterr().err.splitlines() == [f"pumafuse: {name}: {what}" for name, what in expected]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("death", ["os._exit(9)", "os.kill(os.getpid(), signal.SIGKILL)"])
-def test_a_worker_that_dies_is_one_line(death: str, tmp_path: Path) -> None:
+def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
     """As when memory runs out: the command says so and ends; what was half written is swept, what is whole is kept."""
     script, out = tmp_path / "dies.py", tmp_path / "out"
     script.write_text(
-        "import os, signal, sys, time\nfrom functools import partial\nfrom pathlib import Path\n"
+        "import os, signal, time\nfrom pathlib import Path\n"
         "from pumafuse import folders\nfrom pumafuse.cli import many, main\n"
         f"out = Path({str(out)!r})\n"
         "def whole():\n    with folders.replacing(out / 'a') as new:\n        (new / 'x').write_text('')\n"
         "def die():\n    while not (out / 'a').exists():\n        time.sleep(0.01)\n"
-        f"    with folders.replacing(out / 'b'):\n        {death}\n"
-        "def app():\n    jobs = {'a': whole, 'b': die}\n"
-        "    many.report_failures(many.run_jobs('x', jobs, [out / name for name in jobs])[1], 2, 'here')\n"
+        "    with folders.replacing(out / 'b'):\n        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "def app():\n    many.run_jobs('x', {'a': whole, 'b': die}, [out / 'a', out / 'b'])\n"
         "if __name__ == '__main__':\n    main.app = app\n    main.main()\n"
     )
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1
-    lines = done.stderr.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("pumafuse: a worker process died"), done.stderr
-    assert "of 2 runs are done and kept" in lines[0]
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("pumafuse: a worker process died") and "of 2 runs are done and kept" in line
     assert names(out) == {"a"} and names(out / "a") == {"x"}
 
 
-def interrupted(words: list[object], out: Path, finished: int, group: bool) -> set[str]:
-    """Interrupt a command once it has ``finished`` some folders; the folders that are left when it has ended."""
+@pytest.mark.long
+@pytest.mark.parametrize("kill", [os.killpg, os.kill], ids=["terminal", "one"])
+def test_an_interrupted_simulation_keeps_whole_runs_and_nothing_else(
+    kill: Callable[[int, int], None], tmp_path: Path
+) -> None:
+    """Exit code 130, a line that says how many are done; every folder is a whole run, and nothing hidden is left.
+
+    Ctrl-C reaches every process of a terminal, a signal only one.
+    """
+    out = tmp_path / "out"
+    words = [str(EXECUTABLE), "simulate", str(SCENARIOS / "step-campaign.toml"), "-o", str(out), "--runs", "300"]
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what ignores it hands that on
-    command = [str(EXECUTABLE), *map(str, words)]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
     signal.signal(signal.SIGINT, before)
     give_up = time.monotonic() + 100.0
-    while process.poll() is None and time.monotonic() < give_up:
-        if out.exists() and len([path for path in out.iterdir() if not path.name.startswith(".")]) >= finished:
-            break
+    while time.monotonic() < give_up and len([path for path in out.glob("*") if not path.name.startswith(".")]) < 3:
         time.sleep(0.01)
     assert process.poll() is None, process.communicate()
-    if group:
-        os.killpg(process.pid, signal.SIGINT)  # Ctrl-C reaches every process of the terminal
-    else:
-        os.kill(process.pid, signal.SIGINT)
+    kill(process.pid, signal.SIGINT)
     _, message = process.communicate(timeout=100)
     assert process.returncode == 130
     assert "Traceback" not in message and "interrupted: " in message
     time.sleep(1.0)  # what is still running would still write
-    return names(out)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("group", [True, False], ids=["terminal", "one"])
-def test_an_interrupted_simulation_keeps_whole_runs_and_nothing_else(group: bool, tmp_path: Path) -> None:
-    """Exit code 130, a line that says how many are done; every folder is a whole run, and nothing hidden is left."""
-    out = tmp_path / "out"
-    left = interrupted(["simulate", SCENARIOS / "step-campaign.toml", "-o", out, "--runs", 300], out, 3, group)
-    assert 3 <= len(left) < 300
-    for name in left:
+    assert 3 <= len(names(out)) < 300
+    for name in names(out):
         assert names(out / name) == (FILES - {"eye.csv"}) | {"scope.csv", "trials.csv", "samples.csv"}
         assert pf.Run.read(out / name).name.endswith(f"seed {name.removeprefix('seed-')}")
 
 
-def ours(name: str) -> bool:
-    return name in ("run.toml", "a.csv")
+# ---- Output folders -------------------------------------------------------------------------------------------------
 
 
-def test_a_folder_is_writable_when_it_is_absent_empty_or_ours_with_force(tmp_path: Path) -> None:
-    """Only an earlier output needs --force."""
-    (tmp_path / "empty").mkdir()
-    for name in ("absent", "empty", "deep/er"):
-        folders.check_writable(tmp_path / name, False, ["run.toml"], ours)
-    earlier = tmp_path / "earlier"
-    earlier.mkdir()
-    for name in ("run.toml", "a.csv"):
-        (earlier / name).write_text("")
-    with pytest.raises(folders.FolderError, match="exists; --force replaces it"):
-        folders.check_writable(earlier, False, ["run.toml"], ours)
-    folders.check_writable(earlier, True, ["run.toml"], ours)
+@pytest.mark.parametrize(
+    ("entries", "forced", "unforced"),
+    [
+        ([], None, None),
+        (["run.toml", "a.csv"], None, "exists; --force replaces it"),
+        (["run.toml", "b.txt"], "holds 'b.txt'", "holds 'b.txt'"),
+        (["run.toml", ".git"], "holds '.git'", "holds '.git'"),
+        (["a.csv"], "holds no output of pumafuse", "holds no output of pumafuse"),
+        (["run.toml", "a.csv/"], "holds 'a.csv'", "holds 'a.csv'"),
+    ],
+)
+def test_a_folder_is_writable_when_it_is_empty_or_ours_with_force(
+    entries: list[str], forced: str | None, unforced: str | None, tmp_path: Path
+) -> None:
+    """Only an earlier output needs --force; with something else in it, or without the marker, it is never ours."""
+    for entry in entries:
+        path = tmp_path / entry
+        path.mkdir() if entry.endswith("/") else path.write_text("")
+    for force, message in ((True, forced), (False, unforced)):
+        check = partial(folders.check_writable, tmp_path, force, ["run.toml"], {"run.toml", "a.csv"}.__contains__)
+        if message is None:
+            check()
+        else:
+            with pytest.raises(folders.FolderError, match=message):
+                check()
 
 
-@pytest.mark.parametrize("force", [False, True])
-def test_strange_folders_are_never_ours(force: bool, tmp_path: Path) -> None:
-    """A file in the place, something else in it, a folder in it, or our kind of file without the marker."""
+def test_an_output_that_fails_half_way_leaves_the_old_one_and_no_trace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever goes wrong while it is written, and if the last rename fails."""
+    run, rename = tmp_path / "run", Path.replace
 
-    def refused(path: Path) -> str:
-        with pytest.raises(folders.FolderError) as error:
-            folders.check_writable(path, force, ["run.toml"], ours)
-        return str(error.value)
+    def write(text: str, error: type[BaseException] | None = None) -> None:
+        with folders.replacing(run) as new:
+            (new / "run.toml").write_text(text)
+            if error is not None:
+                raise error
 
-    (tmp_path / "file").write_text("")
-    assert "is not a folder" in refused(tmp_path / "file")
-    for name, entries in {
-        "strange": ["run.toml", "b.txt"],
-        "unmarked": ["a.csv"],
-        "hidden": ["run.toml", ".git"],
-    }.items():
-        (tmp_path / name).mkdir()
-        for entry in entries:
-            (tmp_path / name / entry).write_text("")
-    assert "holds 'b.txt'" in refused(tmp_path / "strange")
-    assert "holds no output of pumafuse" in refused(tmp_path / "unmarked")
-    assert "holds '.git'" in refused(tmp_path / "hidden")
-    (tmp_path / "nested" / "a.csv").mkdir(parents=True)
-    (tmp_path / "nested" / "run.toml").write_text("")
-    assert "holds 'a.csv'" in refused(tmp_path / "nested")
+    def broken(self: Path, target: Path) -> Path:
+        if self.name == "new":
+            raise OSError(5, "disk gone")
+        return rename(self, target)
 
-
-def test_an_output_that_fails_half_way_leaves_the_old_one_and_no_trace(tmp_path: Path) -> None:
-    """Whatever goes wrong while it is written."""
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "run.toml").write_text("old")
-
-    def half() -> None:
-        with folders.replacing(tmp_path / "run") as new:
-            (new / "run.toml").write_text("half")
-            raise KeyboardInterrupt
-
+    write("old")
     with pytest.raises(KeyboardInterrupt):
-        half()
-    assert names(tmp_path) == {"run"} and (tmp_path / "run" / "run.toml").read_text() == "old"
-    with folders.replacing(tmp_path / "run") as new:
-        (new / "run.toml").write_text("new")
-    assert names(tmp_path) == {"run"} and (tmp_path / "run" / "run.toml").read_text() == "new"
+        write("half", KeyboardInterrupt)
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "replace", broken)
+        with pytest.raises(folders.FolderError, match="disk gone"):
+            write("new")
+    assert names(tmp_path) == {"run"} and (run / "run.toml").read_text() == "old"
+    write("new")
+    assert names(tmp_path) == {"run"} and (run / "run.toml").read_text() == "new"
 
 
 def test_a_simulated_run_is_replaced_only_with_force(scenario: Path, tmp_path: Path) -> None:
@@ -315,74 +264,37 @@ def test_a_simulated_run_is_replaced_only_with_force(scenario: Path, tmp_path: P
     assert {name: digest for name, digest in digests(run).items() if name != "mine.csv"} == after
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(("more", "runs"), [((), ()), (("fusion.toml", "arm.toml"), ("--runs", 1))])
-def test_a_run_that_was_recorded_is_not_replaced_even_with_force(
-    more: tuple[str, ...], runs: tuple[object, ...], scenario: Path, tmp_path: Path
+@pytest.mark.parametrize("scenario_beside", [False, True])
+def test_what_somebody_made_is_not_replaced_even_with_force(
+    scenario_beside: bool, scenario: Path, tmp_path: Path
 ) -> None:
-    """A folder with run.toml and tables of its own is somebody's measurement, not our output."""
-    recorded = tmp_path / "measured" / "seed-3" if runs else tmp_path / "measured"
-    recorded.mkdir(parents=True)
-    (recorded / "run.toml").write_text('[command]\nfile = "host.csv"\ntime = "t_s"\nradial = "u_mm"\n')
-    (recorded / "host.csv").write_text("t_s,u_mm\n0.0,1.0\n")
-    for name in more:
-        (recorded / name).write_text("")
-    before = digests(recorded)
-    done = pumafuse("simulate", scenario, "-o", tmp_path / "measured", "--force", *runs, code=1)
-    assert "holds no output of pumafuse, which is not ours to replace" in done.stderr
-    assert digests(recorded) == before
-    assert names(tmp_path / "measured") == ({"seed-3"} if runs else set(before))
-
-
-def test_a_folder_with_a_scenario_of_ones_own_is_not_replaced_even_with_force(tmp_path: Path) -> None:
-    """A hand-written scenario.toml and the path beside it are nobody's output."""
+    """A run.toml with tables of its own is a measurement; a scenario with its path is written by hand."""
     mine = tmp_path / "mine"
     mine.mkdir()
-    path = '[trajectory]\nkind = "path"\nfile = "path.csv"\naxes = ["radial"]\n'
-    (mine / "scenario.toml").write_text('name = "mine"\narm = "puma560-internal"\n' + path)
-    (mine / "path.csv").write_text("time_s,radial_mm\n0.0,1.0\n1.0,2.0\n")
+    if scenario_beside:
+        path = 'trajectory = { kind = "path", file = "path.csv", axes = ["radial"] }\n'
+        scenario = mine / "scenario.toml"
+        scenario.write_text(f'name = "mine"\narm = "puma560-internal"\n{path}')
+        (mine / "path.csv").write_text("time_s,radial_mm\n0.0,1.0\n1.0,2.0\n")
+    else:
+        (mine / "run.toml").write_text('[command]\nfile = "commands.csv"\ntime = "t_s"\nradial = "u_mm"\n')
+        (mine / "commands.csv").write_text("t_s,u_mm\n0.0,1.0\n")
     before = digests(mine)
-    pumafuse("simulate", mine / "scenario.toml", "-o", mine, "--force", code=1)
+    assert "not ours to replace" in pumafuse("simulate", scenario, "-o", mine, "--force", code=1).stderr
     assert digests(mine) == before
 
 
 @pytest.mark.long
-def test_a_run_along_a_path_is_simulated_anew_where_it_lies(scenario: Path, tmp_path: Path) -> None:
+def test_a_run_along_a_path_is_simulated_anew_where_it_lies(tmp_path: Path) -> None:
     """Its table goes with it: the same bytes, also in its own place."""
-    (tmp_path / "there").mkdir()
-    (tmp_path / "there" / "way.csv").write_text("time_s,radial_mm\n0.0,0.0\n1.0,20.0\n2.0,5.0\n")
-    path = '[trajectory]\nkind = "path"\nfile = "there/way.csv"\naxes = ["radial"]\n'
-    along = scenario.with_name("along.toml")
-    along.write_text(SCENARIO[: SCENARIO.index("[trajectory]")] + path + SCENARIO[SCENARIO.index("[sensors.eye]") :])
-    pumafuse("simulate", along, "-o", tmp_path / "one")
-    before = digests(tmp_path / "one")
+    along, one, two = tmp_path / "along.toml", tmp_path / "one", tmp_path / "two"
+    (tmp_path / "way.csv").write_text("time_s,radial_mm\n0.0,0.0\n1.0,20.0\n2.0,5.0\n")
+    path = 'trajectory = { kind = "path", file = "way.csv", axes = ["radial"] }'
+    lines = [path if line.startswith("trajectory") else line for line in SCENARIO.splitlines()]
+    along.write_text("\n".join(lines))
+    pumafuse("simulate", along, "-o", one)
+    before = digests(one)
     assert "path.csv" in before
-    pumafuse("simulate", tmp_path / "one" / "scenario.toml", "-o", tmp_path / "two")
-    pumafuse("simulate", tmp_path / "one" / "scenario.toml", "-o", tmp_path / "one", "--force")
-    assert digests(tmp_path / "two") == before == digests(tmp_path / "one")
-
-
-@pytest.mark.long
-def test_a_reference_without_rows_is_a_note_and_commands_without_rows_are_refused(
-    scenario: Path, tmp_path: Path
-) -> None:
-    """A reference that was never recorded: exit code 0, no score, and the summary says so. No run without commands."""
-    run, result = tmp_path / "run", tmp_path / "result"
-    pumafuse("simulate", scenario, "-o", run)
-    (run / "truth.csv").write_text((run / "truth.csv").read_text().splitlines()[0] + "\n")
-    done = pumafuse("fuse", run, "-c", run / "fusion.toml", "-o", result)
-    summary = json.loads((result / "summary.json").read_text())
-    assert "truth.csv: the table has no rows" in done.stderr
-    assert "truth.csv: the table has no rows" in summary["notes"]
-    assert [summary["axes"][axis]["score"] for axis in ("radial", "vertical")] == [None, None]
-
-    (run / "commands.csv").write_text((run / "commands.csv").read_text().splitlines()[0] + "\n")
-    done = pumafuse("fuse", run, "-c", run / "fusion.toml", "-o", tmp_path / "none", code=1)
-    assert len(done.stderr.splitlines()) == 1 and "commands.csv" in done.stderr
-    assert not (tmp_path / "none").exists()
-
-
-@pytest.mark.parametrize("arguments", [("--runs", "0"), ("--runs", "-1"), ("--runs", "two"), ()])
-def test_wrong_usage_exits_with_2(arguments: tuple[str, ...], scenario: Path) -> None:
-    """Impossible numbers of runs, and no output folder."""
-    pumafuse("simulate", scenario, *(("-o", "out", *arguments) if arguments else ()), code=2)
+    pumafuse("simulate", one / "scenario.toml", "-o", two)
+    pumafuse("simulate", one / "scenario.toml", "-o", one, "--force")
+    assert digests(two) == before == digests(one)

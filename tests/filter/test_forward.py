@@ -14,7 +14,7 @@ from pumafuse.arrays import CodeArray, TimeArray
 from pumafuse.filter.axis import Model, Sensors, State
 from pumafuse.filter.events import COMMAND, Events, Results, joined
 from pumafuse.filter.forward import Outputs, filter_events, no_history
-from pumafuse.filter.outcome import ABSENT, Outcome
+from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.engine import arranged, biased_sensors
 from pumafuse.fusion.segments import Segment, build
 
@@ -69,7 +69,10 @@ class Pass:
         return Pass(*arranged(segment, CONFIG, biased_sensors(segment, CONFIG), places), [], [])
 
     def run(self, events: Events, times: TimeArray, outcome: CodeArray | None = None) -> None:
-        results, outputs = Results.room(len(events.time), len(AXES)), Outputs(*np.empty((6, len(AXES), len(times))))
+        results, outputs = (
+            Results.room(len(events.time), len(AXES)),
+            Outputs(*np.empty((len(Outputs._fields), len(AXES), len(times)))),
+        )
         if outcome is not None:
             results.outcome[:] = outcome
         history, arrived = no_history(len(AXES), self.state.x.shape[1]), np.zeros(0, dtype=np.bool_)
@@ -121,22 +124,6 @@ def test_estimates_leave_no_trace() -> None:
         np.testing.assert_array_equal(part[:, ::7], other)
 
 
-def test_given_outcomes_are_repeated() -> None:
-    """Those of the gates give the same bits again; without rejections everything is fused, whatever the gates say."""
-    segment = segment_of(2)
-    events, _ = segment.events(CONFIG)
-    decided, repeated, fused = (Pass.over(segment) for _ in range(3))
-    decided.run(events, GRID)
-    outcome = decided.results[0].outcome
-    repeated.run(events, GRID, outcome)
-    for name in ("innovation", "innovation_sd", "outcome"):
-        np.testing.assert_array_equal(getattr(repeated.results[0], name), getattr(decided.results[0], name))
-    np.testing.assert_array_equal(repeated.outputs[0].position, decided.outputs[0].position)
-    fused.run(events, GRID, np.where(outcome == ABSENT, outcome, np.uint8(Outcome.FUSED)))
-    assert np.nanmax(np.abs(fused.results[0].innovation / fused.results[0].innovation_sd)) > 10.0
-    assert not (fused.results[0].outcome == Outcome.REJECTED).any()
-
-
 @settings(derandomize=True, deadline=None, max_examples=20)
 @given(st.integers(0, 1000))
 def test_late_events_end_as_events_in_time(seed: int) -> None:
@@ -148,7 +135,7 @@ def test_late_events_end_as_events_in_time(seed: int) -> None:
     arrival[events.source == COMMAND] = events.stamp[events.source == COMMAND]
     times = np.append(GRID, arrival.max())
     live, whole = Pass.over(segment, count + 1), Pass.over(segment)
-    results, outputs = Results.room(count, 2), Outputs(*np.empty((6, 2, len(times))))
+    results, outputs = Results.room(count, 2), Outputs(*np.empty((len(Outputs._fields), 2, len(times))))
     arrived, history = np.zeros(count, dtype=np.bool_), no_history(len(AXES), live.state.x.shape[1])
     queue = np.argsort(arrival, kind="stable")
     known = live.model, live.sensors, events, live.state

@@ -78,18 +78,6 @@ def check_same(est: pf.Estimates, wanted: pf.Estimates) -> None:
         np.testing.assert_allclose(est[axis].position_sd, wanted[axis].position_sd, rtol=1e-9)
 
 
-def test_a_sensor_that_is_always_wrong_is_named(
-    scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
-) -> None:
-    """50 mm off beside a good one: rejected throughout, said with both names, and no estimate is the worse for it."""
-    est, summary = fused(scan, config, lambda source: changed(source, lambda value: value + 0.05))
-    check_same(est, camera_alone)
-    assert any("'tracker' contradicts 'vision'" in note for note in summary.notes)
-    assert said(summary, "of its components were rejected")
-    for axis in AXES:
-        assert set(summary.axes[axis].sensors["tracker"].outcomes) == {"rejected"}
-
-
 def test_a_constant_error_is_found_where_a_bias_is_expected(
     scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
 ) -> None:
@@ -134,15 +122,6 @@ def test_a_sensor_of_nothing_but_nan_is_left_out(
         assert found.nis_mean is None
 
 
-def test_an_infinite_measurement_is_as_good_as_none(
-    scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
-) -> None:
-    """A minute of ±∞ is a minute of invalid measurements."""
-    est, summary = fused(scan, config, lambda source: changed(source, lambda value: np.copysign(np.inf, value)))
-    check_same(est, camera_alone)
-    assert summary.axes["radial"].sensors["tracker"].outcomes == {"invalid": 5999}
-
-
 def shifted(seconds: float) -> Callable[[Source], Source]:
     return lambda source: replace(source, stamp=source.stamp + int(seconds * 1e9))
 
@@ -154,14 +133,6 @@ def test_a_sensor_on_the_epoch_s_clock_is_asked_about(
     est, summary = fused(scan, config, shifted(1.7e9))
     check_same(est, camera_alone)
     assert said(summary, "after the last command", "one clock")
-
-
-def test_a_clock_of_another_era_does_not_stretch_the_grid(scan: pf.Run, config: pf.FusionConfig) -> None:
-    """Estimates at 20 Hz end with the run, not with a sensor's stamps of 2023."""
-    est, summary = fused(scan, config, shifted(1.7e9), rate=20.0)
-    end = (scan.command.stamp.max() - scan.command.stamp.min()) / 1e9
-    assert abs(est.time[-1] - end) < 1.0
-    assert said(summary, "one clock")
 
 
 def test_a_sensor_on_a_clock_since_boot_is_asked_about(
@@ -176,12 +147,3 @@ def test_a_sensor_on_a_clock_since_boot_is_asked_about(
     assert said(summary, "5999 rows have a time before the first command", "before_start")
     assert said(summary, "before the first command", "one clock")
     assert summary.axes["radial"].sensors["tracker"].outcomes == {"before_start": 5999}
-
-
-def test_measurements_long_after_the_run_are_noted(
-    scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
-) -> None:
-    """Two hours late, the tracker says nothing of the run: its estimates are the camera's, and the hours are named."""
-    est, summary = fused(scan, config, shifted(7200.0))
-    check_same(est, camera_alone)
-    assert said(summary, "2.0 hours after the last command")

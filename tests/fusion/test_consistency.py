@@ -146,19 +146,6 @@ def outlying(world: World, rows: range) -> tuple[pf.Run, np.ndarray]:
     return run, good
 
 
-def test_rejected_components_leave_the_counts() -> None:
-    """With blunders rejected, count, NIS, correlation and verdict are those of the run without these rows."""
-    world = World(gate=6.0)
-    run, good = outlying(world, range(10, 250, 20))
-    found = judged(run, world)["axis0"]
-    clean = replace(run, sensors={"camera": run.sensors["camera"].rows(good)})
-    wanted = judged(clean, world)["axis0"]
-    assert found.count == wanted.count == good.sum()
-    assert (found.nis, found.whiteness) == pytest.approx((wanted.nis, wanted.whiteness), rel=1e-9)
-    assert found.correlation == pytest.approx(wanted.correlation, abs=1e-9)
-    assert found.verdict == wanted.verdict
-
-
 def test_a_rejected_component_costs_as_much_as_one_at_the_gate() -> None:
     """−½(ln 2πS + gate²) for each rejected component, −½(ln 2πS + ν²/S) for each other: normal densities in mm."""
     world = World(gate=6.0)
@@ -224,33 +211,6 @@ def test_verdicts_name_the_key_that_is_wrong(moving: pf.Run, configured: World, 
     """Double the noise, 30 ms too early and too late, no process noise or far too much: on every axis."""
     for axis, found in judged(moving, configured).items():
         assert verdict in found.verdict, (axis, found.verdict)
-
-
-@pytest.mark.parametrize(("count", "few"), [(29, True), (30, False)])
-def test_few_measurements_are_not_judged(count: int, few: bool) -> None:
-    """Below 30 the verdict is that there are too few, and how many."""
-    world = World()
-    found = judged(simulated(world, swing(2.0), 0.033, count, 1, 5), world)["axis0"]
-    assert (found.verdict == f"too few measurements ({count}) to tell") == few
-    assert found.count == count
-
-
-def test_nothing_fused_is_nothing_judged() -> None:
-    """Only values that are not finite: no numbers, and no division by nothing."""
-    run = pf.Run.from_arrays([0.0, 0.028], {"axis0": [0.0, 0.0]}, {"camera": ([0.03, 0.04], {"axis0": [np.nan] * 2})})
-    with pytest.warns(pf.PumafuseWarning, match="invalid"):
-        est = pf.fuse(run, World().config(run))
-    assert consistency(est, "camera", "axis0") is None
-
-
-def test_half_the_noise_blames_sd_first():
-    """Each innovation pulls against the last: that is sd_mm, and not the process noise."""
-    world = World(sd=0.3e-3, drift=0.5e-3)
-    run = simulated(world, swing(11.0), 0.01, 1000, 6, 3)
-    for found in judged(run, replace(world, sd=0.15e-3)).values():
-        assert found.correlation[0] < 0.0
-        assert "the process noise too small" not in found.verdict
-        assert "sd_mm" in found.verdict
 
 
 @pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")

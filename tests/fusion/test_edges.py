@@ -9,9 +9,8 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.fusion import results
-from pumafuse.fusion.consistency import consistency
 from pumafuse.logs.axes import in_axes
-from pumafuse.logs.frames import Cylindrical, Rotated
+from pumafuse.logs.frames import Cylindrical
 from pumafuse.views.figures import error_figure, validation_figure
 
 DATA = Path(pf.__file__).parent / "data"
@@ -57,12 +56,6 @@ def test_a_measurement_on_the_base_axis_does_not_poison_the_filter(sensor):
     assert np.isfinite(est["tangential"].position).all()
 
 
-def test_a_rejected_measurement_on_the_base_axis_leaves_a_readable_folder(tmp_path):
-    """A rejected measurement on the base axis leaves a readable folder."""
-    results.write(quiet(arc(x=0.0, y=0.0), config()), tmp_path / "out", False)
-    results.read(tmp_path / "out")
-
-
 def test_an_infinite_command_is_no_radius():
     """An infinite command is no radius."""
     run = arc()
@@ -70,23 +63,11 @@ def test_an_infinite_command_is_no_radius():
     assert quiet(run, config()).radius == pytest.approx(0.5)
 
 
-def test_infinite_values_raise_no_numpy_warning():
-    """Infinite values raise no numpy warning."""
-    quiet(arc(frame=Rotated(azimuth=0.0), x=np.inf), config())
-
-
 @pytest.mark.parametrize("start", [{"x": 0.5}, {"y": 0.5}])
 def test_half_a_start_level_is_refused(start):
     """Half a start level is refused."""
     with pytest.raises(pf.RunError, match="start"):
         in_axes(replace(arc(), start=start), None)
-
-
-def test_a_frame_in_fusion_toml_does_not_refuse_runs_that_name_axes():
-    """A frame in fusion toml does not refuse runs that name axes."""
-    run = pf.Run.from_arrays([0.0, 0.028], {"radial": [0.5, 0.5]})
-    est = quiet(run, pf.FusionConfig(arm=ARM, frame=Cylindrical()))
-    assert est["radial"].position[0] == 0.5
 
 
 def test_a_sensor_in_x_y_without_a_frame_is_not_dropped_silently():
@@ -132,48 +113,6 @@ def test_a_second_segment_keeps_the_frame_of_the_run():
     assert est["tangential"].position[-1] == pytest.approx(0.1)
 
 
-def test_a_latency_too_large_is_not_called_too_small():
-    """A latency too large is not called too small."""
-    import msgspec
-
-    scan, conf = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
-    tracker = msgspec.structs.replace(conf.sensors["tracker"], latency=0.038, gate=0.0)  # 8 ms is right
-    est = quiet(scan, msgspec.structs.replace(conf, sensors={"tracker": tracker}))
-    for axis in est.axes:
-        assert "latency_ms too small" not in consistency(est, "tracker", axis).verdict, axis
-
-
-def test_a_sensor_frozen_for_most_of_the_run_is_noted():
-    """A sensor frozen for most of the run is noted."""
-    scan, conf = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
-    tracker = scan.sensors["tracker"]
-    frozen = tracker.stamp - scan.command.stamp.min() > 5_000_000_000
-    values = {axis: np.where(frozen, value[frozen.argmax()], value) for axis, value in tracker.values.items()}
-    est = quiet(replace(scan, sensors={"tracker": replace(tracker, values=values)}), conf, sensors=["tracker"])
-    assert any("froze" in note for note in est.notes)
-
-
-def test_re_acquisitions_are_counted_by_rows():
-    """A tracker alone that jumps twice re-acquires twice, on all axes at once."""
-    scan, conf = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
-    tracker = scan.sensors["tracker"]
-    second = (tracker.stamp - scan.command.stamp.min()) / 1e9
-    jumped = 0.05 * ((second > 10.0) & (second < 20.0))
-    off = replace(tracker, values={axis: value + jumped for axis, value in tracker.values.items()})
-    est = quiet(replace(scan, sensors={"tracker": off}), conf, sensors=["tracker"])
-    assert est.measurements.counts()["reacquired"] == 6
-    assert any("tracker: its gate reacquired 2 times" in note for note in est.notes), est.notes
-
-
-def test_measurements_only_after_the_run_are_noted():
-    """Measurements only after the run are noted."""
-    scan, conf = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
-    tracker = scan.sensors["tracker"]
-    late = replace(tracker, stamp=tracker.stamp + 70_000_000_000)
-    est = quiet(replace(scan, sensors={**scan.sensors, "tracker": late}), conf, sensors=["tracker", "vision"])
-    assert any("after the last command" in note for note in est.notes), est.notes
-
-
 def small(shift=0.0, spoil=0.0):
     time = 10 + 0.028 * np.arange(60)
     seen = 10 + 0.01 * np.arange(1, 100)
@@ -203,13 +142,6 @@ def test_no_variance_leaves_a_readable_folder(tmp_path):
     est = quiet(run, pf.FusionConfig(arm=ARM, start=pf.Start(offset_sd=0.0), process=sure))
     results.write(est, tmp_path / "out", False)
     results.read(tmp_path / "out")
-
-
-def test_a_wrong_direction_is_refused_with_the_accepted_ones(tmp_path):
-    """A wrong direction is refused with the accepted ones."""
-    (tmp_path / "fusion.toml").write_text('arm = "puma560-internal"\n[frame]\nkind = "cylindrical"\npositive = "cw"\n')
-    with pytest.raises(pf.ConfigError, match="counterclockwise, clockwise"):
-        pf.FusionConfig.load(tmp_path / "fusion.toml")
 
 
 def test_a_reference_s_own_noise_scales_like_a_measurement_s():

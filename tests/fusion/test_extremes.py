@@ -8,7 +8,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import product
 
 import numpy as np
 import pytest
@@ -154,22 +153,6 @@ def check(edge: Edge, rate: float | None = None) -> dict[str, Estimates]:
 any_plant = pytest.mark.parametrize("plant", PLANTS.values(), ids=PLANTS.keys())
 
 
-@any_plant
-def test_any_process_noise_moves_any_plant(plant: Plant) -> None:
-    """From none to a kilometre, on poles from nanohertz to 100 MHz."""
-    for process in PROCESSES.values():
-        check(Edge(plant, process), 170.0)
-
-
-@any_plant
-def test_any_noise_meets_any_prior(plant: Plant) -> None:
-    """Sensors of a nanometre and of a kilometre, offsets known exactly and not at all; a wide one is estimated."""
-    for sd, offset_sd in product([1e-9, 1e-6, 1.0, 1e3], [0.0, 1e3]):
-        found = check(Edge(plant, offset_sd=offset_sd, sensors={"tracker": sensor(sd, latency=0.008)}), 170.0)
-        for estimates in found.values():
-            assert estimates["radial"].position_sd[-1] < max(10.0 * sd, 0.1)
-
-
 @pytest.mark.parametrize("offset_sd", [0.0, 1e3])
 def test_without_noise_an_offset_is_a_mean(offset_sd: float) -> None:
     """A certain one keeps every error bar at 0 whatever is measured; an unknown one is the mean of the measurements."""
@@ -187,25 +170,6 @@ def test_without_noise_an_offset_is_a_mean(offset_sd: float) -> None:
             assert radial.position_sd[-1] == pytest.approx(0.05e-3 / np.sqrt(known.sum()), rel=1e-6)
 
 
-GAPS = {
-    "between measurements": Edge(rows=np.concatenate([grid(20), grid(20, first=DAY)])),
-    "between commands": Edge(commands=np.concatenate([grid(6, T), grid(6, T, DAY)])),
-    "between both": Edge(
-        commands=np.concatenate([grid(6, T), grid(6, T, DAY)]), rows=np.concatenate([grid(20), grid(20, first=DAY)])
-    ),
-    "before the first measurement": Edge(commands=np.array([0, DAY]), rows=grid(20, first=DAY + 5 * MS)),
-    "after the last one": Edge(commands=np.array([0, DAY]), rows=grid(20)),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("gap", GAPS.values(), ids=GAPS.keys())
-@any_plant
-def test_a_day_may_pass(plant: Plant, gap: Edge) -> None:
-    """A day without a measurement or a command is one step for every plant."""
-    for process in ("ordinary", "huge", "none"):
-        check(replace(gap, plant=plant, process=PROCESSES[process]))
-
-
 @any_plant
 def test_a_day_of_rest_forgets_the_plant_and_widens_the_offset(plant: Plant) -> None:
     """After it the error bars are what noise alone makes of them: stationary for the plant, a walk for the offset."""
@@ -221,66 +185,6 @@ def test_a_day_of_rest_forgets_the_plant_and_widens_the_offset(plant: Plant) -> 
     assert walked == pytest.approx(0.4e-3**2 * 86_400.0, rel=1e-4)
     if slowest * 86_400.0 > 20.0:
         assert radial.position_sd[-1] ** 2 - walked == pytest.approx(0.03e-3**2 * stationary, rel=1e-3)
-
-
-@any_plant
-def test_measurements_may_be_a_nanosecond_apart(plant: Plant) -> None:
-    """Forty in 40 ns, while a command comes to act, and estimates in between."""
-    for sd in (1e-9, 1e-3):
-        edge = Edge(plant, sensors={"tracker": sensor(sd)}, rows=grid(40, 1, 60 * MS - 20), delay=0.06)
-        check(edge)
-        commands = np.concatenate([grid(3, T), grid(30, 1, 90 * MS)])
-        check(replace(edge, commands=commands, rows=grid(40, 1, 150 * MS - 5)))
-
-
-@pytest.mark.parametrize("gate", [0.0, 5.0])
-@pytest.mark.parametrize("bias_sd", [0.0, 1e-3])
-def test_a_hundred_sensors_may_measure_at_one_instant(bias_sd: float, gate: float) -> None:
-    """One after the other; without biases they are one measurement of a tenth of their noise."""
-    known = {
-        f"s{number}": pf.Sensor(sd=1e-3, bias_sd=bias_sd if number < 20 else 0.0, gate=gate) for number in range(100)
-    }
-    edge = Edge(offset_sd=1.0, process=PROCESSES["none"], sensors=known, rows=grid(3, 50 * MS, 50 * MS))
-    last = check(edge)["filtered"]["radial"].position_sd[-1]
-    assert last >= 1e-3 / np.sqrt(300) * 0.999
-    if not bias_sd and not gate:
-        assert last == pytest.approx(1e-3 / np.sqrt(300), rel=1e-6)
-
-
-@any_plant
-def test_eight_biases_on_one_axis(plant: Plant) -> None:
-    """Eight sensors, each with a bias of a metre, an offset of a kilometre: their mean stays unknown, as it is."""
-    known = {
-        f"s{number}": sensor(1e-4, bias_sd=1.0, scale=-1.0 if number % 2 else 2.0, latency=0.01 * number)
-        for number in range(8)
-    }
-    rows = {name: grid(20, 15 * MS, number * MS) for number, name in enumerate(known)}
-    for estimates in check(Edge(plant, offset_sd=1e3, sensors=known, rows=rows), 90.0).values():
-        assert set(estimates.biases) == set(known)
-        assert estimates["radial"].position_sd[-1] > 0.1
-
-
-@any_plant
-def test_any_delay(plant: Plant) -> None:
-    """None, a nanosecond, and ten seconds with everything in flight."""
-    for delay in (0.0, 1e-9, 10.0):
-        check(Edge(plant, delay=delay), 170.0)
-
-
-@any_plant
-def test_any_recovery_of_the_gain(plant: Plant) -> None:
-    """From a nanosecond to eleven days, as fast as the plant and nearly so, also over a day."""
-    fastest = plant.time_constant if isinstance(plant, pf.FirstOrder) else 1.0 / plant.natural_frequency
-    for recovery in (1e-9, fastest, fastest * (1 + 1e-12), 0.1, 1e6):
-        check(Edge(plant, recovery=recovery), 170.0)
-        check(replace(GAPS["between both"], plant=plant, recovery=recovery))
-
-
-@any_plant
-def test_one_command_is_a_run(plant: Plant) -> None:
-    """With measurements and without."""
-    for rate, known in product([None, 100.0], [Edge().sensors, {}]):
-        check(Edge(plant, commands=np.zeros(1, dtype=np.int64), sensors=known), rate)
 
 
 def test_no_measurements_is_a_run() -> None:
@@ -315,14 +219,6 @@ def test_a_value_that_is_none_leaves_no_trace(value: float, gate: float) -> None
             assert values.tobytes() == without[name].tobytes(), (mode, name)
 
 
-@any_plant
-def test_a_value_of_a_thousand_kilometres_is_survived(plant: Plant) -> None:
-    """Fused or rejected, what is no sentinel spoils nothing but its own estimate."""
-    for value, gate in product([9.99e5, -9.99e5, 1e-300, -0.0], [0.0, 5.0]):
-        known = {"tracker": pf.Sensor(sd=1e-3, gate=gate, latency_sd=0.005)}
-        check(Edge(plant, sensors=known, values={5: value, 20: value}), 170.0)
-
-
 def test_a_sensor_that_is_never_right_re_acquires_and_nothing_breaks() -> None:
     """A thousand kilometres off, again and again: the offset follows each time."""
     off = {row: 9.9e5 * (-1.0) ** (row // 70) for row in range(300)}
@@ -351,7 +247,7 @@ def edges(draw: st.DrawFn) -> tuple[Edge, float | None]:
         )
         for number in range(draw(st.integers(0, 8)))
     }
-    steps = st.sampled_from([1, 1000, MS, 10 * MS, 1000 * MS, 3_600_000 * MS])
+    steps = st.sampled_from([1, 1000, MS, 10 * MS, 1000 * MS, DAY])
     rows = {
         name: np.cumsum([draw(st.sampled_from([-MS, 0, 60 * MS])), *draw(st.lists(steps, max_size=12))])
         for name in known
@@ -369,16 +265,8 @@ def edges(draw: st.DrawFn) -> tuple[Edge, float | None]:
     return edge, draw(st.sampled_from([None, None, 1e-3]))
 
 
-@settings(derandomize=True, deadline=None, max_examples=60)
+@settings(derandomize=True, deadline=None, max_examples=100)
 @given(edges())
 def test_extremes_may_meet(made: tuple[Edge, float | None]) -> None:
     """Any of them together: estimates stay numbers, and the same bits come again."""
-    check(*made)
-
-
-@pytest.mark.long
-@settings(derandomize=True, deadline=None, max_examples=1500)
-@given(edges())
-def test_extremes_may_meet_in_any_way(made: tuple[Edge, float | None]) -> None:
-    """As above, many more."""
     check(*made)

@@ -134,28 +134,6 @@ def test_a_commanded_circle_stays_a_circle(positive: str) -> None:
     assert 0.06045 * rate < behind[50] < 0.15 * rate
 
 
-@pytest.mark.parametrize("how", [{"smooth": True}, {"as_live": True}, {"rate": 50.0}])
-def test_every_kind_of_estimate_has_its_x_y_z(how: dict[str, bool | float]) -> None:
-    """Smoothed, as live or on a grid: x, y and z lie at radius and height of the axes, one for each estimate."""
-    run = circle(0.4)
-    est = pf.fuse(run, about_the_base(), **how)
-    assert all(len(est.cartesian[letter]) == len(est.time) for letter in "xyz")
-    radius = np.hypot(est.cartesian["x"] - 0.1, est.cartesian["y"] + 0.2)
-    np.testing.assert_allclose(radius, est["radial"].position, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(est.cartesian["z"], est["vertical"].position)
-
-
-def test_commands_beyond_the_arm_s_radius_are_reported_once(recwarn: pytest.WarningsRecorder) -> None:
-    """720 mm from the base where the model holds to 700: one sentence with both and the 20 mm between."""
-    est = pf.fuse(circle(0.72), about_the_base())
-    assert [str(warning.message) for warning in recwarn] == [
-        "run 'run': commands reach 720.0 mm from the base axis, 20.0 mm beyond the 700 mm that the arm model is valid"
-        " for"
-    ]
-    validity = summarise(est).validity
-    assert (validity.max_radius_mm, validity.commanded_radius_mm) == pytest.approx((700.0, 720.0))
-
-
 @pytest.mark.parametrize(("reach", "reported"), [(0.701, ["701.0 mm"]), (0.699, [])])
 def test_the_radius_is_the_largest_of_the_run_and_not_that_of_its_start(
     reach: float, reported: list[str], recwarn: pytest.WarningsRecorder
@@ -165,13 +143,6 @@ def test_the_radius_is_the_largest_of_the_run_and_not_that_of_its_start(
     est = pf.fuse(pf.Run.from_arrays(0.028 * np.arange(60), values), about_the_base())
     assert est.radius == pytest.approx(reach)
     assert [str(warning.message).split(" reach ")[1][:8] for warning in recwarn] == reported
-
-
-def test_a_run_that_names_axes_has_no_radius_to_check() -> None:
-    """Without a frame radial may be counted from anywhere: 'not checked', however large."""
-    run = pf.Run.from_arrays(0.028 * np.arange(2), {"radial": [0.9, 0.9]})
-    est = pf.fuse(run, pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal")))
-    assert summarise(est).validity.commanded_radius_mm == "not checked"
 
 
 @pytest.mark.parametrize(

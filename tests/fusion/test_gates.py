@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from pumafuse.errors import PumafuseWarning
 from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
-from pumafuse.fusion.consistency import log_likelihood
 from pumafuse.fusion.engine import innovations
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
@@ -106,15 +105,6 @@ def contradictions(rows: Sequence[Row], sensors: Mapping[str, Sensor]) -> list[t
 # ---- a sensor alone -------------------------------------------------------------------------------------------------
 
 
-def test_a_single_outlier_is_rejected_and_nothing_moves() -> None:
-    """The estimates are those without the row."""
-    good = every(100, [0.1e-3] * 10)
-    found, wanted = fused([*good[:5], *rows_at([450], [OFF]), *good[5:]]), fused(good)
-    assert outcomes(found) == [FUSED] * 5 + [REJECTED] + [FUSED] * 5
-    for name in ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd"):
-        np.testing.assert_allclose(getattr(found["radial"], name), getattr(wanted["radial"], name), rtol=1e-10)
-
-
 @pytest.mark.parametrize(("apart", "second"), [(T, REACQUIRED), (T - 1, REJECTED), (20 * T, REACQUIRED)])
 def test_two_that_agree_a_period_apart_are_believed(apart: int, second: Outcome) -> None:
     """Nearer than T the second may be the same glitch seen twice."""
@@ -129,48 +119,6 @@ def test_a_step_is_followed_after_a_period(interval: float, rejected: int) -> No
     assert got == [FUSED] * 5 + [REJECTED] * rejected + [REACQUIRED] + [FUSED] * 4
 
 
-def test_two_that_disagree_are_not_believed() -> None:
-    """Each is compared with the one before: outliers that jump about stay rejected, until two agree."""
-    off = [0.0] * 5 + [OFF, 2 * OFF, -OFF, OFF, -2 * OFF, -2 * OFF]
-    assert outcomes(fused(every(100, off))) == [FUSED] * 5 + [REJECTED] * 5 + [REACQUIRED]
-
-
-def test_how_near_two_must_be_to_agree() -> None:
-    """Within gate · √(R₁ + R₂ + the variance of the motion between)."""
-    xx = INPUT_NOISE**2 / (2.0 * TAU)  # at rest for long
-    a = math.exp(-0.1 / TAU)
-    motion = (a - 1.0) ** 2 * xx + (1.0 - a * a) * xx + DRIFT**2 * 0.1
-    limit = 5.0 * math.sqrt(2 * 0.2e-3**2 + motion)
-    for share, outcome in ((0.9, REACQUIRED), (1.1, REJECTED)):
-        rows = every(100, [0.0] * 20 + [OFF, OFF + share * limit])
-        assert outcomes(fused(rows))[-1] == outcome
-
-
-def test_a_measurement_that_passes_ends_the_wait() -> None:
-    """Every second one off by the same is an outlier every time."""
-    assert outcomes(fused(every(50, [0.0, OFF] * 10))) == [FUSED, REJECTED] * 10
-
-
-def test_a_gate_of_zero_rejects_nothing() -> None:
-    """Measurements off by thousands of standard deviations are fused at once and plainly."""
-    estimates = fused(every(10, [0.0] * 5 + [OFF, -OFF] * 40), {"tracker": sensor(0.0)})
-    assert set(outcomes(estimates)) == {FUSED}
-    assert np.abs(estimates.measurements.innovation / estimates.measurements.innovation_sd).max() > 100.0
-
-
-@pytest.mark.parametrize("scale", [1.0, -2.0, 0.1])
-def test_re_acquiring_takes_the_offset_to_the_measurement(scale: float) -> None:
-    """ν² / scale² more variance: the offset moves by nearly ν / scale, and is as uncertain as that measurement."""
-    # S becomes S + ν², as a position off by ν / scale explains all of ν
-    estimates = fused(every(100, [0.0] * 6 + [OFF, OFF]), {"tracker": sensor(scale=scale)})
-    radial, measurements = estimates["radial"], estimates.measurements
-    S_before = measurements.innovation_sd[-2] ** 2
-    assert measurements.innovation_sd[-1] ** 2 == pytest.approx(S_before + measurements.innovation[-1] ** 2, rel=1e-2)
-    assert measurements.innovation[-1] == pytest.approx(scale * OFF, rel=0.02)
-    assert radial.offset[-1] == pytest.approx(OFF, rel=1e-2)
-    assert radial.position_sd[-1] == pytest.approx(0.2e-3 / abs(scale), rel=1e-2)
-
-
 def test_a_re_acquisition_is_counted_and_said() -> None:
     """The outcome is in the counts, and a warning names the sensor."""
     run, config = recorded(every(50, [0.0] * 5 + [OFF] * 5), TRACKER)
@@ -180,44 +128,7 @@ def test_a_re_acquisition_is_counted_and_said() -> None:
     assert any("tracker" in str(one.message) and "reacquired" in str(one.message) for one in said)
 
 
-# ---- rows -----------------------------------------------------------------------------------------------------------
-
-ERRATIC = [OFF, -OFF, 2 * OFF, -2 * OFF, 3 * OFF]
-
-
-@pytest.mark.parametrize("gate_rows", [True, False])
-def test_a_row_re_acquires_only_if_all_its_rejected_axes_agree(gate_rows: bool) -> None:
-    """Off by the same on one axis and about at random on the other: the first re-acquires where axes are apart."""
-    rows = every(100, [0.0] * 3)
-    rows += [Row((300 + 100 * k) * MS, "tracker", {"radial": OFF, "vertical": off}) for k, off in enumerate(ERRATIC)]
-    estimates = fused(rows, {"tracker": sensor(gate_rows=gate_rows)})
-    off_radial = [REJECTED] * 5 if gate_rows else [REJECTED, REACQUIRED, FUSED, FUSED, FUSED]
-    assert outcomes(estimates)[-5:] == off_radial
-    assert outcomes(estimates, axis="vertical")[-5:] == [REJECTED] * 5
-
-
-@pytest.mark.parametrize("gate_rows", [True, False])
-def test_an_axis_that_is_off_takes_its_row_along(gate_rows: bool) -> None:
-    """By rows the good axis is rejected and comes back, as fused, with the other."""
-    off = [0.0, 0.0, OFF, OFF, OFF]
-    rows = [Row(100 * k * MS, "tracker", {"radial": one, "vertical": 0.0}) for k, one in enumerate(off)]
-    estimates = fused(rows, {"tracker": sensor(gate_rows=gate_rows)})
-    assert outcomes(estimates) == [FUSED, FUSED, REJECTED, REACQUIRED, FUSED]
-    assert outcomes(estimates, axis="vertical") == [FUSED, FUSED, REJECTED if gate_rows else FUSED, FUSED, FUSED]
-
-
 # ---- two sensors ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("order", [("tracker", "camera"), ("camera", "tracker")])
-def test_what_another_sensor_contradicts_stays_rejected_and_is_named(order: tuple[str, str]) -> None:
-    """The sensor that was fused all along stands for what is believed."""
-    rows = every(100, [0.0] * 30, name="tracker") + every(70, [0.0] * 3 + [OFF] * 30, 5, "camera")
-    sensors = {name: BOTH[name] for name in order}
-    estimates = fused(rows, sensors)
-    assert outcomes(estimates, "tracker") == [FUSED] * 30
-    assert outcomes(estimates, "camera") == [FUSED] * 3 + [REJECTED] * 30
-    assert contradictions(rows, sensors) == [("camera", "tracker")] * 29
 
 
 @pytest.mark.parametrize(("since", "wanted"), [(500.0, REJECTED), (500.000001, REACQUIRED)])
@@ -225,21 +136,6 @@ def test_a_sensor_stands_for_what_is_believed_for_half_a_second(since: float, wa
     """From then on another one may re-acquire."""
     rows = every(100, [0.0] * 5) + rows_at([400 + since / 2, 400 + since], [OFF, OFF], "camera")
     assert outcomes(fused(rows, BOTH), "camera") == [REJECTED, wanted]
-
-
-def test_a_sensor_on_another_axis_does_not_count() -> None:
-    """Who has seen nothing of an axis cannot stand for what is believed of it."""
-    rows = rows_at(range(0, 1000, 100), [0.0] * 10, "camera", ["vertical"])
-    rows += every(100, [0.0] * 3 + [OFF] * 4, 3, "tracker")
-    assert outcomes(fused(rows, BOTH)) == [FUSED] * 3 + [REJECTED, REACQUIRED, FUSED, FUSED]
-    assert contradictions(rows, BOTH) == []
-
-
-def test_an_outlier_contradicts_nobody() -> None:
-    """One that disagrees with the one before is rejected, and no contradiction is said."""
-    rows = every(100, [0.0] * 10, name="tracker") + every(100, [0.0, *ERRATIC, 0.0], 5, "camera")
-    assert outcomes(fused(rows, BOTH), "camera") == [FUSED, *[REJECTED] * 5, FUSED]
-    assert contradictions(rows, BOTH) == []
 
 
 @pytest.mark.parametrize(
@@ -256,14 +152,6 @@ def test_re_acquisitions_are_forgotten_after_five_seconds_of_agreement(
     estimates = fused(rows, BOTH)
     assert outcomes(estimates)[4:10] == [FUSED, *[REJECTED] * 4, REACQUIRED]
     assert outcomes(estimates, "camera")[-2:] == [REJECTED, wanted]
-
-
-def test_the_contradiction_is_in_the_notes() -> None:
-    """Both names, the axis and since when."""
-    rows = every(100, [0.0] * 30, name="tracker") + every(100, [0.0] * 3 + [OFF] * 20, 5, "camera")
-    (note,) = [note for note in fused(rows, BOTH).notes if "'camera' contradicts 'tracker'" in note]
-    for word in ("radial", "mm", " s"):
-        assert word in note
 
 
 # ---- the rule, by hand ----------------------------------------------------------------------------------------------
@@ -481,47 +369,11 @@ def check_log(rows: list[Row], sensors: dict[str, Sensor], as_live: bool) -> Non
     check_estimates(estimates, rows, sensors, as_live)
 
 
-@settings(derandomize=True, deadline=None, max_examples=40)
+@settings(derandomize=True, deadline=None, max_examples=60)
 @given(logs(), st.booleans())
 def test_any_log_is_decided_as_the_rule_says(log: tuple[list[Row], dict[str, Sensor]], as_live: bool) -> None:
     """Outcomes, innovations, estimates and error bars are those worked out by hand, with all that had arrived."""
     check_log(*log, as_live)
 
 
-@pytest.mark.long
-@settings(derandomize=True, deadline=None, max_examples=200)
-@given(logs(), st.booleans())
-def test_many_logs_are_decided_as_the_rule_says(log: tuple[list[Row], dict[str, Sensor]], as_live: bool) -> None:
-    """As above, many more."""
-    check_log(*log, as_live)
-
-
 # ---- the likelihood -------------------------------------------------------------------------------------------------
-
-
-def test_the_log_likelihood_is_the_sum_over_all_components_decided_on() -> None:
-    """−½(ln 2πS + ν²/S) each, in mm, and −½(ln 2πS + gate²) for a rejected one, whether or not its own axis failed."""
-    off = [{"radial": 0.1e-3 * k, "vertical": OFF * (4 <= k < 40)} for k in range(-5, 50)]
-    rows = [Row(k * 30 * MS, "tracker", one) for k, one in enumerate(off)]
-    rows += every(143, [1e-3, -1e-3, OFF, 0.0, 2e-3, OFF], 3, "camera")
-    sensors = {"tracker": sensor(4.0), "camera": sensor(0.0, 1e-3)}
-    estimates, total = fused(rows, sensors), 0.0
-    judge = judged(rows, sensors)
-    for name, outcome, nu, S in judge.components:
-        square = sensors[name].gate ** 2 if outcome == REJECTED else nu**2 / S
-        total -= 0.5 * (math.log(2.0 * math.pi * S * 1e6) + square)
-    assert {outcome for _, outcome, _, _ in judge.components} == {FUSED, REJECTED, REACQUIRED}
-    assert log_likelihood(estimates.measurements, sensors) == pytest.approx(total, rel=1e-9)
-
-
-def test_components_that_were_never_decided_on_do_not_count_in_the_likelihood() -> None:
-    """Neither a duplicate, nor a row before the first command, nor a missing value, nor an unknown sensor."""
-    rows = every(50, [0.1e-3] * 6)
-    more = [*rows[2:4], Row(-100 * MS, "tracker", {"radial": 0.0}), Row(75 * MS, "tracker", {"radial": math.nan})]
-    more.append(Row(0, "other", {"radial": 0.0}))
-    run, _ = recorded([*rows, *more], {**TRACKER, "other": sensor()})
-    plain = fused(rows)
-    with pytest.warns(PumafuseWarning):
-        estimates = fuse(run, plain.config)
-    assert len(estimates.measurements.value) == len(rows) + 5
-    assert log_likelihood(estimates.measurements, TRACKER) == log_likelihood(plain.measurements, TRACKER)

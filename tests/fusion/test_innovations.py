@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 
 import msgspec
 import numpy as np
-import pytest
 from hypothesis import given, settings
 
-from fusion.test_oracle import CASES, LAG, MS, NOISE, UNDER, VISION, Case, Seen, cases, every, sensor
+from fusion.test_oracle import LAG, MS, UNDER, Case, Seen, cases, every, sensor
 from fusion_oracle import AxisOracle
 from pumafuse.errors import PumafuseWarning
 from pumafuse.filter.events import Results
@@ -56,15 +54,6 @@ def check(run: Run, config: FusionConfig) -> Results:
     assert [part.tobytes() for part in again[:3]] == [part.tobytes() for part in found[:3]]
     assert (known == found.outcome).all()
     return found
-
-
-@pytest.mark.parametrize("gate_rows", [True, False], ids=["rows", "components"])
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
-def test_innovations_are_those_of_a_fusion(case: Case, gate_rows: bool) -> None:
-    """ν, √S and outcome of every component, to the last bit; with the outcomes given they are the same again."""
-    run, config = case.made()
-    check(run, config)
-    check(run, gated(config, gate_rows=gate_rows))
 
 
 @settings(derandomize=True, deadline=None, max_examples=60)
@@ -117,33 +106,3 @@ def test_given_outcomes_are_repeated_whatever_the_gates_would_say() -> None:
         fused = order[outcome[order, column] != Outcome.REJECTED]
         np.testing.assert_allclose(repeated.innovation[fused, column], nu, rtol=0.0, atol=1e-11)
         np.testing.assert_allclose(repeated.innovation_sd[fused, column], sd, rtol=1e-8)
-
-
-def test_a_rejected_component_has_its_innovation_and_no_influence() -> None:
-    """Its ν and √S are those it would have if it alone were fused; of later ones only then do any know of it."""
-    run, config = contradicting()
-    segment, other = build(run, config), louder(config)
-    outcome = innovations(segment, config).outcome
-    repeated = innovations(segment, other, outcome)
-    order = segment.events(other)[1]
-    order = order[order >= 0]
-    for row, column in np.argwhere(outcome == Outcome.REJECTED)[::2]:
-        back = outcome.copy()
-        back[row, column] = Outcome.FUSED
-        another = innovations(segment, other, back)
-        at = int(np.flatnonzero(order == row)[0])
-        for name in ("innovation", "innovation_sd"):
-            now, then = getattr(another, name)[order], getattr(repeated, name)[order]
-            assert now[: at + 1].tobytes() == then[: at + 1].tobytes()
-            assert now[at + 1 :, 1 - column].tobytes() == then[at + 1 :, 1 - column].tobytes()
-        assert now[at + 1, column] != then[at + 1, column]
-
-
-def test_to_give_all_as_fused_is_to_have_no_gate() -> None:
-    """All outcomes given as fused under narrow gates: the innovations of a fusion whose gates are off."""
-    case = replace(CASES["axes and missing values"], process=NOISE, seen={"vision": VISION})
-    run, config = case.made()
-    segment = build(run, config)
-    repeated = innovations(segment, gated(config), segment.measurement_rows.known)
-    assert (innovations(segment, gated(config)).outcome == Outcome.REJECTED).any()
-    same(repeated, quietly(run, gated(config, 0.0)), segment, config)

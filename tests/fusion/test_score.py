@@ -16,8 +16,7 @@ import pumafuse as pf
 from executable import pumafuse
 from pumafuse.cli.tables import score_table
 from pumafuse.fusion import results
-from pumafuse.fusion.reference import ReferenceTrack
-from pumafuse.fusion.score import score_velocity
+from pumafuse.fusion.score import ReferenceTrack, score_velocity
 
 PERIOD = 0.028
 

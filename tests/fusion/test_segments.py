@@ -95,7 +95,8 @@ def crowded_runs(draw: st.DrawFn) -> tuple[Run, FusionConfig]:
     sensors = {name: Sensor(sd=draw(sd), latency=draw(latency)) for name in names}
     value = st.sampled_from([0.0, 1.0, 2.0, np.nan, np.inf])
     stamp = st.one_of(
-        st.integers(-2, 8).map(lambda ms: ORIGIN + ms * MS), st.sampled_from([NO_STAMP, ORIGIN + 2 * SECOND])
+        st.integers(-2, 8).map(lambda ms: ORIGIN + ms * MS),
+        st.sampled_from([NO_STAMP, ORIGIN + SECOND, ORIGIN + 2 * SECOND]),
     )
     streams = {}
     for name in draw(st.permutations([*names, "stranger"])):
@@ -170,31 +171,6 @@ def test_a_measurement_is_left_out_only_for_a_reason_it_has(case: tuple[Run, Fus
                 assert Outcome(events.known[at, number]).word in wanted
 
 
-def test_the_order_of_the_configuration_decides_ties() -> None:
-    """Valid at one instant, sensors come as in fusion.toml, not by stamp, name or place in the run."""
-    run = recorded({"a": measurements((5, 1.0)), "b": measurements((15, 2.0)), "c": measurements((10, 3.0))})
-    sensors = {
-        "b": Sensor(sd=1e-4, latency=0.015),
-        "c": Sensor(sd=1e-4, latency=0.01),
-        "a": Sensor(sd=1e-4, latency=0.005),
-    }
-    segment = build(run, config(**sensors))
-    events, place = segment.events(config(**sensors))
-    assert events.time[place >= 0].tolist() == [ORIGIN] * 3
-    assert events.value[place >= 0].ravel().tolist() == [2.0, 3.0, 1.0]
-    assert segment.sensors == ("b", "c", "a")
-
-
-@pytest.mark.parametrize(
-    ("latency", "ns"), [(0.001_234_567, 1_234_567), (3600.0, 3600 * SECOND), (-3600, -3600 * SECOND)]
-)
-def test_valid_times_are_exact_today(latency: float, ns: int) -> None:
-    """Stamps of 2023 in ns keep their last digit when the latency, up to an hour, is taken off."""
-    rows = build(recorded({"a": measurements((5, 1.0))}), config(a=Sensor(sd=1e-4, latency=latency))).measurement_rows
-    assert rows.time.tolist() == [ORIGIN + 5 * MS - ns]
-    assert rows.stamp.tolist() == [ORIGIN + 5 * MS]
-
-
 @pytest.mark.parametrize("chosen", [["a"], ["b", "a"], []])
 def test_only_chosen_sensors_have_rows(chosen: list[str]) -> None:
     """Sensors that are not chosen, configured or not, leave no row and no note."""
@@ -203,13 +179,6 @@ def test_only_chosen_sensors_have_rows(chosen: list[str]) -> None:
     assert segment.sensors == tuple(sorted(chosen))
     assert len(segment.measurement_rows.value) == len(chosen)
     assert segment.notes == ()
-
-
-def test_a_sensor_that_is_not_configured_cannot_be_chosen() -> None:
-    """Choosing what fusion.toml has not is refused, even if the run has it."""
-    run = recorded({"stranger": measurements((5, 1.0))})
-    with pytest.raises(UnknownNameError, match="stranger"):
-        build(run, config(a=Sensor(sd=1e-4)), ["stranger"])
 
 
 def test_an_axis_that_the_arm_has_not_is_refused() -> None:
@@ -225,95 +194,21 @@ def test_an_axis_that_the_arm_has_not_is_refused() -> None:
 A = Sensor(sd=1e-4, latency=0.005)
 nan = math.nan
 
-OUTCOMES: dict[str, tuple[Rows, list[str], tuple[str, ...]]] = {
-    # rows as (ms, value), their outcomes in order of valid time, what the one note of this outcome must say
-    "duplicate": (
-        measurements((10, 1.0), (11, 2.0), (10, 1.0), (10, 3.0), (11, 2.0)),
-        ["fused", "duplicate", "fused", "fused", "duplicate"],
-        ("2 rows", "row 3"),
-    ),
-    "before_start": (
-        measurements((-3, 1.0), (4.999999, 1.0), (5, 1.0)),
-        ["before_start", "before_start", "fused"],
-        ("2 rows", "row 1"),
-    ),
-    "too_late": (
-        measurements((3000, 1.0), (1999, 2.0), (2000, 3.0), (1000, 4.0)),
-        ["too_late", "too_late", "fused", "fused"],
-        ("2 rows", "row 2"),
-    ),
-    "invalid": (
-        measurements((10, 1.0), (11, nan), (12, math.inf), (13, -math.inf)),
-        ["fused", "invalid", "invalid", "invalid"],
-        ("3 rows", "row 2", "no finite radial value"),
-    ),
-    "no stamp": (
-        measurements((10, 1.0), (nan, 1.0), (nan, nan)),
-        ["invalid", "invalid", "fused"],
-        ("2 rows", "row 2", "invalid"),
-    ),
-}
 
-
-@pytest.mark.parametrize("outcome", OUTCOMES)
-def test_each_outcome_is_counted_and_noted_once(outcome: str) -> None:
-    """A defect is one note for its sensor: how many rows have it, and where the first is."""
-    rows, wanted, words = OUTCOMES[outcome]
-    segment = build(recorded({"a": rows}), config(a=A))
-    assert outcomes(segment) == wanted
-    note = one_note(segment, outcome)
-    assert note.startswith("a: ")
-    for word in words:
-        assert word in note
-
-
-def test_a_clean_run_has_no_notes() -> None:
-    """Measurements without a defect are all the filter's, and nothing is said."""
-    segment = build(recorded({"a": measurements((5, 1.0), (6, 1.0), (7, 2.0))}), config(a=A))
-    assert outcomes(segment) == ["fused"] * 3
-    assert segment.notes == ()
-
-
-def test_stamps_that_step_back_a_little_are_sorted_and_noted() -> None:
-    """Up to 1 s out of order is sorted, counted and fused."""
-    rows = measurements((1500, 1.0), (500, 2.0), (1600, 3.0), (1599, 4.0))
-    segment = build(recorded({"a": rows}), config(a=A))
-    assert segment.measurement_rows.value.ravel().tolist() == [2.0, 1.0, 4.0, 3.0]
-    assert outcomes(segment) == ["fused"] * 4
-    note = one_note(segment, "steps back")
-    assert "2 rows" in note
-    assert "row 2" in note
-
-
-def test_a_sensor_that_is_not_configured_is_unknown() -> None:
-    """Its rows are kept, named and left out, after those of the configured sensors at the same instant."""
-    run = recorded({"stranger": measurements((5, 1.0), (6, nan)), "a": measurements((10, 3.0))})
-    segment = build(run, config(a=A))
-    assert segment.sensors == ("a", "stranger")
-    assert segment.measurement_rows.value[:2].ravel().tolist() == [3.0, 1.0]
-    assert outcomes(segment) == ["fused", "unknown", "unknown"]
-    note = one_note(segment, "unknown")
-    for word in ("stranger", "2 rows", "row 1"):
-        assert word in note
-
-
-def test_an_axis_without_noise_is_unknown_to_its_sensor() -> None:
-    """A sensor with noise for one axis is fused on that axis alone, though it logs another."""
-    rows = [ORIGIN + 10 * MS, ORIGIN + 11 * MS], {"radial": [1.0, 2.0], "vertical": [3.0, 4.0]}
-    segment = build(recorded({"a": rows}, ("radial", "vertical")), config(a=Sensor(sd={"vertical": 1e-4})))
-    assert outcomes(segment) == ["unknown", "fused", "unknown", "fused"]
-    (note,) = segment.notes
-    for word in ("a: ", "sd_mm", "radial", "unknown"):
-        assert word in note
-    assert "vertical" not in note
-
-
-def test_rows_are_noted_once_and_values_once_for_each_axis() -> None:
-    """What is wrong with a whole row is one note whatever its axes say; what is wrong with values is one an axis."""
+def test_every_defect_is_noted_once() -> None:
+    """With its number and its first row: of rows whatever their axes say, of values for each axis."""
     stamp = [ORIGIN + 10 * MS, NO_STAMP, ORIGIN - SECOND, ORIGIN + 10 * MS, ORIGIN + 11 * MS, ORIGIN + 12 * MS]
     columns = {"vertical": [3.0, nan, nan, 3.0, nan, math.inf], "radial": [1.0, nan, nan, 1.0, nan, 2.0]}
-    run = recorded({"stranger": (stamp, columns), "a": (stamp, columns)}, ("radial", "vertical"))
+    sensors = {"stranger": (stamp, columns), "a": (stamp, columns), "b": (stamp[:1], {"radial": [1.0]})}
+    given = [ORIGIN, NO_STAMP, ORIGIN + 2 * TICK, ORIGIN + TICK, ORIGIN + 2 * TICK, ORIGIN + 3 * TICK]
+    run = Run.from_arrays(given, {"radial": [0.5, 0.6, 0.7, 0.6, 0.7, nan], "vertical": [0.5] * 6}, sensors)
     wanted = [
+        "torn line",
+        "command: 1 row has no stamp: not used (first: row 2)",
+        "command: 1 row has a stamp that steps back: sorted (first: row 4)",
+        "command: 1 row has the stamp and values of an earlier row: duplicate (first: row 5)",
+        "command: 1 row has no finite radial command: not used (first: row 6)",
+        "sensor 'silent' of the configuration has no measurements in this run",
         "stranger: 1 row has a stamp that steps back",
         "stranger: 6 rows have no sensor of this name in the configuration: unknown (first: row 1)",
         "a: 1 row has a stamp that steps back",
@@ -322,30 +217,13 @@ def test_rows_are_noted_once_and_values_once_for_each_axis() -> None:
         "a: 1 row has a stamp more than 1 s behind an earlier one: too_late (first: row 3)",
         "a: 1 row has no finite radial value: invalid (first: row 5)",
         "a: 2 rows have no finite vertical value: invalid (first: row 5)",
+        "b: sd_mm has no entry for radial, which is not used: unknown",
     ]
-    notes = build(run, config(a=Sensor(sd=1e-4))).notes
+    known = {"a": Sensor(sd=1e-4), "b": Sensor(sd={"vertical": 1e-4}), "silent": Sensor(sd=1e-4)}
+    notes = build(replace(run, notes=("torn line",)), config(**known)).notes
     assert len(notes) == len(wanted)
     for sentence in wanted:
-        assert sum(note.startswith(sentence) for note in notes) == 1, sentence
-
-
-def test_an_empty_axis_of_a_row_leaves_the_others_to_the_filter() -> None:
-    """A row that lacks one axis is invalid on that axis alone."""
-    rows = [ORIGIN + 10 * MS], {"radial": [nan], "vertical": [3.0]}
-    segment = build(recorded({"a": rows}, ("radial", "vertical")), config(a=A))
-    assert outcomes(segment) == ["invalid", "fused"]
-
-
-def test_a_configured_sensor_without_measurements_is_noted() -> None:
-    """A sensor of fusion.toml that the run has not is a note, not an error."""
-    segment = build(recorded(), config(a=A))
-    assert "'a'" in one_note(segment, "no measurements")
-    assert len(segment.measurement_rows.value) == 0
-
-
-def test_notes_of_the_files_come_with_the_run() -> None:
-    """What was wrong with the files is among the segment's notes."""
-    assert build(replace(recorded(), notes=("torn line",)), config()).notes == ("torn line",)
+        assert sum(note.startswith(sentence) for note in notes) == 1, (sentence, notes)
 
 
 # ---- commands
@@ -360,7 +238,7 @@ def test_an_axis_has_its_own_commands_and_start() -> None:
     assert segment.start == {"radial": 0.4, "vertical": 0.2}
     assert [part.tolist() for part in segment.given("radial")] == [[stamp[0], stamp[2]], [0.5, 0.7]]
     assert [part.tolist() for part in segment.given("vertical")] == [stamp[1:], [0.2, 0.3]]
-    assert segment.commands.tolist() == stamp
+    assert segment.commands.tolist() == output_times(segment, config(), None).tolist() == stamp
     assert segment.origin == ORIGIN
 
 
@@ -379,22 +257,6 @@ def test_a_command_is_an_event_for_each_distinct_delay() -> None:
     assert (events.known == Outcome.FUSED).all()
 
 
-def test_one_axis_of_a_segment() -> None:
-    """Its commands and start alone, and those of the measurements that are asked for."""
-    stamp = [ORIGIN, ORIGIN + TICK, ORIGIN + 2 * TICK]
-    rows = [ORIGIN + 10 * MS, ORIGIN + 11 * MS], {"radial": [1.0, 2.0], "vertical": [3.0, nan]}
-    run = Run.from_arrays(stamp, {"vertical": [nan, 0.2, 0.3], "radial": [0.5, nan, 0.7]}, {"a": rows})
-    whole = build(run, config(a=A))
-    part = whole.of_axis("vertical", np.array([1]))
-    assert part.axes == ("vertical",)
-    assert [one.tolist() for one in part.given("vertical")] == [one.tolist() for one in whole.given("vertical")]
-    assert part.command_rows.value.tolist() == [[0.2], [0.3]]
-    assert outcomes(part) == ["invalid"]
-    assert (part.origin, part.commands.tolist()) == (whole.origin, whole.commands.tolist())
-    events, _ = part.events(config(a=A))
-    assert events.source.tolist() == [0, COMMAND, COMMAND]
-
-
 @pytest.mark.parametrize("clock", ["stamps", "regular"])
 @pytest.mark.parametrize("filled", [True, False])
 def test_a_column_at_the_rate_of_the_log_is_one_command_per_change(clock: Clock, filled: bool) -> None:
@@ -403,18 +265,6 @@ def test_a_column_at_the_rate_of_the_log_is_one_command_per_change(clock: Clock,
     value = np.where(filled | (row % 28 == 0), 0.5 + np.floor(row / 28) * 1e-3, nan)
     wanted = [(ORIGIN + tick * TICK, round(0.5 + tick * 1e-3, 12)) for tick in range(2000 // 28 + 1)]
     assert commanded((ORIGIN + row * MS).tolist(), value.tolist(), clock) == wanted
-
-
-@pytest.mark.parametrize(("apart", "count"), [(14 * MS - 1, 1), (14 * MS, 2), (28 * MS, 2)])
-def test_a_repetition_within_half_a_period_is_no_command(apart: int, count: int) -> None:
-    """The same value again is a command from half a period on; a hold sends it again every period."""
-    assert len(commanded([ORIGIN, ORIGIN + apart], [0.5, 0.5])) == count
-
-
-def test_of_rows_with_one_stamp_the_last_counts() -> None:
-    """Said twice at one instant, the later row of the file is the command; an empty one takes nothing back."""
-    stamp = [ORIGIN, ORIGIN, ORIGIN + TICK, ORIGIN + TICK, ORIGIN + TICK]
-    assert commanded(stamp, [0.1, 0.2, 0.3, 0.4, nan]) == [(ORIGIN, 0.2), (ORIGIN + TICK, 0.4)]
 
 
 def commands_by_hand(rows: Sequence[tuple[int, float]]) -> list[tuple[int, float]]:
@@ -448,34 +298,6 @@ def test_commands_are_those_of_a_walk_through_the_rows(rows: list[tuple[int, flo
     assert build(run, config()).origin == wanted[0][0]
 
 
-def test_defects_of_the_commands_are_noted_once() -> None:
-    """Rows without a stamp, without a value, twice or out of order are counted, with where the first is."""
-    stamp = [
-        ORIGIN,
-        NO_STAMP,
-        ORIGIN + 2 * TICK,
-        ORIGIN + TICK,
-        ORIGIN + 2 * TICK,
-        ORIGIN + 3 * TICK,
-        ORIGIN + 4 * TICK,
-    ]
-    segment = build(Run.from_arrays(stamp, {"radial": [0.5, 0.6, 0.7, 0.6, 0.7, nan, math.inf]}), config())
-    found = {"no stamp": ("1 row", "row 2"), "steps back": ("1 row", "row 4"), "duplicate": ("1 row", "row 5")}
-    found["no finite radial command"] = ("2 rows", "row 6")
-    for defect, words in found.items():
-        note = one_note(segment, defect)
-        for word in ("command", *words):
-            assert word in note
-    assert len(segment.notes) == len(found)
-    assert segment.given("radial")[0].tolist() == [ORIGIN, ORIGIN + TICK, ORIGIN + 2 * TICK]
-
-
-def test_commands_that_step_back_a_little_are_sorted() -> None:
-    """The arm gets commands in the order of their stamps, not of the file."""
-    wanted = [(ORIGIN, 0.1), (ORIGIN + TICK, 0.2), (ORIGIN + 2 * TICK, 0.3)]
-    assert commanded([ORIGIN, ORIGIN + 2 * TICK, ORIGIN + TICK], [0.1, 0.3, 0.2]) == wanted
-
-
 def test_a_regular_clock_puts_commands_on_even_ticks() -> None:
     """A regular clock takes the jitter off the commands, missing ones or not; otherwise the stamps are believed."""
     rng = np.random.default_rng(0)
@@ -507,13 +329,6 @@ def test_a_drift_between_the_clocks_is_noted() -> None:
     assert "+50.0 ppm" in one_note(build(run, config()), "clock")
 
 
-def test_a_regular_clock_with_another_period_is_refused() -> None:
-    """Commands every 30 ms are no grid of 28 ms."""
-    run = Run.from_arrays(np.arange(100) * 30 * MS, {"radial": np.arange(100.0)}, clock="regular")
-    with pytest.raises(RunError, match="28 ms"):
-        build(run, config())
-
-
 @pytest.mark.parametrize("clock", ["stamps", "regular"])
 def test_commands_that_are_no_positions_are_refused(clock: Clock) -> None:
     """An axis with nothing but sentinels has no start level."""
@@ -534,13 +349,6 @@ def test_the_speed_is_the_fastest_step_of_any_axis() -> None:
 # ---- output times
 
 
-def test_estimates_are_asked_for_at_each_command() -> None:
-    """Without a rate there is one estimate for every instant at which any axis was commanded."""
-    stamp = [ORIGIN, ORIGIN + TICK, ORIGIN + 2 * TICK]
-    run = Run.from_arrays(stamp, {"radial": [0.5, nan, 0.6], "vertical": [0.5, 0.6, nan]})
-    assert output_times(build(run, config()), config(), None).tolist() == stamp
-
-
 @pytest.mark.parametrize(
     ("rows", "end"),
     [
@@ -557,7 +365,7 @@ def test_the_end_is_the_last_event_of_the_filter(rows: list[tuple[float, float]]
 
 
 @properties
-@given(st.integers(1, 2000), st.integers(0, 1000), st.integers(1, 10**5))
+@given(st.integers(1, 2000), st.integers(0, 1000), st.just(0) | st.integers(1, 10**5))
 def test_an_even_grid_has_every_point_up_to_the_end(rate: int, last: int, more: int) -> None:
     """Estimates at k / rate from the first command on, as long as the run lasts, to the nearest ns."""
     end = ORIGIN + math.ceil(Fraction(last * 10**9, rate)) + more
@@ -566,16 +374,6 @@ def test_an_even_grid_has_every_point_up_to_the_end(rate: int, last: int, more: 
     got = output_times(segment, config(), float(rate))
     assert len(got) == len(wanted)
     assert np.abs(got - np.array(wanted)).max() <= 1
-
-
-@pytest.mark.parametrize("rate", [10, 1000])
-def test_a_run_that_ends_on_a_grid_point_has_that_point(rate: int) -> None:
-    """0.29 s at 100 Hz are 30 points, and so for every whole number of points."""
-    segment = build(recorded(), config())
-    for count in range(501):
-        end = ORIGIN + count * (SECOND // rate)
-        got = output_times(replace(segment, commands=np.array([ORIGIN, end])), config(), float(rate))
-        assert (len(got), int(got[-1])) == (count + 1, end)
 
 
 def test_more_estimates_than_anybody_wants_are_refused() -> None:

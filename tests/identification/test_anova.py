@@ -18,7 +18,6 @@ from pumafuse.identification.anova import (
     ordered,
     outlying,
     scatter,
-    speed_levels,
     welch,
 )
 from pumafuse.identification.trials import Trial
@@ -76,19 +75,6 @@ def test_welchs_test_is_welchs() -> None:
 # ---- several factors ------------------------------------------------------------------------------------------------
 
 
-def test_a_factor_that_only_goes_along_with_another_is_cleared_by_its_adjusted_p() -> None:
-    """Table I's weakness: load was mostly heavy at high speed, only speed matters, and both look dependent."""
-    rng = np.random.default_rng(7)
-    speed = ["0.1"] * 12 + ["0.5"] * 12
-    load = ["light"] * 10 + ["heavy"] * 2 + ["heavy"] * 10 + ["light"] * 2
-    values = 1.0 + 0.1 * (np.array(speed) == "0.5") + 0.03 * rng.standard_normal(24)
-    by = {one.factor: one for one in dependences({"gain": values}, {"speed_m_s": speed, "load": load})}
-    assert by["speed_m_s"].i_ratio > 1.0 and by["load"].i_ratio > 1.0
-    assert by["speed_m_s"].adjusted_p < 1e-4 and by["load"].adjusted_p > 0.05
-    assert by["speed_m_s"].verdict == "dependent"
-    assert by["load"].verdict == "dependent; beside the other factors independent"
-
-
 def test_a_factor_that_is_another_by_another_name_is_confounded() -> None:
     """Its levels are known when the other's are: there is no adjusted p."""
     values = np.array([1.0, 1.1, 1.5, 1.6, 2.1, 2.2])
@@ -115,26 +101,6 @@ def test_a_factor_that_is_hidden_by_another_is_found_by_its_adjusted_p() -> None
     assert by["speed"].verdict == "independent; beside the other factors dependent"
 
 
-def test_every_coefficient_is_analysed_against_every_factor() -> None:
-    """In their order; without repetitions there is no test."""
-    values = np.arange(4.0)
-    found = dependences({"delay_ms": values, "gain": -values}, {"a": list("1122"), "b": list("wxyz")})
-    assert [(one.coefficient, one.factor) for one in found] == [
-        ("delay_ms", "a"), ("delay_ms", "b"), ("gain", "a"), ("gain", "b"),
-    ]  # fmt: skip
-    assert (found[1].i_ratio, found[1].p, found[1].welch_p, found[1].adjusted_p) == (None, None, None, None)
-    assert found[1].verdict == "cannot be tested: no scatter within any level"
-    assert [level.sd for level in found[1].levels] == [None] * 4
-
-
-def test_the_verdict_names_what_welchs_test_sees_and_f_does_not() -> None:
-    """A small group that hardly scatters, beside wide ones."""
-    values = np.concatenate(([1.0, 1.01, 0.99, 1.0], [3.0, -6.0, 9.0, 4.0], [1.3, 1.31, 1.29, 1.3]))
-    found = dependence(values, list("aaaabbbbcccc"))
-    assert found.i_ratio < 1.0 and found.welch_p < 0.05
-    assert found.verdict == "independent, but Welch's test says it is"
-
-
 # ---- scatter --------------------------------------------------------------------------------------------------------
 
 
@@ -158,13 +124,6 @@ def test_clean_trials_are_rarely_called_outlying() -> None:
     rng = np.random.default_rng(6)
     named = sum(outlying(60.0 + 2.0 * rng.standard_normal(12), np.zeros(12)).any() for _ in range(1000))
     assert named < 30
-
-
-def test_outlying_needs_five_values_and_half_a_percent() -> None:
-    """Of four none is outlying; where most agree to the last digit, 4 % of the median is still no outlier."""
-    assert not outlying(np.array([1.0, 1.0, 1.0, 9.0]), np.zeros(4)).any()
-    assert outlying(np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.05]), np.zeros(6)).tolist() == [False] * 5 + [True]
-    assert not outlying(np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.039]), np.zeros(6)).any()
 
 
 def test_replicates_scatter_within_their_settings() -> None:
@@ -202,29 +161,6 @@ def test_factors_are_what_varies_and_no_counter() -> None:
         "sense": ["-", "+"] * 4,
         "pose": ["a"] * 4 + ["b"] * 4,
     }
-
-
-def test_sense_is_a_factor_only_where_both_occur() -> None:
-    """Steps all up, or all down, have none; a speed that was not recorded is step over period."""
-    for sign in (1.0, -1.0):
-        trials = [trial(str(k), sign * 0.004 * (1 + k % 2), np.nan) for k in range(6)]
-        assert factors_of(trials, 0.028) == {"speed_m_s": ["0.14", "0.29"] * 3}
-        assert speed_levels(trials, 0.04) == ["0.1", "0.2"] * 3
-    assert "sense" in factors_of([*trials, trial("6", 0.004)], 0.028)
-
-
-def test_a_factor_of_many_numbers_is_cut_into_quarters() -> None:
-    """20 heights become four levels of five, named by their middles; 12 stay as they are, words too."""
-    rng = np.random.default_rng(2)
-    heights = rng.permutation(np.arange(20)) * 10.0
-    trials = [trial(str(k), height_mm=f"{height:g}", pose="ab"[k % 2]) for k, height in enumerate(heights)]
-    found = factors_of(trials, 0.028)["height_mm"]
-    assert ordered(set(found)) == ["20", "70", "120", "170"]
-    assert found == [f"{20 + 50 * int(height // 50):g}" for height in heights]
-    twelve = [trial(str(k), height_mm=str(k % 12)) for k in range(24)]
-    assert factors_of(twelve, 0.028)["height_mm"] == [str(k % 12) for k in range(24)]
-    words = [trial(str(k), height_mm=f"shelf {k % 13}") for k in range(26)]
-    assert factors_of(words, 0.028)["height_mm"] == [f"shelf {k % 13}" for k in range(26)]
 
 
 def test_levels_are_in_the_order_of_their_values() -> None:

@@ -120,44 +120,6 @@ def test_equations_are_the_dense_ones_with_delays_eliminated(order: int, plant: 
 # ---- minima ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("noise", [0.005, 0.05])
-@pytest.mark.parametrize(("order", "plant"), PLANTS)
-def test_fit_each_finds_a_minimum_of_each_row(order: int, plant: tuple[float, float], noise: float) -> None:
-    """From starts up to 30 % away; trust-region least squares in all five parameters finds nothing below it."""
-    trials = campaign(plant, noise, 3)
-    batch = Batch.of(trials, WEIGHTS)
-    start = shapes(plant) * np.array([0.95, 1.3, 1.2 if order == 2 else 0.0])
-    found = batch.fit_each(start, order)
-    np.testing.assert_allclose(found.cost, batch.point(found.shape).cost, rtol=1e-12)
-    for row, (trial, weight) in enumerate(zip(trials, WEIGHTS, strict=True)):
-        delay, q, p = found.shape[row]
-
-        def left(x: np.ndarray, trial: Trial = trial, weight: float = weight) -> np.ndarray:
-            c = unit_response(trial.time - x[0], x[1], x[4] if order == 2 else 0.0)
-            return weight * (trial.position - x[3] - x[2] * c)
-
-        x = np.array([delay, q, *linear(trial, delay, (q, p)), p][: 3 + order])
-        low = np.array([0.0, 1e-6, -np.inf, -np.inf, 0.0][: 3 + order])
-        best = least_squares(
-            left, np.maximum(x, low + 1e-12), bounds=(low, np.inf), x_scale=np.abs(x) + 1e-6, xtol=1e-14
-        )
-        assert found.cost[row] == pytest.approx(np.sum(left(x) ** 2), rel=1e-9)
-        assert found.cost[row] <= 2.0 * best.cost * (1.0 + KINKS)
-
-
-def test_second_order_of_a_first_order_arm_stops_at_its_bound() -> None:
-    """1/ω² stays at 0 where the noise would move it below; then the plant is the first-order one."""
-    bounded = 0
-    for seed in range(8):
-        batch = Batch.of(campaign(FIRST, 0.01, seed), WEIGHTS)
-        one, two = (batch.fit_shared(*plant, DELAYS, order) for order, plant in ((1, FIRST), (2, (0.04, 1e-4))))
-        assert two.cost.sum() <= one.cost.sum() * (1.0 + 1e-9)
-        if two.shape[0, 2] == 0.0:
-            bounded += 1
-            np.testing.assert_allclose(two.shape, one.shape, rtol=1e-5)
-    assert 0 < bounded < 8
-
-
 @pytest.mark.parametrize("delays", [DELAYS, np.array([0.0, 0.0551, 0.0, 0.0313])], ids=["late", "at once"])
 @pytest.mark.parametrize(("order", "plant"), PLANTS)
 def test_fit_shared_finds_the_minimum_of_the_dense_problem(
@@ -170,9 +132,8 @@ def test_fit_shared_finds_the_minimum_of_the_dense_problem(
     worst = 0.0
     for seed in (0, 5, 10, 38):
         trials = campaign(plant, 0.05, seed, delays)
-        found = Batch.of(trials, WEIGHTS).fit_shared(
-            1.2 * plant[0], 0.8 * plant[1], np.maximum(delays - 0.004, 0.0), order
-        )
+        start = shapes((1.2 * plant[0], 0.8 * plant[1]), np.maximum(delays - 0.004, 0.0))
+        found = Batch.of(trials, WEIGHTS).fit(start, order, together=True)
         assert found.shape[:, 0].min() >= 0.0
         x = unpacked(trials, (found.shape[0, 1], found.shape[0, 2]), found.shape[:, 0], order)
         low = np.concatenate(([1e-6, 0.0][:order], np.tile([0.0, -np.inf, -np.inf], 4)))
@@ -188,28 +149,3 @@ def test_fit_shared_finds_the_minimum_of_the_dense_problem(
 
 
 # ---- stacking -------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("order", "plant"), PLANTS)
-def test_padding_changes_no_number(order: int, plant: tuple[float, float]) -> None:
-    """A trial beside longer ones, with other stamps, is fitted as it is alone."""
-    trials = campaign(plant, 0.05)
-    batch = Batch.of(trials, WEIGHTS)
-    assert batch.time.shape == (4, max(LENGTHS)) and batch.count.tolist() == list(LENGTHS)
-    at = batch.point(shapes(plant))
-    slopes, heights = batch.slopes(at, order)
-    equations = batch.equations(at, slopes)
-    cost = batch.fit_each(shapes(plant), order).cost
-    for row, trial in enumerate(trials):
-        alone = Batch.of([trial], WEIGHTS[row : row + 1])
-        one = alone.point(shapes(plant)[row : row + 1])
-        own, height = alone.slopes(one, order)
-        assert alone.time.shape == (1, LENGTHS[row])
-        assert (batch.span[row], batch.spacing[row]) == (alone.span[0], alone.spacing[0])
-        assert batch.spacing[row] == pytest.approx((trial.time[-1] - trial.time[0]) / (len(trial.time) - 1), rel=1e-12)
-        np.testing.assert_allclose(slopes[:, row, : LENGTHS[row]], own[:, 0], rtol=0.0, atol=1e-9 * np.abs(own).max())
-        assert not slopes[:, row, LENGTHS[row] :].any()
-        np.testing.assert_allclose(heights[:, row], height[:, 0], rtol=1e-9)
-        for whole, part in zip(equations, alone.equations(one, own), strict=True):
-            np.testing.assert_allclose(whole[row], part[0], rtol=1e-7)
-        assert cost[row] == pytest.approx(alone.fit_each(shapes(plant)[row : row + 1], order).cost[0], rel=KINKS)

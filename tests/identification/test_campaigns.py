@@ -123,16 +123,6 @@ def test_a_campaign_without_noise_is_found_exactly() -> None:
             assert value == pytest.approx(truths_of(order)[name], rel=1e-4), name
 
 
-def test_a_jittering_delay_is_not_taken_for_lag() -> None:
-    """With a delay of its own for every trial 5 ms of jitter leave ω and ζ where they are; its scatter is reported."""
-    found = identified(Arm(2, noise=0.01e-3, jitter=0.005, replicates=6, bits=14).campaign(4))
-    estimates = estimates_of(found)
-    assert estimates["natural_frequency"][0] == pytest.approx(OMEGA, rel=0.01)
-    assert estimates["damping"][0] == pytest.approx(ZETA, rel=0.01)
-    assert found.axes["radial"].delay_spread == pytest.approx(0.005, rel=0.4)
-    assert found.axes["radial"].delay_noise < 0.0005
-
-
 def test_one_delay_for_axes_that_share_it_and_one_each_for_those_that_do_not() -> None:
     """By Welch's test, in words, and in arm.toml."""
     arm = Arm(1, noise=0.03e-3)
@@ -203,15 +193,6 @@ def test_a_gain_that_is_no_line_is_called_none() -> None:
     assert axis.gain_words.endswith("not along a straight line")
     straight = identified(Arm(1, 0.01e-3).campaign(2)).axes["radial"]
     assert straight.lack_of_fit_p is not None and straight.lack_of_fit_p > 0.05
-
-
-def test_the_three_delays_are_what_they_say() -> None:
-    """Onset after Td by the time to 2 % of the step; the lag is Td + τ."""
-    axis = identified(Arm(1, noise=0.005e-3, jitter=0.0, bits=14).campaign(5)).axes["radial"]
-    assert axis.delays.fitted.value == pytest.approx(DELAY, abs=2e-4)
-    assert axis.delays.lag.value == pytest.approx(DELAY + TAU, abs=3e-4)
-    first_above = TIMES[np.argmax(INTERCEPT * (1.0 - np.exp(-np.maximum(TIMES - DELAY, 0.0) / TAU)) > 0.02)]
-    assert axis.delays.onset.value == pytest.approx(first_above, abs=0.0057)
 
 
 def test_the_model_is_called_valid_up_to_where_it_holds() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
 
 from pumafuse import FirstOrder, SecondOrder
 from pumafuse.identification.fit import StepFit, fit_steps, flags
@@ -31,24 +30,10 @@ def fit_step(one: Trial, order: int, samples: int | None = None) -> StepFit:
     return fit_steps([one.cut(samples)])[0][order - 1]
 
 
-# ---- the response ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("q", "p"), [(0.04, 3e-4), (0.04, 4e-4), (0.04, 4.0000001e-4), (0.04, 2e-3), (0.1, 1e-5)])
-def test_the_response_solves_its_equation(q: float, p: float) -> None:
-    """The equation p c″ + q c′ + c = 1, integrated by a Runge-Kutta method."""
-    solved = solve_ivp(
-        lambda _, x: [x[1], (1.0 - x[0] - q * x[1]) / p], (0.0, TIMES[-1]), [0.0, 0.0], "DOP853", TIMES,
-        rtol=1e-12, atol=1e-13, max_step=1e-3,
-    )  # fmt: skip
-    np.testing.assert_allclose(unit_response(TIMES, q, p), solved.y[0], rtol=0.0, atol=1e-9)
-
-
 def test_second_order_becomes_first_order() -> None:
     """As p falls to 0, without a step at 0."""
     first = FirstOrder(time_constant=0.04).step_response(TIMES)
-    np.testing.assert_allclose(unit_response(TIMES, 0.04, 0.0), first, rtol=0.0, atol=1e-15)
-    for p in (1e-30, 1e-14, 1e-10):
+    for p in (0.0, 1e-30, 1e-14, 1e-10):
         np.testing.assert_allclose(unit_response(TIMES, 0.04, p), first, rtol=0.0, atol=max(1e3 * p, 1e-12))
 
 
@@ -108,17 +93,6 @@ def test_second_order_never_fits_worse_than_first(noise: float) -> None:
         assert second.squares <= first.squares * (1.0 + 1e-12)
 
 
-def test_only_the_first_samples_are_used_when_so_many_are_asked_for() -> None:
-    """The paper's window: 30 from the step on, what comes after is not seen."""
-    whole = trial(*SLOW, 0.05e-3)
-    spoilt = whole.position.copy()
-    spoilt[30:] = 99.0
-    cut = Trial("1", "radial", STEP, 0.28, {}, TIMES, spoilt)
-    found, expected = fit_step(cut, 1, 30), fit_step(whole, 1, 30)
-    assert (found.shape, found.gain, found.zero, found.samples) == (expected.shape, expected.gain, expected.zero, 30)
-    assert found.shape != fit_step(whole, 1).shape
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(("order", "shape"), [(1, SLOW), (2, SWINGING)], ids=["first", "second"])
 def test_intervals_hold(order: int, shape: tuple[float, float]) -> None:
@@ -139,12 +113,12 @@ def test_intervals_of_a_second_order_plant_that_is_none_are_open() -> None:
     """A first-order response says how slow ω is at least, and no more; its 1/ω² may be 0."""
     fit = fit_step(trial(*SLOW, 0.1e-3, 3), 2)
     assert fit.ci95.p[0] <= 0.0
-    assert fit.natural_frequency_ci95[1] == np.inf and fit.damping_ci95[1] == np.inf
+    assert fit.plant.natural_frequency_ci95[1] == np.inf and fit.plant.damping_ci95[1] == np.inf
     assert "long flat valley: first order may do" in flags(fit)
     clear = fit_step(trial(*SWINGING, 0.02e-3, 1), 2)
-    low, high = clear.natural_frequency_ci95
+    low, high = clear.plant.natural_frequency_ci95
     assert low < 53.9 < high < 60.0
-    assert clear.damping_ci95[0] < 0.864 < clear.damping_ci95[1] < 1.0
+    assert clear.plant.damping_ci95[0] < 0.864 < clear.plant.damping_ci95[1] < 1.0
     assert flags(clear) == []
 
 
@@ -160,14 +134,11 @@ def test_flags_name_what_spoils_a_trial() -> None:
 
 @pytest.mark.long
 @pytest.mark.skipif(not SHARED.exists(), reason="the recorded campaigns are not beside the project")
-def test_recorded_trials_are_fitted_as_expected() -> None:
-    """86 trials, 30 samples: first-order medians of τ and delay within 3 ms of a plain fit's; 90 of a robot at 98 %."""
-    puma = StepTrials.read(SHARED / "puma-virtual" / "steps")
-    for axis, tau, delay in (("tangential", 26e-3, 71e-3), ("radial", 42e-3, 59e-3), ("vertical", 39e-3, 61e-3)):
-        shapes = np.array([fit_step(one, 1, 30).shape for one in puma.of(axis)])
-        assert np.abs(np.median(shapes, axis=0)[:2] - [delay, tau]).max() < 3e-3
-    shares = []
-    for one in StepTrials.read(SHARED / "robot-steps").trials:
-        fit = fit_step(one, 1)
-        shares.append(1.0 - fit.rms / np.std(one.position))
+def test_recorded_trials_of_a_robot_are_read_whole_and_fitted() -> None:
+    """90 of an industrial robot, 52 of which begin before their command, at 98 %."""
+    robot = StepTrials.read(SHARED / "robot-steps")
+    assert (len(robot.trials), robot.notes) == (90, ())
+    assert sum(trial.time[0] < 0.0 for trial in robot.trials) == 52
+    fits = [first for first, _ in fit_steps(robot.trials)]
+    shares = [1.0 - fit.rms / np.std(one.position) for fit, one in zip(fits, robot.trials, strict=True)]
     assert np.median(shares) > 0.98

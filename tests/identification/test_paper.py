@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from pumafuse.identification.fit import StepFit
+from pumafuse.identification.fit import StepFit, fit_steps
 from pumafuse.identification.paper import fit_as_published, onset
 from pumafuse.identification.trials import Trial
 from pumafuse.model.unit_response import unit_response
@@ -42,7 +42,8 @@ def test_the_onset_is_the_first_sample_that_is_away(step: float) -> None:
 def test_gain_delay_and_zero_are_those_that_are_read() -> None:
     """The last three samples over the step, the onset, the rest level; the plant is that of the least eq. 10."""
     one = trial(2)
-    for order, fit in enumerate(fit_as_published(one), 1):
+    for order, fitted in enumerate(fit_steps([one])[0], 1):
+        fit = fit_as_published(one, fitted)
         zero = np.mean(one.position[:5])
         assert fit.zero == pytest.approx(zero, rel=1e-12)
         assert fit.gain == pytest.approx((np.mean(one.position[-3:]) - zero) / one.step, rel=1e-12)

@@ -13,6 +13,7 @@ import pytest
 import pumafuse as pf
 from pumafuse.folders import FolderError
 from pumafuse.identification.plan import Design, plan, write
+from refusals import one_line
 
 ARM = pf.ArmModel.load("puma560-internal")
 POSITIONS = ({"y_mm": "350", "z_mm": "-90"}, {"y_mm": "700", "z_mm": "210"}, {"y_mm": "525", "z_mm": "-400"})
@@ -98,50 +99,25 @@ def test_a_planned_campaign_is_read_by_identify(tmp_path: Path) -> None:
         write(plan(design()), tmp_path / "plan", True)
 
 
-WARNED: dict[str, tuple[dict[str, Any], str]] = {
-    "window": ({"hold": 0.2}, "radial: the hold of 200 ms is too short to settle: 227 ms are needed"),
-    "rest": ({"rest": 0.05}, "radial: the rest of 100 ms between steps is too short to settle"),
-    "speed": ({"speeds": (0.1, 0.6)}, "commanded speeds reach 0.6 m/s, the limit is 0.5 m/s"),
-    "noise": ({"amplitudes": (0.02,)}, "commanded speeds reach 0.714 m/s, the limit is 0.5 m/s"),
-    "one speed": ({"speeds": (0.1,)}, "one speed only: the gain's dependence on speed is not identifiable"),
-    "no replicates": ({"replicates": 1}, "no replicates: scatter from trial to trial cannot be separated"),
-    "no noise": ({"amplitudes": ()}, "no white noise: there will be nothing to verify the model with"),
-}
-
-
-@pytest.mark.parametrize("case", WARNED)
-def test_what_will_spoil_a_campaign_is_warned_of(case: str) -> None:
-    """Once for each axis it is true of, and nothing else; a good plan has no warning."""
-    changes, words = WARNED[case]
-    assert plan(design(), ARM).warnings == ()
-    warned = plan(design(**changes), ARM).warnings
-    assert any(line.startswith(words) for line in warned), warned
-    topic = words.split(": ")[-1][:12]
-    assert all(topic in line for line in warned), warned
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
+        ({"hold": 0.2}, "radial: the hold of 200 ms is too short to settle: 227 ms are needed"),
+        ({"rest": 0.05}, "radial: the rest between steps of 128 ms is too short to settle: 227 ms are needed"),
+        ({"speeds": (0.1, 0.6)}, "commanded speeds reach 0.6 m/s, the limit is 0.5 m/s"),
+        ({"amplitudes": (0.02,)}, "commanded speeds reach 0.714 m/s, the limit is 0.5 m/s"),
+        ({"speeds": (0.1,)}, "one speed only: the gain's dependence on speed is not identifiable"),
+        ({"replicates": 1}, "no replicates: scatter from trial to trial cannot be separated"),
+        ({"amplitudes": ()}, "no white noise: there will be nothing to verify the model with"),
         ({"speeds": (100.0, 200.0)}, "steps are 5.6e+03 mm at most, 200 m/s at T; is a unit wrong?"),
-        ({"amplitudes": (4.0,)}, "steps are 4e+03 mm at most, 143 m/s at T; is a unit wrong?"),
-        ({"period": 28e-6, "amplitudes": ()}, "steps are 0.0112 mm at most, 0.4 m/s at T; is a unit wrong?"),
         ({"speeds": (1e-3,), "amplitudes": ()}, "steps are 0.028 mm at most, 0.001 m/s at T; is a unit wrong?"),
         ({"positions": (POSITIONS[0], POSITIONS[0])}, "positions: one is listed twice"),
     ],
 )
-def test_a_slip_is_warned_of_without_an_arm_too(changes: dict[str, Any], words: str) -> None:
-    """Speeds in mm/s, amplitudes in m, a period in s: steps that no arm makes, or that nobody would see."""
-    assert not any("unit" in line or "twice" in line for line in plan(design()).warnings)
-    assert any(line.startswith(words) for line in plan(design(**changes)).warnings)
-
-
-def test_the_settling_time_is_the_plants() -> None:
-    """Td + 2 % settling of τ = 42.5 ms is 60.45 + 166.3 ms: a hold just below it warns, just above does not."""
-    needed = 0.06045 - 0.0425 * np.log(0.02)
-    for hold, warned in ((needed - 0.001, True), (needed + 0.001, False)):
-        lines = plan(design(axes=("radial",), hold=hold), ARM).warnings
-        assert any("too short" in line for line in lines) == warned
+def test_what_will_spoil_a_campaign_is_warned_of(changes: dict[str, Any], words: str) -> None:
+    """A good plan has no warning. The plant of 42.5 ms settles to 2 % in 166 ms, after a delay of 60 ms."""
+    assert plan(design(), ARM).warnings == ()
+    assert any(line.startswith(words) for line in plan(design(**changes), ARM).warnings)
 
 
 @pytest.mark.parametrize(
@@ -165,6 +141,4 @@ def test_the_settling_time_is_the_plants() -> None:
 )
 def test_a_design_that_cannot_be_carried_out_is_refused(changes: dict[str, Any], words: str) -> None:
     """In one line."""
-    with pytest.raises(pf.ConfigError, match=words) as refused:
-        design(**changes)
-    assert len(str(refused.value).splitlines()) == 1
+    assert words in one_line(pf.ConfigError, lambda: design(**changes))

@@ -10,10 +10,9 @@ import pyarrow as pa
 import pyarrow.parquet as papq
 import pytest
 
-import pumafuse as pf
 from pumafuse.identification.trials import StepTrials, TrialsError
+from refusals import one_line
 
-SHARED = Path(__file__).parents[3] / "shared" / "data"
 TIMES = np.round(np.arange(-2, 12) * 0.005, 6)
 
 
@@ -64,27 +63,29 @@ def test_other_units_names_and_formats(tmp_path: Path) -> None:
 
 
 WHOLE = "1,radial,8,0.2857,350,a\n"
+LISTED = "2,radial,8,0.2857,350,a\n"
 BROKEN: dict[str, tuple[str, str, str]] = {
-    "twice": ("2,radial,8,0.2857,350,a\n2,radial,4,0.1429,350,a\n", rows("2"), "trial '2': listed 2 times"),
-    "no step": ("2,radial,0,0.2857,350,a\n", rows("2"), "trial '2': its step is 0 or no number"),
-    "step that is a word": ("2,radial,big,0.2857,350,a\n", rows("2"), "trial '2': its step is 0 or no number"),
-    "no axis": ("2,,8,0.2857,350,a\n", rows("2"), "trial '2': it names no axis"),
-    "no samples": ("2,radial,8,0.2857,350,a\n", "", "trial '2': 0 samples from the step on"),
-    "one sample": ("2,radial,8,0.2857,350,a\n", "2,0.1,1.0\n", "trial '2': 1 samples from the step on"),
-    "only before": ("2,radial,8,0.2857,350,a\n", rows("2", TIMES - 1.0), "trial '2': 0 samples from the step on"),
-    "all NaN": ("2,radial,8,0.2857,350,a\n", rows("2", value=np.nan).replace("0.25", "nan"), "trial '2': 0 samples"),
+    "twice": (2 * LISTED, rows("2"), "listed 2 times"),
+    "no step": (LISTED.replace("8", "0", 1), rows("2"), "its step is 0 or no number"),
+    "step that is a word": (LISTED.replace("8", "big", 1), rows("2"), "its step is 0 or no number"),
+    "no axis": (LISTED.replace("radial", ""), rows("2"), "it names no axis"),
+    "one sample": (LISTED, "2,0.1,1.0\n", "1 samples from the step on"),
+    "only before": (LISTED, rows("2", TIMES - 1.0), "0 samples from the step on"),
+    "all NaN": (LISTED, rows("2", value=np.nan).replace("0.25", "nan"), "0 samples"),
 }
 
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_trial_costs_only_itself(case: str, tmp_path: Path) -> None:
-    """It is named once, with the reason."""
+    """It is named once, with the reason; alone it is refused in one line."""
     listed, sampled, reason = BROKEN[case]
     found = StepTrials.read(written(tmp_path, WHOLE + listed, rows("1") + sampled))
     assert [trial.name for trial in found.trials] == ["1"]
     notes = [note for note in found.notes if note.startswith("trial '2'")]
     assert notes
-    assert all(note.startswith(reason) and note.endswith(": left out") for note in notes)
+    assert all(note.startswith(f"trial '2': {reason}") and note.endswith(": left out") for note in notes)
+    refused = one_line(TrialsError, lambda: StepTrials.read(written(tmp_path, listed, sampled)))
+    assert "no trial can be used; " in refused and f"trial '2': {reason}" in refused
 
 
 def test_what_can_be_mended_is_mended_and_reported(tmp_path: Path) -> None:
@@ -99,24 +100,6 @@ def test_what_can_be_mended_is_mended_and_reported(tmp_path: Path) -> None:
         "trial '1': 1 samples without a number: left out",
         "trial '1': times step back: sorted",
     )
-
-
-def test_nothing_to_use_is_one_line(tmp_path: Path) -> None:
-    """With every reason."""
-    with pytest.raises(TrialsError, match="no trial can be used; trial '1': its step is 0") as refused:
-        StepTrials.read(written(tmp_path, "1,radial,0,0.2857,350,a\n", rows("1")))
-    assert len(str(refused.value).splitlines()) == 1
-    (tmp_path / "samples.csv").unlink()
-    with pytest.raises(pf.RunError, match=r"no samples\.csv"):
-        StepTrials.read(tmp_path)
-
-
-def test_many_reasons_are_still_a_line_to_read(tmp_path: Path) -> None:
-    """The first few of them, and how many more."""
-    listed = "".join(f"{k},radial,10,0.357,0,a\n" for k in range(100))
-    with pytest.raises(TrialsError, match=r"trial '2': 0 samples .*; and 97 more$") as refused:
-        StepTrials.read(written(tmp_path, listed, rows("other")))
-    assert len(str(refused.value)) < 600
 
 
 def campaign(folder: Path, *steps: tuple[float, float]) -> StepTrials:
@@ -140,13 +123,3 @@ def test_no_period_is_guessed(steps: list[tuple[float, float]], tmp_path: Path) 
     """Trials that disagree, a velocity step, a period below 1 ms, no speed."""
     with pytest.raises(TrialsError, match="give --period"):
         campaign(tmp_path, *steps).period()
-
-
-@pytest.mark.skipif(not SHARED.exists(), reason="the recorded campaigns are not beside the project")
-def test_recorded_campaigns_are_read_whole() -> None:
-    """86 and 90 trials, nothing to remark; 52 of the robot's begin before their command."""
-    puma, robot = (StepTrials.read(SHARED / name) for name in ("puma-virtual/steps", "robot-steps"))
-    assert (len(puma.trials), puma.axes, puma.notes) == (86, ("tangential", "radial", "vertical"), ())
-    assert puma.period() == pytest.approx(0.028, rel=0.03)
-    assert (len(robot.trials), robot.notes) == (90, ())
-    assert sum(trial.time[0] < 0.0 for trial in robot.trials) == 52

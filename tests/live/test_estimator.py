@@ -33,25 +33,6 @@ def running(seconds: float = 1.0, **options: object) -> pf.LiveEstimator:
     return live
 
 
-def test_the_readme_way() -> None:
-    """A command, a measurement and an estimate, in m and s."""
-    live = pf.LiveEstimator(CONFIG)
-    assert live.command(0.0, radial=0.57).outcome is pf.Outcome.FUSED
-    told = live.measurement(0.02, "tracker", radial=0.5697)
-    assert (told.outcome, dict(told.axes)) == (pf.Outcome.FUSED, {"radial": pf.Outcome.FUSED})
-    estimate = live.estimate(at=0.02)
-    assert abs(estimate["radial"].position - 0.5697) < 1e-4
-    assert estimate.time == 0.02
-    assert list(estimate.axes) == ["radial"]
-
-
-def test_now_is_the_newest_stamp() -> None:
-    """Without a time the estimate is that at the newest stamp, whoever said it."""
-    live = running()
-    assert live.estimate().stamp == live.newest
-    assert live.estimate() == live.estimate(live.newest)
-
-
 def test_the_future_is_where_the_last_command_leads() -> None:
     """A step is given: long after it the arm is there, and on the way the model alone says where; sd only grows."""
     live = running()
@@ -74,6 +55,7 @@ def test_the_past_knows_no_later_measurement() -> None:
     assert live.estimate(0.8)["radial"] == before["radial"]
     assert now.reason == "now"
     assert before.reason == "filtered"
+    assert live.estimate() == live.estimate(live.newest)
 
 
 def test_times_that_have_no_estimate_say_why() -> None:
@@ -239,17 +221,6 @@ def test_x_and_y_mean_nothing_before_the_frame_has_its_place() -> None:
     assert live.command(0.01, x=0.0, y=0.0).outcome is pf.Outcome.INVALID
     assert live.command(0.03, x=0.1, y=0.5).outcome is pf.Outcome.FUSED
     assert live.estimate().outcome is pf.Outcome.FUSED
-
-
-def test_a_command_on_the_bases_axis_costs_nothing_but_itself() -> None:
-    """A late first command where the frame has no angle is refused, and all that was there stays."""
-    live = pf.LiveEstimator(msgspec.structs.replace(CONFIG, frame=Cylindrical()))
-    for step in range(10):
-        live.command(1.0 + step * PERIOD, x=0.1, y=0.5)
-    before = live.estimate()
-    assert live.command(0.9, x=0.0, y=0.0).outcome is pf.Outcome.INVALID
-    assert live.estimate() == before
-    assert live.health().commands["fused"] == 10
 
 
 def test_an_axis_with_a_start_level_is_there_before_its_first_command() -> None:

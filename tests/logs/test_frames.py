@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.logs.axes import in_axes
-from pumafuse.logs.frames import Cylindrical, Frame, Rotated
+from pumafuse.logs.frames import Cylindrical, Frame, Placed, Rotated
+from pumafuse.logs.run import Source
 from refusals import one_line
 
 PERIOD = 0.028
@@ -78,6 +79,14 @@ def config(frame: Frame | None = None, sd: float = 1e-3, **process: float) -> pf
 refusal = partial(one_line, pf.RunError)
 
 
+def check(source: Source, placed: Placed, wanted: Path2D, tangential: np.ndarray, radial: np.ndarray) -> None:
+    """A source is at these positions of the axes, and they are the path's x and y."""
+    pairs = [(source.values["tangential"], tangential), (source.values["radial"], radial)]
+    pairs += zip(placed.to_log(tangential, radial), (wanted.x, wanted.y), strict=True)
+    for found, right in pairs:
+        np.testing.assert_allclose(found, right, rtol=0, atol=EXACT)
+
+
 @settings(derandomize=True, deadline=None, max_examples=60)
 @given(paths(), directions)
 def test_cylindrical_axes_are_radius_and_arc(drawn: tuple[Path2D, Path2D], positive: str) -> None:
@@ -85,13 +94,8 @@ def test_cylindrical_axes_are_radius_and_arc(drawn: tuple[Path2D, Path2D], posit
     path, measured = drawn
     run, placed = in_axes(logged(path, measured, Cylindrical(base=path.base, positive=positive)), None)
     for source, wanted in ((run.command, path), (run.sensors["camera"], measured)):
-        tangential, radial = source.values["tangential"], source.values["radial"]
         arc = SIGN[positive] * path.radius[0] * (wanted.angle - path.angle[0])
-        np.testing.assert_allclose(tangential, arc, rtol=0, atol=EXACT)
-        np.testing.assert_allclose(radial, wanted.radius, rtol=0, atol=EXACT)
-        x, y = placed.to_log(tangential, radial)
-        np.testing.assert_allclose(x, wanted.x, rtol=0, atol=EXACT)
-        np.testing.assert_allclose(y, wanted.y, rtol=0, atol=EXACT)
+        check(source, placed, wanted, arc, wanted.radius)
 
 
 @settings(derandomize=True, deadline=None, max_examples=60)
@@ -103,31 +107,7 @@ def test_rotated_axes_are_a_fixed_rotation(drawn: tuple[Path2D, Path2D], positiv
     turn = math.cos(math.radians(azimuth)) - 1j * math.sin(math.radians(azimuth))
     for source, wanted in ((run.command, path), (run.sensors["camera"], seen)):
         turned = (wanted.x + 1j * wanted.y) * turn
-        np.testing.assert_allclose(source.values["radial"], turned.real, rtol=0, atol=EXACT)
-        np.testing.assert_allclose(source.values["tangential"], SIGN[positive] * turned.imag, rtol=0, atol=EXACT)
-        x, y = placed.to_log(source.values["tangential"], source.values["radial"])
-        np.testing.assert_allclose(x, wanted.x, rtol=0, atol=EXACT)
-        np.testing.assert_allclose(y, wanted.y, rtol=0, atol=EXACT)
-
-
-@pytest.mark.parametrize(("positive", "way"), [("counterclockwise", 1.0), ("clockwise", -1.0)])
-@pytest.mark.parametrize("kind", ["cylindrical", "rotated"])
-def test_directions_are_seen_from_above(kind: str, positive: str, way: float) -> None:
-    """With x to the right and y up, going up on the right of the base is counterclockwise."""
-    frame = Cylindrical(positive=positive) if kind == "cylindrical" else Rotated(azimuth=0.0, positive=positive)
-    run = pf.Run.from_arrays(stamps(2), {"x": [0.6, 0.6], "y": [0.0, 1e-3]}, frame=frame)
-    moved = np.diff(in_axes(run, None)[0].command.values["tangential"])
-    assert moved == pytest.approx(way * 1e-3, rel=1e-5)
-
-
-def test_the_turns_count_from_the_start_level() -> None:
-    """At rest at 179°, first commanded to −179°: that is 2° on, not 358° back."""
-    degree = math.pi / 180.0
-    start = {"x": 0.5 * math.cos(179.0 * degree), "y": 0.5 * math.sin(179.0 * degree)}
-    path = Path2D((0.0, 0.0), np.array([-179.0, -178.0]) * degree, np.full(2, 0.5))
-    found = in_axes(logged(path, path, Cylindrical(), start=start), None)[0]
-    for source in (found.command, found.sensors["camera"]):
-        np.testing.assert_allclose(source.values["tangential"], np.array([1.0, 1.5]) * degree, atol=EXACT)
+        check(source, placed, wanted, SIGN[positive] * turned.imag, turned.real)
 
 
 def test_sensors_are_placed_by_the_command_of_their_own_time() -> None:
@@ -145,11 +125,11 @@ def test_sensors_are_placed_by_the_command_of_their_own_time() -> None:
 
 
 def test_the_start_level_places_the_frame() -> None:
-    """R0 and θ0 are those of [command.start]: from (0, −0.4) to (0.6, 0) is a quarter turn, 0.4 m out."""
-    start = {"x": 0.0, "y": -0.4, "z": 0.1}
-    run = pf.Run.from_arrays(stamps(1), {"x": [0.6], "y": [0.0], "z": [0.2]}, start=start, frame=Cylindrical())
-    found = in_axes(run, None)[0]
-    assert found.command.values["tangential"] == pytest.approx(0.4 * math.pi / 2.0)
+    """R0, θ0 and the turn are those of [command.start]: from 179°, 0.4 m out, to −179° are 2° on, not 358° back."""
+    start = {"x": 0.4 * math.cos(math.radians(179.0)), "y": 0.4 * math.sin(math.radians(179.0)), "z": 0.1}
+    to = {"x": [0.6 * math.cos(math.radians(-179.0))], "y": [0.6 * math.sin(math.radians(-179.0))], "z": [0.2]}
+    found = in_axes(pf.Run.from_arrays(stamps(1), to, start=start, frame=Cylindrical()), None)[0]
+    assert found.command.values["tangential"] == pytest.approx(0.4 * math.radians(2.0))
     assert found.command.values["radial"] == pytest.approx(0.6)
     assert dict(found.start) == pytest.approx({"tangential": 0.0, "radial": 0.4, "vertical": 0.1})
 
@@ -204,20 +184,16 @@ def test_what_a_frame_cannot_place_is_refused(
     assert message in refusal(lambda: in_axes(run, None))
 
 
-def test_a_row_without_x_or_y_is_invalid_but_its_z_is_fused() -> None:
-    """Tangential and radial need both; vertical needs neither."""
-    values = {"x": np.full(6, 0.5), "y": np.zeros(6), "z": np.zeros(6)}
-    camera = {axis: value.copy() for axis, value in values.items()}
-    camera["x"][1] = camera["y"][2] = camera["z"][3] = np.nan
-    camera["x"][4] = camera["y"][4] = np.nan
-    run = pf.Run.from_arrays(stamps(6), values, {"camera": (stamps(6), camera)}, frame=Cylindrical())
-    with pytest.warns(pf.PumafuseWarning, match="no finite"):
-        est = pf.fuse(run, config())
-    for axis, invalid in (("tangential", [1, 2, 4]), ("radial", [1, 2, 4]), ("vertical", [3])):
-        outcome = est.measurements.of("camera", axis).outcome
-        wanted = [pf.Outcome.INVALID if row in invalid else pf.Outcome.FUSED for row in range(6)]
-        assert outcome.tolist() == wanted, axis
-    assert all(np.isfinite(est[axis].position).all() for axis in est.axes)
+def test_tangential_and_radial_need_both_x_and_y_vertical_needs_neither() -> None:
+    """NaN where one is missing, and on the base's axis, where there is no angle: not used, and no turn is lost."""
+    x, y = [0.5, np.nan, 0.0, -0.1, 0.0, np.nan], [0.0, 0.1, np.nan, 0.5, 0.0, np.nan]
+    z = [0.0, 0.0, 0.0, np.nan, 0.0, 0.0]
+    run = pf.Run.from_arrays(stamps(6), {"x": x, "y": y, "z": z}, frame=Cylindrical())
+    found = in_axes(run, None)[0].command.values
+    assert np.flatnonzero(np.isnan(found["tangential"])).tolist() == [1, 2, 4, 5]
+    assert np.flatnonzero(np.isnan(found["radial"])).tolist() == [1, 2, 4, 5]
+    assert np.flatnonzero(np.isnan(found["vertical"])).tolist() == [3]
+    assert found["tangential"][3] == pytest.approx(0.5 * math.atan2(0.5, -0.1))
 
 
 def test_commands_in_x_y_z_without_a_frame_are_refused_with_what_is_missing() -> None:
@@ -227,55 +203,28 @@ def test_commands_in_x_y_z_without_a_frame_are_refused_with_what_is_missing() ->
     assert message == "command: commands are in x, y, z; give a [frame] in run.toml or fusion.toml"
 
 
-RUN_TOML = """
-[command]
-file = "log.csv"
-time = "time_s"
-x = "command.x_mm"
-y = "command.y_mm"
-"""
-FUSION_TOML = """
-arm = "puma560-internal"
-[frame]
-kind = "rotated"
-azimuth_deg = 0.0
-"""
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+@pytest.mark.parametrize(
+    ("file", "frame", "tangential", "radial"),
+    [
+        ("log.csv", "", 500.0, 100.0),  # at azimuth 0 radial is x and tangential y
+        ("run.toml", "", 500.0, 100.0),
+        ("run.toml", '[frame]\nkind = "rotated"\nazimuth_deg = 90.0\n', -100.0, 500.0),
+        ("run.toml", '[frame]\nkind = "cylindrical"\nbase_mm = [100.0, 200]\npositive = "clockwise"\n', 0.0, 300.0),
+    ],
+)
+def test_the_frame_of_the_run_beats_that_of_fusion_toml(
+    tmp_path: Path, file: str, frame: str, tangential: float, radial: float
+) -> None:
+    """A single table cannot hold a frame, a manifest need not; files are in mm and degrees; estimates get x, y back."""
     (tmp_path / "log.csv").write_text("time_s,command.x_mm,command.y_mm\n0,100,500\n0.028,100,500\n")
-    (tmp_path / "run.toml").write_text(RUN_TOML)
-    (tmp_path / "fusion.toml").write_text(FUSION_TOML)
-    return tmp_path
-
-
-def resting(folder: Path, run: str) -> tuple[float, float]:
-    """Tangential and radial [mm] of an arm that rests at x = 100, y = 500."""
-    est = pf.fuse(pf.Run.read(folder / run), pf.FusionConfig.load(folder / "fusion.toml"))
-    assert est.cartesian["x"] == pytest.approx(0.1)
-    assert est.cartesian["y"] == pytest.approx(0.5)
-    return est["tangential"].position[-1] * 1e3, est["radial"].position[-1] * 1e3
-
-
-@pytest.mark.parametrize("run", ["log.csv", "run.toml"])
-def test_the_frame_of_fusion_toml_serves_runs_without_one(folder: Path, run: str) -> None:
-    """A single table cannot hold a frame, a manifest need not: at azimuth 0 radial is x and tangential y."""
-    assert resting(folder, run) == pytest.approx((500.0, 100.0))
-
-
-def test_the_frame_of_the_run_beats_that_of_fusion_toml(folder: Path) -> None:
-    """What the log says of itself goes: at azimuth 90° radial is y and tangential −x."""
-    (folder / "run.toml").write_text(RUN_TOML + '[frame]\nkind = "rotated"\nazimuth_deg = 90.0\n')
-    assert resting(folder, "run.toml") == pytest.approx((-100.0, 500.0))
-
-
-def test_a_frame_in_a_file_is_in_mm_and_degrees(folder: Path) -> None:
-    """base_mm is the base's axis: about (100, 200) the arm rests 300 mm out at tangential 0."""
-    frame = '[frame]\nkind = "cylindrical"\nbase_mm = [100.0, 200]\npositive = "clockwise"\n'
-    (folder / "run.toml").write_text(RUN_TOML + frame)
-    assert pf.Run.read(folder).frame == Cylindrical(base=(0.1, 0.2), positive="clockwise")
-    assert resting(folder, "run.toml") == pytest.approx((0.0, 300.0))
+    command = '[command]\nfile = "log.csv"\ntime = "time_s"\nx = "command.x_mm"\ny = "command.y_mm"\n'
+    (tmp_path / "run.toml").write_text(command + frame)
+    own = '[frame]\nkind = "rotated"\nazimuth_deg = 0.0\n'
+    (tmp_path / "fusion.toml").write_text('arm = "puma560-internal"\n' + own)
+    est = pf.fuse(pf.Run.read(tmp_path / file), pf.FusionConfig.load(tmp_path / "fusion.toml"))
+    assert est["tangential"].position[-1] * 1e3 == pytest.approx(tangential)
+    assert est["radial"].position[-1] * 1e3 == pytest.approx(radial)
+    assert (est.cartesian["x"][0], est.cartesian["y"][0]) == pytest.approx((0.1, 0.5))
 
 
 @settings(derandomize=True, deadline=None, max_examples=10)

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pumafuse.errors import RunError
-from pumafuse.logs.grid import regular_grid
-from pumafuse.logs.grid_kernels import CHOICES, MOST_LATE, cheapest_ticks
+from pumafuse.logs.grid import assigned_ticks, regular_grid
 from refusals import one_line
 
 SECOND = 1_000_000_000
@@ -30,7 +29,7 @@ def grid_of(ticks: np.ndarray, period_ns: float = TICK, origin: int = 1_700_000_
 
 
 @properties
-@given(st.sampled_from([PERIOD, 0.004, 1 / 30, 0.0281234567]), st.integers(200, 500), st.integers(0, 2**32 - 1))
+@given(st.sampled_from([PERIOD, 0.004, 1 / 30, 0.0281234567]), st.integers(40, 500), st.integers(0, 2**32 - 1))
 def test_the_grid_behind_jittered_stamps_is_even_to_a_nanosecond(period: float, count: int, seed: int) -> None:
     """Stamps off by up to a fifth of a period, with commands missing, come back on ticks of exactly T."""
     rng = np.random.default_rng(seed)
@@ -64,28 +63,6 @@ def test_one_or_two_stamps_are_a_grid(stamp: list[int], wanted: list[int]) -> No
     assert got.tolist() == wanted
 
 
-@pytest.mark.parametrize("count", [3, 5, 10, 20, 40])
-def test_a_short_run_with_jitter_has_a_grid(count: int) -> None:
-    """1 ms of jitter on a few commands is no wrong period: the slope's own error is allowed for."""
-    for seed in range(20):
-        jitter = np.rint(np.random.default_rng(seed).normal(0.0, 1e6, count)).astype(np.int64)
-        got, note = regular_grid(grid_of(np.arange(count)) + jitter, PERIOD, "host")
-        np.testing.assert_array_equal(np.diff(got), TICK)
-        assert note is None
-
-
-@pytest.mark.parametrize("first", [2000, 10, 3997])
-def test_a_late_stamp_moves_no_other_command(first: int) -> None:
-    """One stamp more than half a tick late, the next one less: every command is on its own tick."""
-    true = grid_of(np.arange(4000))
-    stamp = true.copy()
-    stamp[first] += 15_000_000
-    stamp[first + 1] += 3_000_000
-    got, note = regular_grid(stamp, PERIOD, "host")
-    assert note == "host: 1 commands are stamped more than half a period late: set back to their ticks"
-    np.testing.assert_allclose(got - true, 0, atol=1)
-
-
 @pytest.mark.parametrize("ppm", [50.0, -50.0])
 def test_a_pause_does_not_hide_the_drift(ppm: float) -> None:
     """50 ppm through a pause of 10 minutes are one tick: the grid is on the true ticks after it."""
@@ -96,14 +73,14 @@ def test_a_pause_does_not_hide_the_drift(ppm: float) -> None:
     assert np.abs(got - true).max() < 1000
 
 
-@pytest.mark.parametrize("period", [0.056, 0.030, 0.0281, 0.0279, 0.027, 0.0200])
-def test_a_wrong_period_is_refused(period: float) -> None:
-    """Stamps 28 ms apart do not fit another period: refused with both periods and what to do."""
-    ticks = np.arange(500)
-    jitter = np.random.default_rng(5).uniform(-1e6, 1e6, len(ticks))
-    text = refusal(lambda: regular_grid(grid_of(ticks) + np.rint(jitter).astype(np.int64), period, "host"))
+@pytest.mark.parametrize("ratio", [2.0, 1.5, 4 / 3, 1.01, 1.004, 0.996, 0.99, 64 / 65, 63 / 64, 0.75, 2 / 3])
+@pytest.mark.parametrize("sd", [0.0, 0.1, 0.2])
+def test_a_wrong_period_is_refused(ratio: float, sd: float) -> None:
+    """Also one that fits as well at each second or 64th command: refused with both periods and what to do."""
+    _, stamp = logged(np.arange(500), PERIOD, sd, 5)
+    text = refusal(lambda: regular_grid(stamp, PERIOD * ratio, "host"))
     assert text.startswith("host: ")
-    for words in (f"ticks of {period * 1e3:g} ms", "median interval is 28.0", "clock = 'stamps'"):
+    for words in (f"ticks of {PERIOD * ratio * 1e3:g} ms", "median interval is 2", "clock = 'stamps'"):
         assert words in text
 
 
@@ -158,17 +135,6 @@ def test_a_queue_behind_a_stalled_logger_is_set_back_to_its_ticks(sd: float, len
     assert "more than half a period" in note
 
 
-@pytest.mark.parametrize("place", [100, 2000, 3900])
-def test_an_early_stamp_moves_no_other_command(place: int) -> None:
-    """With 0.15 T of jitter a stamp that is 0.6 T early is nearest to the tick before it, which is taken."""
-    true, stamp = logged(np.arange(4000), 0.002, 0.15, 11)
-    stamp[place - 1 : place + 1] = true[place] - [1_900_000, 1_200_000]
-    got, note = regular_grid(in_order(stamp), 0.002, "host")
-    np.testing.assert_allclose(got, true, rtol=0, atol=30_000)  # 4 standard errors of a median
-    assert note is not None
-    assert "of them early: put on them" in note
-
-
 @properties
 @given(
     st.sampled_from([0.002, PERIOD]), st.floats(0.0, 0.4), st.sampled_from([0.0, 0.02, 0.5]), st.integers(0, 2**32 - 1)
@@ -199,16 +165,6 @@ def test_stamps_without_ticks_are_refused(count: int, apart: float, seed: int) -
     assert text.endswith("; check update_period_ms, or use clock = 'stamps'")
 
 
-@properties
-@given(
-    st.sampled_from([64 / 65, 63 / 64, 2 / 3, 0.75, 4 / 3, 1.5, 1.01, 0.99]), st.integers(200, 3000), st.floats(0, 0.2)
-)
-def test_a_period_that_fits_now_and_then_is_refused(ratio: float, count: int, sd: float) -> None:
-    """Also one that fits as well at each 64th command, or at each second."""
-    _, stamp = logged(np.arange(count), PERIOD, sd, count)
-    refusal(lambda: regular_grid(stamp, PERIOD * ratio, "host"))
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_much_jitter_beside_many_missing_ticks_is_refused(seed: int) -> None:
     """Of 0.25 T, with every second tick missing, some 2 % lie nearer to a free tick: no order decides which."""
@@ -216,17 +172,6 @@ def test_much_jitter_beside_many_missing_ticks_is_refused(seed: int) -> None:
     ticks = np.flatnonzero(rng.random(5000) < 0.5)
     place = np.sort(ticks + rng.normal(0.0, 0.25, len(ticks)))
     assert "beside missing ticks may be of those" in refusal(lambda: regular_grid(grid_of(place), PERIOD, "host"))
-
-
-def test_a_refusal_says_how_many_stamps_are_off_and_what_to_do() -> None:
-    """Every seventh stamp is 0.7 T late: the ticks are clear, but that is no jitter about them."""
-    true = grid_of(np.arange(1000))
-    late = np.where(np.arange(1000) % 7 == 3, 20_000_000, 0)
-    text = refusal(lambda: regular_grid(true + late, PERIOD, "host"))
-    off = np.count_nonzero(late)
-    assert f"{off} of 1000 are stamped more than half a period off their ticks" in text
-    assert "median" not in text
-    assert text.endswith("; check update_period_ms, or use clock = 'stamps'")
 
 
 def cost(off: np.ndarray) -> np.ndarray:
@@ -238,10 +183,8 @@ def cost(off: np.ndarray) -> np.ndarray:
 def test_of_all_rows_of_ticks_the_cheapest_is_found(places: list[float]) -> None:
     """No other strictly ascending row of ticks costs less: all of them are tried."""
     place = np.sort(np.array(places))
-    ticks = np.empty(len(place), dtype=np.int64)
-    first = np.floor(place).astype(np.int64) - MOST_LATE
-    workspace = np.empty(CHOICES), np.empty((len(place), CHOICES), dtype=np.uint8)
-    assert cheapest_ticks(place, first, *workspace, ticks)
+    ticks = assigned_ticks(place)
+    assert ticks is not None
     assert np.all(np.diff(ticks) > 0)
     rows = np.array(list(combinations(range(-5, 9), len(place))))
     least = cost(place - rows).sum(axis=1).min()

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
+import pyarrow.csv as pacsv
 import pyarrow.parquet as papq
 import pytest
 
 from pumafuse.arrays import NO_STAMP
-from pumafuse.errors import ConfigError, PumafuseError, RunError, UnknownNameError
-from pumafuse.logs.run import Reference, Run, Source
+from pumafuse.errors import PumafuseError
+from pumafuse.logs.run import Run, Source
 from refusals import one_line
 
-HOST = "t_ms,nominal_mm,correction_um,z_m,note\n0,560,500,0.1,a\n28,561,-500,0.2,b\n"
+HOST = "t_ms,nominal_mm,correction_um,z_m,note\n0,560,500,0.1,a\n28,561,-500,0.2,b\n56,561,,0.2,c\n"
 TRACKER = "stamp_us,y_mm,z_mm\n5000,569.5,\n15000,,-93\n"
 TRUTH = "t_s,y_mm\n0.0,560.25\n0.1,561.25\n"
 
@@ -41,8 +41,8 @@ time = "t_s"
 radial = "y_mm"
 """
 SINGLE = (
-    "time_s,command.vertical_mm,command.radial_mm,tracker.radial_um,reference.radial_m\n"
-    "0,10,560,,\n0.01,,,569500,\n0.028,20,,,0.5\n0.03,,,,\n"
+    "time_s,command.vertical_mm,command.radial_mm,tracker.radial_um,reference.radial_m,weather,speed_mm_s\n"
+    "0,10,560,,,dry,1\n0.01,,,569500,,,\n0.028,20,,,0.5,,\n0.03,,,,,,\n"
 )
 COLUMNS = "t_ms, nominal_mm, correction_um, z_m, note"
 
@@ -78,28 +78,18 @@ def check_source(source: Source, stamp: list[int], **values: list[float]) -> Non
 
 
 def test_a_manifest_says_where_everything_stands(folder: Path) -> None:
-    """Commands are sums of columns in metres; each source has its own clock, and empty cells are NaN."""
-    run = read(folder, 'name = "scan1"\n' + COMMAND + SENSOR + REFERENCE + "sd_mm = 0.02\n")
+    """Commands are sums of columns, if all have a value; each source has its own clock; empty cells are NaN."""
+    start = "start = { radial_um = 560500 }\n"
+    run = read(folder, 'name = "scan1"\n' + COMMAND + start + SENSOR + REFERENCE + "sd_mm = 0.02\n")
     assert run.name == "scan1"
     assert run.axes == ("radial", "vertical")
-    check_source(run.command, [0, 28_000_000], radial=[0.5605, 0.5605], vertical=[0.1, 0.2])
+    stamp = [0, 28_000_000, 56_000_000]
+    check_source(run.command, stamp, radial=[0.5605, 0.5605, np.nan], vertical=[0.1, 0.2, 0.2])
     check_source(run.sensors["tracker"], [5_000_000, 15_000_000], radial=[0.5695, np.nan], vertical=[np.nan, -0.093])
-    assert isinstance(run.reference, Reference)
+    assert run.reference is not None
     check_source(run.reference, [0, 100_000_000], radial=[0.56025, 0.56125])
     assert run.reference.sd == 2e-5
-    assert (run.start, run.clock, run.notes) == ({}, "stamps", ())
-
-
-def test_a_sum_with_an_empty_part_is_no_command(folder: Path) -> None:
-    """Where one of the columns to add has nothing the sum has nothing, never the other part alone."""
-    (folder / "host.csv").write_text("t_ms,nominal_mm,correction_um,z_m\n0,560,500,0\n28,561,,1\n56,562,0,2\n")
-    np.testing.assert_array_equal(read(folder, COMMAND).command.values["radial"], [0.5605, np.nan, 0.562])
-
-
-@pytest.mark.parametrize("key", ["radial_mm = 560.5", "radial_m = 0.5605", "radial_um = 560500"])
-def test_the_start_level_is_in_the_unit_of_its_key(folder: Path, key: str) -> None:
-    """`start` gives the level of an axis before its first command, in the unit of its key."""
-    assert read(folder, COMMAND + f"start = {{ {key} }}\n").start == {"radial": 0.5605}
+    assert (run.start, run.clock, run.notes) == ({"radial": 0.5605}, "stamps", ())
 
 
 def test_notes_of_a_table_are_noted_once(folder: Path) -> None:
@@ -118,26 +108,20 @@ MANIFEST_REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "command is a number": ("command = 3", ("run.toml", "command", "table")),
     "command without file": ('[command]\ntime = "t_ms"\nradial = "z_m"', ("run.toml", "'command.file'")),
     "file is absent": (COMMAND.replace("host", "absent"), ("absent.csv", "no such file")),
-    "file with a null character": (COMMAND.replace("host.csv", "a\\u0000b"), ("no such file",)),
+    "file with a null character": (COMMAND.replace("host.csv", "a\\u0000b"), ("NUL",)),
     "time is absent": (COMMAND.replace("t_ms", "t_s"), ("host.csv", "'t_s'", "did you mean 't_ms'", COLUMNS)),
-    "time is a length": (COMMAND.replace("t_ms", "z_m"), ("host.csv", "'z_m'", "_s, _ms, _us, _ns")),
     "column is a number": (COMMAND.replace('"z_m"', "3"), ("run.toml", "command.vertical", "column")),
     "column is absent": (COMMAND.replace("z_m", "y_m"), ("host.csv", "'y_m'", "did you mean 'z_m'", COLUMNS)),
     "column has no unit": (COMMAND.replace("z_m", "note"), ("host.csv", "'note'", "_m, _mm, _um")),
     "start without unit": (COMMAND + "start = { radial = 560.0 }", ("run.toml", "command.start.radial", "radial_mm")),
-    "start is nan": (COMMAND + "start = { radial_mm = nan }", ("run.toml", "radial_mm", "finite")),
     "start of an unknown axis": (COMMAND + "start = { radail_mm = 1.0 }", ("'radail'", "did you mean 'radial'")),
     "clock is unknown": (COMMAND + 'clock = "exact"', ("run.toml", "command.clock", "'exact'")),
     "sensors is a number": ("sensors = 3\n" + COMMAND, ("run.toml", "sensors", "table")),
-    "sensor is a number": (COMMAND + "[sensors]\ntracker = 3", ("run.toml", "sensors.tracker", "table")),
     "sensor of an unknown axis": (COMMAND + SENSOR + 'radail = "y_mm"', ("tracker", "'radail'", "radial, vertical")),
     "sensor with noise": (COMMAND + SENSOR + "sd_mm = 0.1", ("run.toml", "sensors.tracker.sd_mm", "column")),
     "reference with negative sd": (COMMAND + REFERENCE + "sd_mm = -1.0", ("run.toml", "reference.sd_mm", "0")),
-    "reference with infinite sd": (COMMAND + REFERENCE + "sd_mm = inf", ("run.toml", "sd_mm", "finite")),
     "unknown key": ("commands = 3\n" + COMMAND, ("run.toml", "'commands'", "did you mean 'command'", "sensors")),
     "not TOML": ("command file host.csv", ("run.toml", "TOML")),
-    "huge integer with unit": (f"x_mm = {'9' * 400}\n{COMMAND}", ("run.toml", "x_mm", "finite")),
-    "endless exponent": (f"x = 1e{'9' * 20}\n{COMMAND}", ("run.toml", "out of range")),
     "endless nesting": (f"x = {'[' * 5000}{']' * 5000}\n{COMMAND}", ("run.toml", "nest")),
 }
 
@@ -147,57 +131,30 @@ def test_a_wrong_manifest_is_refused_in_one_line(folder: Path, case: str) -> Non
     """Wrong keys, types and names are one line with the file, the key and what would be accepted."""
     manifest, named = MANIFEST_REFUSALS[case]
     text = refusal(lambda: read(folder, manifest))
-    for words in named:
-        assert words in text
-
-
-def test_a_manifest_that_is_no_text_is_refused(folder: Path) -> None:
-    """Bytes that are not UTF-8 are refused in one line."""
-    (folder / "run.toml").write_bytes(b"\xff\xfe[command]")
-    assert "UTF-8" in refusal(lambda: Run.read(folder), ConfigError)
+    assert all(words in text for words in named), text
 
 
 def test_a_path_without_a_run_is_refused(tmp_path: Path) -> None:
-    """An absent file, and a folder without run.toml, are refused with what to do."""
-    for name in ("absent", "absent.toml", "null\0character", "null\0character.csv"):
+    """Nothing there, and a folder without run.toml."""
+    for name in ("absent", "absent.toml", "absent.csv", ""):
         assert "no such file" in refusal(lambda name=name: Run.read(tmp_path / name))
-    text = refusal(lambda: Run.read(tmp_path), RunError)
-    assert str(tmp_path) in text
-    assert "run.toml" in text
 
 
 def test_a_single_table_holds_every_source(tmp_path: Path) -> None:
     """Each source has the rows where it says something, in the units of its columns."""
     run = single(tmp_path, SINGLE)
-    assert run.name == "log"
-    assert run.axes == ("radial", "vertical")
+    assert (run.name, run.axes) == ("log", ("radial", "vertical"))
     check_source(run.command, [0, 28_000_000], radial=[0.56, np.nan], vertical=[0.01, 0.02])
     assert list(run.sensors) == ["tracker"]
     check_source(run.sensors["tracker"], [10_000_000], radial=[0.5695])
     assert run.reference is not None
     check_source(run.reference, [28_000_000], radial=[0.5])
-    assert run.notes == ()
-
-
-def test_a_single_parquet_table_says_what_the_csv_says(tmp_path: Path) -> None:
-    """Parquet with nulls, and ns stamps of today, is the same single table."""
-    origin = 1_700_000_000_123_456_789
-    columns: dict[str, list[Any]] = {
-        "time_ns": [origin, origin + 10_000_000, None],
-        "command.radial_mm": [560.0, None, 561.0],
-        "tracker.radial_um": [None, 569500.0, None],
-    }
-    papq.write_table(pa.table(columns), tmp_path / "log.parquet")
-    run = Run.read(tmp_path / "log.parquet")
-    check_source(run.command, [origin, NO_STAMP], radial=[0.56, 0.561])
-    check_source(run.sensors["tracker"], [origin + 10_000_000], radial=[0.5695])
-
-
-def test_columns_of_no_source_are_noted(tmp_path: Path) -> None:
-    """Columns that belong to no source are left out and named in one note."""
-    run = single(tmp_path, "time_s,command.radial_mm,weather,speed_mm_s\n0,560,dry,1\n")
     (note,) = run.notes
-    assert "weather, speed_mm_s" in note
+    assert "<source>.<axis>_mm are not used: weather, speed_mm_s" in note
+    papq.write_table(pacsv.read_csv(tmp_path / "log.csv"), tmp_path / "log.parquet")
+    again = Run.read(tmp_path / "log.parquet")
+    for one, other in ((run.command, again.command), (run.sensors["tracker"], again.sensors["tracker"])):
+        check_source(one, other.stamp.tolist(), **other.values)
 
 
 @pytest.mark.parametrize(
@@ -208,25 +165,15 @@ def test_columns_of_no_source_are_noted(tmp_path: Path) -> None:
         ("time_x,command.radial_mm", ("time_x", "_s, _ms, _us, _ns")),
         ("time_s,tracker.radial_mm", ("command.<axis>_mm", "tracker.radial_mm")),
         ("time_s,command.radial", ("'command.radial'", "_m, _mm, _um")),
-        ("time_s,command.radial_mm,command.radial_m", ("two columns", "command.radial")),
         ("time_s,command.radial_mm,tracker.radial_mm,tracker.radial_um", ("two columns", "tracker.radial")),
         ("time_s,command.radial_mm,tracker.vertical_mm", ("tracker", "'vertical'", "radial")),
-        ("time_s,command.radial_mm,reference.vertical_mm", ("reference", "'vertical'", "radial")),
     ],
 )
 def test_a_wrong_single_table_is_refused_in_one_line(tmp_path: Path, header: str, named: tuple[str, ...]) -> None:
     """A table without its time, commands or a unit, with an axis twice or not commanded: one line, with names."""
     row = ",".join(["1"] * len(header.split(",")))
     text = refusal(lambda: single(tmp_path, f"{header}\n{row}\n"))
-    for words in named:
-        assert words in text
-
-
-@pytest.mark.parametrize("rows", ["0,\n1,\n", ",1\n,2\n", "0,inf\n1,-inf\n", "0,\n,1\n"])
-def test_commands_without_one_that_has_both_stamp_and_value_are_refused(tmp_path: Path, rows: str) -> None:
-    """A run in which nothing was commanded is refused by the name of the axis."""
-    text = refusal(lambda: single(tmp_path, f"time_s,command.radial_mm\n{rows}"), RunError)
-    assert "'radial'" in text
+    assert all(words in text for words in named), text
 
 
 def test_arrays_are_copied() -> None:
@@ -251,13 +198,9 @@ def test_stamps_of_arrays_are_seconds_or_whole_nanoseconds() -> None:
     seconds = [0.1, np.nan, 123456.000000001, np.inf]
     run = Run.from_arrays(seconds, {"radial": np.zeros(4)})
     assert run.command.stamp.tolist() == [100_000_000, NO_STAMP, 123_456_000_000_001, NO_STAMP]
-
-
-def test_stamps_of_arrays_may_be_dates() -> None:
-    """datetime64 of any unit is exact, from 1970 on and before it; NaT means no stamp."""
-    stamps = [1_700_000_000_123_456_789, NO_STAMP, -1]
-    run = Run.from_arrays(np.array(stamps).view("M8[ns]"), {"radial": np.zeros(3)})
-    assert run.command.stamp.tolist() == stamps
+    dates = [*stamps, NO_STAMP, -1]  # datetime64 of any unit is exact, from 1970 on and before it
+    run = Run.from_arrays(np.array(dates).view("M8[ns]"), {"radial": np.zeros(4)})
+    assert run.command.stamp.tolist() == dates
     run = Run.from_arrays(np.array(["1970-01-02", "NaT"], "M8[D]"), {"radial": np.zeros(2)})
     assert run.command.stamp.tolist() == [86_400_000_000_000, NO_STAMP]
 
@@ -270,10 +213,18 @@ ARRAY_REFUSALS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "two dimensions": ({"time": [[0.0]], "command": {"radial": [[1.0]]}}, ("command", "(1, 1)")),
     "no axis": ({"command": {}}, ("command",)),
     "no stamps": ({"time": [np.nan, np.inf]}, ("command", "radial")),
+    "stamp and value in no row": ({"time": [0.0, np.nan], "command": {"radial": [np.inf, 1.0]}}, ("command", "radial")),
+    "sensor of an unknown axis": (
+        {"sensors": {"tracker": ([0.0], {"yaw": [1.0]})}},
+        ("sensor tracker", "yaw", "radial"),
+    ),
+    "reference of an unknown axis": ({"reference": ([0.0], {"vertical": [1.0]})}, ("reference", "vertical", "radial")),
+    "start of an unknown axis": ({"start": {"vertical": 1.0}}, ("start", "vertical", "accepted: radial")),
     "text for values": ({"command": {"radial": ["a", "b"]}}, ("command", "number")),
     "text for stamps": ({"time": ["a", "b"]}, ("command", "stamp")),
     "seconds beyond reach": ({"time": [0.0, 4.6e9]}, ("command", "stamp")),
     "nanoseconds beyond reach": ({"time": [0, -4_600_000_000_000_000_000]}, ("command", "stamp")),
+    "dates beyond reach": ({"time": np.array(["1970-01-01", "2200-01-01"], "M8[D]")}, ("command", "stamp")),
     "stamps beyond any integer": ({"time": [0, 2**70]}, ("command", "stamp")),
     "sensor with too few values": ({"sensors": {"tracker": ([0.0, 1.0], {"radial": [1.0]})}}, ("tracker", "radial")),
     "reference beyond reach": ({"reference": ([5e9], {"radial": [1.0]})}, ("reference", "stamp")),
@@ -288,20 +239,4 @@ def test_arrays_that_do_not_fit_are_refused(case: str) -> None:
     """Lengths that differ, sources that say nothing and stamps beyond reach: one line that names the source."""
     more, named = ARRAY_REFUSALS[case]
     text = refusal(lambda: Run.from_arrays(**{"time": [0.0, 1.0], "command": {"radial": [0.0, 1.0]}, **more}))
-    for words in named:
-        assert words in text
-
-
-@pytest.mark.parametrize("place", ["sensor", "reference", "start"])
-def test_an_axis_that_is_not_commanded_is_refused_everywhere(place: str) -> None:
-    """Sensors, reference and start level may only name commanded axes; the error carries the names."""
-    rows = ([0.0], {"vertical": [1.0]})
-    more: dict[str, Any] = {
-        "sensor": {"sensors": {"tracker": rows}},
-        "reference": {"reference": rows},
-        "start": {"start": {"vertical": 1.0}},
-    }[place]
-    with pytest.raises(UnknownNameError) as caught:
-        Run.from_arrays([0.0], {"tangential": [1.0], "radial": [1.0]}, **more)
-    assert (caught.value.name, caught.value.accepted) == ("vertical", ("tangential", "radial"))
-    assert place in str(caught.value)
+    assert all(words in text for words in named), text

@@ -63,24 +63,17 @@ def test_lengths_are_the_exact_quotient_by_their_unit(tmp_path: Path, unit: str,
     assert note is None
 
 
-@properties
-@given(st.lists(st.integers(-(2**63), 2**64), min_size=1, max_size=20))
-def test_whole_lengths_of_any_size_are_numbers(tmp_path: Path, values: list[int]) -> None:
-    """Integers beyond 2^53, and beyond int64, are lengths to a float's precision."""
-    got, note = column(tmp_path, "x_mm", [str(value) for value in values]).numbers("x_mm")
-    np.testing.assert_allclose(got, [value / 1000 for value in values], rtol=4e-16, atol=0)  # rounded twice
-    assert note is None
-
-
 @pytest.mark.parametrize("unit", TIMES)
 @properties
 @given(st.data())
 def test_whole_stamps_are_exact_in_every_unit(tmp_path: Path, unit: str, data: st.DataObject) -> None:
-    """Integer stamps come out in ns without a rounding, wherever within reach they lie."""
+    """Integer stamps come out in ns without a rounding, wherever within reach they lie, also beside gaps and words."""
     limit = LAST_S * 10 ** (9 - TIMES[unit])
     stamps = data.draw(st.lists(st.integers(-limit, limit), min_size=1, max_size=20))
-    got, _ = column(tmp_path, f"t{unit}", [str(stamp) for stamp in stamps]).stamps(f"t{unit}")
-    assert got.tolist() == [stamp * 10 ** TIMES[unit] for stamp in stamps]
+    bad = data.draw(st.lists(st.sampled_from(["", "NaN", " ", "word"]), max_size=1))
+    got, note = column(tmp_path, f"t{unit}", [*map(str, stamps), *bad]).stamps(f"t{unit}")
+    assert got.tolist() == [*(stamp * 10 ** TIMES[unit] for stamp in stamps), *([NO_STAMP] if bad else [])]
+    assert (note is not None) == (bad == ["word"])
 
 
 @pytest.mark.parametrize("unit", ["_s", "_ms", "_us"])
@@ -92,14 +85,6 @@ def test_decimal_stamps_of_a_run_are_exact(tmp_path: Path, unit: str, stamps: li
     assert column(tmp_path, f"t{unit}", [*cells, "0.5"]).stamps(f"t{unit}")[0].tolist()[:-1] == stamps
 
 
-@pytest.mark.parametrize("bad", ["", "NaN", " ", "word"])
-def test_epoch_stamps_in_nanoseconds_stay_exact_beside_a_bad_cell(tmp_path: Path, bad: str) -> None:
-    """int64 ns of today keep their last digit in a column with gaps or words."""
-    got, note = column(tmp_path, "t_ns", [str(EPOCH_NS), bad, str(EPOCH_NS + 1), str(-EPOCH_NS)]).stamps("t_ns")
-    assert got.tolist() == [EPOCH_NS, NO_STAMP, EPOCH_NS + 1, -EPOCH_NS]
-    assert (note is not None) == (bad == "word")
-
-
 @pytest.mark.parametrize("zone", ["", "Z"])
 def test_calendar_stamps_are_exact(tmp_path: Path, zone: str) -> None:
     """Dates with a time are ns since 1970 in UTC, to the last digit."""
@@ -107,56 +92,44 @@ def test_calendar_stamps_are_exact(tmp_path: Path, zone: str) -> None:
     assert column(tmp_path, "t_s", cells).stamps("t_s")[0].tolist() == [EPOCH_NS, NO_STAMP, -1]
 
 
-@pytest.mark.parametrize("blank", ["", "NaN", "nan", "NA", "N/A", "NULL", "null", "None", '""'])
+BLANKS = ("", "NaN", "nan", "NA", "N/A", "NULL", "null", "None", '""')
+WORDS = ("bad", "1_000", "0x10", "1.5.2", "--1", "1e", "+", "−1.5", "1 5", "٣", '"1,5"')
+CELLS = {
+    **dict.fromkeys(BLANKS, np.nan),
+    **dict.fromkeys(["+1.5", "1.5", " 1.5 ", '"1.5"', "15e-1", "1.5E+0", "0001.5"], 1.5),
+    "inf": np.inf,
+    "-inf": -np.inf,
+    "Inf": np.inf,
+    "1e400": np.inf,
+    str(2**64): 2.0**64,
+}
+
+
 @pytest.mark.parametrize("words", [[], ["word"]])
-def test_a_blank_cell_is_missing_and_no_word(tmp_path: Path, blank: str, words: list[str]) -> None:
-    """A cell that says "nothing here" is missing without a note, also in a column that holds words elsewhere."""
-    cells = ["1", blank, "3", *words]
-    values, note = column(tmp_path, "x_mm", cells).numbers("x_mm")
-    np.testing.assert_array_equal(values[:3], [1e-3, np.nan, 3e-3])
-    assert (note is None) == (not words)
-    stamps, _ = column(tmp_path, "t_s", cells).stamps("t_s")
-    assert stamps[:3].tolist() == [10**9, NO_STAMP, 3 * 10**9]
-
-
-@pytest.mark.parametrize(("cell", "value"), [("inf", np.inf), ("-inf", -np.inf), ("Inf", np.inf), ("1e400", np.inf)])
-@pytest.mark.parametrize("words", [[], ["word"]])
-def test_an_infinite_cell_stays_infinite_and_is_no_stamp(
-    tmp_path: Path, cell: str, value: float, words: list[str]
-) -> None:
-    """Infinity is kept for the timeline to call invalid; as a stamp it is missing."""
-    assert column(tmp_path, "x_mm", [cell, "1", *words]).numbers("x_mm")[0][0] == value
-    assert column(tmp_path, "t_s", [cell, "1", *words]).stamps("t_s")[0][0] == NO_STAMP
-
-
-@pytest.mark.parametrize("cell", ["+1.5", "1.5", " 1.5 ", '"1.5"', "15e-1", "1.5E+0", "0001.5"])
-@pytest.mark.parametrize("words", [[], ["word"]])
+@pytest.mark.parametrize("cell", CELLS)
 def test_one_number_however_written(tmp_path: Path, cell: str, words: list[str]) -> None:
-    """Sign, blanks, quotes, exponent and leading zeros change nothing, also beside words."""
-    assert column(tmp_path, "x_mm", [cell, "2", *words]).numbers("x_mm")[0][0] == 1.5e-3
+    """Also beside words; a blank cell is missing and no word; infinity is kept as a value and is no stamp."""
+    values, note = column(tmp_path, "x_mm", ["1", cell, *words]).numbers("x_mm")
+    np.testing.assert_allclose(values[:2], [1e-3, CELLS[cell] / 1e3], rtol=4e-16)
+    assert (note is None) == (not words)
+    if cell != str(2**64):
+        ns = CELLS[cell] * 1e9
+        stamps, _ = column(tmp_path, "t_s", ["1", cell, *words]).stamps("t_s")
+        assert stamps[:2].tolist() == [10**9, int(ns) if np.isfinite(ns) else NO_STAMP]
 
 
-@pytest.mark.parametrize("cell", ["bad", "1_000", "0x10", "1.5.2", "--1", "1e", "+", "−1.5", "1 5", "٣", '"1,5"'])
+@pytest.mark.parametrize("cell", WORDS)
 def test_words_are_missing_and_noted_once(tmp_path: Path, cell: str) -> None:
     """Cells that are no number are missing; one note has how many, the first of them and its row."""
     values, note = column(tmp_path, "x_mm", ["1", cell, "3", "worse"]).numbers("x_mm")
     np.testing.assert_array_equal(values, [1e-3, np.nan, 3e-3, np.nan])
-    assert note is not None
-    assert "2 cells" in note
-    assert "x_mm" in note
-    assert f"'{cell.strip(chr(34))}'" in note
-    assert "row 2" in note
+    shown = cell.strip('"')
+    assert f"2 cells of column 'x_mm' without a number, first '{shown}' in row 2" in str(note)
 
 
 @pytest.mark.parametrize(
     ("first", "far", "missing"),
-    [
-        ("1", "word", True),
-        ("1", "2.5", False),
-        ("", "2.5", False),
-        ("2024-01-01", "2.5", False),
-        ("true", "2.5", False),
-    ],
+    [("1", "word", True), ("1", "2.5", False), ("", "2.5", False), ("2024-01-01", "2.5", False)],
 )
 def test_a_cell_beyond_the_first_block_may_be_of_another_kind(
     tmp_path: Path, first: str, far: str, missing: bool
@@ -173,21 +146,18 @@ def test_a_cell_beyond_the_first_block_may_be_of_another_kind(
 
 
 @pytest.mark.parametrize(
-    ("body", "kept", "words"),
+    ("body", "kept", "said"),
     [
-        ("0,1,2\n1,2,3\n2,3", [0, 1], ("1 line", "2 cells", "has 3", "line 4")),  # torn in the middle of the last line
-        ("0,1,2\n1\n2,3,4\n3\n", [0, 2], ("2 lines", "1 cells", "has 3", "line 3")),
-        ("0,1,2\n1,2,3,4\n2,3,4\n", [0, 2], ("1 line", "4 cells", "has 3", "line 3")),
+        ("0,1,2\n1,2,3\n2,3", [0, 1], "1 line left out: 2 cells where the header has 3, first in line 4"),
+        ("0,1,2\n1\n2,3,4\n3\n", [0, 2], "2 lines left out: 1 cells where the header has 3, first in line 3"),
+        ("0,1,2\n1,2,3,4\n2,3,4\n", [0, 2], "1 line left out: 4 cells where the header has 3, first in line 3"),
     ],
 )
-def test_a_torn_line_is_left_out_and_noted(tmp_path: Path, body: str, kept: list[int], words: tuple[str, ...]) -> None:
+def test_a_torn_line_is_left_out_and_noted(tmp_path: Path, body: str, kept: list[int], said: str) -> None:
     """A line of another length than the header is left out; one note has how many and where the first is."""
     table = csv(tmp_path, f"t_s,x_mm,y_mm\n{body}")
     assert table.stamps("t_s")[0].tolist() == [10**9 * second for second in kept]
-    assert table.rows == len(kept)
-    (note,) = table.notes
-    for part in words:
-        assert part in note
+    assert table.notes == (f"log.csv: {said}",)
 
 
 @pytest.mark.parametrize(
@@ -229,13 +199,7 @@ def test_gzip_and_parquet_say_what_the_csv_says(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "value"),
-    [
-        (pa.float16(), np.float16(2.0)),
-        (pa.float32(), 2.0),
-        (pa.uint8(), 2),
-        (pa.large_string(), "2"),
-        (pa.null(), None),
-    ],
+    [(pa.float16(), np.float16(2.0)), (pa.uint8(), 2), (pa.large_string(), "2"), (pa.null(), None)],
     ids=str,
 )
 def test_parquet_kinds_that_are_numbers(tmp_path: Path, kind: pa.DataType, value: object) -> None:
@@ -245,10 +209,9 @@ def test_parquet_kinds_that_are_numbers(tmp_path: Path, kind: pa.DataType, value
     assert table.stamps("t_s")[0].tolist() == [NO_STAMP if value is None else 2 * 10**9]
 
 
-GARBAGE = random.Random(0).randbytes(5000)
-
 UNREADABLE: dict[str, tuple[str, bytes | None, str]] = {
     "absent": ("log.csv", None, "no such file"),
+    "folder": ("", None, "cannot be read"),
     "empty": ("log.csv", b"", "empty"),
     "header, no newline": ("log.csv", b"t_s,x_mm", "Empty CSV"),
     "column twice": ("log.csv", b"t_s,x_mm,x_mm\n0,1,2\n", "two columns are named 'x_mm'"),
@@ -283,48 +246,33 @@ def test_a_header_without_rows_is_a_table_of_no_rows(tmp_path: Path, name: str) 
     """Its columns are read as nothing, and a note says so with the file's name."""
     text, path = b"t_s,x_mm\n", tmp_path / name
     if name.endswith(".parquet"):
-        papq.write_table(pa.table({"t_s": pa.array([], pa.float64()), "x_mm": pa.array([], pa.float64())}), path)
+        written(tmp_path, t_s=pa.array([], pa.float64()), x_mm=pa.array([], pa.float64()))
     else:
         path.write_bytes(gzip.compress(text) if name.endswith(".gz") else text)
     table = tables.read(path)
-    assert table.rows == 0
     assert table.notes == (f"{name}: the table has no rows",)
-    stamp, values = table.stamps("t_s")[0], table.numbers("x_mm")[0]
-    assert (stamp.shape, stamp.dtype) == ((0,), np.int64)
-    assert (values.shape, values.dtype) == ((0,), np.float64)
-
-
-@pytest.mark.parametrize("name", ["folder", "folder.csv", "folder.parquet"])
-def test_a_folder_is_no_table(tmp_path: Path, name: str) -> None:
-    """A folder where a table is expected is refused in one line."""
-    (tmp_path / name).mkdir()
-    assert name in refusal(lambda: tables.read(tmp_path / name))
+    for found, kind in ((table.stamps("t_s")[0], np.int64), (table.numbers("x_mm")[0], np.float64)):
+        assert (found.shape, found.dtype) == ((0,), kind)
 
 
 def test_a_column_that_is_not_there_is_refused_with_those_that_are(tmp_path: Path) -> None:
     """An unknown column is an error that lists the columns, the closest first, and carries the names as data."""
     table = csv(tmp_path, "t_s,x_mm,y_mm\n0,1,2\n")
     for call, name in ((table.numbers, "z_mm"), (table.stamps, "t_ms"), (table.numbers, "")):
-        with pytest.raises(UnknownNameError) as caught:
+        with pytest.raises(UnknownNameError, match=f"{table.path}: unknown column '{name}'") as caught:
             call(name)
-        assert caught.value.name == name
-        assert caught.value.accepted == ("t_s", "x_mm", "y_mm")
-        assert f"{table.path}: unknown column '{name}'" in str(caught.value)
-        assert "t_s, x_mm, y_mm" in str(caught.value)
+        assert (caught.value.name, caught.value.accepted) == (name, ("t_s", "x_mm", "y_mm"))
     assert "did you mean 't_s'?" in refusal(lambda: table.stamps("t_ms"))
 
 
 def test_a_column_without_its_unit_is_refused_with_the_accepted_ones(tmp_path: Path) -> None:
     """A length needs an ending of length and a stamp one of time; the error names them and gives an example."""
     table = csv(tmp_path, "t,t_s,x,x_mm,v_mm_s,x_MM\n0,0,0,0,0,0\n")
-    for name in ("x", "t_s", "v_mm_s", "x_MM"):
-        text = refusal(lambda name=name: table.numbers(name))
-        assert f"'{name}'" in text
-        assert "_m, _mm, _um" in text
-    for name in ("t", "x_mm"):
-        text = refusal(lambda name=name: table.stamps(name))
-        assert f"'{name}'" in text
-        assert "_s, _ms, _us, _ns" in text
+    wanted = [(table.numbers, name, "_m, _mm, _um") for name in ("x", "t_s", "v_mm_s", "x_MM")]
+    wanted += [(table.stamps, name, "_s, _ms, _us, _ns") for name in ("t", "x_mm")]
+    for call, name, accepted in wanted:
+        text = refusal(lambda call=call, name=name: call(name))
+        assert f"'{name}'" in text and accepted in text
 
 
 @pytest.mark.parametrize("cell", ["true", "2024-01-01", "10:00:00"])
@@ -334,36 +282,16 @@ def test_a_column_of_another_kind_is_refused(tmp_path: Path, cell: str) -> None:
     assert "not numbers" in refusal(lambda: column(tmp_path, "t_s", [cell, cell]).stamps("t_s"))
 
 
-@pytest.mark.parametrize("unit", ["_s", "_ms", "_us"])
-@pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize("ending", ["", ".0", "\nword"])
-def test_a_stamp_beyond_reach_is_refused_and_the_last_within_is_not(
-    tmp_path: Path, unit: str, sign: int, ending: str
-) -> None:
-    """Stamps below 4.6e18 ns, whose differences int64 can hold, are read; a second later they are refused by row."""
-    name = f"t{unit}"
-
-    def stamps(second: int) -> list[int]:
-        cell = f"{sign * second * 10 ** (9 - TIMES[unit])}{ending}"
-        return column(tmp_path, name, ["0", *cell.split()]).stamps(name)[0].tolist()
-
-    assert stamps(LAST_S)[1] == sign * LAST_S * 10**9
-    text = refusal(lambda: stamps(LAST_S + 1))
-    assert f"'{name}'" in text
-    assert "row 2" in text
-
-
 @pytest.mark.parametrize(
     "cells",
     [
-        ["9000000000000000000", "-9000000000000000000"],
+        [str(LAST_S * 10**9), str(-(LAST_S + 1) * 10**9)],
         ["9223372036854775807"],
         ["9223372036854775808"],
         ["9999999999999999999", "word"],
         ["1e300"],
         ["2200-01-01T00:00:00"],
         ["1800-01-01T00:00:00"],
-        ["9999-01-01T00:00:00"],
     ],
 )
 def test_stamps_too_far_from_1970_are_refused_in_one_line(tmp_path: Path, cells: list[str]) -> None:
@@ -407,11 +335,3 @@ def test_a_growing_file_read_at_any_moment(tmp_path_factory: pytest.TempPathFact
     assert table.stamps("t_ns")[0].tolist() == [stamp for stamp, _ in rows[:whole]]
     np.testing.assert_array_equal(table.numbers("x_mm")[0], [x / 1e3 for _, x in rows[:whole]])
     assert there.endswith("\n") != any("may be torn" in note for note in table.notes)
-
-
-def test_a_compressed_table_is_whole(tmp_path: Path) -> None:
-    """A gzip that was torn cannot be read at all; one that can has all it should."""
-    (tmp_path / "log.csv.gz").write_bytes(gzip.compress(b"t_ns,x_mm\n1,2\n3,4"))
-    table = tables.read(tmp_path / "log.csv.gz", growing=True)
-    assert table.rows == 2
-    assert table.notes == ()

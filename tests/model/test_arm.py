@@ -15,7 +15,6 @@ from pumafuse.model.plants import FirstOrder, SecondOrder
 from pumafuse.units import ending
 
 TOP = "name, update_period_ms, delay_ms, delay_ms_ci95, validity, axes, provenance"
-GAIN = "slope_s_m, intercept, slope_s_m_ci95, intercept_ci95"
 
 ARM = """\
 name = "bench"
@@ -34,11 +33,14 @@ time_constant_ms = 42.5
 gain = { slope_s_m = 0.0818, intercept = 0.933 }
 gain_recovery_ms = 100.0
 delay_ms = 38.5
+delay_ms_ci95 = [38.0, 39]
+[provenance]
+window_ms = 169
+date = 2024-05-01
 """
 
-finite = st.floats(allow_nan=False, allow_infinity=False)
-positive = st.floats(min_value=0.0, exclude_min=True, allow_nan=False, allow_infinity=False)
-not_negative = st.just(0.0) | positive
+finite = st.floats(-1e9, 1e9)
+positive = st.floats(0.0, 1e9, exclude_min=True)
 interval = st.none() | st.tuples(finite, finite)
 word = st.text(max_size=8)
 
@@ -56,7 +58,7 @@ axis_models = st.builds(
     plant=first_order | second_order,
     gain=gains,
     gain_recovery=st.none() | positive,
-    delay=st.none() | st.floats(0.0, 1e6),
+    delay=st.none() | st.floats(0.0, 1e4),
     delay_ci95=interval,
 )
 provenance = st.fixed_dictionaries(
@@ -75,7 +77,7 @@ arms = st.builds(
     ArmModel,
     name=word,
     update_period=positive,
-    delay=st.floats(0.0, 1e6),
+    delay=st.floats(0.0, 1e4),
     delay_ci95=interval,
     validity=st.builds(Validity, max_speed=st.none() | positive, max_radius=st.none() | positive),
     axes=st.dictionaries(axis_names, axis_models, min_size=1, max_size=4),
@@ -116,7 +118,7 @@ def test_numbers_are_converted_without_rounding_twice(tmp_path_factory: pytest.T
 
 
 def test_file_is_in_file_units_and_python_in_si(load) -> None:
-    """Each key of the file lands in its attribute, in SI; what is absent has its default."""
+    """Each key of the file lands in its attribute, in SI, but provenance; what is absent has its default."""
     assert load(ARM) == ArmModel(
         name="bench",
         update_period=0.028,
@@ -129,22 +131,10 @@ def test_file_is_in_file_units_and_python_in_si(load) -> None:
                 gain=Gain(slope=0.0818, intercept=0.933),
                 gain_recovery=0.1,
                 delay=0.0385,
+                delay_ci95=(0.038, 0.039),
             ),
         },
-    )
-
-
-def test_intervals_are_in_the_unit_of_their_key(load) -> None:
-    """A key ending in _ci95 takes the unit before it."""
-    arm = load(
-        ARM.replace("60.45", "60.45\ndelay_ms_ci95 = [60.0, 61]")
-        .replace("42.5", "42.5\ntime_constant_ms_ci95 = [40.0, 45.0]")
-        .replace("0.864", "0.864\ndamping_ci95 = [0.8, 0.9]\nnatural_frequency_rad_s_ci95 = [50.0, 55.0]")
-    )
-    assert arm.delay_ci95 == (0.06, 0.061)
-    assert arm.axes["radial"].plant == FirstOrder(time_constant=0.0425, time_constant_ci95=(0.04, 0.045))
-    assert arm.axes["tangential"].plant == SecondOrder(
-        natural_frequency=53.9, damping=0.864, natural_frequency_ci95=(50.0, 55.0), damping_ci95=(0.8, 0.9)
+        provenance={"window_ms": 169, "date": datetime.date(2024, 5, 1)},
     )
 
 
@@ -165,25 +155,15 @@ def test_presets_are_table_ii(preset: str, delay: float) -> None:
         assert arm.axes[name] == AxisModel(plant=plant, gain=gain, gain_recovery=0.1)
 
 
-def test_a_preset_can_be_saved_and_edited(tmp_path: Path) -> None:
-    """A preset written to a file is the same arm, and a path to it is taken as text too."""
-    preset = ArmModel.load("puma560-internal")
-    preset.save(tmp_path / "arm.toml")
-    assert ArmModel.load(str(tmp_path / "arm.toml")) == preset
-
-
 REFUSED = {
     "unknown key": ("[validity]", "colour = 3\n[validity]", "'colour'", TOP),
-    "unknown table": ("[validity]", "[validty]", "'validty'; did you mean 'validity'", TOP),
     "unknown key below": ("max_speed_m_s", "speed_m_s", "'validity.speed_m_s'", "max_speed_m_s, max_radius_mm"),
-    "unknown gain key": ("slope_s_m", "slope", "'axes.radial.gain.slope'; did you mean 'slope_s_m'", GAIN),
+    "unknown gain key": ("slope_s_m", "slope", "'axes.radial.gain.slope'; did you mean 'slope_s_m'", "intercept_ci95"),
     "missing unit of a plant": ("natural_frequency_rad_s", "natural_frequency", "'axes.tangential.natural_frequency'",
                                 "natural_frequency_rad_s"),
-    "unit of another kind": ("60.45", "60.45\ndelay_s = 0.06", "'delay_s'; did you mean 'delay_ms'", TOP),
     "key of the other plant": ("0.864", "0.864\ntime_constant_ms = 3.0", "'axes.tangential.time_constant_ms'",
                                "natural_frequency_rad_s, damping"),
     "text for a number": ("28.0", '"28"', "update_period_ms", "float"),
-    "list for a number": ("42.5", "[42.5]", "axes.radial.time_constant_ms", "float"),
     "number for a table": ("{ slope_s_m = 0.0818, intercept = 0.933 }", "0.9", "axes.radial.gain", "object"),
     "number for an axis": ("[axes.tangential]", "[axes]\nvertical = 3\n[axes.tangential]", "axes.vertical", "table"),
     "interval of one": ("60.45", "60.45\ndelay_ms_ci95 = [60.0]", "delay_ms_ci95", "length 2"),
@@ -194,7 +174,8 @@ REFUSED = {
     "unknown plant": ('"first-order"', '"third-order"', "axes.radial.plant", "first-order, second-order"),
     "plant of a wrong type": ('"first-order"', '["first-order"]', "axes.radial.plant", "first-order, second-order"),
     "no plant": ('plant = "first-order"', "", "axes.radial.plant", "first-order, second-order"),
-    "misspelled axis key": ("42.5", "42.5\ngain_recovry_ms = 9.0", "axes.radial.gain_recovry_ms", "gain_recovery_ms"),
+    "no axis": (ARM[ARM.index("[axes.t") : ARM.index("[prov")], "", "'axes' is missing", TOP),
+    "axes that are none": (ARM[ARM.index("[axes.t") : ARM.index("[prov")], "[axes]\n", "axes", "length >= 1"),
     "integer beyond a float": ("28.0", "1" + "0" * 400, "update_period_ms", "not a finite number"),
     "exponent beyond decimal": ("28.0", "1e99999999999999999999", "number", "out of range"),
     "key with a newline": ("42.5", '42.5\n"a\\nb" = 1', "axes.radial", ""),
@@ -218,13 +199,6 @@ def test_a_wrong_file_is_refused_in_one_line(load, tmp_path: Path, old: str, new
     assert len(message.splitlines()) == 1
 
 
-@pytest.mark.parametrize("axes", ["", "axes = {}", "axes = 3"])
-def test_an_arm_has_an_axis(load, axes: str) -> None:
-    """A file without an axis is refused, and the key is named."""
-    with pytest.raises(ConfigError, match="axes"):
-        load(f'name = "x"\nupdate_period_ms = 28.0\ndelay_ms = 0.0\n{axes}\n')
-
-
 @pytest.mark.parametrize(
     ("source", "message"),
     [
@@ -240,13 +214,6 @@ def test_a_source_that_is_no_arm_is_refused(source: str, message: str) -> None:
         ArmModel.load(source)
 
 
-def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
-    """By its name."""
-    (tmp_path / "arm.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="not a text file"):
-        ArmModel.load(tmp_path / "arm.toml")
-
-
 def test_an_unknown_axis_is_refused_with_the_known_ones(load) -> None:
     """Asking for an axis that the arm does not have names the ones it has."""
     with pytest.raises(
@@ -254,6 +221,8 @@ def test_an_unknown_axis_is_refused_with_the_known_ones(load) -> None:
     ) as caught:
         load(ARM).axis("vertical")
     assert caught.value.accepted == ("tangential", "radial")
+    names = {"wrist", "vertical", "elbow", "radial", "tangential"}
+    assert ordered_axes(names) == ("tangential", "radial", "vertical", "elbow", "wrist")
 
 
 def test_an_axis_may_override_the_delay(load) -> None:
@@ -262,6 +231,14 @@ def test_an_axis_may_override_the_delay(load) -> None:
     assert arm.delay_of("tangential") == 0.0
     assert arm.delay_of("radial") == 0.0385
     assert load(ARM).delay_of("tangential") == 0.06045
+
+
+def test_numbers_of_numpy_come_back_as_plain_ones(tmp_path: Path) -> None:
+    """And so do whole numbers in place of floats, and open intervals."""
+    axes = {"radial": AxisModel(plant=FirstOrder(time_constant=2))}
+    arm = ArmModel(name="x", update_period=np.float64(0.028), delay=0.06, axes=axes, delay_ci95=(0.05, np.inf))
+    arm.save(tmp_path / "arm.toml")
+    assert ArmModel.load(tmp_path / "arm.toml") == arm
 
 
 def test_gain_is_equation_11() -> None:
@@ -273,58 +250,21 @@ def test_gain_is_equation_11() -> None:
     )
 
 
-def test_axes_come_in_the_papers_order() -> None:
-    """Tangential, radial, vertical, then any others by name."""
-    names = {"wrist", "vertical", "elbow", "radial", "tangential"}
-    assert ordered_axes(names) == ("tangential", "radial", "vertical", "elbow", "wrist")
-
-
 LIMITS = Validity(max_speed=0.5, max_radius=0.7)
-
-
-def test_validity_says_by_how_much() -> None:
-    """Each limit exceeded is one sentence with what was reached, the limit, and the excess."""
-    speed, radius = LIMITS.excess(0.68, 0.7321)
-    assert speed.startswith("commanded speed reaches 0.68 m/s, 1.36 times the 0.5 m/s")
-    assert radius.startswith("commands reach 732.1 mm from the base axis, 32.1 mm beyond the 700 mm")
 
 
 @pytest.mark.parametrize(
     ("limits", "speed", "radius", "exceeded"),
-    [(LIMITS, 0.5001, 0.7, 0), (LIMITS, 0.51, None, 1), (LIMITS, 0.5, 0.701, 1), (Validity(), 9.0, 9.0, 0)],
+    [
+        (LIMITS, 0.68, 0.7321, ["0.68 m/s, 1.36 times the 0.5 m/s", "732.1 mm from the base axis, 32.1 mm beyond"]),
+        (LIMITS, 0.5001, 0.7, []),
+        (LIMITS, 0.51, None, ["1.02 times"]),
+        (Validity(), 9.0, 9.0, []),
+    ],
 )
 def test_validity_counts_only_what_is_exceeded(
-    limits: Validity, speed: float, radius: float | None, exceeded: int
+    limits: Validity, speed: float, radius: float | None, exceeded: list[str]
 ) -> None:
-    """Beyond a limit by less than is shown is within it; absent limits and an unknown radius are no limits."""
-    assert len(limits.excess(speed, radius)) == exceeded
-
-
-def bench(**changed: object) -> ArmModel:
-    axes = {"radial": AxisModel(plant=FirstOrder(time_constant=0.04))}
-    return ArmModel(**{"name": "x", "update_period": 0.028, "delay": 0.06, "axes": axes, **changed})
-
-
-@pytest.mark.parametrize(
-    "changed",
-    [
-        {"update_period": 1},
-        {"axes": {"radial": AxisModel(plant=FirstOrder(time_constant=2))}},
-        {"update_period": np.float64(0.028)},
-        {"provenance": {"window_ms": 169}},
-        {"provenance": {"date": datetime.date(2024, 5, 1)}},
-        {"delay_ci95": (0.05, np.inf)},
-    ],
-    ids=["whole seconds", "whole time constant", "numpy float", "whole number", "date", "open interval"],
-)
-def test_numbers_of_any_kind_and_dates_come_back(tmp_path: Path, changed: dict[str, object]) -> None:
-    """Whole numbers, numpy numbers and dates come back as they were."""
-    bench(**changed).save(tmp_path / "arm.toml")
-    assert ArmModel.load(tmp_path / "arm.toml") == bench(**changed)
-
-
-def test_provenance_is_kept_as_it_is(tmp_path: Path) -> None:
-    """A provenance number is not converted: nothing reads it (ArmModel's docstring)."""
-    path = tmp_path / "arm.toml"
-    path.write_text(ARM + "[provenance]\nwindow_ms = 169.0\n")
-    assert ArmModel.load(path).provenance == {"window_ms": 169.0}
+    """A sentence for each, with the excess; beyond by less than is shown is within; an unknown radius is no limit."""
+    sentences = limits.excess(speed, radius)
+    assert all(words in sentence for words, sentence in zip(exceeded, sentences, strict=True))

@@ -11,9 +11,9 @@ from pumafuse.model.plants import FirstOrder, SecondOrder
 
 OMEGA = 53.9
 NEAR_ONE = [1 + sign * off for off in (1e-12, 1e-9, 1e-6, 1e-4) for sign in (-1, 1)]
-DAMPINGS = [0.5, 0.7, 0.864, *NEAR_ONE, 1.0, 1.1, 1.5, 2.0]
+DAMPINGS = [0.5, 0.7, 0.864, *NEAR_ONE, 1.0, 1.1, 1.5, 2.0, 50.0, 1e3]
 # Times in units of 1/ω, from the first instants to far beyond the end.
-TIMES = np.concatenate([[0.0], np.logspace(-6.0, 3.0, 120), np.linspace(0.1, 30.0, 120)])
+TIMES = np.concatenate([[0.0], np.logspace(-9.0, 9.0, 120), np.linspace(0.1, 30.0, 120)])
 
 
 def second_order_step(omega: float, damping: float, t: float) -> mp.mpf:
@@ -37,7 +37,7 @@ def second_order(damping: float) -> SecondOrder:
     return SecondOrder(natural_frequency=OMEGA, damping=damping)
 
 
-PLANTS = [FirstOrder(time_constant=0.0425), *map(second_order, [0.1, *DAMPINGS, 50.0])]
+PLANTS = [FirstOrder(time_constant=0.0425), *map(second_order, [0.1, *DAMPINGS])]
 
 
 @pytest.mark.parametrize("damping", DAMPINGS)
@@ -55,15 +55,6 @@ def test_second_order_step_response_holds_for_any_plant(omega: float, damping: f
     assert worst_error(omega, damping, np.array([scaled / omega])) <= 1e-12
 
 
-@pytest.mark.parametrize("damping", [50.0, 1e3])
-def test_very_over_damped_step_response_stays_finite_and_right(damping: float) -> None:
-    """Far above ζ = 1 nothing overflows, and the response is right from the first instant to long after its end."""
-    times = np.concatenate([[0.0], np.logspace(-9.0, 9.0, 200)])
-    assert np.isfinite(second_order(damping).step_response(times)).all()
-    assert worst_error(OMEGA, damping, times) <= 1e-12
-    assert second_order(damping).step_response(1e9) == 1.0
-
-
 @mp.workdps(50)
 @pytest.mark.parametrize("tau", [1e-4, 0.0356, 0.0425, 12.0])
 def test_first_order_step_response_is_equation_4(tau: float) -> None:
@@ -76,19 +67,12 @@ def test_first_order_step_response_is_equation_4(tau: float) -> None:
 
 @pytest.mark.parametrize("plant", PLANTS, ids=str)
 def test_nothing_moves_before_the_step(plant: FirstOrder | SecondOrder) -> None:
-    """The response is exactly zero up to and at the step, and not after it."""
-    response = plant.step_response([-1e9, -1.0, -1e-12, -0.0, 0.0, 1e-3])
-    assert (response[:-1] == 0.0).all()
-    assert response[-1] > 0.0
-
-
-@pytest.mark.parametrize("plant", PLANTS, ids=str)
-def test_step_response_has_the_shape_of_its_times(plant: FirstOrder | SecondOrder) -> None:
-    """A table of times gives a table of positions, each that of its own time; one time gives one position."""
-    times = np.linspace(-0.01, 0.3, 6).reshape(2, 3)
-    response = plant.step_response(times)
+    """The response is exactly zero up to and at the step, and not after it; it has the shape of its times."""
+    response = plant.step_response(np.array([[-1e9, -1e-12, 0.0], [1e-3, 1e3, 1e9]]))
     assert response.shape == (2, 3)
-    assert [float(plant.step_response(t)) for t in times.ravel()] == response.ravel().tolist()
+    assert (response[0] == 0.0).all()
+    assert response[1, 0] > 0.0
+    assert response[1, 2] == 1.0 == plant.step_response(1e9)
 
 
 @pytest.mark.parametrize("plant", PLANTS, ids=str)
@@ -101,33 +85,13 @@ def test_state_space_answers_as_the_step_response(plant: FirstOrder | SecondOrde
     np.testing.assert_allclose((C @ held[:, :n, n:])[:, 0, 0], plant.step_response(times), rtol=0.0, atol=1e-11)
 
 
-@pytest.mark.parametrize("tau", [1e-4, 0.0425, 12.0])
-def test_first_order_transfer_function_is_equation_3(tau: float) -> None:
-    """1 / (τs + 1), coefficient by coefficient."""
-    tf = FirstOrder(time_constant=tau).transfer_function()
-    numerator, denominator = coefficients(tf, 1.0 / tau)
-    np.testing.assert_allclose(numerator, [0.0, 0.0, 1.0], atol=1e-13)
-    np.testing.assert_allclose(denominator, [0.0, 1.0, 1.0], atol=1e-13)
-
-
-@pytest.mark.parametrize(("omega", "damping"), [(1e-2, 0.1), (OMEGA, 1.0), (1e4, 50.0)])
-def test_second_order_transfer_function_is_equation_5(omega: float, damping: float) -> None:
-    """ω² / (s² + 2ζωs + ω²), coefficient by coefficient."""
-    tf = SecondOrder(natural_frequency=omega, damping=damping).transfer_function()
-    numerator, denominator = coefficients(tf, omega)
-    np.testing.assert_allclose(numerator, [0.0, 0.0, 1.0], atol=1e-12)
-    np.testing.assert_allclose(denominator, [1.0, 2.0 * damping, 1.0], rtol=1e-12)
-
-
-def coefficients(tf, omega: float) -> tuple[np.ndarray, np.ndarray]:
-    """Numerator and denominator as polynomials in s/ω of degree 2, scaled to a denominator that ends in 1."""
-    scale = omega ** np.array([2.0, 1.0, 0.0]) / tf.den[0][0][-1]
-    return tuple(np.pad(poly, (3 - len(poly), 0)) * scale for poly in (tf.num[0][0], tf.den[0][0]))
-
-
-@pytest.mark.parametrize("damping", [0.864, 1 - 1e-9, 50.0])
-def test_transfer_function_has_the_coefficients_themselves(damping: float) -> None:
-    """No spurious power of s, and the denominator's numbers to the last digits."""
-    tf = SecondOrder(natural_frequency=53.9, damping=damping).transfer_function()
-    np.testing.assert_allclose(np.trim_zeros(tf.num[0][0], "f"), [53.9**2], rtol=1e-15)
-    np.testing.assert_allclose(tf.den[0][0], [1.0, 2 * damping * 53.9, 53.9**2], rtol=1e-15)
+@pytest.mark.parametrize("damping", [0.1, 0.864, 1 - 1e-9, 50.0])
+def test_transfer_functions_are_equations_3_and_5(damping: float) -> None:
+    """1 / (τs + 1) and ω² / (s² + 2ζωs + ω²), coefficient by coefficient, to a factor; no spurious power of s."""
+    for plant, right in (
+        (FirstOrder(time_constant=0.0425), [1.0, 1.0 / 0.0425]),
+        (second_order(damping), [1.0, 2.0 * damping * OMEGA, OMEGA**2]),
+    ):
+        tf = plant.transfer_function()
+        np.testing.assert_allclose(np.trim_zeros(tf.num[0][0], "f"), right[-1:], rtol=1e-15)
+        np.testing.assert_allclose(tf.den[0][0], right, rtol=1e-15)

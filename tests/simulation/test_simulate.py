@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import warnings
 from pathlib import Path
 
 import msgspec
@@ -17,7 +16,6 @@ from pumafuse.logs.run import Source
 from pumafuse.simulation.simulate import write
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
-ALL = sorted(path.stem for path in SCENARIOS.glob("*.toml") if "[trajectory]" in path.read_text())
 BASE = """
 name = "test"
 arm = "puma560-internal"
@@ -66,47 +64,25 @@ def test_a_reference_with_noise_of_its_own_says_so(tmp_path: Path) -> None:
     assert abs(np.mean(noise**2) - 1.0) < 4.0 * (2.0 / len(noise)) ** 0.5
 
 
-@pytest.mark.parametrize("rate", ["1.0", "78.0", "2142.0"])
-def test_another_rate_changes_no_other_measurement_and_no_motion(rate: str, tmp_path: Path) -> None:
+CHANGES = (
+    ("77.0", "2142.0"),
+    ("77.0", "77.0\nbursts = { per_minute = 60.0, length_s = 0.1 }"),
+    ("77.0", "77.0\noutliers = { share = 0.2, from_mm = 5.0, to_mm = 9.0 }"),
+    ("77.0", "77.0\nlatency_sd_ms = 3.0"),
+)
+
+
+@pytest.mark.parametrize(("was", "now"), CHANGES)
+def test_a_sensor_changes_no_other_measurement_and_no_motion(was: str, now: str, tmp_path: Path) -> None:
     """To the last bit, on an arm that strays, has play, and whose commands are late by chance."""
     loose = BASE + "[true_arm]\nbacklash_mm = 0.2\nstiction_mm = 0.1\ndelay_jitter_ms = 2.0\n" + EAR
-    one, two = (pf.simulate(load(tmp_path, text)).run for text in (loose, loose.replace("77.0", rate)))
+    one, two = (pf.simulate(load(tmp_path, text)).run for text in (loose, loose.replace(was, now)))
     same_source(one.command, two.command)
-    assert one.reference is not None and two.reference is not None
-    same_source(one.reference, two.reference)
-    same_source(one.sensors["eye"], two.sensors["eye"])
-    assert len(one.sensors["ear"].stamp) != len(two.sensors["ear"].stamp)
-
-
-@pytest.mark.parametrize(
-    "fault",
-    [
-        "bursts = { per_minute = 60.0, length_s = 0.1 }",
-        "outliers = { share = 0.2, from_mm = 5.0, to_mm = 9.0 }",
-        "latency_sd_ms = 3.0",
-    ],
-)
-def test_a_fault_of_one_sensor_changes_no_other_sensor_and_no_motion(fault: str, tmp_path: Path) -> None:
-    """To the last bit."""
-    one, two = (pf.simulate(load(tmp_path, BASE + EAR + more)).run for more in ("", fault + "\n"))
     assert one.reference is not None and two.reference is not None
     same_source(one.reference, two.reference)
     same_source(one.sensors["eye"], two.sensors["eye"])
     with pytest.raises(AssertionError):
         same_source(one.sensors["ear"], two.sensors["ear"])
-
-
-@pytest.mark.parametrize("rows", [2, 7, 60])
-def test_more_rows_of_the_reference_change_no_measurement_and_no_motion(rows: int, tmp_path: Path) -> None:
-    """How the reference is recorded is no part of what happens; each period's first row is at its command."""
-    one, two = (pf.simulate(load(tmp_path, BASE + f"[reference]\nrows_per_command = {n}\n")).run for n in (1, rows))
-    same_source(one.sensors["eye"], two.sensors["eye"])
-    assert one.reference is not None and two.reference is not None
-    assert (one.reference.stamp == one.command.stamp).all()
-    same_source(one.reference, two.reference.rows(slice(None, None, rows)))
-    apart = np.diff(two.reference.stamp) / (28e6 / rows)
-    assert len(two.reference.stamp) == rows * len(two.command.stamp)
-    assert np.abs(apart - 1.0).max() <= rows / 60 + 1e-6  # even, but for the grid
 
 
 def test_commands_are_given_at_their_ticks_and_logged_with_jitter(tmp_path: Path) -> None:
@@ -135,22 +111,6 @@ def test_start_levels_are_in_the_run_and_in_every_measurement(tmp_path: Path) ->
     for one, two in ((low.command, high.command), (low.sensors["eye"], high.sensors["eye"])):
         assert two.values["radial"] - one.values["radial"] == pytest.approx(0.560, abs=1.1e-9)
         assert np.array_equal(one.values["tangential"], two.values["tangential"])
-
-
-def test_a_sensor_that_was_silent_for_the_whole_run_can_be_read(tmp_path: Path) -> None:
-    """All its rows lost is a fault to study too: the run is written, read with a note, and fused without it."""
-    simulated = pf.simulate(load(tmp_path, BASE + EAR + "dropouts = 1.0\n"))
-    write(simulated, tmp_path / "run", force=False)
-    again = pf.Run.read(tmp_path / "run")
-    assert again.notes == ("ear.csv: the table has no rows",)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pf.PumafuseWarning)
-        est = pf.fuse(again, simulated.config)
-        without = pf.simulate(load(tmp_path, BASE))
-        other = pf.fuse(without.run, without.config)
-    assert set(est.measurements.counts()) == {"fused"}
-    for axis in ("tangential", "radial"):
-        assert np.array_equal(est[axis].position, other[axis].position)
 
 
 def test_a_sensor_of_axes_that_are_not_commanded_is_left_out(tmp_path: Path) -> None:
@@ -233,7 +193,7 @@ latency_ms = 33.3
 """
 
 
-@pytest.mark.parametrize("name", [*ALL, "odd"])
+@pytest.mark.parametrize("name", ["panel-vision", "odd"])
 def test_a_written_folder_is_the_run_and_makes_it_again(name: str, tmp_path: Path) -> None:
     """Read back, it is the run in memory, bit for bit; its scenario.toml gives the same bytes again."""
     if name == "odd":
@@ -287,29 +247,6 @@ def test_a_log_in_x_y_z_gives_the_axes_back(kind: str, positive: str, tmp_path: 
         for axis in ("tangential", "radial"):
             assert two.values[axis] == pytest.approx(one.values[axis], abs=3e-9)
     assert back.command.values["vertical"] == pytest.approx(-0.1, abs=1e-12)
-
-
-def test_a_cylindrical_log_is_where_geometry_puts_it(tmp_path: Path) -> None:
-    """X and y by hand: 560 mm from the base at 90°, +tangential clockwise, so that x grows with it."""
-    text = (
-        "start_azimuth_deg = 90.0\n" + BASE + "[start]\noffset_sd_mm = 0.0\nlevel = { radial_mm = 560.0 }\n"
-        '[frame]\nkind = "cylindrical"\npositive = "clockwise"\nbase_mm = [5.0, 7.0]\n'
-    )
-    plain = pf.simulate(load(tmp_path, text.partition("[frame]")[0])).run.command.values
-    logged = pf.simulate(load(tmp_path, text)).run
-    angle, radius = plain["tangential"] / 0.560, plain["radial"]
-    assert logged.command.values["x"] == pytest.approx(0.005 + radius * np.sin(angle), abs=1e-9)
-    assert logged.command.values["y"] == pytest.approx(0.007 + radius * np.cos(angle), abs=1e-9)
-    assert logged.start == pytest.approx({"x": 0.005, "y": 0.567, "z": 0.0}, abs=1e-9)
-
-
-def test_a_sensor_that_names_its_axes_is_logged_in_them() -> None:
-    """Beside others in x, y, z."""
-    run = pf.simulate(pf.Scenario.load(SCENARIOS / "cylindrical-cartesian.toml")).run
-    assert {name: list(source.values) for name, source in run.sensors.items()} == {
-        "vision": ["x", "y", "z"],
-        "range": ["radial"],
-    }
 
 
 STEPS = """

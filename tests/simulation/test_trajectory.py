@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import binom
 
 from pumafuse.errors import ConfigError, PumafuseError
-from pumafuse.simulation.trajectory import Hold, PathFromFile, Raster, SineSweep, Steps, WhiteNoise, ticks
+from pumafuse.simulation.trajectory import PathFromFile, Raster, SineSweep, Steps, WhiteNoise, ticks
 
 PERIOD = 0.028
 
@@ -23,25 +23,13 @@ def rng(seed: int = 1) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def on_raster(x: float, y: float, width: float, height: float, pitch: float) -> bool:
-    """Whether a point lies on one of the lines or on the edge that joins it to the next."""
-    line = y / pitch
-    if abs(line - round(line)) < 1e-9:
-        return -1e-9 <= x <= width + 1e-9
-    return abs(x - (width if int(line) % 2 == 0 else 0.0)) < 1e-9 and -1e-9 <= y <= height + 1e-9
-
-
 def test_a_raster_goes_to_and_fro_at_constant_speed() -> None:
-    """Every command is on the lines, and within one tick of each corner in turn when the speed says so."""
+    """Every command is as far along its way as speed and time say; within a tick of each corner in its turn."""
     width, height, pitch, speed = 0.300, 0.060, 0.020, 0.06
     found = Raster(width=width, height=height, pitch=pitch, speed=speed).offsets(PERIOD, rng())
     x, y = found["tangential"], found["vertical"]
-    assert all(on_raster(a, b, width, height, pitch) for a, b in zip(x.tolist(), y.tolist(), strict=True))
     way = np.abs(np.diff(x)) + np.abs(np.diff(y))
-    assert way[:-1].max() <= speed * PERIOD * (1 + 1e-9)
-    on_one_line = np.minimum(np.abs(np.diff(x)), np.abs(np.diff(y)))[:-1] == 0.0
     assert np.allclose(way[:-1], speed * PERIOD, rtol=1e-9, atol=0.0)  # around a corner too: the two legs add up
-    assert on_one_line.mean() > 0.95
     corners = [(0, 0), (1, 0), (1, 1), (0, 1), (0, 2), (1, 2), (1, 3), (0, 3)]
     length = 0.0
     for (a, b), before in zip(corners, [(0, 0), *corners], strict=False):
@@ -61,15 +49,6 @@ def test_a_raster_covers_its_height(lines: int, pitch_mm: int) -> None:
     assert raster.offsets(PERIOD, rng())["vertical"].max() == pytest.approx(height, abs=1e-9)
 
 
-def test_a_raster_may_run_along_any_axes() -> None:
-    """`along` and `across` name them."""
-    found = Raster(along="radial", across="tangential", width=0.1, height=0.0, pitch=0.01, speed=0.1)
-    assert found.moving == ("radial", "tangential")
-    offsets = found.offsets(PERIOD, rng())
-    assert offsets["radial"].max() == pytest.approx(0.1)
-    assert not offsets["tangential"].any()
-
-
 def campaign(**different: object) -> Steps:
     given = {"axes": ["a", "b"], "sizes": [0.002, 0.004, 0.008], "replicates": 3, "rest": 0.5, "scope": "s"}
     return Steps(**(given | different))  # pyright: ignore[reportArgumentType]
@@ -83,15 +62,6 @@ def test_a_campaign_has_every_combination_as_often_as_asked() -> None:
     }
     for up, down in zip(plan[::2], plan[1::2], strict=True):
         assert up[1] > 0.0 and down == (up[0], -up[1])
-
-
-def test_a_campaign_is_in_random_order_and_can_be_cut_short() -> None:
-    """Another seed gives another order, the same seed the same; `trials` keeps the first of them."""
-    plans = [campaign().plan(rng(seed)) for seed in (1, 1, 2)]
-    assert plans[0] == plans[1] != plans[2]
-    assert plans[0] != sorted(plans[0]) and sorted(plans[0]) == sorted(plans[2])
-    for kept in (1, 7, 36, 1000):
-        assert campaign(trials=kept).plan(rng()) == plans[0][:kept]
 
 
 def test_steps_are_one_command_each_after_a_rest() -> None:
@@ -143,13 +113,6 @@ def test_a_sweep_has_the_frequency_it_says(start: float, end: float) -> None:
     for a, b in itertools.pairwise(crossing):
         at = np.linspace(a, b, 400)
         assert np.trapezoid(start * (end / start) ** (at / 10.0), at) == pytest.approx(1.0, rel=1e-3)
-
-
-def test_hold_moves_nothing() -> None:
-    """For as long as it says, the last tick at or after the end."""
-    found = Hold(axes=["a"], duration=1.0).offsets(PERIOD, rng())["a"]
-    assert not found.any()
-    assert len(found) == 37 and 35 * PERIOD < 1.0 <= 36 * PERIOD
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -131,34 +130,8 @@ def test_a_noise_of_0_has_an_interval_from_0_on() -> None:
     assert none - end == pytest.approx(0.5 * ROOT**2, rel=0.08)
 
 
-def test_an_unlimited_end_is_open() -> None:
-    """A drift so weak that none at all is hardly less likely."""
-    for seed in range(20):
-        values = walking(2e-4, seed)
-        likelihood, config = at_rest(values, drift=3e-4, sd=2e-4)
-        best, found = intervals(likelihood, config, "sensors.eye.sd_mm.tip", "process.tip.drift_mm_rts")
-        drift = found["process.tip.drift_mm_rts"]
-        peak = profile_of_drift(values, 1e3 * best.process["tip"].drift)
-        if drift.at is None and peak - profile_of_drift(values, 1e-4) < 1.5:
-            assert drift.open == (True, False)
-            assert drift.ci95[0] == pytest.approx(1e-7, rel=1e-6)
-            assert peak - profile_of_drift(values, 1e3 * drift.ci95[1]) == pytest.approx(0.5 * ROOT**2, rel=0.08)
-            return
-    pytest.fail("no such run among 20")
-
-
-def of_one_axis(run: pf.Run, axis: str) -> pf.Run:
-    sensors = {name: replace(one, values={axis: one.values[axis]}) for name, one in run.sensors.items()}
-    command = replace(run.command, values={axis: run.command.values[axis]})
-    return replace(run, command=command, sensors=sensors, start={axis: run.start[axis]}, reference=None)
-
-
-@pytest.mark.xfail(reason="since 0.2 one end has dropped by 1.53: the cause is not found yet")
 def test_a_shared_parameter_has_the_profile_of_all_measurements() -> None:
-    """A camera's latency, two axes, their noises following by Nelder and Mead: dropped by 1.92 (± 20 %) at both ends.
-
-    An end is that of the curvature where that is right to 20 % on its own path.
-    """
+    """A camera's latency, two axes, their noises following by Nelder and Mead: dropped by 1.92 (± 8 %) at both ends."""
     sim = outage(2)
     names = ["sensors.vision.latency_ms", "sensors.vision.sd_mm.tangential", "sensors.vision.sd_mm.vertical"]
     likelihood = Likelihood([sim.run], sim.config, ["vision"])
@@ -177,23 +150,7 @@ def test_a_shared_parameter_has_the_profile_of_all_measurements() -> None:
 
     top, ends = highest(latency.get(best)), found[latency.key].ci95
     for end in ends:
-        assert top - highest(end) == pytest.approx(0.5 * ROOT**2, rel=0.2)
-
-
-def test_the_information_on_a_shared_parameter_adds_up() -> None:
-    """One over its square, the width is the sum of those from each axis's measurements (± 25 %)."""
-    sim = outage(2)
-    names = ["sensors.vision.latency_ms", "sensors.vision.sd_mm.tangential", "sensors.vision.sd_mm.vertical"]
-    likelihood = Likelihood([sim.run], sim.config, ["vision"])
-    best, found = intervals(likelihood, sim.config, *names)
-    latency = {one.key: one for one in free_of(likelihood, best, ("noise", "latency"))}[names[0]]
-    ends = found[latency.key].ci95
-    inverse_squares = 0.0
-    for axis in likelihood.axes:
-        alone = Likelihood([of_one_axis(sim.run, axis)], sim.config, ["vision"])
-        low, high = intervals(alone, sim.config, *names)[1][latency.key].ci95
-        inverse_squares += (high - low) ** -2
-    assert (ends[1] - ends[0]) ** -2 == pytest.approx(inverse_squares, rel=0.25)
+        assert top - highest(end) == pytest.approx(0.5 * ROOT**2, rel=0.08)
 
 
 def test_an_axis_has_the_information_of_the_others_on_a_shared_parameter() -> None:

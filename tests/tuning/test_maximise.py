@@ -11,18 +11,12 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.tuning.likelihood import Derivatives, Likelihood
-from pumafuse.tuning.maximise import Point, _step, derivatives, maximise, maximise_with_gates, point
+from pumafuse.tuning.maximise import Point, _step, derivatives, maximise, point
 from pumafuse.tuning.parameters import Fit, Parameter, moved
 from tuning_runs import (
     free_of,
     outage,
-    replaced,
-    scenario,
-    spoiled,
     spoiled_arm,
-    with_outliers,
-    with_process,
-    with_sensors,
 )
 
 
@@ -42,9 +36,6 @@ def still_to_gain(likelihood: Likelihood, at: Point, free: Sequence[Parameter]) 
     g, information = found.score[known], found.information[np.ix_(known, known)]
     room = np.where(found.score > 0.0, high - where, where - low)[inside & ~known]
     return 0.5 * float(g @ np.linalg.solve(information, g)) + float(np.abs(found.score[inside & ~known]) @ room)
-
-
-# ---- with fixed outcomes --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -78,22 +69,6 @@ def test_a_search_ends_at_a_maximum(seed: int, fit: Sequence[Fit]) -> None:
         assert point(likelihood, there, free, outcomes).log_posterior < best.log_posterior + 0.01
 
 
-def test_an_absent_noise_goes_to_its_bound() -> None:
-    """A process without drift and maneuvers: at their lower bounds the score still points outward."""
-    found = scenario("panel-tracker-outage", 0.1, 0.02)
-    calm = dict.fromkeys(("tangential", "vertical"), pf.Process(input_noise=0.0, drift=0.0))
-    sim = pf.simulate(replaced(found, process=calm), 2)
-    likelihood = Likelihood([sim.run], with_process(sim.config, input_noise=3e-5, drift=3e-4))
-    free = free_of(likelihood, likelihood.config, ("noise",))
-    best = maximise(likelihood, likelihood.config, free)
-    where, (low, _) = coordinates(free, best.config), np.array([one.range for one in free]).T
-    least = where <= low + 1e-9
-    assert least.any()
-    assert (derivatives(likelihood, best, free).score[least] < 0.0).all()
-    assert all(one.vanishes for one, at in zip(free, least.tolist(), strict=True) if at)
-    assert still_to_gain(likelihood, best, free) < 0.01
-
-
 @st.composite
 def problems(draw: st.DrawFn) -> tuple[Derivatives, np.ndarray, np.ndarray, np.ndarray]:
     """A score, an information with scales apart by up to 10⁶ and at times nearly singular, a box with 0 in it."""
@@ -125,31 +100,3 @@ def test_a_step_is_the_best_there_is_in_its_box(
     close = 1e-6 * (1.0 + np.abs(size * found.score).max())
     assert (slope[step > low + tiny] > -close).all()
     assert (slope[step < high - tiny] < close).all()
-
-
-def test_a_parameter_without_information_does_not_move() -> None:
-    """The others step as if it were not there."""
-    information = np.diag([4.0, 0.0, 1.0])
-    step = _step(Derivatives(np.array([2.0, 0.0, -3.0]), information), -np.ones(3), np.ones(3), np.zeros(3))
-    np.testing.assert_allclose(step, [0.5, 0.0, -1.0], atol=1e-9)
-
-
-# ---- with gates -----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("gate_rows", [True, False], ids=["rows", "components"])
-def test_a_search_under_the_gates_ends_at_its_own_maximum(gate_rows: bool) -> None:
-    """The outcomes are those of the gates at the end, and a second search stays there."""
-    sim = with_outliers(4, 0.06)
-    config = with_sensors(spoiled(sim.config), gate=3.0, gate_rows=gate_rows)
-    likelihood = Likelihood([sim.run], config)
-    free = free_of(likelihood, config, ("noise",))
-    best = maximise_with_gates(likelihood, config, free)
-    assert best.log_posterior > point(likelihood, config, free).log_posterior + 5.0
-    alone = likelihood.evaluate(best.config)
-    assert alone.total == best.log_likelihood.total
-    assert [part.tolist() for part in alone.outcomes] == [part.tolist() for part in best.outcomes]
-    assert (np.concatenate(alone.outcomes) == pf.Outcome.REJECTED).any()
-    assert still_to_gain(likelihood, best, free) < 0.5
-    again = maximise_with_gates(likelihood, best.config, free)
-    assert best.log_posterior <= again.log_posterior < best.log_posterior + 0.1

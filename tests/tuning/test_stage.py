@@ -11,9 +11,8 @@ import pytest
 import pumafuse as pf
 from pumafuse.simulation.true_sensor import Outliers, TrueSensor
 from pumafuse.tuning.intervals import ConfidenceInterval
-from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.parameters import with_order
-from pumafuse.tuning.stage import Plan, Stage, repeat_stage, run_stage
+from pumafuse.tuning.stage import Stage
 from tuning_runs import (
     SCENARIOS,
     fit_stage,
@@ -39,17 +38,17 @@ def numbers(stage: Stage) -> dict[str, float]:
 # ---- latencies ------------------------------------------------------------------------------------------------------
 
 
-def wrong_latency(seed: int, *size: float) -> tuple[Stage, ConfidenceInterval]:
-    """A camera that is 45 ms late and configured as 9; noise as wrong as elsewhere."""
+def wrong_latency(seed: int, believed: float, *size: float) -> tuple[Stage, ConfidenceInterval]:
+    """A camera that is 45 ms late and configured otherwise; noise as wrong as elsewhere."""
     sim = pf.simulate(scenario("wrong-latency", *size), seed)
-    found = fit_stage(sim.run, with_sensors(spoiled(sim.config), latency=0.009), ("noise", "latency"))
+    found = fit_stage(sim.run, with_sensors(spoiled(sim.config), latency=believed), ("noise", "latency"))
     return found, intervals_of(found)["sensors.vision.latency_ms"]
 
 
-@pytest.mark.parametrize("seed", [1, later(2), later(3)])
-def test_a_wrong_latency_is_found(seed: int) -> None:
-    """45 ms within 4 ms from 9, by some 105 rows; its 95 % interval contains it and is at most 16 ms wide."""
-    found, interval = wrong_latency(seed, 0.1, 0.02)
+@pytest.mark.parametrize("believed", [0.009, 0.135])
+def test_a_wrong_latency_is_found(believed: float) -> None:
+    """45 ms within 4 ms by some 105 rows, from far beyond a tick too; the 95 % interval is at most 16 ms wide."""
+    found, interval = wrong_latency(1, believed, 0.1, 0.02)
     assert list(found.not_identifiable) == []
     assert found.best.config.sensors["vision"].latency == pytest.approx(0.045, abs=0.004)
     low, high = interval.ci95
@@ -64,21 +63,11 @@ def test_intervals_of_latencies_over_60_runs() -> None:
     """
     inside, off = [], []
     for seed in range(60):
-        found, interval = wrong_latency(seed)
+        found, interval = wrong_latency(seed, 0.009)
         inside.append(interval.ci95[0] < 0.045 < interval.ci95[1])
         off.append(found.best.config.sensors["vision"].latency - 0.045)
     assert np.mean(inside) >= 0.88
     assert abs(np.mean(off)) < 5e-4
-
-
-def test_latencies_far_beyond_a_tick_are_found() -> None:
-    """90 ms too long and 250 ms too short: the likelihood has other maxima between."""
-    sim = outage(2)
-    for believed in (0.135, -0.205):
-        found = fit_stage(
-            sim.run, with_sensors(spoiled(sim.config), "vision", latency=believed), ("noise", "latency"), "tracker"
-        )
-        assert found.best.config.sensors["vision"].latency == pytest.approx(0.045, abs=0.004)
 
 
 @pytest.mark.parametrize("believed", [0.020, later(0.008), later(-0.004)])
@@ -248,16 +237,3 @@ def test_what_is_fixed_stays_to_the_last_bit_and_the_rest_moves() -> None:
     for one in found.free:
         assert one.get(best) != one.get(config), one.key
     assert "axes.tangential.damping" in numbers(found) and "axes.vertical.delay_ms" in numbers(found)
-
-
-def test_a_repeated_stage_ends_at_the_maximum_of_all_measurements() -> None:
-    """From two thirds to the whole: what was fixed stays fixed, and it is as likely as a new search finds it."""
-    sim = outage(1)
-    config = spoiled(sim.config)
-    early = run_stage([sim.run], config, Plan(("noise",), ["tracker.sd_mm"]), 2.4)
-    assert early.likelihood.count.sum() < Likelihood([sim.run], config).count.sum()
-    more = repeat_stage(early, [sim.run], early.best.config)
-    whole = fit_stage(sim.run, config, ("noise",), "tracker.sd_mm")
-    assert [one.key for one in more.free] == [one.key for one in early.free] == [one.key for one in whole.free]
-    assert more.best.log_posterior == pytest.approx(whole.best.log_posterior, abs=0.1)
-    assert more.best.config.sensors["tracker"] == config.sensors["tracker"]

@@ -15,12 +15,10 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.logs.run import Source
-from pumafuse.tuning.intervals import profiles
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import Point
 from pumafuse.tuning.parameters import Fit, with_order
 from pumafuse.tuning.summary import TuningSummary
-from pumafuse.tuning.summary import fitted as fitted_one
 from pumafuse.tuning.tune import Pipeline, plans
 from pumafuse.tuning.validation import check
 from tuning_runs import (
@@ -29,7 +27,6 @@ from tuning_runs import (
     outage,
     quietly,
     replaced,
-    scenario,
     spoiled,
     spoiled_arm,
     with_outliers,
@@ -44,12 +41,6 @@ ARM: tuple[Fit, ...] = ("noise", "delay", "plant")
 def tuned() -> pf.Tuning:
     """Noise, delays and plants from one run of tracker and camera, all of them spoiled."""
     return quietly(lambda: pf.tune([outage(1).run], spoiled_arm(outage(1).config), fit=ARM))
-
-
-@cache
-def tuned_noise() -> pf.Tuning:
-    """Likewise its noise alone, the arm as it is."""
-    return quietly(lambda: pf.tune([outage(1).run], spoiled(outage(1).config)))
 
 
 def total(run: pf.Run, config: pf.FusionConfig) -> float:
@@ -83,22 +74,19 @@ def test_the_result_is_likelier_and_reports_by_how_much() -> None:
     assert not found.summary.interrupted
 
 
-def test_the_truth_is_near() -> None:
-    """Delays within 3 ms, plants within 20 %, sds within 20 %, from a run of 4 seconds; what is not commanded stays."""
-    found, truth = tuned().config, outage(1).config
+def test_the_truth_is_near_and_the_rest_stays() -> None:
+    """Delays within 3 ms, plants and sds within 20 %, from a run of 4 seconds; what is not commanded stays."""
+    found, truth, before = tuned().config, outage(1).config, tuned().before
     for axis in AXES:
         assert found.arm.delay_of(axis) == pytest.approx(0.06045, abs=0.003)
         assert found.arm.axes[axis].plant.lag == pytest.approx(truth.arm.axes[axis].plant.lag, rel=0.2)
         for name in ("tracker", "vision"):
             assert found.sensors[name].sd_of(axis) == pytest.approx(truth.sensors[name].sd_of(axis), rel=0.2)
-    before = tuned().before
-    assert found.arm.axes["radial"] == before.arm.axes["radial"]
-    assert found.process["radial"] == before.process["radial"]
-    assert found.start == before.start
-    for name, one in found.sensors.items():
-        given = before.sensors[name]
-        assert (one.latency, one.scale) == (given.latency, given.scale)
-        assert (one.gate, one.gate_rows) == (given.gate, given.gate_rows)  # a search uses others
+    assert (found.arm.axes["radial"], found.process["radial"]) == (before.arm.axes["radial"], before.process["radial"])
+    # a search uses other gates
+    assert {name: replaced(one, sd=1.0) for name, one in found.sensors.items()} == {
+        name: replaced(one, sd=1.0) for name, one in before.sensors.items()
+    }
 
 
 def test_what_is_saved_loads_and_is_as_likely(tmp_path: Path) -> None:
@@ -110,39 +98,13 @@ def test_what_is_saved_loads_and_is_as_likely(tmp_path: Path) -> None:
     for key, one in fitted(found).items():
         assert float(f"{one.value:.6g}") == pytest.approx(one.value, rel=1e-12), key
     arm, numbers = tomllib.loads((tmp_path / "arm.toml").read_text()), fitted(found)
-    for axis, keys in (
-        ("tangential", ("delay_ms", "natural_frequency_rad_s", "damping")),
-        ("vertical", ("delay_ms", "time_constant_ms")),
-    ):
-        for key in keys:
-            table = arm["axes"][axis]
-            table = table if key in table else table["plant"]
-            one = numbers[f"axes.{axis}.{key}"]
-            assert table[key] == pytest.approx(one.value, rel=1e-9)
-            assert table[f"{key}_ci95"] == pytest.approx(one.ci95, rel=1e-5)
-    assert arm["provenance"]["tuned_on"] == [run.name]
+    table = arm["axes"]["tangential"]
+    for key in ("delay_ms", "natural_frequency_rad_s", "damping"):
+        one = numbers[f"axes.tangential.{key}"]
+        assert table[key] == pytest.approx(one.value, rel=1e-9)
+        assert table[f"{key}_ci95"] == pytest.approx(one.ci95, rel=1e-5)
     known = outage(1).config.arm.provenance
-    assert {key: arm["provenance"][key] for key in known} == known
-
-
-def test_gain_intervals_are_in_the_arm_too() -> None:
-    """Of intercept and recovery, where they are fitted."""
-    noise = scenario("white-noise")
-    sim = pf.simulate(replaced(noise, trajectory=replaced(noise.trajectory, duration=4.0)), 1)
-    found = quietly(lambda: pf.tune([sim.run], sim.config, fit=["gain"]))
-    model, numbers = found.config.arm.axes["tangential"], fitted(found)
-    assert numbers.keys() == {"axes.tangential.gain.intercept", "axes.tangential.gain_recovery_ms"}
-    assert model.gain.intercept_ci95 == pytest.approx(numbers["axes.tangential.gain.intercept"].ci95, rel=1e-5)
-    recovery = np.array(model.gain_recovery_ci95)
-    assert 1e3 * recovery == pytest.approx(numbers["axes.tangential.gain_recovery_ms"].ci95, rel=1e-5)
-
-
-def test_the_summary_is_its_own_schema() -> None:
-    """Its text parses into itself. A fit of noise leaves the arm as it is, provenance too."""
-    assert tuned_noise().config.arm == tuned_noise().before.arm
-    for found in (tuned(), tuned_noise()):
-        assert msgspec.json.decode(found.to_json(), type=TuningSummary) == found.summary
-        assert found.to_json().endswith("}\n")
+    assert {key: arm["provenance"][key] for key in known} == known and arm["provenance"]["tuned_on"] == [run.name]
 
 
 def sds_alone(runs: Sequence[pf.Run], config: pf.FusionConfig, **more: object) -> pf.Tuning:
@@ -155,11 +117,9 @@ def test_the_reference_plays_no_part() -> None:
     run, config = outage(1).run, spoiled(outage(1).config)
     assert run.reference is not None
     nonsense = replace(run.reference, values={axis: 1.0 + value[::-1] for axis, value in run.reference.values.items()})
-    wanted = sds_alone([run], config)
-    for reference in (None, nonsense):
-        found = sds_alone([replace(run, reference=reference)], config)
-        assert found.config == wanted.config
-        assert found.summary.parameters == wanted.summary.parameters
+    found = [sds_alone([replace(run, reference=one)], config) for one in (run.reference, None, nonsense)]
+    assert found[0].config == found[1].config == found[2].config
+    assert found[0].config.arm == config.arm  # provenance too
 
 
 # ---- validation -----------------------------------------------------------------------------------------------------
@@ -214,67 +174,22 @@ def test_a_run_that_was_fitted_on_is_no_validation() -> None:
     assert note.endswith("whether the numbers hold elsewhere is not known") and found.summary.validation
 
 
-def test_of_several_runs_none_is_validated_on() -> None:
-    """With a note; the interval of an sd from two runs is narrower by about √2."""
-    runs = [outage(seed).run for seed in (1, 2)]
-    config = spoiled(outage(1).config)
-    both = sds_alone(runs, config)
-    assert [note for note in both.summary.notes if "no run was left to validate on" in note]
-    assert both.summary.validation is None and both.summary.runs == [run.name for run in runs]
-    key = "sensors.vision.sd_mm.vertical"
-    widths = [np.ptp(fitted(found)[key].ci95) for found in (both, sds_alone(runs[:1], config))]
-    assert widths[0] == pytest.approx(widths[1] / np.sqrt(2.0), rel=0.25)
-
-
-def test_a_run_whose_clock_was_set_back_is_fitted_on_whole() -> None:
-    """Without validation: thirds of it mean nothing."""
-    sim = pf.simulate(scenario("panel-tracker-outage", 0.2, 0.0), 1)
-
-    def back(source: Source) -> Source:
-        late = source.stamp > 1_700_000_000
-        return replace(source, stamp=np.where(late, source.stamp - 3_600_000_000_000, source.stamp))
-
-    sensors = {name: back(one) for name, one in sim.run.sensors.items()}
-    run = replace(sim.run, command=back(sim.run.command), sensors=sensors, reference=None)
-    found = sds_alone([run], with_sensors(sim.config, sd=1e-3))
-    assert found.summary.validation is None
-    assert found.config.sensors["vision"].sd_of("tangential") == pytest.approx(5e-4, rel=0.4)
-    assert found.summary.likelihood["tangential"].after == pytest.approx(
-        Likelihood([run], found.config).evaluate(found.config).axes[0], rel=1e-9
-    )
-
-
 # ---- a trusted sensor -----------------------------------------------------------------------------------------------
 
 
-@cache
-def trusting() -> pf.Tuning:
-    """Trusting the tracker; the camera is configured as 10 ms late and is 45."""
+def test_the_arm_is_fitted_on_the_trusted_sensor_and_the_others_after_it() -> None:
+    """Arm, process noise and its own noise are as from a run without the others; its latency stays.
+
+    The other's is 45 ms within 3 from 10, inside its interval, its sds are within 20 %.
+    """
     sim = outage(1)
     config = with_sensors(spoiled(sim.config), "vision", latency=0.010)
-    return quietly(lambda: pf.tune([sim.run], config, fit=["noise", "delay", "latency"], trust="tracker"))
-
-
-@pytest.mark.long
-def test_the_arm_is_fitted_on_the_trusted_sensor_alone() -> None:
-    """Arm, process noise and its own noise are as from a run without the others."""
-    found, sim = trusting(), outage(1)
+    found = quietly(lambda: pf.tune([sim.run], config, fit=["noise", "delay", "latency"], trust="tracker"))
     alone = replace(sim.run, sensors={"tracker": sim.run.sensors["tracker"]})
     lone = replaced(found.before, sensors={"tracker": found.before.sensors["tracker"]})
-    other = quietly(lambda: pf.tune([alone], lone, fit=["noise", "delay"]))
-    assert found.config.process == other.config.process
-    assert found.config.sensors["tracker"] == other.config.sensors["tracker"]
-    for axis in AXES:
-        ours, theirs = found.config.arm.axes[axis], other.config.arm.axes[axis]
-        assert (ours.plant.lag, ours.delay) == (theirs.plant.lag, theirs.delay)
-    assert found.summary.orders == other.summary.orders
-    assert found.summary.trusted == "tracker" and len(found.stages) == 2
-
-
-def test_the_others_are_fitted_after_it() -> None:
-    """45 ms within 3 from 10, inside its interval; sds within 20 %. The trusted sensor's own latency stays."""
-    found = trusting()
-    assert found.config.sensors["tracker"].latency == 0.008
+    other = quietly(lambda: pf.tune([alone], lone, fit=["noise", "delay"])).config
+    assert (found.config.process, found.config.sensors["tracker"]) == (other.process, other.sensors["tracker"])
+    assert [found.config.arm.delay_of(axis) for axis in AXES] == [other.arm.delay_of(axis) for axis in AXES]
     assert found.config.sensors["vision"].latency == pytest.approx(0.045, abs=0.003)
     low, high = fitted(found)["sensors.vision.latency_ms"].ci95
     assert low is not None and high is not None and low < 45.0 < high
@@ -282,13 +197,7 @@ def test_the_others_are_fitted_after_it() -> None:
         assert found.config.sensors["vision"].sd_of(axis) == pytest.approx(5e-4, rel=0.2)
     second = {one.key for one in found.stages[1].free}
     assert second == {"sensors.vision.latency_ms", *(f"sensors.vision.sd_mm.{axis}" for axis in AXES)}
-    assert "sensors.tracker.latency_ms" not in fitted(found)
-
-
-def test_a_trusted_sensor_must_exist() -> None:
-    """An unknown one is refused with the nearest."""
-    with pytest.raises(pf.UnknownNameError, match="unknown sensor 'trakker'; did you mean 'tracker'"):
-        pf.tune([outage(1).run], outage(1).config, trust="trakker")
+    assert found.summary.trusted == "tracker"
 
 
 # ---- Ctrl-C ---------------------------------------------------------------------------------------------------------
@@ -340,8 +249,8 @@ def test_interrupted_it_gives_the_best_so_far(share: float, trust: str | None, t
         assert total(sim.run, found.config) == pytest.approx(stop.calls[-1][1].log_posterior, abs=0.05)
 
 
-def test_what_is_kept_has_the_parameters_of_its_own_plants() -> None:
-    """A search that chose other orders and ended lower: stages have the given plants, and no orders are reported."""
+def test_what_is_as_likely_at_first_is_kept() -> None:
+    """A search that chose other orders and ended lower: the configuration is the one as given, with a note."""
     sim = outage(1)
     given = with_order(with_order(sim.config, "tangential", 1), "vertical", 2)
     pipeline = Pipeline([sim.run], given, plans(given, ARM, [], None), lambda _, __: None)
@@ -351,14 +260,8 @@ def test_what_is_kept_has_the_parameters_of_its_own_plants() -> None:
     assert isinstance(chosen["vertical"].plant, pf.FirstOrder)
     pipeline.best = with_sensors(pipeline.best, sd=0.1)
     pipeline.keep_the_better()
-    assert pipeline.kept
-    (stage,) = pipeline.stages
-    assert stage.orders == {} and stage.best.config.arm == given.arm
-    found = {one.key: fitted_one(one, given, pipeline.result(), None) for one in stage.free}
-    assert all(one.value == pytest.approx(one.before, rel=1e-5) for one in found.values())
-    plants = ["axes.tangential.time_constant_ms", "axes.vertical.natural_frequency_rad_s", "axes.vertical.damping"]
-    assert [key for key in found if key.startswith("axes") and not key.endswith("delay_ms")] == plants
-    assert profiles(stage, {key: one.ci95 for key, one in found.items()})
+    assert pipeline.result() == given and pipeline.stages == []
+    assert pipeline.notes[-1].startswith("nothing more likely was found than the configuration as given")
 
 
 # ---- the shipped scan -----------------------------------------------------------------------------------------------
@@ -399,7 +302,7 @@ def test_the_shipped_scan_is_tuned_as_well_as_it_was_by_hand() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.xfail(reason="since 0.2 it is 0.161 mm: the cause is not found yet")
+@pytest.mark.xfail(reason="0.1611 mm: the fitted gain is at its bound, the model does not fit this axis")
 def test_the_camera_alone_follows_the_vertical_axis_of_the_scan() -> None:
     """At most 0.160 mm, tuned by the tracker."""
     assert scan_errors("vision")["vertical"] <= 0.160

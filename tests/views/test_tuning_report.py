@@ -18,8 +18,7 @@ from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.consistency import consistency, densities_of
 from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
-from pumafuse.tuning.intervals import Profile, profiles
-from pumafuse.tuning.maximise import maximise
+from pumafuse.tuning.intervals import Profile
 from pumafuse.views import colours as style
 from pumafuse.views import tuning_report
 from pumafuse.views.tuning_report import page
@@ -69,7 +68,7 @@ def shown() -> str:
 
 
 def drawn(found: pf.Tuning) -> dict[str, Profile]:
-    return {one.key: one for one in profiles(found.stages[0], {one.key: one.ci95 for one in found.summary.parameters})}
+    return {one.key: one for one in found.profiles}
 
 
 def test_every_part_of_the_page_has_its_heading_and_sentence_and_nothing_is_loaded() -> None:
@@ -121,23 +120,6 @@ def test_an_interval_ends_where_its_profile_has_dropped_by_half_a_chi_square() -
     assert ends == 9
     noise = curves["process.tip.input_noise_mm_rtHz"]  # its interval includes 0: on a linear scale, from 0 on
     assert not noise.log and noise.values[0] < 0.01 * noise.values[-1] and (np.diff(noise.drop) < 0.0).all()
-
-
-def test_the_others_follow_along_the_ridge() -> None:
-    """Nowhere more likely than the maximum with this parameter fixed, and hardly less."""
-    found, _ = tuned()
-    stage = found.stages[0]
-    (delay,) = [one for one in stage.free if one.key == "axes.tip.delay_ms"]
-    others = [one for one in stage.free if one is not delay]
-    best = maximise(stage.likelihood, stage.best.config, stage.free, outcomes=stage.best.outcomes)
-    curve = drawn(found)["axes.tip.delay_ms"]
-    for value, drop in zip(curve.values, curve.drop, strict=True):
-        fixed = delay.put(best.config, value * delay.unit)
-        highest = maximise(stage.likelihood, fixed, others, outcomes=best.outcomes).log_posterior - best.log_posterior
-        alone = stage.likelihood.evaluate(fixed, best.outcomes).total - best.log_posterior
-        assert highest - 0.3 < drop < highest + 0.01
-        if abs(highest) > 1.0:
-            assert alone < 1.3 * highest  # were they to stay, it would drop much faster
 
 
 def test_the_profile_of_a_lone_parameter_is_the_likelihood_of_a_fusion() -> None:
@@ -199,7 +181,8 @@ def test_innovations_are_shown_before_and_after_on_one_scale(figures: list[Figur
     """Those that were fused, over their standard deviations; and the autocorrelations of both."""
     found, run = tuned()
     pair = [pf.fuse(run, config) for config in (found.before, found.config)]
-    tuning_report.innovation_figure(*pair, "camera", "tip")
+    tests = tuple(consistency(est, "camera", "tip") for est in pair)
+    tuning_report.innovation_figure(*pair, "camera", "tip", tests)
     *series, correlation = figures[0].axes
     for axes, est in zip(series, pair, strict=True):
         fused = est.measurements.where(est.measurements.outcome == Outcome.FUSED)
@@ -208,32 +191,18 @@ def test_innovations_are_shown_before_and_after_on_one_scale(figures: list[Figur
         np.testing.assert_array_equal(dots.get_ydata(), fused.innovation / fused.innovation_sd)
     assert series[0].get_ylim() == series[1].get_ylim()
     bars = [bar.get_height() for bars in correlation.containers for bar in bars]
-    tests = [consistency(est, "camera", "tip") for est in pair]
     np.testing.assert_array_equal(bars, np.concatenate([one.correlation for one in tests if one is not None]))
 
 
-def test_the_sentence_on_innovations_has_the_numbers_of_a_fusion() -> None:
-    """NIS and whiteness of the run before and after, as `fuse` has them."""
-    found, run = tuned()
-    tests = [consistency(pf.fuse(run, config), "camera", "tip") for config in (found.before, found.config)]
-    before, after = (one for one in tests if one is not None)
+def test_the_page_has_the_numbers_of_fusions_and_the_files_as_they_are_written(tmp_path: Path) -> None:
+    """NIS of the run before and after, each number of the validation, and what `pumafuse tune` writes."""
+    (found, run), text = tuned(), shown()
+    before, after = (consistency(pf.fuse(run, config), "camera", "tip") for config in (found.before, found.config))
     assert abs(after.nis - 1.0) < 0.1 < abs(before.nis - 1.0)
-    sentence = outline(shown()).sentences["Innovations before and after"]
+    sentence = outline(text).sentences["Innovations before and after"]
     assert f"tip, camera: NIS {before.nis:.2f} → {after.nis:.2f}" in sentence
     assert "came nearer to it for 1 of 1; 0 → 1 of 1 are white" in sentence
-
-
-def test_files_are_shown_as_they_are_written(tmp_path: Path) -> None:
-    """What stands under fusion.toml and arm.toml is what `pumafuse tune` writes there."""
-    texts = [html.unescape(text) for text in re.findall(r"<pre>(.*?)</pre>", shown(), re.DOTALL)]
-    tuned()[0].config.save(tmp_path)
-    assert texts == [(tmp_path / name).read_text(encoding="utf-8") for name in ("fusion.toml", "arm.toml")]
-
-
-def test_the_validation_is_there_before_and_after() -> None:
-    """Numbers of the check in their row, and the sentence says which axis is better."""
-    text = shown()
-    (check,) = tuned()[0].summary.validation or ()
+    (check,) = found.summary.validation or ()
     old, new = check.before, check.after
     for part in (
         f"{old.sensors['camera'].nis:.2f} → {new.sensors['camera'].nis:.2f}",
@@ -243,6 +212,9 @@ def test_the_validation_is_there_before_and_after() -> None:
     ):
         assert part in text
     assert "fitted on, tip is better." in outline(text).sentences["Validation"]
+    found.config.save(tmp_path)
+    files = [html.unescape(text) for text in re.findall(r"<pre>(.*?)</pre>", text, re.DOTALL)]
+    assert files == [(tmp_path / name).read_text(encoding="utf-8") for name in ("fusion.toml", "arm.toml")]
 
 
 def test_names_are_text_and_nothing_else() -> None:

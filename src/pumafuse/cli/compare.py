@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
-
-import msgspec
+from typing import Any
 
 from ..errors import RunError
 from ..fusion import results
-from ..fusion.summary import ScoreSummary
-from .tables import console, score_table
-
-
-class Compared(msgspec.Struct, frozen=True, kw_only=True):
-    """One entry of the list that ``compare --json`` prints: a result folder and its scores by axis."""
-
-    folder: str
-    run: str
-    mode: str
-    axes: dict[str, ScoreSummary]
+from .tables import console, print_json, score_table
 
 
 def run(folders: Sequence[Path], reference: Path | None, json: bool) -> None:
@@ -28,7 +18,7 @@ def run(folders: Sequence[Path], reference: Path | None, json: bool) -> None:
     Raises:
         PumafuseError: A folder holds no results, or nothing can be scored.
     """
-    compared: list[Compared] = []
+    compared: list[dict[str, Any]] = []
     for folder in folders:
         result = results.read(folder)
         track = result.reference
@@ -42,8 +32,9 @@ def run(folders: Sequence[Path], reference: Path | None, json: bool) -> None:
                 f"{folder}: the reference covers no estimate on any axis; do its axes ({', '.join(track.position)})"
                 " and its clock fit the run?"
             )
-        compared.append(Compared(folder=str(folder), run=result.summary.run, mode=result.summary.mode, axes=scores))
+        run, mode = result.summary.run, result.summary.mode
+        compared.append({"folder": str(folder), "run": run, "mode": mode, "axes": scores})
     if json:
-        print(msgspec.json.format(msgspec.json.encode(compared), indent=2).decode())
+        print_json(compared)
     else:
-        console().print(score_table([(entry.folder, entry.axes) for entry in compared]))
+        console(sys.stdout).print(score_table((one["folder"], one["axes"]) for one in compared))

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
-import msgspec
 import numpy as np
+import typer
 
 from ..arrays import FloatArray
 from ..model.arm import ArmModel
 from ..model.discrete import DiscreteModel, discretize
 from ..units import shifted
-from .tables import console
+from .tables import print_json
 
 _MOST_TICKS = 200  # of a step response
+_MATRICES = {"F": "", "B": "", "H": "", "Q": " [mm²] for input noise of 1 mm/√Hz"}
 
 
 def run(source: str, axis: str | None, period_ms: float | None, json: bool) -> None:
@@ -31,47 +31,36 @@ def run(source: str, axis: str | None, period_ms: float | None, json: bool) -> N
         for name in (arm.axes if axis is None else [axis])
     }
     if json:
-        axes = {name: _as_json(model) for name, model in models.items()}
-        print(msgspec.json.format(msgspec.json.encode({"arm": arm.name, "axes": axes}), indent=2).decode())
+        print_json({"arm": arm.name, "axes": {name: _tree(model) for name, model in models.items()}})
         return
     for name, model in models.items():
         _print(f"{arm.name}, {name}", model)
 
 
-def _as_json(model: DiscreteModel) -> dict[str, Any]:
+def _tree(model: DiscreteModel) -> dict[str, object]:
     return {
         "period_ms": shifted(model.period, 3),
         "delay_ms": shifted(model.delay, 3),
         "states": model.states,
-        "F": model.F.tolist(),
-        "B": model.B.tolist(),
-        "H": model.H.tolist(),
-        "Q": model.Q.tolist(),
+        **{name: getattr(model, name).tolist() for name in _MATRICES},
         "poles": [(pole.real, pole.imag) for pole in model.poles.tolist()],
         "step_response_mm": _step_response(model).tolist(),
     }
 
 
 def _print(title: str, model: DiscreteModel) -> None:
-    out = console(soft_wrap=True)
-    out.print(title, style="bold", markup=False, end="")
-    out.print(f": period {shifted(model.period, 3):g} ms, delay {shifted(model.delay, 3):g} ms", markup=False)
-    out.print(f"states: {', '.join(model.states)} (mm, mm/s)", markup=False)
+    typer.echo(f"{title}: period {shifted(model.period, 3):g} ms, delay {shifted(model.delay, 3):g} ms")
+    typer.echo(f"states: {', '.join(model.states)} (mm, mm/s)")
     with np.printoptions(precision=6, suppress=False, linewidth=120):
-        for name in ("F", "B", "H", "Q"):
-            unit = " [mm²] for input noise of 1 mm/√Hz" if name == "Q" else ""
-            out.print(f"{name}{unit} =\n{getattr(model, name)}", markup=False)
-        poles = ", ".join(
-            f"{pole.real:.6g}" if pole.imag == 0.0 else f"{pole.real:.6g}{pole.imag:+.6g}j"
-            for pole in model.poles.tolist()
-        )
-        out.print(f"poles: {poles}", markup=False)
-        out.print(f"step response, p[0], p[1], …:\n{_step_response(model)}\n", markup=False)
+        for name, unit in _MATRICES.items():
+            typer.echo(f"{name}{unit} =\n{getattr(model, name)}")
+        poles = (f"{pole.real:.6g}" + (f"{pole.imag:+.6g}j" if pole.imag else "") for pole in model.poles.tolist())
+        typer.echo(f"poles: {', '.join(poles)}")
+        typer.echo(f"step response, p[0], p[1], …:\n{_step_response(model)}\n")
 
 
 def _step_response(model: DiscreteModel) -> FloatArray:
     """Positions at the ticks until the slowest pole has settled to 1e-3."""
-    plant = [abs(pole) for pole in model.poles if abs(pole) > 1e-9]
-    slowest = max(plant, default=0.0)
-    settling = math.ceil(math.log(1e-3) / math.log(slowest)) if 0.0 < slowest < 1.0 else 1
+    slowest = float(np.abs(model.poles).max())
+    settling = math.ceil(math.log(1e-3) / math.log(slowest)) if 1e-9 < slowest < 1.0 else 1
     return model.step_response(min(math.ceil(model.delay / model.period) + settling + 2, _MOST_TICKS))

@@ -6,16 +6,15 @@ import os
 import sys
 import warnings
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar, overload
+from typing import Annotated, Literal
 
 import typer
+from typer import Argument, BadParameter, Option
 
 from ..errors import PumafuseError, PumafuseWarning
 
 # With matrices of 5 by 5 the threads of a BLAS only wait for each other, ten times as long on a busy machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-N = TypeVar("N", float, float | None)
 
 app = typer.Typer(
     name="pumafuse",
@@ -26,12 +25,12 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-Runs = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")]
-Config = Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")]
-Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")]
-Report = Annotated[Path | None, typer.Option(metavar="DIR", help="Also write tables and figures as one HTML page.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace an earlier result.")]
+Runs = Annotated[list[Path], Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")]
+Config = Annotated[Path, Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")]
+Rate = Annotated[float | None, Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")]
+Report = Annotated[Path | None, Option(metavar="DIR", help="Also write tables and figures as one HTML page.")]
+Json = Annotated[bool, Option("--json", help="Print JSON instead of a table.")]
+Force = Annotated[bool, Option("--force", help="Replace an earlier result.")]
 
 
 def _version(wanted: bool) -> None:
@@ -44,9 +43,7 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _root(  # pyright: ignore[reportUnusedFunction]
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
-    ] = False,
+    version: Annotated[bool, Option("--version", callback=_version, is_eager=True, help="Show the version.")] = False,
 ) -> None:
     pass
 
@@ -55,19 +52,15 @@ def _root(  # pyright: ignore[reportUnusedFunction]
 def fuse(
     runs: Runs,
     config: Config,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")],
-    sensors: Annotated[
-        str | None, typer.Option(metavar="A,B", help="Which sensors to use; default: all configured.")
-    ] = None,
+    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")],
+    sensors: Annotated[str | None, Option(metavar="A,B", help="Which sensors to use; default: all configured.")] = None,
     rate: Rate = None,
-    smooth: Annotated[
-        bool, typer.Option("--smooth", help="Use later measurements too: the best estimate afterwards, no velocity.")
-    ] = False,
-    as_live: Annotated[bool, typer.Option("--as-live", help="Use only measurements that had arrived by then.")] = False,
-    rrd: Annotated[bool, typer.Option("--rrd", help="Also write fused.rrd for the Rerun viewer.")] = False,
-    figures: Annotated[bool, typer.Option("--figures", help="Also draw the run and its validation.")] = False,
+    smooth: Annotated[bool, Option("--smooth", help="Use later measurements too; gives no velocity.")] = False,
+    as_live: Annotated[bool, Option("--as-live", help="Use only measurements that had arrived by then.")] = False,
+    rrd: Annotated[bool, Option("--rrd", help="Also write fused.rrd for the Rerun viewer.")] = False,
+    figures: Annotated[bool, Option("--figures", help="Also draw the run and its validation.")] = False,
     engine: Annotated[
-        Literal["compiled", "filterpy"], typer.Option(help="filterpy: the slow reference, only for filtered estimates.")
+        Literal["compiled", "filterpy"], Option(help="filterpy: the slow reference, only for filtered estimates.")
     ] = "compiled",
     force: Force = False,
 ) -> None:
@@ -78,30 +71,17 @@ def fuse(
     from . import fuse as command
 
     if smooth and as_live:
-        raise typer.BadParameter("choose one of --smooth and --as-live")
+        raise BadParameter("choose one of --smooth and --as-live")
     if engine == "filterpy" and (smooth or as_live):
-        raise typer.BadParameter("--engine filterpy gives filtered estimates only: without --smooth and --as-live")
-    options = command.Options(
-        config=config,
-        output=output,
-        sensors=None if sensors is None else _names(sensors),
-        rate=_positive(rate, "--rate"),
-        smooth=smooth,
-        as_live=as_live,
-        rrd=rrd,
-        figures=figures,
-        engine=engine,
-        force=force,
-    )
-    command.run(runs, options)
+        raise BadParameter("--engine filterpy gives filtered estimates only: without --smooth and --as-live")
+    _check_positive(rate=rate)
+    command.run(runs, config, output, _names(sensors), rate, smooth, as_live, rrd, figures, engine, force)
 
 
 @app.command()
 def compare(
-    folders: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Result folders of `pumafuse fuse`.")],
-    reference: Annotated[
-        Path | None, typer.Option(metavar="FILE_OR_RUN", help="A reference from elsewhere; default: each folder's own.")
-    ] = None,
+    folders: Annotated[list[Path], Argument(metavar="DIR...", help="Result folders of `pumafuse fuse`.")],
+    reference: Annotated[Path | None, Option(metavar="FILE_OR_RUN", help="Default: each folder's own.")] = None,
     json: Json = False,
 ) -> None:
     """Score results against a reference: RMSE, 95 % coverage, bias and mean NEES of each axis, and of its velocity."""
@@ -112,26 +92,23 @@ def compare(
 
 @app.command()
 def discretize(
-    arm: Annotated[str, typer.Argument(metavar="ARM", help="An arm.toml, or the name of a preset.")],
-    axis: Annotated[str | None, typer.Option(metavar="NAME", help="One axis; default: all.")] = None,
-    period: Annotated[float | None, typer.Option(metavar="MS", help="Period; default: the arm's own.")] = None,
+    arm: Annotated[str, Argument(metavar="ARM", help="An arm.toml, or the name of a preset.")],
+    axis: Annotated[str | None, Option(metavar="NAME", help="One axis; default: all.")] = None,
+    period: Annotated[float | None, Option(metavar="MS", help="Period; default: the arm's own.")] = None,
     json: Json = False,
 ) -> None:
     """Show the exact delay-augmented model of an arm: F, B, H, Q, poles and step response."""
     from . import discretize as command
 
-    command.run(arm, axis, _positive(period, "--period"), json)
+    _check_positive(period=period)
+    command.run(arm, axis, period, json)
 
 
 @app.command()
 def simulate(
-    scenario: Annotated[
-        Path, typer.Argument(metavar="SCENARIO.TOML", help="The run to simulate, and the filter's configuration.")
-    ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the recorded run goes.")],
-    runs: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="N runs with seeds in a row, in DIR/seed-K.")
-    ] = None,
+    scenario: Annotated[Path, Argument(metavar="SCENARIO.TOML", help="The run, and the filter's configuration.")],
+    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the recorded run goes.")],
+    runs: Annotated[int | None, Option(metavar="N", min=1, help="N runs with seeds in a row, in DIR/seed-K.")] = None,
     force: Force = False,
 ) -> None:
     """Make a recorded run with its reference from a scenario, and the configuration of a filter for it."""
@@ -142,69 +119,43 @@ def simulate(
 
 @app.command()
 def plan(
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the sequences go.")],
-    axes: Annotated[
-        str | None, typer.Option(metavar="A,B", help="Axes to step; default: the arm's, or the paper's three.")
-    ] = None,
+    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the sequences go.")],
+    axes: Annotated[str | None, Option(metavar="A,B", help="Default: the arm's, or the paper's three.")] = None,
     speeds: Annotated[
-        str, typer.Option(metavar="M_S,...", help="Speeds of the steps; a step is its speed times the period.")
+        str, Option(metavar="M_S,...", help="Speeds of the steps; a step is its speed times the period.")
     ] = "0.071,0.14,0.28,0.68",
-    positions: Annotated[
-        Path | None, typer.Option(metavar="TABLE", help="Where to step: a row a position, a column a coordinate.")
-    ] = None,
-    replicates: Annotated[int, typer.Option(metavar="N", min=1, help="How often each combination is tried.")] = 2,
-    period: Annotated[
-        float | None, typer.Option(metavar="MS", help="Update period; default: the arm's, or 28.")
-    ] = None,
-    hold: Annotated[float, typer.Option(metavar="S", help="How long a step is held.")] = 0.5,
-    rest: Annotated[float, typer.Option(metavar="S", help="How long the arm rests before and after it.")] = 0.5,
-    noise: Annotated[
-        str, typer.Option(metavar="MM,...", help="Amplitudes of the white noise; empty: none.")
-    ] = "4,8,14",
-    noise_duration: Annotated[float, typer.Option(metavar="S", help="Of each white-noise sequence.")] = 4.2,
-    arm: Annotated[
-        str | None, typer.Option(metavar="ARM", help="What is known of the arm, to check the plan: arm.toml or preset.")
-    ] = None,
-    max_speed: Annotated[
-        float | None, typer.Option(metavar="M_S", help="The arm's limit; default: the arm's validity.")
-    ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the order and of the noise.")] = 1,
+    positions: Annotated[Path | None, Option(metavar="TABLE", help="Where to step, a position a row.")] = None,
+    replicates: Annotated[int, Option(metavar="N", min=1, help="How often each combination is tried.")] = 2,
+    period: Annotated[float | None, Option(metavar="MS", help="Update period; default: the arm's, or 28.")] = None,
+    hold: Annotated[float, Option(metavar="S", help="How long a step is held.")] = 0.5,
+    rest: Annotated[float, Option(metavar="S", help="How long the arm rests before and after it.")] = 0.5,
+    noise: Annotated[str, Option(metavar="MM,...", help="Amplitudes of the white noise; empty: none.")] = "4,8,14",
+    noise_duration: Annotated[float, Option(metavar="S", help="Of each white-noise sequence.")] = 4.2,
+    arm: Annotated[str | None, Option(metavar="ARM", help="Check the plan for this arm: arm.toml or preset.")] = None,
+    max_speed: Annotated[float | None, Option(metavar="M_S", help="Limit; default: the arm's validity.")] = None,
+    seed: Annotated[int, Option(metavar="N", min=0, help="Of the order and of the noise.")] = 1,
     force: Force = False,
 ) -> None:
     """Lay out a step campaign and white noise to send to an arm, tick by tick."""
     from . import plan as command
 
-    wanted = command.Wanted(
-        axes=None if axes is None else _names(axes, "--axes"),
-        speeds=_numbers(speeds, "--speeds"),
-        positions=positions,
-        replicates=replicates,
-        period=_si(_positive(period, "--period")),
-        hold=_positive(hold, "--hold"),
-        rest=_positive(rest, "--rest"),
-        amplitudes=tuple(_si(amplitude) for amplitude in _numbers(noise, "--noise")),
-        noise_duration=_positive(noise_duration, "--noise-duration"),
-        seed=seed,
-    )
-    command.run(output, wanted, arm, _positive(max_speed, "--max-speed"), force)
+    _check_positive(period=period, hold=hold, rest=rest, noise_duration=noise_duration, max_speed=max_speed)
+    steps = {"speeds": _numbers(speeds, "--speeds"), "replicates": replicates, "hold": hold, "rest": rest, "seed": seed}
+    white = {"amplitudes": tuple(map(_si, _numbers(noise, "--noise"))), "noise_duration": noise_duration}
+    named, period_s = _names(axes, "--axes"), period and _si(period)
+    command.run(output, named, period_s, positions, arm, max_speed, force, **steps, **white)
 
 
 @app.command()
 def identify(
-    trials: Annotated[Path, typer.Argument(metavar="TRIALS", help="Folder with trials.csv and samples.csv.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="ARM.TOML", help="Where the model goes.")],
-    period: Annotated[
-        float | None, typer.Option(metavar="MS", help="Update period; default: step over speed, where trials agree.")
-    ] = None,
+    trials: Annotated[Path, Argument(metavar="TRIALS", help="Folder with trials.csv and samples.csv.")],
+    output: Annotated[Path, Option("--output", "-o", metavar="ARM.TOML", help="Where the model goes.")],
+    period: Annotated[float | None, Option(metavar="MS", help="Update period; default: step over speed.")] = None,
     samples: Annotated[
-        int | None, typer.Option(metavar="N", min=8, help="Use only N samples from each step on; default: all.")
+        int | None, Option(metavar="N", min=8, help="Samples used from each step; default: all.")
     ] = None,
-    paper: Annotated[
-        bool, typer.Option("--paper", help="Read delay and gain off each trial, as published, instead of fitting.")
-    ] = False,
-    tolerance: Annotated[
-        float, typer.Option(metavar="MM", help="RMS beyond which the model is not called valid.")
-    ] = 1.0,
+    paper: Annotated[bool, Option("--paper", help="Read delay and gain off each trial, as published.")] = False,
+    tolerance: Annotated[float, Option(metavar="MM", help="RMS beyond which the model is not called valid.")] = 1.0,
     report: Report = None,
     json: Json = False,
     force: Force = False,
@@ -212,29 +163,17 @@ def identify(
     """Make a model of an arm from step trials: order, gain, delay and plant of each axis, with intervals."""
     from . import identify as command
 
-    options = command.Options(
-        output=output,
-        period=_si(_positive(period, "--period")),
-        samples=samples,
-        paper=paper,
-        tolerance=_si(_positive(tolerance, "--tolerance")),
-        report=report,
-        json=json,
-        force=force,
-    )
-    command.run(trials, options)
+    _check_positive(period=period, tolerance=tolerance)
+    command.run(trials, output, period and _si(period), samples, paper, _si(tolerance), report, json, force)
 
 
 @app.command()
 def verify(
     runs: Runs,
-    arm: Annotated[str, typer.Option("--arm", metavar="ARM", help="An arm.toml, or the name of a preset.")],
-    sensors: Annotated[
-        str | None, typer.Option(metavar="A,B", help="Compare with these; default: the reference, else every sensor.")
-    ] = None,
+    arm: Annotated[str, Option("--arm", metavar="ARM", help="An arm.toml, or the name of a preset.")],
+    sensors: Annotated[str | None, Option(metavar="A,B", help="Default: the reference, else every sensor.")] = None,
     start: Annotated[
-        list[str] | None,
-        typer.Option(metavar="AXIS=MM", help="Level before the first command; default: the run's, else chosen by RMS."),
+        list[str] | None, Option(metavar="AXIS=MM", help="Start level; default: the run's, else chosen by RMS.")
     ] = None,
     report: Report = None,
     json: Json = False,
@@ -244,27 +183,21 @@ def verify(
     from . import verify as command
 
     levels = dict(_level(text) for text in start or ())
-    command.run(runs, arm, None if sensors is None else _names(sensors), levels, report, json, force)
+    command.run(runs, arm, _names(sensors), levels, report, json, force)
 
 
 @app.command()
 def tune(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")],
-    config: Annotated[Path, typer.Option("--config", "-c", metavar="FUSION.TOML", help="What to start from.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the tuned files go.")],
-    fit: Annotated[str, typer.Option(metavar="A,B", help="What to fit: noise, delay, plant, gain, latency.")] = "noise",
+    runs: Annotated[list[Path], Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")],
+    config: Annotated[Path, Option("--config", "-c", metavar="FUSION.TOML", help="What to start from.")],
+    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the tuned files go.")],
+    fit: Annotated[str, Option(metavar="A,B", help="What to fit: noise, delay, plant, gain, latency.")] = "noise",
     fix: Annotated[
-        list[str] | None,
-        typer.Option(metavar="KEY", help="Leave this as it is: a name or part of one, as sensors.tracker; repeatable."),
+        list[str] | None, Option(metavar="KEY", help="Leave as it is: a name or part, as sensors.tracker; repeatable.")
     ] = None,
-    trust: Annotated[
-        str | None,
-        typer.Option(metavar="SENSOR", help="An accurate sensor to fit the arm on; the others are fitted after it."),
-    ] = None,
-    validate: Annotated[
-        Path | None, typer.Option(metavar="RUN", help="Validate on this run. Default: a single run's last third.")
-    ] = None,
-    report: Annotated[bool, typer.Option("--report", help="Also write report.html into DIR.")] = False,
+    trust: Annotated[str | None, Option(metavar="SENSOR", help="Fit the arm on this accurate sensor first.")] = None,
+    validate: Annotated[Path | None, Option(metavar="RUN", help="Default: a single run's last third.")] = None,
+    report: Annotated[bool, Option("--report", help="Also write report.html into DIR.")] = False,
     json: Json = False,
     force: Force = False,
 ) -> None:
@@ -274,45 +207,30 @@ def tune(
     """
     from . import tune as command
 
-    kinds = _names(fit, "--fit")
-    fixed = [name for listed in fix or () for name in _names(listed, "--fix")]
+    kinds, fixed = _names(fit, "--fit") or [], _names(",".join(fix) if fix else None, "--fix") or []
     command.run(runs, config, output, kinds, fixed, trust, validate, report, json, force)
 
 
 @app.command()
 def live(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="SOURCE",
-            help="stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, or replay:RUN?speed=4 (speed=max:"
-            " as fast as it can be).",
-        ),
-    ],
+    source: Annotated[str, Argument(metavar="SOURCE", help="Where events come from, see above.")],
     config: Config,
     rate: Rate = None,
-    window: Annotated[float, typer.Option(metavar="S", help="How late an event may come.")] = 2.0,
-    stale_after: Annotated[
-        float, typer.Option(metavar="S", help="Without a measurement for so long an axis is stale.")
-    ] = 1.0,
-    out: Annotated[
-        str | None, typer.Option(metavar="udp://HOST:PORT", help="Send the estimates there; default: standard output.")
-    ] = None,
-    record: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Record the stream as a run, into a new folder.")
-    ] = None,
+    window: Annotated[float, Option(metavar="S", help="How late an event may come.")] = 2.0,
+    stale_after: Annotated[float, Option(metavar="S", help="Without a measurement so long an axis is stale.")] = 1.0,
+    out: Annotated[str | None, Option(metavar="udp://HOST:PORT", help="Where estimates go; default: stdout.")] = None,
+    record: Annotated[Path | None, Option(metavar="DIR", help="Record the stream as a run, into a new folder.")] = None,
     rerun: Annotated[
-        str | None, typer.Option(metavar="spawn|connect|web", help="Draw live: a new viewer, one that runs, a browser.")
+        str | None, Option(metavar="spawn|connect|web", help="Draw live: a new viewer, one that runs, a browser.")
     ] = None,
-    status: Annotated[bool, typer.Option("--status", help="Show estimates and sensors on one live screen.")] = False,
-    listen: Annotated[
-        str | None, typer.Option(metavar="ADDR", help="Listen there instead of on loopback; needs --allow.")
-    ] = None,
-    allow: Annotated[
-        list[str] | None, typer.Option(metavar="CIDR", help="Senders accepted with --listen; may be given again.")
-    ] = None,
+    status: Annotated[bool, Option("--status", help="Show estimates and sensors on one live screen.")] = False,
+    listen: Annotated[str | None, Option(metavar="ADDR", help="Listen there, not on loopback; needs --allow.")] = None,
+    allow: Annotated[list[str] | None, Option(metavar="CIDR", help="Who may send with --listen; repeatable.")] = None,
 ) -> None:
     """Estimate from a stream of commands and measurements, as they come.
+
+    SOURCE is stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, or a recorded run: replay:RUN?speed=4
+    (speed=max: as fast as it can be).
 
     One JSON object a line, in mm and s. In: {"t": 12.345, "command": {"radial": 570.0}} and {"t": 12.351, "sensor":
     "tracker", "radial": 569.7}. Out: {"t": ..., "radial": {"position_mm": ..., "sd_mm": ..., "velocity_mm_s": ...}}.
@@ -320,27 +238,14 @@ def live(
     from . import live as command
 
     if bool(listen) != bool(allow) or listen == "":
-        raise typer.BadParameter("--listen ADDR and --allow CIDR go together", param_hint="--listen")
-    options = command.Options(
-        config=config,
-        rate=_positive(rate, "--rate"),
-        window=_positive(window, "--window"),
-        stale_after=_positive(stale_after, "--stale-after"),
-        status=status,
-        out=out,
-        record=record,
-        rerun=rerun,
-        listen=listen,
-        allow=allow or [],
-    )
-    command.run(source, options)
+        raise BadParameter("--listen ADDR and --allow CIDR go together", param_hint="--listen")
+    _check_positive(rate=rate, window=window, stale_after=stale_after)
+    command.run(source, config, rate, window, stale_after, out, record, rerun, status, listen, allow or [])
 
 
 @app.command()
 def demo(
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")] = Path(
-        "demo"
-    ),
+    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the result goes.")] = Path("demo"),
     force: Force = False,
 ) -> None:
     """Fuse a recorded run that comes with pumafuse, score it against its reference, and draw it."""
@@ -371,10 +276,11 @@ def _one_line(message: Warning | str, category: type[Warning], *_: object) -> No
     typer.echo(f"{name}: {message}", err=True)
 
 
-def _names(listed: str, option: str = "--sensors") -> list[str]:
-    names = [name.strip() for name in listed.split(",") if name.strip()]
-    if not names:
-        raise typer.BadParameter("names nothing", param_hint=option)
+def _names(listed: str | None, option: str = "--sensors") -> list[str] | None:
+    """Names with commas between; None if the option is not given."""
+    names = None if listed is None else [name.strip() for name in listed.split(",") if name.strip()]
+    if names == []:
+        raise BadParameter("names nothing", param_hint=option)
     return names
 
 
@@ -382,7 +288,7 @@ def _numbers(listed: str, option: str) -> tuple[float, ...]:
     try:
         return tuple(float(number) for number in listed.split(",") if number.strip())
     except ValueError:
-        raise typer.BadParameter(f"expected numbers with commas between, not '{listed}'", param_hint=option) from None
+        raise BadParameter(f"expected numbers with commas between, not '{listed}'", param_hint=option) from None
 
 
 def _level(text: str) -> tuple[str, float]:
@@ -391,21 +297,18 @@ def _level(text: str) -> tuple[str, float]:
     try:
         return axis.strip(), _si(float(level))
     except ValueError:
-        raise typer.BadParameter(f"expected AXIS=MM, not '{text}'", param_hint="--start") from None
+        raise BadParameter(f"expected AXIS=MM, not '{text}'", param_hint="--start") from None
 
 
-@overload
-def _si(value: float) -> float: ...
-@overload
-def _si(value: None) -> None: ...
-def _si(value: float | None) -> float | None:
+def _si(value: float) -> float:
     """Milliseconds or millimetres of the command line in s or m, without a binary rounding in between."""
     from ..units import shifted  # imports numpy, which no --help needs
 
-    return None if value is None else shifted(value, -3)
+    return shifted(value, -3)
 
 
-def _positive(value: N, name: str) -> N:
-    if value is not None and not 0.0 < value < float("inf"):
-        raise typer.BadParameter(f"must be a positive number, not {value}", param_hint=name)
-    return value
+def _check_positive(**options: float | None) -> None:
+    """Refuse an option that is given and is no positive number."""
+    for name, value in options.items():
+        if value is not None and not 0.0 < value < float("inf"):
+            raise BadParameter(f"must be a positive number, not {value}", param_hint=f"--{name.replace('_', '-')}")

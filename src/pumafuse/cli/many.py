@@ -5,14 +5,16 @@ joblib runs the jobs; ``joblib.parallel_config`` around :func:`run_jobs` chooses
 
 from __future__ import annotations
 
-import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar, cast
 
+import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.markup import escape
+from rich.progress import Progress
 
 from ..errors import PumafuseError, PumafuseWarning
 from ..folders import sweep
@@ -20,8 +22,13 @@ from ..folders import sweep
 R = TypeVar("R")
 
 
-class SomeFailedError(PumafuseError):
-    """Some of many jobs failed; the others are done."""
+@contextmanager
+def progress_bar(what: str, total: float = 1.0) -> Generator[Callable[[float], None]]:
+    """A progress bar on stderr, where that is a terminal, and the function that moves it to a part of ``total``."""
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(escape(what), total=total)
+        yield lambda done: bar.update(task, completed=done)
 
 
 def run_jobs(
@@ -39,47 +46,44 @@ def run_jobs(
 
     Raises:
         KeyboardInterrupt: Passed on, after printing how many are done.
-        SomeFailedError: A worker process died.
+        PumafuseError: A worker process died.
     """
     from joblib import Parallel, delayed
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     results: dict[str, R] = {}
     failed: dict[str, str] = {}
-    columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task(what, total=len(jobs))
-        parallel = Parallel(n_jobs=-1, return_as="generator_unordered", batch_size=1)
-        try:
+    parallel = Parallel(n_jobs=-1, return_as="generator_unordered", batch_size=1)
+    try:
+        with progress_bar(what, len(jobs)) as move:
             for name, result, problem in parallel(delayed(_guarded)(name, job) for name, job in jobs.items()):
                 if problem is None:
                     results[name] = cast(R, result)
                 else:
                     failed[name] = problem
-                bar.advance(task)
-        except KeyboardInterrupt:
-            print(f"interrupted: {len(results)} of {len(jobs)} runs are done and kept", file=sys.stderr)
-            sweep(places)
-            raise
-        except TerminatedWorkerError:
-            sweep(places)
-            raise SomeFailedError(
-                f"a worker process died (out of memory?): {len(results)} of {len(jobs)} runs are done and kept"
-            ) from None
+                move(len(results) + len(failed))
+    except KeyboardInterrupt:
+        typer.echo(f"interrupted: {len(results)} of {len(jobs)} runs are done and kept", err=True)
+        raise
+    except TerminatedWorkerError:
+        kept = f"{len(results)} of {len(jobs)} runs are done and kept"
+        raise PumafuseError(f"a worker process died (out of memory?): {kept}") from None
+    finally:
+        sweep(places)
     done = {name: results[name] for name in jobs if name in results}
     return done, {name: failed[name] for name in jobs if name in failed}
 
 
-def report_failures(failed: Mapping[str, str], count: int, where: str) -> None:
+def report_failures(failed: Mapping[str, str], count: int, where: Path) -> None:
     """Print the error of each job that failed.
 
     Raises:
-        SomeFailedError: There is one.
+        PumafuseError: There is one.
     """
     for name, problem in failed.items():
-        print(f"pumafuse: {name}: {problem}", file=sys.stderr)
+        typer.echo(f"pumafuse: {name}: {problem}", err=True)
     if failed:
-        raise SomeFailedError(f"{len(failed)} of {count} runs failed (see above); the others are in {where}")
+        raise PumafuseError(f"{len(failed)} of {count} runs failed (see above); the others are in {where}")
 
 
 def _guarded(name: str, job: Callable[[], R]) -> tuple[str, R | None, str | None]:

@@ -4,61 +4,64 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import typer
 
 from ..errors import ConfigError, PumafuseWarning
 from ..identification import plan as plans
 from ..identification.plan import Design
 from ..logs import tables
 from ..model.arm import CANONICAL_AXES, ArmModel
-from .tables import console
 
 _PERIOD = 0.028  # s, the paper's
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """Options of the command line, in s, m and m/s; axes and period as None are the arm's."""
-
-    axes: Sequence[str] | None
-    speeds: tuple[float, ...]
-    positions: Path | None
-    replicates: int
-    period: float | None
-    hold: float
-    rest: float
-    amplitudes: tuple[float, ...]
-    noise_duration: float
-    seed: int
-
-    def design(self, arm: ArmModel | None) -> Design:
-        """The campaign, for an arm that may be known."""
-        axes = self.axes or (CANONICAL_AXES if arm is None else tuple(arm.axes))
-        period = self.period or (_PERIOD if arm is None else arm.update_period)
-        positions: tuple[Mapping[str, str], ...] = ({},) if self.positions is None else _positions(self.positions)
-        options: dict[str, Any] = {**vars(self), "axes": tuple(axes), "period": period, "positions": positions}
-        return Design(**options)
-
-
-def run(output: Path, wanted: Wanted, arm: str | None, max_speed: float | None, force: bool) -> None:
+def run(
+    output: Path,
+    axes: Sequence[str] | None,
+    period: float | None,
+    positions: Path | None,
+    arm: str | None,
+    max_speed: float | None,
+    force: bool,
+    **design: Any,
+) -> None:
     """Lay out a campaign and write it.
+
+    Args:
+        output: Where it goes.
+        axes: To step; None: those of the arm.
+        period: Update period [s]; None: that of the arm.
+        positions: Table of the positions to step at; None: where the arm is.
+        arm: What is known of the arm, to check the plan.
+        max_speed: Its limit [m/s]; None: the arm's validity.
+        force: Replace an earlier campaign.
+        design: The other attributes of :class:`Design`.
 
     Raises:
         PumafuseError: The campaign cannot be carried out, or the folder is in the way.
     """
     plans.check_writable(output, force)
     model = None if arm is None else ArmModel.load(arm)
-    planned = plans.plan(wanted.design(model), model, max_speed)
+    planned = plans.plan(
+        Design(
+            axes=tuple(axes or (CANONICAL_AXES if model is None else model.axes)),
+            period=period or (_PERIOD if model is None else model.update_period),
+            positions=({},) if positions is None else _positions(positions),
+            **design,
+        ),
+        model,
+        max_speed,
+    )
     for warning in planned.warnings:
         warnings.warn(warning, PumafuseWarning, stacklevel=1)
     plans.write(planned, output, force)
-    counted = f"{len(planned.trials)} step trials and {len(planned.noise)} white-noise sequences"
-    console(soft_wrap=True).print(
-        f"{counted}, {planned.duration / 60.0:.1f} minutes without the moves between positions, written to {output}"
-        f"\nnext: record samples.csv beside trials.csv, then pumafuse identify {output} -o arm.toml",
-        markup=False,
+    typer.echo(
+        f"{len(planned.trials)} step trials and {len(planned.noise)} white-noise sequences,"
+        f" {planned.duration / 60.0:.1f} minutes without the moves between positions, written to {output}"
+        f"\nnext: record samples.csv beside trials.csv, then pumafuse identify {output} -o arm.toml"
     )
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+import typer
+
 from ..simulation import simulate as simulation
+from ..simulation.campaign import TRIALS
 from ..simulation.scenario import Scenario
 from .many import report_failures, run_jobs
-from .tables import console
 
 
 def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
@@ -17,25 +19,23 @@ def run(path: Path, output: Path, runs: int | None, force: bool) -> None:
     Raises:
         PumafuseError: The scenario is wrong, a folder is in the way, or at least one run failed.
     """
-    scenario, out = Scenario.load(path), console(soft_wrap=True)
+    scenario = Scenario.load(path)
     if scenario.teaches:
-        out.print(f"{scenario.name}: {scenario.teaches}", markup=False)
+        typer.echo(f"{scenario.name}: {scenario.teaches}")
     failed: dict[str, str] = {}
     if runs is None:
-        written, folders = [_simulate(scenario, scenario.seed, output, force)], str(output)
+        written, folders = [_simulate(scenario, scenario.seed, output, force)], output
     else:
         seeds = range(scenario.seed, scenario.seed + runs)
         jobs = {f"seed-{seed}": partial(_simulate, scenario, seed, output / f"seed-{seed}", force) for seed in seeds}
         done, failed = run_jobs("simulating", jobs, [output / name for name in jobs])
-        written, folders = list(done.values()), str(output / "seed-*")
+        written, folders = list(done.values()), output / "seed-*"
     if written:
         commands, rows, trials = (sum(counts) for counts in zip(*written, strict=True))
         counted = f"{commands} commands, {rows} rows of measurements" + (f", {trials} step trials" if trials else "")
-        how_many = "1 run" if len(written) == 1 else f"{len(written)} runs"
-        config = min(output.glob("**/fusion.toml"))
-        out.print(f"{how_many}: {counted}, written to {output}", markup=False)
-        out.print(f"next: pumafuse fuse {folders} -c {config} -o result", markup=False)
-    report_failures(failed, len(written) + len(failed), str(output))
+        typer.echo(f"{len(written)} {'run' if len(written) == 1 else 'runs'}: {counted}, written to {output}")
+        typer.echo(f"next: pumafuse fuse {folders} -c {min(output.glob('**/fusion.toml'))} -o result")
+    report_failures(failed, len(written) + len(failed), output)
 
 
 def _simulate(scenario: Scenario, seed: int, folder: Path, force: bool) -> tuple[int, int, int]:
@@ -44,4 +44,5 @@ def _simulate(scenario: Scenario, seed: int, folder: Path, force: bool) -> tuple
     simulated = simulation.simulate(scenario, seed)
     simulation.write(simulated, folder, force)
     rows = sum(len(source.stamp) for source in simulated.run.sensors.values())
-    return len(simulated.run.command.stamp), rows, 0 if simulated.trials is None else len(simulated.trials.axis)
+    trials = simulated.trials.get(TRIALS, ())
+    return len(simulated.run.command.stamp), rows, len(trials)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
+from io import StringIO
+from typing import Any, TextIO
 
+import msgspec
+import typer
 from rich import box
 from rich.console import Console
 from rich.markup import escape
@@ -14,93 +16,102 @@ from rich.table import Table
 from ..fusion.score import Z95
 from ..fusion.summary import ScoreSummary, Summary
 
-if TYPE_CHECKING:
-    from ..views.report import TextTable
+Columns = Mapping[str, tuple[str, str, float]]  # by heading: an attribute, its format, and what it is multiplied by
 
 _FEW_RUNS = 20  # that get lines of their own
+_SCORE: Columns = {
+    "RMSE, mm": ("rmse_mm", ".3f", 1.0),
+    "bias, mm": ("bias_mm", "+.3f", 1.0),
+    "95 %\ncoverage": ("coverage", ".1%", 1.0),
+    "NEES": ("nees_mean", ".2f", 1.0),
+    "scored": ("rows", ".0f", 1.0),
+    "left\nout": ("left_out", ".0f", 1.0),
+    "velocity\nRMSE, mm/s": ("velocity_rmse_mm_s", ".3f", 1.0),
+    "velocity\n95 % cov.": ("velocity_coverage", ".1%", 1.0),
+}
 
 
-def console(*, soft_wrap: bool = False) -> Console:
-    """Standard output for people; 120 columns wide where it is no terminal."""
-    width = None if sys.stdout.isatty() else 120
-    return Console(highlight=False, soft_wrap=soft_wrap, width=width)
+def console(file: TextIO) -> Console:
+    """A stream for people: 120 columns wide where it is no terminal; nowhere if it is closed, which makes it None."""
+    there = file or StringIO()
+    return Console(file=there, highlight=False, width=None if there.isatty() else 120)
 
 
-def text_table(text: TextTable) -> Table:
-    """A table of text as it is: numbers are right-justified, cells that have lines are not wrapped."""
-    table = Table(box=box.SIMPLE_HEAD)
-    for place, (heading, is_text) in enumerate(text.columns):
-        lines = any("\n" in row[place] for row in text.rows)
-        table.add_column(heading, justify="left" if is_text else "right", overflow="fold", no_wrap=lines)
-    for row in text.rows:
-        table.add_row(*map(escape, row))
-    return table
+def print_json(tree: Any) -> None:
+    """Print a tree of dictionaries, lists and structs on standard output."""
+    encoded = msgspec.json.Encoder(decimal_format="number").encode(tree)
+    typer.echo(msgspec.json.format(encoded, indent=2))
+
+
+def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """A table for the terminal, without columns in which no row has anything.
+
+    Columns of numbers are right-justified. They and cells of several lines are not wrapped.
+    """
+    made = Table(box=box.SIMPLE_HEAD)
+    kept: list[Sequence[str]] = []
+    for heading, *cells in zip(headings, *rows, strict=True):
+        if not set(cells) <= {"", "–"}:
+            numbers = all(cell[:1] in "+-–…<0123456789" for cell in cells)
+            whole = numbers or any("\n" in cell for cell in cells)
+            made.add_column(heading, justify="right" if numbers else "left", overflow="fold", no_wrap=whole)
+            kept.append([escape(cell) for cell in cells])
+    for row in zip(*kept, strict=True):
+        made.add_row(*row)
+    return made
+
+
+def number(value: float | None, form: str = ".3f") -> str:
+    """A number as the format specification says; a dash for None."""
+    return "–" if value is None else format(value, form)
+
+
+def interval(value: float | None, sd: float | None) -> str:
+    """A value with its 95 % interval; a dash for None."""
+    return "–" if value is None or sd is None else f"{value:.3f} ± {Z95 * sd:.3f}"
+
+
+def cells(row: object, columns: Columns) -> list[str]:
+    """The attributes of ``row`` as text."""
+    found = ((getattr(row, name), form, factor) for name, form, factor in columns.values())
+    return ["–" if value is None else format(value * factor, form) for value, form, factor in found]
 
 
 def outcome_table(summary: Summary) -> Table:
     """Components by outcome, innovations and their expected size, for each axis and sensor."""
-    table = Table(box=box.SIMPLE_HEAD)
-    biased = any(sensor.bias_mm is not None for axis in summary.axes.values() for sensor in axis.sensors.values())
-    words = sorted(
-        {word for axis in summary.axes.values() for sensor in axis.sensors.values() for word in sensor.outcomes}
-    )
-    words.sort(key=lambda word: word != "fused")
-    for heading in ("axis", "sensor"):
-        table.add_column(heading)
-    for heading in (*words, "innovation, mm", "expected, mm", *(["bias, mm"] if biased else [])):
-        table.add_column(heading, justify="right")
-    table.add_column("verdict", overflow="fold")
-    for axis, part in summary.axes.items():
-        for name, sensor in part.sensors.items():
-            counts = [str(sensor.outcomes.get(word, 0)) for word in words]
-            spread = [_mm(sensor.innovation_rms_mm), _mm(sensor.innovation_sd_mm)]
-            bias = [_interval(sensor.bias_mm, sensor.bias_sd_mm)] if biased else []
-            table.add_row(escape(axis), escape(name), *counts, *spread, *bias, sensor.verdict)
-    return table
+    sensors = [(axis, name, one) for axis, part in summary.axes.items() for name, one in part.sensors.items()]
+    words = sorted({word for *_, one in sensors for word in one.outcomes}, key=lambda word: (word != "fused", word))
+    rows = [
+        [
+            axis,
+            name,
+            *(str(one.outcomes.get(word, 0)) for word in words),
+            number(one.innovation_rms_mm),
+            number(one.innovation_sd_mm),
+            interval(one.bias_mm, one.bias_sd_mm),
+            one.verdict,
+        ]
+        for axis, name, one in sensors
+    ]
+    return table(["axis", "sensor", *words, "innovation, mm", "expected, mm", "bias, mm", "verdict"], rows)
 
 
-def score_table(results: Sequence[tuple[str, Mapping[str, ScoreSummary]]]) -> Table:
-    """Scores against the reference, for each result and axis; columns of the velocity where a result has one."""
-    moving = any(score.velocity_rmse_mm_s is not None for _, scores in results for score in scores.values())
-    table = Table(box=box.SIMPLE_HEAD, collapse_padding=True)
-    table.add_column("result", overflow="fold")
-    table.add_column("axis")
-    velocity = ("velocity RMSE, mm/s", "95 % coverage") if moving else ()
-    for heading in ("RMSE, mm", "bias, mm", "95 % coverage", "NEES", "scored", "left out", *velocity):
-        table.add_column(heading, justify="right", max_width=8)  # the result's name needs the width
-    for name, scores in results:
-        for axis, score in scores.items():
-            table.add_row(
-                escape(name),
-                escape(axis),
-                _mm(score.rmse_mm),
-                f"{score.bias_mm:+.3f}",
-                f"{score.coverage:.1%}",
-                "–" if score.nees_mean is None else f"{score.nees_mean:.2f}",
-                str(score.rows),
-                str(score.left_out),
-                *([_mm(score.velocity_rmse_mm_s), _percent(score.velocity_coverage)] if moving else []),
-            )
-    return table
+def score_table(results: Iterable[tuple[str, Mapping[str, ScoreSummary]]]) -> Table:
+    """Scores against the reference, for each result and axis; of the velocity where a result has one."""
+    rows = [[name, axis, *cells(one, _SCORE)] for name, scores in results for axis, one in scores.items()]
+    return table(["result", "axis", *_SCORE], rows)
 
 
 def runs_table(results: Mapping[str, Summary]) -> Table:
     """Many results: lines for each of up to 20 by name, and for each axis all of them together."""
-    summaries = list(results.values())
-    table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("result", overflow="fold")
-    table.add_column("axis")
-    for heading in ("RMSE, mm", "worst, mm", "95 % coverage", "NEES", "NIS", "fused", "rejected", "notes"):
-        table.add_column(heading, justify="right")
-    if len(summaries) <= _FEW_RUNS:
-        for name, summary in results.items():
-            for axis in summary.axes:
-                table.add_row(escape(name), escape(axis), *_pooled([summary], axis))
-        table.add_section()
-    for axis in dict.fromkeys(axis for summary in summaries for axis in summary.axes):
-        having = [summary for summary in summaries if axis in summary.axes]
-        table.add_row(f"all {len(having)}", escape(axis), *_pooled(having, axis))
-    return table
+    rows: list[list[str]] = []
+    if len(results) <= _FEW_RUNS:
+        rows += [[name, axis, *_pooled([one], axis)] for name, one in results.items() for axis in one.axes]
+    for axis in dict.fromkeys(axis for one in results.values() for axis in one.axes):
+        having = [one for one in results.values() if axis in one.axes]
+        rows.append([f"all {len(having)}", axis, *_pooled(having, axis)])
+    scores = ("RMSE, mm", "worst, mm", "95 % coverage", "NEES")
+    return table(["result", "axis", *scores, "NIS", "fused", "rejected", "notes"], rows)
 
 
 def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
@@ -108,32 +119,23 @@ def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
     parts = [summary.axes[axis] for summary in summaries]
     scores = [part.score for part in parts if part.score is not None]
     sensors = [sensor for part in parts for sensor in part.sensors.values()]
-    nis = [(sensor.nis_mean, sensor.outcomes.get("fused", 0)) for sensor in sensors if sensor.nis_mean is not None]
-    fused, rejected = (sum(sensor.outcomes.get(word, 0) for sensor in sensors) for word in ("fused", "rejected"))
-    rows = sum(score.rows for score in scores)
-    cells = ["–"] * 4
-    if rows:
-        square = sum(score.rmse_mm**2 * score.rows for score in scores) / rows
-        coverage = sum(score.coverage * score.rows for score in scores) / rows
-        nees = [(score.nees_mean, score.rows) for score in scores if score.nees_mean is not None]
-        cells = [_mm(square**0.5), _mm(max(score.rmse_mm for score in scores)), f"{coverage:.1%}", _mean(nees)]
-    notes = sum(len(summary.notes) for summary in summaries)
-    return [*cells, _mean(nis), str(fused), str(rejected), str(notes)]
+    fused, rejected = ([sensor.outcomes.get(word, 0) for sensor in sensors] for word in ("fused", "rejected"))
+    rows = [score.rows for score in scores]
+    square = _mean([score.rmse_mm**2 for score in scores], rows)
+    return [
+        number(None if square is None else square**0.5),
+        number(max((score.rmse_mm for score in scores), default=None)),
+        number(_mean([score.coverage for score in scores], rows), ".1%"),
+        number(_mean([score.nees_mean for score in scores], rows), ".2f"),
+        number(_mean([sensor.nis_mean for sensor in sensors], fused), ".2f"),
+        str(sum(fused)),
+        str(sum(rejected)),
+        str(sum(len(summary.notes) for summary in summaries)),
+    ]
 
 
-def _mean(weighted: Sequence[tuple[float, int]]) -> str:
-    total = sum(weight for _, weight in weighted)
-    return f"{sum(value * weight for value, weight in weighted) / total:.2f}" if total else "–"
-
-
-def _interval(value: float | None, sd: float | None) -> str:
-    """A value with its 95 % interval."""
-    return "–" if value is None or sd is None else f"{value:.3f} ± {Z95 * sd:.3f}"
-
-
-def _mm(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"
-
-
-def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{share:.1%}"
+def _mean(values: Sequence[float | None], weights: Sequence[int]) -> float | None:
+    """The weighted mean of the values that there are; None without any."""
+    known = [(value, weight) for value, weight in zip(values, weights, strict=True) if value is not None]
+    total = sum(weight for _, weight in known)
+    return sum(value * weight for value, weight in known) / total if total else None

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import msgspec
+import typer
 
 from .. import units
 from ..errors import PumafuseWarning
@@ -14,13 +16,13 @@ from ..identification.verify import verify
 from ..logs.run import Run
 from ..model.arm import ArmModel
 from ..views import report as reports
-from .tables import console, text_table
+from .tables import console, print_json, table
 
 
 def run(
     paths: Sequence[Path],
     arm: str,
-    sensors: list[str] | None,
+    sensors: Sequence[str] | None,
     start: Mapping[str, float],
     report: Path | None,
     json: bool,
@@ -42,12 +44,9 @@ def run(
         for note in one.notes:
             warnings.warn(f"run '{one.run}': {note}", PumafuseWarning, stacklevel=1)
     if json:
-        tree = [units.from_si(msgspec.to_builtins(one, enc_hook=float)) for one in verified]
-        print(msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode())
+        print_json([units.from_si(msgspec.to_builtins(one, enc_hook=float)) for one in verified])
         return
-    out = console()
-    out.print(text_table(reports.verifications(verified)))
-    for one in verified:
-        out.print(reports.verdict(one), markup=False)
+    console(sys.stdout).print(table(*reports.verifications(verified)))
+    typer.echo("\n".join(map(reports.verdict, verified)))
     if report is not None:
-        out.print(f"written to {report}", markup=False, soft_wrap=True)
+        typer.echo(f"written to {report}")

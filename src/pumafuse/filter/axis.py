@@ -84,7 +84,7 @@ class State(NamedTuple):
     """All that changes, one row for each axis; further rows have room for predictions aside and for checkpoints.
 
     Attributes:
-        x: Mean; the last entry is 0, or a clone of the position, see :func:`clone_position`, (r, s).
+        x: Mean, (r, s).
         P: Covariance, (r, s, s).
         clock: The instant of x and P, int64 ns, (r,).
         drive: Start level u₀ (``START``, NaN before it is known), command in force ``U`` relative to it, its ``STEP``,
@@ -124,7 +124,7 @@ def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
         x[row, POSITION] += position * drive[row, ERROR]
         x[row, RATE] += rate * drive[row, ERROR]
         drive[row, ERROR] *= left
-    size, first = P.shape[2], REST
+    size, first = model.states[axis], REST
     move_pair(P, row, POSITION_, size, f11, f12, f21, f22)
     add_to_pair(P, row, POSITION_, q * q11, q * q12, q * q22)
     P[row, OFFSET, OFFSET] += drive[row, DRIFT] * dt
@@ -291,26 +291,32 @@ def position_of(disturbance: int, x: FloatArray, P: FloatArray, row: int) -> tup
 
 
 @compiled
-def clone_position(model: Model, state: State, axis: int, row: int) -> None:
-    """Add the position as it is now to the state of a row, to be compared with a later one (stochastic cloning)."""
-    P, clone, disturbance = state.P, state.P.shape[2] - 1, model.disturbance[axis]
+def variance_of_motion(model: Model, state: State, axis: int, row: int, dt: float) -> float:
+    """Variance [m²] of the motion over ``dt`` [s] that the state leads to: h (Φ − I) P (Φ − I)ᵀ hᵀ; h makes p of it."""
+    work = state.work
     for i in range(model.states[axis]):
-        across = P[row, i, POSITION] + P[row, i, OFFSET]
-        if disturbance != NONE:
-            across += P[row, i, REST]
-        P[row, i, clone] = P[row, clone, i] = across
-    state.x[row, clone], P[row, clone, clone] = position_of(disturbance, state.x, P, row)
+        work[axis, 0, i] = 0.0
+    f11, f12, _, _, _, _, _ = transition(model.order[axis], model.constants, axis, dt)
+    work[axis, 0, POSITION], work[axis, 0, RATE] = f11 - 1.0, f12
+    if model.disturbance[axis] == ROUGH:
+        work[axis, 0, REST] = math.expm1(-model.rest[axis, REST, REVERTING] * dt)
+    elif model.disturbance[axis] == SMOOTH:
+        f11, f12, _, _, _, _, _ = matern(model.rest[axis, REST, REVERTING], dt)
+        work[axis, 0, REST], work[axis, 0, REST + 1] = f11 - 1.0, f12
+    return variance_along(state.P, row, model.states[axis], 0.0, work, axis)
 
 
 @compiled
-def motion_since_clone(model: Model, state: State, axis: int, row: int) -> tuple[float, float]:
-    """How far the position has moved since it was cloned [m], and the variance of that [m²]."""
-    P, clone, disturbance = state.P, state.P.shape[2] - 1, model.disturbance[axis]
-    position, variance = position_of(disturbance, state.x, P, row)
-    across = P[row, POSITION, clone] + P[row, OFFSET, clone]
-    if disturbance != NONE:
-        across += P[row, REST, clone]
-    return position - state.x[row, clone], max(variance - 2.0 * across + P[row, clone, clone], 0.0)
+def noise_of_motion(model: Model, state: State, axis: int, dt: float) -> float:
+    """Variance [m²] of the motion over ``dt`` [s] that comes from noise on the way: h Q hᵀ."""
+    _, _, _, _, q11, _, _ = transition(model.order[axis], model.constants, axis, dt)
+    noise = state.drive[axis, NOISE] * q11 + state.drive[axis, DRIFT] * dt
+    if model.disturbance[axis] == ROUGH:
+        noise -= model.rest[axis, REST, VARIANCE] * math.expm1(-2.0 * model.rest[axis, REST, REVERTING] * dt)
+    elif model.disturbance[axis] == SMOOTH:
+        _, _, _, _, q11, _, _ = matern(model.rest[axis, REST, REVERTING], dt)
+        noise += model.rest[axis, REST, VARIANCE] * q11
+    return noise
 
 
 @compiled

@@ -1,8 +1,9 @@
 """The reference engine: a `filterpy.kalman.KalmanFilter` for each axis on the delay-augmented matrices.
 
 Fed with the same events, for filtered estimates. State of an axis: the plant's states, the offset, the disturbance, the
-biases, the gain error e, and a register of the inputs in flight, the newest first. Over an interval the plant follows the register's
-acting entry r_k and e, which decays; a command shifts the register when it is given and moves e when it acts:
+biases, the gain error e, and a register of the inputs in flight, the newest first. Over an interval the plant follows
+the register's acting entry r_k and e, which decays; a command shifts the register when it is given and moves e when it
+acts:
 
     x⁺ = Φ x + Γ r_k + Γ_e e,   o⁺ = o,   b⁺ = b,   e⁺ = e exp(−Δ / recovery),   r⁺ = (u, r_0, r_1, …)
 

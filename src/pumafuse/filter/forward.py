@@ -27,15 +27,14 @@ from .axis import (
     Sensors,
     State,
     apply_command,
-    clone_position,
     copy_estimate,
     copy_rows,
     innovation,
-    motion_since_clone,
     noise,
     position_of,
     predict,
     update,
+    variance_of_motion,
 )
 from .events import COMMAND, FUSED, Events, Results
 from .gate import NOBODY, agrees, contradicted, count_fused, count_reacquired, count_rejected
@@ -335,11 +334,15 @@ def estimate(
             outputs.velocity[axis, n] = outputs.velocity_sd[axis, n] = math.nan
             continue
         period = model.gain[axis, PERIOD]
-        clone_position(model, state, axis, here)
         until = time + int(np.rint(period * 1e9))
+        known = variance_of_motion(model, state, axis, here, (until - time) / 1e9)
+        for i in range(model.states[axis]):
+            for j in range(model.states[axis]):
+                state.P[here, i, j] = 0.0  # what comes is noise alone
         follow_commands(model, events, state, axis, here, pending, end, time, until, time)
-        motion, variance = motion_since_clone(model, state, axis, here)
-        outputs.velocity[axis, n], outputs.velocity_sd[axis, n] = motion / period, math.sqrt(variance) / period
+        later, noise = position_of(model.disturbance[axis], state.x, state.P, here)
+        outputs.velocity[axis, n] = (later - outputs.position[axis, n]) / period
+        outputs.velocity_sd[axis, n] = math.sqrt(known + noise) / period
 
 
 @compiled

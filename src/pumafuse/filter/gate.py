@@ -15,25 +15,7 @@ import math
 
 from ..arrays import ALWAYS
 from ..compiled import compiled
-from ..model.closed import transition
-from ..model.matern import matern
-from .axis import (
-    DRIFT,
-    NOISE,
-    NONE,
-    OFFSET,
-    PERIOD,
-    POSITION,
-    RATE,
-    REST,
-    REVERTING,
-    SMOOTH,
-    VARIANCE,
-    Model,
-    Sensors,
-    State,
-    variance_along,
-)
+from .axis import OFFSET, PERIOD, Model, Sensors, State, noise_of_motion, variance_of_motion
 
 NU, R_THEN = range(2)  # of State.rejected
 REJECTED_AT, FUSED_AT = range(2)  # of State.gate_time
@@ -55,29 +37,10 @@ def agrees(model: Model, sensors: Sensors, state: State, axis: int, sensor: int,
     between = time - state.gate_time[axis, sensor, REJECTED_AT]
     if between < model.gain[axis, PERIOD] * 1e9:
         return -1
-    variance = state.rejected[axis, sensor, R_THEN] + R
-    variance = variance_of_motion(model, state, axis, between / 1e9, sensors.scale[sensor], variance)
+    dt, scale = between / 1e9, sensors.scale[sensor]
+    motion = variance_of_motion(model, state, axis, axis, dt) + noise_of_motion(model, state, axis, dt)
+    variance = state.rejected[axis, sensor, R_THEN] + R + scale * scale * motion
     return int(abs(nu - state.rejected[axis, sensor, NU]) <= sensors.gate[sensor] * math.sqrt(variance))
-
-
-@compiled
-def variance_of_motion(model: Model, state: State, axis: int, dt: float, scale: float, more: float) -> float:
-    """h (Φ − I) P (Φ − I)ᵀ hᵀ + h Q hᵀ over ``dt`` [s], times scale², and ``more`` [m²]; h makes p of the state."""
-    work, drive = state.work, state.drive
-    for i in range(model.states[axis]):
-        work[axis, 0, i] = 0.0
-    f11, f12, _, _, q11, _, _ = transition(model.order[axis], model.constants, axis, dt)
-    work[axis, 0, POSITION], work[axis, 0, RATE] = scale * (f11 - 1.0), scale * f12
-    noise = drive[axis, NOISE] * q11 + drive[axis, DRIFT] * dt
-    if model.disturbance[axis] != NONE:
-        rate, variance = model.rest[axis, REST, REVERTING], model.rest[axis, REST, VARIANCE]
-        f11, f12, q11 = math.exp(-rate * dt), 0.0, -math.expm1(-2.0 * rate * dt)
-        if model.disturbance[axis] == SMOOTH:
-            f11, f12, _, _, q11, _, _ = matern(rate, dt)
-            work[axis, 0, REST + 1] = scale * f12
-        work[axis, 0, REST] = scale * (f11 - 1.0)
-        noise += variance * q11
-    return variance_along(state.P, axis, model.states[axis], scale * scale * noise + more, work, axis)
 
 
 @compiled

@@ -84,7 +84,7 @@ def smooth(
         entry = history.first[axis] + history.used[axis] - 1
         until = history.time[entry] if entry >= history.first[axis] else origin
         while n >= 0 and times[n] >= until:
-            smoothed_estimate(model.disturbance[axis], states, axis, n, history, eta, N, ZERO, work, factor, outputs)
+            smoothed_estimate(model, axis, n, history, eta, N, ZERO, work, factor, outputs)
             n -= 1
         while entry >= history.first[axis]:
             until = history.time[entry]
@@ -97,7 +97,7 @@ def smooth(
                         for j in range(states):
                             N[1, i, j] = N[0, i, j]
                     over_interval(model, axis, eta, N, ONE, until - times[n], q, d, work)
-                    smoothed_estimate(model.disturbance[axis], states, axis, n, history, eta, N, ONE, work, factor, outputs)
+                    smoothed_estimate(model, axis, n, history, eta, N, ONE, work, factor, outputs)
                     n -= 1
                 over_interval(model, axis, eta, N, ZERO, until - start, q, d, work)
             else:
@@ -202,8 +202,7 @@ def through_noise(
 
 @compiled
 def smoothed_estimate(
-    disturbance: int,
-    states: int,
+    model: Model,
     axis: int,
     n: int,
     history: History,
@@ -215,7 +214,7 @@ def smoothed_estimate(
     outputs: Outputs,
 ) -> None:
     """P_s = (I + P N)⁻¹ P and x_s = x + P_s η, one column of N = L Lᵀ at a time: wide priors would cancel in P_s η."""
-    x, P = history.x[axis], history.P[axis]
+    x, P, states = history.x[axis], history.P[axis], model.states[axis]
     root(N, eta, at, states, L, work[0, 3])
     for k in range(states):
         nu = L[states, k]
@@ -228,7 +227,7 @@ def smoothed_estimate(
         for m in range(k + 1, states):
             for i in range(states):
                 L[states, m] -= L[i, m] * work[0, 1, i] * nu
-    write_outputs(disturbance, x, P, n, outputs, axis, n)
+    write_outputs(model.disturbance[axis], x, P, n, outputs, axis, n)
 
 
 @compiled

@@ -399,7 +399,8 @@ class Window:
         """
         estimate_at(self._flat, self._places, time)
         found: list[tuple[list[float], int] | None] = []
-        levels, fused = self.memory.state.drive[:, START].tolist(), self.memory.incoming.times[:, LAST_FUSED].tolist()
+        fused = self.memory.incoming.times[:, LAST_FUSED].tolist()
+        levels = self.memory.state.drive[: len(fused), START].tolist()  # the rows behind are checkpoints
         for number, outputs in enumerate(self._outputs[:, :, 0].T.tolist()):
             outputs[0] += levels[number]
             found.append(None if math.isnan(levels[number]) else (outputs, fused[number]))

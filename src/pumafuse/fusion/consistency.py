@@ -27,6 +27,16 @@ _WIDEST = 1e6  # largest ratio of prior to noise at which double precision keeps
 _NEVER = 1e-6  # expected number below which chance is no explanation
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
 _MANY_REJECTED = 0.1  # share of rejected components beyond which the others are a selection
+_TOO_SMALL = "rejected: sd_mm, latency_ms or the process noise too small"
+_ONE_CLOCK = "are both stamped by one clock?"
+_CAUSES = {  # by whether the NIS is above its band, and the sign of a notable correlation
+    (True, 1): ", innovations positively correlated: the process noise too small, or latency_ms wrong",
+    (True, 0): ": sd_mm or the process noise too small",
+    (True, -1): ", innovations negatively correlated: sd_mm too small",
+    (False, 1): ": sd_mm or the process noise too large",
+    (False, 0): ": sd_mm or the process noise too large",
+    (False, -1): ", innovations negatively correlated: the process noise too large",
+}
 
 
 @dataclass(frozen=True)
@@ -121,55 +131,50 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
 
 def sensor_problems(est: Estimates) -> list[str]:
     """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows, other clocks, frozen."""
-    found = _too_wide(est)
-    for name in est.measurements.sensors:
-        mine = est.measurements.where(est.measurements.sensor == est.measurements.sensors.index(name))
-        total, counts = len(mine.outcome), mine.counts()
-        if not total:
+    found, given, end = list[str](), est.measurements, est.last_command
+    for number, name in enumerate(given.sensors):
+        mine = np.flatnonzero(given.sensor == number)
+        if not len(mine):
             continue
-        reacquired = len(np.unique(mine.time[mine.outcome == Outcome.REACQUIRED]))
-        if reacquired:
-            times = "once" if reacquired == 1 else f"{reacquired} times"
-            found.append(
-                f"{name}: its gate reacquired {times}: it contradicts the others or the model; if it is off by a"
-                " constant, give it bias_sd_mm"
-            )
-        if counts.get(Outcome.BEFORE_START.word, 0) > 0.5 * total:
-            found.append(f"{name}: most measurements lie before the first command: are both stamped by one clock?")
-        last = float(np.nanmax(mine.time, initial=-np.inf))
-        if last > est.last_command + LONGEST_TAIL_NS / 1e9:
-            hours = (last - est.last_command) / 3600.0
-            found.append(
-                f"{name}: measurements go on for {hours:.1f} hours after the last command: are both stamped by one"
-                " clock?"
-            )
-        elif float(np.mean(mine.time > est.last_command + 1.0)) > 0.5:
-            found.append(f"{name}: most measurements lie after the last command: are both stamped by one clock?")
-        rejected = counts.get(Outcome.REJECTED.word, 0) / total
-        if rejected > _MANY_REJECTED:
-            found.append(
-                f"{name}: {rejected:.0%} of its components were rejected: sd_mm, latency_ms or the process noise too"
-                " small"
-            )
-        for number, axis in enumerate(mine.axes):
-            if frozen := _frozen(mine.value[mine.axis == number]):
-                found.append(f"{name}: {frozen} {axis} measurements in a row have the same value: it froze")
+        outcome, time, axis, value = given.outcome[mine], given.time[mine], given.axis[mine], given.value[mine]
+        early, rejected = (
+            np.count_nonzero(outcome == int(kind)) / len(mine) for kind in (Outcome.BEFORE_START, Outcome.REJECTED)
+        )
+        reacquired = len(np.unique(time[outcome == Outcome.REACQUIRED]))
+        times = "once" if reacquired == 1 else f"{reacquired} times"
+        width, tail = _width_of_prior(est, name), float(np.fmax.reduce(time)) - end
+        hours_later = tail > LONGEST_TAIL_NS / 1e9
+        later = np.count_nonzero(time > end + 1.0) > 0.5 * len(mine)
+        frozen = {each: _frozen(value[axis == column]) for column, each in enumerate(given.axes)}
+        problems = [
+            (
+                width > _WIDEST,
+                f"its prior (offset_sd_mm, bias_sd_mm) is {width:.1e} times its noise: more than double precision"
+                " resolves; use a narrower prior",
+            ),
+            (
+                reacquired > 0,
+                f"its gate reacquired {times}: it contradicts the others or the model; if it is off by a constant, give"
+                " it bias_sd_mm",
+            ),
+            (early > 0.5, f"most measurements lie before the first command: {_ONE_CLOCK}"),
+            (hours_later, f"measurements go on for {tail / 3600.0:.1f} hours after the last command: {_ONE_CLOCK}"),
+            (later and not hours_later, f"most measurements lie after the last command: {_ONE_CLOCK}"),
+            (rejected > _MANY_REJECTED, f"{rejected:.0%} of its components were {_TOO_SMALL}"),
+            *(
+                (count > 0, f"{count} {each} measurements in a row have the same value: it froze")
+                for each, count in frozen.items()
+            ),
+        ]
+        found += [f"{name}: {problem}" for holds, problem in problems if holds]
     return found
 
 
-def _too_wide(est: Estimates) -> list[str]:
-    """Notes on priors so much wider than a sensor's noise that double precision blurs the error bars."""
-    found: list[str] = []
-    for name, sensor in est.config.sensors.items():
-        sds = [sd for axis in est.axes if (sd := sensor.sd_of(axis)) is not None]
-        if sds and name in est.measurements.sensors:
-            ratio = max(est.config.start.offset_sd, sensor.bias_sd) / min(sds)
-            if ratio > _WIDEST:
-                found.append(
-                    f"{name}: its prior (offset_sd_mm, bias_sd_mm) is {ratio:.1e} times its noise: more than double"
-                    " precision resolves; use a narrower prior"
-                )
-    return found
+def _width_of_prior(est: Estimates, name: str) -> float:
+    """How many times the prior is as wide as a sensor's noise: beyond 1e6 double precision blurs the error bars."""
+    sensor = est.config.sensors.get(name)
+    sds = [sd for axis in est.axes if sensor is not None and (sd := sensor.sd_of(axis)) is not None]
+    return 0.0 if sensor is None else max(est.config.start.offset_sd, sensor.bias_sd) / min(sds, default=np.inf)
 
 
 def _frozen(values: FloatArray) -> int:
@@ -194,25 +199,17 @@ def _verdict(est: Estimates, axis: str, fused: Measurements, found: Consistency,
     low, high = found.nis_band
     nis = f"NIS {found.nis:.2f}, expected {low:.2f} to {high:.2f}"
     if rejected > _MANY_REJECTED:  # the others were selected to fit
-        return f"{nis}, but {rejected:.0%} were rejected: sd_mm, latency_ms or the process noise too small"
-    correlation = found.correlation
-    first, strongest = float(correlation[0]), int(np.argmax(np.abs(correlation)))
-    coloured = found.whiteness < 0.01 and abs(first) > _NOTABLE
-    if found.nis > high:
-        if coloured and _follows_velocity(est, axis, fused):
-            return f"{nis}, innovations follow the velocity: latency_ms is wrong"
-        if coloured and first > 0.0:
-            return f"{nis}, innovations positively correlated: the process noise too small, or latency_ms wrong"
-        if coloured:
-            return f"{nis}, innovations negatively correlated: sd_mm too small"
-        return f"{nis}: sd_mm or the process noise too small"
-    if found.nis < low:
-        if coloured and first < 0.0:
-            return f"{nis}, innovations negatively correlated: the process noise too large"
-        return f"{nis}: sd_mm or the process noise too large"
-    if found.whiteness < 0.01 and abs(correlation[strongest]) > _NOTABLE:
-        return f"{nis}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
-    return f"{nis}: consistent"
+        return f"{nis}, but {rejected:.0%} were {_TOO_SMALL}"
+    correlation, coloured = found.correlation, found.whiteness < 0.01
+    if low <= found.nis <= high:
+        strongest = int(np.argmax(np.abs(correlation)))
+        if coloured and abs(correlation[strongest]) > _NOTABLE:
+            return f"{nis}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
+        return f"{nis}: consistent"
+    sign = int(np.sign(correlation[0])) if coloured and abs(correlation[0]) > _NOTABLE else 0
+    if found.nis > high and sign and _follows_velocity(est, axis, fused):
+        return f"{nis}, innovations follow the velocity: latency_ms is wrong"
+    return nis + _CAUSES[found.nis > high, sign]
 
 
 def _follows_velocity(est: Estimates, axis: str, fused: Measurements) -> bool:

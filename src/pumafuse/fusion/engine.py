@@ -131,17 +131,16 @@ def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
         for number, name in enumerate(segment.sensors)
         if name in config.sensors and config.sensors[name].biased
     ]
-    used = {number: (rows.known[rows.source == number] == Outcome.FUSED).any(axis=0) for number, _ in biased}
-    return [[name for number, name in biased if used[number][axis]] for axis in range(len(segment.axes))]
+    fused = [column == Outcome.FUSED for column in rows.known.T]
+    return [[name for number, name in biased if fused_on[rows.source == number].any()] for fused_on in fused]
 
 
 def _history(events: Events, state: State, estimates: int) -> History:
     """Room for what happens to each axis: an interval for each command, an interval and an update for a measurement."""
     axes, width = events.known.shape[1], state.x.shape[1]
-    decided = events.known == Outcome.FUSED
-    measured = events.source != COMMAND
-    room = decided[~measured].sum(axis=0) + 2 * decided[measured].sum(axis=0)
-    size = int(room.sum())
+    measured, decided = events.source != COMMAND, [column == Outcome.FUSED for column in events.known.T]
+    room = [np.count_nonzero(fused) + np.count_nonzero(fused & measured) for fused in decided]
+    size = sum(room)
     return History(
         np.concatenate(([0], np.cumsum(room))),
         np.zeros(axes, dtype=np.int64),

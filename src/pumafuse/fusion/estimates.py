@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -12,7 +12,7 @@ from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
 from ..errors import UnknownNameError
 from ..filter.outcome import Outcome
 from .config import FusionConfig
-from .reference import ReferenceTrack
+from .score import ReferenceTrack
 
 Mode = Literal["filtered", "as-live", "smoothed"]
 
@@ -106,14 +106,8 @@ class Measurements:
 
     def counts(self) -> dict[str, int]:
         """The number of components with each outcome, without those that do not occur."""
-        found = {outcome.word: int(np.count_nonzero(self.outcome == outcome)) for outcome in Outcome}
-        return {word: count for word, count in found.items() if count}
-
-    @staticmethod
-    def joined(parts: Sequence[Measurements]) -> Measurements:
-        """The components of several segments, one after the other."""
-        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in Measurements.ARRAYS}
-        return replace(parts[0], **arrays)
+        found = np.bincount(self.outcome, minlength=len(Outcome)).tolist()
+        return {outcome.word: found[outcome] for outcome in Outcome if found[outcome]}
 
 
 @dataclass(frozen=True)

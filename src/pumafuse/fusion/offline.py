@@ -5,9 +5,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import get_args
+from typing import Any, TypeVar, get_args
 
 import numpy as np
+import numpy.typing as npt
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import PumafuseWarning
@@ -16,15 +17,16 @@ from ..filter.outcome import ABSENT, Outcome
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.frames import Cylindrical, Placed
-from ..logs.run import Run
+from ..logs.run import Run, Source
 from ..units import MM, seconds
 from .config import FusionConfig
 from .consistency import sensor_problems
 from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
-from .reference import joined_references, late_rows, reference_track
-from .score import interpolated
+from .score import late_rows, reference_track
 from .segments import Segment, build, output_times
+
+S = TypeVar("S", bound=np.generic)
 
 
 def fuse(
@@ -72,71 +74,68 @@ def fuse(
     chosen = None if sensors is None else tuple(sensors)
     in_place, placed = in_axes(run, config.frame)
     logged, jumps = segments(in_place)
-    parts: list[Estimates] = []
+    parts: list[tuple[Segment, TimeArray, Filtered]] = []
     for number, part in enumerate(logged):
-        built = build(part, config, chosen)
-        times = output_times(built, config, rate)
+        segment = build(part, config, chosen)
+        times = output_times(segment, config, rate)
         share = None if progress is None else _share(progress, number, len(logged))
-        parts.append(_fuse_segment(part, placed, built, times, config, mode, engine, share))
-    joined = _joined(parts, jumps)
-    excess = config.arm.validity.excess(joined.speed, joined.radius)
-    joined = replace(
-        joined, notes=(*joined.notes, *_reference_notes(joined, logged), *excess, *sensor_problems(joined))
+        parts.append((segment, times, filter_segment(segment, config, times, mode, engine, share)))
+    cut, times, filtered = zip(*parts, strict=True)
+    origin, references = cut[0].origin, [part.reference for part in logged if part.reference is not None]
+    axes = {
+        axis: AxisEstimate(
+            *(_joined(getattr(part.axes[axis], field) for part in filtered) for field in AxisEstimate.FIELDS)
+        )
+        for axis in cut[0].axes
+    }
+    est = Estimates(
+        run=run.name,
+        time=seconds(_joined(times), origin),
+        axes=axes,
+        cartesian=None if placed is None else _cartesian(placed, axes),
+        measurements=_measurements(cut, filtered),
+        biases=filtered[-1].biases,
+        reference=reference_track(references, origin) if references else None,
+        origin=origin,
+        last_command=(max(int(part.commands[-1]) for part in cut) - origin) / 1e9,
+        segment=np.repeat(np.arange(len(parts)), [len(part) for part in times]),
+        mode=mode,
+        engine=engine,
+        config=config,
+        speed=max(part.highest_speed(config.arm.update_period) for part in cut),
+        radius=_highest_radius(in_place, placed),
+        notes=(),
     )
-    for note in joined.notes:
+    notes = [note for part in parts for note in (*part[0].notes, *_contradictions(part[0], part[2], origin))]
+    notes += [*jumps, *_reference_notes(est, references), *config.arm.validity.excess(est.speed, est.radius)]
+    est = replace(est, notes=(*notes, *sensor_problems(est)))
+    for note in est.notes:
         warnings.warn(f"run '{run.name}': {note}", PumafuseWarning, stacklevel=2)
-    return joined
-
-
-def _reference_notes(est: Estimates, parts: Sequence[Run]) -> list[str]:
-    """What is wrong with the reference: rows behind a jump of its clock, or nothing near any estimate."""
-    if est.reference is None:
-        return []
-    sources = [part.reference for part in parts if part.reference is not None]
-    late = sum(int(np.sum(late_rows(source))) for source in sources)
-    found = (
-        [f"{sources[0].label}: {late} rows are stamped more than 1 s behind an earlier one: not used"] if late else []
-    )
-    known = [name for name in est.axes if name in est.reference.position]
-    if not any(np.isfinite(interpolated(est.time, est.segment, est.reference, name)).any() for name in known):
-        found.append("the reference covers no estimate: are both stamped by one clock?")
-    return found
+    return est
 
 
 def _share(progress: Callable[[float], None], number: int, count: int) -> Callable[[float], None]:
     return lambda done: progress((number + done) / count)
 
 
-def _fuse_segment(
-    run: Run,
-    placed: Placed | None,
-    segment: Segment,
-    times: TimeArray,
-    config: FusionConfig,
-    mode: Mode,
-    engine: Engine,
-    progress: Callable[[float], None] | None,
-) -> Estimates:
-    filtered = filter_segment(segment, config, times, mode, engine, progress)
-    origin = segment.origin
-    return Estimates(
-        run=run.name,
-        time=seconds(times, origin),
-        axes=filtered.axes,
-        cartesian=None if placed is None else _cartesian(placed, filtered.axes),
-        measurements=_measurements(segment, filtered),
-        biases=filtered.biases,
-        reference=None if run.reference is None else reference_track(run.reference, origin),
-        origin=origin,
-        last_command=(int(segment.commands[-1]) - origin) / 1e9,
-        segment=np.zeros(len(times), dtype=np.int64),
-        mode=mode,
-        engine=engine,
-        config=config,
-        speed=segment.highest_speed(config.arm.update_period),
-        radius=_highest_radius(run, placed),
-        notes=(*segment.notes, *_contradictions(segment, filtered)),
-    )
+def _joined(parts: Iterable[npt.NDArray[S]]) -> npt.NDArray[S]:
+    """Arrays of segments, one after the other."""
+    arrays = list(parts)
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+def _reference_notes(est: Estimates, sources: Sequence[Source]) -> list[str]:
+    """What is wrong with the reference: rows behind a jump of its clock, or no row at the time of any estimate."""
+    if est.reference is None:
+        return []
+    found, late = list[str](), sum(int(np.count_nonzero(late_rows(source.stamp))) for source in sources)
+    if late:
+        found.append(f"{sources[0].label}: {late} rows are stamped more than 1 s behind an earlier one: not used")
+    given = [np.isfinite(value) for axis, value in est.reference.position.items() if axis in est.axes]
+    time = est.reference.time[np.any(given, axis=0)] if given else np.empty(0)
+    if not len(time) or time.max() < est.time.min() or time.min() > est.time.max():
+        found.append("the reference covers no estimate: are both stamped by one clock?")
+    return found
 
 
 def _cartesian(placed: Placed, axes: Mapping[str, AxisEstimate]) -> dict[str, FloatArray]:
@@ -157,81 +156,33 @@ def _highest_radius(run: Run, placed: Placed | None) -> float | None:
     return float(np.max(radial[np.isfinite(radial) & (run.command.stamp != NO_STAMP)]))
 
 
-def _contradictions(segment: Segment, filtered: Filtered) -> list[str]:
+def _contradictions(segment: Segment, filtered: Filtered, origin: int) -> list[str]:
     """A sentence on each pair of sensors of which one contradicts the other time after time."""
     events, results, found = filtered.events, filtered.results, list[str]()
     rows = np.flatnonzero(results.contradicts >= 0)
-    if not len(rows):
-        return []
-    pair = events.source[rows].astype(np.int64) * len(segment.sensors) + results.contradicts[rows]
-    for one in np.unique(pair).tolist():
-        sensor, other = divmod(one, len(segment.sensors))
-        mine = rows[pair == one]
+    pairs = events.source[rows].astype(np.int64) * len(segment.sensors) + results.contradicts[rows]
+    for pair in np.unique(pairs).tolist():
+        sensor, other = divmod(pair, len(segment.sensors))
+        mine = rows[pairs == pair]
         first, count = mine[0], len(mine)
         rejected = np.flatnonzero(results.outcome[first] == Outcome.REJECTED)
         off = [f"{segment.axes[axis]} by {results.innovation[first, axis] * MM:+.4g} mm" for axis in rejected.tolist()]
-        since = (int(events.time[first]) - segment.origin) / 1e9
         found.append(
-            f"sensor '{segment.sensors[sensor]}' contradicts '{segment.sensors[other]}' since {since:.2f} s"
-            f" ({', '.join(off)}), {count} times: its measurements are rejected; which of the two is wrong?"
+            f"sensor '{segment.sensors[sensor]}' contradicts '{segment.sensors[other]}' since"
+            f" {(int(events.time[first]) - origin) / 1e9:.2f} s ({', '.join(off)}), {count} times:"
+            " its measurements are rejected; which of the two is wrong?"
         )
     return found
 
 
-def _measurements(segment: Segment, filtered: Filtered) -> Measurements:
+def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measurements:
     """Every component of every measurement in the order of the filter."""
-    events, results = filtered.events, filtered.results
-    given = np.flatnonzero((events.source != COMMAND)[:, None] & (events.known != ABSENT))
-    row = given // len(segment.axes)
-    axis = given - row * len(segment.axes)
-    return Measurements(
-        time=seconds(events.time, segment.origin)[row],
-        stamp=seconds(events.stamp, segment.origin)[row],
-        sensor=events.source[row],
-        axis=axis.astype(np.int16),
-        value=events.value.take(given),
-        innovation=results.innovation.take(given),
-        innovation_sd=results.innovation_sd.take(given),
-        outcome=results.outcome.take(given),
-        sensors=segment.sensors,
-        axes=segment.axes,
-    )
-
-
-def _joined(parts: Sequence[Estimates], jumps: Sequence[str]) -> Estimates:
-    """Segments one after the other, all in seconds since the run's first command."""
-    first = parts[0]
-    if len(parts) == 1:
-        return first
-    late = [(part.origin - first.origin) / 1e9 for part in parts]
-    numbers = list(zip(parts, late, range(len(parts)), strict=True))
-    axes = {
-        name: AxisEstimate(
-            *(np.concatenate([getattr(part[name], field) for part in parts]) for field in AxisEstimate.FIELDS)
-        )
-        for name in first.axes
-    }
-    cartesian = {
-        name: np.concatenate([part.cartesian[name] for part in parts if part.cartesian is not None])
-        for name in first.cartesian or ()
-    }
-    shifted = [
-        replace(part.measurements, time=part.measurements.time + t, stamp=part.measurements.stamp + t)
-        for part, t, _ in numbers
-    ]
-    references = [(part.reference, shift, number) for part, shift, number in numbers if part.reference is not None]
-    reference = joined_references(references) if references else None
-    return replace(
-        first,
-        time=np.concatenate([part.time + shift for part, shift, _ in numbers]),
-        axes=axes,
-        cartesian=None if first.cartesian is None else cartesian,
-        measurements=Measurements.joined(shifted),
-        biases=parts[-1].biases,
-        reference=reference,
-        last_command=max(part.last_command + shift for part, shift, _ in numbers),
-        segment=np.concatenate([np.full(len(part.time), number) for part, _, number in numbers]),
-        speed=max(part.speed for part in parts),
-        radius=max((part.radius for part in parts if part.radius is not None), default=None),
-        notes=(*(note for part in parts for note in part.notes), *jumps),
-    )
+    first, columns = cut[0], list[tuple[npt.NDArray[Any], ...]]()
+    for events, results in ((part.events, part.results) for part in filtered):
+        given = np.flatnonzero((events.source != COMMAND)[:, None] & (events.known != ABSENT))
+        row = given // len(first.axes)
+        axis = (given - row * len(first.axes)).astype(np.int16)
+        time, stamp = (seconds(part, first.origin)[row] for part in (events.time, events.stamp))
+        of_filter = (part.take(given) for part in (results.innovation, results.innovation_sd, results.outcome))
+        columns.append((time, stamp, events.source[row], axis, events.value.take(given), *of_filter))
+    return Measurements(*map(_joined, zip(*columns, strict=True)), sensors=first.sensors, axes=first.axes)

@@ -26,19 +26,17 @@ from ..logs.tables import Table
 from ..units import MM, seconds
 from .config import FusionConfig
 from .estimates import AxisEstimate, Estimates
-from .reference import ReferenceTrack, joined_references, reference_track
+from .score import ReferenceTrack, reference_track
 from .summary import ScoreSummary, Summary, score_axis, summarise
 
-ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY = (
-    "estimates.parquet",
-    "measurements.parquet",
-    "reference.parquet",
-    "summary.json",
-)
-_FILES = frozenset(
-    {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, "fusion.toml", "arm.toml"}
-    | {"fused.rrd", "fused.png", "error.png", "validation.png"}
-)  # a folder with anything else in it is never replaced
+ESTIMATES, MEASUREMENTS, REFERENCE = "estimates.parquet", "measurements.parquet", "reference.parquet"
+SUMMARY = "summary.json"
+_FILES = {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, "fusion.toml", "arm.toml"} | {
+    "fused.rrd",
+    "fused.png",
+    "error.png",
+    "validation.png",
+}  # a folder with anything else in it is never replaced
 _REFERENCE_PREFIX = "reference."
 
 
@@ -115,23 +113,17 @@ def read(folder: Path) -> Result:
     """
     try:
         summary = msgspec.json.decode((folder / SUMMARY).read_bytes(), type=Summary)
-    except (FileNotFoundError, NotADirectoryError):
-        raise FolderError(f"{folder}: no result folder of `pumafuse fuse` ({SUMMARY} is missing)") from None
-    except OSError as error:
-        raise FolderError(f"{folder / SUMMARY}: cannot be read: {error.strerror}") from None
-    except msgspec.MsgspecError as error:
-        raise FolderError(f"{folder / SUMMARY}: not a summary of pumafuse: {error}") from None
-    table = tables.read(folder / ESTIMATES)
-    axes = {axis: AxisEstimate(*(_lengths(table, axis, name) for name in AxisEstimate.FIELDS)) for axis in summary.axes}
+    except (OSError, msgspec.MsgspecError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise FolderError(f"{folder}: no result folder of `pumafuse fuse` ({SUMMARY}: {why})") from None
+    config, table = FusionConfig.load(folder / "fusion.toml"), tables.read(folder / ESTIMATES)
+    axes = {
+        axis: AxisEstimate(*(table.plain(_column(axis, name))[0] / MM for name in AxisEstimate.FIELDS))
+        for axis in summary.axes
+    }
     path = folder / REFERENCE
-    return Result(
-        summary,
-        FusionConfig.load(folder / "fusion.toml"),
-        _seconds(table),
-        _segment(table),
-        axes,
-        _own_reference(tables.read(path)) if path.exists() else None,
-    )
+    reference = _own_reference(tables.read(path)) if path.exists() else None
+    return Result(summary, config, *_time_and_segment(table), axes, reference)
 
 
 def read_reference(path: Path, origin: int, frame: Frame | None = None) -> ReferenceTrack:
@@ -148,10 +140,10 @@ def read_reference(path: Path, origin: int, frame: Frame | None = None) -> Refer
     """
     if path.is_dir() or path.suffix == ".toml":
         run, _ = in_axes(Run.read(path), frame)
-        tracks = [reference_track(part.reference, origin) for part in segments(run)[0] if part.reference is not None]
-        if not tracks:
+        parts = [part.reference for part in segments(run)[0] if part.reference is not None]
+        if not parts:
             raise RunError(f"{path}: the run has no reference")
-        return joined_references(list(zip(tracks, [0.0] * len(tracks), range(len(tracks)), strict=True)))
+        return reference_track(parts, origin)
     table = tables.read(path)
     logged = [name for name in table.columns if name.startswith(_REFERENCE_PREFIX)]
     if not logged:
@@ -163,12 +155,13 @@ def read_reference(path: Path, origin: int, frame: Frame | None = None) -> Refer
 
 
 def _estimates_table(est: Estimates) -> pa.Table:
-    columns: dict[str, FloatArray | IntArray | pa.Array] = {"time_s": est.time}
-    for axis, estimate in est.axes.items():
-        for name in AxisEstimate.FIELDS:
-            columns[_column(axis, name)] = _nullable(getattr(estimate, name) * MM)
-    columns |= {f"{name}_mm": position * MM for name, position in (est.cartesian or {}).items()}
-    return pa.table({**columns, **_segment_column(est.segment)})
+    columns = {
+        _column(axis, name): _nullable(getattr(estimate, name) * MM)
+        for axis, estimate in est.axes.items()
+        for name in AxisEstimate.FIELDS
+    }
+    columns |= {f"{name}_mm": _nullable(position * MM) for name, position in (est.cartesian or {}).items()}
+    return pa.table({"time_s": est.time, **columns, **_segment_column(est.segment)})
 
 
 def _measurements_table(est: Estimates) -> pa.Table:
@@ -191,26 +184,24 @@ def _measurements_table(est: Estimates) -> pa.Table:
 def _reference_table(reference: ReferenceTrack) -> pa.Table:
     columns: dict[str, pa.Array | FloatArray] = {"time_s": reference.time}
     for axis, position in reference.position.items():
-        columns[f"{axis}.position_mm"] = _nullable(position * MM)
-        columns[f"{axis}.position_sd_mm"] = reference.sd[axis] * MM
+        columns[_column(axis, "position")] = _nullable(position * MM)
+        columns[_column(axis, "position_sd")] = reference.sd[axis] * MM
     return pa.table({**columns, **_segment_column(reference.segment)})
 
 
 def _own_reference(table: Table) -> ReferenceTrack:
-    ending = ".position_mm"
+    ending = _column("", "position")
     axes = [name.removesuffix(ending) for name in table.columns if name.endswith(ending)]
     if not axes:
         raise RunError(
             f"{table.path}: no column 'reference.<axis>_mm' or '<axis>{ending}'; it has: {', '.join(table.columns)}"
         )
-    noise = {
-        axis: table.numbers(f"{axis}.position_sd_mm")[0]
-        if f"{axis}.position_sd_mm" in table.columns
-        else np.zeros(table.rows)
-        for axis in axes
-    }
-    position = {axis: table.numbers(f"{axis}{ending}")[0] for axis in axes}
-    return ReferenceTrack(_seconds(table), position, noise, _segment(table))
+    position, noise = (
+        {axis: table.numbers(column)[0] for axis in axes if (column := _column(axis, name)) in table.columns}
+        for name in ("position", "position_sd")
+    )
+    time, segment = _time_and_segment(table)
+    return ReferenceTrack(time, position, {axis: np.zeros(table.rows) for axis in axes} | noise, segment)
 
 
 def _column(axis: str, name: str) -> str:
@@ -218,28 +209,21 @@ def _column(axis: str, name: str) -> str:
     return f"{axis}.{name}_mm_s" if name.startswith("velocity") else f"{axis}.{name}_mm"
 
 
-def _lengths(table: Table, axis: str, name: str) -> FloatArray:
-    return table.plain(_column(axis, name))[0] / MM
-
-
 def _names(index: npt.NDArray[np.integer[Any]], names: Sequence[str]) -> pa.Array:
     """The name of each index as a column of text."""
     return pa.DictionaryArray.from_arrays(index.astype(np.int32), list(names)).cast(pa.string())
 
 
-def _seconds(table: Table) -> FloatArray:
-    return seconds(table.stamps("time_s")[0])
+def _time_and_segment(table: Table) -> tuple[FloatArray, IntArray]:
+    time = seconds(table.stamps("time_s")[0])
+    if "segment" not in table.columns:
+        return time, np.zeros(table.rows, dtype=np.int64)
+    return time, table.columns["segment"].to_numpy().astype(np.int64)
 
 
 def _segment_column(segment: IntArray) -> dict[str, IntArray]:
     """A column only where the log's clock was set back: most runs are one segment."""
     return {"segment": segment} if segment.any() else {}
-
-
-def _segment(table: Table) -> IntArray:
-    if "segment" not in table.columns:
-        return np.zeros(table.rows, dtype=np.int64)
-    return table.columns["segment"].to_numpy().astype(np.int64)
 
 
 def _nullable(values: FloatArray) -> pa.Array:

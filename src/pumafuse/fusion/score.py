@@ -1,16 +1,55 @@
-"""Scores against a reference: error, coverage and NEES of position and velocity."""
+"""Scores against a reference: error, coverage and NEES of position and velocity; and the reference in order."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
-from .reference import ReferenceTrack
+from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray
+from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
+from ..logs.run import Source
+from ..units import seconds
 
 Z95 = 1.959963984540054  # a normal variable lies within ± this in 95 % of cases
 _SHORTEST_GAP = 0.050  # s; a reference is interpolated at least across this
+
+
+@dataclass(frozen=True)
+class ReferenceTrack:
+    """The reference in the run's own time.
+
+    Attributes:
+        time: [s since the first command], ascending, (k,).
+        position: For each axis [m], NaN where it has none, (k,).
+        sd: Standard deviation of its own noise on each axis [m], (k,).
+        segment: As in :class:`pumafuse.fusion.estimates.Estimates`, (k,).
+    """
+
+    time: FloatArray
+    position: Mapping[str, FloatArray]
+    sd: Mapping[str, FloatArray]
+    segment: IntArray
+
+
+def late_rows(stamp: TimeArray) -> BoolArray:
+    """Rows stamped more than 1 s behind an earlier one; they are not used, (rows,)."""
+    return behind(stamp) > TOLERATED_STEP_BACK_NS
+
+
+def reference_track(parts: Sequence[Source], origin: int) -> ReferenceTrack:
+    """The reference of a run's segments in order, in seconds since ``origin`` (int ns), without late rows."""
+    late = [(part.stamp == NO_STAMP) | late_rows(part.stamp) for part in parts]
+    orders = [np.argsort(part.stamp, kind="stable") for part in parts]
+    used = [part.rows(order[~not_used[order]]) for part, order, not_used in zip(parts, orders, late, strict=True)]
+    noise = [{axis: part.sd * part.spread.get(axis, np.ones(len(part.stamp))) for axis in part.values} for part in used]
+    return ReferenceTrack(
+        seconds(np.concatenate([part.stamp for part in used]), origin),
+        {axis: np.concatenate([part.values[axis] for part in used]) for axis in used[0].values},
+        {axis: np.concatenate([sd[axis] for sd in noise]) for axis in noise[0]},
+        np.repeat(np.arange(len(used)), [len(part.stamp) for part in used]),
+    )
 
 
 @dataclass(frozen=True)
@@ -52,8 +91,8 @@ def score(
     """
     if axis not in reference.position:
         return None
-    true = interpolated(time, segment, reference, axis)
-    return _score(position - true, sd**2 + _noise_variance(time, reference, axis))
+    true, noise = _true(time, segment, reference, axis)
+    return _score(position - true, sd**2 + noise)
 
 
 def score_velocity(
@@ -84,9 +123,8 @@ def score_velocity(
     """
     if axis not in reference.position:
         return None
-    before, after = (interpolated(t, segment, reference, axis) for t in (time, time + period))
-    noise = _noise_variance(time, reference, axis) + _noise_variance(time + period, reference, axis)
-    return _score(velocity - (after - before) / period, sd**2 + noise / period**2)
+    (before, noise), (after, more) = (_true(t, segment, reference, axis) for t in (time, time + period))
+    return _score(velocity - (after - before) / period, sd**2 + (noise + more) / period**2)
 
 
 def interpolated(time: FloatArray, segment: IntArray, reference: ReferenceTrack, axis: str) -> FloatArray:
@@ -122,11 +160,10 @@ def _score(error: FloatArray, variance: FloatArray) -> Score | None:
     )
 
 
-def _noise_variance(time: FloatArray, reference: ReferenceTrack, axis: str) -> FloatArray:
-    """Variance of the reference's own noise [m²] at ``time``, (n,)."""
-    if not len(reference.time):
-        return np.zeros(len(time))
-    return np.interp(time, reference.time, reference.sd[axis]) ** 2
+def _true(time: FloatArray, segment: IntArray, reference: ReferenceTrack, axis: str) -> tuple[FloatArray, FloatArray]:
+    """The reference [m] at ``time``, and the variance of its own noise [m²], (n,)."""
+    sd = np.interp(time, reference.time, reference.sd[axis]) if len(reference.time) else np.zeros(len(time))
+    return interpolated(time, segment, reference, axis), sd**2
 
 
 def _between(time: FloatArray, known: FloatArray, value: FloatArray) -> FloatArray:

@@ -6,31 +6,34 @@ Delays and latencies only say when events are, so another configuration's times 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
+from typing import TypeAlias
 
 import numpy as np
 
-from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray
+from ..arrays import NO_STAMP, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
+from ..filter.axis import Model, Sensors, State
 from ..filter.events import COMMAND, Events, classify_all, joined
 from ..filter.outcome import ABSENT, Outcome
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
 from ..logs.run import Run, Source, note_rows
-from ..model.arm import ArmModel
 from .config import FusionConfig
 from .setup import at_rest, filter_model, filter_sensors
 
 LONGEST_TAIL_NS = 3_600_000_000_000  # measurements this long after the last command no longer belong to the run
 _MOST_ESTIMATES = 10_000_000
 
-_REASONS: Mapping[Outcome, str] = {
+_REASONS = {
     Outcome.DUPLICATE: "the stamp and values of an earlier row",
     Outcome.BEFORE_START: "a time before the first command",
     Outcome.TOO_LATE: "a stamp more than 1 s behind an earlier one",
 }
+_Policy: TypeAlias = tuple[Model, Sensors, State]  # what decides on values before the filter does
 
 
 @dataclass(frozen=True)
@@ -68,15 +71,17 @@ class Segment:
         """
         delay, latency = [round(config.arm.delay_of(axis) * 1e9) for axis in self.axes], self._latency(config)
         times = (*delay, *latency.tolist())  # a search asks for many configurations of the same times
-        found = self._latest.get(times)
-        if found is None:
-            found = self._ordered(delay, latency)
+        if times not in self._latest:
             self._latest.clear()
-            self._latest[times] = found
-        return found
+            self._latest[times] = self._ordered(np.array(delay), latency)
+        return self._latest[times]
 
-    def _ordered(self, delay: list[int], latency: IntArray) -> tuple[Events, IntArray]:
-        parts = delayed(self.command_rows, delay)
+    def _ordered(self, delay: IntArray, latency: IntArray) -> tuple[Events, IntArray]:
+        rows, parts = self.command_rows, list[Events]()
+        for one in sorted(set(delay.tolist())):  # a command is one event for each distinct delay
+            known = np.where(delay == one, rows.known, np.uint8(ABSENT))
+            given = np.flatnonzero(_on_any_axis(known, Outcome.FUSED))
+            parts.append(rows._replace(time=rows.stamp + one, known=known).rows(given))
         commands = sum(len(part.time) for part in parts)
         unordered = joined([*parts, self._measured(latency)])
         order = np.argsort(unordered.time, kind="stable")  # each source is in its order: commands, then the sensors'
@@ -116,7 +121,7 @@ class Segment:
         Measurements an hour after the last command are on another clock.
         """
         rows = self._measured(self._latency(config))
-        valid = rows.time[(rows.known == Outcome.FUSED).any(axis=1)]
+        valid = rows.time[_on_any_axis(rows.known, Outcome.FUSED)]
         return int(valid[valid <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
 
     def _latency(self, config: FusionConfig) -> IntArray:
@@ -140,32 +145,32 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     Raises:
         PumafuseError: The run commands an axis that the arm has not, or a chosen sensor is not configured.
     """
-    arm, notes = config.arm, list(run.notes)
+    arm, label, notes = config.arm, run.command.label, list(run.notes)
     for axis in run.axes:
         if axis in CARTESIAN and axis not in arm.axes:
-            raise RunError(f"{run.command.label}: commands are in x, y, z; give a [frame] in run.toml or fusion.toml")
+            raise RunError(f"{label}: commands are in x, y, z; give a [frame] in run.toml or fusion.toml")
         if axis not in arm.axes:
-            raise UnknownNameError(
-                f"{run.command.label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes
-            )
+            raise UnknownNameError(f"{label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes)
     for name, source in run.sensors.items():
         if any(axis in CARTESIAN and axis not in run.axes for axis in source.values):
             raise RunError(
                 f"sensor '{name}' is in x, y, z, the commands are not; give a [frame], and them in x, y, z too"
             )
-    rows = command_rows(run, arm, notes)
-    commands = rows.stamp[(rows.known == Outcome.FUSED).any(axis=1)]
-    commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
-    start = {axis: run.start.get(axis, _first_value(rows, number)) for number, axis in enumerate(run.axes)}
     chosen = config.sensor_names(sensors)
-    named = tuple(name for name in chosen if name in run.sensors)
-    others = tuple(name for name in run.sensors if name not in config.sensors) if sensors is None else ()
+    strangers = [name for name in run.sensors if name not in config.sensors] if sensors is None else []
+    used = (*(name for name in chosen if name in run.sensors), *strangers)
+    policy = _policy(config, run.axes, used)
+    rows = _command_rows(run, config, policy, notes)
     silent = [name for name in chosen if name not in run.sensors]
     notes.extend(f"sensor '{name}' of the configuration has no measurements in this run" for name in silent)
+    commands = rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)]
+    commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
+    given = {axis: (rows.known[:, number] == Outcome.FUSED).argmax() for number, axis in enumerate(run.axes)}
+    first = {axis: float(rows.value[row, number]) for number, (axis, row) in enumerate(given.items())}
     origin = int(commands[0])
-    parts = [_measurement_rows(run, config, name, number, origin, notes) for number, name in enumerate(named + others)]
+    parts = [_measurement_rows(run, config, number, used, policy, origin, notes) for number in range(len(used))]
     measured = joined([Events.empty(len(run.axes)), *parts])
-    return Segment(run.axes, named + others, origin, start, commands, rows, measured, tuple(notes))
+    return Segment(run.axes, used, origin, {**first, **run.start}, commands, rows, measured, tuple(notes))
 
 
 def output_times(segment: Segment, config: FusionConfig, rate: float | None) -> TimeArray:
@@ -183,59 +188,7 @@ def output_times(segment: Segment, config: FusionConfig, rate: float | None) -> 
     return segment.origin + grid[grid <= span]
 
 
-def command_rows(run: Run, arm: ArmModel, notes: list[str]) -> Events:
-    """The stamped command rows of a segment in order, each value classified.
-
-    Args:
-        run: One segment of a recorded run.
-        arm: Its period T says what a repetition is, and what grid the stamps follow where the run's clock is regular.
-        notes: Gets a sentence on everything that is wrong with the rows.
-
-    Raises:
-        RunError: No command of an axis is possible, or the run's clock is regular and the stamps do not follow ticks
-            of T.
-    """
-    source, period = run.command, arm.update_period
-    missing = source.stamp == NO_STAMP
-    note_rows(notes, source.label, missing, "no stamp: not used")
-    note_rows(notes, source.label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
-    kept = np.flatnonzero(~missing)
-    kept = kept[np.argsort(source.stamp[kept], kind="stable")]
-    rows = _table(source, run.axes, kept, COMMAND)._replace(time=source.stamp[kept])
-    rows = _classified(rows, FusionConfig(arm=arm), run.axes, (), int(rows.time[0]), np.zeros(len(kept), np.bool_))
-    note_rows(notes, source.label, source.repeated() & ~missing, "the stamp and values of an earlier row: duplicate")
-    for number, axis in enumerate(run.axes):
-        hollow = np.zeros(len(source.stamp), dtype=np.bool_)
-        hollow[kept] = rows.known[:, number] == Outcome.INVALID
-        note_rows(notes, source.label, hollow, f"no finite {axis} command: not used")
-        if not (rows.known[:, number] == Outcome.FUSED).any():
-            raise RunError(f"{source.label}: no command for axis '{axis}' is a position within 1000 km")
-    if run.clock == "stamps":
-        return rows
-    used = (rows.known == Outcome.FUSED).any(axis=1)
-    distinct, place = np.unique(rows.stamp[used], return_inverse=True)
-    grid, note = regular_grid(distinct, period, source.label)
-    notes.extend([] if note is None else [note])
-    rows = rows.rows(np.flatnonzero(used))
-    return rows._replace(time=grid[place], stamp=grid[place])
-
-
-def delayed(rows: Events, delay: list[int]) -> list[Events]:
-    """Commands by when they act: an event for each distinct delay.
-
-    Args:
-        rows: Commands by stamp.
-        delay: Td of each axis [ns].
-    """
-    found: list[Events] = []
-    for one in sorted(set(delay)):
-        known = np.where(np.array(delay) == one, rows.known, ABSENT).astype(np.uint8)
-        given = np.flatnonzero((known == Outcome.FUSED).any(axis=1))
-        found.append(rows._replace(time=rows.stamp + one, known=known).rows(given))
-    return found
-
-
-def as_commanded(run: Run, arm: ArmModel) -> Source:
+def as_commanded(run: Run, config: FusionConfig) -> Source:
     """The rows of a run's commands as they are believed: as logged, or where the run says so on the grid of T.
 
     Raises:
@@ -243,46 +196,82 @@ def as_commanded(run: Run, arm: ArmModel) -> Source:
     """
     if run.clock == "stamps":
         return run.command
-    rows = command_rows(run, arm, [])
+    rows = _command_rows(run, config, _policy(config, run.axes, ()), [])
     value = np.where(rows.known == Outcome.FUSED, rows.value, np.nan)
     return Source(rows.stamp, dict(zip(run.axes, value.T, strict=True)), run.command.label)
 
 
-def _first_value(rows: Events, axis: int) -> float:
-    return float(rows.value[np.flatnonzero(rows.known[:, axis] == Outcome.FUSED)[0], axis])
+def _policy(config: FusionConfig, axes: Sequence[str], sensors: Sequence[str]) -> _Policy:
+    none = [()] * len(axes)
+    state = at_rest(config, axes, 0, none, 0, dict.fromkeys(axes, 0.0))
+    return filter_model(config, axes, none), filter_sensors(config, sensors, axes, none), state
 
 
-def _measurement_rows(run: Run, config: FusionConfig, name: str, number: int, origin: int, notes: list[str]) -> Events:
-    """One sensor's rows by stamp, each value classified."""
-    source, sensor = run.sensors[name], config.sensors.get(name)
-    label, latency = source.label_for(name), 0 if sensor is None else round(sensor.latency * 1e9)
+def _command_rows(run: Run, config: FusionConfig, policy: _Policy, notes: list[str]) -> Events:
+    """The stamped command rows of a segment in order, with time = stamp, each value classified.
+
+    Args:
+        run: One segment of a recorded run.
+        config: Its period T says what grid the stamps follow where the run's clock is regular.
+        policy: What classifies the values.
+        notes: Gets a sentence on everything that is wrong with the rows.
+
+    Raises:
+        RunError: No command of an axis is possible, or the run's clock is regular and the stamps do not follow ticks
+            of T.
+    """
+    source = run.command
+    missing, label = source.stamp == NO_STAMP, source.label
+    note_rows(notes, label, missing, "no stamp: not used")
+    note_rows(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
+    order = np.argsort(source.stamp, kind="stable")[np.count_nonzero(missing) :]
+    rows = _classified(_table(source, run.axes, order, COMMAND), policy, 0, np.zeros(len(order), np.bool_))
+    note_rows(notes, label, source.repeated() & ~missing, "the stamp and values of an earlier row: duplicate")
+    for number, axis in enumerate(run.axes):
+        known, hollow = rows.known[:, number], np.zeros(len(missing), dtype=np.bool_)
+        hollow[order] = known == Outcome.INVALID
+        note_rows(notes, label, hollow, f"no finite {axis} command: not used")
+        if not (known == Outcome.FUSED).any():
+            raise RunError(f"{label}: no command for axis '{axis}' is a position within 1000 km")
+    if run.clock == "stamps":
+        return rows
+    rows = rows.rows(np.flatnonzero(_on_any_axis(rows.known, Outcome.FUSED)))
+    distinct, place = np.unique(rows.stamp, return_inverse=True)
+    grid, note = regular_grid(distinct, config.arm.update_period, label)
+    notes.extend([] if note is None else [note])
+    return rows._replace(time=grid[place], stamp=grid[place])
+
+
+def _measurement_rows(
+    run: Run, config: FusionConfig, number: int, names: Sequence[str], policy: _Policy, origin: int, notes: list[str]
+) -> Events:
+    """The rows of one of the sensors ``names`` by stamp, each value classified."""
+    name = names[number]
+    source, sensor, lag = run.sensors[name], config.sensors.get(name), behind(run.sensors[name].stamp)
+    label, missing = source.label_for(name), source.stamp == NO_STAMP
     order = np.argsort(source.stamp, kind="stable")
-    rows = _table(source, run.axes, order, 0)
-    rows = rows._replace(time=_valid(rows.stamp, latency))
-    too_late = behind(source.stamp) > TOLERATED_STEP_BACK_NS
-    rows = _classified(rows, config, run.axes, (name,), origin, too_late[order])
-    rows = rows._replace(source=np.full_like(rows.source, number))
+    rows = _table(source, run.axes, order, number, 0 if sensor is None else round(sensor.latency * 1e9))
+    rows = _classified(rows, policy, origin, lag[order] > TOLERATED_STEP_BACK_NS)
+    note_rows(notes, label, lag > 0, "a stamp that steps back: sorted")
+    if sensor is None:
+        note_rows(notes, label, missing | True, "no sensor of this name in the configuration: unknown")
+        return rows
+    note_rows(notes, label, missing, f"no stamp: {Outcome.INVALID.word}")
+    if ((rows.known == int(Outcome.FUSED)) | (rows.known == ABSENT)).all():
+        return rows
     known = np.empty_like(rows.known)
     known[order] = rows.known
-    note_rows(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
-    if sensor is None:
-        note_rows(notes, label, np.ones(len(known), np.bool_), "no sensor of this name in the configuration: unknown")
-        return rows
-    note_rows(notes, label, source.stamp == NO_STAMP, f"no stamp: {Outcome.INVALID.word}")
     for kind, reason in _REASONS.items():
-        note_rows(notes, label, (known == kind).any(axis=1), f"{reason}: {kind.word}")
-    for number, axis in enumerate(run.axes):
-        if axis not in source.values:
-            continue
-        if sensor.sd_of(axis) is None:
+        note_rows(notes, label, _on_any_axis(known, kind), f"{reason}: {kind.word}")
+    for column, axis in enumerate(run.axes):
+        if axis in source.values and sensor.sd_of(axis) is None:
             notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
-            continue
-        hollow = (known[:, number] == Outcome.INVALID) & (source.stamp != NO_STAMP)
+        hollow = (known[:, column] == Outcome.INVALID) & ~missing
         note_rows(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
     return rows
 
 
-def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int | np.int64) -> Events:
+def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int | np.int64, latency: int = 0) -> Events:
     """Rows of a source in an order, everything that it gives for the filter to decide on."""
     stamp, shape = source.stamp[order], (len(order), len(axes))
     value, known = np.full(shape, np.nan), np.full(shape, ABSENT, dtype=np.uint8)
@@ -292,24 +281,20 @@ def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int |
         value[:, at], known[:, at] = column[order], Outcome.FUSED
         if axis in source.spread:
             spread[:, at] = source.spread[axis][order]
-    return Events(stamp, np.full(len(order), number, dtype=np.int16), stamp, value, spread, known)
+    return Events(_valid(stamp, latency), np.full(len(order), number, dtype=np.int16), stamp, value, spread, known)
 
 
-def _classified(
-    rows: Events,
-    config: FusionConfig,
-    axes: tuple[str, ...],
-    sensors: tuple[str, ...],
-    origin: int,
-    too_late: BoolArray,
-) -> Events:
+def _classified(rows: Events, policy: _Policy, origin: int, too_late: BoolArray) -> Events:
     """Rows of one source with every value classified."""
-    none = [()] * len(axes)
-    known, start = np.empty_like(rows.known), dict.fromkeys(axes, 0.0)
-    model, filtered = filter_model(config, axes, none), filter_sensors(config, sensors, axes, none)
-    state = at_rest(config, axes, len(sensors), none, origin, start)
-    classify_all(model, filtered, rows, state, origin, too_late, known)
+    model, sensors, state = policy
+    known = np.empty_like(rows.known)
+    classify_all(model, sensors, rows, state, origin, too_late, known)
     return rows._replace(known=known)
+
+
+def _on_any_axis(known: CodeArray, kind: Outcome) -> BoolArray:
+    """Rows of which a value is of a kind, (n,); ``any(axis=1)`` takes twenty times as long for few axes."""
+    return reduce(np.logical_or, (known == int(kind)).T)
 
 
 def _valid(stamp: TimeArray, latency: IntArray | int) -> TimeArray:

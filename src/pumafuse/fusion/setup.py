@@ -18,8 +18,8 @@ def _rest(config: FusionConfig, axis: str, biased: Sequence[str]) -> tuple[Float
     """The states of an axis behind the offset.
 
     Returns:
-        How fast each reverts [1/s] and its variance at the start [m²], (k, 2), and of which sensor each of the last is a
-        bias, and whether that is constant.
+        How fast each reverts [1/s] and its variance at the start [m²], (k, 2); of which
+        sensor each of the last ones is a bias, and whether that is constant.
     """
     process, found, owners = config.process[axis], list[tuple[float, float]](), list[tuple[str, bool]]()
     if _disturbance(config, axis) == SMOOTH:
@@ -120,7 +120,7 @@ def at_rest(
         places: Room for how many checkpoints.
     """
     rest = [_rest(config, axis, biased)[0] for axis, biased in zip(axes, biases, strict=True)]
-    count, width = len(axes), REST + max(map(len, rest), default=0) + 1  # and the clone
+    count, width = len(axes), REST + max(map(len, rest), default=0)
     rows = count * (1 + places) + 1
     P, drive = np.zeros((rows, width, width)), np.zeros((rows, 6))
     for number, axis in enumerate(axes):

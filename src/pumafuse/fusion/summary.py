@@ -13,8 +13,7 @@ from ..filter.outcome import Outcome
 from ..units import MM
 from .consistency import chi_square_band, consistency, log_likelihood
 from .estimates import AxisEstimate, Estimates
-from .reference import ReferenceTrack
-from .score import score, score_velocity
+from .score import ReferenceTrack, score, score_velocity
 
 
 class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from itertools import product
 
 import msgspec
 import numpy as np
@@ -20,10 +21,10 @@ from ..model.arm import Validity, ordered_axes
 from .trials import Trial
 
 _COUNTERS = frozenset({"replicate", "repetition", "repeat", "rep", "run", "observation"})  # columns that only count
-_MOST_LEVELS = 12  # a numeric factor with more is cut into quarters
 _OUTLYING = 8.0  # robust standard deviations from the median
 _LEAST_SD = 0.005  # of the median: the smallest robust standard deviation that is believed
 _FEWEST = 5  # values among which one can be outlying
+_MOST_LEVELS = 12  # a numeric factor with more is cut into quarters
 
 
 class Level(msgspec.Struct, frozen=True, kw_only=True):
@@ -155,11 +156,8 @@ def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Se
         coefficients: By name, each (trials,).
         factors: By name, the level of each trial.
     """
-    return [
-        _dependence(coefficient, values, factor, factors)
-        for coefficient, values in coefficients.items()
-        for factor in factors
-    ]
+    pairs = product(coefficients.items(), factors)
+    return [_dependence(coefficient, values, factor, factors) for (coefficient, values), factor in pairs]
 
 
 def welch(groups: Sequence[FloatArray]) -> float | None:
@@ -217,12 +215,22 @@ def performances(factors: Mapping[str, Sequence[str]], rms: FloatArray, toleranc
         rms: Of the model's residuals in each trial [m], (n,).
         tolerance: RMS beyond which it is not called valid [m].
     """
-    found: list[Performance] = []
-    for factor, cells in factors.items():
-        levels = levels_of(rms * units.MM, cells)
-        limit, verdict = _limit(levels, tolerance * units.MM)
-        found.append(Performance(factor=factor, levels=levels, limit=limit, verdict=verdict))
-    return found
+    every = {factor: levels_of(rms * units.MM, cells) for factor, cells in factors.items()}
+    limits = {factor: _limit(levels, tolerance * units.MM) for factor, levels in every.items()}
+    return [
+        Performance(factor=factor, levels=every[factor], limit=limit, verdict=verdict)
+        for factor, (limit, verdict) in limits.items()
+    ]
+
+
+def _levels(cells: Sequence[str]) -> list[str]:
+    """A factor's levels; a numeric one with many is cut into quarters."""
+    values = numbers(cells)
+    if values is None or len(set(cells)) <= _MOST_LEVELS:
+        return list(cells)
+    quarter = np.searchsorted(np.quantile(values, [0.25, 0.5, 0.75]), values)
+    middles = {part: f"{np.median(np.array(values)[quarter == part]):.4g}" for part in set(quarter.tolist())}
+    return [middles[part] for part in quarter.tolist()]
 
 
 def validity(performance: Sequence[Performance], fastest: float) -> Validity:
@@ -237,16 +245,6 @@ def validity(performance: Sequence[Performance], fastest: float) -> Validity:
     return Validity(
         max_speed=limits.get("speed_m_s") or fastest, max_radius=None if radius is None else radius / units.MM
     )
-
-
-def _levels(cells: Sequence[str]) -> list[str]:
-    """A factor's levels; a numeric one with many is cut into quarters."""
-    values = numbers(cells)
-    if values is None or len(set(cells)) <= _MOST_LEVELS:
-        return list(cells)
-    quarter = np.searchsorted(np.quantile(values, [0.25, 0.5, 0.75]), values)
-    middles = {part: f"{np.median(np.array(values)[quarter == part]):.4g}" for part in set(quarter.tolist())}
-    return [middles[part] for part in quarter.tolist()]
 
 
 def _groups(values: FloatArray, cells: Sequence[str]) -> dict[str, FloatArray]:
@@ -267,9 +265,14 @@ def _replicate_sd(trials: Sequence[Trial], values: FloatArray) -> float | None:
 
 
 def _dependence(coefficient: str, values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> Dependence:
+    from scipy.stats import f, f_oneway
+
     groups = list(_groups(values, factors[factor]).values())
-    ratio, p = _one_way(groups)
-    by_welch, adjusted = welch(groups), _adjusted(values, factor, factors)
+    by_welch, adjusted, ratio, p = welch(groups), _adjusted(values, factor, factors), None, None
+    if any(np.ptp(group) > 0.0 for group in groups):
+        found = f_oneway(*groups)
+        ratio = float(found.statistic / f.ppf(0.95, len(groups) - 1, len(values) - len(groups)))
+        p = float(found.pvalue)
     return Dependence(
         coefficient=coefficient,
         factor=factor,
@@ -280,17 +283,6 @@ def _dependence(coefficient: str, values: FloatArray, factor: str, factors: Mapp
         adjusted_p=adjusted,
         verdict=_verdict(ratio, by_welch, adjusted, alone=len(factors) == 1),
     )
-
-
-def _one_way(groups: Sequence[FloatArray]) -> tuple[float | None, float | None]:
-    """The i-ratio and the p of a one-way analysis of variance."""
-    from scipy.stats import f, f_oneway
-
-    between, within = len(groups) - 1, sum(len(group) for group in groups) - len(groups)
-    if within < 1 or not any(np.ptp(group) > 0.0 for group in groups):
-        return None, None
-    found = f_oneway(*groups)
-    return float(found.statistic / f.ppf(0.95, between, within)), float(found.pvalue)
 
 
 def _adjusted(values: FloatArray, factor: str, factors: Mapping[str, Sequence[str]]) -> float | None:
@@ -318,31 +310,26 @@ def _design(rows: int, factors: Sequence[Sequence[str]]) -> FloatArray:
 def _verdict(ratio: float | None, welch: float | None, adjusted: float | None, alone: bool) -> str:
     if ratio is None:
         return "cannot be tested: no scatter within any level"
-    words = "dependent" if ratio > 1.0 else "independent"
+    words = {True: "dependent", False: "independent"}
+    found = words[ratio > 1.0]
     if welch is not None and (welch < 0.05) != (ratio > 1.0):
-        words += ", but Welch's test " + ("says it is" if welch < 0.05 else "does not confirm it")
-    if alone:
-        return words
+        found += f", but by Welch's test {words[welch < 0.05]}"
     if adjusted is None:
-        return words + "; confounded with the other factors"
+        return found if alone else f"{found}; confounded with the other factors"
     if (adjusted < 0.05) != (ratio > 1.0):
-        words += "; beside the other factors " + ("dependent" if adjusted < 0.05 else "independent")
-    return words
+        found += f"; beside the other factors {words[adjusted < 0.05]}"
+    return found
 
 
 def _limit(levels: Sequence[Level], tolerance: float) -> tuple[float | None, str]:
     """Where the mean RMS passes the tolerance, and in words. RMS and tolerance in mm."""
     within = [level.mean <= tolerance for level in levels]
-    if all(within):
-        return None, f"within {tolerance:g} mm at every level tried"
-    if not any(within):
-        return None, f"beyond {tolerance:g} mm at every level tried"
-    first = within.index(False)
-    at = numbers([level.level for level in levels])
+    if len(set(within)) == 1:
+        return None, f"{'within' if within[0] else 'beyond'} {tolerance:g} mm at every level tried"
+    at, first = numbers([level.level for level in levels]), within.index(False)
     if at is None or not first or any(within[first:]):
-        good = ", ".join(level.level for level, fine in zip(levels, within, strict=True) if fine)
+        good = ", ".join(level.level for level in levels if level.mean <= tolerance)
         return None, f"within {tolerance:g} mm at {good} only"
-    low, high = levels[first - 1].mean, levels[first].mean
-    limit = at[first - 1] + (tolerance - low) / (high - low) * (at[first] - at[first - 1])
-    between = f"between the levels {levels[first - 1].level} and {levels[first].level}"
-    return limit, f"within {tolerance:g} mm up to {limit:.3g} ({between})"
+    low, high = levels[first - 1 : first + 1]
+    limit = float(np.interp(tolerance, [low.mean, high.mean], at[first - 1 : first + 1]))
+    return limit, f"within {tolerance:g} mm up to {limit:.3g} (between the levels {low.level} and {high.level})"

@@ -1,9 +1,9 @@
 """Nonlinear least squares on many trials at once, one trial in a row.
 
 The unit response of a delay, q and p is compared with each row. Gain and zero are linear and always at their optimum
-(variable projection). Gauss-Newton steps with Levenberg's damping fit each row by itself (:meth:`Batch.fit_each`), or
-one plant to all rows (:meth:`Batch.fit_shared`). There each trial's own delay is eliminated from the normal equations,
-so that the work is proportional to the number of trials.
+(variable projection). Gauss-Newton steps with Levenberg's damping fit each row by itself, or one plant to all rows
+(:meth:`Batch.fit`). Each trial's own delay is eliminated from the normal equations, so that the work is proportional to
+the number of trials.
 """
 
 from __future__ import annotations
@@ -114,31 +114,23 @@ class Batch:
         amplitude = np.einsum("ij,ij->i", c, z) / _power(c)
         return Point(shape, z - amplitude[:, None] * c, c, amplitude)
 
-    def slopes(
-        self, at: Point, order: Order, chord: tuple[FloatArray, FloatArray] | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Derivatives by (delay, q, p) of the fitted response (k, R, m) and of its amplitude (k, R).
+    def slopes(self, at: Point, order: Order) -> tuple[FloatArray, FloatArray]:
+        """Derivatives by (delay, q, p) of the fitted response (k, R, m) and of its amplitude (k, R); order 1 without p.
 
-        Args:
-            at: Where.
-            order: 1 without p.
-            chord: How far below and above p its difference quotient reaches, (R,) each; None: a small step, one-sided
-                where p is 0.
+        The difference quotient of p is one-sided where p is 0.
         """
         q, p = at.shape[:, 1], at.shape[:, 2]
         size = _REACH * q
-        ends = [(size, size), (size, size), chord or (np.minimum(size * q, p), size * q)][: order + 1]
+        ends = [(size, size), (size, size), (np.minimum(size * q, p), size * q)][: order + 1]
         quotients: list[FloatArray] = []
-        for place, (below, above) in enumerate(ends):
-            low, high = at.shape.copy(), at.shape.copy()
-            low[:, place] -= below
-            high[:, place] += above
+        for unit, (below, above) in zip(np.eye(3), ends, strict=False):
+            low, high = at.shape - below[:, None] * unit, at.shape + above[:, None] * unit
             quotients.append((self.response(high) - self.response(low)) / (above + below)[:, None])
         raw = np.stack([self.project(quotient) for quotient in quotients]) * at.amplitude[:, None]
         share = np.einsum("kij,ij->ki", raw, at.unit) / _power(at.unit)
         return raw - share[:, :, None] * at.unit, -share
 
-    def equations(self, at: Point, slopes: FloatArray, damping: float = 0.0) -> Equations:
+    def equations(self, at: Point, slopes: FloatArray, damping: FloatArray | float = 0.0) -> Equations:
         """Normal equations of q and p with the delays eliminated.
 
         A delay takes no part where it has no effect, or where its bound 0 is active.
@@ -161,66 +153,49 @@ class Batch:
         score = np.einsum("kij,ij->ik", slopes[1:], at.residual) - coupling * gradient[:, None]
         return Equations(gradient / own, coupling, information, score, delay_sd)
 
-    def fit_each(self, shape: FloatArray, order: Order) -> Point:
-        """The nearest minimum of each row from its own start (R, 3)."""
-        found = self.point(self._bounded(shape))
-        rows, at = np.arange(len(shape)), found
-        damping = np.full(len(shape), 1e-3)
+    def fit(self, start: FloatArray, order: Order, together: bool = False) -> Point:
+        """The nearest minimum from ``start`` (R, 3): of each row by itself, or ``together`` of one plant for all rows.
+
+        Together, each row keeps a delay of its own.
+        """
+        most = float(self.span.max())
+        low = np.array([0.0, 1e-3 * float(self.spacing.min()), 0.0])
+        high = np.array([most, 20.0 * most, (5.0 * most) ** 2])
+        found = self.point(np.clip(start, low, high))
+        size = len(start) if together else 1  # rows that share a plant
+        rows, damping = np.arange(len(start)), np.full(len(start) // size, 1e-3)
+
+        def grouped(values: FloatArray) -> FloatArray:
+            return values.reshape(-1, size, *values.shape[1:]).sum(axis=1)
+
         for _ in range(_ITERATIONS):
-            here = self.take(rows)
+            here, at = self.take(rows), Point(*(whole[rows] for whole in found))
             slopes, _ = here.slopes(at, order)
-            H = np.einsum("kij,lij->ikl", slopes, slopes)
-            g = np.einsum("kij,ij->ik", slopes, at.residual)
-            new = here.point(here._bounded(_damped_step(at.shape, H, g, damping)))
-            better, decrease = new.cost <= at.cost, at.cost - new.cost
+            own = here.equations(at, slopes, np.repeat(damping, size))
+            plant = _damped_step(at.shape[::size, 1:], grouped(own.information), grouped(own.score), damping)
+            plant = np.clip(np.repeat(plant, size, axis=0), low[1:], high[1:])
+            plant[:, 0] = np.maximum(plant[:, 0], 0.2 * at.shape[:, 1])
+            moved = (plant - at.shape[:, 1:])[:, :order]
+            delay = at.shape[:, 0] + own.shift - np.einsum("ij,ij->i", own.coupling, moved)
+            new = here.point(np.column_stack((np.clip(delay, low[0], high[0]), plant)))
+            cost = grouped(at.cost)
+            decrease = cost - grouped(new.cost)
+            better = decrease >= 0.0
             damping = np.where(better, np.maximum(0.2 * damping, 1e-12), 8.0 * damping)
-            going = np.where(better, decrease > _CONVERGED * at.cost, damping < _MOST_DAMPING)
+            going = np.where(better, decrease > _CONVERGED * cost, damping < _MOST_DAMPING)
+            better, kept = np.repeat(better, size), np.repeat(going, size)
             for whole, part in zip(found, new, strict=True):
                 whole[rows[better]] = part[better]
-            if not going.any():
+            rows, damping = rows[kept], damping[going]
+            if not len(rows):
                 break
-            rows, damping = rows[going], damping[going]
-            at = Point(*(whole[rows] for whole in found))
         return found
-
-    def fit_shared(self, q: float, p: float, delay: FloatArray, order: Order) -> Point:
-        """The nearest minimum over all rows of one plant for all and a delay (R,) for each."""
-        at, damping = self.point(_shapes(delay, q, p)), 1e-3
-        for _ in range(_ITERATIONS):
-            slopes, _ = self.slopes(at, order)
-            cost = float(at.cost.sum())
-            while True:
-                found = self.equations(at, slopes, damping)
-                H, g = found.information.sum(axis=0)[None], found.score.sum(axis=0)[None]
-                plant = _damped_step(at.shape[:1, 1:], H, g, np.array([damping]))
-                plant = np.clip(plant, [[0.2 * at.shape[0, 1], 0.0]], np.inf)
-                delays = at.shape[:, 0] + found.shift - found.coupling @ (plant - at.shape[:1, 1:])[0, :order]
-                new = self.point(_shapes(np.maximum(delays, 0.0), *plant[0].tolist()))
-                decrease = cost - float(new.cost.sum())
-                if decrease >= 0.0 or damping > _MOST_DAMPING:
-                    break
-                damping *= 8.0
-            if decrease >= 0.0:
-                at = new
-            if decrease <= _CONVERGED * cost:
-                break
-            damping = max(0.2 * damping, 1e-12)
-        return at
-
-    def _bounded(self, shape: FloatArray) -> FloatArray:
-        span, least = self.span, 1e-3 * self.spacing
-        most = np.stack((span, 20.0 * span, (5.0 * span) ** 2), axis=1)
-        return np.clip(shape, np.stack((0.0 * least, least, 0.0 * least), axis=1), most)
 
 
 def _power(unit: FloatArray) -> FloatArray:
     """Sum of squares of each row, infinite where it is 0, for a division, (R,)."""
     power = np.einsum("ij,ij->i", unit, unit)
     return np.where(power > 0.0, power, np.inf)
-
-
-def _shapes(delay: FloatArray, q: float, p: float) -> FloatArray:
-    return np.stack((delay, np.full(len(delay), q), np.full(len(delay), p)), axis=1)
 
 
 def _damped_step(shape: FloatArray, H: FloatArray, g: FloatArray, damping: FloatArray) -> FloatArray:

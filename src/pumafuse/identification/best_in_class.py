@@ -17,6 +17,7 @@ _SPIKE = 8.0  # robust standard deviations
 _DELAYS, _LATEST = 13, 9.0  # of the first grid: how many, up to how many periods
 _LAGS, _RATIOS = 5, (0.05, 0.25, 0.8)  # of 2ζ/ω; of 1/ω² over its square
 _STARTS = 3  # cells of it to search from
+_BOUNDS = -12.0, 6.0  # of √Td, log q and log √p
 
 
 class Fit(msgspec.Struct, frozen=True, kw_only=True):
@@ -181,9 +182,9 @@ def _gain_columns(command: Commands, model: AxisModel) -> list[AxisModel]:
 
 def _coordinates(delay: float, q: float, p: float) -> FloatArray:
     """√Td, log q and, of second order, log √p: free of bounds."""
-    return np.array([np.sqrt(delay), np.log(q), *([0.5 * np.log(p)] if p > 0.0 else [])])
+    return np.clip([np.sqrt(delay), np.log(q), *([0.5 * np.log(p)] if p > 0.0 else [])], *_BOUNDS)
 
 
 def _plant_at(x: FloatArray) -> PLANTS:
-    bounded = np.clip(x, -12.0, 6.0)
+    bounded = np.clip(x, *_BOUNDS)
     return plant_of(float(np.exp(bounded[1])), float(np.exp(2.0 * bounded[2])) if len(x) == 3 else 0.0)

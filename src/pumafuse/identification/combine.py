@@ -6,26 +6,23 @@ differ (a delay that jitters, friction, the pose) is the same for all samples of
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 
 from ..arrays import FloatArray
 from ..model.arm import AxisModel, Gain
-from ..model.plants import PLANTS, FirstOrder, SecondOrder
+from ..model.plants import PLANTS, FirstOrder
+from ..units import MS
 from .anova import ordered, outlying, speed_levels
 from .batch import Order
 from .estimate import Estimate, common, mean, regression, robust
-from .fit import HARDLY_MOVED, UNKNOWN_GAIN, StepFit, flags, least_p
+from .fit import StepFit, doubt, least_p, plant_of
 from .joint import JointFit, fit_together, inverse_square
 from .paper import minimise
 from .trials import Trial
-
-if TYPE_CHECKING:
-    from statsmodels.regression.linear_model import RegressionResults
 
 _FEWEST = 3  # trials for a model
 
@@ -113,6 +110,7 @@ class Common:
     """The common plant of an axis, and delay and gain of each trial under it; arrays (n,).
 
     Attributes:
+        trials: That it is made of.
         choice: Of the order.
         plant: Of that order.
         lag: 2ζ/ω, or τ, plus each trial's influence on it [s].
@@ -122,6 +120,7 @@ class Common:
         gain_sd: Its standard deviation by the noise.
     """
 
+    trials: Sequence[Trial]
     choice: OrderChoice
     plant: PLANTS
     lag: FloatArray
@@ -131,22 +130,7 @@ class Common:
     gain_sd: FloatArray
 
 
-@dataclass(frozen=True)
-class Combination:
-    """A combined axis, its common plant, and the names of the trials in it."""
-
-    axis: CombinedAxis
-    common: Common
-    names: Sequence[str]
-
-    @property
-    def own(self) -> dict[str, tuple[float, float]]:
-        """Td [s] and K of each trial under the common plant, by the trial's name."""
-        pairs = zip(self.common.delay.tolist(), self.common.gain.tolist(), strict=True)
-        return dict(zip(self.names, pairs, strict=True))
-
-
-def combine(fitted: Sequence[Fitted], period: float, paper: bool) -> Combination | str:
+def combine(fitted: Sequence[Fitted], period: float, paper: bool) -> tuple[CombinedAxis, Common] | str:
     """Combine the trials of one axis.
 
     Args:
@@ -157,28 +141,29 @@ def combine(fitted: Sequence[Fitted], period: float, paper: bool) -> Combination
     Returns:
         The model, or why there is none.
     """
-    if usual_gain(fitted) == 0.0:
+    usual = usual_gain(fitted)
+    if usual == 0.0:
         return "the arm does not move"
-    left_out = (_unseen(fitted) if paper else _outlying(fitted)) | _still(fitted)
+    left_out = _unseen(fitted) if paper else _outlying(fitted)
+    left_out |= {one.trial.name: why for one in fitted if (why := doubt(one.first, usual)) is not None}
     used = [one for one in fitted if one.trial.name not in left_out]
     if len(used) < _FEWEST:
         why = "; ".join(f"trial '{name}' {reason}" for name, reason in list(left_out.items())[:3])
         return f"{len(used)} usable trials, at least {_FEWEST} are needed" + (f" ({why})" if why else "")
     found = _published(used) if paper else _fitted_together(used)
-    speed = np.array([one.trial.speed_at(period) for one in used])
-    line, lack, words = _gain_line(speed, found, speed_levels([one.trial for one in used], period))
+    gain, lack, words = _gain_line(found, period)
     delay = common(found.delay, found.delay_sd)
     tau = np.array([one.first.shape.q for one in used])
-    seen = [one.onset for one in used if np.isfinite(one.onset)]
+    seen = np.array([one.onset for one in used if np.isfinite(one.onset)])
     axis = CombinedAxis(
         trials=len(used),
         left_out=left_out,
         choice=found.choice,
-        model=AxisModel(plant=found.plant, gain=line, delay=delay.value, delay_ci95=delay.ci95),
+        model=AxisModel(plant=found.plant, gain=gain, delay=delay.value, delay_ci95=delay.ci95),
         time_constant_mean=mean(tau),
         time_constant_robust=robust(tau),
         delays=Delays(
-            onset=mean(np.array(seen)) if seen else None,
+            onset=mean(seen) if len(seen) else None,
             fitted=delay,
             lag=common(found.delay + found.lag, found.delay_sd),
         ),
@@ -187,7 +172,7 @@ def combine(fitted: Sequence[Fitted], period: float, paper: bool) -> Combination
         lack_of_fit_p=lack,
         gain_words=words,
     )
-    return Combination(axis, found, [one.trial.name for one in used])
+    return axis, found
 
 
 def combined_rms(trial: Trial, model: AxisModel, delay: float, period: float) -> float:
@@ -201,11 +186,12 @@ def usual_gain(fitted: Sequence[Fitted]) -> float:
     return float(np.median([one.first.gain for one in fitted]))
 
 
-def _still(fitted: Sequence[Fitted]) -> dict[str, str]:
-    """Trials in which the arm hardly moved."""
-    usual = usual_gain(fitted)
-    found = {one.trial.name: flag for one in fitted for flag in flags(one.first, usual)[:1]}
-    return {name: flag for name, flag in found.items() if flag.startswith((HARDLY_MOVED, UNKNOWN_GAIN))}
+def coefficients(fitted: Sequence[Fitted]) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """The paper's three coefficients of first-order fits with their sds, in the units of their names, (n,) each."""
+    values = np.array([(*one.first.shape, one.first.gain) for one in fitted])
+    sds = np.array([one.first.sd for one in fitted])
+    scales = {"delay_ms": (0, MS), "gain": (3, 1.0), "time_constant_ms": (1, MS)}
+    return {name: (values[:, place] * unit, sds[:, place] * unit) for name, (place, unit) in scales.items()}
 
 
 def _unseen(fitted: Sequence[Fitted]) -> dict[str, str]:
@@ -217,11 +203,10 @@ def _unseen(fitted: Sequence[Fitted]) -> dict[str, str]:
 def _outlying(fitted: Sequence[Fitted]) -> dict[str, str]:
     """Trials of which a coefficient is far from all the others."""
     found: dict[str, str] = {}
-    values = [(*one.first.shape[:2], one.first.gain) for one in fitted]
-    sds = [(*one.first.sd[:2], one.first.sd.gain) for one in fitted]
-    for word, column, sd in zip(("delay", "time constant", "gain"), np.array(values).T, np.array(sds).T, strict=True):
-        for place in np.flatnonzero(outlying(column, sd)).tolist():
-            shown = f"{column[place]:.2f}" if word == "gain" else f"{1e3 * column[place]:.0f} ms"
+    for name, (values, sd) in coefficients(fitted).items():
+        for place in np.flatnonzero(outlying(values, sd)).tolist():
+            shown = f"{values[place]:.2f}" if name == "gain" else f"{values[place]:.0f} ms"
+            word = name.removesuffix("_ms").replace("_", " ")
             found.setdefault(fitted[place].trial.name, f"outlying: its {word} is {shown}")
     return found
 
@@ -239,15 +224,10 @@ def _fitted_together(used: Sequence[Fitted]) -> Common:
         inverse_square=inverse_square(*joints),
     )
     best = joints[choice.order - 1]
-    if choice.order == 1:
-        half = best.half_width([1.0, 0.0])
-        plant: PLANTS = FirstOrder(time_constant=best.q, time_constant_ci95=(best.q - half, best.q + half))
-    else:
-        halves = [best.half_width(slope) for slope in _log_slopes(best.q, best.p)]
-        plant = _second_order(best.q, best.p, *halves)
     return Common(
+        trials=trials,
         choice=choice,
-        plant=plant,
+        plant=_plant(best.q, best.p, best.half_width),
         lag=best.q + best.influence[:, 0],
         # an error of the plant shifts every trial's delay and gain: that part belongs to the trials that cause it
         delay=best.delay + best.influence @ best.delay_slope.mean(axis=0),
@@ -258,49 +238,47 @@ def _fitted_together(used: Sequence[Fitted]) -> Common:
 
 
 def _published(used: Sequence[Fitted]) -> Common:
-    """The paper's combination: averages of what was read off, and equation 10 over all trials for ω and ζ."""
+    """The paper's combination: averages of what was read off and of τ; equation 10 over all trials for ω and ζ."""
+    trials, n = [one.trial for one in used], len(used)
     count = sum(one.first.samples for one in used)
     squares = [sum(one.first.squares for one in used), sum(one.second.squares for one in used)]
     choice = _choose(
         squares=squares,
-        parameters=[(order + 3) * len(used) for order in (1, 2)],  # what is read off counts as fitted
+        parameters=[(order + 3) * n for order in (1, 2)],  # what is read off counts as fitted
         samples=count,
         rms=[float(np.sqrt(square / count)) for square in squares],
         inverse_square=mean(np.array([one.second.shape.p for one in used])),
     )
     own = [one.first if choice.order == 1 else one.second for one in used]
-    if choice.order == 1:
-        lag = np.array([fit.shape.q for fit in own])
-        tau = mean(lag)
-        plant: PLANTS = FirstOrder(time_constant=tau.value, time_constant_ci95=tau.ci95)
-    else:
-        trials = [one.trial for one in used]
-        q, p = minimise(trials, own, 2)
-        p = max(p, least_p(q))
-        without = [minimise(trials[:k] + trials[k + 1 :], own[:k] + own[k + 1 :], 2) for k in range(len(own))]
-        influence = (len(own) - 1) * (np.array([q, p]) - without)  # jackknife
-        lag = q + influence[:, 0]
-        intervals = [mean(influence @ slope).ci95 for slope in _log_slopes(q, p)]
-        plant = _second_order(q, p, *(0.5 * (high - low) for low, high in intervals))
-    zeros = np.zeros(len(used))
-    delay, gain = np.array([fit.shape.delay for fit in own]), np.array([fit.gain for fit in own])
-    return Common(choice, plant, lag, delay, zeros, gain, zeros)
+    lags = np.array([fit.shape.q for fit in own])
+
+    def over(rows: list[int]) -> tuple[float, float]:
+        if choice.order == 1:
+            return float(lags[rows].mean()), 0.0
+        q, p = minimise([trials[row] for row in rows], [own[row] for row in rows])
+        return q, max(p, least_p(q))
+
+    q, p = over(list(range(n)))
+    without = [over([other for other in range(n) if other != row]) for row in range(n)]
+    influence = (n - 1) * (np.array([q, p]) - without)  # jackknife
+    plant = _plant(q, p, lambda slope: float(np.ptp(mean(influence @ slope).ci95)) / 2.0)
+    delay, gain = np.array([(fit.shape.delay, fit.gain) for fit in own]).T
+    return Common(trials, choice, plant, q + influence[:, 0], delay, np.zeros(n), gain, np.zeros(n))
 
 
-def _log_slopes(q: float, p: float) -> tuple[list[float], list[float]]:
-    """∂/∂(q, p) of log ω and of log ζ, whose errors are nearer to normal than those of ω and ζ."""
-    return [0.0, -0.5 / p], [1.0 / q, -0.5 / p]
-
-
-def _second_order(q: float, p: float, omega_half: float, zeta_half: float) -> SecondOrder:
-    """ω and ζ with half their intervals in the logarithm."""
-    omega, zeta = p**-0.5, 0.5 * q * p**-0.5
-    wide, wide_zeta = float(np.exp(omega_half)), float(np.exp(zeta_half))
-    return SecondOrder(
-        natural_frequency=omega,
-        damping=zeta,
-        natural_frequency_ci95=(omega / wide, omega * wide),
-        damping_ci95=(zeta / wide_zeta, zeta * wide_zeta),
+def _plant(q: float, p: float, half_width: Callable[[list[float]], float]) -> PLANTS:
+    """The plant with its intervals; ``half_width`` is of half a 95 % interval, by its gradient in q and p (2,)."""
+    found = plant_of(q, p)
+    if isinstance(found, FirstOrder):
+        half = half_width([1.0, 0.0])
+        return msgspec.structs.replace(found, time_constant_ci95=(q - half, q + half))
+    # of log ω and log ζ, whose errors are nearer to normal than those of ω and ζ
+    wide = np.exp(half_width([0.0, -0.5 / p]))
+    damping_wide = np.exp(half_width([1.0 / q, -0.5 / p]))
+    return msgspec.structs.replace(
+        found,
+        natural_frequency_ci95=(float(found.natural_frequency / wide), float(found.natural_frequency * wide)),
+        damping_ci95=(float(found.damping / damping_wide), float(found.damping * damping_wide)),
     )
 
 
@@ -328,23 +306,23 @@ def _choose(
     more, freedom = parameters[1] - parameters[0], max(samples - parameters[1], 1)
     F = (squares[0] - squares[1]) / more / (squares[1] / freedom) if squares[1] > 0.0 else 0.0
     p = float(fisher.sf(F, more, freedom))
-    first, second = (_aicc(one, samples, count + 1) for one, count in zip(squares, parameters, strict=True))
-    gain = first - second if np.isfinite(second) else None
-    aicc = "too few samples for AICc"
-    if gain is not None:
-        aicc = f"AICc {abs(gain):.3g} {'lower' if gain > 0.0 else 'higher'}"
-    numbers = (
-        f"first order leaves {1e3 * rms[0]:.3g} mm, second {1e3 * rms[1]:.3g} (each trial weighted by its noise:"
-        f" F({more}, {freedom}) = {F:.3g}, p {'< 0.001' if p < 1e-3 else f'= {p:.2g}'}; {aicc})"
-    )
+    gain, words = None, "too few samples for AICc"
+    if samples > parameters[1] + 2:  # the noise is one parameter more
+        counts = np.array(parameters) + 1
+        aicc = samples * (np.log(np.maximum(squares, 1e-300)) + 2.0 * counts / (samples - counts - 1))
+        gain = float(aicc[0] - aicc[1])
+        words = f"AICc {abs(gain):.3g} {'lower' if gain > 0.0 else 'higher'}"
     preferred = p < 0.05 and gain is not None and gain > 0.0
-    order: Order = 1
-    if preferred and inverse_square.ci95[0] > 0.0:
-        order, why = 2, f"second order: {numbers}, and the trials agree that 1/ω² is above 0"
-    elif preferred:
-        why = f"first order: {numbers}, but as the trials scatter 1/ω² may be 0"
-    else:
-        why = f"first order: {numbers}"
+    order: Order = 2 if preferred and inverse_square.ci95[0] > 0.0 else 1
+    why = (
+        f"{'second' if order == 2 else 'first'} order: first order leaves {1e3 * rms[0]:.3g} mm, second"
+        f" {1e3 * rms[1]:.3g} (each trial weighted by its noise: F({more}, {freedom}) = {F:.3g},"
+        f" p {'< 0.001' if p < 1e-3 else f'= {p:.2g}'}; {words})"
+    )
+    if preferred:
+        why += (
+            ", and the trials agree that 1/ω² is above 0" if order == 2 else ", but as the trials scatter 1/ω² may be 0"
+        )
     return OrderChoice(
         order=order,
         first_rms=rms[0],
@@ -357,16 +335,11 @@ def _choose(
     )
 
 
-def _aicc(squares: float, samples: int, parameters: int) -> float:
-    """Akaike's criterion, corrected for few samples (infinite where there are too few)."""
-    room = samples - parameters - 1
-    if room <= 0:
-        return np.inf
-    return samples * float(np.log(max(squares, 1e-300))) + 2.0 * parameters * (1.0 + (parameters + 1) / room)
-
-
-def _gain_line(speed: FloatArray, found: Common, levels: Sequence[str]) -> tuple[Gain, float | None, str]:
+def _gain_line(found: Common, period: float) -> tuple[Gain, float | None, str]:
     """K = a·speed + b with intervals, the p of its lack of fit, and what the line shows."""
+    from statsmodels.regression.linear_model import WLS
+
+    speed, levels = np.array([one.speed_at(period) for one in found.trials]), speed_levels(found.trials, period)
     distinct = ordered(set(levels))
     if len(distinct) == 1 or len(speed) < 4:
         level = common(found.gain, found.gain_sd)
@@ -379,19 +352,9 @@ def _gain_line(speed: FloatArray, found: Common, levels: Sequence[str]) -> tuple
     words = "the slope is not significant"
     if a_low > 0.0 or a_high < 0.0:
         words = "K rises with speed" if a > 0.0 else "K falls with speed"
-    lack = None
-    if 2 < len(distinct) < len(speed):
-        lack = _lack_of_fit(line, levels)
-        if lack < 0.05:
-            words += "; not along a straight line"
-    return gain, lack, words
-
-
-def _lack_of_fit(line: RegressionResults, levels: Sequence[str]) -> float:
-    """P of the hypothesis that the means at each level lie on the line."""
-    from statsmodels.regression.linear_model import WLS
-
-    cells = np.array(levels)
-    design = np.column_stack([cells == level for level in ordered(set(levels))]).astype(np.float64)
-    apart = WLS(line.model.endog, design, weights=line.model.weights).fit()
-    return float(apart.compare_f_test(line)[1])
+    if not 2 < len(distinct) < len(speed):
+        return gain, None, words
+    at_levels = np.array(levels)[:, None] == np.array(distinct)
+    apart = WLS(found.gain, at_levels.astype(np.float64), weights=line.model.weights).fit()
+    lack = float(apart.compare_f_test(line)[1])  # p of the hypothesis that the means of all levels lie on the line
+    return gain, lack, words + ("; not along a straight line" if lack < 0.05 else "")

@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Generic, NamedTuple, TypeVar
+from typing import NamedTuple
 
+import msgspec
 import numpy as np
 
 from ..arrays import FloatArray
@@ -22,9 +23,6 @@ from .batch import Batch, Order
 from .estimate import t_quantile
 from .trials import Trial
 
-HARDLY_MOVED = "hardly moved (stiction?)"
-UNKNOWN_GAIN = "gain not identifiable: it may be 0"
-
 _STARTS = 4  # cells of the grid to search from
 _RATIOS = (0.0, 0.08, 0.16, 0.25, 0.4, 0.8, 2.0)  # p/q² = 1/(4ζ²): ζ from ∞ to 0.35
 _LAGS = 14  # values of q on the grid
@@ -33,8 +31,6 @@ _FINE = 8  # instants between samples at which the grid's responses are known
 _SETTLED = 0.98  # share of the final value that a settled response has reached at the end
 _FASTEST = 1e-3  # of 2ζ/ω, lower bound of 1/ω
 _MOVES = 0.5  # share of the usual gain below which an arm has hardly moved
-
-T = TypeVar("T")
 
 
 class Shape(NamedTuple):
@@ -51,13 +47,13 @@ class Shape(NamedTuple):
     p: float
 
 
-class Coefficients(NamedTuple, Generic[T]):
-    """One value for each of delay Td [s], q [s], p [s²] and gain K."""
+class Intervals(NamedTuple):
+    """95 % intervals of delay Td [s], q [s], p [s²] and gain K."""
 
-    delay: T
-    q: T
-    p: T
-    gain: T
+    delay: Interval
+    q: Interval
+    p: Interval
+    gain: Interval
 
 
 @dataclass(frozen=True)
@@ -91,39 +87,34 @@ class StepFit:
         """Sum of squared residuals [m²]."""
         return self.rms**2 * self.samples
 
-    @property
-    def plant(self) -> PLANTS:
-        """The plant; one of second order whose p is 0 gets the highest ω that q allows."""
-        _, q, p = self.shape
-        return plant_of(q, 0.0 if self.order == 1 else max(p, least_p(q)))
+    @cached_property
+    def sd(self) -> FloatArray:
+        """Standard deviations of delay, q, p, K and z₀, (5,)."""
+        return np.sqrt(np.diag(self.covariance))
 
     @cached_property
-    def sd(self) -> Coefficients[float]:
-        """Standard deviations."""
-        return Coefficients(*np.sqrt(np.diag(self.covariance))[:4].tolist())
-
-    @cached_property
-    def ci95(self) -> Coefficients[Interval]:
+    def ci95(self) -> Intervals:
         """95 % intervals."""
-        pairs = zip((*self.shape, self.gain), self.sd, strict=True)
-        return Coefficients(*((value - self._t * sd, value + self._t * sd) for value, sd in pairs))
+        pairs = zip((*self.shape, self.gain), (self._t * self.sd).tolist(), strict=False)
+        return Intervals(*((value - half, value + half) for value, half in pairs))
 
-    @property
-    def natural_frequency_ci95(self) -> Interval:
-        """95 % interval of ω [rad/s], its upper end infinite where 1/ω² may be 0."""
-        low, high = self.ci95.p
-        return float(high**-0.5), float(low**-0.5) if low > 0.0 else np.inf
+    @cached_property
+    def plant(self) -> PLANTS:
+        """The plant with its intervals; one of second order whose p is 0 gets the highest ω that q allows.
 
-    @property
-    def damping_ci95(self) -> Interval:
-        """95 % interval of ζ = q/(2√p), infinite where 1/ω² may be 0; to first order in q and log p."""
-        p, q = self.shape.p, self.shape.q
-        if self.ci95.p[0] <= 0.0:
-            return 0.0, np.inf
-        slope = np.array([1.0 / q, -0.5 / p])
-        half = self._t * float(np.sqrt(slope @ self.covariance[1:3, 1:3] @ slope))
-        zeta = 0.5 * q / np.sqrt(p)
-        return float(zeta * np.exp(-half)), float(zeta * np.exp(half))
+        Where 1/ω² may be 0, ω and ζ may be infinite. The interval of ζ = q/(2√p) is to first order in q and log p.
+        """
+        _, q, p = self.shape
+        if self.order == 1:
+            return FirstOrder(time_constant=q, time_constant_ci95=self.ci95.q)
+        omega_ci95, damping_ci95 = (float(self.ci95.p[1] ** -0.5), np.inf), (0.0, np.inf)
+        if self.ci95.p[0] > 0.0:
+            slope = np.array([1.0 / q, -0.5 / p])
+            wide = float(np.exp(self._t * np.sqrt(slope @ self.covariance[1:3, 1:3] @ slope)))
+            zeta = 0.5 * q * p**-0.5
+            omega_ci95, damping_ci95 = (omega_ci95[0], self.ci95.p[0] ** -0.5), (zeta / wide, zeta * wide)
+        found = plant_of(q, max(p, least_p(q)))
+        return msgspec.structs.replace(found, natural_frequency_ci95=omega_ci95, damping_ci95=damping_ci95)
 
     @property
     def _t(self) -> float:
@@ -142,14 +133,20 @@ def fit_steps(trials: Sequence[Trial]) -> list[tuple[StepFit, StepFit]]:
     return [(_fit(trial, one, 1), _fit(trial, two, 2)) for trial, one, two in zip(trials, first, second, strict=True)]
 
 
-def flags(fit: StepFit, usual: float = 1.0) -> list[str]:
-    """What a user should know before trusting a fit; ``usual`` is the median gain of its axis."""
-    found: list[str] = []
+def doubt(fit: StepFit, usual: float) -> str | None:
+    """Why a trial tells nothing of its axis, whose median gain is ``usual``; None where it does."""
     moved = fit.gain * fit.reached
     if usual == 0.0 or moved / usual < _MOVES:
-        found.append(f"{HARDLY_MOVED}: {max(moved, 0.0):.0%} of the step")
-    elif not fit.ci95.gain[1] - fit.ci95.gain[0] < 2.0 * abs(fit.gain):
-        found.append(UNKNOWN_GAIN)
+        return f"hardly moved (stiction?): {max(moved, 0.0):.0%} of the step"
+    if not fit.ci95.gain[1] - fit.ci95.gain[0] < 2.0 * abs(fit.gain):
+        return "gain not identifiable: it may be 0"
+    return None
+
+
+def flags(fit: StepFit, usual: float = 1.0) -> list[str]:
+    """What a user should know before trusting a fit; ``usual`` is the median gain of its axis."""
+    useless = doubt(fit, usual)
+    found = [] if useless is None else [useless]
     if fit.reached < _SETTLED:
         found.append(f"not settled: {fit.reached:.0%} reached")
     if fit.order == 2 and fit.ci95.p[0] <= 0.0:
@@ -164,7 +161,7 @@ def _search(batch: Batch, order: Order, more: list[FloatArray]) -> FloatArray:
     count = len(batch.time)
     grid = np.stack([_starts(batch, row, order) for row in range(count)], axis=1)
     starts = np.concatenate([grid, *(shape[None] for shape in more)])
-    found = batch.take(np.tile(np.arange(count), len(starts))).fit_each(starts.reshape(-1, 3), order)
+    found = batch.take(np.tile(np.arange(count), len(starts))).fit(starts.reshape(-1, 3), order)
     shapes, cost = found.shape.reshape(starts.shape), found.cost.reshape(len(starts), count)
     for shape in more:  # the search begins inside its bounds; a start on them may have been better
         shapes, cost = np.concatenate((shapes, shape[None])), np.concatenate((cost, batch.point(shape).cost[None]))

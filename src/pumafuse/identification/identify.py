@@ -5,18 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
-from typing import Any
 
 import msgspec
 import numpy as np
 
 from .. import units
-from ..arrays import FloatArray
 from ..model.arm import ArmModel
-from ..model.plants import FirstOrder
 from ..toml import Interval
 from . import anova
-from .combine import Combination, CombinedAxis, Fitted, combine, combined_rms, usual_gain
+from .combine import CombinedAxis, Common, Fitted, coefficients, combine, combined_rms, usual_gain
 from .estimate import common
 from .fit import StepFit, fit_steps, flags
 from .paper import fit_as_published, onset
@@ -158,38 +155,41 @@ def identify(
     fitted = _fit_all(trials.trials, samples, paper)
     by_axis = {axis: [one for one in fitted if one.trial.axis == axis] for axis in trials.axes}
     usual = {axis: usual_gain(of_axis) for axis, of_axis in by_axis.items()}
-    notes, combined = list[str](), dict[str, Combination]()
+    notes, axes, commons = list[str](), dict[str, CombinedAxis](), dict[str, Common]()
     for axis, of_axis in by_axis.items():
         found = combine(of_axis, period, paper)
         if isinstance(found, str):
             notes.append(f"{axis}: no model: {found}")
         else:
-            combined[axis] = found
-            notes.extend(f"{axis}: {doubt}" for doubt in _doubts(usual[axis], found.axis.delays.lag.value))
-    if not combined:
+            axes[axis], commons[axis] = found
+            notes.extend(f"{axis}: {doubt}" for doubt in _doubts(usual[axis], axes[axis].delays.lag.value))
+    if not axes:
         reasons = first_few([*notes, *trials.notes])
         raise TrialsError("; ".join(["no axis has trials enough for a model", *reasons]))
-    arm, one_delay = _arm(combined, period, name)
+    arm, one_delay = _arm(axes, commons, period, name)
     rms = {
         one.trial.name: combined_rms(one.trial, arm.axes[one.trial.axis], arm.delay_of(one.trial.axis), period)
         for one in fitted
-        if one.trial.axis in combined
+        if one.trial.axis in axes
     }
-    left_out = {trial: why for found in combined.values() for trial, why in found.axis.left_out.items()}
-    own = {trial: pair for found in combined.values() for trial, pair in found.own.items()}
+    left_out = {trial: why for axis in axes.values() for trial, why in axis.left_out.items()}
+    own = {
+        trial.name: (delay, gain)
+        for one in commons.values()
+        for trial, delay, gain in zip(one.trials, one.delay.tolist(), one.gain.tolist(), strict=True)
+    }
     used = [one for one in fitted if one.trial.name in own]
     factors = anova.factors_of([one.trial for one in used], period)
     performance = anova.performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance)
     fastest = max(one.trial.speed_at(period) for one in used)
-    coefficients = {key: values for key, (values, _) in _coefficients(used).items()}
     provenance = {
         "made_by": f"pumafuse identify {version('pumafuse')}",
-        "trials": {axis: found.axis.trials for axis, found in combined.items()},
+        "trials": {axis: one.trials for axis, one in axes.items()},
         "left_out": left_out,
-        "order": {axis: found.axis.choice.why for axis, found in combined.items()},
+        "order": {axis: one.choice.why for axis, one in axes.items()},
         "delay": one_delay,
-        "delay_spread_ms": {axis: round(found.axis.delay_spread * units.MS, 2) for axis, found in combined.items()},
-        "gain": {axis: found.axis.gain_words for axis, found in combined.items()},
+        "delay_spread_ms": {axis: round(one.delay_spread * units.MS, 2) for axis, one in axes.items()},
+        "gain": {axis: one.gain_words for axis, one in axes.items()},
         "validity": {one.factor: one.verdict for one in performance},
         "samples": "all" if samples is None else samples,
         "method": "delay and gain read off each trial (--paper)" if paper else "all parameters fitted",
@@ -201,13 +201,13 @@ def identify(
         samples=samples,
         tolerance=tolerance,
         trials=[_result(one, period, usual[one.trial.axis], own, rms, left_out) for one in fitted],
-        axes={axis: found.axis for axis, found in combined.items()},
+        axes=axes,
         one_delay=one_delay,
-        dependences=anova.dependences(coefficients, factors) if factors else [],
+        dependences=anova.dependences({key: values for key, (values, _) in coefficients(used).items()}, factors),
         scatter=[
             anova.scatter(coefficient, [one.trial for one in of_axis], values, sd)
             for of_axis in by_axis.values()
-            for coefficient, (values, sd) in _coefficients(of_axis).items()
+            for coefficient, (values, sd) in coefficients(of_axis).items()
         ],
         performance=performance,
         notes=[*trials.notes, *notes],
@@ -221,12 +221,13 @@ def _fit_all(trials: Sequence[Trial], samples: int | None, paper: bool) -> list[
     cut = [trial.cut(samples) for trial in trials]
     batches = [cut[first : first + _BATCH] for first in range(0, len(cut), _BATCH)]
     parallel = Parallel(n_jobs=-1 if len(batches) > 1 else 1, return_as="generator")
-    fits = [pair for batch in parallel(delayed(_fit_batch)(batch, paper) for batch in batches) for pair in batch]
+    fits = [pair for batch in parallel(delayed(fit_steps)(batch) for batch in batches) for pair in batch]
+    if paper:
+        fits = [
+            (fit_as_published(one, first), fit_as_published(one, second))
+            for one, (first, second) in zip(cut, fits, strict=True)
+        ]
     return [Fitted(one, *pair, onset(trial)) for trial, one, pair in zip(trials, cut, fits, strict=True)]
-
-
-def _fit_batch(trials: Sequence[Trial], paper: bool) -> list[tuple[StepFit, StepFit]]:
-    return [fit_as_published(trial) for trial in trials] if paper else fit_steps(trials)
 
 
 def _doubts(gain: float, lag: float) -> Iterator[str]:
@@ -239,36 +240,25 @@ def _doubts(gain: float, lag: float) -> Iterator[str]:
         yield f"the arm is {lag:.3g} s behind its commands; is the unit of time wrong?"
 
 
-def _arm(combined: Mapping[str, Combination], period: float, name: str) -> tuple[ArmModel, str]:
+def _arm(
+    axes: Mapping[str, CombinedAxis], commons: Mapping[str, Common], period: float, name: str
+) -> tuple[ArmModel, str]:
     """The arm with one delay, or one for each axis where they differ significantly, and which in words."""
-    delays = [found.common.delay for found in combined.values()]
-    every = common(np.concatenate(delays), np.concatenate([found.common.delay_sd for found in combined.values()]))
-    p = anova.welch(delays) if len(delays) > 1 else None
-    axes = {axis: found.axis.model for axis, found in combined.items()}
+    delays = [one.delay for one in commons.values()]
+    every = common(np.concatenate(delays), np.concatenate([one.delay_sd for one in commons.values()]))
+    models, p = {axis: one.model for axis, one in axes.items()}, anova.welch(delays)
     if p is not None and p < 0.05:
         words = f"a delay for each axis: they differ (Welch's test, p {'< 0.001' if p < 1e-3 else f'= {p:.2g}'})"
     else:
-        axes = {axis: msgspec.structs.replace(one, delay=None, delay_ci95=None) for axis, one in axes.items()}
-        words = "one delay: whether axes differ cannot be tested"
-        if len(delays) == 1:
-            words = "one axis, one delay"
-        elif p is not None:
-            words = f"one delay: the axes do not differ (Welch's test, p = {p:.2g})"
-    return ArmModel(name=name, update_period=period, delay=every.value, delay_ci95=every.ci95, axes=axes), words
+        models = {axis: msgspec.structs.replace(one, delay=None, delay_ci95=None) for axis, one in models.items()}
+        words = "one delay" + ("" if p is None else f": the axes do not differ (Welch's test, p = {p:.2g})")
+    return ArmModel(name=name, update_period=period, delay=every.value, delay_ci95=every.ci95, axes=models), words
 
 
 def _rounded(arm: ArmModel) -> ArmModel:
     """The arm in six digits: more would suggest a precision that it has not."""
     text = json.dumps(msgspec.to_builtins(arm))
     return msgspec.convert(json.loads(text, parse_float=lambda number: float(f"{float(number):.{_DIGITS}g}")), ArmModel)
-
-
-def _coefficients(fitted: Sequence[Fitted]) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """The paper's three coefficients of first-order fits with their sds, in the units of their names."""
-    values = np.array([(*one.first.shape[:2], one.first.gain) for one in fitted])
-    sds = np.array([(*one.first.sd[:2], one.first.sd.gain) for one in fitted])
-    scales = {"delay_ms": (0, units.MS), "gain": (2, 1.0), "time_constant_ms": (1, units.MS)}
-    return {name: (values[:, place] * unit, sds[:, place] * unit) for name, (place, unit) in scales.items()}
 
 
 def _result(
@@ -298,22 +288,13 @@ def _result(
 
 
 def _order_fit(fit: StepFit, trial: Trial, usual: float) -> OrderFit:
-    moved, plant = float(np.std(trial.position)), fit.plant
-    if isinstance(plant, FirstOrder):
-        own: dict[str, Any] = {"time_constant": plant.time_constant, "time_constant_ci95": fit.ci95.q}
-    else:
-        own = {
-            "natural_frequency": plant.natural_frequency,
-            "natural_frequency_ci95": fit.natural_frequency_ci95,
-            "damping": plant.damping,
-            "damping_ci95": fit.damping_ci95,
-        }
+    moved = float(np.std(trial.position))
     return OrderFit(
         gain=fit.gain,
         gain_ci95=fit.ci95.gain,
         delay=fit.shape.delay,
         delay_ci95=fit.ci95.delay,
-        **own,
+        **msgspec.structs.asdict(fit.plant),
         rms=fit.rms,
         rms_percent=100.0 * fit.rms / abs(trial.step),
         fit_percent=100.0 * (1.0 - fit.rms / moved) if moved > 0.0 else 0.0,

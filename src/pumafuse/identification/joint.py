@@ -19,7 +19,6 @@ from .trials import Trial
 
 _STARTS = (0.0, 0.05, 0.15, 0.25, 0.4, 1.0)  # p/q² to search from
 _NOISELESS = 1e-6  # of the step: less noise than this is none
-_RESOLVED = 1e-9  # of the information in 1/ω², what must be left when delay and q are eliminated
 
 
 @dataclass(frozen=True)
@@ -82,15 +81,12 @@ def fit_together(trials: Sequence[Trial], own: Sequence[StepFit], order: Order) 
     found: list[Point] = []
     for ratio in _STARTS[: 1 if order == 1 else None]:
         q = middle if ratio == 0.0 else 1.3 * middle
-        found.append(batch.fit_shared(q, ratio * q * q, np.maximum(lag - q, 0.0), order))
+        start = np.stack(np.broadcast_arrays(np.maximum(lag - q, 0.0), q, ratio * q * q), axis=1)
+        found.append(batch.fit(start, order, together=True))
     at = min(found, key=lambda point: float(point.cost.sum()))
-    n, p = len(step), at.shape[:, 2]
+    n = len(step)
     slopes, amplitude_slopes = batch.slopes(at, order)
     equations = batch.equations(at, slopes)
-    if order == 2 and not _resolved(equations.information.sum(axis=0), slopes):
-        # a pole much faster than the sampling acts like a delay: only its lower bound is identifiable
-        slopes, amplitude_slopes = batch.slopes(at, order, (p, np.median(batch.spacing) * at.shape[:, 1]))
-        equations = batch.equations(at, slopes)
     influence, expected = _influence(equations)
     delay_slope, gain_slope = np.zeros((n, 2)), np.zeros((n, 2))
     delay_slope[:, :order] = -equations.coupling
@@ -99,7 +95,7 @@ def fit_together(trials: Sequence[Trial], own: Sequence[StepFit], order: Order) 
     by_delay = np.where(known, amplitude_slopes[0] * np.where(known, equations.delay_sd, 0.0), np.inf)
     return JointFit(
         q=float(at.shape[0, 1]),
-        p=float(p[0]),
+        p=float(at.shape[0, 2]),
         delay=at.shape[:, 0],
         gain=at.amplitude / step,
         rms=np.sqrt(at.cost / batch.count) * noise,
@@ -160,11 +156,3 @@ def _corrected(information: FloatArray) -> FloatArray:
     remaining, basis = np.linalg.eigh(np.eye(len(scale)) - root @ scaled @ root)
     inverse_root = basis / np.sqrt(np.maximum(remaining, 1e-3))[:, None, :] @ basis.swapaxes(1, 2)
     return root @ inverse_root @ root * np.outer(scale, scale)
-
-
-def _resolved(information: FloatArray, slopes: FloatArray) -> bool:
-    """Whether any information in 1/ω² is left when delay and q are eliminated."""
-    if not information[0, 0] > 0.0:
-        return False
-    remaining = information[1, 1] - information[0, 1] ** 2 / information[0, 0]
-    return bool(remaining > _RESOLVED * float(np.sum(slopes[-1] ** 2)))

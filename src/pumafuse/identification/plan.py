@@ -6,7 +6,8 @@ during the day does not look like a factor, and a campaign that is cut short aft
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -20,7 +21,7 @@ from .. import folders
 from ..arrays import FloatArray, IntArray
 from ..errors import ConfigError
 from ..logs import tables
-from ..model.arm import ArmModel, commanded_speed, ordered_axes
+from ..model.arm import ArmModel, ordered_axes
 from ..simulation.trajectory import WhiteNoise, ticks
 from ..units import MM, MS, refuse_unit
 
@@ -67,12 +68,12 @@ class Design:
             raise ConfigError("plan: at least one axis, and each once")
         for axis in self.axes:
             refuse_unit("axis", axis)
-            if axis in _TAKEN or not axis.replace("_", "").replace("-", "").replace(" ", "").isalnum():
+            if axis in _TAKEN or re.search(r"[^\w -]", axis):
                 raise ConfigError(f"plan: an axis cannot be called '{axis}'")
         if not self.speeds:
             raise ConfigError("plan: at least one speed")
-        sizes = {"speeds": [speed * self.period for speed in self.speeds], "amplitudes": list(self.amplitudes)}
-        for name, lengths in sizes.items():
+        steps = [speed * self.period for speed in self.speeds]
+        for name, lengths in (("speeds", steps), ("amplitudes", self.amplitudes)):
             if any(not _LEAST <= length <= _MOST for length in lengths):
                 raise ConfigError(f"plan: {name} must make steps of {_LEAST * MM:g} mm to {_MOST:g} m")
             if len({_written(length) for length in lengths}) < len(lengths):
@@ -90,9 +91,9 @@ class Design:
 class PlannedTrial:
     """One step of a campaign."""
 
+    position: Mapping[str, str]
     axis: str
     speed: float
-    position: Mapping[str, str]
     replicate: int
 
 
@@ -125,11 +126,11 @@ def plan(design: Design, arm: ArmModel | None = None, max_speed: float | None = 
     """
     rng = np.random.default_rng(design.seed)
     cells = list(product(design.positions, design.axes, design.speeds))
-    trials: list[PlannedTrial] = []
-    for block in range(1, design.replicates + 1):
-        order: list[int] = rng.permutation(len(cells)).tolist()
-        for position, axis, speed in (cells[index] for index in order):
-            trials.append(PlannedTrial(axis, speed, position, block))
+    trials = [
+        PlannedTrial(*cells[index], block)
+        for block in range(1, design.replicates + 1)
+        for index in map(int, rng.permutation(len(cells)))
+    ]
     resting = np.zeros(_ticks(design.rest, design.period))
     noise: dict[tuple[str, float], FloatArray] = {}
     for axis, amplitude in product(design.axes, design.amplitudes):
@@ -158,27 +159,30 @@ def write(planned: Plan, folder: Path, force: bool) -> None:
     """
     check_writable(folder, force)
     design, trials, step = planned.design, planned.trials, _one_step(planned.design)
-    number, sizes = np.arange(1, len(trials) + 1), np.array([trial.speed * design.period for trial in trials])
-    listed: dict[str, Sequence[object]] = {
-        "trial": number.tolist(),
+    listed = {
+        "trial": range(1, len(trials) + 1),
         "axis": [trial.axis for trial in trials],
-        "step_mm": _millimetres(sizes).tolist(),
+        "step_mm": _millimetres(np.array([trial.speed for trial in trials]) * design.period),
         "speed_m_s": [trial.speed for trial in trials],
         **{name: [trial.position[name] for trial in trials] for name in design.positions[0]},
         "replicate": [trial.replicate for trial in trials],
     }
     offsets = {
-        axis: np.outer([size * (trial.axis == axis) for trial, size in zip(trials, sizes, strict=True)], step).ravel()
+        axis: np.outer([trial.speed * design.period * (trial.axis == axis) for trial in trials], step).ravel()
         for axis in ordered_axes(set(design.axes))
     }
-    ticks = np.tile(np.arange(len(step)), len(trials))
+    steps = _sequence(np.tile(np.arange(len(step)), len(trials)), design.period, offsets)
+    files = {
+        TRIALS: listed,
+        STEPS: {"trial": np.repeat(listed["trial"], len(step)), **steps},
+        **{
+            f"{_NOISE}{axis}-{_written(size)}mm.csv": _sequence(np.arange(len(noise)), design.period, {axis: noise})
+            for (axis, size), noise in planned.noise.items()
+        },
+    }
     with folders.replacing(folder) as new:
-        tables.write(pa.table(listed), new / TRIALS)
-        steps = _sequence(ticks, design.period, offsets)
-        tables.write(pa.table({"trial": np.repeat(number, len(step)), **steps}), new / STEPS)
-        for (axis, amplitude), noise in planned.noise.items():
-            file = new / f"{_NOISE}{axis}-{_written(amplitude)}mm.csv"
-            tables.write(pa.table(_sequence(np.arange(len(noise)), design.period, {axis: noise})), file)
+        for name, columns in files.items():
+            tables.write(pa.table(columns), new / name)
 
 
 def _written(length: float) -> str:
@@ -215,26 +219,22 @@ def _warnings(design: Design, arm: ArmModel | None, max_speed: float | None) -> 
     if not design.amplitudes:
         found.append("no white noise: there will be nothing to verify the model with")
     limit = arm.validity.max_speed if max_speed is None and arm is not None else max_speed
-    largest = commanded_speed(np.array(design.amplitudes), design.period)
-    fastest = max(*design.speeds, float(largest.max(initial=0.0)))
-    longest = max([speed * design.period for speed in design.speeds] + list(design.amplitudes))
+    sizes = [*(speed * design.period for speed in design.speeds), *design.amplitudes]
+    longest, fastest = max(sizes), max(sizes) / design.period
     if fastest > _FASTEST or longest < _SHORTEST:
         found.append(f"steps are {longest * MM:.3g} mm at most, {fastest:.3g} m/s at T; is a unit wrong?")
     if len({tuple(place.items()) for place in design.positions}) < len(design.positions):
         found.append("positions: one is listed twice: it is tried twice as often as the others")
-    if limit is not None and fastest > limit:
+    if limit is not None and fastest > limit * (1.0 + 1e-9):
         found.append(f"commanded speeds reach {fastest:.3g} m/s, the limit is {limit:.3g} m/s")
     if arm is None:
-        found.append("not checked: whether steps settle within the hold; give --arm")
-        return found
-    for axis in design.axes:
+        return [*found, "not checked: whether steps settle within the hold; give --arm"]
+    between = {"the hold": design.hold, "the rest between steps": 2.0 * design.rest + design.period}
+    for axis, (name, length) in product(design.axes, between.items()):
         needed = arm.delay_of(axis) + _settling(arm, axis)
-        if needed > design.hold:
-            found.append(
-                f"{axis}: the hold of {design.hold * MS:.0f} ms is too short to settle: {needed * MS:.0f} ms are needed"
-            )
-        if needed > 2.0 * design.rest + design.period:
-            found.append(f"{axis}: the rest of {2.0 * design.rest * MS:.0f} ms between steps is too short to settle")
+        if needed > length:
+            times = f"{length * MS:.0f} ms is too short to settle: {needed * MS:.0f} ms are needed"
+            found.append(f"{axis}: {name} of {times}")
     return found
 
 

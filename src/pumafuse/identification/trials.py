@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -117,9 +117,8 @@ class StepTrials:
         listed, sampled = _table(Path(folder), "trials"), _table(Path(folder), "samples")
         notes = [*listed.notes, *sampled.notes]
         step = _noted(listed.numbers(_column(listed, "step")), notes)
-        speed = np.full(listed.rows, np.nan)
-        if "speed_m_s" in listed.columns:
-            speed = _noted(listed.plain("speed_m_s"), notes)
+        has_speed = "speed_m_s" in listed.columns
+        speed = _noted(listed.plain("speed_m_s"), notes) if has_speed else np.full(listed.rows, np.nan)
         names, axes = listed.texts("trial"), listed.texts("axis")
         own = {"trial", "axis", "speed_m_s", _column(listed, "step")}
         factors = {column: listed.texts(column) for column in listed.columns if column not in own}
@@ -140,11 +139,10 @@ class StepTrials:
                 continue
             if not found.all():
                 notes.append(f"trial '{name}': {int((~found).sum())} samples without a number: left out")
-            time, position = time[found], position[found]
-            if (np.diff(time) < 0.0).any():
+            if (np.diff(time[found]) < 0.0).any():
                 notes.append(f"trial '{name}': times step back: sorted")
-                order = np.argsort(time, kind="stable")
-                time, position = time[order], position[order]
+            order = np.argsort(time, kind="stable")
+            time, position = time[order[found[order]]], position[order[found[order]]]
             of = {factor: cells[row] for factor, cells in factors.items()}
             trials.append(Trial(name, axes[row], float(step[row]), float(speed[row]), of, time, position))
         if not trials:
@@ -164,10 +162,8 @@ def _unusable(times_listed: int, axis: str, step: float, time: FloatArray) -> st
         return f"listed {times_listed} times"
     if not axis:
         return "it names no axis"
-    if step == 0.0 or not np.isfinite(step):
-        return "its step is 0 or no number"
     if not _STEPS[0] <= abs(step) <= _STEPS[1]:
-        return "its step is of no size an arm has"
+        return "its step is 0 or no number, or of no size an arm has"
     after = len(np.unique(time[time >= 0.0]))
     return f"{after} samples from the step on, at least {_FEWEST} are needed" if after < _FEWEST else None
 
@@ -181,26 +177,22 @@ def _table(folder: Path, stem: str) -> tables.Table:
 
 def _column(table: tables.Table, stem: str) -> str:
     """The column of this name with any unit."""
-    for name in table.columns:
-        if name.removesuffix(ending(name) or "") == stem:
-            return name
+    if named := [name for name in table.columns if name.removesuffix(ending(name) or "") == stem]:
+        return named[0]
     raise RunError(f"{table.path}: no column '{stem}' with a unit in its name; it has {', '.join(table.columns)}")
 
 
 def _noted(column: tuple[Any, str | None], notes: list[str]) -> Any:
     """The values of a column; its note goes to ``notes``."""
-    values, note = column
-    notes.extend([] if note is None else [note])
-    return values
+    notes.extend(note for note in column[1:] if note)
+    return column[0]
 
 
 def _samples(table: tables.Table, notes: list[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Times [s] and positions [m] of each trial, in the order of the file."""
     time = seconds(_noted(table.stamps(_column(table, "time")), notes))
     position = _noted(table.numbers(_column(table, "position")), notes)
-    if not table.rows:
-        return {}
-    names, place = np.unique(np.array(table.texts("trial"), dtype=object), return_inverse=True)
-    order = np.argsort(place, kind="stable")
-    parts = np.split(order, np.cumsum(np.bincount(place, minlength=len(names)))[:-1])
-    return {str(name): (time[part], position[part]) for name, part in zip(names.tolist(), parts, strict=True)}
+    rows: defaultdict[str, list[int]] = defaultdict(list)
+    for row, name in enumerate(table.texts("trial")):
+        rows[name].append(row)
+    return {name: (time[part], position[part]) for name, part in rows.items()}

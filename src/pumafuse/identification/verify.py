@@ -23,7 +23,6 @@ from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import Run
 from ..model.arm import ArmModel, AxisModel
-from ..model.plants import SecondOrder
 from .best_in_class import BestInClass, Commands, Fit, Measured, best_in_class
 
 RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
@@ -31,7 +30,7 @@ REFERENCE = "reference"
 _FEWEST = 20  # measurements
 _MOST_LEVELS = 8  # of a run whose start level is searched among them
 _AS_GOOD, _FAR = 1.2, 3.0  # times the error of the best in class
-_FARTHEST, _SLOWEST = 1e6, 1e4  # m, s: sizes beyond which numbers overflow
+_FARTHEST, _SLOWEST = 1e6, 1e4  # m, from the start level; s
 _HOLDS = 50.0  # % fit
 _BETTER = 0.8  # share of the error below which a recovery is recommended
 
@@ -107,11 +106,6 @@ def verify(
     Raises:
         PumafuseError: The run has no such sensor, commands an axis that the arm has not, or nothing to compare with.
     """
-    for axis, level in (start or {}).items():
-        if not abs(level) <= _FARTHEST:
-            raise ConfigError(
-                f"start level of '{axis}': {level * units.MM:g} mm is not finite, or nowhere an arm can be"
-            )
     chosen = _with_sources(run, None if sensors is None else tuple(sensors))
     config = FusionConfig(arm=arm, sensors={name: Sensor(sd=1e-3) for name in chosen.sensors})
     parts, jumps = segments(in_axes(chosen, None)[0])
@@ -159,11 +153,14 @@ def _verified(
     measured: Measured, axis: str, command: Commands, first: float, arm: ArmModel, given: bool, notes: list[str]
 ) -> tuple[AxisVerification, Trace]:
     model, delay = arm.axes[axis], arm.delay_of(axis)
-    _check_sizes(axis, first, model, delay)
     recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
+    farthest = np.abs(command.moved(model, delay, first, measured.time)).max()
+    if not (abs(first) + farthest <= _FARTHEST and model.plant.lag <= _SLOWEST):  # also where it is not a number
+        raise ConfigError(f"axis '{axis}': a start level, gain or plant of no size that an arm has")
     start, start_from = _start(measured, command, first, model, delay, given)
     count = len(measured.time)
     measured = measured.without_spikes(command.moved(model, delay, start, measured.time))
+    modelled = command.moved(model, delay, start, measured.time)
 
     def fitted(gain_recovery: float | None) -> Fit:
         other = msgspec.structs.replace(model, gain_recovery=gain_recovery)
@@ -171,7 +168,6 @@ def _verified(
 
     as_it_is, recovering = fitted(model.gain_recovery), fitted(recovery)
     best = best_in_class(measured, command, model, delay, start)
-    modelled = command.moved(model, delay, start, measured.time)
     trace = Trace(
         units.seconds(measured.time, int(command.time[0])),
         measured.position - measured.position.mean(),
@@ -197,25 +193,13 @@ def _verified(
     return verification, trace
 
 
-def _check_sizes(axis: str, start: float, model: AxisModel, delay: float) -> None:
-    """Refuse numbers that are too large or too small to compute with."""
-    rates = [model.plant.natural_frequency] if isinstance(model.plant, SecondOrder) else []
-    if not all(1.0 / _SLOWEST <= rate <= _FARTHEST for rate in (*rates, 1.0 / max(model.plant.lag, 1e-300))):
-        raise ConfigError(f"axis '{axis}': a plant of no speed that an arm has")
-    sizes = (abs(start), abs(model.gain.slope), abs(model.gain.intercept))
-    if not (max(sizes) <= _FARTHEST and delay <= _SLOWEST):
-        raise ConfigError(f"axis '{axis}': a start level, gain or delay of no size that an arm has")
-
-
 def _start(
     measured: Measured, command: Commands, first: float, model: AxisModel, delay: float, given: bool
 ) -> tuple[float, str]:
     """Level before the first command [m], and where it comes from."""
-    if given:
-        return first, "given"
     levels = np.unique(command.value)
-    if len(levels) > _MOST_LEVELS:
-        return first, "the first command"
+    if given or len(levels) > _MOST_LEVELS:
+        return first, "given" if given else "the first command"
     rms = [np.std(measured.position - command.moved(model, delay, level, measured.time)) for level in levels.tolist()]
     return float(levels[np.argmin(rms)]), f"chosen among the run's {len(levels)} levels by RMS"
 

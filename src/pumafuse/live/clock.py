@@ -59,6 +59,7 @@ class Clock:
         newest: The newest stamp that is accepted, int ns; None at first.
         low: Stamps from here …
         high: … to here are plainly right [ns]; none is while there is a doubt.
+        other: Stamps of the commands in a row that have another time.
         ahead_of: Whose stamp raised the latest doubt: a sensor's name, None for a command.
     """
 
@@ -71,7 +72,7 @@ class Clock:
         self._ahead = max(window, AHEAD_NS)
         self._sure: int | None = None  # the newest stamp before a jump ahead that is still in doubt
         self._jumped, self._commands = 0, 0  # where it jumped to, and how many commands have confirmed it
-        self._other: list[int] = []  # stamps of commands in a row that have another time
+        self.other: list[int] = []
 
     @property
     def doubtful(self) -> bool:
@@ -91,18 +92,13 @@ class Clock:
         return self.newest if self._sure is None or self._commands else self._sure
 
     @property
-    def strays(self) -> int:
-        """Number of commands in a row that had another time."""
-        return len(self._other)
-
-    @property
     def bound(self) -> int:
         """Stamps after it are in doubt [ns]."""
         return self.sure + self._ahead
 
     def start(self, stamp: int) -> None:
         """Set the clock to ``stamp`` [ns], whatever was before."""
-        self._other = []
+        self.other = []
         self.settle(stamp)
 
     def settle(self, newest: int) -> None:
@@ -113,7 +109,7 @@ class Clock:
 
     def confirm(self) -> None:
         """Forget commands that had another time, as one has come that is plainly right."""
-        self._other = []
+        self.other = []
 
     def judge(self, stamp: int, source: str | None) -> Verdict:
         """Judge a stamp that is not between ``low`` and ``high``, and move on to it if it is accepted.
@@ -134,7 +130,7 @@ class Clock:
             return Verdict.ACCEPTED
         if stamp < self.newest - self.window or stamp > self.newest + LONGEST_TAIL_NS:
             return self._elsewhere(stamp, command)
-        self._other = [] if command else self._other
+        self.other = [] if command else self.other
         if self._sure is None and stamp > self.newest + self._ahead:
             self._sure, self._jumped, self._commands, self.ahead_of = self.newest, stamp, 0, source
             self.low, self.high = 1, 0
@@ -149,8 +145,8 @@ class Clock:
         """Judge a stamp that is too late or too far ahead: wrong, or of a clock that was reset."""
         assert self.newest is not None
         if command:
-            follows = self._other and self._other[-1] < stamp <= self._other[-1] + LONGEST_TAIL_NS
-            self._other = [*self._other, stamp] if follows else [stamp]
-            if len(self._other) >= RESET_AFTER:
+            follows = self.other and self.other[-1] < stamp <= self.other[-1] + LONGEST_TAIL_NS
+            self.other = [*self.other, stamp] if follows else [stamp]
+            if len(self.other) >= RESET_AFTER:
                 return Verdict.RESET
         return Verdict.BEHIND if stamp < self.newest else Verdict.AHEAD

@@ -299,9 +299,9 @@ class LiveEstimator:
         if verdict is Verdict.RESET:
             return self._start_anew(event, newest)
         outcome = _TOO_LATE if verdict is Verdict.BEHIND else _INVALID
-        if clock.strays == 1 and command:
+        if len(clock.other) == 1 and command:
             self._aside = []
-        if clock.strays and len(self._aside) < _MOST_ASIDE:
+        if clock.other and len(self._aside) < _MOST_ASIDE:
             self._aside.append((event._replace(values=dict(values)), outcome))
         if verdict is Verdict.AHEAD:
             return self._refuse(sensor, values, outcome, f"stamped {(stamp - newest) / 1e9:.0f} s ahead of all others")

@@ -6,15 +6,18 @@ dropped before. A TCP sender that is too fast is slowed down: its connection is 
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
+import queue
+import select
 import socket
 import struct
 import sys
+import threading
+import time
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from typing import TypeAlias
 
 from ..errors import RunError
 from .address import Address, Allowed, SocketAddress, host_port, listener, receiver
@@ -25,6 +28,7 @@ from .wire import Lines
 _LARGEST = 65_536  # bytes of a datagram, or of a piece of a connection
 _MOST_DATAGRAMS = 65_536  # that wait
 _MOST_BYTES = 16 << 20  # of waiting datagrams
+_MOST_RECEIVED = 1024  # datagrams that are read from the socket at once
 _MOST_AT_ONCE = 64  # datagrams taken in before the socket is emptied again: about a ms of work
 _RECEIVE_BUFFER = 8 << 20  # bytes that the system is asked to keep for a socket; it may give less
 _SO_MEMINFO, _DROPS = 55, 8  # Linux: a socket's counters, and the place of the one of dropped datagrams
@@ -32,30 +36,6 @@ _MOST_CONNECTIONS = 256
 _MOST_PIECES = 16  # of all connections that wait
 _FIRST_WAIT, _LONGEST_WAIT = 0.5, 30.0  # s until a connection is tried again
 _PATIENCE = 10.0  # s for a connection to be made
-
-
-class Source(Protocol):
-    """Lines from the network."""
-
-    async def start(self) -> None:
-        """Open it.
-
-        Raises:
-            RunError: The system refuses.
-        """
-        ...
-
-    async def get(self) -> list[bytes]:
-        """The next lines; none after a tenth of a second without any."""
-        ...
-
-    async def stop(self) -> list[bytes]:
-        """Close it, and return the lines that have come and were not given yet."""
-        ...
-
-    def summary(self) -> str:
-        """What has come, in a sentence."""
-        ...
 
 
 def source(address: Address, listen: str | None, allow: list[str], notify: Callable[[str], None]) -> Source:
@@ -87,47 +67,33 @@ class UdpListener:
         self._place, self._allowed = place, allowed
         self._notify, self._log = notify, RateLimitedLog(notify)
         self._waiting, self._bytes = deque[bytes](), 0
-        self._some = asyncio.Event()
         self._received = self._dropped_here = self._dropped_before = self._refused = self._reported = 0
 
-    async def start(self) -> None:
+    def start(self) -> None:
         """Open the socket.
 
         Raises:
             RunError: The system refuses.
         """
-        family, place = self._place
-        self._socket = socket.socket(family, socket.SOCK_DGRAM)
-        try:
-            self._socket.setblocking(False)
-            with contextlib.suppress(OSError):
-                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
-            self._socket.bind(place)
-        except OSError as error:
-            self._socket.close()
-            raise RunError(f"udp://{host_port(*place)}: cannot be listened at: {error.strerror}") from None
-        self._name = f"udp://{host_port(*self._socket.getsockname()[:2])}"
-        self._notify(f"listening at {self._name}")
-        asyncio.get_running_loop().add_reader(self._socket, self._receive)
+        self._socket = socket.socket(self._place[0], socket.SOCK_DGRAM)
+        with contextlib.suppress(OSError):
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        self._name = _listen(self._socket, "udp", self._place[1], self._notify)
+        self._socket.setblocking(False)
 
-    async def get(self) -> list[bytes]:
-        """The lines of some datagrams."""
-        if self._waiting:
-            await asyncio.sleep(0)  # the socket is emptied first
-        else:
-            self._some.clear()
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(QUIET):
-                    await self._some.wait()
+    def get(self) -> list[bytes]:
+        """The lines of some datagrams; none after a tenth of a second without any."""
+        if not self._waiting:
+            select.select([self._socket], [], [], QUIET)
+        self._receive(_MOST_RECEIVED)
         if (lost := self._lost()) > self._reported:
             self._reported = lost
             self._log.write("lost", f"{self._name}: {lost} datagrams came faster than they were taken in: lost")
         return self._lines(_MOST_AT_ONCE)
 
-    async def stop(self) -> list[bytes]:
-        """Close the socket, and return the lines that wait."""
-        asyncio.get_running_loop().remove_reader(self._socket)
-        self._receive()
+    def stop(self) -> list[bytes]:
+        """Close the socket, and return the lines that have come and were not given yet."""
+        self._receive(_MOST_DATAGRAMS)
         self._lost()  # for the last time
         self._socket.close()
         return self._lines(_MOST_DATAGRAMS)
@@ -146,13 +112,13 @@ class UdpListener:
             lines += datagram.split(b"\n")
         return lines
 
-    def _receive(self) -> None:
-        """Read datagrams from the socket."""
-        for _ in range(1024):
+    def _receive(self, most: int) -> None:
+        """Read at most so many datagrams from the socket, which is to be empty soon: the system keeps few."""
+        for _ in range(most):
             try:
                 datagram, sender = self._socket.recvfrom(_LARGEST)
             except OSError:  # there is no more
-                break
+                return
             if not self._allowed(sender[0]):
                 self._refused += 1
                 self._log.write("refused", f"a datagram from {sender[0]}, which --allow does not name: refused")
@@ -163,7 +129,6 @@ class UdpListener:
             while len(self._waiting) > _MOST_DATAGRAMS or self._bytes > _MOST_BYTES:
                 self._bytes -= len(self._waiting.popleft())
                 self._dropped_here += 1
-        self._some.set()
 
     def _lost(self) -> int:
         """How many datagrams were dropped, here or by the system."""
@@ -175,42 +140,38 @@ class UdpListener:
 
 
 class _Tcp:
-    """Connections whose lines are put together in the order in which they come."""
+    """Connections, each read by a thread, whose lines are put together in the order in which they come."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self._notify, self._log = notify, RateLimitedLog(notify)
-        self._pieces = asyncio.Queue[list[bytes]](_MOST_PIECES)
+        self._pieces = queue.Queue[list[bytes]](_MOST_PIECES)
 
-    async def get(self) -> list[bytes]:
-        """Some lines of one connection."""
+    def get(self) -> list[bytes]:
+        """Some lines of one connection; none after a tenth of a second without any."""
         try:
-            async with asyncio.timeout(QUIET):
-                return await self._pieces.get()
-        except TimeoutError:
+            return self._pieces.get(timeout=QUIET)
+        except queue.Empty:
             return []
 
-    def _waiting_lines(self) -> list[bytes]:
-        """Lines that have come and were not given."""
+    def stop(self) -> list[bytes]:
+        """The lines that have come and were not given yet; the connections end with the process."""
+        self._log = RateLimitedLog(lambda _: None)  # a thread that writes while the process ends would stop it
         lines: list[bytes] = []
         while not self._pieces.empty():
-            lines += self._pieces.get_nowait()
+            lines += self._pieces.get()
         return lines
 
-    async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+    def _read(self, connection: socket.socket) -> bool:
         """Read a connection to its end, a last line without its end, too; whether there was anything."""
         lines, some = Lines(), False
-        try:
-            _keep_alive(writer.get_extra_info("socket"))
-            while piece := await reader.read(_LARGEST):
+        with connection, contextlib.suppress(OSError):
+            _keep_alive(connection)
+            while piece := connection.recv(_LARGEST):
                 some = True
                 if whole := lines.cut(piece):
-                    await self._pieces.put(whole)
-        except OSError:
-            pass
-        finally:
-            writer.close()
+                    self._pieces.put(whole)
         if rest := lines.rest():
-            await self._pieces.put(rest)
+            self._pieces.put(rest)
         return some
 
 
@@ -221,58 +182,49 @@ class TcpListener(_Tcp):
         """Prepare; :meth:`start` listens."""
         super().__init__(notify)
         self._place, self._allowed = place, allowed
-        self._open = set[asyncio.Task[None]]()
+        self._open = set[socket.socket]()
         self._accepted = self._refused = 0
 
-    async def start(self) -> None:
+    def start(self) -> None:
         """Listen.
 
         Raises:
             RunError: The system refuses.
         """
-        family, place = self._place
-        try:
-            self._server = await asyncio.start_server(self._accept, *place, family=family, limit=_LARGEST)
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise RunError(f"tcp-listen://{host_port(*place)}: cannot be listened at: {reason}") from None
-        self._name = f"tcp-listen://{host_port(*self._server.sockets[0].getsockname()[:2])}"
-        self._notify(f"listening at {self._name}")
-
-    async def stop(self) -> list[bytes]:
-        """Close all connections, and return the lines that wait."""
-        self._server.close()
-        for task in self._open:
-            task.cancel()
-        await asyncio.gather(*self._open)
-        return self._waiting_lines()
+        self._socket = socket.socket(self._place[0], socket.SOCK_STREAM)
+        if os.name == "posix":  # elsewhere two could listen at one port
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._name = _listen(self._socket, "tcp-listen", self._place[1], self._notify)
+        _in_a_thread(self._accept_all)
 
     def summary(self) -> str:
         """How many connections there were and are."""
         text = f"{self._name}: connections: {self._accepted}, {len(self._open)} open"
         return f"{text}, {self._refused} refused" if self._refused else text
 
-    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Read a connection to its end, unless its sender is not allowed or too many are open."""
-        peer = str((writer.get_extra_info("peername") or ("somewhere",))[0])
-        why = "" if self._allowed(peer) else "--allow does not name it"
-        why = f"{_MOST_CONNECTIONS} are open" if not why and len(self._open) >= _MOST_CONNECTIONS else why
-        if why:
-            self._refused += 1
-            self._log.write("refused", f"a connection from {peer}: refused, {why}")
-            writer.transport.abort()
-            return
-        self._accepted += 1
-        self._log.write("connected", f"{peer} has connected")
-        task = asyncio.current_task()
-        assert task is not None
-        self._open.add(task)
-        try:
-            await self._read(reader, writer)
-        except asyncio.CancelledError:  # at the end; asyncio would log a task that was cancelled
-            return
-        finally:
-            self._open.discard(task)
+    def _accept_all(self) -> None:
+        """Read all connections, but not of senders that are not allowed, nor too many at once."""
+        while True:
+            try:
+                connection, (peer, *_) = self._socket.accept()
+            except OSError:  # it has gone already, or the process may not have more
+                time.sleep(QUIET)
+                continue
+            why = "" if self._allowed(peer) else "--allow does not name it"
+            why = f"{_MOST_CONNECTIONS} are open" if not why and len(self._open) >= _MOST_CONNECTIONS else why
+            if why:
+                self._refused += 1
+                self._log.write("refused", f"a connection from {peer}: refused, {why}")
+                connection.close()
+                continue
+            self._accepted += 1
+            self._log.write("connected", f"{peer} has connected")
+            self._open.add(connection)
+            _in_a_thread(self._serve, connection, peer)
+
+    def _serve(self, connection: socket.socket, peer: str) -> None:
+        self._read(connection)
+        self._open.discard(connection)
         self._log.write("gone", f"the connection from {peer} has ended")
 
 
@@ -284,43 +236,66 @@ class TcpClient(_Tcp):
         super().__init__(notify)
         self._address, self._name = address, address.text
         self._made, self._connected = 0, False
+        self._stopped = threading.Event()
 
-    async def start(self) -> None:
+    def start(self) -> None:
         """Begin to connect."""
-        self._task = asyncio.create_task(self._stay_connected())
+        _in_a_thread(self._stay_connected)
 
-    async def stop(self) -> list[bytes]:
-        """Close the connection, and return the lines that wait."""
-        self._task.cancel()
-        await asyncio.gather(self._task, return_exceptions=True)
-        return self._waiting_lines()
+    def stop(self) -> list[bytes]:
+        """The lines that have come and were not given yet; no connection is made any more."""
+        self._stopped.set()
+        return super().stop()
 
     def summary(self) -> str:
         """How often the connection was made, and whether it is there."""
         return f"{self._name}: connections made: {self._made}, {'open' if self._connected else 'none open'}"
 
-    async def _stay_connected(self) -> None:
+    def _stay_connected(self) -> None:
         """Connect and read, again and again, with waits that double as long as nothing comes."""
         wait = _FIRST_WAIT
-        while True:
+        while not self._stopped.is_set():
             try:
-                async with asyncio.timeout(_PATIENCE):
-                    reader, writer = await asyncio.open_connection(
-                        self._address.host, self._address.port, limit=_LARGEST
-                    )
-            except (OSError, UnicodeError) as error:  # a TimeoutError is an OSError
-                reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else "no answer"
-                reason = error.strerror or reason if isinstance(error, socket.gaierror) else reason
+                connection = socket.create_connection((self._address.host, self._address.port), _PATIENCE)
+            except (OSError, UnicodeError) as error:
+                reason = getattr(error, "strerror", None) or "no answer"
                 self._log.write("unreachable", f"{self._name}: cannot be reached: {reason}; tried again in {wait:g} s")
             else:
+                connection.settimeout(None)
                 self._made, self._connected = self._made + 1, True
                 self._log.write("connected", f"{self._name}: connected")
-                if await self._read(reader, writer):
+                if self._read(connection):
                     wait = _FIRST_WAIT
                 self._connected = False
                 self._log.write("ended", f"{self._name}: the connection has ended; made again in {wait:g} s")
-            await asyncio.sleep(wait)
+            self._stopped.wait(wait)
             wait = min(2.0 * wait, _LONGEST_WAIT)
+
+
+Source: TypeAlias = UdpListener | TcpListener | TcpClient
+
+
+def _listen(listening: socket.socket, kind: str, place: tuple[str, int], notify: Callable[[str], None]) -> str:
+    """Let a socket listen; returns its address as people write it.
+
+    Raises:
+        RunError: The system refuses.
+    """
+    try:
+        listening.bind(place)
+        if kind == "tcp-listen":
+            listening.listen()
+    except OSError as error:
+        listening.close()
+        raise RunError(f"{kind}://{host_port(*place)}: cannot be listened at: {error.strerror}") from None
+    name = f"{kind}://{host_port(*listening.getsockname()[:2])}"
+    notify(f"listening at {name}")
+    return name
+
+
+def _in_a_thread(work: Callable[..., None], *given: object) -> None:
+    """Do what may wait for long in a thread that ends with the process."""
+    threading.Thread(target=work, args=given, name="network", daemon=True).start()
 
 
 def _keep_alive(connection: socket.socket) -> None:

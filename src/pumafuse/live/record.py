@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from .. import toml
-from ..folders import FolderError, write_file
+from ..folders import FolderError, check_writable, write_file
 from ..fusion.config import FusionConfig
 from ..logs.clock import TOLERATED_STEP_BACK_NS
 from ..logs.frames import CARTESIAN
@@ -79,7 +79,8 @@ class Recorder:
         self._first = self._folder = folder = folder.absolute()
         self.late = self.lost = self._given = 0
         self._segment = 1
-        _make(folder)
+        check_writable(folder, force=False, markers=(), ours=lambda _: False)
+        folder.mkdir(parents=True, exist_ok=True)
         self._writer = Writer(",".join((_TIME, *(f"{axis}_mm" for axis in self._columns))).encode() + b"\n")
         self._due, self._reported, self._troubled = 0.0, -math.inf, False
         self._clear()
@@ -290,7 +291,7 @@ class Writer:
     def _begin(self, folder: Path) -> None:
         """Begin a run in a folder."""
         self._folder, self._manifest = folder, ""
-        self._torn: dict[str, bool] = {}  # of each file that has rows, whether its last line is torn
+        self._sizes: dict[str, int] = {}  # of each file, as far as its rows are complete
 
     def _tried(self, job: Job) -> bool:
         """Write what is left of a job; whether all of it is written."""
@@ -302,29 +303,24 @@ class Writer:
             if job.manifest != self._manifest or not (job.folder / _MANIFEST).exists():
                 write_file(job.folder / _MANIFEST, job.manifest)
                 self._manifest = job.manifest
-        except OSError as error:
-            self.trouble = f"{job.folder}: {error.strerror or error}"
-            return False
-        except FolderError as error:
-            self.trouble = str(error)
+        except (OSError, FolderError) as error:
+            self.trouble = f"{job.folder}: {getattr(error, 'strerror', None) or error}"
             return False
         self.trouble = f"{job.folder} or a file in it had gone, and is begun anew" if any(gone) else ""
         return True
 
     def _append(self, job: Job, name: str) -> bool:
-        """Write a file's rows, without what a full disk took of them before; whether the file had gone."""
+        """Write a file's rows, in the place of what a full disk took of them before; whether the file had gone."""
         descriptor = os.open(job.folder / name, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         try:
-            empty = not os.fstat(descriptor).st_size
-            gone = empty and name in self._torn
-            if gone and self._torn[name]:  # the rest of a line whose beginning has gone
-                job.rows[name] = job.rows[name].partition(b"\n")[2]
-            if empty and not job.rows[name].startswith(self._header):
-                job.rows[name] = self._header + job.rows[name]
-            while rows := job.rows[name]:
-                written = os.write(descriptor, rows)
-                job.rows[name] = rows[written:]
-                self._torn[name] = rows[written - 1 : written] != b"\n"
+            known = self._sizes.get(name, 0)
+            gone = os.fstat(descriptor).st_size < known
+            self._sizes[name] = known = 0 if gone else known
+            os.ftruncate(descriptor, known)
+            rows = job.rows[name] if known else self._header + job.rows[name]
+            while rows:
+                rows = rows[os.write(descriptor, rows) :]
+            self._sizes[name] = os.fstat(descriptor).st_size
         finally:
             os.close(descriptor)
         del job.rows[name]
@@ -335,27 +331,10 @@ def _file(sensor: str | None) -> str:
     return _COMMANDS if sensor is None else f"{sensor}.csv"
 
 
-def _make(folder: Path) -> None:
-    """Make a folder.
-
-    Raises:
-        FolderError: It holds something, or cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise FolderError(f"{folder}: is not empty; a recording needs a folder of its own")
-    except OSError as error:
-        raise FolderError(f"{folder}: cannot be written: {error.strerror}") from None
-
-
 def _cell(value: object) -> str:
     """A length [m] in mm, with the digits that bring the same float back; empty for what is no finite number."""
     if not isinstance(value, float | int) or not math.isfinite(value):
         return ""
     mm = value * MM
-    short = f"{mm:.12g}"
-    if float(short) / MM == value:
-        return short
-    around = (mm, math.nextafter(mm, -math.inf), math.nextafter(mm, math.inf))
+    around = (float(f"{mm:.12g}"), mm, math.nextafter(mm, -math.inf), math.nextafter(mm, math.inf))
     return repr(next((one for one in around if one / MM == value), mm))

@@ -59,7 +59,7 @@ def replayed(run: Run, config: FusionConfig, speed: float) -> Iterator[list[Even
 
 def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
     """When each event arrives [ns], ascending, (n,), and the events."""
-    sources = [*run.sensors.items(), ("", as_commanded(run, config.arm))]
+    sources = [*run.sensors.items(), ("", as_commanded(run, config))]
     arrival = np.concatenate([np.maximum.accumulate(source.stamp) for _, source in sources])
     events = [event for name, source in sources for event in _events(name, source)]
     order = np.argsort(arrival, kind="stable")

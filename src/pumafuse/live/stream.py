@@ -23,11 +23,9 @@ class Watcher(Protocol):
 
     def event(self, event: Event, result: UpdateResult) -> None:
         """Receive an event and what became of it."""
-        ...
 
     def estimate(self, estimate: LiveEstimate) -> None:
         """Receive an estimate that goes out."""
-        ...
 
 
 class Stream:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray
 from ..errors import RunError
-from .clock import TOLERATED_STEP_BACK_NS, behind, without_strays
+from .clock import segments, without_strays
 from .frames import CARTESIAN, Frame, Placed, Rotated
 from .run import Run, Source
-
-S = TypeVar("S", bound=Source)
 
 
 def in_axes(run: Run, frame: Frame | None) -> tuple[Run, Placed | None]:
@@ -37,46 +34,32 @@ def in_axes(run: Run, frame: Frame | None) -> tuple[Run, Placed | None]:
     named = {name for source in (run.command, *run.sensors.values()) for name in source.values}
     if frame is None or named.isdisjoint(CARTESIAN):
         return run, None
-    if ("x" in run.start) != ("y" in run.start):
-        raise RunError(f"run '{run.name}': start gives one of x and y; a frame needs both")
     placed = _placed(run, frame)
     command = _converted(run.command, placed, None)
-    start = {axis: level for axis, level in run.start.items() if axis not in CARTESIAN}
-    if "x" in run.start:
-        tangential, radial, _ = placed.to_axes(np.array([run.start["x"]]), np.array([run.start["y"]]))
-        start |= {"tangential": float(tangential[0]), "radial": float(radial[0])}
-    if "z" in run.start:
-        start["vertical"] = run.start["z"]
-    return replace(
-        run,
-        command=command,
-        sensors={name: _converted(source, placed, command) for name, source in run.sensors.items()},
-        reference=None if run.reference is None else _converted(run.reference, placed, command),
-        start=start,
-        frame=None,
-    ), placed
+    rest = Source(np.zeros(1, np.int64), {axis: np.array([level]) for axis, level in run.start.items()}, "start")
+    start = {axis: float(level[0]) for axis, level in _converted(rest, placed, None).values.items()}
+    converted = run.each(lambda _, source: command if source is run.command else _converted(source, placed, command))
+    return replace(converted, start=start, frame=None), placed
 
 
 def _placed(run: Run, frame: Frame) -> Placed:
+    where = f"run '{run.name}'"
     if isinstance(frame, Rotated):
-        return placed_at(frame, 0.0, 0.0, "")
+        return placed_at(frame, 0.0, 0.0, where)
     if "x" in run.start and "y" in run.start:
-        x, y = run.start["x"], run.start["y"]
-    elif "x" in run.command.values and "y" in run.command.values:
-        x_all, y_all = run.command.values["x"], run.command.values["y"]
-        usable = np.flatnonzero(np.isfinite(x_all) & np.isfinite(y_all) & (run.command.stamp != NO_STAMP))
-        if not len(usable):
-            raise RunError(f"{run.command.label}: no command has both x and y")
-        jumps = np.flatnonzero(behind(run.command.stamp) > TOLERATED_STEP_BACK_NS)
-        segment = usable[usable < jumps[0]] if len(jumps) and usable[0] < jumps[0] else usable
-        first = segment[np.argmin(run.command.stamp[segment])]
-        x, y = float(x_all[first]), float(y_all[first])
-    else:
+        return placed_at(frame, run.start["x"], run.start["y"], where)
+    if "x" not in run.command.values or "y" not in run.command.values:
         raise RunError(
-            f"run '{run.name}': a cylindrical frame takes its radius and angle from the start level; give the commands,"
-            " or start, in x and y"
+            f"{where}: a cylindrical frame takes its radius and angle from the start level; give the commands, or"
+            " start, in x and y"
         )
-    return placed_at(frame, x, y, f"run '{run.name}'")
+    command = segments(run)[0][0].command
+    x, y = command.values["x"], command.values["y"]
+    usable = np.flatnonzero(np.isfinite(x) & np.isfinite(y) & (command.stamp != NO_STAMP))
+    if not len(usable):
+        raise RunError(f"{command.label}: no command has both x and y")
+    first = usable[np.argmin(command.stamp[usable])]
+    return placed_at(frame, float(x[first]), float(y[first]), where)
 
 
 def placed_at(frame: Frame, x: float, y: float, label: str) -> Placed:
@@ -93,7 +76,7 @@ def placed_at(frame: Frame, x: float, y: float, label: str) -> Placed:
     return Placed(frame, float(np.hypot(dx, dy)), float(np.arctan2(dy, dx)))
 
 
-def _converted(source: S, placed: Placed, command: Source | None) -> S:
+def _converted(source: Source, placed: Placed, command: Source | None) -> Source:
     given = [name for name in CARTESIAN if name in source.values]
     if not given:
         return source

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
 
@@ -16,8 +15,6 @@ from .run import Run, Source, note_rows
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
 _NEW_CLOCK = 3  # so many rows in a row with another time: the clock was set anew; fewer are stray
 _MOST_JUMPS = 100
-
-S = TypeVar("S", bound=Source)
 
 
 def behind(stamp: TimeArray) -> TimeArray:
@@ -90,30 +87,20 @@ def without_strays(run: Run) -> Run:
     """
     if run.without_strays:
         return run
-    notes: list[str] = []
-    command = _without_strays(run.command, run.command.label, ("ahead of", "behind"), notes)
-    sensors = {
-        name: _without_strays(source, source.label_for(name), ("ahead of",), notes)
-        for name, source in run.sensors.items()
-    }
-    reference = run.reference
-    if reference is not None:
-        reference = _without_strays(reference, reference.label, ("ahead of",), notes)
-    if not notes:
-        return run
-    notes = [*run.notes, *notes]
-    return replace(run, command=command, sensors=sensors, reference=reference, notes=tuple(notes), without_strays=True)
+    notes = list(run.notes)
 
+    def mended(label: str, source: Source) -> Source:
+        apart = stray_offsets(source.stamp)
+        if source is not run.command:
+            apart = np.maximum(apart, 0)
+        for side, rows in (("ahead of", apart > 0), ("behind", apart < 0)):
+            if rows.any():
+                what = f"a stray stamp, more than 1 s {side} the rows around: taken for none"
+                note_rows(notes, label, rows, what, f", by {abs(apart[rows][0]) / 1e9:.3f} s")
+        return replace(source, stamp=np.where(apart == 0, source.stamp, NO_STAMP))
 
-def _without_strays(source: S, label: str, sides: Sequence[str], notes: list[str]) -> S:
-    apart = stray_offsets(source.stamp)
-    for side in sides:
-        rows = apart > 0 if side == "ahead of" else apart < 0
-        if rows.any():
-            what = f"a stray stamp, more than 1 s {side} the rows around: taken for none"
-            note_rows(notes, label, rows, what, f", by {abs(apart[rows][0]) / 1e9:.3f} s")
-            source = replace(source, stamp=np.where(rows, NO_STAMP, source.stamp))
-    return source
+    kept = run.each(mended)
+    return run if len(notes) == len(run.notes) else replace(kept, notes=tuple(notes), without_strays=True)
 
 
 def segments(run: Run) -> tuple[list[Run], list[str]]:
@@ -134,7 +121,7 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
     if not cuts:
         return [run], []
 
-    def pieces(source: S) -> list[S]:
+    def pieces(source: Source) -> list[Source]:
         jumps = _jumps(source)
         if len(jumps) != len(cuts):
             raise RunError(
@@ -166,14 +153,13 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
 
 def _jumps(source: Source) -> list[int]:
     """Rows at which the clock was set back by more than 1 s."""
-    stamped = np.flatnonzero(source.stamp != NO_STAMP)
-    stamp, found, first = source.stamp[stamped], list[int](), 0
+    found: list[int] = []
     while True:
-        back = np.flatnonzero(behind(stamp[first:]) > TOLERATED_STEP_BACK_NS)
+        first = found[-1] if found else 0
+        back = np.flatnonzero(behind(source.stamp[first:]) > TOLERATED_STEP_BACK_NS)
         if not len(back):
             return found
-        first += int(back[0])
-        found.append(int(stamped[first]))
+        found.append(first + int(back[0]))
         if len(found) > _MOST_JUMPS:
             raise RunError(
                 f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock"

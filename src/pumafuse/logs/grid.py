@@ -1,14 +1,22 @@
 """Fit of a controller's even ticks of T to stamps that jitter."""
 
+# pyright: reportArgumentType=false, reportAssignmentType=false
+# (an element of an array is a plain number in a kernel: numba compiles it, numpy's types do not know)
+
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 
-from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
+from ..arrays import BoolArray, CodeArray, FloatArray, IntArray, TimeArray
+from ..compiled import kernel
 from ..errors import RunError
 
+_MOST_LATE = 9  # a stamp's ticks are sought from this many before it ...
+_CHOICES = _MOST_LATE + 3  # ... to two after it
+_LATE, _LATE_COST, _LATER_COST = math.sqrt(0.5), 0.5, 0.01
 _BLOCK = 64  # commands over which the two clocks' drift is small against T
 _MOST_DRIFT = 1e-3  # two quartz clocks differ by 1e-4 at the worst
 _MOST_ASTRAY = 0.08  # share of stamps that may be more than half a period off their tick
@@ -49,41 +57,41 @@ def regular_grid(stamp: TimeArray, period: float, label: str) -> tuple[TimeArray
     tick = period * 1e9
     since = (stamp - stamp[0]).astype(np.float64)
     place = _places(since, tick)
-    ticks = _assigned_ticks(place)
+    ticks = assigned_ticks(place)
     if ticks is None:
         shared = int(np.sum(np.diff(np.rint(place)) <= 0))
         fault = f"{shared} of {len(stamp)} are stamped nearest to the tick of the one before"
         raise _refusal(fault, stamp, period, label)
-    slope, error = _line(ticks, since)
-    drift, note = slope / tick - 1.0, None
-    if len(stamp) >= _BLOCK and abs(drift) * tick > 5.0 * error and abs(drift) * tick * np.ptp(ticks) > 1.0:
-        if abs(drift) > _MOST_DRIFT:
-            fault = f"on the nearest ticks they are {slope / 1e6:.4f} ms a tick"
-            raise _refusal(fault, stamp, period, label)
-        tick = slope
-        note = f"{label}: the log's clock runs {drift * 1e6:+.1f} ppm against the controller's; the grid follows it"
+    notes: list[str] = []
+    if len(stamp) >= _BLOCK:
+        fit = cast(tuple[FloatArray, FloatArray], np.polyfit(ticks, since, 1, cov=True))
+        slope, error = float(fit[0][0]), math.sqrt(fit[1][0, 0])
+        drift = slope / tick - 1.0
+        if abs(slope - tick) > max(5.0 * error, 1.0 / np.ptp(ticks)):
+            if abs(drift) > _MOST_DRIFT:
+                raise _refusal(f"on the nearest ticks they are {slope / 1e6:.4f} ms a tick", stamp, period, label)
+            tick = slope
+            notes.append(f"the log's clock runs {drift * 1e6:+.1f} ppm against the controller's; the grid follows it")
     residual = since - ticks * tick
     offset = float(np.median(residual))
     off = (residual - offset) / tick
     late, early = int(np.sum(off > 0.5)), int(np.sum(off < -0.5))
-    doubt = _doubt(ticks, off)
-    if doubt is not None:
+    if doubt := _doubt(ticks, off):
         fault = f"{late + early} of {len(stamp)} are stamped more than half a period off their ticks, {doubt}"
         raise _refusal(fault, stamp, period, label)
     if late or early:
         how = "late: set back to their ticks" if not early else f"off their ticks, {early} of them early: put on them"
-        moved = f"{label}: {late + early} commands are stamped more than half a period {how}"
-        note = moved if note is None else f"{note}; {moved}"
+        notes.append(f"{late + early} commands are stamped more than half a period {how}")
+    note = f"{label}: {'; '.join(notes)}" if notes else None
     return stamp[0] + np.rint(ticks * tick + offset).astype(np.int64), note
 
 
 def _refusal(fault: str, stamp: TimeArray, period: float, label: str) -> RunError:
     """The error with the fault and the fix."""
-    median = float(np.median(np.diff(stamp))) / 1e9
-    beside = f" (their median interval is {median * 1e3:.4f} ms)" if f"{median:.3g}" != f"{period:.3g}" else ""
+    median = float(np.median(np.diff(stamp))) / 1e6
     return RunError(
-        f"{label}: clock = 'regular', but the commands do not come on ticks of {period * 1e3:g} ms: {fault}{beside};"
-        " check update_period_ms, or use clock = 'stamps'"
+        f"{label}: clock = 'regular', but the commands do not come on ticks of {period * 1e3:g} ms: {fault} (their"
+        f" median interval is {median:.4f} ms); check update_period_ms, or use clock = 'stamps'"
     )
 
 
@@ -96,17 +104,17 @@ def _doubt(ticks: IntArray, off: FloatArray) -> str | None:
     clear = min(float(np.abs(np.mean(np.exp(2j * np.pi * off)))), 1.0)
     spread = math.sqrt(-2.0 * math.log(clear)) / (2.0 * math.pi) if clear > 0.0 else math.inf
     aside = _aside(ticks, late, spread)
-    if np.mean(np.abs(off) > 0.5) > _MOST_ASTRAY:
-        return f"and more than {_MOST_ASTRAY:.0%} is too many"
-    if row > _LONGEST_QUEUE:
-        return f"{row} of them in a row"
-    if clear < max(_LEAST_CLEAR, 3.0 / math.sqrt(len(off) + 9)):  # of stamps without ticks one in e⁹ reaches this
-        return "and the others lie about the ticks as they would about any"
-    if early > max(0.5, _MOST_EARLY * spread):
-        return f"one of them {early:.2f} periods early, where the jitter's standard deviation is {spread:.2f}"
-    if aside > max(_MOST_ASIDE * len(off), 2.0):
-        return f"and some {aside:.0f} beside missing ticks may be of those"
-    return None
+    least = max(_LEAST_CLEAR, 3.0 / math.sqrt(len(off) + 9))  # of stamps without ticks one in e⁹ reaches this
+    doubts = {
+        f"and more than {_MOST_ASTRAY:.0%} is too many": np.mean(np.abs(off) > 0.5) > _MOST_ASTRAY,
+        f"{row} of them in a row": row > _LONGEST_QUEUE,
+        "and the others lie about the ticks as they would about any": clear < least,
+        f"one of them {early:.2f} periods early, where the jitter's standard deviation is {spread:.2f}": (
+            early > max(0.5, _MOST_EARLY * spread)
+        ),
+        f"and some {aside:.0f} beside missing ticks may be of those": aside > max(_MOST_ASIDE * len(off), 2.0),
+    }
+    return next((words for words, holds in doubts.items() if holds), None)
 
 
 def _aside(ticks: IntArray, late: BoolArray, spread: float) -> float:
@@ -124,16 +132,52 @@ def _longest(flag: BoolArray) -> int:
     return int(np.diff(np.flatnonzero(np.concatenate(([True], ~flag, [True])))).max()) - 1
 
 
-def _assigned_ticks(place: FloatArray) -> IntArray | None:
+def assigned_ticks(place: FloatArray) -> IntArray | None:
     """Ascending ticks of least total cost for stamps in periods, (n,); None if there are too few ticks."""
     ticks = np.rint(place).astype(np.int64)
     if np.all(np.diff(ticks) > 0):
         return ticks
-    from .grid_kernels import CHOICES, MOST_LATE, cheapest_ticks
+    first = np.floor(place).astype(np.int64) - _MOST_LATE
+    workspace = np.empty(_CHOICES), np.empty((len(place), _CHOICES), dtype=np.uint8)
+    return ticks if _cheapest_ticks(place, first, *workspace, ticks) else None
 
-    first = np.floor(place).astype(np.int64) - MOST_LATE
-    workspace = np.empty(CHOICES), np.empty((len(place), CHOICES), dtype=np.uint8)
-    return ticks if cheapest_ticks(place, first, *workspace, ticks) else None
+
+@kernel
+def _cheapest_ticks(place: FloatArray, first: IntArray, best: FloatArray, choice: CodeArray, ticks: IntArray) -> bool:
+    """Fill in the strictly ascending ticks of least total cost; False if there are too few ticks about the stamps.
+
+    A stamp's cost is the square of its distance from the tick in periods; beyond 0.7 late it hardly grows.
+
+    Args:
+        place: Each stamp in periods; ticks are whole numbers, (n,).
+        first: The first of the _CHOICES ticks open to each stamp, (n,).
+        best: Workspace: the least cost so far if the last stamp has no later tick than this, (_CHOICES,).
+        choice: Workspace: the tick of this cost, counted from the first, (n, _CHOICES).
+        ticks: The ticks found, (n,).
+    """
+    for n in range(len(place)):
+        ahead = first[n] - first[n - 1] - 1 if n else 0  # choice j comes after choice j + ahead of the row before
+        for one in range(_CHOICES):
+            j = one if ahead >= 0 else _CHOICES - 1 - one  # overwrite no cost that is still needed
+            off = place[n] - (first[n] + j)
+            cost = _LATE_COST + _LATER_COST * (off - _LATE) if off > _LATE else off * off
+            if n:
+                cost += best[min(j + ahead, _CHOICES - 1)] if j + ahead >= 0 else math.inf
+            best[j] = cost
+        choice[n, 0] = 0
+        for j in range(1, _CHOICES):
+            choice[n, j] = j
+            if best[j - 1] < best[j]:
+                best[j] = best[j - 1]
+                choice[n, j] = choice[n, j - 1]
+        if best[_CHOICES - 1] == math.inf:
+            return False
+    upto = _CHOICES - 1
+    for n in range(len(place) - 1, -1, -1):
+        ticks[n] = first[n] + choice[n, upto]
+        if n:
+            upto = min(ticks[n] - 1 - first[n - 1], _CHOICES - 1)
+    return True
 
 
 def _places(since: FloatArray, tick: float) -> FloatArray:
@@ -164,14 +208,3 @@ def _blocks(start: IntArray, end: int) -> IntArray:
     count = -(-size // _BLOCK)
     number = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
     return np.repeat(start, count) + number * np.repeat(size, count) // np.repeat(count, count)
-
-
-def _line(ticks: IntArray, since: FloatArray) -> tuple[float, float]:
-    """Slope of the stamps over their ticks by least squares, and its standard error [ns]."""
-    if len(ticks) < 3:
-        return np.inf, np.inf
-    centred = ticks - ticks.mean()
-    weight = float(centred @ centred)
-    slope = float(centred @ since) / weight
-    residual = since - since.mean() - slope * centred
-    return slope, float(np.sqrt(residual @ residual / (len(ticks) - 2) / weight))

@@ -13,15 +13,13 @@ from ..toml import NotNegative
 from ..units import LENGTHS, ending
 from .frames import Frame
 
-Columns = str | list[str]
-
 
 class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
-    """A source of a run: its ``file``, its ``time`` column, and the column (or columns to add up) of each axis."""
+    """A source of a run: its ``file``, its ``time`` column, and the columns of each axis, which are added up."""
 
     file: str
     time: str
-    axes: dict[str, Columns]
+    axes: dict[str, list[str]]
 
 
 class CommandEntry(SourceEntry, frozen=True, kw_only=True):
@@ -54,36 +52,32 @@ def load(path: Path) -> Manifest:
         ConfigError: The file is no manifest; names the key and the accepted ones.
     """
     tree, where = toml.read(path), str(path)
+    for key, kind in (("command", CommandEntry), ("reference", ReferenceEntry)):
+        if key in tree:
+            tree[key] = _source(tree[key], kind, where, key)
     sensors: Any = tree.get("sensors", {})
     if not isinstance(sensors, dict):
         raise ConfigError(f"{where}: sensors: expected a table for each sensor, as in [sensors.tracker]")
-    parts = {
-        "command": _source(tree.get("command"), CommandEntry, where, "command"),
-        "sensors": {
-            name: _source(table, SourceEntry, where, f"sensors.{name}")
-            for name, table in cast(dict[str, Any], sensors).items()
-        },
-        "reference": _source(tree.get("reference"), ReferenceEntry, where, "reference"),
-    }
-    return toml.struct({**tree, **{key: part for key, part in parts.items() if part is not None}}, Manifest, where)
+    named = cast(dict[str, Any], sensors)
+    tree["sensors"] = {name: _source(table, SourceEntry, where, f"sensors.{name}") for name, table in named.items()}
+    return toml.struct(tree, Manifest, where)
 
 
-def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> SourceEntry | None:
-    """A source from its table; every key that is none of the source's fields is an axis. None without a table."""
-    if table is None:
-        return None
+def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> SourceEntry:
+    """A source from its table; every key that is none of the source's fields is an axis."""
     if not isinstance(table, dict):
         raise ConfigError(f"{where}: {path}: expected a table")
     keys: dict[str, Any] = dict(table)  # pyright: ignore[reportUnknownArgumentType]
     if isinstance(keys.get("start"), dict):
         keys["start"] = {axis_of(key, where, f"{path}.start"): value for key, value in keys["start"].items()}
     own = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes"}
-    axes = {key: keys.pop(key) for key in list(keys) if key not in own}
+    axes = {axis: keys.pop(axis) for axis in list(keys) if axis not in own}
     for axis, columns in axes.items():
-        if not isinstance(columns, str) and not (isinstance(columns, list) and columns):
+        if not columns or not isinstance(columns, str | list):
             raise ConfigError(
                 f"{where}: {path}.{axis}: expected a column name or a list of them, as in {axis} = 'x_mm'"
             )
+        axes[axis] = [columns] if isinstance(columns, str) else columns
     if not axes:
         raise ConfigError(f"{where}: [{path}] names no column for any axis, as in radial = 'y_mm'")
     return toml.struct({**keys, "axes": axes}, kind, where, path)

@@ -7,10 +7,11 @@ they are. Each measurement gets its outcome when the run is fused.
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,6 @@ from . import manifest, tables
 from .frames import CARTESIAN, Frame
 
 Clock = Literal["stamps", "regular"]
-S = TypeVar("S", bound="Source")
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,14 @@ class Source:
         values: For each axis the value [m], NaN where the row has none, (rows,).
         label: What a person calls it: the file, or the column group of a single table.
         spread: For an axis computed by a frame, the factor on the noise of each row, (rows,).
+        sd: Standard deviation of the noise of a reference [m].
     """
 
     stamp: TimeArray
     values: Mapping[str, FloatArray]
     label: str
     spread: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
+    sd: float = 0.0
 
     def label_for(self, name: str) -> str:
         """The name of the source in notes, with its label where that is another one."""
@@ -48,27 +50,17 @@ class Source:
 
     def repeated(self) -> BoolArray:
         """Rows whose stamp and values are all those of an earlier row, (rows,)."""
-        found = np.zeros(len(self.stamp), dtype=bool)
         if (np.diff(self.stamp) > 0).all():
-            return found
-        keys = [self.stamp, *(np.ascontiguousarray(value).view(np.int64) for value in self.values.values())]
-        order = np.lexsort(keys)
-        again = np.all([np.diff(key[order]) == 0 for key in keys], axis=0)
-        found[order[1:][again]] = True
-        return found
+            return np.zeros(len(self.stamp), dtype=bool)
+        columns = [self.stamp, *(np.ascontiguousarray(value).view(np.int64) for value in self.values.values())]
+        _, first = np.unique(np.stack(columns, axis=1), axis=0, return_index=True)
+        return ~np.isin(np.arange(len(self.stamp)), first)
 
-    def rows(self: S, chosen: BoolArray | IntArray | slice) -> S:
+    def rows(self, chosen: BoolArray | IntArray | slice) -> Source:
         """The chosen rows, in the order chosen."""
         values = {axis: value[chosen] for axis, value in self.values.items()}
         spread = {axis: value[chosen] for axis, value in self.spread.items()}
         return replace(self, stamp=self.stamp[chosen], values=values, spread=spread)
-
-
-@dataclass(frozen=True)
-class Reference(Source):
-    """A reference for scoring, which no filter uses; ``sd`` [m] is the standard deviation of its own noise."""
-
-    sd: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -79,7 +71,7 @@ class Run:
         name: For people and for result folders.
         command: The commands u.
         sensors: The measurements by sensor.
-        reference: Positions to score against, where there are any.
+        reference: Positions to score against, where there are any; no filter uses them.
         start: The start level u₀ [m] of axes that rest elsewhere than at their first command.
         clock: Whether the commands' stamps are used as they are (``stamps``) or replaced by a grid of T (``regular``).
         frame: The arm's axes in the log's x, y, z, for sources that give these.
@@ -90,7 +82,7 @@ class Run:
     name: str
     command: Source
     sensors: Mapping[str, Source]
-    reference: Reference | None = None
+    reference: Source | None = None
     start: Mapping[str, float] = field(default_factory=dict[str, float])
     clock: Clock = "stamps"
     frame: Frame | None = None
@@ -98,31 +90,40 @@ class Run:
     without_strays: bool = False
 
     def __post_init__(self) -> None:
-        sources = {f"sensor {name}": source for name, source in self.sensors.items()}
+        where = f"run '{self.name}'"
+        named = {f"sensor {name}": source.values for name, source in self.sensors.items()}
         if self.reference is not None:
-            sources["the reference"] = self.reference
-        named = {axis for source in sources.values() for axis in source.values} | set(self.axes)
-        framed = self.frame is not None or not named.isdisjoint(CARTESIAN)
+            named["the reference"] = self.reference.values
+        framed = self.frame is not None or not set(self.axes).union(*named.values()).isdisjoint(CARTESIAN)
         accepted = dict.fromkeys((*self.axes, *CARTESIAN, *CANONICAL_AXES)) if framed else self.axes
-        for name, source in sources.items():
-            _known_axes(f"run '{self.name}', {name}", source.values, accepted)
-        _known_axes(f"run '{self.name}', start", self.start, accepted)
+        for what, values in {**named, "start": self.start}.items():
+            for axis in values:
+                if axis not in accepted:
+                    raise UnknownNameError(f"{where}, {what}", "axis", axis, accepted)
         if self.clock not in get_args(Clock):
-            raise UnknownNameError(f"run '{self.name}'", "clock", str(self.clock), get_args(Clock))
+            raise UnknownNameError(where, "clock", str(self.clock), get_args(Clock))
         for axis, level in self.start.items():
             if not np.isfinite(level):
-                raise RunError(f"run '{self.name}': the start level of {axis} is not finite")
+                raise RunError(f"{where}: the start level of {axis} is not finite")
         if self.reference is not None and not 0.0 <= self.reference.sd < np.inf:
-            raise RunError(f"run '{self.name}': the reference's sd must be finite and not negative")
-        stamped = self.command.stamp != NO_STAMP
+            raise RunError(f"{where}: the reference's sd must be finite and not negative")
         for axis, command in self.command.values.items():
-            if not (np.isfinite(command) & stamped).any():
+            if not (np.isfinite(command) & (self.command.stamp != NO_STAMP)).any():
                 raise RunError(f"{self.command.label}: no command for axis '{axis}' has both a stamp and a value")
 
     @property
     def axes(self) -> tuple[str, ...]:
         """The commanded axes, in the order tangential, radial, vertical, then others by name."""
         return ordered_axes(set(self.command.values))
+
+    def each(self, change: Callable[[str, Source], Source]) -> Run:
+        """The run with each of its sources changed; ``change`` is given its name in notes, too."""
+        return replace(
+            self,
+            command=change(self.command.label, self.command),
+            sensors={name: change(source.label_for(name), source) for name, source in self.sensors.items()},
+            reference=None if self.reference is None else change(self.reference.label, self.reference),
+        )
 
     @staticmethod
     def read(path: str | Path) -> Run:
@@ -134,11 +135,7 @@ class Run:
         path = Path(path)
         if os.path.isdir(path):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
             path = path / "run.toml"
-            if not path.exists():
-                raise RunError(f"{path.parent}: a folder without run.toml; write one, or give a single table")
-        if path.suffix == ".toml":
-            return _read_manifest(path)
-        return _read_single(path)
+        return _read_manifest(path) if path.suffix == ".toml" else _read_single(path)
 
     @staticmethod
     def from_arrays(
@@ -170,7 +167,7 @@ class Run:
             RunError: Lengths differ, or there is no command.
         """
         streams = {sensor: _from_arrays(sensor, *arrays) for sensor, arrays in (sensors or {}).items()}
-        scored = None if reference is None else _as_reference(_from_arrays("reference", *reference), reference_sd)
+        scored = None if reference is None else replace(_from_arrays("reference", *reference), sd=reference_sd)
         return Run(name, _from_arrays("command", time, command), streams, scored, dict(start or {}), clock, frame)
 
 
@@ -180,12 +177,6 @@ def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: s
     if len(found):
         plural = "row has" if len(found) == 1 else "rows have"
         notes.append(f"{label}: {len(found)} {plural} {what} (first: row {found[0] + 1}{first})")
-
-
-def _known_axes(where: str, named: Mapping[str, object], axes: Collection[str]) -> None:
-    for axis in named:
-        if axis not in axes:
-            raise UnknownNameError(where, "axis", axis, axes)
 
 
 def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.ArrayLike]) -> Source:
@@ -213,87 +204,74 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
         ValueError: A stamp is beyond reach of int64 ns.
         TypeError: The stamps are of another type.
     """
-    if time.dtype.kind == "M":
-        rough_s = time.astype("M8[s]").astype(np.float64)
-        if (np.abs(rough_s[~np.isnat(time)]) >= REACH_NS / 1e9).any():
-            raise ValueError("a stamp beyond the year 2110")
-        time = time.astype("M8[ns]").astype(np.int64)
-    if time.dtype.kind not in "iuf":
+    kind = time.dtype.kind
+    if kind not in "Miuf":
         raise TypeError(f"got {time.dtype}")
-    whole = time.dtype.kind in "iu"
-    rough = time.astype(np.float64) * (1.0 if whole else 1e9)
-    missing = (time == NO_STAMP) if whole else ~np.isfinite(rough)
-    if (np.abs(rough[~missing]) >= REACH_NS).any():
+    if kind == "f":
+        missing, rough = ~np.isfinite(time), time.astype(np.float64)
+    else:
+        missing = np.isnat(time) if kind == "M" else time == NO_STAMP
+        rough = time.astype("M8[s]").astype(np.float64) if kind == "M" else time / 1e9
+    if (np.abs(rough[~missing]) >= REACH_NS / 1e9).any():
         raise ValueError("a stamp beyond the year 2110")
-    return time.astype(np.int64) if whole else nanoseconds(rough / 1e9)
-
-
-def _as_reference(source: Source, sd: float) -> Reference:
-    return Reference(source.stamp, source.values, source.label, sd=sd)
+    return nanoseconds(rough) if kind == "f" else time.astype("M8[ns]").astype(np.int64)
 
 
 def _read_manifest(path: Path) -> Run:
     listed = manifest.load(path)
     notes: list[str] = []
-    loaded: dict[str, tables.Table] = {}
+
+    @cache
+    def table_of(file: str) -> tables.Table:
+        table = tables.read(path.parent / file, growing=True)
+        notes.extend(table.notes)
+        return table
 
     def source(entry: manifest.SourceEntry) -> Source:
-        if entry.file not in loaded:
-            loaded[entry.file] = tables.read(path.parent / entry.file, growing=True)
-            notes.extend(loaded[entry.file].notes)
-        table = loaded[entry.file]
-        stamp, note = table.stamps(entry.time)
-        found = [note]
-        values: dict[str, FloatArray] = {}
-        for axis, columns in entry.axes.items():
-            parts = [table.numbers(column) for column in ([columns] if isinstance(columns, str) else columns)]
-            values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
-            found.extend(note for _, note in parts)
-        notes.extend(note for note in found if note is not None and note not in notes)
-        return Source(stamp, values, entry.file)
+        return _source(table_of(entry.file), entry.time, entry.axes, entry.file, notes)
 
     command = source(listed.command)
     sensors = {name: source(entry) for name, entry in listed.sensors.items()}
-    reference = None
-    if listed.reference is not None:
-        reference = _as_reference(source(listed.reference), listed.reference.sd)
-    name = listed.name or path.parent.resolve().name
-    return Run(
-        name, command, sensors, reference, listed.command.start, listed.command.clock, listed.frame, tuple(notes)
-    )
+    scored = listed.reference
+    reference = None if scored is None else replace(source(scored), sd=scored.sd)
+    name, start, clock = listed.name or path.parent.resolve().name, listed.command.start, listed.command.clock
+    return Run(name, command, sensors, reference, start, clock, listed.frame, tuple(notes))
 
 
 def _read_single(path: Path) -> Run:
     """One table: ``time_s``, ``command.<axis>_mm``, ``<sensor>.<axis>_mm``, ``reference.<axis>_mm``."""
     table = tables.read(path, growing=True)
+    listed = ", ".join(table.columns)
     clocks = [name for name in table.columns if name.startswith("time_")]
     if len(clocks) != 1:
-        raise RunError(f"{path}: a single table needs one time column, 'time_s'; it has: {', '.join(table.columns)}")
-    stamp, note = table.stamps(clocks[0])
-    notes = [*table.notes, *([note] if note else [])]
-    groups: dict[str, dict[str, FloatArray]] = {}
-    left: list[str] = []
+        raise RunError(f"{path}: a single table needs one time column, 'time_s'; it has: {listed}")
+    groups: dict[str, dict[str, list[str]]] = {}
     for column in table.columns:
         source, dot, rest = column.partition(".")
-        if not dot:
-            left.extend([column] if column != clocks[0] else [])
-            continue
-        values, note = table.numbers(column)
-        axis = rest[: rest.rindex("_")]
-        if axis in groups.setdefault(source, {}):
-            raise RunError(f"{path}: two columns for {source}.{axis}; give one")
-        groups[source][axis] = values
-        notes.extend([note] if note else [])
-    if left:
-        notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
+        if dot:
+            axis = rest.rpartition("_")[0]
+            if axis in groups.setdefault(source, {}):
+                raise RunError(f"{path}: two columns for {source}.{axis}; give one")
+            groups[source][axis] = [column]
     if "command" not in groups:
-        raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {', '.join(table.columns)}")
+        raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {listed}")
+    notes, sources = list(table.notes), dict[str, Source]()
+    for name, axes in groups.items():
+        source = _source(table, clocks[0], axes, name, notes)
+        sources[name] = source.rows(np.any(~np.isnan(list(source.values.values())), axis=0))
+    if left := [column for column in table.columns if "." not in column and column != clocks[0]]:
+        notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
+    command, reference = sources.pop("command"), sources.pop("reference", None)
+    return Run(path.name.split(".")[0], command, sources, reference, notes=tuple(notes))
 
-    def source_of(name: str) -> Source:
-        given = ~np.all([np.isnan(value) for value in groups[name].values()], axis=0)
-        return Source(stamp, groups[name], name).rows(given)
 
-    sensors = {name: source_of(name) for name in groups if name not in ("command", "reference")}
-    reference = _as_reference(source_of("reference"), 0.0) if "reference" in groups else None
-    name = path.name.split(".")[0]
-    return Run(name, source_of("command"), sensors, reference, notes=tuple(notes))
+def _source(table: tables.Table, time: str, axes: Mapping[str, Sequence[str]], label: str, notes: list[str]) -> Source:
+    """A source from its columns, those of an axis added up; new notes on them are appended."""
+    stamp, note = table.stamps(time)
+    values, found = dict[str, FloatArray](), [note]
+    for axis, columns in axes.items():
+        parts = [table.numbers(column) for column in columns]
+        values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
+        found.extend(note for _, note in parts)
+    notes.extend(note for note in found if note is not None and note not in notes)
+    return Source(stamp, values, label)

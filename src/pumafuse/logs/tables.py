@@ -6,13 +6,11 @@ noted in one sentence each.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pacsv
@@ -20,9 +18,14 @@ import pyarrow.parquet as papq
 
 from .. import units
 from ..arrays import NO_STAMP, REACH_NS, FloatArray, TimeArray
-from ..errors import RunError, UnknownNameError
+from ..errors import RunError, UnknownNameError, counted
 
-N = TypeVar("N", np.float64, np.int64)
+_COMPRESSED = {".gz", ".bz2", ".lz4", ".zst", ".br"}  # a torn one cannot be read at all
+_WHOLE = r"^[+-]?\d{1,19}$"
+_NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
+_BLANK = ("", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None")
+_NUMBERS = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
+_NEITHER_NUMBERS_NOR_TEXT = (pa.types.is_boolean, pa.types.is_temporal, pa.types.is_nested)
 
 
 @dataclass(frozen=True)
@@ -49,7 +52,7 @@ class Table:
         """
         exponent = self._exponent(name, units.LENGTHS, "_mm")
         values, note = self.plain(name)
-        return (values / 10.0**-exponent if exponent < 0 else values), note  # a quotient is rounded once
+        return values / 10.0**-exponent, note  # a quotient is rounded once
 
     def plain(self, name: str) -> tuple[FloatArray, str | None]:
         """A column of numbers without conversion, with NaN and note as in :meth:`numbers`.
@@ -58,7 +61,7 @@ class Table:
             RunError: The column is absent or holds something else than numbers.
         """
         column, note = self._numeric(name)
-        return _floats(column), note
+        return _filled(column.cast(pa.float64(), safe=False), np.nan), note
 
     def texts(self, name: str) -> list[str]:
         """A column as trimmed text, empty where a cell is; whole numbers without a point.
@@ -80,39 +83,31 @@ class Table:
         Raises:
             RunError: The column is absent, its name ends in no unit of time, or a stamp is beyond reach of int64 ns.
         """
-        column = self._column(name)
+        column, note, per_unit = self._column(name), None, 1
         if pa.types.is_timestamp(column.type):
-            whole, note, per_unit = self._cast(name, column, pa.timestamp("ns")), None, 1
-            counted = _copied(whole.cast(pa.int64()), np.int64, NO_STAMP)
-            values = np.where(counted == NO_STAMP, np.nan, counted.astype(np.float64))
+            column = self._cast(name, column, pa.timestamp("ns")).cast(pa.int64())
         else:
             per_unit = 10 ** (9 + self._exponent(name, units.TIMES, "_s"))
             column, note = self._numeric(name)
-            values = _floats(column)
-            counted = self._whole(name, column)
-        rough = values * per_unit
+        rough = _filled(column.cast(pa.float64(), safe=False), np.nan) * per_unit
         beyond = np.flatnonzero(np.isfinite(rough) & (np.abs(rough) >= REACH_NS))
         if len(beyond):
             raise RunError(
                 f"{self.path}: column '{name}', row {beyond[0] + 1}: a stamp beyond the year 2110; is its unit what its"
                 " name says?"
             )
-        rounded = np.where(np.isfinite(rough), np.nan_to_num(np.rint(rough)), 0.0).astype(np.int64)
-        ticks = np.where(counted != NO_STAMP, counted * per_unit, rounded)
-        return np.where(np.isfinite(rough), ticks, NO_STAMP), note
-
-    def _whole(self, name: str, column: pa.ChunkedArray) -> TimeArray:
-        """The whole numbers of a column exactly, ``NO_STAMP`` for its other cells."""
+        found = np.where(np.isfinite(rough), np.rint(rough), NO_STAMP).astype(np.int64)
         if pa.types.is_string(column.type):
             column = pc.if_else(pc.match_substring_regex(column, _WHOLE), column, pa.scalar(None, pa.string()))
-        elif not pa.types.is_integer(column.type):
-            return np.full(self.rows, NO_STAMP)
-        return _copied(self._cast(name, column, pa.int64()), np.int64, NO_STAMP)
+        if pa.types.is_string(column.type) or pa.types.is_integer(column.type):
+            whole = _filled(self._cast(name, column, pa.int64()), NO_STAMP)
+            found = np.where(whole == NO_STAMP, found, whole * per_unit)
+        return found, note
 
     def _cast(self, name: str, column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
         try:
             return column.cast(kind)
-        except pa.ArrowInvalid as error:
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
             raise RunError(f"{self.path}: column '{name}': {str(error).splitlines()[0]}") from None
 
     def _exponent(self, name: str, accepted: tuple[str, ...], example: str) -> int:
@@ -132,37 +127,23 @@ class Table:
 
     def _numeric(self, name: str) -> tuple[pa.ChunkedArray, str | None]:
         """A column of numbers, or of text that is numbers; cells of other text are null, and counted in a note."""
-        column, kind = self._column(name), self._column(name).type
-        if pa.types.is_dictionary(kind):
-            column = self._cast(name, column, kind.value_type)
-        if pa.types.is_large_string(column.type) or pa.types.is_string_view(column.type):
-            column = column.cast(pa.string())
-        if pa.types.is_string(column.type):
-            trimmed = pc.utf8_trim_whitespace(column)
-            numeric = pc.match_substring_regex(trimmed, _NUMBER)
-            blank = pc.is_in(trimmed, value_set=pa.array(sorted(_BLANK)))
-            words = pc.and_(pc.is_valid(column), pc.invert(pc.or_(numeric, blank)))
-            count, note = pc.sum(words).as_py() or 0, None
-            if count:
-                row = pc.index(words, value=True).as_py()
-                cells = "1 cell" if count == 1 else f"{count} cells"
-                note = (
-                    f"{self.path.name}: {cells} of column '{name}' without a number, first"
-                    f" {column[row].as_py()[:40]!r} in row {row + 1}: taken as missing"
-                )
-            return pc.if_else(numeric, trimmed, pa.scalar(None, pa.string())), note
-        kinds = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
-        if pa.types.is_binary(column.type):
-            raise RunError(f"{self.path}: column '{name}': its text is not UTF-8")
-        if not any(is_kind(column.type) for is_kind in kinds):
+        column = self._column(name)
+        if any(is_kind(column.type) for is_kind in _NUMBERS):
+            return column, None
+        if any(is_kind(column.type) for is_kind in _NEITHER_NUMBERS_NOR_TEXT):
             raise RunError(f"{self.path}: column '{name}' holds {column.type}, not numbers")
-        return column, None
-
-
-_COMPRESSED = {".gz", ".bz2", ".lz4", ".zst", ".br"}  # a torn one cannot be read at all
-_WHOLE = r"^[+-]?\d{1,19}$"
-_NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
-_BLANK = {"", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None"}
+        column = self._cast(name, column, pa.string())
+        trimmed = pc.utf8_trim_whitespace(column)
+        numeric = pc.match_substring_regex(trimmed, _NUMBER)
+        words = pc.and_(pc.is_valid(column), pc.invert(pc.or_(numeric, pc.is_in(trimmed, value_set=pa.array(_BLANK)))))
+        count, note = pc.sum(words).as_py() or 0, None
+        if count:
+            row = pc.index(words, value=True).as_py()
+            note = (
+                f"{self.path.name}: {counted(count, 'cell')} of column '{name}' without a number, first"
+                f" {column[row].as_py()[:40]!r} in row {row + 1}: taken as missing"
+            )
+        return pc.if_else(numeric, trimmed, pa.scalar(None, pa.string())), note
 
 
 def read(path: Path, *, growing: bool = False) -> Table:
@@ -177,22 +158,25 @@ def read(path: Path, *, growing: bool = False) -> Table:
         RunError: The file is absent, empty, or neither CSV nor Parquet inside.
     """
     try:
-        table, notes = (papq.read_table(path), list[str]()) if path.suffix == ".parquet" else _read_csv(path, growing)
+        with pa.input_stream(str(path)) as stream:
+            content = stream.read()
+        if not content:
+            raise RunError(f"{path}: the file is empty")
+        if path.suffix == ".parquet":
+            table, notes = papq.read_table(pa.BufferReader(content)), list[str]()
+        else:
+            table, notes = _parsed(path, content, growing)
         names: list[str] = table.column_names
-    except FileNotFoundError:
-        raise RunError(f"{path}: no such file") from None
     except UnicodeDecodeError:
         raise RunError(f"{path}: not a table that can be read: its text is not UTF-8") from None
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
         reason = str(error).splitlines()[0].removeprefix("CSV parse error: ")
         raise RunError(f"{path}: not a table that can be read: {reason}") from None
+    except FileNotFoundError:
+        raise RunError(f"{path}: no such file") from None
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror or str(error).splitlines()[0]}") from None
-    except ValueError:  # a null character in the path
-        raise RunError(f"{str(path)!r}: no such file") from None
     if table.num_rows == 0:
-        if path.is_dir():
-            raise RunError(f"{path}: the table has no rows")
         notes = [f"{path.name}: the table has no rows", *notes]
     repeated = next((name for name in names if names.count(name) > 1), None)
     if repeated is not None:
@@ -208,22 +192,24 @@ def write(table: pa.Table, path: Path) -> None:
         papq.write_table(table, path, compression="zstd")
 
 
-def _read_csv(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
-    """Read a CSV file; lines with the wrong number of cells, and a torn last line, are left out and noted."""
-    if path.stat().st_size == 0:
-        raise RunError(f"{path}: the file is empty")
-    text, notes = _without_torn_end(path) if growing else (None, [])
+def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]]:
+    """The table in a CSV text; lines with the wrong number of cells, and a torn last line, are left out and noted."""
+    notes: list[str] = []
+    if growing and b"\n" in text and not text.endswith((b"\n", b"\r")) and path.suffix not in _COMPRESSED:
+        text = text[: text.rindex(b"\n") + 1]
+        torn = "the last line has no end and may be torn: left out (if it is whole, end it with a line break)"
+        notes = [f"{path.name}: {torn}"]
     wrong: list[pacsv.InvalidRow] = []
 
     def leave_out(row: pacsv.InvalidRow) -> str:
         wrong.append(row)
         return "skip"
 
-    def parsed(**options: pacsv.ParseOptions) -> pa.Table:
+    def parsed(**options: Any) -> pa.Table:
         return pacsv.read_csv(
-            path if text is None else pa.BufferReader(text),
+            pa.BufferReader(text),
             read_options=pacsv.ReadOptions(use_threads=False),
-            convert_options=pacsv.ConvertOptions(null_values=sorted(_BLANK), strings_can_be_null=True),
+            convert_options=pacsv.ConvertOptions(null_values=_BLANK, strings_can_be_null=True),
             **options,
         )
 
@@ -232,45 +218,20 @@ def _read_csv(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
     except pa.ArrowInvalid as error:
         if " columns, got " not in str(error):
             raise
-    pa.input_stream(str(path)).read().decode("utf-8")  # pyarrow cannot hand over a wrong line that is not UTF-8
+    text.decode("utf-8")  # pyarrow cannot hand over a wrong line that is not UTF-8
     table = parsed(parse_options=pacsv.ParseOptions(invalid_row_handler=leave_out))
-    lines = "1 line" if len(wrong) == 1 else f"{len(wrong)} lines"
-    where = "" if wrong[0].number is None else f", first in line {wrong[0].number}"
     note = (
-        f"{path.name}: {lines} left out: {wrong[0].actual_columns} cells where the header has"
-        f" {wrong[0].expected_columns}{where}"
+        f"{path.name}: {counted(len(wrong), 'line')} left out: {wrong[0].actual_columns} cells where the header has"
+        f" {wrong[0].expected_columns}, first in line {wrong[0].number}"
     )
     if table.num_rows == 0:  # not the kind of table that it should be
         raise RunError(f"{path}: the table has no rows; {note}")
     return table, [note, *notes]
 
 
-def _without_torn_end(path: Path) -> tuple[pa.Buffer | None, list[str]]:
-    """The text up to the last line break, and a note on what is left out; None if nothing is."""
-    with path.open("rb") as file:
-        file.seek(-1, os.SEEK_END)
-        if path.suffix in _COMPRESSED or file.read(1) in b"\n\r":
-            return None, []
-        file.seek(0)
-        text = file.read()
-    end = text.rfind(b"\n") + 1
-    if not end:
-        return None, []
-    return pa.py_buffer(memoryview(text)[:end]), [
-        f"{path.name}: the last line has no end and may be torn: left out (if it is whole, end it with a line break)"
-    ]
-
-
-def _floats(column: pa.ChunkedArray) -> FloatArray:
-    return _copied(column.cast(pa.float64(), safe=False), np.float64, np.nan)
-
-
-def _copied(column: pa.ChunkedArray, kind: type[N], missing: float) -> npt.NDArray[N]:
-    """The numbers of a column of ``kind``, from its buffer: pyarrow's ``to_numpy`` would import pandas (0.2 s)."""
+def _filled(column: pa.ChunkedArray, missing: float) -> Any:
+    """The numbers of a column, ``missing`` where it has none. Pyarrow's ``to_numpy`` would import pandas (0.2 s)."""
     whole = column.combine_chunks()
-    if not len(whole):
-        return np.empty(0, dtype=kind)
-    found = np.frombuffer(whole.buffers()[1], dtype=kind, count=len(whole), offset=whole.offset * 8).copy()
-    if whole.null_count:
-        found[np.from_dlpack(pc.is_null(whole).cast(pa.uint8())) > 0] = missing
+    found = np.full(len(whole), missing)
+    found[np.from_dlpack(pc.is_valid(whole).cast(pa.uint8())) > 0] = np.from_dlpack(pc.drop_null(whole))
     return found

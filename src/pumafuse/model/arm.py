@@ -121,13 +121,10 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         Raises:
             ConfigError: No such file or preset, or its content is not an arm; names the key and the accepted ones.
         """
-        where, preset = str(source), PRESETS.get(str(source))
-        if preset is not None:
-            tree = toml.parse(preset, where)
-        elif os.path.exists(source):  # noqa: PTH110 - Path.exists raises on a name that is too long
-            tree = toml.read(Path(source))
-        else:
+        path = PRESETS.get(str(source), Path(source))
+        if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises on a name that is too long
             raise ConfigError(f"{source}: no such arm file, and not a preset ({', '.join(PRESETS)})")
+        tree, where = toml.read(path), str(source)
         axes = tree.get("axes")
         if isinstance(axes, dict):
             tree["axes"] = {name: _axis(table, where, f"axes.{name}") for name, table in axes.items()}  # pyright: ignore

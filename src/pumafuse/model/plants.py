@@ -19,7 +19,7 @@ from .unit_response import unit_response
 if TYPE_CHECKING:
     import control
 
-Delay = Annotated[float, msgspec.Meta(ge=0, le=1e6)]  # s
+Delay = Annotated[float, msgspec.Meta(ge=0, le=1e4)]  # s
 
 
 class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid_unknown_fields=True):
@@ -34,8 +34,11 @@ class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid
         raise NotImplementedError
 
     def transfer_function(self) -> control.TransferFunction:
-        """The plant as a `control` transfer function from v to p, without gain and delay."""
-        raise NotImplementedError
+        """The plant as a `control` transfer function from v to p, without gain and delay; A is a companion form."""
+        import control
+
+        A = self.state_space()[0]
+        return control.tf([-A[-1, 0]], [1.0, *-A[-1, ::-1]])
 
     @property
     def lag(self) -> float:
@@ -58,12 +61,6 @@ class FirstOrder(Plant, frozen=True, kw_only=True, tag="first-order", forbid_unk
         """One state, the position [m]."""
         rate = 1.0 / self.time_constant
         return np.array([[-rate]]), np.array([[rate]]), np.array([[1.0]])
-
-    def transfer_function(self) -> control.TransferFunction:
-        """Equation 3."""
-        import control
-
-        return control.tf([1.0], [self.time_constant, 1.0])
 
     @property
     def lag(self) -> float:
@@ -96,13 +93,6 @@ class SecondOrder(Plant, frozen=True, kw_only=True, tag="second-order", forbid_u
         square = self.natural_frequency**2
         A = np.array([[0.0, 1.0], [-square, -2.0 * self.damping * self.natural_frequency]])
         return A, np.array([[0.0], [square]]), np.array([[1.0, 0.0]])
-
-    def transfer_function(self) -> control.TransferFunction:
-        """Equation 5."""
-        import control
-
-        square = self.natural_frequency**2
-        return control.tf([square], [1.0, 2.0 * self.damping * self.natural_frequency, square])
 
     @property
     def lag(self) -> float:

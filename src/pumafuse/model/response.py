@@ -35,18 +35,8 @@ def response(
     order = 1 if isinstance(axis.plant, FirstOrder) else 2
     decay = 0.0 if axis.gain_recovery is None else 1.0 / axis.gain_recovery
     acting = given + round(delay * 1e9)
-    _respond(
-        order,
-        constants(axis.plant)[None],
-        gain.slope,
-        gain.intercept,
-        decay,
-        period,
-        acting,
-        command - start,
-        time,
-        found,
-    )
+    known, by_gain = constants(axis.plant)[None], (gain.slope, gain.intercept, decay, period)
+    _respond(order, known, by_gain, acting, command - start, time, found)
     return found
 
 
@@ -54,15 +44,13 @@ def response(
 def _respond(
     order: int,
     constants: FloatArray,
-    slope: float,
-    intercept: float,
-    decay: float,
-    period: float,
+    by_gain: tuple[float, float, float, float],
     acting: TimeArray,
     command: FloatArray,
     time: TimeArray,
     found: FloatArray,
 ) -> None:
+    slope, intercept, decay, period = by_gain
     at, u, error, position, rate = 0, 0.0, 0.0, 0.0, 0.0
     clock = min(time[0], acting[0]) if len(time) and len(acting) else 0
     for n in range(len(time)):

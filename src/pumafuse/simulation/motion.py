@@ -11,6 +11,7 @@ Nothing of the filter's discretisation is used here: the filter is tested agains
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import TypeAlias
 
 import numpy as np
@@ -128,12 +129,9 @@ def _plant_input(
     error = _sum_of_decays(decay.astype(np.complex128), jump.astype(np.complex128)).real
     if not axis.stiction:
         return command, error
-    held, level = 0.0, np.empty_like(command)
-    for number, wanted in enumerate((command + error).tolist()):
-        if abs(wanted - held) > axis.stiction:
-            held = wanted
-        level[number] = held
-    return level, np.zeros_like(level)
+    wanted = (command + error).tolist()
+    held = accumulate(wanted, lambda now, to: to if abs(to - now) > axis.stiction else now, initial=0.0)
+    return np.fromiter(held, dtype=np.float64)[1:], np.zeros_like(command)
 
 
 def _response(pole: complex, rate: float, interval: FloatArray) -> ComplexArray:
@@ -180,11 +178,9 @@ def _events(acting: TimeArray, instants: TimeArray, fastest: float) -> TimeArray
     longest = max(int(_LONGEST_TURN * 1e9 / fastest), 1)
     end = instants[-1]
     if end / longest > _MOST_EVENTS:
-        shortest = end / 1e6 / _MOST_EVENTS / _LONGEST_TURN
-        raise ConfigError(
-            f"a lag or time constant of {1e3 / fastest:.3g} ms is too short to follow over {end / 1e9:.0f} s:"
-            f" at least {shortest:.2g} ms"
-        )
+        least = end / 1e6 / _MOST_EVENTS / _LONGEST_TURN
+        lag = f"a lag or time constant of {1e3 / fastest:.3g} ms"
+        raise ConfigError(f"{lag} is too short to follow over {end / 1e9:.0f} s: at least {least:.2g} ms")
     finer = np.arange(0, end if longest < instants[1] else 0, longest, dtype=np.int64)
     return np.unique(np.concatenate((acting[acting <= end], instants, finer)))
 
@@ -204,8 +200,5 @@ def _backlash(position: FloatArray, width: float) -> FloatArray:
     """The position behind a gear with ``width`` [m] of play: y_n = clip(y_(n−1), x_n − width/2, x_n + width/2)."""
     if not width:
         return position
-    behind, y = np.empty_like(position), float(position[0])
-    for number, x in enumerate(position.tolist()):
-        y = min(max(y, x - 0.5 * width), x + 0.5 * width)
-        behind[number] = y
-    return behind
+    tool = accumulate(position.tolist(), lambda y, x: min(max(y, x - 0.5 * width), x + 0.5 * width))
+    return np.fromiter(tool, dtype=np.float64)

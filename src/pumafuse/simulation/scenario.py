@@ -105,7 +105,6 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             save.check_axis(name)
         for name, sensor in self.sensors.items():
             save.check_name(name)
-            self._check_axes_of(f"sensors.{name}", sensor)
             self._check(f"sensors.{name}", sensor)
         if isinstance(self.trajectory, Steps):
             self._check_scope(self.trajectory)
@@ -119,27 +118,21 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
                 raise ConfigError("frame: start.level.radial_mm must say how far from the base's axis the arm starts")
         _ = self.config, self.true_axes  # raise now if something does not fit together
 
-    def _check_axes_of(self, where: str, sensor: TrueSensor) -> None:
-        logged = self._logged_axes(sensor)
+    def _check(self, where: str, sensor: TrueSensor) -> None:
+        logged, fastest = self._logged_axes(sensor), POINTS / self.arm.update_period
         for key, named in (("axes", sensor.axes), ("sd_mm", sensor.sd), ("bias_mm", sensor.bias)):
             for name in named if isinstance(named, list | dict) else ():
                 if name not in logged:
                     raise UnknownNameError(f"{where}.{key}", "axis", name, logged)
-        if not isinstance(sensor.sd, dict):
-            return
-        if logged is CARTESIAN:
-            raise ConfigError(f"{where}.sd_mm: one number for a sensor in x, y, z")
-        moving = set(self.trajectory.moving)
-        measured = moving if sensor.axes is None else moving & set(sensor.axes)
-        for axis in sorted(measured - set(sensor.sd)):
-            raise ConfigError(f"{where}.sd_mm: no entry for '{axis}', which it measures")
-
-    def _check(self, where: str, sensor: TrueSensor) -> None:
-        fastest = POINTS / self.arm.update_period
+        if isinstance(sensor.sd, dict):
+            if logged is CARTESIAN:
+                raise ConfigError(f"{where}.sd_mm: one number for a sensor in x, y, z")
+            for axis in self.trajectory.moving:
+                if axis in (sensor.axes or logged) and axis not in sensor.sd:
+                    raise ConfigError(f"{where}.sd_mm: no entry for '{axis}', which it measures")
         if sensor.rate > fastest:
-            raise ConfigError(
-                f"{where}.rate_hz: at most {fastest:g} on this arm ({POINTS} rows a command), got {sensor.rate:g}"
-            )
+            limit = f"at most {fastest:g} on this arm ({POINTS} rows a command)"
+            raise ConfigError(f"{where}.rate_hz: {limit}, got {sensor.rate:g}")
         if sensor.outliers is not None and sensor.outliers.largest < sensor.outliers.smallest:
             raise ConfigError(f"{where}.outliers: to_mm is smaller than from_mm")
         for start, end in sensor.outages:
@@ -149,9 +142,9 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def _check_scope(self, campaign: Steps) -> None:
         if campaign.scope not in self.sensors:
             raise UnknownNameError("trajectory.scope", "sensor", campaign.scope, self.sensors)
-        measured = self.sensors[campaign.scope].axes or self._logged_axes(self.sensors[campaign.scope])
+        scope = self.sensors[campaign.scope]
         for axis in campaign.axes:
-            if axis not in measured:
+            if axis not in (scope.axes or self._logged_axes(scope)):
                 raise ConfigError(f"sensors.{campaign.scope}.axes: the scope must measure '{axis}', which is stepped")
 
     def _logged_axes(self, sensor: TrueSensor) -> tuple[str, ...]:

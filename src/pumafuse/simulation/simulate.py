@@ -8,27 +8,25 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import msgspec
 import numpy as np
+import pyarrow as pa
 
 from .. import folders, toml
 from ..arrays import FloatArray
 from ..errors import ConfigError
 from ..fusion.config import ARM_FILE, FusionConfig, Process
-from ..logs import save
+from ..logs import save, tables
 from ..logs.frames import Cylindrical, Placed
-from ..logs.run import Reference, Run, Source
+from ..logs.run import Run, Source
 from ..model.arm import ordered_axes
 from ..units import MM
 from . import campaign, sensing
 from .grid import POINTS, grid
-from .motion import simulate_axis
+from .motion import Motion, simulate_axis
 from .scenario import Scenario
 from .trajectory import PathFromFile
-
-SourceT = TypeVar("SourceT", bound=Source)
 
 SCENARIO = "scenario.toml"
 MANIFEST = "run.toml"
@@ -45,14 +43,14 @@ class Simulated:
         seed: With which seed.
         run: The recorded run; its reference is the true motion.
         config: The filter's configuration.
-        trials: The step trials of a campaign.
+        trials: The tables of a campaign's step trials, by the names of their files; else none.
     """
 
     scenario: Scenario
     seed: int
     run: Run
     config: FusionConfig
-    trials: campaign.Trials | None
+    trials: Mapping[str, pa.Table]
 
 
 def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
@@ -74,18 +72,11 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
     axes, count = tuple(commands), len(next(iter(commands.values())))
     tick = np.rint(np.arange(count) * (period * 1e9)).astype(np.int64)
     instants = grid(count, period)
-    motions = {
-        axis: simulate_axis(
-            scenario.true_axes[axis],
-            scenario.process.get(axis, Process()),
-            scenario.start.offset_sd,
-            tick,
-            command,
-            period,
-            _stream(seed, "axis", axis),
-        )
-        for axis, command in commands.items()
-    }
+    true_axes, motions = scenario.true_axes, dict[str, Motion]()
+    for axis, command in commands.items():
+        process, draws = scenario.process.get(axis, Process()), _stream(seed, "axis", axis)
+        offset_sd = scenario.start.offset_sd
+        motions[axis] = simulate_axis(true_axes[axis], process, offset_sd, tick, command, period, draws)
 
     sensors: dict[str, Source] = {}
     for name, sensor in scenario.sensors.items():
@@ -108,7 +99,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
         name=f"{scenario.name}, seed {seed}",
         command=_rounded(Source(stamp, _logged(scenario, commands), "command")),
         sensors=sensors,
-        reference=_rounded(Reference(rows, reference, "reference", sd=scenario.reference.sd)),
+        reference=_rounded(Source(rows, reference, "reference", sd=scenario.reference.sd)),
         start={axis: float(_nanometres(level)[0]) for axis, level in start.items()},
         clock=scenario.command.clock,
         frame=scenario.frame,
@@ -139,14 +130,13 @@ def write(simulated: Simulated, folder: Path, force: bool) -> None:
         save.save(simulated.run, new)
         simulated.config.save(new)
         if isinstance(trajectory := scenario.trajectory, PathFromFile):
-            endings = (name for name in _PATHS if trajectory.file.endswith(name.removeprefix("path")))
-            name = next(endings, _PATHS[0])
+            name = next((name for name in _PATHS if trajectory.file.endswith(name[4:])), _PATHS[0])
             shutil.copyfile(trajectory.file, new / name)
             beside = msgspec.structs.replace(trajectory, file=name)
             scenario = msgspec.structs.replace(scenario, trajectory=beside)
         (new / SCENARIO).write_text(scenario.to_toml(simulated.seed, ARM_FILE), encoding="utf-8")
-        if simulated.trials is not None:
-            campaign.write_trials(simulated.trials, new)
+        for name, table in simulated.trials.items():
+            tables.write(table, new / name)
 
 
 def _files_of(folder: Path) -> set[str]:
@@ -156,8 +146,8 @@ def _files_of(folder: Path) -> set[str]:
     except ConfigError:
         return set(_ALWAYS_WRITTEN)
     sources = [manifest.get("command"), manifest.get("reference"), *manifest.get("sensors", {}).values()]
-    tables = {str(source["file"]) for source in sources if source}
-    return {*_ALWAYS_WRITTEN, campaign.TRIALS, campaign.SAMPLES, *_PATHS, *tables}
+    files = {str(source["file"]) for source in sources if source}
+    return {*_ALWAYS_WRITTEN, campaign.TRIALS, campaign.SAMPLES, *_PATHS, *files}
 
 
 def _logged(scenario: Scenario, moved: Mapping[str, FloatArray], *, in_axes: bool = False) -> dict[str, FloatArray]:
@@ -199,5 +189,5 @@ def _nanometres(value: FloatArray) -> FloatArray:
     return np.round(value * MM, 6) / MM
 
 
-def _rounded(source: SourceT) -> SourceT:
+def _rounded(source: Source) -> Source:
     return replace(source, values={axis: _nanometres(value) for axis, value in source.values.items()})

@@ -22,16 +22,11 @@ Count: TypeAlias = Annotated[int, msgspec.Meta(gt=0, le=10_000)]
 
 
 class Trajectory(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", forbid_unknown_fields=True):
-    """Base of the trajectories; axes that one does not move hold their start level."""
+    """Base of the trajectories; axes that one does not move hold their start level.
 
-    @property
-    def moving(self) -> tuple[str, ...]:
-        """The axes that move."""
-        raise NotImplementedError
-
-    def offsets(self, period: float, rng: np.random.Generator) -> Offsets:
-        """Commands [m] relative to the start level at ticks 0, T, 2T, …, by axis, all of one length (ticks,)."""
-        raise NotImplementedError
+    ``moving`` names the axes that move. ``offsets(period, rng)`` are the commands [m] relative to the start level at
+    ticks 0, T, 2T, …, by axis, all of one length (ticks,).
+    """
 
 
 class OnAxes(Trajectory, frozen=True, kw_only=True):
@@ -162,7 +157,7 @@ class WhiteNoise(Timed, frozen=True, kw_only=True, tag="white-noise"):
         for axis in self.axes:
             switches = rng.random(count) < 0.5
             switches[0] = False
-            found[axis] = np.where(np.cumsum(switches) % 2 == 1, self.amplitude, 0.0)
+            found[axis] = np.where(np.cumsum(switches) % 2, self.amplitude, 0.0)
         return found
 
 

@@ -14,6 +14,8 @@ from ..model.arm import AxisModel, Gain
 from ..model.plants import PLANTS, FirstOrder, SecondOrder
 from ..toml import NotNegative, Positive
 
+_OF_PLANTS = ("time_constant_ms", "natural_frequency_rad_s", "damping")
+
 
 class GainCurve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A gain that is no line: K at some speeds [m/s], linear between them and level outside."""
@@ -109,13 +111,9 @@ class TrueArm(Imperfections, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def _plant(self, model: PLANTS, where: str) -> PLANTS:
         kind = self.plant or model.__struct_config__.tag
-        given = {
-            "time_constant_ms": self.time_constant,
-            "natural_frequency_rad_s": self.natural_frequency,
-            "damping": self.damping,
-        }
-        tree = toml.builtins(model) if model.__struct_config__.tag == kind else {}
-        tree |= {name: value for name, value in given.items() if value is not None}
-        tree.pop("plant", None)
+        tree = toml.builtins(self)
+        if model.__struct_config__.tag == kind:
+            tree = toml.builtins(model) | tree
+        given = {key: value for key, value in tree.items() if key in _OF_PLANTS}
         chosen = FirstOrder if kind == "first-order" else SecondOrder
-        return toml.struct(tree, chosen, f"{where}, a {kind} plant")
+        return toml.struct(given, chosen, f"{where}, a {kind} plant")

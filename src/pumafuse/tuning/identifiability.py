@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from ..arrays import FloatArray
@@ -27,6 +28,14 @@ _FIXED_FIRST = ("latency", "gain", "plant", "delay")  # which kind of a combinat
 
 class TuneError(PumafuseError):
     """Recorded runs that nothing can be fitted to."""
+
+
+class Correlation(msgspec.Struct, frozen=True, kw_only=True):
+    """Two highly correlated parameters."""
+
+    first: str
+    second: str
+    correlation: float
 
 
 @dataclass(frozen=True)
@@ -121,18 +130,15 @@ def within_bounds(free: Sequence[Parameter], config: FusionConfig) -> list[Param
     return [one for one in free if one.at_bound(config) is None]
 
 
-def correlations(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> list[tuple[str, str, float]]:
+def correlations(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> list[Correlation]:
     """Pairs of parameters with a correlation beyond ± 0.9."""
     inside = within_bounds(free, best.config)
-    if not inside:
-        return []
     cov = covariance(derivatives(likelihood, best, inside).information, inside)
     sd = np.sqrt(np.diag(cov))
     matrix = cov / np.outer(sd, sd)
     return [
-        (inside[i].key, inside[j].key, float(matrix[i, j]))
-        for i, j in zip(*np.tril_indices(len(inside), -1), strict=True)
-        if abs(matrix[i, j]) > _HIGH
+        Correlation(first=inside[i].key, second=inside[j].key, correlation=float(matrix[i, j]))
+        for i, j in np.argwhere(np.tril(np.abs(matrix) > _HIGH, -1)).tolist()
     ]
 
 
@@ -162,13 +168,10 @@ def not_identifiable(likelihood: Likelihood, best: Point, free: Sequence[Paramet
 def not_identifiable_noise(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> list[Parameter]:
     """The noises of sensors that are uncertain by more than a factor of e, or at their lower bound."""
     inside = within_bounds(free, best.config)
-    sd = np.sqrt(np.diag(covariance(derivatives(likelihood, best, inside).information, inside))) if inside else ()
-    wide = {one.key for one, spread in zip(inside, sd, strict=True) if spread > 1.0}
-    return [
-        one
-        for one in free
-        if one.fit == "noise" and not one.vanishes and (one.key in wide or one.at_bound(best.config) == "lower")
-    ]
+    cov = covariance(derivatives(likelihood, best, inside).information, inside)
+    wide = {one.key for one, variance in zip(inside, np.diag(cov), strict=True) if variance > 1.0}
+    noise = [one for one in free if one.fit == "noise" and not one.vanishes]
+    return [one for one in noise if one.key in wide or one.at_bound(best.config) == "lower"]
 
 
 def shared_times(
@@ -187,20 +190,18 @@ def shared_times(
     """
     delays = {one.axis: one for one in free if one.fit == "delay"}
     latencies = {one.sensor: one for one in free if one.fit == "latency"}
-    left = {axis: set(sensors[axis]) for axis in axes}
-    unmoved = [one.key for name, one in latencies.items() if not any(name in names for names in left.values())]
-    found = [NotIdentifiable((key,), key) for key in unmoved]
-    while left:
-        group = [next(iter(left))]
-        names = left.pop(group[0])
-        while joined := [axis for axis, others in left.items() if names & others]:
-            for axis in joined:
-                group.append(axis)
-                names |= left.pop(axis)
-        if all(axis in delays for axis in group) and all(name in latencies for name in names):
+    groups: list[tuple[set[str], set[str]]] = []  # axes and sensors that are connected
+    for axis in axes:
+        joined = [group for group in groups if group[1] & {*sensors[axis]}]
+        groups = [group for group in groups if group not in joined]
+        groups.append(({axis}.union(*(one for one, _ in joined)), {*sensors[axis]}.union(*(one for _, one in joined))))
+    moved = set[str]().union(*(names for _, names in groups))
+    found = [NotIdentifiable((one.key,), one.key) for name, one in latencies.items() if name not in moved]
+    for group, names in groups:
+        if group <= delays.keys() and names <= latencies.keys():
             mine = [latencies[name] for name in sorted(names)]
             fixed = min(mine, key=lambda one: _noise_of(one, config))
-            members = [*mine, *(delays[axis] for axis in group)]
+            members = [*mine, *(delays[axis] for axis in sorted(group))]
             found.append(NotIdentifiable(tuple(one.key for one in members), fixed.key))
     return found
 

@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -69,8 +69,7 @@ class LogLikelihood:
         return float(self.axes.sum())
 
 
-@dataclass(frozen=True)
-class Derivatives:
+class Derivatives(NamedTuple):
     """Score and information of k parameters.
 
     Attributes:
@@ -83,26 +82,22 @@ class Derivatives:
 
 
 @dataclass(frozen=True)
-class _AxisSegment:
+class _Part:
     """One axis of one segment.
 
     Attributes:
-        number: The index of the axis in :attr:`Likelihood.axes`.
+        whole: The index of the segment.
+        axis: The index of the axis in :attr:`Likelihood.axes`.
         segment: Only this axis and its measurements.
         rows: The rows of these among the whole segment's measurements, (m,).
         column: The column of the axis there.
     """
 
-    number: int
+    whole: int
+    axis: int
     segment: Segment
     rows: IntArray
     column: int
-
-
-@dataclass(frozen=True)
-class _Segment:
-    whole: Segment
-    axes: tuple[_AxisSegment, ...]
 
 
 class Likelihood:
@@ -146,45 +141,37 @@ class Likelihood:
         ]
         self.config = config
         self.axes = ordered_axes({axis for segment in built for axis in segment.axes})
-        parts = [_decided(segment, until, latest) for segment in built]
-        self._segments = [_Segment(part, tuple(_axis_segments(part, self.axes))) for part in parts]
-        measured: set[tuple[str, str]] = {
-            (self.axes[one.number], one.segment.sensors[sensor])
-            for segment in self._segments
-            for one in segment.axes
-            for sensor in np.unique(one.segment.measurement_rows.source).tolist()
-        }
-        self.sensors: Mapping[str, Sequence[str]] = {
-            axis: [name for name in chosen if (axis, name) in measured]
-            for axis in self.axes
-            if any((axis, name) in measured for name in chosen)
-        }
+        self._segments = [_decided(segment, until, latest) for segment in built]
+        self._parts = [
+            _Part(number, self.axes.index(axis), segment.of_axis(axis, rows), rows, column)
+            for number, segment in enumerate(self._segments)
+            for column, axis in enumerate(segment.axes)
+            if len(rows := np.flatnonzero(segment.measurement_rows.known[:, column] == Outcome.FUSED))
+        ]
         self.count = np.zeros(len(self.axes), dtype=np.int64)
-        for segment in self._segments:
-            for one in segment.axes:
-                self.count[one.number] += len(one.rows)
+        measured: dict[str, set[str]] = {}
+        for part in self._parts:
+            self.count[part.axis] += len(part.rows)
+            measured.setdefault(self.axes[part.axis], set()).update(part.segment.rows_by_sensor())
+        self.sensors: Mapping[str, Sequence[str]] = {
+            axis: [name for name in chosen if name in measured[axis]] for axis in self.axes if axis in measured
+        }
 
     def of_axis(self, axis: str) -> Likelihood:
         """The likelihood of the measurements of one axis; ``axes`` stay as they are."""
-        number = self.axes.index(axis)
-        found = copy(self)
-        found._segments = [
-            _Segment(one.segment, (replace(one, rows=np.arange(len(one.rows)), column=0),))
-            for segment in self._segments
-            for one in segment.axes
-            if one.number == number
+        found, mine = copy(self), self._of(axis)
+        found._segments = [part.segment for part in mine]
+        found._parts = [
+            replace(part, whole=number, rows=np.arange(len(part.rows)), column=0) for number, part in enumerate(mine)
         ]
         return found
 
     def outcomes_of(self, axis: str, outcomes: Sequence[CodeArray]) -> list[CodeArray]:
         """Those outcomes that are of one axis's measurements, for each segment of :meth:`of_axis`."""
-        number = self.axes.index(axis)
-        return [
-            outcome[one.rows, one.column, None]
-            for segment, outcome in zip(self._segments, outcomes, strict=True)
-            for one in segment.axes
-            if one.number == number
-        ]
+        return [outcomes[part.whole][part.rows, part.column, None] for part in self._of(axis)]
+
+    def _of(self, axis: str) -> list[_Part]:
+        return [part for part in self._parts if self.axes[part.axis] == axis]
 
     @cached_property
     def scatter(self) -> dict[str, float]:
@@ -194,13 +181,12 @@ class Likelihood:
         robust against outliers.
         """
         found: dict[str, list[float]] = {}
-        for segment in self._segments:
-            for one in segment.axes:
-                for name, rows in one.segment.rows_by_sensor().items():
-                    third = np.diff(rows.value[:, 0], 3)
-                    if len(third):
-                        sd = 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)
-                        found.setdefault(f"sensors.{name}.sd_mm.{self.axes[one.number]}", []).append(sd)
+        for part in self._parts:
+            for name, rows in part.segment.rows_by_sensor().items():
+                third = np.diff(rows.value[:, 0], 3)
+                if len(third):
+                    sd = 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)
+                    found.setdefault(f"sensors.{name}.sd_mm.{self.axes[part.axis]}", []).append(sd)
         return {key: float(np.median(sds)) for key, sds in found.items() if min(sds) > 0.0}
 
     @cached_property
@@ -208,8 +194,8 @@ class Likelihood:
         """The share of each sensor's measurements that lies more than 1 s after the last command."""
         late, every = dict[str, int](), dict[str, int]()
         for segment in self._segments:
-            end = int(segment.whole.commands[-1]) + 1_000_000_000
-            for name, rows in segment.whole.rows_by_sensor().items():
+            end = int(segment.commands[-1]) + 1_000_000_000
+            for name, rows in segment.rows_by_sensor().items():
                 late[name] = late.get(name, 0) + int(np.count_nonzero(rows.time > end))
                 every[name] = every.get(name, 0) + len(rows.time)
         return {name: late[name] / count for name, count in every.items() if count}
@@ -219,8 +205,8 @@ class Likelihood:
         """The range of the commands of each axis, of the run where it is greatest [m]."""
         found = dict.fromkeys(self.axes, 0.0)
         for segment in self._segments:
-            for axis in segment.whole.axes:
-                reached = float(np.ptp(np.append(segment.whole.given(axis)[1], segment.whole.start[axis])))
+            for axis in segment.axes:
+                reached = float(np.ptp(np.append(segment.given(axis)[1], segment.start[axis])))
                 found[axis] = max(found[axis], reached)
         return found
 
@@ -243,29 +229,29 @@ class Likelihood:
             sensors={name: msgspec.structs.replace(one, bias_sd=0.0, gate=0.0) for name, one in config.sensors.items()},
         )
         found: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
-        for segment in self._segments:
-            for one in segment.axes:
-                value, source = one.segment.measurement_rows.value[:, 0], one.segment.measurement_rows.source
-                predicted = value - innovations(one.segment, certain).innovation[:, 0]
-                for number, name in enumerate(one.segment.sensors):
-                    mine = source == number
-                    if mine.any():
-                        expected, measured = predicted[mine], value[mine]
-                        if centred:
-                            expected, measured = expected - np.median(expected), measured - np.median(measured)
-                        found.setdefault((name, self.axes[one.number]), []).append((expected, measured))
+        for part in self._parts:
+            rows = part.segment.measurement_rows
+            predicted = rows.value[:, 0] - innovations(part.segment, certain).innovation[:, 0]
+            for number, name in enumerate(part.segment.sensors):
+                mine = rows.source == number
+                if not mine.any():
+                    continue
+                expected, measured = predicted[mine], rows.value[mine, 0]
+                if centred:
+                    expected, measured = expected - np.median(expected), measured - np.median(measured)
+                found.setdefault((name, self.axes[part.axis]), []).append((expected, measured))
         return {
             key: (np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]))
             for key, pairs in found.items()
         }
 
-    def misfit(self, config: FusionConfig) -> FloatArray:
-        """The median distance of the noiseless arm from the nearest sensor's measurements [m], by axis, (A,)."""
-        found: list[list[float]] = [[0.0] for _ in self.axes]
+    def misfit(self, config: FusionConfig) -> dict[str, float]:
+        """The median distance of the noiseless arm from the nearest sensor's measurements [m], by axis."""
+        found: dict[str, list[float]] = {axis: [] for axis in self.axes}
         for (name, axis), (expected, measured) in self.responses(config).items():
             apart = 1.4826 * float(np.median(np.abs(measured - expected)))
-            found[self.axes.index(axis)].append(apart / abs(config.sensors[name].scale))
-        return np.array([max(min(apart[1:], default=0.0), _SMALLEST) for apart in found])
+            found[axis].append(max(apart / abs(config.sensors[name].scale), _SMALLEST))
+        return {axis: min(apart, default=_SMALLEST) for axis, apart in found.items()}
 
     def evaluate(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> LogLikelihood:
         """The log-likelihood of the measurements under a configuration.
@@ -274,15 +260,14 @@ class Likelihood:
             config: The configuration.
             outcomes: The outcome of each component, to be repeated; None: the configuration's gates decide.
         """
-        axes, decided = np.zeros(len(self.axes)), list[CodeArray]()
+        axes, decided, densities = np.zeros(len(self.axes)), list[CodeArray](), list[FloatArray]()
         for number, segment in enumerate(self._segments):
-            rows = segment.whole.measurement_rows
-            found = innovations(segment.whole, config, None if outcomes is None else outcomes[number])
-            gates = np.array([config.sensors[name].gate for name in segment.whole.sensors])
-            density = log_density(found.innovation, found.innovation_sd, found.outcome, gates[rows.source][:, None])
+            found = innovations(segment, config, None if outcomes is None else outcomes[number])
+            gates = np.array([config.sensors[name].gate for name in segment.sensors])[segment.measurement_rows.source]
+            densities.append(log_density(found.innovation, found.innovation_sd, found.outcome, gates[:, None]))
             decided.append(found.outcome)
-            for one in segment.axes:
-                axes[one.number] += float(density[one.rows, one.column].sum())
+        for part in self._parts:
+            axes[part.axis] += float(densities[part.whole][part.rows, part.column].sum())
         return LogLikelihood(axes, decided)
 
     def derivatives(
@@ -290,49 +275,40 @@ class Likelihood:
     ) -> Derivatives:
         """Score and information of parameters while each component's outcome stays as it is."""
         score, information = np.zeros(len(parameters)), np.zeros((len(parameters), len(parameters)))
-        jobs = [
-            (one, outcome[one.rows, one.column])
-            for segment, outcome in zip(self._segments, outcomes, strict=True)
-            for one in segment.axes
-        ]
-        found = in_threads(lambda job: self._axis_derivatives(*job, config, parameters), jobs)
-        for mine, part, square in found:
-            score[mine] += part
+
+        def of(part: _Part) -> tuple[list[int], FloatArray, FloatArray]:
+            return self._part_derivatives(part, outcomes[part.whole][part.rows, part.column], config, parameters)
+
+        for mine, gradient, square in in_threads(of, self._parts):
+            score[mine] += gradient
             information[np.ix_(mine, mine)] += square
         return Derivatives(score, information)
 
-    def _axis_derivatives(
-        self, part: _AxisSegment, outcome: CodeArray, config: FusionConfig, parameters: Sequence[Parameter]
+    def _part_derivatives(
+        self, part: _Part, outcome: CodeArray, config: FusionConfig, parameters: Sequence[Parameter]
     ) -> tuple[list[int], FloatArray, FloatArray]:
-        axis = self.axes[part.number]
-        mine = [number for number, one in enumerate(parameters) if one.axis in (None, axis)]
-        nu, S = self._innovations(part, outcome, config)
+        def innovated(at: FusionConfig) -> tuple[FloatArray, FloatArray]:
+            """ν and S of the measurements, whose outcomes are known."""
+            found = innovations(part.segment, at, outcome[:, None])
+            return found.innovation[:, 0], found.innovation_sd[:, 0] ** 2
+
+        mine = [number for number, one in enumerate(parameters) if one.axis in (None, self.axes[part.axis])]
+        nu, S = innovated(config)
         fused = outcome != Outcome.REJECTED
         d_nu, d_S = np.empty((len(mine), len(nu))), np.empty((len(mine), len(nu)))
         for place, number in enumerate(mine):
             one = parameters[number]
-            at = one.at(config)
-            if one.log:
-                nu_up, S_up = self._innovations(part, outcome, one.move(config, at + _LOG_STEP))
-                d_nu[place], d_S[place] = (nu_up - nu) / _LOG_STEP, (S_up - S) / _LOG_STEP
-            else:
-                nu_up, S_up = self._innovations(part, outcome, one.put(config, at + _STEP))
-                nu_down, S_down = self._innovations(part, outcome, one.put(config, at - _STEP))
-                d_nu[place] = (nu_up - nu_down) / (2.0 * _STEP)
-                d_S[place] = (S_up - S_down) / (2.0 * _STEP)
+            step, at = _LOG_STEP if one.log else _STEP, one.at(config)
+            nu_up, S_up = innovated(one.move(config, at + step))
+            nu_down, S_down = (nu, S) if one.log else innovated(one.move(config, at - step))
+            width = step if one.log else 2.0 * step
+            d_nu[place], d_S[place] = (nu_up - nu_down) / width, (S_up - S_down) / width
         d_nu *= fused / np.sqrt(S)
         d_S /= S
         r = nu / np.sqrt(S)
         excess = np.where(fused, r * r - 1.0, -1.0)
         score = -d_nu @ r + 0.5 * d_S @ excess
         return mine, score, d_nu @ d_nu.T + 0.5 * d_S @ d_S.T
-
-    def _innovations(
-        self, part: _AxisSegment, outcome: CodeArray, config: FusionConfig
-    ) -> tuple[FloatArray, FloatArray]:
-        """ν and S of the measurements of one axis, whose outcomes are known."""
-        found = innovations(part.segment, config, outcome[:, None])
-        return found.innovation[:, 0], found.innovation_sd[:, 0] ** 2
 
 
 def _decided(segment: Segment, until: float | None, latest: float | None) -> Segment:
@@ -346,10 +322,3 @@ def _decided(segment: Segment, until: float | None, latest: float | None) -> Seg
     known = np.where((rows.known == Outcome.FUSED) & chosen[:, None], rows.known, ABSENT).astype(np.uint8)
     kept = np.flatnonzero((known != ABSENT).any(axis=1))
     return replace(segment, measurement_rows=rows._replace(known=known).rows(kept))
-
-
-def _axis_segments(segment: Segment, axes: Sequence[str]) -> Iterable[_AxisSegment]:
-    for column, axis in enumerate(segment.axes):
-        rows = np.flatnonzero(segment.measurement_rows.known[:, column] == Outcome.FUSED)
-        if len(rows):
-            yield _AxisSegment(axes.index(axis), segment.of_axis(axis, rows), rows, column)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..arrays import CodeArray, FloatArray
 from ..fusion.config import FusionConfig
-from .likelihood import Derivatives, Likelihood, LogLikelihood, in_threads
+from .likelihood import Derivatives, Likelihood, in_threads
 from .parameters import Parameter, coordinates, moved, with_axis_of
 
 _ITERATIONS = 60
@@ -36,24 +36,15 @@ class Point:
 
     Attributes:
         config: The configuration.
-        log_likelihood: Its log-likelihood, with the outcome of each component.
-        log_prior: Logarithm of the prior density of each axis's parameters (shared ones count for the first axis), but
-            for a constant, (A,).
+        log_likelihood: Its log-likelihood.
+        axes: The log-posterior of each axis but for a constant (shared parameters' priors count for the first), (A,).
+        outcomes: The outcome of each component, for each segment, (m,).
     """
 
     config: FusionConfig
-    log_likelihood: LogLikelihood
-    log_prior: FloatArray
-
-    @property
-    def outcomes(self) -> Sequence[CodeArray]:
-        """The outcome of each component, for each segment, (m,)."""
-        return self.log_likelihood.outcomes
-
-    @property
-    def axes(self) -> FloatArray:
-        """The log-posterior of each axis, (A,)."""
-        return self.log_likelihood.axes + self.log_prior
+    log_likelihood: float
+    axes: FloatArray
+    outcomes: Sequence[CodeArray]
 
     @property
     def log_posterior(self) -> float:
@@ -75,10 +66,10 @@ def point(
     outcomes: Sequence[CodeArray] | None = None,
 ) -> Point:
     """Evaluate a configuration; with ``outcomes`` these are repeated and its gates are not applied."""
-    prior = np.zeros(len(likelihood.axes))
+    found, prior = likelihood.evaluate(config, outcomes), np.zeros(len(likelihood.axes))
     for one in free:
         prior[0 if one.axis is None else likelihood.axes.index(one.axis)] += one.log_prior(config)
-    return Point(config, likelihood.evaluate(config, outcomes), prior)
+    return Point(config, found.total, found.axes + prior, found.outcomes)
 
 
 def derivatives(likelihood: Likelihood, at: Point, free: Sequence[Parameter]) -> Derivatives:

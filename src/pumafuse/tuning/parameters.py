@@ -1,10 +1,10 @@
-"""The parameters that can be fitted, by their names in the files, and configurations with one thing changed."""
+"""The parameters that can be fitted, a line of a table each, and configurations with one thing changed."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias, TypeVar, cast, get_args
 
 import msgspec
@@ -12,7 +12,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import ConfigError, suggestion
-from ..fusion.config import FusionConfig, Process
+from ..fusion.config import FusionConfig, Sensor
 from ..model.plants import FirstOrder, SecondOrder
 
 Fit = Literal["noise", "delay", "plant", "gain", "latency"]
@@ -22,29 +22,12 @@ Path: TypeAlias = tuple[str, ...]
 T = TypeVar("T")
 
 _replace = msgspec.structs.replace
-_NOISES = {  # field of Process: bounds, SI; the lower bound stands for no noise
-    "input_noise": (1e-7, 1.0),
-    "drift": (1e-7, 10.0),
-    "maneuver_noise": (1e-6, 30.0),
-    "maneuver_drift": (1e-5, 300.0),
-}
-_PLANTS = {  # field of a plant: bounds, SI
-    "time_constant": (1e-4, 10.0),
-    "natural_frequency": (0.5, 5e3),
-    "damping": (0.05, 20.0),
-}
-_SDS = (1e-7, 1.0)  # m
 LATENCIES = (-0.1, 0.3)  # s; bounds of a latency, relative to the configured one
 DELAYS = (-0.1, 0.2)  # s; likewise of a delay, which is never below 0
-_MM = _MS = 1e-3
+_RECOVERY = (0.020, 0.500)  # s; 95 % of the prior lie within
+_RECOVERY_PRIOR = (0.5 * math.log(_RECOVERY[0] * _RECOVERY[1]), math.log(_RECOVERY[1] / _RECOVERY[0]) / (2.0 * 1.96))
+_INTERCEPT = {"log": False, "scale": 0.1, "prior": (0.0, 0.1)}
 _TICK = 0.028  # s; a large change of a time, on any arm
-RECOVERY = ".gain_recovery_ms"
-_RECOVERY = (0.020, 0.500)  # s
-_RECOVERY_PRIOR = (  # mean and standard deviation of the logarithm; 95 % lie within the bounds
-    0.5 * math.log(_RECOVERY[0] * _RECOVERY[1]),
-    math.log(_RECOVERY[1] / _RECOVERY[0]) / (2.0 * 1.96),
-)
-_GAIN_SD = 0.1
 _DIGITS = 6  # of a number that is written
 _AT_BOUND = 1e-6  # of the range of coordinates
 
@@ -77,33 +60,33 @@ class Parameter:
     """A number that can be fitted.
 
     Attributes:
-        key: Its name: table, axis or sensor, and key as in ``fusion.toml`` or ``arm.toml``.
         fit: Which kind of fitting it belongs to.
-        axis: Its axis; None where it belongs to all.
+        key: Its name: table, axis or sensor, and key as in ``fusion.toml`` or ``arm.toml``.
         path: Where it is in a configuration: fields and keys.
         bounds: Lower and upper bound [SI].
         log: Whether it is searched on a log scale: the coordinate is then the number's logarithm.
         scale: A large change of the coordinate.
         unit: One unit of the key in SI: 1e-3 for ``delay_ms``.
-        sensor: Its sensor, if it has one.
         prior: Mean and standard deviation of the coordinate a priori; None: uniform within the bounds.
+        axis: Its axis; None where it belongs to all.
+        sensor: Its sensor, if it has one.
     """
 
-    key: str
     fit: Fit
-    axis: str | None
+    key: str
     path: Path
     bounds: tuple[float, float]
     log: bool = True
     scale: float = 1.0
     unit: float = 1.0
-    sensor: str | None = None
     prior: tuple[float, float] | None = None
+    axis: str | None = None
+    sensor: str | None = None
 
     @property
     def vanishes(self) -> bool:
         """Whether it may be 0, for which its lower bound stands."""
-        return self.key.startswith("process.")
+        return self.path[0] == "process"
 
     @property
     def range(self) -> tuple[float, float]:
@@ -112,8 +95,8 @@ class Parameter:
 
     def given(self, config: FusionConfig) -> float | None:
         """The number as configured [SI]; None where it is not: no recovery, or a plant of the other order."""
-        if self.fit == "delay" and self.axis is not None:
-            return config.arm.delay_of(self.axis)
+        if self.fit == "delay":
+            return config.arm.delay_of(str(self.axis))
         node: Any = config
         for name in self.path:
             if isinstance(node, int | float):
@@ -124,11 +107,7 @@ class Parameter:
     def get(self, config: FusionConfig) -> float:
         """The number in a configuration [SI]; the prior's mean where it is not configured."""
         value = self.given(config)
-        if value is not None:
-            return value
-        if self.prior is None:
-            raise AttributeError(f"{self.key}: the configuration has no such number")
-        return self.value(self.prior[0])
+        return self.value(cast("tuple[float, float]", self.prior)[0]) if value is None else value
 
     def put(self, config: FusionConfig, value: float) -> FusionConfig:
         """The configuration with another number [SI]."""
@@ -162,9 +141,39 @@ class Parameter:
 
     def log_prior(self, config: FusionConfig) -> float:
         """Logarithm of the prior density, but for a constant."""
-        if self.prior is None:
-            return 0.0
-        return -0.5 * ((self.at(config) - self.prior[0]) / self.prior[1]) ** 2
+        return 0.0 if self.prior is None else -0.5 * ((self.at(config) - self.prior[0]) / self.prior[1]) ** 2
+
+    def of(self, known: FusionConfig, axis: str | None, sensor: str | None) -> Parameter:
+        """This line of the table for an axis and a sensor; bounds about the number in ``known`` if not log."""
+        key = self.key.format(axis=axis, sensor=sensor)
+        path = tuple(part.format(axis=axis, sensor=sensor) for part in self.path)
+        one = replace(self, key=key, path=path, axis=axis, sensor=sensor)
+        if self.log:
+            return one
+        middle, (low, high) = one.get(known), self.bounds
+        bounds = (max(middle + low, 0.0) if self.fit == "delay" else middle + low, middle + high)
+        return replace(one, bounds=bounds, prior=self.prior and (middle + self.prior[0], self.prior[1]))
+
+
+def _line(fit: Fit, key: str, path: str, low: float, high: float, **more: Any) -> Parameter:
+    unit = 1e-3 if "_mm" in key or "_ms" in key else 1.0
+    return Parameter(fit, key, tuple(path.split(".")), (low, high), unit=unit, **more)
+
+
+_TABLE = (  # a process noise at its lower bound is none; bounds and prior of what is not logarithmic are relative
+    _line("noise", "process.{axis}.input_noise_mm_rtHz", "process.{axis}.input_noise", 1e-7, 1.0),
+    _line("noise", "process.{axis}.drift_mm_rts", "process.{axis}.drift", 1e-7, 10.0),
+    _line("noise", "process.{axis}.maneuver_noise_mm_rtHz_per_m_s", "process.{axis}.maneuver_noise", 1e-6, 30.0),
+    _line("noise", "process.{axis}.maneuver_drift_mm_rts_per_m_s", "process.{axis}.maneuver_drift", 1e-5, 300.0),
+    _line("noise", "sensors.{sensor}.sd_mm.{axis}", "sensors.{sensor}.sd.{axis}", 1e-7, 1.0),
+    _line("delay", "axes.{axis}.delay_ms", "arm.axes.{axis}.delay", *DELAYS, log=False, scale=_TICK),
+    _line("plant", "axes.{axis}.time_constant_ms", "arm.axes.{axis}.plant.time_constant", 1e-4, 10.0),
+    _line("plant", "axes.{axis}.natural_frequency_rad_s", "arm.axes.{axis}.plant.natural_frequency", 0.5, 5e3),
+    _line("plant", "axes.{axis}.damping", "arm.axes.{axis}.plant.damping", 0.05, 20.0),
+    _line("gain", "axes.{axis}.gain.intercept", "arm.axes.{axis}.gain.intercept", -0.5, 0.5, **_INTERCEPT),
+    _line("gain", "axes.{axis}.gain_recovery_ms", "arm.axes.{axis}.gain_recovery", *_RECOVERY, prior=_RECOVERY_PRIOR),
+    _line("latency", "sensors.{sensor}.latency_ms", "sensors.{sensor}.latency", *LATENCIES, log=False, scale=_TICK),
+)
 
 
 def parameters(
@@ -183,46 +192,16 @@ def parameters(
         fit: Which kinds.
         fixed: Parts of names: a parameter whose name has all the parts of one, in their order, is left out.
     """
-    every = [one for axis, names in sensors.items() for one in _of_axis(axis, names, config, known)]
     used = {name for names in sensors.values() for name in names}
-    for name in known.sensors:
-        if name in used:
-            path, bounds = ("sensors", name, "latency"), _around(known.sensors[name].latency, LATENCIES)
-            key = f"sensors.{name}.latency_ms"
-            every.append(Parameter(key, "latency", None, path, bounds, False, _TICK, _MS, name))
-    return [one for one in every if one.fit in fit and not is_fixed(one.key, fixed)]
-
-
-def _of_axis(axis: str, sensors: Sequence[str], config: FusionConfig, known: FusionConfig) -> list[Parameter]:
-    found: list[Parameter] = []
-    for field, bounds in _NOISES.items():
-        key = f"process.{axis}.{_key(Process, field)}"
-        found.append(Parameter(key, "noise", axis, ("process", axis, field), bounds, unit=_MM))
-    for name in sensors:
-        path = ("sensors", name, "sd", axis)
-        found.append(Parameter(f"sensors.{name}.sd_mm.{axis}", "noise", axis, path, _SDS, unit=_MM, sensor=name))
-    arm, key = ("arm", "axes", axis), f"axes.{axis}"
-    low, high = _around(known.arm.delay_of(axis), DELAYS)
-    bounds = (max(low, 0.0), high)
-    found.append(Parameter(f"{key}.delay_ms", "delay", axis, (*arm, "delay"), bounds, False, _TICK, _MS))
-    plant = config.arm.axes[axis].plant
-    for field in ("time_constant",) if isinstance(plant, FirstOrder) else ("natural_frequency", "damping"):
-        name, unit = f"{key}.{_key(type(plant), field)}", _MS if field == "time_constant" else 1.0
-        found.append(Parameter(name, "plant", axis, (*arm, "plant", field), _PLANTS[field], unit=unit))
-    gain = known.arm.axes[axis].gain.intercept
-    path, bounds, prior = (*arm, "gain", "intercept"), (gain - 0.5, gain + 0.5), (gain, _GAIN_SD)
-    found.append(Parameter(f"{key}.gain.intercept", "gain", axis, path, bounds, False, _GAIN_SD, prior=prior))
-    path = (*arm, "gain_recovery")
-    found.append(Parameter(f"{key}{RECOVERY}", "gain", axis, path, _RECOVERY, unit=_MS, prior=_RECOVERY_PRIOR))
-    return found
-
-
-def _around(middle: float, span: tuple[float, float]) -> tuple[float, float]:
-    return middle + span[0], middle + span[1]
-
-
-def _key(kind: type[msgspec.Struct], field: str) -> str:
-    return next(entry.encode_name for entry in msgspec.structs.fields(kind) if entry.name == field)
+    every = [
+        line.of(known, axis, name)
+        for axis, names in (*sensors.items(), (None, [name for name in known.sensors if name in used]))
+        for line in _TABLE
+        if ("{axis}" in line.key) == (axis is not None)
+        for name in (names if "{sensor}" in line.key else [None])
+    ]
+    free = [one for one in every if one.fit in fit and not is_fixed(one.key, fixed)]
+    return [one for one in free if one.fit != "plant" or one.given(config) is not None]  # not of the other order
 
 
 def kinds_of(fit: Iterable[str]) -> list[Fit]:
@@ -319,18 +298,10 @@ def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> Fusion
     return changed(config, ("process", axis), other.process[axis])
 
 
-def with_gates(config: FusionConfig, times: float) -> FusionConfig:
-    """The configuration with gates so many times as wide, each component for itself."""
-    sensors = {
-        name: _replace(sensor, gate=times * sensor.gate, gate_rows=False) for name, sensor in config.sensors.items()
-    }
-    return _replace(config, sensors=sensors)
-
-
-def with_gates_of(config: FusionConfig, other: FusionConfig) -> FusionConfig:
-    """The configuration with the gates of another."""
-    sensors = {
-        name: _replace(sensor, gate=other.sensors[name].gate, gate_rows=other.sensors[name].gate_rows)
-        for name, sensor in config.sensors.items()
-    }
+def with_gates(config: FusionConfig, given: FusionConfig, wider: float | None = None) -> FusionConfig:
+    """The configuration with the gates of another; with ``wider`` so many times as wide, each component for itself."""
+    sensors: dict[str, Sensor] = {}
+    for name, sensor in config.sensors.items():
+        gate, rows = given.sensors[name].gate, given.sensors[name].gate_rows and wider is None
+        sensors[name] = _replace(sensor, gate=(wider or 1.0) * gate, gate_rows=rows)
     return _replace(config, sensors=sensors)

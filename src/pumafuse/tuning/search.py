@@ -20,11 +20,9 @@ from .maximise import Notify, Point, maximise, maximise_by_axis, maximise_with_g
 from .parameters import (
     DELAYS,
     LATENCIES,
-    RECOVERY,
     Parameter,
     with_axis_of,
     with_gates,
-    with_gates_of,
     with_lag,
     with_order,
 )
@@ -35,12 +33,9 @@ _GRID_STEP = 0.010  # s, between delays and latencies that are tried: their maxi
 _LAGS = (1.0, 1.8)  # starts, times the configured; a delay can be taken for a lag and a lag for a delay
 _LEAST_SHARE = 0.2  # of a lag that is left where a tick less of it is tried
 _GAINS = ((0.0, 0.1), (0.0, 0.4), (0.3, 0.025))  # starts: gain above the configured one, and recovery [s]
-_PROCESSES = (  # starts, in units of the distance between the noiseless arm and the measurements
-    Process(input_noise=0.1, drift=1.0, maneuver_noise=1.0, maneuver_drift=10.0),
-    Process(input_noise=0.01, drift=0.1, maneuver_noise=0.1, maneuver_drift=1.0),
-    Process(input_noise=1.0, drift=10.0, maneuver_noise=10.0, maneuver_drift=100.0),
-    Process(input_noise=0.01, drift=1.0, maneuver_noise=0.1, maneuver_drift=10.0),
-    Process(input_noise=1.0, drift=0.1, maneuver_noise=10.0, maneuver_drift=1.0),
+_PROCESSES = tuple(  # starts, in units of the distance between the noiseless arm and the measurements
+    {"input_noise": noise, "drift": drift, "maneuver_noise": 10.0 * noise, "maneuver_drift": 10.0 * drift}
+    for noise, drift in ((0.1, 1.0), (0.01, 0.1), (1.0, 10.0), (0.01, 1.0), (1.0, 0.1))
 )
 
 FreeOf: TypeAlias = Callable[[FusionConfig], list[Parameter]]
@@ -62,18 +57,18 @@ def search(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: N
     def own(at: FusionConfig) -> list[Parameter]:
         return [one for one in free(at) if one.axis is not None]
 
-    best = _times(likelihood, with_gates(config, _WIDER), free(config))
-    best = _noise(likelihood, with_gates(with_gates_of(best, config), 1.0), own(config), notify)
+    best = _times(likelihood, with_gates(config, config, _WIDER), free(config))
+    best = _noise(likelihood, with_gates(best, config, 1.0), own(config), notify)
     shared = [one for one in free(best) if one.axis is None]
     if shared:
         best = maximise(likelihood, best, shared, notify, tolerance=_ROUGHLY).config
     orders: dict[str, str] = {}
     if any(one.fit != "noise" for one in own(best)):
         best, orders = _arm(likelihood, best, own, notify)
-    return maximise_with_gates(likelihood, with_gates_of(best, config), free(best), notify), orders
+    return maximise_with_gates(likelihood, with_gates(best, config), free(best), notify), orders
 
 
-def penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter]) -> FloatArray:
+def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter]) -> FloatArray:
     """The log-posterior of each axis less the Bayesian information criterion's penalty for its parameters, (A,)."""
     count = np.array([sum(one.axis == axis for one in free) for axis in likelihood.axes])
     return peak.axes - 0.5 * count * np.log(np.maximum(likelihood.count, 2))
@@ -92,14 +87,13 @@ def _times(likelihood: Likelihood, config: FusionConfig, free: Sequence[Paramete
         shifts: list[float] = np.linspace(*span, 1 + round((span[1] - span[0]) / _GRID_STEP)).tolist()
         return [(shift, point(likelihood, _shifted(at, times, shift), free)) for shift in shifts for at in levels]
 
-    best: list[tuple[Parameter, float]] = []
     delays = [one for one in free if one.fit == "delay"]
     if delays:
         tried = on_grid(delays, DELAYS)
-        highest = np.argmax([found.axes for _, found in tried], axis=0)
-        best = [(one, tried[highest[likelihood.axes.index(str(one.axis))]][0]) for one in delays]
-    for one, shift in best:
-        config, *levels = (_shifted(at, [one], shift) for at in (config, *levels))
+        highest: list[int] = np.argmax([found.axes for _, found in tried], axis=0).tolist()
+        for one in delays:
+            shift, _ = tried[highest[likelihood.axes.index(str(one.axis))]]
+            config, *levels = (_shifted(at, [one], shift) for at in (config, *levels))
     for one in free:
         if one.fit == "latency":
             shift, _ = max(on_grid([one], LATENCIES), key=lambda found: found[1].log_posterior)
@@ -121,7 +115,7 @@ def _noise(likelihood: Likelihood, config: FusionConfig, free: Sequence[Paramete
         return config
     peaks: list[Point] = []
     for times in (_WIDER, 1.0):
-        one_by_one = with_gates(config, times)
+        one_by_one = with_gates(config, config, times)
         starts = [
             point(likelihood, _with_noise(one_by_one, process, sds, noise), noise)
             for process in (one_by_one.process, *_processes(likelihood, one_by_one))
@@ -129,18 +123,15 @@ def _noise(likelihood: Likelihood, config: FusionConfig, free: Sequence[Paramete
         ]
         start = _best_by_axis(likelihood, starts)
         rough = maximise_by_axis(likelihood, start, noise, notify, _ROUGHLY).config
-        peaks.append(maximise_by_axis(likelihood, with_gates_of(rough, config), noise, notify, _ROUGHLY))
+        peaks.append(maximise_by_axis(likelihood, with_gates(rough, config), noise, notify, _ROUGHLY))
     return _best_by_axis(likelihood, peaks)
 
 
 def _processes(likelihood: Likelihood, config: FusionConfig) -> list[dict[str, Process]]:
     """Starts for each axis's process noise, in proportion to the misfit of the noiseless arm."""
-    misfit = dict(zip(likelihood.axes, likelihood.misfit(config).tolist(), strict=True))
+    misfit = likelihood.misfit(config)
     return [
-        {
-            axis: Process(**{name: getattr(one, name) * metres for name in Process.__struct_fields__})
-            for axis, metres in misfit.items()
-        }
+        {axis: Process(**{key: value * metres for key, value in one.items()}) for axis, metres in misfit.items()}
         for one in _PROCESSES
     ]
 
@@ -165,17 +156,18 @@ def _arm(
 
     whole = [axis for axis in likelihood.axes if _plant_is_free(free(config), axis)]
     second = _with_orders(config, whole, 2)
-    starts = [_with_lag(second, whole, free(second), times) for times in _LAGS]
-    if any(one.key.endswith(RECOVERY) for one in free(second)):
+    starts = [_lagging(second, whole, free(second), times=times) for times in _LAGS]
+    if any(one.path[-1] == "gain_recovery" for one in free(second)):
         starts += [_with_gain(second, free(second), more, recovery) for more, recovery in _GAINS]
     best = _best_by_axis(likelihood, maxima(starts))
     if not whole:
         return best, {}
-    beside = [_lagging_more(best, whole, free(best), ticks) for ticks in (-1.0, 1.0)]
+    # the arm gets one command a tick: the likelihood has a false maximum a tick of delay on either side
+    beside = [_lagging(best, whole, free(best), ticks=ticks) for ticks in (-1.0, 1.0)]
     best = _best_by_axis(likelihood, [point(likelihood, best, free(best)), *maxima(beside)])
     pair = maxima([best, _with_orders(best, whole, 1)])
     gains = pair[0].axes - pair[1].axes
-    lowered = [penalised(likelihood, peak, free(peak.config)) for peak in pair]
+    lowered = [_penalised(likelihood, peak, free(peak.config)) for peak in pair]
     orders: dict[str, str] = {}
     for number, axis in enumerate(likelihood.axes):
         if axis in whole:
@@ -199,31 +191,23 @@ def _with_orders(config: FusionConfig, axes: Sequence[str], order: int) -> Fusio
     return config
 
 
-def _with_lag(config: FusionConfig, axes: Sequence[str], free: Sequence[Parameter], times: float) -> FusionConfig:
-    """The configuration with plants that lag so many times as long, and delays that make up for it where free."""
+def _lagging(
+    config: FusionConfig, axes: Sequence[str], free: Sequence[Parameter], times: float = 1.0, ticks: float = 0.0
+) -> FusionConfig:
+    """The configuration with plants that lag so many times or ticks more, and delays that make up for it where free."""
     for axis in axes:
         lag = config.arm.axes[axis].plant.lag
-        config = with_lag(config, axis, times * lag)
+        longer = max(times * lag + ticks * config.arm.update_period, _LEAST_SHARE * lag)
+        config = with_lag(config, axis, longer)
         delays = [one for one in free if one.axis == axis and one.fit == "delay"]
-        config = _shifted(config, delays, (1.0 - times) * lag)
-    return config
-
-
-def _lagging_more(config: FusionConfig, axes: Sequence[str], free: Sequence[Parameter], ticks: float) -> FusionConfig:
-    """The configuration with plants that lag so many ticks more, and delays that are shorter by as much where free.
-
-    The arm gets one command a tick: the likelihood has a false maximum a tick of delay on either side.
-    """
-    for axis in axes:
-        more = ticks * config.arm.update_period / config.arm.axes[axis].plant.lag
-        config = _with_lag(config, [axis], free, max(1.0 + more, _LEAST_SHARE))
+        config = _shifted(config, delays, lag - longer)
     return config
 
 
 def _with_gain(config: FusionConfig, free: Sequence[Parameter], more: float, recovery: float) -> FusionConfig:
     """The configuration with every free gain greater by ``more`` and every free recovery at ``recovery`` [s]."""
     for one in free:
-        if one.key.endswith(RECOVERY):
+        if one.path[-1] == "gain_recovery":
             config = one.put(config, recovery)
         elif one.fit == "gain":
             config = one.put(config, one.get(config) + more)

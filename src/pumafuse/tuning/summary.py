@@ -7,6 +7,7 @@ import msgspec
 from ..fusion.config import FusionConfig
 from ..logs.run import Run
 from ..units import MM
+from .identifiability import Correlation
 from .intervals import ConfidenceInterval
 from .parameters import Parameter
 from .validation import Check, fused
@@ -30,14 +31,6 @@ class Fitted(msgspec.Struct, frozen=True, kw_only=True):
     ci95: tuple[float | None, float | None]
     profiled: bool
     notes: str
-
-
-class Correlation(msgspec.Struct, frozen=True, kw_only=True):
-    """Two highly correlated parameters."""
-
-    first: str
-    second: str
-    correlation: float
 
 
 class FoundBias(msgspec.Struct, frozen=True, kw_only=True):

@@ -9,7 +9,6 @@ from importlib.metadata import version
 from typing import TypeAlias
 
 import msgspec
-import numpy as np
 
 from ..arrays import NO_STAMP
 from ..errors import PumafuseWarning
@@ -17,16 +16,16 @@ from ..fusion.config import FusionConfig
 from ..logs.clock import segments
 from ..logs.run import Run
 from .identifiability import TuneError, correlations, excited_axes
-from .intervals import ConfidenceInterval, confidence_intervals
-from .likelihood import Likelihood
-from .maximise import Notify, Point
-from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates_of
-from .stage import Plan, Stage, likelihood_of, repeat_stage, reset_stage, run_stage
-from .summary import AxisLikelihood, Correlation, TuningSummary, fitted, found_biases
+from .intervals import ConfidenceInterval, Profile, confidence_intervals
+from .likelihood import Likelihood, LogLikelihood
+from .maximise import Point
+from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
+from .stage import Plan, Stage, likelihood_of, run_stage
+from .summary import AxisLikelihood, TuningSummary, fitted, found_biases
 from .validation import Check, check
 
 _FITTED_ON = 2.0 / 3.0  # of a single run; the rest is for validation
-_NOTHING = 0.01  # log-likelihood that a noise must gain, or it is 0
+_NOTHING = 0.01  # log-likelihood by which the configuration as given must be ahead to be kept
 
 Progress: TypeAlias = Callable[[str, Point], None]
 
@@ -39,13 +38,15 @@ class Tuning:
         config: The tuned configuration, ready for :func:`pumafuse.fuse`.
         before: The configuration as given.
         summary: What ``tuning.json`` holds, in the units of files.
-        stages: The stages of the fit: one, or two with a trusted sensor.
+        stages: The stages of the fit: one, or two with a trusted sensor; none if it is the configuration as given.
+        profiles: The likelihood along each parameter that has an interval.
     """
 
     config: FusionConfig
     before: FusionConfig
     summary: TuningSummary
     stages: Sequence[Stage]
+    profiles: Sequence[Profile]
 
     def to_json(self) -> str:
         """The text of ``tuning.json``."""
@@ -73,7 +74,7 @@ def tune(
         trust: An accurate sensor that arm and process noise are fitted on alone. Its latency is believed; of the others
             only noise and latency are fitted then.
         validate: A run to compare before and after on. For None a single run is fitted on its first two thirds,
-            validated on the last third, and then fitted once more as a whole.
+            validated on the last third, and then fitted anew as a whole.
         progress: Called with what is being done and the best point so far.
 
     Returns:
@@ -93,7 +94,7 @@ def tune(
     kinds, fixed = kinds_of(fit), list(fix)
     check_fixed(config, fixed)
     pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust), progress)
-    excited_axes(pipeline.likelihood(), config)  # refuses the runs before a part of them is fitted on
+    excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
     until = _fitted_until(runs[0]) if len(runs) == 1 and validate is None else None
     intervals: dict[str, ConfidenceInterval] = {}
     validation: list[Check] | None = None
@@ -102,11 +103,11 @@ def tune(
         pipeline.fit(until)
         if until is not None:
             validation = check(runs[0], config, pipeline.result(), since=until)
-            pipeline.repeat()
+            pipeline.fit(None)
         pipeline.keep_the_better()
         if validate is not None:
             validation = check(validate, config, pipeline.result())
-        for stage in [] if pipeline.kept else pipeline.stages:
+        for stage in pipeline.stages:
             progress("computing intervals", stage.best)
             intervals |= confidence_intervals(stage.likelihood, stage.best, stage.free)
     except KeyboardInterrupt:
@@ -114,12 +115,10 @@ def tune(
         pipeline.keep_the_better()
     stages, names = pipeline.stages, [run.name for run in runs]
     free = [one for stage in stages for one in stage.free]
-    if not stages:  # interrupted before the first was complete
-        free = parameters(pipeline.best, config, pipeline.likelihood().sensors, kinds, fixed)
+    if not stages:  # the configuration as given, or interrupted before a stage was complete
+        free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed)
     tuned = _with_provenance(pipeline.result(), free, intervals, names)
-    notes = [note for stage in stages for note in (*stage.likelihood.notes, *stage.notes)]
-    if pipeline.kept:
-        notes.append("nothing more likely was found than the configuration as given, which is kept")
+    notes = list(pipeline.notes)
     if interrupted:
         notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
     known = validate is not None and any(_same(validate, run) for run in runs)
@@ -131,14 +130,10 @@ def tune(
         fixed=fixed,
         trusted=trust,
         interrupted=interrupted,
-        likelihood=_likelihoods(pipeline.likelihood(), config, tuned),
+        likelihood=_likelihoods(pipeline.whole, config, tuned),
         parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in free],
         biases=[one for run in runs for one in found_biases(run, tuned)],
-        correlations=[
-            Correlation(first=first, second=second, correlation=value)
-            for stage in stages
-            for first, second, value in correlations(stage.likelihood, stage.best, stage.free)
-        ],
+        correlations=[one for stage in stages for one in correlations(stage.likelihood, stage.best, stage.free)],
         not_identifiable=[str(one) for stage in stages for one in stage.not_identifiable],
         orders={axis: why for stage in stages for axis, why in stage.orders.items()},
         validation=validation,
@@ -147,7 +142,7 @@ def tune(
     )
     for note in summary.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=2)
-    return Tuning(tuned, config, summary, tuple(stages))
+    return Tuning(tuned, config, summary, tuple(stages), [one.profile for one in intervals.values()])
 
 
 def plans(config: FusionConfig, kinds: Sequence[Fit], fixed: Sequence[str], trust: str | None) -> list[Plan]:
@@ -168,88 +163,73 @@ class Pipeline:
     """Stages one after the other, each from where the last one ended; the best is there at any moment.
 
     Attributes:
+        whole: The likelihood of all measurements.
         best: The best configuration so far, with the gates of the search and all digits.
-        stages: The stages that are complete.
-        kept: Whether the configuration as given is the result.
+        stages: The stages that are complete; none where the configuration as given is the result.
+        notes: What was noticed, a sentence each.
     """
 
     def __init__(self, runs: Sequence[Run], config: FusionConfig, plans: Sequence[Plan], progress: Progress) -> None:
         self.runs, self.config, self.plans, self.progress = runs, config, plans, progress
+        self.whole = likelihood_of(runs, config, plans[-1])
         self.best = config
         self.stages: list[Stage] = []
-        self.kept = False
+        self.notes: list[str] = []
 
     def fit(self, until: float | None) -> None:
         """Run every stage on the measurements until then [s after the first command].
 
+        A second fit counts when it is complete.
+
         Raises:
             TuneError: No stage has any free parameter.
         """
+        config, stages, again = self.config, list[Stage](), bool(self.stages)
+
+        def notify(found: Point) -> None:
+            if not again:
+                self.best, self.stages = found.config, stages
+            self.progress("fitting on the whole run" if again else "searching", found)
+
         for plan in self.plans:
-            self.stages.append(run_stage(self.runs, self.best, plan, until, self._notify("searching")))
-            self.best = self.stages[-1].best.config
-        if not any(stage.free for stage in self.stages):
+            stages.append(run_stage(self.runs, config, plan, until, notify))
+            config = stages[-1].best.config
+        if not any(stage.free for stage in stages):
             raise TuneError("everything that could be fitted is fixed: nothing to fit")
-
-    def repeat(self) -> None:
-        """Run every stage once more, on all measurements."""
-        for number, stage in enumerate(self.stages):
-            more = repeat_stage(stage, self.runs, self.best, self._notify("fitting on the whole run"))
-            self.stages[number], self.best = more, more.best.config
-
-    def likelihood(self) -> Likelihood:
-        """The likelihood of the last stage's measurements, of whole runs."""
-        plan = self.stages[-1].plan if self.stages else Plan((), ())
-        return likelihood_of(self.runs, self.config, plan)
+        self.best, self.stages = config, stages
+        self.notes = [note for stage in stages for note in (*stage.likelihood.notes, *stage.notes)]
 
     def keep_the_better(self) -> None:
         """Go back to the configuration as given if it is more likely: with gates the search may pass worse points."""
-        likelihood = self.likelihood()
-        before, after = (
-            likelihood.evaluate(with_gates_of(config, likelihood.config)).total
-            for config in (self.config, self.result())
-        )
+        before, after = (_evaluated(self.whole, config).total for config in (self.config, self.result()))
         if after < before - _NOTHING:
-            self.best, self.kept = self.config, True
-            self.stages = [reset_stage(stage, self.config) for stage in self.stages]
+            self.best, self.stages = self.config, []
+            self.notes.append("nothing more likely was found than the configuration as given, which is kept")
 
     def result(self) -> FusionConfig:
-        """The best configuration: gates as given, numbers rounded, noise that gains nothing set to 0."""
-        best = with_gates_of(self.best, self.config)
-        for stage in self.stages:
-            mine = [one for one in stage.free if one.given(best) is not None]
-            for one in mine:
-                best = one.put(best, one.clipped(rounded(one.get(best))))
-            for one in mine:
-                if one.vanishes and one.at_bound(best) == "lower":
-                    none = one.put(best, 0.0)
-                    with_it, without = (
-                        stage.likelihood.evaluate(with_gates_of(config, stage.likelihood.config)).total
-                        for config in (best, none)
-                    )
-                    if with_it - without < _NOTHING:
-                        best = none
+        """The best configuration: gates as given, numbers rounded, and 0 for a noise at its lower bound."""
+        best = with_gates(self.best, self.config)
+        for one in (one for stage in self.stages for one in stage.free if one.given(best) is not None):
+            none = one.vanishes and one.at_bound(best) == "lower"
+            best = one.put(best, 0.0 if none else one.clipped(rounded(one.get(best))))
         return best
 
-    def _notify(self, what: str) -> Notify:
-        def notify(found: Point) -> None:
-            self.best = found.config
-            self.progress(what, found)
 
-        return notify
+def _evaluated(likelihood: Likelihood, config: FusionConfig) -> LogLikelihood:
+    """The log-likelihood of a configuration under the gates that the likelihood was made with."""
+    return likelihood.evaluate(with_gates(config, likelihood.config))
 
 
 def _same(run: Run, other: Run) -> bool:
     """Whether two runs have the same measurements."""
-    if run.sensors.keys() != other.sensors.keys():
-        return False
-    pairs = [(source, other.sensors[name]) for name, source in run.sensors.items()]
-    return all(
-        np.array_equal(one.stamp, two.stamp)
-        and one.values.keys() == two.values.keys()
-        and all(np.array_equal(value, two.values[axis], equal_nan=True) for axis, value in one.values.items())
-        for one, two in pairs
+    one, two = (
+        {
+            name: (source.stamp.tobytes(), {axis: value.tobytes() for axis, value in source.values.items()})
+            for name, source in each.sensors.items()
+        }
+        for each in (run, other)
     )
+    return one == two
 
 
 def _fitted_until(run: Run) -> float | None:
@@ -261,12 +241,9 @@ def _fitted_until(run: Run) -> float | None:
 
 
 def _likelihoods(likelihood: Likelihood, before: FusionConfig, after: FusionConfig) -> dict[str, AxisLikelihood]:
-    old, new = (likelihood.evaluate(with_gates_of(config, likelihood.config)).axes for config in (before, after))
-    return {
-        axis: AxisLikelihood(components=int(likelihood.count[n]), before=float(old[n]), after=float(new[n]))
-        for n, axis in enumerate(likelihood.axes)
-        if likelihood.count[n]
-    }
+    old, new = (_evaluated(likelihood, config).axes.tolist() for config in (before, after))
+    numbers = zip(likelihood.axes, likelihood.count.tolist(), old, new, strict=True)
+    return {axis: AxisLikelihood(components=n, before=one, after=two) for axis, n, one, two in numbers if n}
 
 
 def _with_provenance(
@@ -282,14 +259,12 @@ def _with_provenance(
 
 def _validation_notes(validation: Sequence[Check] | None, known: bool, interrupted: bool) -> list[str]:
     """What to know of the validation; ``known``: it was on a run that was fitted on."""
-    unknown = "whether the numbers hold elsewhere is not known"
     notes = [f"{one.run}, {one.axis}: {one.verdict}" for one in validation or () if one.worse]
+    why = ""
     if validation is None and not interrupted:
-        notes.append(f"no run was left to validate on (--validate RUN): {unknown}")
-    if known and validation:
-        notes.append(f"validated on a run that was fitted on: {unknown}")
-    if validation == []:
-        notes.append(
-            "the part to validate on has no measurement of a sensor that is used: whether it is better is not known"
-        )
-    return notes
+        why = "no run was left to validate on (--validate RUN)"
+    elif validation == []:
+        why = "the part to validate on has no measurement of a sensor that is used"
+    elif known and validation:
+        why = "validated on a run that was fitted on"
+    return [*notes, f"{why}: whether the numbers hold elsewhere is not known"] if why else notes

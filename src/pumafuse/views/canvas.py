@@ -1,18 +1,18 @@
-"""HTML pages from templates, and SVG pictures with matplotlib for them."""
+"""HTML pages from templates, and matplotlib's canvas in the style of all pictures."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import matplotlib
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-
-_EDGE = 0.12  # inch, right of the last column
 
 
 def render(template: str, content: Mapping[str, Any]) -> str:
@@ -21,12 +21,18 @@ def render(template: str, content: Mapping[str, Any]) -> str:
     return pages.get_template(template).render(content)
 
 
+@dataclass
 class Canvas:
-    """Axes to draw on; ``svg`` is the picture as text once the drawing is done."""
+    """A figure and its axes, row by row."""
 
-    def __init__(self, axes: list[Axes]) -> None:
-        self.axes = axes
-        self.svg = ""
+    figure: Figure
+    axes: list[Axes]
+
+    def svg(self) -> Markup:
+        """The picture as text for a page."""
+        text = io.StringIO()
+        self.figure.savefig(text, format="svg", metadata={"Date": None})
+        return Markup(text.getvalue()[text.getvalue().index("<svg") :])
 
 
 @contextmanager
@@ -37,9 +43,9 @@ def drawing(
     width: float | None = None,
     height: float = 2.9,
     ratios: Sequence[float] | None = None,
-    room: tuple[float, float, float] | None = None,
+    sharex: Literal["none", "col"] = "none",
 ) -> Generator[Canvas]:
-    """A canvas of ``rows`` by ``columns`` axes, row by row, turned into SVG on leaving the block.
+    """A canvas of ``rows`` by ``columns`` axes; what is drawn and saved in the block is in our style.
 
     Args:
         columns: How many axes in a row.
@@ -47,8 +53,7 @@ def drawing(
         width: Width of the picture [inch]; None: 3.6 a column.
         height: Height of a row [inch].
         ratios: Relative widths of the columns; None: all alike.
-        room: Margins left of, below and above every axes [inch], the same in every picture and fast to lay out; None:
-            as much as the labels take.
+        sharex: Whether the axes of a column have one scale.
     """
     with matplotlib.rc_context(
         {
@@ -60,25 +65,6 @@ def drawing(
             "text.parse_math": False,  # a name with $ in it is a name
         }
     ):
-        size = (width or 3.6 * columns, height * rows)
-        figure = Figure(figsize=size, layout="constrained" if room is None else None)
-        if room is not None:
-            _set_margins(figure, columns, rows, *room)
-        grid = figure.subplots(rows, columns, squeeze=False, width_ratios=ratios)
-        canvas = Canvas(grid.ravel().tolist())
-        yield canvas
-        text = io.StringIO()
-        figure.savefig(text, format="svg", metadata={"Date": None})
-        canvas.svg = text.getvalue()[text.getvalue().index("<svg") :]
-
-
-def _set_margins(figure: Figure, columns: int, rows: int, left: float, below: float, above: float) -> None:
-    width, height = figure.get_size_inches().tolist()
-    figure.subplots_adjust(
-        left=left / width,
-        right=1.0 - _EDGE / width,
-        bottom=below / height,
-        top=1.0 - above / height,
-        wspace=left / ((width - _EDGE) / columns - left),
-        hspace=(below + above) / (height / rows - below - above),
-    )
+        figure = Figure(figsize=(width or 3.6 * columns, height * rows), layout="constrained")
+        grid = figure.subplots(rows, columns, squeeze=False, sharex=sharex, width_ratios=ratios)
+        yield Canvas(figure, grid.ravel().tolist())

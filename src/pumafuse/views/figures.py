@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ..arrays import FloatArray
 from ..filter.outcome import Outcome
-from ..fusion.consistency import LAGS, consistency
+from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates
 from ..fusion.score import Z95, interpolated
 from ..logs.axes import in_axes
 from ..logs.run import Run
 from ..units import MM, seconds
 from . import colours
+from .canvas import drawing
 
 _ZOOM_S = 2.0  # length of the detail in which the band and single measurements can be seen
+_TIME = "time since the first command [s]"
 
 
 def fused_figure(est: Estimates, run: Run, path: Path) -> None:
@@ -35,19 +35,21 @@ def fused_figure(est: Estimates, run: Run, path: Path) -> None:
     commanded = in_axes(run, est.config.frame)[0].command
     time = seconds(commanded.stamp, est.origin)
     start, end = est.busiest(_ZOOM_S)
-    with _figure(est, path, len(est.axes), 2) as grid:
-        for (whole, zoom), name in zip(grid, est.axes, strict=True):
+    zoomed = (est.time >= start) & (est.time <= end)
+    with _figure(est, path, len(est.axes), [_TIME, _TIME], [1.0, 1.0]) as panels:
+        for name, whole, zoom in zip(est.axes, panels[::2], panels[1::2], strict=True):
             position = est[name].position
-            for axes in (whole, zoom):
+            for axes, shown in ((whole, position), (zoom, position[zoomed])):
                 axes.step(time, commanded.values[name] * MM, where="post", color=colours.COMMAND, lw=1, label="command")
                 _measurements(axes, est, name)
                 _band(axes, est, name, position)
                 axes.plot(est.time, position * MM, color=colours.ESTIMATE, lw=1.0, label="estimate")
                 axes.set_ylabel(f"{name} [mm]")
-            _limits(whole, position * MM)
+                low, high = float(shown.min()) * MM, float(shown.max()) * MM
+                margin = 0.1 * (high - low) + 0.5
+                axes.set_ylim(low - margin, high + margin)
             zoom.set_xlim(start, end)
-            _limits(zoom, position[(est.time >= start) & (est.time <= end)] * MM)
-        grid[0][1].legend(loc="best", ncols=2, frameon=False)
+        panels[1].legend(loc="best", ncols=2, frameon=False)
 
 
 def error_figure(est: Estimates, path: Path) -> None:
@@ -70,8 +72,8 @@ def error_figure(est: Estimates, path: Path) -> None:
     errors = {name: error for name, error in errors.items() if np.isfinite(error).any()}
     if not errors:
         return
-    with _figure(est, path, len(errors), 1) as grid:
-        for (axes,), (name, error) in zip(grid, errors.items(), strict=True):
+    with _figure(est, path, len(errors), [_TIME], [1.0]) as panels:
+        for axes, (name, error) in zip(panels, errors.items(), strict=True):
             for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
                 measured = est.measured_positions(sensor, name)
                 first = np.zeros(len(measured.time), dtype=np.int64)  # only the first segment: enough for a picture
@@ -81,11 +83,11 @@ def error_figure(est: Estimates, path: Path) -> None:
             _band(axes, est, name, np.zeros(len(est.time)))
             axes.plot(est.time, error * MM, color=colours.REFERENCE, lw=0.8, label="estimate")
             rms = float(np.sqrt(np.nanmean(error**2))) * MM
-            axes.set_title(f"{name}: RMS error {rms:.3f} mm", loc="left", fontsize=9)
+            axes.set_title(f"{name}: RMS error {rms:.3f} mm", loc="left")
             axes.set_ylabel("error [mm]")
             limit = max(1.3 * float(np.nanmax(np.abs(error))) * MM, 1e-6)
             axes.set_ylim(-limit, limit)
-        grid[0][0].legend(loc="upper right", ncols=3, frameon=False)
+        panels[0].legend(loc="upper right", ncols=3, frameon=False)
 
 
 def validation_figure(est: Estimates, path: Path) -> None:
@@ -98,51 +100,63 @@ def validation_figure(est: Estimates, path: Path) -> None:
         est: The estimates.
         path: Where the picture goes.
     """
-    pairs = [(sensor, axis) for axis in est.axes for sensor in est.measurements.sensors]
+    by_sensor = colours.sensor_colours(est.measurements.sensors)
+    pairs = [(sensor, axis) for axis in est.axes for sensor in by_sensor]
     rows = [(sensor, axis, found) for sensor, axis in pairs if (found := consistency(est, sensor, axis)) is not None]
     if not rows:
         return
-    by_sensor = colours.sensor_colours(est.measurements.sensors)
     at = np.linspace(-4.5, 4.5, 91)
-    with _figure(est, path, len(rows), 3, share_time=False) as grid:
-        for (series, histogram, correlation), (sensor, axis, found) in zip(grid, rows, strict=True):
-            measurements, colour = est.measurements.of(sensor, axis), by_sensor[sensor]
-            fused = measurements.where(measurements.outcome == Outcome.FUSED)
-            normalised = fused.innovation / fused.innovation_sd
-            series.plot(fused.time, normalised, ".", ms=1.5, color=colour)
-            series.axhspan(-Z95, Z95, color=colours.ESTIMATE, alpha=0.15, lw=0)
-            series.set_title(f"{axis}, {sensor}. {found.verdict}", loc="left", fontsize=9)
+    labels = ["time [s]", "innovation / sd", "lag [measurements]"]
+    with _figure(est, path, len(rows), labels, [3.0, 1.0, 1.0]) as panels:
+        for number, (sensor, axis, found) in enumerate(rows):
+            series, histogram, correlation = panels[3 * number : 3 * number + 3]
+            normalised = innovations(series, est, sensor, axis, by_sensor[sensor])
+            series.set_title(f"{axis}, {sensor}. {found.verdict}", loc="left")
             series.set_ylabel("innovation / sd")
             inside = np.clip(normalised, at[0], at[-1])
-            histogram.hist(inside, bins=45, range=(at[0], at[-1]), density=True, color=colour, alpha=0.6)
+            histogram.hist(inside, bins=45, range=(at[0], at[-1]), density=True, color=by_sensor[sensor], alpha=0.6)
             histogram.plot(at, np.exp(-0.5 * at**2) / np.sqrt(2.0 * np.pi), color=colours.REFERENCE, lw=1.0)
             histogram.set_ylabel("density")
-            correlation.bar(np.arange(1, len(found.correlation) + 1), found.correlation, color=colour, width=0.6)
-            band = found.correlation_band
-            correlation.axhspan(-band, band, color=colours.ESTIMATE, alpha=0.2, lw=0)
-            correlation.set_ylim(min(-0.3, 1.1 * float(found.correlation.min(initial=0.0))), 1.0)
-            correlation.set_xlim(0, LAGS + 1)
+            correlations(correlation, [found], [by_sensor[sensor]])
             correlation.set_ylabel("autocorrelation")
-        for axes, label in zip(grid[-1], ("time [s]", "innovation / sd", "lag [measurements]"), strict=True):
-            axes.set_xlabel(label)
+
+
+def innovations(axes: Axes, est: Estimates, sensor: str, axis: str, colour: str) -> FloatArray:
+    """Draw a sensor's innovations on an axis over their sd, those that were fused; the values."""
+    measurements = est.measurements.of(sensor, axis)
+    fused = measurements.where(measurements.outcome == Outcome.FUSED)
+    normalised = fused.innovation / fused.innovation_sd
+    axes.plot(fused.time, normalised, ".", ms=1.5, color=colour, rasterized=True)
+    axes.axhspan(-Z95, Z95, color=colours.ESTIMATE, alpha=0.15, lw=0)
+    return normalised
+
+
+def correlations(axes: Axes, tests: Sequence[Consistency | None], by_test: Sequence[str]) -> None:
+    """Draw autocorrelations side by side in their colours, with the narrowest of their bands."""
+    highest, band, width = 0.12, 1.0, 0.8 / len(tests)
+    for number, (found, colour) in enumerate(zip(tests, by_test, strict=True)):
+        if found is not None:
+            lags = np.arange(1, len(found.correlation) + 1) + width * (number - 0.5 * (len(tests) - 1))
+            axes.bar(lags, found.correlation, color=colour, width=width)
+            highest = max(highest, 1.1 * float(np.abs(found.correlation).max(initial=0.0)))
+            band = min(band, found.correlation_band)
+    axes.axhspan(-band, band, color=colours.ESTIMATE, alpha=0.2, lw=0)
+    axes.set_xlim(0, LAGS + 1)
+    axes.set_ylim(-highest, highest)
 
 
 @contextmanager
 def _figure(
-    est: Estimates, path: Path, rows: int, columns: int, *, share_time: bool = True
-) -> Generator[list[list[Axes]]]:
-    """A grid of axes, written to ``path`` on leaving the block."""
-    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(13.0, 2.4 * rows + 0.8), layout="constrained")
-        ratios = [3.0, 1.0, 1.0] if columns == 3 else [1.0] * columns
-        grid = figure.subplots(rows, columns, squeeze=False, sharex="col" if share_time else False, width_ratios=ratios)
-        yield grid.tolist()
-        if share_time:
-            for axes in grid[-1]:
-                axes.set_xlabel("time since the first command [s]")
+    est: Estimates, path: Path, rows: int, labels: Sequence[str], ratios: Sequence[float]
+) -> Generator[list[Axes]]:
+    """Axes row by row, a column for each label below; written to ``path`` on leaving the block."""
+    with drawing(len(labels), rows, width=13.0, height=2.4 + 0.8 / rows, ratios=ratios, sharex="col") as canvas:
+        yield canvas.axes
+        for axes, label in zip(canvas.axes[-len(labels) :], labels, strict=True):
+            axes.set_xlabel(label)
         sensors = ", ".join(est.measurements.sensors) or "commands only"
-        figure.suptitle(f"{est.run}: {sensors}, {est.mode}, arm {est.config.arm.name}")
-        figure.savefig(path, dpi=130)
+        canvas.figure.suptitle(f"{est.run}: {sensors}, {est.mode}, arm {est.config.arm.name}")
+        canvas.figure.savefig(path, dpi=130)
 
 
 def _band(axes: Axes, est: Estimates, name: str, centre: FloatArray) -> None:
@@ -159,9 +173,3 @@ def _measurements(axes: Axes, est: Estimates, name: str) -> None:
         if rejected.any():
             time, value = measured.time[rejected], measured.value[rejected] * MM
             axes.plot(time, value, "x", ms=4, color=colours.REJECTED, label=f"{sensor}, rejected")
-
-
-def _limits(axes: Axes, values: FloatArray) -> None:
-    low, high = float(np.min(values)), float(np.max(values))
-    margin = 0.1 * (high - low) + 0.5
-    axes.set_ylim(low - margin, high + margin)

@@ -15,7 +15,7 @@ from ..toml import Interval
 from ..units import MS
 
 if TYPE_CHECKING:
-    from ..tuning.summary import Correlation
+    from ..tuning.identifiability import Correlation
 
 
 def with_interval(value: float, interval: Interval | None, unit: float = 1.0) -> str:

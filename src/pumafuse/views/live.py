@@ -1,6 +1,6 @@
 """A live estimator's view in Rerun: :class:`LiveView`.
 
-The drawing is done by a process of its own (:mod:`pumafuse.views.live_drawer`), which gets a frame ten times a second
+The drawing is done by a process of its own (:mod:`pumafuse.views.live_drawer`), which gets a frame twice a second
 through a pipe. Whatever becomes of it, of the viewer or of the connection between them, the estimator does not wait:
 a frame that does not fit into the pipe is left out.
 
@@ -15,14 +15,13 @@ the estimate.
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
+from collections.abc import Callable, Mapping
+from typing import IO, TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
@@ -37,13 +36,14 @@ if TYPE_CHECKING:
     from ..live.results import Health, LiveEstimate, UpdateResult
     from ..live.wire import Event
 
-Rows: TypeAlias = dict[str, list[tuple[float, ...]]]
+# Everything since the frame before, as rows that begin with their time [s]; the first word of a name says what follows:
+# ``command/<axis>`` u [m]; ``measurement/<axis>/<sensor>`` z [m] and whether it was rejected (0 or 1);
+# ``estimate/<axis>`` position and sd [m]; ``path/command``, ``path/estimate`` and ``path/<sensor>`` a position in space
+# [m]; ``nis/<sensor>``; ``rate/<sensor>`` [Hz].
+Frame: TypeAlias = dict[str, list[tuple[float, ...]]]
 
-_LENGTH = 4  # bytes
-_LARGEST = 1 << 26  # bytes of a frame
 
-
-class SensorHead(msgspec.Struct, array_like=True):
+class SensorHead(msgspec.Struct):
     """How a sensor's measurements become positions: (z − bias) / scale, at stamp − latency.
 
     Attributes:
@@ -77,84 +77,13 @@ class Header(msgspec.Struct):
     web_port: int
 
 
-class SensorsNow(msgspec.Struct, array_like=True):
-    """NIS and rate [Hz] of the sensors that have them, at one time [s]."""
-
-    time: float
-    nis: dict[str, float]
-    rate: dict[str, float]
-
-
-class Frame(msgspec.Struct):
-    """Everything since the frame before, as rows that begin with their time [s].
-
-    Attributes:
-        commands: By axis, rows with u [m].
-        measurements: By ``axis/sensor``, rows with z [m] and whether it was rejected (0 or 1).
-        estimates: By axis, rows with position and sd [m].
-        paths: By ``command``, ``estimate`` and sensors in x, y, z, rows with a position in space [m].
-        health: Now and then.
-    """
-
-    commands: Rows = {}
-    measurements: Rows = {}
-    estimates: Rows = {}
-    paths: Rows = {}
-    health: SensorsNow | None = None
-
-    def add(self, later: Frame) -> None:
-        """Add the rows of a later frame."""
-        for kind in ("commands", "measurements", "estimates", "paths"):
-            mine: Rows = getattr(self, kind)
-            for name, rows in getattr(later, kind).items():
-                mine.setdefault(name, []).extend(rows)
-        self.health = later.health or self.health
-
-
-def packed(message: Header | Frame) -> bytes:
-    """A message as it goes through the pipe."""
-    body = msgspec.msgpack.encode(message)
-    return len(body).to_bytes(_LENGTH, "big") + body
-
-
-def bodies(pipe: BinaryIO) -> Iterator[bytes]:
-    """The messages that come out of the pipe, until it ends."""
-    while len(head := pipe.read(_LENGTH)) == _LENGTH:
-        length = int.from_bytes(head, "big")
-        body = pipe.read(length)
-        if length > _LARGEST or len(body) < length:
-            return
-        yield body
-
-
 MODES = ("spawn", "connect", "web")
 PORT = 9876  # of the viewer or its server
 WEB_PORT = 9090  # of the page
-_FRAME = 0.1  # s between frames
+_FRAME = 0.5  # s between frames: a browser without a graphics card takes no more, and would fall behind for good
 _HEALTH = 1.0  # s between two readings of the health
-_MOST = 500  # rows of one source in a frame; a plot is not wider
+_MOST = 1000  # rows of one source in a frame; a plot is not wider
 _LONGEST_END = 2.0  # s
-
-
-class _Thinned:
-    """Rows since the last frame, evenly thinned where there are too many."""
-
-    def __init__(self) -> None:
-        self._rows: list[Any] = []
-        self._count, self._every = 0, 1
-
-    def add(self, row: Any) -> None:
-        self._count += 1
-        if self._count % self._every == 0:
-            self._rows.append(row)
-            if len(self._rows) >= _MOST:
-                del self._rows[::2]
-                self._every *= 2
-
-    def take(self) -> list[Any]:
-        rows, self._rows = self._rows, []
-        self._count, self._every = 0, 1
-        return rows
 
 
 class LiveView:
@@ -179,8 +108,6 @@ class LiveView:
             raise ConfigError(f"--rerun: no mode '{mode}'; there are: {', '.join(MODES)}")
         if os.name != "posix":
             raise ConfigError("--rerun: the live view needs Linux or macOS; a result folder can be drawn everywhere")
-        if importlib.util.find_spec("rerun") is None or importlib.util.find_spec("rerun_cli") is None:
-            raise ConfigError("--rerun: rerun-sdk is not installed; pip install rerun-sdk")
         self.dropped = 0
         self._notify = notify
         self._framed = config.frame is not None
@@ -193,16 +120,17 @@ class LiveView:
         self._origin: float | None = None
         self._newest = 0.0
         self._segments = 1
-        self._events = {name: _Thinned() for name in ("", *config.sensors)}
-        self._estimates = _Thinned()
+        self._events: dict[str, list[Any]] = {name: [] for name in ("", *config.sensors)}
+        self._estimates: list[Any] = []
         self._sent = self._health_read = 0.0
         self._unsent, self._notices = b"", b""
-        self._child: subprocess.Popen[bytes] | None = _start()
+        self._child: subprocess.Popen[bytes] | None
+        self._child, self._stdin, self._stdout = _start()
         sensors = {
             name: SensorHead(sensor.scale, sensor.latency, sensor.bias_sd > 0.0)
             for name, sensor in config.sensors.items()
         }
-        self._write(packed(Header(mode, axes, self._space, sensors, PORT, WEB_PORT)))
+        self._write(Header(mode, axes, self._space, sensors, PORT, WEB_PORT))
 
     def event(self, event: Event, result: UpdateResult) -> None:
         """Take in an event and what became of it."""
@@ -212,7 +140,7 @@ class LiveView:
         moment = t if type(t) is float else t / 1e9
         if self._origin is None:
             self._origin = moment
-        self._events[sensor].add((moment - self._origin, values, result.axes))
+        self._events[sensor].append((moment - self._origin, values, result.axes))
 
     def estimate(self, estimate: LiveEstimate) -> None:
         """Take in an estimate."""
@@ -220,10 +148,11 @@ class LiveView:
             return
         moment = estimate.stamp / 1e9 - self._origin
         self._newest = max(moment, self._newest)
-        self._estimates.add((moment, estimate.axes, estimate.cartesian))
+        self._estimates.append((moment, estimate.axes, estimate.cartesian))
 
     def tick(self, health: Callable[[], Health]) -> None:
         """Send a frame if it is due, now and then with the health."""
+        self._flush()
         now = time.monotonic()
         if self._child is None or now - self._sent < _FRAME:
             return
@@ -232,40 +161,40 @@ class LiveView:
         frame = self._frame()
         if now - self._health_read >= _HEALTH:
             self._health_read = now
-            frame.health = self._health(health())
-        self._send(frame)
+            self._add_health(frame, health())
+        self._write(frame)
 
     def close(self) -> None:
         """Send the last frame and end the drawing."""
         if self._child is None:
             return
         child, deadline = self._child, time.monotonic() + _LONGEST_END
-        self._send(self._frame())
+        self._write(self._frame())
         while self._unsent and time.monotonic() < deadline:
             time.sleep(0.01)
-            self._write(b"")
-        _close_input(child)
+            self._flush()
+        self._stdin.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             child.wait(max(deadline - time.monotonic(), 0.0))
         self._pass_on_notices()
         self._end()
 
     def _frame(self) -> Frame:
-        """Everything since the frame before."""
-        frame = Frame()
-        for source, thinned in self._events.items():
-            for moment, values, outcomes in thinned.take():
+        """Everything since the frame before, evenly thinned where there is too much."""
+        frame: Frame = {}
+        for source, events in self._events.items():
+            for moment, values, outcomes in _taken(events):
                 for axis, outcome in outcomes.items():
                     if axis in values and source and outcome in COMPARED:
                         row = moment, float(values[axis]), float(outcome is Outcome.REJECTED)
-                        frame.measurements.setdefault(f"{axis}/{source}", []).append(row)
+                        frame.setdefault(f"measurement/{axis}/{source}", []).append(row)
                     elif axis in values and not source and outcome is Outcome.FUSED:
-                        frame.commands.setdefault(axis, []).append((moment, float(values[axis])))
+                        frame.setdefault(f"command/{axis}", []).append((moment, float(values[axis])))
                 if source in self._in_space:
                     self._add_position(frame, source or "command", moment, values)
-        for moment, axes, cartesian in self._estimates.take():
+        for moment, axes, cartesian in _taken(self._estimates):
             for axis, now in axes.items():
-                frame.estimates.setdefault(axis, []).append((moment, now.position, now.position_sd))
+                frame.setdefault(f"estimate/{axis}", []).append((moment, now.position, now.position_sd))
             place = cartesian if self._framed else {axis: now.position for axis, now in axes.items()}
             self._add_position(frame, "estimate", moment, place or {})
         return frame
@@ -274,32 +203,33 @@ class LiveView:
         """Add a position in space to a path, if it is one."""
         if self._space and all(coordinate in place for coordinate in self._space):
             row = moment, *(float(place[coordinate]) for coordinate in self._space)
-            frame.paths.setdefault(name, []).append(row)
+            frame.setdefault(f"path/{name}", []).append(row)
 
-    def _health(self, health: Health) -> SensorsNow:
-        """The health for a frame; after a jump of the stream's clock, time goes on where it was."""
+    def _add_health(self, frame: Frame, health: Health) -> None:
+        """Add the health; after a jump of the stream's clock, time goes on where it was."""
         if health.segments != self._segments and health.newest is not None and self._origin is not None:
             self._segments = health.segments
             self._origin = health.newest / 1e9 - self._newest
-        nis = {name: sensor.nis for name, sensor in health.sensors.items() if sensor.nis is not None}
-        return SensorsNow(self._newest, nis, {name: sensor.rate for name, sensor in health.sensors.items()})
+        for name, sensor in health.sensors.items():
+            frame[f"rate/{name}"] = [(self._newest, sensor.rate)]
+            if sensor.nis is not None:
+                frame[f"nis/{name}"] = [(self._newest, sensor.nis)]
 
-    def _send(self, frame: Frame) -> None:
-        """Put a frame into the pipe; leave it out if the one before has not gone in yet."""
-        self._write(b"")
+    def _write(self, message: Header | Frame) -> None:
+        """Put a message into the pipe; leave it out if the one before has not gone in yet."""
+        self._flush()
         if self._unsent:
             self.dropped += 1
-        elif self._child is not None:
-            self._write(packed(frame))
+        else:
+            self._unsent = msgspec.json.encode(message) + b"\n"
+            self._flush()
 
-    def _write(self, message: bytes) -> None:
-        """Write what is left, and a message, as far as the pipe takes it."""
-        self._unsent += message
+    def _flush(self) -> None:
+        """Write what is left, as far as the pipe takes it."""
         if self._child is None or not self._unsent:
             return
-        assert self._child.stdin is not None
         try:
-            self._unsent = self._unsent[os.write(self._child.stdin.fileno(), self._unsent) :]
+            self._unsent = self._unsent[os.write(self._stdin.fileno(), self._unsent) :]
         except BlockingIOError:
             return
         except OSError:
@@ -310,9 +240,8 @@ class LiveView:
         child = self._child
         if child is None:
             return
-        assert child.stdout is not None
         with contextlib.suppress(BlockingIOError):
-            self._notices += os.read(child.stdout.fileno(), 1 << 16)
+            self._notices += os.read(self._stdout.fileno(), 1 << 16)
         *lines, self._notices = self._notices.split(b"\n")
         for line in lines:
             self._notify(line.decode(errors="replace"))
@@ -327,18 +256,21 @@ class LiveView:
         child, self._child = self._child, None
         if child is None:
             return
-        self._unsent = b""
-        self._events = {name: _Thinned() for name in self._events}
-        self._estimates = _Thinned()
         with contextlib.suppress(OSError):
             os.killpg(child.pid, signal.SIGKILL)
-        _close_input(child)
         child.wait()
-        assert child.stdout is not None
-        child.stdout.close()
+        self._stdin.close()
+        self._stdout.close()
 
 
-def _start() -> subprocess.Popen[bytes]:
+def _taken(rows: list[Any]) -> list[Any]:
+    """The rows, evenly thinned where they are too many; the list is empty then."""
+    taken = rows[:: 1 + len(rows) // _MOST]
+    rows.clear()
+    return taken
+
+
+def _start() -> tuple[subprocess.Popen[bytes], IO[bytes], IO[bytes]]:
     """The process that draws, in a group of its own: Ctrl-C is for the estimator, which then ends it."""
     child = subprocess.Popen(
         [sys.executable, "-P", "-m", "pumafuse.views.live_drawer"],
@@ -351,10 +283,4 @@ def _start() -> subprocess.Popen[bytes]:
     assert child.stdin is not None and child.stdout is not None
     os.set_blocking(child.stdin.fileno(), False)
     os.set_blocking(child.stdout.fileno(), False)
-    return child
-
-
-def _close_input(child: subprocess.Popen[bytes]) -> None:
-    assert child.stdin is not None
-    with contextlib.suppress(OSError):
-        child.stdin.close()
+    return child, child.stdin, child.stdout

@@ -27,7 +27,7 @@ _VIEWER_MEMORY = "1GiB"
 _BEHIND_VIEWER = "64MiB"  # of its own server, which only hands on
 _SERVER_MEMORY = "32MiB"  # what a browser gets that is opened later: more than the seconds that are shown
 _OPENED_WITHIN = 30.0  # s
-_FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 5.0  # s between two tries to find a viewer
+_PAUSE = 0.5  # s between two tries to find a viewer
 _PASSED_ON = ("Content-Type", "rerun-final-length")  # headers of the page
 _WAIT = 30.0  # s for Rerun's own server
 
@@ -48,22 +48,22 @@ class Viewer:
             self._port = _free(header.port)
             self._web_port, self._behind = _free(header.web_port), _free(0)
             self._own = _start(_arguments(self._mode, self._port, self._behind), keep=self._mode == "spawn")
+        self._awaited = [self._port, self._behind] if self._mode == "web" else [self._port]
         self.url = f"rerun+http://{HOST}:{self._port}/proxy"
 
     def wait(self) -> bool:
         """Wait until the viewer listens, and report where it is; whether it ever will."""
-        begin, pause, reported = time.monotonic(), _FIRST_PAUSE, False
-        while not _listens(self._port) or (self._mode == "web" and not _listens(self._behind)):
-            if self._own is None:
-                if not reported:
-                    self._report(f"Rerun: no viewer listens at {self.url}; it is drawn into as soon as one does")
-                reported, pause = True, min(2.0 * pause, _LONGEST_PAUSE)
-            elif self._own.poll() is not None or time.monotonic() - begin > _OPENED_WITHIN:
+        begin, reported = time.monotonic(), False
+        while not all(map(_listens, self._awaited)):
+            if self._own is None and not reported:
+                self._report(f"Rerun: no viewer listens at {self.url}; it is drawn into as soon as one does")
+                reported = True
+            elif self._own and (self._own.poll() is not None or time.monotonic() - begin > _OPENED_WITHIN):
                 screen = "; is there a screen? --rerun web needs none" if self._mode == "spawn" else ""
                 why = "was closed" if self._opened else f"cannot be started{screen}"
                 self._report(f"Rerun: the viewer {why}; nothing is drawn")
                 return False
-            time.sleep(pause)
+            time.sleep(_PAUSE)
         if self._mode == "web" and not self._opened:
             _serve(self._web_port, self._behind, self._port)
             self._report(f"Rerun: open http://{HOST}:{self._web_port}/?url={quote(self.url, safe='')}")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from markupsafe import Markup
 
 from .. import folders
 from ..identification.identify import Identification, OrderFit, TrialResult
@@ -23,6 +22,7 @@ PAGE = "report.html"
 _TEXT = frozenset({"axis", "coefficient", "factor", "level: mean ± sd (trials)", "verdict", "outlying trials"}) | {
     "plant", "trial", "flags", "run", "source",
 }  # fmt: skip
+T = TypeVar("T")
 
 
 class TextTable(NamedTuple):
@@ -35,6 +35,11 @@ class TextTable(NamedTuple):
     def columns(self) -> list[tuple[str, bool]]:
         """The headings, and whether their column is text, not numbers."""
         return [(heading, heading in _TEXT) for heading in self.headings]
+
+
+def _table(items: Iterable[T], cells: Mapping[str, Callable[[T], str]]) -> TextTable:
+    """A row for each item; ``cells`` are by heading."""
+    return TextTable(list(cells), [[cell(item) for cell in cells.values()] for item in items])
 
 
 def models(found: Identification) -> TextTable:
@@ -55,38 +60,34 @@ def models(found: Identification) -> TextTable:
 
 def dependences(found: Identification) -> TextTable:
     """Dependence of each coefficient on each factor (the paper's Table I)."""
-    rows = [
-        [
-            row.coefficient,
-            row.factor,
-            "\n".join(formatting.level(level) for level in row.levels),
-            "–" if row.i_ratio is None else f"{row.i_ratio:.2f}",
-            formatting.p_value(row.welch_p),
-            formatting.p_value(row.adjusted_p),
-            row.verdict,
-        ]
-        for row in found.dependences
-    ]
-    levels = "level: mean ± sd (trials)"
-    return TextTable(("coefficient", "factor", levels, "i-ratio", "Welch p", "adjusted p", "verdict"), rows)
+    return _table(
+        found.dependences,
+        {
+            "coefficient": lambda row: row.coefficient,
+            "factor": lambda row: row.factor,
+            "level: mean ± sd (trials)": lambda row: "\n".join(formatting.level(level) for level in row.levels),
+            "i-ratio": lambda row: "–" if row.i_ratio is None else f"{row.i_ratio:.2f}",
+            "Welch p": lambda row: formatting.p_value(row.welch_p),
+            "adjusted p": lambda row: formatting.p_value(row.adjusted_p),
+            "verdict": lambda row: row.verdict,
+        },
+    )
 
 
 def scatter(found: Identification) -> TextTable:
     """Scatter of each coefficient on each axis."""
-    rows = [
-        [
-            row.coefficient,
-            row.axis,
-            f"{row.median:.4g}",
-            formatting.p_value(row.normal_p),
-            "–" if row.replicate_sd is None else f"{row.replicate_sd:.2g}",
-            f"{row.own_sd:.2g}",
-            ", ".join(row.outlying) or "none",
-        ]
-        for row in found.scatter
-    ]
-    spreads = ("median", "normal p", "sd of replicates", "sd by noise")
-    return TextTable(("coefficient", "axis", *spreads, "outlying trials"), rows)
+    return _table(
+        found.scatter,
+        {
+            "coefficient": lambda row: row.coefficient,
+            "axis": lambda row: row.axis,
+            "median": lambda row: f"{row.median:.4g}",
+            "normal p": lambda row: formatting.p_value(row.normal_p),
+            "sd of replicates": lambda row: "–" if row.replicate_sd is None else f"{row.replicate_sd:.2g}",
+            "sd by noise": lambda row: f"{row.own_sd:.2g}",
+            "outlying trials": lambda row: ", ".join(row.outlying) or "none",
+        },
+    )
 
 
 def sentences(found: Identification) -> list[str]:
@@ -104,23 +105,21 @@ def sentences(found: Identification) -> list[str]:
 
 def verifications(verified: Sequence[AxisVerification]) -> TextTable:
     """Errors of the model on each run, axis and source (the paper's Table III)."""
-    rows = [
-        [
-            one.run,
-            one.axis,
-            one.source,
-            f"{one.amplitude * MM:.4g}",
-            f"{one.model.rms * MM:.3f}",
-            f"{one.model.percent:.1f} %",
-            f"{one.model.fit:.1f} %" if np.isfinite(one.model.fit) else "–",
-            f"{one.without_recovery.rms * MM:.3f}",
-            f"{one.with_recovery.rms * MM:.3f}",
-            f"{one.best_in_class.fit.rms * MM:.3f}",
-        ]
-        for one in verified
-    ]
-    errors = ("signal, mm", "RMS, mm", "of signal", "fit", "no recovery", "recovery", "best, mm")
-    return TextTable(("run", "axis", "source", *errors), rows)
+    return _table(
+        verified,
+        {
+            "run": lambda one: one.run,
+            "axis": lambda one: one.axis,
+            "source": lambda one: one.source,
+            "signal, mm": lambda one: f"{one.amplitude * MM:.4g}",
+            "RMS, mm": lambda one: f"{one.model.rms * MM:.3f}",
+            "of signal": lambda one: f"{one.model.percent:.1f} %",
+            "fit": lambda one: f"{one.model.fit:.1f} %" if np.isfinite(one.model.fit) else "–",
+            "no recovery": lambda one: f"{one.without_recovery.rms * MM:.3f}",
+            "recovery": lambda one: f"{one.with_recovery.rms * MM:.3f}",
+            "best, mm": lambda one: f"{one.best_in_class.fit.rms * MM:.3f}",
+        },
+    )
 
 
 def verdict(one: AxisVerification) -> str:
@@ -155,16 +154,7 @@ def write_identification(found: Identification, trials: StepTrials, folder: Path
     Raises:
         FolderError: See :func:`check_writable`, or the disk refuses.
     """
-    contour, contours = step_figures.valleys(found, trials)
-    figures = {
-        "responses": step_figures.responses(found, trials),
-        "delays": step_figures.delays(found),
-        "gains": step_figures.gains(found),
-        "histograms": step_figures.histograms(found),
-        "fits": step_figures.fits_by_factor(found, trials),
-        "valleys": contour,
-        "performance": step_figures.performance(found),
-    }
+    valleys, contours = step_figures.valleys(found, trials)
     content = {
         "found": found,
         "rms_mm": _rms(found) * MM,
@@ -179,7 +169,15 @@ def write_identification(found: Identification, trials: StepTrials, folder: Path
         "flat": sum("flat valley" in flag for one in found.trials for flag in one.second.flags),
         "trials": _trials(found),
         "flagged": sum(bool(one.first.flags or one.second.flags or one.left_out) for one in found.trials),
-        "figures": {name: Markup(svg) for name, svg in figures.items()},
+        "figures": {
+            "responses": step_figures.responses(found, trials),
+            "delays": step_figures.delays(found),
+            "gains": step_figures.gains(found),
+            "histograms": step_figures.histograms(found),
+            "fits": step_figures.fits_by_factor(found, trials),
+            "valleys": valleys,
+            "performance": step_figures.performance(found),
+        },
         "arm": found.arm.to_toml(),
     }
     _write("identification.html", content, folder, force)
@@ -203,11 +201,9 @@ def write_verification(
     content = {
         "arm": arm,
         "runs": {one.run for one in every},
-        "worst": max(
-            (one for one, _ in verified), key=lambda one: one.model.rms / max(one.best_in_class.fit.rms, 1e-12)
-        ),
-        "table_iii": verifications([one for one, _ in verified]),
-        "figures": [(Markup(step_figures.verification(one, trace)), verdict(one)) for one, trace in verified],
+        "worst": max(every, key=lambda one: one.model.rms / max(one.best_in_class.fit.rms, 1e-12)),
+        "table_iii": verifications(every),
+        "figures": [(step_figures.verification(one, trace), verdict(one)) for one, trace in verified],
     }
     _write("verification.html", content, folder, force)
 
@@ -222,15 +218,11 @@ def _trials(found: Identification) -> TextTable:
     factors = list(found.trials[0].factors)
     rows = [
         [
-            one.trial,
-            one.axis,
-            f"{one.step * MM:g}",
-            f"{one.speed:.3g}",
+            *(one.trial, one.axis, f"{one.step * MM:g}", f"{one.speed:.3g}"),
             *(one.factors[name] for name in factors),
             *_coefficients(one.first),
             *_coefficients(one.second),
-            "–" if one.combined_rms is None else f"{one.combined_rms * MM:.3f}",
-            _flags(one),
+            *("–" if one.combined_rms is None else f"{one.combined_rms * MM:.3f}", _flags(one)),
         ]
         for one in found.trials
     ]

@@ -105,9 +105,7 @@ def _band(stream: rr.RecordingStream, path: str, time: FloatArray, centre: Float
     _series(stream, f"{path}/lower", styles.edge("−2σ"), time, centre - half)
 
 
-def _series(
-    stream: rr.RecordingStream, path: str, style: rr.SeriesLines | rr.SeriesPoints, time: FloatArray, value: FloatArray
-) -> None:
+def _series(stream: rr.RecordingStream, path: str, style: styles.Style, time: FloatArray, value: FloatArray) -> None:
     """Send the style and the finite values [m] of an entity; nothing where there are none."""
     if (np.isfinite(time) & np.isfinite(value)).any():
         rr.log(path, style, static=True, recording=stream)

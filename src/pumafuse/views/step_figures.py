@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, MaxNLocator, NullLocator
 
-from ..identification.anova import Level, Performance, factors_of, levels_of, numbers
+from ..identification.anova import Level, factors_of, levels_of, numbers
 from ..identification.batch import Batch
 from ..identification.identify import Identification, TrialResult
 from ..identification.trials import StepTrials, Trial
@@ -21,8 +20,6 @@ from .canvas import drawing
 _SECONDS = 1.2  # of a white-noise run that is shown in detail
 _GRID = 40  # points each way of a contour plot
 _SPREAD = 4.0  # factor by which it reaches above and below ω and ζ
-
-T = TypeVar("T")
 
 
 def responses(found: Identification, trials: StepTrials) -> str:
@@ -41,11 +38,9 @@ def responses(found: Identification, trials: StepTrials) -> str:
             longest = max(longest, float(t[-1]))
         t = np.linspace(-0.02, longest, 400)
         axes.plot(t * MS, plant.step_response(t), color=colours.REFERENCE, lw=1.4)
-        axes.set_title(axis, loc="left")
-        axes.set_xlabel("time since the trial's own delay [ms]")
         axes.set_ylim(-0.15, 1.3)
 
-    return _panels(found.axes, draw, "share of the final value")
+    return _panels(found.axes, draw, "share of the final value", "time since the trial's own delay [ms]")
 
 
 def delays(found: Identification) -> str:
@@ -57,10 +52,8 @@ def delays(found: Identification) -> str:
         fitted = found.axes[axis].delays.fitted
         axes.axhline(fitted.value * MS, color=colours.REFERENCE, lw=1.0)
         axes.axhspan(fitted.ci95[0] * MS, fitted.ci95[1] * MS, color=colours.ESTIMATE, alpha=0.2, lw=0)
-        axes.set_title(axis, loc="left")
-        axes.set_xlabel("trial, in the order of the list")
 
-    return _panels(found.axes, draw, "delay [ms]")
+    return _panels(found.axes, draw, "delay [ms]", "trial, in the order of the list")
 
 
 def gains(found: Identification) -> str:
@@ -72,10 +65,8 @@ def gains(found: Identification) -> str:
         axes.plot(speed, [one.common_gain or np.nan for one in used], ".", color=colours.ESTIMATE, ms=4)
         at = np.linspace(0.0, 1.05 * float(speed.max()), 50)
         axes.plot(at, found.axes[axis].model.gain.at(at), color=colours.REFERENCE, lw=1.0)
-        axes.set_title(axis, loc="left")
-        axes.set_xlabel("speed [m/s]")
 
-    return _panels(found.axes, draw, "gain K")
+    return _panels(found.axes, draw, "gain K", "speed [m/s]")
 
 
 def histograms(found: Identification) -> str:
@@ -90,7 +81,6 @@ def histograms(found: Identification) -> str:
     def draw(axes: Axes, name: str) -> None:
         axes.hist(columns[name], bins="auto", color=colours.BAND, edgecolor="white")
         axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.set_xlabel(name)
 
     return _panels(columns, draw, "trials")
 
@@ -108,7 +98,6 @@ def fits_by_factor(found: Identification, trials: StepTrials) -> str:
     def draw(axes: Axes, factor: str) -> None:
         for order, (rms, colour, aside) in orders.items():
             _levels(axes, levels_of(rms, factors[factor]), colour, order, aside)
-        axes.set_xlabel(factor)
         axes.set_ylim(bottom=0.0)
         if factor == next(iter(factors)):
             axes.legend(frameon=False)
@@ -118,16 +107,16 @@ def fits_by_factor(found: Identification, trials: StepTrials) -> str:
 
 def performance(found: Identification) -> str:
     """RMS of the combined model by each factor (the paper's Fig. 7); empty without factors."""
+    levels = {one.factor: one.levels for one in found.performance}
 
-    def draw(axes: Axes, one: Performance) -> None:
-        _levels(axes, one.levels, colours.ESTIMATE, "combined model", 0.0)
-        top = max(level.mean + 2.0 * (level.sd or 0.0) for level in one.levels)
+    def draw(axes: Axes, factor: str) -> None:
+        _levels(axes, levels[factor], colours.ESTIMATE, "combined model", 0.0)
+        top = max(level.mean + 2.0 * (level.sd or 0.0) for level in levels[factor])
         if found.tolerance * MM < 3.0 * top:
             axes.axhline(found.tolerance * MM, color=colours.REJECTED, lw=0.8, ls="--")
-        axes.set_xlabel(one.factor)
         axes.set_ylim(bottom=0.0)
 
-    return _panels(found.performance, draw, "RMS of the combined model [mm]")
+    return _panels(levels, draw, "RMS of the combined model [mm]")
 
 
 def valleys(found: Identification, trials: StepTrials) -> tuple[str, list[str]]:
@@ -141,12 +130,14 @@ def valleys(found: Identification, trials: StepTrials) -> tuple[str, list[str]]:
         low, high = one.second.natural_frequency_ci95 or (1.0, np.inf)
         return high / max(low, 1e-9)
 
-    chosen = [
-        max((one for one in found.trials if one.axis == axis and one.left_out is None), key=width)
-        for axis in found.axes
-    ]
-    figure = _panels(chosen, lambda axes, one: _valley(axes, one, measured[one.trial]), "damping ζ")
-    return figure, [one.trial for one in chosen]
+    every = [one for one in found.trials if one.left_out is None]
+    chosen = [max((one for one in every if one.axis == axis), key=width) for axis in found.axes]
+    named = {f"{one.axis}, trial {one.trial}": one for one in chosen}
+
+    def draw(axes: Axes, name: str) -> None:
+        _valley(axes, named[name], measured[named[name].trial])
+
+    return _panels(named, draw, "damping ζ", "natural frequency ω [rad/s]"), [one.trial for one in chosen]
 
 
 def verification(verified: AxisVerification, trace: Trace) -> str:
@@ -160,19 +151,21 @@ def verification(verified: AxisVerification, trace: Trace) -> str:
         axes.set_xlabel("time since the first command [s]")
         axes.set_ylabel("position without its mean [mm]")
         axes.legend(frameon=False, ncols=2, loc="upper right")
-    return canvas.svg
+        return canvas.svg()
 
 
-def _panels(items: Iterable[T], draw: Callable[[Axes, T], None], ylabel: str) -> str:
-    """One panel for each item, side by side; empty without items."""
-    every = list(items)
+def _panels(names: Iterable[str], draw: Callable[[Axes, str], None], ylabel: str, xlabel: str = "") -> str:
+    """One panel for each name, side by side: its title, or its label below where there is no other; empty without."""
+    every = list(names)
     if not every:
         return ""
     with drawing(len(every)) as canvas:
-        for axes, item in zip(canvas.axes, every, strict=True):
-            draw(axes, item)
+        for axes, name in zip(canvas.axes, every, strict=True):
+            draw(axes, name)
+            axes.set_title(name if xlabel else "", loc="left")
+            axes.set_xlabel(xlabel or name)
         canvas.axes[0].set_ylabel(ylabel)
-    return canvas.svg
+        return canvas.svg()
 
 
 def _valley(axes: Axes, one: TrialResult, trial: Trial) -> None:
@@ -199,8 +192,6 @@ def _valley(axes: Axes, one: TrialResult, trial: Trial) -> None:
         side.set_minor_locator(NullLocator())
     axes.set_xlim(across[0], across[-1])
     axes.set_ylim(up[0], up[-1])
-    axes.set_title(f"{one.axis}, trial {one.trial}", loc="left")
-    axes.set_xlabel("natural frequency ω [rad/s]")
 
 
 def _levels(axes: Axes, levels: Sequence[Level], colour: str, label: str, aside: float) -> None:

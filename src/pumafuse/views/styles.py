@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 import rerun as rr
@@ -12,6 +12,7 @@ from . import colours
 
 TIMELINE = "time"
 Marker = Literal["Circle", "Cross"]
+Style: TypeAlias = rr.SeriesLines | rr.SeriesPoints
 
 
 def line(colour: str, label: str, *, width: float = 1.5, step: bool = False) -> rr.SeriesLines:

@@ -12,21 +12,27 @@ from matplotlib.ticker import FixedLocator, FormatStrFormatter, LogLocator, MaxN
 
 from .. import toml
 from ..arrays import FloatArray
-from ..filter.outcome import Outcome
 from ..fusion.config import ARM_FILE
-from ..fusion.consistency import LAGS, Consistency, consistency
+from ..fusion.consistency import Consistency, consistency
 from ..fusion.estimates import Estimates
 from ..fusion.score import Z95
 from ..logs.run import Run
-from ..tuning.intervals import Profile, profiles
+from ..tuning.intervals import Profile
 from ..tuning.summary import Fitted, TuningSummary
 from ..tuning.tune import Tuning
 from ..tuning.validation import Check, fused
 from . import colours, formatting
 from .canvas import drawing, render
+from .figures import correlations, innovations
 
 _Pair: TypeAlias = tuple[Consistency | None, Consistency | None]  # before and after
 _WHITE = 0.01  # p-value from which innovations count as white
+_COLUMNS = 5  # of profiles
+_WIDTH = 11.0  # inch; as wide as a page
+_TITLE = 32  # letters over a panel
+_WITHIN_REACH = 4.0  # last over first of a log scale, up to which its ticks are evenly spaced
+_SMOOTH = 100  # points of a profile's curve
+_DEEPEST = -6.2  # of a profile; what lies below −5 has room for the number before
 
 
 def page(found: Tuning, runs: Sequence[Run]) -> str:
@@ -38,11 +44,11 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
     """
     summary = found.summary
     fitted = {one.key: one for one in summary.parameters}
-    drawn = {} if summary.interrupted else _profiles(found)  # a search that did not end has no peak to look from
     before, after = (fused(runs[0], config) for config in (found.before, found.config))
-    tests = _tests(before, after)
+    pairs = [(sensor, axis) for axis in after.axes for sensor in after.measurements.sensors]
+    tests = {pair: (consistency(before, *pair), consistency(after, *pair)) for pair in pairs}
+    tests = {pair: both for pair, both in tests.items() if any(both)}
     known = [one for one in summary.parameters if one.before is not None]
-    both = [pair for pair in tests.values() if all(pair)]
     content = {
         "title": f"Tuning: {', '.join(summary.runs)}",
         "tuning": summary,
@@ -52,16 +58,12 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
         "outside": sum(not _contains(one.ci95, one.before) for one in known),
         "zero": sum(one.value == 0.0 for one in summary.parameters),
         "open": not summary.interrupted and any(None in one.ci95 for one in summary.parameters),
-        "profiles": [Markup(profile_figure(some, fitted)) for some in drawn.values()],
+        "profiles": profile_figure(found.profiles, fitted) if found.profiles else None,
         "validation": [_check(one) for one in summary.validation or ()],
         "innovations": [
-            {
-                "figure": Markup(innovation_figure(before, after, sensor, axis)),
-                "sentence": _sentence(sensor, axis, pair),
-            }
-            for (sensor, axis), pair in tests.items()
+            (innovation_figure(before, after, *pair, both), _sentence(*pair, both)) for pair, both in tests.items()
         ],
-        "nearer": sum(abs(np.log(new.nis)) < abs(np.log(old.nis)) for old, new in both if old and new),
+        "nearer": sum(abs(np.log(new.nis)) < abs(np.log(old.nis)) for old, new in tests.values() if old and new),
         "white": [
             sum(one is not None and one.whiteness > _WHITE for one in some)
             for some in zip(*tests.values(), strict=True)
@@ -71,23 +73,6 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
         "arm": found.config.arm.to_toml(),
     }
     return render("tuning.html", content)
-
-
-def _profiles(found: Tuning) -> dict[str | None, list[Profile]]:
-    """The profiles of each axis, and under None those of shared parameters."""
-    drawn: dict[str | None, list[Profile]] = {}
-    intervals = {one.key: one.ci95 for one in found.summary.parameters}
-    for stage in found.stages:
-        for one in profiles(stage, intervals):
-            drawn.setdefault(one.axis, []).append(one)
-    return drawn
-
-
-def _tests(before: Estimates, after: Estimates) -> dict[tuple[str, str], _Pair]:
-    """The tests of the innovations by sensor and axis, where there are any before or after."""
-    pairs = [(sensor, axis) for axis in after.axes for sensor in after.measurements.sensors]
-    tests = {pair: (consistency(before, *pair), consistency(after, *pair)) for pair in pairs}
-    return {pair: both for pair, both in tests.items() if any(both)}
 
 
 def _notes(summary: TuningSummary) -> list[str]:
@@ -106,22 +91,19 @@ def _parameter(one: Fitted, interrupted: bool) -> Mapping[str, Any]:
 def _check(one: Check) -> Mapping[str, Any]:
     states = (one.before, one.after)
     names = list(dict.fromkeys(name for state in states for name in state.sensors))
-    pairs = [[state.sensors.get(name) for state in states] for name in names]
+
+    def changes(of: str, form: str) -> list[str]:
+        """A number of each sensor."""
+        pairs = ([getattr(state.sensors.get(name), of, None) for state in states] for name in names)
+        return [formatting.change(pair, form) for pair in pairs]
+
     return {
         "run": f"{one.run} from\u00a0{one.since_s:.1f}\u00a0s" if one.since_s else one.run,
         "axis": one.axis,
-        "sensors": [
-            names,
-            [formatting.change([None if check is None else check.nis for check in pair], ".2f") for pair in pairs],
-            [
-                formatting.change([None if check is None else check.correlation for check in pair], "+z.2f")
-                for pair in pairs
-            ],
-        ],
+        "sensors": [names, changes("nis", ".2f"), changes("correlation", "+z.2f")],
         "numbers": [
-            formatting.change([state.rejected for state in states], "d"),
-            formatting.change([state.rmse_mm for state in states], ".3f"),
-            formatting.change([state.coverage for state in states], ".3f"),
+            formatting.change([getattr(state, of) for state in states], form)
+            for of, form in (("rejected", "d"), ("rmse_mm", ".3f"), ("coverage", ".3f"))
         ],
         "verdict": one.verdict,
         "worse": one.worse,
@@ -142,51 +124,37 @@ def _sentence(sensor: str, axis: str, tests: _Pair) -> str:
     return f"{axis}, {sensor}: NIS {nis}{expected}; whiteness p {white}."
 
 
-_COLUMNS = 5  # of profiles
-_WIDTH = 11.0  # inch; as wide as a page
-_TITLE = 32  # letters over a panel
-_TICKS = 3
-_WITHIN_REACH = 4.0  # last over first of a log scale, up to which its ticks are evenly spaced
-_DECADES = 100.0  # likewise, beyond which only decades have ticks
-_SMOOTH = 100  # points of its curve
-_DEEPEST = -6.2  # of a profile; what lies below −5 has room for the number before
-
-
-def profile_figure(found: Sequence[Profile], fitted: Mapping[str, Fitted]) -> str:
+def profile_figure(found: Sequence[Profile], fitted: Mapping[str, Fitted]) -> Markup:
     """Draw the log-likelihood along each parameter, with its 95 % interval and its value before, as SVG text."""
     rows = -(-len(found) // _COLUMNS)
-    with drawing(_COLUMNS, rows, width=_WIDTH, height=1.95, room=(0.45, 0.3, 0.42)) as sheet:
-        for axes, one in zip(sheet.axes, found, strict=False):
+    with drawing(_COLUMNS, rows, width=_WIDTH, height=1.95) as canvas:
+        for axes, one in zip(canvas.axes, found, strict=False):
             _profile(axes, one, fitted[one.key])
-        for axes in sheet.axes[len(found) :]:
+        for axes in canvas.axes[len(found) :]:
             axes.set_visible(False)
-        for axes in sheet.axes[::_COLUMNS]:
+        for axes in canvas.axes[::_COLUMNS]:
             axes.set_ylabel("log-likelihood")
-    return sheet.svg
+        return canvas.svg()
 
 
-def innovation_figure(before: Estimates, after: Estimates, sensor: str, axis: str) -> str:
+def innovation_figure(before: Estimates, after: Estimates, sensor: str, axis: str, tests: _Pair) -> Markup:
     """Draw a sensor's normalised innovations on an axis before and after, with autocorrelations, as SVG text."""
-    colour = colours.sensor_colours(after.measurements.sensors)[sensor]
-    with drawing(3, width=_WIDTH, height=2.2, ratios=(2.2, 2.2, 1.0), room=(0.6, 0.45, 0.25)) as sheet:
-        *series, correlation = sheet.axes
-        highest = 4.0
-        for number, (axes, est) in enumerate(zip(series, (before, after), strict=True)):
-            measurements = est.measurements.of(sensor, axis)
-            fused = measurements.where(measurements.outcome == Outcome.FUSED)
-            normalised = fused.innovation / fused.innovation_sd
-            highest = max(highest, 1.05 * float(np.abs(normalised).max(initial=0.0)))
-            axes.plot(fused.time, normalised, ".", ms=1.5, color=(colours.COMMAND, colour)[number], rasterized=True)
-            axes.axhspan(-Z95, Z95, color=colours.ESTIMATE, alpha=0.15, lw=0)
-            axes.set_title(f"{('before', 'after')[number]}: {_cut(axis)}, {_cut(sensor)}", loc="left")
+    pair = (colours.COMMAND, colours.sensor_colours(after.measurements.sensors)[sensor])
+    with drawing(3, width=_WIDTH, height=2.2, ratios=(2.2, 2.2, 1.0)) as canvas:
+        *series, correlation = canvas.axes
+        for axes, when, est, colour in zip(series, ("before", "after"), (before, after), pair, strict=True):
+            innovations(axes, est, sensor, axis, colour)
+            axes.set_title(f"{when}: {axis}, {sensor}", loc="left")
             axes.set_xlabel("time since the first command [s]")
+        highest = max(4.0, *(abs(end) for axes in series for end in axes.get_ylim()))
         for axes in series:
             axes.set_ylim(-highest, highest)
             axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
         series[0].set_ylabel("innovation / sd")
-        tests = [consistency(est, sensor, axis) for est in (before, after)]
-        _correlations(correlation, tests, (colours.COMMAND, colour))
-    return sheet.svg
+        correlations(correlation, tests, pair)
+        correlation.set_title("autocorrelation", loc="left")
+        correlation.set_xlabel("lag [measurements]")
+        return canvas.svg()
 
 
 def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
@@ -199,11 +167,14 @@ def _profile(axes: Axes, one: Profile, fitted: Fitted) -> None:
     axes.axvspan(*ends, color=colours.ESTIMATE, alpha=0.15, lw=0)
     axes.axhline(-0.5 * Z95**2, color=colours.COMMAND, lw=0.8, ls="--")
     axes.plot(*_smooth(one), color=colours.ESTIMATE, lw=1.2)
-    if fitted.before is not None:
-        _before(axes, fitted.before, low, high)
-    wide = high / low if one.log else 1.0
-    subs = (1.0,) if wide > _DECADES else (1.0, 3.0)
-    axes.xaxis.set_major_locator(MaxNLocator(_TICKS) if wide < _WITHIN_REACH else LogLocator(subs=subs))
+    before = fitted.before
+    if before is not None and low <= before <= high:
+        axes.plot([before, before], [_DEEPEST, -5.0], color=colours.REJECTED, lw=1.6)
+    elif before is not None:
+        at, side, text = (0.02, "left", f"← {before:.4g}") if before < low else (0.98, "right", f"{before:.4g} →")
+        axes.text(at, 0.02, text, transform=axes.transAxes, ha=side, va="bottom", fontsize=8, color=colours.REJECTED)
+    wide = one.log and high > _WITHIN_REACH * low
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)) if wide else MaxNLocator(3))
     axes.xaxis.set_major_formatter(FormatStrFormatter("%.4g"))
     axes.xaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_locator(FixedLocator([-4.0, -2.0, 0.0]))
@@ -221,32 +192,5 @@ def _smooth(one: Profile) -> tuple[FloatArray, FloatArray]:
     return np.exp(at) if one.log else at, one.drop[peak] - np.interp(at, places, root) ** 2
 
 
-def _before(axes: Axes, before: float, low: float, high: float) -> None:
-    """Draw a tick at the value before, or an arrow and the value where it lies outside."""
-    if low <= before <= high:
-        axes.plot([before, before], [_DEEPEST, -5.0], color=colours.REJECTED, lw=1.6)
-        return
-    left = before < low
-    text = f"← {before:.4g}" if left else f"{before:.4g} →"
-    at, side = (0.02, "left") if left else (0.98, "right")
-    axes.text(at, 0.02, text, transform=axes.transAxes, ha=side, va="bottom", fontsize=8, color=colours.REJECTED)
-
-
 def _cut(text: str) -> str:
     return text if len(text) <= _TITLE else f"{text[: _TITLE - 1]}…"
-
-
-def _correlations(axes: Axes, tests: Sequence[Consistency | None], pair: Sequence[str]) -> None:
-    """Draw autocorrelations before and after side by side, with the narrower band of the two."""
-    highest, band = 0.12, 1.0
-    for number, (one, colour) in enumerate(zip(tests, pair, strict=True)):
-        if one is not None:
-            lags = np.arange(1, len(one.correlation) + 1) + 0.2 * (2 * number - 1)
-            axes.bar(lags, one.correlation, color=colour, width=0.4)
-            highest = max(highest, 1.1 * float(np.abs(one.correlation).max(initial=0.0)))
-            band = min(band, one.correlation_band)
-    axes.axhspan(-band, band, color=colours.ESTIMATE, alpha=0.15, lw=0)
-    axes.set_title("autocorrelation", loc="left")
-    axes.set_xlabel("lag [measurements]")
-    axes.set_xlim(0, LAGS + 1)
-    axes.set_ylim(-highest, highest)
