@@ -293,11 +293,15 @@ def position_of(disturbance: int, x: FloatArray, P: FloatArray, row: int) -> tup
 @compiled
 def variance_of_motion(model: Model, state: State, axis: int, row: int, dt: float) -> float:
     """Variance [m²] of the motion over ``dt`` [s] that the state leads to: h (Φ − I) P (Φ − I)ᵀ hᵀ; h makes p of it."""
-    work = state.work
+    P, work = state.P, state.work
+    f11, f12, _, _, _, _, _ = transition(model.order[axis], model.constants, axis, dt)
+    a, b = f11 - 1.0, f12
+    if model.disturbance[axis] == NONE:
+        own = a * a * P[row, POSITION, POSITION] + 2.0 * a * b * P[row, POSITION, RATE] + b * b * P[row, RATE, RATE]
+        return max(own, 0.0)
     for i in range(model.states[axis]):
         work[axis, 0, i] = 0.0
-    f11, f12, _, _, _, _, _ = transition(model.order[axis], model.constants, axis, dt)
-    work[axis, 0, POSITION], work[axis, 0, RATE] = f11 - 1.0, f12
+    work[axis, 0, POSITION], work[axis, 0, RATE] = a, b
     if model.disturbance[axis] == ROUGH:
         work[axis, 0, REST] = math.expm1(-model.rest[axis, REST, REVERTING] * dt)
     elif model.disturbance[axis] == SMOOTH:

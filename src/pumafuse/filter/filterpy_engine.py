@@ -344,7 +344,6 @@ def _estimate(axes: Sequence[_Axis], time: int, outputs: Outputs, n: int) -> Non
         h, x, P, period = axis.position[0], axis.kf.x[:, 0], axis.kf.P, axis.period
         outputs.position[number, n], outputs.position_sd[number, n] = h @ x, np.sqrt(max(h @ P @ h, 0.0))
         outputs.offset[number, n], outputs.offset_sd[number, n] = x[axis.n], np.sqrt(max(P[axis.n, axis.n], 0.0))
-        outputs.disturbance[number, n] = outputs.disturbance_sd[number, n] = 0.0
         if axis.disturbance:
             outputs.disturbance[number, n] = x[axis.rest]
             outputs.disturbance_sd[number, n] = np.sqrt(max(P[axis.rest, axis.rest], 0.0))

@@ -56,7 +56,7 @@ class Outputs(NamedTuple):
         velocity_sd: [m/s].
         offset: o [m].
         offset_sd: [m].
-        disturbance: d [m].
+        disturbance: d [m]; left as it is where the model has none.
         disturbance_sd: [m].
     """
 
@@ -354,7 +354,6 @@ def write_outputs(
     outputs.position_sd[axis, n] = math.sqrt(variance)
     outputs.offset[axis, n] = x[row, OFFSET]
     outputs.offset_sd[axis, n] = math.sqrt(max(P[row, OFFSET, OFFSET], 0.0))
-    outputs.disturbance[axis, n] = outputs.disturbance_sd[axis, n] = 0.0
     if disturbance != NONE:
         outputs.disturbance[axis, n] = x[row, REST]
         outputs.disturbance_sd[axis, n] = math.sqrt(max(P[row, REST, REST], 0.0))

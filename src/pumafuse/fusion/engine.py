@@ -69,7 +69,7 @@ def filter_segment(
     history = _history(events, state, len(times)) if mode == "smoothed" else no_history(axes, width)
     results = Results.room(count, axes)
     results.outcome[:] = events.known
-    outputs = Outputs(*np.empty((len(Outputs._fields), axes, len(times))))
+    outputs = Outputs(*np.zeros((len(Outputs._fields), axes, len(times))))
     known = model, sensors, events, state
     if engine == "filterpy":
         from ..filter import filterpy_engine

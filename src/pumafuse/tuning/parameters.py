@@ -165,6 +165,8 @@ _TABLE = (  # a process noise at its lower bound is none; bounds and prior of wh
     _line("noise", "process.{axis}.drift_mm_rts", "process.{axis}.drift", 1e-7, 10.0),
     _line("noise", "process.{axis}.maneuver_noise_mm_rtHz_per_m_s", "process.{axis}.maneuver_noise", 1e-6, 30.0),
     _line("noise", "process.{axis}.maneuver_drift_mm_rts_per_m_s", "process.{axis}.maneuver_drift", 1e-5, 300.0),
+    _line("noise", "process.{axis}.disturbance_sd_mm", "process.{axis}.disturbance_sd", 1e-7, 10.0),
+    _line("noise", "process.{axis}.disturbance_time_ms", "process.{axis}.disturbance_time", 1e-3, 1e3),
     _line("noise", "sensors.{sensor}.sd_mm.{axis}", "sensors.{sensor}.sd.{axis}", 1e-7, 1.0),
     _line("delay", "axes.{axis}.delay_ms", "arm.axes.{axis}.delay", *DELAYS, log=False, scale=_TICK),
     _line("plant", "axes.{axis}.time_constant_ms", "arm.axes.{axis}.plant.time_constant", 1e-4, 10.0),
