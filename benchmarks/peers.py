@@ -18,6 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 import numpy.typing as npt
 import project
@@ -28,7 +29,7 @@ from pumafuse.filter.axis import OFFSET, POSITION, RATE, START
 from pumafuse.filter.events import COMMAND, Events
 from pumafuse.fusion.engine import Filtered, arranged, biased_sensors, filter_segment, innovations
 from pumafuse.fusion.segments import Segment, build
-from pumafuse.model.closed import decaying_response, gain_error, transition
+from pumafuse.model import closed
 
 Array = npt.NDArray[np.float64]
 Answer = Mapping[str, Array]  # outputs (axes, estimates), innovations (events, axes), or the log_likelihood
@@ -38,6 +39,11 @@ FIELDS = pf.AxisEstimate.FIELDS
 SOURCE = Path(__file__).with_name("loop.cpp")
 LIBRARY = SOURCE.parent / ".build" / "loop.so"
 MICRO = 1e6  # dynamax adds 1e-9 to the diagonal of what it inverts: too much in m², nothing in µm²
+
+# Parts of kernels, to be called from Python.
+transition, decaying_response, gain_error = (
+    numba.njit(part.py_func) for part in (closed.transition, closed.decaying_response, closed.gain_error)
+)
 
 
 @dataclass(frozen=True)
