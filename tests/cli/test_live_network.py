@@ -153,9 +153,9 @@ def test_a_million_broken_datagrams() -> None:
             shadow.take(good)
             assert process.received(len(written)) == written
             written.clear()
-            if piece == count // 500:
+            if piece == count // 200:  # by then all of its room has been used once
                 least = process.memory()
-        assert process.memory() < least + 4096, "memory grows"
+        assert process.memory() < least + 1024, "memory grows"
         log = process.end()
     assert garbage > 0.5 * count
     assert f"{count + 2 * (count // 100)} datagrams taken in, 0 lost" in log
