@@ -21,13 +21,10 @@ from .parameters import (
     DELAYS,
     LATENCIES,
     Parameter,
-    changed,
     with_axis_of,
-    with_disturbance,
     with_gates,
     with_lag,
     with_order,
-    with_recovery,
 )
 
 _ROUGHLY = 0.1  # tolerance in log-likelihood where maxima are only compared
@@ -40,10 +37,6 @@ _PROCESSES = tuple(  # starts, in units of the distance between the noiseless ar
     {"input_noise": noise, "drift": drift, "maneuver_noise": 10.0 * noise, "maneuver_drift": 10.0 * drift}
     for noise, drift in ((0.1, 1.0), (0.01, 0.1), (1.0, 10.0), (0.01, 1.0), (1.0, 0.1))
 )
-
-_TIME = 0.3  # s, of a disturbance: start
-_QUIET = 0.1  # share of noise that is left beside a disturbance: start
-_DISTURBANCES = ("none", "smooth (Matérn)", "rough (Ornstein-Uhlenbeck)")
 
 FreeOf: TypeAlias = Callable[[FusionConfig], list[Parameter]]
 
@@ -58,84 +51,26 @@ def search(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: N
         notify: Called with each better point.
 
     Returns:
-        The best point, and for each axis the reasons for the order of its plant and for its disturbance.
+        The best point, and for each axis whose plant is free the reason for its order.
     """
 
     def own(at: FusionConfig) -> list[Parameter]:
         return [one for one in free(at) if one.axis is not None]
 
-    start = _times(likelihood, with_gates(config, config, _WIDER), free(config))
-    found: list[tuple[Point, dict[str, str]]] = []
-    for model in _models(likelihood, start, own):
-        best = _noise(likelihood, with_gates(model, config, 1.0), own(model), notify)
-        shared = [one for one in free(best) if one.axis is None]
-        if shared:
-            best = maximise(likelihood, best, shared, notify, tolerance=_ROUGHLY).config
-        orders: dict[str, str] = {}
-        if any(one.fit != "noise" for one in own(best)):
-            best, orders = _arm(likelihood, best, own, notify)
-        found.append((maximise_by_axis(likelihood, best, own(best), notify, _ROUGHLY), orders))
-    best, reasons = _most_likely_models(likelihood, found, own)
-    best = _without_needless(likelihood, best, own, notify)
-    return maximise_with_gates(likelihood, with_gates(best, config), free(best), notify), reasons
-
-
-def _models(likelihood: Likelihood, config: FusionConfig, free: FreeOf) -> list[FusionConfig]:
-    """Without a disturbance, and where one may be fitted with one of each kind and little other noise."""
-    models = [config]
-    misfit = likelihood.misfit(config)
-    for kind in ("matern", "ou"):
-        model = config
-        for axis, metres in misfit.items():
-            quiet = msgspec.structs.replace(
-                config.process[axis], **{key: _QUIET * value * metres for key, value in _PROCESSES[0].items()}
-            )
-            model = with_disturbance(changed(model, ("process", axis), quiet), axis, 0.5 * metres, _TIME, kind)
-        if any(one.path[-1].startswith("disturbance") for one in free(model)):
-            models.append(model)
-    return models
-
-
-def _most_likely_models(
-    likelihood: Likelihood, found: Sequence[tuple[Point, dict[str, str]]], free: FreeOf
-) -> tuple[FusionConfig, dict[str, str]]:
-    """The model that is best for each axis after the penalty for its numbers, and why."""
-    peaks = [peak for peak, _ in found]
-    scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
-    reasons: dict[str, str] = {}
-    for number, axis in enumerate(likelihood.axes):
-        mine = [float(score[number]) for score in scores]
-        chosen = int(np.argmax(mine))
-        parts = [found[chosen][1].get(axis)]
-        if len(found) > 1 and axis in likelihood.sensors:
-            gain = max(mine[1:]) - mine[0]
-            parts.append(f"disturbance: {_DISTURBANCES[chosen]}; one gains {gain:+.1f} after the penalty (BIC)")
-        if any(parts):
-            reasons[axis] = "; ".join(filter(None, parts))
-    return _best_by_axis(likelihood, peaks, scores), reasons
-
-
-def _without_needless(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> FusionConfig:
-    """The configuration without the noises that are not worth their penalty, one kind after the other."""
-    for field in _PROCESSES[0]:
-        without = config
-        for one in free(config):
-            if one.path[-1] == field:
-                without = one.put(without, one.bounds[0])
-        peaks = [point(likelihood, config, free(config))]
-        peaks.append(maximise_by_axis(likelihood, without, free(without), notify, _ROUGHLY))
-        scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
-        config = _best_by_axis(likelihood, peaks, scores)
-    return config
+    best = _times(likelihood, with_gates(config, config, _WIDER), free(config))
+    best = _noise(likelihood, with_gates(best, config, 1.0), own(config), notify)
+    shared = [one for one in free(best) if one.axis is None]
+    if shared:
+        best = maximise(likelihood, best, shared, notify, tolerance=_ROUGHLY).config
+    orders: dict[str, str] = {}
+    if any(one.fit != "noise" for one in own(best)):
+        best, orders = _arm(likelihood, best, own, notify)
+    return maximise_with_gates(likelihood, with_gates(best, config), free(best), notify), orders
 
 
 def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter]) -> FloatArray:
-    """The log-posterior of each axis less the Bayesian information criterion's penalty for its parameters, (A,).
-
-    A noise at its lower bound is none, and costs nothing.
-    """
-    used = [one for one in free if not (one.vanishes and one.at_bound(peak.config) == "lower")]
-    count = np.array([sum(one.axis == axis for one in used) for axis in likelihood.axes])
+    """The log-posterior of each axis less the Bayesian information criterion's penalty for its parameters, (A,)."""
+    count = np.array([sum(one.axis == axis for one in free) for axis in likelihood.axes])
     return peak.axes - 0.5 * count * np.log(np.maximum(likelihood.count, 2))
 
 
@@ -225,18 +160,9 @@ def _arm(
     whole = [axis for axis in likelihood.axes if _plant_is_free(free(config), axis)]
     second = _with_orders(config, whole, 2)
     starts = [_lagging(second, whole, free(second), times=times) for times in _LAGS]
-    recovers = second
-    for axis in likelihood.axes:
-        recovers = with_recovery(recovers, axis, second.arm.axes[axis].gain_recovery or _GAINS[0][1])
-    recovering = [str(one.axis) for one in free(recovers) if one.path[-1] == "gain_recovery"]
-    if recovering:
-        static = second
-        for axis in recovering:
-            static = with_recovery(static, axis, None)
-        starts += [_with_gain(recovers, free(recovers), more, recovery) for more, recovery in _GAINS]
-        starts += [_lagging(static, whole, free(static), times=times) for times in _LAGS]
-    peaks = maxima(starts)
-    best = _best_by_axis(likelihood, peaks, [_penalised(likelihood, peak, free(peak.config)) for peak in peaks])
+    if any(one.path[-1] == "gain_recovery" for one in free(second)):
+        starts += [_with_gain(second, free(second), more, recovery) for more, recovery in _GAINS]
+    best = _best_by_axis(likelihood, maxima(starts))
     if not whole:
         return best, {}
     # the arm gets one command a tick: the likelihood has a false maximum a tick of delay on either side

@@ -18,7 +18,7 @@ from .maximise import Notify, Point, ignore, maximise_with_gates
 from .parameters import LATENCIES, Fit, Parameter, changed, is_fixed, parameters, smallest_sd
 from .search import FreeOf, search
 
-_GATE = 5.0  # of the fit for a sensor with a narrow one:
+_GATE = 5.0  # of the fit for a sensor without a gate, as outliers must not count, or with a narrow one:
 _NARROWEST = 3.0  # below it rejecting good measurements would pay, the more the smaller the noise
 _MOST_FIXED = 8  # combinations of which one parameter each is fixed, at most
 _AT_REST = ("input_noise_mm_rtHz", "drift_mm_rts", "sd_mm")  # what an axis at rest still determines
@@ -110,7 +110,7 @@ def run_stage(
         f"{name}: was fitted with a gate of {_GATE:g}, not of {sensor.gate:g}: outliers must not count, good"
         " measurements must"
         for name, sensor in config.sensors.items()
-        if 0.0 < sensor.gate < _NARROWEST and name in used
+        if sensor.gate < _NARROWEST and name in used
     ]
     return Stage(likelihood, best, free(best.config), fixed, orders, notes)
 
@@ -118,7 +118,7 @@ def run_stage(
 def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float | None = None) -> Likelihood:
     """The likelihood of the runs; where latencies vary, without what one could put before the first command."""
     sensors = {
-        name: msgspec.structs.replace(sensor, gate=_GATE) if 0.0 < sensor.gate < _NARROWEST else sensor
+        name: sensor if sensor.gate >= _NARROWEST else msgspec.structs.replace(sensor, gate=_GATE)
         for name, sensor in config.sensors.items()
     }
     latest = None
