@@ -138,7 +138,7 @@ def test_last_one_held_and_filter(est: pf.Estimates, sensor: str, axis: str):
 
 
 def by_velocity(time: np.ndarray, value: np.ndarray, density: float) -> list[float]:
-    """What is wrong with each value by a regression on those before: level, slope, integrated random walk of the slope."""
+    """Each value less a regression on those before: on level, slope, and an integrated random walk of the slope."""
     t, y = time - time[0], value - value[0]
     early, late = np.minimum.outer(t, t), np.maximum.outer(t, t)
     walk = density * early**2 * (late / 2.0 - early / 6.0)
