@@ -28,7 +28,7 @@ from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
 
 DIGITS = 50
-FIELDS = ("position", "velocity", "offset")
+FIELDS = ("position", "velocity", "offset", "disturbance")
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # 1e-18 of an integral over 1/fastest pole
 _MANY, _OF_MANY = np.polynomial.legendre.leggauss(24)  # likewise, of one 16 times as long
@@ -177,7 +177,9 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Rows:
-    """Linear functions of the path, one a row: position·p(t) + speed·(the plant's ṗ)(t) + velocity·v(t) + offset·o(t).
+    """Linear functions of the path: position·p(t) + speed·ṡ(t) + velocity·v(t) + offset·o(t) + disturbance·d(t).
+
+    ṡ is the speed of the plant and of a smooth disturbance.
 
     All arrays are (rows,).
     """
@@ -187,16 +189,21 @@ class Rows:
     speed: np.ndarray
     velocity: np.ndarray
     offset: np.ndarray
+    disturbance: np.ndarray
 
     @staticmethod
     def at(time: Sequence[int] | np.ndarray, **weights: object) -> Rows:
         """Rows at ``time``, weights given once or one by one, 0 where not."""
-        names = ("position", "speed", "velocity", "offset")
+        names = ("position", "speed", "velocity", "offset", "disturbance")
         each = [np.broadcast_to(np.asarray(weights.get(name, 0.0), float), np.shape(time)) for name in names]
         return Rows(np.asarray(time, dtype=np.int64), *each)
 
     def __add__(self, other: Rows) -> Rows:
         return Rows(*(np.concatenate([getattr(rows, name) for rows in (self, other)]) for name in self.__annotations__))
+
+    def part(self, chosen: slice) -> Rows:
+        """Some of the rows."""
+        return Rows(*(getattr(self, name)[chosen] for name in self.__annotations__))
 
     @property
     def level(self) -> np.ndarray:
@@ -214,6 +221,8 @@ class Belief:
     velocity_sd: np.ndarray
     offset: np.ndarray
     offset_sd: np.ndarray
+    disturbance: np.ndarray
+    disturbance_sd: np.ndarray
 
 
 class AxisOracle:
@@ -328,13 +337,13 @@ class AxisOracle:
             n = len(order)
             L, w, joint = self._condition(order, rows)
             C = _substituted(joint.cross[n:], L)
-            C[np.arange(n) >= np.tile(count, 3)[:, None]] = Decimal(0)
+            C[np.arange(n) >= np.tile(count, len(FIELDS))[:, None]] = Decimal(0)
             mean = joint.mean[n:] + C.dot(w) if n else joint.mean[n:]
             variance = joint.variance[n:] - (C * C).sum(axis=1) if n else joint.variance[n:]
-            position, velocity, offset = mean.reshape(3, -1)
-            sd = [_root(part) for part in variance.reshape(3, -1)]
+            position, *others = mean.reshape(len(FIELDS), -1)
+            sd = [_root(part) for part in variance.reshape(len(FIELDS), -1)]
             position = position + Decimal(self.start)
-        means = [part.astype(float) for part in (position, velocity, offset)]
+        means = [part.astype(float) for part in (position, *others)]
         return Belief(*(part for pair in zip(means, sd, strict=True) for part in pair))
 
     def _condition(self, order: Sequence[Measurement], rows: Rows) -> tuple[np.ndarray, np.ndarray, _Joint]:
@@ -365,18 +374,61 @@ class AxisOracle:
         level, prior = _decimal(rows.level), Decimal(self.config.start.offset_sd) ** 2
         exact_cross = _decimal(cross) + prior * np.multiply.outer(level, level[:n])
         exact_variance = _decimal(variance) + prior * level * level
+        exact_cross += self._disturbed(rows, rows.part(slice(n)))
+        alone = [rows.part(slice(k, k + 1)) for k in range(len(rows.time))]
+        exact_variance += [self._disturbed(one, one)[0, 0] for one in alone]
         for k, one in enumerate(order):
-            bias = Decimal(self.config.sensors[one.sensor].bias_sd) ** 2
-            exact_variance[k] += bias
+            sensor = self.config.sensors[one.sensor]
+            bias, drift = Decimal(sensor.bias_sd) ** 2, Decimal(sensor.bias_drift_sd) ** 2
+            exact_variance[k] += bias + drift
             for j, other in enumerate(order):
                 if one.sensor == other.sensor:
-                    exact_cross[k, j] += bias
+                    apart = Decimal(abs(one.valid - other.valid)) / 1_000_000_000
+                    exact_cross[k, j] += bias + drift * (-apart / Decimal(sensor.bias_time)).exp()
         for k, variance in self.jumps.items():
             after = np.where(np.arange(len(level)) < n, np.arange(len(level)) >= k, rows.time >= order[k].valid)
             jumped = level * after
             exact_cross += Decimal(variance) * np.multiply.outer(jumped, jumped[:n])
             exact_variance += Decimal(variance) * jumped * jumped
         return _Joint(_decimal(mean), exact_variance, exact_cross)
+
+    def _disturbed(self, rows: Rows, others: Rows) -> np.ndarray:
+        """Covariance of rows by the disturbance, from its covariance function k and the derivatives of that."""
+        process, found = self.process, np.full((len(rows.time), len(others.time)), Decimal(0))
+        if process.disturbance_sd == 0.0:
+            return found
+        smooth = process.disturbance_kind == "matern"
+        period, variance = Decimal(self.period), Decimal(process.disturbance_sd) ** 2
+        rate = (
+            Decimal(3).sqrt() / Decimal(process.disturbance_time) if smooth else 1 / Decimal(process.disturbance_time)
+        )
+
+        def covariance(lag: int, derived: int, other: int) -> Decimal:
+            """Of d or its derivative at s + lag [ns], and d or its derivative at s."""
+            s = Decimal(lag) / 1_000_000_000
+            a = rate * abs(s)
+            share = variance * (-a).exp()
+            if not smooth:
+                return share * (not derived and not other)
+            if derived and other:
+                return share * rate**2 * (1 - a)
+            return share * rate**2 * s * (other - derived) if derived or other else share * (1 + a)
+
+        def shares(part: Rows, k: int) -> list[tuple[Decimal, int, int]]:
+            """A row as a sum of d and its derivative: weight, time, which derivative."""
+            level, speed, velocity = part.position[k] + part.disturbance[k], part.speed[k], part.velocity[k]
+            mean = Decimal(velocity) / period
+            now, then = int(part.time[k]), int(part.time[k]) + self.ahead
+            every = [(Decimal(level) - mean, now, 0), (mean, then, 0), (Decimal(speed), now, 1)]
+            return [one for one in every if one[0]]
+
+        known = [shares(others, j) for j in range(len(others.time))]
+        for i in range(len(rows.time)):
+            for j, parts in enumerate(known):
+                for weight, time, derived in shares(rows, i):
+                    for other_weight, other_time, other in parts:
+                        found[i, j] += weight * other_weight * covariance(time - other_time, derived, other)
+        return found
 
     def _mean(self, rows: Rows) -> np.ndarray:
         """Superposed responses [m or m/s]; a command that acts at an instant is already seen there."""

@@ -16,7 +16,7 @@ from pumafuse.live.wire import Lines
 
 MS = 1_000_000
 T = 28 * MS
-FIELDS = ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd")
+FIELDS = pf.AxisEstimate.FIELDS
 
 
 class Event(NamedTuple):

@@ -58,7 +58,16 @@ def test_the_scan_is_fused_as_well_as_promised(demo: Path, with_tracker: Path) -
 def test_result_tables_have_the_documented_columns(with_tracker: Path) -> None:
     """Names and row counts of design and README: an even grid, every component of both sensors with its outcome."""
     estimates = pq.read_table(with_tracker / "estimates.parquet")
-    kinds = ("position_mm", "position_sd_mm", "velocity_mm_s", "velocity_sd_mm_s", "offset_mm", "offset_sd_mm")
+    kinds = (
+        "position_mm",
+        "position_sd_mm",
+        "velocity_mm_s",
+        "velocity_sd_mm_s",
+        "offset_mm",
+        "offset_sd_mm",
+        "disturbance_mm",
+        "disturbance_sd_mm",
+    )
     assert estimates.column_names == ["time_s", *(f"{axis}.{kind}" for axis in AXES for kind in kinds)]
     assert estimates["time_s"].to_pylist()[:3] == [0.0, 0.005, 0.01]
     measurements = pq.read_table(with_tracker / "measurements.parquet")

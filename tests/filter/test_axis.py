@@ -11,11 +11,12 @@ from pumafuse.arrays import FloatArray
 from pumafuse.filter import axis as algebra
 from pumafuse.filter import forward
 from pumafuse.filter.axis import (
-    BIASES,
     DRIFT,
     ERROR,
     NOISE,
+    NONE,
     OFFSET,
+    REST,
     STEP,
     Model,
     Sensors,
@@ -155,33 +156,36 @@ def test_an_update_is_the_textbook_s(axis: int, sensor: int) -> None:
     H = np.zeros(len(x))
     H[[0, OFFSET]] = known.scale
     if sensor:
-        H[BIASES + sensor - 1] = 1.0
+        H[REST + sensor - 1] = 1.0
     A, B = plant_matrices(axis)
     speed = (A @ x[:2] + B[:, 0] * (state.drive[axis, U] + state.drive[axis, ERROR]))[0]
     R = (1.5 * known.sd) ** 2 + (known.scale * speed * known.latency_sd) ** 2
     assert noise(model, sensors, state, axis, sensor, 1.5) == pytest.approx(R, rel=1e-12)
     z = known.scale * 0.5 + 3e-3
-    nu, S = innovation(sensors, state, axis, sensor, z, R)
+    nu, S = innovation(model, sensors, state, axis, sensor, z, R)
     assert nu == pytest.approx(3e-3 - H @ x, rel=1e-10)
     assert pytest.approx(H @ P @ H + R, rel=1e-12) == S
     K = P @ H / S
     left = np.eye(len(x)) - np.outer(K, H)
-    update(model, sensors, state, axis, sensor, nu, R)
+    update(model, state, axis, nu, R)
     np.testing.assert_allclose(state.x[axis], x + K * nu, rtol=1e-10, atol=1e-16)
     np.testing.assert_allclose(state.P[axis], left @ P @ left.T + R * np.outer(K, K), rtol=1e-9, atol=1e-18)
     np.testing.assert_array_equal(state.P[axis], state.P[axis].T)
     h = np.zeros(len(x))
     h[[0, OFFSET]] = 1.0
-    assert position_of(state, axis) == pytest.approx((h @ state.x[axis], h @ state.P[axis] @ h), rel=1e-12)
+    assert position_of(NONE, state.x, state.P, axis) == pytest.approx(
+        (h @ state.x[axis], h @ state.P[axis] @ h), rel=1e-12
+    )
 
 
 def test_what_a_measurement_does_not_see_keeps_its_bits() -> None:
     """A bias that shares nothing with the rest is as it was."""
     model, sensors, state = arranged()
-    last = BIASES + 1
+    last = REST + 1
     state.P[1, last, :last] = state.P[1, :last, last] = 0.0
     x, P = state.x[1, last], state.P[1, last, last]
-    update(model, sensors, state, 1, 0, 1e-3, 1e-8)
+    innovation(model, sensors, state, 1, 0, 0.5, 1e-8)
+    update(model, state, 1, 1e-3, 1e-8)
     assert (state.x[1, last], state.P[1, last, last]) == (x, P)
     assert not state.P[1, last, :last].any()
 
@@ -195,7 +199,8 @@ def test_a_checkpoint_brings_back_every_bit() -> None:
     for axis in range(3):
         predict(model, state, axis, axis, 50_000_000)
         apply_command(model, state, axis, axis, 0.51)
-        update(model, sensors, state, axis, 1, 1e-3, 1e-8)
+        innovation(model, sensors, state, axis, 1, 0.5, 1e-8)
+        update(model, state, axis, 1e-3, 1e-8)
     for part in (state.rejected, state.gate_time, state.gate_count, state.unsettled):
         part[:3] = 7
     copy_rows(state, place, 0, 3)

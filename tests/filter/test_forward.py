@@ -69,7 +69,10 @@ class Pass:
         return Pass(*arranged(segment, CONFIG, biased_sensors(segment, CONFIG), places), [], [])
 
     def run(self, events: Events, times: TimeArray, outcome: CodeArray | None = None) -> None:
-        results, outputs = Results.room(len(events.time), len(AXES)), Outputs(*np.empty((6, len(AXES), len(times))))
+        results, outputs = (
+            Results.room(len(events.time), len(AXES)),
+            Outputs(*np.zeros((len(Outputs._fields), len(AXES), len(times)))),
+        )
         if outcome is not None:
             results.outcome[:] = outcome
         history, arrived = no_history(len(AXES), self.state.x.shape[1]), np.zeros(0, dtype=np.bool_)
@@ -132,7 +135,7 @@ def test_late_events_end_as_events_in_time(seed: int) -> None:
     arrival[events.source == COMMAND] = events.stamp[events.source == COMMAND]
     times = np.append(GRID, arrival.max())
     live, whole = Pass.over(segment, count + 1), Pass.over(segment)
-    results, outputs = Results.room(count, 2), Outputs(*np.empty((6, 2, len(times))))
+    results, outputs = Results.room(count, 2), Outputs(*np.zeros((len(Outputs._fields), 2, len(times))))
     arrived, history = np.zeros(count, dtype=np.bool_), no_history(len(AXES), live.state.x.shape[1])
     queue = np.argsort(arrival, kind="stable")
     known = live.model, live.sensors, events, live.state

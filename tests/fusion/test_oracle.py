@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -30,6 +31,7 @@ MS = 1_000_000  # ns
 T = 28 * MS
 UNDER, CRITICAL, OVER = (SecondOrder(natural_frequency=45.0, damping=damping) for damping in (0.4, 1.0, 1.8))
 LAG = FirstOrder(time_constant=0.0425)
+replace_ = msgspec.structs.replace
 NOISE = Process(input_noise=0.3e-3, drift=0.8e-3, maneuver_noise=0.5e-3, maneuver_drift=5e-3)
 PAPER = Gain(slope=0.0818, intercept=0.933)
 
@@ -188,6 +190,20 @@ CASES = {
         times=IRREGULAR,
     ),
     "start elsewhere": Case(one(UNDER, gain=PAPER, gain_recovery=0.1), start={"radial": 0.46}),
+    "smooth disturbance": Case(one(UNDER), process=replace_(NOISE, disturbance_sd=2e-3, disturbance_time=0.2)),
+    "rough disturbance": Case(
+        process=replace_(NOISE, drift=0.0, disturbance_sd=1e-3, disturbance_time=0.05, disturbance_kind="ou")
+    ),
+    "nearly of constant velocity": Case(
+        process=Process(input_noise=0.0, drift=0.0, disturbance_sd=1.0, disturbance_time=100.0), offset_sd=0.0
+    ),
+    "a bias that drifts beside a constant one": Case(
+        process=NOISE,
+        seen={
+            "panel": Seen(sensor(1e-4, bias_sd=1e-2, bias_drift_sd=1e-3, bias_time=0.3), VISION.valid),
+            "vision": VISION,
+        },
+    ),
     "offset never": Case(one(CRITICAL), offset_sd=0.0, process=Process(input_noise=1e-3, drift=0.0)),
     "maneuver alone": Case(process=Process(input_noise=0.0, drift=0.0, maneuver_noise=1e-3, maneuver_drift=1e-2)),
     "measured as commands act": Case(delay=0.0565, seen={"tracker": Seen(sensor(latency=0.0033), GRID + 56_500_000)}),
@@ -244,6 +260,8 @@ def sensors(first: int, bias_sd: float) -> st.SearchStrategy[Seen]:
         latency=ms,
         scale=st.sampled_from([1.0, -1.0, 0.3]),
         bias_sd=st.just(bias_sd),
+        bias_drift_sd=st.sampled_from([0.0, 1e-3]),
+        bias_time=st.sampled_from([0.05, 10.0]),
     )
     valid = st.builds(
         every, st.floats(8.0, 150.0), st.integers(3, 13), st.integers(0, 200).map(lambda t: t * MS + first)
@@ -264,7 +282,14 @@ def cases(draw: st.DrawFn) -> Case:
     )
     level = st.one_of(st.just(0.0), st.floats(1e-5, 2e-3))
     process = st.builds(
-        Process, input_noise=level, drift=level, maneuver_noise=level, maneuver_drift=level.map(lambda d: 10 * d)
+        Process,
+        input_noise=level,
+        drift=level,
+        maneuver_noise=level,
+        maneuver_drift=level.map(lambda d: 10 * d),
+        disturbance_sd=level,
+        disturbance_time=st.sampled_from([0.004, 0.1, 3.0, 1e3]),
+        disturbance_kind=st.sampled_from(["matern", "ou"]),
     )
     axis = AxisModel(
         plant=draw(plants()),

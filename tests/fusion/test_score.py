@@ -87,7 +87,7 @@ def estimates(*, smoothed: bool) -> pf.Estimates:
     """Exact positions, and mean velocities with an error of 2 mm/s where there are any."""
     time = PERIOD * np.arange(50)
     velocity = np.full(50, np.nan) if smoothed else mean_velocity(time) + 2e-3
-    axis = pf.AxisEstimate(path(time), np.full(50, 1e-4), velocity, velocity * 0.0 + 1e-3, 0.0 * time, 0.0 * time)
+    axis = pf.AxisEstimate(path(time), np.full(50, 1e-4), velocity, velocity * 0.0 + 1e-3, *np.zeros((4, 50)))
     run = pf.Run.from_arrays(time, {"radial": path(time)}, reference=(time, {"radial": path(time)}), name="made")
     est = pf.fuse(run, pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal")))
     return replace(est, axes={"radial": axis}, mode="smoothed" if smoothed else "filtered")

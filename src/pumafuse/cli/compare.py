@@ -9,7 +9,8 @@ from typing import Any
 
 from ..errors import RunError
 from ..fusion import results
-from .tables import console, print_json, score_table
+from ..fusion.summary import Summary
+from .tables import console, print_json, score_table, skill_table
 
 
 def run(folders: Sequence[Path], reference: Path | None, json: bool) -> None:
@@ -18,7 +19,7 @@ def run(folders: Sequence[Path], reference: Path | None, json: bool) -> None:
     Raises:
         PumafuseError: A folder holds no results, or nothing can be scored.
     """
-    compared: list[dict[str, Any]] = []
+    compared, summaries = list[dict[str, Any]](), dict[str, Summary]()
     for folder in folders:
         result = results.read(folder)
         track = result.reference
@@ -32,9 +33,14 @@ def run(folders: Sequence[Path], reference: Path | None, json: bool) -> None:
                 f"{folder}: the reference covers no estimate on any axis; do its axes ({', '.join(track.position)})"
                 " and its clock fit the run?"
             )
-        run, mode = result.summary.run, result.summary.mode
-        compared.append({"folder": str(folder), "run": run, "mode": mode, "axes": scores})
+        run, mode, summaries[str(folder)] = result.summary.run, result.summary.mode, result.summary
+        skill = {
+            axis: {name: one.skill for name, one in part.sensors.items()} for axis, part in result.summary.axes.items()
+        }
+        compared.append({"folder": str(folder), "run": run, "mode": mode, "axes": scores, "skill": skill})
     if json:
         print_json(compared)
     else:
-        console(sys.stdout).print(score_table((one["folder"], one["axes"]) for one in compared))
+        for table in (score_table((one["folder"], one["axes"]) for one in compared), skill_table(summaries.items())):
+            if table.columns:
+                console(sys.stdout).print(table)

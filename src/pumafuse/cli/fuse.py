@@ -19,7 +19,7 @@ from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
 from ..logs.run import Run
 from .many import progress_bar, report_failures, run_jobs
-from .tables import console, outcome_table, runs_table, score_table
+from .tables import console, outcome_table, runs_table, score_table, skill_table
 
 
 def run(
@@ -125,7 +125,7 @@ def _show(summary: Summary) -> None:
         f" arm {summary.arm}"
     )
     scores = {axis: part.score for axis, part in summary.axes.items() if part.score is not None}
-    for table in (outcome_table(summary), score_table([(summary.run, scores)])):
+    for table in (outcome_table(summary), skill_table([("", summary)]), score_table([(summary.run, scores)])):
         if table.columns:
             console(sys.stdout).print(table)
 

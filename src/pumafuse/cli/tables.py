@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from ..fusion.score import Z95
+from ..fusion.skill import PredictionError
 from ..fusion.summary import ScoreSummary, Summary
 
 Columns = Mapping[str, tuple[str, str, float]]  # by heading: an attribute, its format, and what it is multiplied by
@@ -96,6 +97,29 @@ def outcome_table(summary: Summary) -> Table:
     return table(["axis", "sensor", *words, "innovation, mm", "expected, mm", "bias, mm", "verdict"], rows)
 
 
+def skill_table(results: Iterable[tuple[str, Summary]]) -> Table:
+    """Errors of predicting each sensor's next measurement, by this filter and by simpler means."""
+    rows = [
+        [name, axis, sensor, str(one.skill.predictions), *map(_prediction, msgspec.structs.astuple(one.skill)[1:])]
+        for name, summary in results
+        for axis, part in summary.axes.items()
+        for sensor, one in part.sensors.items()
+        if one.skill is not None
+    ]
+    by = ["last one\nheld", "constant\nvelocity", "command\nalone", "this\nfilter"]
+    made = table(["result", "axis", "sensor", "predictions", *by], rows)
+    made.title, made.title_justify, made.title_style = (
+        "Error of predicting the next measurement, RMS / median in mm, by …",
+        "left",
+        "",
+    )
+    return made
+
+
+def _prediction(error: PredictionError) -> str:
+    return f"{error.rms_mm:.3f} / {error.median_mm:.3f}"
+
+
 def score_table(results: Iterable[tuple[str, Mapping[str, ScoreSummary]]]) -> Table:
     """Scores against the reference, for each result and axis; of the velocity where a result has one."""
     rows = [[name, axis, *cells(one, _SCORE)] for name, scores in results for axis, one in scores.items()]
@@ -111,7 +135,7 @@ def runs_table(results: Mapping[str, Summary]) -> Table:
         having = [one for one in results.values() if axis in one.axes]
         rows.append([f"all {len(having)}", axis, *_pooled(having, axis)])
     scores = ("RMSE, mm", "worst, mm", "95 % coverage", "NEES")
-    return table(["result", "axis", *scores, "NIS", "fused", "rejected", "notes"], rows)
+    return table(["result", "axis", *scores, "NIS", "prediction,\nof best other", "fused", "rejected", "notes"], rows)
 
 
 def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
@@ -121,6 +145,7 @@ def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
     sensors = [sensor for part in parts for sensor in part.sensors.values()]
     fused, rejected = ([sensor.outcomes.get(word, 0) for sensor in sensors] for word in ("fused", "rejected"))
     rows = [score.rows for score in scores]
+    skills = [sensor.skill for sensor in sensors if sensor.skill is not None]
     square = _mean([score.rmse_mm**2 for score in scores], rows)
     return [
         number(None if square is None else square**0.5),
@@ -128,6 +153,7 @@ def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
         number(_mean([score.coverage for score in scores], rows), ".1%"),
         number(_mean([score.nees_mean for score in scores], rows), ".2f"),
         number(_mean([sensor.nis_mean for sensor in sensors], fused), ".2f"),
+        number(_mean([one.of_best_other for one in skills], [one.predictions for one in skills]), ".2f"),
         str(sum(fused)),
         str(sum(rejected)),
         str(sum(len(summary.notes) for summary in summaries)),

@@ -1,14 +1,15 @@
 """The algebra of one axis: predict, apply a command, innovation, update.
 
-State of an axis, in this order: the plant's position [m] and rate [m/s] (0 for a first-order plant), the offset, and
-the bias of each sensor that has one. Beside it what the commands have left: the input u and the gain error e, both
-known, so that they move x and not P. All is relative to the start level at which the axis rested.
+State of an axis, in this order: the plant's position [m] and rate [m/s] (0 for a first-order plant); the offset; the
+disturbance d and, where it is smooth, its rate; of each sensor that has them a bias that drifts and one that is
+constant. Beside it what the commands have left: the input u and the gain error e, both known, so that they move x and
+not P. All is relative to the start level at which the axis rested.
 
     x⁺ = u + Φ (x − u) + Γ_e e,   P⁺ = Φ P Φᵀ + Q,   var(offset)⁺ = var(offset) + drift² Δ,   e⁺ = e exp(−Δ / recovery)
+    d⁺ = Φ_d d (:mod:`pumafuse.model.matern`), or like a drifting bias: b⁺ = b exp(−Δ / time)
 
-Another block of states would have its place between offset and biases, and its transition in :func:`predict`.
-Each axis is a row of the arrays, which change in place: a copy of them is a checkpoint. No fast-math: the same events
-give the same bits.
+The whole position is p = plant + offset + d. Each axis is a row of the arrays, which change in place: a copy of them is
+a checkpoint. No fast-math: the same events give the same bits.
 """
 
 # pyright: reportArgumentType=false, reportAssignmentType=false, reportReturnType=false, reportConstantRedefinition=false
@@ -16,16 +17,23 @@ give the same bits.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
+
+import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..compiled import compiled, compiled_apart
 from ..model.closed import decaying_response, gain_error, transition
+from ..model.matern import matern
 
-POSITION, RATE, OFFSET, BIASES = range(4)  # of a state
+POSITION, RATE, OFFSET, REST = range(4)  # of a state; the disturbance, if there is one, is the first of the rest
+NONE, ROUGH, SMOOTH = range(3)  # disturbances, by how many states they have
+REVERTING, VARIANCE = range(2)  # of a state of the rest
 START, U, STEP, ERROR, NOISE, DRIFT = range(6)  # of a drive
 SLOPE, INTERCEPT, DECAY, PERIOD = range(4)  # of a gain
 INPUT_NOISE, RANDOM_WALK, MANEUVER_NOISE, MANEUVER_DRIFT = range(4)  # of a process
+POSITION_, REST_ = np.int64(POSITION), np.int64(REST)  # as arguments: a literal would compile what is called once more
 _ROUNDING = 1e-15  # of the variances that S is made of: S cannot be known to be smaller
 
 
@@ -36,6 +44,9 @@ class Model(NamedTuple):
         order: Of the plant, 1 or 2, (A,).
         constants: Of the plant, see :mod:`pumafuse.model.closed`, (A, c).
         states: How many of the state's entries are used, (A,).
+        disturbance: ``NONE``, ``ROUGH`` (Ornstein-Uhlenbeck) or ``SMOOTH`` (Matérn), (A,).
+        rest: How fast each of the state's entries reverts to 0 [1/s] and its stationary variance [m²]: λ and σ² of the
+            disturbance; 0 and 0 of what is constant, (A, s, 2).
         gain: ``SLOPE`` [s/m], ``INTERCEPT``, ``DECAY`` of its error [1/s] (0: none) and the ``PERIOD`` T [s], (A, 4).
         process: ``INPUT_NOISE`` [m/√Hz], ``RANDOM_WALK`` [m/√s], and what each m/s of maneuver adds to them, (A, 4).
     """
@@ -43,6 +54,8 @@ class Model(NamedTuple):
     order: IntArray
     constants: FloatArray
     states: IntArray
+    disturbance: IntArray
+    rest: FloatArray
     gain: FloatArray
     process: FloatArray
 
@@ -56,7 +69,7 @@ class Sensors(NamedTuple):
         latency_sd: How far the latency wanders [s], (S,).
         gate: In standard deviations, 0 for none, (S,).
         gate_rows: Whether one axis rejected rejects the row, (S,).
-        bias: Which state is its bias on each axis, −1 for none, (S, A).
+        bias: Which states are its drifting and its constant bias on each axis, −1 for none, (S, A, 2).
     """
 
     scale: FloatArray
@@ -80,7 +93,7 @@ class State(NamedTuple):
         gate_time: When that one was valid, and when the last one was fused, int64 ns, (r, S, 2).
         gate_count: Rejections in a row, and re-acquisitions, (r, S, 2).
         unsettled: When sensors last disagreed while re-acquisitions were counted, int64 ns, ``ALWAYS`` for never, (r,).
-        work: Room for the vectors of an update: H, K, P Hᵀ and (I − K H) P Hᵀ, (4, s).
+        work: Room for the vectors of an update: H, K, P Hᵀ and (I − K H) P Hᵀ, (A, 4, s).
     """
 
     x: FloatArray
@@ -111,17 +124,53 @@ def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
         x[row, POSITION] += position * drive[row, ERROR]
         x[row, RATE] += rate * drive[row, ERROR]
         drive[row, ERROR] *= left
-    a, b, c = P[row, 0, 0], P[row, 0, 1], P[row, 1, 1]
-    d, e = f11 * a + f12 * b, f11 * b + f12 * c
-    P[row, 0, 0] = d * f11 + e * f12 + q * q11
-    P[row, 0, 1] = P[row, 1, 0] = d * f21 + e * f22 + q * q12
-    P[row, 1, 1] = (f21 * a + f22 * b) * f21 + (f21 * b + f22 * c) * f22 + q * q22
-    for j in range(OFFSET, model.states[axis]):
-        a, b = P[row, 0, j], P[row, 1, j]
-        P[row, 0, j] = P[row, j, 0] = f11 * a + f12 * b
-        P[row, 1, j] = P[row, j, 1] = f21 * a + f22 * b
+    size, first = model.states[axis], REST
+    move_pair(P, row, POSITION_, size, f11, f12, f21, f22)
+    add_to_pair(P, row, POSITION_, q * q11, q * q12, q * q22)
     P[row, OFFSET, OFFSET] += drive[row, DRIFT] * dt
+    if model.disturbance[axis] == SMOOTH:
+        variance = model.rest[axis, REST, VARIANCE]
+        f11, f12, f21, f22, q11, q12, q22 = matern(model.rest[axis, REST, REVERTING], dt)
+        d, rate = x[row, REST], x[row, REST + 1]
+        x[row, REST], x[row, REST + 1] = f11 * d + f12 * rate, f21 * d + f22 * rate
+        move_pair(P, row, REST_, size, f11, f12, f21, f22)
+        add_to_pair(P, row, REST_, variance * q11, variance * q12, variance * q22)
+        first = REST + 2
+    for i in range(first, model.states[axis]):
+        if model.rest[axis, i, REVERTING] > 0.0:
+            fading = -model.rest[axis, i, REVERTING] * dt
+            left = math.exp(fading)
+            x[row, i] *= left
+            for j in range(size):
+                P[row, i, j] *= left
+                P[row, j, i] *= left
+            P[row, i, i] -= model.rest[axis, i, VARIANCE] * math.expm1(2.0 * fading)
     state.clock[row] = time
+
+
+@compiled
+def move_pair(M: FloatArray, at: int, i: int, size: int, f11: float, f12: float, f21: float, f22: float) -> None:
+    """M⁺ = F M Fᵀ where F moves the states ``i`` and ``i + 1`` of ``size``."""
+    k = i + 1
+    a, b, c = M[at, i, i], M[at, i, k], M[at, k, k]
+    d, e = f11 * a + f12 * b, f11 * b + f12 * c
+    M[at, i, i] = d * f11 + e * f12
+    M[at, i, k] = M[at, k, i] = d * f21 + e * f22
+    M[at, k, k] = (f21 * a + f22 * b) * f21 + (f21 * b + f22 * c) * f22
+    for j in range(size):
+        if j < i or j > k:
+            a, b = M[at, i, j], M[at, k, j]
+            M[at, i, j] = M[at, j, i] = f11 * a + f12 * b
+            M[at, k, j] = M[at, j, k] = f21 * a + f22 * b
+
+
+@compiled
+def add_to_pair(P: FloatArray, at: int, i: int, q11: float, q12: float, q22: float) -> None:
+    """P⁺ = P + Q where Q is of the states ``i`` and ``i + 1``."""
+    P[at, i, i] += q11
+    P[at, i, i + 1] += q12
+    P[at, i + 1, i] += q12
+    P[at, i + 1, i + 1] += q22
 
 
 @compiled
@@ -148,93 +197,130 @@ def noise(model: Model, sensors: Sensors, state: State, axis: int, sensor: int, 
         speed = x[axis, RATE]
         if model.order[axis] == 1:  # ẋ = (u + e − x) / τ
             speed = model.constants[axis, 0] * (drive[axis, U] + drive[axis, ERROR] - x[axis, POSITION])
+        if model.disturbance[axis] == SMOOTH:
+            speed += x[axis, REST + 1]
         R += (sensors.scale[sensor] * speed * sensors.latency_sd[sensor]) ** 2
     return R
 
 
 @compiled
-def innovation(sensors: Sensors, state: State, axis: int, sensor: int, z: float, R: float) -> tuple[float, float]:
-    """ν = z − H x and S = H P Hᵀ + R of a measurement ``z`` [m] as logged, here and now."""
-    x, P, scale, bias = state.x, state.P, sensors.scale[sensor], sensors.bias[sensor, axis]
-    nu = z - scale * state.drive[axis, START] - scale * (x[axis, POSITION] + x[axis, OFFSET])
-    own = scale * scale * (P[axis, POSITION, POSITION] + P[axis, OFFSET, OFFSET])
-    S = own + 2.0 * scale * scale * P[axis, POSITION, OFFSET]
-    if bias >= 0:
-        nu -= x[axis, bias]
-        S += 2.0 * scale * (P[axis, POSITION, bias] + P[axis, OFFSET, bias]) + P[axis, bias, bias]
-        own += P[axis, bias, bias]
-    return nu, max(S + R, R, _ROUNDING * own)
-
-
-@compiled
-def update(model: Model, sensors: Sensors, state: State, axis: int, sensor: int, nu: float, R: float) -> None:
-    """x⁺ = x + K ν and P⁺ in Joseph form; H and K stay in ``work[0]`` and ``work[1]``."""
-    observation(sensors, axis, sensor, model.states[axis], state.work)
-    joseph(state.P, axis, model.states[axis], R, state.work)
-    for i in range(model.states[axis]):
-        state.x[axis, i] += state.work[1, i] * nu
-
-
-@compiled
-def observation(sensors: Sensors, axis: int, sensor: int, states: int, work: FloatArray) -> None:
-    """H of a sensor on an axis, into ``work[0]``."""
+def innovation(
+    model: Model, sensors: Sensors, state: State, axis: int, sensor: int, z: float, R: float
+) -> tuple[float, float]:
+    """ν = z − H x and S = H P Hᵀ + R of a measurement ``z`` [m] as logged, here and now; H stays in ``work``."""
+    work, scale, states = state.work, sensors.scale[sensor], model.states[axis]
+    observation(model, sensors, axis, sensor, work, axis)
+    nu = z - scale * state.drive[axis, START]
     for i in range(states):
-        work[0, i] = 0.0
-    work[0, POSITION] = work[0, OFFSET] = sensors.scale[sensor]
-    if sensors.bias[sensor, axis] >= 0:
-        work[0, sensors.bias[sensor, axis]] = 1.0
+        nu -= work[axis, 0, i] * state.x[axis, i]
+    return nu, variance_along(state.P, axis, states, R, work, axis)
 
 
 @compiled
-def joseph(P: FloatArray, at: int, states: int, R: float, work: FloatArray) -> None:
-    """P⁺ = (I − K H) P (I − K H)ᵀ + K R Kᵀ with H in ``work[0]`` and K = P Hᵀ / (H P Hᵀ + R), left in ``work[1]``.
+def observation(model: Model, sensors: Sensors, axis: int, sensor: int, work: FloatArray, at: int) -> None:
+    """H of a sensor on an axis, into ``work[at, 0]``."""
+    for i in range(model.states[axis]):
+        work[at, 0, i] = 0.0
+    work[at, 0, POSITION] = work[at, 0, OFFSET] = sensors.scale[sensor]
+    if model.disturbance[axis] != NONE:
+        work[at, 0, REST] = sensors.scale[sensor]
+    for k in range(2):
+        if sensors.bias[sensor, axis, k] >= 0:
+            work[at, 0, sensors.bias[sensor, axis, k]] = 1.0
+
+
+@compiled
+def variance_along(P: FloatArray, row: int, states: int, R: float, work: FloatArray, at: int) -> float:
+    """S = H P Hᵀ + R with H in ``work[at, 0]``; P Hᵀ and S stay in ``work[at, 2]`` and ``work[at, 3, 0]``."""
+    S, own = R, 0.0
+    for i in range(states):
+        own += work[at, 0, i] * work[at, 0, i] * P[row, i, i]
+        across = 0.0
+        for j in range(states):
+            across += P[row, i, j] * work[at, 0, j]
+        work[at, 2, i] = across
+        S += work[at, 0, i] * across
+    work[at, 3, 0] = max(S, R, _ROUNDING * own)
+    return work[at, 3, 0]
+
+
+@compiled
+def update(model: Model, state: State, axis: int, nu: float, R: float) -> None:
+    """x⁺ = x + K ν and P⁺ in Joseph form, right after :func:`innovation`; K stays in ``work``."""
+    joseph(state.P, axis, model.states[axis], R, state.work, axis)
+    for i in range(model.states[axis]):
+        state.x[axis, i] += state.work[axis, 1, i] * nu
+
+
+@compiled
+def joseph(P: FloatArray, row: int, states: int, R: float, work: FloatArray, at: int) -> None:
+    """P⁺ = (I − K H) P (I − K H)ᵀ + K R Kᵀ right after :func:`variance_along`; K = P Hᵀ / S stays in ``work[at, 1]``.
 
     The smoother uses it for its dual, too: information that passes through noise of unit variance along H. A state that
     H does not see and that shares nothing with the others changes no bit of theirs. A quotient is exactly 1 where a
     prior is all there is to S; a product with 1/S would leave a variance below 0.
     """
-    S, own = R, 0.0
+    S = work[at, 3, 0]
     for i in range(states):
-        own += work[0, i] * work[0, i] * P[at, i, i]
-        across = 0.0
-        for j in range(states):
-            across += P[at, i, j] * work[0, j]
-        work[2, i] = across
-        S += work[0, i] * across
-    S = max(S, R, _ROUNDING * own)
-    for i in range(states):
-        work[1, i] = work[2, i] / S
+        work[at, 1, i] = work[at, 2, i] / S
     for i in range(states):  # W = (I − K H) P and W Hᵀ
         across = 0.0
         for j in range(states):
-            P[at, i, j] -= work[1, i] * work[2, j]
-            across += P[at, i, j] * work[0, j]
-        work[3, i] = across
+            P[row, i, j] -= work[at, 1, i] * work[at, 2, j]
+            across += P[row, i, j] * work[at, 0, j]
+        work[at, 3, i] = across
     for i in range(states):  # W − W Hᵀ Kᵀ + K R Kᵀ; the last apart, or beside a wide prior it would be rounded away
         for j in range(i + 1):
-            left = P[at, i, j] - work[3, i] * work[1, j] + P[at, j, i] - work[3, j] * work[1, i]
-            P[at, i, j] = P[at, j, i] = 0.5 * left + work[1, i] * R * work[1, j]
+            left = P[row, i, j] - work[at, 3, i] * work[at, 1, j] + P[row, j, i] - work[at, 3, j] * work[at, 1, i]
+            P[row, i, j] = P[row, j, i] = 0.5 * left + work[at, 1, i] * R * work[at, 1, j]
     for i in range(states):  # rounding beside a prior 1e16 times as wide: known, as far as doubles go
-        if P[at, i, i] < 0.0:
+        if P[row, i, i] < 0.0:
             for j in range(states):
-                P[at, i, j] = P[at, j, i] = 0.0
+                P[row, i, j] = P[row, j, i] = 0.0
 
 
 @compiled
-def position_of(state: State, row: int) -> tuple[float, float]:
-    """Plant and offset together [m], relative to the start level, and their variance [m²]."""
-    P = state.P
+def position_of(disturbance: int, x: FloatArray, P: FloatArray, row: int) -> tuple[float, float]:
+    """Plant, offset and disturbance together [m], relative to the start level, and their variance [m²]."""
+    position = x[row, POSITION] + x[row, OFFSET]
     variance = P[row, POSITION, POSITION] + 2.0 * P[row, POSITION, OFFSET] + P[row, OFFSET, OFFSET]
-    return state.x[row, POSITION] + state.x[row, OFFSET], max(variance, 0.0)
+    if disturbance != NONE:
+        position += x[row, REST]
+        variance += 2.0 * (P[row, POSITION, REST] + P[row, OFFSET, REST]) + P[row, REST, REST]
+    return position, max(variance, 0.0)
 
 
 @compiled
 def variance_of_motion(model: Model, state: State, axis: int, row: int, dt: float) -> float:
     """Variance [m²] of the motion over ``dt`` [s] that the state leads to: h (Φ − I) P (Φ − I)ᵀ hᵀ; h makes p of it."""
-    P = state.P
+    P, work = state.P, state.work
     f11, f12, _, _, _, _, _ = transition(model.order[axis], model.constants, axis, dt)
     a, b = f11 - 1.0, f12
-    return a * a * P[row, POSITION, POSITION] + 2.0 * a * b * P[row, POSITION, RATE] + b * b * P[row, RATE, RATE]
+    if model.disturbance[axis] == NONE:
+        own = a * a * P[row, POSITION, POSITION] + 2.0 * a * b * P[row, POSITION, RATE] + b * b * P[row, RATE, RATE]
+        return max(own, 0.0)
+    for i in range(model.states[axis]):
+        work[axis, 0, i] = 0.0
+    work[axis, 0, POSITION], work[axis, 0, RATE] = a, b
+    if model.disturbance[axis] == ROUGH:
+        work[axis, 0, REST] = math.expm1(-model.rest[axis, REST, REVERTING] * dt)
+    elif model.disturbance[axis] == SMOOTH:
+        f11, f12, _, _, _, _, _ = matern(model.rest[axis, REST, REVERTING], dt)
+        work[axis, 0, REST], work[axis, 0, REST + 1] = f11 - 1.0, f12
+    return variance_along(state.P, row, model.states[axis], 0.0, work, axis)
+
+
+@compiled
+def noise_of_motion(model: Model, state: State, axis: int, dt: float) -> float:
+    """Variance [m²] of the motion over ``dt`` [s] that comes from noise on the way: h Q hᵀ."""
+    _, _, _, _, q11, _, _ = transition(model.order[axis], model.constants, axis, dt)
+    noise = state.drive[axis, NOISE] * q11 + state.drive[axis, DRIFT] * dt
+    if model.disturbance[axis] == ROUGH:
+        noise -= model.rest[axis, REST, VARIANCE] * math.expm1(-2.0 * model.rest[axis, REST, REVERTING] * dt)
+    elif model.disturbance[axis] == SMOOTH:
+        _, _, _, _, q11, _, _ = matern(model.rest[axis, REST, REVERTING], dt)
+        noise += model.rest[axis, REST, VARIANCE] * q11
+    return noise
 
 
 @compiled

@@ -1,8 +1,9 @@
 """The reference engine: a `filterpy.kalman.KalmanFilter` for each axis on the delay-augmented matrices.
 
-Fed with the same events, for filtered estimates. State of an axis: the plant's states, the offset, the biases, the gain
-error e, and a register of the inputs in flight, the newest first. Over an interval the plant follows the register's
-acting entry r_k and e, which decays; a command shifts the register when it is given and moves e when it acts:
+Fed with the same events, for filtered estimates. State of an axis: the plant's states, the offset, the disturbance, the
+biases, the gain error e, and a register of the inputs in flight, the newest first. Over an interval the plant follows
+the register's acting entry r_k and e, which decays; a command shifts the register when it is given and moves e when it
+acts:
 
     x⁺ = Φ x + Γ r_k + Γ_e e,   o⁺ = o,   b⁺ = b,   e⁺ = e exp(−Δ / recovery),   r⁺ = (u, r_0, r_1, …)
 
@@ -25,7 +26,6 @@ from ..arrays import FloatArray, TimeArray
 from ..model.arm import AxisModel
 from ..model.discrete import transition
 from .axis import (
-    BIASES,
     DECAY,
     INPUT_NOISE,
     INTERCEPT,
@@ -34,7 +34,9 @@ from .axis import (
     OFFSET,
     PERIOD,
     RANDOM_WALK,
+    REST,
     SLOPE,
+    SMOOTH,
     START,
     Model,
     Sensors,
@@ -66,14 +68,18 @@ class _Axis:
         in_flight = int((issued - np.arange(len(self._u))).max(initial=1))
         A, _, C = self._plant.state_space()
         self.n = len(A)
-        self.biases = self.n + 1
-        self.error = self.biases + int(model.states[axis]) - BIASES
+        self.rest = self.n + 1
+        self.reverts = model.rest[axis, REST : model.states[axis]]
+        self.disturbance = int(model.disturbance[axis])
+        self.biases = self.rest + self.disturbance
+        self.error = self.rest + len(self.reverts)
         size = self.error + 1 + in_flight + 1
         self.position = np.zeros((1, size))
         self.position[0, : self.n], self.position[0, self.n] = C[0], 1.0
+        self.position[0, self.rest : self.biases][:1] = 1.0
         self.kf = KalmanFilter(dim_x=size, dim_z=1, dim_u=size)
         self.kf.P = np.zeros((size, size))
-        prior = [self.n, *range(self.biases, self.error)]
+        prior = range(self.n, self.error)
         self.kf.P[prior, prior] = np.diagonal(state.P[axis])[OFFSET : OFFSET + len(prior)]
         self.kf.B = np.eye(size)
         self.clock: int = int(state.clock[axis])
@@ -105,6 +111,17 @@ class _Axis:
             Q = transition(self._plant, dt).Q
         return moved[:n, :n], moved[:n, n], Q, moved[:n, n + 1], float(moved[-1, -1])
 
+    @lru_cache(maxsize=10_000)  # noqa: B019 - lives as long as the axis
+    def _smooth(self, ns: int) -> Matrices:
+        """F and Q of a smooth disturbance, from its differential equation d″ = −λ² d − 2 λ d′ + white noise."""
+        from scipy.linalg import expm
+
+        rate, variance = self.reverts[0]
+        A, noise = np.array([[0.0, 1.0], [-rate * rate, -2.0 * rate]]), np.diag([0.0, 4.0 * rate**3 * variance])
+        van_loan = expm(np.block([[-A, noise], [np.zeros((2, 2)), A.T]]) * (ns / 1e9))
+        F = van_loan[2:, 2:].T
+        return F, F @ van_loan[:2, 2:]
+
     def matrices(self, ns: int) -> Matrices:
         """F and Q over an interval of the state with the command that acts now."""
         n, size = self.n, len(self.position[0])
@@ -116,6 +133,12 @@ class _Axis:
         maneuver = self._maneuver(self._acting)
         process = self._process
         Q[:n, :n] = Q_unit * (process[INPUT_NOISE] ** 2 + (process[MANEUVER_NOISE] * maneuver) ** 2)
+        first = self.rest
+        if self.disturbance == SMOOTH:
+            first = self.biases
+            F[self.rest : first, self.rest : first], Q[self.rest : first, self.rest : first] = self._smooth(ns)
+        for i, (rate, variance) in enumerate(self.reverts[first - self.rest :], first):
+            F[i, i], Q[i, i] = np.exp(-rate * ns / 1e9), -variance * np.expm1(-2.0 * rate * ns / 1e9)
         Q[n, n] = (process[RANDOM_WALK] ** 2 + (process[MANEUVER_DRIFT] * maneuver) ** 2) * (ns / 1e9)
         return F, Q
 
@@ -158,7 +181,8 @@ class _Axis:
         A, B, C = self._plant.state_space()
         u = self._u[self._acting] if self._acting >= 0 else 0.0
         v = u + self.kf.x[self.error, 0]
-        return float((C @ (A @ self.kf.x[: self.n, 0] + B[:, 0] * v))[0])
+        rate = self.kf.x[self.rest + 1, 0] if self.disturbance == SMOOTH else 0.0
+        return float((C @ (A @ self.kf.x[: self.n, 0] + B[:, 0] * v))[0] + rate)
 
     def _step(self, command: int) -> float:
         before = self._u[command - 1] if command > 0 else 0.0
@@ -255,10 +279,9 @@ def filter_events(
     for number in range(at, len(times)):
         _estimate(axes, int(times[number]), outputs, number)
     for number, axis in enumerate(axes):
-        names = axis.error - axis.biases
-        state.x[number, BIASES : BIASES + names] = axis.kf.x[axis.biases : axis.error, 0]
-        block = axis.kf.P[axis.biases : axis.error, axis.biases : axis.error]
-        state.P[number, BIASES : BIASES + names, BIASES : BIASES + names] = block
+        rest = slice(REST, REST + len(axis.reverts))
+        state.x[number, rest] = axis.kf.x[axis.rest : axis.error, 0]
+        state.P[number, rest, rest] = axis.kf.P[axis.rest : axis.error, axis.rest : axis.error]
 
 
 def _add(
@@ -278,8 +301,9 @@ def _add(
         axis = axes[number]
         axis.advance(time)
         H = scale * axis.position
-        if (bias := sensors.bias[sensor, number]) >= 0:
-            H[0, axis.biases + bias - BIASES] = 1.0
+        for bias in sensors.bias[sensor, number]:
+            if bias >= 0:
+                H[0, axis.rest + bias - REST] = 1.0
         sd = sensors.sd[sensor, number] * (events.spread[row, number] if len(events.spread) else 1.0)
         R = float(sd**2 + (scale * axis.speed * sensors.latency_sd[sensor]) ** 2)
         z = float(events.value[row, number] - scale * state.drive[number, START])
@@ -320,6 +344,9 @@ def _estimate(axes: Sequence[_Axis], time: int, outputs: Outputs, n: int) -> Non
         h, x, P, period = axis.position[0], axis.kf.x[:, 0], axis.kf.P, axis.period
         outputs.position[number, n], outputs.position_sd[number, n] = h @ x, np.sqrt(max(h @ P @ h, 0.0))
         outputs.offset[number, n], outputs.offset_sd[number, n] = x[axis.n], np.sqrt(max(P[axis.n, axis.n], 0.0))
+        if axis.disturbance:
+            outputs.disturbance[number, n] = x[axis.rest]
+            outputs.disturbance_sd[number, n] = np.sqrt(max(P[axis.rest, axis.rest], 0.0))
         F, Q, later = axis.later(time, time + round(period * 1e9))
         row = h @ F - h
         row[axis.biases :] = 0.0  # known: the inputs and e

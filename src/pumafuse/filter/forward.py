@@ -19,8 +19,10 @@ from ..compiled import compiled, kernel
 from .axis import (
     DRIFT,
     NOISE,
+    NONE,
     OFFSET,
     PERIOD,
+    REST,
     Model,
     Sensors,
     State,
@@ -54,6 +56,8 @@ class Outputs(NamedTuple):
         velocity_sd: [m/s].
         offset: o [m].
         offset_sd: [m].
+        disturbance: d [m]; left as it is where the model has none.
+        disturbance_sd: [m].
     """
 
     position: FloatArray
@@ -62,6 +66,8 @@ class Outputs(NamedTuple):
     velocity_sd: FloatArray
     offset: FloatArray
     offset_sd: FloatArray
+    disturbance: FloatArray
+    disturbance_sd: FloatArray
 
 
 class History(NamedTuple):
@@ -206,7 +212,7 @@ def add_measurement(
             continue
         advance(model, state, axis, time, history)
         R = noise_of(model, sensors, events, state, row, axis)
-        nu, S = innovation(sensors, state, axis, sensor, events.value[row, axis], R)
+        nu, S = innovation(model, sensors, state, axis, sensor, events.value[row, axis], R)
         results.innovation[row, axis], results.innovation_sd[row, axis] = nu, math.sqrt(S)
         beyond |= gate > 0.0 and abs(nu) > gate * math.sqrt(S)
     reacquires = False
@@ -228,9 +234,9 @@ def add_measurement(
         if outcome == REACQUIRED:
             widened = (nu / sensors.scale[sensor]) ** 2
             count_reacquired(state, axis, sensor, widened, time)
-            _, S = innovation(sensors, state, axis, sensor, events.value[row, axis], R)
+            _, S = innovation(model, sensors, state, axis, sensor, events.value[row, axis], R)
             results.innovation_sd[row, axis] = math.sqrt(S)
-        update(model, sensors, state, axis, sensor, nu, R)
+        update(model, state, axis, nu, R)
         count_fused(state, axis, sensor, time)
         write_history(history, axis, time, row, R, widened, state.work)
 
@@ -280,13 +286,13 @@ def advance(model: Model, state: State, axis: int, time: int, history: History) 
 def write_history(
     history: History, axis: int, time: int, row: int, noise: float, drift: float, work: FloatArray
 ) -> None:
-    """Keep an entry, where entries are kept; the gain of an update is in ``work[1]``."""
+    """Keep an entry, where entries are kept; the gain of an update is in ``work[axis, 1]``."""
     at = history.first[axis] + history.used[axis]
     if at < history.first[axis + 1]:
         history.time[at], history.row[at], history.noise[at], history.drift[at] = time, row, noise, drift
         if row != INTERVAL:
             for i in range(history.gain.shape[1]):
-                history.gain[at, i] = work[1, i]
+                history.gain[at, i] = work[axis, 1, i]
         history.used[axis] += 1
 
 
@@ -319,10 +325,7 @@ def estimate(
     for axis in range(len(model.order)):
         copy_estimate(state, axis, here)
         follow_commands(model, events, state, axis, here, pending, end, state.clock[axis] - 1, time, time)
-        position, variance = position_of(state, here)
-        outputs.position[axis, n], outputs.position_sd[axis, n] = position, math.sqrt(variance)
-        outputs.offset[axis, n] = state.x[here, OFFSET]
-        outputs.offset_sd[axis, n] = math.sqrt(max(state.P[here, OFFSET, OFFSET], 0.0))
+        write_outputs(model.disturbance[axis], state.x, state.P, here, outputs, axis, n)
         if history.x.shape[1]:
             for i in range(model.states[axis]):
                 history.x[axis, n, i] = state.x[here, i]
@@ -337,9 +340,23 @@ def estimate(
             for j in range(model.states[axis]):
                 state.P[here, i, j] = 0.0  # what comes is noise alone
         follow_commands(model, events, state, axis, here, pending, end, time, until, time)
-        later, noise = position_of(state, here)
-        outputs.velocity[axis, n] = (later - position) / period
-        outputs.velocity_sd[axis, n] = math.sqrt(max(known, 0.0) + noise) / period
+        later, noise = position_of(model.disturbance[axis], state.x, state.P, here)
+        outputs.velocity[axis, n] = (later - outputs.position[axis, n]) / period
+        outputs.velocity_sd[axis, n] = math.sqrt(known + noise) / period
+
+
+@compiled
+def write_outputs(
+    disturbance: int, x: FloatArray, P: FloatArray, row: int, outputs: Outputs, axis: int, n: int
+) -> None:
+    """What a state says of its axis, but for the velocity, as estimate ``n``."""
+    outputs.position[axis, n], variance = position_of(disturbance, x, P, row)
+    outputs.position_sd[axis, n] = math.sqrt(variance)
+    outputs.offset[axis, n] = x[row, OFFSET]
+    outputs.offset_sd[axis, n] = math.sqrt(max(P[row, OFFSET, OFFSET], 0.0))
+    if disturbance != NONE:
+        outputs.disturbance[axis, n] = x[row, REST]
+        outputs.disturbance_sd[axis, n] = math.sqrt(max(P[row, REST, REST], 0.0))
 
 
 @compiled

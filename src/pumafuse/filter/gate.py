@@ -15,8 +15,7 @@ import math
 
 from ..arrays import ALWAYS
 from ..compiled import compiled
-from ..model.closed import transition
-from .axis import DRIFT, NOISE, OFFSET, PERIOD, Model, Sensors, State, variance_of_motion
+from .axis import OFFSET, PERIOD, Model, Sensors, State, noise_of_motion, variance_of_motion
 
 NU, R_THEN = range(2)  # of State.rejected
 REJECTED_AT, FUSED_AT = range(2)  # of State.gate_time
@@ -38,10 +37,8 @@ def agrees(model: Model, sensors: Sensors, state: State, axis: int, sensor: int,
     between = time - state.gate_time[axis, sensor, REJECTED_AT]
     if between < model.gain[axis, PERIOD] * 1e9:
         return -1
-    dt, drive = between / 1e9, state.drive
-    _, _, _, _, q11, _, _ = transition(model.order[axis], model.constants, axis, dt)
-    motion = variance_of_motion(model, state, axis, axis, dt) + drive[axis, NOISE] * q11 + drive[axis, DRIFT] * dt
-    scale = sensors.scale[sensor]
+    dt, scale = between / 1e9, sensors.scale[sensor]
+    motion = variance_of_motion(model, state, axis, axis, dt) + noise_of_motion(model, state, axis, dt)
     variance = state.rejected[axis, sensor, R_THEN] + R + scale * scale * motion
     return int(abs(nu - state.rejected[axis, sensor, NU]) <= sensors.gate[sensor] * math.sqrt(variance))
 

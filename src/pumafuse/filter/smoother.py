@@ -26,11 +26,26 @@ import numpy as np
 from ..arrays import FloatArray, TimeArray
 from ..compiled import compiled, kernel
 from ..model.closed import transition
-from .axis import OFFSET, POSITION, RATE, Model, Sensors, joseph, observation
+from ..model.matern import matern
+from .axis import (
+    OFFSET,
+    POSITION_,
+    REST,
+    REST_,
+    REVERTING,
+    SMOOTH,
+    VARIANCE,
+    Model,
+    Sensors,
+    joseph,
+    move_pair,
+    observation,
+    variance_along,
+)
 from .events import Events, Results
-from .forward import INTERVAL, ONE, ZERO, History, Outputs
+from .forward import INTERVAL, ONE, ZERO, History, Outputs, write_outputs
 
-_POSITION, _RATE, _OFFSET = np.int64(POSITION), np.int64(RATE), np.int64(OFFSET)  # as arguments: see forward.ZERO
+OFFSET_ = np.int64(OFFSET)  # as an argument: see forward.ZERO
 _NOTHING = 1e-15  # of a pivot, below which it is rounding
 
 
@@ -56,7 +71,7 @@ def smooth(
         history: What it did, with the states at ``times``.
         origin: Where it began, int64 ns.
         times: Of the estimates, int64 ns, ascending.
-        room: η (2, s), N (2, s, s), vectors (4, s) and a factor (s + 1, s) to compute in.
+        room: η (2, s), N (2, s, s), vectors (1, 4, s) and a factor (s + 1, s) to compute in.
         outputs: Gets the estimates.
     """
     eta, N, work, factor = room
@@ -69,7 +84,7 @@ def smooth(
         entry = history.first[axis] + history.used[axis] - 1
         until = history.time[entry] if entry >= history.first[axis] else origin
         while n >= 0 and times[n] >= until:
-            smoothed_estimate(states, axis, n, history, eta, N, ZERO, work, factor, outputs)
+            smoothed_estimate(model, axis, n, history, eta, N, ZERO, work, factor, outputs)
             n -= 1
         while entry >= history.first[axis]:
             until = history.time[entry]
@@ -82,7 +97,7 @@ def smooth(
                         for j in range(states):
                             N[1, i, j] = N[0, i, j]
                     over_interval(model, axis, eta, N, ONE, until - times[n], q, d, work)
-                    smoothed_estimate(states, axis, n, history, eta, N, ONE, work, factor, outputs)
+                    smoothed_estimate(model, axis, n, history, eta, N, ONE, work, factor, outputs)
                     n -= 1
                 over_interval(model, axis, eta, N, ZERO, until - start, q, d, work)
             else:
@@ -105,16 +120,16 @@ def over_update(
 ) -> None:
     """η[0] and N[0] over an update, backward."""
     states, row = model.states[axis], history.row[entry]
-    observation(sensors, axis, events.source[row], states, work)
+    observation(model, sensors, axis, events.source[row], work, ZERO)
     nu, R = results.innovation[row, axis], history.noise[entry]
     for i in range(states):
         for j in range(states):
             eta[0, i] += N[0, i, j] * history.gain[entry, j] * nu
-        eta[0, i] += work[0, i] * nu / R
+        eta[0, i] += work[0, 0, i] * nu / R
     for i in range(states):
         for j in range(states):
-            N[0, i, j] += work[0, i] * work[0, j] / R
-    through_noise(eta, N, ZERO, states, _OFFSET, math.sqrt(history.drift[entry]), 0.0, work)  # what re-acquiring added
+            N[0, i, j] += work[0, 0, i] * work[0, 0, j] / R
+    through_noise(eta, N, ZERO, states, OFFSET_, math.sqrt(history.drift[entry]), 0.0, work)  # what re-acquiring added
 
 
 @compiled
@@ -122,24 +137,47 @@ def over_interval(
     model: Model, axis: int, eta: FloatArray, N: FloatArray, at: int, ns: int, q: float, d: float, work: FloatArray
 ) -> None:
     """η[at] and N[at] over an interval, backward: through its noise, one independent part at a time, then by Fᵀ."""
-    dt, states = ns / 1e9, model.states[axis]
+    dt, states, first = ns / 1e9, model.states[axis], REST
     f11, f12, f21, f22, q11, q12, q22 = transition(model.order[axis], model.constants, axis, dt)
-    first = math.sqrt(q * q11)
-    both = q * q12 / first if first > 0.0 else 0.0
-    through_noise(eta, N, at, states, _POSITION, first, both, work)
-    through_noise(eta, N, at, states, _RATE, math.sqrt(max(q * q22 - both * both, 0.0)), 0.0, work)
-    through_noise(eta, N, at, states, _OFFSET, math.sqrt(d * dt), 0.0, work)
-    a, b = eta[at, 0], eta[at, 1]
-    eta[at, 0], eta[at, 1] = f11 * a + f21 * b, f12 * a + f22 * b
-    a, b, c = N[at, 0, 0], N[at, 0, 1], N[at, 1, 1]
-    u, w = f11 * a + f21 * b, f11 * b + f21 * c
-    N[at, 0, 0] = u * f11 + w * f21
-    N[at, 0, 1] = N[at, 1, 0] = u * f12 + w * f22
-    N[at, 1, 1] = (f12 * a + f22 * b) * f12 + (f12 * b + f22 * c) * f22
-    for j in range(OFFSET, states):
-        a, b = N[at, 0, j], N[at, 1, j]
-        N[at, 0, j] = N[at, j, 0] = f11 * a + f21 * b
-        N[at, 1, j] = N[at, j, 1] = f12 * a + f22 * b
+    pair_through_noise(eta, N, at, states, POSITION_, q * q11, q * q12, q * q22, work)
+    through_noise(eta, N, at, states, OFFSET_, math.sqrt(d * dt), 0.0, work)
+    move_back(eta, N, at, states, POSITION_, f11, f12, f21, f22)
+    if model.disturbance[axis] == SMOOTH:
+        variance = model.rest[axis, REST, VARIANCE]
+        f11, f12, f21, f22, q11, q12, q22 = matern(model.rest[axis, REST, REVERTING], dt)
+        pair_through_noise(eta, N, at, states, REST_, variance * q11, variance * q12, variance * q22, work)
+        move_back(eta, N, at, states, REST_, f11, f12, f21, f22)
+        first = REST + 2
+    for i in range(first, states):
+        if model.rest[axis, i, REVERTING] > 0.0:
+            fading = -model.rest[axis, i, REVERTING] * dt
+            noise = math.sqrt(-model.rest[axis, i, VARIANCE] * math.expm1(2.0 * fading))
+            through_noise(eta, N, at, states, i, noise, 0.0, work)
+            eta[at, i] *= math.exp(fading)
+            for j in range(states):
+                N[at, i, j] *= math.exp(fading)
+                N[at, j, i] *= math.exp(fading)
+
+
+@compiled
+def move_back(
+    eta: FloatArray, N: FloatArray, at: int, states: int, i: int, f11: float, f12: float, f21: float, f22: float
+) -> None:
+    """η ← Fᵀ η and N ← Fᵀ N F where F moves the states ``i`` and ``i + 1``."""
+    a, b = eta[at, i], eta[at, i + 1]
+    eta[at, i], eta[at, i + 1] = f11 * a + f21 * b, f12 * a + f22 * b
+    move_pair(N, at, i, states, f11, f21, f12, f22)
+
+
+@compiled
+def pair_through_noise(
+    eta: FloatArray, N: FloatArray, at: int, states: int, i: int, q11: float, q12: float, q22: float, work: FloatArray
+) -> None:
+    """η[at] and N[at] through the noise of the states ``i`` and ``i + 1``, as two independent parts."""
+    first = math.sqrt(q11)
+    both = q12 / first if first > 0.0 else 0.0
+    through_noise(eta, N, at, states, i, first, both, work)
+    through_noise(eta, N, at, states, i + 1, math.sqrt(max(q22 - both * both, 0.0)), 0.0, work)
 
 
 @compiled
@@ -150,20 +188,21 @@ def through_noise(
     if first == 0.0 and second == 0.0:
         return
     for i in range(states):
-        work[0, i] = 0.0
-    work[0, enters] = first
+        work[0, 0, i] = 0.0
+    work[0, 0, enters] = first
     seen = first * eta[at, enters]
     if second != 0.0:
-        work[0, enters + 1] = second
+        work[0, 0, enters + 1] = second
         seen += second * eta[at, enters + 1]
-    joseph(N, at, states, 1.0, work)
+    variance_along(N, at, states, 1.0, work, ZERO)
+    joseph(N, at, states, 1.0, work, ZERO)
     for i in range(states):
-        eta[at, i] -= work[1, i] * seen
+        eta[at, i] -= work[0, 1, i] * seen
 
 
 @compiled
 def smoothed_estimate(
-    states: int,
+    model: Model,
     axis: int,
     n: int,
     history: History,
@@ -175,23 +214,20 @@ def smoothed_estimate(
     outputs: Outputs,
 ) -> None:
     """P_s = (I + P N)⁻¹ P and x_s = x + P_s η, one column of N = L Lᵀ at a time: wide priors would cancel in P_s η."""
-    x, P = history.x[axis], history.P[axis]
-    root(N, eta, at, states, L, work[3])
+    x, P, states = history.x[axis], history.P[axis], model.states[axis]
+    root(N, eta, at, states, L, work[0, 3])
     for k in range(states):
         nu = L[states, k]
         for i in range(states):
-            work[0, i] = L[i, k]
-        joseph(P, n, states, 1.0, work)
+            work[0, 0, i] = L[i, k]
+        variance_along(P, n, states, 1.0, work, ZERO)
+        joseph(P, n, states, 1.0, work, ZERO)
         for i in range(states):
-            x[n, i] += work[1, i] * nu
+            x[n, i] += work[0, 1, i] * nu
         for m in range(k + 1, states):
             for i in range(states):
-                L[states, m] -= L[i, m] * work[1, i] * nu
-    variance = P[n, POSITION, POSITION] + 2.0 * P[n, POSITION, OFFSET] + P[n, OFFSET, OFFSET]
-    outputs.position[axis, n] = x[n, POSITION] + x[n, OFFSET]
-    outputs.position_sd[axis, n] = math.sqrt(max(variance, 0.0))
-    outputs.offset[axis, n] = x[n, OFFSET]
-    outputs.offset_sd[axis, n] = math.sqrt(max(P[n, OFFSET, OFFSET], 0.0))
+                L[states, m] -= L[i, m] * work[0, 1, i] * nu
+    write_outputs(model.disturbance[axis], x, P, n, outputs, axis, n)
 
 
 @compiled

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -36,12 +36,18 @@ class Process(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         drift: Density of the offset's random walk [m/√s].
         maneuver_noise: More input noise per m/s of change in commanded speed [m/√Hz per m/s].
         maneuver_drift: More drift per m/s of change in commanded speed [m/√s per m/s].
+        disturbance_sd: Standard deviation of a disturbance that reverts to 0 [m]; 0: there is none.
+        disturbance_time: How long it lasts [s].
+        disturbance_kind: ``matern``: of smoothness 3/2, or ``ou``: Ornstein-Uhlenbeck, of smoothness 1/2.
     """
 
     input_noise: NotNegative = msgspec.field(name="input_noise_mm_rtHz", default=0.03e-3)
     drift: NotNegative = msgspec.field(name="drift_mm_rts", default=0.4e-3)
     maneuver_noise: NotNegative = msgspec.field(name="maneuver_noise_mm_rtHz_per_m_s", default=0.0)
     maneuver_drift: NotNegative = msgspec.field(name="maneuver_drift_mm_rts_per_m_s", default=0.0)
+    disturbance_sd: NotNegative = msgspec.field(name="disturbance_sd_mm", default=0.0)
+    disturbance_time: Positive = msgspec.field(name="disturbance_time_ms", default=0.3)
+    disturbance_kind: Literal["matern", "ou"] = "matern"
 
 
 class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -53,6 +59,8 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
         latency_sd: Standard deviation of the latency from measurement to measurement [s].
         scale: Factor on the position; −1 for a distance to a panel in front.
         bias_sd: Prior uncertainty of a constant bias [m]; 0: no bias is estimated.
+        bias_drift_sd: Standard deviation of a bias that drifts and reverts to 0, beside the constant one [m]; 0: none.
+        bias_time: How long such a drift lasts [s].
         gate: A measurement beyond this many standard deviations is rejected; 0: never.
         gate_rows: Whether one rejected axis rejects the whole row.
     """
@@ -62,8 +70,15 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     latency_sd: NotNegative = msgspec.field(name="latency_sd_ms", default=0.0)
     scale: float = 1.0
     bias_sd: NotNegative = msgspec.field(name="bias_sd_mm", default=0.0)
+    bias_drift_sd: NotNegative = msgspec.field(name="bias_drift_sd_mm", default=0.0)
+    bias_time: Positive = msgspec.field(name="bias_time_s", default=10.0)
     gate: NotNegative = 5.0
     gate_rows: bool = True
+
+    @property
+    def biased(self) -> bool:
+        """Whether it has a bias, constant or drifting."""
+        return self.bias_sd > 0.0 or self.bias_drift_sd > 0.0
 
     def sd_of(self, axis: str) -> float | None:
         """The noise on one axis [m]; None where the sensor has none and so is not used."""

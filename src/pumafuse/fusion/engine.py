@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..arrays import CodeArray, TimeArray
-from ..filter.axis import BIASES, Model, Sensors, State
+from ..filter.axis import Model, Sensors, State
 from ..filter.events import COMMAND, Events, Results
 from ..filter.forward import History, Outputs, filter_events, no_history
 from ..filter.outcome import Outcome
@@ -69,7 +69,7 @@ def filter_segment(
     history = _history(events, state, len(times)) if mode == "smoothed" else no_history(axes, width)
     results = Results.room(count, axes)
     results.outcome[:] = events.known
-    outputs = Outputs(*np.empty((len(Outputs._fields), axes, len(times))))
+    outputs = Outputs(*np.zeros((len(Outputs._fields), axes, len(times))))
     known = model, sensors, events, state
     if engine == "filterpy":
         from ..filter import filterpy_engine
@@ -79,13 +79,13 @@ def filter_segment(
     else:
         filter_events(*known, False, arrival, queue, times, results, history, arrived, places, outputs)
     if mode == "smoothed":
-        room = np.empty((2, width)), np.empty((2, width, width)), np.empty((4, width)), np.empty((width + 1, width))
+        room = np.empty((2, width)), np.empty((2, width, width)), np.empty((1, 4, width)), np.empty((width + 1, width))
         smooth(model, sensors, events, results, history, segment.origin, times, room, outputs)
     estimates = {
         axis: AxisEstimate(segment.start[axis] + outputs.position[number], *(part[number] for part in outputs[1:]))
         for number, axis in enumerate(segment.axes)
     }
-    return Filtered(estimates, events, results, _known_biases(segment, state, biases))
+    return Filtered(estimates, events, results, _known_biases(segment, sensors, state))
 
 
 def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | None = None) -> Results:
@@ -129,7 +129,7 @@ def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
     biased = [
         (number, name)
         for number, name in enumerate(segment.sensors)
-        if name in config.sensors and config.sensors[name].bias_sd > 0.0
+        if name in config.sensors and config.sensors[name].biased
     ]
     fused = [column == Outcome.FUSED for column in rows.known.T]
     return [[name for number, name in biased if fused_on[rows.source == number].any()] for fused_on in fused]
@@ -162,10 +162,12 @@ def _most_taken_back(time: TimeArray, arrival: TimeArray, times: TimeArray) -> i
     return int(np.maximum(np.maximum(until, before) - np.arange(len(time)), 0).max(initial=0)) + 1
 
 
-def _known_biases(segment: Segment, state: State, biases: list[list[str]]) -> dict[str, dict[str, Bias]]:
+def _known_biases(segment: Segment, sensors: Sensors, state: State) -> dict[str, dict[str, Bias]]:
+    """The constant biases at the end."""
     found: dict[str, dict[str, Bias]] = {}
     for number, axis in enumerate(segment.axes):
-        for place, name in enumerate(biases[number], BIASES):
-            sd = float(np.sqrt(max(state.P[number, place, place], 0.0)))
-            found.setdefault(name, {})[axis] = Bias(float(state.x[number, place]), sd)
+        for name, place in zip(segment.sensors, sensors.bias[:, number, 1].tolist(), strict=True):
+            if place >= 0:
+                sd = float(np.sqrt(max(state.P[number, place, place], 0.0)))
+                found.setdefault(name, {})[axis] = Bias(float(state.x[number, place]), sd)
     return found

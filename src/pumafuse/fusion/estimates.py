@@ -13,6 +13,7 @@ from ..errors import UnknownNameError
 from ..filter.outcome import Outcome
 from .config import FusionConfig
 from .score import ReferenceTrack
+from .segments import Segment
 
 Mode = Literal["filtered", "as-live", "smoothed"]
 
@@ -28,6 +29,8 @@ class AxisEstimate:
         velocity_sd: Its standard deviation [m/s].
         offset: o [m], what the model cannot explain.
         offset_sd: Its standard deviation [m].
+        disturbance: d [m], which reverts to 0; 0 where the model has none.
+        disturbance_sd: Its standard deviation [m].
     """
 
     position: FloatArray
@@ -36,8 +39,19 @@ class AxisEstimate:
     velocity_sd: FloatArray
     offset: FloatArray
     offset_sd: FloatArray
+    disturbance: FloatArray
+    disturbance_sd: FloatArray
 
-    FIELDS = ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd")
+    FIELDS = (
+        "position",
+        "position_sd",
+        "velocity",
+        "velocity_sd",
+        "offset",
+        "offset_sd",
+        "disturbance",
+        "disturbance_sd",
+    )
 
 
 @dataclass(frozen=True)
@@ -57,6 +71,7 @@ class Measurements:
         stamp: As logged [s since the first command], NaN without a stamp.
         sensor: Index into ``sensors``.
         axis: Index into ``axes``.
+        segment: As in :class:`Estimates`.
         value: As logged [m].
         innovation: One step ahead [m], NaN where the filter did not use the component.
         innovation_sd: Predicted standard deviation of the innovation, √S [m].
@@ -69,6 +84,7 @@ class Measurements:
     stamp: FloatArray
     sensor: IndexArray
     axis: IndexArray
+    segment: IntArray
     value: FloatArray
     innovation: FloatArray
     innovation_sd: FloatArray
@@ -76,7 +92,7 @@ class Measurements:
     sensors: tuple[str, ...]
     axes: tuple[str, ...]
 
-    ARRAYS = ("time", "stamp", "sensor", "axis", "value", "innovation", "innovation_sd", "outcome")
+    ARRAYS = ("time", "stamp", "sensor", "axis", "segment", "value", "innovation", "innovation_sd", "outcome")
 
     @property
     def nis(self) -> FloatArray:
@@ -112,6 +128,7 @@ class Estimates:
         origin: Stamp of the first command, int ns.
         last_command: Time of the last command [s since the first].
         segment: 0, and one more after each time the log's clock was set back.
+        segments: Commands and measurements of each segment as the filter was given them.
         mode: Which measurements an estimate uses: all that are valid by then (``filtered``), only those that had
             arrived (``as-live``), or all of the run (``smoothed``).
         engine: Which engine computed it.
@@ -131,6 +148,7 @@ class Estimates:
     origin: int
     last_command: float
     segment: IntArray
+    segments: tuple[Segment, ...]
     mode: Mode
     engine: str
     config: FusionConfig

@@ -99,6 +99,7 @@ def fuse(
         origin=origin,
         last_command=(max(int(part.commands[-1]) for part in cut) - origin) / 1e9,
         segment=np.repeat(np.arange(len(parts)), [len(part) for part in times]),
+        segments=cut,
         mode=mode,
         engine=engine,
         config=config,
@@ -178,11 +179,12 @@ def _contradictions(segment: Segment, filtered: Filtered, origin: int) -> list[s
 def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measurements:
     """Every component of every measurement in the order of the filter."""
     first, columns = cut[0], list[tuple[npt.NDArray[Any], ...]]()
-    for events, results in ((part.events, part.results) for part in filtered):
+    for number, (events, results) in enumerate((part.events, part.results) for part in filtered):
         given = np.flatnonzero((events.source != COMMAND)[:, None] & (events.known != ABSENT))
         row = given // len(first.axes)
         axis = (given - row * len(first.axes)).astype(np.int16)
         time, stamp = (seconds(part, first.origin)[row] for part in (events.time, events.stamp))
         of_filter = (part.take(given) for part in (results.innovation, results.innovation_sd, results.outcome))
-        columns.append((time, stamp, events.source[row], axis, events.value.take(given), *of_filter))
+        segment = np.full(len(given), number)
+        columns.append((time, stamp, events.source[row], axis, segment, events.value.take(given), *of_filter))
     return Measurements(*map(_joined, zip(*columns, strict=True)), sensors=first.sensors, axes=first.axes)

@@ -177,6 +177,7 @@ def _measurements_table(est: Estimates) -> pa.Table:
             "innovation_sd_mm": _nullable(r.innovation_sd * MM),
             "nis": _nullable(r.nis),
             "outcome": _names(r.outcome, [outcome.word for outcome in Outcome]),
+            **_segment_column(r.segment),
         }
     )
 

@@ -2,15 +2,47 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..arrays import ALWAYS
-from ..filter.axis import BIASES, DRIFT, NOISE, OFFSET, START, Model, Sensors, State
+from ..arrays import ALWAYS, FloatArray
+from ..filter.axis import DRIFT, NOISE, NONE, OFFSET, REST, ROUGH, SMOOTH, START, VARIANCE, Model, Sensors, State
 from ..model import closed
 from ..model.plants import FirstOrder
 from .config import FusionConfig
+
+
+def _rest(config: FusionConfig, axis: str, biased: Sequence[str]) -> tuple[FloatArray, list[tuple[str, bool]]]:
+    """The states of an axis behind the offset.
+
+    Returns:
+        How fast each reverts [1/s] and its variance at the start [m²], (k, 2); of which
+        sensor each of the last ones is a bias, and whether that is constant.
+    """
+    process, found, owners = config.process[axis], list[tuple[float, float]](), list[tuple[str, bool]]()
+    if _disturbance(config, axis) == SMOOTH:
+        rate, variance = math.sqrt(3.0) / process.disturbance_time, process.disturbance_sd**2
+        found += [(rate, variance), (rate, rate * rate * variance)]
+    elif _disturbance(config, axis) == ROUGH:
+        found.append((1.0 / process.disturbance_time, process.disturbance_sd**2))
+    for name in biased:
+        sensor = config.sensors[name]
+        if sensor.bias_drift_sd > 0.0:
+            found.append((1.0 / sensor.bias_time, sensor.bias_drift_sd**2))
+            owners.append((name, False))
+        if sensor.bias_sd > 0.0:
+            found.append((0.0, sensor.bias_sd**2))
+            owners.append((name, True))
+    return np.array(found).reshape(-1, 2), owners
+
+
+def _disturbance(config: FusionConfig, axis: str) -> int:
+    process = config.process[axis]
+    if process.disturbance_sd == 0.0:
+        return NONE
+    return SMOOTH if process.disturbance_kind == "matern" else ROUGH
 
 
 def filter_model(config: FusionConfig, axes: Sequence[str], biases: Sequence[Sequence[str]]) -> Model:
@@ -24,10 +56,16 @@ def filter_model(config: FusionConfig, axes: Sequence[str], biases: Sequence[Seq
     models, process = [config.arm.axes[axis] for axis in axes], [config.process[axis] for axis in axes]
     decay = [0.0 if model.gain_recovery is None else 1.0 / model.gain_recovery for model in models]
     period = config.arm.update_period
+    rest = [_rest(config, axis, biased)[0] for axis, biased in zip(axes, biases, strict=True)]
+    table = np.zeros((len(axes), REST + max(map(len, rest), default=0), 2))
+    for number, part in enumerate(rest):
+        table[number, REST : REST + len(part)] = part
     return Model(
         order=np.array([1 if isinstance(model.plant, FirstOrder) else 2 for model in models]),
         constants=np.array([closed.constants(model.plant) for model in models]),
-        states=np.array([BIASES + len(biased) for biased in biases]),
+        states=np.array([REST + len(part) for part in rest]),
+        disturbance=np.array([_disturbance(config, axis) for axis in axes]),
+        rest=table,
         gain=np.array([[m.gain.slope, m.gain.intercept, rate, period] for m, rate in zip(models, decay, strict=True)]),
         process=np.array([[p.input_noise, p.drift, p.maneuver_noise, p.maneuver_drift] for p in process]),
     )
@@ -46,13 +84,14 @@ def filter_sensors(
     """
     known = [config.sensors.get(name) for name in names]
     sd = [[np.nan if one is None or (own := one.sd_of(axis)) is None else own for axis in axes] for one in known]
-    bias = np.full((len(names), len(axes)), -1)
-    for number, biased in enumerate(biases):
-        for place, name in enumerate(biased, BIASES):
-            bias[names.index(name), number] = place
+    bias = np.full((len(names), len(axes), 2), -1)
+    for number, (axis, biased) in enumerate(zip(axes, biases, strict=True)):
+        states, owners = _rest(config, axis, biased)
+        for place, (name, constant) in enumerate(owners, REST + len(states) - len(owners)):
+            bias[names.index(name), number, int(constant)] = place
     return Sensors(
         scale=np.array([1.0 if one is None else one.scale for one in known]),
-        sd=np.array(sd).reshape(bias.shape),
+        sd=np.array(sd).reshape(bias.shape[:2]),
         latency_sd=np.array([0.0 if one is None else one.latency_sd for one in known]),
         gate=np.array([0.0 if one is None else one.gate for one in known]),
         gate_rows=np.array([one is None or one.gate_rows for one in known], dtype=np.bool_),
@@ -80,13 +119,14 @@ def at_rest(
         start: The level u₀ [m] of each axis where it is known.
         places: Room for how many checkpoints.
     """
-    count, width = len(axes), BIASES + max((len(biased) for biased in biases), default=0)
+    rest = [_rest(config, axis, biased)[0] for axis, biased in zip(axes, biases, strict=True)]
+    count, width = len(axes), REST + max(map(len, rest), default=0)
     rows = count * (1 + places) + 1
     P, drive = np.zeros((rows, width, width)), np.zeros((rows, 6))
-    for number, (axis, biased) in enumerate(zip(axes, biases, strict=True)):
+    for number, axis in enumerate(axes):
         P[number, OFFSET, OFFSET] = config.start.offset_sd**2
-        for place, name in enumerate(biased, BIASES):
-            P[number, place, place] = config.sensors[name].bias_sd ** 2
+        for place, variance in enumerate(rest[number][:, VARIANCE], REST):
+            P[number, place, place] = variance
         process = config.process[axis]
         drive[number, [START, NOISE, DRIFT]] = start.get(axis, np.nan), process.input_noise**2, process.drift**2
     return State(
@@ -98,5 +138,5 @@ def at_rest(
         gate_time=np.full((rows, sensors, 2), ALWAYS),
         gate_count=np.zeros((rows, sensors, 2), dtype=np.int64),
         unsettled=np.full(rows, ALWAYS),
-        work=np.zeros((4, width)),
+        work=np.zeros((count, 4, width)),
     )

@@ -14,6 +14,7 @@ from ..units import MM
 from .consistency import chi_square_band, consistency, log_likelihood
 from .estimates import AxisEstimate, Estimates
 from .score import ReferenceTrack, score, score_velocity
+from .skill import Skill, skill
 
 
 class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -32,6 +33,8 @@ class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):
         verdict: In words, with the likely cause and the key to change.
         bias_mm: The estimated bias in the log's coordinates; null where none is estimated.
         bias_sd_mm: Its standard deviation.
+        skill: How well its next measurement is predicted, by this filter and by simpler means; null with fewer than
+            two measurements.
     """
 
     outcomes: dict[str, int]
@@ -45,6 +48,7 @@ class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):
     verdict: str = "nothing fused"
     bias_mm: float | None = None
     bias_sd_mm: float | None = None
+    skill: Skill | None = None
 
 
 class ScoreSummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -201,7 +205,7 @@ def _axis_summary(est: Estimates, axis: str) -> AxisSummary:
 def _sensor_summary(est: Estimates, sensor: str, axis: str) -> SensorSummary:
     measurements, found = est.measurements.of(sensor, axis), consistency(est, sensor, axis)
     if found is None:
-        return SensorSummary(outcomes=measurements.counts())
+        return SensorSummary(outcomes=measurements.counts(), skill=skill(est, measurements))
     fused = measurements.where(measurements.outcome == Outcome.FUSED)
     bias = est.biases.get(sensor, {}).get(axis)
     first = 1 if bias is not None and len(fused.value) > 1 else 0  # the first measurement determines the bias
@@ -217,4 +221,5 @@ def _sensor_summary(est: Estimates, sensor: str, axis: str) -> SensorSummary:
         verdict=found.verdict,
         bias_mm=None if bias is None else bias.value * MM,
         bias_sd_mm=None if bias is None else bias.sd * MM,
+        skill=skill(est, measurements),
     )

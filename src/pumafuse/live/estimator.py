@@ -499,7 +499,7 @@ def empty_window(
     """
     names, count = tuple(config.sensors), len(axes)
     biases = [
-        [name for name, sensor in config.sensors.items() if sensor.bias_sd > 0.0 and sensor.sd_of(axis) is not None]
+        [name for name, sensor in config.sensors.items() if sensor.biased and sensor.sd_of(axis) is not None]
         for axis in axes
     ]
     state = at_rest(config, axes, len(names), biases, NEVER, start, FIRST_ROWS + 2)

@@ -54,10 +54,12 @@ class AxisNow(NamedTuple):
     Attributes:
         position: [m], in the stream's own coordinates.
         position_sd: [m].
-        velocity: The model's drift [m/s].
+        velocity: Mean over the coming update period [m/s].
         velocity_sd: [m/s].
         offset: How far the arm is from its model [m].
         offset_sd: [m].
+        disturbance: What of that reverts to 0 [m]; beside the offset.
+        disturbance_sd: [m].
     """
 
     position: float
@@ -66,6 +68,8 @@ class AxisNow(NamedTuple):
     velocity_sd: float
     offset: float
     offset_sd: float
+    disturbance: float
+    disturbance_sd: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -131,7 +131,10 @@ def _processes(likelihood: Likelihood, config: FusionConfig) -> list[dict[str, P
     """Starts for each axis's process noise, in proportion to the misfit of the noiseless arm."""
     misfit = likelihood.misfit(config)
     return [
-        {axis: Process(**{key: value * metres for key, value in one.items()}) for axis, metres in misfit.items()}
+        {
+            axis: msgspec.structs.replace(config.process[axis], **{key: value * metres for key, value in one.items()})
+            for axis, metres in misfit.items()
+        }
         for one in _PROCESSES
     ]
 

@@ -1,0 +1,154 @@
+"""Skill: how well a sensor's next measurement is predicted, without a truth; by the filter, and by simpler means.
+
+Every predictor has the same measurements to predict: those that the filter decided on, rejected ones too, but for the
+first of each segment, before which the others know nothing. All but the command alone know the sensor's earlier ones:
+
+- the last one held;
+- a constant-velocity filter of this sensor alone: white acceleration, no gate, the rate unknown at the start. What it
+  predicts depends on the density of its noise over R alone: of eleven densities the one that, in hindsight, has the
+  smallest RMS. It is a limit of our filter: see :mod:`pumafuse.model.matern`;
+- the command alone: the arm's delay, plant and gain, and the sensor's scale. An unknown constant bias is the mean of
+  what was left over at the earlier measurements that the gate let pass;
+- the filter, by its innovations. It may know other sensors.
+"""
+
+# pyright: reportArgumentType=false
+# (an element of an array is a plain number in a kernel: numba compiles it, numpy's types do not know)
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+
+from ..arrays import FloatArray
+from ..compiled import kernel
+from ..filter.outcome import Outcome
+from ..model.response import response
+from ..units import MM
+from .estimates import Estimates, Measurements
+
+_DENSITIES = np.logspace(-8.0, 2.0, 11)  # of the acceleration, over R and the cube of the median interval
+_UNKNOWN = 1e6  # variance of the rate at the start, over R and the square of the median interval
+
+
+class PredictionError(msgspec.Struct, frozen=True, kw_only=True):
+    """Errors of predicting a sensor's measurements: root mean square, and median of their sizes."""
+
+    rms_mm: float
+    median_mm: float
+
+
+class Skill(msgspec.Struct, frozen=True, kw_only=True):
+    """How well a sensor's next measurement on one axis is predicted.
+
+    Attributes:
+        predictions: How many: those fused, rejected and re-acquired, without the first of each segment.
+        last_held: By the measurement before it.
+        constant_velocity: By a constant-velocity filter of this sensor, with the noise that is best in hindsight.
+        command_alone: By the commands through the arm's delay, plant and gain.
+        filter: By this filter, which may know other sensors.
+    """
+
+    predictions: int
+    last_held: PredictionError
+    constant_velocity: PredictionError
+    command_alone: PredictionError
+    filter: PredictionError
+
+    @property
+    def of_best_other(self) -> float | None:
+        """RMS of the filter's errors over the smallest of the others'; None where another makes no error."""
+        best = min(one.rms_mm for one in (self.last_held, self.constant_velocity, self.command_alone))
+        return self.filter.rms_mm / best if best > 0.0 else None
+
+
+def skill(est: Estimates, measured: Measurements) -> Skill | None:
+    """Errors of predicting the next measurement of a sensor on an axis; None with fewer than two in every segment.
+
+    Args:
+        est: The estimates.
+        measured: Their components of one sensor on one axis.
+    """
+    predicted = np.isfinite(measured.innovation)
+    parts = [measured.where(predicted & (measured.segment == number)) for number in range(len(est.segments))]
+    parts = [part for part in parts if len(part.value) > 1]
+    if not parts:
+        return None
+    return Skill(
+        predictions=sum(len(part.value) - 1 for part in parts),
+        last_held=_summed_up(np.concatenate([np.diff(part.value) for part in parts])),
+        constant_velocity=_summed_up(_by_constant_velocity(parts)),
+        command_alone=_summed_up(np.concatenate([_by_command(est, part) for part in parts])),
+        filter=_summed_up(np.concatenate([part.innovation[1:] for part in parts])),
+    )
+
+
+def _summed_up(error: FloatArray) -> PredictionError:
+    rms = float(np.sqrt(error @ error / len(error)))
+    return PredictionError(rms_mm=rms * MM, median_mm=float(np.median(np.abs(error))) * MM)
+
+
+def _by_command(est: Estimates, measured: Measurements) -> FloatArray:
+    """Measurements of one segment less what the commands say of them [m], without the first, (n - 1,)."""
+    sensor, axis = measured.sensors[int(measured.sensor[0])], measured.axes[int(measured.axis[0])]
+    arm, known, segment = est.config.arm, est.config.sensors[sensor], est.segments[int(measured.segment[0])]
+    time, start = est.origin + np.rint(measured.time * 1e9).astype(np.int64), segment.start[axis]
+    stamp, command = segment.given(axis)
+    moved = response(arm.axes[axis], arm.update_period, arm.delay_of(axis), stamp, command, start, time)
+    left = measured.value - known.scale * (start + moved)
+    if known.bias_sd == 0.0:
+        return left[1:]
+    passed = measured.outcome != Outcome.REJECTED
+    bias = np.cumsum(np.where(passed, left, 0.0)) / np.maximum(np.cumsum(passed), 1)
+    return left[1:] - bias[:-1]
+
+
+def _by_constant_velocity(parts: Sequence[Measurements]) -> FloatArray:
+    """Innovations [m] of the best constant-velocity filter on each segment, without the first of each, (n,)."""
+    intervals = np.concatenate([np.diff(part.time) for part in parts])
+    unit = float(np.median(intervals[intervals > 0.0])) if (intervals > 0.0).any() else 1.0
+    square, found, end = np.zeros(len(_DENSITIES)), np.empty(len(intervals)), 0
+    for part in parts:
+        _filter(part.time / unit, part.value, _DENSITIES, np.empty((5, len(square))), square, found[:0])
+    best = _DENSITIES[[np.argmin(square)]]
+    for part in parts:
+        begin, end = end, end + len(part.value) - 1
+        _filter(part.time / unit, part.value, best, np.empty((5, 1)), np.zeros(1), found[begin:end])
+    return found
+
+
+@kernel
+def _filter(
+    time: FloatArray, value: FloatArray, density: FloatArray, room: FloatArray, square: FloatArray, found: FloatArray
+) -> None:
+    """Constant-velocity filters with R = 1.
+
+    Args:
+        time: Of the measurements, ascending, (n,).
+        value: Of the measurements, (n,).
+        density: Of each filter's noise, white on the acceleration, (g,).
+        room: For the filters' states, (5, g).
+        square: The sum of the squares of each one's innovations is added, (g,).
+        found: Gets the last one's innovations, without the first, (n - 1,); (0,): they are not kept.
+    """
+    position, rate, p11, p12, p22 = room[0], room[1], room[2], room[3], room[4]
+    position[:], rate[:], p11[:], p12[:], p22[:] = value[0], 0.0, 1.0, 0.0, _UNKNOWN
+    last = 0.0
+    for n in range(1, len(value)):
+        dt = time[n] - time[n - 1]
+        for g in range(len(density)):
+            noise = density[g] * dt
+            a = p11[g] + dt * (2.0 * p12[g] + dt * (p22[g] + noise / 3.0))
+            b = p12[g] + dt * (p22[g] + 0.5 * noise)
+            gain, gain_of_rate = a / (a + 1.0), b / (a + 1.0)
+            predicted = position[g] + rate[g] * dt
+            nu = value[n] - predicted
+            square[g] += nu * nu
+            position[g] = predicted + gain * nu
+            rate[g] += gain_of_rate * nu
+            p11[g], p12[g], p22[g] = gain, gain_of_rate, p22[g] + noise - gain_of_rate * b
+            last = nu
+        if len(found):
+            found[n - 1] = last

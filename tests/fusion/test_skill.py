@@ -1,0 +1,277 @@
+"""Skill: each predictor against itself worked out one measurement at a time.
+
+The constant-velocity filter is judged by regression on all earlier measurements at once, the command alone by the
+superposition of closed-form responses.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from executable import pumafuse
+from fusion_oracle import Response, commands
+from pumafuse.fusion import results
+from pumafuse.fusion.skill import PredictionError, Skill, skill
+
+PERIOD, SD = 0.028, 0.5e-3
+ARM = pf.ArmModel(
+    name="simulated",
+    update_period=PERIOD,
+    delay=0.0605,
+    axes={
+        "radial": pf.AxisModel(
+            plant=pf.SecondOrder(natural_frequency=40.0, damping=0.7),
+            gain=pf.Gain(slope=0.1, intercept=1.02),
+            gain_recovery=0.14,
+            delay=0.05,
+        ),
+        "vertical": pf.AxisModel(plant=pf.FirstOrder(time_constant=0.0425)),
+    },
+)
+DENSITIES = [10.0**power for power in range(-8, 3)]
+
+
+def config(**sensors: pf.Sensor) -> pf.FusionConfig:
+    return pf.FusionConfig(arm=ARM, sensors=sensors)
+
+
+def fused(run: pf.Run, of: pf.FusionConfig) -> pf.Estimates:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        return pf.fuse(run, of)
+
+
+def found(est: pf.Estimates, sensor: str, axis: str) -> Skill:
+    one = skill(est, est.measurements.of(sensor, axis))
+    assert one is not None
+    return one
+
+
+def moving_run(seed: int, begin: float = 10.0, count: int = 90) -> pf.Run:
+    """Two axes that move after a rest; a camera with gaps, outliers and NaN, and a range sensor of scale −1."""
+    rng = np.random.default_rng(seed)
+    time = begin + PERIOD * np.arange(count)
+    path = {
+        "radial": 0.5 + 0.03 * np.sin(1.5 * np.maximum(time - begin - 0.4, 0.0)),
+        "vertical": 0.2 + 0.02 * np.maximum(time - begin - 0.4, 0.0),
+    }
+    seen = np.sort(begin + rng.uniform(0.1, PERIOD * count, 60))
+    seen = seen[(seen < begin + 1.0) | (seen > begin + 1.5)]
+    sight = {axis: np.interp(seen - 0.1, time, u) + SD * rng.standard_normal(len(seen)) for axis, u in path.items()}
+    sight["radial"][[7, 20]] += 0.05, -0.04
+    sight["vertical"][11] = np.nan
+    ranged = begin + 0.05 + 0.02 * np.arange(80)
+    distance = 1.2 - np.interp(ranged - 0.1, time, path["radial"]) + 1e-4 * rng.standard_normal(80)
+    distance[30] += 0.02
+    return pf.Run.from_arrays(
+        time, path, {"camera": (seen + 0.02, sight), "range": (ranged, {"radial": distance})}, name=f"run {seed}"
+    )
+
+
+def one_after_the_other(first: pf.Run, second: pf.Run) -> pf.Run:
+    """A log whose clock was set back."""
+
+    def sources(a, b):
+        values = {axis: np.concatenate([a.values[axis], b.values[axis]]) for axis in a.values}
+        return replace(a, stamp=np.concatenate([a.stamp, b.stamp]), values=values)
+
+    sensors = {name: sources(first.sensors[name], second.sensors[name]) for name in first.sensors}
+    return replace(first, command=sources(first.command, second.command), sensors=sensors)
+
+
+SENSORS = {
+    "camera": pf.Sensor(sd=SD, latency=0.02, gate=5.0),
+    "range": pf.Sensor(sd=1e-4, scale=-1.0, bias_sd=2.0, gate=5.0),
+}
+PAIRS = [("camera", "radial"), ("camera", "vertical"), ("range", "radial")]
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[pf.Run]:
+    return [moving_run(1), moving_run(2, begin=3.0, count=70)]
+
+
+@pytest.fixture(scope="module")
+def est(runs) -> pf.Estimates:
+    return fused(one_after_the_other(*runs), config(**SENSORS))
+
+
+def segments_of(est: pf.Estimates, sensor: str, axis: str) -> list[pf.Measurements]:
+    """What a sensor gave on an axis that was a measurement, by segment: by the time that starts anew."""
+    mine = est.measurements.of(sensor, axis)
+    mine = mine.where(mine.outcome <= pf.Outcome.REACQUIRED)
+    back = int(np.flatnonzero(np.diff(mine.time) < 0.0)[0]) + 1
+    early = np.arange(len(mine.time)) < back
+    return [mine.where(early), mine.where(~early)]
+
+
+def errors(values: list[float]) -> PredictionError:
+    ordered = sorted(abs(value) for value in values)
+    half = len(ordered) // 2
+    median = ordered[half] if len(ordered) % 2 else (ordered[half - 1] + ordered[half]) / 2.0
+    mean_square = sum(value * value for value in values) / len(values)
+    return PredictionError(rms_mm=1e3 * math.sqrt(mean_square), median_mm=1e3 * median)
+
+
+def check(got: PredictionError, values: list[float], rel: float = 1e-9) -> None:
+    wanted = errors(values)
+    assert (got.rms_mm, got.median_mm) == (pytest.approx(wanted.rms_mm, rel), pytest.approx(wanted.median_mm, rel))
+
+
+@pytest.mark.parametrize(("sensor", "axis"), PAIRS)
+def test_last_one_held_and_filter(est: pf.Estimates, sensor: str, axis: str):
+    """Differences of successive measurements, and innovations, but for the first of each segment."""
+    got, parts = found(est, sensor, axis), segments_of(est, sensor, axis)
+    check(got.last_held, [float(b - a) for part in parts for a, b in zip(part.value, part.value[1:], strict=False)])
+    check(got.filter, [float(nu) for part in parts for nu in part.innovation[1:]])
+    assert got.predictions == sum(len(part.value) - 1 for part in parts)
+    counts = pf.summarise(est).axes[axis].sensors[sensor].outcomes
+    assert counts["rejected"] >= 1  # and are among the predicted
+    assert got.predictions == counts["fused"] + counts["rejected"] + counts.get("reacquired", 0) - 2
+
+
+def by_velocity(time: np.ndarray, value: np.ndarray, density: float) -> list[float]:
+    """Each value less a regression on those before: on level, slope, and an integrated random walk of the slope."""
+    t, y = time - time[0], value - value[0]
+    early, late = np.minimum.outer(t, t), np.maximum.outer(t, t)
+    walk = density * early**2 * (late / 2.0 - early / 6.0)
+    line, prior = np.stack([np.ones(len(t)), t], axis=1), np.diag([0.0, 1e-6])  # precision: the level is unknown
+    found = [float(y[1])]  # after one measurement no slope is known but 0
+    for k in range(2, len(t)):
+        weighted = np.linalg.solve(walk[:k, :k] + np.eye(k), np.column_stack([line[:k], y[:k], walk[:k, k]]))
+        fit = np.linalg.solve(line[:k].T @ weighted[:, :2] + prior, line[:k].T @ weighted[:, 2])
+        found.append(float(y[k] - line[k] @ fit - weighted[:, 3] @ (y[:k] - line[:k] @ fit)))
+    return found
+
+
+@pytest.mark.parametrize(("sensor", "axis"), PAIRS)
+def test_constant_velocity(est: pf.Estimates, sensor: str, axis: str):
+    """The best of eleven regressions, each told all earlier measurements at once."""
+    parts = segments_of(est, sensor, axis)
+    unit = np.median(np.concatenate([np.diff(part.time) for part in parts]))
+    tried = [[e for part in parts for e in by_velocity(part.time / unit, part.value, d)] for d in DENSITIES]
+    check(found(est, sensor, axis).constant_velocity, min(tried, key=lambda one: sum(e * e for e in one)), 1e-6)
+
+
+@pytest.mark.parametrize(("sensor", "axis"), PAIRS)
+def test_command_alone(est: pf.Estimates, runs: list[pf.Run], sensor: str, axis: str):
+    """Superposed responses to the steps of the commands; a constant bias is the mean of what was left over before."""
+    left: list[float] = []
+    response, known = Response(ARM.axes[axis]), SENSORS[sensor]
+    for run, part in zip(runs, segments_of(est, sensor, axis), strict=True):
+        given, start = commands(run, est.config, axis), float(run.command.values[axis][0])
+        begin, before = int(run.command.stamp[0]) - est.origin, list[float]()
+        for n, time in enumerate(part.time.tolist()):
+            since = (round(time * 1e9) - begin - given.acting) * 1e-9
+            acts = since > 0.0
+            moved = given.step[acts] @ response.step(since[acts]) + given.error[acts] @ response.gain_error(since[acts])
+            error = float(part.value[n] - known.scale * (start + moved))
+            left += [error - (sum(before) / max(len(before), 1) if known.bias_sd else 0.0)] if n else []
+            before += [error] if part.outcome[n] != pf.Outcome.REJECTED else []
+    check(found(est, sensor, axis).command_alone, left, 1e-7)
+
+
+def test_nothing_to_predict():
+    """One measurement predicts nothing, two predict one; neither do rows that are no measurement, nor one a segment."""
+    run = moving_run(1)
+    sight, camera = run.sensors["camera"], SENSORS["camera"]
+
+    def first(count: int, stamp: float = 0.0) -> pf.Run:
+        source = replace(
+            sight,
+            stamp=sight.stamp[:count] + round(stamp * 1e9),
+            values={axis: value[:count] for axis, value in sight.values.items()},
+        )
+        return replace(run, sensors={"camera": source})
+
+    def skill_of(run: pf.Run, of: pf.FusionConfig) -> Skill | None:
+        est = fused(run, of)
+        summary = pf.summarise(est).axes["radial"].sensors["camera"]
+        assert summary.skill == skill(est, est.measurements.of("camera", "radial"))
+        return summary.skill
+
+    assert skill_of(first(1), config(camera=camera)) is None
+    assert skill_of(first(2), config(camera=camera)).predictions == 1
+    assert skill_of(first(30), config()) is None  # unknown
+    assert skill_of(first(30, -100.0), config(camera=camera)) is None  # before the start
+    assert skill_of(one_after_the_other(first(1), replace(first(1, -8.0), name="x")), config(camera=camera)) is None
+
+
+def test_values_that_do_not_change():
+    """A frozen sensor is predicted exactly by its last value; no ratio is made of it."""
+    time = 10.0 + PERIOD * np.arange(50)
+    still = {axis: np.full(50, 0.3) for axis in ARM.axes}
+    run = pf.Run.from_arrays(time, still, {"camera": (time + 0.03, still)})
+    got = found(fused(run, config(camera=SENSORS["camera"])), "camera", "radial")
+    assert got.last_held == PredictionError(rms_mm=0.0, median_mm=0.0)
+    assert got.of_best_other is None
+
+
+def test_a_constant_velocity_filter_is_nested():
+    """With gain 0 and a disturbance of 4 λ³ σ² = q, long and large, fusion predicts as the best of the others does."""
+    rng, count, interval = np.random.default_rng(5), 3000, 0.02
+    density = SD**2 / interval**3
+    kick = np.linalg.cholesky(density * np.array([[interval**3 / 3, interval**2 / 2], [interval**2 / 2, interval]]))
+    path, state = np.empty(count), np.zeros(2)
+    for n in range(count):
+        state = np.array([[1.0, interval], [0.0, 1.0]]) @ state + kick @ rng.standard_normal(2)
+        path[n] = state[0]
+    time = 10.0 + interval * np.arange(count)
+    run = pf.Run.from_arrays(
+        time[::10],
+        {"vertical": 0.1 * rng.standard_normal(count // 10)},
+        {"camera": (time, {"vertical": path + SD * rng.standard_normal(count)})},
+        start={"vertical": 0.0},
+    )
+    sd = 1e8 * SD
+    of = pf.FusionConfig(
+        arm=pf.ArmModel(
+            name="none",
+            update_period=10 * interval,
+            delay=0.0,
+            axes={"vertical": pf.AxisModel(plant=pf.FirstOrder(time_constant=0.01), gain=pf.Gain(intercept=0.0))},
+        ),
+        start=pf.Start(offset_sd=0.0),
+        process={
+            "vertical": pf.Process(
+                input_noise=0.0,
+                drift=0.0,
+                disturbance_sd=sd,
+                disturbance_time=math.sqrt(3.0) / (density / (4.0 * sd**2)) ** (1.0 / 3.0),
+            )
+        },
+        sensors={"camera": pf.Sensor(sd=SD, gate=0.0)},
+    )
+    got = found(fused(run, of), "camera", "vertical")
+    assert got.filter.rms_mm == pytest.approx(got.constant_velocity.rms_mm, 1e-3)
+    assert got.filter.median_mm == pytest.approx(got.constant_velocity.median_mm, 1e-3)
+    assert got.of_best_other == pytest.approx(1.0, abs=1e-3)
+    assert got.last_held.rms_mm > 1.5 * got.filter.rms_mm
+    assert got.command_alone.rms_mm > 1.5 * got.filter.rms_mm
+
+
+def test_files_and_screens_have_it(tmp_path):
+    """`summary.json` read back is the summary; measurements have segments; `fuse` and `compare` print."""
+    runs = moving_run(1), moving_run(2, begin=3.0, count=70)
+    est = fused(one_after_the_other(*runs), config(**SENSORS))
+    results.write(est, tmp_path / "set-back", force=False)
+    read = results.read(tmp_path / "set-back").summary
+    assert read.axes["radial"].sensors["range"].skill == found(est, "range", "radial")
+    table = results.tables.read(tmp_path / "set-back" / "measurements.parquet")
+    assert table.columns["segment"].to_pylist() == est.measurements.segment.tolist()
+
+    scan = pf.__path__[0] + "/data"
+    printed = pumafuse("fuse", f"{scan}/scan1", "-c", f"{scan}/fusion.toml", "-o", str(tmp_path / "out")).stdout
+    compared = pumafuse("compare", str(tmp_path / "out")).stdout
+    one = json.loads(pumafuse("compare", str(tmp_path / "out"), "--json").stdout)[0]["skill"]["radial"]["range"]
+    for text in (printed, compared):
+        row = next(line for line in text.splitlines() if " range " in line and " / " in line)
+        cells = [f"{one[key]['rms_mm']:.3f} / {one[key]['median_mm']:.3f}" for key in list(one)[1:]]
+        assert row.split(maxsplit=5)[0] and all(cell in row for cell in cells)
