@@ -82,17 +82,24 @@ def search(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: N
 
 def _models(likelihood: Likelihood, config: FusionConfig, free: FreeOf) -> list[FusionConfig]:
     """Without a disturbance, and where one may be fitted with one of each kind and little other noise."""
+    misfit, every = likelihood.misfit(config), config
+    for axis in misfit:
+        every = with_disturbance(every, axis, misfit[axis], _TIME)
+    disturbed = [str(one.axis) for one in free(every) if one.path[-1] == "disturbance_sd"]
     models = [config]
-    misfit = likelihood.misfit(config)
-    for kind in ("matern", "ou"):
+    for axis in disturbed:
+        known = config.process[axis]
+        models[0] = with_disturbance(models[0], axis, 0.0, known.disturbance_time, known.disturbance_kind)
+    for kind in ("matern", "ou") if disturbed else ():
         model = config
-        for axis, metres in misfit.items():
-            quiet = msgspec.structs.replace(
-                config.process[axis], **{key: _QUIET * value * metres for key, value in _PROCESSES[0].items()}
-            )
-            model = with_disturbance(changed(model, ("process", axis), quiet), axis, 0.5 * metres, _TIME, kind)
-        if any(one.path[-1].startswith("disturbance") for one in free(model)):
-            models.append(model)
+        for axis in disturbed:
+            model = with_disturbance(model, axis, 0.5 * misfit[axis], config.process[axis].disturbance_time, kind)
+        for one in free(model):
+            if one.axis in disturbed and one.path[-1] in _PROCESSES[0]:
+                model = one.put(model, _QUIET * _PROCESSES[0][one.path[-1]] * misfit[one.axis])
+            elif one.axis in disturbed and one.path[-1] == "disturbance_time":
+                model = one.put(model, _TIME)
+        models.append(model)
     return models
 
 
@@ -251,7 +258,7 @@ def _arm(
             ahead = float(lowered[0][number] - lowered[1][number])
             orders[axis] = (
                 f"{'second' if ahead >= 0.0 else 'first'} order: second gains {gains[number]:.1f} in log-likelihood,"
-                f" {ahead:+.1f} after the penalty for one number more (BIC)"
+                f" {ahead:+.1f} after the penalty for numbers (BIC)"
             )
     return _best_by_axis(likelihood, pair, lowered), orders
 

@@ -37,12 +37,14 @@ class Plan:
         fixed: Names of parameters to leave as they are.
         sensors: The sensors to use; None: all.
         trusted: The sensor that the arm was fitted on: only parameters of other sensors are free; None: all.
+        sd_prior: Whether a sensor's noise is believed to be the configured one within a factor of 1.5.
     """
 
     fit: Sequence[Fit]
     fixed: Sequence[str]
     sensors: Sequence[str] | None = None
     trusted: str | None = None
+    sd_prior: bool = True
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def run_stage(
 
     def free(at: FusionConfig) -> list[Parameter]:
         names = [*plan.fixed, *(one.fixed for one in fixed)]
-        every = parameters(at, config, likelihood.sensors, plan.fit, names)
+        every = parameters(at, config, likelihood.sensors, plan.fit, names, plan.sd_prior)
         return [one for one in every if _may_vary(one, plan, excited)]
 
     start, notes = likelihood.config, list[str]()
