@@ -53,7 +53,7 @@ def test_a_parameter_at_a_bound_is_reported() -> None:
 
 
 def test_pairs_beyond_nine_tenths_are_named() -> None:
-    """Delay and time constant by a camera alone: the correlations of the inverted information with the priors', no others."""
+    """Delay and time constant by a camera alone: the correlations of the inverted information and priors, no others."""
     sim = with_outliers(2)
     found = fit_stage(sim.run, sim.config, ("noise", "delay", "plant"))
     inside = [one for one in found.free if one.at_bound(found.best.config) is None]

@@ -101,7 +101,7 @@ UNBIASED = {
 
 @pytest.mark.parametrize("case", UNBIASED.values(), ids=UNBIASED.keys())
 def test_without_gates_it_is_the_density_of_the_joint_gaussian(case: Case) -> None:
-    """All measurements of an axis at once, with the mean and covariance of the oracle, factored in 50 digits; lengths in mm."""
+    """All measurements of an axis at once, with the oracle's mean and covariance, in 50 digits; lengths in mm."""
     run, config = case.made()
     assert all(one.gate == 0.0 for one in config.sensors.values())
     likelihood = Likelihood([run], config)

@@ -166,9 +166,9 @@ def not_identifiable(likelihood: Likelihood, best: Point, free: Sequence[Paramet
 
 
 def not_identifiable_noise(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> list[Parameter]:
-    """The noises of sensors that the measurements, without any prior, leave uncertain by a factor of e, or put at 0."""
+    """The noises of sensors that are uncertain by more than a factor of e, or at their lower bound."""
     inside = within_bounds(free, best.config)
-    cov = covariance(likelihood.derivatives(best.config, inside, best.outcomes).information, inside)
+    cov = covariance(derivatives(likelihood, best, inside).information, inside)
     wide = {one.key for one, variance in zip(inside, np.diag(cov), strict=True) if variance > 1.0}
     noise = [one for one in free if one.fit == "noise" and one.sensor is not None]
     return [one for one in noise if one.key in wide or one.at_bound(best.config) == "lower"]

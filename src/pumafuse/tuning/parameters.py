@@ -26,6 +26,7 @@ LATENCIES = (-0.1, 0.3)  # s; bounds of a latency, relative to the configured on
 DELAYS = (-0.1, 0.2)  # s; likewise of a delay, which is never below 0
 _RECOVERY = (0.020, 0.500)  # s; 95 % of the prior lie within
 _RECOVERY_PRIOR = (0.5 * math.log(_RECOVERY[0] * _RECOVERY[1]), math.log(_RECOVERY[1] / _RECOVERY[0]) / (2.0 * 1.96))
+SD_BOUNDS = (1e-7, 1.0)  # m
 _SD_PRIOR = (0.0, math.log(1.5))  # about the configured number
 _INTERCEPT = {"log": False, "scale": 0.1, "prior": (0.0, 0.1)}
 _TICK = 0.028  # s; a large change of a time, on any arm
@@ -169,7 +170,7 @@ _TABLE = (  # a process noise at its lower bound is none; bounds and prior of wh
     _line("noise", "process.{axis}.maneuver_drift_mm_rts_per_m_s", "process.{axis}.maneuver_drift", 1e-5, 300.0),
     _line("noise", "process.{axis}.disturbance_sd_mm", "process.{axis}.disturbance_sd", 1e-7, 10.0),
     _line("noise", "process.{axis}.disturbance_time_ms", "process.{axis}.disturbance_time", 1e-3, 1e3),
-    _line("noise", "sensors.{sensor}.sd_mm.{axis}", "sensors.{sensor}.sd.{axis}", 1e-7, 1.0, prior=_SD_PRIOR),
+    _line("noise", "sensors.{sensor}.sd_mm.{axis}", "sensors.{sensor}.sd.{axis}", *SD_BOUNDS, prior=_SD_PRIOR),
     _line("delay", "axes.{axis}.delay_ms", "arm.axes.{axis}.delay", *DELAYS, log=False, scale=_TICK),
     _line("plant", "axes.{axis}.time_constant_ms", "arm.axes.{axis}.plant.time_constant", 1e-4, 10.0),
     _line("plant", "axes.{axis}.natural_frequency_rad_s", "arm.axes.{axis}.plant.natural_frequency", 0.5, 5e3),

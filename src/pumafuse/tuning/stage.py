@@ -56,7 +56,7 @@ class Stage:
         best: The most likely point.
         free: The parameters that were fitted.
         not_identifiable: What the measurements do not determine, so that one parameter of each was fixed.
-        orders: The reason for each axis's plant's order, where it was chosen.
+        orders: The reasons for the order of each axis's plant, for its gain and for its disturbance, where chosen.
         notes: Everything else noticed.
     """
 
