@@ -85,16 +85,22 @@ def spoiled_arm(config: pf.FusionConfig) -> pf.FusionConfig:
     return replaced(config, arm=replaced(arm, axes=axes))
 
 
-def free_of(likelihood: Likelihood, config: pf.FusionConfig, fit: Sequence[Fit], *fixed: str) -> list[Parameter]:
+def free_of(
+    likelihood: Likelihood, config: pf.FusionConfig, fit: Sequence[Fit], *fixed: str, sd_prior: bool = True
+) -> list[Parameter]:
     """The free parameters of a configuration."""
-    return parameters(config, likelihood.config, likelihood.sensors, fit, fixed)
+    return parameters(config, likelihood.config, likelihood.sensors, fit, fixed, sd_prior)
 
 
 def fit_stage(
-    run: pf.Run | Sequence[pf.Run], config: pf.FusionConfig, fit: Sequence[Fit] = ("noise",), *fixed: str
+    run: pf.Run | Sequence[pf.Run],
+    config: pf.FusionConfig,
+    fit: Sequence[Fit] = ("noise",),
+    *fixed: str,
+    sd_prior: bool = True,
 ) -> Stage:
     """The result of one stage on whole runs."""
-    return run_stage([run] if isinstance(run, pf.Run) else run, config, Plan(fit, fixed))
+    return run_stage([run] if isinstance(run, pf.Run) else run, config, Plan(fit, fixed, sd_prior=sd_prior))
 
 
 def intervals_of(stage: Stage) -> dict[str, ConfidenceInterval]:

@@ -53,11 +53,12 @@ def test_a_parameter_at_a_bound_is_reported() -> None:
 
 
 def test_pairs_beyond_nine_tenths_are_named() -> None:
-    """Delay and time constant by a camera alone: the correlations of the inverted information, no others."""
-    sim = with_outliers(1)
+    """Delay and time constant by a camera alone: the correlations of the inverted information and priors, no others."""
+    sim = with_outliers(2)
     found = fit_stage(sim.run, sim.config, ("noise", "delay", "plant"))
     inside = [one for one in found.free if one.at_bound(found.best.config) is None]
     information = found.likelihood.derivatives(found.best.config, inside, found.best.outcomes).information
+    information += np.diag([0.0 if one.prior is None else one.prior[1] ** -2 for one in inside])
     inverse = np.linalg.inv(information)
     sd = np.sqrt(np.diag(inverse))
     matrix = inverse / np.outer(sd, sd)

@@ -40,10 +40,10 @@ def at_rest(values: np.ndarray, drift: float, sd: float) -> tuple[Likelihood, pf
 
 
 def intervals(
-    likelihood: Likelihood, config: pf.FusionConfig, *keys: str
+    likelihood: Likelihood, config: pf.FusionConfig, *keys: str, sd_prior: bool = False
 ) -> tuple[pf.FusionConfig, dict[str, ConfidenceInterval]]:
     """The best configuration and the intervals of these parameters, all others fixed."""
-    free = [one for one in free_of(likelihood, config, ("noise", "latency")) if one.key in keys]
+    free = [one for one in free_of(likelihood, config, ("noise", "latency"), sd_prior=sd_prior) if one.key in keys]
     best = maximise(likelihood, config, free)
     return best.config, confidence_intervals(likelihood, best, free)
 
@@ -51,22 +51,31 @@ def intervals(
 # ---- against likelihoods without a filter ---------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("sd_prior", [False, True], ids=["alone", "with its prior"])
 @pytest.mark.parametrize("count", [12, 40, 3000])
-def test_a_lone_sd_has_the_interval_of_white_noise(count: int) -> None:
-    """L(σ) = −n ln σ − Σz²/2σ²: both ends where that has dropped by 1.92, to 3 % of the root, for few measurements too.
+def test_a_lone_sd_has_the_interval_of_white_noise(count: int, sd_prior: bool) -> None:
+    """L(σ) = −n ln σ − Σz²/2σ², with the prior less ½ (ln(σ/σ₀) / ln 1.5)²: both ends where that has dropped by 1.92.
+
+    To 3 % of the root, for few measurements too.
 
     Few measurements make it skew: the curvature alone would put the ends of 12 measurements at σ e^(±1.96/√24), 20 %
     off.
     """
     z = 2e-4 * np.random.default_rng(count).standard_normal(count)
     likelihood, config = at_rest(z, drift=0.0, sd=1e-3)
-    best, found = intervals(likelihood, config, "sensors.eye.sd_mm.tip")
-    one, top = found["sensors.eye.sd_mm.tip"], float(np.sqrt(np.mean(z**2)))
-    assert best.sensors["eye"].sd_of("tip") == pytest.approx(top, rel=1e-3)
+    best, found = intervals(likelihood, config, "sensors.eye.sd_mm.tip", sd_prior=sd_prior)
+    one = found["sensors.eye.sd_mm.tip"]
+
+    def density(sigma: float) -> float:
+        prior = -0.5 * (np.log(sigma / 1e-3) / np.log(1.5)) ** 2 if sd_prior else 0.0
+        return float(prior - count * np.log(sigma) - 0.5 * np.sum(z**2) / sigma**2)
+
+    peak = minimize_scalar(lambda log: -density(np.exp(log)), bracket=np.log([1e-4, 1e-3]), tol=1e-10)
+    top = float(np.exp(peak.x))
+    assert best.sensors["eye"].sd_of("tip") == pytest.approx(top, rel=2e-3)
 
     def root(sigma: float) -> float:
-        drop = count * (np.log(sigma / top) + 0.5 * (top / sigma) ** 2 - 0.5)
-        return float(np.sign(sigma - top) * np.sqrt(2.0 * drop))
+        return float(np.sign(sigma - top) * np.sqrt(2.0 * max(density(top) - density(sigma), 0.0)))
 
     assert [root(end) for end in one.ci95] == pytest.approx([-ROOT, ROOT], rel=0.03)
     assert one.open == (False, False) and one.at is None

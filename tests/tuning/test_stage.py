@@ -101,19 +101,14 @@ def test_of_delays_and_latencies_one_latency_is_fixed(believed: float) -> None:
 
 @pytest.mark.parametrize("fit", [("noise", "gain"), later(("noise", "delay", "plant", "gain"))], ids="-".join)
 def test_a_gain_of_one_does_not_run_away(fit: Sequence[str]) -> None:
-    """With K = 1 nothing recovers: each axis's recovery is fixed as configured and named.
-
-    The intercept is fixed too, or near 1; delay and plant are as without.
-    """
+    """With K = 1 nothing recovers: the gain is constant, near 1; delay and plant are as without."""
     arm = outage(1).config.arm
     flat = {axis: replaced(model, gain=pf.Gain(slope=0.0, intercept=1.0)) for axis, model in arm.axes.items()}
     sim = pf.simulate(scenario("panel-tracker-outage", 0.1, 0.02, arm=replaced(arm, axes=flat)), 1)
     found = fit_stage(sim.run, spoiled(sim.config), fit)
-    sentences = [str(one) for one in found.not_identifiable]
     for axis in AXES:
         model = found.best.config.arm.axes[axis]
-        assert model.gain_recovery == 0.1
-        assert any(line.startswith(f"axes.{axis}.gain_recovery_ms is fixed: ") for line in sentences)
+        assert model.gain_recovery is None and model.gain.slope == 0.0
         assert model.gain.intercept == pytest.approx(1.0, abs=0.06)
         assert found.best.config.arm.delay_of(axis) == pytest.approx(0.06045, abs=0.003)
     assert not [key for key in numbers(found) if key.endswith("gain_recovery_ms")]
@@ -147,7 +142,8 @@ def test_a_gain_is_found_where_it_shows() -> None:
 def test_the_order_of_a_plant_is_its_own(seed: int, begin: tuple[int, int]) -> None:
     """By BIC: second for ω = 53.9 rad/s, ζ = 0.864, first for τ = 35.6 ms, whichever it was configured to be.
 
-    The penalty is half the logarithm of the number of measurements. Numbers are within 20 % of the truth.
+    The penalty of each number more, noises that are not 0 among them, is half the logarithm of the number of
+    measurements. Numbers are within 20 % of the truth.
     """
     sim = outage(seed)
     config = spoiled_arm(sim.config)
@@ -161,9 +157,10 @@ def test_the_order_of_a_plant_is_its_own(seed: int, begin: tuple[int, int]) -> N
     assert first.time_constant == pytest.approx(0.0356, rel=0.2)
     for axis, word, sign in zip(AXES, ("second", "first"), (1.0, -1.0), strict=True):
         assert found.orders[axis].startswith(f"{word} order: ")
-        gain, ahead = map(float, re.findall(r"[-+]?\d+\.\d", found.orders[axis]))
+        gain, ahead = map(float, re.findall(r"[-+]?\d+\.\d", found.orders[axis].partition(";")[0]))
         count = found.likelihood.count[found.likelihood.axes.index(axis)]
-        assert gain - ahead == pytest.approx(0.5 * np.log(count), abs=0.11)
+        numbers_more = (gain - ahead) / (0.5 * np.log(count))
+        assert numbers_more == pytest.approx(round(numbers_more), abs=0.05)
         assert sign * ahead > 0.0
 
 
@@ -173,7 +170,7 @@ def test_an_order_that_is_fixed_stays() -> None:
     found = fit_stage(sim.run, with_order(sim.config, "vertical", 2), ("noise", "plant"), "damping")
     assert isinstance(found.best.config.arm.axes["vertical"].plant, pf.SecondOrder)
     assert "axes.vertical.natural_frequency_rad_s" in numbers(found)
-    assert found.orders == {}
+    assert not [why for why in found.orders.values() if "order" in why]
 
 
 # ---- outliers and noise ---------------------------------------------------------------------------------------------
@@ -192,36 +189,48 @@ def camera(share: float, seed: int) -> tuple[pf.Run, pf.FusionConfig]:
 def test_outliers_do_not_count(seed: int) -> None:
     """1 % of measurements 5 to 20 mm off leave the fitted sd within 3 % of the same run's without them.
 
-    Also with the gate off in the configuration: it is fitted with one of 5, with a note.
+    A gate of 2 in the configuration is one of 5 in the fit, with a note. One that is off stays off: outliers count.
     """
     clean = fit_stage(*camera(0.0, seed))
     run, config = camera(0.01, seed)
     off = run.sensors["vision"].values["vertical"] - camera(0.0, seed)[0].sensors["vision"].values["vertical"]
     assert np.sum(np.abs(off) > 4.9e-3) == np.sum(off != 0.0) >= 1
-    for gate in (5.0, 0.0):
+    for gate in (5.0, 2.0):
         found = fit_stage(run, with_sensors(config, gate=gate))
         assert found.best.config.sensors["vision"].gate == 5.0
         for axis in AXES:
             sd, wanted = (stage.best.config.sensors["vision"].sd_of(axis) for stage in (found, clean))
             assert sd == pytest.approx(wanted, rel=0.03)
-        assert [note[:46] for note in found.notes] == ["vision: was fitted with a gate of 5, not of 0:"] * (gate == 0.0)
+        assert [note[:46] for note in found.notes] == ["vision: was fitted with a gate of 5, not of 2:"] * (gate == 2.0)
+    off = fit_stage(run, with_sensors(config, gate=0.0), sd_prior=False)
+    assert off.best.config.sensors["vision"].gate == 0.0 and not off.notes
+    with_all, without = (stage.best.config.sensors["vision"].sd_of("vertical") for stage in (off, clean))
+    assert with_all is not None and without is not None and with_all > 1.3 * without
 
 
 def test_a_noise_that_is_not_identifiable_is_fixed() -> None:
     """A gauge of a few micrometres, rare beside a camera: its innovations hardly depend on its sd.
 
-    It stays as configured and is named alone.
+    It stays as configured and is named alone. With its prior it is the configured one within a factor of 1.5, and its
+    interval is hardly narrower than the prior's.
     """
     camera_alone = scenario("panel-vision", 0.1, 0.02)
     gauge = TrueSensor(rate=5.0, sd=4e-6)
     sim = pf.simulate(replaced(camera_alone, sensors={**camera_alone.sensors, "gauge": gauge}), 1)
     config = with_sensors(sim.config, "gauge", sd=5e-6)
-    found = fit_stage(sim.run, config)
+    found = fit_stage(sim.run, config, sd_prior=False)
     keys = [f"sensors.gauge.sd_mm.{axis}" for axis in AXES]
     assert sorted(one.fixed for one in found.not_identifiable) == keys
     assert all(one.members == (one.fixed,) for one in found.not_identifiable)
     assert all(found.best.config.sensors["gauge"].sd_of(axis) == 5e-6 for axis in AXES)
     assert not set(keys) & set(numbers(found))
+    believed = fit_stage(sim.run, config)
+    assert list(believed.not_identifiable) == []
+    for key, one in intervals_of(believed).items():
+        if key in keys:
+            low, high = one.ci95
+            assert numbers(believed)[key] == pytest.approx(5e-3, rel=0.5)
+            assert 0.8 < np.log(high / low) / (2.0 * 1.96 * np.log(1.5)) < 1.1
 
 
 def test_what_is_fixed_stays_to_the_last_bit_and_the_rest_moves() -> None:

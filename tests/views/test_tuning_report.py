@@ -125,7 +125,7 @@ def test_an_interval_ends_where_its_profile_has_dropped_by_half_a_chi_square() -
 def test_the_profile_of_a_lone_parameter_is_the_likelihood_of_a_fusion() -> None:
     """With all else fixed, the curve is the log density of what `fuse` reports, less the one at the best."""
     run, config = recorded("tip", "camera", "a run"), known("tip", "camera")
-    found = quietly(lambda: pf.tune([run], with_sd(config, 5e-4, gate=50.0), fit=["noise"], fix=["process"]))
+    found = quietly(lambda: pf.tune([run], with_sd(config, 5e-4, gate=50.0), fix=["process"], sd_prior=False))
     (curve,) = drawn(found).values()
     assert curve.key == "sensors.camera.sd_mm.tip"
     assert curve.log

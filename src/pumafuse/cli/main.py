@@ -191,12 +191,17 @@ def tune(
     runs: Annotated[list[Path], Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")],
     config: Annotated[Path, Option("--config", "-c", metavar="FUSION.TOML", help="What to start from.")],
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the tuned files go.")],
-    fit: Annotated[str, Option(metavar="A,B", help="What to fit: noise, delay, plant, gain, latency.")] = "noise",
+    fit: Annotated[
+        str, Option(metavar="A,B", help="What to fit: noise, delay, plant, gain, latency, scale.")
+    ] = "noise",
     fix: Annotated[
         list[str] | None, Option(metavar="KEY", help="Leave as it is: a name or part, as sensors.tracker; repeatable.")
     ] = None,
     trust: Annotated[str | None, Option(metavar="SENSOR", help="Fit the arm on this accurate sensor first.")] = None,
     validate: Annotated[Path | None, Option(metavar="RUN", help="Default: a single run's last third.")] = None,
+    no_sd_prior: Annotated[
+        bool, Option("--no-sd-prior", help="Let a sensor's sd be any; else as configured within a factor of some 1.5.")
+    ] = False,
     report: Annotated[bool, Option("--report", help="Also write report.html into DIR.")] = False,
     json: Json = False,
     force: Force = False,
@@ -208,7 +213,7 @@ def tune(
     from . import tune as command
 
     kinds, fixed = _names(fit, "--fit") or [], _names(",".join(fix) if fix else None, "--fix") or []
-    command.run(runs, config, output, kinds, fixed, trust, validate, report, json, force)
+    command.run(runs, config, output, kinds, fixed, trust, validate, not no_sd_prior, report, json, force)
 
 
 @app.command()

@@ -35,6 +35,7 @@ def run(
     fix: Sequence[str],
     trust: str | None,
     validate: Path | None,
+    sd_prior: bool,
     report: bool,
     json: bool,
     force: bool,
@@ -58,7 +59,7 @@ def run(
         def progress(what: str, at: Point) -> None:
             status.update(f"{what}: log-likelihood {at.log_likelihood:.1f} (Ctrl-C keeps the best so far)")
 
-        found = tune(runs, given, fit=kinds, fix=fix, trust=trust, validate=other, progress=progress)
+        found = tune(runs, given, fit=kinds, fix=fix, trust=trust, validate=other, sd_prior=sd_prior, progress=progress)
     with folders.replacing(output) as new:
         found.config.save(new)
         (new / SUMMARY).write_text(found.to_json(), encoding="utf-8")

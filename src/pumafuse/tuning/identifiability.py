@@ -23,7 +23,7 @@ _RATIO = (0.1, 10.0)  # bounds of a sensor's motion over the commanded one
 _TESTED = 10.0  # motion over scatter from which a sensor is tested
 _HIGH = 0.9  # a correlation worth reporting
 _MEMBER = 0.3  # share of the largest weight, from which a parameter belongs to a combination
-_FIXED_FIRST = ("latency", "gain", "plant", "delay")  # which kind of a combination is fixed before the next
+_FIXED_FIRST = ("latency", "scale", "gain", "plant", "delay")  # which kind of a combination is fixed before the next
 
 
 class TuneError(PumafuseError):
@@ -143,7 +143,7 @@ def correlations(likelihood: Likelihood, best: Point, free: Sequence[Parameter])
 
 
 def not_identifiable(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> NotIdentifiable | None:
-    """The least determined combination of delays, latencies, plants and gains, if it is not identifiable.
+    """The least determined combination of delays, latencies, scales, plants and gains, if it is not identifiable.
 
     It is not where its standard deviation, without any prior, is more than a large change: a factor e, a tick of 28 ms,
     a tenth of the gain. The one to fix is a latency first, that of the sensor with the least noise.
@@ -170,7 +170,7 @@ def not_identifiable_noise(likelihood: Likelihood, best: Point, free: Sequence[P
     inside = within_bounds(free, best.config)
     cov = covariance(derivatives(likelihood, best, inside).information, inside)
     wide = {one.key for one, variance in zip(inside, np.diag(cov), strict=True) if variance > 1.0}
-    noise = [one for one in free if one.fit == "noise" and not one.vanishes]
+    noise = [one for one in free if one.fit == "noise" and one.sensor is not None]
     return [one for one in noise if one.key in wide or one.at_bound(best.config) == "lower"]
 
 

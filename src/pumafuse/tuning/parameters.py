@@ -15,7 +15,7 @@ from ..errors import ConfigError, suggestion
 from ..fusion.config import FusionConfig, Sensor
 from ..model.plants import FirstOrder, SecondOrder
 
-Fit = Literal["noise", "delay", "plant", "gain", "latency"]
+Fit = Literal["noise", "delay", "plant", "gain", "latency", "scale"]
 FITS: tuple[Fit, ...] = get_args(Fit)
 
 Path: TypeAlias = tuple[str, ...]
@@ -26,6 +26,8 @@ LATENCIES = (-0.1, 0.3)  # s; bounds of a latency, relative to the configured on
 DELAYS = (-0.1, 0.2)  # s; likewise of a delay, which is never below 0
 _RECOVERY = (0.020, 0.500)  # s; 95 % of the prior lie within
 _RECOVERY_PRIOR = (0.5 * math.log(_RECOVERY[0] * _RECOVERY[1]), math.log(_RECOVERY[1] / _RECOVERY[0]) / (2.0 * 1.96))
+SD_BOUNDS = (1e-7, 1.0)  # m
+_SD_PRIOR = (0.0, math.log(1.5))  # about the configured number
 _INTERCEPT = {"log": False, "scale": 0.1, "prior": (0.0, 0.1)}
 _TICK = 0.028  # s; a large change of a time, on any arm
 _DIGITS = 6  # of a number that is written
@@ -86,7 +88,7 @@ class Parameter:
     @property
     def vanishes(self) -> bool:
         """Whether it may be 0, for which its lower bound stands."""
-        return self.path[0] == "process"
+        return self.path[0] == "process" and self.path[-1] != "disturbance_time"
 
     @property
     def range(self) -> tuple[float, float]:
@@ -149,7 +151,8 @@ class Parameter:
         path = tuple(part.format(axis=axis, sensor=sensor) for part in self.path)
         one = replace(self, key=key, path=path, axis=axis, sensor=sensor)
         if self.log:
-            return one
+            around = self.prior and one.fit == "noise"
+            return replace(one, prior=(one.at(known), self.prior[1])) if around and self.prior else one
         middle, (low, high) = one.get(known), self.bounds
         bounds = (max(middle + low, 0.0) if self.fit == "delay" else middle + low, middle + high)
         return replace(one, bounds=bounds, prior=self.prior and (middle + self.prior[0], self.prior[1]))
@@ -165,7 +168,9 @@ _TABLE = (  # a process noise at its lower bound is none; bounds and prior of wh
     _line("noise", "process.{axis}.drift_mm_rts", "process.{axis}.drift", 1e-7, 10.0),
     _line("noise", "process.{axis}.maneuver_noise_mm_rtHz_per_m_s", "process.{axis}.maneuver_noise", 1e-6, 30.0),
     _line("noise", "process.{axis}.maneuver_drift_mm_rts_per_m_s", "process.{axis}.maneuver_drift", 1e-5, 300.0),
-    _line("noise", "sensors.{sensor}.sd_mm.{axis}", "sensors.{sensor}.sd.{axis}", 1e-7, 1.0),
+    _line("noise", "process.{axis}.disturbance_sd_mm", "process.{axis}.disturbance_sd", 1e-7, 10.0),
+    _line("noise", "process.{axis}.disturbance_time_ms", "process.{axis}.disturbance_time", 1e-3, 1e3),
+    _line("noise", "sensors.{sensor}.sd_mm.{axis}", "sensors.{sensor}.sd.{axis}", *SD_BOUNDS, prior=_SD_PRIOR),
     _line("delay", "axes.{axis}.delay_ms", "arm.axes.{axis}.delay", *DELAYS, log=False, scale=_TICK),
     _line("plant", "axes.{axis}.time_constant_ms", "arm.axes.{axis}.plant.time_constant", 1e-4, 10.0),
     _line("plant", "axes.{axis}.natural_frequency_rad_s", "arm.axes.{axis}.plant.natural_frequency", 0.5, 5e3),
@@ -173,6 +178,7 @@ _TABLE = (  # a process noise at its lower bound is none; bounds and prior of wh
     _line("gain", "axes.{axis}.gain.intercept", "arm.axes.{axis}.gain.intercept", -0.5, 0.5, **_INTERCEPT),
     _line("gain", "axes.{axis}.gain_recovery_ms", "arm.axes.{axis}.gain_recovery", *_RECOVERY, prior=_RECOVERY_PRIOR),
     _line("latency", "sensors.{sensor}.latency_ms", "sensors.{sensor}.latency", *LATENCIES, log=False, scale=_TICK),
+    _line("scale", "sensors.{sensor}.scale", "sensors.{sensor}.scale", -0.5, 0.5, log=False, scale=0.1),
 )
 
 
@@ -182,6 +188,7 @@ def parameters(
     sensors: Mapping[str, Sequence[str]],
     fit: Sequence[Fit],
     fixed: Iterable[str] = (),
+    sd_prior: bool = True,
 ) -> list[Parameter]:
     """The parameters to fit, those of each axis together.
 
@@ -191,6 +198,7 @@ def parameters(
         sensors: For each axis the sensors that measure it.
         fit: Which kinds.
         fixed: Parts of names: a parameter whose name has all the parts of one, in their order, is left out.
+        sd_prior: Whether a sensor's noise is believed to be the configured one within a factor of 1.5.
     """
     used = {name for names in sensors.values() for name in names}
     every = [
@@ -201,7 +209,15 @@ def parameters(
         for name in (names if "{sensor}" in line.key else [None])
     ]
     free = [one for one in every if one.fit in fit and not is_fixed(one.key, fixed)]
-    return [one for one in free if one.fit != "plant" or one.given(config) is not None]  # not of the other order
+    free = [one for one in free if _belongs(one, config)]
+    return free if sd_prior else [replace(one, prior=None) if one.fit == "noise" else one for one in free]
+
+
+def _belongs(one: Parameter, config: FusionConfig) -> bool:
+    """Whether a configuration has a parameter: the plant's order, a gain that recovers, a disturbance."""
+    if one.axis is not None and one.path[-1].startswith("disturbance"):
+        return config.process[one.axis].disturbance_sd > 0.0
+    return one.given(config) is not None
 
 
 def kinds_of(fit: Iterable[str]) -> list[Fit]:
@@ -229,7 +245,7 @@ def check_fixed(config: FusionConfig, fixed: Iterable[str]) -> None:
     keys = {f"sensors.{name}.bias_sd_mm" for name in config.sensors}
     for order in (1, 2):
         for axis in sensors:
-            config = with_order(config, axis, order)
+            config = with_recovery(with_disturbance(with_order(config, axis, order), axis, 1e-3, 1.0), axis, 1.0)
         keys |= {one.key for one in parameters(config, config, sensors, FITS)}
     for name in fixed:
         if not any(is_fixed(key, [name]) for key in keys):
@@ -277,6 +293,20 @@ def with_order(config: FusionConfig, axis: str, order: int) -> FusionConfig:
     lag = plant.lag
     plant = FirstOrder(time_constant=lag) if order == 1 else SecondOrder(natural_frequency=2.0 / lag, damping=1.0)
     return changed(config, ("arm", "axes", axis, "plant"), plant)
+
+
+def with_recovery(config: FusionConfig, axis: str, recovery: float | None) -> FusionConfig:
+    """The configuration with a gain of an axis that recovers so fast [s], or for None is constant."""
+    config = changed(config, ("arm", "axes", axis, "gain_recovery"), recovery)
+    return config if recovery is not None else changed(config, ("arm", "axes", axis, "gain", "slope"), 0.0)
+
+
+def with_disturbance(
+    config: FusionConfig, axis: str, sd: float, time: float, kind: Literal["matern", "ou"] = "matern"
+) -> FusionConfig:
+    """The configuration with a disturbance of an axis of this sd [m] and time [s]."""
+    process = _replace(config.process[axis], disturbance_sd=sd, disturbance_time=time, disturbance_kind=kind)
+    return changed(config, ("process", axis), process)
 
 
 def with_lag(config: FusionConfig, axis: str, lag: float) -> FusionConfig:

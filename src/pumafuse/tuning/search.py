@@ -22,9 +22,11 @@ from .parameters import (
     LATENCIES,
     Parameter,
     with_axis_of,
+    with_disturbance,
     with_gates,
     with_lag,
     with_order,
+    with_recovery,
 )
 
 _ROUGHLY = 0.1  # tolerance in log-likelihood where maxima are only compared
@@ -37,6 +39,10 @@ _PROCESSES = tuple(  # starts, in units of the distance between the noiseless ar
     {"input_noise": noise, "drift": drift, "maneuver_noise": 10.0 * noise, "maneuver_drift": 10.0 * drift}
     for noise, drift in ((0.1, 1.0), (0.01, 0.1), (1.0, 10.0), (0.01, 1.0), (1.0, 0.1))
 )
+
+_TIME = 0.3  # s, of a disturbance: start
+_QUIET = 0.1  # share of noise that is left beside a disturbance: start
+_DISTURBANCES = ("none", "smooth (Matérn)", "rough (Ornstein-Uhlenbeck)")
 
 FreeOf: TypeAlias = Callable[[FusionConfig], list[Parameter]]
 
@@ -51,26 +57,95 @@ def search(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: N
         notify: Called with each better point.
 
     Returns:
-        The best point, and for each axis whose plant is free the reason for its order.
+        The best point, and for each axis the reasons for the order of its plant, its gain and its disturbance.
     """
 
     def own(at: FusionConfig) -> list[Parameter]:
         return [one for one in free(at) if one.axis is not None]
 
-    best = _times(likelihood, with_gates(config, config, _WIDER), free(config))
-    best = _noise(likelihood, with_gates(best, config, 1.0), own(config), notify)
-    shared = [one for one in free(best) if one.axis is None]
-    if shared:
-        best = maximise(likelihood, best, shared, notify, tolerance=_ROUGHLY).config
-    orders: dict[str, str] = {}
-    if any(one.fit != "noise" for one in own(best)):
-        best, orders = _arm(likelihood, best, own, notify)
-    return maximise_with_gates(likelihood, with_gates(best, config), free(best), notify), orders
+    start = _times(likelihood, with_gates(config, config, _WIDER), free(config))
+    found: list[tuple[Point, dict[str, str]]] = []
+    for model in _models(likelihood, start, own):
+        if found:  # the arm of the first model is near that of the others
+            model = _with_arm_of(model, found[0][0].config, free)
+        best = _noise(likelihood, with_gates(model, config, 1.0), own(model), notify)
+        shared = [one for one in free(best) if one.axis is None]
+        if shared:
+            best = maximise(likelihood, best, shared, notify, tolerance=_ROUGHLY).config
+        orders: dict[str, str] = {}
+        if any(one.fit != "noise" for one in own(best)):
+            best, orders = _arm(likelihood, best, own, notify, again=bool(found))
+        found.append((maximise_by_axis(likelihood, best, own(best), notify, _ROUGHLY), orders))
+    best, reasons = _most_likely_models(likelihood, found, own)
+    best = _without_needless(likelihood, best, own, notify)
+    if len(found) > 1:
+        best = _past_ticks(likelihood, best, own, notify)
+    return maximise_with_gates(likelihood, with_gates(best, config), free(best), notify), reasons
+
+
+def _models(likelihood: Likelihood, config: FusionConfig, free: FreeOf) -> list[FusionConfig]:
+    """Without a disturbance, and where one may be fitted with one of each kind and little other noise."""
+    misfit, every = likelihood.misfit(config), config
+    for axis in misfit:
+        every = with_disturbance(every, axis, misfit[axis], _TIME)
+    disturbed = [str(one.axis) for one in free(every) if one.path[-1] == "disturbance_sd"]
+    models = [config]
+    for axis in disturbed:
+        known = config.process[axis]
+        models[0] = with_disturbance(models[0], axis, 0.0, known.disturbance_time, known.disturbance_kind)
+    for kind in ("matern", "ou") if disturbed else ():
+        model = config
+        for axis in disturbed:
+            model = with_disturbance(model, axis, 0.5 * misfit[axis], config.process[axis].disturbance_time, kind)
+        for one in free(model):
+            if one.axis in disturbed and one.path[-1] in _PROCESSES[0]:
+                model = one.put(model, _QUIET * _PROCESSES[0][one.path[-1]] * misfit[one.axis])
+            elif one.axis in disturbed and one.path[-1] == "disturbance_time":
+                model = one.put(model, _TIME)
+        models.append(model)
+    return models
+
+
+def _most_likely_models(
+    likelihood: Likelihood, found: Sequence[tuple[Point, dict[str, str]]], free: FreeOf
+) -> tuple[FusionConfig, dict[str, str]]:
+    """The model that is best for each axis after the penalty for its numbers, and why."""
+    peaks = [peak for peak, _ in found]
+    scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
+    reasons: dict[str, str] = {}
+    for number, axis in enumerate(likelihood.axes):
+        mine = [float(score[number]) for score in scores]
+        chosen = int(np.argmax(mine))
+        parts = [found[chosen][1].get(axis)]
+        if len(found) > 1 and axis in likelihood.sensors:
+            gain = max(mine[1:]) - mine[0]
+            parts.append(f"disturbance: {_DISTURBANCES[chosen]}; one gains {gain:+.1f} after the penalty (BIC)")
+        if any(parts):
+            reasons[axis] = "; ".join(filter(None, parts))
+    return _best_by_axis(likelihood, peaks, scores), reasons
+
+
+def _without_needless(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> FusionConfig:
+    """The configuration without the noises that are not worth their penalty, one kind after the other."""
+    for field in _PROCESSES[0]:
+        without = config
+        for one in free(config):
+            if one.path[-1] == field:
+                without = one.put(without, one.bounds[0])
+        peaks = [point(likelihood, config, free(config))]
+        peaks.append(maximise_by_axis(likelihood, without, free(without), notify, _ROUGHLY))
+        scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
+        config = _best_by_axis(likelihood, peaks, scores)
+    return config
 
 
 def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter]) -> FloatArray:
-    """The log-posterior of each axis less the Bayesian information criterion's penalty for its parameters, (A,)."""
-    count = np.array([sum(one.axis == axis for one in free) for axis in likelihood.axes])
+    """The log-posterior of each axis less the Bayesian information criterion's penalty for its parameters, (A,).
+
+    A noise at its lower bound is none, and costs nothing.
+    """
+    used = [one for one in free if not (one.vanishes and one.at_bound(peak.config) == "lower")]
+    count = np.array([sum(one.axis == axis for one in used) for axis in likelihood.axes])
     return peak.axes - 0.5 * count * np.log(np.maximum(likelihood.count, 2))
 
 
@@ -114,7 +189,8 @@ def _noise(likelihood: Likelihood, config: FusionConfig, free: Sequence[Paramete
     if not noise:
         return config
     peaks: list[Point] = []
-    for times in (_WIDER, 1.0):
+    gated = any(sensor.gate > 0.0 for sensor in config.sensors.values())
+    for times in (_WIDER, 1.0) if gated else (1.0,):
         one_by_one = with_gates(config, config, times)
         starts = [
             point(likelihood, _with_noise(one_by_one, process, sds, noise), noise)
@@ -150,36 +226,94 @@ def _with_noise(
 
 
 def _arm(
-    likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify
+    likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify, again: bool
 ) -> tuple[FusionConfig, dict[str, str]]:
-    """The best arm and noise from several lags and recoveries, with both orders where the whole plant is free."""
+    """The best arm and noise from several lags and recoveries, with both orders where the whole plant is free.
+
+    Both kinds of gain are tried where a gain is free. ``again``: the configuration's arm is near the best.
+    """
 
     def maxima(starts: Sequence[FusionConfig]) -> list[Point]:
         return [maximise_by_axis(likelihood, start, free(start), notify, _ROUGHLY) for start in starts]
 
+    def penalised(peaks: Sequence[Point]) -> list[FloatArray]:
+        return [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
+
     whole = [axis for axis in likelihood.axes if _plant_is_free(free(config), axis)]
     second = _with_orders(config, whole, 2)
-    starts = [_lagging(second, whole, free(second), times=times) for times in _LAGS]
-    if any(one.path[-1] == "gain_recovery" for one in free(second)):
-        starts += [_with_gain(second, free(second), more, recovery) for more, recovery in _GAINS]
-    best = _best_by_axis(likelihood, maxima(starts))
+    lags, gains = (_LAGS[:1], _GAINS[:1]) if again else (_LAGS, _GAINS)
+    starts = [_lagging(second, whole, free(second), times=times) for times in lags]
+    recovers = static = second
+    for axis in _with_free_gain(second, likelihood.axes, free):
+        recovers = with_recovery(recovers, axis, second.arm.axes[axis].gain_recovery or _GAINS[0][1])
+        static = with_recovery(static, axis, None)
+    if recovers != static:
+        starts += [_with_gain(recovers, free(recovers), more, recovery) for more, recovery in gains]
+    if static != second:
+        starts += [_lagging(static, whole, free(static), times=times) for times in lags]
+    peaks = maxima(starts)
+    reasons = _kinds_of_gain(likelihood, peaks, penalised(peaks))
+    best = _best_by_axis(likelihood, peaks, penalised(peaks))
     if not whole:
-        return best, {}
-    # the arm gets one command a tick: the likelihood has a false maximum a tick of delay on either side
-    beside = [_lagging(best, whole, free(best), ticks=ticks) for ticks in (-1.0, 1.0)]
-    best = _best_by_axis(likelihood, [point(likelihood, best, free(best)), *maxima(beside)])
+        return best, reasons
+    if not again:
+        best = _past_ticks(likelihood, best, free, notify)
     pair = maxima([best, _with_orders(best, whole, 1)])
-    gains = pair[0].axes - pair[1].axes
-    lowered = [_penalised(likelihood, peak, free(peak.config)) for peak in pair]
-    orders: dict[str, str] = {}
+    gained, scores = pair[0].axes - pair[1].axes, penalised(pair)
     for number, axis in enumerate(likelihood.axes):
         if axis in whole:
-            ahead = float(lowered[0][number] - lowered[1][number])
-            orders[axis] = (
-                f"{'second' if ahead >= 0.0 else 'first'} order: second gains {gains[number]:.1f} in log-likelihood,"
-                f" {ahead:+.1f} after the penalty for one number more (BIC)"
+            ahead = float(scores[0][number] - scores[1][number])
+            order = (
+                f"{'second' if ahead >= 0.0 else 'first'} order: second gains {gained[number]:.1f} in log-likelihood,"
+                f" {ahead:+.1f} after the penalty for numbers (BIC)"
             )
-    return _best_by_axis(likelihood, pair, lowered), orders
+            reasons[axis] = "; ".join(filter(None, (order, reasons.get(axis))))
+    return _best_by_axis(likelihood, pair, scores), reasons
+
+
+def _past_ticks(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> FusionConfig:
+    """The best of a configuration and the maxima a tick of delay on either side, as much less or more being lag.
+
+    The arm gets one command a tick: the likelihood has false maxima there.
+    """
+    whole = [axis for axis in likelihood.axes if _plant_is_free(free(config), axis)]
+    peaks = [point(likelihood, config, free(config))]
+    for ticks in (-1.0, 1.0) if whole else ():
+        beside = _lagging(config, whole, free(config), ticks=ticks)
+        peaks.append(maximise_by_axis(likelihood, beside, free(beside), notify, _ROUGHLY))
+    return _best_by_axis(likelihood, peaks)
+
+
+def _with_free_gain(config: FusionConfig, axes: Sequence[str], free: FreeOf) -> list[str]:
+    """The axes whose gain may be of either kind: where it is free, and with a recovery that too."""
+    for axis in axes:
+        config = with_recovery(config, axis, config.arm.axes[axis].gain_recovery or _GAINS[0][1])
+    fields = [(one.axis, one.path[-1]) for one in free(config)]
+    return [axis for axis in axes if (axis, "intercept") in fields and (axis, "gain_recovery") in fields]
+
+
+def _kinds_of_gain(likelihood: Likelihood, peaks: Sequence[Point], scores: Sequence[FloatArray]) -> dict[str, str]:
+    """For each axis that was fitted with both kinds of gain, which is the better one and by how much."""
+    found: dict[str, str] = {}
+    for number, axis in enumerate(likelihood.axes):
+        best: dict[bool, float] = {}
+        for peak, score in zip(peaks, scores, strict=True):
+            recovers = peak.config.arm.axes[axis].gain_recovery is not None
+            best[recovers] = max(float(score[number]), best.get(recovers, -np.inf))
+        if len(best) > 1:
+            ahead = best[True] - best[False]
+            kind = "recovering" if ahead > 0.0 else "constant"
+            found[axis] = f"gain: {kind}; a recovering one gains {ahead:+.1f} after the penalty (BIC)"
+    return found
+
+
+def _with_arm_of(config: FusionConfig, other: FusionConfig, free: FreeOf) -> FusionConfig:
+    """The configuration with the arm of another, and with its numbers that all axes share."""
+    config = msgspec.structs.replace(config, arm=other.arm)
+    for one in free(other):
+        if one.axis is None:
+            config = one.put(config, one.get(other))
+    return config
 
 
 def _plant_is_free(free: Sequence[Parameter], axis: str) -> bool:

@@ -18,7 +18,7 @@ from .maximise import Notify, Point, ignore, maximise_with_gates
 from .parameters import LATENCIES, Fit, Parameter, changed, is_fixed, parameters, smallest_sd
 from .search import FreeOf, search
 
-_GATE = 5.0  # of the fit for a sensor without a gate, as outliers must not count, or with a narrow one:
+_GATE = 5.0  # of the fit for a sensor with a narrow one:
 _NARROWEST = 3.0  # below it rejecting good measurements would pay, the more the smaller the noise
 _MOST_FIXED = 8  # combinations of which one parameter each is fixed, at most
 _AT_REST = ("input_noise_mm_rtHz", "drift_mm_rts", "sd_mm")  # what an axis at rest still determines
@@ -37,12 +37,14 @@ class Plan:
         fixed: Names of parameters to leave as they are.
         sensors: The sensors to use; None: all.
         trusted: The sensor that the arm was fitted on: only parameters of other sensors are free; None: all.
+        sd_prior: Whether a sensor's noise is believed to be the configured one within a factor of 1.5.
     """
 
     fit: Sequence[Fit]
     fixed: Sequence[str]
     sensors: Sequence[str] | None = None
     trusted: str | None = None
+    sd_prior: bool = True
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Stage:
         best: The most likely point.
         free: The parameters that were fitted.
         not_identifiable: What the measurements do not determine, so that one parameter of each was fixed.
-        orders: The reason for each axis's plant's order, where it was chosen.
+        orders: The reasons for the order of each axis's plant, for its gain and for its disturbance, where chosen.
         notes: Everything else noticed.
     """
 
@@ -86,7 +88,7 @@ def run_stage(
 
     def free(at: FusionConfig) -> list[Parameter]:
         names = [*plan.fixed, *(one.fixed for one in fixed)]
-        every = parameters(at, config, likelihood.sensors, plan.fit, names)
+        every = parameters(at, config, likelihood.sensors, plan.fit, names, plan.sd_prior)
         return [one for one in every if _may_vary(one, plan, excited)]
 
     start, notes = likelihood.config, list[str]()
@@ -110,7 +112,7 @@ def run_stage(
         f"{name}: was fitted with a gate of {_GATE:g}, not of {sensor.gate:g}: outliers must not count, good"
         " measurements must"
         for name, sensor in config.sensors.items()
-        if sensor.gate < _NARROWEST and name in used
+        if 0.0 < sensor.gate < _NARROWEST and name in used
     ]
     return Stage(likelihood, best, free(best.config), fixed, orders, notes)
 
@@ -118,7 +120,7 @@ def run_stage(
 def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float | None = None) -> Likelihood:
     """The likelihood of the runs; where latencies vary, without what one could put before the first command."""
     sensors = {
-        name: sensor if sensor.gate >= _NARROWEST else msgspec.structs.replace(sensor, gate=_GATE)
+        name: msgspec.structs.replace(sensor, gate=_GATE) if 0.0 < sensor.gate < _NARROWEST else sensor
         for name, sensor in config.sensors.items()
     }
     latest = None

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 
 from ..fusion.config import FusionConfig
+from ..fusion.score import Z95
 from ..logs.run import Run
 from ..units import MM
 from .identifiability import Correlation
 from .intervals import ConfidenceInterval
 from .parameters import Parameter
 from .validation import Check, fused
+
+_FROM_PRIOR = 0.8  # of the prior's interval, from which the measurements have told hardly anything
 
 
 class Fitted(msgspec.Struct, frozen=True, kw_only=True):
@@ -74,13 +79,14 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
         fit: The kinds of parameters fitted.
         fixed: Names that were fixed, as asked.
         trusted: The trusted sensor, if there is one.
+        sd_prior: Whether sensors' noises were believed to be the configured ones within a factor of 1.5.
         interrupted: Whether it was stopped before the end; the numbers are the best until then.
         likelihood: By axis.
         parameters: The fitted parameters.
         biases: Of the sensors that have one to estimate.
         correlations: Pairs beyond ± 0.9.
         not_identifiable: Combinations that the measurements do not determine, a sentence each.
-        orders: The reason for each axis's plant's order, where it was chosen.
+        orders: The reasons for the order of each axis's plant, for its gain and for its disturbance, where chosen.
         validation: Before and after on what was validated on; null where nothing was.
         worse: Whether any axis got worse there.
         notes: Everything noticed, a sentence each.
@@ -91,6 +97,7 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
     fit: list[str]
     fixed: list[str]
     trusted: str | None
+    sd_prior: bool
     interrupted: bool
     likelihood: dict[str, AxisLikelihood]
     parameters: list[Fitted]
@@ -132,7 +139,12 @@ def _notes(one: Parameter, interval: ConfidenceInterval) -> str:
         return "not identifiable"
     if interval.open[0]:
         return "not significant: the interval includes 0" if one.vanishes else f"open down to {bounds['lower']}"
-    return f"open up to {bounds['upper']}" if interval.open[1] else ""
+    if interval.open[1]:
+        return f"open up to {bounds['upper']}"
+    low, high = interval.ci95
+    if one.sensor and one.prior and math.log(high / low) > _FROM_PRIOR * 2.0 * Z95 * one.prior[1]:
+        return "as configured, within a factor of 1.5: the measurements hardly tell it"
+    return ""
 
 
 def found_biases(run: Run, config: FusionConfig) -> list[FoundBias]:

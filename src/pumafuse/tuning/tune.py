@@ -61,20 +61,23 @@ def tune(
     fix: Iterable[str] = (),
     trust: str | None = None,
     validate: Run | None = None,
+    sd_prior: bool = True,
     progress: Progress = lambda _, __: None,
 ) -> Tuning:
-    """Fit noise, delays, plants, gains and latencies to recorded runs by maximum likelihood; no reference is needed.
+    """Fit noise, delays, plants, gains, latencies and scales to runs by maximum likelihood; no reference is needed.
 
     Args:
         runs: The recorded runs to fit on.
         config: The configuration to start from.
-        fit: What to fit: any of ``noise``, ``delay``, ``plant``, ``gain``, ``latency``.
+        fit: What to fit: any of ``noise``, ``delay``, ``plant``, ``gain``, ``latency``, ``scale``.
         fix: What of that stays as it is: names as in the files, or parts of them (``sensors.tracker``,
             ``drift_mm_rts``).
         trust: An accurate sensor that arm and process noise are fitted on alone. Its latency is believed; of the others
-            only noise and latency are fitted then.
+            only noise, latency and scale are fitted then.
         validate: A run to compare before and after on. For None a single run is fitted on its first two thirds,
             validated on the last third, and then fitted anew as a whole.
+        sd_prior: Whether a sensor's noise is believed to be the configured one within a factor of 1.5 (log-normal, one
+            standard deviation); else the measurements alone decide, which may be too few to.
         progress: Called with what is being done and the best point so far.
 
     Returns:
@@ -93,7 +96,7 @@ def tune(
             raise TuneError(f"run '{run.name}' is given twice: its measurements would count twice")
     kinds, fixed = kinds_of(fit), list(fix)
     check_fixed(config, fixed)
-    pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust), progress)
+    pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust, sd_prior), progress)
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
     until = _fitted_until(runs[0]) if len(runs) == 1 and validate is None else None
     intervals: dict[str, ConfidenceInterval] = {}
@@ -116,7 +119,7 @@ def tune(
     stages, names = pipeline.stages, [run.name for run in runs]
     free = [one for stage in stages for one in stage.free]
     if not stages:  # the configuration as given, or interrupted before a stage was complete
-        free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed)
+        free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed, sd_prior)
     tuned = _with_provenance(pipeline.result(), free, intervals, names)
     notes = list(pipeline.notes)
     if interrupted:
@@ -129,6 +132,7 @@ def tune(
         fit=list(kinds),
         fixed=fixed,
         trusted=trust,
+        sd_prior=sd_prior,
         interrupted=interrupted,
         likelihood=_likelihoods(pipeline.whole, config, tuned),
         parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in free],
@@ -145,18 +149,20 @@ def tune(
     return Tuning(tuned, config, summary, tuple(stages), [one.profile for one in intervals.values()])
 
 
-def plans(config: FusionConfig, kinds: Sequence[Fit], fixed: Sequence[str], trust: str | None) -> list[Plan]:
-    """One plan for all sensors; with a trusted sensor one for it, then one for the others' noise and latency.
+def plans(
+    config: FusionConfig, kinds: Sequence[Fit], fixed: Sequence[str], trust: str | None, sd_prior: bool = True
+) -> list[Plan]:
+    """One plan for all sensors; with a trusted sensor one for it, then one for the others' noise, latency and scale.
 
     Raises:
         UnknownNameError: The trusted sensor is not configured.
     """
     if trust is None:
-        return [Plan(kinds, fixed)]
+        return [Plan(kinds, fixed, sd_prior=sd_prior)]
     config.sensor_names([trust])
-    arm: list[Fit] = [kind for kind in kinds if kind != "latency"]
-    others: list[Fit] = [kind for kind in kinds if kind in ("noise", "latency")]
-    return [Plan(arm, fixed, [trust]), Plan(others, fixed, trusted=trust)]
+    arm: list[Fit] = [kind for kind in kinds if kind not in ("latency", "scale")]
+    others: list[Fit] = [kind for kind in kinds if kind in ("noise", "latency", "scale")]
+    return [Plan(arm, fixed, [trust], sd_prior=sd_prior), Plan(others, fixed, trusted=trust, sd_prior=sd_prior)]
 
 
 class Pipeline:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import msgspec
@@ -19,6 +19,7 @@ from ..fusion.offline import fuse
 from ..fusion.score import Z95, interpolated, score
 from ..logs.run import Run
 from ..units import MM
+from .parameters import SD_BOUNDS
 
 _WORSE = 1.02  # RMSE after over before that is worse where it is beyond chance
 _FAR_WORSE = 1.2  # likewise, whatever chance would make of it
@@ -130,10 +131,19 @@ def _check(run: str, axis: str, since: float, before: Estimates, after: Estimate
     if closer is not None:
         verdict += f", RMSE {100.0 * (closer - 1.0):+.1f} %"
     verdict = f"{'worse' if worse else 'better' if gained > chance else 'no different'}: {verdict}"
+    bound = _at_bound(after.config, axis, new.sensors)
+    if bound:
+        verdict += f"; the noise of {' and '.join(bound)} is at its bound: error bars do not hold"
     count = len(gains)
     return Check(
         run=run, axis=axis, since_s=since, components=count, before=old, after=new, worse=worse, verdict=verdict
     )
+
+
+def _at_bound(config: FusionConfig, axis: str, names: Iterable[str]) -> list[str]:
+    """The sensors whose noise on an axis is at a bound of what is fitted, or beyond."""
+    low, high = SD_BOUNDS
+    return [name for name in names if not low < (config.sensors[name].sd_of(axis) or low) < high]
 
 
 def _squares(est: Estimates, axis: str) -> FloatArray:

@@ -1,0 +1,164 @@
+"""A disturbance, the kind of a gain and a scale are found where they are, and not where they are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.tuning.stage import Stage
+from tuning_runs import contains, fit_stage, intervals_of, later, quietly, replaced, with_sensors
+
+PERIOD, COUNT = 0.02, 2000
+
+
+def moving(gain: float = 1.0, recovery: float | None = None) -> tuple[pf.FusionConfig, np.ndarray, np.ndarray]:
+    """An arm of one axis that is commanded from one random level to the next, its commands and its path, (n,) [m].
+
+    A camera measures at every second command; the configured gain is 1, constant.
+    """
+    rng = np.random.default_rng(5)
+    command = np.repeat(0.02 * rng.standard_normal(COUNT // 25), 25)
+    arm = pf.ArmModel(
+        name="one axis",
+        update_period=PERIOD,
+        delay=0.04,
+        axes={"tip": pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05), gain=pf.Gain(slope=0.0, intercept=1.0))},
+    )
+    noise = pf.Process(input_noise=1e-5, drift=1e-4)
+    config = pf.FusionConfig(arm=arm, process={"tip": noise}, sensors={"camera": pf.Sensor(sd=3e-4, gate=0.0)})
+    true = replaced(arm.axes["tip"], gain=pf.Gain(slope=0.0, intercept=gain), gain_recovery=recovery)
+    bare = pf.FusionConfig(arm=replaced(arm, axes={"tip": true}))
+    run = pf.Run.from_arrays(PERIOD * np.arange(COUNT), {"tip": command})
+    return config, command, pf.fuse(run, bare)["tip"].position
+
+
+def measured(command: np.ndarray, path: np.ndarray, seed: int, sd: float = 3e-4) -> pf.Run:
+    """The run, with a camera's white noise of ``sd`` on every second sample of the path."""
+    time = PERIOD * np.arange(COUNT)
+    seen = path + sd * np.random.default_rng(seed).standard_normal(COUNT)
+    return pf.Run.from_arrays(time, {"tip": command}, {"camera": (time[::2], {"tip": seen[::2]})})
+
+
+def fitted(run: pf.Run, config: pf.FusionConfig, *fit: str) -> tuple[Stage, pf.Process]:
+    found = fit_stage(run, config, fit or ("noise",))  # pyright: ignore
+    return found, found.best.config.process["tip"]
+
+
+# ---- disturbances ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [1, later(2), later(3)])
+@pytest.mark.parametrize("kind", ["matern", "ou"])
+def test_a_disturbance_is_found_with_its_sd_and_time(kind: str, seed: int) -> None:
+    """A path drawn from σ² (1 + √3 s/t) exp(−√3 s/t), or σ² exp(−s/t): of that kind, both numbers in their intervals.
+
+    The sensor's noise beside it is within 10 %, and the reason names the kind.
+    """
+    config, command, path = moving()
+    apart = PERIOD * np.abs(np.subtract.outer(np.arange(COUNT), np.arange(COUNT))) / 0.25
+    smooth = (1.0 + np.sqrt(3.0) * apart) * np.exp(-np.sqrt(3.0) * apart)
+    covariance = smooth if kind == "matern" else np.exp(-apart)
+    root = np.linalg.cholesky(covariance + 1e-9 * np.eye(COUNT))
+    drawn = 1e-3 * root @ np.random.default_rng(100 + seed).standard_normal(COUNT)
+    found, process = fitted(measured(command, path + drawn, seed), config)
+    assert process.disturbance_kind == kind
+    assert f"disturbance: {'smooth' if kind == 'matern' else 'rough'}" in found.orders["tip"]
+    assert found.best.config.sensors["camera"].sd_of("tip") == pytest.approx(3e-4, rel=0.1)
+    noise = replaced(config.process["tip"], disturbance_sd=1e-3, disturbance_time=0.25)
+    truth, ends = replaced(config, process={"tip": noise}), intervals_of(found)
+    mine = [one for one in found.free if one.path[-1].startswith("disturbance")]
+    assert len(mine) == 2
+    for one in mine:
+        assert contains(ends[one.key], one, truth), one.key
+        low, high = ends[one.key].ci95
+        assert high < 3.0 * low
+
+
+def test_no_disturbance_is_invented() -> None:
+    """White noise alone, and a random walk beside it: of ten runs each, at most one has a disturbance."""
+    config, command, path = moving()
+    for drift in (0.0, 2e-4):
+        invented = 0
+        for seed in range(10):
+            walk = drift * np.sqrt(PERIOD) * np.cumsum(np.random.default_rng(200 + seed).standard_normal(COUNT))
+            found, process = fitted(measured(command, path + walk, seed), config)
+            invented += process.disturbance_sd > 0.0
+            assert found.best.config.sensors["camera"].sd_of("tip") == pytest.approx(3e-4, rel=0.1)
+        assert invented <= 1
+
+
+# ---- gains and scales -----------------------------------------------------------------------------------------------
+
+
+def test_a_constant_gain_is_found() -> None:
+    """0.9 for ever, configured as 1: constant, within 1 %; delay and lag are not bent to make up for it."""
+    config, command, path = moving(gain=0.9)
+    found, _ = fitted(measured(command, path, 1), config, "noise", "delay", "plant", "gain")
+    model = found.best.config.arm.axes["tip"]
+    assert model.gain_recovery is None and "gain: constant" in found.orders["tip"]
+    assert model.gain.intercept == pytest.approx(0.9, abs=0.01)
+    assert found.best.config.arm.delay_of("tip") + model.plant.lag == pytest.approx(0.09, abs=0.003)
+
+
+def test_a_gain_that_recovers_is_kept() -> None:
+    """1.2 that is back in 100 ms, configured as 1 for ever: recovering, both within 20 %."""
+    config, command, path = moving(gain=1.2, recovery=0.1)
+    found, _ = fitted(measured(command, path, 1), config, "noise", "gain")
+    model = found.best.config.arm.axes["tip"]
+    assert "gain: recovering" in found.orders["tip"] and model.gain_recovery == pytest.approx(0.1, rel=0.2)
+    assert model.gain.intercept - 1.0 == pytest.approx(0.2, rel=0.2)
+
+
+def test_a_fixed_gain_stays_of_its_kind() -> None:
+    """With its intercept fixed it gets no recovery."""
+    config, command, path = moving()
+    found = fit_stage(measured(command, path, 1), config, ("noise", "delay", "gain"), "gain")
+    assert found.best.config.arm.axes["tip"].gain == config.arm.axes["tip"].gain
+    assert found.best.config.arm.axes["tip"].gain_recovery is None
+
+
+def test_the_scale_of_a_sensor_is_found() -> None:
+    """4 % off, by the arm that is known: within 0.3 %, inside its interval."""
+    config, command, path = moving()
+    found = quietly(lambda: pf.tune([measured(command, 1.04 * path, 1)], config, fit=["noise", "scale"]))
+    assert found.config.sensors["camera"].scale == pytest.approx(1.04, abs=0.003)
+    (one,) = [each for each in found.summary.parameters if each.key == "sensors.camera.scale"]
+    assert one.ci95[0] is not None and one.ci95[1] is not None and one.ci95[0] < 1.04 < one.ci95[1]
+
+
+def test_a_scale_and_a_constant_gain_are_not_identifiable_apart() -> None:
+    """The scale is fixed as configured, and named with the gain."""
+    config, command, path = moving(gain=0.9)
+    found, _ = fitted(measured(command, path, 1), config, "noise", "gain", "scale")
+    assert found.best.config.sensors["camera"].scale == 1.0
+    assert [one.fixed for one in found.not_identifiable] == ["sensors.camera.scale"]
+    assert found.best.config.arm.axes["tip"].gain.intercept == pytest.approx(0.9, abs=0.01)
+
+
+# ---- the prior of a sensor's noise ----------------------------------------------------------------------------------
+
+
+def test_the_prior_of_a_noise_can_be_turned_off() -> None:
+    """A camera of 0.3 mm configured as 3 mm: without the prior as it is, with it nearer to 3 mm.
+
+    Both as `tune` takes them; the summary says which it was.
+    """
+    config, command, path = moving()
+    run, config = (
+        measured(command, path, 1),
+        with_sensors(config, sd=3e-3),
+    )
+    with_prior, without = (quietly(lambda on=on: pf.tune([run], config, sd_prior=on)) for on in (True, False))
+    assert with_prior.summary.sd_prior and not without.summary.sd_prior
+    sds = [found.config.sensors["camera"].sd_of("tip") for found in (with_prior, without)]
+    assert sds[0] is not None and sds[1] is not None and sds[0] > sds[1] == pytest.approx(3e-4, rel=0.1)
+
+
+def test_a_verdict_tells_a_noise_at_its_bound() -> None:
+    """Measurements without any noise of their own, the prior off: the verdict does not say better and nothing else."""
+    config, command, path = moving()
+    found = quietly(lambda: pf.tune([measured(command, path, 1, sd=0.0)], config, sd_prior=False))
+    assert found.config.sensors["camera"].sd_of("tip") == 1e-7
+    (check,) = found.summary.validation or []
+    assert check.verdict.endswith("; the noise of camera is at its bound: error bars do not hold")
