@@ -179,7 +179,9 @@ def best_in_class(measured: Measured, command: Commands, model: AxisModel, delay
         """The axis with these parameters, its gain at the mean speed."""
         share = parameters[len(best) :]
         gain = share[0] + sum(share[k] * (columns[k].gain.at(speed) - 1.0) for k in range(1, len(columns)))
-        return msgspec.structs.replace(model, plant=_plant_at(parameters), gain=Gain(intercept=float(gain)))
+        return msgspec.structs.replace(
+            model, plant=_plant_at(parameters[: len(best)]), gain=Gain(intercept=float(gain))
+        )
 
     def lag(parameters: FloatArray) -> float:
         return axis_at(parameters).lag(float(parameters[0]) ** 2)
