@@ -43,7 +43,7 @@ def test_json_has_the_numbers_of_python(run: Path, found: list[dict[str, object]
     assert len(found) == 4
     for one, other in zip(found, expected, strict=True):
         assert set(one) == {
-            *("run", "axis", "source", "measurements", "amplitude_mm", "start_mm", "start_from", "model"),
+            *("run", "axis", "source", "lag_ms", "measurements", "amplitude_mm", "start_mm", "start_from", "model"),
             *("without_recovery", "with_recovery", "recovery_ms", "best_in_class", "outlying", "verdict", "notes"),
         }
         assert [one[key] for key in ("axis", "source", "verdict")] == [other.axis, other.source, other.verdict]
@@ -51,6 +51,9 @@ def test_json_has_the_numbers_of_python(run: Path, found: list[dict[str, object]
         assert one["model"]["rms_mm"] == pytest.approx(1e3 * other.model.rms, rel=1e-9)
         assert one["model"]["rms_mm"] == pytest.approx({"scope": 0.05, "eye": 0.5}[one["source"]], rel=0.2)
         best = one["best_in_class"]
+        assert one["lag_ms"] == pytest.approx(1e3 * arm.lag_of(one["axis"], 0.0), abs=6.0)
+        low, high = best["lag_ms_ci95"]
+        assert low < best["lag_ms"] < high
         assert best["delay_ms"] == pytest.approx(1e3 * other.best_in_class.delay, rel=1e-9)
         assert best["plant"]["time_constant_ms"] == pytest.approx(1e3 * other.best_in_class.plant.time_constant)
         assert (one["recovery_ms"], one["amplitude_mm"]) == pytest.approx((100.0, 8.0))
@@ -64,6 +67,7 @@ def test_the_table_shows_the_same_numbers(run: Path, found: list[dict[str, objec
         best = one["best_in_class"]
         assert {f"{one['model']['rms_mm']:.3f}", f"{best['fit']['rms_mm']:.3f}"} <= set(row)
         assert f"start level {one['start_mm']:g} mm ({one['start_from']})" in shown
+        assert f"{one['run']}, {one['axis']}: lag {one['lag_ms']:.1f} ms, here {best['lag_ms']:.0f}"[:-1] in shown
         assert f"the best in class is K {best['gain']:.3f}, Td {best['delay_ms']:.1f} ms" in shown
 
 

@@ -65,13 +65,14 @@ def identified(trials: list[Trial]) -> pf.Identification:
 
 def truths_of(order: int) -> dict[str, float]:
     plant = {"time_constant": TAU} if order == 1 else {"natural_frequency": OMEGA, "damping": ZETA}
-    return {"delay": DELAY, "slope": SLOPE, "intercept": INTERCEPT, **plant}
+    lag = DELAY + (TAU if order == 1 else 2.0 * ZETA / OMEGA)
+    return {"lag": lag, "delay": DELAY, "slope": SLOPE, "intercept": INTERCEPT, **plant}
 
 
 def estimates_of(found: pf.Identification) -> dict[str, tuple[float, tuple[float, float]]]:
-    axis = found.axes["radial"].model
+    axis, lag = found.axes["radial"].model, found.axes["radial"].delays.lag
     fields = {part: part.__struct_fields__ for part in (axis, axis.gain, axis.plant)}
-    return {
+    return {"lag": (lag.value, lag.ci95)} | {
         name: (getattr(part, name), getattr(part, f"{name}_ci95"))
         for part, names in fields.items()
         for name in names

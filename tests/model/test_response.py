@@ -96,6 +96,27 @@ def test_it_settles_however_long_it_rests(plant: PLANTS, recovery: float | None)
     np.testing.assert_allclose(found, command * (0.9 if recovery is None else 1.0), rtol=1e-14)
 
 
+@pytest.mark.parametrize("recovery", [None, 0.14])
+@plants
+def test_the_lag_is_how_far_a_ramp_is_behind(plant: PLANTS, recovery: float | None) -> None:
+    """Settled on a staircase of constant velocity, over a tick: v·lag behind what is held, T/2 more behind v·t.
+
+    Without recovery the motion itself is K times as large; then K is 1 here.
+    """
+    speed, ticks, fine = 0.2, 400, 4000
+    gain = Gain(slope=0.3, intercept=0.9) if recovery is not None else Gain()
+    axis = AxisModel(plant=plant, gain=gain, gain_recovery=recovery)
+    given = np.arange(ticks) * 28_000_000
+    command = speed * given * 1e-9
+    time = given[-1] + (np.arange(fine) * 28_000_000 + 14_000_000) // fine  # the last tick, at its fine midpoints
+    position = response(axis, PERIOD, DELAY, given, command, 0.0, time)
+    held, path = command[-1], speed * time * 1e-9
+    arm = pf.ArmModel(name="one", update_period=PERIOD, delay=DELAY, axes={"radial": axis})
+    lag = arm.lag_of("radial", speed)
+    assert np.mean(held - position) == pytest.approx(speed * lag, rel=1e-6)
+    assert np.mean(path - position) == pytest.approx(speed * (lag + 0.5 * PERIOD), rel=1e-6)
+
+
 @plants
 def test_the_filter_predicts_the_same(plant: PLANTS) -> None:
     """Without measurements the estimates are the response, from the start level on."""

@@ -70,7 +70,7 @@ def run(
     if json:
         typer.echo(found.to_json(), nl=False)
     else:
-        _show(found.summary)
+        _show(found.summary, found.config.arm.update_period)
         typer.echo(f"written to {output}\nnext: pumafuse fuse RUN -c {output / 'fusion.toml'} -o DIR")
     if found.summary.interrupted:
         raise typer.Exit(_INTERRUPTED)
@@ -78,10 +78,12 @@ def run(
         raise typer.Exit(_WORSE)
 
 
-def _show(summary: TuningSummary) -> None:
-    """Print the summary on stdout."""
+def _show(summary: TuningSummary, period: float) -> None:
+    """Print the summary on stdout; period [s]."""
     out = console(sys.stdout)
     out.print(_parameters(summary))
+    if summary.lags:
+        typer.echo(formatting.lag(period))
     lines = [f"{axis}: {why}" for axis, why in summary.orders.items()] + summary.not_identifiable
     lines += [formatting.together(pair) for pair in summary.correlations]
     for one in summary.biases:
@@ -100,15 +102,23 @@ def _show(summary: TuningSummary) -> None:
 
 
 def _parameters(summary: TuningSummary) -> Table:
-    """The parameters with their intervals."""
-    rows: list[list[str]] = []
-    for one in summary.parameters:
-        low, high = ("…" if end is None else f"{end:.4g}" for end in one.ci95)
-        limits = "" if one.ci95 == (None, None) else f"{low} to {high}"
-        rows.append([one.key, number(one.before, ".4g"), number(one.value, ".4g"), limits, one.notes])
+    """The lags and the parameters with their intervals."""
+    rows = [
+        [f"lag of {axis}, ms", f"{one.before_ms:.4g}", f"{one.lag_ms:.4g}", _limits(one.lag_ms_ci95), ""]
+        for axis, one in summary.lags.items()
+    ]
+    rows += [
+        [one.key, number(one.before, ".4g"), number(one.value, ".4g"), _limits(one.ci95), one.notes]
+        for one in summary.parameters
+    ]
     made = table(["parameter", "before", "fitted", "95 % interval", ""], rows)
     made.columns[0].no_wrap = True
     return made
+
+
+def _limits(ci95: tuple[float | None, float | None]) -> str:
+    low, high = ("…" if end is None else f"{end:.4g}" for end in ci95)
+    return "" if ci95 == (None, None) else f"{low} to {high}"
 
 
 def _validation(summary: TuningSummary) -> Table:

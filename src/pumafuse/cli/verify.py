@@ -15,6 +15,7 @@ from ..errors import PumafuseWarning
 from ..identification.verify import verify
 from ..logs.run import Run
 from ..model.arm import ArmModel
+from ..views import formatting
 from ..views import report as reports
 from .tables import console, print_json, table
 
@@ -47,6 +48,6 @@ def run(
         print_json([units.from_si(msgspec.to_builtins(one, enc_hook=float)) for one in verified])
         return
     console(sys.stdout).print(table(*reports.verifications(verified)))
-    typer.echo("\n".join(map(reports.verdict, verified)))
+    typer.echo("\n".join([formatting.lag(model.update_period), *map(reports.verdict, verified)]))
     if report is not None:
         typer.echo(f"written to {report}")

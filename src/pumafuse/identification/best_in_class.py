@@ -11,12 +11,16 @@ from ..arrays import FloatArray, TimeArray
 from ..model.arm import AxisModel, Gain, commanded_speed
 from ..model.plants import PLANTS, SecondOrder
 from ..model.response import response
+from ..toml import Interval
+from .estimate import t_quantile
 from .fit import plant_of
 
 _SPIKE = 8.0  # robust standard deviations
 _DELAYS, _LATEST = 13, 9.0  # of the first grid: how many, up to how many periods
 _LAGS, _RATIOS = 5, (0.05, 0.25, 0.8)  # of 2ζ/ω; of 1/ω² over its square
 _STARTS = 3  # cells of it to search from
+_BLOCKS = 10  # of a run, whose errors count as independent of each other
+_STEP = 1e-4  # of the derivatives for the lag's interval
 _BOUNDS = -12.0, 6.0  # of √Td, log q and log √p
 
 
@@ -39,12 +43,16 @@ class BestInClass(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         fit: Its error.
+        lag: Behind the held command at constant velocity, at the commands' mean speed [s].
+        lag_ci95: Its 95 % interval [s].
         delay: Td [s].
         gain: K, at the commands' mean speed.
         plant: Of unit gain.
     """
 
     fit: Fit
+    lag: float = msgspec.field(name="lag_ms")
+    lag_ci95: Interval = msgspec.field(name="lag_ms_ci95")
     delay: float = msgspec.field(name="delay_ms")
     gain: float
     plant: PLANTS
@@ -134,14 +142,18 @@ def best_in_class(measured: Measured, command: Commands, model: AxisModel, delay
     z = measured.position - measured.position.mean()
     columns = _gain_columns(command, model)
 
-    def linear(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Simulated position without its mean (n,), and the coefficients of the gain columns, of the best gain."""
+    def design(x: FloatArray) -> FloatArray:
+        """Simulated positions without their means, a gain column each, (n, g)."""
         axes = [msgspec.structs.replace(axis, plant=_plant_at(x)) for axis in columns]
         moved = [command.moved(axis, float(x[0]) ** 2, start, measured.time) for axis in axes]
-        design = np.stack([moved[0], *(column - moved[0] for column in moved[1:])], axis=1)
-        design -= design.mean(axis=0)
-        share = np.asarray(np.linalg.lstsq(design, z, rcond=None)[0], dtype=np.float64)
-        return design @ share, share
+        found = np.stack([moved[0], *(column - moved[0] for column in moved[1:])], axis=1)
+        return found - found.mean(axis=0)
+
+    def linear(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Simulated position (n,), and the coefficients of the gain columns (g,), of the best gain."""
+        found = design(x)
+        share = np.asarray(np.linalg.lstsq(found, z, rcond=None)[0], dtype=np.float64)
+        return found @ share, share
 
     def residual(x: FloatArray) -> FloatArray:
         return z - linear(x)[0]
@@ -162,12 +174,52 @@ def best_in_class(measured: Measured, command: Commands, model: AxisModel, delay
     best = min(found, key=lambda one: float(one.cost)).x
     modelled, share = linear(best)
     speed = np.array(command.speeds.mean())
+
+    def axis_at(parameters: FloatArray) -> AxisModel:
+        """The axis with these parameters, its gain at the mean speed."""
+        share = parameters[len(best) :]
+        gain = share[0] + sum(share[k] * (columns[k].gain.at(speed) - 1.0) for k in range(1, len(columns)))
+        return msgspec.structs.replace(
+            model, plant=_plant_at(parameters[: len(best)]), gain=Gain(intercept=float(gain))
+        )
+
+    def lag(parameters: FloatArray) -> float:
+        return axis_at(parameters).lag(float(parameters[0]) ** 2)
+
+    at = np.concatenate((best, share))
+    steps = _STEP * np.eye(len(at))
+    slope = np.array([lag(at + step) - lag(at - step) for step in steps])
+    moves = [design(one[: len(best)]) @ one[len(best) :] for step in steps for one in (at + step, at - step)]
+    jacobian = np.stack(moves[::2], axis=1) - np.stack(moves[1::2], axis=1)
+    half = _half_width(jacobian, slope, z - modelled)
+    axis = axis_at(at)
     return BestInClass(
         fit=measured.fit(modelled, command.amplitude),
+        lag=lag(at),
+        lag_ci95=(lag(at) - half, lag(at) + half),
         delay=float(best[0]) ** 2,
-        gain=float(share[0] + sum(share[k] * (columns[k].gain.at(speed) - 1.0) for k in range(1, len(columns)))),
-        plant=_plant_at(best),
+        gain=axis.gain.intercept,
+        plant=axis.plant,
     )
+
+
+def _half_width(jacobian: FloatArray, slope: FloatArray, residual: FloatArray) -> float:
+    """Half the 95 % interval of a quantity that is fitted by least squares.
+
+    What a model leaves over of a run is correlated, and each measurement alone would count far too much: a block of the
+    run counts as one observation (Bester, Conley & Hansen, J. Econometrics 165, 2011).
+
+    Args:
+        jacobian: Derivatives of the fitted positions, (n, k).
+        slope: Of the quantity, (k,).
+        residual: (n,).
+    """
+    size = np.linalg.norm(jacobian, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    weight = (slope / size) @ np.linalg.pinv(jacobian / size, rcond=1e-10)
+    first = np.arange(_BLOCKS) * len(residual) // _BLOCKS
+    variance = _BLOCKS / (_BLOCKS - 1) * float(np.sum(np.add.reduceat(weight * residual, first) ** 2))
+    return t_quantile(_BLOCKS - 1) * variance**0.5
 
 
 def _gain_columns(command: Commands, model: AxisModel) -> list[AxisModel]:

@@ -65,14 +65,14 @@ class Delays(msgspec.Struct, frozen=True, kw_only=True):
     """Three delays [s].
 
     Attributes:
-        onset: When the arm is first seen to move: above 3 standard deviations and 2 % of the step; null: never.
-        fitted: Td of the model.
         lag: Behind the held command at constant velocity: Td + τ, or Td + 2ζ/ω.
+        fitted: Td of the model.
+        onset: When the arm is first seen to move: above 3 standard deviations and 2 % of the step; null: never.
     """
 
-    onset: Estimate | None = msgspec.field(name="onset_ms")
-    fitted: Estimate = msgspec.field(name="fitted_ms")
     lag: Estimate = msgspec.field(name="lag_ms")
+    fitted: Estimate = msgspec.field(name="fitted_ms")
+    onset: Estimate | None = msgspec.field(name="onset_ms")
 
 
 class CombinedAxis(msgspec.Struct, frozen=True, kw_only=True):
@@ -163,9 +163,9 @@ def combine(fitted: Sequence[Fitted], period: float, paper: bool) -> tuple[Combi
         time_constant_mean=mean(tau),
         time_constant_robust=robust(tau),
         delays=Delays(
-            onset=mean(seen) if len(seen) else None,
-            fitted=delay,
             lag=common(found.delay + found.lag, found.delay_sd),
+            fitted=delay,
+            onset=mean(seen) if len(seen) else None,
         ),
         delay_spread=float(found.delay.std(ddof=1)),
         delay_noise=float(np.median(found.delay_sd)),

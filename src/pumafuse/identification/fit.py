@@ -98,6 +98,17 @@ class StepFit:
         pairs = zip((*self.shape, self.gain), (self._t * self.sd).tolist(), strict=False)
         return Intervals(*((value - half, value + half) for value, half in pairs))
 
+    @property
+    def lag(self) -> float:
+        """Td + τ, or Td + 2ζ/ω [s]."""
+        return self.shape.delay + self.shape.q
+
+    @property
+    def lag_ci95(self) -> Interval:
+        """Its 95 % interval [s], by the covariance of both; they are known much better together than each."""
+        half = self._t * float(np.sqrt(self.covariance[:2, :2].sum()))
+        return self.lag - half, self.lag + half
+
     @cached_property
     def plant(self) -> PLANTS:
         """The plant with its intervals; one of second order whose p is 0 gets the highest ω that q allows.

@@ -30,8 +30,10 @@ class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
     """One trial's fit of one order; plant parameters of the other order are null, as are infinite ends of intervals.
 
     Attributes:
+        lag: Td + τ, or Td + 2ζ/ω [s]: behind the held command at constant velocity.
+        lag_ci95: Its 95 % interval [s].
         gain: K.
-        gain_ci95: Its 95 % interval.
+        gain_ci95: Its interval.
         delay: Td [s].
         delay_ci95: Its interval.
         time_constant: τ [s].
@@ -46,6 +48,8 @@ class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
         flags: What to know before trusting it.
     """
 
+    lag: float = msgspec.field(name="lag_ms")
+    lag_ci95: Interval = msgspec.field(name="lag_ms_ci95")
     gain: float
     gain_ci95: Interval
     delay: float = msgspec.field(name="delay_ms")
@@ -289,11 +293,15 @@ def _result(
 
 def _order_fit(fit: StepFit, trial: Trial, usual: float) -> OrderFit:
     moved = float(np.std(trial.position))
+    read = fit.covariance[0, 0] == 0.0  # off the trial, delay and gain: the noise says nothing of their errors
+    unknown = (-np.inf, np.inf)
     return OrderFit(
+        lag=fit.lag,
+        lag_ci95=unknown if read else fit.lag_ci95,
         gain=fit.gain,
-        gain_ci95=fit.ci95.gain,
+        gain_ci95=unknown if read else fit.ci95.gain,
         delay=fit.shape.delay,
-        delay_ci95=fit.ci95.delay,
+        delay_ci95=unknown if read else fit.ci95.delay,
         **msgspec.structs.asdict(fit.plant),
         rms=fit.rms,
         rms_percent=100.0 * fit.rms / abs(trial.step),

@@ -122,8 +122,9 @@ def inverse_square(first: JointFit, second: JointFit) -> Estimate:
     half = second.half_width([0.0, 1.0])
     if p == 0.0:
         # at the bound the influences do not sum to 0: their mean is how far p would have gone below it
-        centre = float(second.influence[:, 1].mean())
-        return Estimate(value=p, ci95=(min(centre - half, p), max(centre + half, p)))
+        centre = min(float(second.influence[:, 1].mean()), 0.0)
+        upper = centre + half
+        return Estimate(value=p, ci95=(-np.inf, upper if upper > 0.0 else half))
     line = first.residual - second.residual
     weight = np.einsum("ij,ij->i", line, line)
     total = max(float(weight.sum()), 1e-300)

@@ -42,6 +42,7 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
         run: Its name.
         axis: The axis.
         source: The sensor, or ``reference``.
+        lag: The model's, behind the held command at constant velocity, at the commands' mean speed [s].
         measurements: How many were compared.
         amplitude: From the lowest to the highest command [m].
         start: Level at which the arm was taken to rest before the first command [m].
@@ -59,6 +60,7 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
     run: str
     axis: str
     source: str
+    lag: float = msgspec.field(name="lag_ms")
     measurements: int
     amplitude: float = msgspec.field(name="amplitude_mm")
     start: float = msgspec.field(name="start_mm")
@@ -168,6 +170,7 @@ def _verified(
 
     as_it_is, recovering = fitted(model.gain_recovery), fitted(recovery)
     best = best_in_class(measured, command, model, delay, start)
+    lag = model.lag(delay, float(command.speeds.mean()))
     trace = Trace(
         units.seconds(measured.time, int(command.time[0])),
         measured.position - measured.position.mean(),
@@ -177,6 +180,7 @@ def _verified(
         run=measured.run,
         axis=axis,
         source=measured.source,
+        lag=lag,
         measurements=len(measured.time),
         amplitude=command.amplitude,
         start=start,
@@ -187,7 +191,7 @@ def _verified(
         recovery=recovery,
         best_in_class=best,
         outlying=count - len(measured.time),
-        verdict=_verdict(as_it_is, model, delay, best) + _recovers(as_it_is, recovering, recovery),
+        verdict=_verdict(as_it_is, lag, best) + _recovers(as_it_is, recovering, recovery),
         notes=notes,
     )
     return verification, trace
@@ -204,14 +208,14 @@ def _start(
     return float(levels[np.argmin(rms)]), f"chosen among the run's {len(levels)} levels by RMS"
 
 
-def _verdict(model: Fit, axis: AxisModel, delay: float, best: BestInClass) -> str:
-    """The model's error beside that of the best of its order, and where the two differ."""
+def _verdict(model: Fit, lag: float, best: BestInClass) -> str:
+    """The model's error beside that of the best of its order, and where the two differ; lag [s]."""
     if max(best.fit.fit, model.fit) < _HOLDS:
         return "no linear model of this order fits: look at the log"
     ratio = model.rms / best.fit.rms if best.fit.rms > 0.0 else 1.0 if model.rms == 0.0 else np.inf
     if ratio < _AS_GOOD:
         return "as good as any model of its order"
-    later = (best.delay + best.plant.lag) - (delay + axis.plant.lag)
+    later = best.lag - lag
     difference = f"here the arm answers {abs(later) * units.MS:.1f} ms {'later' if later > 0.0 else 'sooner'}"
     holds = "does not hold" if model.fit < _HOLDS else "follows the motion" if ratio > _FAR else "holds"
     return (

@@ -60,6 +60,19 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     delay: Delay | None = msgspec.field(name="delay_ms", default=None)
     delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
 
+    def lag(self, delay: float, speed: float = 0.0) -> float:
+        """Total lag [s] behind the held command at constant velocity: Td + τ, or Td + 2ζ/ω, plus (1 − K)·recovery.
+
+        Behind the path through the commanded points it is T/2 more: a held command is that late itself. A gain that
+        does not recover is no lag; it makes the motion smaller.
+
+        Args:
+            delay: Td [s] of this axis; :meth:`ArmModel.lag_of` knows it.
+            speed: At which K is taken [m/s]; 0: slow motion.
+        """
+        gain_error = 1.0 - (self.gain.slope * speed + self.gain.intercept)
+        return delay + self.plant.lag + gain_error * (self.gain_recovery or 0.0)
+
 
 class Validity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Limits within which the model was found to hold; beyond them pumafuse warns and goes on.
@@ -154,6 +167,10 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """Td [s] of one axis: its own, or the arm's."""
         own = self.axis(axis).delay
         return self.delay if own is None else own
+
+    def lag_of(self, axis: str, speed: float = 0.0) -> float:
+        """Total lag [s] of one axis behind the held command at constant velocity: :meth:`AxisModel.lag`."""
+        return self.axis(axis).lag(self.delay_of(axis), speed)
 
 
 def ordered_axes(names: set[str]) -> tuple[str, ...]:

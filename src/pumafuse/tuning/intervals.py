@@ -89,7 +89,8 @@ def confidence_intervals(
     along, has not dropped by what that predicts (1.92), the end is where its profile has (Cox & Hinkley, Theoretical
     Statistics, 9.3). Gates make the likelihood jump; the intervals are those of the maximum that it has while the
     outcomes stay as they are. That maximum is not the result: there the gates decide otherwise, and for a lower
-    likelihood, or the search would have gone there. So an interval beside the result is extended to it.
+    likelihood, or the search would have gone there. So an interval beside the result is extended to it, and beyond it
+    by as much as it goes beyond the maximum.
     """
     result = best.config
     best = maximise(likelihood, result, free, outcomes=best.outcomes)
@@ -97,11 +98,15 @@ def confidence_intervals(
 
     def of(one: Parameter) -> ConfidenceInterval:
         low, high = (_end(views[one.axis], best, one, sign) for sign in (-1.0, 1.0))
+        peak = one.value(one.at(best.config))
         value, at = one.clipped(rounded(one.get(result))), one.at_bound(result)
         log = one.log and not (one.vanishes and low.value <= one.bounds[0])
-        values, drop = np.array(sorted([*low.curve, (one.value(one.at(best.config)), 0.0), *high.curve])).T
+        values, drop = np.array(sorted([*low.curve, (peak, 0.0), *high.curve])).T
         return ConfidenceInterval(
-            ci95=(min(low.value, value), max(high.value, value)),
+            ci95=(
+                low.value if low.value < value else one.clipped(value - (peak - low.value)),
+                high.value if high.value > value else one.clipped(value + (high.value - peak)),
+            ),
             profiled=low.profiled or high.profiled,
             at=one.at_bound(best.config),
             open=(low.open or at == "lower", high.open or at == "upper"),

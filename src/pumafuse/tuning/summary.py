@@ -38,6 +38,21 @@ class Fitted(msgspec.Struct, frozen=True, kw_only=True):
     notes: str
 
 
+class FittedLag(msgspec.Struct, frozen=True, kw_only=True):
+    """An axis's total lag behind the held command at constant, slow velocity; behind the commanded path it is T/2 more.
+
+    Attributes:
+        before_ms: As configured.
+        lag_ms: As fitted.
+        lag_ms_ci95: Its 95 % interval, the latencies that are fixed being right; null at an end that the measurements
+            do not limit.
+    """
+
+    before_ms: float
+    lag_ms: float
+    lag_ms_ci95: tuple[float | None, float | None]
+
+
 class FoundBias(msgspec.Struct, frozen=True, kw_only=True):
     """The bias of a sensor on an axis in a run, in the log's coordinates.
 
@@ -82,6 +97,7 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
         sd_prior: Whether sensors' noises were believed to be the configured ones within a factor of 1.5.
         interrupted: Whether it was stopped before the end; the numbers are the best until then.
         likelihood: By axis.
+        lags: Of each axis of whose arm anything was fitted that the lag depends on.
         parameters: The fitted parameters.
         biases: Of the sensors that have one to estimate.
         correlations: Pairs beyond ± 0.9.
@@ -100,6 +116,7 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
     sd_prior: bool
     interrupted: bool
     likelihood: dict[str, AxisLikelihood]
+    lags: dict[str, FittedLag]
     parameters: list[Fitted]
     biases: list[FoundBias]
     correlations: list[Correlation]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from ..logs.clock import segments
 from ..logs.run import Run
 from .identifiability import TuneError, correlations, excited_axes
 from .intervals import ConfidenceInterval, Profile, confidence_intervals
+from .lag import Distances, fitted_lags, lag_intervals
 from .likelihood import Likelihood, LogLikelihood
 from .maximise import Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
@@ -100,6 +102,7 @@ def tune(
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
     until = _fitted_until(runs[0]) if len(runs) == 1 and validate is None else None
     intervals: dict[str, ConfidenceInterval] = {}
+    around: dict[str, Distances] = {}
     validation: list[Check] | None = None
     interrupted = False
     try:
@@ -112,6 +115,7 @@ def tune(
             validation = check(validate, config, pipeline.result())
         for stage in pipeline.stages:
             progress("computing intervals", stage.best)
+            around |= lag_intervals(stage.likelihood, stage.best, stage.free)
             intervals |= confidence_intervals(stage.likelihood, stage.best, stage.free)
     except KeyboardInterrupt:
         interrupted = True
@@ -135,6 +139,7 @@ def tune(
         sd_prior=sd_prior,
         interrupted=interrupted,
         likelihood=_likelihoods(pipeline.whole, config, tuned),
+        lags=fitted_lags(free, config, tuned, around),
         parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in free],
         biases=[one for run in runs for one in found_biases(run, tuned)],
         correlations=[one for stage in stages for one in correlations(stage.likelihood, stage.best, stage.free)],
@@ -258,8 +263,12 @@ def _with_provenance(
     """The configuration with the intervals of the arm's parameters, and the runs they were fitted on."""
     arm = [one for one in free if one.path[0] == "arm" and one.key in intervals]
     for one in arm:
-        low, high = intervals[one.key].ci95
-        config = changed(config, (*one.path[:-1], f"{one.path[-1]}_ci95"), (rounded(low), rounded(high)))
+        found = intervals[one.key]
+        low, high = (
+            sign * math.inf if is_open else rounded(end)
+            for sign, is_open, end in zip((-1, 1), found.open, found.ci95, strict=True)
+        )
+        config = changed(config, (*one.path[:-1], f"{one.path[-1]}_ci95"), (low, high))
     return changed(config, ("arm", "provenance", "tuned_on"), runs) if arm else config
 
 

@@ -32,6 +32,14 @@ def milliseconds(estimate: Estimate | None) -> str:
     return "–" if estimate is None else with_interval(estimate.value, estimate.ci95, MS)
 
 
+def lag(period: float) -> str:
+    """Which lag is meant, of an arm with this update period [s]."""
+    return (
+        "lag: behind the held command at constant velocity (dead time, plant and a gain that recovers); behind the path"
+        f" through the commanded points it is T/2 = {0.5 * period * MS:g} ms more"
+    )
+
+
 def p_value(value: float | None) -> str:
     """A p-value with three decimals; a dash without one."""
     return "–" if value is None else "< 0.001" if value < 1e-3 else f"{value:.3f}"

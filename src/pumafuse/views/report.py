@@ -52,9 +52,9 @@ def models(found: Identification) -> TextTable:
             own = formatting.milliseconds(one.time_constant_mean), formatting.milliseconds(one.time_constant_robust)
             described += f"\ntrials' mean {own[0]},\nrobust {own[1]} ms"
         gain = formatting.gain(one.model.gain).replace(" + ", "\n+ ")
-        times = [formatting.milliseconds(delay) for delay in (delays.fitted, delays.onset, delays.lag)]
-        rows.append([axis, str(one.trials), described, gain, *times, f"{_rms(found, axis) * MM:.3f}"])
-    headings = ("axis", "trials", "plant", "K at speed s [m/s]", "Td, ms", "onset, ms", "lag, ms", "RMS, mm")
+        times = [formatting.milliseconds(delay) for delay in (delays.lag, delays.fitted, delays.onset)]
+        rows.append([axis, str(one.trials), *times, described, gain, f"{_rms(found, axis) * MM:.3f}"])
+    headings = ("axis", "trials", "lag, ms", "Td, ms", "onset, ms", "plant", "K at speed s [m/s]", "RMS, mm")
     return TextTable(headings, rows)
 
 
@@ -91,8 +91,8 @@ def scatter(found: Identification) -> TextTable:
 
 
 def sentences(found: Identification) -> list[str]:
-    """What was decided for each axis, and which trials were left out."""
-    lines: list[str] = []
+    """Which lag is meant, what was decided for each axis, and which trials were left out."""
+    lines = [formatting.lag(found.arm.update_period)]
     for axis, one in found.axes.items():
         lines.append(f"{axis}: {one.choice.why}; {one.gain_words}")
         if one.delay_spread > 2.0 * one.delay_noise:
@@ -123,11 +123,13 @@ def verifications(verified: Sequence[AxisVerification]) -> TextTable:
 
 
 def verdict(one: AxisVerification) -> str:
-    """The verdict on one axis, with the start level and the best in class."""
+    """The lag of one axis by the model and by the best in class, the verdict, and the start level."""
     best = one.best_in_class
     left_out = f"; {one.outlying} outlying measurements left out" if one.outlying else ""
     return (
-        f"{one.run}, {one.axis}: {one.verdict}; start level {one.start * MM:g} mm ({one.start_from}); gain recovery"
+        f"{one.run}, {one.axis}: lag {one.lag * MS:.1f} ms, here"
+        f" {formatting.with_interval(best.lag, best.lag_ci95, MS)} ms; {one.verdict}; start level"
+        f" {one.start * MM:g} mm ({one.start_from}); gain recovery"
         f" tried with {one.recovery * MS:g} ms; the best in class is K {best.gain:.3f}, Td {best.delay * MS:.1f} ms,"
         f" {formatting.plant(best.plant)}{left_out}"
     )
@@ -201,6 +203,7 @@ def write_verification(
     content = {
         "arm": arm,
         "runs": {one.run for one in every},
+        "lag": formatting.lag(arm.update_period),
         "worst": max(every, key=lambda one: one.model.rms / max(one.best_in_class.fit.rms, 1e-12)),
         "table_iii": verifications(every),
         "figures": [(step_figures.verification(one, trace), verdict(one)) for one, trace in verified],
@@ -226,7 +229,8 @@ def _trials(found: Identification) -> TextTable:
         ]
         for one in found.trials
     ]
-    first, second = ("K", "Td, ms", "τ, ms", "RMS, mm"), ("K", "Td, ms", "ω, rad/s", "ζ", "RMS, mm")
+    first = ("lag, ms", "K", "Td, ms", "τ, ms", "RMS, mm")
+    second = ("lag, ms", "K", "Td, ms", "ω, rad/s", "ζ", "RMS, mm")
     settings = ("trial", "axis", "step, mm", "speed, m/s", *factors)
     return TextTable((*settings, *first, *second, "combined RMS, mm", "flags"), rows)
 
@@ -239,7 +243,7 @@ def _flags(one: TrialResult) -> str:
 
 
 def _coefficients(fit: OrderFit) -> list[str]:
-    values = [(fit.gain, fit.gain_ci95, 1.0), (fit.delay, fit.delay_ci95, MS)]
+    values = [(fit.lag, fit.lag_ci95, MS), (fit.gain, fit.gain_ci95, 1.0), (fit.delay, fit.delay_ci95, MS)]
     values += [(fit.time_constant, fit.time_constant_ci95, MS)]
     values += [(fit.natural_frequency, fit.natural_frequency_ci95, 1.0), (fit.damping, fit.damping_ci95, 1.0)]
     found = [formatting.with_interval(value, ci95, unit) for value, ci95, unit in values if value is not None]

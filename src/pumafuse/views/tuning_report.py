@@ -53,6 +53,11 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
         "title": f"Tuning: {', '.join(summary.runs)}",
         "tuning": summary,
         "notes": _notes(summary),
+        "lags": [
+            {"key": f"lag of {axis}, ms", "numbers": _numbers(one.before_ms, one.lag_ms, one.lag_ms_ci95), "notes": ""}
+            for axis, one in summary.lags.items()
+        ],
+        "lag_words": formatting.lag(found.config.arm.update_period),
         "parameters": [_parameter(one, summary.interrupted) for one in summary.parameters],
         "known": len(known),
         "outside": sum(not _contains(one.ci95, one.before) for one in known),
@@ -82,10 +87,17 @@ def _notes(summary: TuningSummary) -> list[str]:
 
 
 def _parameter(one: Fitted, interrupted: bool) -> Mapping[str, Any]:
-    low, high = ("…" if end is None else f"{end:.4g}" for end in one.ci95)
-    before = "–" if one.before is None else f"{one.before:.4g}"
-    interval = "–" if interrupted and one.ci95 == (None, None) else f"{low} to {high}"
-    return {"key": one.key, "numbers": [before, f"{one.value:.4g}", interval], "notes": one.notes}
+    numbers = _numbers(one.before, one.value, one.ci95, interrupted)
+    return {"key": one.key, "numbers": numbers, "notes": one.notes}
+
+
+def _numbers(
+    before: float | None, value: float, ci95: tuple[float | None, float | None], interrupted: bool = True
+) -> list[str]:
+    """A number before and after with its interval, as cells; an interval that was not computed is a dash."""
+    low, high = ("…" if end is None else f"{end:.4g}" for end in ci95)
+    interval = "–" if interrupted and ci95 == (None, None) else f"{low} to {high}"
+    return ["–" if before is None else f"{before:.4g}", f"{value:.4g}", interval]
 
 
 def _check(one: Check) -> Mapping[str, Any]:
