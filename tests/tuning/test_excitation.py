@@ -175,7 +175,7 @@ def test_a_wrong_delay_is_no_reason_to_refuse_a_run_that_is_mostly_rest(late: fl
     """One move in a minute of rest, later than the arm model says: only while it moves does anything differ."""
     sim, count, rng = outage(1), 2000, np.random.default_rng(1)
     time, moved = 0.028 * np.arange(count), np.clip(np.arange(count) - 1600, 0, 40)
-    command = 0.15 * np.sin(np.pi * moved / 40.0)
+    command = 0.012 * (10.0 - np.abs(np.minimum(moved, 20) - 10.0))  # there and back without a stop
     arm = sim.config.arm
     true = pf.FusionConfig(arm=replaced(arm, delay=arm.delay + late))
     position = pf.fuse(pf.Run.from_arrays(time, {"radial": command}), true, rate=100.0)["radial"].position
