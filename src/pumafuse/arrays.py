@@ -11,6 +11,7 @@ FloatArray: TypeAlias = npt.NDArray[np.float64]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 IndexArray: TypeAlias = npt.NDArray[np.int16]  # which of a few sensors or axes
+ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 CodeArray: TypeAlias = npt.NDArray[np.uint8]
 TimeArray: TypeAlias = npt.NDArray[np.int64]  # absolute stamps, int64 ns
 

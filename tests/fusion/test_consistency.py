@@ -207,6 +207,7 @@ def moving() -> pf.Run:
         (World(input_noise=1e-3, drift=6e-3), "the process noise too large"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:.*latency_ms is -10:pumafuse.PumafuseWarning")
 def test_verdicts_name_the_key_that_is_wrong(moving: pf.Run, configured: World, verdict: str) -> None:
     """Double the noise, 30 ms too early and too late, no process noise or far too much: on every axis."""
     for axis, found in judged(moving, configured).items():

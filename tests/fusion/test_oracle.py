@@ -231,6 +231,7 @@ CASES = {
 }  # fmt: skip
 
 
+@pytest.mark.filterwarnings("ignore:.*sensors.ahead.latency_ms:pumafuse.PumafuseWarning")
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 def test_estimates_are_conditional_means(case: Case, mode: str) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 import pumafuse as pf
 from executable import pumafuse
+from pumafuse.fusion.consistency import consistency
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
@@ -140,6 +141,22 @@ def test_a_fast_arm_under_a_fast_sensor(tmp_path: Path) -> None:
         sensor = worked.sensor(axis, "interferometer")
         assert sensor["outcomes"]["fused"] > 9900
         assert 0.93 < sensor["nis_mean"] < 1.07
+
+
+@pytest.mark.long
+def test_what_is_left_over_is_smooth_and_the_camera_drifts(tmp_path: Path) -> None:
+    """smooth-disturbance: error bars hold and NIS is 1; a random walk instead is worse, and its NIS is not."""
+    worked = Worked("smooth-disturbance", tmp_path)
+    for axis in ("tangential", "vertical"):
+        worked.check(axis, (0.135, 0.311), (0.90, 1.0))
+        assert 0.69 < worked.sensor(axis, "vision")["nis_mean"] < 1.29
+        assert 0.5 < worked.sensor(axis, "tracker")["nis_mean"] < 1.54
+    told = pf.FusionConfig.load(worked.run / "fusion.toml")
+    process = dict.fromkeys(told.process, pf.Process(input_noise=3e-5, drift=3e-3))
+    est = pf.fuse(pf.Run.read(worked.run), pf.FusionConfig(arm=told.arm, process=process, sensors=told.sensors))
+    for axis in ("tangential", "vertical"):
+        found = consistency(est, "vision", axis)
+        assert found is not None and found.nis < 0.65
 
 
 @pytest.mark.long

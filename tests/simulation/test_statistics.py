@@ -63,6 +63,20 @@ axes = ["tangential"]
 sd_mm = 0.15
 latency_ms = -3.0
 """
+DISTURBED = SCENARIO.replace(
+    "[sensors.vision]",
+    """[process.tangential]
+disturbance_sd_mm = 0.8
+disturbance_time_ms = 250.0
+[process.radial]
+drift_mm_rts = 0.0
+disturbance_sd_mm = 0.5
+disturbance_time_ms = 150.0
+disturbance_kind = "ou"
+[sensors.vision]
+bias_drift_sd_mm = 0.6
+bias_time_s = 0.8""",
+)
 
 
 @dataclass(frozen=True)
@@ -190,6 +204,27 @@ def test_smoothed_and_live_estimates_are_consistent_too(scenario: pf.Scenario, m
     found = fused(scenario, **{mode: True})
     check_anees(found)
     check_coverage(found.error)
+
+
+@pytest.mark.parametrize("mode", ["filtered", "smooth", "as_live"])
+def test_error_bars_hold_with_a_disturbance_and_a_drifting_bias(tmp_path: Path, mode: str) -> None:
+    """ANEES, 95 ± 1 % of the positions and NIS: Matérn on one axis, Ornstein-Uhlenbeck on the other, with true numbers.
+
+    A filter that is not told of either is seen at once.
+    """
+    path = tmp_path / "disturbed.toml"
+    path.write_text(DISTURBED)
+    found = fused(pf.Scenario.load(path), smooth=mode == "smooth", as_live=mode == "as_live")
+    check_anees(found)
+    check_coverage(found.error)
+    for nis in found.nis.values():
+        low, high = band(len(nis), len(found.nis))
+        assert low < nis.mean() < high
+    untold = ("process.tangential]\ndisturbance_sd_mm = 0.0", "sensors.vision]\nbias_drift_sd_mm = 0.0")
+    for one in untold if mode == "filtered" else ():
+        path.write_text(f"{DISTURBED}[filter.{one}\n")
+        nis = fused(pf.Scenario.load(path), runs=20).nis["vision", "tangential"]
+        assert nis.mean() > band(len(nis))[1]
 
 
 def test_a_filter_with_wrong_noise_or_latency_falls_out_of_the_bands(tmp_path: Path) -> None:

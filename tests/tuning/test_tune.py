@@ -107,6 +107,23 @@ def test_what_is_saved_loads_and_is_as_likely(tmp_path: Path) -> None:
     assert {key: arm["provenance"][key] for key in known} == known and arm["provenance"]["tuned_on"] == [run.name]
 
 
+def test_a_configuration_that_had_seen_the_part_for_validation_says_so() -> None:
+    """Tuned on the whole run in the end, it is no stranger to the run's last third; another run it does not know."""
+    run, other = outage(1).run, outage(2).run
+    first = sds_alone([run], outage(1).config)
+    assert first.config.arm.provenance["tuned_on"] == [run.name]
+    assert not [note for note in first.summary.notes if "fitted on '" in note]
+    again = sds_alone([run], first.config)
+    assert [
+        note
+        for note in again.summary.notes
+        if note.startswith(f"the configuration as given was fitted on '{run.name}'")
+    ]
+    elsewhere = sds_alone([run], first.config, validate=other)
+    assert not [note for note in elsewhere.summary.notes if "was fitted on '" in note]
+    assert sds_alone([other], first.config).config.arm.provenance["tuned_on"] == [run.name, other.name]
+
+
 def sds_alone(runs: Sequence[pf.Run], config: pf.FusionConfig, **more: object) -> pf.Tuning:
     """The noise of the sensors with the process fixed, which takes least time."""
     return quietly(lambda: pf.tune(runs, config, fix=["process"], **more))

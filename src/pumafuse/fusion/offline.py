@@ -23,6 +23,7 @@ from .config import FusionConfig
 from .consistency import sensor_problems
 from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
+from .faults import latency_questions, sensor_faults
 from .score import late_rows, reference_track
 from .segments import Segment, build, output_times
 
@@ -108,6 +109,8 @@ def fuse(
         notes=(),
     )
     notes = [note for part in parts for note in (*part[0].notes, *_contradictions(part[0], part[2], origin))]
+    notes += [note for segment in cut for note in sensor_faults(segment, config)]
+    notes += latency_questions(config, cut[0].sensors)
     notes += [*jumps, *_reference_notes(est, references), *config.arm.validity.excess(est.speed, est.radius)]
     est = replace(est, notes=(*notes, *sensor_problems(est)))
     for note in est.notes:

@@ -12,19 +12,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
-from ..arrays import FloatArray, TimeArray
+from ..arrays import ComplexArray, FloatArray, TimeArray
 from ..errors import ConfigError
 from ..fusion.config import Process
 from ..model.plants import FirstOrder
+from . import reverting
 from .grid import grid
+from .reverting import sum_of_decays
 from .true_arm import TrueAxis
-
-ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 
 _APART = {2: 1e-5, 3: 1e-4}  # equal poles are set this far apart, relatively: it changes the response by its square
 _NODES = 3  # of the noise integral: exact to 1e-10 while |p|Δ ≤ _LONGEST_TURN
@@ -62,7 +60,7 @@ def simulate_axis(
 
     Args:
         axis: The true axis.
-        process: Its process noise.
+        process: Its process noise, and its disturbance, which is stationary from the start.
         offset_sd: Standard deviation of its offset at the start [m].
         issued: When each command is given, on the ticks of T, int64 ns, (n,).
         command: Relative to the start level [m], (n,).
@@ -75,7 +73,7 @@ def simulate_axis(
     Raises:
         ConfigError: A time constant is too short for so long a run.
     """
-    noises = rng.spawn(4)  # so that one kind of noise changes no other
+    noises = rng.spawn(5)  # so that one kind of noise changes no other
     delay = np.maximum(axis.delay + axis.delay_jitter * noises[0].standard_normal(len(issued)), 0.0)
     acting = issued + np.rint(delay * 1e9).astype(np.int64)
     acting = np.maximum.accumulate(acting)  # commands do not overtake one another
@@ -105,11 +103,14 @@ def simulate_axis(
         response = np.exp(pole * 0.5 * (node + 1.0) * distinct[:, None])[place]
         forced = _response(pole, 0.0, distinct)[place] * level + _response(pole, -decay_rate, distinct)[place] * error
         forced += np.einsum("ij,ij->i", response, white)
-        position[1:] += (share * _sum_of_decays(np.exp(pole * distinct)[place], forced)).real
+        position[1:] += (share * sum_of_decays(np.exp(pole * distinct)[place], forced)).real
 
     position = _backlash(position, axis.backlash)
     position[1:] += np.cumsum(np.sqrt(drift * interval) * noises[2].standard_normal(len(interval)))
     position += offset_sd * noises[3].standard_normal()
+    if process.disturbance_sd:
+        kind = reverting.smooth if process.disturbance_kind == "matern" else reverting.rough
+        position += kind(time, process.disturbance_sd, process.disturbance_time, noises[4])
     if axis.slow_drift:
         position += axis.slow_drift * np.sin(2.0 * np.pi * (time - time[0]) / 1e9 / axis.slow_drift_period)
     return Motion(time, position)
@@ -126,7 +127,7 @@ def _plant_input(
     step = np.diff(command, prepend=0.0)
     jump = (axis.gain_at(np.abs(step) / period) - 1.0) * step
     decay = np.exp(-decay_rate * np.diff(acting, prepend=acting[0]) / 1e9)
-    error = _sum_of_decays(decay.astype(np.complex128), jump.astype(np.complex128)).real
+    error = sum_of_decays(decay.astype(np.complex128), jump.astype(np.complex128)).real
     if not axis.stiction:
         return command, error
     wanted = (command + error).tolist()
@@ -183,17 +184,6 @@ def _events(acting: TimeArray, instants: TimeArray, fastest: float) -> TimeArray
         raise ConfigError(f"{lag} is too short to follow over {end / 1e9:.0f} s: at least {least:.2g} ms")
     finer = np.arange(0, end if longest < instants[1] else 0, longest, dtype=np.int64)
     return np.unique(np.concatenate((acting[acting <= end], instants, finer)))
-
-
-def _sum_of_decays(decay: ComplexArray, added: ComplexArray) -> ComplexArray:
-    """z_n = decay_n · z_(n−1) + added_n from z = 0, by doubling strides."""
-    factor, total, stride = decay.copy(), added.copy(), 1
-    while stride < len(total) and np.abs(factor[stride:]).max() > 1e-30:
-        total[stride:] += factor[stride:] * total[:-stride].copy()
-        factor[stride:] *= factor[:-stride].copy()
-        factor[:stride] = 0.0
-        stride *= 2
-    return total
 
 
 def _backlash(position: FloatArray, width: float) -> FloatArray:

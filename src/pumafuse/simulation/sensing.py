@@ -6,6 +6,7 @@ import numpy as np
 
 from ..arrays import BoolArray, FloatArray, TimeArray
 from ..logs.run import Source
+from . import reverting
 from .true_sensor import TrueSensor
 
 
@@ -31,7 +32,7 @@ def measure(
         position: True positions then, in the coordinates in which the sensor is logged [m], (rows,) each.
         rng: Draws everything random of this sensor.
     """
-    noises = rng.spawn(6)  # so that one kind of fault changes no other
+    noises = rng.spawn(7)  # so that one kind of fault changes no other
     count, seconds = len(valid), valid / 1e9
     outlier = _outliers(sensor, count, list(position), noises[1])
     values: dict[str, FloatArray] = {}
@@ -39,6 +40,8 @@ def measure(
         sd = sensor.sd[axis] if isinstance(sensor.sd, dict) else sensor.sd
         bias = sensor.bias.get(axis, 0.0) if isinstance(sensor.bias, dict) else sensor.bias
         bias += sensor.bias_sd * noises[2].standard_normal()
+        if sensor.bias_drift_sd:
+            bias = bias + reverting.rough(valid, sensor.bias_drift_sd, sensor.bias_time, noises[6])
         z = sensor.scale * true + bias + sd * noises[0].standard_normal(count) + outlier[axis]
         values[axis] = np.rint(z / sensor.quantisation) * sensor.quantisation if sensor.quantisation else z
     late = sensor.latency + sensor.latency_sd * noises[3].standard_normal(count)

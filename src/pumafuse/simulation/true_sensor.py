@@ -53,6 +53,8 @@ class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         scale: Factor on the position.
         bias: Constant [m].
         bias_sd: Standard deviation of one more bias, drawn for each run and axis [m].
+        bias_drift_sd: Standard deviation of one more bias that drifts and reverts to 0, on each axis [m]; 0: none.
+        bias_time: How long such a drift lasts [s].
         quantisation: Step between two values [m]; 0: none.
         dropouts: Share of rows lost, one by one.
         bursts: Rows lost together.
@@ -71,6 +73,8 @@ class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     scale: float = 1.0
     bias: PerAxis = msgspec.field(name="bias_mm", default=0.0)
     bias_sd: NotNegative = msgspec.field(name="bias_sd_mm", default=0.0)
+    bias_drift_sd: NotNegative = msgspec.field(name="bias_drift_sd_mm", default=0.0)
+    bias_time: Positive = msgspec.field(name="bias_time_s", default=10.0)
     quantisation: NotNegative = msgspec.field(name="quantisation_mm", default=0.0)
     dropouts: Share = 0.0
     bursts: Bursts | None = None
@@ -90,4 +94,6 @@ class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             "latency_sd_ms": self.latency_sd,
             "scale": self.scale,
             "bias_sd_mm": math.hypot(self.bias_sd, *biases),
+            "bias_drift_sd_mm": self.bias_drift_sd,
+            "bias_time_s": self.bias_time,
         }

@@ -97,7 +97,8 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
 def _check_follows(name: str, axis: str, expected: FloatArray, measured: FloatArray) -> None:
     """Refuse a sensor that does not follow the response to its commands, or moves much more or less, (m,)."""
     distance = np.abs(measured - expected)
-    near = distance <= 10.0 * np.median(distance) + 1e-12  # without outliers
+    # Without outliers. At rest all is near: what is off while it moves, as a wrong delay makes it, is no outlier.
+    near = distance <= max(10.0 * float(np.median(distance)), float(np.ptp(expected))) + 1e-12
     expected, measured = expected[near], measured[near]
     power = float(np.sqrt(np.sum(expected**2) * np.sum(measured**2)))
     correlation = float(np.sum(expected * measured)) / power if power > 0.0 else 0.0

@@ -7,13 +7,14 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import msgspec
 
 from ..arrays import NO_STAMP
 from ..errors import PumafuseWarning
 from ..fusion.config import FusionConfig
+from ..fusion.faults import latency_questions
 from ..logs.clock import segments
 from ..logs.run import Run
 from .identifiability import TuneError, correlations, excited_axes
@@ -129,6 +130,8 @@ def tune(
     if interrupted:
         notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
     known = validate is not None and any(_same(validate, run) for run in runs)
+    notes += _seen_before(config, runs[0] if validate is None else validate, validation)
+    notes += latency_questions(tuned, pipeline.whole.share_after_end)
     notes += _validation_notes(validation, known, interrupted)
     summary = TuningSummary(
         pumafuse=version("pumafuse"),
@@ -269,7 +272,25 @@ def _with_provenance(
             for sign, is_open, end in zip((-1, 1), found.open, found.ci95, strict=True)
         )
         config = changed(config, (*one.path[:-1], f"{one.path[-1]}_ci95"), (low, high))
-    return changed(config, ("arm", "provenance", "tuned_on"), runs) if arm else config
+    earlier = _tuned_on(config)  # what is not fitted now is from there
+    return changed(config, ("arm", "provenance", "tuned_on"), [*(one for one in earlier if one not in runs), *runs])
+
+
+def _tuned_on(config: FusionConfig) -> list[str]:
+    """The runs on which a configuration was fitted, by the provenance of its arm."""
+    found: object = config.arm.provenance.get("tuned_on", [])
+    return [str(one) for one in cast(list[object], found)] if isinstance(found, list) else [str(found)]
+
+
+def _seen_before(config: FusionConfig, run: Run, validation: Sequence[Check] | None) -> list[str]:
+    """A sentence if the configuration to start from was fitted on what the result was validated on."""
+    if not validation or run.name not in _tuned_on(config):
+        return []
+    return [
+        f"the configuration as given was fitted on '{run.name}' (tuned_on in [provenance] of its arm), so that it knows"
+        " the part validated on: the comparison with it says little; start from one that does not, or --validate"
+        " another run"
+    ]
 
 
 def _validation_notes(validation: Sequence[Check] | None, known: bool, interrupted: bool) -> list[str]:
