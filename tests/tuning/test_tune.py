@@ -136,7 +136,12 @@ def test_the_reference_plays_no_part() -> None:
     nonsense = replace(run.reference, values={axis: 1.0 + value[::-1] for axis, value in run.reference.values.items()})
     found = [sds_alone([replace(run, reference=one)], config) for one in (run.reference, None, nonsense)]
     assert found[0].config == found[1].config == found[2].config
-    assert found[0].config.arm == config.arm  # provenance too
+    assert found[0].config.arm == with_provenance(config.arm, tuned_on=[run.name])
+
+
+def with_provenance(arm: pf.ArmModel, **more: object) -> pf.ArmModel:
+    """The arm with more said of where it is from."""
+    return msgspec.structs.replace(arm, provenance={**arm.provenance, **more})
 
 
 # ---- validation -----------------------------------------------------------------------------------------------------
@@ -256,7 +261,8 @@ def test_interrupted_it_gives_the_best_so_far(share: float, trust: str | None, t
     assert total(sim.run, found.config) >= total(sim.run, config)
     for name, sensor in found.config.sensors.items():
         assert (sensor.gate, sensor.gate_rows) == (config.sensors[name].gate, config.sensors[name].gate_rows)
-    assert (found.config.arm, found.config.start) == (config.arm, config.start)
+    assert found.config.arm == with_provenance(config.arm, tuned_on=[sim.run.name])
+    assert found.config.start == config.start
     assert msgspec.json.decode(found.to_json(), type=TuningSummary) == found.summary
     found.config.save(tmp_path)
     assert total(sim.run, pf.FusionConfig.load(tmp_path / "fusion.toml")) == pytest.approx(

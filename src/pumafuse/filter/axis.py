@@ -124,10 +124,19 @@ def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
         x[row, POSITION] += position * drive[row, ERROR]
         x[row, RATE] += rate * drive[row, ERROR]
         drive[row, ERROR] *= left
-    size, first = model.states[axis], REST
+    size = model.states[axis]
     move_pair(P, row, POSITION_, size, f11, f12, f21, f22)
     add_to_pair(P, row, POSITION_, q * q11, q * q12, q * q22)
     P[row, OFFSET, OFFSET] += drive[row, DRIFT] * dt
+    if size > REST:
+        revert(model, state, axis, row, dt)
+    state.clock[row] = time
+
+
+@compiled_apart
+def revert(model: Model, state: State, axis: int, row: int, dt: float) -> None:
+    """Bring disturbance and drifting biases ``dt`` [s] on: they revert to 0, and what is lost of them comes as noise."""
+    x, P, size, first = state.x, state.P, model.states[axis], REST
     if model.disturbance[axis] == SMOOTH:
         variance = model.rest[axis, REST, VARIANCE]
         f11, f12, f21, f22, q11, q12, q22 = matern(model.rest[axis, REST, REVERTING], dt)
@@ -136,7 +145,7 @@ def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
         move_pair(P, row, REST_, size, f11, f12, f21, f22)
         add_to_pair(P, row, REST_, variance * q11, variance * q12, variance * q22)
         first = REST + 2
-    for i in range(first, model.states[axis]):
+    for i in range(first, size):
         if model.rest[axis, i, REVERTING] > 0.0:
             fading = -model.rest[axis, i, REVERTING] * dt
             left = math.exp(fading)
@@ -145,7 +154,6 @@ def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
                 P[row, i, j] *= left
                 P[row, j, i] *= left
             P[row, i, i] -= model.rest[axis, i, VARIANCE] * math.expm1(2.0 * fading)
-    state.clock[row] = time
 
 
 @compiled
