@@ -135,7 +135,7 @@ def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
 
 @compiled_apart
 def revert(model: Model, state: State, axis: int, row: int, dt: float) -> None:
-    """Bring disturbance and drifting biases ``dt`` [s] on: they revert to 0, and what is lost of them comes as noise."""
+    """Bring disturbance and drifting biases ``dt`` [s] on: they revert to 0, and what they lose comes back as noise."""
     x, P, size, first = state.x, state.P, model.states[axis], REST
     if model.disturbance[axis] == SMOOTH:
         variance = model.rest[axis, REST, VARIANCE]
