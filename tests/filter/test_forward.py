@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
-from pumafuse.arrays import CodeArray, TimeArray
+from pumafuse.arrays import CodeArray, FloatArray, TimeArray
 from pumafuse.filter.axis import Model, Sensors, State
 from pumafuse.filter.events import COMMAND, Events, Results, joined
-from pumafuse.filter.forward import Outputs, filter_events, no_history
+from pumafuse.filter.forward import Output, filter_events, no_history
 from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.engine import arranged, biased_sensors
 from pumafuse.fusion.segments import Segment, build
@@ -62,7 +62,7 @@ class Pass:
     sensors: Sensors
     state: State
     results: list[Results]
-    outputs: list[Outputs]
+    outputs: list[FloatArray]
 
     @staticmethod
     def over(segment: Segment, places: int = 0) -> Pass:
@@ -71,7 +71,7 @@ class Pass:
     def run(self, events: Events, times: TimeArray, outcome: CodeArray | None = None) -> None:
         results, outputs = (
             Results.room(len(events.time), len(AXES)),
-            Outputs(*np.zeros((len(Outputs._fields), len(AXES), len(times)))),
+            np.zeros((len(Output), len(AXES), len(times))),
         )
         if outcome is not None:
             results.outcome[:] = outcome
@@ -86,8 +86,7 @@ class Pass:
         """Every outcome, innovation and estimate, and the state at the end, to the bit."""
         for mine, theirs in zip(zip(*self.results, strict=True), zip(*other.results, strict=True), strict=True):
             np.testing.assert_array_equal(np.concatenate(mine), np.concatenate(theirs))
-        for mine, theirs in zip(zip(*self.outputs, strict=True), zip(*other.outputs, strict=True), strict=True):
-            np.testing.assert_array_equal(np.concatenate(mine, axis=1), np.concatenate(theirs, axis=1))
+        np.testing.assert_array_equal(np.concatenate(self.outputs, axis=2), np.concatenate(other.outputs, axis=2))
         for mine, theirs in zip(self.state[:-1], other.state[:-1], strict=True):
             np.testing.assert_array_equal(mine[: len(AXES)], theirs[: len(AXES)])
 
@@ -120,8 +119,7 @@ def test_estimates_leave_no_trace() -> None:
     sparse.run(events, GRID[::7])
     np.testing.assert_array_equal(dense.results[0].outcome, without.results[0].outcome)
     np.testing.assert_array_equal(dense.state.x[:2], without.state.x[:2])
-    for part, other in zip(dense.outputs[0], sparse.outputs[0], strict=True):
-        np.testing.assert_array_equal(part[:, ::7], other)
+    np.testing.assert_array_equal(dense.outputs[0][:, :, ::7], sparse.outputs[0])
 
 
 @settings(derandomize=True, deadline=None, max_examples=20)
@@ -135,13 +133,13 @@ def test_late_events_end_as_events_in_time(seed: int) -> None:
     arrival[events.source == COMMAND] = events.stamp[events.source == COMMAND]
     times = np.append(GRID, arrival.max())
     live, whole = Pass.over(segment, count + 1), Pass.over(segment)
-    results, outputs = Results.room(count, 2), Outputs(*np.zeros((len(Outputs._fields), 2, len(times))))
+    results, outputs = Results.room(count, 2), np.zeros((len(Output), 2, len(times)))
     arrived, history = np.zeros(count, dtype=np.bool_), no_history(len(AXES), live.state.x.shape[1])
     queue = np.argsort(arrival, kind="stable")
     known = live.model, live.sensors, events, live.state
     filter_events(*known, False, arrival, queue, times, results, history, arrived, count + 1, outputs)
     live.results.append(results)
-    live.outputs.append(Outputs(*(part[:, -1:] for part in outputs)))
+    live.outputs.append(outputs[:, :, -1:])
     whole.run(events, times[-1:])
     live.compare(whole)
 

@@ -28,6 +28,7 @@ from ..model.closed import decaying_response, gain_error, transition
 from ..model.matern import matern
 
 POSITION, RATE, OFFSET, REST = range(4)  # of a state; the disturbance, if there is one, is the first of the rest
+ORDER, DISTURBANCE, STATES = range(3)  # of a kind
 NONE, ROUGH, SMOOTH = range(3)  # disturbances, by how many states they have
 REVERTING, VARIANCE = range(2)  # of a state of the rest
 START, U, STEP, ERROR, NOISE, DRIFT = range(6)  # of a drive
@@ -41,20 +42,17 @@ class Model(NamedTuple):
     """What is known of each of the A axes.
 
     Attributes:
-        order: Of the plant, 1 or 2, (A,).
+        kind: ``ORDER`` of the plant, 1 or 2, ``DISTURBANCE``: ``NONE``, ``ROUGH`` (Ornstein-Uhlenbeck) or ``SMOOTH``
+            (Matérn), and how many ``STATES`` there are, (A, 3).
         constants: Of the plant, see :mod:`pumafuse.model.closed`, (A, c).
-        states: How many of the state's entries are used, (A,).
-        disturbance: ``NONE``, ``ROUGH`` (Ornstein-Uhlenbeck) or ``SMOOTH`` (Matérn), (A,).
         rest: How fast each of the state's entries reverts to 0 [1/s] and its stationary variance [m²]: λ and σ² of the
             disturbance; 0 and 0 of what is constant, (A, s, 2).
         gain: ``SLOPE`` [s/m], ``INTERCEPT``, ``DECAY`` of its error [1/s] (0: none) and the ``PERIOD`` T [s], (A, 4).
         process: ``INPUT_NOISE`` [m/√Hz], ``RANDOM_WALK`` [m/√s], and what each m/s of maneuver adds to them, (A, 4).
     """
 
-    order: IntArray
+    kind: IntArray
     constants: FloatArray
-    states: IntArray
-    disturbance: IntArray
     rest: FloatArray
     gain: FloatArray
     process: FloatArray
@@ -113,18 +111,19 @@ def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
     if time <= state.clock[row]:
         return
     x, P, drive, dt = state.x, state.P, state.drive, (time - state.clock[row]) / 1e9
-    f11, f12, f21, f22, q11, q12, q22 = transition(model.order[axis], model.constants, axis, dt)
+    f11, f12, f21, f22, q11, q12, q22 = transition(model.kind[axis, ORDER], model.constants, axis, dt)
     u, q = drive[row, U], drive[row, NOISE]
     gap, rate = x[row, POSITION] - u, x[row, RATE]
     x[row, POSITION] = u + (f11 * gap + f12 * rate)
     x[row, RATE] = f21 * gap + f22 * rate
     if drive[row, ERROR] != 0.0:
         decay = model.gain[axis, DECAY]
-        position, rate, left = decaying_response(model.order[axis], model.constants, axis, decay, dt, f11, f12, f22)
+        order = model.kind[axis, ORDER]
+        position, rate, left = decaying_response(order, model.constants, axis, decay, dt, f11, f12, f22)
         x[row, POSITION] += position * drive[row, ERROR]
         x[row, RATE] += rate * drive[row, ERROR]
         drive[row, ERROR] *= left
-    size = model.states[axis]
+    size = model.kind[axis, STATES]
     move_pair(P, row, POSITION_, size, f11, f12, f21, f22)
     add_to_pair(P, row, POSITION_, q * q11, q * q12, q * q22)
     P[row, OFFSET, OFFSET] += drive[row, DRIFT] * dt
@@ -136,8 +135,8 @@ def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
 @compiled_apart
 def revert(model: Model, state: State, axis: int, row: int, dt: float) -> None:
     """Bring disturbance and drifting biases ``dt`` [s] on: they revert to 0, and what they lose comes back as noise."""
-    x, P, size, first = state.x, state.P, model.states[axis], REST
-    if model.disturbance[axis] == SMOOTH:
+    x, P, size, first = state.x, state.P, model.kind[axis, STATES], REST
+    if model.kind[axis, DISTURBANCE] == SMOOTH:
         variance = model.rest[axis, REST, VARIANCE]
         f11, f12, f21, f22, q11, q12, q22 = matern(model.rest[axis, REST, REVERTING], dt)
         d, rate = x[row, REST], x[row, REST + 1]
@@ -203,20 +202,20 @@ def noise(model: Model, sensors: Sensors, state: State, axis: int, sensor: int, 
     if sensors.latency_sd[sensor] > 0.0:
         x, drive = state.x, state.drive
         speed = x[axis, RATE]
-        if model.order[axis] == 1:  # ẋ = (u + e − x) / τ
+        if model.kind[axis, ORDER] == 1:  # ẋ = (u + e − x) / τ
             speed = model.constants[axis, 0] * (drive[axis, U] + drive[axis, ERROR] - x[axis, POSITION])
-        if model.disturbance[axis] == SMOOTH:
+        if model.kind[axis, DISTURBANCE] == SMOOTH:
             speed += x[axis, REST + 1]
         R += (sensors.scale[sensor] * speed * sensors.latency_sd[sensor]) ** 2
     return R
 
 
-@compiled
+@compiled_apart
 def innovation(
     model: Model, sensors: Sensors, state: State, axis: int, sensor: int, z: float, R: float
 ) -> tuple[float, float]:
     """ν = z − H x and S = H P Hᵀ + R of a measurement ``z`` [m] as logged, here and now; H stays in ``work``."""
-    work, scale, states = state.work, sensors.scale[sensor], model.states[axis]
+    work, scale, states = state.work, sensors.scale[sensor], model.kind[axis, STATES]
     observation(model, sensors, axis, sensor, work, axis)
     nu = z - scale * state.drive[axis, START]
     for i in range(states):
@@ -227,10 +226,10 @@ def innovation(
 @compiled
 def observation(model: Model, sensors: Sensors, axis: int, sensor: int, work: FloatArray, at: int) -> None:
     """H of a sensor on an axis, into ``work[at, 0]``."""
-    for i in range(model.states[axis]):
+    for i in range(model.kind[axis, STATES]):
         work[at, 0, i] = 0.0
     work[at, 0, POSITION] = work[at, 0, OFFSET] = sensors.scale[sensor]
-    if model.disturbance[axis] != NONE:
+    if model.kind[axis, DISTURBANCE] != NONE:
         work[at, 0, REST] = sensors.scale[sensor]
     for k in range(2):
         if sensors.bias[sensor, axis, k] >= 0:
@@ -252,11 +251,11 @@ def variance_along(P: FloatArray, row: int, states: int, R: float, work: FloatAr
     return work[at, 3, 0]
 
 
-@compiled
+@compiled_apart
 def update(model: Model, state: State, axis: int, nu: float, R: float) -> None:
     """x⁺ = x + K ν and P⁺ in Joseph form, right after :func:`innovation`; K stays in ``work``."""
-    joseph(state.P, axis, model.states[axis], R, state.work, axis)
-    for i in range(model.states[axis]):
+    joseph(state.P, axis, model.kind[axis, STATES], R, state.work, axis)
+    for i in range(model.kind[axis, STATES]):
         state.x[axis, i] += state.work[axis, 1, i] * nu
 
 
@@ -298,34 +297,34 @@ def position_of(disturbance: int, x: FloatArray, P: FloatArray, row: int) -> tup
     return position, max(variance, 0.0)
 
 
-@compiled
+@compiled_apart
 def variance_of_motion(model: Model, state: State, axis: int, row: int, dt: float) -> float:
     """Variance [m²] of the motion over ``dt`` [s] that the state leads to: h (Φ − I) P (Φ − I)ᵀ hᵀ; h makes p of it."""
     P, work = state.P, state.work
-    f11, f12, _, _, _, _, _ = transition(model.order[axis], model.constants, axis, dt)
+    f11, f12, _, _, _, _, _ = transition(model.kind[axis, ORDER], model.constants, axis, dt)
     a, b = f11 - 1.0, f12
-    if model.disturbance[axis] == NONE:
+    if model.kind[axis, DISTURBANCE] == NONE:
         own = a * a * P[row, POSITION, POSITION] + 2.0 * a * b * P[row, POSITION, RATE] + b * b * P[row, RATE, RATE]
         return max(own, 0.0)
-    for i in range(model.states[axis]):
+    for i in range(model.kind[axis, STATES]):
         work[axis, 0, i] = 0.0
     work[axis, 0, POSITION], work[axis, 0, RATE] = a, b
-    if model.disturbance[axis] == ROUGH:
+    if model.kind[axis, DISTURBANCE] == ROUGH:
         work[axis, 0, REST] = math.expm1(-model.rest[axis, REST, REVERTING] * dt)
-    elif model.disturbance[axis] == SMOOTH:
+    elif model.kind[axis, DISTURBANCE] == SMOOTH:
         f11, f12, _, _, _, _, _ = matern(model.rest[axis, REST, REVERTING], dt)
         work[axis, 0, REST], work[axis, 0, REST + 1] = f11 - 1.0, f12
-    return variance_along(state.P, row, model.states[axis], 0.0, work, axis)
+    return variance_along(state.P, row, model.kind[axis, STATES], 0.0, work, axis)
 
 
-@compiled
+@compiled_apart
 def noise_of_motion(model: Model, state: State, axis: int, dt: float) -> float:
     """Variance [m²] of the motion over ``dt`` [s] that comes from noise on the way: h Q hᵀ."""
-    _, _, _, _, q11, _, _ = transition(model.order[axis], model.constants, axis, dt)
+    _, _, _, _, q11, _, _ = transition(model.kind[axis, ORDER], model.constants, axis, dt)
     noise = state.drive[axis, NOISE] * q11 + state.drive[axis, DRIFT] * dt
-    if model.disturbance[axis] == ROUGH:
+    if model.kind[axis, DISTURBANCE] == ROUGH:
         noise -= model.rest[axis, REST, VARIANCE] * math.expm1(-2.0 * model.rest[axis, REST, REVERTING] * dt)
-    elif model.disturbance[axis] == SMOOTH:
+    elif model.kind[axis, DISTURBANCE] == SMOOTH:
         _, _, _, _, q11, _, _ = matern(model.rest[axis, REST, REVERTING], dt)
         noise += model.rest[axis, REST, VARIANCE] * q11
     return noise

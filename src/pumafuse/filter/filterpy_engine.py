@@ -27,6 +27,7 @@ from ..model.arm import AxisModel
 from ..model.discrete import transition
 from .axis import (
     DECAY,
+    DISTURBANCE,
     INPUT_NOISE,
     INTERCEPT,
     MANEUVER_DRIFT,
@@ -38,12 +39,13 @@ from .axis import (
     SLOPE,
     SMOOTH,
     START,
+    STATES,
     Model,
     Sensors,
     State,
 )
 from .events import COMMAND, Events, Results
-from .forward import Outputs
+from .forward import Output
 from .gate import RECENT_NS, SETTLED_NS
 from .outcome import Outcome
 
@@ -69,8 +71,8 @@ class _Axis:
         A, _, C = self._plant.state_space()
         self.n = len(A)
         self.rest = self.n + 1
-        self.reverts = model.rest[axis, REST : model.states[axis]]
-        self.disturbance = int(model.disturbance[axis])
+        self.reverts = model.rest[axis, REST : model.kind[axis, STATES]]
+        self.disturbance = int(model.kind[axis, DISTURBANCE])
         self.biases = self.rest + self.disturbance
         self.error = self.rest + len(self.reverts)
         size = self.error + 1 + in_flight + 1
@@ -258,7 +260,7 @@ def filter_events(
     state: State,
     times: TimeArray,
     results: Results,
-    outputs: Outputs,
+    outputs: FloatArray,
     progress: Callable[[float], None] | None = None,
 ) -> None:
     """What :func:`pumafuse.filter.forward.filter_events` does; ``state`` gets the final biases."""
@@ -337,18 +339,20 @@ def _add(
         gate.count_fused((sensor, number), time)
 
 
-def _estimate(axes: Sequence[_Axis], time: int, outputs: Outputs, n: int) -> None:
+def _estimate(axes: Sequence[_Axis], time: int, outputs: FloatArray, n: int) -> None:
     """Every axis at ``time`` [ns], as estimate ``n``; a filter that is brought there changes nothing by it."""
     for number, axis in enumerate(axes):
         axis.advance(time)
         h, x, P, period = axis.position[0], axis.kf.x[:, 0], axis.kf.P, axis.period
-        outputs.position[number, n], outputs.position_sd[number, n] = h @ x, np.sqrt(max(h @ P @ h, 0.0))
-        outputs.offset[number, n], outputs.offset_sd[number, n] = x[axis.n], np.sqrt(max(P[axis.n, axis.n], 0.0))
+        outputs[Output.POSITION, number, n] = h @ x
+        outputs[Output.POSITION_SD, number, n] = np.sqrt(max(h @ P @ h, 0.0))
+        outputs[Output.OFFSET, number, n] = x[axis.n]
+        outputs[Output.OFFSET_SD, number, n] = np.sqrt(max(P[axis.n, axis.n], 0.0))
         if axis.disturbance:
-            outputs.disturbance[number, n] = x[axis.rest]
-            outputs.disturbance_sd[number, n] = np.sqrt(max(P[axis.rest, axis.rest], 0.0))
+            outputs[Output.DISTURBANCE, number, n] = x[axis.rest]
+            outputs[Output.DISTURBANCE_SD, number, n] = np.sqrt(max(P[axis.rest, axis.rest], 0.0))
         F, Q, later = axis.later(time, time + round(period * 1e9))
         row = h @ F - h
         row[axis.biases :] = 0.0  # known: the inputs and e
-        outputs.velocity[number, n] = (h @ later[:, 0] - h @ x) / period
-        outputs.velocity_sd[number, n] = np.sqrt(max(row @ P @ row + h @ Q @ h, 0.0)) / period
+        outputs[Output.VELOCITY, number, n] = (h @ later[:, 0] - h @ x) / period
+        outputs[Output.VELOCITY_SD, number, n] = np.sqrt(max(row @ P @ row + h @ Q @ h, 0.0)) / period

@@ -10,6 +10,7 @@ to a checkpoint and run on from there, as in the window of a stream; for a likel
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -17,12 +18,14 @@ import numpy as np
 from ..arrays import NEVER, BoolArray, FloatArray, IntArray, TimeArray
 from ..compiled import compiled, kernel
 from .axis import (
+    DISTURBANCE,
     DRIFT,
     NOISE,
     NONE,
     OFFSET,
     PERIOD,
     REST,
+    STATES,
     Model,
     Sensors,
     State,
@@ -46,28 +49,17 @@ ZERO, ONE, NO = np.int64(0), np.int64(1), np.bool_(False)
 INTERVAL = np.int64(-1)  # the row of an entry of the history that is no update
 
 
-class Outputs(NamedTuple):
-    """Estimates of each axis, relative to its start level; all (A, n).
+class Output(IntEnum):
+    """What an estimate says of an axis, relative to its start level; first index of outputs, (8, A, n)."""
 
-    Attributes:
-        position: p [m].
-        position_sd: [m].
-        velocity: Mean over the coming update period [m/s].
-        velocity_sd: [m/s].
-        offset: o [m].
-        offset_sd: [m].
-        disturbance: d [m]; left as it is where the model has none.
-        disturbance_sd: [m].
-    """
-
-    position: FloatArray
-    position_sd: FloatArray
-    velocity: FloatArray
-    velocity_sd: FloatArray
-    offset: FloatArray
-    offset_sd: FloatArray
-    disturbance: FloatArray
-    disturbance_sd: FloatArray
+    POSITION = 0  # p [m]
+    POSITION_SD = 1
+    VELOCITY = 2  # mean over the coming update period [m/s]
+    VELOCITY_SD = 3
+    OFFSET = 4  # o [m]
+    OFFSET_SD = 5
+    DISTURBANCE = 6  # d [m]; left as it is where the model has none
+    DISTURBANCE_SD = 7
 
 
 class History(NamedTuple):
@@ -118,7 +110,7 @@ def filter_events(
     history: History,
     arrived: BoolArray,
     places: int,
-    outputs: Outputs,
+    outputs: FloatArray,
 ) -> None:
     """Every event in its order, and an estimate at each of ``times`` (ascending) by the events until then.
 
@@ -146,7 +138,7 @@ def filter_events(
             begin = min(begin, queue[due])
             due += 1
         if begin < done:
-            copy_rows(state, checkpoint_of(model, begin, places), ZERO, len(model.order))
+            copy_rows(state, checkpoint_of(model, begin, places), ZERO, len(model.kind))
         while done < end and events.time[done] <= until:
             done += 1
         run_events(model, sensors, events, state, begin, done, given, results, history, arrived, places)
@@ -172,7 +164,7 @@ def run_events(
 
     Before each row the state is kept in one of its ``places``; with none, nothing can be taken back, all have arrived.
     """
-    axes = len(model.order)
+    axes = len(model.kind)
     for row in range(begin, end):
         if places > 0:
             copy_rows(state, ZERO, checkpoint_of(model, row, places), axes)
@@ -305,7 +297,7 @@ def estimate(
     end: int,
     time: int,
     history: History,
-    outputs: Outputs,
+    outputs: FloatArray,
     n: int,
 ) -> None:
     """Every axis at ``time`` [ns], as estimate ``n``; the state stays as it is.
@@ -321,42 +313,42 @@ def estimate(
         outputs: Gets the estimates.
         n: Their place.
     """
-    here = len(model.order)  # a row of the state for predictions aside
-    for axis in range(len(model.order)):
+    here = len(model.kind)  # a row of the state for predictions aside
+    for axis in range(len(model.kind)):
         copy_estimate(state, axis, here)
         follow_commands(model, events, state, axis, here, pending, end, state.clock[axis] - 1, time, time)
-        write_outputs(model.disturbance[axis], state.x, state.P, here, outputs, axis, n)
+        write_outputs(model.kind[axis, DISTURBANCE], state.x, state.P, here, outputs, axis, n)
         if history.x.shape[1]:
-            for i in range(model.states[axis]):
+            for i in range(model.kind[axis, STATES]):
                 history.x[axis, n, i] = state.x[here, i]
-                for j in range(model.states[axis]):
+                for j in range(model.kind[axis, STATES]):
                     history.P[axis, n, i, j] = state.P[here, i, j]
-            outputs.velocity[axis, n] = outputs.velocity_sd[axis, n] = math.nan
+            outputs[Output.VELOCITY, axis, n] = outputs[Output.VELOCITY_SD, axis, n] = math.nan
             continue
         period = model.gain[axis, PERIOD]
         until = time + int(np.rint(period * 1e9))
         known = variance_of_motion(model, state, axis, here, (until - time) / 1e9)
-        for i in range(model.states[axis]):
-            for j in range(model.states[axis]):
+        for i in range(model.kind[axis, STATES]):
+            for j in range(model.kind[axis, STATES]):
                 state.P[here, i, j] = 0.0  # what comes is noise alone
         follow_commands(model, events, state, axis, here, pending, end, time, until, time)
-        later, noise = position_of(model.disturbance[axis], state.x, state.P, here)
-        outputs.velocity[axis, n] = (later - outputs.position[axis, n]) / period
-        outputs.velocity_sd[axis, n] = math.sqrt(known + noise) / period
+        later, noise = position_of(model.kind[axis, DISTURBANCE], state.x, state.P, here)
+        outputs[Output.VELOCITY, axis, n] = (later - outputs[Output.POSITION, axis, n]) / period
+        outputs[Output.VELOCITY_SD, axis, n] = math.sqrt(known + noise) / period
 
 
 @compiled
 def write_outputs(
-    disturbance: int, x: FloatArray, P: FloatArray, row: int, outputs: Outputs, axis: int, n: int
+    disturbance: int, x: FloatArray, P: FloatArray, row: int, outputs: FloatArray, axis: int, n: int
 ) -> None:
     """What a state says of its axis, but for the velocity, as estimate ``n``."""
-    outputs.position[axis, n], variance = position_of(disturbance, x, P, row)
-    outputs.position_sd[axis, n] = math.sqrt(variance)
-    outputs.offset[axis, n] = x[row, OFFSET]
-    outputs.offset_sd[axis, n] = math.sqrt(max(P[row, OFFSET, OFFSET], 0.0))
+    outputs[Output.POSITION, axis, n], variance = position_of(disturbance, x, P, row)
+    outputs[Output.POSITION_SD, axis, n] = math.sqrt(variance)
+    outputs[Output.OFFSET, axis, n] = x[row, OFFSET]
+    outputs[Output.OFFSET_SD, axis, n] = math.sqrt(max(P[row, OFFSET, OFFSET], 0.0))
     if disturbance != NONE:
-        outputs.disturbance[axis, n] = x[row, REST]
-        outputs.disturbance_sd[axis, n] = math.sqrt(max(P[row, REST, REST], 0.0))
+        outputs[Output.DISTURBANCE, axis, n] = x[row, REST]
+        outputs[Output.DISTURBANCE_SD, axis, n] = math.sqrt(max(P[row, REST, REST], 0.0))
 
 
 @compiled
@@ -386,5 +378,5 @@ def follow_commands(
 @compiled
 def checkpoint_of(model: Model, row: int, places: int) -> int:
     """The first row of the state where it is kept as it was before an event ``row``, in a ring of places."""
-    axes = len(model.order)
+    axes = len(model.kind)
     return axes + 1 + axes * (row % places)

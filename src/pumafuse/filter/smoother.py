@@ -28,12 +28,15 @@ from ..compiled import compiled, kernel
 from ..model.closed import transition
 from ..model.matern import matern
 from .axis import (
+    DISTURBANCE,
     OFFSET,
+    ORDER,
     POSITION_,
     REST,
     REST_,
     REVERTING,
     SMOOTH,
+    STATES,
     VARIANCE,
     Model,
     Sensors,
@@ -43,7 +46,7 @@ from .axis import (
     variance_along,
 )
 from .events import Events, Results
-from .forward import INTERVAL, ONE, ZERO, History, Outputs, write_outputs
+from .forward import INTERVAL, ONE, ZERO, History, write_outputs
 
 OFFSET_ = np.int64(OFFSET)  # as an argument: see forward.ZERO
 _NOTHING = 1e-15  # of a pivot, below which it is rounding
@@ -59,7 +62,7 @@ def smooth(
     origin: int,
     times: TimeArray,
     room: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    outputs: Outputs,
+    outputs: FloatArray,
 ) -> None:
     """Replace filtered estimates by those that know every measurement.
 
@@ -75,8 +78,8 @@ def smooth(
         outputs: Gets the estimates.
     """
     eta, N, work, factor = room
-    for axis in range(len(model.order)):
-        states, n = model.states[axis], len(times) - 1
+    for axis in range(len(model.kind)):
+        states, n = model.kind[axis, STATES], len(times) - 1
         for i in range(states):
             eta[0, i] = 0.0
             for j in range(states):
@@ -119,7 +122,7 @@ def over_update(
     work: FloatArray,
 ) -> None:
     """η[0] and N[0] over an update, backward."""
-    states, row = model.states[axis], history.row[entry]
+    states, row = model.kind[axis, STATES], history.row[entry]
     observation(model, sensors, axis, events.source[row], work, ZERO)
     nu, R = results.innovation[row, axis], history.noise[entry]
     for i in range(states):
@@ -137,12 +140,12 @@ def over_interval(
     model: Model, axis: int, eta: FloatArray, N: FloatArray, at: int, ns: int, q: float, d: float, work: FloatArray
 ) -> None:
     """η[at] and N[at] over an interval, backward: through its noise, one independent part at a time, then by Fᵀ."""
-    dt, states, first = ns / 1e9, model.states[axis], REST
-    f11, f12, f21, f22, q11, q12, q22 = transition(model.order[axis], model.constants, axis, dt)
+    dt, states, first = ns / 1e9, model.kind[axis, STATES], REST
+    f11, f12, f21, f22, q11, q12, q22 = transition(model.kind[axis, ORDER], model.constants, axis, dt)
     pair_through_noise(eta, N, at, states, POSITION_, q * q11, q * q12, q * q22, work)
     through_noise(eta, N, at, states, OFFSET_, math.sqrt(d * dt), 0.0, work)
     move_back(eta, N, at, states, POSITION_, f11, f12, f21, f22)
-    if model.disturbance[axis] == SMOOTH:
+    if model.kind[axis, DISTURBANCE] == SMOOTH:
         variance = model.rest[axis, REST, VARIANCE]
         f11, f12, f21, f22, q11, q12, q22 = matern(model.rest[axis, REST, REVERTING], dt)
         pair_through_noise(eta, N, at, states, REST_, variance * q11, variance * q12, variance * q22, work)
@@ -211,10 +214,10 @@ def smoothed_estimate(
     at: int,
     work: FloatArray,
     L: FloatArray,
-    outputs: Outputs,
+    outputs: FloatArray,
 ) -> None:
     """P_s = (I + P N)⁻¹ P and x_s = x + P_s η, one column of N = L Lᵀ at a time: wide priors would cancel in P_s η."""
-    x, P, states = history.x[axis], history.P[axis], model.states[axis]
+    x, P, states = history.x[axis], history.P[axis], model.kind[axis, STATES]
     root(N, eta, at, states, L, work[0, 3])
     for k in range(states):
         nu = L[states, k]
@@ -227,7 +230,7 @@ def smoothed_estimate(
         for m in range(k + 1, states):
             for i in range(states):
                 L[states, m] -= L[i, m] * work[0, 1, i] * nu
-    write_outputs(model.disturbance[axis], x, P, n, outputs, axis, n)
+    write_outputs(model.kind[axis, DISTURBANCE], x, P, n, outputs, axis, n)
 
 
 @compiled

@@ -20,7 +20,7 @@ from ..compiled import compiled, compiled_apart, kernel
 from .axis import PERIOD, START, STEP, Model, Sensors, State, U, copy_rows
 from .counters import Counters, count_duplicate, count_rows, forget_after
 from .events import COMMAND, DUPLICATE, FUSED, Events, Results, classify, repeats_earlier
-from .forward import NO, ONE, ZERO, History, Outputs, checkpoint_of, estimate, run_events
+from .forward import NO, ONE, ZERO, History, Output, checkpoint_of, estimate, run_events
 from .gate import FUSED_AT
 from .outcome import ABSENT, Outcome
 
@@ -158,7 +158,7 @@ def add_command(flat: Flat, stamp: int, given: int, horizon: int) -> int:
 
 
 @kernel
-def estimate_at(flat: Flat, outputs: tuple[FloatArray, ...], time: int) -> None:
+def estimate_at(flat: Flat, outputs: FloatArray, time: int) -> None:
     """Every axis at ``time`` [ns] by all measurements valid until then, into ``outputs``; nothing changes."""
     m = opened(flat)
     span, incoming, axes = m.incoming.span, m.incoming, len(m.incoming.outcome)
@@ -168,7 +168,7 @@ def estimate_at(flat: Flat, outputs: tuple[FloatArray, ...], time: int) -> None:
     copy_rows(m.state, ZERO, aside, axes)
     if pending < span[DONE]:
         copy_rows(m.state, checkpoint_of(m.model, pending, len(m.events.time)), ZERO, axes)
-    estimate(m.model, m.events, m.state, pending, span[END], time, m.history, Outputs(*outputs), ZERO)
+    estimate(m.model, m.events, m.state, pending, span[END], time, m.history, outputs, ZERO)
     for axis in range(axes):
         incoming.times[axis, LAST_FUSED] = span[ORIGIN]
         for sensor in range(len(incoming.latency)):
@@ -345,8 +345,7 @@ class Window:
         self.floor = ALWAYS
         self._counters, self._counted = counters, 0
         self._behind = int(memory.incoming.latency.max(initial=0)) + int(memory.model.gain[:, PERIOD].max() * 1e9)
-        self._outputs = np.zeros((len(Outputs._fields), len(memory.incoming.outcome), 1))
-        self._places = tuple(self._outputs)
+        self._outputs = np.zeros((len(Output), len(memory.incoming.outcome), 1))
         self._set(memory)
 
     @property
@@ -394,10 +393,10 @@ class Window:
         """Every axis at an instant [ns].
 
         Returns:
-            For each axis what :class:`Outputs` has, in the stream's own coordinates and SI, and when the last
+            For each axis what :class:`.forward.Output` has, in the stream's own coordinates and SI, and when the last
             measurement was valid that it knows of [ns]; None as long as the axis has no start level.
         """
-        estimate_at(self._flat, self._places, time)
+        estimate_at(self._flat, self._outputs, time)
         found: list[tuple[list[float], int] | None] = []
         fused = self.memory.incoming.times[:, LAST_FUSED].tolist()
         levels = self.memory.state.drive[: len(fused), START].tolist()  # the rows behind are checkpoints

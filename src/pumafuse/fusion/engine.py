@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import CodeArray, TimeArray
 from ..filter.axis import Model, Sensors, State
 from ..filter.events import COMMAND, Events, Results
-from ..filter.forward import History, Outputs, filter_events, no_history
+from ..filter.forward import History, Output, filter_events, no_history
 from ..filter.outcome import Outcome
 from ..filter.smoother import smooth
 from .config import FusionConfig
@@ -69,7 +69,7 @@ def filter_segment(
     history = _history(events, state, len(times)) if mode == "smoothed" else no_history(axes, width)
     results = Results.room(count, axes)
     results.outcome[:] = events.known
-    outputs = Outputs(*np.zeros((len(Outputs._fields), axes, len(times))))
+    outputs = np.zeros((len(Output), axes, len(times)))
     known = model, sensors, events, state
     if engine == "filterpy":
         from ..filter import filterpy_engine
@@ -82,7 +82,7 @@ def filter_segment(
         room = np.empty((2, width)), np.empty((2, width, width)), np.empty((1, 4, width)), np.empty((width + 1, width))
         smooth(model, sensors, events, results, history, segment.origin, times, room, outputs)
     estimates = {
-        axis: AxisEstimate(segment.start[axis] + outputs.position[number], *(part[number] for part in outputs[1:]))
+        axis: AxisEstimate(segment.start[axis] + outputs[0, number], *outputs[1:, number])
         for number, axis in enumerate(segment.axes)
     }
     return Filtered(estimates, events, results, _known_biases(segment, sensors, state))
@@ -103,7 +103,7 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
     results = Results.room(len(events.time), axes)
     if outcome is not None:
         results.outcome[measured] = outcome[place[measured]]
-    none, outputs = np.empty(0, dtype=np.int64), Outputs(*np.empty((len(Outputs._fields), axes, 0)))
+    none, outputs = np.empty(0, dtype=np.int64), np.empty((len(Output), axes, 0))
     given, history, arrived = outcome is not None, no_history(axes, state.x.shape[1]), np.zeros(0, dtype=np.bool_)
     filter_events(model, sensors, events, state, given, none, none, none, results, history, arrived, 0, outputs)
     found = Results.room(len(measured), axes)

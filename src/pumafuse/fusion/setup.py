@@ -61,10 +61,13 @@ def filter_model(config: FusionConfig, axes: Sequence[str], biases: Sequence[Seq
     for number, part in enumerate(rest):
         table[number, REST : REST + len(part)] = part
     return Model(
-        order=np.array([1 if isinstance(model.plant, FirstOrder) else 2 for model in models]),
+        kind=np.array(
+            [
+                (1 if isinstance(model.plant, FirstOrder) else 2, _disturbance(config, axis), REST + len(part))
+                for axis, model, part in zip(axes, models, rest, strict=True)
+            ]
+        ),
         constants=np.array([closed.constants(model.plant) for model in models]),
-        states=np.array([REST + len(part) for part in rest]),
-        disturbance=np.array([_disturbance(config, axis) for axis in axes]),
         rest=table,
         gain=np.array([[m.gain.slope, m.gain.intercept, rate, period] for m, rate in zip(models, decay, strict=True)]),
         process=np.array([[p.input_noise, p.drift, p.maneuver_noise, p.maneuver_drift] for p in process]),

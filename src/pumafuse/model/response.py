@@ -13,6 +13,8 @@ from .arm import AxisModel
 from .closed import constants, decaying_response, gain_error, transition
 from .plants import FirstOrder
 
+_ONLY = np.int64(0)  # row of constants: a literal would compile what the filter has compiled already
+
 
 def response(
     axis: AxisModel, period: float, delay: float, given: TimeArray, command: FloatArray, start: float, time: TimeArray
@@ -59,8 +61,8 @@ def _respond(
             until = acting[at] if due else time[n]
             if until > clock:
                 dt, gap = (until - clock) * 1e-9, position - u
-                f11, f12, f21, f22, _, _, _ = transition(order, constants, 0, dt)
-                a, b, left = decaying_response(order, constants, 0, decay, dt, f11, f12, f22)
+                f11, f12, f21, f22, _, _, _ = transition(order, constants, _ONLY, dt)
+                a, b, left = decaying_response(order, constants, _ONLY, decay, dt, f11, f12, f22)
                 position, rate = u + f11 * gap + f12 * rate + a * error, f21 * gap + f22 * rate + b * error
                 error *= left
             clock = until
