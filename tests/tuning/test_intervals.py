@@ -14,7 +14,7 @@ import pumafuse as pf
 from pumafuse.tuning.intervals import ConfidenceInterval, confidence_intervals
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import maximise, maximise_with_gates, point
-from pumafuse.tuning.parameters import Fit, moved, rounded
+from pumafuse.tuning.parameters import Fit, moved, rounded, with_own_delays
 from tuning_runs import contains, fit_stage, free_of, intervals_of, outage, scenario, spoiled, spoiled_arm
 
 ROOT = 1.96  # √(2 · 1.92): the root of twice the drop at an end
@@ -170,9 +170,10 @@ def test_an_axis_has_the_information_of_the_others_on_a_shared_parameter() -> No
     """
     sim = outage(2)
     names = ["axes.vertical.delay_ms", "sensors.vision.latency_ms"]
-    likelihood = Likelihood([sim.run], sim.config, ["vision"])
-    free = [one for one in free_of(likelihood, sim.config, ("delay", "latency")) if one.key in names]
-    best = maximise(likelihood, sim.config, free)
+    config = with_own_delays(sim.config, ["vertical"])
+    likelihood = Likelihood([sim.run], config, ["vision"])
+    free = [one for one in free_of(likelihood, config, ("delay", "latency")) if one.key in names]
+    best = maximise(likelihood, config, free)
     delay, latency = (next(one for one in free if one.key == name) for name in names)
     found, outcomes = confidence_intervals(likelihood, best, free)[delay.key], best.outcomes
 

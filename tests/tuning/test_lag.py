@@ -10,15 +10,17 @@ import pytest
 from pumafuse.tuning.lag import fitted_lags, lag_intervals
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import derivatives, point
+from pumafuse.tuning.parameters import with_own_delays
 from tuning_runs import fit_stage, free_of, outage, replaced, spoiled_arm
 
 
 def test_it_is_the_covariance_of_delay_and_plant() -> None:
     """By hand: a first-order axis is Td + τ late, and d τ = τ d log τ; the information inverted as it is."""
     sim = outage(2)
-    likelihood = Likelihood([sim.run], sim.config)
-    free = [one for one in free_of(likelihood, sim.config, ("delay", "plant")) if one.axis == "vertical"]
-    best = point(likelihood, sim.config, free)
+    config = with_own_delays(sim.config, ["vertical"])
+    likelihood = Likelihood([sim.run], config)
+    free = [one for one in free_of(likelihood, config, ("delay", "plant")) if one.axis == "vertical"]
+    best = point(likelihood, config, free)
     tau = sim.config.arm.axes["vertical"].plant.lag
     slope = np.array([1.0 if one.fit == "delay" else tau for one in free])
     wanted = 1.96 * np.sqrt(slope @ np.linalg.inv(derivatives(likelihood, best, free).information) @ slope)
@@ -47,11 +49,12 @@ def test_a_gain_that_recovers_is_part_of_it() -> None:
 def test_an_end_is_open_only_where_nothing_can_go_there() -> None:
     """A delay of 0 alone cannot be less, so that end is open; with the plant free both ends are there."""
     sim = outage(2)
-    likelihood = Likelihood([sim.run], sim.config)
-    free = [one for one in free_of(likelihood, sim.config, ("delay", "plant")) if one.axis == "vertical"]
+    config = with_own_delays(sim.config, ["vertical"])
+    likelihood = Likelihood([sim.run], config)
+    free = [one for one in free_of(likelihood, config, ("delay", "plant")) if one.axis == "vertical"]
     free = [replace(one, bounds=(0.0, 0.3)) if one.fit == "delay" else one for one in free]
     (delay,) = (one for one in free if one.fit == "delay")
-    none = point(likelihood, delay.put(sim.config, 0.0), free)
+    none = point(likelihood, delay.put(config, 0.0), free)
     below, above = lag_intervals(likelihood, none, [delay])["vertical"]
     assert np.isinf(below) and 0.0 < above < 0.01
     both = lag_intervals(likelihood, none, free)["vertical"]

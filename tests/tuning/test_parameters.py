@@ -22,12 +22,14 @@ from pumafuse.tuning.parameters import (
     with_axis_of,
     with_lag,
     with_order,
+    with_own_delays,
 )
 from tuning_runs import replaced
 
 ARM = pf.ArmModel.load("puma560-internal")  # tangential is second order, radial and vertical are first
 TRACKER, CAMERA = pf.Sensor(sd=5e-5, latency=0.008), pf.Sensor(sd={"radial": 4e-4, "vertical": 3e-4}, latency=0.045)
-CONFIG = pf.FusionConfig(arm=ARM, sensors={"tracker": TRACKER, "camera": CAMERA, "spare": pf.Sensor(sd=1.0)})
+SHARED = pf.FusionConfig(arm=ARM, sensors={"tracker": TRACKER, "camera": CAMERA, "spare": pf.Sensor(sd=1.0)})
+CONFIG = with_own_delays(SHARED, ARM.axes)
 SENSORS = {"tangential": ["tracker"], "radial": ["tracker", "camera"], "vertical": ["camera"]}
 
 
@@ -55,10 +57,14 @@ def test_what_can_be_fitted() -> None:
     sds = {f"sensors.{name}.sd_mm.{axis}" for axis, sensors in SENSORS.items() for name in sensors}
     assert keys["noise"] == sds | {f"process.{axis}.{key}" for axis in SENSORS for key in noises}
     assert keys["delay"] == {f"axes.{axis}.delay_ms" for axis in SENSORS}
+    assert {one.key for one in parameters(SHARED, SHARED, SENSORS, ["delay"])} == {"delay_ms"}
+    some = with_own_delays(SHARED, ["radial"])
+    assert {one.key for one in parameters(some, some, SENSORS, ["delay"])} == {"delay_ms", "axes.radial.delay_ms"}
     second = {"axes.tangential.natural_frequency_rad_s", "axes.tangential.damping"}
     assert keys["plant"] == {*second, "axes.radial.time_constant_ms", "axes.vertical.time_constant_ms"}
     assert keys["gain"] == {f"axes.{axis}.{key}" for axis in SENSORS for key in ("gain.intercept", "gain_recovery_ms")}
-    assert keys["latency"] == {"sensors.tracker.latency_ms", "sensors.camera.latency_ms"}
+    for kind, numbers in {"latency": ["latency_ms"], "bias": ["bias_drift_sd_mm", "bias_time_s"]}.items():
+        assert keys[kind] == {f"sensors.{name}.{key}" for name in ("tracker", "camera") for key in numbers}
 
 
 def in_file(tree: dict[str, object], key: str) -> object:

@@ -192,10 +192,13 @@ def tune(
     config: Annotated[Path, Option("--config", "-c", metavar="FUSION.TOML", help="What to start from.")],
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the tuned files go.")],
     fit: Annotated[
-        str, Option(metavar="A,B", help="What to fit: noise, delay, plant, gain, latency, scale.")
+        str, Option(metavar="A,B", help="What to fit: noise, delay, plant, gain, latency, scale, bias.")
     ] = "noise",
     fix: Annotated[
         list[str] | None, Option(metavar="KEY", help="Leave as it is: a name or part, as sensors.tracker; repeatable.")
+    ] = None,
+    share: Annotated[
+        Literal["delay"] | None, Option(help="One for all axes, also where the measurements say otherwise.")
     ] = None,
     trust: Annotated[str | None, Option(metavar="SENSOR", help="Fit the arm on this accurate sensor first.")] = None,
     validate: Annotated[Path | None, Option(metavar="RUN", help="Default: a single run's last third.")] = None,
@@ -213,7 +216,7 @@ def tune(
     from . import tune as command
 
     kinds, fixed = _names(fit, "--fit") or [], _names(",".join(fix) if fix else None, "--fix") or []
-    command.run(runs, config, output, kinds, fixed, trust, validate, not no_sd_prior, report, json, force)
+    command.run(runs, config, output, kinds, fixed, share, trust, validate, not no_sd_prior, report, json, force)
 
 
 @app.command()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import typer
 from rich.console import Console
@@ -33,6 +34,7 @@ def run(
     output: Path,
     fit: Sequence[str],
     fix: Sequence[str],
+    share: Literal["delay"] | None,
     trust: str | None,
     validate: Path | None,
     sd_prior: bool,
@@ -59,7 +61,17 @@ def run(
         def progress(what: str, at: Point) -> None:
             status.update(f"{what}: log-likelihood {at.log_likelihood:.1f} (Ctrl-C keeps the best so far)")
 
-        found = tune(runs, given, fit=kinds, fix=fix, trust=trust, validate=other, sd_prior=sd_prior, progress=progress)
+        found = tune(
+            runs,
+            given,
+            fit=kinds,
+            fix=fix,
+            share=[share] if share else [],
+            trust=trust,
+            validate=other,
+            sd_prior=sd_prior,
+            progress=progress,
+        )
     with folders.replacing(output) as new:
         found.config.save(new)
         (new / SUMMARY).write_text(found.to_json(), encoding="utf-8")

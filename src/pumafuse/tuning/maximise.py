@@ -172,7 +172,7 @@ def maximise_with_gates(
         best = maximise_by_axis(likelihood, start, free, notify, _TOLERANCE)
     else:
         best = maximise(likelihood, start, free, notify)
-    best = _past_bumps(likelihood, best, free, notify)
+    best = past_bumps(likelihood, best, free, notify)
     for _ in range(_GATE_ROUNDS):
         peak = maximise(likelihood, best.config, free, outcomes=best.outcomes)
         at = coordinates(best.config, free)
@@ -188,7 +188,7 @@ def maximise_with_gates(
     return best
 
 
-def _past_bumps(likelihood: Likelihood, best: Point, free: Sequence[Parameter], notify: Notify) -> Point:
+def past_bumps(likelihood: Likelihood, best: Point, free: Sequence[Parameter], notify: Notify = ignore) -> Point:
     """Pass the small bumps that the likelihood has along a time, where measurements pass commands and each other."""
     for one in free:
         if one.fit not in ("delay", "latency"):

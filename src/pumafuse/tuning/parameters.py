@@ -15,7 +15,7 @@ from ..errors import ConfigError, suggestion
 from ..fusion.config import FusionConfig, Sensor
 from ..model.plants import FirstOrder, SecondOrder
 
-Fit = Literal["noise", "delay", "plant", "gain", "latency", "scale"]
+Fit = Literal["noise", "delay", "plant", "gain", "latency", "scale", "bias"]
 FITS: tuple[Fit, ...] = get_args(Fit)
 
 Path: TypeAlias = tuple[str, ...]
@@ -88,7 +88,7 @@ class Parameter:
     @property
     def vanishes(self) -> bool:
         """Whether it may be 0, for which its lower bound stands."""
-        return self.path[0] == "process" and self.path[-1] != "disturbance_time"
+        return self.path[-1] == "bias_drift_sd" or (self.path[0] == "process" and self.path[-1] != "disturbance_time")
 
     @property
     def range(self) -> tuple[float, float]:
@@ -97,8 +97,8 @@ class Parameter:
 
     def given(self, config: FusionConfig) -> float | None:
         """The number as configured [SI]; None where it is not: no recovery, or a plant of the other order."""
-        if self.fit == "delay":
-            return config.arm.delay_of(str(self.axis))
+        if self.fit == "delay" and self.axis is not None:
+            return config.arm.delay_of(self.axis)
         node: Any = config
         for name in self.path:
             if isinstance(node, int | float):
@@ -172,6 +172,7 @@ _TABLE = (  # a process noise at its lower bound is none; bounds and prior of wh
     _line("noise", "process.{axis}.disturbance_time_ms", "process.{axis}.disturbance_time", 1e-3, 1e3),
     _line("noise", "sensors.{sensor}.sd_mm.{axis}", "sensors.{sensor}.sd.{axis}", *SD_BOUNDS, prior=_SD_PRIOR),
     _line("delay", "axes.{axis}.delay_ms", "arm.axes.{axis}.delay", *DELAYS, log=False, scale=_TICK),
+    _line("delay", "delay_ms", "arm.delay", *DELAYS, log=False, scale=_TICK),
     _line("plant", "axes.{axis}.time_constant_ms", "arm.axes.{axis}.plant.time_constant", 1e-4, 10.0),
     _line("plant", "axes.{axis}.natural_frequency_rad_s", "arm.axes.{axis}.plant.natural_frequency", 0.5, 5e3),
     _line("plant", "axes.{axis}.damping", "arm.axes.{axis}.plant.damping", 0.05, 20.0),
@@ -179,6 +180,8 @@ _TABLE = (  # a process noise at its lower bound is none; bounds and prior of wh
     _line("gain", "axes.{axis}.gain_recovery_ms", "arm.axes.{axis}.gain_recovery", *_RECOVERY, prior=_RECOVERY_PRIOR),
     _line("latency", "sensors.{sensor}.latency_ms", "sensors.{sensor}.latency", *LATENCIES, log=False, scale=_TICK),
     _line("scale", "sensors.{sensor}.scale", "sensors.{sensor}.scale", -0.5, 0.5, log=False, scale=0.1),
+    _line("bias", "sensors.{sensor}.bias_drift_sd_mm", "sensors.{sensor}.bias_drift_sd", *SD_BOUNDS),
+    _line("bias", "sensors.{sensor}.bias_time_s", "sensors.{sensor}.bias_time", 1e-2, 1e4),
 )
 
 
@@ -209,14 +212,17 @@ def parameters(
         for name in (names if "{sensor}" in line.key else [None])
     ]
     free = [one for one in every if one.fit in fit and not is_fixed(one.key, fixed)]
-    free = [one for one in free if _belongs(one, config)]
+    free = [one for one in free if _belongs(one, config, sensors)]
     return free if sd_prior else [replace(one, prior=None) if one.fit == "noise" else one for one in free]
 
 
-def _belongs(one: Parameter, config: FusionConfig) -> bool:
-    """Whether a configuration has a parameter: the plant's order, a gain that recovers, a disturbance."""
+def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:
+    """Whether a configuration has a parameter: a plant's order, an axis's own delay, a recovery, a disturbance."""
     if one.axis is not None and one.path[-1].startswith("disturbance"):
         return config.process[one.axis].disturbance_sd > 0.0
+    if one.fit == "delay":
+        shares = [axis for axis in axes if config.arm.axes[axis].delay is None]
+        return bool(shares) if one.axis is None else one.axis not in shares
     return one.given(config) is not None
 
 
@@ -242,10 +248,11 @@ def check_fixed(config: FusionConfig, fixed: Iterable[str]) -> None:
         ConfigError: It names none.
     """
     sensors = dict.fromkeys(config.arm.axes, tuple(config.sensors))
-    keys = {f"sensors.{name}.bias_sd_mm" for name in config.sensors}
+    keys = {f"sensors.{name}.bias_sd_mm" for name in config.sensors} | {"delay_ms"}
     for order in (1, 2):
         for axis in sensors:
             config = with_recovery(with_disturbance(with_order(config, axis, order), axis, 1e-3, 1.0), axis, 1.0)
+        config = with_own_delays(config, sensors)
         keys |= {one.key for one in parameters(config, config, sensors, FITS)}
     for name in fixed:
         if not any(is_fixed(key, [name]) for key in keys):
@@ -293,6 +300,20 @@ def with_order(config: FusionConfig, axis: str, order: int) -> FusionConfig:
     lag = plant.lag
     plant = FirstOrder(time_constant=lag) if order == 1 else SecondOrder(natural_frequency=2.0 / lag, damping=1.0)
     return changed(config, ("arm", "axes", axis, "plant"), plant)
+
+
+def with_own_delays(config: FusionConfig, axes: Iterable[str]) -> FusionConfig:
+    """The configuration with a delay of its own for each of these axes, the same as before."""
+    for axis in axes:
+        config = changed(config, ("arm", "axes", axis, "delay"), config.arm.delay_of(axis))
+    return config
+
+
+def with_shared_delay(config: FusionConfig, axes: Iterable[str], delay: float) -> FusionConfig:
+    """The configuration with one delay [s] of the arm for these axes."""
+    for axis in axes:
+        config = changed(config, ("arm", "axes", axis, "delay"), None)
+    return changed(config, ("arm", "delay"), delay)
 
 
 def with_recovery(config: FusionConfig, axis: str, recovery: float | None) -> FusionConfig:

@@ -8,6 +8,7 @@ component is rejected for itself, whole rows are rejected only at the end.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import TypeAlias
 
 import msgspec
@@ -16,23 +17,27 @@ import numpy as np
 from ..arrays import FloatArray
 from ..fusion.config import FusionConfig, Process
 from .likelihood import Likelihood
-from .maximise import Notify, Point, maximise, maximise_by_axis, maximise_with_gates, point
+from .maximise import Notify, Point, ignore, maximise, maximise_by_axis, maximise_with_gates, past_bumps, point
 from .parameters import (
     DELAYS,
     LATENCIES,
     Parameter,
+    changed,
     with_axis_of,
     with_disturbance,
     with_gates,
     with_lag,
     with_order,
     with_recovery,
+    with_shared_delay,
 )
 
 _ROUGHLY = 0.1  # tolerance in log-likelihood where maxima are only compared
 _WIDER = 3.0
 _GRID_STEP = 0.010  # s, between delays and latencies that are tried: their maxima are as wide
 _LAGS = (1.0, 1.8)  # starts, times the configured; a delay can be taken for a lag and a lag for a delay
+_SAME_DELAY = 1e-4  # s, by which delays differ that are tried as one for all axes
+_NEARLY = 10.0  # log-likelihood that is lost where the one delay is not yet at its best
 _LEAST_SHARE = 0.2  # of a lag that is left where a tick less of it is tried
 _GAINS = ((0.0, 0.1), (0.0, 0.4), (0.3, 0.025))  # starts: gain above the configured one, and recovery [s]
 _PROCESSES = tuple(  # starts, in units of the distance between the noiseless arm and the measurements
@@ -47,7 +52,9 @@ _DISTURBANCES = ("none", "smooth (Matérn)", "rough (Ornstein-Uhlenbeck)")
 FreeOf: TypeAlias = Callable[[FusionConfig], list[Parameter]]
 
 
-def search(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> tuple[Point, dict[str, str]]:
+def search(
+    likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify, one_delay: bool = False
+) -> tuple[Point, dict[str, str]]:
     """Find the most likely configuration.
 
     Args:
@@ -55,9 +62,11 @@ def search(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: N
         config: The configuration as given.
         free: The parameters to vary, which depend on the order of the plants.
         notify: Called with each better point.
+        one_delay: Whether all axes whose delay is free share one whatever the measurements say.
 
     Returns:
-        The best point, and for each axis the reasons for the order of its plant, its gain and its disturbance.
+        The best point, and for each axis the reasons for the order of its plant, its gain, its disturbance and whether
+        it shares the arm's delay.
     """
 
     def own(at: FusionConfig) -> list[Parameter]:
@@ -80,6 +89,9 @@ def search(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: N
     best = _without_needless(likelihood, best, own, notify)
     if len(found) > 1:
         best = _past_ticks(likelihood, best, own, notify)
+    best, shares = _with_one_delay(likelihood, best, free, one_delay)
+    for axis, why in shares.items():
+        reasons[axis] = "; ".join(filter(None, (reasons.get(axis), why)))
     return maximise_with_gates(likelihood, with_gates(best, config), free(best), notify), reasons
 
 
@@ -282,6 +294,63 @@ def _past_ticks(likelihood: Likelihood, config: FusionConfig, free: FreeOf, noti
         beside = _lagging(config, whole, free(config), ticks=ticks)
         peaks.append(maximise_by_axis(likelihood, beside, free(beside), notify, _ROUGHLY))
     return _best_by_axis(likelihood, peaks)
+
+
+def _with_one_delay(
+    likelihood: Likelihood, config: FusionConfig, free: FreeOf, whatever: bool
+) -> tuple[FusionConfig, dict[str, str]]:
+    """One delay for the axes to which an own one is not worth its number, or for all; and for each axis the reason.
+
+    Delay and lag of an axis are known much better together than each. So axes of which each has its own delay seem to
+    differ where they do not. The price of an own one is twice that of another number (BIC): along a delay the
+    likelihood has bumps, of which the highest gains more by chance than a number of a smooth likelihood does.
+    """
+    own = {str(one.axis): one for one in free(config) if one.fit == "delay" and one.axis is not None}
+    if len(own) < 2:
+        return config, {}
+    alone = point(likelihood, config, free(config)).axes
+    price = np.full(len(alone), np.inf) if whatever else np.log(np.maximum(likelihood.count, 2))
+    delays = sorted(one.get(config) for one in own.values())
+    tried: list[Point] = []
+    for delay in [delays[0], *(late for early, late in pairwise(delays) if late - early > _SAME_DELAY)]:
+        there = config
+        for axis, one in own.items():
+            there = _delayed(there, axis, free(there), one.clipped(delay) - one.get(there))
+        rest = [one for one in free(there) if one.fit != "delay"]
+        tried.append(maximise_by_axis(likelihood, there, rest, ignore, _ROUGHLY))
+    places = {axis: likelihood.axes.index(axis) for axis in own}
+    peak = max(tried, key=lambda one: float(np.maximum(one.axes, alone - price)[list(places.values())].sum()))
+    gains = {axis: float((alone - peak.axes - price)[place]) for axis, place in places.items()}
+    shares = [axis for axis in own if gains[axis] < _NEARLY]
+    while len(shares) > 1:
+        there = config
+        for axis in shares:
+            there = with_axis_of(there, peak.config, axis)
+        there = with_shared_delay(there, shares, peak.config.arm.delay_of(shares[0]))
+        mine = [one for one in free(there) if one.axis is None or one.axis in shares]
+        peak = past_bumps(likelihood, maximise(likelihood, there, mine, tolerance=_ROUGHLY), mine)
+        gains |= {axis: float((alone - peak.axes - price)[places[axis]]) for axis in shares}
+        worst = max(shares, key=gains.__getitem__)
+        if gains[worst] <= 0.0:
+            break
+        shares.remove(worst)
+    else:
+        shares, peak = [], point(likelihood, config, free(config))
+    reasons = {
+        axis: f"delay: {'shared' if axis in shares else 'its own'}"
+        + ("" if whatever else f"; an own one gains {gain:+.1f} after the penalty")
+        for axis, gain in gains.items()
+    }
+    return peak.config, reasons
+
+
+def _delayed(config: FusionConfig, axis: str, free: Sequence[Parameter], more: float) -> FusionConfig:
+    """The configuration with a longer delay of an axis [s], and so much less lag where its plant is free."""
+    config = changed(config, ("arm", "axes", axis, "delay"), config.arm.delay_of(axis) + more)
+    if not _plant_is_free(free, axis):
+        return config
+    lag = config.arm.axes[axis].plant.lag
+    return with_lag(config, axis, max(lag - more, _LEAST_SHARE * lag))
 
 
 def _with_free_gain(config: FusionConfig, axes: Sequence[str], free: FreeOf) -> list[str]:

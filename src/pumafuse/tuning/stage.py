@@ -15,7 +15,7 @@ from ..units import MM
 from .identifiability import NotIdentifiable, excited_axes, not_identifiable, not_identifiable_noise, shared_times
 from .likelihood import Likelihood
 from .maximise import Notify, Point, ignore, maximise_with_gates
-from .parameters import LATENCIES, Fit, Parameter, changed, is_fixed, parameters, smallest_sd
+from .parameters import LATENCIES, Fit, Parameter, changed, is_fixed, parameters, smallest_sd, with_own_delays
 from .search import FreeOf, search
 
 _GATE = 5.0  # of the fit for a sensor with a narrow one:
@@ -38,6 +38,7 @@ class Plan:
         sensors: The sensors to use; None: all.
         trusted: The sensor that the arm was fitted on: only parameters of other sensors are free; None: all.
         sd_prior: Whether a sensor's noise is believed to be the configured one within a factor of 1.5.
+        one_delay: Whether all axes share one delay whatever the measurements say.
     """
 
     fit: Sequence[Fit]
@@ -45,6 +46,7 @@ class Plan:
     sensors: Sequence[str] | None = None
     trusted: str | None = None
     sd_prior: bool = True
+    one_delay: bool = False
 
 
 @dataclass(frozen=True)
@@ -89,14 +91,19 @@ def run_stage(
     def free(at: FusionConfig) -> list[Parameter]:
         names = [*plan.fixed, *(one.fixed for one in fixed)]
         every = parameters(at, config, likelihood.sensors, plan.fit, names, plan.sd_prior)
-        return [one for one in every if _may_vary(one, plan, excited)]
+        return [one for one in every if _may_vary(one, at, plan, excited)]
 
     start, notes = likelihood.config, list[str]()
+    own = with_own_delays(start, excited)
+    if any(one.fit == "delay" for one in free(own)):
+        start = own
+    if "bias" in plan.fit:
+        start = _with_drifts(start)
     if "noise" in plan.fit:
         start, notes = with_large_biases(likelihood, start, plan.fixed)
     if "latency" in plan.fit:
         fixed += shared_times(likelihood.sensors, excited, free(start), start)
-    best, orders = search(likelihood, start, free, notify)
+    best, orders = search(likelihood, start, free, notify, plan.one_delay)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
         if more:
@@ -129,8 +136,18 @@ def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: 
     return Likelihood(runs, msgspec.structs.replace(config, sensors=sensors), plan.sensors, until=until, latest=latest)
 
 
-def _may_vary(one: Parameter, plan: Plan, excited: Sequence[str]) -> bool:
+def _with_drifts(config: FusionConfig) -> FusionConfig:
+    """A start: every sensor with a bias that drifts, as much as it is noisy where nothing else is configured."""
+    for name, sensor in config.sensors.items():
+        if sensor.bias_drift_sd == 0.0:
+            config = changed(config, ("sensors", name, "bias_drift_sd"), smallest_sd(config, name))
+    return config
+
+
+def _may_vary(one: Parameter, config: FusionConfig, plan: Plan, excited: Sequence[str]) -> bool:
     """Whether a parameter is not the trusted sensor's, and measurements of its axis can tell it."""
+    if one.fit == "delay" and one.axis is None:
+        return plan.trusted is None and any(config.arm.axes[axis].delay is None for axis in excited)
     moves = one.axis is None or one.axis in excited or any(key in one.key.split(".") for key in _AT_REST)
     return moves and (plan.trusted is None or one.sensor not in (None, plan.trusted))
 

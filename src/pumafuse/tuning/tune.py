@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import TypeAlias, cast
+from typing import Literal, TypeAlias, cast
 
 import msgspec
 
@@ -65,14 +65,15 @@ def tune(
     trust: str | None = None,
     validate: Run | None = None,
     sd_prior: bool = True,
+    share: Iterable[Literal["delay"]] = (),
     progress: Progress = lambda _, __: None,
 ) -> Tuning:
-    """Fit noise, delays, plants, gains, latencies and scales to runs by maximum likelihood; no reference is needed.
+    """Fit noise, delays, plants, gains, latencies, scales and drifts to runs by maximum likelihood, without references.
 
     Args:
         runs: The recorded runs to fit on.
         config: The configuration to start from.
-        fit: What to fit: any of ``noise``, ``delay``, ``plant``, ``gain``, ``latency``, ``scale``.
+        fit: What to fit: any of ``noise``, ``delay``, ``plant``, ``gain``, ``latency``, ``scale``, ``bias``.
         fix: What of that stays as it is: names as in the files, or parts of them (``sensors.tracker``,
             ``drift_mm_rts``).
         trust: An accurate sensor that arm and process noise are fitted on alone. Its latency is believed; of the others
@@ -81,6 +82,8 @@ def tune(
             validated on the last third, and then fitted anew as a whole.
         sd_prior: Whether a sensor's noise is believed to be the configured one within a factor of 1.5 (log-normal, one
             standard deviation); else the measurements alone decide, which may be too few to.
+        share: ``delay``: all axes share one whatever the measurements say. Else those share one to which an own one is
+            not worth its number (Bayesian information criterion).
         progress: Called with what is being done and the best point so far.
 
     Returns:
@@ -99,7 +102,7 @@ def tune(
             raise TuneError(f"run '{run.name}' is given twice: its measurements would count twice")
     kinds, fixed = kinds_of(fit), list(fix)
     check_fixed(config, fixed)
-    pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust, sd_prior), progress)
+    pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust, sd_prior, "delay" in share), progress)
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
     until = _fitted_until(runs[0]) if len(runs) == 1 and validate is None else None
     intervals: dict[str, ConfidenceInterval] = {}
@@ -158,7 +161,12 @@ def tune(
 
 
 def plans(
-    config: FusionConfig, kinds: Sequence[Fit], fixed: Sequence[str], trust: str | None, sd_prior: bool = True
+    config: FusionConfig,
+    kinds: Sequence[Fit],
+    fixed: Sequence[str],
+    trust: str | None,
+    sd_prior: bool = True,
+    one_delay: bool = False,
 ) -> list[Plan]:
     """One plan for all sensors; with a trusted sensor one for it, then one for the others' noise, latency and scale.
 
@@ -166,11 +174,14 @@ def plans(
         UnknownNameError: The trusted sensor is not configured.
     """
     if trust is None:
-        return [Plan(kinds, fixed, sd_prior=sd_prior)]
+        return [Plan(kinds, fixed, sd_prior=sd_prior, one_delay=one_delay)]
     config.sensor_names([trust])
-    arm: list[Fit] = [kind for kind in kinds if kind not in ("latency", "scale")]
-    others: list[Fit] = [kind for kind in kinds if kind in ("noise", "latency", "scale")]
-    return [Plan(arm, fixed, [trust], sd_prior=sd_prior), Plan(others, fixed, trusted=trust, sd_prior=sd_prior)]
+    arm: list[Fit] = [kind for kind in kinds if kind not in ("latency", "scale", "bias")]
+    others: list[Fit] = [kind for kind in kinds if kind in ("noise", "latency", "scale", "bias")]
+    return [
+        Plan(arm, fixed, [trust], sd_prior=sd_prior, one_delay=one_delay),
+        Plan(others, fixed, trusted=trust, sd_prior=sd_prior),
+    ]
 
 
 class Pipeline:
