@@ -122,16 +122,15 @@ def _evidence(segment: Segment, config: FusionConfig, axis: str, speed: float) -
     What such a motion adds to one from rest is fitted to the measurements until the model has settled, beside a
     constant of each sensor. Score over information is the share, 1/√information its standard deviation.
     """
-    arm, column, score, information = config.arm, segment.axes.index(axis), 0.0, 0.0
-    model, delay, period, settled = arm.axes[axis], arm.delay_of(axis), arm.update_period, _settled(config, axis)
+    model, delay, period = config.arm.axes[axis], config.arm.delay_of(axis), config.arm.update_period
+    settled, column, score, information = _settled(config, axis), segment.axes.index(axis), 0.0, 0.0
     (given, command), start = segment.given(axis), segment.start[axis]
-    before = np.arange(-min(int(settled / period) + 1, _MOST), 0)
+    before = np.arange(-min(int(settled / period) + 1, _MOST), 0.0)
     earlier = np.concatenate([given[0] + np.rint(before * (period * 1e9)).astype(np.int64), given])
     moving = np.concatenate([start + before * (period * speed), command])
     for name, rows in segment.rows_by_sensor().items():
-        if name not in config.sensors:
+        if (sensor := config.sensors.get(name)) is None:
             continue
-        sensor = config.sensors[name]
         valid = rows.stamp - round(sensor.latency * 1e9)
         early = (rows.known[:, column] == int(Outcome.FUSED)) & (valid <= given[0] + round(settled * 1e9))
         if np.count_nonzero(early) < _FEWEST:
@@ -139,11 +138,12 @@ def _evidence(segment: Segment, config: FusionConfig, axis: str, speed: float) -
         valid, value = valid[early], rows.value[early, column] / sensor.scale
         rest = start + response(model, period, delay, given, command, start, valid)
         added = moving[0] + response(model, period, delay, earlier, moving, float(moving[0]), valid) - rest
-        added, left = added - added.mean(), value - rest - np.mean(value - rest)
-        size = max(float(added @ added), 1e-30)
-        scatter = float(np.std(left - float(added @ left) / size * added))
-        variance = max((sensor.sd_of(axis) or 0.0) / abs(sensor.scale), scatter) ** 2
-        score, information = score + float(added @ left) / variance, information + size / variance
+        added -= added.mean()
+        left = value - rest
+        left -= left.mean()
+        along, size = float(added @ left), max(float(added @ added), 1e-30)
+        noise = max((sensor.sd_of(axis) or 0.0) / abs(sensor.scale), float(np.std(left - added * (along / size))))
+        score, information = score + along / noise**2, information + size / noise**2
     return score, information
 
 
