@@ -19,6 +19,7 @@ from pumafuse.tuning.likelihood import Likelihood
 from tuning_runs import SCENARIOS, outage, scenario
 
 CONFIG = outage(1).config
+LATENCY = {"camera": 0.045, "vision": 0.045, "tracker": 0.008}  # s, of recorded sensors
 
 
 def notes(run: pf.Run, config: pf.FusionConfig = CONFIG) -> list[str]:
@@ -137,7 +138,7 @@ def guessed(run: pf.Run) -> pf.FusionConfig:
     axes = {axis: pf.AxisModel(plant=pf.FirstOrder(time_constant=0.045)) for axis in run.axes}
     period = float(np.median(np.diff(run.command.stamp))) / 1e9
     arm = pf.ArmModel(name="guess", update_period=period, delay=0.15 if "m1" in axes else 0.06, axes=axes)
-    sensors = {name: pf.Sensor(sd=5e-4, latency=0.045 if name == "camera" else 0.0) for name in run.sensors}
+    sensors = {name: pf.Sensor(sd=5e-4, latency=LATENCY.get(name, 0.0)) for name in run.sensors}
     return pf.FusionConfig(arm=arm, sensors=sensors)
 
 
