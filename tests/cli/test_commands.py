@@ -100,6 +100,34 @@ def test_as_live_has_fewer_measurements(demo: Path, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "live" / "summary.json").read_text())["mode"] == "as-live"
 
 
+def test_a_part_of_a_run_is_fused_with_pictures(with_tracker: Path, tmp_path: Path) -> None:
+    """Only its estimates, measurements and reference, of several runs as well; the summary and the screen say which."""
+    out = pumafuse(*FUSE_SCAN, "-o", tmp_path / "part", "--from", 20, "--to", 21.5, "--figures", "--rrd").stdout
+    assert "1.5 s from 20 s on" in out
+    summary = json.loads((tmp_path / "part" / "summary.json").read_text())
+    assert (summary["from_s"], summary["to_s"]) == (20.0, 21.5)
+    assert {"fused.png", "error.png", "validation.png", "fused.rrd"} < names(tmp_path / "part")
+    times = {name: pq.read_table(tmp_path / "part" / f"{name}.parquet") for name in ("estimates", "reference")}
+    stamps = pq.read_table(tmp_path / "part" / "measurements.parquet")["stamp_s"].to_numpy()
+    for time in (*(table["time_s"].to_numpy() for table in times.values()), stamps):
+        assert 20.0 <= time.min() < 20.05 and 21.45 < time.max() <= 21.5
+    whole = json.loads((with_tracker / "summary.json").read_text())
+    assert (whole["from_s"], whole["to_s"]) == (None, None)
+    pumafuse("fuse", SCAN, SCAN / "run.toml", "-c", FUSION, "-o", tmp_path / "two", "--from", 59)
+    assert names(tmp_path / "two") == {"scan1", "scan1_2"}
+
+
+@pytest.mark.parametrize("command", ["fuse", "tune"])
+def test_a_part_that_is_none_is_refused(command: str, tmp_path: Path) -> None:
+    """An option that is no time is a wrong usage; a part without measurements is one line about the data."""
+    given = (command, SCAN, "-c", FUSION, "-o", tmp_path / "out")
+    for option, ends in {"--to": ("20", "20"), "--from": ("-1", "3"), "--from ": ("nan", "3")}.items():
+        error = pumafuse(*given, "--from", ends[0], "--to", ends[1], code=2).stderr
+        assert option.strip() in error and "seconds after" in error
+    assert "no measurement to use is stamped from 100 s after" in refused(*given, "--from", 100)
+    assert not (tmp_path / "out").exists()
+
+
 def test_only_an_earlier_result_is_replaced_and_only_with_force(with_tracker: Path, tmp_path: Path) -> None:
     """Nothing of it is lost when it is refused; a folder of somebody's files is not a result."""
     before = (with_tracker / "summary.json").read_bytes()

@@ -34,6 +34,7 @@ def run(
     figures: bool = False,
     engine: Engine = "compiled",
     force: bool = False,
+    part: tuple[float | None, float | None] = (None, None),
 ) -> None:
     """Fuse each run into a result folder; a run that fails is reported and does not stop the others.
 
@@ -43,7 +44,7 @@ def run(
     given = FusionConfig.load(config)
     names = given.sensor_names(sensors)
     how = partial(fuse, config=given, sensors=names, rate=rate, smooth=smooth, as_live=as_live, engine=engine)
-    job = partial(_fuse, how, rrd=rrd, figures=figures, force=force)
+    job = partial(_fuse, how, part=part, rrd=rrd, figures=figures, force=force)
     if len(runs) == 1:
         with progress_bar(str(runs[0])) as progress:
             summary = job(runs[0], output, progress)
@@ -93,13 +94,14 @@ def _fuse(
     folder: Path,
     progress: Callable[[float], None] | None = None,
     *,
+    part: tuple[float | None, float | None],
     rrd: bool,
     figures: bool,
     force: bool,
 ) -> Summary:
-    """Read a run, fuse it and write its result folder, with ``fused.rrd`` and figures if wanted."""
+    """Read a run, fuse a part of it and write its result folder, with ``fused.rrd`` and figures if wanted."""
     results.check_writable(folder, force)
-    recorded = Run.read(path)
+    recorded = Run.read(path).between(*part)
     est = how(recorded, progress=progress)
 
     def extras(new: Path) -> None:
@@ -120,8 +122,9 @@ def _fuse(
 
 def _show(summary: Summary) -> None:
     """Print the tables of one fusion."""
+    part = "" if summary.from_s is None else f" from {summary.from_s:g} s on"
     typer.echo(
-        f"{summary.run}: {summary.estimates} estimates over {summary.duration_s:.1f} s, {summary.mode},"
+        f"{summary.run}: {summary.estimates} estimates over {summary.duration_s:.1f} s{part}, {summary.mode},"
         f" arm {summary.arm}"
     )
     scores = {axis: part.score for axis, part in summary.axes.items() if part.score is not None}

@@ -28,6 +28,10 @@ app = typer.Typer(
 Runs = Annotated[list[Path], Argument(metavar="RUN...", help="Folders with run.toml, or single tables.")]
 Config = Annotated[Path, Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors.")]
 Rate = Annotated[float | None, Option(metavar="HZ", help="Estimates on an even grid; default: one a command.")]
+From = Annotated[
+    float | None, Option("--from", metavar="S", help="Begin S seconds after the first command; earlier commands count.")
+]
+To = Annotated[float | None, Option("--to", metavar="S", help="End S seconds after the first command.")]
 Report = Annotated[Path | None, Option(metavar="DIR", help="Also write tables and figures as one HTML page.")]
 Json = Annotated[bool, Option("--json", help="Print JSON instead of a table.")]
 Force = Annotated[bool, Option("--force", help="Replace an earlier result.")]
@@ -62,6 +66,8 @@ def fuse(
     engine: Annotated[
         Literal["compiled", "filterpy"], Option(help="filterpy: the slow reference, only for filtered estimates.")
     ] = "compiled",
+    since: From = None,
+    until: To = None,
     force: Force = False,
 ) -> None:
     """Fuse recorded runs: estimates, the outcome of each measurement, and a summary.
@@ -75,7 +81,9 @@ def fuse(
     if engine == "filterpy" and (smooth or as_live):
         raise BadParameter("--engine filterpy gives filtered estimates only: without --smooth and --as-live")
     _check_positive(rate=rate)
-    command.run(runs, config, output, _names(sensors), rate, smooth, as_live, rrd, figures, engine, force)
+    _check_interval(since, until)
+    part = since, until
+    command.run(runs, config, output, _names(sensors), rate, smooth, as_live, rrd, figures, engine, force, part)
 
 
 @app.command()
@@ -205,6 +213,8 @@ def tune(
     no_sd_prior: Annotated[
         bool, Option("--no-sd-prior", help="Let a sensor's sd be any; else as configured within a factor of some 1.5.")
     ] = False,
+    since: From = None,
+    until: To = None,
     report: Annotated[bool, Option("--report", help="Also write report.html into DIR.")] = False,
     json: Json = False,
     force: Force = False,
@@ -216,7 +226,9 @@ def tune(
     from . import tune as command
 
     kinds, fixed = _names(fit, "--fit") or [], _names(",".join(fix) if fix else None, "--fix") or []
-    command.run(runs, config, output, kinds, fixed, share, trust, validate, not no_sd_prior, report, json, force)
+    _check_interval(since, until)
+    prior, part = not no_sd_prior, (since, until)
+    command.run(runs, config, output, kinds, fixed, share, trust, validate, prior, report, json, force, part)
 
 
 @app.command()
@@ -313,6 +325,14 @@ def _si(value: float) -> float:
     from ..units import shifted  # imports numpy, which no --help needs
 
     return shifted(value, -3)
+
+
+def _check_interval(since: float | None, until: float | None) -> None:
+    """Refuse ``--from`` and ``--to`` that are no interval after the first command."""
+    if since is not None and not 0.0 <= since < float("inf"):
+        raise BadParameter(f"must be a number of seconds after the first command, not {since}", param_hint="--from")
+    if until is not None and not (since or 0.0) < until < float("inf"):
+        raise BadParameter(f"must be a number of seconds after --from, not {until}", param_hint="--to")
 
 
 def _check_positive(**options: float | None) -> None:

@@ -41,6 +41,7 @@ def run(
     report: bool,
     json: bool,
     force: bool,
+    part: tuple[float | None, float | None] = (None, None),
 ) -> None:
     """Tune a configuration on recorded runs and write the result; the arguments are the options of the command.
 
@@ -54,7 +55,7 @@ def run(
     except ConfigError as error:
         raise typer.BadParameter(str(error)) from None
     given = FusionConfig.load(config)
-    runs = [Run.read(path) for path in paths]
+    runs = [Run.read(path).between(*part) for path in paths]
     other = None if validate is None else Run.read(validate)
     with Console(stderr=True).status("preparing") as status:
 

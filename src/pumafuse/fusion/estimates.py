@@ -136,6 +136,8 @@ class Estimates:
         speed: Highest commanded speed [m/s].
         radius: Greatest distance of a command from the base's axis [m]; None without a cylindrical frame.
         notes: What was noticed, a sentence each.
+        since: Where the part of the run that was used begins [s]; None: with the run.
+        until: Where it ends [s], likewise.
     """
 
     run: str
@@ -155,6 +157,8 @@ class Estimates:
     speed: float
     radius: float | None
     notes: tuple[str, ...]
+    since: float | None = None
+    until: float | None = None
 
     def __getitem__(self, axis: str) -> AxisEstimate:
         """The estimates of one axis.

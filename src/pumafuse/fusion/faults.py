@@ -1,4 +1,4 @@
-"""Faults of sensors that show before anything is filtered: another zero, repeated values, a negative latency."""
+"""Faults of a log that show before anything is filtered: another zero, repeated values, a begin in mid-motion."""
 
 from __future__ import annotations
 
@@ -18,6 +18,11 @@ _FEW = 30  # rows, or changes of a value, below which nothing is said
 _ENOUGH = 500  # values that tell where a sensor is
 _FAR = 5.0  # sds beyond which chance and priors are no explanation
 _TAIL_NS = 1_000_000_000  # after the last command
+_ALIKE, _UNEQUAL = 3, 0.3  # first steps, and how far they may be from their mean, over it
+_SETTLED = 5.0  # lags of the plant
+_MOVED = 0.5  # share of a motion
+_FEWEST = 4  # measurements of a sensor
+_MOST = 10_000  # commands before the first
 _COARSE = 3.0  # typical over smallest change of a value: below it the sensor counts steps
 
 
@@ -40,6 +45,26 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
             off = _off(segment, config, name, segment.axes[column], rows.stamp[mine], rows.value[mine, column])
             found.extend([] if off is None else [off])
     return found
+
+
+def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
+    """A sentence if the arm is in motion at the first command already, where the model has it at rest.
+
+    That commands begin with a speed is not enough: an arm at rest may be commanded so. Measurements of the moving axes
+    together must follow a motion that was there before, at least half of it, rather than one that begins.
+    """
+    speeds = {axis: speed for axis in segment.axes if (speed := _first_speed(segment, axis))}
+    evidence = [_evidence(segment, config, axis, speed) for axis, speed in speeds.items()]
+    score, information = sum(one[0] for one in evidence), sum(one[1] for one in evidence)
+    if score <= _MOVED * information + 3.0 * math.sqrt(information):  # three standard deviations
+        return []
+    off = {axis: abs(speed) * config.arm.lag_of(axis, abs(speed)) for axis, speed in speeds.items()}
+    most = max(off, key=off.__getitem__)
+    return [
+        f"the run begins in motion ({speeds[most] * MM:.3g} mm/s on {most}), the model at rest: estimates are wrong by"
+        f" up to {off[most] * MM:.2g} mm at first; record from rest, or use --from"
+        f" {max(_settled(config, axis) for axis in speeds):.2g} or later"
+    ]
 
 
 def latency_questions(config: FusionConfig, names: Iterable[str]) -> list[str]:
@@ -76,6 +101,53 @@ def _off(
         f"sensor '{name}' is {median * MM:+.4g} mm from where the commands lead {axis}, all the time (noise and priors:"
         f" {expected * MM:.2g} mm): has it another zero? Give it bias_sd_mm, or say in run.toml where the arm starts"
     )
+
+
+def _first_speed(segment: Segment, axis: str) -> float:
+    """The commanded speed [m/s] that a segment begins with; 0 where its first steps are not alike."""
+    given, command = (part[: _ALIKE + 1] for part in segment.given(axis))
+    steps = np.diff(command)
+    if len(steps) < _ALIKE or command[0] != segment.start[axis]:
+        return 0.0
+    if np.abs(steps - steps.mean()).max() > _UNEQUAL * abs(steps.mean()):
+        return 0.0
+    return float(command[-1] - command[0]) / (int(given[-1] - given[0]) / 1e9)
+
+
+def _settled(config: FusionConfig, axis: str) -> float:
+    """How long the model of an axis remembers where it began [s]."""
+    return config.arm.delay_of(axis) + _SETTLED * config.arm.axes[axis].plant.lag
+
+
+def _evidence(segment: Segment, config: FusionConfig, axis: str, speed: float) -> tuple[float, float]:
+    """Score and information on the share of a motion at ``speed`` [m/s] that was there before the first command.
+
+    What such a motion adds to one from rest is fitted to the measurements until the model has settled, beside a
+    constant of each sensor. Score over information is the share, 1/√information its standard deviation.
+    """
+    model, delay, period = config.arm.axes[axis], config.arm.delay_of(axis), config.arm.update_period
+    settled, column, score, information = _settled(config, axis), segment.axes.index(axis), 0.0, 0.0
+    (given, command), start = segment.given(axis), segment.start[axis]
+    before = np.arange(-min(int(settled / period) + 1, _MOST), 0.0)
+    earlier = np.concatenate([given[0] + np.rint(before * (period * 1e9)).astype(np.int64), given])
+    moving = np.concatenate([start + before * (period * speed), command])
+    for name, rows in segment.rows_by_sensor().items():
+        if (sensor := config.sensors.get(name)) is None:
+            continue
+        valid = rows.stamp - round(sensor.latency * 1e9)
+        early = (rows.known[:, column] == int(Outcome.FUSED)) & (valid <= given[0] + round(settled * 1e9))
+        if np.count_nonzero(early) < _FEWEST:
+            continue
+        valid, value = valid[early], rows.value[early, column] / sensor.scale
+        rest = start + response(model, period, delay, given, command, start, valid)
+        added = moving[0] + response(model, period, delay, earlier, moving, float(moving[0]), valid) - rest
+        added -= added.mean()
+        left = value - rest
+        left -= left.mean()
+        along, size = float(added @ left), max(float(added @ added), 1e-30)
+        noise = max((sensor.sd_of(axis) or 0.0) / abs(sensor.scale), float(np.std(left - added * (along / size))))
+        score, information = score + along / noise**2, information + size / noise**2
+    return score, information
 
 
 def _times_each(values: FloatArray) -> int:

@@ -23,7 +23,7 @@ from .config import FusionConfig
 from .consistency import sensor_problems
 from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
-from .faults import latency_questions, sensor_faults
+from .faults import latency_questions, sensor_faults, starts_in_motion
 from .score import late_rows, reference_track
 from .segments import Segment, build, output_times
 
@@ -82,7 +82,10 @@ def fuse(
         share = None if progress is None else _share(progress, number, len(logged))
         parts.append((segment, times, filter_segment(segment, config, times, mode, engine, share)))
     cut, times, filtered = zip(*parts, strict=True)
-    origin, references = cut[0].origin, [part.reference for part in logged if part.reference is not None]
+    origin = cut[0].origin
+    references = [
+        source.rows(part.within(source.stamp, origin)) for part in logged if (source := part.reference) is not None
+    ]
     axes = {
         axis: AxisEstimate(
             *(_joined(getattr(part.axes[axis], field) for part in filtered) for field in AxisEstimate.FIELDS)
@@ -107,9 +110,11 @@ def fuse(
         speed=max(part.highest_speed(config.arm.update_period) for part in cut),
         radius=_highest_radius(in_place, placed),
         notes=(),
+        since=run.since,
+        until=run.until,
     )
     notes = [note for part in parts for note in (*part[0].notes, *_contradictions(part[0], part[2], origin))]
-    notes += [note for segment in cut for note in sensor_faults(segment, config)]
+    notes += [note for segment in cut for note in (*starts_in_motion(segment, config), *sensor_faults(segment, config))]
     notes += latency_questions(config, cut[0].sensors)
     notes += [*jumps, *_reference_notes(est, references), *config.arm.validity.excess(est.speed, est.radius)]
     est = replace(est, notes=(*notes, *sensor_problems(est)))

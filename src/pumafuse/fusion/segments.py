@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..arrays import NO_STAMP, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
+from ..arrays import ALWAYS, NEVER, NO_STAMP, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
 from ..filter.axis import Model, Sensors, State
 from ..filter.events import COMMAND, Events, classify_all, joined
@@ -49,6 +49,7 @@ class Segment:
         command_rows: Rows of the commands by stamp, with time = stamp.
         measurement_rows: Rows of all sensors, one sensor after the other, each by stamp.
         notes: Every anomaly once: how many, where first.
+        ends: First and last stamp of the part that is used, int ns; before it there are commands only.
     """
 
     axes: tuple[str, ...]
@@ -59,6 +60,7 @@ class Segment:
     command_rows: Events
     measurement_rows: Events
     notes: tuple[str, ...]
+    ends: tuple[int, int] = (ALWAYS, NEVER)
     _latest: dict[tuple[int, ...], tuple[Events, IntArray]] = field(
         default_factory=dict[tuple[int, ...], tuple[Events, IntArray]], init=False, repr=False, compare=False
     )
@@ -143,7 +145,8 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
         sensors: Which of the configured sensors to use; all for None.
 
     Raises:
-        PumafuseError: The run commands an axis that the arm has not, or a chosen sensor is not configured.
+        PumafuseError: The run commands an axis that the arm has not, a chosen sensor is not configured, or the part of
+            the run to use has no measurement.
     """
     arm, label, notes = config.arm, run.command.label, list(run.notes)
     for axis in run.axes:
@@ -161,31 +164,54 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     used = (*(name for name in chosen if name in run.sensors), *strangers)
     policy = _policy(config, run.axes, used)
     rows = _command_rows(run, config, policy, notes)
+    origin = int(rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)][0])
+    ends = run.ends(origin)
+    rows = rows.rows(np.flatnonzero(rows.stamp <= ends[1]))
     silent = [name for name in chosen if name not in run.sensors]
     notes.extend(f"sensor '{name}' of the configuration has no measurements in this run" for name in silent)
     commands = rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)]
     commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
+    if late := [axis for axis, known in zip(run.axes, rows.known.T, strict=True) if Outcome.FUSED not in known]:
+        raise RunError(f"{label}: no command for axis '{late[0]}' {run.interval} after the first command")
     given = {axis: (rows.known[:, number] == Outcome.FUSED).argmax() for number, axis in enumerate(run.axes)}
     first = {axis: float(rows.value[row, number]) for number, (axis, row) in enumerate(given.items())}
-    origin = int(commands[0])
     parts = [_measurement_rows(run, config, number, used, policy, origin, notes) for number in range(len(used))]
     measured = joined([Events.empty(len(run.axes)), *parts])
-    return Segment(run.axes, used, origin, {**first, **run.start}, commands, rows, measured, tuple(notes))
+    if run.interval and not (measured.known == Outcome.FUSED).any():
+        raise RunError(f"run '{run.name}': no measurement to use is stamped {run.interval} after the first command")
+    return Segment(run.axes, used, origin, {**first, **run.start}, commands, rows, measured, tuple(notes), ends)
 
 
 def output_times(segment: Segment, config: FusionConfig, rate: float | None) -> TimeArray:
-    """When estimates are asked for: at each command, or on an even grid of ``rate`` [Hz] from the first command on."""
+    """When estimates are asked for: at each command, or on an even grid of ``rate`` [Hz] from the first command on.
+
+    Raises:
+        RunError: There are too many, or none in the part of the run to use.
+    """
+    since, until = segment.ends
     if rate is None:
-        return segment.commands
-    span = segment.end(config) - segment.origin
-    count = int(span / 1e9 * rate) + 2
+        times = segment.commands[segment.commands >= since]
+    else:
+        times = _grid(segment.origin, max(since, segment.origin), min(until, segment.end(config)), rate)
+    if not len(times):
+        what = "no command" if rate is None else f"no tick of {rate:g} Hz"
+        raise RunError(
+            f"there is {what} in the part of the run to use, so no estimate: a longer one, or another --rate"
+        )
+    return times
+
+
+def _grid(origin: int, first: int, last: int, rate: float) -> TimeArray:
+    """Ticks 0, 1/rate, … [1/Hz] after ``origin`` that lie from ``first`` to ``last``, int64 ns, (n,)."""
+    span = last - first
+    begin, count = int((first - origin) / 1e9 * rate), int(span / 1e9 * rate) + 2
     if count > _MOST_ESTIMATES:
         raise RunError(
             f"{rate:g} estimates a second over {span / 86400e9:.1f} days are {count:.1e} estimates, more than"
             f" {_MOST_ESTIMATES:.0e}: a lower --rate? Or are not all stamps on one clock?"
         )
-    grid = np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
-    return segment.origin + grid[grid <= span]
+    grid = origin + np.rint(np.arange(begin, begin + count) * (1e9 / rate)).astype(np.int64)
+    return grid[(grid >= first) & (grid <= last)]
 
 
 def as_commanded(run: Run, config: FusionConfig) -> Source:
@@ -247,18 +273,21 @@ def _measurement_rows(
 ) -> Events:
     """The rows of one of the sensors ``names`` by stamp, each value classified."""
     name = names[number]
-    source, sensor, lag = run.sensors[name], config.sensors.get(name), behind(run.sensors[name].stamp)
-    label, missing = source.label_for(name), source.stamp == NO_STAMP
+    source, sensor = run.sensors[name], config.sensors.get(name)
+    label, used = source.label_for(name), run.within(source.stamp, origin)
+    lag, missing = np.where(used, behind(source.stamp), 0), used & (source.stamp == NO_STAMP)
     order = np.argsort(source.stamp, kind="stable")
     rows = _table(source, run.axes, order, number, 0 if sensor is None else round(sensor.latency * 1e9))
     rows = _classified(rows, policy, origin, lag[order] > TOLERATED_STEP_BACK_NS)
+    rows.known[~used[order]] = ABSENT
+    kept = rows.rows(np.flatnonzero(used[order]))
     note_rows(notes, label, lag > 0, "a stamp that steps back: sorted")
     if sensor is None:
-        note_rows(notes, label, missing | True, "no sensor of this name in the configuration: unknown")
-        return rows
+        note_rows(notes, label, used, "no sensor of this name in the configuration: unknown")
+        return kept
     note_rows(notes, label, missing, f"no stamp: {Outcome.INVALID.word}")
     if ((rows.known == int(Outcome.FUSED)) | (rows.known == ABSENT)).all():
-        return rows
+        return kept
     known = np.empty_like(rows.known)
     known[order] = rows.known
     for kind, reason in _REASONS.items():
@@ -268,7 +297,7 @@ def _measurement_rows(
             notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
         hollow = (known[:, column] == Outcome.INVALID) & ~missing
         note_rows(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
-    return rows
+    return kept
 
 
 def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int | np.int64, latency: int = 0) -> Events:

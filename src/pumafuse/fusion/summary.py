@@ -113,6 +113,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
             arrived) or ``smoothed`` (all of the run).
         engine: Which engine computed it.
         origin_ns: Stamp of the first command: time 0 of every table.
+        from_s: Where the part of the run that was used begins, since the first command; null: with the run.
+        to_s: Where it ends, likewise.
         duration_s: From the first to the last estimate.
         estimates: How many.
         segments: 1, and one more for each time the log's clock was set back.
@@ -127,6 +129,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     mode: str
     engine: str
     origin_ns: int
+    from_s: float | None = None
+    to_s: float | None = None
     duration_s: float
     estimates: int
     segments: int
@@ -145,6 +149,8 @@ def summarise(est: Estimates) -> Summary:
         mode=est.mode,
         engine=est.engine,
         origin_ns=est.origin,
+        from_s=est.since,
+        to_s=est.until,
         duration_s=float(np.ptp(est.time)),
         estimates=len(est.time),
         segments=int(est.segment[-1]) + 1,

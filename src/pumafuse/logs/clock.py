@@ -114,12 +114,18 @@ def segments(run: Run) -> tuple[list[Run], list[str]]:
         The segments in order, and a sentence on each jump.
 
     Raises:
-        RunError: The commands' clock jumped and another source's did not, or it jumps all the time.
+        RunError: The commands' clock jumped and another source's did not, or it jumps all the time; or it jumped and
+            only a part of the run is to be used.
     """
     run = without_strays(run)
     cuts = _jumps(run.command)
     if not cuts:
         return [run], []
+    if run.interval:
+        raise RunError(
+            f"{run.command.label}: the clock is set back in row {cuts[0] + 1}, so that '{run.interval}' is of two"
+            " times; cut the log there first"
+        )
 
     def pieces(source: Source) -> list[Source]:
         jumps = _jumps(source)

@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
+from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
 from ..model.arm import CANONICAL_AXES, ordered_axes
 from ..units import nanoseconds
@@ -77,6 +77,8 @@ class Run:
         frame: The arm's axes in the log's x, y, z, for sources that give these.
         notes: What was wrong with the files, a sentence each.
         without_strays: Whether stray stamps are removed already, see :func:`pumafuse.logs.clock.without_strays`.
+        since: Where the part to use begins [s after the first command], see :meth:`between`; None: with the log.
+        until: Where it ends, likewise.
     """
 
     name: str
@@ -88,6 +90,8 @@ class Run:
     frame: Frame | None = None
     notes: tuple[str, ...] = ()
     without_strays: bool = False
+    since: float | None = None
+    until: float | None = None
 
     def __post_init__(self) -> None:
         where = f"run '{self.name}'"
@@ -115,6 +119,42 @@ class Run:
     def axes(self) -> tuple[str, ...]:
         """The commanded axes, in the order tangential, radial, vertical, then others by name."""
         return ordered_axes(set(self.command.values))
+
+    def between(self, since: float | None = None, until: float | None = None) -> Run:
+        """A part of the run, for example one that begins in mid-motion.
+
+        Measurements and rows of the reference that are stamped outside do not count, and estimates are given only
+        inside. All commands before it do: the arm moves by them from the log's beginning on, so that at ``since`` it is
+        in motion if they move it, and as uncertain as its model says.
+
+        Args:
+            since: Where the part begins [s after the first command]; None: where the log does.
+            until: Where it ends, likewise.
+
+        Raises:
+            RunError: That is no interval after the first command.
+        """
+        low, high = 0.0 if since is None else since, np.inf if until is None else until
+        if not (0.0 <= low < high and low < np.inf):
+            raise RunError(f"run '{self.name}': from {since} to {until} s is no interval after the first command")
+        return replace(self, since=since, until=until if high < np.inf else None)
+
+    @property
+    def interval(self) -> str:
+        """The part to use in words; empty for the whole run."""
+        ends = ("from", self.since), ("to", self.until)
+        return " ".join(f"{word} {end:g} s" for word, end in ends if end is not None)
+
+    def ends(self, origin: int) -> tuple[int, int]:
+        """First and last stamp of the part to use, int ns; ``origin`` is the first command's."""
+        since = ALWAYS if self.since is None else origin + round(self.since * 1e9)
+        until = NEVER if self.until is None else origin + round(self.until * 1e9)
+        return min(since, NEVER), min(until, NEVER)
+
+    def within(self, stamp: TimeArray, origin: int) -> BoolArray:
+        """Rows stamped in the part to use, (rows,); in the whole run all rows, also those without a stamp."""
+        since, until = self.ends(origin)
+        return (stamp >= since) & (stamp <= until) if self.interval else np.ones(len(stamp), dtype=np.bool_)
 
     def each(self, change: Callable[[str, Source], Source]) -> Run:
         """The run with each of its sources changed; ``change`` is given its name in notes, too."""

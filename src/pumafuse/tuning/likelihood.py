@@ -27,6 +27,7 @@ from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations
+from ..fusion.faults import starts_in_motion
 from ..fusion.segments import Segment, build
 from ..logs.axes import in_axes
 from ..logs.clock import segments
@@ -137,7 +138,9 @@ class Likelihood:
         named = [(run.name, part) for run in runs for part in segments(in_axes(run, config.frame)[0])[0]]
         built = [build(part, config, chosen) for _, part in named]
         self.notes = [
-            f"run '{name}': {note}" for (name, _), segment in zip(named, built, strict=True) for note in segment.notes
+            f"run '{name}': {note}"
+            for (name, _), segment in zip(named, built, strict=True)
+            for note in (*segment.notes, *starts_in_motion(segment, config))
         ]
         self.config = config
         self.axes = ordered_axes({axis for segment in built for axis in segment.axes})

@@ -91,6 +91,7 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         pumafuse: Version that wrote it.
         runs: Names of the runs fitted on.
+        parts: Of those that only a part was used of, from and to [s after the first command]; null: from or to the end.
         fit: The kinds of parameters fitted.
         fixed: Names that were fixed, as asked.
         trusted: The trusted sensor, if there is one.
@@ -110,6 +111,7 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
 
     pumafuse: str
     runs: list[str]
+    parts: dict[str, tuple[float | None, float | None]] = {}
     fit: list[str]
     fixed: list[str]
     trusted: str | None

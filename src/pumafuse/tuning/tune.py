@@ -139,6 +139,7 @@ def tune(
     summary = TuningSummary(
         pumafuse=version("pumafuse"),
         runs=names,
+        parts={run.name: (run.since, run.until) for run in runs if run.interval},
         fit=list(kinds),
         fixed=fixed,
         trusted=trust,
@@ -246,7 +247,10 @@ def _evaluated(likelihood: Likelihood, config: FusionConfig) -> LogLikelihood:
 
 
 def _same(run: Run, other: Run) -> bool:
-    """Whether two runs have the same measurements."""
+    """Whether two runs have the same measurements, and the parts of them to use overlap."""
+    (since, until), (begin, end) = run.ends(0), other.ends(0)
+    if until <= begin or end <= since:
+        return False
     one, two = (
         {
             name: (source.stamp.tobytes(), {axis: value.tobytes() for axis, value in source.values.items()})
@@ -262,7 +266,8 @@ def _fitted_until(run: Run) -> float | None:
     if len(segments(run)[0]) > 1:
         return None
     stamp = run.command.stamp[run.command.stamp != NO_STAMP]
-    return _FITTED_ON * float(stamp.max() - stamp.min()) / 1e9
+    since, end = run.since or 0.0, float(stamp.max() - stamp.min()) / 1e9
+    return since + _FITTED_ON * (min(end, run.until or end) - since)
 
 
 def _likelihoods(likelihood: Likelihood, before: FusionConfig, after: FusionConfig) -> dict[str, AxisLikelihood]:

@@ -49,6 +49,8 @@ def fused_figure(est: Estimates, run: Run, path: Path) -> None:
                 margin = 0.1 * (high - low) + 0.5
                 axes.set_ylim(low - margin, high + margin)
             zoom.set_xlim(start, end)
+            if est.since is not None or est.until is not None:
+                whole.set_xlim(est.time[0], max(est.time[-1], est.time[0] + 1e-3))
         panels[1].legend(loc="best", ncols=2, frameon=False)
 
 
