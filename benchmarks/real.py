@@ -1,9 +1,10 @@
 """Real recordings: errors of pumafuse and of filters without a gate, filtered, as live and smoothed.
 
-    python benchmarks/real.py [--servo DIR]
+    python benchmarks/real.py [--servo DIR [--write]]
 
 Everything is tuned on one recording and scored on another, at the instants of the reference; in brackets the share of
-errors within 95 % bars, in %. The first table is that of docs/generic-filters.md, the last one the README's.
+errors within 95 % bars, in %. All but the last table is for docs/generic-filters.md, which is the README's: ``--write``
+puts them there.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ OURS = {"pumafuse": {}, "pumafuse, no gate": {"gate": 0.0}}
 METHODS = ["held", *KINDS, "LSQ+OU", *OURS]
 FIT = ["noise", "delay", "plant", "gain"]
 LEARNT = 100.0  # s of trunk-servo
+MARKS = ("<!-- made by benchmarks/real.py -->", "<!-- until here -->")
 
 Errors = Mapping[str, tuple[float, float]]  # of each method: RMSE [mm], coverage (NaN where there are no bars)
 
@@ -205,7 +207,7 @@ def verdicts(rows: Sequence[Row]) -> Iterator[str]:
         ]
         yield f"{name} loses {len(lost)} times: {'; '.join(lost) or 'nowhere'}"
         outside = [row for row in rows if not 0.90 <= row.errors[name][1] <= 0.98]
-        where = [f"{row.run}, {row.axis}, {row.mode} ({100.0 * row.errors[name][1]:.0f})" for row in outside]
+        where = [f"{row.run}, {row.axis}, {row.mode} ({100.0 * row.errors[name][1]:.1f})" for row in outside]
         yield f"{name}, coverage outside 90 to 98 %: {'; '.join(where) or 'nowhere'}"
 
 
@@ -217,6 +219,13 @@ def readme(rows: Sequence[Row]) -> str:
         for axis in dict.fromkeys(axis for axis, _ in trunk)
     ]
     return table(["axis", *SHOWN], lines, 1)
+
+
+def put(page: Path, text: str) -> None:
+    """Put a text between its marks on a page."""
+    old = page.read_text(encoding="utf-8")
+    head, tail = old[: old.index(MARKS[0])], old[old.index(MARKS[1]) :]
+    page.write_text(f"{head}{MARKS[0]}\n\n{text}\n\n{tail}", encoding="utf-8")
 
 
 SHOWN = {
@@ -232,11 +241,19 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--servo", type=Path, metavar="DIR", help="recordings of a real servo, not in this repository")
+    parser.add_argument("--write", action="store_true", help="put it into README.md and docs/generic-filters.md")
     given = parser.parse_args()
+    if given.write and given.servo is None:
+        parser.error("the pages have the servo, too: --servo DIR")
     warnings.simplefilter("ignore", pf.PumafuseWarning)  # what is odd in the runs, and what fits cannot tell
     rows = [row for recording in recordings(given.servo) for row in measure(recording)]
     lines = [[row.run, row.axis, row.mode, *row.cells(METHODS)] for row in rows]
-    print(table(["recording", "axis", "mode", *METHODS], lines, 3), *verdicts(rows), readme(rows), sep="\n\n")
+    listed = "\n".join(f"- {verdict}" for verdict in verdicts(rows))
+    compared = f"{table(['recording', 'axis', 'mode', *METHODS], lines, 3)}\n\n{listed}"
+    print(compared, readme(rows), sep="\n\n")
+    if given.write:
+        put(REPOSITORY / "docs" / "generic-filters.md", compared)
+        put(REPOSITORY / "README.md", readme(rows))
 
 
 if __name__ == "__main__":
