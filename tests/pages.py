@@ -32,7 +32,7 @@ from markdown_it.token import Token
 import pumafuse as pf
 
 ROOT = Path(__file__).parent.parent
-LONGEST = 120.0  # s that any block may take
+LONGEST = 300.0  # s that any block may take
 _FILE = re.compile(r"# ([\w./-]+\.(?:toml|py))\n")
 _LEFT_OUT = re.compile(r"<!-- not executed: (.+) -->")
 _COLOUR = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")

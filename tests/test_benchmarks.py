@@ -1,0 +1,78 @@
+"""Rivals without a gate, which pumafuse is compared with on real recordings."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pages import ROOT
+
+SHARED = ROOT.parent / "shared" / "data" / "trunk-servo"
+
+
+@pytest.fixture
+def ungated(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return importlib.import_module("ungated")
+
+
+def covariance(order: int, density: float, time: float, prior: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Of a process at ``s`` with itself at ``t``: its covariance function, not its transitions."""
+    first, after = np.minimum(s[:, None], t), np.maximum(s[:, None], t)
+    if order == 1:
+        return 0.5 * density**2 * time * np.exp(-(after - first) / time)
+    noise = {2: first**2 * after / 2 - first**3 / 6, 3: first**3 * (10 * after**2 - 5 * first * after + first**2) / 120}
+    powers = [np.outer(s**i, t**i) / max(i, 1) ** 2 for i in range(order)]  # 0! = 1! = 1, 2! = 2
+    return density**2 * noise[order] + sum(variance * power for variance, power in zip(prior, powers, strict=True))
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize(("late", "smooth"), [(0.0, False), (0.07, False), (0.0, True)])
+def test_estimates_are_those_of_a_gaussian_process(ungated: ModuleType, order: int, late: float, smooth: bool) -> None:
+    """Filtered, as live and smoothed: mean and sd of a regression on the measurements known then, all at once."""
+    rng = np.random.default_rng(1)
+    time, at = np.append(0.0, np.sort(rng.uniform(0.0, 3.0, 20))), np.sort(rng.uniform(0.2, 3.0, 15))
+    value = 3.0 * np.sin(2.0 * time) + rng.normal(0.0, 0.3, len(time))
+    model = ungated.Process(order, 2.0, 0.3, 0.4)
+    mean, sd = model.estimate(time, value, at, late, smooth)
+    prior, level = np.var(value) * 100.0 ** np.arange(order), 0.0 if order == 1 else value[0]
+    for k, instant in enumerate(at):
+        seen = time <= (np.inf if smooth else instant - late)
+        K, cross, own = (
+            covariance(order, 2.0, 0.4, prior, a, b)
+            for a, b in ((time[seen], time[seen]), (at[k : k + 1], time[seen]), (at[k : k + 1], at[k : k + 1]))
+        )
+        weights = np.linalg.solve(K + 0.09 * np.eye(seen.sum()), cross.T)[:, 0]
+        assert mean[k] == pytest.approx(level + weights @ (value[seen] - level), abs=1e-6)
+        assert sd[k] ** 2 == pytest.approx(own[0, 0] - cross[0] @ weights, rel=1e-5)
+
+
+def test_least_squares_find_what_the_commands_lead_to(ungated: ModuleType) -> None:
+    """Superposed step responses, delayed, with another gain and an offset: all four numbers come back."""
+    rng = np.random.default_rng(2)
+    time = np.cumsum(rng.uniform(0.008, 0.012, 1000))
+    command, when = np.cumsum(rng.normal(0.0, 1.0, 1000)), np.sort(rng.uniform(1.0, 9.0, 200))
+    late = np.maximum(when[:, None] - 0.13 - time, 0.0)
+    moved = command[0] + (1.0 - np.exp(-late[:, 1:] / 0.06)) @ np.diff(command)
+    found = ungated.least_squares(time, command, when, 2.0 + 0.8 * moved)
+    assert [found.delay, found.time_constant] == pytest.approx([0.13, 0.06], abs=1e-4)
+    assert [found.gain, found.offset] == pytest.approx([0.8, 2.0], abs=1e-3)
+    assert found.at(time, command, when) == pytest.approx(2.0 + 0.8 * moved, abs=1e-2)
+
+
+@pytest.mark.parametrize("name", ["0g", "100g"])
+def test_the_example_is_the_recording(name: str) -> None:
+    """Values and stamps of examples/trunk-servo are those of the recording, to the digit."""
+    if not SHARED.exists():
+        pytest.skip("the recordings that the example was made from are not at hand")
+    run = pf.Run.read(ROOT / "examples" / "trunk-servo" / name)
+    assert run.reference is not None and not run.notes
+    for file, source in {"commands": run.command, "camera": run.sensors["camera"], "encoder": run.reference}.items():
+        table = np.loadtxt(SHARED / name / f"{file}.csv.gz", delimiter=",", skiprows=1)
+        assert np.array_equal(source.stamp, np.rint(table[:, 0] * 1e9).astype(np.int64))
+        for number, values in enumerate(source.values.values(), 1):
+            assert np.array_equal(values, table[:, number] / 1e3)
