@@ -61,10 +61,10 @@ def test_a_disturbance_is_found_with_its_sd_and_time(kind: str, seed: int) -> No
     covariance = smooth if kind == "matern" else np.exp(-apart)
     root = np.linalg.cholesky(covariance + 1e-9 * np.eye(COUNT))
     drawn = 1e-3 * root @ np.random.default_rng(100 + seed).standard_normal(COUNT)
-    found, process = fitted(measured(command, path + drawn, seed), config)
+    found, process = fitted(measured(command, path + drawn, seed, sd=1e-4), with_sensors(config, sd=1e-4))
     assert process.disturbance_kind == kind
     assert f"disturbance: {'smooth' if kind == 'matern' else 'rough'}" in found.orders["tip"]
-    assert found.best.config.sensors["camera"].sd_of("tip") == pytest.approx(3e-4, rel=0.1)
+    assert found.best.config.sensors["camera"].sd_of("tip") == pytest.approx(1e-4, rel=0.1)
     noise = replaced(config.process["tip"], disturbance_sd=1e-3, disturbance_time=0.25)
     truth, ends = replaced(config, process={"tip": noise}), intervals_of(found)
     mine = [one for one in found.free if one.path[-1].startswith("disturbance")]
@@ -158,7 +158,11 @@ def test_the_prior_of_a_noise_can_be_turned_off() -> None:
 def test_a_verdict_tells_a_noise_at_its_bound() -> None:
     """Measurements without any noise of their own, the prior off: the verdict does not say better and nothing else."""
     config, command, path = moving()
-    found = quietly(lambda: pf.tune([measured(command, path, 1, sd=0.0)], config, sd_prior=False))
+    run = measured(command, path, 1, sd=0.0)
+    found = quietly(lambda: pf.tune([run], config, sd_prior=False))
     assert found.config.sensors["camera"].sd_of("tip") == 1e-7
     (check,) = found.summary.validation or []
-    assert check.verdict.endswith("; the noise of camera is at its bound: error bars do not hold")
+    assert check.verdict.startswith("better, but its error bars do not hold (sd_mm of camera is at its bound")
+    assert not check.holds
+    verdict = pf.summarise(quietly(lambda: pf.fuse(run, found.config))).axes["tip"].sensors["camera"].verdict
+    assert verdict is not None and "consistent" not in verdict

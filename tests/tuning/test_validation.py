@@ -39,6 +39,32 @@ def test_the_same_twice_is_no_different_and_worse_is_the_opposite_of_better() ->
         assert same[axis].verdict == "no different: log-likelihood +0.0 (chance: ± 0.0), RMSE +0.0 %"
 
 
+def test_error_bars_that_do_not_hold_are_no_plain_improvement() -> None:
+    """A third of the truth's sd is better than a thousandth, and not right: said with the number that shows it."""
+
+    def noisy(factor: float) -> pf.FusionConfig:
+        config = run().config
+        sensors = {name: replaced(one, sd=factor * one.sd_of("vertical")) for name, one in config.sensors.items()}
+        return replaced(config, sensors=sensors)
+
+    blind = replace(run().run, reference=None)
+    for one in (*check(run().run, noisy(1e-3), noisy(1 / 3)), *check(blind, noisy(1e-3), noisy(1 / 3))):
+        assert not one.holds and not one.worse
+        assert one.verdict.startswith("better, but its error bars do not hold (NIS of vision ")
+        assert ("coverage" in one.verdict) == (one.after.coverage is not None and one.after.coverage < 0.8)
+    for one in (*check(run().run, noisy(1 / 3), noisy(1.0)), *check(blind, noisy(1 / 3), noisy(1.0))):
+        assert one.holds and one.verdict.startswith("better: ")
+
+
+def test_a_simpler_way_that_predicts_better_is_named() -> None:
+    """An arm whose commands count for nothing beside a drift that follows the camera: the command alone is better."""
+    config = with_process(run().config, drift=10.0, input_noise=0.0)
+    for one in check(run().run, config, config):
+        skill = one.after.sensors["vision"].skill
+        assert skill is not None and skill > 1.02
+        assert f"a simpler way predicts the next measurement better (error over its: vision {skill:.2f})" in one.verdict
+
+
 @pytest.mark.parametrize("since", [0.0, 2.5])
 def test_numbers_are_those_of_a_fusion(since: float) -> None:
     """Likelihood, rejections, NIS, whiteness, RMSE and coverage, from measurements and estimates since then only.

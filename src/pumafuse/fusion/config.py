@@ -18,6 +18,7 @@ from ..model.presets import PRESETS
 from ..toml import NotNegative, Positive
 from ..units import refuse_unit
 
+SD_BOUNDS = (1e-7, 1.0)  # m; of a sensor's noise that is fitted
 _LONGEST_LATENCY = 3600.0  # s
 ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
 
@@ -72,7 +73,7 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     bias_sd: NotNegative = msgspec.field(name="bias_sd_mm", default=0.0)
     bias_drift_sd: NotNegative = msgspec.field(name="bias_drift_sd_mm", default=0.0)
     bias_time: Positive = msgspec.field(name="bias_time_s", default=10.0)
-    gate: NotNegative = 8.0
+    gate: NotNegative = 20.0
     gate_rows: bool = True
 
     @property
@@ -83,6 +84,11 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def sd_of(self, axis: str) -> float | None:
         """The noise on one axis [m]; None where the sensor has none and so is not used."""
         return self.sd.get(axis) if isinstance(self.sd, dict) else self.sd
+
+    def is_at_bound(self, axis: str) -> bool:
+        """Whether its noise on an axis is at a bound of what is fitted, or beyond: no measurement determined it."""
+        sd = self.sd_of(axis)
+        return sd is not None and not SD_BOUNDS[0] < sd < SD_BOUNDS[1]
 
 
 class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

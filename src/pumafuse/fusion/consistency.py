@@ -126,7 +126,7 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
     whiteness = ljung_box(fused.innovation / fused.innovation_sd)
     found = Consistency(count, float(np.mean(fused.nis)), chi_square_band(count), *whiteness, verdict="")
     rejected = 1.0 - count / np.count_nonzero(measurements.outcome <= Outcome.REACQUIRED)
-    return replace(found, verdict=_verdict(est, axis, fused, found, rejected))
+    return replace(found, verdict=_verdict(est, sensor, axis, fused, found, rejected))
 
 
 def sensor_problems(est: Estimates) -> list[str]:
@@ -193,7 +193,7 @@ def _frozen(values: FloatArray) -> int:
     return longest if longest >= _FROZEN and len(values) * elsewhere ** (longest - 1) < _NEVER else 0
 
 
-def _verdict(est: Estimates, axis: str, fused: Measurements, found: Consistency, rejected: float) -> str:
+def _verdict(est: Estimates, sensor: str, axis: str, fused: Measurements, found: Consistency, rejected: float) -> str:
     if found.count < _FEW:
         return f"too few measurements ({found.count}) to tell"
     low, high = found.nis_band
@@ -205,6 +205,8 @@ def _verdict(est: Estimates, axis: str, fused: Measurements, found: Consistency,
         strongest = int(np.argmax(np.abs(correlation)))
         if coloured and abs(correlation[strongest]) > _NOTABLE:
             return f"{nis}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
+        if est.config.sensors[sensor].is_at_bound(axis):
+            return f"{nis}, but sd_mm is at a bound of what can be fitted: error bars need not hold; configure it"
         return f"{nis}: consistent"
     sign = int(np.sign(correlation[0])) if coloured and abs(correlation[0]) > _NOTABLE else 0
     if found.nis > high and sign and _follows_velocity(est, axis, fused):

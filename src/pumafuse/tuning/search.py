@@ -45,6 +45,8 @@ _PROCESSES = tuple(  # starts, in units of the distance between the noiseless ar
     for noise, drift in ((0.1, 1.0), (0.01, 0.1), (1.0, 10.0), (0.01, 1.0), (1.0, 0.1))
 )
 
+_SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
+_QUICKEST = 2.0  # update periods, of a disturbance
 _TIME = 0.3  # s, of a disturbance: start
 _QUIET = 0.1  # share of noise that is left beside a disturbance: start
 _DISTURBANCES = ("none", "smooth (Matérn)", "rough (Ornstein-Uhlenbeck)")
@@ -126,6 +128,12 @@ def _most_likely_models(
     scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
     reasons: dict[str, str] = {}
     for number, axis in enumerate(likelihood.axes):
+        for peak, score in zip(peaks, scores, strict=True):
+            process = peak.config.process[axis]
+            if process.disturbance_sd > 0.0 and process.disturbance_time < _QUICKEST * peak.config.arm.update_period:
+                score[number] = -np.inf  # no motion of an arm, but noise of its sensors
+            elif process.disturbance_sd > 0.0 and process.disturbance_kind == "matern":
+                score[number] -= _SMOOTHER
         mine = [float(score[number]) for score in scores]
         chosen = int(np.argmax(mine))
         parts = [found[chosen][1].get(axis)]
@@ -154,11 +162,13 @@ def _without_needless(likelihood: Likelihood, config: FusionConfig, free: FreeOf
 def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter]) -> FloatArray:
     """The log-posterior of each axis less the Bayesian information criterion's penalty for its parameters, (A,).
 
-    A noise at its lower bound is none, and costs nothing.
+    A noise at its lower bound is none, and costs nothing. Others of the random walk cost twice as much as BIC says:
+    real arms jerk, and any noise that is large at that moment gains likelihood without being true elsewhere.
     """
     used = [one for one in free if not (one.vanishes and one.at_bound(peak.config) == "lower")]
-    count = np.array([sum(one.axis == axis for one in used) for axis in likelihood.axes])
-    return peak.axes - 0.5 * count * np.log(np.maximum(likelihood.count, 2))
+    prices = [(one.axis, 2.0 if one.path[-1] in _PROCESSES[0] else 1.0) for one in used]
+    price = np.array([sum(price for owner, price in prices if owner == axis) for axis in likelihood.axes])
+    return peak.axes - 0.5 * price * np.log(np.maximum(likelihood.count, 2))
 
 
 def _times(likelihood: Likelihood, config: FusionConfig, free: Sequence[Parameter]) -> FusionConfig:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from ..fusion.config import FusionConfig
+from ..fusion.config import FusionConfig, Sensor
 from ..fusion.score import Z95
 from ..logs.run import Run
 from ..units import MM
@@ -18,8 +18,9 @@ from .maximise import Notify, Point, ignore, maximise_with_gates
 from .parameters import LATENCIES, Fit, Parameter, changed, is_fixed, parameters, smallest_sd, with_own_delays
 from .search import FreeOf, search
 
-_GATE = 5.0  # of the fit for a sensor with a wider or a narrow one: a jerk of the arm, beyond it but fused, must not
-_NARROWEST = 3.0  # widen all error bars; below this one rejecting good measurements pays, the more the smaller the sd
+_GATE = 5.0  # of the fit for a sensor with a narrow one:
+_NARROWEST = 3.0  # below it rejecting good measurements would pay, the more the smaller the noise
+_WIDEST = 8.0  # of the fit for a sensor with a wider one: a few outliers or jerks must not widen all error bars
 _MOST_FIXED = 8  # combinations of which one parameter each is fixed, at most
 _AT_REST = ("input_noise_mm_rtHz", "drift_mm_rts", "sd_mm")  # what an axis at rest still determines
 _BIAS_GAIN = 3.0  # log-likelihood that a bias must gain; the width of its prior is already paid for in it
@@ -126,12 +127,11 @@ def run_stage(
 
 def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float | None = None) -> Likelihood:
     """The likelihood of the runs; where latencies vary, without what one could put before the first command."""
-    sensors = {
-        name: sensor
-        if sensor.gate == 0.0 or _NARROWEST <= sensor.gate <= _GATE
-        else msgspec.structs.replace(sensor, gate=_GATE)
-        for name, sensor in config.sensors.items()
-    }
+
+    def gate_of(sensor: Sensor) -> float:
+        return _GATE if 0.0 < sensor.gate < _NARROWEST else min(sensor.gate, _WIDEST)
+
+    sensors = {name: msgspec.structs.replace(one, gate=gate_of(one)) for name, one in config.sensors.items()}
     latest = None
     if "latency" in plan.fit:
         latest = LATENCIES[1] + max((sensor.latency for sensor in config.sensors.values()), default=0.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import msgspec
@@ -13,16 +13,18 @@ from ..arrays import FloatArray
 from ..errors import PumafuseWarning
 from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
-from ..fusion.consistency import consistency, densities_of
+from ..fusion.consistency import chi_square_band, consistency, densities_of
 from ..fusion.estimates import AxisEstimate, Estimates, Measurements
 from ..fusion.offline import fuse
 from ..fusion.score import Z95, interpolated, score
+from ..fusion.skill import skill
 from ..logs.run import Run
 from ..units import MM
-from .parameters import SD_BOUNDS
 
 _WORSE = 1.02  # RMSE after over before that is worse where it is beyond chance
 _FAR_WORSE = 1.2  # likewise, whatever chance would make of it
+_COVERAGE = 0.90  # of errors within 95 % error bars, below which these do not hold
+_NIS = (0.71, 1.42)  # likewise: normal errors of which 98 and 90 % lie within
 _BATCHES = 20
 
 
@@ -30,14 +32,18 @@ class SensorCheck(msgspec.Struct, frozen=True, kw_only=True):
     """One sensor's innovations on one axis.
 
     Attributes:
+        count: Its fused components.
         nis: Mean ν²/S; 1 for a consistent filter.
         whiteness_p: Ljung-Box p-value; small: the innovations are not white.
         correlation: Autocorrelation of the innovations at lag 1.
+        skill: Error of predicting its next measurement, over that of the best simpler way; null where there is none.
     """
 
+    count: int
     nis: float
     whiteness_p: float
     correlation: float
+    skill: float | None
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
@@ -69,6 +75,7 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
         before: Under the configuration as given.
         after: Under the tuned one.
         worse: Whether it got worse.
+        holds: Whether the error bars of the tuned one do: by the reference's coverage, else by NIS.
         verdict: In words.
     """
 
@@ -79,6 +86,7 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
     before: State
     after: State
     worse: bool
+    holds: bool
     verdict: str
 
 
@@ -130,20 +138,38 @@ def _check(run: str, axis: str, since: float, before: Estimates, after: Estimate
     verdict = f"log-likelihood {gained:+.1f} (chance: ± {chance:.1f})"
     if closer is not None:
         verdict += f", RMSE {100.0 * (closer - 1.0):+.1f} %"
-    verdict = f"{'worse' if worse else 'better' if gained > chance else 'no different'}: {verdict}"
-    bound = _at_bound(after.config, axis, new.sensors)
-    if bound:
-        verdict += f"; the noise of {' and '.join(bound)} is at its bound: error bars do not hold"
-    count = len(gains)
+    doubts = _doubts(after, axis, new)
+    head = "worse" if worse else "better" if gained > chance else "no different"
+    if doubts and head == "better":
+        head += f", but its error bars do not hold ({', '.join(doubts)})"
+    simple = [f"{name} {one.skill:.2f}" for name, one in new.sensors.items() if (one.skill or 0.0) > _WORSE]
+    if simple:
+        verdict += f"; a simpler way predicts the next measurement better (error over its: {', '.join(simple)})"
     return Check(
-        run=run, axis=axis, since_s=since, components=count, before=old, after=new, worse=worse, verdict=verdict
+        run=run,
+        axis=axis,
+        since_s=since,
+        components=len(gains),
+        before=old,
+        after=new,
+        worse=worse,
+        holds=not doubts,
+        verdict=f"{head}: {verdict}",
     )
 
 
-def _at_bound(config: FusionConfig, axis: str, names: Iterable[str]) -> list[str]:
-    """The sensors whose noise on an axis is at a bound of what is fitted, or beyond."""
-    low, high = SD_BOUNDS
-    return [name for name in names if not low < (config.sensors[name].sd_of(axis) or low) < high]
+def _doubts(est: Estimates, axis: str, state: State) -> list[str]:
+    """Why error bars do not hold: a noise at a bound; NIS, or coverage on the reference, off by more than chance."""
+    found = [f"sd_mm of {name} is at its bound" for name in state.sensors if est.config.sensors[name].is_at_bound(axis)]
+    for name, one in state.sensors.items():
+        low, high = chi_square_band(one.count)
+        if one.nis < min(low, _NIS[0]) or one.nis > max(high, _NIS[1]):
+            found.append(f"NIS of {name} {one.nis:.2f}")
+    if state.coverage is not None and state.coverage < _COVERAGE:
+        inside = np.sqrt(_squares(est, axis)) <= Z95 * est[axis].position_sd
+        if _beyond_chance(_COVERAGE - inside.astype(np.float64)):
+            found.append(f"coverage {state.coverage:.0%}")
+    return found
 
 
 def _squares(est: Estimates, axis: str) -> FloatArray:
@@ -181,7 +207,14 @@ def _state(est: Estimates, axis: str) -> State:
     for name in mine.sensors:
         one = consistency(est, name, axis)
         if one is not None and len(one.correlation):
-            sensors[name] = SensorCheck(nis=one.nis, whiteness_p=one.whiteness, correlation=float(one.correlation[0]))
+            predicted = skill(est, est.measurements.of(name, axis))
+            sensors[name] = SensorCheck(
+                count=one.count,
+                nis=one.nis,
+                whiteness_p=one.whiteness,
+                correlation=float(one.correlation[0]),
+                skill=None if predicted is None else predicted.of_best_other,
+            )
     return State(
         log_likelihood=float(densities_of(mine, est.config.sensors).sum()),
         rejected=int(np.count_nonzero(mine.outcome == Outcome.REJECTED)),
