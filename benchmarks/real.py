@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from generic import REPOSITORY, beginning
 from kinematic import ORDERS, Array
@@ -27,8 +26,7 @@ import pumafuse as pf
 
 MODES: dict[str, dict[str, Any]] = {"filtered": {}, "as live": {"as_live": True}, "smoothed": {"smooth": True}}
 KINDS = [f"constant {kind}" for kind in ORDERS]
-OURS = {"pumafuse": {}, "pumafuse, no gate": {"gate": 0.0}}
-METHODS = ["held", *KINDS, "LSQ+OU", *OURS]
+METHODS = ["held", *KINDS, "LSQ+OU", "pumafuse"]
 FIT = ["noise", "delay", "plant", "gain"]
 LEARNT = 100.0  # s of trunk-servo
 MARKS = ("<!-- made by benchmarks/real.py -->", "<!-- until here -->")
@@ -92,9 +90,10 @@ def cell(rmse: float, covered: float) -> str:
 def recordings(servo: Path | None) -> Iterator[Recording]:
     """All of them."""
     trunk = REPOSITORY / "examples" / "trunk-servo"
-    config, light = pf.FusionConfig.load(trunk / "fusion.toml"), pf.Run.read(trunk / "0g")
-    loaded = pf.Run.read(trunk / "100g")
-    yield Recording("trunk", beginning(light, config, LEARNT), config, [loaded], skip=3.0)
+    config = pf.FusionConfig.load(trunk / "fusion.toml")
+    light, loaded = (pf.Run.read(trunk / name) for name in ("0g", "100g"))
+    for learnt, scored in ((light, loaded), (loaded, light)):
+        yield Recording("trunk", beginning(learnt, config, LEARNT), config, [scored], skip=3.0)
     if servo is not None:
         runs = [pf.Run.read(servo / name) for name in ("sin_time_square", "sin_sin")]
         tip = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.030))
@@ -142,18 +141,15 @@ def score(mean: Array, sd: Array, true: Array) -> tuple[float, float]:
 
 def measure(recording: Recording) -> Iterator[Row]:
     """A row for each axis and mode of what is scored."""
-    name, sensor = next(iter(recording.config.sensors.items()))
-    tuned: dict[str, pf.FusionConfig] = {}
-    for ours, change in OURS.items():
-        config = msgspec.structs.replace(recording.config, sensors={name: msgspec.structs.replace(sensor, **change)})
-        tuned[ours] = pf.tune([recording.learnt], config, fit=FIT, validate=recording.scored[-1]).config
+    (sensor,) = recording.config.sensors.values()
+    tuned = pf.tune([recording.learnt], recording.config, fit=FIT, validate=recording.scored[-1]).config
     fitted = {axis: rivals(log(recording.learnt, recording.config, axis)) for axis in recording.config.arm.axes}
     modes = {mode: options for mode, options in MODES.items() if mode != "as live" or sensor.latency}  # else filtered
     for run in recording.scored:
         for mode, options in modes.items():
-            estimates = {ours: pf.fuse(run, config, **options) for ours, config in tuned.items()}
+            est = pf.fuse(run, tuned, **options)
             for axis, found in fitted.items():
-                yield row(recording, run, axis, mode, estimates, found)
+                yield row(recording, run, axis, mode, est, found)
 
 
 def row(
@@ -161,11 +157,11 @@ def row(
     run: pf.Run,
     axis: str,
     mode: str,
-    estimates: Mapping[str, pf.Estimates],
+    est: pf.Estimates,
     found: Mapping[str, Callable[..., list[Array]]],
 ) -> Row:
     """All methods at the instants of the reference at which there is a command, and so an estimate of pumafuse."""
-    est, seen = estimates["pumafuse"], log(run, recording.config, axis)
+    seen = log(run, recording.config, axis)
     assert est.reference is not None
     true, at = 1e3 * est.reference.position[axis], est.reference.time
     scored = (at > recording.skip) & (at < seen.valid[-1]) & np.isin(at, est.time) & np.isfinite(true)
@@ -178,8 +174,7 @@ def row(
         made.errors["held"] = score(*held(seen, at, late), true)
     for name, method in found.items():
         made.errors[name] = score(*method(seen, at, late, mode == "smoothed"), true)
-    for name, ours in estimates.items():
-        made.errors[name] = score(1e3 * ours[axis].position[here], 1e3 * ours[axis].position_sd[here], true)
+    made.errors["pumafuse"] = score(1e3 * est[axis].position[here], 1e3 * est[axis].position_sd[here], true)
     return made
 
 
@@ -191,29 +186,29 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], words: int) -> str
 
 def verdicts(rows: Sequence[Row]) -> Iterator[str]:
     """Geometric means of pumafuse's error over that of others, and where it loses."""
-    for name in OURS:
-        for mode in MODES:
-            mine = [row for row in rows if row.mode == mode]
-            ratios = {
-                other: math.exp(np.mean([math.log(row.errors[name][0] / row.errors[other][0]) for row in mine]))
-                for other in (*KINDS, "LSQ+OU")
-            }
-            yield f"{name}, {mode}: " + ", ".join(f"{ratio:.2f} of {other}" for other, ratio in ratios.items())
-        lost = [
-            f"{row.run}, {row.axis}, {row.mode} ({row.errors[name][0]:.3f}, {other} {row.errors[other][0]:.3f})"
-            for row in rows
-            for other in (*KINDS, "LSQ+OU")
-            if row.errors[other][0] < row.errors[name][0]
-        ]
-        yield f"{name} loses {len(lost)} times: {'; '.join(lost) or 'nowhere'}"
-        outside = [row for row in rows if not 0.90 <= row.errors[name][1] <= 0.98]
-        where = [f"{row.run}, {row.axis}, {row.mode} ({100.0 * row.errors[name][1]:.1f})" for row in outside]
-        yield f"{name}, coverage outside 90 to 98 %: {'; '.join(where) or 'nowhere'}"
+    name, others = METHODS[-1], METHODS[1:-1]
+    for mode in MODES:
+        mine = [row for row in rows if row.mode == mode]
+        ratios = {
+            other: math.exp(np.mean([math.log(row.errors[name][0] / row.errors[other][0]) for row in mine]))
+            for other in others
+        }
+        yield f"{name}, {mode}: " + ", ".join(f"{ratio:.2f} of {other}" for other, ratio in ratios.items())
+    lost = [
+        f"{row.run}, {row.axis}, {row.mode} ({row.errors[name][0]:.3f}, {other} {row.errors[other][0]:.3f})"
+        for row in rows
+        for other in others
+        if row.errors[other][0] < row.errors[name][0]
+    ]
+    yield f"it loses {len(lost)} of {len(rows) * len(others)} times: {'; '.join(lost) or 'nowhere'}"
+    for other in (*others, name):
+        holding = sum(0.90 <= row.errors[other][1] <= 0.98 for row in rows)
+        yield f"coverage of {other} within 90 to 98 %: {holding} of {len(rows)} rows"
 
 
 def readme(rows: Sequence[Row]) -> str:
     """The README's table: trunk-servo in few columns."""
-    trunk = {(row.axis, row.mode): row.errors for row in rows if row.run.startswith("trunk")}
+    trunk = {(row.axis, row.mode): row.errors for row in rows if row.run == "trunk, 100 g"}
     lines = [
         [axis, *(cell(*trunk[axis, mode][name]) for name, mode in SHOWN.values())]
         for axis in dict.fromkeys(axis for axis, _ in trunk)

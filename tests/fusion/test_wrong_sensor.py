@@ -24,7 +24,10 @@ SLIP = 0.05  # m
 PROCESS = pf.Process(input_noise=0.03e-3, drift=0.4e-3)
 AXIS = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04))
 ARM = pf.ArmModel(name="an arm", update_period=0.028, delay=0.06, axes={"radial": AXIS})
-SENSORS = {"tracker": pf.Sensor(sd=0.05e-3, latency=0.008), "camera": pf.Sensor(sd=0.5e-3, latency=0.04)}
+SENSORS = {
+    "tracker": pf.Sensor(sd=0.05e-3, latency=0.008, gate=5.0),
+    "camera": pf.Sensor(sd=0.5e-3, latency=0.04, gate=5.0),  # 3 mm are beyond it
+}
 ORDERS = [("tracker", "camera"), ("camera", "tracker")]
 COMMANDS = 28 * MS * np.arange(SECONDS * 1000 // 28)
 U = 0.5 + 0.05 * np.sin(COMMANDS / 1e9)

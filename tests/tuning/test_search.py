@@ -100,7 +100,7 @@ def test_nothing_higher_is_found_by_differential_evolution(seed: int, generation
     config = with_sensors(spoiled(sim.config), gate=3.5, gate_rows=gate_rows)
     found = fit_stage(sim.run, config)
     assert (np.concatenate(found.best.outcomes) == pf.Outcome.REJECTED).sum() >= 4
-    assert len(found.free) == 10
+    assert len(found.free) >= 10
     assert found.best.log_posterior > best_of_all(found.likelihood, config, found.free, seed, generations) - 0.1
 
 

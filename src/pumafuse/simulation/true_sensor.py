@@ -25,6 +25,9 @@ class Bursts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     length: Positive = msgspec.field(name="length_s")
 
 
+_GATE = 5.0  # of a sensor that has outliers
+
+
 class Outliers(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Measurements with a large error.
 
@@ -87,6 +90,7 @@ class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         """The sensor's keys of ``fusion.toml``, in SI: exactly what it does, the unknown biases as ``bias_sd_mm``."""
         sds = self.sd if isinstance(self.sd, dict) else dict.fromkeys(self.axes or [""], self.sd)  # "": of any axis
         sds = {axis: math.hypot(sd, self.quantisation / math.sqrt(12.0)) for axis, sd in sds.items()}
+        gate = {} if self.outliers is None else {"gate": _GATE}
         biases = self.bias.values() if isinstance(self.bias, dict) else [self.bias]
         return {
             "sd_mm": sds.get("", sds),
@@ -96,4 +100,5 @@ class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             "bias_sd_mm": math.hypot(self.bias_sd, *biases),
             "bias_drift_sd_mm": self.bias_drift_sd,
             "bias_time_s": self.bias_time,
+            **gate,
         }

@@ -25,6 +25,7 @@ _WORSE = 1.02  # RMSE after over before that is worse where it is beyond chance
 _FAR_WORSE = 1.2  # likewise, whatever chance would make of it
 _COVERAGE = 0.90  # of errors within 95 % error bars, below which these do not hold
 _NIS = (0.71, 1.42)  # likewise: normal errors of which 98 and 90 % lie within
+_FARTHEST = 5.0  # sd that a component counts as at most
 _BATCHES = 20
 
 
@@ -195,7 +196,13 @@ def _gains(before: Estimates, after: Estimates, axis: str) -> FloatArray:
     old, new = _of_axis(before, axis), _of_axis(after, axis)
     keys = [np.rint(one.stamp * 1e6).astype(np.int64) * len(one.sensors) + one.sensor for one in (old, new)]
     _, there, here = np.intersect1d(keys[0], keys[1], return_indices=True)
-    return densities_of(new, after.config.sensors)[here] - densities_of(old, before.config.sensors)[there]
+    return _bounded(new)[here] - _bounded(old)[there]
+
+
+def _bounded(components: Measurements) -> FloatArray:
+    """Log of each component's predicted density, none farther off than 5 sd: else a few outliers would decide, (m,)."""
+    square = np.minimum(components.nis, _FARTHEST**2)
+    return -0.5 * (np.log(2.0 * np.pi * (components.innovation_sd * MM) ** 2) + square)
 
 
 def _state(est: Estimates, axis: str) -> State:
