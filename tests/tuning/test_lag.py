@@ -15,7 +15,10 @@ from tuning_runs import fit_stage, free_of, outage, replaced, spoiled_arm
 
 
 def test_it_is_the_covariance_of_delay_and_plant() -> None:
-    """By hand: a first-order axis is Td + τ late, and d τ = τ d log τ; the information inverted as it is."""
+    """By hand: a first-order axis is Td + τ late, and d τ = τ d log τ; the information inverted as it is.
+
+    Or, where that is more, the scatter of the score over 20 pieces of the run between two of its inverses.
+    """
     sim = outage(2)
     config = with_own_delays(sim.config, ["vertical"])
     likelihood = Likelihood([sim.run], config)
@@ -23,10 +26,30 @@ def test_it_is_the_covariance_of_delay_and_plant() -> None:
     best = point(likelihood, config, free)
     tau = sim.config.arm.axes["vertical"].plant.lag
     slope = np.array([1.0 if one.fit == "delay" else tau for one in free])
-    wanted = 1.96 * np.sqrt(slope @ np.linalg.inv(derivatives(likelihood, best, free).information) @ slope)
+    _, information, scatter = derivatives(likelihood, best, free)
+    part = slope @ np.linalg.inv(information)
+    wanted = 1.96 * np.sqrt(max(part @ slope, part @ scatter @ part))
     found = lag_intervals(likelihood, best, free)
     assert set(found) == {"vertical"}
     assert found["vertical"] == pytest.approx((wanted, wanted), rel=1e-3)
+
+
+def test_the_scatter_is_the_information_where_the_model_is_right() -> None:
+    """The median of twelve drawn runs, within a third; three times that where a camera's clock wanders by 20 ms."""
+    ratios: dict[bool, list[float]] = {False: [], True: []}
+    for seed in range(12):
+        sim = outage(seed)
+        for wanders, found in ratios.items():
+            camera = sim.run.sensors["vision"]
+            time = (camera.stamp - camera.stamp[0]) / 1e9
+            off = np.rint(2e7 * wanders * np.sin(2.0 * np.pi * time / 1.3)).astype(np.int64)
+            run = replace(sim.run, sensors={"vision": replace(camera, stamp=camera.stamp + off)})
+            likelihood = Likelihood([run], sim.config)
+            free = [one for one in free_of(likelihood, sim.config, ("latency",)) if one.sensor == "vision"]
+            _, information, scatter = derivatives(likelihood, point(likelihood, sim.config, free), free)
+            found.append(float(scatter[0, 0] / information[0, 0]))
+    assert 0.67 < np.median(ratios[False]) < 1.5
+    assert np.median(ratios[True]) > 3.0 * np.median(ratios[False])
 
 
 def test_a_gain_that_recovers_is_part_of_it() -> None:
@@ -56,7 +79,7 @@ def test_an_end_is_open_only_where_nothing_can_go_there() -> None:
     (delay,) = (one for one in free if one.fit == "delay")
     none = point(likelihood, delay.put(config, 0.0), free)
     below, above = lag_intervals(likelihood, none, [delay])["vertical"]
-    assert np.isinf(below) and 0.0 < above < 0.01
+    assert np.isinf(below) and 0.0 < above < 0.03
     both = lag_intervals(likelihood, none, free)["vertical"]
     assert both[0] == both[1] and 0.0 < both[0] < 0.05
 

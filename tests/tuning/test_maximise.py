@@ -81,7 +81,7 @@ def problems(draw: st.DrawFn) -> tuple[Derivatives, np.ndarray, np.ndarray, np.n
     edge = rng.random(count)  # a number at a bound can move but one way
     low, high = np.where(edge < 0.2, 0.0, low), np.where(edge > 0.8, 0.0, -high)
     damping = np.full(count, draw(st.sampled_from([1e-4, 1e-2, 1.0])))
-    return Derivatives(rng.standard_normal(count) * scale, information), low, high, damping
+    return Derivatives(rng.standard_normal(count) * scale, information, information), low, high, damping
 
 
 @settings(derandomize=True, deadline=None, max_examples=200)

@@ -45,6 +45,9 @@ def fitted_lags(
 def lag_intervals(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> dict[str, Distances]:
     """How far the 95 % interval of each axis's lag reaches down and up, by its gradient and the information.
 
+    Where the score scatters more over pieces of the runs than the information says, the interval is as much wider
+    (White, Econometrica 50, 1982): a real arm's lag wanders a little, and the next recording has another one.
+
     A delay at its bound of 0 counts as if it were inside: plant and delay make up for each other there, too, and
     without it the lag would seem to be known as well as the plant alone. Other parameters at a bound stay there. Where
     all that would move the lag one way are at their bounds, it is open that way.
@@ -55,10 +58,13 @@ def lag_intervals(likelihood: Likelihood, best: Point, free: Sequence[Parameter]
     bounds = [one.at_bound(best.config) for one in free]
     inside = [n for n, (one, bound) in enumerate(zip(free, bounds, strict=True)) if bound is None or one.fit == "delay"]
     some = [free[n] for n in inside]
-    cov = covariance(derivatives(likelihood, best, some).information, some)
+    _, information, scatter = derivatives(likelihood, best, some)
+    cov = covariance(information, some)
+    real = cov @ scatter @ cov
     found: dict[str, Distances] = {}
     for axis, slope in slopes.items():
-        half = Z95 * float(np.sqrt(slope[inside] @ cov @ slope[inside]))
+        inner = slope[inside]
+        half = Z95 * float(np.sqrt(max(inner @ cov @ inner, inner @ real @ inner)))
         half = half if 0.0 < half < _UNLIMITED else np.inf
         moving = [(bounds[n], slope[n] > 0.0) for n in np.flatnonzero(slope)]
         down, up = (

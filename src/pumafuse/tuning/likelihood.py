@@ -37,6 +37,7 @@ from .parameters import Parameter
 
 _LOG_STEP = 1e-4  # of a logarithm, one-sided: the truncation error is half of it, the rounding error 1e-11
 _STEP = 2e-5  # s, or of a gain; central, because the likelihood bends where a measurement passes a command
+_PIECES = 20  # of a run, that a model which is right has independent scores in
 _SMALLEST = 1e-6  # m; misfit of a simulated arm without any noise
 
 T = TypeVar("T")
@@ -76,10 +77,13 @@ class Derivatives(NamedTuple):
     Attributes:
         score: ∂L/∂a, (k,).
         information: The expected −∂²L/∂a², (k, k).
+        scatter: What it is by the scatter of the score over pieces of the runs; the same where the model is right,
+            (k, k).
     """
 
     score: FloatArray
     information: FloatArray
+    scatter: FloatArray
 
 
 @dataclass(frozen=True)
@@ -277,15 +281,19 @@ class Likelihood:
         self, config: FusionConfig, parameters: Sequence[Parameter], outcomes: Sequence[CodeArray]
     ) -> Derivatives:
         """Score and information of parameters while each component's outcome stays as it is."""
-        score, information = np.zeros(len(parameters)), np.zeros((len(parameters), len(parameters)))
+        size = len(parameters)
+        information, scores = (
+            np.zeros((size, size)),
+            np.zeros((1 + max(part.whole for part in self._parts), size, _PIECES)),
+        )
 
         def of(part: _Part) -> tuple[list[int], FloatArray, FloatArray]:
             return self._part_derivatives(part, outcomes[part.whole][part.rows, part.column], config, parameters)
 
-        for mine, gradient, square in in_threads(of, self._parts):
-            score[mine] += gradient
+        for part, (mine, pieces, square) in zip(self._parts, in_threads(of, self._parts), strict=True):
+            scores[part.whole, mine] += pieces
             information[np.ix_(mine, mine)] += square
-        return Derivatives(score, information)
+        return Derivatives(scores.sum(axis=(0, 2)), information, np.einsum("nip,njp->ij", scores, scores))
 
     def _part_derivatives(
         self, part: _Part, outcome: CodeArray, config: FusionConfig, parameters: Sequence[Parameter]
@@ -310,8 +318,9 @@ class Likelihood:
         d_S /= S
         r = nu / np.sqrt(S)
         excess = np.where(fused, r * r - 1.0, -1.0)
-        score = -d_nu @ r + 0.5 * d_S @ excess
-        return mine, score, d_nu @ d_nu.T + 0.5 * d_S @ d_S.T
+        pieces = [slice(n * len(r) // _PIECES, (n + 1) * len(r) // _PIECES) for n in range(_PIECES)]
+        score = [-d_nu[:, piece] @ r[piece] + 0.5 * d_S[:, piece] @ excess[piece] for piece in pieces]
+        return mine, np.array(score).T, d_nu @ d_nu.T + 0.5 * d_S @ d_S.T
 
 
 def _decided(segment: Segment, until: float | None, latest: float | None) -> Segment:

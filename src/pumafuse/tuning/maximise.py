@@ -81,7 +81,7 @@ def derivatives(likelihood: Likelihood, at: Point, free: Sequence[Parameter]) ->
             mean, sd = one.prior
             score[number] -= (one.at(at.config) - mean) / sd**2
             information[number, number] += 1.0 / sd**2
-    return Derivatives(score, information)
+    return Derivatives(score, information, found.scatter)
 
 
 def maximise(
