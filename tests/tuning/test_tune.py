@@ -326,7 +326,6 @@ def test_the_shipped_scan_is_tuned_as_well_as_it_was_by_hand() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.xfail(reason="0.1611 mm: the fitted gain is at its bound, the model does not fit this axis")
 def test_the_camera_alone_follows_the_vertical_axis_of_the_scan() -> None:
     """At most 0.160 mm, tuned by the tracker."""
     assert scan_errors("vision")["vertical"] <= 0.160

@@ -73,7 +73,7 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     bias_sd: NotNegative = msgspec.field(name="bias_sd_mm", default=0.0)
     bias_drift_sd: NotNegative = msgspec.field(name="bias_drift_sd_mm", default=0.0)
     bias_time: Positive = msgspec.field(name="bias_time_s", default=10.0)
-    gate: NotNegative = 20.0
+    gate: NotNegative = 50.0
     gate_rows: bool = True
 
     @property

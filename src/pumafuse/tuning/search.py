@@ -45,7 +45,9 @@ _PROCESSES = tuple(  # starts, in units of the distance between the noiseless ar
     for noise, drift in ((0.1, 1.0), (0.01, 0.1), (1.0, 10.0), (0.01, 1.0), (1.0, 0.1))
 )
 
+_WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
 _SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
+_PROHIBITIVE = 1e6  # penalties
 _QUICKEST = 2.0  # update periods, of a disturbance
 _TIME = 0.3  # s, of a disturbance: start
 _QUIET = 0.1  # share of noise that is left beside a disturbance: start
@@ -130,9 +132,9 @@ def _most_likely_models(
     for number, axis in enumerate(likelihood.axes):
         for peak, score in zip(peaks, scores, strict=True):
             process = peak.config.process[axis]
-            if process.disturbance_sd > 0.0 and process.disturbance_time < _QUICKEST * peak.config.arm.update_period:
-                score[number] = -np.inf  # no motion of an arm, but noise of its sensors
-            elif process.disturbance_sd > 0.0 and process.disturbance_kind == "matern":
+            if process.disturbance_sd == 0.0:
+                score[number] -= _WANDERS
+            elif process.disturbance_kind == "matern":
                 score[number] -= _SMOOTHER
         mine = [float(score[number]) for score in scores]
         chosen = int(np.argmax(mine))
@@ -146,7 +148,11 @@ def _most_likely_models(
 
 
 def _without_needless(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> FusionConfig:
-    """The configuration without the noises that are not worth their penalty, one kind after the other."""
+    """The configuration without the noises that are not worth their penalty, one kind after the other.
+
+    Beside a disturbance it is twice as high: real arms jerk, and any noise that is large at that moment gains
+    likelihood without being true elsewhere.
+    """
     for field in _PROCESSES[0]:
         without = config
         for one in free(config):
@@ -154,20 +160,26 @@ def _without_needless(likelihood: Likelihood, config: FusionConfig, free: FreeOf
                 without = one.put(without, one.bounds[0])
         peaks = [point(likelihood, config, free(config))]
         peaks.append(maximise_by_axis(likelihood, without, free(without), notify, _ROUGHLY))
-        scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
+        scores = [_penalised(likelihood, peak, free(peak.config), of_noise=2.0) for peak in peaks]
         config = _best_by_axis(likelihood, peaks, scores)
     return config
 
 
-def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter]) -> FloatArray:
+def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter], of_noise: float = 1.0) -> FloatArray:
     """The log-posterior of each axis less the Bayesian information criterion's penalty for its parameters, (A,).
 
-    A noise at its lower bound is none, and costs nothing. Others of the random walk cost twice as much as BIC says:
-    real arms jerk, and any noise that is large at that moment gains likelihood without being true elsewhere.
+    A noise at its lower bound is none, and costs nothing. ``of_noise``: how many times its penalty another one of the
+    random walk costs beside a disturbance. A disturbance that is forgotten within two update periods is never worth it:
+    it is no motion of an arm, but noise of its sensors.
     """
     used = [one for one in free if not (one.vanishes and one.at_bound(peak.config) == "lower")]
-    prices = [(one.axis, 2.0 if one.path[-1] in _PROCESSES[0] else 1.0) for one in used]
-    price = np.array([sum(price for owner, price in prices if owner == axis) for axis in likelihood.axes])
+    price = np.zeros(len(likelihood.axes))
+    for one in used:
+        if one.axis is not None:
+            beside = one.path[-1] in _PROCESSES[0] and peak.config.process[one.axis].disturbance_sd > 0.0
+            price[likelihood.axes.index(one.axis)] += of_noise if beside else 1.0
+            if one.path[-1] == "disturbance_time" and one.get(peak.config) < _QUICKEST * peak.config.arm.update_period:
+                price[likelihood.axes.index(one.axis)] += _PROHIBITIVE
     return peak.axes - 0.5 * price * np.log(np.maximum(likelihood.count, 2))
 
 
