@@ -216,17 +216,22 @@ def test_an_interval_contains_the_result() -> None:
 def shares(
     name: str, seeds: Sequence[int], fit: Sequence[Fit], wrong: Callable[[pf.FusionConfig], pf.FusionConfig]
 ) -> tuple[dict[str, float], float]:
-    """For each parameter the share of runs in which its interval contains the truth, and the share over all."""
+    """For each parameter the share of runs in which its interval contains the truth, and the share over all.
+
+    Without disturbances, as is true: an interval is one of the model that was chosen. A parameter that less than half
+    of the runs have, as a delay of an axis's own, gets no share.
+    """
     inside = defaultdict[str, list[bool]](list)
     for seed in seeds:
         sim = pf.simulate(scenario(name), seed)
-        found = fit_stage(sim.run, wrong(sim.config), fit)
+        found = fit_stage(sim.run, wrong(sim.config), fit, "disturbance_sd_mm")
         ends = intervals_of(found)
         for one in found.free:
             known = one.given(sim.config) is not None  # else the plant is of another order
             inside[one.key].append(known and contains(ends[one.key], one, sim.config))
     every = [hit for hits in inside.values() for hit in hits]
-    return {key: float(np.mean(hits)) for key, hits in inside.items()}, float(np.mean(every))
+    often = {key: float(np.mean(hits)) for key, hits in inside.items() if len(hits) >= len(seeds) / 2}
+    return often, float(np.mean(every))
 
 
 @pytest.mark.long
