@@ -27,6 +27,7 @@ DELAYS = (-0.1, 0.2)  # s; likewise of a delay, which is never below 0
 _RECOVERY = (0.020, 0.500)  # s; 95 % of the prior lie within
 _RECOVERY_PRIOR = (0.5 * math.log(_RECOVERY[0] * _RECOVERY[1]), math.log(_RECOVERY[1] / _RECOVERY[0]) / (2.0 * 1.96))
 _SD_PRIOR = (0.0, math.log(1.5))  # about the configured number
+_QUICKEST = 2.0  # update periods, of a disturbance
 _INTERCEPT = {"log": False, "scale": 0.1, "prior": (0.0, 0.1)}
 _TICK = 0.028  # s; a large change of a time, on any arm
 _DIGITS = 6  # of a number that is written
@@ -149,6 +150,8 @@ class Parameter:
         key = self.key.format(axis=axis, sensor=sensor)
         path = tuple(part.format(axis=axis, sensor=sensor) for part in self.path)
         one = replace(self, key=key, path=path, axis=axis, sensor=sensor)
+        if one.path[-1] == "disturbance_time":  # what is faster is no motion of an arm but noise of its sensors
+            return replace(one, bounds=(quickest(known), one.bounds[1]))
         if self.log:
             around = self.prior and one.fit == "noise"
             return replace(one, prior=(one.at(known), self.prior[1])) if around and self.prior else one
@@ -266,6 +269,11 @@ def is_fixed(key: str, fixed: Iterable[str]) -> bool:
         if all(part in parts for part in name.split(".")):
             return True
     return False
+
+
+def quickest(config: FusionConfig) -> float:
+    """The shortest time of a disturbance [s] that is believed."""
+    return _QUICKEST * config.arm.update_period
 
 
 def smallest_sd(config: FusionConfig, name: str) -> float:

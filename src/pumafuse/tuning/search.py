@@ -8,6 +8,7 @@ component is rejected for itself, whole rows are rejected only at the end.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -23,6 +24,7 @@ from .parameters import (
     LATENCIES,
     Parameter,
     changed,
+    quickest,
     with_axis_of,
     with_disturbance,
     with_gates,
@@ -48,7 +50,7 @@ _PROCESSES = tuple(  # starts, in units of the distance between the noiseless ar
 _WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
 _SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
 _PROHIBITIVE = 1e6  # penalties
-_QUICKEST = 2.0  # update periods, of a disturbance
+_TIMES = (1e-3, 1e3)  # s, of a disturbance: bounds far from the best
 _TIME = 0.3  # s, of a disturbance: start
 _QUIET = 0.1  # share of noise that is left beside a disturbance: start
 _DISTURBANCES = ("none", "smooth (Matérn)", "rough (Ornstein-Uhlenbeck)")
@@ -76,20 +78,24 @@ def search(
     def own(at: FusionConfig) -> list[Parameter]:
         return [one for one in free(at) if one.axis is not None]
 
+    def rough(at: FusionConfig) -> list[Parameter]:
+        """Without the bound of a disturbance's time, at which a search from afar would stick."""
+        return [replace(one, bounds=_TIMES) if one.path[-1] == "disturbance_time" else one for one in own(at)]
+
     start = _times(likelihood, with_gates(config, config, _WIDER), free(config))
     found: list[tuple[Point, dict[str, str]]] = []
-    for model in _models(likelihood, start, own):
+    for model in _models(likelihood, start, rough):
         if found:  # the arm of the first model is near that of the others
             model = _with_arm_of(model, found[0][0].config, free)
-        best = _noise(likelihood, with_gates(model, config, 1.0), own(model), notify)
+        best = _noise(likelihood, with_gates(model, config, 1.0), rough(model), notify)
         shared = [one for one in free(best) if one.axis is None]
         if shared:
             best = maximise(likelihood, best, shared, notify, tolerance=_ROUGHLY).config
         orders: dict[str, str] = {}
         if any(one.fit != "noise" for one in own(best)):
-            best, orders = _arm(likelihood, best, own, notify, again=bool(found))
-        found.append((maximise_by_axis(likelihood, best, own(best), notify, _ROUGHLY), orders))
-    best, reasons = _most_likely_models(likelihood, found, own)
+            best, orders = _arm(likelihood, best, rough, notify, again=bool(found))
+        found.append((maximise_by_axis(likelihood, best, rough(best), notify, _ROUGHLY), orders))
+    best, reasons = _most_likely_models(likelihood, found, rough)
     best = _without_needless(likelihood, best, own, notify)
     if len(found) > 1:
         best = _past_ticks(likelihood, best, own, notify)
@@ -178,7 +184,7 @@ def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter], o
         if one.axis is not None:
             beside = one.path[-1] in _PROCESSES[0] and peak.config.process[one.axis].disturbance_sd > 0.0
             price[likelihood.axes.index(one.axis)] += of_noise if beside else 1.0
-            if one.path[-1] == "disturbance_time" and one.get(peak.config) < _QUICKEST * peak.config.arm.update_period:
+            if one.path[-1] == "disturbance_time" and one.get(peak.config) < quickest(peak.config):
                 price[likelihood.axes.index(one.axis)] += _PROHIBITIVE
     return peak.axes - 0.5 * price * np.log(np.maximum(likelihood.count, 2))
 
