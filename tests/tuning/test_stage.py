@@ -141,9 +141,8 @@ def test_a_gain_is_found_where_it_shows() -> None:
 def test_the_order_of_a_plant_is_its_own(seed: int, begin: tuple[int, int]) -> None:
     """By BIC: second for ω = 53.9 rad/s, ζ = 0.864, first for τ = 35.6 ms, whichever it was configured to be.
 
-    Where chance makes the latter one of second order, too, that is by less than 5. The penalty of each number more,
-    noises that are not 0 among them, is half the logarithm of the number of measurements. Numbers are within 20 % of
-    the truth.
+    Where chance makes the latter one of second order, too, that is by less than 5. The penalty of each number of the
+    arm more is half the logarithm of the number of measurements. Numbers are within 20 % of the truth.
     """
     sim = outage(seed)
     config = spoiled_arm(sim.config)

@@ -277,7 +277,9 @@ def _arm(
         return [maximise_by_axis(likelihood, start, free(start), notify, _ROUGHLY) for start in starts]
 
     def penalised(peaks: Sequence[Point]) -> list[FloatArray]:
-        return [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
+        """By the numbers of the arm alone: a noise that is next to none is not yet at its bound."""
+        numbers = [[one for one in free(peak.config) if one.fit != "noise"] for peak in peaks]
+        return [_penalised(likelihood, peak, some) for peak, some in zip(peaks, numbers, strict=True)]
 
     whole = [axis for axis in likelihood.axes if _plant_is_free(free(config), axis)]
     second = _with_orders(config, whole, 2)
