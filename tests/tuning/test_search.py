@@ -98,9 +98,9 @@ def test_nothing_higher_is_found_by_differential_evolution(seed: int, generation
     """Noise of two axes with 6 % of outliers, from a poor start: within 0.1 of a global search's best."""
     sim = with_outliers(seed, 0.06)
     config = with_sensors(spoiled(sim.config), gate=3.5, gate_rows=gate_rows)
-    found = fit_stage(sim.run, config)
+    found = fit_stage(sim.run, config, ("noise",), "disturbance_sd_mm")
     assert (np.concatenate(found.best.outcomes) == pf.Outcome.REJECTED).sum() >= 4
-    assert len(found.free) >= 10
+    assert len(found.free) == 10
     assert found.best.log_posterior > best_of_all(found.likelihood, config, found.free, seed, generations) - 0.1
 
 

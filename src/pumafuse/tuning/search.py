@@ -49,13 +49,13 @@ _PROCESSES = tuple(  # starts, in units of the distance between the noiseless ar
 
 _WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
 _SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
-_PROHIBITIVE = 1e6  # penalties
 _TIMES = (1e-3, 1e3)  # s, of a disturbance: bounds far from the best
 _TIME = 0.3  # s, of a disturbance: start
 _QUIET = 0.1  # share of noise that is left beside a disturbance: start
 _DISTURBANCES = ("none", "smooth (Matérn)", "rough (Ornstein-Uhlenbeck)")
 
 FreeOf: TypeAlias = Callable[[FusionConfig], list[Parameter]]
+Reasons: TypeAlias = dict[str, dict[str, str]]  # by axis, then by what was chosen
 
 
 def search(
@@ -83,7 +83,7 @@ def search(
         return [replace(one, bounds=_TIMES) if one.path[-1] == "disturbance_time" else one for one in own(at)]
 
     start = _times(likelihood, with_gates(config, config, _WIDER), free(config))
-    found: list[tuple[Point, dict[str, str]]] = []
+    found: list[tuple[Point, Reasons]] = []
     for model in _models(likelihood, start, rough):
         if found:  # the arm of the first model is near that of the others
             model = _with_arm_of(model, found[0][0].config, free)
@@ -91,18 +91,23 @@ def search(
         shared = [one for one in free(best) if one.axis is None]
         if shared:
             best = maximise(likelihood, best, shared, notify, tolerance=_ROUGHLY).config
-        orders: dict[str, str] = {}
+        arm: Reasons = {}
         if any(one.fit != "noise" for one in own(best)):
-            best, orders = _arm(likelihood, best, rough, notify, again=bool(found))
-        found.append((maximise_by_axis(likelihood, best, rough(best), notify, _ROUGHLY), orders))
+            best, arm = _arm(likelihood, best, rough, notify, again=bool(found))
+        found.append((maximise_by_axis(likelihood, best, rough(best), notify, _ROUGHLY), arm))
     best, reasons = _most_likely_models(likelihood, found, rough)
     best = _without_needless(likelihood, best, own, notify)
     if len(found) > 1:
         best = _past_ticks(likelihood, best, own, notify)
-    best, shares = _with_one_delay(likelihood, best, free, one_delay)
-    for axis, why in shares.items():
-        reasons[axis] = "; ".join(filter(None, (reasons.get(axis), why)))
-    return maximise_with_gates(likelihood, with_gates(best, config), free(best), notify), reasons
+    best, delays = _with_one_delay(likelihood, best, free, one_delay)
+    orders: Reasons = {}
+    if any(one.axis is None and one.fit == "delay" for one in free(best)):
+        best, orders = _orders(likelihood, best, own, notify)  # an own delay can look like a second order
+    for more in (delays, orders):
+        for axis, why in more.items():
+            reasons.setdefault(axis, {}).update(why)
+    best = maximise_with_gates(likelihood, with_gates(best, config), free(best), notify)
+    return best, {axis: "; ".join(why.values()) for axis, why in reasons.items() if why}
 
 
 def _models(likelihood: Likelihood, config: FusionConfig, free: FreeOf) -> list[FusionConfig]:
@@ -129,12 +134,12 @@ def _models(likelihood: Likelihood, config: FusionConfig, free: FreeOf) -> list[
 
 
 def _most_likely_models(
-    likelihood: Likelihood, found: Sequence[tuple[Point, dict[str, str]]], free: FreeOf
-) -> tuple[FusionConfig, dict[str, str]]:
+    likelihood: Likelihood, found: Sequence[tuple[Point, Reasons]], free: FreeOf
+) -> tuple[FusionConfig, Reasons]:
     """The model that is best for each axis after the penalty for its numbers, and why."""
     peaks = [peak for peak, _ in found]
     scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
-    reasons: dict[str, str] = {}
+    reasons: Reasons = {}
     for number, axis in enumerate(likelihood.axes):
         for peak, score in zip(peaks, scores, strict=True):
             process = peak.config.process[axis]
@@ -144,12 +149,15 @@ def _most_likely_models(
                 score[number] -= _SMOOTHER
         mine = [float(score[number]) for score in scores]
         chosen = int(np.argmax(mine))
-        parts = [found[chosen][1].get(axis)]
+        reasons[axis] = dict(found[chosen][1].get(axis, {}))
         if len(found) > 1 and axis in likelihood.sensors:
             gain = max(mine[1:]) - mine[0]
-            parts.append(f"disturbance: {_DISTURBANCES[chosen]}; one gains {gain:+.1f} after the penalty (BIC)")
-        if any(parts):
-            reasons[axis] = "; ".join(filter(None, parts))
+            why = f"one gains {gain:+.1f} after the penalty (BIC)"
+            if np.isinf(gain):
+                why = (
+                    f"one would be forgotten within {1e3 * quickest(peaks[chosen].config):.0f} ms, too soon for an arm"
+                )
+            reasons[axis]["disturbance"] = f"disturbance: {_DISTURBANCES[chosen]}; {why}"
     return _best_by_axis(likelihood, peaks, scores), reasons
 
 
@@ -171,6 +179,12 @@ def _without_needless(likelihood: Likelihood, config: FusionConfig, free: FreeOf
     return config
 
 
+def _penalised_arms(likelihood: Likelihood, peaks: Sequence[Point], free: FreeOf) -> list[FloatArray]:
+    """By the numbers of the arm alone: a noise that is next to none is not yet at its bound."""
+    numbers = [[one for one in free(peak.config) if one.fit != "noise"] for peak in peaks]
+    return [_penalised(likelihood, peak, some) for peak, some in zip(peaks, numbers, strict=True)]
+
+
 def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter], of_noise: float = 1.0) -> FloatArray:
     """The log-posterior of each axis less the Bayesian information criterion's penalty for its parameters, (A,).
 
@@ -185,7 +199,7 @@ def _penalised(likelihood: Likelihood, peak: Point, free: Sequence[Parameter], o
             beside = one.path[-1] in _PROCESSES[0] and peak.config.process[one.axis].disturbance_sd > 0.0
             price[likelihood.axes.index(one.axis)] += of_noise if beside else 1.0
             if one.path[-1] == "disturbance_time" and one.get(peak.config) < quickest(peak.config):
-                price[likelihood.axes.index(one.axis)] += _PROHIBITIVE
+                price[likelihood.axes.index(one.axis)] = np.inf
     return peak.axes - 0.5 * price * np.log(np.maximum(likelihood.count, 2))
 
 
@@ -267,7 +281,7 @@ def _with_noise(
 
 def _arm(
     likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify, again: bool
-) -> tuple[FusionConfig, dict[str, str]]:
+) -> tuple[FusionConfig, Reasons]:
     """The best arm and noise from several lags and recoveries, with both orders where the whole plant is free.
 
     Both kinds of gain are tried where a gain is free. ``again``: the configuration's arm is near the best.
@@ -275,11 +289,6 @@ def _arm(
 
     def maxima(starts: Sequence[FusionConfig]) -> list[Point]:
         return [maximise_by_axis(likelihood, start, free(start), notify, _ROUGHLY) for start in starts]
-
-    def penalised(peaks: Sequence[Point]) -> list[FloatArray]:
-        """By the numbers of the arm alone: a noise that is next to none is not yet at its bound."""
-        numbers = [[one for one in free(peak.config) if one.fit != "noise"] for peak in peaks]
-        return [_penalised(likelihood, peak, some) for peak, some in zip(peaks, numbers, strict=True)]
 
     whole = [axis for axis in likelihood.axes if _plant_is_free(free(config), axis)]
     second = _with_orders(config, whole, 2)
@@ -294,14 +303,26 @@ def _arm(
     if static != second:
         starts += [_lagging(static, whole, free(static), times=times) for times in lags]
     peaks = maxima(starts)
-    reasons = _kinds_of_gain(likelihood, peaks, penalised(peaks))
-    best = _best_by_axis(likelihood, peaks, penalised(peaks))
-    if not whole:
-        return best, reasons
-    if not again:
+    scores = _penalised_arms(likelihood, peaks, free)
+    kinds = _kinds_of_gain(likelihood, peaks, scores)
+    best = _best_by_axis(likelihood, peaks, scores)
+    if whole and not again:
         best = _past_ticks(likelihood, best, free, notify)
-    pair = maxima([best, _with_orders(best, whole, 1)])
-    gained, scores = pair[0].axes - pair[1].axes, penalised(pair)
+    best, reasons = _orders(likelihood, best, free, notify)
+    for axis, why in kinds.items():
+        reasons.setdefault(axis, {})["gain"] = why
+    return best, reasons
+
+
+def _orders(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify) -> tuple[FusionConfig, Reasons]:
+    """The better order of each plant that is wholly free, and why."""
+    whole = [axis for axis in likelihood.axes if _plant_is_free(free(config), axis)]
+    if not whole:
+        return config, {}
+    starts = [_with_orders(config, whole, order) for order in (2, 1)]
+    pair = [maximise_by_axis(likelihood, start, free(start), notify, _ROUGHLY) for start in starts]
+    gained, scores = pair[0].axes - pair[1].axes, _penalised_arms(likelihood, pair, free)
+    reasons: Reasons = {}
     for number, axis in enumerate(likelihood.axes):
         if axis in whole:
             ahead = float(scores[0][number] - scores[1][number])
@@ -309,7 +330,7 @@ def _arm(
                 f"{'second' if ahead >= 0.0 else 'first'} order: second gains {gained[number]:.1f} in log-likelihood,"
                 f" {ahead:+.1f} after the penalty for numbers (BIC)"
             )
-            reasons[axis] = "; ".join(filter(None, (order, reasons.get(axis))))
+            reasons[axis] = {"order": order}
     return _best_by_axis(likelihood, pair, scores), reasons
 
 
@@ -328,7 +349,7 @@ def _past_ticks(likelihood: Likelihood, config: FusionConfig, free: FreeOf, noti
 
 def _with_one_delay(
     likelihood: Likelihood, config: FusionConfig, free: FreeOf, whatever: bool
-) -> tuple[FusionConfig, dict[str, str]]:
+) -> tuple[FusionConfig, Reasons]:
     """One delay for the axes to which an own one is not worth its number, or for all; and for each axis the reason.
 
     Delay and lag of an axis are known much better together than each. So axes of which each has its own delay seem to
@@ -367,8 +388,10 @@ def _with_one_delay(
     else:
         shares, peak = [], point(likelihood, config, free(config))
     reasons = {
-        axis: f"delay: {'shared' if axis in shares else 'its own'}"
-        + ("" if whatever else f"; an own one gains {gain:+.1f} after the penalty")
+        axis: {
+            "delay": f"delay: {'shared' if axis in shares else 'its own'}"
+            + ("" if whatever else f"; an own one gains {gain:+.1f} after the penalty")
+        }
         for axis, gain in gains.items()
     }
     return peak.config, reasons
