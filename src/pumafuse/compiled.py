@@ -48,7 +48,7 @@ else:
     compiled_apart = numba.njit(no_cpython_wrapper=True, **_OPTIONS)
     kernel = numba.njit(**_OPTIONS)
     _HOW_OFTEN = (
-        "only this once (some 10 s)"
+        "once for each part of it (some 10 s)"
         if _KEPT
         else "at each start (some 10 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
     )

@@ -20,6 +20,7 @@ S = TypeVar("S", bound=msgspec.Struct)
 MOST = 1e9  # in SI, of any number: what is larger is no size of an arm, and would overflow
 Positive = Annotated[float, msgspec.Meta(gt=0, le=MOST)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, le=MOST)]
+Time = Annotated[float, msgspec.Meta(ge=1e-6, le=MOST)]  # s, after which something is forgotten
 Interval = tuple[float, float]  # lower and upper end
 
 

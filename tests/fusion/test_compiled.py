@@ -28,7 +28,9 @@ def test_the_first_use_says_once_that_it_compiles_and_the_next_loads(tmp_path: P
         subprocess.run(words, env=environment, capture_output=True, text=True, check=True, timeout=200)
         for _ in range(2)
     )
-    assert first.stderr.splitlines() == ["compiling the filter for this machine, only this once (some 10 s) ..."]
+    assert first.stderr.splitlines() == [
+        "compiling the filter for this machine, once for each part of it (some 10 s) ..."
+    ]
     assert second.stderr == ""
     assert first.stdout == second.stdout
 

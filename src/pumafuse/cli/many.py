@@ -83,7 +83,8 @@ def report_failures(failed: Mapping[str, str], count: int, where: Path) -> None:
     for name, problem in failed.items():
         typer.echo(f"pumafuse: {name}: {problem}", err=True)
     if failed:
-        raise PumafuseError(f"{len(failed)} of {count} runs failed (see above); the others are in {where}")
+        rest = "" if len(failed) == count else f"; the others are in {where}"
+        raise PumafuseError(f"{len(failed)} of {count} runs failed (see above){rest}")
 
 
 def _guarded(name: str, job: Callable[[], R]) -> tuple[str, R | None, str | None]:

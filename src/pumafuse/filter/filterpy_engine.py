@@ -25,6 +25,7 @@ from filterpy.kalman import KalmanFilter
 from ..arrays import FloatArray, TimeArray
 from ..model.arm import AxisModel
 from ..model.discrete import transition
+from ..model.plants import SecondOrder
 from .axis import (
     DECAY,
     DISTURBANCE,
@@ -115,14 +116,10 @@ class _Axis:
 
     @lru_cache(maxsize=10_000)  # noqa: B019 - lives as long as the axis
     def _smooth(self, ns: int) -> Matrices:
-        """F and Q of a smooth disturbance, from its differential equation d″ = −λ² d − 2 λ d′ + white noise."""
-        from scipy.linalg import expm
-
+        """F and Q of a smooth disturbance: d″ = −λ² d − 2 λ d′ + λ² w is a plant with white noise at its input."""
         rate, variance = self.reverts[0]
-        A, noise = np.array([[0.0, 1.0], [-rate * rate, -2.0 * rate]]), np.diag([0.0, 4.0 * rate**3 * variance])
-        van_loan = expm(np.block([[-A, noise], [np.zeros((2, 2)), A.T]]) * (ns / 1e9))
-        F = van_loan[2:, 2:].T
-        return F, F @ van_loan[:2, 2:]
+        found = transition(SecondOrder(natural_frequency=rate, damping=1.0), ns / 1e9)
+        return found.Phi, found.Q * (4.0 * variance / rate)  # 4 λ³ σ² is the density at d′
 
     def matrices(self, ns: int) -> Matrices:
         """F and Q over an interval of the state with the command that acts now."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,7 +15,7 @@ from ..errors import ConfigError, UnknownNameError
 from ..logs.frames import Frame
 from ..model.arm import ArmModel
 from ..model.presets import PRESETS
-from ..toml import NotNegative, Positive
+from ..toml import NotNegative, Positive, Time
 from ..units import refuse_unit
 
 SD_BOUNDS = (1e-7, 1.0)  # m; of a sensor's noise that is fitted
@@ -47,7 +47,7 @@ class Process(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     maneuver_noise: NotNegative = msgspec.field(name="maneuver_noise_mm_rtHz_per_m_s", default=0.0)
     maneuver_drift: NotNegative = msgspec.field(name="maneuver_drift_mm_rts_per_m_s", default=0.0)
     disturbance_sd: NotNegative = msgspec.field(name="disturbance_sd_mm", default=0.0)
-    disturbance_time: Positive = msgspec.field(name="disturbance_time_ms", default=0.3)
+    disturbance_time: Time = msgspec.field(name="disturbance_time_ms", default=0.3)
     disturbance_kind: Literal["matern", "ou"] = "matern"
 
 
@@ -72,7 +72,7 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     scale: float = 1.0
     bias_sd: NotNegative = msgspec.field(name="bias_sd_mm", default=0.0)
     bias_drift_sd: NotNegative = msgspec.field(name="bias_drift_sd_mm", default=0.0)
-    bias_time: Positive = msgspec.field(name="bias_time_s", default=10.0)
+    bias_time: Time = msgspec.field(name="bias_time_s", default=10.0)
     gate: NotNegative = 50.0
     gate_rows: bool = True
 
@@ -110,11 +110,10 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     def __post_init__(self) -> None:
         _known_axes("process", self.process, self.arm)
+        for path, part in self._parts():  # if made in Python, unchecked
+            toml.struct(toml.builtins(part), type(part), "configuration", path)
         for name, sensor in self.sensors.items():
             refuse_unit("sensor", name)
-            toml.struct(
-                toml.builtins(sensor), Sensor, "configuration", f"sensors.{name}"
-            )  # if made in Python, unchecked
             if not math.isfinite(sensor.scale + sensor.latency + sensor.gate + sensor.bias_sd + sensor.latency_sd):
                 raise ConfigError(f"sensors.{name}: scale, latency, gate and sds must be finite")
             if isinstance(sensor.sd, dict):
@@ -125,6 +124,12 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
                 raise ConfigError(f"sensors.{name}.scale: must not be 0: measurements would not depend on the position")
         complete = {axis: self.process.get(axis, Process()) for axis in self.arm.axes}
         msgspec.structs.force_setattr(self, "process", complete)
+
+    def _parts(self) -> Iterator[tuple[str, msgspec.Struct]]:
+        """Its tables with their places in the file."""
+        yield "start", self.start
+        yield from ((f"process.{axis}", process) for axis, process in self.process.items())
+        yield from ((f"sensors.{name}", sensor) for name, sensor in self.sensors.items())
 
     @staticmethod
     def load(path: str | Path) -> FusionConfig:

@@ -154,8 +154,12 @@ def sensor_problems(est: Estimates) -> list[str]:
             ),
             (
                 reacquired > 0,
-                f"its gate reacquired {times}: it contradicts the others or the model; if it is off by a constant, give"
-                " it bias_sd_mm",
+                f"its gate reacquired {times}: it contradicts "
+                + (
+                    "the others or the model; if it is off by a constant, give it bias_sd_mm"
+                    if len(set(given.sensor.tolist())) > 1
+                    else "the model; sd_mm, latency_ms or the process noise may be wrong"
+                ),
             ),
             (early > 0.5, f"most measurements lie before the first command: {_ONE_CLOCK}"),
             (hours_later, f"measurements go on for {tail / 3600.0:.1f} hours after the last command: {_ONE_CLOCK}"),
@@ -197,7 +201,8 @@ def _verdict(est: Estimates, sensor: str, axis: str, fused: Measurements, found:
     if found.count < _FEW:
         return f"too few measurements ({found.count}) to tell"
     low, high = found.nis_band
-    nis = f"NIS {found.nis:.2f}, expected {low:.2f} to {high:.2f}"
+    digits = next(n for n in range(2, 17) if _beside([found.nis, low, high]) == _beside([found.nis, low, high], n))
+    nis = f"NIS {found.nis:.{digits}f}, expected {low:.{digits}f} to {high:.{digits}f}"
     if rejected > _MANY_REJECTED:  # the others were selected to fit
         return f"{nis}, but {rejected:.0%} were {_TOO_SMALL}"
     correlation, coloured = found.correlation, found.whiteness < 0.01
@@ -212,6 +217,12 @@ def _verdict(est: Estimates, sensor: str, axis: str, fused: Measurements, found:
     if found.nis > high and sign and _follows_velocity(est, axis, fused):
         return f"{nis}, innovations follow the velocity: latency_ms is wrong"
     return nis + _CAUSES[found.nis > high, sign]
+
+
+def _beside(numbers: list[float], digits: int = 16) -> tuple[bool, bool]:
+    """Whether a number, as printed, is below a band and whether it is above."""
+    value, low, high = (round(number, digits) for number in numbers)
+    return value < low, value > high
 
 
 def _follows_velocity(est: Estimates, axis: str, fused: Measurements) -> bool:

@@ -147,8 +147,8 @@ class Run:
 
     def ends(self, origin: int) -> tuple[int, int]:
         """First and last stamp of the part to use, int ns; ``origin`` is the first command's."""
-        since = ALWAYS if self.since is None else origin + round(self.since * 1e9)
-        until = NEVER if self.until is None else origin + round(self.until * 1e9)
+        since = ALWAYS if self.since is None else origin + round(min(self.since * 1e9, REACH_NS))
+        until = NEVER if self.until is None else origin + round(min(self.until * 1e9, REACH_NS))
         return min(since, NEVER), min(until, NEVER)
 
     def within(self, stamp: TimeArray, origin: int) -> BoolArray:

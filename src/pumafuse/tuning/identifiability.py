@@ -150,7 +150,7 @@ def not_identifiable(likelihood: Likelihood, best: Point, free: Sequence[Paramet
     a tenth of the gain. The one to fix is a latency first, that of the sensor with the least noise.
     """
     inside = within_bounds(free, best.config)
-    arm = [number for number, one in enumerate(inside) if one.fit != "noise"]
+    arm = [number for number, one in enumerate(inside) if one.fit in _FIXED_FIRST]
     if not arm:
         return None
     found = likelihood.derivatives(best.config, inside, best.outcomes)
@@ -167,12 +167,12 @@ def not_identifiable(likelihood: Likelihood, best: Point, free: Sequence[Paramet
 
 
 def not_identifiable_noise(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> list[Parameter]:
-    """The noises of sensors that are uncertain by more than a factor of e, or at their lower bound."""
+    """The noises and drifts of sensors that are uncertain by more than a factor of e, or at their lower bound."""
     inside = within_bounds(free, best.config)
     cov = covariance(derivatives(likelihood, best, inside).information, inside)
     wide = {one.key for one, variance in zip(inside, np.diag(cov), strict=True) if variance > 1.0}
-    noise = [one for one in free if one.fit == "noise" and one.sensor is not None]
-    return [one for one in noise if one.key in wide or one.at_bound(best.config) == "lower"]
+    noises = [one for one in free if one.sensor is not None and (one.fit == "noise" or one.path[-1] == "bias_drift_sd")]
+    return [one for one in noises if one.key in wide or one.at_bound(best.config) == "lower"]
 
 
 def shared_times(

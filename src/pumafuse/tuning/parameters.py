@@ -156,6 +156,8 @@ class Parameter:
             around = self.prior and one.fit == "noise"
             return replace(one, prior=(one.at(known), self.prior[1])) if around and self.prior else one
         middle, (low, high) = one.get(known), self.bounds
+        if self.fit == "scale":  # shares of it: a scale of 0 is none
+            low, high, one = low * abs(middle), high * abs(middle), replace(one, scale=self.scale * abs(middle))
         bounds = (max(middle + low, 0.0) if self.fit == "delay" else middle + low, middle + high)
         return replace(one, bounds=bounds, prior=self.prior and (middle + self.prior[0], self.prior[1]))
 
@@ -219,9 +221,11 @@ def parameters(
 
 
 def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:
-    """Whether a configuration has a parameter: a plant's order, an axis's own delay, a recovery, a disturbance."""
+    """Whether a configuration has it: a plant's order, an axis's own delay, a recovery, a disturbance, a drift."""
     if one.axis is not None and one.path[-1].startswith("disturbance"):
         return config.process[one.axis].disturbance_sd > 0.0
+    if one.fit == "bias" and one.sensor is not None:
+        return config.sensors[one.sensor].bias_drift_sd > 0.0
     if one.fit == "delay":
         shares = [axis for axis in axes if config.arm.axes[axis].delay is None]
         return bool(shares) if one.axis is None else one.axis not in shares
@@ -254,7 +258,7 @@ def check_fixed(config: FusionConfig, fixed: Iterable[str]) -> None:
     for order in (1, 2):
         for axis in sensors:
             config = with_recovery(with_disturbance(with_order(config, axis, order), axis, 1e-3, 1.0), axis, 1.0)
-        config = with_own_delays(config, sensors)
+        config = with_drifts(with_own_delays(config, sensors))
         keys |= {one.key for one in parameters(config, config, sensors, FITS)}
     for name in fixed:
         if not any(is_fixed(key, [name]) for key in keys):
@@ -269,6 +273,14 @@ def is_fixed(key: str, fixed: Iterable[str]) -> bool:
         if all(part in parts for part in name.split(".")):
             return True
     return False
+
+
+def with_drifts(config: FusionConfig) -> FusionConfig:
+    """The configuration with a drifting bias of every sensor, by default as large as its noise."""
+    for name, sensor in config.sensors.items():
+        if sensor.bias_drift_sd == 0.0:
+            config = changed(config, ("sensors", name, "bias_drift_sd"), smallest_sd(config, name))
+    return config
 
 
 def quickest(config: FusionConfig) -> float:

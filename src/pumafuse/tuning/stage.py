@@ -15,7 +15,17 @@ from ..units import MM
 from .identifiability import NotIdentifiable, excited_axes, not_identifiable, not_identifiable_noise, shared_times
 from .likelihood import Likelihood
 from .maximise import Notify, Point, ignore, maximise_with_gates
-from .parameters import LATENCIES, Fit, Parameter, changed, is_fixed, parameters, smallest_sd, with_own_delays
+from .parameters import (
+    LATENCIES,
+    Fit,
+    Parameter,
+    changed,
+    is_fixed,
+    parameters,
+    smallest_sd,
+    with_drifts,
+    with_own_delays,
+)
 from .search import FreeOf, search
 
 _GATE = 5.0  # of the fit for a sensor with a narrow one:
@@ -99,7 +109,7 @@ def run_stage(
     if any(one.fit == "delay" for one in free(own)):
         start = own
     if "bias" in plan.fit:
-        start = _with_drifts(start)
+        start = with_drifts(start)
     if "noise" in plan.fit:
         start, notes = with_large_biases(likelihood, start, plan.fixed)
     if "latency" in plan.fit:
@@ -138,14 +148,6 @@ def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: 
     return Likelihood(runs, msgspec.structs.replace(config, sensors=sensors), plan.sensors, until=until, latest=latest)
 
 
-def _with_drifts(config: FusionConfig) -> FusionConfig:
-    """A start: every sensor with a bias that drifts, as much as it is noisy where nothing else is configured."""
-    for name, sensor in config.sensors.items():
-        if sensor.bias_drift_sd == 0.0:
-            config = changed(config, ("sensors", name, "bias_drift_sd"), smallest_sd(config, name))
-    return config
-
-
 def _may_vary(one: Parameter, config: FusionConfig, plan: Plan, excited: Sequence[str]) -> bool:
     """Whether a parameter is not the trusted sensor's, and measurements of its axis can tell it."""
     if one.fit == "delay" and one.axis is None:
@@ -174,8 +176,8 @@ def _identified(
         fixed.append(found)
         best = maximise_with_gates(likelihood, start, free(best.config), notify)
     for one in not_identifiable_noise(likelihood, best, free(best.config)):
-        others = [other for other in free(best.config) if other.key != one.key]
-        without = maximise_with_gates(likelihood, as_configured(one), others)
+        start = as_configured(one)
+        without = maximise_with_gates(likelihood, start, [other for other in free(start) if other.key != one.key])
         if without.log_posterior > best.log_posterior - 0.5 * Z95**2:
             fixed.append(NotIdentifiable((one.key,), one.key))
             best = without

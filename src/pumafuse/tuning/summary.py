@@ -162,7 +162,7 @@ def _notes(one: Parameter, interval: ConfidenceInterval) -> str:
         return f"open up to {bounds['upper']}"
     low, high = interval.ci95
     if one.sensor and one.prior and math.log(high / low) > _FROM_PRIOR * 2.0 * Z95 * one.prior[1]:
-        return "as configured, within a factor of 1.5: the measurements hardly tell it"
+        return "mostly by its prior, as configured within a factor of 1.5: the measurements hardly tell it"
     return ""
 
 

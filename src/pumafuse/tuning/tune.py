@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias, cast
 import msgspec
 
 from ..arrays import NO_STAMP
-from ..errors import PumafuseWarning
+from ..errors import ConfigError, PumafuseWarning
 from ..fusion.config import FusionConfig
 from ..fusion.faults import latency_questions
 from ..logs.clock import segments
@@ -102,6 +102,11 @@ def tune(
             raise TuneError(f"run '{run.name}' is given twice: its measurements would count twice")
     kinds, fixed = kinds_of(fit), list(fix)
     check_fixed(config, fixed)
+    for word in share:
+        if word != "delay":
+            raise ConfigError(f"--share: unknown '{word}'; accepted: delay")
+        if "delay" not in kinds:
+            raise ConfigError("--share delay: delays are not fitted; add delay to --fit")
     pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust, sd_prior, "delay" in share), progress)
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
     until = _fitted_until(runs[0]) if len(runs) == 1 and validate is None else None
@@ -221,7 +226,8 @@ class Pipeline:
             stages.append(run_stage(self.runs, config, plan, until, notify))
             config = stages[-1].best.config
         if not any(stage.free for stage in stages):
-            raise TuneError("everything that could be fitted is fixed: nothing to fit")
+            why = [str(one) for stage in stages for one in stage.not_identifiable]
+            raise TuneError("; ".join([*why, "everything that could be fitted is fixed: nothing to fit"]))
         self.best, self.stages = config, stages
         self.notes = [note for stage in stages for note in (*stage.likelihood.notes, *stage.notes)]
 
