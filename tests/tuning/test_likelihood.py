@@ -322,6 +322,31 @@ def test_scatter_is_the_noise_whatever_the_motion(share: float) -> None:
     assert likelihood.scatter == pytest.approx(wanted, rel=0.2 if share else 0.08)
 
 
+def at_rest(seed: int, sds: dict[str, float]) -> tuple[pf.Run, pf.FusionConfig]:
+    """An axis that is commanded to stay, and sensors with noises of ``sds`` [m] on it."""
+    time, rng = np.arange(300) * 0.01, np.random.default_rng(seed)
+    read = {name: (time, {"radial": sd * rng.standard_normal(len(time))}) for name, sd in sds.items()}
+    run = pf.Run.from_arrays(time, {"radial": np.zeros(len(time))}, read)
+    arm = pf.ArmModel.load("puma560-internal")
+    return run, pf.FusionConfig(arm=arm, sensors={name: pf.Sensor(sd=1e-3) for name in sds})
+
+
+def test_misfit_is_the_distance_from_the_best_sensor() -> None:
+    """An arm that does what it is told, beside sensors of 0.1 and 5 mm: 0.1 mm, whichever comes first."""
+    for sds in ({"tracker": 1e-4, "camera": 5e-3}, {"camera": 5e-3, "tracker": 1e-4}):
+        run, config = at_rest(1, sds)
+        assert Likelihood([run], config).misfit(config) == {"radial": pytest.approx(1e-4, rel=0.15)}
+
+
+def test_a_sensor_that_froze_in_a_run_has_no_scatter() -> None:
+    """In one of two runs: it is left out, and a sensor that scatters in both is not."""
+    well, config = at_rest(1, {"tracker": 1e-4, "camera": 5e-3})
+    frozen, _ = at_rest(2, {"tracker": 1e-4, "camera": 0.0})
+    both = {f"sensors.{name}.sd_mm.radial" for name in ("tracker", "camera")}
+    assert set(Likelihood([well], config).scatter) == both
+    assert set(Likelihood([well, frozen], config).scatter) == {"sensors.tracker.sd_mm.radial"}
+
+
 def test_the_response_of_the_noiseless_arm_is_that_of_the_oracle() -> None:
     """As each sensor would measure it: with scale, start levels and delays."""
     case = CASES["axes and missing values"]

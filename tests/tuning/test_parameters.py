@@ -20,6 +20,7 @@ from pumafuse.tuning.parameters import (
     kinds_of,
     parameters,
     with_axis_of,
+    with_disturbance,
     with_lag,
     with_order,
     with_own_delays,
@@ -86,6 +87,14 @@ def test_a_parameter_is_under_its_key_in_the_files(key: str, tmp_path: Path) -> 
     written = in_file(tomllib.loads((tmp_path / file).read_text()), key)
     assert written == pytest.approx(value / one.unit, rel=1e-12)
     assert one.get(pf.FusionConfig.load(tmp_path / "fusion.toml")) == pytest.approx(value, rel=1e-12)
+
+
+def test_what_may_be_none() -> None:
+    """A process noise, a disturbance's sd and a drifting bias's; no sensor's noise and no time."""
+    disturbed = reduce(lambda config, axis: with_disturbance(config, axis, 1e-3, 0.3), SENSORS, CONFIG)
+    none = {one.path[-1] for one in everything(config=disturbed) if one.vanishes}
+    walk = {"input_noise", "drift", "maneuver_noise", "maneuver_drift"}
+    assert none == {*walk, "disturbance_sd", "bias_drift_sd"}
 
 
 def test_what_was_not_configured_has_no_value_before() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -14,16 +16,17 @@ PERIOD, COUNT, DELAY = 0.02, 1500, 0.06
 AXES, TIME = "xyz", PERIOD * np.arange(COUNT)
 
 
-def known(delays: dict[str, float] | None = None) -> pf.FusionConfig:
-    """Three axes of different lags, measured by one camera; with ``delays`` some of their own."""
+def known(delays: dict[str, float] | None = None, sds: dict[str, float] | None = None) -> pf.FusionConfig:
+    """Three axes of different lags, measured by one camera; with ``delays`` and ``sds`` some of their own."""
     lags = {"x": 0.03, "y": 0.05, "z": 0.08}
     axes = {
         axis: pf.AxisModel(plant=pf.FirstOrder(time_constant=lag), delay=(delays or {}).get(axis))
         for axis, lag in lags.items()
     }
     arm = pf.ArmModel(name="three axes", update_period=PERIOD, delay=DELAY, axes=axes)
+    camera = pf.Sensor(sd=dict.fromkeys(AXES, 3e-4) | (sds or {}), gate=0.0)
     process = dict.fromkeys(AXES, pf.Process(input_noise=2e-5, drift=1e-4))
-    return pf.FusionConfig(arm=arm, process=process, sensors={"camera": pf.Sensor(sd=3e-4, gate=0.0)})
+    return pf.FusionConfig(arm=arm, process=process, sensors={"camera": camera})
 
 
 def drawn(truth: pf.FusionConfig, seed: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
@@ -49,12 +52,13 @@ def drawn(truth: pf.FusionConfig, seed: int) -> tuple[dict[str, np.ndarray], dic
 def measured(truth: pf.FusionConfig, seed: int) -> pf.Run:
     """The run, with a camera's white noise on every second sample."""
     (command, paths), rng = drawn(truth, seed), np.random.default_rng(100 + seed)
-    seen = {axis: path[::2] + 3e-4 * rng.standard_normal(COUNT // 2) for axis, path in paths.items()}
+    sd = truth.sensors["camera"].sd_of
+    seen = {axis: path[::2] + sd(axis) * rng.standard_normal(COUNT // 2) for axis, path in paths.items()}
     return pf.Run.from_arrays(TIME, command, {"camera": (TIME[::2], seen)})
 
 
 def stage(truth: pf.FusionConfig, seed: int, one_delay: bool = False) -> Stage:
-    start = replaced(known(), arm=replaced(known().arm, delay=0.075))
+    start = replaced(known(), arm=replaced(known().arm, delay=0.075), sensors=truth.sensors)
     return run_stage([measured(truth, seed)], start, Plan(("delay", "plant"), (), one_delay=one_delay))
 
 
@@ -84,6 +88,26 @@ def test_another_delay_stays_the_axis_own(seed: int) -> None:
     assert "delay: its own; an own one gains +" in found.orders["z"]
     forced = stage(truth, seed, one_delay=True).best.config.arm
     assert {one.delay for one in forced.axes.values()} == {None}
+
+
+@pytest.mark.parametrize("seed", [1, later(2), later(3)])
+def test_another_delay_stays_the_axis_own_where_it_hardly_shows(seed: int) -> None:
+    """8 ms later, by a camera of 2 mm: an own delay gains no more than 10, and is kept."""
+    found = stage(known({"z": DELAY + 0.008}, {"z": 2e-3}), seed)
+    arm = found.best.config.arm
+    assert (arm.axes["x"].delay, arm.axes["y"].delay) == (None, None)
+    assert arm.axes["z"].delay == pytest.approx(DELAY + 0.008, abs=0.004)
+    assert 0.0 < float(re.findall(r"an own one gains ([-+]\d+\.\d)", found.orders["z"])[0]) < 10.0
+
+
+@pytest.mark.parametrize("seed", [1, later(2), later(3)])
+def test_the_shared_delay_is_not_that_of_the_axis_that_is_measured_best(seed: int) -> None:
+    """Two axes of the same delay and one 12 ms later with a third of their noise: that one has its own, they share."""
+    found = stage(known({"z": DELAY + 0.012}, {"x": 1e-3, "y": 1e-3}), seed)
+    arm = found.best.config.arm
+    assert (arm.axes["x"].delay, arm.axes["y"].delay) == (None, None)
+    assert arm.delay == pytest.approx(DELAY, abs=0.004)
+    assert arm.axes["z"].delay == pytest.approx(DELAY + 0.012, abs=0.004)
 
 
 def test_what_is_fixed_is_not_shared() -> None:

@@ -136,7 +136,7 @@ def test_a_gain_is_found_where_it_shows() -> None:
 # ---- orders ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [1, later(2), later(3)])
+@pytest.mark.parametrize("seed", [1, later(2), 3])  # 3: with a delay of its own the second looks like second order
 @pytest.mark.parametrize("begin", [(1, 2), later((1, 1)), later((2, 2))], ids=str)
 def test_the_order_of_a_plant_is_its_own(seed: int, begin: tuple[int, int]) -> None:
     """By BIC: second for ω = 53.9 rad/s, ζ = 0.864, first for τ = 35.6 ms, whichever it was configured to be.

@@ -6,8 +6,22 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
+from pumafuse.tuning.likelihood import Likelihood
+from pumafuse.tuning.maximise import point
+from pumafuse.tuning.parameters import quickest
+from pumafuse.tuning.search import _penalised  # pyright: ignore[reportPrivateUsage]
 from pumafuse.tuning.stage import Stage
-from tuning_runs import contains, fit_stage, intervals_of, later, quietly, replaced, with_sensors
+from tuning_runs import (
+    contains,
+    fit_stage,
+    free_of,
+    intervals_of,
+    later,
+    quietly,
+    replaced,
+    with_process,
+    with_sensors,
+)
 
 PERIOD, COUNT = 0.02, 2000
 
@@ -86,6 +100,55 @@ def test_no_disturbance_is_invented() -> None:
             invented += process.disturbance_sd > 0.0
             assert found.best.config.sensors["camera"].sd_of("tip") == pytest.approx(3e-4, rel=0.1)
         assert invented <= 1
+
+
+def score_of(without: str = "", of_noise: float = 1.0, **changes: float) -> float:
+    """The penalised log-posterior of one axis whose process has ``changes``, all noise but ``without`` being free."""
+    config, command, path = moving()
+    config = with_process(config, **changes)
+    likelihood = Likelihood([measured(command, path, 1)], config)
+    free = free_of(likelihood, config, ("noise",))
+    kept = [one for one in free if one.path[-1] != without]
+    assert len(kept) == len(free) - bool(without)
+    (found,) = _penalised(likelihood, point(likelihood, config, free), kept, of_noise)
+    return float(found)
+
+
+def test_a_noise_costs_more_beside_a_disturbance() -> None:
+    """Input noise and drift, at twice the price: ½ ln n more for each of the two; without a disturbance no more."""
+    alone, beside = {"disturbance_sd": 0.0}, {"disturbance_sd": 1e-3}
+    more = score_of(**beside) - score_of(of_noise=2.0, **beside)
+    assert more == pytest.approx(2 * 0.5 * np.log(COUNT // 2), rel=1e-9)
+    assert score_of(of_noise=2.0, **alone) == score_of(**alone)
+
+
+def test_a_noise_that_is_none_costs_nothing() -> None:
+    """At its bound the score is that of a fit in which it is not free; above it ½ ln n less."""
+    without = "input_noise"
+    assert score_of(input_noise=1e-7) == score_of(without, input_noise=1e-7)
+    more = score_of(without, input_noise=2e-7) - score_of(input_noise=2e-7)
+    assert more == pytest.approx(0.5 * np.log(COUNT // 2), rel=1e-9)
+
+
+def test_a_disturbance_that_is_too_quick_is_never_worth_it() -> None:
+    """Forgotten within less than two update periods: no likelihood makes up for it. One of two periods may be."""
+    least = quickest(moving()[0])
+    assert least == 2.0 * PERIOD
+    assert score_of(disturbance_sd=1e-3, disturbance_time=0.99 * least) == -np.inf
+    assert np.isfinite(score_of(disturbance_sd=1e-3, disturbance_time=least))
+
+
+def test_noise_that_is_correlated_for_ten_milliseconds_is_no_disturbance() -> None:
+    """A camera's at every command, 1 mm of it: none is fitted, and the reason says why."""
+    config, command, path = moving()
+    left, noise = np.exp(-PERIOD / 0.01), 1e-3 * np.random.default_rng(3).standard_normal(COUNT)
+    for n in range(1, COUNT):
+        noise[n] = left * noise[n - 1] + np.sqrt(1.0 - left**2) * noise[n]
+    time, white = PERIOD * np.arange(COUNT), 1e-4 * np.random.default_rng(1).standard_normal(COUNT)
+    run = pf.Run.from_arrays(time, {"tip": command}, {"camera": (time, {"tip": path + noise + white})})
+    found, process = fitted(run, with_sensors(config, sd=1e-4))
+    assert process.disturbance_sd == 0.0
+    assert "disturbance: none; one would be forgotten within 40 ms, too soon for an arm" in found.orders["tip"]
 
 
 # ---- gains and scales -----------------------------------------------------------------------------------------------

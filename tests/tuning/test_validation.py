@@ -10,6 +10,7 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.fusion.consistency import consistency, densities_of
+from pumafuse.logs.run import Source
 from pumafuse.tuning.validation import Check, check
 from tuning_runs import replaced, spoiled, with_outliers, with_process, with_sensors
 
@@ -127,6 +128,70 @@ def test_a_better_likelihood_with_larger_errors_is_worse() -> None:
     assert one.after.log_likelihood > one.before.log_likelihood
     assert one.after.rmse_mm > 3.0 * one.before.rmse_mm
     assert one.worse and one.verdict.startswith("worse:")
+
+
+def against(before: pf.FusionConfig, after: pf.FusionConfig, nearer: np.ndarray) -> Check:
+    """Of the vertical axis, against a reference between both estimates, by ``nearer`` toward the former (0: midway)."""
+    old, new = (pf.fuse(run().run, config)["vertical"].position for config in (before, after))
+    stamp = run().run.command.stamp
+    assert len(stamp) == len(old)
+    reference = Source(stamp, {"vertical": 0.5 * (old + new) + 0.5 * nearer * (old - new)}, "reference")
+    vertical = replace(run().run, reference=reference)
+    return next(one for one in check(vertical, before, after) if one.axis == "vertical")
+
+
+def test_larger_errors_are_worse_only_beyond_chance() -> None:
+    """An RMSE that is 3 to 15 % larger: worse where errors grew all along, no worse where all is of one stretch."""
+    before, after = spoiled(run().config), run().config
+    count = len(run().run.command.stamp)
+    along, once = np.full(count, 0.04), np.zeros(count)
+    once[49:56] = 1.0
+    for nearer, worse in ((along, True), (once, False)):
+        one = against(before, after, nearer)
+        assert one.before.rmse_mm is not None and one.after.rmse_mm is not None
+        assert 1.03 < one.after.rmse_mm / one.before.rmse_mm < 1.15
+        assert one.worse == worse
+
+
+def with_nis(nis: float, since: float = 0.0) -> Check:
+    """Of the vertical axis without a reference, all noise being as large as gives its camera this NIS."""
+    bare = replace(run().run, reference=None)
+
+    def noisy(factor: float) -> Check:
+        config, fields = run().config, ("input_noise", "drift", "maneuver_noise", "maneuver_drift")
+        for field in fields:
+            config = with_process(config, **{field: factor * getattr(config.process["vertical"], field)})
+        camera = config.sensors["vision"]
+        config = with_sensors(config, sd=factor * camera.sd, latency_sd=factor * camera.latency_sd, gate=0.0)
+        config = replaced(config, start=replaced(config.start, offset_sd=factor * config.start.offset_sd))
+        return next(one for one in check(bare, config, config, since=since) if one.axis == "vertical")
+
+    found = noisy(np.sqrt(noisy(1.0).after.sensors["vision"].nis / nis))
+    assert found.after.sensors["vision"].nis == pytest.approx(nis, rel=1e-6)
+    return found
+
+
+@pytest.mark.parametrize(("nis", "holds"), [(1.6, False), (1.38, True), (0.73, True), (0.6, False)])
+def test_error_bars_hold_while_the_nis_is_between_0_71_and_1_42(nis: float, holds: bool) -> None:
+    """A NIS of some hundred components, of which chance alone makes 0.75 to 1.3."""
+    assert with_nis(nis).holds == holds
+
+
+def test_error_bars_hold_while_the_nis_is_within_chance() -> None:
+    """A mean of 1.6 over some ten components is."""
+    found = with_nis(1.6, since=3.4)
+    assert 8 <= found.components <= 12
+    assert found.holds
+
+
+def test_components_of_one_instant_are_counted_by_sensor() -> None:
+    """Two cameras whose stamps are the same: the components of both are compared, each with itself."""
+    camera, sensor = run().run.sensors["vision"], run().config.sensors["vision"]
+    twice = replace(run().run, sensors={"vision": camera, "other": camera})
+    config = replaced(run().config, sensors={"vision": sensor, "other": sensor})
+    for one in check(twice, config, config):
+        assert one.components == sum(sensor.count for sensor in one.after.sensors.values()) + one.after.rejected
+        assert one.verdict.startswith("no different: log-likelihood +0.0 (chance: ± 0.0)")
 
 
 def test_without_a_reference_the_likelihood_decides() -> None:
