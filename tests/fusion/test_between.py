@@ -120,12 +120,15 @@ def test_a_part_that_cannot_be_used_is_one_line() -> None:
         assert "no interval" in one_line(pf.RunError, lambda since=since, until=until: sim.run.between(since, until))
     for since, until, said in (
         (100.0, 200.0, "no measurement"),
+        (1e300, None, "no measurement"),
         (0.985, 1.005, "no command"),
         (1.0, 1.0 + 2e-9, "no meas"),
     ):
         part = sim.run.between(since, until)
         line = one_line(pf.RunError, lambda part=part: quiet(part, sim.config))
         assert said in line, line
+    whole = quiet(sim.run.between(0.0, 1e300), sim.config)
+    assert np.array_equal(whole["vertical"].position, quiet(sim.run, sim.config)["vertical"].position)
     back = sim.run.each(lambda _, one: replace(one, stamp=one.stamp - (one.stamp > 2e9) * 3_600_000_000_000))
     assert len(quiet(back, sim.config).segments) == 2
     assert "set back" in one_line(pf.RunError, lambda: quiet(back.between(1.0), sim.config))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -180,6 +181,25 @@ def test_a_file_that_cannot_be_read_is_refused(tmp_path: Path, content: bytes | 
     if content is not None:
         path.write_bytes(content)
     assert str(path) in refusal(lambda: FusionConfig.load(path))
+
+
+@pytest.mark.parametrize(
+    ("key", "wrong"),
+    [
+        ("disturbance_sd", np.nan),
+        ("disturbance_sd", -1.0),
+        ("disturbance_time", 0.0),
+        ("disturbance_time", 1e-120),
+        ("disturbance_time", np.inf),
+        ("disturbance_kind", "Matern"),
+        ("drift", -1.0),
+    ],
+)
+def test_process_noise_made_in_python_is_checked_like_a_file(key: str, wrong: float | str) -> None:
+    """A number out of range names its key, rather than make estimates that are no numbers."""
+    arm = ArmModel.load("puma560-internal")
+    with pytest.raises(ConfigError, match=rf"process\.radial\.{key}"):
+        FusionConfig(arm=arm, process={"radial": Process(**{key: wrong})})
 
 
 def test_a_configuration_made_in_python_is_checked_like_a_file() -> None:

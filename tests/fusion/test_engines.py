@@ -199,6 +199,26 @@ def test_both_engines_make_the_same_of_any_log() -> None:
     assert all(seen[outcome] for outcome in set(Outcome) - {Outcome.TOO_LATE})
 
 
+@pytest.mark.parametrize(("lasts", "pause"), [(0.3, 200.0), (0.001, 0.0), (1e-6, 0.0)])
+def test_a_smooth_disturbance_is_forgotten_in_any_pause(lasts: float, pause: float) -> None:
+    """Of 300 ms over 200 s, and of 1 ms and 1 µs over intervals of 28 ms: the same to 1e-9 sd."""
+    time = 0.028 * np.arange(60)
+    time[30:] += pause
+    position = 0.01 * np.sin(3.0 * np.arange(60) * 0.028)
+    run = pf.Run.from_arrays(time, {"x": position}, {"camera": (time + 0.01, {"x": position})})
+    arm = pf.ArmModel(
+        name="one", update_period=0.028, delay=0.05, axes={"x": pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04))}
+    )
+    process = {"x": pf.Process(disturbance_sd=1e-3, disturbance_time=lasts)}
+    config = pf.FusionConfig(arm=arm, process=process, sensors={"camera": pf.Sensor(sd=1e-3)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        got, wanted = pf.fuse(run, config)["x"], pf.fuse(run, config, engine="filterpy")["x"]
+    assert np.abs(got.position - wanted.position).max() < 1e-9 * got.position_sd.min()
+    assert got.position_sd == pytest.approx(wanted.position_sd, rel=1e-9)
+
+
 def test_fuse_by_filterpy_says_the_same() -> None:
     """Measurements, notes and estimates of `fuse` by either engine; progress goes up; other modes are refused."""
     scan, config = Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")

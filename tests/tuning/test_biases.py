@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 import pumafuse as pf
-from tuning_runs import fit_stage, later, quietly, replaced, scenario, spoiled, with_sensors
+from tuning_runs import fit_stage, later, outage, quietly, replaced, scenario, spoiled, with_sensors
 
 AXES = ("tangential", "vertical")
 Off = float | dict[str, float]
@@ -109,3 +109,14 @@ def test_each_run_has_its_own_constant() -> None:
     }
     for each in biases:
         assert each.bias_mm == pytest.approx(0.3 if each.run == one.name else 0.8, abs=3.0 * each.sd_mm)
+
+
+def test_a_drift_that_the_only_sensor_cannot_tell_is_none() -> None:
+    """It is set back to what is configured, and said."""
+    sim = outage(1)
+    config = replaced(sim.config, sensors={"vision": sim.config.sensors["vision"]})
+    found = fit_stage(sim.run, config, ("noise", "bias"))
+    said = [str(one) for one in found.not_identifiable if "bias" in one.fixed]
+    assert said == ["sensors.vision.bias_drift_sd_mm is fixed: not identifiable"]
+    assert found.best.config.sensors["vision"].bias_drift_sd == 0.0
+    assert not [one.key for one in found.free if one.fit == "bias"]

@@ -21,6 +21,7 @@ from pumafuse.tuning.parameters import (
     parameters,
     with_axis_of,
     with_disturbance,
+    with_drifts,
     with_lag,
     with_order,
     with_own_delays,
@@ -30,7 +31,7 @@ from tuning_runs import replaced
 ARM = pf.ArmModel.load("puma560-internal")  # tangential is second order, radial and vertical are first
 TRACKER, CAMERA = pf.Sensor(sd=5e-5, latency=0.008), pf.Sensor(sd={"radial": 4e-4, "vertical": 3e-4}, latency=0.045)
 SHARED = pf.FusionConfig(arm=ARM, sensors={"tracker": TRACKER, "camera": CAMERA, "spare": pf.Sensor(sd=1.0)})
-CONFIG = with_own_delays(SHARED, ARM.axes)
+CONFIG = with_drifts(with_own_delays(SHARED, ARM.axes))
 SENSORS = {"tangential": ["tracker"], "radial": ["tracker", "camera"], "vertical": ["camera"]}
 
 
@@ -66,6 +67,15 @@ def test_what_can_be_fitted() -> None:
     assert keys["gain"] == {f"axes.{axis}.{key}" for axis in SENSORS for key in ("gain.intercept", "gain_recovery_ms")}
     for kind, numbers in {"latency": ["latency_ms"], "bias": ["bias_drift_sd_mm", "bias_time_s"]}.items():
         assert keys[kind] == {f"sensors.{name}.{key}" for name in ("tracker", "camera") for key in numbers}
+    assert parameters(SHARED, SHARED, SENSORS, ["bias"]) == []  # no bias drifts
+
+
+@pytest.mark.parametrize("scale", [1.0, -1.0, 0.06, 1e3])
+def test_a_scale_stays_within_half_of_what_is_configured(scale: float) -> None:
+    """So it is never 0, and never turns its sign."""
+    config = replaced(CONFIG, sensors={**CONFIG.sensors, "tracker": replaced(TRACKER, scale=scale)})
+    (found,) = (one for one in parameters(config, config, SENSORS, ["scale"]) if one.sensor == "tracker")
+    assert found.bounds == pytest.approx((scale - 0.5 * abs(scale), scale + 0.5 * abs(scale)))
 
 
 def in_file(tree: dict[str, object], key: str) -> object:
