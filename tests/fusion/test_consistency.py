@@ -12,6 +12,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 import pytest
 from scipy import stats
@@ -20,11 +21,13 @@ import pumafuse as pf
 from pumafuse.fusion.consistency import (
     LAGS,
     Consistency,
+    _frozen,  # pyright: ignore[reportPrivateUsage]
     chi_square_band,
     consistency,
     ljung_box,
     log_likelihood,
 )
+from tuning_runs import with_sensors
 
 PERIOD, DELAY, TAU = 28_000_000, 60_450_000, 0.0425  # ns, ns, s
 FIRST = 40_000_000  # ns, of the first measurement
@@ -202,6 +205,8 @@ def moving() -> pf.Run:
         (World(sd=1.0e-3), ": sd_mm or the process noise too large"),
         (World(latency=-0.010), "latency_ms is wrong"),
         (World(latency=0.050), "latency_ms is wrong"),
+        (World(latency=0.015), "innovations follow the velocity: latency_ms is wrong"),
+        (World(latency=0.025), "innovations follow the velocity: latency_ms is wrong"),
         (World(input_noise=0.0, drift=0.0), "the process noise too small"),
         (World(input_noise=0.05e-5, drift=0.3e-5), "the process noise too small"),
         (World(input_noise=1e-3, drift=6e-3), "the process noise too large"),
@@ -209,7 +214,7 @@ def moving() -> pf.Run:
 )
 @pytest.mark.filterwarnings("ignore:.*latency_ms is -10:pumafuse.PumafuseWarning")
 def test_verdicts_name_the_key_that_is_wrong(moving: pf.Run, configured: World, verdict: str) -> None:
-    """Double the noise, 30 ms too early and too late, no process noise or far too much: on every axis."""
+    """Double the noise, 5 and 30 ms too early and too late, no process noise or far too much: on every axis."""
     for axis, found in judged(moving, configured).items():
         assert verdict in found.verdict, (axis, found.verdict)
 
@@ -242,3 +247,27 @@ def test_the_verdict_on_smoothed_estimates_takes_the_velocity_from_their_positio
     smoothed = replace(est, axes={name: replace(axis, velocity=nothing) for name, axis in est.axes.items()})
     for axis in est.axes:
         assert "latency_ms is wrong" in consistency(smoothed, "camera", axis).verdict
+
+
+@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+@pytest.mark.parametrize(("sds", "said"), [(2e6, True), (0.5e6, False)])
+@pytest.mark.parametrize("prior", ["offset_sd", "bias_sd"])
+def test_a_prior_too_wide_for_double_precision_is_said(moving: pf.Run, prior: str, sds: float, said: bool) -> None:
+    """Of the offset or of a bias, more than a million times the noise."""
+    config = World().config(moving)
+    if prior == "bias_sd":
+        config = with_sensors(config, bias_sd=sds * World.sd)
+    else:
+        config = msgspec.structs.replace(config, start=pf.Start(offset_sd=sds * World.sd))
+    notes = [note for note in pf.fuse(moving, config).notes if note.startswith("camera: its prior")]
+    assert len(notes) == said
+    assert all("is 2.0e+06 times its noise" in note for note in notes)
+
+
+@pytest.mark.parametrize(("equal", "found"), [(9, 0), (10, 10), (25, 25)])
+def test_ten_equal_values_in_white_noise_are_frozen(equal: int, found: int) -> None:
+    """Their number is said, wherever they are; nine are not enough."""
+    for first in (0, 100, 300 - equal):
+        values = np.random.default_rng(1).standard_normal(300)
+        values[first : first + equal] = values[first]
+        assert _frozen(values) == found

@@ -26,7 +26,7 @@ from pumafuse.logs.run import Run
 from pumafuse.model.plants import Plant
 
 MS = 1_000_000  # ns
-FIELDS = ("position", "velocity", "offset")
+FIELDS = ("position", "velocity", "offset", "disturbance")
 DATA = Path(pf.__file__).parent / "data"
 PAPER = pf.Gain(slope=0.0818, intercept=0.933)
 
@@ -99,6 +99,8 @@ def sensors(draw: st.DrawFn, axes: tuple[str, ...]) -> pf.Sensor:
         latency_sd=some(draw, 0.0, 0.0, 0.003),
         scale=some(draw, 1.0, -1.0, 2.5),
         bias_sd=some(draw, 0.0, 0.0, 5e-3),
+        bias_drift_sd=some(draw, 0.0, 1e-3),
+        bias_time=some(draw, 0.05, 10.0),
         gate=some(draw, 0.0, 2.0, 3.0, 5.0),
         gate_rows=draw(st.booleans()),
     )
@@ -148,7 +150,13 @@ def logs(draw: st.DrawFn) -> tuple[Run, pf.FusionConfig, float | None]:
     level = st.sampled_from([0.0, 0.2e-3, 1e-3])
     noise = {
         axis: pf.Process(
-            input_noise=draw(level), drift=draw(level), maneuver_noise=draw(level), maneuver_drift=10 * draw(level)
+            input_noise=draw(level),
+            drift=draw(level),
+            maneuver_noise=draw(level),
+            maneuver_drift=10 * draw(level),
+            disturbance_sd=some(draw, 0.0, 1e-3),
+            disturbance_time=some(draw, 0.02, 0.1, 3.0),
+            disturbance_kind=some(draw, "matern", "ou"),
         )
         for axis in axes
     }
@@ -184,7 +192,7 @@ def logs(draw: st.DrawFn) -> tuple[Run, pf.FusionConfig, float | None]:
 
 
 def test_both_engines_make_the_same_of_any_log() -> None:
-    """Random axes, delays, gains, sensors, gates, outliers, gaps, latencies: every fate and estimate is the same."""
+    """Random axes, delays, gains, noise, sensors, gates, outliers, gaps: every fate and estimate is the same."""
     seen = dict.fromkeys(Outcome, 0)
 
     @settings(derandomize=True, deadline=None, max_examples=40)

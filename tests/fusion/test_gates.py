@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -126,6 +127,24 @@ def test_a_re_acquisition_is_counted_and_said() -> None:
         estimates = fuse(run, config)
     assert estimates.measurements.counts() == {"fused": 8, "rejected": 1, "reacquired": 1}
     assert any("tracker" in str(one.message) and "reacquired" in str(one.message) for one in said)
+
+
+@pytest.mark.parametrize("engine", ["compiled", "filterpy"])
+@pytest.mark.parametrize(("share", "second"), [(0.99, REACQUIRED), (1.01, REJECTED)])
+@pytest.mark.parametrize("kind", ["matern", "ou"])
+def test_two_agree_as_far_as_a_disturbance_may_move_between(
+    kind: str, share: float, second: Outcome, engine: str
+) -> None:
+    """Of covariance k(Δ), with nothing else that moves: within gate · √(R₁ + R₂ + 2 (k(0) − k(Δ))), and no farther."""
+    rate, sd, apart = (math.sqrt(3.0) if kind == "matern" else 1.0) / 0.05, 1e-3, 0.040
+    correlation = math.exp(-rate * apart) * (1.0 + rate * apart if kind == "matern" else 1.0)
+    farthest = 5.0 * math.sqrt(2.0 * 0.2e-3**2 + 2.0 * sd**2 * (1.0 - correlation))
+    run, config = recorded(rows_at([10, 50], [OFF, OFF + share * farthest]), TRACKER)
+    moves = Process(input_noise=0.0, drift=0.0, disturbance_sd=sd, disturbance_time=0.05, disturbance_kind=kind)
+    config = msgspec.structs.replace(config, start=Start(offset_sd=0.0), process=dict.fromkeys(LEVEL, moves))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PumafuseWarning)
+        assert outcomes(fuse(run, config, engine=engine)) == [REJECTED, second]
 
 
 # ---- two sensors ----------------------------------------------------------------------------------------------------

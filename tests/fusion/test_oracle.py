@@ -120,11 +120,11 @@ def warned(run: Run, config: FusionConfig) -> AbstractContextManager[object]:
 MODES = {"filtered": {}, "as_live": {"as_live": True}, "smoothed": {"smooth": True}}
 
 
-def check(case: Case, mode: str = "filtered") -> None:
+def check(case: Case, mode: str = "filtered", engine: str = "compiled") -> None:
     """Estimates and innovations of a case agree with the oracle."""
     run, config = case.made()
     with warned(run, config):
-        estimates = fuse(run, config, rate=case.rate, **MODES[mode])
+        estimates = fuse(run, config, rate=case.rate, engine=engine, **MODES[mode])
     times = nanoseconds(estimates)
     grid = case.times if case.rate is None else every(case.rate, len(times))
     assert times.tolist() == grid.tolist()
@@ -239,11 +239,19 @@ def test_estimates_are_conditional_means(case: Case, mode: str) -> None:
     check(case, mode)
 
 
-@pytest.mark.parametrize("case", [Case(delay=0.0), Case(one(UNDER))], ids=["first order", "second order"])
-def test_wandering_latency_counts_with_speed(case: Case) -> None:
-    """A measurement's variance grows by (scale · predicted speed · latency_sd)²; a command acts before it."""
+DISTURBED = replace_(NOISE, disturbance_sd=2e-3, disturbance_time=0.05)
+WANDERING = {"first order": Case(delay=0.0), "second order": Case(one(UNDER)), "disturbed": Case(process=DISTURBED)}
+
+
+@pytest.mark.parametrize("engine", ["compiled", "filterpy"])
+@pytest.mark.parametrize("case", WANDERING.values(), ids=WANDERING.keys())
+def test_wandering_latency_counts_with_speed(case: Case, engine: str) -> None:
+    """A measurement's variance grows by (scale · predicted speed · latency_sd)²; a command acts before it.
+
+    The speed is that of the plant and of a smooth disturbance.
+    """
     wanders = Seen(sensor(latency=0.02, latency_sd=0.004, scale=-1.5), np.union1d(case.times, every(70, 28)))
-    check(replace(case, seen={"wandering": wanders, "vision": VISION}))
+    check(replace(case, seen={"wandering": wanders, "vision": VISION}), engine=engine)
 
 
 def plants() -> st.SearchStrategy[Plant]:

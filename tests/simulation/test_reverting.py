@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 import pumafuse as pf
 from pumafuse.simulation import reverting
 from pumafuse.simulation.grid import grid
-from pumafuse.simulation.motion import simulate_axis
+from pumafuse.simulation.motion import Motion, simulate_axis
 from pumafuse.simulation.sensing import measure
 from pumafuse.simulation.true_arm import TrueAxis
 from pumafuse.simulation.true_sensor import TrueSensor
@@ -20,6 +20,9 @@ Floats = NDArray[np.float64]
 SD = 0.7
 #: Instants [ns] with equal, tiny (1 ns), zero and long gaps.
 TIMES = np.cumsum([5, 20_000_000, 20_000_000, 1, 0, 3_000, 470_000, 900_000_000, 20_000_000, 40_000_000_000])
+ARM = pf.ArmModel.load("puma560-internal")
+RADIAL = ARM.axis("radial")
+AXIS = TrueAxis(plant=RADIAL.plant, gain=RADIAL.gain, gain_recovery=RADIAL.gain_recovery, delay=ARM.delay)
 
 
 def matern(apart: Floats, length: float) -> Floats:
@@ -69,23 +72,30 @@ def test_a_process_has_exactly_its_covariance_function(process: Any, expected: A
         assert grown == pytest.approx(-2.0 * SD**2 * np.expm1(-gap / length), rel=1e-9)
 
 
+def moved(seed: int, kind: Any = "matern", sd: float = 0.0) -> Motion:
+    """Through five commands, with a disturbance of 0.2 s."""
+    issued, command = np.arange(5) * 28_000_000, np.linspace(0.0, 0.01, 5)
+    process = pf.Process(disturbance_sd=sd, disturbance_time=0.2, disturbance_kind=kind)
+    return simulate_axis(AXIS, process, 0.001, issued, command, 0.028, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(("kind", "process"), [("matern", reverting.smooth), ("ou", reverting.rough)])
+def test_a_disturbance_is_the_process_of_its_sd_and_time(kind: str, process: Any) -> None:
+    """To rounding the one that the axis's own random numbers for it give."""
+    disturbed = moved(7, kind, SD)
+    own = np.random.default_rng(7).spawn(5)[4]
+    expected = process(disturbed.time, SD, 0.2, own)
+    assert disturbed.position - moved(7).position == pytest.approx(expected, abs=1e-14)
+
+
 def test_an_axis_is_disturbed_from_its_start_on_and_nothing_else_changes() -> None:
     """Motion with a disturbance = motion without + the process; variance and covariance over 400 seeds within 4 se."""
-    arm = pf.ArmModel.load("puma560-internal")
-    model = arm.axis("radial")
-    axis = TrueAxis(plant=model.plant, gain=model.gain, gain_recovery=model.gain_recovery, delay=arm.delay)
-    issued, command = np.arange(5) * 28_000_000, np.linspace(0.0, 0.01, 5)
-
-    def moved(seed: int, kind: Any = "matern", sd: float = 0.0) -> Floats:
-        process = pf.Process(disturbance_sd=sd, disturbance_time=0.2, disturbance_kind=kind)
-        rng = np.random.default_rng(seed)
-        return simulate_axis(axis, process, 0.001, issued, command, 0.028, rng).at(grid(5, 0.028))
-
+    instants = grid(5, 0.028)
     for kind, expected in (("matern", matern), ("ou", ornstein_uhlenbeck)):
-        d = np.array([moved(seed, kind, SD) - moved(seed) for seed in range(400)]) / SD
+        d = np.array([moved(seed, kind, SD).at(instants) - moved(seed).at(instants) for seed in range(400)]) / SD
         for place in (0, 150, 300):
             assert np.mean(d[:, place] ** 2) == pytest.approx(1.0, abs=4.0 * (2.0 / 400) ** 0.5)
-        late = float(grid(5, 0.028)[150] / 1e9)
+        late = float(instants[150] / 1e9)
         assert np.mean(d[:, 0] * d[:, 150]) == pytest.approx(expected(late, 0.2) / SD**2, abs=4.0 * (2.0 / 400) ** 0.5)
 
 

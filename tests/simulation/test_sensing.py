@@ -104,6 +104,14 @@ def test_bias_sd_is_one_more_bias_for_each_run_and_axis() -> None:
     within(float(np.mean(drawn[:, 0] * drawn[:, 1])), 0.0, 4000**-0.5)
 
 
+def test_a_bias_that_drifts_leaves_the_constant_ones_as_they_are() -> None:
+    """A drift of 1 nm beside constants of 10 mm moves no axis by more than some nm."""
+    plain, drifting = (measured(sensor(bias_sd=0.01, bias_drift_sd=sd)) for sd in (0.0, 1e-9))
+    for axis in "ab":
+        moved = np.abs(drifting.values[axis] - plain.values[axis])
+        assert 1e-10 < moved.max() < 1e-8
+
+
 def test_dropouts_lose_their_share_one_by_one() -> None:
     """The share is binomial, and one loss says nothing of the next."""
     lost = ~np.isin(even(), measured(sensor(dropouts=0.1)).stamp)
