@@ -163,7 +163,9 @@ def read(path: Path, *, growing: bool = False) -> Table:
         if not content:
             raise RunError(f"{path}: the file is empty")
         if path.suffix == ".parquet":
-            table, notes = papq.read_table(pa.BufferReader(content)), list[str]()
+            # Without threads: one that outlives the interpreter aborts it (apache/arrow issue 34314).
+            whole = papq.read_table(pa.BufferReader(content), use_threads=False, pre_buffer=False)
+            table, notes = whole, list[str]()
         else:
             table, notes = _parsed(path, content, growing)
         names: list[str] = table.column_names
