@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
@@ -13,7 +13,7 @@ import msgspec
 import tomli_w
 
 from .errors import ConfigError, PumafuseError, suggestion
-from .units import from_si, to_si
+from .units import AN, KINDS, Kind, as_length, from_si, of_kind, to_si
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -46,7 +46,7 @@ def read(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: {error}") from None
 
 
-def struct(tree: Any, kind: type[S], where: str, path: str = "") -> S:
+def struct(tree: Any, kind: type[S], where: str, path: str = "", axis: Kind = "length") -> S:
     """``tree`` (SI numbers) as a struct of ``kind``.
 
     Args:
@@ -54,18 +54,31 @@ def struct(tree: Any, kind: type[S], where: str, path: str = "") -> S:
         kind: The struct that declares the accepted keys.
         where: The file, for errors.
         path: The table's path in the file, such as ``axes.radial``.
+        axis: What the axes are to which the table belongs: its keys have the units of that.
 
     Raises:
         ConfigError: An unknown key, a missing one, a wrong type or a value out of range; names file, key and the
             accepted names.
     """
+    if axis != "length" and (problem := next(_problems(tree, kind, path, axis), None)):
+        raise ConfigError(f"{where}: {problem}")
     try:
-        return msgspec.convert(tree, kind)
+        return msgspec.convert(tree if axis == "length" else _renamed(tree, as_length), kind)
     except msgspec.ValidationError as error:
-        problem = next(_problems(tree, kind, path), f"{path}: {error}" if path else str(error))
+        problem = next(_problems(tree, kind, path, axis), f"{path}: {error}" if path else str(error))
         raise ConfigError(f"{where}: {problem}") from None
     except PumafuseError as error:  # a struct's own check
         raise ConfigError(f"{where}: {error}") from None
+
+
+def check(value: Any, kind: Any, where: str, path: str) -> None:
+    """Refuse a value (SI numbers) that is not of a type.
+
+    Raises:
+        ConfigError: It is not; names file and key.
+    """
+    for problem in _problems(value, kind, path):
+        raise ConfigError(f"{where}: {problem}")
 
 
 def text(tree: Mapping[str, Any]) -> str:
@@ -73,10 +86,16 @@ def text(tree: Mapping[str, Any]) -> str:
     return tomli_w.dumps(from_si(tree))
 
 
-def builtins(value: msgspec.Struct) -> dict[str, Any]:
-    """A struct as plain tables with the file's key names; None is left out, as TOML has none."""
+def builtins(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
+    """A struct as plain tables with the file's key names; None is left out, as TOML has none.
+
+    Args:
+        value: The struct.
+        axis: What the axes are to which it belongs: its keys get the units of that.
+    """
     dates = (datetime.datetime, datetime.date, datetime.time)
-    return _without_none(msgspec.to_builtins(value, builtin_types=dates, enc_hook=float))  # numpy's numbers are floats
+    tree = _without_none(msgspec.to_builtins(value, builtin_types=dates, enc_hook=float))  # numpy's numbers are floats
+    return tree if axis == "length" else _renamed(tree, lambda name: of_kind(name, axis))
 
 
 def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
@@ -85,6 +104,13 @@ def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
         for key, value in tree.items()
         if value is not None
     }
+
+
+def _renamed(tree: Any, name: Callable[[str], str]) -> Any:
+    """A tree of tables with every key renamed."""
+    if not isinstance(tree, Mapping):
+        return tree
+    return {name(key): _renamed(value, name) for key, value in cast(Mapping[str, Any], tree).items()}
 
 
 def _tagged(kind: Any) -> dict[str, type[msgspec.Struct]]:
@@ -98,15 +124,18 @@ def _words(kind: Any) -> tuple[str, ...]:
     return tuple(word for part in (kind, *get_args(kind)) if get_origin(part) is Literal for word in get_args(part))
 
 
-def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
+def _problems(tree: Any, kind: Any, path: str, axis: Kind = "length") -> Iterator[str]:
     """The faults of ``tree``, the deepest first, each with its key."""
     prefix = f"{path}." if path else ""
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct) and isinstance(tree, Mapping):
-        fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
+        fields = {of_kind(field.encode_name, axis): field for field in msgspec.structs.fields(kind)}
+        of_others = {of_kind(one.encode_name, other): name for name, one in fields.items() for other in KINDS}
         tag = kind.__struct_config__.tag_field
         for key, value in tree.items():  # pyright: ignore[reportUnknownVariableType]
             if key in fields:
-                yield from _problems(value, fields[key].type, f"{prefix}{key}")
+                yield from _problems(value, fields[key].type, f"{prefix}{key}", axis)
+            elif key in of_others:
+                yield f"{prefix}{key}: for {AN[axis]} it is '{of_others[key]}'"
             elif key != tag:
                 yield f"unknown key '{prefix}{key}'; {suggestion(str(key), fields)}"  # pyright: ignore
         for key, field in fields.items():
@@ -116,14 +145,14 @@ def _problems(tree: Any, kind: Any, path: str) -> Iterator[str]:
         tag = next(iter(tagged.values())).__struct_config__.tag_field or ""
         name = str(tree.get(tag, "none"))  # pyright: ignore[reportUnknownArgumentType]
         if name in tagged:
-            yield from _problems(tree, tagged[name], path)
+            yield from _problems(tree, tagged[name], path, axis)
         else:
             yield f"{path}.{tag}: unknown {tag} '{name}'; {suggestion(name, tagged)}"
     elif isinstance(tree, str) and (words := _words(kind)) and tree not in words:
         yield f"{path}: unknown value '{tree}'; {suggestion(tree, words)}"
     elif get_origin(kind) is dict and isinstance(tree, Mapping):
         for key, value in tree.items():  # pyright: ignore[reportUnknownVariableType]
-            yield from _problems(value, get_args(kind)[1], f"{prefix}{key}")
+            yield from _problems(value, get_args(kind)[1], f"{prefix}{key}", axis)
     else:
         try:
             msgspec.convert(tree, cast(Any, kind))

@@ -1,33 +1,81 @@
 """Conversion of units: names carry the unit, Python carries SI.
 
 Every number in a file, a column or on a screen has its unit as the ending of its name (``latency_ms``, ``x_mm``). All
-units are powers of ten of an SI unit, so conversion moves the decimal point of the shortest decimal form of the number:
-60.45 ms is exactly the float 0.06045 s, and comes back as 60.45.
+units but degrees are powers of ten of an SI unit, so conversion moves the decimal point of the shortest decimal form of
+the number: 60.45 ms is exactly the float 0.06045 s, and comes back as 60.45. So does an angle that was given in degrees.
+
+An axis is a length (m inside) or an angle (rad inside). Names in the code are those of lengths (``sd_mm``); files and
+screens have those of the axis's kind (``sd_deg``): :func:`of_kind`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from decimal import Decimal
-from typing import Any, cast
+from dataclasses import dataclass
+from decimal import Context, Decimal
+from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 
 from .arrays import NO_STAMP, FloatArray, TimeArray
 from .errors import ConfigError
 
-_ENDINGS = {  # power of ten to SI -> endings of names
-    0: ("_m", "_s", "_m_s", "_rad_s", "_s_m"),
-    -3: ("_mm", "_ms", "_mm_s", "_mm_rtHz", "_mm_rts", "_mm_rtHz_per_m_s", "_mm_rts_per_m_s"),
+Kind: TypeAlias = Literal["length", "angle"]
+KINDS: tuple[Kind, ...] = ("length", "angle")
+
+
+@dataclass(frozen=True)
+class Screen:
+    """The unit in which files and screens show positions of a kind of axis.
+
+    Attributes:
+        unit: Of a position, and the ending of its name.
+        scale: How many of them an SI unit is: an SI array times this is what is shown.
+        fast: Unit of commanded speeds, which are of whole axes or paths.
+        fast_scale: How many of these an SI unit is.
+    """
+
+    unit: str
+    scale: float
+    fast: str
+    fast_scale: float
+
+
+MM = 1e3  # mm in a metre
+MS = 1e3  # ms in a second
+DEG = 180.0 / math.pi  # degrees in a radian
+SCREEN: dict[Kind, Screen] = {
+    "length": Screen("mm", MM, "m/s", 1.0),
+    "angle": Screen("deg", DEG, "deg/s", DEG),
+}
+AN: dict[Kind, str] = {"length": "a length", "angle": "an angle"}
+LENGTHS = ("_m", "_mm", "_um")
+ANGLES = ("_rad", "_mrad", "_deg")
+TIMES = ("_s", "_ms", "_us", "_ns")
+OF_KIND: dict[Kind, tuple[str, ...]] = {"length": LENGTHS, "angle": ANGLES}
+_EXPONENTS = {  # power of ten to SI -> endings of names
+    0: ("_m", "_s", "_m_s", "_rad_s", "_s_m", "_rad", "_s_rad", "_deg_rtHz_per_deg_s", "_deg_rts_per_deg_s"),
+    -3: ("_mm", "_ms", "_mm_s", "_mm_rtHz", "_mm_rts", "_mm_rtHz_per_m_s", "_mm_rts_per_m_s", "_mrad"),
     -6: ("_um", "_us"),
     -9: ("_ns",),
 }
-EXPONENTS = {ending: exponent for exponent, endings in _ENDINGS.items() for ending in endings}
-LENGTHS = ("_m", "_mm", "_um")
-TIMES = ("_s", "_ms", "_us", "_ns")
-MM = 1e3  # mm in a metre: SI arrays times this are what files and screens show
-MS = 1e3  # ms in a second, likewise
+_DEGREES = ("_deg", "_deg_s", "_deg_rtHz", "_deg_rts")
+_UNITS = {ending: exponent for exponent, endings in _EXPONENTS.items() for ending in endings}
+_UNITS |= dict.fromkeys(_DEGREES, None)  # of names; None: degrees
+_AS_ANGLE = {  # endings that carry the kind of an axis
+    "_mm_rtHz_per_m_s": "_deg_rtHz_per_deg_s",
+    "_mm_rts_per_m_s": "_deg_rts_per_deg_s",
+    "_mm_rtHz": "_deg_rtHz",
+    "_mm_rts": "_deg_rts",
+    "_mm_s": "_deg_s",
+    "_mm": "_deg",
+    "_m_s": "_deg_s",
+    "_s_m": "_s_rad",
+}
+_AS_LENGTH = {angle: length for length, angle in _AS_ANGLE.items() if length != "_m_s"}
+_PRECISE = Context(prec=50)
+_RADIANS = Decimal("0.017453292519943295769236907684886127134428718885417254560971914402")  # in a degree
 PROVENANCE = "provenance"  # a table of this name is kept as it is
 INTERVAL = "_ci95"  # `time_constant_ms_ci95` is in ms
 
@@ -35,7 +83,28 @@ INTERVAL = "_ci95"  # `time_constant_ms_ci95` is in ms
 def ending(name: str) -> str | None:
     """The longest known unit at the end of ``name``, so that ``max_speed_m_s`` is in m/s; None without one."""
     stem = name.removesuffix(INTERVAL)
-    return max((unit for unit in EXPONENTS if stem.endswith(unit)), key=len, default=None)
+    return max((unit for unit in _UNITS if stem.endswith(unit)), key=len, default=None)
+
+
+def of_kind(name: str, kind: Kind) -> str:
+    """The name with the unit for a kind of axis, from the name for a length: ``sd_mm`` → ``sd_deg``."""
+    stem = name.removesuffix(INTERVAL)
+    unit = ending(name) if kind == "angle" else None
+    if unit not in _AS_ANGLE:
+        return name
+    return stem.removesuffix(unit) + _AS_ANGLE[unit] + name[len(stem) :]
+
+
+def as_length(name: str) -> str:
+    """The inverse of :func:`of_kind` for the quantities of one axis: ``sd_deg`` → ``sd_mm``."""
+    stem, unit = name.removesuffix(INTERVAL), ending(name)
+    return name if unit not in _AS_LENGTH else stem.removesuffix(unit) + _AS_LENGTH[unit] + name[len(stem) :]
+
+
+def si_of(values: FloatArray, unit: str) -> FloatArray:
+    """An array of numbers in the unit of an ending, in SI; the quotient by a power of ten is rounded once."""
+    exponent = _UNITS[unit]
+    return values / DEG if exponent is None else values / 10.0**-exponent
 
 
 def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
@@ -46,12 +115,12 @@ def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ConfigError: A number outside an interval (``_ci95``) is not finite.
     """
-    return _converted(tree, 0, "", _si)
+    return _converted(tree, "", "", _si)
 
 
 def from_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     """The inverse of :func:`to_si`: SI numbers in the units of their names."""
-    return _converted(tree, 0, "", _in_unit)
+    return _converted(tree, "", "", _in_unit)
 
 
 def refuse_unit(kind: str, name: str) -> None:
@@ -67,10 +136,25 @@ def refuse_unit(kind: str, name: str) -> None:
         raise ConfigError(f"{kind} '{name}': a name must not end in a unit ({unit})")
 
 
-def shifted(value: float | Decimal, exponent: int) -> float:
-    """``value`` × 10^exponent, exact in the shortest decimal form of ``value`` (no binary rounding in between)."""
-    decimal = value if isinstance(value, Decimal) else Decimal(repr(value))
-    return float(decimal.scaleb(exponent))
+def si(value: float | Decimal, unit: str) -> float:
+    """A number in the unit of an ending in SI, from its shortest decimal form (no binary rounding in between)."""
+    decimal, exponent = value if isinstance(value, Decimal) else Decimal(repr(value)), _UNITS[unit]
+    return float(_PRECISE.multiply(decimal, _RADIANS) if exponent is None else decimal.scaleb(exponent))
+
+
+def in_unit(value: float, unit: str) -> float | Decimal:
+    """The inverse of :func:`si`: the shortest decimal that is read as ``value`` again, a float if it is one's."""
+    exponent = _UNITS[unit]
+    if exponent is not None:
+        decimal = Decimal(repr(float(value))).scaleb(-exponent)
+    elif not math.isfinite(value):
+        return value
+    else:
+        exact = _PRECISE.divide(Decimal(value), _RADIANS)
+        rounded = (Context(prec=digits).plus(exact) for digits in range(15, 25))
+        decimal = next(one for one in rounded if si(one, unit) == value)
+    plain = float(decimal)
+    return plain if Decimal(repr(plain)) == decimal else decimal  # the 17th digit would be lost in a float
 
 
 def seconds(stamp: TimeArray, origin: int = 0) -> FloatArray:
@@ -86,31 +170,28 @@ def nanoseconds(time: FloatArray) -> TimeArray:
     return np.where(finite, np.rint(np.where(finite, time, 0.0) * 1e9).astype(np.int64), NO_STAMP)
 
 
-def _converted(value: Any, exponent: int | None, path: str, convert: Callable[[Any, int, str], Any]) -> Any:
-    """``value`` with every number in it converted; ``exponent`` is that of its unit, None within provenance."""
+def _converted(value: Any, unit: str | None, path: str, convert: Callable[[Any, str, str], Any]) -> Any:
+    """``value`` with every number in it converted; ``unit`` is "" for none, None within provenance."""
     if isinstance(value, Mapping):
         found: dict[str, Any] = {}
         for key, item in cast(Mapping[str, Any], value).items():
-            place, unit = f"{path}.{key}" if path else key, ending(key)
-            known = exponent is not None and place != PROVENANCE
-            inner = exponent if unit is None else EXPONENTS[unit]
-            found[key] = _converted(item, inner if known else None, place, convert)
+            place, own = f"{path}.{key}" if path else key, ending(key)
+            known = unit is not None and place != PROVENANCE
+            found[key] = _converted(item, (unit if own is None else own) if known else None, place, convert)
         return found
     if isinstance(value, list | tuple):
-        return [_converted(item, exponent, path, convert) for item in cast(list[Any], value)]
-    if isinstance(value, float | Decimal) or (type(value) is int and exponent):
-        return float(value) if exponent is None else convert(value, exponent, path)
+        return [_converted(item, unit, path, convert) for item in cast(list[Any], value)]
+    if isinstance(value, float | Decimal) or (type(value) is int and unit and _UNITS[unit] != 0):
+        return float(value) if unit is None else convert(value, unit, path)
     return value
 
 
-def _si(value: float | Decimal, exponent: int, path: str) -> float:
-    number = shifted(value, exponent)
+def _si(value: float | Decimal, unit: str, path: str) -> float:
+    number = si(value, unit) if unit else float(value)
     if not math.isfinite(number) and not path.endswith(INTERVAL):
         raise ConfigError(f"{path}: {str(value)[:24]} is not a finite number")
     return number
 
 
-def _in_unit(value: float, exponent: int, _: str) -> float | Decimal:
-    decimal = Decimal(repr(float(value))).scaleb(-exponent)
-    plain = float(decimal)
-    return plain if Decimal(repr(plain)) == decimal else decimal  # the 17th digit would be lost in a float
+def _in_unit(value: float, unit: str, _: str) -> float | Decimal:
+    return in_unit(value, unit) if unit else float(value)

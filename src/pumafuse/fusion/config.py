@@ -1,12 +1,16 @@
-"""``fusion.toml``: the arm, the process noise, and the sensors."""
+"""``fusion.toml``: the arm, the process noise, and the sensors.
+
+Keys of one axis have the units of its kind; tables for all axes may hold both: ``sd_mm`` for the axes that are lengths,
+``sd_deg`` for those that are angles.
+"""
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
@@ -16,21 +20,30 @@ from ..logs.frames import Frame
 from ..model.arm import ArmModel
 from ..model.presets import PRESETS
 from ..toml import NotNegative, Positive, Time
-from ..units import refuse_unit
+from ..units import AN, KINDS, Kind, of_kind, refuse_unit
 
-SD_BOUNDS = (1e-7, 1.0)  # m; of a sensor's noise that is fitted
+S = TypeVar("S", bound=msgspec.Struct)
+PerAxis = NotNegative | Annotated[dict[str, NotNegative], msgspec.Meta(min_length=1)]  # one number, or one for each axis
+
+SD_BOUNDS = (1e-7, 1.0)  # m or rad; of a sensor's noise that is fitted
 _LONGEST_LATENCY = 3600.0  # s
+_OFFSET_SD = 5e-3  # m or rad
+_PER_AXIS = ("sd_mm", "bias_sd_mm", "bias_drift_sd_mm")  # keys of a sensor that may differ from axis to axis
 ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
 
 
 class Start(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Prior uncertainty at the start: ``offset_sd`` is that of the offset [m]."""
+    """Prior uncertainty at the start: ``offset_sd`` is that of the offset [m or rad], one number or one for each axis."""
 
-    offset_sd: NotNegative = msgspec.field(name="offset_sd_mm", default=5e-3)
+    offset_sd: PerAxis = msgspec.field(name="offset_sd_mm", default=_OFFSET_SD)
+
+    def offset_sd_of(self, axis: str) -> float:
+        """The uncertainty of one axis's offset [m or rad]."""
+        return self.offset_sd.get(axis, _OFFSET_SD) if isinstance(self.offset_sd, dict) else self.offset_sd
 
 
 class Process(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Process noise of one axis; the variances of the two parts of each density add up.
+    """Process noise of one axis, m being rad for an angle; the variances of the two parts of each density add up.
 
     Attributes:
         input_noise: Density of the white noise at the plant's input [m/√Hz].
@@ -55,12 +68,13 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """z = scale · p(stamp − latency) + bias + noise.
 
     Attributes:
-        sd: Noise [m], one number or one for each axis.
+        sd: Noise [m or rad], one number or one for each axis.
         latency: From the instant at which the measurement is valid to its stamp [s].
         latency_sd: Standard deviation of the latency from measurement to measurement [s].
         scale: Factor on the position; −1 for a distance to a panel in front.
-        bias_sd: Prior uncertainty of a constant bias [m]; 0: no bias is estimated.
-        bias_drift_sd: Standard deviation of a bias that drifts and reverts to 0, beside the constant one [m]; 0: none.
+        bias_sd: Prior uncertainty of a constant bias [m or rad], one number or one for each axis; 0: no bias is
+            estimated.
+        bias_drift_sd: Standard deviation of a bias that drifts and reverts to 0, beside the constant one, likewise.
         bias_time: How long such a drift lasts [s].
         gate: A measurement beyond this many standard deviations is rejected; 0: never.
         gate_rows: Whether one rejected axis rejects the whole row.
@@ -70,20 +84,27 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     latency: float = msgspec.field(name="latency_ms", default=0.0)
     latency_sd: NotNegative = msgspec.field(name="latency_sd_ms", default=0.0)
     scale: float = 1.0
-    bias_sd: NotNegative = msgspec.field(name="bias_sd_mm", default=0.0)
-    bias_drift_sd: NotNegative = msgspec.field(name="bias_drift_sd_mm", default=0.0)
+    bias_sd: PerAxis = msgspec.field(name="bias_sd_mm", default=0.0)
+    bias_drift_sd: PerAxis = msgspec.field(name="bias_drift_sd_mm", default=0.0)
     bias_time: Time = msgspec.field(name="bias_time_s", default=10.0)
     gate: NotNegative = 50.0
     gate_rows: bool = True
 
-    @property
-    def biased(self) -> bool:
-        """Whether it has a bias, constant or drifting."""
-        return self.bias_sd > 0.0 or self.bias_drift_sd > 0.0
-
     def sd_of(self, axis: str) -> float | None:
-        """The noise on one axis [m]; None where the sensor has none and so is not used."""
+        """The noise on one axis [m or rad]; None where the sensor has none and so is not used."""
         return self.sd.get(axis) if isinstance(self.sd, dict) else self.sd
+
+    def bias_sd_of(self, axis: str) -> float:
+        """The uncertainty of its constant bias on one axis [m or rad]; 0 where none is estimated."""
+        return self.bias_sd.get(axis, 0.0) if isinstance(self.bias_sd, dict) else self.bias_sd
+
+    def bias_drift_sd_of(self, axis: str) -> float:
+        """The standard deviation of its drifting bias on one axis [m or rad]; 0 where there is none."""
+        return self.bias_drift_sd.get(axis, 0.0) if isinstance(self.bias_drift_sd, dict) else self.bias_drift_sd
+
+    def is_biased(self, axis: str) -> bool:
+        """Whether it has a bias on one axis, constant or drifting."""
+        return self.bias_sd_of(axis) > 0.0 or self.bias_drift_sd_of(axis) > 0.0
 
     def is_at_bound(self, axis: str) -> bool:
         """Whether its noise on an axis is at a bound of what is fitted, or beyond: no measurement determined it."""
@@ -110,14 +131,15 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     def __post_init__(self) -> None:
         _known_axes("process", self.process, self.arm)
-        for path, part in self._parts():  # if made in Python, unchecked
-            toml.struct(toml.builtins(part), type(part), "configuration", path)
+        for path, part, kind in self._parts():  # if made in Python, unchecked
+            toml.struct(toml.builtins(part, kind), type(part), "configuration", path, kind)
         for name, sensor in self.sensors.items():
             refuse_unit("sensor", name)
-            if not math.isfinite(sensor.scale + sensor.latency + sensor.gate + sensor.bias_sd + sensor.latency_sd):
+            if not math.isfinite(sensor.scale + sensor.latency + sensor.gate + sensor.latency_sd):
                 raise ConfigError(f"sensors.{name}: scale, latency, gate and sds must be finite")
-            if isinstance(sensor.sd, dict):
-                _known_axes(f"sensors.{name}.sd_mm", sensor.sd, self.arm)
+            for key, value in zip(_PER_AXIS, (sensor.sd, sensor.bias_sd, sensor.bias_drift_sd), strict=True):
+                if isinstance(value, dict):
+                    _known_axes(f"sensors.{name}.{key}", value, self.arm)
             if abs(sensor.latency) > _LONGEST_LATENCY:
                 raise ConfigError(f"sensors.{name}.latency_ms: more than an hour; is it in ms?")
             if sensor.scale == 0.0:
@@ -125,11 +147,12 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         complete = {axis: self.process.get(axis, Process()) for axis in self.arm.axes}
         msgspec.structs.force_setattr(self, "process", complete)
 
-    def _parts(self) -> Iterator[tuple[str, msgspec.Struct]]:
-        """Its tables with their places in the file."""
-        yield "start", self.start
-        yield from ((f"process.{axis}", process) for axis, process in self.process.items())
-        yield from ((f"sensors.{name}", sensor) for name, sensor in self.sensors.items())
+    def _parts(self) -> Iterator[tuple[str, msgspec.Struct, Kind]]:
+        """Its tables with their places in the file, and of which kind of axis they are."""
+        kind = self.arm.kinds[0]
+        yield "start", self.start, kind
+        yield from ((f"process.{axis}", process, self.arm.axes[axis].kind) for axis, process in self.process.items())
+        yield from ((f"sensors.{name}", sensor, kind) for name, sensor in self.sensors.items())
 
     @staticmethod
     def load(path: str | Path) -> FusionConfig:
@@ -143,12 +166,22 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         tree["arm"] = load_arm(tree, path)
         if isinstance(tree.get("process"), dict):
             tree["process"] = by_axis(tree["process"], Process, tree["arm"], where, "process")
+        if isinstance(tree.get("start"), dict):
+            tree["start"] = of_all_axes(tree["start"], Start, tree["arm"], where, "start", ["offset_sd_mm"])
+        if isinstance(tree.get("sensors"), dict):
+            tree["sensors"] = {
+                name: of_all_axes(table, Sensor, tree["arm"], where, f"sensors.{name}", _PER_AXIS)
+                for name, table in tree["sensors"].items()
+            }
         return toml.struct(tree, FusionConfig, where)
 
     def save(self, folder: Path) -> None:
         """Write ``fusion.toml`` and the arm as ``arm.toml`` beside it."""
         tree = toml.builtins(self)
         tree["arm"] = ARM_FILE
+        tree["process"] = {axis: toml.builtins(one, self.arm.axes[axis].kind) for axis, one in self.process.items()}
+        tree["start"] = with_kinds(tree["start"], self.arm, ["offset_sd_mm"])
+        tree["sensors"] = {name: with_kinds(table, self.arm, _PER_AXIS) for name, table in tree["sensors"].items()}
         (folder / "fusion.toml").write_text(toml.text(tree), encoding="utf-8")
         self.arm.save(folder / ARM_FILE)
 
@@ -184,10 +217,8 @@ def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
     return ArmModel.load(beside)
 
 
-def by_axis(
-    table: Mapping[str, Any], kind: type[msgspec.Struct], arm: ArmModel, where: str, path: str
-) -> dict[str, dict[str, Any]]:
-    """A table for each axis of the arm: ``[process]`` is for all axes, ``[process.radial]`` overrides it for one.
+def by_axis(table: Mapping[str, Any], kind: type[S], arm: ArmModel, where: str, path: str) -> dict[str, S]:
+    """A struct for each axis of the arm: ``[process]`` is for all axes, ``[process.radial]`` overrides it for one.
 
     Args:
         table: The table with the tables in it, in SI.
@@ -199,14 +230,74 @@ def by_axis(
     Raises:
         ConfigError: A table names no axis, or a key is not declared.
     """
-    keys = {field.encode_name for field in msgspec.structs.fields(kind)}
+    names = {of: {of_kind(field.encode_name, of) for field in msgspec.structs.fields(kind)} for of in KINDS}
+    keys = set[str]().union(*names.values())
     own: dict[str, dict[str, Any]] = {
         key: value for key, value in table.items() if isinstance(value, dict) and key not in keys
     }
-    common = {key: value for key, value in table.items() if key not in own}
     _known_axes(f"{where}: {path}", own, arm)
-    toml.struct(common, kind, where, path)
-    return {axis: {**common, **own.get(axis, {})} for axis in arm.axes}
+    common = {key: value for key, value in table.items() if key not in own}
+    needless = {key: value for key, value in common.items() if not any(key in names[of] for of in arm.kinds)}
+    toml.struct(needless, kind, where, path, arm.kinds[0])
+    of_kinds = {of: {key: value for key, value in common.items() if key in names[of]} for of in arm.kinds}
+    for of, shared in of_kinds.items():
+        toml.struct(shared, kind, where, path, of)
+    return {
+        axis: toml.struct({**of_kinds[one.kind], **own.get(axis, {})}, kind, where, f"{path}.{axis}", one.kind)
+        for axis, one in arm.axes.items()
+    }
+
+
+def of_all_axes(
+    table: Any, kind: type[S], arm: ArmModel, where: str, path: str, per_axis: Sequence[str]
+) -> dict[str, Any] | Any:
+    """A table for all axes of the arm as one of lengths: where they are of both kinds, with a number for each axis.
+
+    Args:
+        table: The table, in SI: ``sd_mm`` holds for the axes that are lengths, ``sd_deg`` for those that are angles.
+        kind: The struct that declares its keys, as those of lengths.
+        arm: Its axes are of one kind or of both.
+        where: The file, for errors.
+        path: The table's place in the file.
+        per_axis: The keys that may have a number for each axis.
+
+    Raises:
+        ConfigError: A key is of a kind that no axis has, or its value is out of range.
+    """
+    if not isinstance(table, dict):
+        return table
+    found: dict[str, Any] = dict(table)  # pyright: ignore[reportUnknownArgumentType]
+    for key in per_axis:
+        given = {of: found.pop(name) for of in KINDS if (name := of_kind(key, of)) in found}
+        for of, value in given.items():
+            name = of_kind(key, of)
+            if of not in arm.kinds:
+                right = of_kind(key, arm.kinds[0])
+                raise ConfigError(f"{where}: {path}.{name}: no axis of the arm is {AN[of]}; give {right}")
+            fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
+            toml.check(value, fields[key].type, where, f"{path}.{name}")
+        if len(arm.kinds) == 1:
+            found |= {key: value for value in given.values()}
+        elif given:
+            axes = {axis: given[one.kind] for axis, one in arm.axes.items() if one.kind in given}
+            each = {axis: value.get(axis) if isinstance(value, dict) else value for axis, value in axes.items()}
+            named = {axis: value for one in given.values() if isinstance(one, dict) for axis, value in one.items()}
+            found[key] = {**named, **{axis: value for axis, value in each.items() if value is not None}}
+    return found
+
+
+def with_kinds(table: Mapping[str, Any], arm: ArmModel, per_axis: Sequence[str]) -> dict[str, Any]:
+    """The inverse of :func:`of_all_axes`: a table of lengths with a key for each kind of the arm's axes."""
+    found = dict(table)
+    for key in per_axis:
+        value = found.pop(key, None)
+        for of in arm.kinds if value is not None else ():
+            mine = value
+            if isinstance(value, dict):
+                mine = {axis: one for axis, one in value.items() if arm.axes[axis].kind == of}  # pyright: ignore
+            if mine != {}:
+                found[of_kind(key, of)] = mine
+    return found
 
 
 def _known_axes(where: str, named: Mapping[str, object], arm: ArmModel) -> None:

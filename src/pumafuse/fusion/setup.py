@@ -29,11 +29,12 @@ def _rest(config: FusionConfig, axis: str, biased: Sequence[str]) -> tuple[Float
         found.append((1.0 / process.disturbance_time, process.disturbance_sd**2))
     for name in biased:
         sensor = config.sensors[name]
-        if sensor.bias_drift_sd > 0.0:
-            found.append((1.0 / sensor.bias_time, sensor.bias_drift_sd**2))
+        drifting, constant = sensor.bias_drift_sd_of(axis), sensor.bias_sd_of(axis)
+        if drifting > 0.0:
+            found.append((1.0 / sensor.bias_time, drifting**2))
             owners.append((name, False))
-        if sensor.bias_sd > 0.0:
-            found.append((0.0, sensor.bias_sd**2))
+        if constant > 0.0:
+            found.append((0.0, constant**2))
             owners.append((name, True))
     return np.array(found).reshape(-1, 2), owners
 
@@ -127,7 +128,7 @@ def at_rest(
     rows = count * (1 + places) + 1
     P, drive = np.zeros((rows, width, width)), np.zeros((rows, 6))
     for number, axis in enumerate(axes):
-        P[number, OFFSET, OFFSET] = config.start.offset_sd**2
+        P[number, OFFSET, OFFSET] = config.start.offset_sd_of(axis) ** 2
         for place, variance in enumerate(rest[number][:, VARIANCE], REST):
             P[number, place, place] = variance
         process = config.process[axis]

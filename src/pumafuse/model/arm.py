@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -13,7 +14,7 @@ from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError, suggestion
 from ..toml import Interval, Positive
-from ..units import MM, refuse_unit
+from ..units import KINDS, MM, SCREEN, Kind, Screen, refuse_unit
 from .plants import PLANTS, Delay
 from .presets import PRESETS
 
@@ -25,9 +26,9 @@ class Gain(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """Gain K = slope · speed + intercept of a step, equation 11.
 
     Attributes:
-        slope: a [s/m] (the paper's Table II prints m/s; K has no unit, so it is s/m).
+        slope: a [s/m or s/rad] (the paper's Table II prints m/s; K has no unit, so it is s/m).
         intercept: b, the gain of an infinitely slow step.
-        slope_ci95: 95 % interval of a [s/m], if it was identified.
+        slope_ci95: 95 % interval of a, if it was identified.
         intercept_ci95: 95 % interval of b.
     """
 
@@ -37,7 +38,7 @@ class Gain(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     intercept_ci95: Interval | None = None
 
     def at(self, speed: FloatArray) -> FloatArray:
-        """K at ``speed`` [m/s]; the shape of ``speed``."""
+        """K at ``speed`` [m/s or rad/s]; the shape of ``speed``."""
         return self.slope * speed + self.intercept
 
 
@@ -45,6 +46,7 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """The model of one axis.
 
     Attributes:
+        kind: Whether its positions are lengths [m] or angles [rad].
         plant: The plant, of unit gain.
         gain: The gain over speed, which acts on the command before the plant.
         gain_recovery: Time constant [s] with which the gain error decays, by the servo's integral action; None: never.
@@ -53,6 +55,7 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         delay_ci95: Its 95 % interval [s], if it was fitted.
     """
 
+    kind: Kind = "length"
     plant: PLANTS
     gain: Gain = Gain()
     gain_recovery: Positive | None = msgspec.field(name="gain_recovery_ms", default=None)
@@ -68,7 +71,7 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
 
         Args:
             delay: Td [s] of this axis; :meth:`ArmModel.lag_of` knows it.
-            speed: At which K is taken [m/s]; 0: slow motion.
+            speed: At which K is taken [m/s or rad/s]; 0: slow motion.
         """
         gain_error = 1.0 - (self.gain.slope * speed + self.gain.intercept)
         return delay + self.plant.lag + gain_error * (self.gain_recovery or 0.0)
@@ -78,21 +81,35 @@ class Validity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """Limits within which the model was found to hold; beyond them pumafuse warns and goes on.
 
     Attributes:
-        max_speed: Commanded speed [m/s].
+        max_speed: Commanded speed of an axis that is a length [m/s].
+        max_angular_speed: Of one that is an angle [rad/s].
         max_radius: Distance from the base's vertical axis [m].
     """
 
     max_speed: Positive | None = msgspec.field(name="max_speed_m_s", default=None)
+    max_angular_speed: Positive | None = msgspec.field(name="max_speed_deg_s", default=None)
     max_radius: Positive | None = msgspec.field(name="max_radius_mm", default=None)
 
-    def excess(self, speed: float, radius: float | None) -> list[str]:
-        """One sentence for each limit that the highest commanded ``speed`` [m/s] or ``radius`` [m] exceeds."""
+    def limit_of(self, kind: Kind) -> float | None:
+        """The highest commanded speed of axes of a kind [m/s or rad/s]."""
+        return self.max_speed if kind == "length" else self.max_angular_speed
+
+    def excess(self, speed: Mapping[Kind, float], radius: float | None) -> list[str]:
+        """One sentence for each limit that is exceeded.
+
+        Args:
+            speed: The highest commanded one for each kind of axis [m/s or rad/s].
+            radius: The largest commanded one [m]; None: not known.
+        """
         sentences: list[str] = []
-        if self.max_speed is not None and speed > self.max_speed * _EXCEEDED:
-            sentences.append(
-                f"commanded speed reaches {speed:.3g} m/s, {speed / self.max_speed:.2f} times the"
-                f" {self.max_speed:g} m/s that the arm model is valid for"
-            )
+        for kind, fastest in speed.items():
+            limit, screen = self.limit_of(kind), SCREEN[kind]
+            if limit is not None and fastest > limit * _EXCEEDED:
+                sentences.append(
+                    f"commanded speed reaches {fastest * screen.fast_scale:.3g} {screen.fast},"
+                    f" {fastest / limit:.2f} times the {limit * screen.fast_scale:g} {screen.fast} that the arm model is"
+                    " valid for"
+                )
         if self.max_radius is not None and radius is not None and radius > self.max_radius:
             beyond = (radius - self.max_radius) * MM
             sentences.append(
@@ -150,7 +167,10 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def to_toml(self) -> str:
         """The text of ``arm.toml``."""
         tree = toml.builtins(self)
-        tree["axes"] = {name: {**axis.pop("plant"), **axis} for name, axis in tree["axes"].items()}
+        for name, axis in self.axes.items():
+            table = toml.builtins(axis, axis.kind)
+            kind = {} if axis.kind == "length" else {"kind": axis.kind}
+            tree["axes"][name] = {**kind, **table.pop("plant"), **{key: table[key] for key in table if key != "kind"}}
         return toml.text({key: value for key, value in tree.items() if value != {}})
 
     def axis(self, name: str) -> AxisModel:
@@ -162,6 +182,15 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         if name not in self.axes:
             raise UnknownNameError(self.name, "axis", name, self.axes)
         return self.axes[name]
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """The kinds of its axes."""
+        return tuple(kind for kind in KINDS if any(axis.kind == kind for axis in self.axes.values()))
+
+    def screen_of(self, axis: str) -> Screen:
+        """How files and screens show positions of one axis."""
+        return SCREEN[self.axis(axis).kind]
 
     def delay_of(self, axis: str) -> float:
         """Td [s] of one axis: its own, or the arm's."""
@@ -180,7 +209,7 @@ def ordered_axes(names: set[str]) -> tuple[str, ...]:
 
 
 def commanded_speed(step: FloatArray, period: float) -> FloatArray:
-    """Speed [m/s] of each command: its step [m] over the update period [s] (the paper's "speed" of a step)."""
+    """Speed of each command: its step over the update period [s] (the paper's "speed" of a step)."""
     return np.abs(step) / period
 
 
@@ -194,8 +223,10 @@ def _axis(table: Any, where: str, path: str) -> AxisModel:
     if name not in plants:
         raise ConfigError(f"{where}: {path}.plant: unknown plant '{name}'; {suggestion(name, plants)}")
     plant = [field.encode_name for field in msgspec.structs.fields(plants[name])]
+    kind: Kind = "angle" if keys.get("kind") == "angle" else "length"
     accepted = dict.fromkeys(["plant", *plant, *(field.encode_name for field in msgspec.structs.fields(AxisModel))])
     for key in keys.keys() - accepted.keys():
         raise ConfigError(f"{where}: unknown key '{path}.{key}'; {suggestion(key, accepted)}")
     parameters = {key: keys.pop(key) for key in plant if key in keys}
-    return toml.struct({**keys, "plant": toml.struct(parameters, plants[name], where, path)}, AxisModel, where, path)
+    made = toml.struct(parameters, plants[name], where, path)
+    return toml.struct({**keys, "plant": made}, AxisModel, where, path, kind)
