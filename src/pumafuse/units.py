@@ -2,7 +2,7 @@
 
 Every number in a file, a column or on a screen has its unit as the ending of its name (``latency_ms``, ``x_mm``). All
 units but degrees are powers of ten of an SI unit, so conversion moves the decimal point of the shortest decimal form of
-the number: 60.45 ms is exactly the float 0.06045 s, and comes back as 60.45. So does an angle that was given in degrees.
+the number: 60.45 ms is exactly the float 0.06045 s, and comes back as 60.45. So does an angle given in degrees.
 
 An axis is a length (m inside) or an angle (rad inside). Names in the code are those of lengths (``sd_mm``); files and
 screens have those of the axis's kind (``sd_deg``): :func:`of_kind`.
@@ -61,8 +61,10 @@ _EXPONENTS = {  # power of ten to SI -> endings of names
     -9: ("_ns",),
 }
 _DEGREES = ("_deg", "_deg_s", "_deg_rtHz", "_deg_rts")
-_UNITS = {ending: exponent for exponent, endings in _EXPONENTS.items() for ending in endings}
-_UNITS |= dict.fromkeys(_DEGREES, None)  # of names; None: degrees
+_UNITS: dict[str, int | None] = {  # of names; None: degrees
+    **{ending: exponent for exponent, endings in _EXPONENTS.items() for ending in endings},
+    **dict.fromkeys(_DEGREES, None),
+}
 _AS_ANGLE = {  # endings that carry the kind of an axis
     "_mm_rtHz_per_m_s": "_deg_rtHz_per_deg_s",
     "_mm_rts_per_m_s": "_deg_rts_per_deg_s",
@@ -84,6 +86,12 @@ def ending(name: str) -> str | None:
     """The longest known unit at the end of ``name``, so that ``max_speed_m_s`` is in m/s; None without one."""
     stem = name.removesuffix(INTERVAL)
     return max((unit for unit in _UNITS if stem.endswith(unit)), key=len, default=None)
+
+
+def kind_of(name: str) -> Kind | None:
+    """The kind of axis of which a name that ends in a unit of position is; None for any other name."""
+    unit = ending(name)
+    return next((kind for kind in KINDS if unit in OF_KIND[kind]), None)
 
 
 def of_kind(name: str, kind: Kind) -> str:

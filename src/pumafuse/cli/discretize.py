@@ -10,11 +10,11 @@ import typer
 from ..arrays import FloatArray
 from ..model.arm import ArmModel
 from ..model.discrete import DiscreteModel, discretize
-from ..units import shifted
+from ..units import MS, Screen, in_unit, si
 from .tables import print_json
 
 _MOST_TICKS = 200  # of a step response
-_MATRICES = {"F": "", "B": "", "H": "", "Q": " [mm²] for input noise of 1 mm/√Hz"}
+_MATRICES = ("F", "B", "H", "Q")
 
 
 def run(source: str, axis: str | None, period_ms: float | None, json: bool) -> None:
@@ -24,35 +24,38 @@ def run(source: str, axis: str | None, period_ms: float | None, json: bool) -> N
         PumafuseError: No such arm or axis.
     """
     arm = ArmModel.load(source)
-    period = arm.update_period if period_ms is None else shifted(period_ms, -3)
-    # 1 m/√Hz and states in m give the same numbers as 1 mm/√Hz and states in mm.
+    period = arm.update_period if period_ms is None else si(period_ms, "_ms")
+    # 1 m/√Hz and states in m give the same numbers as 1 mm/√Hz and states in mm, or as degrees.
     models = {
         name: discretize(arm.axis(name), period, arm.delay_of(name), input_noise=1.0)
         for name in (arm.axes if axis is None else [axis])
     }
     if json:
-        print_json({"arm": arm.name, "axes": {name: _tree(model) for name, model in models.items()}})
+        print_json(
+            {"arm": arm.name, "axes": {name: _tree(model, arm.screen_of(name)) for name, model in models.items()}}
+        )
         return
     for name, model in models.items():
-        _print(f"{arm.name}, {name}", model)
+        _print(f"{arm.name}, {name}", model, arm.screen_of(name))
 
 
-def _tree(model: DiscreteModel) -> dict[str, object]:
+def _tree(model: DiscreteModel, screen: Screen) -> dict[str, object]:
     return {
-        "period_ms": shifted(model.period, 3),
-        "delay_ms": shifted(model.delay, 3),
+        "period_ms": in_unit(model.period, "_ms"),
+        "delay_ms": in_unit(model.delay, "_ms"),
         "states": model.states,
         **{name: getattr(model, name).tolist() for name in _MATRICES},
         "poles": [(pole.real, pole.imag) for pole in model.poles.tolist()],
-        "step_response_mm": _step_response(model).tolist(),
+        f"step_response_{screen.unit}": _step_response(model).tolist(),
     }
 
 
-def _print(title: str, model: DiscreteModel) -> None:
-    typer.echo(f"{title}: period {shifted(model.period, 3):g} ms, delay {shifted(model.delay, 3):g} ms")
-    typer.echo(f"states: {', '.join(model.states)} (mm, mm/s)")
+def _print(title: str, model: DiscreteModel, screen: Screen) -> None:
+    typer.echo(f"{title}: period {model.period * MS:g} ms, delay {model.delay * MS:g} ms")
+    typer.echo(f"states: {', '.join(model.states)} ({screen.unit}, {screen.unit}/s)")
     with np.printoptions(precision=6, suppress=False, linewidth=120):
-        for name, unit in _MATRICES.items():
+        for name in _MATRICES:
+            unit = f" [{screen.unit}²] for input noise of 1 {screen.unit}/√Hz" if name == "Q" else ""
             typer.echo(f"{name}{unit} =\n{getattr(model, name)}")
         poles = (f"{pole.real:.6g}" + (f"{pole.imag:+.6g}j" if pole.imag else "") for pole in model.poles.tolist())
         typer.echo(f"poles: {', '.join(poles)}")

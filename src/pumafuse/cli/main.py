@@ -322,9 +322,9 @@ def _level(text: str) -> tuple[str, float]:
 
 def _si(value: float) -> float:
     """Milliseconds or millimetres of the command line in s or m, without a binary rounding in between."""
-    from ..units import shifted  # imports numpy, which no --help needs
+    from ..units import si  # imports numpy, which no --help needs
 
-    return shifted(value, -3)
+    return si(value, "_mm")
 
 
 def _check_interval(since: float | None, until: float | None) -> None:

@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, cast
 
 import msgspec
 
@@ -23,7 +23,9 @@ from ..toml import NotNegative, Positive, Time
 from ..units import AN, KINDS, Kind, of_kind, refuse_unit
 
 S = TypeVar("S", bound=msgspec.Struct)
-PerAxis = NotNegative | Annotated[dict[str, NotNegative], msgspec.Meta(min_length=1)]  # one number, or one for each axis
+PerAxis = (
+    NotNegative | Annotated[dict[str, NotNegative], msgspec.Meta(min_length=1)]
+)  # one number, or one for each axis
 
 SD_BOUNDS = (1e-7, 1.0)  # m or rad; of a sensor's noise that is fitted
 _LONGEST_LATENCY = 3600.0  # s
@@ -33,7 +35,7 @@ ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
 
 
 class Start(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Prior uncertainty at the start: ``offset_sd`` is that of the offset [m or rad], one number or one for each axis."""
+    """Prior uncertainty at the start: ``offset_sd`` is that of the offset [m or rad], for all axes or for each."""
 
     offset_sd: PerAxis = msgspec.field(name="offset_sd_mm", default=_OFFSET_SD)
 
@@ -149,10 +151,11 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     def _parts(self) -> Iterator[tuple[str, msgspec.Struct, Kind]]:
         """Its tables with their places in the file, and of which kind of axis they are."""
-        kind = self.arm.kinds[0]
-        yield "start", self.start, kind
-        yield from ((f"process.{axis}", process, self.arm.axes[axis].kind) for axis, process in self.process.items())
-        yield from ((f"sensors.{name}", sensor, kind) for name, sensor in self.sensors.items())
+        yield "start", self.start, self.arm.kinds[0]
+        for axis, process in self.process.items():
+            yield f"process.{axis}", process, self.arm.axes[axis].kind
+        for name, sensor in self.sensors.items():
+            yield f"sensors.{name}", sensor, self.arm.kinds[0]
 
     @staticmethod
     def load(path: str | Path) -> FusionConfig:
@@ -231,7 +234,7 @@ def by_axis(table: Mapping[str, Any], kind: type[S], arm: ArmModel, where: str, 
         ConfigError: A table names no axis, or a key is not declared.
     """
     names = {of: {of_kind(field.encode_name, of) for field in msgspec.structs.fields(kind)} for of in KINDS}
-    keys = set[str]().union(*names.values())
+    keys = names["length"] | names["angle"]
     own: dict[str, dict[str, Any]] = {
         key: value for key, value in table.items() if isinstance(value, dict) and key not in keys
     }
@@ -239,7 +242,9 @@ def by_axis(table: Mapping[str, Any], kind: type[S], arm: ArmModel, where: str, 
     common = {key: value for key, value in table.items() if key not in own}
     needless = {key: value for key, value in common.items() if not any(key in names[of] for of in arm.kinds)}
     toml.struct(needless, kind, where, path, arm.kinds[0])
-    of_kinds = {of: {key: value for key, value in common.items() if key in names[of]} for of in arm.kinds}
+    of_kinds: dict[Kind, dict[str, Any]] = {
+        of: {key: value for key, value in common.items() if key in names[of]} for of in arm.kinds
+    }
     for of, shared in of_kinds.items():
         toml.struct(shared, kind, where, path, of)
     return {
@@ -248,10 +253,8 @@ def by_axis(table: Mapping[str, Any], kind: type[S], arm: ArmModel, where: str, 
     }
 
 
-def of_all_axes(
-    table: Any, kind: type[S], arm: ArmModel, where: str, path: str, per_axis: Sequence[str]
-) -> dict[str, Any] | Any:
-    """A table for all axes of the arm as one of lengths: where they are of both kinds, with a number for each axis.
+def of_all_axes(table: Any, kind: type[S], arm: ArmModel, where: str, path: str, per_axis: Sequence[str]) -> Any:
+    """A table for all axes of the arm as one of lengths; where axes are of both kinds, with a number for each axis.
 
     Args:
         table: The table, in SI: ``sd_mm`` holds for the axes that are lengths, ``sd_deg`` for those that are angles.
@@ -266,23 +269,28 @@ def of_all_axes(
     """
     if not isinstance(table, dict):
         return table
-    found: dict[str, Any] = dict(table)  # pyright: ignore[reportUnknownArgumentType]
+    found, types = (
+        cast(dict[str, Any], table).copy(),
+        {one.encode_name: one.type for one in msgspec.structs.fields(kind)},
+    )
     for key in per_axis:
-        given = {of: found.pop(name) for of in KINDS if (name := of_kind(key, of)) in found}
-        for of, value in given.items():
+        each: dict[str, Any] = {}
+        for of in KINDS:
             name = of_kind(key, of)
+            if name not in found:
+                continue
+            value = found.pop(name)
             if of not in arm.kinds:
                 right = of_kind(key, arm.kinds[0])
                 raise ConfigError(f"{where}: {path}.{name}: no axis of the arm is {AN[of]}; give {right}")
-            fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
-            toml.check(value, fields[key].type, where, f"{path}.{name}")
-        if len(arm.kinds) == 1:
-            found |= {key: value for value in given.values()}
-        elif given:
-            axes = {axis: given[one.kind] for axis, one in arm.axes.items() if one.kind in given}
-            each = {axis: value.get(axis) if isinstance(value, dict) else value for axis, value in axes.items()}
-            named = {axis: value for one in given.values() if isinstance(one, dict) for axis, value in one.items()}
-            found[key] = {**named, **{axis: value for axis, value in each.items() if value is not None}}
+            toml.check(value, types[key], where, f"{path}.{name}")
+            if len(arm.kinds) == 1:
+                found[key] = value
+            else:
+                mine = [axis for axis, one in arm.axes.items() if one.kind == of]
+                each |= cast(dict[str, Any], value) if isinstance(value, dict) else dict.fromkeys(mine, value)
+        if each:
+            found[key] = each
     return found
 
 
@@ -290,12 +298,13 @@ def with_kinds(table: Mapping[str, Any], arm: ArmModel, per_axis: Sequence[str])
     """The inverse of :func:`of_all_axes`: a table of lengths with a key for each kind of the arm's axes."""
     found = dict(table)
     for key in per_axis:
-        value = found.pop(key, None)
+        value: Any = found.pop(key, None)
         for of in arm.kinds if value is not None else ():
-            mine = value
-            if isinstance(value, dict):
-                mine = {axis: one for axis, one in value.items() if arm.axes[axis].kind == of}  # pyright: ignore
-            if mine != {}:
+            if not isinstance(value, dict):
+                found[of_kind(key, of)] = value
+                continue
+            each = cast(dict[str, Any], value)
+            if mine := {axis: one for axis, one in each.items() if arm.axes[axis].kind == of}:
                 found[of_kind(key, of)] = mine
     return found
 

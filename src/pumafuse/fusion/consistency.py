@@ -176,9 +176,15 @@ def sensor_problems(est: Estimates) -> list[str]:
 
 def _width_of_prior(est: Estimates, name: str) -> float:
     """How many times the prior is as wide as a sensor's noise: beyond 1e6 double precision blurs the error bars."""
-    sensor = est.config.sensors.get(name)
-    sds = [sd for axis in est.axes if sensor is not None and (sd := sensor.sd_of(axis)) is not None]
-    return 0.0 if sensor is None else max(est.config.start.offset_sd, sensor.bias_sd) / min(sds, default=np.inf)
+    sensor, start = est.config.sensors.get(name), est.config.start
+    if sensor is None:
+        return 0.0
+    widths = [
+        max(start.offset_sd_of(axis), sensor.bias_sd_of(axis)) / sd
+        for axis in est.axes
+        if (sd := sensor.sd_of(axis)) is not None
+    ]
+    return max(widths, default=0.0)
 
 
 def _frozen(values: FloatArray) -> int:

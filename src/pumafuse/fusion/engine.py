@@ -126,13 +126,16 @@ def arranged(
 def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
     """For each axis the sensors whose bias is in its state: those that measure it, in their order."""
     rows = segment.measurement_rows
-    biased = [
-        (number, name)
-        for number, name in enumerate(segment.sensors)
-        if name in config.sensors and config.sensors[name].biased
+    return [
+        [
+            name
+            for number, name in enumerate(segment.sensors)
+            if name in config.sensors
+            and config.sensors[name].is_biased(axis)
+            and (known[rows.source == number] == Outcome.FUSED).any()
+        ]
+        for axis, known in zip(segment.axes, rows.known.T, strict=True)
     ]
-    fused = [column == Outcome.FUSED for column in rows.known.T]
-    return [[name for number, name in biased if fused_on[rows.source == number].any()] for fused_on in fused]
 
 
 def _history(events: Events, state: State, estimates: int) -> History:

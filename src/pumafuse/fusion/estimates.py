@@ -133,7 +133,7 @@ class Estimates:
             arrived (``as-live``), or all of the run (``smoothed``).
         engine: Which engine computed it.
         config: The configuration as used.
-        speed: Highest commanded speed [m/s].
+        speed: Highest commanded speed for each kind of axis [m/s or rad/s].
         radius: Greatest distance of a command from the base's axis [m]; None without a cylindrical frame.
         notes: What was noticed, a sentence each.
         since: Where the part of the run that was used begins [s]; None: with the run.
@@ -154,7 +154,7 @@ class Estimates:
     mode: Mode
     engine: str
     config: FusionConfig
-    speed: float
+    speed: Mapping[Kind, float]
     radius: float | None
     notes: tuple[str, ...]
     since: float | None = None

@@ -10,8 +10,7 @@ import numpy as np
 from ..arrays import FloatArray, TimeArray
 from ..filter.outcome import Outcome
 from ..model.response import response
-from ..units import MM
-from .config import FusionConfig
+from .config import FusionConfig, Sensor
 from .segments import Segment
 
 _FEW = 30  # rows, or changes of a value, below which nothing is said
@@ -60,9 +59,11 @@ def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
         return []
     off = {axis: abs(speed) * config.arm.lag_of(axis, abs(speed)) for axis, speed in speeds.items()}
     most = max(off, key=off.__getitem__)
+    screen = config.arm.screen_of(most)
     return [
-        f"the run begins in motion ({speeds[most] * MM:.3g} mm/s on {most}), the model at rest: estimates are wrong by"
-        f" up to {off[most] * MM:.2g} mm at first; record from rest, or use --from"
+        f"the run begins in motion ({speeds[most] * screen.scale:.3g} {screen.unit}/s on {most}), the model at rest:"
+        f" estimates are wrong by up to {off[most] * screen.scale:.2g} {screen.unit} at first; record from rest, or use"
+        f" --from"
         f" {max(_settled(config, axis) for axis in speeds):.2g} or later"
     ]
 
@@ -93,14 +94,21 @@ def _off(
     median = float(np.median(distance))
     spread = 1.4826 * float(np.median(np.abs(distance - median)))
     walked = process.drift * math.sqrt(float(valid[-1] - valid[0]) / 1e9)
-    of_sensor = math.hypot(sensor.sd_of(axis) or 0.0, sensor.bias_sd, sensor.bias_drift_sd) / abs(sensor.scale)
-    expected = math.hypot(config.start.offset_sd, walked, process.disturbance_sd, of_sensor)
+    of_sensor = _sd_and_bias(sensor, axis) / abs(sensor.scale)
+    expected = math.hypot(config.start.offset_sd_of(axis), walked, process.disturbance_sd, of_sensor)
     if abs(median) <= _FAR * max(spread, expected):
         return None
+    screen = config.arm.screen_of(axis)
     return (
-        f"sensor '{name}' is {median * MM:+.4g} mm from where the commands lead {axis}, all the time (noise and priors:"
-        f" {expected * MM:.2g} mm): has it another zero? Give it bias_sd_mm, or say in run.toml where the arm starts"
+        f"sensor '{name}' is {median * screen.scale:+.4g} {screen.unit} from where the commands lead {axis}, all the"
+        f" time (noise and priors: {expected * screen.scale:.2g} {screen.unit}): has it another zero? Give it"
+        f" bias_sd_{screen.unit}, or say in run.toml where the arm starts"
     )
+
+
+def _sd_and_bias(sensor: Sensor, axis: str) -> float:
+    """Noise and biases of a sensor on one axis together [m or rad]."""
+    return math.hypot(sensor.sd_of(axis) or 0.0, sensor.bias_sd_of(axis), sensor.bias_drift_sd_of(axis))
 
 
 def _first_speed(segment: Segment, axis: str) -> float:

@@ -18,7 +18,8 @@ from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run, Source
-from ..units import MM, seconds
+from ..model.arm import ArmModel
+from ..units import Kind, seconds
 from .config import FusionConfig
 from .consistency import sensor_problems
 from .engine import Engine, Filtered, filter_segment
@@ -107,13 +108,13 @@ def fuse(
         mode=mode,
         engine=engine,
         config=config,
-        speed=max(part.highest_speed(config.arm.update_period) for part in cut),
+        speed=_highest_speeds(cut, config.arm),
         radius=_highest_radius(in_place, placed),
         notes=(),
         since=run.since,
         until=run.until,
     )
-    notes = [note for part in parts for note in (*part[0].notes, *_contradictions(part[0], part[2], origin))]
+    notes = [note for part in parts for note in (*part[0].notes, *_contradictions(part[0], config, part[2], origin))]
     notes += [note for segment in cut for note in (*starts_in_motion(segment, config), *sensor_faults(segment, config))]
     notes += latency_questions(config, cut[0].sensors)
     notes += [*jumps, *_reference_notes(est, references), *config.arm.validity.excess(est.speed, est.radius)]
@@ -157,6 +158,15 @@ def _cartesian(placed: Placed, axes: Mapping[str, AxisEstimate]) -> dict[str, Fl
     return found
 
 
+def _highest_speeds(cut: Sequence[Segment], arm: ArmModel) -> dict[Kind, float]:
+    """The highest commanded speed of the axes of each kind [m/s or rad/s]."""
+    found: dict[Kind, float] = {}
+    for axis in cut[0].axes:
+        fastest = max(part.highest_speed(axis, arm.update_period) for part in cut)
+        found[arm.axes[axis].kind] = max(found.get(arm.axes[axis].kind, 0.0), fastest)
+    return found
+
+
 def _highest_radius(run: Run, placed: Placed | None) -> float | None:
     """The commands' greatest distance from the base's axis [m]; None where no cylindrical frame says where that is."""
     if placed is None or not isinstance(placed.frame, Cylindrical) or "radial" not in run.command.values:
@@ -165,7 +175,7 @@ def _highest_radius(run: Run, placed: Placed | None) -> float | None:
     return float(np.max(radial[np.isfinite(radial) & (run.command.stamp != NO_STAMP)]))
 
 
-def _contradictions(segment: Segment, filtered: Filtered, origin: int) -> list[str]:
+def _contradictions(segment: Segment, config: FusionConfig, filtered: Filtered, origin: int) -> list[str]:
     """A sentence on each pair of sensors of which one contradicts the other time after time."""
     events, results, found = filtered.events, filtered.results, list[str]()
     rows = np.flatnonzero(results.contradicts >= 0)
@@ -175,7 +185,11 @@ def _contradictions(segment: Segment, filtered: Filtered, origin: int) -> list[s
         mine = rows[pairs == pair]
         first, count = mine[0], len(mine)
         rejected = np.flatnonzero(results.outcome[first] == Outcome.REJECTED)
-        off = [f"{segment.axes[axis]} by {results.innovation[first, axis] * MM:+.4g} mm" for axis in rejected.tolist()]
+        off = [
+            f"{name} by {screen.scale * results.innovation[first, axis]:+.4g} {screen.unit}"
+            for axis in rejected.tolist()
+            if (screen := config.arm.screen_of(name := segment.axes[axis]))
+        ]
         found.append(
             f"sensor '{segment.sensors[sensor]}' contradicts '{segment.sensors[other]}' since"
             f" {(int(events.time[first]) - origin) / 1e9:.2f} s ({', '.join(off)}), {count} times:"

@@ -43,7 +43,10 @@ def reference_track(parts: Sequence[Source], origin: int) -> ReferenceTrack:
     late = [(part.stamp == NO_STAMP) | late_rows(part.stamp) for part in parts]
     orders = [np.argsort(part.stamp, kind="stable") for part in parts]
     used = [part.rows(order[~not_used[order]]) for part, order, not_used in zip(parts, orders, late, strict=True)]
-    noise = [{axis: part.sd * part.spread.get(axis, np.ones(len(part.stamp))) for axis in part.values} for part in used]
+    noise = [
+        {axis: part.sd_of(axis) * part.spread.get(axis, np.ones(len(part.stamp))) for axis in part.values}
+        for part in used
+    ]
     return ReferenceTrack(
         seconds(np.concatenate([part.stamp for part in used]), origin),
         {axis: np.concatenate([part.values[axis] for part in used]) for axis in used[0].values},

@@ -22,6 +22,7 @@ from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
 from ..logs.run import Run, Source, note_rows
+from ..units import AN
 from .config import FusionConfig
 from .setup import at_rest, filter_model, filter_sensors
 
@@ -112,10 +113,9 @@ class Segment:
             measurement_rows=self.measurement_rows.rows(rows).columns(column),
         )
 
-    def highest_speed(self, period: float) -> float:
-        """Highest commanded speed on any axis [m/s]."""
-        steps = [np.diff(self.given(axis)[1], prepend=self.start[axis]) for axis in self.axes]
-        return max(float(np.abs(step).max(initial=0.0)) for step in steps) / period
+    def highest_speed(self, axis: str, period: float) -> float:
+        """Highest commanded speed on an axis [m/s or rad/s]."""
+        return float(np.abs(np.diff(self.given(axis)[1], prepend=self.start[axis])).max(initial=0.0)) / period
 
     def end(self, config: FusionConfig) -> int:
         """Where an even grid of estimates ends, int ns: with the last command or measurement.
@@ -154,6 +154,12 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
             raise RunError(f"{label}: commands are in x, y, z; give a [frame] in run.toml or fusion.toml")
         if axis not in arm.axes:
             raise UnknownNameError(f"{label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes)
+    for axis, kind in run.kinds.items():
+        if axis in arm.axes and kind != arm.axes[axis].kind:
+            raise RunError(
+                f"run '{run.name}': {axis} is {AN[kind]}, the arm '{arm.name}' says {AN[arm.axes[axis].kind]}; give"
+                f' [axes.{axis}] kind = "{kind}", or columns of the other unit'
+            )
     for name, source in run.sensors.items():
         if any(axis in CARTESIAN and axis not in run.axes for axis in source.values):
             raise RunError(

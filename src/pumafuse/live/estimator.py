@@ -20,8 +20,8 @@ from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS
 from ..fusion.setup import at_rest, filter_model, filter_sensors
 from ..logs.frames import CARTESIAN, Cylindrical
-from ..model.arm import ordered_axes
-from ..units import MM
+from ..model.arm import Validity, ordered_axes
+from ..units import Kind
 from .clock import Clock, Time, Verdict, nanoseconds
 from .frame_start import FrameStart
 from .rate_limit import RateLimitedLog
@@ -412,13 +412,16 @@ class LiveEstimator:
     def _watch_limits(self) -> None:
         """Say when a command leaves what the arm model is valid for."""
         validity = self.config.arm.validity
-        if validity.max_speed is None and validity.max_radius is None:
+        if validity == Validity():
             return
         latest = {axis: found for axis in self.axes if (found := self._window.command_at(self._bits[axis])) is not None}
         if not latest:
             return
         stamp = max(stamp for stamp, _, _ in latest.values())
-        speed = max(abs(step) for _, _, step in latest.values()) / self.config.arm.update_period
+        speed: dict[Kind, float] = {}
+        for axis, (_, _, step) in latest.items():
+            kind = self.config.arm.axes[axis].kind
+            speed[kind] = max(speed.get(kind, 0.0), abs(step) / self.config.arm.update_period)
         radius = latest["radial"][1] if isinstance(self.config.frame, Cylindrical) and "radial" in latest else None
         for passed in validity.excess(speed, radius):
             self._log.write(passed.split(" reach")[0], f"{passed}, at {stamp / 1e9:.3f} s")
@@ -449,7 +452,12 @@ class LiveEstimator:
             return
         self._contradicting[sensor] = other
         found = zip(self.axes, window.outcome.tolist(), window.innovation.tolist(), strict=True)
-        off = ", ".join(f"{axis} by {nu * MM:+.4g} mm" for axis, outcome, nu in found if outcome == Outcome.REJECTED)
+        screens = {axis: self.config.arm.screen_of(axis) for axis, _, _ in found}
+        off = ", ".join(
+            f"{axis} by {nu * screens[axis].scale:+.4g} {screens[axis].unit}"
+            for axis, outcome, nu in found
+            if outcome == Outcome.REJECTED
+        )
         self._log.write(
             f"{sensor} contradicts {other}",
             f"sensor '{sensor}' contradicts '{other}' since {stamp / 1e9:.3f} s ({off}): its measurements are rejected",
@@ -499,7 +507,7 @@ def empty_window(
     """
     names, count = tuple(config.sensors), len(axes)
     biases = [
-        [name for name, sensor in config.sensors.items() if sensor.biased and sensor.sd_of(axis) is not None]
+        [name for name, sensor in config.sensors.items() if sensor.is_biased(axis) and sensor.sd_of(axis) is not None]
         for axis in axes
     ]
     state = at_rest(config, axes, len(names), biases, NEVER, start, FIRST_ROWS + 2)

@@ -10,7 +10,7 @@ import msgspec
 from .. import toml
 from ..errors import ConfigError
 from ..toml import NotNegative
-from ..units import LENGTHS, ending
+from ..units import Kind, ending, kind_of
 from .frames import Frame
 
 
@@ -23,16 +23,18 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CommandEntry(SourceEntry, frozen=True, kw_only=True):
-    """The commands, with the start level by axis [m] and how to use their stamps."""
+    """The commands, with the start level by axis [m or rad], the kinds that its keys say, and how to use the stamps."""
 
     start: dict[str, float] = {}
+    kinds: dict[str, Kind] = {}
     clock: Literal["stamps", "regular"] = "stamps"
 
 
 class ReferenceEntry(SourceEntry, frozen=True, kw_only=True):
-    """A reference for scoring, with the standard deviation [m] of its own noise."""
+    """A reference for scoring, with the standard deviation of its own noise, of lengths [m] and of angles [rad]."""
 
     sd: NotNegative = msgspec.field(name="sd_mm", default=0.0)
+    angular_sd: NotNegative = msgspec.field(name="sd_deg", default=0.0)
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -68,9 +70,12 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
     if not isinstance(table, dict):
         raise ConfigError(f"{where}: {path}: expected a table")
     keys: dict[str, Any] = dict(table)  # pyright: ignore[reportUnknownArgumentType]
+    kinds: dict[str, Any] = {}
     if isinstance(keys.get("start"), dict):
-        keys["start"] = {axis_of(key, where, f"{path}.start"): value for key, value in keys["start"].items()}
-    own = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes"}
+        given = {key: axis_of(key, where, f"{path}.start") for key in keys["start"]}
+        keys["start"] = {axis: keys["start"][key] for key, axis in given.items()}
+        kinds = {axis: kind_of(key) for key, axis in given.items()}
+    own = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes", "kinds"}
     axes = {axis: keys.pop(axis) for axis in list(keys) if axis not in own}
     for axis, columns in axes.items():
         if not columns or not isinstance(columns, str | list):
@@ -80,16 +85,17 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
         axes[axis] = [columns] if isinstance(columns, str) else columns
     if not axes:
         raise ConfigError(f"{where}: [{path}] names no column for any axis, as in radial = 'y_mm'")
-    return toml.struct({**keys, "axes": axes}, kind, where, path)
+    more = {"kinds": kinds} if kinds else {}
+    return toml.struct({**keys, **more, "axes": axes}, kind, where, path)
 
 
 def axis_of(key: str, where: str, path: str) -> str:
-    """``radial_mm`` → ``radial``; the number itself is already in metres.
+    """``radial_mm`` → ``radial``; the number itself is already in m or rad.
 
     Raises:
-        ConfigError: The key ends in no unit of length.
+        ConfigError: The key ends in no unit of a length or an angle.
     """
     unit = ending(key)
-    if unit not in LENGTHS:
-        raise ConfigError(f"{where}: {path}.{key} has no unit in its name, as in {key}_mm")
+    if unit is None or kind_of(key) is None:
+        raise ConfigError(f"{where}: {path}.{key} has no unit in its name, as in {key}_mm or {key}_deg")
     return key.removesuffix(unit)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
 from ..model.arm import CANONICAL_AXES, ordered_axes
-from ..units import nanoseconds
+from ..units import AN, Kind, kind_of, nanoseconds
 from . import manifest, tables
 from .frames import CARTESIAN, Frame
 
@@ -35,14 +35,18 @@ class Source:
         values: For each axis the value [m], NaN where the row has none, (rows,).
         label: What a person calls it: the file, or the column group of a single table.
         spread: For an axis computed by a frame, the factor on the noise of each row, (rows,).
-        sd: Standard deviation of the noise of a reference [m].
+        sd: Standard deviation of the noise of a reference [m or rad], for all axes or for each.
     """
 
     stamp: TimeArray
     values: Mapping[str, FloatArray]
     label: str
     spread: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
-    sd: float = 0.0
+    sd: float | Mapping[str, float] = 0.0
+
+    def sd_of(self, axis: str) -> float:
+        """Standard deviation of the noise of a reference on one axis [m or rad]."""
+        return self.sd if isinstance(self.sd, float | int) else self.sd.get(axis, 0.0)
 
     def label_for(self, name: str) -> str:
         """The name of the source in notes, with its label where that is another one."""
@@ -75,6 +79,7 @@ class Run:
         start: The start level u₀ [m] of axes that rest elsewhere than at their first command.
         clock: Whether the commands' stamps are used as they are (``stamps``) or replaced by a grid of T (``regular``).
         frame: The arm's axes in the log's x, y, z, for sources that give these.
+        kinds: Of what kind the axes are, where the units of a log say so.
         notes: What was wrong with the files, a sentence each.
         without_strays: Whether stray stamps are removed already, see :func:`pumafuse.logs.clock.without_strays`.
         since: Where the part to use begins [s after the first command], see :meth:`between`; None: with the log.
@@ -88,6 +93,7 @@ class Run:
     start: Mapping[str, float] = field(default_factory=dict[str, float])
     clock: Clock = "stamps"
     frame: Frame | None = None
+    kinds: Mapping[str, Kind] = field(default_factory=dict[str, Kind])
     notes: tuple[str, ...] = ()
     without_strays: bool = False
     since: float | None = None
@@ -109,8 +115,10 @@ class Run:
         for axis, level in self.start.items():
             if not np.isfinite(level):
                 raise RunError(f"{where}: the start level of {axis} is not finite")
-        if self.reference is not None and not 0.0 <= self.reference.sd < np.inf:
-            raise RunError(f"{where}: the reference's sd must be finite and not negative")
+        if self.reference is not None:
+            for axis in self.reference.values:
+                if not 0.0 <= self.reference.sd_of(axis) < np.inf:
+                    raise RunError(f"{where}: the reference's sd must be finite and not negative")
         for axis, command in self.command.values.items():
             if not (np.isfinite(command) & (self.command.stamp != NO_STAMP)).any():
                 raise RunError(f"{self.command.label}: no command for axis '{axis}' has both a stamp and a value")
@@ -184,7 +192,7 @@ class Run:
         sensors: Mapping[str, tuple[npt.ArrayLike, Mapping[str, npt.ArrayLike]]] | None = None,
         reference: tuple[npt.ArrayLike, Mapping[str, npt.ArrayLike]] | None = None,
         *,
-        reference_sd: float = 0.0,
+        reference_sd: float | Mapping[str, float] = 0.0,
         start: Mapping[str, float] | None = None,
         clock: Clock = "stamps",
         frame: Frame | None = None,
@@ -194,11 +202,11 @@ class Run:
 
         Args:
             time: Stamps of the commands, float seconds or int64 ns, (n,).
-            command: u [m] for each axis, (n,).
-            sensors: For each sensor its stamps (m,) and its values [m] for each axis, (m,).
-            reference: Stamps (k,) and reference positions [m] for each axis, (k,).
-            reference_sd: Standard deviation of the reference's own noise [m].
-            start: Start level [m] of axes that rest elsewhere than at their first command.
+            command: u [m or rad] for each axis, (n,).
+            sensors: For each sensor its stamps (m,) and its values for each axis, (m,).
+            reference: Stamps (k,) and reference positions for each axis, (k,).
+            reference_sd: Standard deviation of the reference's own noise, for all axes or for each.
+            start: Start level of axes that rest elsewhere than at their first command.
             clock: ``stamps`` or ``regular``.
             frame: For sources in x, y, z.
             name: For people.
@@ -259,7 +267,7 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
 
 def _read_manifest(path: Path) -> Run:
     listed = manifest.load(path)
-    notes: list[str] = []
+    notes, units = list[str](), dict(listed.command.kinds)
 
     @cache
     def table_of(file: str) -> tables.Table:
@@ -268,14 +276,17 @@ def _read_manifest(path: Path) -> Run:
         return table
 
     def source(entry: manifest.SourceEntry) -> Source:
-        return _source(table_of(entry.file), entry.time, entry.axes, entry.file, notes)
+        return _source(table_of(entry.file), entry.time, entry.axes, entry.file, notes, units)
 
     command = source(listed.command)
     sensors = {name: source(entry) for name, entry in listed.sensors.items()}
     scored = listed.reference
-    reference = None if scored is None else replace(source(scored), sd=scored.sd)
+    reference = None if scored is None else source(scored)
+    if reference is not None and scored is not None:
+        of_kind = {"length": scored.sd, "angle": scored.angular_sd}
+        reference = replace(reference, sd={axis: of_kind[units[axis]] for axis in reference.values})
     name, start, clock = listed.name or path.parent.resolve().name, listed.command.start, listed.command.clock
-    return Run(name, command, sensors, reference, start, clock, listed.frame, tuple(notes))
+    return Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
 
 
 def _read_single(path: Path) -> Run:
@@ -295,22 +306,35 @@ def _read_single(path: Path) -> Run:
             groups[source][axis] = [column]
     if "command" not in groups:
         raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {listed}")
-    notes, sources = list(table.notes), dict[str, Source]()
+    notes, sources, units = list(table.notes), dict[str, Source](), dict[str, Kind]()
     for name, axes in groups.items():
-        source = _source(table, clocks[0], axes, name, notes)
+        source = _source(table, clocks[0], axes, name, notes, units)
         sources[name] = source.rows(np.any(~np.isnan(list(source.values.values())), axis=0))
     if left := [column for column in table.columns if "." not in column and column != clocks[0]]:
         notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
     command, reference = sources.pop("command"), sources.pop("reference", None)
-    return Run(path.name.split(".")[0], command, sources, reference, notes=tuple(notes))
+    return Run(path.name.split(".")[0], command, sources, reference, kinds=units, notes=tuple(notes))
 
 
-def _source(table: tables.Table, time: str, axes: Mapping[str, Sequence[str]], label: str, notes: list[str]) -> Source:
-    """A source from its columns, those of an axis added up; new notes on them are appended."""
+def _source(
+    table: tables.Table,
+    time: str,
+    axes: Mapping[str, Sequence[str]],
+    label: str,
+    notes: list[str],
+    units: dict[str, Kind],
+) -> Source:
+    """A source from its columns, those of an axis added up; new notes and new kinds of axes are put in."""
     stamp, note = table.stamps(time)
     values, found = dict[str, FloatArray](), [note]
     for axis, columns in axes.items():
         parts = [table.numbers(column) for column in columns]
+        for column in columns:
+            kind = kind_of(column) or "length"
+            if units.setdefault(axis, kind) != kind:
+                raise RunError(
+                    f"{table.path}: column '{column}' is {AN[kind]}, but {axis} is {AN[units[axis]]} elsewhere"
+                )
         values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
         found.extend(note for _, note in parts)
     notes.extend(note for note in found if note is not None and note not in notes)

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from .. import toml
 from ..errors import RunError
-from ..units import MM, seconds
+from ..units import SCREEN, Screen, seconds
 from . import tables
 from .run import Run, Source
 
@@ -32,17 +32,17 @@ def save(run: Run, folder: Path) -> None:
         check_name(name)
     for axis in run.axes:
         check_axis(axis)
-    manifest: dict[str, Any] = {"name": run.name, "command": _entry(run.command, "commands.csv", folder)}
+    manifest: dict[str, Any] = {"name": run.name, "command": _entry(run, run.command, "commands.csv", folder)}
     if run.start:
-        manifest["command"]["start"] = {f"{axis}_mm": level for axis, level in run.start.items()}
+        manifest["command"]["start"] = {f"{axis}_{_screen(run, axis).unit}": level for axis, level in run.start.items()}
     if run.clock != "stamps":
         manifest["command"]["clock"] = run.clock
     if run.sensors:
-        manifest["sensors"] = {name: _entry(source, f"{name}.csv", folder) for name, source in run.sensors.items()}
+        manifest["sensors"] = {name: _entry(run, source, f"{name}.csv", folder) for name, source in run.sensors.items()}
     if run.reference is not None:
-        manifest["reference"] = _entry(run.reference, "truth.csv", folder)
-        if run.reference.sd:
-            manifest["reference"]["sd_mm"] = run.reference.sd
+        manifest["reference"] = _entry(run, run.reference, "truth.csv", folder)
+        noise = {f"sd_{_screen(run, axis).unit}": run.reference.sd_of(axis) for axis in run.reference.values}
+        manifest["reference"] |= {key: sd for key, sd in noise.items() if sd}
     if run.frame is not None:
         manifest["frame"] = toml.builtins(run.frame)
     (folder / "run.toml").write_text(toml.text(manifest), encoding="utf-8")
@@ -72,11 +72,17 @@ def check_axis(axis: str) -> None:
         raise RunError(f"axis '{axis}': run.toml uses this word itself; no axis can be called {', '.join(_KEYS)}")
 
 
-def _entry(source: Source, file: str, folder: Path) -> dict[str, Any]:
+def _screen(run: Run, axis: str) -> Screen:
+    return SCREEN[run.kinds.get(axis, "length")]
+
+
+def _entry(run: Run, source: Source, file: str, folder: Path) -> dict[str, Any]:
     """Write one source and return its table of ``run.toml``."""
+    screens = {axis: _screen(run, axis) for axis in source.values}
     columns = {
-        f"{axis}_mm": pa.array(np.round(value * MM, 6), from_pandas=True) for axis, value in source.values.items()
+        f"{axis}_{screen.unit}": pa.array(np.round(source.values[axis] * screen.scale, 6), from_pandas=True)
+        for axis, screen in screens.items()
     }
     stamp = pa.array(seconds(source.stamp), from_pandas=True)
     tables.write(pa.table({"time_s": stamp, **columns}), folder / file)
-    return {"file": file, "time": "time_s", **{axis: f"{axis}_mm" for axis in source.values}}
+    return {"file": file, "time": "time_s", **{axis: f"{axis}_{screen.unit}" for axis, screen in screens.items()}}

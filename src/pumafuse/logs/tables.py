@@ -45,14 +45,15 @@ class Table:
     notes: tuple[str, ...]
 
     def numbers(self, name: str) -> tuple[FloatArray, str | None]:
-        """A length column [m], NaN where a cell is empty or no number, and a note on cells that were text.
+        """A column of positions [m or rad], NaN where a cell is empty or no number, and a note on cells that were text.
 
         Raises:
-            RunError: The column is absent, its name ends in no unit of length, or it holds something else than numbers.
+            RunError: The column is absent, its name ends in no unit of a length or an angle, or it holds something else
+                than numbers.
         """
-        exponent = self._exponent(name, units.LENGTHS, "_mm")
+        unit = self._unit(name, (*units.LENGTHS, *units.ANGLES), "_mm")
         values, note = self.plain(name)
-        return values / 10.0**-exponent, note  # a quotient is rounded once
+        return units.si_of(values, unit), note
 
     def plain(self, name: str) -> tuple[FloatArray, str | None]:
         """A column of numbers without conversion, with NaN and note as in :meth:`numbers`.
@@ -87,7 +88,7 @@ class Table:
         if pa.types.is_timestamp(column.type):
             column = self._cast(name, column, pa.timestamp("ns")).cast(pa.int64())
         else:
-            per_unit = 10 ** (9 + self._exponent(name, units.TIMES, "_s"))
+            per_unit = 10 ** (9 - 3 * units.TIMES.index(self._unit(name, units.TIMES, "_s")))
             column, note = self._numeric(name)
         rough = _filled(column.cast(pa.float64(), safe=False), np.nan) * per_unit
         beyond = np.flatnonzero(np.isfinite(rough) & (np.abs(rough) >= REACH_NS))
@@ -110,15 +111,15 @@ class Table:
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
             raise RunError(f"{self.path}: column '{name}': {str(error).splitlines()[0]}") from None
 
-    def _exponent(self, name: str, accepted: tuple[str, ...], example: str) -> int:
+    def _unit(self, name: str, accepted: tuple[str, ...], example: str) -> str:
         self._column(name)
         unit = units.ending(name)
-        if unit not in accepted:
+        if unit is None or unit not in accepted:
             raise RunError(
                 f"{self.path}: column '{name}' has no unit in its name; it must end in {', '.join(accepted)}"
                 f" (for instance '{name}{example}')"
             )
-        return units.EXPONENTS[unit]
+        return unit
 
     def _column(self, name: str) -> pa.ChunkedArray:
         if name not in self.columns:

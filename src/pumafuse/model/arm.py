@@ -105,10 +105,10 @@ class Validity(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         for kind, fastest in speed.items():
             limit, screen = self.limit_of(kind), SCREEN[kind]
             if limit is not None and fastest > limit * _EXCEEDED:
+                shown = f"{limit * screen.fast_scale:g} {screen.fast}"
                 sentences.append(
                     f"commanded speed reaches {fastest * screen.fast_scale:.3g} {screen.fast},"
-                    f" {fastest / limit:.2f} times the {limit * screen.fast_scale:g} {screen.fast} that the arm model is"
-                    " valid for"
+                    f" {fastest / limit:.2f} times the {shown} that the arm model is valid for"
                 )
         if self.max_radius is not None and radius is not None and radius > self.max_radius:
             beyond = (radius - self.max_radius) * MM

@@ -225,7 +225,7 @@ def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:
     if one.axis is not None and one.path[-1].startswith("disturbance"):
         return config.process[one.axis].disturbance_sd > 0.0
     if one.fit == "bias" and one.sensor is not None:
-        return config.sensors[one.sensor].bias_drift_sd > 0.0
+        return config.sensors[one.sensor].bias_drift_sd != 0.0
     if one.fit == "delay":
         shares = [axis for axis in axes if config.arm.axes[axis].delay is None]
         return bool(shares) if one.axis is None else one.axis not in shares

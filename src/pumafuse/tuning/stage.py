@@ -200,7 +200,7 @@ def with_large_biases(
     for (name, axis), (expected, measured) in likelihood.responses(config, centred=False).items():
         gap = abs(float(np.median(measured - expected)))
         scatter = likelihood.scatter.get(f"sensors.{name}.sd_mm.{axis}", 0.0)
-        if gap > _FAR * (scatter + misfit[axis] + config.start.offset_sd):
+        if gap > _FAR * (scatter + misfit[axis] + config.start.offset_sd_of(axis)):
             gaps[name] = max(gap, gaps.get(name, 0.0))
     notes: list[str] = []
     for name, gap in gaps.items():

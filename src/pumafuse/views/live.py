@@ -127,7 +127,7 @@ class LiveView:
         self._child: subprocess.Popen[bytes] | None
         self._child, self._stdin, self._stdout = _start()
         sensors = {
-            name: SensorHead(sensor.scale, sensor.latency, sensor.bias_sd > 0.0)
+            name: SensorHead(sensor.scale, sensor.latency, sensor.bias_sd != 0.0)
             for name, sensor in config.sensors.items()
         }
         self._write(Header(mode, axes, self._space, sensors, PORT, WEB_PORT))
