@@ -58,7 +58,7 @@ class LogLikelihood:
     """The log-likelihood of a configuration.
 
     Attributes:
-        axes: Of each axis's components, with positions in mm, (A,).
+        axes: Of each axis's components, with positions in mm or mrad, (A,).
         outcomes: The outcome of each measurement on each axis, for each segment, (m, A).
     """
 
@@ -181,19 +181,19 @@ class Likelihood:
         return [part for part in self._parts if self.axes[part.axis] == axis]
 
     @cached_property
-    def scatter(self) -> dict[str, float]:
-        """Rough noise of each sensor on each axis [m], by the key of its sd.
+    def scatter(self) -> dict[tuple[str, str], float]:
+        """Rough noise of each sensor on each axis [m or rad], by the names of both.
 
         From third differences, which remove smooth motion: their variance is 20 times the noise's. Their median is
         robust against outliers.
         """
-        found: dict[str, list[float]] = {}
+        found: dict[tuple[str, str], list[float]] = {}
         for part in self._parts:
             for name, rows in part.segment.rows_by_sensor().items():
                 third = np.diff(rows.value[:, 0], 3)
                 if len(third):
                     sd = 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)
-                    found.setdefault(f"sensors.{name}.sd_mm.{self.axes[part.axis]}", []).append(sd)
+                    found.setdefault((name, self.axes[part.axis]), []).append(sd)
         return {key: float(np.median(sds)) for key, sds in found.items() if min(sds) > 0.0}
 
     @cached_property
