@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
-from ..model.arm import CANONICAL_AXES, ordered_axes
+from ..model.arm import CANONICAL_AXES
 from ..units import AN, Kind, kind_of, nanoseconds
 from . import manifest, tables
 from .frames import CARTESIAN, Frame
@@ -125,8 +125,8 @@ class Run:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """The commanded axes, in the order tangential, radial, vertical, then others by name."""
-        return ordered_axes(set(self.command.values))
+        """The commanded axes, in the order of the log."""
+        return tuple(self.command.values)
 
     def between(self, since: float | None = None, until: float | None = None) -> Run:
         """A part of the run, for example one that begins in mid-motion.

@@ -32,7 +32,6 @@ from ..fusion.segments import Segment, build
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import Run
-from ..model.arm import ordered_axes
 from .parameters import Parameter
 
 _LOG_STEP = 1e-4  # of a logarithm, one-sided: the truncation error is half of it, the rounding error 1e-11
@@ -147,7 +146,7 @@ class Likelihood:
             for note in (*segment.notes, *starts_in_motion(segment, config))
         ]
         self.config = config
-        self.axes = ordered_axes({axis for segment in built for axis in segment.axes})
+        self.axes = tuple(axis for axis in config.arm.axes if any(axis in segment.axes for segment in built))
         self._segments = [_decided(segment, until, latest) for segment in built]
         self._parts = [
             _Part(number, self.axes.index(axis), segment.of_axis(axis, rows), rows, column)

@@ -171,7 +171,9 @@ def _line(fit: Fit, key: str, path: str, low: float, high: float, **more: Any) -
     return Parameter(fit, key, tuple(path.split(".")), (low, high), **more)
 
 
-_TABLE = (  # with the names of lengths; a process noise at its lower bound is none; bounds and prior of what is not logarithmic are relative
+# With the names of lengths. A process noise at its lower bound is none; bounds and prior of what is not logarithmic are
+# relative.
+_TABLE = (
     _line("noise", "process.{axis}.input_noise_mm_rtHz", "process.{axis}.input_noise", 1e-7, 1.0),
     _line("noise", "process.{axis}.drift_mm_rts", "process.{axis}.drift", 1e-7, 10.0),
     _line("noise", "process.{axis}.maneuver_noise_mm_rtHz_per_m_s", "process.{axis}.maneuver_noise", 1e-6, 30.0),

@@ -275,7 +275,7 @@ def _with_noise(
     sds: Mapping[tuple[str, str], float],
     noise: Sequence[Parameter],
 ) -> FusionConfig:
-    """A start: the free noises from ``process`` (by axis) and ``sds`` (by sensor and axis), none of them near its lower bound."""
+    """A start: free noises from ``process`` (by axis) and ``sds`` (by sensor and axis), none near its lower bound."""
     full = msgspec.structs.replace(config, process={**config.process, **process})
     for one in noise:
         value = sds.get((one.sensor or "", one.axis or ""), one.get(full))
