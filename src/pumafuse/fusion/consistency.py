@@ -146,7 +146,7 @@ def sensor_problems(est: Estimates) -> list[str]:
         hours_later = tail > LONGEST_TAIL_NS / 1e9
         later = np.count_nonzero(time > end + 1.0) > 0.5 * len(mine)
         frozen = {each: _frozen(value[axis == column]) for column, each in enumerate(given.axes)}
-        kinds = dict.fromkeys(est.config.arm.axes[given.axes[column]].kind for column in np.unique(axis).tolist())
+        kinds = {est.config.arm.axis(given.axes[column]).kind: None for column in np.unique(axis).tolist()}
         sd, bias_sd, offset_sd = (
             "/".join(of_kind(key, kind) for kind in kinds) for key in ("sd_mm", "bias_sd_mm", "offset_sd_mm")
         )

@@ -196,9 +196,8 @@ def _blueprint(header: Header, first: FloatArray | None = None) -> rrb.Blueprint
         first: Where the path begins [mm], (3,).
     """
     units = {axis: SCREEN[kind].unit for axis, kind in header.axes.items()}
-    positions = [
-        _plot(f"/{axis}", f"{axis} [{unit}]", legend=axis == next(iter(units))) for axis, unit in units.items()
-    ]
+    first_axis = next(iter(units))
+    positions = [_plot(f"/{axis}", f"{axis} [{unit}]", legend=axis == first_axis) for axis, unit in units.items()]
     residuals = [
         _plot(f"/residual/{axis}", f"{axis}: measurement − estimate [{unit}]", legend=False)
         for axis, unit in units.items()

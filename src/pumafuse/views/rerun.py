@@ -121,27 +121,27 @@ def _blueprint(est: Estimates) -> rrb.Blueprint:
     start, end = est.busiest(_OPENING_S)
     bounds = [rrb.TimeRangeBoundary.absolute(seconds=edge) for edge in (start, end)]
     legend = rrb.PlotLegend(rrb.Corner2D.RightTop)
-    positions = [
-        rrb.TimeSeriesView(
-            origin=f"/{name}",
-            name=f"{name} [{est.config.arm.screen_of(name).unit}]",
-            plot_legend=legend,
-            axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(*bounds)),
-            axis_y=rrb.ScalarAxis(
-                range=_span(axis.position[(est.time >= start) & (est.time <= end)], est.config.arm.screen_of(name))
-            ),
+    positions, innovations = list[rrb.TimeSeriesView](), list[rrb.TimeSeriesView]()
+    for name, axis in est.axes.items():
+        screen = est.config.arm.screen_of(name)
+        opening = axis.position[(est.time >= start) & (est.time <= end)]
+        positions.append(
+            rrb.TimeSeriesView(
+                origin=f"/{name}",
+                name=f"{name} [{screen.unit}]",
+                plot_legend=legend,
+                axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(*bounds)),
+                axis_y=rrb.ScalarAxis(range=_span(opening, screen)),
+            )
         )
-        for name, axis in est.axes.items()
-    ]
-    innovations = [
-        rrb.TimeSeriesView(
-            origin=f"/innovation/{name}",
-            name=f"{name}: innovations and ±2σ [{est.config.arm.screen_of(name).unit}]",
-            plot_legend=legend,
-            axis_y=rrb.ScalarAxis(range=_innovation_span(est, name)),
+        innovations.append(
+            rrb.TimeSeriesView(
+                origin=f"/innovation/{name}",
+                name=f"{name}: innovations and ±2σ [{screen.unit}]",
+                plot_legend=legend,
+                axis_y=rrb.ScalarAxis(range=_innovation_span(est, name)),
+            )
         )
-        for name in est.axes
-    ]
     left, right = rrb.Vertical(*positions), rrb.Tabs(*innovations)
     if est.cartesian is not None or in_space(est.config.arm):
         right = rrb.Vertical(rrb.Spatial3DView(origin="/path", name="path [mm]"), right)
