@@ -14,7 +14,7 @@ import numpy as np
 
 from ..arrays import CodeArray, FloatArray
 from ..filter.outcome import Outcome
-from ..units import MM, of_kind
+from ..units import MM, Kind, of_kind
 from .config import Sensor
 from .estimates import Estimates, Measurements
 from .score import Z95
@@ -146,7 +146,8 @@ def sensor_problems(est: Estimates) -> list[str]:
         hours_later = tail > LONGEST_TAIL_NS / 1e9
         later = np.count_nonzero(time > end + 1.0) > 0.5 * len(mine)
         frozen = {each: _frozen(value[axis == column]) for column, each in enumerate(given.axes)}
-        kinds = {est.config.arm.axis(given.axes[column]).kind: None for column in np.unique(axis).tolist()}
+        of_axes = [given.axes[column] for column in set[int](axis.tolist())]
+        kinds: dict[Kind, None] = {est.config.arm.axes[each].kind: None for each in of_axes}
         sd, bias_sd, offset_sd = (
             "/".join(of_kind(key, kind) for kind in kinds) for key in ("sd_mm", "bias_sd_mm", "offset_sd_mm")
         )

@@ -170,7 +170,8 @@ def _estimates_table(est: Estimates) -> pa.Table:
 def _measurements_table(est: Estimates) -> pa.Table:
     r, positions = est.measurements, dict[str, pa.Array]()
     kinds = est.config.arm.kind_of
-    for kind in {kinds[axis]: None for axis in r.axes}:  # a column for each: null on axes of the other
+    known: dict[Kind, None] = {kinds[axis]: None for axis in r.axes}
+    for kind in known:  # columns for each: null on axes of the other
         mine, screen = np.array([kinds[axis] == kind for axis in r.axes])[r.axis], SCREEN[kind]
         for name in ("value", "innovation", "innovation_sd"):
             positions[f"{name}_{screen.unit}"] = _nullable(np.where(mine, getattr(r, name) * screen.scale, np.nan))
