@@ -74,7 +74,7 @@ def struct(tree: Any, kind: type[S], where: str, path: str = "", axis: Kind = "l
     if axis != "length" and (problem := next(_problems(tree, kind, path, axis), None)):
         raise ConfigError(f"{where}: {problem}")
     try:
-        return msgspec.convert(tree if axis == "length" else _renamed(tree, as_length), kind)
+        return msgspec.convert(tree if axis == "length" else as_lengths(tree, kind), kind)
     except msgspec.ValidationError as error:
         problem = next(_problems(tree, kind, path, axis), f"{path}: {error}" if path else str(error))
         raise ConfigError(f"{where}: {problem}") from None
@@ -119,9 +119,10 @@ def reported(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
     return from_si(_renamed(msgspec.to_builtins(value, enc_hook=float), lambda name: of_kind(name, axis)))
 
 
-def from_report(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """The inverse of :func:`reported`: tables in SI with the key names for lengths."""
-    return _renamed(to_si(tree), as_length)
+def as_lengths(tree: Any, kind: type[msgspec.Struct] | None = None) -> Any:
+    """Tables with the key names for lengths, which are those of structs; names of fields of ``kind`` stay."""
+    own = () if kind is None else {field.encode_name for field in msgspec.structs.fields(kind)}
+    return _renamed(tree, lambda name: name if name in own else as_length(name))
 
 
 def _without_none(tree: dict[str, Any]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ the true one, found from the run alone.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -250,7 +251,7 @@ def test_a_log_in_world_coordinates_is_verified_in_the_arms() -> None:
         "x": np.cos(angle) * BINARY - np.sin(angle) * other,
         "y": np.sin(angle) * BINARY + np.cos(angle) * other,
     }
-    run = pf.Run.from_arrays(TIME, commands, {"scope": (SAMPLED, turned)}, frame=Rotated(azimuth=30.0))
+    run = pf.Run.from_arrays(TIME, commands, {"scope": (SAMPLED, turned)}, frame=Rotated(azimuth=math.radians(30.0)))
     axes = {"radial": arm().axes["tip"], "tangential": arm(SECOND).axes["tip"]}
     model = pf.ArmModel(name="turned", update_period=PERIOD, delay=DELAY, axes=axes)
     start = {"radial": LOW, "tangential": float(other[0])}

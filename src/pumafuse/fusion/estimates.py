@@ -15,6 +15,7 @@ from ..units import Kind
 from .config import FusionConfig
 from .score import ReferenceTrack
 from .segments import Segment
+from .setup import turn_of
 
 Mode = Literal["filtered", "as-live", "smoothed"]
 
@@ -178,7 +179,13 @@ class Estimates:
             return measurements.where(np.zeros(len(measurements.value), dtype=bool))
         bias = self.biases.get(sensor, {}).get(axis)
         position = measurements.value if bias is None else measurements.value - bias.value
-        return replace(measurements, value=position / self.config.sensors[sensor].scale)
+        known, turn = self.config.sensors[sensor], turn_of(self.config, sensor, axis)
+        position = position / known.scale
+        if turn:  # the nearest to the estimate
+            turn /= abs(known.scale)
+            away = position - np.interp(measurements.time, self.time, self[axis].position)
+            position = position - turn * np.round(away / turn)
+        return replace(measurements, value=position)
 
     def busiest(self, length: float) -> tuple[float, float]:
         """Start and end of the interval of ``length`` with the most motion [s]; every axis has the same weight."""

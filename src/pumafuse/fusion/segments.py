@@ -50,6 +50,7 @@ class Segment:
         command_rows: Rows of the commands by stamp, with time = stamp.
         measurement_rows: Rows of all sensors, one sensor after the other, each by stamp.
         notes: Every anomaly once: how many, where first.
+        turn: After which angle each sensor's measurements of an axis are the same again [rad], 0 for never, (S, A).
         ends: First and last stamp of the part that is used, int ns; before it there are commands only.
     """
 
@@ -61,6 +62,7 @@ class Segment:
     command_rows: Events
     measurement_rows: Events
     notes: tuple[str, ...]
+    turn: FloatArray
     ends: tuple[int, int] = (ALWAYS, NEVER)
     _latest: dict[tuple[int, ...], tuple[Events, IntArray]] = field(
         default_factory=dict[tuple[int, ...], tuple[Events, IntArray]], init=False, repr=False, compare=False
@@ -97,10 +99,21 @@ class Segment:
         return rows.stamp[chosen], rows.value[chosen, number]
 
     def rows_by_sensor(self) -> dict[str, Events]:
-        """The rows of each sensor that has any, by stamp."""
-        rows = self.measurement_rows
+        """The rows of each sensor that has any, by stamp; angles go on beyond a turn."""
+        rows = self.measurement_rows._replace(value=self.unwrapped())
         found = {name: rows.rows(np.flatnonzero(rows.source == number)) for number, name in enumerate(self.sensors)}
         return {name: part for name, part in found.items() if len(part.time)}
+
+    def unwrapped(self) -> FloatArray:
+        """Values of ``measurement_rows`` without the jumps of a sensor that measures within a turn, (rows, A)."""
+        rows = self.measurement_rows
+        if not self.turn.any():
+            return rows.value
+        value = rows.value.copy()
+        for sensor, axis in np.argwhere(self.turn > 0.0).tolist():
+            mine = (rows.source == sensor) & np.isfinite(value[:, axis])
+            value[mine, axis] = np.unwrap(value[mine, axis], period=float(self.turn[sensor, axis]))
+        return value
 
     def of_axis(self, axis: str, rows: IntArray) -> Segment:
         """The segment with one axis alone, and some of its measurements' ``rows``."""
@@ -111,6 +124,7 @@ class Segment:
             axes=(axis,),
             command_rows=self.command_rows.rows(commands).columns(column),
             measurement_rows=self.measurement_rows.rows(rows).columns(column),
+            turn=self.turn[:, column],
         )
 
     def highest_speed(self, axis: str, period: float) -> float:
@@ -188,7 +202,8 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     measured = joined([Events.empty(len(run.axes)), *parts])
     if run.interval and not (measured.known == Outcome.FUSED).any():
         raise RunError(f"run '{run.name}': no measurement to use is stamped {run.interval} after the first command")
-    return Segment(run.axes, used, origin, {**first, **run.start}, commands, rows, measured, tuple(notes), ends)
+    start, turn = {**first, **run.start}, policy[1].turn
+    return Segment(run.axes, used, origin, start, commands, rows, measured, tuple(notes), turn, ends)
 
 
 def output_times(segment: Segment, config: FusionConfig, rate: float | None) -> TimeArray:

@@ -172,7 +172,7 @@ def decode(text: bytes) -> Summary:
     """
     tree = msgspec.json.decode(text, type=dict[str, Any])
     parts = msgspec.convert(tree, _InUnits)
-    axes = {axis: toml.from_report(one) for axis, one in parts.axes.items()}
+    axes = {axis: toml.as_lengths(to_si(one)) for axis, one in parts.axes.items()}
     return msgspec.convert(tree | {"axes": axes, "validity": to_si(parts.validity)}, Summary)
 
 

@@ -236,13 +236,13 @@ class Likelihood:
         )
         found: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
         for part in self._parts:
-            rows = part.segment.measurement_rows
-            predicted = rows.value[:, 0] - innovations(part.segment, certain).innovation[:, 0]
+            rows, value = part.segment.measurement_rows, part.segment.unwrapped()[:, 0]
+            predicted = value - innovations(part.segment, certain).innovation[:, 0]
             for number, name in enumerate(part.segment.sensors):
                 mine = rows.source == number
                 if not mine.any():
                     continue
-                expected, measured = predicted[mine], rows.value[mine, 0]
+                expected, measured = predicted[mine], value[mine]
                 if centred:
                     expected, measured = expected - np.median(expected), measured - np.median(measured)
                 found.setdefault((name, self.axes[part.axis]), []).append((expected, measured))
