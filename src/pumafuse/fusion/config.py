@@ -28,7 +28,7 @@ PerAxis = (
 
 SD_BOUNDS = (1e-7, 1.0)  # m or rad; of a sensor's noise that is fitted
 _LONGEST_LATENCY = 3600.0  # s
-_OFFSET_SD = 5e-3  # m or rad
+_OFFSET_SD: dict[Kind, float] = {"length": 5e-3, "angle": math.radians(5.0)}
 _PER_AXIS = ("sd_mm", "bias_sd_mm", "bias_drift_sd_mm")  # keys of a sensor that may differ from axis to axis
 ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
 
@@ -39,21 +39,32 @@ def of_axis(value: float | Mapping[str, float], axis: str, absent: float = 0.0) 
 
 
 class Start(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Prior uncertainty at the start: ``offset_sd`` is that of the offset [m or rad], for all axes or for each."""
+    """Prior uncertainty at the start.
 
-    offset_sd: PerAxis = msgspec.field(name="offset_sd_mm", default=_OFFSET_SD)
+    Attributes:
+        offset_sd: That of the offset [m or rad], for all axes or for each; None: 5 mm or 5°, by a configuration's arm.
+    """
 
-    def offset_sd_of(self, axis: str) -> float:
+    offset_sd: PerAxis | None = msgspec.field(name="offset_sd_mm", default=None)
+
+    def offset_sd_of(self, axis: str, kind: Kind = "length") -> float:
         """The uncertainty of one axis's offset [m or rad]."""
-        return of_axis(self.offset_sd, axis, _OFFSET_SD)
+        default = _OFFSET_SD[kind]
+        return default if self.offset_sd is None else of_axis(self.offset_sd, axis, default)
+
+    def of_arm(self, arm: ArmModel) -> Start:
+        """The same with a number for every axis: one, where it is the same for all."""
+        each = {axis: self.offset_sd_of(axis, one.kind) for axis, one in arm.axes.items()}
+        return Start(offset_sd=each if len(set(each.values())) > 1 else next(iter(each.values())))
 
 
 class Process(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Process noise of one axis, m being rad for an angle; the variances of the two parts of each density add up.
 
     Attributes:
-        input_noise: Density of the white noise at the plant's input [m/√Hz].
-        drift: Density of the offset's random walk [m/√s].
+        input_noise: Density of the white noise at the plant's input [m/√Hz]. The default in a file is 0.03 mm/√Hz, or
+            that in degrees for an angle.
+        drift: Density of the offset's random walk [m/√s]. The default in a file is 0.4 mm/√s, or that in degrees.
         maneuver_noise: More input noise per m/s of change in commanded speed [m/√Hz per m/s].
         maneuver_drift: More drift per m/s of change in commanded speed [m/√s per m/s].
         disturbance_sd: Standard deviation of a disturbance that reverts to 0 [m]; 0: there is none.
@@ -68,6 +79,12 @@ class Process(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     disturbance_sd: NotNegative = msgspec.field(name="disturbance_sd_mm", default=0.0)
     disturbance_time: Time = msgspec.field(name="disturbance_time_ms", default=0.3)
     disturbance_kind: Literal["matern", "ou"] = "matern"
+
+
+PROCESS: dict[Kind, Process] = {  # what is not configured
+    "length": Process(),
+    "angle": Process(input_noise=math.radians(0.03), drift=math.radians(0.4)),
+}
 
 
 class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -161,8 +178,9 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
                 raise ConfigError(f"sensors.{name}.turn_deg: no axis of the arm is an angle")
             if sensor.scale == 0.0:
                 raise ConfigError(f"sensors.{name}.scale: must not be 0: measurements would not depend on the position")
-        complete = {axis: self.process.get(axis, Process()) for axis in self.arm.axes}
+        complete = {axis: self.process.get(axis, PROCESS[one.kind]) for axis, one in self.arm.axes.items()}
         msgspec.structs.force_setattr(self, "process", complete)
+        msgspec.structs.force_setattr(self, "start", self.start.of_arm(self.arm))
 
     def _parts(self) -> Iterator[tuple[str, msgspec.Struct, Kind]]:
         """Its tables with their places in the file, and of which kind of axis they are."""
@@ -182,7 +200,10 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         path = Path(path)
         tree, where = toml.read(path), str(path)
         tree["arm"] = load_arm(tree, path)
-        return toml.struct(with_names_of_lengths(tree, tree["arm"], where), FusionConfig, where)
+        tree = with_names_of_lengths(tree, tree["arm"], where)
+        if isinstance(tree.get("process"), dict):
+            tree["process"] = with_defaults(tree["process"], tree["arm"])
+        return toml.struct(tree, FusionConfig, where)
 
     def save(self, folder: Path) -> None:
         """Write ``fusion.toml`` and the arm as ``arm.toml`` beside it."""
@@ -334,22 +355,29 @@ def of_all_axes(
                 mine = [axis for axis, one in arm.axes.items() if one.kind == of]
                 each |= cast(dict[str, Any], value) if isinstance(value, dict) else dict.fromkeys(mine, value)
         if each:
-            found[key] = each
+            same = len(each) == len(arm.axes) and len(set(each.values())) == 1
+            found[key] = next(iter(each.values())) if same else each
     return found
+
+
+def with_defaults(process: Mapping[str, Mapping[str, Any]], arm: ArmModel) -> dict[str, dict[str, Any]]:
+    """The tables of axes, with the key names for lengths, with what they leave out."""
+    return {axis: {**toml.builtins(PROCESS[arm.axes[axis].kind]), **table} for axis, table in process.items()}
 
 
 def with_kinds(table: Mapping[str, Any], arm: ArmModel, per_axis: Sequence[str]) -> dict[str, Any]:
     """The inverse of :func:`of_all_axes`: a table of lengths with a key for each kind of the arm's axes."""
-    found = dict(table)
-    for key in per_axis:
-        value: Any = found.pop(key, None)
-        for of in arm.kinds if value is not None else ():
-            if not isinstance(value, dict):
-                found[of_kind(key, of)] = value
-                continue
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        if key not in per_axis:
+            found[key] = value
+        elif not isinstance(value, dict):
+            found.update((of_kind(key, of), value) for of in arm.kinds)
+        else:
             each = cast(dict[str, Any], value)
-            if mine := {axis: one for axis, one in each.items() if arm.kind_of.get(axis, "length") == of}:
-                found[of_kind(key, of)] = mine
+            for of in KINDS:
+                if mine := {axis: one for axis, one in each.items() if arm.kind_of.get(axis, "length") == of}:
+                    found[of_kind(key, of)] = mine
     return found
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from .. import toml, units
 from ..errors import ConfigError, PumafuseError, UnknownNameError
 from ..fusion.config import (
+    PROCESS,
     FusionConfig,
     PerAxis,
     Process,
@@ -19,6 +20,7 @@ from ..fusion.config import (
     load_arm,
     of_all_axes,
     of_axis,
+    with_defaults,
     with_kinds,
     with_names_of_lengths,
 )
@@ -178,7 +180,9 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """The filter's configuration: what is simulated, overridden by ``filter``."""
         simulated: dict[str, Any] = {
             "start": {"offset_sd_mm": self.start.offset_sd},
-            "process": {axis: toml.builtins(self.process.get(axis, Process())) for axis in self.arm.axes},
+            "process": {
+                axis: toml.builtins(self.process.get(axis, PROCESS[one.kind])) for axis, one in self.arm.axes.items()
+            },
             "sensors": {name: sensor.to_config() for name, sensor in self.sensors.items()},
         }
         override = with_names_of_lengths(self.filter, self.arm, "filter")
@@ -235,6 +239,8 @@ def _with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str) -
     for key, kind in (("true_arm", TrueArm), ("process", Process)):
         if isinstance(found.get(key), dict):
             found[key] = by_axis(found[key], kind, arm, where, key)
+    if isinstance(found.get("process"), dict):
+        found["process"] = with_defaults(found["process"], arm)
     if isinstance(start := found.get("start"), dict):
         found["start"] = _start(cast(dict[str, Any], start), arm, where)
     if "reference" in found:

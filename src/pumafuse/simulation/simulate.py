@@ -15,7 +15,7 @@ import pyarrow as pa
 from .. import folders, toml
 from ..arrays import FloatArray
 from ..errors import ConfigError
-from ..fusion.config import ARM_FILE, FusionConfig, Process, of_axis
+from ..fusion.config import ARM_FILE, PROCESS, FusionConfig, of_axis
 from ..logs import save, tables
 from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run, Source
@@ -73,7 +73,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
     true_axes, motions = scenario.true_axes, dict[str, Motion]()
     scales = {axis: SCREEN[kind].scale for axis, kind in scenario.arm.kind_of.items()}
     for axis, command in commands.items():
-        process, draws = scenario.process.get(axis, Process()), _stream(seed, "axis", axis)
+        process, draws = scenario.process.get(axis, PROCESS[scenario.arm.axes[axis].kind]), _stream(seed, "axis", axis)
         offset_sd = of_axis(scenario.start.offset_sd, axis)
         motions[axis] = simulate_axis(true_axes[axis], process, offset_sd, tick, command, period, draws)
 
