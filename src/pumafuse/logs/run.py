@@ -7,9 +7,9 @@ they are. Each measurement gets its outcome when the run is fused.
 from __future__ import annotations
 
 import os
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
 from ..model.arm import CANONICAL_AXES
-from ..units import AN, Kind, kind_of, nanoseconds
+from ..units import AN, Kind, nanoseconds
 from . import manifest, tables
 from .frames import CARTESIAN, Frame
 
@@ -268,19 +268,26 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
 def _read_manifest(path: Path) -> Run:
     listed = manifest.load(path)
     notes, units = list[str](), dict(listed.command.kinds)
-
-    @cache
-    def table_of(file: str) -> tables.Table:
-        table = tables.read(path.parent / file, growing=True)
-        notes.extend(table.notes)
-        return table
+    fields, read = defaultdict[tuple[str, ...], list[str]](list), dict[tuple[str, ...], tables.Table]()
+    scored = listed.reference
+    for entry in (listed.command, *listed.sensors.values(), *([] if scored is None else [scored])):
+        fields[entry.rows] += entry.fields
 
     def source(entry: manifest.SourceEntry) -> Source:
-        return _source(table_of(entry.file), entry.time, entry.axes, entry.file, notes, units)
+        if entry.rows not in read:
+            read[entry.rows] = table = tables.read(
+                path.parent / entry.file,
+                growing=True,
+                fields=fields[entry.rows],
+                where=entry.where,
+                topic=entry.topic,
+                entity=entry.entity,
+            )
+            notes.extend(note for note in table.notes if note not in notes)
+        return _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units)
 
     command = source(listed.command)
     sensors = {name: source(entry) for name, entry in listed.sensors.items()}
-    scored = listed.reference
     reference = None if scored is None else source(scored)
     if reference is not None and scored is not None:
         of_kind = {"length": scored.sd, "angle": scored.angular_sd}
@@ -296,19 +303,19 @@ def _read_single(path: Path) -> Run:
     clocks = [name for name in table.columns if name.startswith("time_")]
     if len(clocks) != 1:
         raise RunError(f"{path}: a single table needs one time column, 'time_s'; it has: {listed}")
-    groups: dict[str, dict[str, list[str]]] = {}
+    groups: dict[str, dict[str, list[manifest.Column]]] = {}
     for column in table.columns:
         source, dot, rest = column.partition(".")
         if dot:
             axis = rest.rpartition("_")[0]
             if axis in groups.setdefault(source, {}):
                 raise RunError(f"{path}: two columns for {source}.{axis}; give one")
-            groups[source][axis] = [column]
+            groups[source][axis] = [manifest.Column(column)]
     if "command" not in groups:
         raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {listed}")
     notes, sources, units = list(table.notes), dict[str, Source](), dict[str, Kind]()
     for name, axes in groups.items():
-        source = _source(table, clocks[0], axes, name, notes, units)
+        source = _source(table, manifest.Time(clocks[0]), axes, name, notes, units)
         sources[name] = source.rows(np.any(~np.isnan(list(source.values.values())), axis=0))
     if left := [column for column in table.columns if "." not in column and column != clocks[0]]:
         notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
@@ -318,22 +325,22 @@ def _read_single(path: Path) -> Run:
 
 def _source(
     table: tables.Table,
-    time: str,
-    axes: Mapping[str, Sequence[str]],
+    time: manifest.Time,
+    axes: Mapping[str, Sequence[manifest.Column]],
     label: str,
     notes: list[str],
     units: dict[str, Kind],
 ) -> Source:
     """A source from its columns, those of an axis added up; new notes and new kinds of axes are put in."""
-    stamp, note = table.stamps(time)
+    stamp, note = table.stamps(time.column, time.nanoseconds, time.ending)
     values, found = dict[str, FloatArray](), [note]
     for axis, columns in axes.items():
-        parts = [table.numbers(column) for column in columns]
+        parts = [table.numbers(column.column, column.ending) for column in columns]
         for column in columns:
-            kind = kind_of(column) or "length"
+            kind = column.kind or "length"
             if units.setdefault(axis, kind) != kind:
                 raise RunError(
-                    f"{table.path}: column '{column}' is {AN[kind]}, but {axis} is {AN[units[axis]]} elsewhere"
+                    f"{table.path}: column '{column.column}' is {AN[kind]}, but {axis} is {AN[units[axis]]} elsewhere"
                 )
         values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
         found.extend(note for _, note in parts)
