@@ -26,6 +26,7 @@ Columns: TypeAlias = Mapping[str, pa.ChunkedArray]
 NAMES = "name"  # the list beside another one that says what its elements are
 # Seconds and nanoseconds in a struct: ROS 2, ROS 1, Foxglove's JSON schemas, google.protobuf.Timestamp.
 _SPLIT_STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("seconds", "nanos"))
+_NANOSECONDS = re.compile(r"^[^.]*(nano|nsec)[^.]*$", re.IGNORECASE)
 _GIGA = 10**9
 _WHOLE = r"^[+-]?\d{1,19}$"
 _NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
@@ -47,12 +48,14 @@ class Table:
         columns: Its columns by name; they may be nested.
         rows: Number of rows.
         notes: What was wrong with the file as a whole, a sentence each.
+        names: Names and field paths of all that the file has, also where ``columns`` are only some of it.
     """
 
     path: Path
     columns: Columns
     rows: int
     notes: tuple[str, ...]
+    names: tuple[str, ...] = ()
 
     def numbers(self, name: str, unit: str = "") -> tuple[FloatArray, str | None]:
         """A column of positions [m or rad], NaN where a cell is empty or no number, and a note on cells that were text.
@@ -131,6 +134,12 @@ class Table:
             return None
         found = column.filter(pc.match_substring_regex(pc.utf8_trim_whitespace(column), _DATE))
         return pc.any(pc.match_substring_regex(found, _ZONE)).as_py()
+
+    def nanoseconds_beside(self, name: str) -> str | None:
+        """A column beside one of seconds that by its name has their nanoseconds; None without one."""
+        table, dot, _ = name.rpartition(".")
+        beside = (path for path in self.names if path.startswith(table + dot) and path != name)
+        return next((path for path in beside if _NANOSECONDS.search(path.removeprefix(table + dot))), None)
 
     def column(self, path: str) -> pa.ChunkedArray:
         """The column of a name or a field path, nothing converted. A column that has the whole path as its name wins.

@@ -17,13 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
-from ..errors import RunError, UnknownNameError
+from ..errors import RunError, UnknownNameError, counted
 from ..model.arm import CANONICAL_AXES
 from ..units import AN, Kind, nanoseconds
 from . import manifest, tables
 from .frames import CARTESIAN, Frame
 
 Clock = Literal["stamps", "regular"]
+
+_LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
+_FEW_ROWS = 10  # too few to judge a clock by
 
 
 @dataclass(frozen=True)
@@ -214,9 +217,11 @@ class Run:
         Raises:
             RunError: Lengths differ, or there is no command.
         """
-        streams = {sensor: _from_arrays(sensor, *arrays) for sensor, arrays in (sensors or {}).items()}
-        scored = None if reference is None else replace(_from_arrays("reference", *reference), sd=reference_sd)
-        return Run(name, _from_arrays("command", time, command), streams, scored, dict(start or {}), clock, frame)
+        notes = list[str]()
+        commands = _from_arrays("command", time, command, notes)
+        streams = {sensor: _from_arrays(sensor, *arrays, notes) for sensor, arrays in (sensors or {}).items()}
+        scored = None if reference is None else replace(_from_arrays("reference", *reference, notes), sd=reference_sd)
+        return Run(name, commands, streams, scored, dict(start or {}), clock, frame, notes=tuple(notes))
 
 
 def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: str = "") -> None:
@@ -227,7 +232,52 @@ def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: s
         notes.append(f"{label}: {len(found)} {plural} {what} (first: row {found[0] + 1}{first})")
 
 
-def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.ArrayLike]) -> Source:
+def _note_standing_clock(notes: list[str], source: Source, advice: str) -> None:
+    """Append a note on rows with the stamp of the row before and another value; refuse a clock that stands still.
+
+    Real logs have such rows: clocks tick every 1 ms, 10 ms, or 15.6 ms (Windows), a sensor is asked several times.
+    Refused is a clock that ticks every 0.1 s or more, where most values of an axis change within a tick, and not by
+    less than from one tick to the next, as a measurement that is repeated at a standstill does. Measured on scan1 and
+    trunk-servo, whose commands or measurements were given such stamps: ticks up to 15.6 ms cost less than a quarter of
+    the accuracy, 50 ms a half, 0.1 s two thirds, 1 s up to nine tenths. No recording at hand has any such row.
+
+    Args:
+        notes: Gets the note.
+        source: The rows.
+        advice: What to do, if the clock is refused.
+
+    Raises:
+        RunError: The clock stands still.
+    """
+    if not (np.diff(source.stamp) == 0).any():
+        return
+    most, axis = max((int(_changes(source, axis).sum()), axis) for axis in source.values)
+    if not most:
+        return
+    known = np.isfinite(source.values[axis]) & (source.stamp != NO_STAMP)
+    step, tick = np.abs(np.diff(source.values[axis][known])), np.diff(source.stamp[known])
+    ticks = int((tick != 0).sum()) + 1
+    period = np.median(tick[tick > 0]) / 1e9 if (tick > 0).any() else np.inf
+    going_on = 2.0 * step[tick == 0].mean() >= (step[tick != 0].mean() if ticks > 1 else 0.0)
+    if most > ticks and most >= _FEW_ROWS and period >= _LONGEST_TICK and going_on:
+        stands = f", one every {period:.3g} s" if np.isfinite(period) else ""
+        raise RunError(
+            f"{source.label}: {counted(ticks, 'distinct stamp')}{stands}, in {len(step) + 1} rows with {axis}, which"
+            f" goes on while the clock stands still; {advice}"
+        )
+    what = f"the stamp of the row before and another {axis} (of commands, the last of a stamp counts)"
+    note_rows(notes, source.label, _changes(source, axis), what)
+
+
+def _changes(source: Source, axis: str) -> BoolArray:
+    """Rows with the stamp of the row before that has a value of the axis, and another value, (rows,)."""
+    value, found = source.values[axis], np.zeros(len(source.stamp), dtype=np.bool_)
+    known = np.flatnonzero(np.isfinite(value) & (source.stamp != NO_STAMP))
+    found[known[1:]] = (np.diff(source.stamp[known]) == 0) & (np.diff(value[known]) != 0)
+    return found
+
+
+def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.ArrayLike], notes: list[str]) -> Source:
     try:
         stamp = _stamps(np.array(time))
         columns = {axis: np.array(value, dtype=np.float64) for axis, value in values.items()}
@@ -242,7 +292,9 @@ def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.Array
             )
     if not columns or not len(stamp):
         raise RunError(f"{label}: no values")
-    return Source(stamp, columns, label)
+    source = Source(stamp, columns, label)
+    _note_standing_clock(notes, source, "give stamps as fine as the rows")
+    return source
 
 
 def _stamps(time: npt.NDArray[Any]) -> TimeArray:
@@ -345,4 +397,8 @@ def _source(
         values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
         found.extend(note for _, note in parts)
     notes.extend(note for note in found if note is not None and note not in notes)
-    return Source(stamp, values, label)
+    source = Source(stamp, values, label)
+    beside = None if time.nanoseconds else table.nanoseconds_beside(time.column)
+    advice = f"write time = ['{time.column}', '{beside}']" if beside else "name a finer column of time"
+    _note_standing_clock(notes, source, advice)
+    return source

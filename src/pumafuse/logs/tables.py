@@ -62,7 +62,7 @@ def read(
         )
     try:
         if path.suffix == ".parquet":
-            table, notes = _parquet(path, fields, where), list[str]()
+            (table, names), notes = _parquet(path, fields, where), list[str]()
         else:
             with pa.input_stream(str(path)) as stream:
                 content = stream.read()
@@ -70,7 +70,7 @@ def read(
                 raise RunError(f"{path}: the file is empty")
             table, notes = _parsed(path, content, growing)
             whole, conditions = table, _conditions(path, table, where)
-            table = _chosen(path, whole, conditions)
+            table, names = _chosen(path, whole, conditions), whole.column_names
             if where and not table.num_rows:
                 raise _no_row(path, [whole], where)
     except UnicodeDecodeError:
@@ -84,7 +84,7 @@ def read(
         raise RunError(f"{path}: cannot be read: {error.strerror or str(error).splitlines()[0]}") from None
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
-    return Table(path, _named(path, table), table.num_rows, tuple(notes))
+    return Table(path, _named(path, table), table.num_rows, tuple(notes), tuple(names))
 
 
 def is_recording(path: Path) -> bool:
@@ -137,8 +137,8 @@ def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]
     return table, [note, *notes]
 
 
-def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> pa.Table:
-    """The columns asked for, and the rows, batch by batch.
+def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
+    """The columns asked for and the rows, some at a time; and the names of all that the file has.
 
     Without threads: one that outlives the interpreter aborts it (apache/arrow issue 34314). So pyarrow's data sets,
     which filter by themselves, are no way.
@@ -155,7 +155,8 @@ def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> pa.Table
         kept = [_chosen(path, part, conditions) for part in _parts(file, wanted, groups)]
         if where and not any(part.num_rows for part in kept):
             raise _no_row(path, _parts(file, prefixes(list(where)), None), where)
-        return pa.concat_tables(kept) if kept else empty
+        names = [file.schema.column(place).path for place in range(len(file.schema))]
+        return pa.concat_tables(kept) if kept else empty, names
 
 
 def _parts(file: papq.ParquetFile, columns: list[str] | None, groups: list[int] | None) -> Iterator[pa.Table]:
