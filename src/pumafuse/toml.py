@@ -1,4 +1,4 @@
-"""TOML files as msgspec structs: a struct's field types are what is checked, its encoded names the accepted keys."""
+"""Files as msgspec structs: a struct's field types are what is checked, its encoded names the accepted keys."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import msgspec
 import tomli_w
 
 from .errors import ConfigError, PumafuseError, suggestion
-from .units import AN, KINDS, Kind, as_length, from_si, of_kind, to_si
+from .units import AN, KINDS, Kind, as_length, ending, from_si, in_unit, of_kind, to_si
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -22,6 +22,17 @@ Positive = Annotated[float, msgspec.Meta(gt=0, le=MOST)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, le=MOST)]
 Time = Annotated[float, msgspec.Meta(ge=1e-6, le=MOST)]  # s, after which something is forgotten
 Interval = tuple[float, float]  # lower and upper end
+
+
+class Reported(msgspec.Struct, frozen=True, kw_only=True):
+    """SI numbers that can also be had in the unit of a name: ``score.rmse_mm`` or ``score.rmse_deg`` of ``rmse``."""
+
+    def __getattr__(self, name: str) -> Any:
+        unit = ending(name) or ""
+        if not unit or name.removesuffix(unit) not in self.__struct_fields__:
+            raise AttributeError(f"{type(self).__name__} has no '{name}'")
+        value = getattr(self, name.removesuffix(unit))
+        return float(in_unit(value, unit)) if isinstance(value, float) else value
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -96,6 +107,21 @@ def builtins(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
     dates = (datetime.datetime, datetime.date, datetime.time)
     tree = _without_none(msgspec.to_builtins(value, builtin_types=dates, enc_hook=float))  # numpy's numbers are floats
     return tree if axis == "length" else _renamed(tree, lambda name: of_kind(name, axis))
+
+
+def reported(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
+    """A struct (SI numbers) as plain tables for JSON, in the units of the file's key names; None stays.
+
+    Args:
+        value: The struct.
+        axis: What the axes are to which it belongs: its keys have the units of that.
+    """
+    return from_si(_renamed(msgspec.to_builtins(value, enc_hook=float), lambda name: of_kind(name, axis)))
+
+
+def from_report(tree: Mapping[str, Any]) -> dict[str, Any]:
+    """The inverse of :func:`reported`: tables in SI with the key names for lengths."""
+    return _renamed(to_si(tree), as_length)
 
 
 def _without_none(tree: dict[str, Any]) -> dict[str, Any]:

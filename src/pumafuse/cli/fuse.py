@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.resources import as_file, files
@@ -18,8 +17,9 @@ from ..fusion.estimates import Estimates
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
 from ..logs.run import Run
+from ..units import KINDS
 from .many import progress_bar, report_failures, run_jobs
-from .tables import console, outcome_table, runs_table, score_table, skill_table
+from .tables import outcome_table, print_tables, runs_table, score_table, skill_table
 
 
 def run(
@@ -55,7 +55,8 @@ def run(
     jobs = {path: partial(job, Path(path), place) for path, place in places.items()}
     done, failed = run_jobs("fusing", jobs, places.values())
     if done:
-        console(sys.stdout).print(runs_table({places[path].name: summary for path, summary in done.items()}))
+        summaries = {places[path].name: summary for path, summary in done.items()}
+        print_tables(runs_table(summaries, kind) for kind in KINDS)
         typer.echo(f"written to {output}")
     report_failures(failed, len(places), output)
 
@@ -128,9 +129,9 @@ def _show(summary: Summary) -> None:
         f" arm {summary.arm}"
     )
     scores = {axis: part.score for axis, part in summary.axes.items() if part.score is not None}
-    for table in (outcome_table(summary), skill_table([("", summary)]), score_table([(summary.run, scores)])):
-        if table.columns:
-            console(sys.stdout).print(table)
+    print_tables(outcome_table(summary, kind) for kind in KINDS)
+    print_tables(skill_table([("", summary)], kind) for kind in KINDS)
+    print_tables(score_table([(summary.run, summary, scores)], kind) for kind in KINDS)
 
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:

@@ -32,17 +32,17 @@ from ..live.sources import QUIET, replayed, standard_input
 from ..live.stream import Stream
 from ..live.wire import Event
 from ..logs.run import Run
-from ..units import MM, MS
-from .tables import Columns, cells, console, table
+from ..units import MS
+from .tables import Columns, cells, console, headings, table
 
 if TYPE_CHECKING:
     from ..views.live import LiveView
 
 _REDRAWN = 0.25  # s between two pictures of the status
 _AXIS: Columns = {
-    "position, mm": ("position", ".3f", MM),
-    "± sd, mm": ("position_sd", ".3f", MM),
-    "velocity, mm/s": ("velocity", ".1f", MM),
+    "position, {unit}": ("position", ".3f", None),
+    "± sd, {unit}": ("position_sd", ".3f", None),
+    "velocity, {unit}/s": ("velocity", ".1f", None),
 }
 _SENSOR: Columns = {
     "rows": ("rows", ".0f", 1.0),
@@ -213,11 +213,15 @@ def status(stream: Stream, summaries: Sequence[Callable[[], str]] = ()) -> Group
     """
     estimate = stream.live.estimate()
     now = "no event yet" if stream.live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
-    rows = [
-        [name, *cells(axis, _AXIS), "stale" if name in estimate.stale else ""] for name, axis in estimate.axes.items()
-    ]
-    axes = table(["axis", *_AXIS, ""], rows)
-    return Group(Text(now), axes, _sensor_table(stream.live), *map(Text, _sentences(stream, summaries)))
+    arm, tables = stream.live.config.arm, list[Table]()
+    for kind in arm.kinds:
+        rows = [
+            [name, *cells(axis, _AXIS, kind), "stale" if name in estimate.stale else ""]
+            for name, axis in estimate.axes.items()
+            if arm.axes[name].kind == kind
+        ]
+        tables.append(table(["axis", *headings(_AXIS, kind), ""], rows))
+    return Group(Text(now), *tables, _sensor_table(stream.live), *map(Text, _sentences(stream, summaries)))
 
 
 def _sensor_table(live: LiveEstimator) -> Table:

@@ -1,7 +1,8 @@
-"""The tables that commands print."""
+"""The tables that commands print: one for the axes that are lengths, one for those that are angles."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from io import StringIO
 from typing import Any, TextIO
@@ -16,18 +17,20 @@ from rich.table import Table
 from ..fusion.score import Z95
 from ..fusion.skill import PredictionError
 from ..fusion.summary import ScoreSummary, Summary
+from ..units import SCREEN, Kind
 
-Columns = Mapping[str, tuple[str, str, float]]  # by heading: an attribute, its format, and what it is multiplied by
+# By heading: an attribute, its format, and what it is multiplied by; None: what positions are on the screen.
+Columns = Mapping[str, tuple[str, str, float | None]]
 
 _FEW_RUNS = 20  # that get lines of their own
 _SCORE: Columns = {
-    "RMSE, mm": ("rmse_mm", ".3f", 1.0),
-    "bias, mm": ("bias_mm", "+.3f", 1.0),
+    "RMSE, {unit}": ("rmse", ".3f", None),
+    "bias, {unit}": ("bias", "+.3f", None),
     "95 %\ncoverage": ("coverage", ".1%", 1.0),
     "NEES": ("nees_mean", ".2f", 1.0),
     "scored": ("rows", ".0f", 1.0),
     "left\nout": ("left_out", ".0f", 1.0),
-    "velocity\nRMSE, mm/s": ("velocity_rmse_mm_s", ".3f", 1.0),
+    "velocity\nRMSE, {unit}/s": ("velocity_rmse", ".3f", None),
     "velocity\n95 % cov.": ("velocity_coverage", ".1%", 1.0),
 }
 
@@ -62,83 +65,119 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     return made
 
 
+def print_tables(tables: Iterable[Table]) -> None:
+    """Print the tables that have anything in them on standard output."""
+    for one in tables:
+        if one.columns:
+            console(sys.stdout).print(one)
+
+
 def number(value: float | None, form: str = ".3f") -> str:
     """A number as the format specification says; a dash for None."""
     return "–" if value is None else format(value, form)
 
 
-def interval(value: float | None, sd: float | None) -> str:
-    """A value with its 95 % interval; a dash for None."""
-    return "–" if value is None or sd is None else f"{value:.3f} ± {Z95 * sd:.3f}"
+def position(value: float | None, kind: Kind) -> str:
+    """A number with the unit of positions [SI] in that of the screen; a dash for None."""
+    return "–" if value is None else f"{value * SCREEN[kind].scale:.3f}"
 
 
-def cells(row: object, columns: Columns) -> list[str]:
+def interval(value: float | None, sd: float | None, kind: Kind) -> str:
+    """A position with its 95 % interval in the screen's unit; a dash for None."""
+    return "–" if value is None or sd is None else f"{position(value, kind)} ± {position(Z95 * sd, kind)}"
+
+
+def headings(columns: Columns, kind: Kind) -> list[str]:
+    """The headings of columns for axes of a kind."""
+    return [heading.format(unit=SCREEN[kind].unit) for heading in columns]
+
+
+def cells(row: object, columns: Columns, kind: Kind = "length") -> list[str]:
     """The attributes of ``row`` as text."""
-    found = ((getattr(row, name), form, factor) for name, form, factor in columns.values())
-    return ["–" if value is None else format(value * factor, form) for value, form, factor in found]
+    found = ((getattr(row, name), form, scale) for name, form, scale in columns.values())
+    of_positions = SCREEN[kind].scale
+    return [
+        "–" if value is None else format(value * (of_positions if scale is None else scale), form)
+        for value, form, scale in found
+    ]
 
 
-def outcome_table(summary: Summary) -> Table:
-    """Components by outcome, innovations and their expected size, for each axis and sensor."""
-    sensors = [(axis, name, one) for axis, part in summary.axes.items() for name, one in part.sensors.items()]
+def outcome_table(summary: Summary, kind: Kind) -> Table:
+    """Components by outcome, innovations and their expected size, for each axis of a kind and sensor."""
+    axes = {axis: part for axis, part in summary.axes.items() if part.kind == kind}
+    sensors = [(axis, name, one) for axis, part in axes.items() for name, one in part.sensors.items()]
     words = sorted({word for *_, one in sensors for word in one.outcomes}, key=lambda word: (word != "fused", word))
     rows = [
         [
             axis,
             name,
             *(str(one.outcomes.get(word, 0)) for word in words),
-            number(one.innovation_rms_mm),
-            number(one.innovation_sd_mm),
-            interval(one.bias_mm, one.bias_sd_mm),
+            position(one.innovation_rms, kind),
+            position(one.innovation_sd, kind),
+            interval(one.bias, one.bias_sd, kind),
             one.verdict,
         ]
         for axis, name, one in sensors
     ]
-    return table(["axis", "sensor", *words, "innovation, mm", "expected, mm", "bias, mm", "verdict"], rows)
+    unit = SCREEN[kind].unit
+    of_positions = (f"innovation, {unit}", f"expected, {unit}", f"bias, {unit}")
+    return table(["axis", "sensor", *words, *of_positions, "verdict"], rows)
 
 
-def skill_table(results: Iterable[tuple[str, Summary]]) -> Table:
-    """Errors of predicting each sensor's next measurement, by this filter and by simpler means."""
+def skill_table(results: Iterable[tuple[str, Summary]], kind: Kind) -> Table:
+    """Errors of predicting each sensor's next measurement on axes of a kind, by this filter and by simpler means."""
+
+    def prediction(error: PredictionError) -> str:
+        return f"{position(error.rms, kind)} / {position(error.median, kind)}"
+
     rows = [
-        [name, axis, sensor, str(one.skill.predictions), *map(_prediction, msgspec.structs.astuple(one.skill)[1:])]
+        [name, axis, sensor, str(one.skill.predictions), *map(prediction, msgspec.structs.astuple(one.skill)[1:])]
         for name, summary in results
         for axis, part in summary.axes.items()
         for sensor, one in part.sensors.items()
-        if one.skill is not None
+        if one.skill is not None and part.kind == kind
     ]
     by = ["last one\nheld", "constant\nvelocity", "command\nalone", "this\nfilter"]
     made = table(["result", "axis", "sensor", "predictions", *by], rows)
     made.title, made.title_justify, made.title_style = (
-        "Error of predicting the next measurement, RMS / median in mm, by …",
+        f"Error of predicting the next measurement, RMS / median in {SCREEN[kind].unit}, by …",
         "left",
         "",
     )
     return made
 
 
-def _prediction(error: PredictionError) -> str:
-    return f"{error.rms_mm:.3f} / {error.median_mm:.3f}"
+def score_table(results: Iterable[tuple[str, Summary, Mapping[str, ScoreSummary]]], kind: Kind) -> Table:
+    """Scores by axis against a reference, for each result and axis of a kind; of the velocity where there is one."""
+    rows = [
+        [name, axis, *cells(one, _SCORE, kind)]
+        for name, summary, scores in results
+        for axis, one in scores.items()
+        if summary.axes[axis].kind == kind
+    ]
+    return table(["result", "axis", *headings(_SCORE, kind)], rows)
 
 
-def score_table(results: Iterable[tuple[str, Mapping[str, ScoreSummary]]]) -> Table:
-    """Scores against the reference, for each result and axis; of the velocity where a result has one."""
-    rows = [[name, axis, *cells(one, _SCORE)] for name, scores in results for axis, one in scores.items()]
-    return table(["result", "axis", *_SCORE], rows)
-
-
-def runs_table(results: Mapping[str, Summary]) -> Table:
-    """Many results: lines for each of up to 20 by name, and for each axis all of them together."""
+def runs_table(results: Mapping[str, Summary], kind: Kind) -> Table:
+    """Many results: lines for each of up to 20 by name, and for each axis of a kind all of them together."""
+    results = {name: _of_kind(summary, kind) for name, summary in results.items()}
     rows: list[list[str]] = []
     if len(results) <= _FEW_RUNS:
-        rows += [[name, axis, *_pooled([one], axis)] for name, one in results.items() for axis in one.axes]
+        rows += [[name, axis, *_pooled([one], axis, kind)] for name, one in results.items() for axis in one.axes]
     for axis in dict.fromkeys(axis for one in results.values() for axis in one.axes):
         having = [one for one in results.values() if axis in one.axes]
-        rows.append([f"all {len(having)}", axis, *_pooled(having, axis)])
-    scores = ("RMSE, mm", "worst, mm", "95 % coverage", "NEES")
+        rows.append([f"all {len(having)}", axis, *_pooled(having, axis, kind)])
+    unit = SCREEN[kind].unit
+    scores = (f"RMSE, {unit}", f"worst, {unit}", "95 % coverage", "NEES")
     return table(["result", "axis", *scores, "NIS", "prediction,\nof best other", "fused", "rejected", "notes"], rows)
 
 
-def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
+def _of_kind(summary: Summary, kind: Kind) -> Summary:
+    axes = {axis: part for axis, part in summary.axes.items() if part.kind == kind}
+    return msgspec.structs.replace(summary, axes=axes)
+
+
+def _pooled(summaries: Sequence[Summary], axis: str, kind: Kind) -> list[str]:
     """Cells of one axis over several runs; each estimate and each component counts once."""
     parts = [summary.axes[axis] for summary in summaries]
     scores = [part.score for part in parts if part.score is not None]
@@ -146,10 +185,10 @@ def _pooled(summaries: Sequence[Summary], axis: str) -> list[str]:
     fused, rejected = ([sensor.outcomes.get(word, 0) for sensor in sensors] for word in ("fused", "rejected"))
     rows = [score.rows for score in scores]
     skills = [sensor.skill for sensor in sensors if sensor.skill is not None]
-    square = _mean([score.rmse_mm**2 for score in scores], rows)
+    square = _mean([score.rmse**2 for score in scores], rows)
     return [
-        number(None if square is None else square**0.5),
-        number(max((score.rmse_mm for score in scores), default=None)),
+        position(None if square is None else square**0.5, kind),
+        position(max((score.rmse for score in scores), default=None), kind),
         number(_mean([score.coverage for score in scores], rows), ".1%"),
         number(_mean([score.nees_mean for score in scores], rows), ".2f"),
         number(_mean([sensor.nis_mean for sensor in sensors], fused), ".2f"),

@@ -19,6 +19,7 @@ from ..tuning.maximise import Point
 from ..tuning.parameters import kinds_of
 from ..tuning.summary import TuningSummary
 from ..tuning.tune import tune
+from ..units import SCREEN
 from ..views import formatting
 from .tables import console, interval, number, table
 
@@ -100,7 +101,8 @@ def _show(summary: TuningSummary, period: float) -> None:
     lines = [f"{axis}: {why}" for axis, why in summary.orders.items()] + summary.not_identifiable
     lines += [formatting.together(pair) for pair in summary.correlations]
     for one in summary.biases:
-        lines.append(f"{one.run}: {one.sensor} is off by {interval(one.bias_mm, one.sd_mm)} mm on {one.axis}")
+        off = f"{interval(one.bias, one.sd, one.kind)} {SCREEN[one.kind].unit}"
+        lines.append(f"{one.run}: {one.sensor} is off by {off} on {one.axis}")
     for line in lines:
         typer.echo(line)
     likelihood = [
@@ -140,12 +142,12 @@ def _validation(summary: TuningSummary) -> Table:
     for one in summary.validation or ():
         since = f" from {one.since_s:.1f} s" if one.since_s else ""
         pair = (one.before, one.after)
-        rmse = formatting.change([state.rmse_mm for state in pair], ".3f")
+        rmse = formatting.change_of_positions([state.rmse for state in pair], one.kind)
         coverage = formatting.change([state.coverage for state in pair], ".3f")
         for name in one.before.sensors:
             sensors = [state.sensors.get(name) for state in pair]
             nis = formatting.change([sensor and sensor.nis for sensor in sensors], ".2f")
             correlation = formatting.change([sensor and sensor.correlation for sensor in sensors], "+.2f")
             rows.append([one.run + since, one.axis, name, rmse, coverage, nis, correlation])
-    numbers = ("RMSE, mm", "coverage", "NIS", "correlation at lag 1")
+    numbers = ("RMSE", "coverage", "NIS", "correlation at lag 1")
     return table(["validated on", "axis", "sensor", *numbers], rows)

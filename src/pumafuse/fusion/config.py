@@ -180,13 +180,17 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     def save(self, folder: Path) -> None:
         """Write ``fusion.toml`` and the arm as ``arm.toml`` beside it."""
+        (folder / "fusion.toml").write_text(self.to_toml(), encoding="utf-8")
+        self.arm.save(folder / ARM_FILE)
+
+    def to_toml(self) -> str:
+        """The text of ``fusion.toml``, with the arm in a file ``arm.toml`` beside it."""
         tree = toml.builtins(self)
         tree["arm"] = ARM_FILE
         tree["process"] = {axis: toml.builtins(one, self.arm.axes[axis].kind) for axis, one in self.process.items()}
         tree["start"] = with_kinds(tree["start"], self.arm, ["offset_sd_mm"])
         tree["sensors"] = {name: with_kinds(table, self.arm, _PER_AXIS) for name, table in tree["sensors"].items()}
-        (folder / "fusion.toml").write_text(toml.text(tree), encoding="utf-8")
-        self.arm.save(folder / ARM_FILE)
+        return toml.text(tree)
 
     def sensor_names(self, chosen: Iterable[str] | None) -> tuple[str, ...]:
         """The sensors to use, in the order of the file; all of them for None.

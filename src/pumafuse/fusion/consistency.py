@@ -14,7 +14,7 @@ import numpy as np
 
 from ..arrays import CodeArray, FloatArray
 from ..filter.outcome import Outcome
-from ..units import MM
+from ..units import MM, Kind, of_kind
 from .config import Sensor
 from .estimates import Estimates, Measurements
 from .score import Z95
@@ -27,14 +27,14 @@ _WIDEST = 1e6  # largest ratio of prior to noise at which double precision keeps
 _NEVER = 1e-6  # expected number below which chance is no explanation
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
 _MANY_REJECTED = 0.1  # share of rejected components beyond which the others are a selection
-_TOO_SMALL = "rejected: sd_mm, latency_ms or the process noise too small"
+_TOO_SMALL = "rejected: {sd}, latency_ms or the process noise too small"
 _ONE_CLOCK = "are both stamped by one clock?"
 _CAUSES = {  # by whether the NIS is above its band, and the sign of a notable correlation
     (True, 1): ", innovations positively correlated: the process noise too small, or latency_ms wrong",
-    (True, 0): ": sd_mm or the process noise too small",
-    (True, -1): ", innovations negatively correlated: sd_mm too small",
-    (False, 1): ": sd_mm or the process noise too large",
-    (False, 0): ": sd_mm or the process noise too large",
+    (True, 0): ": {sd} or the process noise too small",
+    (True, -1): ", innovations negatively correlated: {sd} too small",
+    (False, 1): ": {sd} or the process noise too large",
+    (False, 0): ": {sd} or the process noise too large",
     (False, -1): ", innovations negatively correlated: the process noise too large",
 }
 
@@ -66,7 +66,7 @@ class Consistency:
 
 
 def log_likelihood(measurements: Measurements, sensors: Mapping[str, Sensor]) -> float:
-    """Log-likelihood of the components that the filter used or rejected, with positions in mm."""
+    """Log-likelihood of the components that the filter used or rejected, with positions in mm or mrad."""
     return float(densities_of(measurements.where(measurements.outcome <= Outcome.REACQUIRED), sensors).sum())
 
 
@@ -77,7 +77,7 @@ def densities_of(components: Measurements, sensors: Mapping[str, Sensor]) -> Flo
 
 
 def log_density(innovation: FloatArray, innovation_sd: FloatArray, outcome: CodeArray, gate: FloatArray) -> FloatArray:
-    """Log of each component's predicted density with positions in mm, (m,).
+    """Log of each component's predicted density with positions in mm or mrad, (m,).
 
     −½(ln 2πS + ν²/S) where it was fused or re-acquired; −½(ln 2πS + gate²) where it was rejected, so that a rejected
     measurement never costs less than one at the gate and a tuner cannot gain by rejecting.
@@ -146,25 +146,30 @@ def sensor_problems(est: Estimates) -> list[str]:
         hours_later = tail > LONGEST_TAIL_NS / 1e9
         later = np.count_nonzero(time > end + 1.0) > 0.5 * len(mine)
         frozen = {each: _frozen(value[axis == column]) for column, each in enumerate(given.axes)}
+        of_axes = [given.axes[column] for column in set[int](axis.tolist())]
+        kinds: dict[Kind, None] = {est.config.arm.axes[each].kind: None for each in of_axes}
+        sd, bias_sd, offset_sd = (
+            "/".join(of_kind(key, kind) for kind in kinds) for key in ("sd_mm", "bias_sd_mm", "offset_sd_mm")
+        )
         problems = [
             (
                 width > _WIDEST,
-                f"its prior (offset_sd_mm, bias_sd_mm) is {width:.1e} times its noise: more than double precision"
+                f"its prior ({offset_sd}, {bias_sd}) is {width:.1e} times its noise: more than double precision"
                 " resolves; use a narrower prior",
             ),
             (
                 reacquired > 0,
                 f"its gate reacquired {times}: it contradicts "
                 + (
-                    "the others or the model; if it is off by a constant, give it bias_sd_mm"
+                    f"the others or the model; if it is off by a constant, give it {bias_sd}"
                     if len(set(given.sensor.tolist())) > 1
-                    else "the model; sd_mm, latency_ms or the process noise may be wrong"
+                    else f"the model; {sd}, latency_ms or the process noise may be wrong"
                 ),
             ),
             (early > 0.5, f"most measurements lie before the first command: {_ONE_CLOCK}"),
             (hours_later, f"measurements go on for {tail / 3600.0:.1f} hours after the last command: {_ONE_CLOCK}"),
             (later and not hours_later, f"most measurements lie after the last command: {_ONE_CLOCK}"),
-            (rejected > _MANY_REJECTED, f"{rejected:.0%} of its components were {_TOO_SMALL}"),
+            (rejected > _MANY_REJECTED, f"{rejected:.0%} of its components were {_TOO_SMALL.format(sd=sd)}"),
             *(
                 (count > 0, f"{count} {each} measurements in a row have the same value: it froze")
                 for each, count in frozen.items()
@@ -206,23 +211,23 @@ def _frozen(values: FloatArray) -> int:
 def _verdict(est: Estimates, sensor: str, axis: str, fused: Measurements, found: Consistency, rejected: float) -> str:
     if found.count < _FEW:
         return f"too few measurements ({found.count}) to tell"
-    low, high = found.nis_band
+    (low, high), sd = found.nis_band, of_kind("sd_mm", est.config.arm.axes[axis].kind)
     digits = next(n for n in range(2, 17) if _beside([found.nis, low, high]) == _beside([found.nis, low, high], n))
     nis = f"NIS {found.nis:.{digits}f}, expected {low:.{digits}f} to {high:.{digits}f}"
     if rejected > _MANY_REJECTED:  # the others were selected to fit
-        return f"{nis}, but {rejected:.0%} were {_TOO_SMALL}"
+        return f"{nis}, but {rejected:.0%} were {_TOO_SMALL.format(sd=sd)}"
     correlation, coloured = found.correlation, found.whiteness < 0.01
     if low <= found.nis <= high:
         strongest = int(np.argmax(np.abs(correlation)))
         if coloured and abs(correlation[strongest]) > _NOTABLE:
             return f"{nis}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
         if est.config.sensors[sensor].is_at_bound(axis):
-            return f"{nis}, but sd_mm is at a bound of what can be fitted: error bars need not hold; configure it"
+            return f"{nis}, but {sd} is at a bound of what can be fitted: error bars need not hold; configure it"
         return f"{nis}: consistent"
     sign = int(np.sign(correlation[0])) if coloured and abs(correlation[0]) > _NOTABLE else 0
     if found.nis > high and sign and _follows_velocity(est, axis, fused):
         return f"{nis}, innovations follow the velocity: latency_ms is wrong"
-    return nis + _CAUSES[found.nis > high, sign]
+    return nis + _CAUSES[found.nis > high, sign].format(sd=sd)
 
 
 def _beside(numbers: list[float], digits: int = 16) -> tuple[bool, bool]:

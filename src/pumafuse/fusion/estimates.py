@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
 from ..errors import UnknownNameError
 from ..filter.outcome import Outcome
+from ..units import Kind
 from .config import FusionConfig
 from .score import ReferenceTrack
 from .segments import Segment

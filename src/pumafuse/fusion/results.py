@@ -1,4 +1,4 @@
-"""Result folders: the files that ``fuse`` writes and ``compare`` reads, in mm and s."""
+"""Result folders: the files that ``fuse`` writes and ``compare`` reads, in mm or degrees, and s."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from ..folders import FolderError
 from ..logs import tables
 from ..logs.axes import in_axes
 from ..logs.clock import segments
-from ..logs.frames import Frame
 from ..logs.run import Run
 from ..logs.tables import Table
-from ..units import MM, seconds
+from ..model.arm import ArmModel
+from ..units import AN, KINDS, MM, SCREEN, Kind, kind_of, of_kind, seconds
 from .config import FusionConfig
 from .estimates import AxisEstimate, Estimates
 from .score import ReferenceTrack, reference_track
-from .summary import ScoreSummary, Summary, score_axis, summarise
+from .summary import ScoreSummary, Summary, decode, encode, score_axis, summarise
 
 ESTIMATES, MEASUREMENTS, REFERENCE = "estimates.parquet", "measurements.parquet", "reference.parquet"
 SUMMARY = "summary.json"
@@ -97,9 +97,9 @@ def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], No
         tables.write(_estimates_table(est), new / ESTIMATES)
         tables.write(_measurements_table(est), new / MEASUREMENTS)
         if est.reference is not None:
-            tables.write(_reference_table(est.reference), new / REFERENCE)
+            tables.write(_reference_table(est.reference, est.config.arm), new / REFERENCE)
         est.config.save(new)
-        (new / SUMMARY).write_bytes(msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n")
+        (new / SUMMARY).write_bytes(encode(summary))
         if extras is not None:
             extras(new)
     return summary
@@ -112,69 +112,76 @@ def read(folder: Path) -> Result:
         PumafuseError: It is none, or one of its files is damaged.
     """
     try:
-        summary = msgspec.json.decode((folder / SUMMARY).read_bytes(), type=Summary)
+        summary = decode((folder / SUMMARY).read_bytes())
     except (OSError, msgspec.MsgspecError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise FolderError(f"{folder}: no result folder of `pumafuse fuse` ({SUMMARY}: {why})") from None
     config, table = FusionConfig.load(folder / "fusion.toml"), tables.read(folder / ESTIMATES)
     axes = {
-        axis: AxisEstimate(*(table.plain(_column(axis, name))[0] / MM for name in AxisEstimate.FIELDS))
-        for axis in summary.axes
+        axis: AxisEstimate(*(_plain(table, axis, name, part.kind) for name in AxisEstimate.FIELDS))
+        for axis, part in summary.axes.items()
     }
     path = folder / REFERENCE
-    reference = _own_reference(tables.read(path)) if path.exists() else None
+    reference = _own_reference(tables.read(path), config.arm) if path.exists() else None
     return Result(summary, config, *_time_and_segment(table), axes, reference)
 
 
-def read_reference(path: Path, origin: int, frame: Frame | None = None) -> ReferenceTrack:
+def read_reference(path: Path, origin: int, config: FusionConfig) -> ReferenceTrack:
     """A reference from elsewhere, in the time of a result.
 
     Args:
         path: A recorded run with a reference; or a table with ``time_s`` (the log's clock) and ``reference.<axis>_mm``;
             or one with ``time_s`` (since the first command) and ``<axis>.position_mm``, as in a result folder.
         origin: Stamp of the result's first command, int ns.
-        frame: For a run in x, y, z that brings no frame of its own.
+        config: Of the result: its arm says of which kind each axis is; its frame is for a run that brings none.
 
     Raises:
         PumafuseError: It is none of these.
     """
     if path.is_dir() or path.suffix == ".toml":
-        run, _ = in_axes(Run.read(path), frame)
+        run, _ = in_axes(Run.read(path), config.frame)
         parts = [part.reference for part in segments(run)[0] if part.reference is not None]
         if not parts:
             raise RunError(f"{path}: the run has no reference")
+        for axis in set(run.kinds) & set(config.arm.axes):
+            _check_kind(path, axis, run.kinds[axis], config.arm)
         return reference_track(parts, origin)
     table = tables.read(path)
     logged = [name for name in table.columns if name.startswith(_REFERENCE_PREFIX)]
     if not logged:
-        return _own_reference(table)
+        return _own_reference(table, config.arm)
     time = seconds(table.stamps("time_s")[0], origin)
-    position = {name[len(_REFERENCE_PREFIX) : name.rindex("_")]: table.numbers(name)[0] for name in logged}
+    columns = {name[len(_REFERENCE_PREFIX) : name.rindex("_")]: name for name in logged}
+    position = {axis: _numbers(table, axis, name, config.arm) for axis, name in columns.items()}
     exact = {axis: np.zeros(len(time)) for axis in position}
     return ReferenceTrack(time, position, exact, np.zeros(len(time), dtype=np.int64))
 
 
 def _estimates_table(est: Estimates) -> pa.Table:
-    columns = {
-        _column(axis, name): _nullable(getattr(estimate, name) * MM)
-        for axis, estimate in est.axes.items()
-        for name in AxisEstimate.FIELDS
-    }
+    columns: dict[str, pa.Array] = {}
+    for axis, estimate in est.axes.items():
+        kind = est.config.arm.axes[axis].kind
+        for name in AxisEstimate.FIELDS:
+            columns[_column(axis, name, kind)] = _nullable(getattr(estimate, name) * SCREEN[kind].scale)
     columns |= {f"{name}_mm": _nullable(position * MM) for name, position in (est.cartesian or {}).items()}
     return pa.table({"time_s": est.time, **columns, **_segment_column(est.segment)})
 
 
 def _measurements_table(est: Estimates) -> pa.Table:
-    r = est.measurements
+    r, positions = est.measurements, dict[str, pa.Array]()
+    kinds = est.config.arm.kind_of
+    known: dict[Kind, None] = {kinds[axis]: None for axis in r.axes}
+    for kind in known:  # columns for each: null on axes of the other
+        mine, screen = np.array([kinds[axis] == kind for axis in r.axes])[r.axis], SCREEN[kind]
+        for name in ("value", "innovation", "innovation_sd"):
+            positions[f"{name}_{screen.unit}"] = _nullable(np.where(mine, getattr(r, name) * screen.scale, np.nan))
     return pa.table(
         {
             "time_s": _nullable(r.time),
             "stamp_s": _nullable(r.stamp),
             "sensor": _names(r.sensor, r.sensors),
             "axis": _names(r.axis, r.axes),
-            "value_mm": _nullable(r.value * MM),
-            "innovation_mm": _nullable(r.innovation * MM),
-            "innovation_sd_mm": _nullable(r.innovation_sd * MM),
+            **positions,
             "nis": _nullable(r.nis),
             "outcome": _names(r.outcome, [outcome.word for outcome in Outcome]),
             **_segment_column(r.segment),
@@ -182,32 +189,55 @@ def _measurements_table(est: Estimates) -> pa.Table:
     )
 
 
-def _reference_table(reference: ReferenceTrack) -> pa.Table:
+def _reference_table(reference: ReferenceTrack, arm: ArmModel) -> pa.Table:
     columns: dict[str, pa.Array | FloatArray] = {"time_s": reference.time}
     for axis, position in reference.position.items():
-        columns[_column(axis, "position")] = _nullable(position * MM)
-        columns[_column(axis, "position_sd")] = reference.sd[axis] * MM
+        kind = arm.axes[axis].kind if axis in arm.axes else "length"  # x, y and z
+        columns[_column(axis, "position", kind)] = _nullable(position * SCREEN[kind].scale)
+        columns[_column(axis, "position_sd", kind)] = reference.sd[axis] * SCREEN[kind].scale
     return pa.table({**columns, **_segment_column(reference.segment)})
 
 
-def _own_reference(table: Table) -> ReferenceTrack:
-    ending = _column("", "position")
-    axes = [name.removesuffix(ending) for name in table.columns if name.endswith(ending)]
-    if not axes:
+def _own_reference(table: Table, arm: ArmModel) -> ReferenceTrack:
+    position, noise = dict[str, FloatArray](), dict[str, FloatArray]()
+    for kind in KINDS:
+        ending = _column("", "position", kind)
+        for name in table.columns:
+            if name.endswith(ending):
+                axis = name.removesuffix(ending)
+                position[axis] = _numbers(table, axis, name, arm)
+                sd = _column(axis, "position_sd", kind)
+                noise[axis] = table.numbers(sd)[0] if sd in table.columns else np.zeros(table.rows)
+    if not position:
         raise RunError(
-            f"{table.path}: no column 'reference.<axis>_mm' or '<axis>{ending}'; it has: {', '.join(table.columns)}"
+            f"{table.path}: no column 'reference.<axis>_mm' or '<axis>.position_mm' (for an angle: _deg); it has:"
+            f" {', '.join(table.columns)}"
         )
-    position, noise = (
-        {axis: table.numbers(column)[0] for axis in axes if (column := _column(axis, name)) in table.columns}
-        for name in ("position", "position_sd")
-    )
     time, segment = _time_and_segment(table)
-    return ReferenceTrack(time, position, {axis: np.zeros(table.rows) for axis in axes} | noise, segment)
+    return ReferenceTrack(time, position, noise, segment)
 
 
-def _column(axis: str, name: str) -> str:
+def _numbers(table: Table, axis: str, column: str, arm: ArmModel) -> FloatArray:
+    """A column of positions of an axis [m or rad]."""
+    found = table.numbers(column)[0]
+    if axis in arm.axes:
+        _check_kind(table.path, axis, kind_of(column) or "length", arm)
+    return found
+
+
+def _check_kind(path: Path, axis: str, kind: Kind, arm: ArmModel) -> None:
+    if arm.axes[axis].kind != kind:
+        raise RunError(f"{path}: {axis} is {AN[kind]} there, but {AN[arm.axes[axis].kind]} in the result")
+
+
+def _column(axis: str, name: str, kind: Kind) -> str:
     """The column of an :class:`AxisEstimate`'s array: ``radial.velocity_sd_mm_s``."""
-    return f"{axis}.{name}_mm_s" if name.startswith("velocity") else f"{axis}.{name}_mm"
+    return of_kind(f"{axis}.{name}_mm_s" if name.startswith("velocity") else f"{axis}.{name}_mm", kind)
+
+
+def _plain(table: Table, axis: str, name: str, kind: Kind) -> FloatArray:
+    """An array of an :class:`AxisEstimate`."""
+    return table.plain(_column(axis, name, kind))[0] / SCREEN[kind].scale
 
 
 def _names(index: npt.NDArray[np.integer[Any]], names: Sequence[str]) -> pa.Array:

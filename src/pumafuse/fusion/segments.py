@@ -151,7 +151,10 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     arm, label, notes = config.arm, run.command.label, list(run.notes)
     for axis in run.axes:
         if axis in CARTESIAN and axis not in arm.axes:
-            raise RunError(f"{label}: commands are in x, y, z; give a [frame] in run.toml or fusion.toml")
+            raise RunError(
+                f"{label}: commands are in x, y, z, the arm '{arm.name}' has {', '.join(arm.axes)}: write an arm.toml"
+                " with axes x, y, z, or give a [frame] in run.toml or fusion.toml"
+            )
         if axis not in arm.axes:
             raise UnknownNameError(f"{label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes)
     for axis, kind in run.kinds.items():

@@ -22,22 +22,22 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
+from .. import toml
 from ..arrays import FloatArray
 from ..compiled import kernel
 from ..filter.outcome import Outcome
 from ..model.response import response
-from ..units import MM
 from .estimates import Estimates, Measurements
 
 _DENSITIES = np.logspace(-8.0, 2.0, 11)  # of the acceleration, over R and the cube of the median interval
 _UNKNOWN = 1e6  # variance of the rate at the start, over R and the square of the median interval
 
 
-class PredictionError(msgspec.Struct, frozen=True, kw_only=True):
-    """Errors of predicting a sensor's measurements: root mean square, and median of their sizes."""
+class PredictionError(toml.Reported, frozen=True, kw_only=True):
+    """Errors of predicting a sensor's measurements [m or rad]: root mean square, and median of their sizes."""
 
-    rms_mm: float
-    median_mm: float
+    rms: float = msgspec.field(name="rms_mm")
+    median: float = msgspec.field(name="median_mm")
 
 
 class Skill(msgspec.Struct, frozen=True, kw_only=True):
@@ -60,8 +60,8 @@ class Skill(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def of_best_other(self) -> float | None:
         """RMS of the filter's errors over the smallest of the others'; None where another makes no error."""
-        best = min(one.rms_mm for one in (self.last_held, self.constant_velocity, self.command_alone))
-        return self.filter.rms_mm / best if best > 0.0 else None
+        best = min(one.rms for one in (self.last_held, self.constant_velocity, self.command_alone))
+        return self.filter.rms / best if best > 0.0 else None
 
 
 def skill(est: Estimates, measured: Measurements) -> Skill | None:
@@ -86,19 +86,18 @@ def skill(est: Estimates, measured: Measurements) -> Skill | None:
 
 
 def _summed_up(error: FloatArray) -> PredictionError:
-    rms = float(np.sqrt(error @ error / len(error)))
-    return PredictionError(rms_mm=rms * MM, median_mm=float(np.median(np.abs(error))) * MM)
+    return PredictionError(rms=float(np.sqrt(error @ error / len(error))), median=float(np.median(np.abs(error))))
 
 
 def _by_command(est: Estimates, measured: Measurements) -> FloatArray:
-    """Measurements of one segment less what the commands say of them [m], without the first, (n - 1,)."""
+    """Measurements of one segment less what the commands say of them [m or rad], without the first, (n - 1,)."""
     sensor, axis = measured.sensors[int(measured.sensor[0])], measured.axes[int(measured.axis[0])]
     arm, known, segment = est.config.arm, est.config.sensors[sensor], est.segments[int(measured.segment[0])]
     time, start = est.origin + np.rint(measured.time * 1e9).astype(np.int64), segment.start[axis]
     stamp, command = segment.given(axis)
     moved = response(arm.axes[axis], arm.update_period, arm.delay_of(axis), stamp, command, start, time)
     left = measured.value - known.scale * (start + moved)
-    if known.bias_sd == 0.0:
+    if known.bias_sd_of(axis) == 0.0:
         return left[1:]
     passed = measured.outcome != Outcome.REJECTED
     bias = np.cumsum(np.where(passed, left, 0.0)) / np.maximum(np.cumsum(passed), 1)
@@ -106,7 +105,7 @@ def _by_command(est: Estimates, measured: Measurements) -> FloatArray:
 
 
 def _by_constant_velocity(parts: Sequence[Measurements]) -> FloatArray:
-    """Innovations [m] of the best constant-velocity filter on each segment, without the first of each, (n,)."""
+    """Innovations [m or rad] of the best constant-velocity filter on each segment, without the first of each, (n,)."""
     intervals = np.concatenate([np.diff(part.time) for part in parts])
     unit = float(np.median(intervals[intervals > 0.0])) if (intervals > 0.0).any() else 1.0
     square, found, end = np.zeros(len(_DENSITIES)), np.empty(len(intervals)), 0

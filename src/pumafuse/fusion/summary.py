@@ -1,78 +1,83 @@
-"""``summary.json``: counts, consistency and scores of a fusion in mm and s. The classes here are its schema."""
+"""``summary.json``: counts, consistency and scores of a fusion. The classes here are its schema, in SI units.
+
+Names of keys are those for lengths; the file has those of each axis's kind: ``rmse_mm`` or ``rmse_deg``.
+"""
 
 from __future__ import annotations
 
 import math
 from importlib.metadata import version
+from typing import Any
 
 import msgspec
 import numpy as np
 
+from .. import toml
 from ..arrays import FloatArray, IntArray
 from ..filter.outcome import Outcome
-from ..units import MM
+from ..units import Kind, to_si
 from .consistency import chi_square_band, consistency, log_likelihood
 from .estimates import AxisEstimate, Estimates
 from .score import ReferenceTrack, score, score_velocity
 from .skill import Skill, skill
 
 
-class SensorSummary(msgspec.Struct, frozen=True, kw_only=True):
+class SensorSummary(toml.Reported, frozen=True, kw_only=True):
     """One sensor on one axis.
 
     Attributes:
         outcomes: Number of components with each outcome, without those that do not occur.
-        innovation_rms_mm: Root mean square of the fused components' innovations; null without any. Without the first of
-            a sensor with a bias, which determines the bias.
-        innovation_sd_mm: Root mean square of their predicted standard deviations.
+        innovation_rms: Root mean square of the fused components' innovations [m or rad]; null without any. Without the
+            first of a sensor with a bias, which determines the bias.
+        innovation_sd: Root mean square of their predicted standard deviations.
         nis_mean: Mean ν²/S of the fused components; 1 for a consistent filter.
         nis_band: Where that mean lies in 95 % of cases for a consistent filter.
         correlation: Autocorrelation of the innovations at lags 1, 2, …
         correlation_band: White innovations' autocorrelations lie within ± this in 95 % of cases.
         whiteness_p: Ljung-Box p-value; small: the innovations are not white.
         verdict: In words, with the likely cause and the key to change.
-        bias_mm: The estimated bias in the log's coordinates; null where none is estimated.
-        bias_sd_mm: Its standard deviation.
+        bias: The estimated bias in the log's coordinates [m or rad]; null where none is estimated.
+        bias_sd: Its standard deviation.
         skill: How well its next measurement is predicted, by this filter and by simpler means; null with fewer than
             two measurements.
     """
 
     outcomes: dict[str, int]
-    innovation_rms_mm: float | None = None
-    innovation_sd_mm: float | None = None
+    innovation_rms: float | None = msgspec.field(name="innovation_rms_mm", default=None)
+    innovation_sd: float | None = msgspec.field(name="innovation_sd_mm", default=None)
     nis_mean: float | None = None
     nis_band: tuple[float, float] | None = None
-    correlation: list[float] = []
+    correlation: list[float] = msgspec.field(default_factory=list[float])
     correlation_band: float | None = None
     whiteness_p: float | None = None
     verdict: str = "nothing fused"
-    bias_mm: float | None = None
-    bias_sd_mm: float | None = None
+    bias: float | None = msgspec.field(name="bias_mm", default=None)
+    bias_sd: float | None = msgspec.field(name="bias_sd_mm", default=None)
     skill: Skill | None = None
 
 
-class ScoreSummary(msgspec.Struct, frozen=True, kw_only=True):
+class ScoreSummary(toml.Reported, frozen=True, kw_only=True):
     """One axis against the reference.
 
     Attributes:
-        rmse_mm: Root mean square error.
-        bias_mm: Mean of estimate − reference.
+        rmse: Root mean square error [m or rad].
+        bias: Mean of estimate − reference [m or rad].
         coverage: Share of errors within 1.96 standard deviations.
         nees_mean: Mean of error²/variance; 1 for a consistent filter; null where a variance is 0.
         rows: Estimates scored.
         left_out: Estimates with no reference near enough.
-        velocity_rmse_mm_s: Root mean square error of the mean velocity over the coming update period; null for smoothed
+        velocity_rmse: Root mean square error of the mean velocity over the coming update period; null for smoothed
             estimates, which have none.
         velocity_coverage: Share of its errors within 1.96 standard deviations; null likewise.
     """
 
-    rmse_mm: float
-    bias_mm: float
+    rmse: float = msgspec.field(name="rmse_mm")
+    bias: float = msgspec.field(name="bias_mm")
     coverage: float
     nees_mean: float | None
     rows: int
     left_out: int
-    velocity_rmse_mm_s: float | None = None
+    velocity_rmse: float | None = msgspec.field(name="velocity_rmse_mm_s", default=None)
     velocity_coverage: float | None = None
 
 
@@ -81,25 +86,38 @@ class AxisSummary(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         sensors: By name, those with components on this axis.
-        log_likelihood: Of its components, with positions in mm.
+        log_likelihood: Of its components, with positions in mm or mrad.
         score: Against the reference; null without one.
         nees_band: Where the mean NEES lies in 95 % of cases for a consistent filter with as many independent errors
             as fused components; null without components.
+        kind: Whether it is a length or an angle.
     """
 
     sensors: dict[str, SensorSummary]
     log_likelihood: float
     score: ScoreSummary | None
     nees_band: tuple[float, float] | None
+    kind: Kind = "length"
 
 
-class ValiditySummary(msgspec.Struct, frozen=True, kw_only=True):
-    """Commands against the arm model's limits; null where there is no limit, ``"not checked"`` without a frame."""
+class ValiditySummary(toml.Reported, frozen=True, kw_only=True):
+    """Commands against the arm model's limits; null where there is no limit, ``"not checked"`` without a frame.
 
-    max_speed_m_s: float | None
-    commanded_speed_m_s: float
-    max_radius_mm: float | None
-    commanded_radius_mm: float | str
+    Attributes:
+        max_speed: Of lengths [m/s].
+        commanded_speed: Likewise; null without an axis that is a length.
+        max_angular_speed: Of angles [rad/s].
+        commanded_angular_speed: Likewise; null without an axis that is an angle.
+        max_radius: Distance from the base's axis [m].
+        commanded_radius: Likewise.
+    """
+
+    max_speed: float | None = msgspec.field(name="max_speed_m_s")
+    commanded_speed: float | None = msgspec.field(name="commanded_speed_m_s")
+    max_angular_speed: float | None = msgspec.field(name="max_speed_deg_s", default=None)
+    commanded_angular_speed: float | None = msgspec.field(name="commanded_speed_deg_s", default=None)
+    max_radius: float | None = msgspec.field(name="max_radius_mm")
+    commanded_radius: float | str = msgspec.field(name="commanded_radius_mm")
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
@@ -139,6 +157,32 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     notes: list[str]
 
 
+def encode(summary: Summary) -> bytes:
+    """The text of ``summary.json``."""
+    tree = msgspec.to_builtins(summary) | {"validity": toml.reported(summary.validity)}
+    tree["axes"] = {axis: toml.reported(one, one.kind) for axis, one in summary.axes.items()}
+    return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2) + b"\n"
+
+
+def decode(text: bytes) -> Summary:
+    """The summary of the text of ``summary.json``.
+
+    Raises:
+        MsgspecError: The text is none.
+    """
+    tree = msgspec.json.decode(text, type=dict[str, Any])
+    parts = msgspec.convert(tree, _InUnits)
+    axes = {axis: toml.from_report(one) for axis, one in parts.axes.items()}
+    return msgspec.convert(tree | {"axes": axes, "validity": to_si(parts.validity)}, Summary)
+
+
+class _InUnits(msgspec.Struct):
+    """The parts of a file that have units."""
+
+    axes: dict[str, dict[str, Any]]
+    validity: dict[str, Any]
+
+
 def summarise(est: Estimates) -> Summary:
     """Counts, consistency and scores of a fusion."""
     limits = est.config.arm.validity
@@ -156,10 +200,12 @@ def summarise(est: Estimates) -> Summary:
         segments=int(est.segment[-1]) + 1,
         axes={axis: _axis_summary(est, axis) for axis in est.axes},
         validity=ValiditySummary(
-            max_speed_m_s=limits.max_speed,
-            commanded_speed_m_s=est.speed,
-            max_radius_mm=None if limits.max_radius is None else limits.max_radius * MM,
-            commanded_radius_mm="not checked" if est.radius is None else est.radius * MM,
+            max_speed=limits.max_speed,
+            commanded_speed=est.speed.get("length"),
+            max_angular_speed=limits.max_angular_speed,
+            commanded_angular_speed=est.speed.get("angle"),
+            max_radius=limits.max_radius,
+            commanded_radius="not checked" if est.radius is None else est.radius,
         ),
         notes=list(est.notes),
     )
@@ -168,7 +214,7 @@ def summarise(est: Estimates) -> Summary:
 def score_axis(
     time: FloatArray, segment: IntArray, estimate: AxisEstimate, reference: ReferenceTrack, axis: str, period: float
 ) -> ScoreSummary | None:
-    """Scores of position and velocity of one axis in mm and mm/s; None where no estimate has a reference.
+    """Scores of position and velocity of one axis; None where no estimate has a reference.
 
     Args:
         time: Of the estimates [s], (n,).
@@ -183,13 +229,13 @@ def score_axis(
         return None
     velocity = score_velocity(time, segment, estimate.velocity, estimate.velocity_sd, reference, axis, period)
     return ScoreSummary(
-        rmse_mm=position.rmse * MM,
-        bias_mm=position.bias * MM,
+        rmse=position.rmse,
+        bias=position.bias,
         coverage=position.coverage,
         nees_mean=position.nees if math.isfinite(position.nees) else None,
         rows=position.rows,
         left_out=position.left_out,
-        velocity_rmse_mm_s=None if velocity is None else velocity.rmse * MM,
+        velocity_rmse=None if velocity is None else velocity.rmse,
         velocity_coverage=None if velocity is None else velocity.coverage,
     )
 
@@ -205,6 +251,7 @@ def _axis_summary(est: Estimates, axis: str) -> AxisSummary:
         log_likelihood=log_likelihood(mine, est.config.sensors),
         score=found,
         nees_band=chi_square_band(fused) if fused else None,
+        kind=est.config.arm.axes[axis].kind,
     )
 
 
@@ -217,15 +264,15 @@ def _sensor_summary(est: Estimates, sensor: str, axis: str) -> SensorSummary:
     first = 1 if bias is not None and len(fused.value) > 1 else 0  # the first measurement determines the bias
     return SensorSummary(
         outcomes=measurements.counts(),
-        innovation_rms_mm=float(np.sqrt(np.mean(fused.innovation[first:] ** 2))) * MM,
-        innovation_sd_mm=float(np.sqrt(np.mean(fused.innovation_sd[first:] ** 2))) * MM,
+        innovation_rms=float(np.sqrt(np.mean(fused.innovation[first:] ** 2))),
+        innovation_sd=float(np.sqrt(np.mean(fused.innovation_sd[first:] ** 2))),
         nis_mean=found.nis,
         nis_band=found.nis_band,
         correlation=found.correlation.tolist(),
         correlation_band=found.correlation_band,
         whiteness_p=found.whiteness,
         verdict=found.verdict,
-        bias_mm=None if bias is None else bias.value * MM,
-        bias_sd_mm=None if bias is None else bias.sd * MM,
+        bias=None if bias is None else bias.value,
+        bias_sd=None if bias is None else bias.sd,
         skill=skill(est, measurements),
     )

@@ -17,7 +17,7 @@ import numpy as np
 
 from .. import units
 from ..arrays import BoolArray, FloatArray
-from ..model.arm import Validity, ordered_axes
+from ..model.arm import Validity
 from .trials import Trial
 
 _COUNTERS = frozenset({"replicate", "repetition", "repeat", "rep", "run", "observation"})  # columns that only count
@@ -130,9 +130,9 @@ def numbers(cells: Sequence[str]) -> list[float] | None:
 
 
 def ordered(levels: set[str]) -> list[str]:
-    """Levels by number where they are numbers, else by name, axes in their own order."""
+    """Levels by number where they are numbers, else by name."""
     if numbers(list(levels)) is None:
-        return list(ordered_axes(levels))
+        return sorted(levels)
     return sorted(levels, key=lambda level: (float(level), level))
 
 

@@ -21,7 +21,7 @@ from .. import folders
 from ..arrays import FloatArray, IntArray
 from ..errors import ConfigError
 from ..logs import tables
-from ..model.arm import ArmModel, ordered_axes
+from ..model.arm import ArmModel
 from ..simulation.trajectory import WhiteNoise, ticks
 from ..units import MM, MS, refuse_unit
 
@@ -169,7 +169,7 @@ def write(planned: Plan, folder: Path, force: bool) -> None:
     }
     offsets = {
         axis: np.outer([trial.speed * design.period * (trial.axis == axis) for trial in trials], step).ravel()
-        for axis in ordered_axes(set(design.axes))
+        for axis in design.axes
     }
     steps = _sequence(np.tile(np.arange(len(step)), len(trials)), design.period, offsets)
     files = {

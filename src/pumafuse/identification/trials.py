@@ -13,7 +13,6 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import PumafuseError, RunError
 from ..logs import tables
-from ..model.arm import ordered_axes
 from ..units import ending, seconds
 
 _FEWEST = 8  # samples from the step on: a second-order fit with delay, gain and zero has five unknowns
@@ -75,8 +74,8 @@ class StepTrials:
 
     @property
     def axes(self) -> tuple[str, ...]:
-        """The axes that were stepped."""
-        return ordered_axes({trial.axis for trial in self.trials})
+        """The axes that were stepped, in the order of their first trials."""
+        return tuple(dict.fromkeys(trial.axis for trial in self.trials))
 
     def of(self, axis: str) -> list[Trial]:
         """The trials of one axis."""

@@ -20,7 +20,7 @@ from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS
 from ..fusion.setup import at_rest, filter_model, filter_sensors
 from ..logs.frames import CARTESIAN, Cylindrical
-from ..model.arm import Validity, ordered_axes
+from ..model.arm import Validity
 from ..units import Kind
 from .clock import Clock, Time, Verdict, nanoseconds
 from .frame_start import FrameStart
@@ -106,7 +106,7 @@ class LiveEstimator:
                 raise ConfigError(f"start: the level of {name} must be a finite position in m, not {value!r:.40}")
         self.config = config
         self.segment = 0
-        self.axes = ordered_axes(set(config.arm.axes))
+        self.axes = tuple(config.arm.axes)
         self._sensors = {name: number for number, name in enumerate(config.sensors)}
         self._bits = {name: number for number, name in enumerate(self.axes)}
         self._stale_ns = round(stale_after * 1e9)

@@ -23,8 +23,7 @@ from ..fusion.config import FusionConfig
 from ..logs.clock import TOLERATED_STEP_BACK_NS
 from ..logs.frames import CARTESIAN
 from ..logs.save import check_axis, check_name
-from ..model.arm import ordered_axes
-from ..units import MM
+from ..units import SCREEN
 
 _FLUSHED = 0.5  # s between two writes
 _REPORTED_AGAIN = 60.0  # s until a trouble that lasts is reported again
@@ -61,27 +60,29 @@ class Recorder:
         Args:
             folder: New, or empty.
             config: Gives the sensors, the axes, and the frame.
-            start: Level [m] of axes that do not rest at their first command before it.
+            start: Level [m or rad] of axes that do not rest at their first command before it.
             notify: Takes a sentence for the log.
 
         Raises:
             FolderError: The folder holds something, or cannot be made.
             RunError: A sensor or axis has a name that a recorded run cannot have.
         """
-        axes = ordered_axes(set(config.arm.axes))
+        axes = config.arm.axes
         for sensor in config.sensors:
             check_name(sensor)
         for axis in axes:
             check_axis(axis)
         framed = CARTESIAN if config.frame is not None else ()
-        self._columns = tuple(dict.fromkeys((*axes, *framed)))
+        screens = {**{axis: config.arm.screen_of(axis) for axis in axes}, **dict.fromkeys(framed, SCREEN["length"])}
+        self._columns = {axis: f"{axis}_{screen.unit}" for axis, screen in screens.items()}
+        self._scales = {axis: screen.scale for axis, screen in screens.items()}
         self._frame, self._start, self._notify = config.frame, dict(start), notify
         self._first = self._folder = folder = folder.absolute()
         self.late = self.lost = self._given = 0
         self._segment = 1
         check_writable(folder, force=False, markers=(), ours=lambda _: False)
         folder.mkdir(parents=True, exist_ok=True)
-        self._writer = Writer(",".join((_TIME, *(f"{axis}_mm" for axis in self._columns))).encode() + b"\n")
+        self._writer = Writer(",".join((_TIME, *self._columns.values())).encode() + b"\n")
         self._due, self._reported, self._troubled = 0.0, -math.inf, False
         self._clear()
 
@@ -100,9 +101,9 @@ class Recorder:
         Args:
             stamp: Int ns.
             sensor: None for a command.
-            values: By axis [m].
+            values: By axis [m or rad].
         """
-        cells = {axis: _cell(values[axis]) for axis in self._columns if axis in values}
+        cells = {axis: _cell(values[axis], scale) for axis, scale in self._scales.items() if axis in values}
         if not cells:
             return
         given = [axis for axis, cell in cells.items() if cell]
@@ -214,14 +215,14 @@ class Recorder:
             sensor: {
                 "file": _file(sensor),
                 "time": _TIME,
-                **{axis: f"{axis}_mm" for axis in self._columns if axis in seen},
+                **{axis: column for axis, column in self._columns.items() if axis in seen},
             }
             for sensor, seen in self._seen.items()
             if sensor in listed
         }
         tree: dict[str, Any] = {"name": self._folder.name, "command": entries.pop(None)}
         if self._start:
-            tree["command"]["start"] = {f"{axis}_mm": level for axis, level in self._start.items()}
+            tree["command"]["start"] = {self._columns[axis]: level for axis, level in self._start.items()}
         if entries:
             tree["sensors"] = entries
         if self._frame is not None:
@@ -331,10 +332,13 @@ def _file(sensor: str | None) -> str:
     return _COMMANDS if sensor is None else f"{sensor}.csv"
 
 
-def _cell(value: object) -> str:
-    """A length [m] in mm, with the digits that bring the same float back; empty for what is no finite number."""
+def _cell(value: object, scale: float) -> str:
+    """A position [m or rad] in the unit of its column, with the digits that bring the same float back.
+
+    Empty for what is no finite number.
+    """
     if not isinstance(value, float | int) or not math.isfinite(value):
         return ""
-    mm = value * MM
-    around = (float(f"{mm:.12g}"), mm, math.nextafter(mm, -math.inf), math.nextafter(mm, math.inf))
-    return repr(next((one for one in around if one / MM == value), mm))
+    shown = value * scale
+    around = (float(f"{shown:.12g}"), shown, math.nextafter(shown, -math.inf), math.nextafter(shown, math.inf))
+    return repr(next((one for one in around if one / scale == value), shown))

@@ -62,7 +62,8 @@ class Stream:
             raise ConfigError(f"rate: at most {_FASTEST:g} estimates a second, not {rate:g}")
         self.live, self.lines, self.bad, self.estimates = live, 0, 0, 0
         self._write, self._watchers = write, tuple(watchers)
-        self._decoder = LineDecoder(live.axes, live.config.frame is not None)
+        self._kinds = live.config.arm.kind_of
+        self._decoder = LineDecoder(self._kinds, live.config.frame is not None)
         self._step = None if rate is None else 1e9 / rate
         self._grid: tuple[int, int] | None = None  # the segment, and where its grid begins [ns]
         self._due = 0
@@ -144,7 +145,7 @@ class Stream:
         estimate = self.live.estimate(stamp)
         if estimate.outcome is Outcome.FUSED:
             self.estimates += 1
-            self._out.append(encode(estimate, self._with_ns))
+            self._out.append(encode(estimate, self._kinds, self._with_ns))
             for watcher in self._watchers:
                 watcher.estimate(estimate)
 

@@ -1,8 +1,8 @@
-"""The wire format: one JSON object a line, in and out; mm, s and ns on the wire, m and s or ns inside."""
+"""The wire format: one JSON object a line, in and out; mm or degrees, s and ns on the wire, SI or ns inside."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
 import msgspec
@@ -10,11 +10,15 @@ from msgspec import UNSET, UnsetType
 
 from ..errors import ConfigError
 from ..logs.frames import CARTESIAN
-from ..units import MM
+from ..units import MM, SCREEN, Kind
 from .results import LiveEstimate
 
 _LONGEST = 64 * 1024  # bytes of a line
 _NAMES = ("t", "t_ns", "command", "sensor")
+_KEYS = {  # of an estimate, and their scale
+    kind: (f"position_{one.unit}", f"sd_{one.unit}", f"velocity_{one.unit}_s", one.scale)
+    for kind, one in SCREEN.items()
+}
 
 
 class Lines:
@@ -58,7 +62,7 @@ class Event(NamedTuple):
     Attributes:
         t: Float seconds or int nanoseconds.
         sensor: Its name, empty for a command.
-        values: By axis [m]; values under unknown names are passed on as they are.
+        values: By axis [m or rad]; values under unknown names are passed on as they are.
     """
 
     t: float | int
@@ -69,13 +73,15 @@ class Event(NamedTuple):
 class LineDecoder:
     """Decoder of lines into events, for one arm's axes."""
 
-    def __init__(self, axes: Sequence[str], framed: bool) -> None:
-        """Prepare for the axes' names, and for x, y, z where there is a frame.
+    def __init__(self, kinds: Mapping[str, Kind], framed: bool) -> None:
+        """Prepare for the axes, of which each is a length or an angle, and for x, y, z where there is a frame.
 
         Raises:
             ConfigError: An axis has the name of another part of a line.
         """
-        self._axes = tuple(dict.fromkeys((*axes, *(CARTESIAN if framed else ()))))
+        every: dict[str, Kind] = {**dict.fromkeys(CARTESIAN if framed else (), "length"), **kinds}
+        self._axes = tuple(dict.fromkeys((*kinds, *every)))
+        self._scales = [SCREEN[every[axis]].scale for axis in self._axes]
         for axis in self._axes:
             if axis in _NAMES:
                 raise ConfigError(f"axis '{axis}': lines of a stream call something else so ({', '.join(_NAMES)})")
@@ -120,8 +126,8 @@ class LineDecoder:
         if (t is None) == (t_ns is None):
             raise BadLine("needs one of 't' (s) and 't_ns' (ns)")
         by_axis: dict[str, Any] = {
-            axis: float("nan") if value is None else cast(float, value) / MM
-            for axis, value in zip(self._axes, values, strict=True)
+            axis: float("nan") if value is None else cast(float, value) / scale
+            for axis, scale, value in zip(self._axes, self._scales, values, strict=True)
             if value is not UNSET
         }
         return Event(cast(float | int, t if t_ns is None else t_ns), sensor, by_axis | unknown)
@@ -136,22 +142,20 @@ class LineDecoder:
         return self._decoder.decode(msgspec.json.encode(tree)), unknown
 
 
-def encode(estimate: LiveEstimate, with_ns: bool) -> bytes:
+def encode(estimate: LiveEstimate, kinds: Mapping[str, Kind], with_ns: bool) -> bytes:
     """The line of an estimate: position, its sd and velocity of each axis, x, y, z with a frame, and stale axes.
 
     Args:
         estimate: The estimate.
+        kinds: Whether each axis is a length or an angle.
         with_ns: Give the time as ``t_ns``, too.
     """
     line: dict[str, Any] = {"t": estimate.time}
     if with_ns:
         line["t_ns"] = estimate.stamp
     for name, axis in estimate.axes.items():
-        line[name] = {
-            "position_mm": axis.position * MM,
-            "sd_mm": axis.position_sd * MM,
-            "velocity_mm_s": axis.velocity * MM,
-        }
+        position, sd, velocity, scale = _KEYS[kinds[name]]
+        line[name] = {position: axis.position * scale, sd: axis.position_sd * scale, velocity: axis.velocity * scale}
     for name, position in (estimate.cartesian or {}).items():
         line[f"{name}_mm"] = position * MM
     if estimate.stale:

@@ -69,7 +69,7 @@ def placed_at(frame: Frame, x: float, y: float, label: str) -> Placed:
         RunError: That is on the base's axis, where there is no angle.
     """
     if isinstance(frame, Rotated):
-        return Placed(frame, 1.0, float(np.deg2rad(frame.azimuth)))
+        return Placed(frame, 1.0, frame.azimuth)
     dx, dy = x - frame.base[0], y - frame.base[1]
     if dx == 0.0 and dy == 0.0:
         raise RunError(f"{label}: the arm starts on its base's axis, where it has no angle; check base_mm")

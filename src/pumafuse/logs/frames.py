@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from ..arrays import FloatArray
+from ..model.arm import CANONICAL_AXES, ArmModel
 
 CARTESIAN = ("x", "y", "z")
 Direction = Literal["counterclockwise", "clockwise"]
@@ -39,7 +40,7 @@ class Rotated(_Kind, frozen=True, kw_only=True, tag="rotated"):
     """Axes at a fixed angle in the log's x and y.
 
     Attributes:
-        azimuth: Direction of +radial, counterclockwise from x [degrees, as in the file].
+        azimuth: Direction of +radial, counterclockwise from x [rad].
         positive: Direction of +tangential seen from above: to the left of +radial, or to its right.
     """
 
@@ -48,6 +49,12 @@ class Rotated(_Kind, frozen=True, kw_only=True, tag="rotated"):
 
 
 Frame: TypeAlias = Cylindrical | Rotated
+
+
+def in_space(arm: ArmModel) -> tuple[str, ...]:
+    """The three axes that are a position in space: x, y, z or tangential, radial, vertical; empty without such."""
+    lengths = {name for name, axis in arm.axes.items() if axis.kind == "length"}
+    return next((names for names in (CARTESIAN, CANONICAL_AXES) if lengths.issuperset(names)), ())
 
 
 @dataclass(frozen=True)

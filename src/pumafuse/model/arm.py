@@ -188,6 +188,11 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """The kinds of its axes."""
         return tuple(kind for kind in KINDS if any(axis.kind == kind for axis in self.axes.values()))
 
+    @property
+    def kind_of(self) -> dict[str, Kind]:
+        """What each of its axes is."""
+        return {name: axis.kind for name, axis in self.axes.items()}
+
     def screen_of(self, axis: str) -> Screen:
         """How files and screens show positions of one axis."""
         return SCREEN[self.axis(axis).kind]
@@ -200,12 +205,6 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def lag_of(self, axis: str, speed: float = 0.0) -> float:
         """Total lag [s] of one axis behind the held command at constant velocity: :meth:`AxisModel.lag`."""
         return self.axis(axis).lag(self.delay_of(axis), speed)
-
-
-def ordered_axes(names: set[str]) -> tuple[str, ...]:
-    """Axis names in the order tangential, radial, vertical, then any others by name."""
-    known = [name for name in CANONICAL_AXES if name in names]
-    return (*known, *sorted(names - set(known)))
 
 
 def commanded_speed(step: FloatArray, period: float) -> FloatArray:

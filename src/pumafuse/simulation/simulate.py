@@ -20,7 +20,6 @@ from ..fusion.config import ARM_FILE, FusionConfig, Process
 from ..logs import save, tables
 from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run, Source
-from ..model.arm import ordered_axes
 from ..units import MM
 from . import campaign, sensing
 from .grid import POINTS, grid
@@ -80,7 +79,7 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
 
     sensors: dict[str, Source] = {}
     for name, sensor in scenario.sensors.items():
-        measured = axes if sensor.axes is None else ordered_axes(set(sensor.axes) & set(axes))
+        measured = axes if sensor.axes is None else tuple(axis for axis in axes if axis in sensor.axes)
         if measured:
             valid = sensing.valid_times(sensor, instants, _stream(seed, "rate", name))
             true = _logged(scenario, {axis: motions[axis].at(valid) for axis in measured}, in_axes=bool(sensor.axes))
@@ -178,7 +177,7 @@ def _commands(scenario: Scenario, seed: int) -> dict[str, FloatArray]:
     offsets = scenario.trajectory.offsets(scenario.arm.update_period, _stream(seed, "trajectory"))
     still = np.zeros(len(next(iter(offsets.values()))))
     commanded = set(offsets) if scenario.frame is None else set(scenario.arm.axes)  # x and y need both their axes
-    commands = {axis: offsets.get(axis, still) for axis in ordered_axes(commanded)}
+    commands = {axis: offsets.get(axis, still) for axis in scenario.arm.axes if axis in commanded}
     if isinstance(scenario.frame, Cylindrical) and (commands["radial"] + scenario.start.level["radial"] <= 0.0).any():
         raise ConfigError("trajectory: the commands cross the base's axis, beyond which radial has no meaning")
     return commands

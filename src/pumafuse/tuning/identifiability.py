@@ -11,7 +11,6 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import PumafuseError
 from ..fusion.config import FusionConfig
-from ..units import MM
 from .likelihood import Likelihood
 from .maximise import Point, derivatives
 from .parameters import Parameter, smallest_sd
@@ -72,13 +71,15 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
         raise TuneError("no measurement of a configured sensor lies within the runs: nothing to fit to")
     found: list[str] = []
     for axis, names in likelihood.sensors.items():
-        noise = min(likelihood.scatter.get(f"sensors.{name}.sd_mm.{axis}", 0.0) for name in names)
+        noise = min(likelihood.scatter.get((name, axis), 0.0) for name in names)
         if likelihood.travel[axis] > _EXCITED * noise:
             found.append(axis)
     if not found:
-        widest = max(likelihood.travel.values()) * MM
+        widest = max(likelihood.travel, key=likelihood.travel.__getitem__)
+        screen = config.arm.screen_of(widest)
+        farthest = f"{likelihood.travel[widest] * screen.scale:.3g} {screen.unit}"
         raise TuneError(
-            f"no axis is commanded to move by more than its sensors' noise (at most {widest:.3g} mm): an arm at rest"
+            f"no axis is commanded to move by more than its sensors' noise (at most {farthest}): an arm at rest"
             " cannot be identified; record a run with motion"
         )
     for name, share in likelihood.share_after_end.items():
@@ -88,7 +89,7 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
                 " stamped by one clock?"
             )
     for (name, axis), (expected, measured) in likelihood.responses(config).items():
-        scatter = likelihood.scatter.get(f"sensors.{name}.sd_mm.{axis}", 0.0)
+        scatter = likelihood.scatter.get((name, axis), 0.0)
         if axis in found and len(measured) >= _FEWEST and np.ptp(expected) >= _TESTED * scatter:
             _check_follows(name, axis, expected, measured)
     return found
@@ -171,7 +172,7 @@ def not_identifiable_noise(likelihood: Likelihood, best: Point, free: Sequence[P
     inside = within_bounds(free, best.config)
     cov = covariance(derivatives(likelihood, best, inside).information, inside)
     wide = {one.key for one, variance in zip(inside, np.diag(cov), strict=True) if variance > 1.0}
-    noises = [one for one in free if one.sensor is not None and (one.fit == "noise" or one.path[-1] == "bias_drift_sd")]
+    noises = [one for one in free if one.sensor is not None and (one.fit == "noise" or "bias_drift_sd" in one.path)]
     return [one for one in noises if one.key in wide or one.at_bound(best.config) == "lower"]
 
 
@@ -208,5 +209,5 @@ def shared_times(
 
 
 def _noise_of(one: Parameter, config: FusionConfig) -> float:
-    """The least noise of the sensor of a parameter [m]; 0 where it has none."""
+    """The least noise of the sensor of a parameter [m or rad]; 0 where it has none."""
     return 0.0 if one.sensor is None else smallest_sd(config, one.sensor)

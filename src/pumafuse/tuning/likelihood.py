@@ -32,7 +32,6 @@ from ..fusion.segments import Segment, build
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import Run
-from ..model.arm import ordered_axes
 from .parameters import Parameter
 
 _LOG_STEP = 1e-4  # of a logarithm, one-sided: the truncation error is half of it, the rounding error 1e-11
@@ -58,7 +57,7 @@ class LogLikelihood:
     """The log-likelihood of a configuration.
 
     Attributes:
-        axes: Of each axis's components, with positions in mm, (A,).
+        axes: Of each axis's components, with positions in mm or mrad, (A,).
         outcomes: The outcome of each measurement on each axis, for each segment, (m, A).
     """
 
@@ -147,7 +146,7 @@ class Likelihood:
             for note in (*segment.notes, *starts_in_motion(segment, config))
         ]
         self.config = config
-        self.axes = ordered_axes({axis for segment in built for axis in segment.axes})
+        self.axes = tuple(axis for axis in config.arm.axes if any(axis in segment.axes for segment in built))
         self._segments = [_decided(segment, until, latest) for segment in built]
         self._parts = [
             _Part(number, self.axes.index(axis), segment.of_axis(axis, rows), rows, column)
@@ -181,19 +180,19 @@ class Likelihood:
         return [part for part in self._parts if self.axes[part.axis] == axis]
 
     @cached_property
-    def scatter(self) -> dict[str, float]:
-        """Rough noise of each sensor on each axis [m], by the key of its sd.
+    def scatter(self) -> dict[tuple[str, str], float]:
+        """Rough noise of each sensor on each axis [m or rad], by the names of both.
 
         From third differences, which remove smooth motion: their variance is 20 times the noise's. Their median is
         robust against outliers.
         """
-        found: dict[str, list[float]] = {}
+        found: dict[tuple[str, str], list[float]] = {}
         for part in self._parts:
             for name, rows in part.segment.rows_by_sensor().items():
                 third = np.diff(rows.value[:, 0], 3)
                 if len(third):
                     sd = 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)
-                    found.setdefault(f"sensors.{name}.sd_mm.{self.axes[part.axis]}", []).append(sd)
+                    found.setdefault((name, self.axes[part.axis]), []).append(sd)
         return {key: float(np.median(sds)) for key, sds in found.items() if min(sds) > 0.0}
 
     @cached_property

@@ -14,6 +14,7 @@ from ..arrays import FloatArray
 from ..errors import ConfigError, suggestion
 from ..fusion.config import SD_BOUNDS, FusionConfig, Sensor
 from ..model.plants import FirstOrder, SecondOrder
+from ..units import ending, of_kind, si
 
 Fit = Literal["noise", "delay", "plant", "gain", "latency", "scale", "bias"]
 FITS: tuple[Fit, ...] = get_args(Fit)
@@ -68,7 +69,6 @@ class Parameter:
         bounds: Lower and upper bound [SI].
         log: Whether it is searched on a log scale: the coordinate is then the number's logarithm.
         scale: A large change of the coordinate.
-        unit: One unit of the key in SI: 1e-3 for ``delay_ms``.
         prior: Mean and standard deviation of the coordinate a priori; None: uniform within the bounds.
         axis: Its axis; None where it belongs to all.
         sensor: Its sensor, if it has one.
@@ -80,15 +80,19 @@ class Parameter:
     bounds: tuple[float, float]
     log: bool = True
     scale: float = 1.0
-    unit: float = 1.0
     prior: tuple[float, float] | None = None
     axis: str | None = None
     sensor: str | None = None
 
     @property
+    def unit(self) -> float:
+        """One unit of the key in SI: 1e-3 for ``delay_ms``."""
+        return next((si(1.0, unit) for part in self.key.split(".") if (unit := ending(part))), 1.0)
+
+    @property
     def vanishes(self) -> bool:
         """Whether it may be 0, for which its lower bound stands."""
-        return self.path[-1] == "bias_drift_sd" or (self.path[0] == "process" and self.path[-1] != "disturbance_time")
+        return "bias_drift_sd" in self.path or (self.path[0] == "process" and self.path[-1] != "disturbance_time")
 
     @property
     def range(self) -> tuple[float, float]:
@@ -147,7 +151,8 @@ class Parameter:
 
     def of(self, known: FusionConfig, axis: str | None, sensor: str | None) -> Parameter:
         """This line of the table for an axis and a sensor; bounds about the number in ``known`` if not log."""
-        key = self.key.format(axis=axis, sensor=sensor)
+        kind = known.arm.kinds[0] if axis is None else known.arm.axes[axis].kind
+        key = ".".join(of_kind(part, kind) for part in self.key.split(".")).format(axis=axis, sensor=sensor)
         path = tuple(part.format(axis=axis, sensor=sensor) for part in self.path)
         one = replace(self, key=key, path=path, axis=axis, sensor=sensor)
         if one.path[-1] == "disturbance_time":  # what is faster is no motion of an arm but noise of its sensors
@@ -163,11 +168,12 @@ class Parameter:
 
 
 def _line(fit: Fit, key: str, path: str, low: float, high: float, **more: Any) -> Parameter:
-    unit = 1e-3 if "_mm" in key or "_ms" in key else 1.0
-    return Parameter(fit, key, tuple(path.split(".")), (low, high), unit=unit, **more)
+    return Parameter(fit, key, tuple(path.split(".")), (low, high), **more)
 
 
-_TABLE = (  # a process noise at its lower bound is none; bounds and prior of what is not logarithmic are relative
+# With the names of lengths. A process noise at its lower bound is none; bounds and prior of what is not logarithmic are
+# relative.
+_TABLE = (
     _line("noise", "process.{axis}.input_noise_mm_rtHz", "process.{axis}.input_noise", 1e-7, 1.0),
     _line("noise", "process.{axis}.drift_mm_rts", "process.{axis}.drift", 1e-7, 10.0),
     _line("noise", "process.{axis}.maneuver_noise_mm_rtHz_per_m_s", "process.{axis}.maneuver_noise", 1e-6, 30.0),
@@ -185,6 +191,7 @@ _TABLE = (  # a process noise at its lower bound is none; bounds and prior of wh
     _line("latency", "sensors.{sensor}.latency_ms", "sensors.{sensor}.latency", *LATENCIES, log=False, scale=_TICK),
     _line("scale", "sensors.{sensor}.scale", "sensors.{sensor}.scale", -0.5, 0.5, log=False, scale=0.1),
     _line("bias", "sensors.{sensor}.bias_drift_sd_mm", "sensors.{sensor}.bias_drift_sd", *SD_BOUNDS),
+    _line("bias", "sensors.{sensor}.bias_drift_sd_mm.{axis}", "sensors.{sensor}.bias_drift_sd.{axis}", *SD_BOUNDS),
     _line("bias", "sensors.{sensor}.bias_time_s", "sensors.{sensor}.bias_time", 1e-2, 1e4),
 )
 
@@ -225,7 +232,10 @@ def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:
     if one.axis is not None and one.path[-1].startswith("disturbance"):
         return config.process[one.axis].disturbance_sd > 0.0
     if one.fit == "bias" and one.sensor is not None:
-        return config.sensors[one.sensor].bias_drift_sd != 0.0
+        drift = config.sensors[one.sensor].bias_drift_sd
+        if isinstance(drift, dict):  # one for each axis
+            return drift.get(one.axis, 0.0) > 0.0 if one.axis is not None else one.path[-1] == "bias_time"
+        return one.axis is None and drift > 0.0
     if one.fit == "delay":
         shares = [axis for axis in axes if config.arm.axes[axis].delay is None]
         return bool(shares) if one.axis is None else one.axis not in shares
@@ -254,7 +264,8 @@ def check_fixed(config: FusionConfig, fixed: Iterable[str]) -> None:
         ConfigError: It names none.
     """
     sensors = dict.fromkeys(config.arm.axes, tuple(config.sensors))
-    keys = {f"sensors.{name}.bias_sd_mm" for name in config.sensors} | {"delay_ms"}
+    biases = {of_kind("bias_sd_mm", kind) for kind in config.arm.kinds}
+    keys = {f"sensors.{name}.{bias}" for name in config.sensors for bias in biases} | {"delay_ms"}
     for order in (1, 2):
         for axis in sensors:
             config = with_recovery(with_disturbance(with_order(config, axis, order), axis, 1e-3, 1.0), axis, 1.0)
@@ -278,8 +289,12 @@ def is_fixed(key: str, fixed: Iterable[str]) -> bool:
 def with_drifts(config: FusionConfig) -> FusionConfig:
     """The configuration with a drifting bias of every sensor, by default as large as its noise."""
     for name, sensor in config.sensors.items():
-        if sensor.bias_drift_sd == 0.0:
-            config = changed(config, ("sensors", name, "bias_drift_sd"), smallest_sd(config, name))
+        if any(sensor.bias_drift_sd_of(axis) for axis in config.arm.axes):
+            continue
+        drift = smallest_sd(config, name)
+        if len(config.arm.kinds) > 1:
+            drift = {axis: sd for axis in config.arm.axes if (sd := sensor.sd_of(axis)) is not None}
+        config = changed(config, ("sensors", name, "bias_drift_sd"), drift)
     return config
 
 
@@ -289,7 +304,7 @@ def quickest(config: FusionConfig) -> float:
 
 
 def smallest_sd(config: FusionConfig, name: str) -> float:
-    """The noise of a sensor [m], on the axis where it is smallest."""
+    """The noise of a sensor [m or rad], on the axis where it is smallest."""
     sd = config.sensors[name].sd
     return min(sd.values()) if isinstance(sd, dict) else sd
 

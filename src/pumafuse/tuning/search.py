@@ -270,12 +270,16 @@ def _processes(likelihood: Likelihood, config: FusionConfig) -> list[dict[str, P
 
 
 def _with_noise(
-    config: FusionConfig, process: Mapping[str, Process], sds: Mapping[str, float], noise: Sequence[Parameter]
+    config: FusionConfig,
+    process: Mapping[str, Process],
+    sds: Mapping[tuple[str, str], float],
+    noise: Sequence[Parameter],
 ) -> FusionConfig:
-    """A start: the free noises from ``process`` (by axis) and ``sds`` (by key), none of them near its lower bound."""
+    """A start: free noises from ``process`` (by axis) and ``sds`` (by sensor and axis), none near its lower bound."""
     full = msgspec.structs.replace(config, process={**config.process, **process})
     for one in noise:
-        config = one.put(config, max(sds.get(one.key, one.get(full)), 30.0 * one.bounds[0]))
+        value = sds.get((one.sensor or "", one.axis or ""), one.get(full))
+        config = one.put(config, max(value, 30.0 * one.bounds[0]))
     return config
 
 

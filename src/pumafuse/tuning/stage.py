@@ -11,7 +11,7 @@ import numpy as np
 from ..fusion.config import FusionConfig, Sensor
 from ..fusion.score import Z95
 from ..logs.run import Run
-from ..units import MM
+from ..units import SCREEN, Kind, as_length, of_kind
 from .identifiability import NotIdentifiable, excited_axes, not_identifiable, not_identifiable_noise, shared_times
 from .likelihood import Likelihood
 from .maximise import Notify, Point, ignore, maximise_with_gates
@@ -34,7 +34,7 @@ _WIDEST = 8.0  # of the fit for a sensor with a wider one: a few outliers or jer
 _MOST_FIXED = 8  # combinations of which one parameter each is fixed, at most
 _AT_REST = ("input_noise_mm_rtHz", "drift_mm_rts", "sd_mm")  # what an axis at rest still determines
 _BIAS_GAIN = 3.0  # log-likelihood that a bias must gain; the width of its prior is already paid for in it
-_BIAS_WIDTHS = (1e-3, 1e-2, 1e-1)  # m, of the prior
+_BIAS_WIDTHS = (1e-3, 1e-2, 1e-1)  # m or rad, of the prior
 _FAR = 20.0  # times all that is uncertain, from which a gap is no noise
 _ROOM = 3.0  # width of the prior over the gap that was found
 
@@ -152,7 +152,7 @@ def _may_vary(one: Parameter, config: FusionConfig, plan: Plan, excited: Sequenc
     """Whether a parameter is not the trusted sensor's, and measurements of its axis can tell it."""
     if one.fit == "delay" and one.axis is None:
         return plan.trusted is None and any(config.arm.axes[axis].delay is None for axis in excited)
-    moves = one.axis is None or one.axis in excited or any(key in one.key.split(".") for key in _AT_REST)
+    moves = one.axis is None or one.axis in excited or any(as_length(part) in _AT_REST for part in one.key.split("."))
     return moves and (plan.trusted is None or one.sensor not in (None, plan.trusted))
 
 
@@ -195,19 +195,21 @@ def with_large_biases(
     Returns:
         The configuration, and a note for each such sensor.
     """
-    gaps: dict[str, float] = {}
+    gaps: dict[tuple[str, Kind], float] = {}
     misfit = likelihood.misfit(config)
     for (name, axis), (expected, measured) in likelihood.responses(config, centred=False).items():
         gap = abs(float(np.median(measured - expected)))
-        scatter = likelihood.scatter.get(f"sensors.{name}.sd_mm.{axis}", 0.0)
+        scatter = likelihood.scatter.get((name, axis), 0.0)
         if gap > _FAR * (scatter + misfit[axis] + config.start.offset_sd_of(axis)):
-            gaps[name] = max(gap, gaps.get(name, 0.0))
+            of = name, config.arm.axes[axis].kind
+            gaps[of] = max(gap, gaps.get(of, 0.0))
     notes: list[str] = []
-    for name, gap in gaps.items():
-        if _may_be_biased(config, name, fixed):
-            config = _with_bias(config, name, _ROOM * gap)
+    for (name, kind), gap in gaps.items():
+        if _may_be_biased(config, name, kind, fixed):
+            config, screen = _with_bias(config, name, kind, _ROOM * gap), SCREEN[kind]
             notes.append(
-                f"sensor '{name}' is off by a constant of up to {gap * MM:.4g} mm: it was given a bias to estimate"
+                f"sensor '{name}' is off by a constant of up to {gap * screen.scale:.4g} {screen.unit}: it was given a"
+                " bias to estimate"
             )
     return config, notes
 
@@ -222,25 +224,34 @@ def with_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str])
     used = {name for names in likelihood.sensors.values() for name in names}
     ranked = sorted((name for name in config.sensors if name in used), key=lambda name: smallest_sd(config, name))
     for name in reversed(ranked[1:]):  # the most accurate is believed, of equals the first in the file
-        if not _may_be_biased(config, name, fixed):
-            continue
-        before = likelihood.evaluate(config).total
-        gains = {width: likelihood.evaluate(_with_bias(config, name, width)).total for width in _BIAS_WIDTHS}
-        width = max(gains, key=gains.__getitem__)
-        gain = gains[width] - before
-        if gain > _BIAS_GAIN:
-            config = _with_bias(config, name, width)
-            notes.append(
-                f"sensor '{name}' is off by a constant: a bias to estimate (bias_sd_mm = {width * MM:g}) gains"
-                f" {gain:.1f} in log-likelihood"
-            )
+        for kind in config.arm.kinds:
+            if not _may_be_biased(config, name, kind, fixed):
+                continue
+            before = likelihood.evaluate(config).total
+            biased = [_with_bias(config, name, kind, width) for width in _BIAS_WIDTHS]
+            gains = [likelihood.evaluate(one).total - before for one in biased]
+            best_width = int(np.argmax(gains))
+            if gains[best_width] > _BIAS_GAIN:
+                config = biased[best_width]
+                width = f"{of_kind('bias_sd_mm', kind)} = {_BIAS_WIDTHS[best_width] * SCREEN[kind].scale:.3g}"
+                notes.append(
+                    f"sensor '{name}' is off by a constant: a bias to estimate ({width}) gains"
+                    f" {gains[best_width]:.1f} in log-likelihood"
+                )
     return config, notes
 
 
-def _may_be_biased(config: FusionConfig, name: str, fixed: Sequence[str]) -> bool:
-    return config.sensors[name].bias_sd == 0.0 and not is_fixed(f"sensors.{name}.bias_sd_mm", fixed)
+def _may_be_biased(config: FusionConfig, name: str, kind: Kind, fixed: Sequence[str]) -> bool:
+    """Whether a sensor without a bias on the axes of a kind may be given one."""
+    sensor = config.sensors[name]
+    biased = any(sensor.bias_sd_of(axis) for axis, one in config.arm.axes.items() if one.kind == kind)
+    return not biased and not is_fixed(f"sensors.{name}.{of_kind('bias_sd_mm', kind)}", fixed)
 
 
-def _with_bias(config: FusionConfig, name: str, width: float) -> FusionConfig:
-    """The configuration with a bias of this width [m], to one digit, of a sensor."""
-    return changed(config, ("sensors", name, "bias_sd"), float(f"{width:.0e}"))
+def _with_bias(config: FusionConfig, name: str, kind: Kind, width: float) -> FusionConfig:
+    """The configuration with a bias of this width [m or rad], to one digit, of a sensor on the axes of a kind."""
+    new = float(f"{width:.0e}")
+    if len(config.arm.kinds) > 1:
+        sensor, axes = config.sensors[name], config.arm.axes.items()
+        new = {axis: new if one.kind == kind else sensor.bias_sd_of(axis) for axis, one in axes}
+    return changed(config, ("sensors", name, "bias_sd"), new)

@@ -1,4 +1,7 @@
-"""``tuning.json``: the result of a tuning, in the units of files. The classes here are its schema."""
+"""``tuning.json``: the result of a tuning. The classes here are its schema.
+
+Fitted parameters are in the units of their keys; what else belongs to an axis is in SI here and in its units there.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,11 @@ import math
 
 import msgspec
 
+from .. import toml
 from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..logs.run import Run
-from ..units import MM
+from ..units import Kind
 from .identifiability import Correlation
 from .intervals import ConfidenceInterval
 from .parameters import Parameter
@@ -53,26 +57,28 @@ class FittedLag(msgspec.Struct, frozen=True, kw_only=True):
     lag_ms_ci95: tuple[float | None, float | None]
 
 
-class FoundBias(msgspec.Struct, frozen=True, kw_only=True):
+class FoundBias(toml.Reported, frozen=True, kw_only=True):
     """The bias of a sensor on an axis in a run, in the log's coordinates.
 
     Attributes:
         run: The run's name.
         sensor: The sensor.
         axis: The axis.
-        bias_mm: The bias.
-        sd_mm: Its standard deviation.
+        kind: Whether that is a length or an angle.
+        bias: The bias [m or rad].
+        sd: Its standard deviation [m or rad].
     """
 
     run: str
     sensor: str
     axis: str
-    bias_mm: float
-    sd_mm: float
+    kind: Kind
+    bias: float = msgspec.field(name="bias_mm")
+    sd: float = msgspec.field(name="sd_mm")
 
 
 class AxisLikelihood(msgspec.Struct, frozen=True, kw_only=True):
-    """Log-likelihood of an axis's components in the runs fitted on, with positions in mm.
+    """Log-likelihood of an axis's components in the runs fitted on, with positions in mm or mrad.
 
     Attributes:
         components: The number of components.
@@ -129,6 +135,15 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
     notes: list[str]
 
 
+def encode(summary: TuningSummary) -> str:
+    """The text of ``tuning.json``: what belongs to an axis is in the units of its kind."""
+    tree = msgspec.to_builtins(summary) | {"biases": [toml.reported(one, one.kind) for one in summary.biases]}
+    if summary.validation is not None:
+        tree["validation"] = [toml.reported(one, one.kind) for one in summary.validation]
+    encoder = msgspec.json.Encoder(decimal_format="number")
+    return msgspec.json.format(encoder.encode(tree), indent=2).decode() + "\n"
+
+
 def fitted(one: Parameter, before: FusionConfig, after: FusionConfig, interval: ConfidenceInterval | None) -> Fitted:
     """A parameter in the unit of its key; without its interval where none was computed."""
     earlier, value = one.given(before), one.get(after)
@@ -168,10 +183,10 @@ def _notes(one: Parameter, interval: ConfidenceInterval) -> str:
 
 def found_biases(run: Run, config: FusionConfig) -> list[FoundBias]:
     """The biases of the sensors in a run under a configuration."""
-    if all(sensor.bias_sd == 0.0 for sensor in config.sensors.values()):
+    if not any(sensor.bias_sd_of(axis) for sensor in config.sensors.values() for axis in config.arm.axes):
         return []
     return [
-        FoundBias(run=run.name, sensor=sensor, axis=axis, bias_mm=one.value * MM, sd_mm=one.sd * MM)
+        FoundBias(run=run.name, sensor=sensor, axis=axis, kind=config.arm.axes[axis].kind, bias=one.value, sd=one.sd)
         for sensor, by_axis in fused(run, config).biases.items()
         for axis, one in by_axis.items()
     ]

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Literal, TypeAlias, cast
 
-import msgspec
-
 from ..arrays import NO_STAMP
 from ..errors import ConfigError, PumafuseWarning
 from ..fusion.config import FusionConfig
@@ -24,7 +22,7 @@ from .likelihood import Likelihood, LogLikelihood
 from .maximise import Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
 from .stage import Plan, Stage, likelihood_of, run_stage
-from .summary import AxisLikelihood, TuningSummary, fitted, found_biases
+from .summary import AxisLikelihood, TuningSummary, encode, fitted, found_biases
 from .validation import Check, check
 
 _FITTED_ON = 2.0 / 3.0  # of a single run; the rest is for validation
@@ -53,7 +51,7 @@ class Tuning:
 
     def to_json(self) -> str:
         """The text of ``tuning.json``."""
-        return msgspec.json.format(msgspec.json.encode(self.summary), indent=2).decode() + "\n"
+        return encode(self.summary)
 
 
 def tune(

@@ -9,6 +9,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from .. import toml
 from ..arrays import FloatArray
 from ..errors import PumafuseWarning
 from ..filter.outcome import Outcome
@@ -19,7 +20,7 @@ from ..fusion.offline import fuse
 from ..fusion.score import Z95, interpolated, score
 from ..fusion.skill import skill
 from ..logs.run import Run
-from ..units import MM
+from ..units import MM, Kind, of_kind
 
 _WORSE = 1.02  # RMSE after over before that is worse where it is beyond chance
 _FAR_WORSE = 1.2  # likewise, whatever chance would make of it
@@ -47,30 +48,31 @@ class SensorCheck(msgspec.Struct, frozen=True, kw_only=True):
     skill: float | None
 
 
-class State(msgspec.Struct, frozen=True, kw_only=True):
+class State(toml.Reported, frozen=True, kw_only=True):
     """One axis under one configuration.
 
     Attributes:
-        log_likelihood: Of its components, with positions in mm.
+        log_likelihood: Of its components, with positions in mm or mrad.
         rejected: Components that were rejected.
         sensors: By name.
-        rmse_mm: Root mean square error on the reference; null without one.
+        rmse: Root mean square error on the reference [m or rad]; null without one.
         coverage: Share of errors within 1.96 standard deviations.
     """
 
     log_likelihood: float
     rejected: int
     sensors: dict[str, SensorCheck]
-    rmse_mm: float | None = None
+    rmse: float | None = msgspec.field(name="rmse_mm", default=None)
     coverage: float | None = None
 
 
-class Check(msgspec.Struct, frozen=True, kw_only=True):
+class Check(toml.Reported, frozen=True, kw_only=True):
     """One axis of one run before and after.
 
     Attributes:
         run: The run's name.
         axis: The axis.
+        kind: Whether that is a length or an angle.
         since_s: Where the part to validate on begins; 0: at the run's begin.
         components: The number of components compared.
         before: Under the configuration as given.
@@ -82,6 +84,7 @@ class Check(msgspec.Struct, frozen=True, kw_only=True):
 
     run: str
     axis: str
+    kind: Kind
     since_s: float
     components: int
     before: State
@@ -131,7 +134,7 @@ def _of_axis(est: Estimates, axis: str) -> Measurements:
 def _check(run: str, axis: str, since: float, before: Estimates, after: Estimates) -> Check:
     old, new, gains = _state(before, axis), _state(after, axis), _gains(before, after, axis)
     gained, chance = float(gains.sum()), Z95 * float(np.sqrt(np.sum(gains**2)))
-    closer = None if old.rmse_mm is None or new.rmse_mm is None else new.rmse_mm / max(old.rmse_mm, 1e-12)
+    closer = None if old.rmse is None or new.rmse is None else new.rmse / max(old.rmse, 1e-12)
     farther = closer is not None and (
         closer > _FAR_WORSE or (closer > _WORSE and _beyond_chance(_squares(after, axis) - _squares(before, axis)))
     )
@@ -149,6 +152,7 @@ def _check(run: str, axis: str, since: float, before: Estimates, after: Estimate
     return Check(
         run=run,
         axis=axis,
+        kind=after.config.arm.axes[axis].kind,
         since_s=since,
         components=len(gains),
         before=old,
@@ -161,7 +165,8 @@ def _check(run: str, axis: str, since: float, before: Estimates, after: Estimate
 
 def _doubts(est: Estimates, axis: str, state: State) -> list[str]:
     """Why error bars do not hold: a noise at a bound; NIS, or coverage on the reference, off by more than chance."""
-    found = [f"sd_mm of {name} is at its bound" for name in state.sensors if est.config.sensors[name].is_at_bound(axis)]
+    sd = of_kind("sd_mm", est.config.arm.axes[axis].kind)
+    found = [f"{sd} of {name} is at its bound" for name in state.sensors if est.config.sensors[name].is_at_bound(axis)]
     for name, one in state.sensors.items():
         low, high = chi_square_band(one.count)
         if one.nis < min(low, _NIS[0]) or one.nis > max(high, _NIS[1]):
@@ -226,6 +231,6 @@ def _state(est: Estimates, axis: str) -> State:
         log_likelihood=float(densities_of(mine, est.config.sensors).sum()),
         rejected=int(np.count_nonzero(mine.outcome == Outcome.REJECTED)),
         sensors=sensors,
-        rmse_mm=None if found is None else found.rmse * MM,
+        rmse=None if found is None else found.rmse,
         coverage=None if found is None else found.coverage,
     )

@@ -16,7 +16,7 @@ from ..fusion.estimates import Estimates
 from ..fusion.score import Z95, interpolated
 from ..logs.axes import in_axes
 from ..logs.run import Run
-from ..units import MM, seconds
+from ..units import seconds
 from . import colours
 from .canvas import drawing
 
@@ -38,14 +38,15 @@ def fused_figure(est: Estimates, run: Run, path: Path) -> None:
     zoomed = (est.time >= start) & (est.time <= end)
     with _figure(est, path, len(est.axes), [_TIME, _TIME], [1.0, 1.0]) as panels:
         for name, whole, zoom in zip(est.axes, panels[::2], panels[1::2], strict=True):
-            position = est[name].position
+            position, screen = est[name].position, est.config.arm.screen_of(name)
+            command = commanded.values[name] * screen.scale
             for axes, shown in ((whole, position), (zoom, position[zoomed])):
-                axes.step(time, commanded.values[name] * MM, where="post", color=colours.COMMAND, lw=1, label="command")
+                axes.step(time, command, where="post", color=colours.COMMAND, lw=1, label="command")
                 _measurements(axes, est, name)
                 _band(axes, est, name, position)
-                axes.plot(est.time, position * MM, color=colours.ESTIMATE, lw=1.0, label="estimate")
-                axes.set_ylabel(f"{name} [mm]")
-                low, high = float(shown.min()) * MM, float(shown.max()) * MM
+                axes.plot(est.time, position * screen.scale, color=colours.ESTIMATE, lw=1.0, label="estimate")
+                axes.set_ylabel(f"{name} [{screen.unit}]")
+                low, high = float(shown.min()) * screen.scale, float(shown.max()) * screen.scale
                 margin = 0.1 * (high - low) + 0.5
                 axes.set_ylim(low - margin, high + margin)
             zoom.set_xlim(start, end)
@@ -76,18 +77,19 @@ def error_figure(est: Estimates, path: Path) -> None:
         return
     with _figure(est, path, len(errors), [_TIME], [1.0]) as panels:
         for axes, (name, error) in zip(panels, errors.items(), strict=True):
+            screen = est.config.arm.screen_of(name)
             for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
                 measured = est.measured_positions(sensor, name)
                 first = np.zeros(len(measured.time), dtype=np.int64)  # only the first segment: enough for a picture
                 raw = measured.value - interpolated(measured.time, first, est.reference, name)
                 label = f"{sensor}, latency removed"
-                axes.plot(measured.time, raw * MM, ".", ms=1.5, color=colour, alpha=0.6, label=label)
+                axes.plot(measured.time, raw * screen.scale, ".", ms=1.5, color=colour, alpha=0.6, label=label)
             _band(axes, est, name, np.zeros(len(est.time)))
-            axes.plot(est.time, error * MM, color=colours.REFERENCE, lw=0.8, label="estimate")
-            rms = float(np.sqrt(np.nanmean(error**2))) * MM
-            axes.set_title(f"{name}: RMS error {rms:.3f} mm", loc="left")
-            axes.set_ylabel("error [mm]")
-            limit = max(1.3 * float(np.nanmax(np.abs(error))) * MM, 1e-6)
+            axes.plot(est.time, error * screen.scale, color=colours.REFERENCE, lw=0.8, label="estimate")
+            rms = float(np.sqrt(np.nanmean(error**2))) * screen.scale
+            axes.set_title(f"{name}: RMS error {rms:.3f} {screen.unit}", loc="left")
+            axes.set_ylabel(f"error [{screen.unit}]")
+            limit = max(1.3 * float(np.nanmax(np.abs(error))) * screen.scale, 1e-6)
             axes.set_ylim(-limit, limit)
         panels[0].legend(loc="upper right", ncols=3, frameon=False)
 
@@ -162,16 +164,17 @@ def _figure(
 
 
 def _band(axes: Axes, est: Estimates, name: str, centre: FloatArray) -> None:
-    half = Z95 * est[name].position_sd
-    low, high = (centre - half) * MM, (centre + half) * MM
+    half, scale = Z95 * est[name].position_sd, est.config.arm.screen_of(name).scale
+    low, high = (centre - half) * scale, (centre + half) * scale
     axes.fill_between(est.time, low, high, color=colours.ESTIMATE, alpha=0.25, lw=0, label="95 % band")
 
 
 def _measurements(axes: Axes, est: Estimates, name: str) -> None:
+    scale = est.config.arm.screen_of(name).scale
     for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
         measured = est.measured_positions(sensor, name)
         rejected = measured.outcome == Outcome.REJECTED
-        axes.plot(measured.time[~rejected], measured.value[~rejected] * MM, ".", ms=2.5, color=colour, label=sensor)
+        axes.plot(measured.time[~rejected], measured.value[~rejected] * scale, ".", ms=2.5, color=colour, label=sensor)
         if rejected.any():
-            time, value = measured.time[rejected], measured.value[rejected] * MM
+            time, value = measured.time[rejected], measured.value[rejected] * scale
             axes.plot(time, value, "x", ms=4, color=colours.REJECTED, label=f"{sensor}, rejected")

@@ -12,7 +12,7 @@ from ..identification.estimate import Estimate
 from ..model.arm import Gain
 from ..model.plants import PLANTS, FirstOrder
 from ..toml import Interval
-from ..units import MS
+from ..units import MS, SCREEN, Kind
 
 if TYPE_CHECKING:
     from ..tuning.identifiability import Correlation
@@ -68,6 +68,13 @@ def gain(found: Gain) -> str:
 def change(values: Sequence[float | None], form: str) -> str:
     """Numbers before and after, joined by an arrow; ``form`` is a format specification."""
     return " → ".join("–" if value is None else format(value, form) for value in values)
+
+
+def change_of_positions(values: Sequence[float | None], kind: Kind) -> str:
+    """Positions [m or rad] before and after, joined by an arrow, with the unit of the screen."""
+    screen = SCREEN[kind]
+    shown = change([None if value is None else value * screen.scale for value in values], ".3f")
+    return shown if None in values else f"{shown} {screen.unit}"
 
 
 def together(pair: Correlation) -> str:

@@ -7,7 +7,8 @@ a frame that does not fit into the pipe is left out.
 Entities: ``<axis>/command``, ``/estimate`` with ``/upper`` and ``/lower`` at ±2σ, ``/<sensor>`` and
 ``/<sensor>/rejected``; ``residual/<axis>/<sensor>``, the measurement minus the estimate, between ``/upper`` and
 ``/lower`` of the estimate; ``path/command``, ``path/estimate``, ``path/tool`` in 3D, and with a frame
-``path/<sensor>``; ``nis/<sensor>``, ``rate/<sensor>``. All against seconds since the first event, positions in mm. With
+``path/<sensor>``; ``nis/<sensor>``, ``rate/<sensor>``. All against seconds since the first event, positions in mm or
+degrees. With
 a frame, commands and measurements in x, y, z are in 3D only. A sensor with a bias is drawn less its mean distance from
 the estimate.
 """
@@ -28,8 +29,8 @@ import msgspec
 from ..errors import ConfigError
 from ..filter.outcome import Outcome
 from ..live.results import COMPARED
-from ..logs.frames import CARTESIAN
-from ..model.arm import CANONICAL_AXES, ordered_axes
+from ..logs.frames import CARTESIAN, in_space
+from ..units import Kind
 
 if TYPE_CHECKING:
     from ..fusion.config import FusionConfig
@@ -62,7 +63,7 @@ class Header(msgspec.Struct):
 
     Attributes:
         mode: ``spawn``, ``connect`` or ``web``.
-        axes: The arm's, in their order.
+        axes: The arm's, in their order, and whether each is a length or an angle.
         space: The three axes, or x, y, z, that are a position in space; empty without.
         sensors: By name.
         port: Where the viewer listens.
@@ -70,7 +71,7 @@ class Header(msgspec.Struct):
     """
 
     mode: str
-    axes: tuple[str, ...]
+    axes: dict[str, Kind]
     space: tuple[str, ...]
     sensors: dict[str, SensorHead]
     port: int
@@ -111,12 +112,17 @@ class LiveView:
         self.dropped = 0
         self._notify = notify
         self._framed = config.frame is not None
-        axes = ordered_axes(set(config.arm.axes))
-        self._space: tuple[str, ...] = CARTESIAN if self._framed else CANONICAL_AXES  # of a position in space
-        if not self._framed and not set(CANONICAL_AXES) <= set(axes):
-            self._space = ()
-        unbiased = {name for name, sensor in config.sensors.items() if sensor.scale == 1.0 and not sensor.bias_sd}
-        self._in_space = {"", *(unbiased if self._framed else ())}  # sources that are drawn as positions in space
+        self._space = CARTESIAN if self._framed else in_space(config.arm)  # of a position in space
+        biased = {
+            name
+            for name, sensor in config.sensors.items()
+            if any(sensor.bias_sd_of(axis) > 0.0 for axis in config.arm.axes)
+        }
+        unbiased = {name for name, sensor in config.sensors.items() if sensor.scale == 1.0 and name not in biased}
+        self._in_space = {
+            "",
+            *(unbiased if self._space == CARTESIAN else ()),
+        }  # sources that are drawn as positions in space
         self._origin: float | None = None
         self._newest = 0.0
         self._segments = 1
@@ -127,10 +133,9 @@ class LiveView:
         self._child: subprocess.Popen[bytes] | None
         self._child, self._stdin, self._stdout = _start()
         sensors = {
-            name: SensorHead(sensor.scale, sensor.latency, sensor.bias_sd != 0.0)
-            for name, sensor in config.sensors.items()
+            name: SensorHead(sensor.scale, sensor.latency, name in biased) for name, sensor in config.sensors.items()
         }
-        self._write(Header(mode, axes, self._space, sensors, PORT, WEB_PORT))
+        self._write(Header(mode, config.arm.kind_of, self._space, sensors, PORT, WEB_PORT))
 
     def event(self, event: Event, result: UpdateResult) -> None:
         """Take in an event and what became of it."""

@@ -20,7 +20,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from ..arrays import FloatArray
-from ..units import MM
+from ..units import MM, SCREEN, Screen
 from . import colours, styles
 from .live import Frame, Header, SensorHead
 from .live_viewer import Viewer
@@ -48,6 +48,7 @@ class Picture:
             header: The axes and sensors.
         """
         self._stream, self._header = stream, header
+        self._screens = {axis: SCREEN[kind] for axis, kind in header.axes.items()}
         self._estimates = {axis: Recent(3) for axis in header.axes}
         self._residuals = {
             (axis, name): Residuals(sensor, self._estimates[axis])
@@ -63,25 +64,27 @@ class Picture:
     def draw(self, frame: Frame) -> None:
         """Send a frame."""
         for axis, known in self._estimates.items():
+            scale = self._screens[axis].scale
             time, command = _columns(frame, f"command/{axis}", 2)
-            self._plot(f"{axis}/command", styles.line(colours.COMMAND, "command", step=True), time, command * MM)
+            self._plot(f"{axis}/command", styles.line(colours.COMMAND, "command", step=True), time, command * scale)
             time, position, sd = estimates = _columns(frame, f"estimate/{axis}", 3)
             known.add(estimates)
-            self._plot(f"{axis}/estimate", styles.line(colours.ESTIMATE, "estimate"), time, position * MM)
+            self._plot(f"{axis}/estimate", styles.line(colours.ESTIMATE, "estimate"), time, position * scale)
             for edge, label, half in (("upper", "+2σ", 2.0 * sd), ("lower", "−2σ", -2.0 * sd)):
-                self._plot(f"{axis}/estimate/{edge}", styles.edge(label), time, (position + half) * MM)
-                self._plot(f"residual/{axis}/{edge}", styles.edge(label), time, half * MM)
+                self._plot(f"{axis}/estimate/{edge}", styles.edge(label), time, (position + half) * scale)
+                self._plot(f"residual/{axis}/{edge}", styles.edge(label), time, half * scale)
         for (axis, name), residuals in self._residuals.items():
             residuals.add(_columns(frame, f"measurement/{axis}/{name}", 3))
             time, position, residual, rejected = residuals.take()
-            fused, shown = ~rejected, self._estimates[axis].clip(position)
+            screen, fused = self._screens[axis], ~rejected
+            shown = self._estimates[axis].clip(position, screen)
             points, crosses = (
                 styles.points(self._colours[name], name),
                 styles.points(colours.REJECTED, "rejected", "Cross"),
             )
-            self._plot(f"{axis}/{name}", points, time[fused], position[fused] * MM)
-            self._plot(f"{axis}/{name}/rejected", crosses, time[rejected], shown[rejected] * MM)
-            self._plot(f"residual/{axis}/{name}", points, time[fused], residual[fused] * MM)
+            self._plot(f"{axis}/{name}", points, time[fused], position[fused] * screen.scale)
+            self._plot(f"{axis}/{name}/rejected", crosses, time[rejected], shown[rejected] * screen.scale)
+            self._plot(f"residual/{axis}/{name}", points, time[fused], residual[fused] * screen.scale)
         for name, colour in self._of_sensors.items():
             for path in (f"nis/{name}", f"rate/{name}"):
                 self._plot(path, styles.line(colour, name), *_columns(frame, path, 2))
@@ -142,12 +145,12 @@ class Recent:
         known = (time >= times[0]) & (times[after] - times[after - 1] <= _LONGEST_GAP)
         return np.where(known, np.interp(time, times, values), np.nan)
 
-    def clip(self, position: FloatArray) -> FloatArray:
-        """Positions [m] with those far off moved to the edge: one wild measurement would flatten the plot."""
+    def clip(self, position: FloatArray, screen: Screen) -> FloatArray:
+        """Positions [SI] with those far off moved to the edge: one wild measurement would flatten the plot."""
         if not self.rows.size:
             return position
         low, high = self.rows[1].min(), self.rows[1].max()
-        margin = 0.3 * (high - low) + 5.0 / MM
+        margin = 0.3 * (high - low) + 5.0 / screen.scale
         return np.clip(position, low - margin, high + margin)
 
 
@@ -161,13 +164,13 @@ class Residuals:
         self._bias, self._averaged = 0.0, 0
 
     def add(self, rows: FloatArray) -> None:
-        """Add stamps [s], measurements [m] and whether they were rejected; the oldest go when no estimate comes."""
+        """Add stamps [s], measurements [SI] and whether they were rejected; the oldest go when no estimate comes."""
         stamp, value, rejected = rows
         rows = np.array([stamp - self._sensor.latency, value / self._sensor.scale, rejected])
         self._waiting = np.concatenate([self._waiting, rows], axis=1)[:, -_MOST_KEPT:]
 
     def take(self) -> tuple[FloatArray, FloatArray, FloatArray, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
-        """Valid times [s], positions [m], positions less the estimate [m], and which were rejected."""
+        """Valid times [s], positions, positions less the estimate [SI], and which were rejected."""
         if self._estimates.rows.shape[1] < 2:
             return np.empty(0), np.empty(0), np.empty(0), np.empty(0, dtype=np.bool_)
         ready = self._waiting[0] <= self._estimates.rows[0, -1]
@@ -192,9 +195,12 @@ def _blueprint(header: Header, first: FloatArray | None = None) -> rrb.Blueprint
         header: The axes.
         first: Where the path begins [mm], (3,).
     """
-    positions = [_plot(f"/{axis}", f"{axis} [mm]", legend=axis == header.axes[0]) for axis in header.axes]
+    units = {axis: SCREEN[kind].unit for axis, kind in header.axes.items()}
+    first_axis = next(iter(units))
+    positions = [_plot(f"/{axis}", f"{axis} [{unit}]", legend=axis == first_axis) for axis, unit in units.items()]
     residuals = [
-        _plot(f"/residual/{axis}", f"{axis}: measurement − estimate [mm]", legend=False) for axis in header.axes
+        _plot(f"/residual/{axis}", f"{axis}: measurement − estimate [{unit}]", legend=False)
+        for axis, unit in units.items()
     ]
     health = [("/nis", "NIS [1 as configured]"), ("/rate", "measurements [Hz]")]
     right: rrb.Container = rrb.Tabs(*(_plot(origin, name, legend=True) for origin, name in health))

@@ -2,7 +2,7 @@
 
 Entities: ``<axis>/command``, ``/reference``, ``/estimate`` with ``/upper`` and ``/lower`` at ±2σ, ``/<sensor>`` and
 ``/<sensor>/rejected``; ``innovation/<axis>/<sensor>`` with its ±2σ band; ``path/command`` and ``path/estimate`` in 3D.
-All against seconds since the run's first command, positions in mm.
+All against seconds since the run's first command, positions in mm or degrees.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from ..arrays import FloatArray
 from ..filter.outcome import Outcome
 from ..fusion.estimates import Estimates
 from ..logs.axes import in_axes
-from ..logs.frames import CARTESIAN
+from ..logs.frames import CARTESIAN, in_space
 from ..logs.run import Run
-from ..model.arm import CANONICAL_AXES
-from ..units import MM, seconds
+from ..units import MM, Screen, seconds
 from . import colours, styles
 
 _OPENING_S = 4.0
@@ -49,37 +48,38 @@ def _send(est: Estimates, run: Run, stream: rr.RecordingStream) -> None:
     command = in_axes(run, est.config.frame)[0].command
     time = seconds(command.stamp, est.origin)
     for name, axis in est.axes.items():
+        screen = est.config.arm.screen_of(name)
         line = styles.line(colours.COMMAND, "command", step=True)
-        _series(stream, f"{name}/command", line, time, command.values[name])
+        _series(stream, f"{name}/command", line, time, command.values[name], screen)
         if est.reference is not None and name in est.reference.position:
             line = styles.line(colours.REFERENCE_3D, "reference")
-            _series(stream, f"{name}/reference", line, est.reference.time, est.reference.position[name])
+            _series(stream, f"{name}/reference", line, est.reference.time, est.reference.position[name], screen)
         for sensor in est.measurements.sensors:
             _sensor(stream, est, sensor, name, by_sensor[sensor])
-        _band(stream, f"{name}/estimate", est.time, axis.position, 2.0 * axis.position_sd)
+        _band(stream, f"{name}/estimate", est.time, axis.position, 2.0 * axis.position_sd, screen)
         line = styles.line(colours.ESTIMATE, "estimate")
-        _series(stream, f"{name}/estimate", line, est.time, axis.position)
+        _series(stream, f"{name}/estimate", line, est.time, axis.position, screen)
     _paths(stream, est, run)
 
 
 def _sensor(stream: rr.RecordingStream, est: Estimates, sensor: str, axis: str, colour: str) -> None:
-    measured = est.measured_positions(sensor, axis)
+    measured, screen = est.measured_positions(sensor, axis), est.config.arm.screen_of(axis)
     fused = (measured.outcome == Outcome.FUSED) | (measured.outcome == Outcome.REACQUIRED)
     points = styles.points(colour, sensor)
-    _series(stream, f"{axis}/{sensor}", points, measured.time[fused], measured.value[fused])
+    _series(stream, f"{axis}/{sensor}", points, measured.time[fused], measured.value[fused], screen)
     crosses = styles.points(colours.REJECTED, "rejected", "Cross")
-    _series(stream, f"{axis}/{sensor}/rejected", crosses, measured.time[~fused], measured.value[~fused])
+    _series(stream, f"{axis}/{sensor}/rejected", crosses, measured.time[~fused], measured.value[~fused], screen)
     path = f"innovation/{axis}/{sensor}"
-    _series(stream, path, points, measured.time, measured.innovation)
-    _band(stream, path, measured.time, np.zeros(len(measured.time)), 2.0 * measured.innovation_sd)
+    _series(stream, path, points, measured.time, measured.innovation, screen)
+    _band(stream, path, measured.time, np.zeros(len(measured.time)), 2.0 * measured.innovation_sd, screen)
 
 
 def _paths(stream: rr.RecordingStream, est: Estimates, run: Run) -> None:
-    """Send command and estimate in 3D: the log's x, y, z with a frame, else tangential, radial, vertical."""
-    names = CANONICAL_AXES if est.cartesian is None else CARTESIAN
+    """Send command and estimate in 3D: the log's x, y, z, or without them tangential, radial, vertical."""
+    names = in_space(est.config.arm) if est.cartesian is None else CARTESIAN
     estimated = est.cartesian or {name: axis.position for name, axis in est.axes.items()}
     command = run.command.values
-    if not all(name in estimated for name in names):
+    if not names or not all(name in estimated for name in names):
         return
     if all(name in command for name in names):
         _strip(stream, "path/command", [command[name] for name in names], colours.COMMAND, 0.3)
@@ -100,16 +100,20 @@ def _strip(stream: rr.RecordingStream, path: str, coordinates: list[FloatArray],
     rr.log(path, line, static=True, recording=stream)
 
 
-def _band(stream: rr.RecordingStream, path: str, time: FloatArray, centre: FloatArray, half: FloatArray) -> None:
-    _series(stream, f"{path}/upper", styles.edge("+2σ"), time, centre + half)
-    _series(stream, f"{path}/lower", styles.edge("−2σ"), time, centre - half)
+def _band(
+    stream: rr.RecordingStream, path: str, time: FloatArray, centre: FloatArray, half: FloatArray, screen: Screen
+) -> None:
+    _series(stream, f"{path}/upper", styles.edge("+2σ"), time, centre + half, screen)
+    _series(stream, f"{path}/lower", styles.edge("−2σ"), time, centre - half, screen)
 
 
-def _series(stream: rr.RecordingStream, path: str, style: styles.Style, time: FloatArray, value: FloatArray) -> None:
-    """Send the style and the finite values [m] of an entity; nothing where there are none."""
+def _series(
+    stream: rr.RecordingStream, path: str, style: styles.Style, time: FloatArray, value: FloatArray, screen: Screen
+) -> None:
+    """Send the style and the finite values [SI] of an entity; nothing where there are none."""
     if (np.isfinite(time) & np.isfinite(value)).any():
         rr.log(path, style, static=True, recording=stream)
-        styles.send(stream, path, time, value * MM)
+        styles.send(stream, path, time, value * screen.scale)
 
 
 def _blueprint(est: Estimates) -> rrb.Blueprint:
@@ -117,40 +121,43 @@ def _blueprint(est: Estimates) -> rrb.Blueprint:
     start, end = est.busiest(_OPENING_S)
     bounds = [rrb.TimeRangeBoundary.absolute(seconds=edge) for edge in (start, end)]
     legend = rrb.PlotLegend(rrb.Corner2D.RightTop)
-    positions = [
-        rrb.TimeSeriesView(
-            origin=f"/{name}",
-            name=f"{name} [mm]",
-            plot_legend=legend,
-            axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(*bounds)),
-            axis_y=rrb.ScalarAxis(range=_span(axis.position[(est.time >= start) & (est.time <= end)])),
+    positions, innovations = list[rrb.TimeSeriesView](), list[rrb.TimeSeriesView]()
+    for name, axis in est.axes.items():
+        screen = est.config.arm.screen_of(name)
+        opening = axis.position[(est.time >= start) & (est.time <= end)]
+        positions.append(
+            rrb.TimeSeriesView(
+                origin=f"/{name}",
+                name=f"{name} [{screen.unit}]",
+                plot_legend=legend,
+                axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(*bounds)),
+                axis_y=rrb.ScalarAxis(range=_span(opening, screen)),
+            )
         )
-        for name, axis in est.axes.items()
-    ]
-    innovations = [
-        rrb.TimeSeriesView(
-            origin=f"/innovation/{name}",
-            name=f"{name}: innovations and ±2σ [mm]",
-            plot_legend=legend,
-            axis_y=rrb.ScalarAxis(range=_innovation_span(est, name)),
+        innovations.append(
+            rrb.TimeSeriesView(
+                origin=f"/innovation/{name}",
+                name=f"{name}: innovations and ±2σ [{screen.unit}]",
+                plot_legend=legend,
+                axis_y=rrb.ScalarAxis(range=_innovation_span(est, name)),
+            )
         )
-        for name in est.axes
-    ]
-    path = rrb.Spatial3DView(origin="/path", name="path [mm]")
-    left, right = rrb.Vertical(*positions), rrb.Vertical(path, rrb.Tabs(*innovations))
+    left, right = rrb.Vertical(*positions), rrb.Tabs(*innovations)
+    if est.cartesian is not None or in_space(est.config.arm):
+        right = rrb.Vertical(rrb.Spatial3DView(origin="/path", name="path [mm]"), right)
     return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[3, 2]), collapse_panels=True)
 
 
-def _span(position: FloatArray) -> tuple[float, float]:
-    """Limits of a plot [mm] of positions [m]."""
-    low, high = float(position.min()) * MM, float(position.max()) * MM
+def _span(position: FloatArray, screen: Screen) -> tuple[float, float]:
+    """Limits of a plot, in the unit of the screen, of positions [SI]."""
+    low, high = float(position.min()) * screen.scale, float(position.max()) * screen.scale
     margin = 0.2 * (high - low) + 0.5
     return low - margin, high + margin
 
 
 def _innovation_span(est: Estimates, axis: str) -> tuple[float, float]:
-    """Limits of an innovation plot [mm]: they show the band and leave out far outliers."""
+    """Limits of an innovation plot, in the unit of the screen: they show the band and leave out far outliers."""
     mine = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
     known = mine.innovation_sd[np.isfinite(mine.innovation_sd)]
-    limit = 6.0 * float(np.median(known)) * MM if len(known) else 1.0
+    limit = 6.0 * float(np.median(known)) * est.config.arm.screen_of(axis).scale if len(known) else 1.0
     return -limit, limit

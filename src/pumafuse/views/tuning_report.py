@@ -10,9 +10,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
 
-from .. import toml
 from ..arrays import FloatArray
-from ..fusion.config import ARM_FILE
 from ..fusion.consistency import Consistency, consistency
 from ..fusion.estimates import Estimates
 from ..fusion.score import Z95
@@ -74,7 +72,7 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
             for some in zip(*tests.values(), strict=True)
         ],
         "white_p": _WHITE,
-        "fusion": toml.text({**toml.builtins(found.config), "arm": ARM_FILE}),
+        "fusion": found.config.to_toml(),
         "arm": found.config.arm.to_toml(),
     }
     return render("tuning.html", content)
@@ -114,8 +112,9 @@ def _check(one: Check) -> Mapping[str, Any]:
         "axis": one.axis,
         "sensors": [names, changes("nis", ".2f"), changes("correlation", "+z.2f")],
         "numbers": [
-            formatting.change([getattr(state, of) for state in states], form)
-            for of, form in (("rejected", "d"), ("rmse_mm", ".3f"), ("coverage", ".3f"))
+            formatting.change([state.rejected for state in states], "d"),
+            formatting.change_of_positions([state.rmse for state in states], one.kind),
+            formatting.change([state.coverage for state in states], ".3f"),
         ],
         "verdict": one.verdict,
         "worse": one.worse,
