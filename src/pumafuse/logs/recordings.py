@@ -27,7 +27,7 @@ import pyarrow.compute as pc
 from ..errors import RunError, suggestion
 from . import bags
 from .bags import Channel, Faults, Message, Record, reason
-from .tables import Table
+from .columns import Table
 
 if TYPE_CHECKING:
     from rerun.chunk import RrdReader, StoreEntry
@@ -61,18 +61,13 @@ class Topic:
     fields: tuple[str, ...]
 
 
-def is_recording(path: Path) -> bool:
-    """Whether a path is of a format that is read here, by its ending; a folder is taken for a bag of ROS 2."""
-    return path.suffix in (".mcap", ".bag", ".db3", ".rrd") or path.is_dir()
-
-
 def read(path: Path, name: str, fields: Sequence[str] | None = None) -> Table:
     """A topic or an entity, its rows in the order in which they were recorded.
 
     Args:
         path: A file, or the folder of a ROS 2 bag.
         name: The topic, or the entity of a Rerun recording.
-        fields: Names or field paths that are wanted; other columns are there but empty. None: all.
+        fields: Columns, whole or to a field, that are wanted. None: all.
 
     Raises:
         RunError: It is no such recording, has no such topic or nothing on it, or is too damaged.
@@ -175,9 +170,8 @@ def _read_topic(path: Path, topic: str, fields: Sequence[str] | None) -> Table:
     time = table[LOG_TIME].cast(pa.int64())
     if pc.any(pc.greater(time[:-1], time[1:])).as_py():  # chunks and files of one bag may overlap
         table = table.take(pc.sort_indices(time))  # stable
-    columns = {name: pa.chunked_array([pa.nulls(table.num_rows)]) for name in names}
-    columns |= dict(zip(table.column_names, table.columns, strict=True))
-    return Table(path, columns, table.num_rows, tuple(notes))
+    columns = dict(zip(table.column_names, table.columns, strict=True))
+    return Table(path, columns, table.num_rows, tuple(notes), (*names, LOG_TIME))
 
 
 def _messages(path: Path, topic: str, faults: Faults, seen: set[Channel]) -> Iterator[tuple[Record, Message]]:
@@ -315,17 +309,17 @@ def _read_entity(path: Path, entity: str, fields: Sequence[str] | None) -> Table
         listed = {one: ", ".join(sorted(components)) for one, components in sorted(known.items())}
         raise _unknown(path, "entity", entity and place, listed, notes)
     table = table.take(pc.sort_indices(table[_ROW])).drop_columns(_ROW)
-    names = _names(known[place], [name for name in table.column_names if name not in known[place]])
+    timelines = [name for name in table.column_names if name not in known[place]]
+    names = _names(known[place], timelines)
     there = [
         pc.greater(pc.fill_null(pc.list_value_length(table[name]), 0), 0)
         for name in names
         if name in table.column_names
     ]
     table = table.filter(reduce(pc.or_, there)) if there else table
-    columns = {name: pa.chunked_array([pa.nulls(table.num_rows)]) for name in names.values()}
-    columns |= {name: table[name] for name in table.column_names if name not in names}
+    columns = {name: table[name] for name in table.column_names if name not in names}
     columns |= {short: _single(table[name]) for name, short in names.items() if name in table.column_names}
-    return Table(path, columns, table.num_rows, tuple(notes))
+    return Table(path, columns, table.num_rows, tuple(notes), (*timelines, *names.values()))
 
 
 def _components(batch: pa.RecordBatch) -> list[str]:

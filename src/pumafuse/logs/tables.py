@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -37,23 +38,23 @@ def read(
     topic: str = "",
     entity: str = "",
 ) -> Table:
-    """Read a CSV or Parquet table, gzip allowed for CSV (``.csv.gz``).
+    """Read a CSV or Parquet table, gzip allowed for CSV (``.csv.gz``), or a part of a recording.
 
     Args:
-        path: The file.
+        path: The file, or the folder of a bag.
         growing: Whether it may still be growing, or its writer may have been killed. A last line of a CSV without its
             line break may then be torn within a number: it is left out, and noted.
-        fields: Columns and field paths that will be asked for; of Parquet no others are read. All for None.
+        fields: Columns and field paths that will be asked for; only of CSV others are read, too. All for None.
         where: Which rows to read; of Parquet, parts of the file that can have none are skipped.
         topic: Which part of a recording is the table.
         entity: The same in a Rerun recording.
 
     Raises:
-        RunError: The file is absent, empty, or neither CSV nor Parquet inside; or ``where`` leaves no row.
+        RunError: The file is absent, empty, or not inside what its ending says; or ``where`` leaves no row.
     """
     where = where or {}
     if is_recording(path):
-        raise RunError(f"{path}: recordings of this format cannot be read; accepted: CSV, Parquet")
+        return _recording(path, topic, entity, fields, where)
     if topic or entity:
         key = "topic" if topic else "entity"
         raise RunError(
@@ -89,7 +90,7 @@ def read(
 
 def is_recording(path: Path) -> bool:
     """Whether a file or folder is an MCAP, a bag or a Rerun recording, which has topics or entities."""
-    return path.suffix in _RECORDINGS or os.path.isfile(path / "metadata.yaml")  # noqa: PTH113 - raises on a long name
+    return path.suffix in _RECORDINGS or os.path.isdir(path)  # noqa: PTH112 - raises on a long name
 
 
 def write(table: pa.Table, path: Path) -> None:
@@ -98,6 +99,25 @@ def write(table: pa.Table, path: Path) -> None:
         pacsv.write_csv(table, path, pacsv.WriteOptions(quoting_style="needed"))
     else:
         papq.write_table(table, path, compression="zstd")
+
+
+def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None, where: Where) -> Table:
+    """A topic or entity of a recording."""
+    from . import recordings
+
+    key, name, wrong, other = "topic", topic, "entity", entity
+    if path.suffix == ".rrd":
+        key, name, wrong, other = wrong, other, key, name
+    if other:
+        raise RunError(f"{path}: of such a file the key is '{key}', not '{wrong}'")
+    found = recordings.read(path, name, None if fields is None else prefixes([*fields, *where]))
+    if not where:
+        return found
+    whole = pa.table(dict(found.columns))
+    table = _chosen(path, whole, _conditions(path, whole, where))
+    if not table.num_rows:
+        raise _no_row(path, [whole], where)
+    return replace(found, columns=_named(path, table), rows=table.num_rows)
 
 
 def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]]:
