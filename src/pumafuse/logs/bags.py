@@ -59,19 +59,27 @@ class Record(NamedTuple):
 
 @dataclass
 class Faults:
-    """What is wrong with a recording: whether it was cut off, and how much of what was left out, by reason."""
+    """What is wrong with a recording.
+
+    Attributes:
+        cut: Whether it was cut off.
+        left_out: How many things of each kind could not be used.
+        first: Of each kind, what was wrong with the first.
+    """
 
     cut: bool = False
-    left_out: Counter[tuple[str, str]] = field(default_factory=Counter[tuple[str, str]])
+    left_out: Counter[str] = field(default_factory=Counter[str])
+    first: dict[str, str] = field(default_factory=dict[str, str])
 
     def leave_out(self, what: str, error: Exception) -> None:
-        """Count something that was left out because of an error."""
-        self.left_out[what, reason(error)] += 1
+        """Count something that cannot be used."""
+        self.left_out[what] += 1
+        self.first.setdefault(what, reason(error))
 
     def notes(self, name: str) -> list[str]:
         """A sentence for each fault of the recording of that name."""
         cut = [f"{name}: the recording was cut off: read as far as it goes"] if self.cut else []
-        return cut + [f"{name}: {counted(n, what)} left out: {why}" for (what, why), n in self.left_out.items()]
+        return cut + [f"{name}: {counted(n, what)} left out: {self.first[what]}" for what, n in self.left_out.items()]
 
 
 # A library says in its own way that bytes are not what they should be.
@@ -318,7 +326,7 @@ def _mcap_records(source: _Whole, faults: Faults, seen: set[Channel]) -> Iterato
             case records.Message() if piece.channel_id in channels:
                 yield Record(channels[piece.channel_id], piece.log_time, piece.data)
             case records.Message():
-                faults.leave_out("message", ValueError("its channel was lost"))
+                faults.leave_out("message without a channel", ValueError("the channel was lost"))
             case _:
                 pass
 
@@ -373,7 +381,7 @@ def _ros1_records(source: _Whole, faults: Faults, seen: set[Channel]) -> Iterato
             case RecordType.MSGDATA if head.get_uint32("conn") in channels:
                 yield Record(channels[head.get_uint32("conn")], head.get_time("time"), data)
             case RecordType.MSGDATA:
-                faults.leave_out("message", ValueError("its connection was lost"))
+                faults.leave_out("message without a connection", ValueError("the connection was lost"))
             case _:
                 pass
 

@@ -186,7 +186,7 @@ def _messages(path: Path, topic: str, faults: Faults, seen: set[Channel]) -> Ite
         try:
             message = decoders[record.channel](record.payload)
         except bags.DAMAGE as error:
-            faults.leave_out(f"message of {topic}", error)
+            faults.leave_out("message", error)
         else:
             yield record, message
 
