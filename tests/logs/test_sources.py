@@ -609,7 +609,7 @@ REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "time is booleans": ('time = { column = "yes", unit = "s" }\nx = "x_m"', ("'yes'", "bool")),
     "time is a struct without stamps": ('time = "pose.position"\nx = "x_m"', ("'pose.position'", "structs of x, y")),
     "nanoseconds beyond a second": ('time = ["plain", "t_ns"]\nx = "x_m"', ("'t_ns'", "row 1", "999999999")),
-    "seconds with decimals": ('time = ["half", "plain"]\nx = "x_m"', ("'half'", "0.5")),
+    "seconds with decimals": ('time = ["half", "plain"]\nx = "x_m"', ("'half'", "whole")),
     "a recording": (
         'time = "t_ns"\nx = "x_m"\n[sensors.s]\nfile = "a.mcap"\ntime = "log_time"\nx = "x_m"',
         ("a.mcap",),

@@ -30,8 +30,8 @@ _NANOSECONDS = re.compile(r"^[^.]*(nano|nsec)[^.]*$", re.IGNORECASE)
 _GIGA = 10**9
 _WHOLE = r"^[+-]?\d{1,19}$"
 _NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
-_DATE = r"^\d{4}-\d\d-\d\d[T ]\d\d(:\d\d){1,2}([.,]\d{1,9})?([zZ]|[+-]\d\d(:?\d\d)?)?$"  # ISO 8601
-_ZONE = r"\d(?:[zZ]|[+-]\d\d(:?\d\d)?)$"  # behind a time
+_DATE = r"^\d{4}-\d\d-\d\d[T ]\d\d(:\d\d){1,2}([.,]\d{1,9})?([Zz]|[+-]\d\d(:?\d\d)?)?$"  # ISO 8601
+_ZONE = r"\d([Zz]|[+-]\d\d(:?\d\d)?)$"  # behind a time
 BLANK = ("", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None")
 _NUMBERS = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
 _NEITHER_NUMBERS_NOR_TEXT = (pa.types.is_boolean, pa.types.is_temporal, pa.types.is_nested, pa.types.is_union)
@@ -185,6 +185,10 @@ class Table:
         column, note = self._numeric(name)
         if pa.types.is_floating(column.type):
             column = pc.if_else(pc.is_finite(column), column, pa.scalar(None, column.type))
+            if pc.any(pc.not_equal(column, pc.round(column))).as_py():
+                raise RunError(
+                    f"{self.path}: column '{shortened(name)}' is beside another of one time: it must be whole"
+                )
         return _filled(self._cast(name, column, pa.int64()), NO_STAMP), note
 
     def _of_clock(self, name: str, column: pa.ChunkedArray) -> TimeArray:
@@ -200,7 +204,7 @@ class Table:
         """
         if not _is_any(column.type, _TEXTS):
             return None
-        text = pc.utf8_trim_whitespace(column)
+        text = pc.utf8_upper(pc.utf8_trim_whitespace(column))
         dated = pc.match_substring_regex(text, _DATE)
         if not pc.any(dated).as_py():
             return None
@@ -353,7 +357,7 @@ def _element(column: pa.ChunkedArray, key: str, names: pa.ChunkedArray | None, l
         place = int(key) if len(key) < 10 else _GIGA
     elif names is None or not _is_any(names.type, _LISTS) or not _is_any(names.type.value_type, _TEXTS):
         raise RunError(
-            f"{label}: no list '{NAMES}' of text beside it that says which element is '{shortened(key)}'; by their place"
+            f"{label}: no list '{NAMES}' of text beside it says which element is '{shortened(key)}'; by their place"
             " they are 0, 1, 2"
         )
     else:
