@@ -30,8 +30,8 @@ _NANOSECONDS = re.compile(r"^[^.]*(nano|nsec)[^.]*$", re.IGNORECASE)
 _GIGA = 10**9
 _WHOLE = r"^[+-]?\d{1,19}$"
 _NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
-_DATE = r"^\d{4}-\d\d-\d\d[T ]\d\d(:\d\d){1,2}([.,]\d{1,9})?([zZ]|[+-]\d\d(:?\d\d)?)?$"  # ISO 8601
-_ZONE = r"\d(?:[zZ]|[+-]\d\d(:?\d\d)?)$"  # behind a time
+_DATE = r"^\d{4}-\d\d-\d\d[T ]\d\d(:\d\d){1,2}([.,]\d{1,9})?([Zz]|[+-]\d\d(:?\d\d)?)?$"  # ISO 8601
+_ZONE = r"\d([Zz]|[+-]\d\d(:?\d\d)?)$"  # behind a time
 BLANK = ("", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None")
 _NUMBERS = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
 _NEITHER_NUMBERS_NOR_TEXT = (pa.types.is_boolean, pa.types.is_temporal, pa.types.is_nested, pa.types.is_union)
@@ -68,7 +68,7 @@ class Table:
             RunError: The column is absent, its name ends in no unit of a length or an angle, or it holds something else
                 than numbers.
         """
-        self.column(name)
+        self._plain_column(name)
         unit = unit or self._ending(name, (*units.LENGTHS, *units.ANGLES), "mm")
         values, note = self.plain(name)
         return units.si_of(values, unit), note
@@ -122,6 +122,7 @@ class Table:
         dates = self._dates(name, column)
         if dates is not None:
             return self._within_reach(name, self._of_clock(name, dates[0])), dates[1]
+        self._plain_column(name)
         exponent = 9 - 3 * units.TIMES.index(unit or self._ending(name, units.TIMES, "s"))
         return self._of_numbers(name, 10**exponent)
 
@@ -184,6 +185,10 @@ class Table:
         column, note = self._numeric(name)
         if pa.types.is_floating(column.type):
             column = pc.if_else(pc.is_finite(column), column, pa.scalar(None, column.type))
+            if pc.any(pc.not_equal(column, pc.round(column))).as_py():
+                raise RunError(
+                    f"{self.path}: column '{shortened(name)}' is beside another of one time: it must be whole"
+                )
         return _filled(self._cast(name, column, pa.int64()), NO_STAMP), note
 
     def _of_clock(self, name: str, column: pa.ChunkedArray) -> TimeArray:
@@ -199,7 +204,7 @@ class Table:
         """
         if not _is_any(column.type, _TEXTS):
             return None
-        text = pc.utf8_trim_whitespace(column)
+        text = pc.utf8_upper(pc.utf8_trim_whitespace(column))
         dated = pc.match_substring_regex(text, _DATE)
         if not pc.any(dated).as_py():
             return None
@@ -245,13 +250,18 @@ class Table:
             )
         return unit
 
-    def _numeric(self, name: str) -> tuple[pa.ChunkedArray, str | None]:
-        """A column of numbers, or of text that is numbers; cells of other text are null, and counted in a note."""
+    def _plain_column(self, name: str) -> pa.ChunkedArray:
+        """A column of numbers or text."""
         column = self.column(name)
-        if _is_any(column.type, _NUMBERS):
-            return column, None
         if _is_any(column.type, _NEITHER_NUMBERS_NOR_TEXT):
             raise RunError(f"{self.path}: column '{shortened(name)}' holds {_in_words(column.type)}, not numbers")
+        return column
+
+    def _numeric(self, name: str) -> tuple[pa.ChunkedArray, str | None]:
+        """A column of numbers, or of text that is numbers; cells of other text are null, and counted in a note."""
+        column = self._plain_column(name)
+        if _is_any(column.type, _NUMBERS):
+            return column, None
         column = self._cast(name, column, pa.string())
         trimmed = pc.utf8_trim_whitespace(column)
         numeric = pc.match_substring_regex(trimmed, _NUMBER)
@@ -346,7 +356,10 @@ def _element(column: pa.ChunkedArray, key: str, names: pa.ChunkedArray | None, l
     if key.isascii() and key.isdigit():
         place = int(key) if len(key) < 10 else _GIGA
     elif names is None or not _is_any(names.type, _LISTS) or not _is_any(names.type.value_type, _TEXTS):
-        raise RunError(f"{label}: no list '{NAMES}' of text beside it that says which element is '{shortened(key)}'")
+        raise RunError(
+            f"{label}: no list '{NAMES}' of text beside it says which element is '{shortened(key)}'; by their place"
+            " they are 0, 1, 2"
+        )
     else:
         place = _places(names, key)
     there = (place >= 0) & (place < lengths)

@@ -14,6 +14,8 @@ from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of
 from .columns import leaf
 from .frames import Frame
 
+_MOST = 2**63  # more than a whole number of a column can be
+
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A column or field path, and its unit (``mm``) where its name does not end in it."""
@@ -154,6 +156,7 @@ def _columns(given: Any, where: str, path: str) -> list[Any]:
             f" {axis} = {{ column = 'pose.position.x', unit = 'm' }}"
         )
     for one in columns:
+        toml.check(one, Column, where, path)
         _check_unit(one, (*LENGTHS, *ANGLES), where, path)
     return columns
 
@@ -178,7 +181,10 @@ def _time(given: Any, where: str, path: str) -> dict[str, Any]:
 def _where(given: Any, where: str, path: str) -> dict[str, Any]:
     """Values by column, in the unit of the column: they are compared with what is in the file."""
     values = cast(dict[str, Any], given if isinstance(given, dict) else {})
-    if not values or not all(isinstance(value, bool | int | float | str) for value in values.values()):
+    known = (
+        isinstance(value, str) or (isinstance(value, int | float) and abs(value) < _MOST) for value in values.values()
+    )
+    if not values or not all(known):
         raise ConfigError(
             f"{where}: {path}: expected a number, a text or a boolean for each column, as in {{ episode_index = 3 }};"
             " a field path is quoted, as in { 'meta.episode' = 3 }"

@@ -319,31 +319,35 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
 
 def _read_manifest(path: Path) -> Run:
     listed = manifest.load(path)
-    notes, units = list[str](), dict(listed.command.kinds)
+    scored, notes, units = listed.reference, list[str](), dict(listed.command.kinds)
+    entries = {"command": listed.command, **{f"sensor {name}": entry for name, entry in listed.sensors.items()}}
+    if scored is not None:
+        entries["reference"] = scored
     fields, read = defaultdict[tuple[str, ...], list[str]](list), dict[tuple[str, ...], tables.Table]()
-    scored = listed.reference
-    for entry in (listed.command, *listed.sensors.values(), *([] if scored is None else [scored])):
+    for entry in entries.values():
         fields[entry.rows] += entry.fields
+    naive, zoned = list[str](), list[str]()
 
-    def source(entry: manifest.SourceEntry) -> Source:
+    def source(name: str) -> Source:
+        entry = entries[name]
         if entry.rows not in read:
-            read[entry.rows] = table = tables.read(
-                path.parent / entry.file,
-                growing=True,
-                fields=fields[entry.rows],
-                where=entry.where,
-                topic=entry.topic,
-                entity=entry.entity,
-            )
+            file, chosen = path.parent / entry.file, {"topic": entry.topic, "entity": entry.entity}
+            table = tables.read(file, growing=True, fields=fields[entry.rows], where=entry.where, **chosen)
             notes.extend(note for note in table.notes if note not in notes)
+            read[entry.rows] = table
+        known = read[entry.rows].zoned(entry.time.column)
+        if known is not None:
+            (zoned if known else naive).append(name)
         return _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units)
 
-    command = source(listed.command)
-    sensors = {name: source(entry) for name, entry in listed.sensors.items()}
-    reference = None if scored is None else source(scored)
+    command = source("command")
+    sensors = {name: source(f"sensor {name}") for name in listed.sensors}
+    reference = None if scored is None else source("reference")
     if reference is not None and scored is not None:
         of_kind = {"length": scored.sd, "angle": scored.angular_sd}
         reference = replace(reference, sd={axis: of_kind[units[axis]] for axis in reference.values})
+    if naive and zoned:
+        notes.append(f"{naive[0]}: dates without a time zone, beside {zoned[0]} with one: taken as UTC")
     name, start, clock = listed.name or path.parent.resolve().name, listed.command.start, listed.command.clock
     return Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
 

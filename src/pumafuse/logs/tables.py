@@ -205,9 +205,7 @@ def _like(path: Path, name: str, kind: pa.DataType, value: bool | float | str) -
     if not isinstance(value, str | bool) and numeric:
         # In the column's own precision: 0.1 is found among float32, too.
         return pa.scalar(value, kind) if pa.types.is_floating(kind) else pa.scalar(value)
-    raise RunError(
-        f"{path}: where: column '{shortened(name)}' holds {shortened(str(kind))}, never {shortened(repr(value))}"
-    )
+    raise RunError(f"{path}: where: column '{shortened(name)}' holds {shortened(str(kind))}, never {_written(value)}")
 
 
 def _chosen(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.Table:
@@ -236,7 +234,7 @@ def _no_row(path: Path, parts: Iterable[Any], where: Where) -> RunError:
             found = {*values, *pc.unique(find(columns, name, str(path)).drop_null()).to_pylist()}
             known = sorted(found)
             held[name] = known[:_SOME] if isinstance(where[name], str) else known[:1] + known[1:][-1:]
-    wanted = " and ".join(f"{shortened(name)} = {shortened(repr(value))}" for name, value in where.items())
+    wanted = " and ".join(f"{shortened(name)} = {_written(value)}" for name, value in where.items())
     ranges = ", ".join(f"{shortened(name)} {_held(values)}" for name, values in held.items())
     return RunError(f"{path}: no row has {wanted}; in this file {ranges}")
 
@@ -246,8 +244,16 @@ def _held(values: Sequence[Any]) -> str:
     if not values:
         return "has no value"
     if isinstance(values[0], str):
-        return f"is {', '.join(shortened(repr(value)) for value in values)}{', …' if len(values) == _SOME else ''}"
-    return f"is {values[0]}" if len(values) == 1 else f"goes from {values[0]} to {values[-1]}"
+        return f"is {', '.join(map(_written, values))}{', …' if len(values) == _SOME else ''}"
+    first, last = _written(values[0]), _written(values[-1])
+    return f"is {first}" if first == last else f"goes from {first} to {last}"
+
+
+def _written(value: Any) -> str:
+    """A value as it is written in run.toml."""
+    return shortened(
+        str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, str) else str(value)
+    )
 
 
 def _named(path: Path, table: pa.Table) -> dict[str, pa.ChunkedArray]:
