@@ -187,10 +187,11 @@ def ros2(path: Path, samples: list[Sample], plugin: str, mode: str = "") -> None
             writer.write(open_[sample.topic], sample.logged, data)
 
 
-def ros1(path: Path, samples: list[Sample], compression: str = "") -> None:
+def ros1(path: Path, samples: list[Sample], compression: str = "", chunk: int = 1 << 20) -> None:
     """A ROS 1 bag, by rosbags."""
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = rosbag1.Writer(path)
+    writer.chunk_threshold = chunk
     if compression:
         writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
     with writer:
@@ -312,7 +313,7 @@ KINDS = {
     "mcap-folder": Kind("drive", partial(ros2, plugin="MCAP"), ROS),
     "bag": Kind("drive.bag", ros1, ROS),
     "bag-bz2": Kind("drive.bag", partial(ros1, compression="BZ2"), ROS),
-    "bag-lz4": Kind("drive.bag", partial(ros1, compression="LZ4"), ROS),
+    "bag-lz4": Kind("drive.bag", partial(ros1, compression="LZ4", chunk=5000), ROS),
     "rrd": Kind("drive.rrd", rrd, RRD),
 }
 

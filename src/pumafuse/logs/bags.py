@@ -416,6 +416,16 @@ def _ros1_head(data: bytes) -> Any:
     return Header.read(BytesIO(struct.pack("<L", len(data)) + data))
 
 
+def _has_lost_pages(path: Path) -> bool:
+    """Whether a database is shorter than its head says, which SQLite itself does not always notice."""
+    with path.open("rb") as file:
+        head = file.read(32)
+    if len(head) < 32:
+        return True
+    (size,), (pages,) = struct.unpack_from(">H", head, 16), struct.unpack_from(">I", head, 28)
+    return path.stat().st_size < (65536 if size == 1 else size) * pages  # sqlite.org/fileformat.html, 1.3
+
+
 def _sqlite_records(path: Path, topic: str | None, faults: Faults, seen: set[Channel]) -> Iterator[Record]:
     import sqlite3
 
@@ -425,10 +435,13 @@ def _sqlite_records(path: Path, topic: str | None, faults: Faults, seen: set[Cha
             f"{path}: its last messages are still in {journal.name}; put them in first:"
             f' sqlite3 {path.name} "pragma wal_checkpoint(truncate)"'
         )
+    faults.cut = faults.cut or _has_lost_pages(path)
     address = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
     with closing(sqlite3.connect(address, uri=True)) as database:
         database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST)
         database.execute("PRAGMA trusted_schema = OFF")
+        if faults.cut:  # what SQLite's own .recover does to read what is there; nothing is written
+            database.execute("PRAGMA writable_schema = ON")
         tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not tables.issuperset(("topics", "messages")):
             raise ValueError("not a bag of ROS 2: it has no tables 'topics' and 'messages'")

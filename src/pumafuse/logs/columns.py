@@ -8,7 +8,7 @@ in ROS's ``sensor_msgs/JointState``. A cell that is empty, no number, or not the
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -315,14 +315,14 @@ def find(columns: Columns, path: str, where: str) -> pa.ChunkedArray:
     Raises:
         RunError: It leads nowhere; says where it ends and what is there.
     """
-    name = _longest(columns, path)
+    name = longest(columns, path)
     if name is None:
         raise UnknownNameError(where, "column", path, columns)
     label = f"{where}: column '{shortened(path)}'"
     return _inside(columns[name], path[len(name) :], columns.get(NAMES), label)
 
 
-def _longest(columns: Columns, path: str) -> str | None:
+def longest(columns: Iterable[str], path: str) -> str | None:
     """The longest name that is the path, or that the path goes on from."""
     fits = (name for name in columns if path.startswith(name) and path[len(name) : len(name) + 1] in ("", ".", "["))
     return max(fits, key=len, default=None)
@@ -342,7 +342,7 @@ def _inside(column: pa.ChunkedArray, rest: str, names: pa.ChunkedArray | None, l
     if not pa.types.is_struct(column.type):
         raise RunError(f"{label}: no field '{shortened(rest[1:])}' in {_in_words(column.type)}")
     fields = {field.name: pc.struct_field(column, [place]) for place, field in enumerate(column.type)}
-    name = _longest(fields, rest[1:])
+    name = longest(fields, rest[1:])
     if name is None:
         raise UnknownNameError(label, "field", rest[1:], fields)
     return _inside(fields[name], rest[1 + len(name) :], fields.get(NAMES), label)

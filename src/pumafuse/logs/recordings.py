@@ -130,9 +130,9 @@ def _unknown(path: Path, key: str, name: str, known: Mapping[str, str], notes: S
     if name in known:
         return RunError(f"{path}: {key} '{name}' has nothing that can be read{why}")
     guess, near, _ = suggestion(name, known).partition("?")
-    asked = f"no {key} '{name}'{f'; {guess}?' if near else ''}" if name else f"the key '{key}' is missing"
+    asked = f"no {key} '{name}'" if name else f"the key '{key}' is missing"
     listed = ", ".join(f"{one} ({kind})" for one, kind in known.items())
-    return RunError(f"{path}: {asked}; it has: {listed}{why}")
+    return RunError(f"{path}: {asked}; {f'{guess}? ' if near else ''}it has: {listed}{why}")
 
 
 def _wanted(name: str, fields: Sequence[str] | None) -> bool:
@@ -232,6 +232,8 @@ def _topics(path: Path) -> tuple[Topic, ...]:
         low, high = ends.get(channel, (time, time))
         ends[channel] = min(low, time), max(high, time)
         found[channel] += 1
+    if not seen:
+        raise _unknown(path, "topic", "", {}, faults.notes(path.name))
     return tuple(
         Topic(one.topic, one.type, found[one], *ends.get(one, (None, None)), _numbers_in(first.get(one)))
         for one in sorted(seen)
@@ -290,7 +292,9 @@ def _chunks(path: Path, notes: list[str]) -> Iterator[tuple[str, pa.RecordBatch]
     reader, recording = _opened(path, notes)
     for chunk in reader.stream(store=recording):
         if not chunk.is_static:
-            yield chunk.entity_path, chunk.to_record_batch()
+            batch = chunk.to_record_batch()
+            names = batch.schema.names  # a component may be called what a timeline is: it cannot be had
+            yield chunk.entity_path, batch.select([names.index(name) for name in dict.fromkeys(names)])
 
 
 def _read_entity(path: Path, entity: str, fields: Sequence[str] | None) -> Table:

@@ -17,8 +17,8 @@ import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 import pyarrow.parquet as papq
 
-from ..errors import RunError, counted, shortened
-from .columns import BLANK, Table, find, prefixes
+from ..errors import RunError, UnknownNameError, counted, shortened
+from .columns import BLANK, Table, find, longest, prefixes
 
 Where: TypeAlias = Mapping[str, bool | int | float | str]  # rows in which each of these columns has this value
 
@@ -110,7 +110,11 @@ def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None
         key, name, wrong, other = wrong, other, key, name
     if other:
         raise RunError(f"{path}: of such a file the key is '{key}', not '{wrong}'")
-    found = recordings.read(path, name, None if fields is None else prefixes([*fields, *where]))
+    asked = None if fields is None else [*fields, *where]
+    found = recordings.read(path, name, None if asked is None else prefixes(asked))
+    for one in asked or ():
+        if longest(found.names, one) is None:
+            raise UnknownNameError(str(path), "column", one, found.names)
     if not where:
         return found
     whole = pa.table(dict(found.columns))
