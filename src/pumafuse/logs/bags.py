@@ -417,13 +417,23 @@ def _ros1_head(data: bytes) -> Any:
 
 
 def _has_lost_pages(path: Path) -> bool:
-    """Whether a database is shorter than its head says, which SQLite itself does not always notice."""
+    """Whether a database is shorter than its head says, which SQLite itself does not always notice.
+
+    Raises:
+        RunError: It ends within a page: SQLite would take zeros for the rest of it.
+    """
     with path.open("rb") as file:
         head = file.read(32)
     if len(head) < 32:
-        return True
-    (size,), (pages,) = struct.unpack_from(">H", head, 16), struct.unpack_from(">I", head, 28)
-    return path.stat().st_size < (65536 if size == 1 else size) * pages  # sqlite.org/fileformat.html, 1.3
+        raise ValueError("not a bag of ROS 2: no database")
+    (page,), (pages,) = struct.unpack_from(">H", head, 16), struct.unpack_from(">I", head, 28)
+    page, length = 65536 if page == 1 else page, path.stat().st_size  # sqlite.org/fileformat.html, 1.3
+    if page and length % page:
+        raise RunError(
+            f"{path}: the recording was cut off within a page; what is there can be read from a copy of whole pages:"
+            f" head -c {length - length % page} {path.name} > saved.db3"
+        )
+    return length < page * pages
 
 
 def _sqlite_records(path: Path, topic: str | None, faults: Faults, seen: set[Channel]) -> Iterator[Record]:
