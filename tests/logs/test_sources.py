@@ -337,6 +337,7 @@ def episodes(**more: object) -> dict[str, Any]:
     group = np.arange(ROWS) // 50  # 0 to 9
     meta = pa.StructArray.from_arrays([pa.array(group)], ["run"])
     columns = {"t_ns": STAMP, "x_m": X, "group": group, "even": pa.array(group % 2 == 0), "meta": meta}
+    columns["tags"] = pa.array([[0, one] if one > 2 else [] for one in group.tolist()])
     return {**columns, "name": [f"run{one}" for one in group], "part": (group / 10).astype(np.float32), **more}
 
 
@@ -350,6 +351,7 @@ AXIS = 'time = "t_ns"\nx = "x_m"'
         ("group = 3.0", (150, 200)),
         ("name = 'run3'", (150, 200)),
         ("'meta.run' = 3", (150, 200)),
+        ("'tags[1]' = 3", (150, 200)),
         ("part = 0.3", (150, 200)),
         ("group = 4, even = true", (200, 250)),
     ],
@@ -359,8 +361,8 @@ def test_where_chooses_rows(tmp_path: Path, where: str, rows: tuple[int, int], n
     """Equality on one column or more, of numbers, texts and booleans."""
     columns = episodes()
     if name == "log.csv":
-        del columns["meta"]
-        where = where.replace("'meta.run'", "group")
+        del columns["meta"], columns["tags"]
+        where = where.replace("'meta.run'", "group").replace("'tags[1]'", "group")
     run = read(tmp_path, f"{AXIS}\nwhere = {{ {where} }}", columns, name)
     same(run.command, STAMP[slice(*rows)], x=X[slice(*rows)])
 
@@ -401,7 +403,7 @@ def test_where_that_leaves_no_row_is_refused_with_what_there_is(
 ) -> None:
     """One line with the range of the column, some of its values, or its type."""
     columns = episodes()
-    del columns["meta"]
+    del columns["meta"], columns["tags"]
     text = refusal(lambda: read(tmp_path, f"{AXIS}\nwhere = {{ {where} }}", columns, name))
     assert all(words in text for words in said), text
 

@@ -171,7 +171,7 @@ class Table:
         """Stamps of whole seconds and nanoseconds apart."""
         (seconds, note), (rest, other) = self._whole(name), self._whole(nanoseconds)
         missing = (seconds == NO_STAMP) | (rest == NO_STAMP)
-        self._refuse_beyond(name, ~missing & (np.abs(seconds / REACH_NS) >= 1 / _GIGA))
+        self._refuse_beyond(name, ~missing & (np.abs(seconds * 1e9) >= REACH_NS))
         wrong = np.flatnonzero(~missing & ((rest < 0) | (rest >= _GIGA)))
         if len(wrong):
             raise RunError(
@@ -302,7 +302,7 @@ def prefixes(paths: Sequence[str]) -> list[str]:
     return list(found)
 
 
-def find(columns: Columns, path: str, where: str) -> pa.ChunkedArray:
+def find(columns: Columns, path: str, where: str, *, part: bool = False) -> pa.ChunkedArray:
     """What a name or a field path leads to among columns, nothing converted.
 
     The longest name that fits wins: flat tables have columns that are called ``a.b`` or ``a[0]``.
@@ -311,6 +311,7 @@ def find(columns: Columns, path: str, where: str) -> pa.ChunkedArray:
         columns: By name.
         path: The name or field path.
         where: The file, for errors.
+        part: Whether there are more rows than these: then these alone need not have the element of a list.
 
     Raises:
         RunError: It leads nowhere; says where it ends and what is there.
@@ -319,7 +320,7 @@ def find(columns: Columns, path: str, where: str) -> pa.ChunkedArray:
     if name is None:
         raise UnknownNameError(where, "column", path, columns)
     label = f"{where}: column '{shortened(path)}'"
-    return _inside(columns[name], path[len(name) :], columns.get(NAMES), label)
+    return _inside(columns[name], path[len(name) :], columns.get(NAMES), label, part)
 
 
 def longest(columns: Iterable[str], path: str) -> str | None:
@@ -328,7 +329,9 @@ def longest(columns: Iterable[str], path: str) -> str | None:
     return max(fits, key=len, default=None)
 
 
-def _inside(column: pa.ChunkedArray, rest: str, names: pa.ChunkedArray | None, label: str) -> pa.ChunkedArray:
+def _inside(
+    column: pa.ChunkedArray, rest: str, names: pa.ChunkedArray | None, label: str, part: bool
+) -> pa.ChunkedArray:
     """What the rest of a field path, ``[2].x``, leads to in a column; ``names`` is the list of names beside it."""
     if not rest:
         return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
@@ -336,7 +339,7 @@ def _inside(column: pa.ChunkedArray, rest: str, names: pa.ChunkedArray | None, l
         key, closed, rest = rest[1:].partition("]")
         if not closed:
             raise RunError(f"{label}: '[' without ']'; an element is written position[2] or position[elbow]")
-        return _inside(_element(column, key, names, label), rest, None, label)
+        return _inside(_element(column, key, names, label, part), rest, None, label, part)
     if not rest.startswith("."):
         raise RunError(f"{label}: '.' or '[' is missing before '{shortened(rest)}'")
     if not pa.types.is_struct(column.type):
@@ -345,10 +348,12 @@ def _inside(column: pa.ChunkedArray, rest: str, names: pa.ChunkedArray | None, l
     name = longest(fields, rest[1:])
     if name is None:
         raise UnknownNameError(label, "field", rest[1:], fields)
-    return _inside(fields[name], rest[1 + len(name) :], fields.get(NAMES), label)
+    return _inside(fields[name], rest[1 + len(name) :], fields.get(NAMES), label, part)
 
 
-def _element(column: pa.ChunkedArray, key: str, names: pa.ChunkedArray | None, label: str) -> pa.ChunkedArray:
+def _element(
+    column: pa.ChunkedArray, key: str, names: pa.ChunkedArray | None, label: str, part: bool
+) -> pa.ChunkedArray:
     """An element of the list in each row, by its place or its name; null in a row that has none."""
     if not _is_any(column.type, _LISTS):
         raise RunError(f"{label}: no element '{shortened(key)}' in {_in_words(column.type)}")
@@ -363,7 +368,7 @@ def _element(column: pa.ChunkedArray, key: str, names: pa.ChunkedArray | None, l
     else:
         place = _places(names, key)
     there = (place >= 0) & (place < lengths)
-    if len(there) and not there.any():
+    if len(there) and not there.any() and not part:
         what = f"at most {lengths.max()} elements" if names is None or isinstance(place, int) else _some_of(names)
         raise RunError(f"{label}: no row has an element '{shortened(key)}'; they have {what}")
     return pa.chunked_array([elements.take(pa.array(starts + place, mask=~there))])

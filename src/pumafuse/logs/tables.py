@@ -69,11 +69,8 @@ def read(
                 content = stream.read()
             if not content:
                 raise RunError(f"{path}: the file is empty")
-            table, notes = _parsed(path, content, growing)
-            whole, conditions = table, _conditions(path, table, where)
-            table, names = _chosen(path, whole, conditions), whole.column_names
-            if where and not table.num_rows:
-                raise _no_row(path, [whole], where)
+            whole, notes = _parsed(path, content, growing)
+            table, names = _only(path, whole, where), whole.column_names
     except UnicodeDecodeError:
         raise RunError(f"{path}: not a table that can be read: its text is not UTF-8") from None
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
@@ -189,6 +186,18 @@ def _parts(file: papq.ParquetFile, columns: list[str] | None, groups: list[int] 
         yield pa.Table.from_batches([batch])
 
 
+def _only(path: Path, whole: pa.Table, where: Where) -> pa.Table:
+    """The rows of a table that ``where`` chooses.
+
+    Raises:
+        RunError: There is none.
+    """
+    chosen = _chosen(path, whole, _conditions(path, whole, where))
+    if where and not chosen.num_rows:
+        raise _no_row(path, [whole], where)
+    return chosen
+
+
 def _conditions(path: Path, table: pa.Table, where: Where) -> dict[str, pa.Scalar]:
     """What the columns of ``where`` are compared with.
 
@@ -215,7 +224,7 @@ def _like(path: Path, name: str, kind: pa.DataType, value: bool | float | str) -
 def _chosen(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.Table:
     """The rows of a table that meet all conditions; what is null meets none."""
     columns = _named(path, rows)
-    met = [pc.equal(find(columns, name, str(path)), value) for name, value in conditions.items()]
+    met = [pc.equal(find(columns, name, str(path), part=True), value) for name, value in conditions.items()]
     return rows.filter(reduce(pc.and_, met)) if met else rows
 
 
@@ -235,7 +244,7 @@ def _no_row(path: Path, parts: Iterable[Any], where: Where) -> RunError:
     for part in parts:
         columns = _named(path, part)
         for name, values in held.items():
-            found = {*values, *pc.unique(find(columns, name, str(path)).drop_null()).to_pylist()}
+            found = {*values, *pc.unique(find(columns, name, str(path), part=True).drop_null()).to_pylist()}
             known = sorted(found)
             held[name] = known[:_SOME] if isinstance(where[name], str) else known[:1] + known[1:][-1:]
     wanted = " and ".join(f"{shortened(name)} = {_written(value)}" for name, value in where.items())
