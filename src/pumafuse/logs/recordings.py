@@ -25,6 +25,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from ..errors import RunError, suggestion
+from ..units import TIMES
 from . import bags
 from .bags import Channel, Faults, Message, Record, reason
 from .columns import Table
@@ -59,6 +60,25 @@ class Topic:
     first: int | None
     last: int | None
     fields: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The Rerun recording that a run was read from.
+
+    Attributes:
+        application: Its application id.
+        id: Its recording id.
+        timeline: The timeline of the run's stamps; empty: they are on none.
+        kind: What it holds: ``timestamp[ns]``, ``duration[ns]``, or whole numbers (``int64``).
+        unit: What one of these is [ns].
+    """
+
+    application: str
+    id: str
+    timeline: str
+    kind: str
+    unit: int
 
 
 def read(path: Path, name: str, fields: Sequence[str] | None = None) -> Table:
@@ -253,15 +273,29 @@ def _numbers_in(record: Record | None) -> tuple[str, ...]:
 # Entities.
 
 
-def identity(path: Path) -> tuple[str, str]:
-    """Application id and recording id of a Rerun recording.
+def recording_of(path: Path, entity: str, time: str, unit: str) -> Recording:
+    """What a result needs to open on top of the Rerun recording that it was made from.
+
+    Args:
+        path: The file.
+        entity: The entity whose stamps are those of the run.
+        time: What they are called.
+        unit: The ending of their unit, if they are numbers.
 
     Raises:
-        RunError: It is none.
+        RunError: It is no recording.
     """
     with _one_line(path):
-        _, recording = _opened(path, [])
-        return recording.application_id, recording.recording_id
+        _, found = _opened(path, [])
+        batch = next(batch for name, batch in _chunks(path, []) if name == _place(entity))
+        is_timeline = time in batch.schema.names and time not in _components(batch)
+        kind = batch.schema.field(time).type if is_timeline else pa.null()
+    count = 10 ** (9 - 3 * TIMES.index(unit)) if pa.types.is_integer(kind) else 1
+    return Recording(found.application_id, found.recording_id, time if is_timeline else "", str(kind), count)
+
+
+def _place(entity: str) -> str:
+    return f"/{entity.strip('/')}"
 
 
 def _opened(path: Path, notes: list[str]) -> tuple[RrdReader, StoreEntry]:
@@ -298,7 +332,7 @@ def _chunks(path: Path, notes: list[str]) -> Iterator[tuple[str, pa.RecordBatch]
 
 
 def _read_entity(path: Path, entity: str, fields: Sequence[str] | None) -> Table:
-    place, notes, known = f"/{entity.strip('/')}", list[str](), dict[str, set[str]]()
+    place, notes, known = _place(entity), list[str](), dict[str, set[str]]()
 
     def parts() -> Iterator[pa.Table]:
         for name, batch in _chunks(path, notes):

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +19,12 @@ import numpy.typing as npt
 from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError, counted
 from ..model.arm import CANONICAL_AXES
-from ..units import AN, Kind, nanoseconds
+from ..units import AN, Kind, ending, nanoseconds
 from . import manifest, tables
 from .frames import CARTESIAN, Frame
+
+if TYPE_CHECKING:
+    from .recordings import Recording
 
 Clock = Literal["stamps", "regular"]
 
@@ -84,6 +87,7 @@ class Run:
         frame: The arm's axes in the log's x, y, z, for sources that give these.
         kinds: Of what kind the axes are, where the units of a log say so.
         notes: What was wrong with the files, a sentence each.
+        recording: The Rerun recording that it was read from, if it was one.
         without_strays: Whether stray stamps are removed already, see :func:`pumafuse.logs.clock.without_strays`.
         since: Where the part to use begins [s after the first command], see :meth:`between`; None: with the log.
         until: Where it ends, likewise.
@@ -98,6 +102,7 @@ class Run:
     frame: Frame | None = None
     kinds: Mapping[str, Kind] = field(default_factory=dict[str, Kind])
     notes: tuple[str, ...] = ()
+    recording: Recording | None = None
     without_strays: bool = False
     since: float | None = None
     until: float | None = None
@@ -352,7 +357,19 @@ def _read_manifest(path: Path) -> Run:
     if naive and zoned:
         notes.append(f"{naive[0]}: dates without a time zone, beside {zoned[0]} with one: taken as UTC")
     name, start, clock = listed.name or path.parent.resolve().name, listed.command.start, listed.command.clock
-    return Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
+    run = Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
+    return replace(run, recording=_recording(path.parent, entries.values()))
+
+
+def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recording | None:
+    """The first of the Rerun recordings that sources are in."""
+    found = next((entry for entry in entries if entry.entity), None)
+    if found is None:
+        return None
+    from .recordings import recording_of
+
+    time = found.time
+    return recording_of(folder / found.file, found.entity, time.column, time.ending or ending(time.column) or "")
 
 
 def _read_single(path: Path) -> Run:
