@@ -284,13 +284,51 @@ def rrd(path: Path, samples: list[Sample], *, recording: str = "take-7", timelin
         for topic in TYPES:
             mine = [sample for sample in samples if sample.topic == topic]
             times = np.array([sample.logged if topic == "/level" else sample.stamp for sample in mine])
-            if timeline == "duration":
-                column = rr.TimeColumn("robot_time", duration=(times - START_NS).astype("m8[ns]"))
-            else:
-                column = rr.TimeColumn("robot_time", timestamp=times.astype("M8[ns]"))
+            since = times - START_NS
+            column = {
+                "timestamp": rr.TimeColumn("robot_time", timestamp=times.astype("M8[ns]")),
+                "duration": rr.TimeColumn("robot_time", duration=since.astype("m8[ns]")),
+                "sequence": rr.TimeColumn("robot_time", sequence=since),
+            }[timeline]
             values = np.array([sample.numbers for sample in mine])
             parts = rr.Scalars.columns(scalars=values.ravel()).partition([values.shape[1]] * len(values))
             rr.send_columns(topic, [column], parts, recording=stream)
+
+
+ARM = """
+name = "lift"
+update_period_ms = 20.0
+delay_ms = 30.0
+""" + "".join(
+    f"""
+[axes.{axis}]
+plant = "first-order"
+time_constant_ms = 40.0
+"""
+    for axis in "xyz"
+)
+FUSION = """
+arm = "arm.toml"
+[start]
+offset_sd_mm = 2.0
+[process]
+input_noise_mm_rtHz = 0.05
+drift_mm_rts = 0.2
+[sensors.camera]
+sd_mm = 1.0
+[sensors.encoder]
+sd_mm = 1.0
+[sensors.level]
+sd_mm = 2.0
+latency_ms = 4.0
+"""
+
+
+def configured(folder: Path) -> Path:
+    """The ``fusion.toml``, and its arm beside it, that fuses the motion."""
+    (folder / "arm.toml").write_text(ARM)
+    (folder / "fusion.toml").write_text(FUSION)
+    return folder / "fusion.toml"
 
 
 @dataclass(frozen=True)

@@ -26,41 +26,11 @@ from pumafuse.errors import PumafuseError, RunError
 from pumafuse.logs import recordings, tables
 from refusals import one_line
 
-ARM = """
-name = "lift"
-update_period_ms = 20.0
-delay_ms = 30.0
-""" + "".join(
-    f"""
-[axes.{axis}]
-plant = "first-order"
-time_constant_ms = 40.0
-"""
-    for axis in "xyz"
-)
-FUSION = """
-arm = "arm.toml"
-[start]
-offset_sd_mm = 2.0
-[process]
-input_noise_mm_rtHz = 0.05
-drift_mm_rts = 0.2
-[sensors.camera]
-sd_mm = 1.0
-[sensors.encoder]
-sd_mm = 1.0
-[sensors.level]
-sd_mm = 2.0
-latency_ms = 4.0
-"""
-
 
 @pytest.fixture(scope="module")
 def config(tmp_path_factory: pytest.TempPathFactory) -> pf.FusionConfig:
     folder = tmp_path_factory.mktemp("config")
-    (folder / "arm.toml").write_text(ARM)
-    (folder / "fusion.toml").write_text(FUSION)
-    return pf.FusionConfig.load(folder / "fusion.toml")
+    return pf.FusionConfig.load(bag_files.configured(folder))
 
 
 @pytest.fixture(scope="module")
