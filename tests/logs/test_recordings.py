@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sqlite3
 import struct
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -225,12 +227,18 @@ def test_bytes_that_are_wrong_are_never_more_than_a_line(kind: str, seed: int, t
         assert mine.issuperset(table.columns["data"].to_pylist())
 
 
-def _mcap(path: Path, *records: Any, definition: str = "float64 data\n", language: str = "ros2msg") -> Path:
+def _mcap(
+    path: Path,
+    *records: Any,
+    definition: str = "float64 data\n",
+    language: str = "ros2msg",
+    encoding: str = "cdr",
+) -> Path:
     """An MCAP file with a channel and records, as no writer would write them."""
     builder = RecordBuilder()
     builder.write(b"\x89MCAP0\r\n")
     schema = Schema(id=1, name="cell_msgs/msg/Level", encoding=language, data=definition.encode())
-    channel = Channel(id=1, topic="/level", message_encoding="cdr", metadata={}, schema_id=1)
+    channel = Channel(id=1, topic="/level", message_encoding=encoding, metadata={}, schema_id=1)
     for record in (Header(profile="ros2", library=""), schema, channel, *records, DataEnd(data_section_crc=0)):
         record.write(builder)
     path.write_bytes(builder.end())
@@ -287,6 +295,38 @@ def test_a_chunk_that_inflates_beyond_reason_is_left_out(name: str, tmp_path: Pa
     assert lines[0] == "2"
     assert lines[1].startswith("bomb.mcap: 1 chunk left out: ")
     assert peak < 200e6
+
+
+IDL = f"""{"=" * 80}
+IDL: cell_msgs/msg/Level
+#include "cell_msgs/msg/Inside.idl"
+module cell_msgs {{ module msg {{ struct Level {{ cell_msgs::msg::Inside data; }}; }}; }};
+{"=" * 80}
+IDL: cell_msgs/msg/Inside
+module cell_msgs {{ module msg {{ struct Inside {{ double value; }}; }}; }};
+"""
+
+
+def test_definitions_in_idl_and_messages_of_ros_1_in_mcap_are_decoded(tmp_path: Path) -> None:
+    """Recorders write either language, and tools convert bags of ROS 1 to MCAP."""
+    path = _mcap(tmp_path / "idl.mcap", _message(1.5), definition=IDL, language="ros2idl")
+    assert recordings.read(path, "/level").column("data.value").to_pylist() == [1.5]
+    ros1 = _message(0.0, struct.pack("<IId", 7, 8, 1.5))
+    path = _mcap(tmp_path / "1.mcap", ros1, definition="time t\nfloat64 data\n", language="ros1msg", encoding="ros1")
+    assert recordings.read(path, "/level").columns["t"].to_pylist() == [{"sec": 7, "nanosec": 8}]
+    path = _mcap(tmp_path / "other.mcap", _message(1.5), encoding="cbor")
+    assert "encoded as 'cbor'; accepted: cdr, ros1" in one_line(RunError, lambda: recordings.read(path, "/level"))
+
+
+def test_bags_without_definitions_have_those_of_ros_2_humble(tmp_path: Path) -> None:
+    """Until 2023 a database had only the names of types; one that is not standard is a line."""
+    path = next(written(tmp_path, KINDS["db3"], motion(5)).glob("*.db3"))
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("DROP TABLE message_definitions")
+        database.execute("UPDATE topics SET type = 'cell_msgs/msg/Level' WHERE name = '/level'")
+        database.commit()
+    assert recordings.read(path, "/command").column("pose.position.x").to_pylist()[0] == 0.0
+    assert "definition of type cell_msgs/msg/Level" in one_line(RunError, lambda: recordings.read(path, "/level"))
 
 
 NESTED = "\n".join(f"{'=' * 80}\nMSG: cell_msgs/C{k}\nC{k + 1} c\nC{k + 1} d" for k in range(60))

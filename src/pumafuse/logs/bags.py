@@ -90,9 +90,9 @@ DAMAGE = (
 
 
 def reason(error: Exception) -> str:
-    """The first line of an error, without the file that it names, short enough for a screen."""
+    """What an error says, without the file that it names, in a line that is short enough for a screen."""
     text = re.sub(r"^Failed to read RRD file at .*?\.rrd: ", "", str(error))
-    return (text.splitlines() or [type(error).__name__])[0][:160].rstrip(". ")
+    return " ".join(text.split())[:160].rstrip(". :") or type(error).__name__
 
 
 # Decoders: from bytes to fields.
@@ -156,7 +156,8 @@ def _ros_decoder(channel: Channel) -> Decoder:
     store = get_typestore(Stores.EMPTY if text.strip() else Stores.ROS2_HUMBLE)  # bags before 2023 hold no definitions
     try:
         if channel.language in _IDL:
-            for part in filter(str.strip, re.split(r"^=+\nIDL: .*\n", text, flags=re.MULTILINE)):
+            parts = re.split(r"^=+\nIDL: .*\n", re.sub(r"^#.*$", "", text, flags=re.MULTILINE), flags=re.MULTILINE)
+            for part in filter(str.strip, parts):
                 store.register(get_types_from_idl(part))
         elif text.strip():
             store.register(get_types_from_msg(text, name))
