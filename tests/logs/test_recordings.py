@@ -338,7 +338,7 @@ DEFINITIONS = {
     "string[4000000000] names\n": "has an array of 4000000000 elements",
     "float64 data; import os\n": "cannot be used",
     "float64 __class__\n": "cannot be used",
-    "float64 data\n" * 100_000: "is longer than 1 MB",
+    "float64 data\n" * 30_000: "is longer than 256 kB",
 }
 
 

@@ -31,7 +31,7 @@ from ..errors import RunError, counted
 _LARGEST = 128 << 20  # bytes of a record or a chunk; recorders make chunks of about 1 MB
 _DEEPEST = 32  # types within types of a message
 _LONGEST_ARRAY = 10_000  # elements of an array of fixed length: decoders have a line of code for each
-_LONGEST_DEFINITION = 1 << 20  # bytes
+_LONGEST_DEFINITION = 1 << 18  # bytes; parsing takes time: that of a large type of MoveIt has 60 kB
 _IDL = ("ros2idl", "omgidl")
 _ZSTD = b"\x28\xb5\x2f\xfd"  # the beginning of a message that rosbag2 has compressed alone; no CDR begins like this
 
@@ -152,7 +152,7 @@ def _ros_decoder(channel: Channel) -> Decoder:
 
     label, name, text = f"topic '{channel.topic}'", normalize_msgtype(channel.type), channel.definition.decode()
     if len(text) > _LONGEST_DEFINITION:
-        raise ValueError(f"{label}: the definition of its type is longer than {_LONGEST_DEFINITION >> 20} MB")
+        raise ValueError(f"{label}: the definition of its type is longer than {_LONGEST_DEFINITION >> 10} kB")
     store = get_typestore(Stores.EMPTY if text.strip() else Stores.ROS2_HUMBLE)  # bags before 2023 hold no definitions
     try:
         if channel.language in _IDL:
