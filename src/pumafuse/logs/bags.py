@@ -247,7 +247,7 @@ def _parts(folder: Path) -> list[Path]:
     if not parts:
         packed = any(path.suffix == ".zstd" for path in listed)
         advice = "; unpack its files first: zstd -d *.zstd" if packed else ""
-        raise RunError(f"{folder}: no bag of ROS 2: the folder has no .mcap and no .db3{advice}")
+        raise RunError(f"{folder}: cannot be read: no bag of ROS 2, the folder has no .mcap and no .db3{advice}")
     return parts
 
 
