@@ -61,7 +61,7 @@ bench: .venv-bench/.ready
 
 # Universal: one lock for every platform and Python. No index address goes into it.
 lock:
-	uv pip compile pyproject.toml --group dev --universal --generate-hashes --no-emit-index-url --no-header --quiet --output-file requirements.lock
+	uv pip compile pyproject.toml --extra bags --group dev --universal --generate-hashes --no-emit-index-url --no-header --quiet --output-file requirements.lock
 
 clean:
 	rm -rf .venv .venv-bench demo site

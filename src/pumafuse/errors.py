@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+_LONGEST_NAME = 120
+
 
 class PumafuseError(Exception):
     """Base of every error a user can cause; its text is one line fit for a screen."""
@@ -32,7 +34,7 @@ class UnknownNameError(PumafuseError):
     def __init__(self, where: str, kind: str, name: str, accepted: Iterable[str]) -> None:
         self.name = name
         self.accepted = tuple(accepted)
-        super().__init__(f"{where}: unknown {kind} '{name}'; {suggestion(name, self.accepted)}")
+        super().__init__(f"{where}: unknown {kind} '{shortened(name)}'; {suggestion(name, self.accepted)}")
 
 
 class PumafuseWarning(UserWarning):
@@ -45,6 +47,11 @@ def suggestion(name: str, accepted: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, names, n=1)
     listed = f"accepted: {', '.join(names)}" if names else "nothing is accepted here"
     return f"did you mean '{close[0]}'? {listed}" if close else listed
+
+
+def shortened(name: str) -> str:
+    """A name as given, cut where it would fill a screen."""
+    return name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME]}…"
 
 
 def counted(number: int, what: str) -> str:

@@ -9,7 +9,9 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
+import bag_files
 import pumafuse as pf
+from executable import pumafuse
 from pumafuse.logs.frames import Cylindrical
 from recordings import columns, series, times
 
@@ -148,3 +150,25 @@ def test_the_shipped_scan_makes_a_small_file_that_rerun_accepts(tmp_path: Path) 
     assert done.returncode == 0, done.stderr
     for sensor, axes in (("tracker", 3), ("vision", 3), ("range", 1)):
         assert sum(entity.endswith(f"/{sensor}") for entity in entities(path)) == 2 * axes
+
+
+@pytest.mark.parametrize("timeline", ["timestamp", "duration", "sequence"])
+def test_the_result_of_a_recording_is_a_layer_of_it(timeline: str, tmp_path: Path) -> None:
+    """It has the recording's ids and its timeline: merged they are one recording, with the same stamps in both."""
+    path = bag_files.written(tmp_path, bag_files.KINDS["rrd"], bag_files.motion())
+    bag_files.rrd(path, bag_files.motion(), timeline=timeline)
+    if timeline == "sequence":
+        manifest = (tmp_path / "run.toml").read_text().replace('"robot_time"', '{ column = "robot_time", unit = "ns" }')
+        (tmp_path / "run.toml").write_text(manifest)
+    pumafuse("fuse", tmp_path, "-c", bag_files.configured(tmp_path), "-o", tmp_path / "fused", "--rrd")
+    layer = tmp_path / "fused" / "fused.rrd"
+    merged = tmp_path / "merged.rrd"
+    viewer = Path(sys.executable).parent / "rerun"
+    subprocess.run([viewer, "rrd", "merge", path, layer, "-o", merged], check=True, capture_output=True)
+    (one,) = RrdReader(merged).recordings()
+    assert (one.application_id, one.recording_id) == ("robot_cell", "take-7")
+    assert not RrdReader(layer).blueprints()
+    found = [columns(merged, entity) for entity in ("/command", "/pumafuse/z/command")]
+    stamps = [np.concatenate([chunk["robot_time"].cast("int64").to_numpy() for chunk in chunks]) for chunks in found]
+    assert np.array_equal(*stamps)
+    assert columns(merged, "/pumafuse/path/tool")

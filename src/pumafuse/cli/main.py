@@ -90,12 +90,13 @@ def fuse(
 def compare(
     folders: Annotated[list[Path], Argument(metavar="DIR...", help="Result folders of `pumafuse fuse`.")],
     reference: Annotated[Path | None, Option(metavar="FILE_OR_RUN", help="Default: each folder's own.")] = None,
+    tum: Annotated[Path | None, Option(metavar="OUT", help="A new folder for trajectories in the TUM format.")] = None,
     json: Json = False,
 ) -> None:
     """Score results against a reference: RMSE, 95 % coverage, bias and mean NEES of each axis, and of its velocity."""
     from . import compare as command
 
-    command.run(folders, reference, json)
+    command.run(folders, reference, json, tum)
 
 
 @app.command()

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from decimal import Decimal
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from .. import folders
 from ..arrays import BoolArray, CodeArray, FloatArray, IndexArray, IntArray
-from ..errors import UnknownNameError
+from ..errors import RunError, UnknownNameError
 from ..filter.outcome import Outcome
+from ..logs.frames import CARTESIAN, in_space
+from ..model.arm import ArmModel
 from ..units import Kind
 from .config import FusionConfig
 from .score import ReferenceTrack
@@ -172,6 +177,22 @@ class Estimates:
             raise UnknownNameError(f"run '{self.run}'", "axis", str(axis), self.axes)
         return self.axes[axis]
 
+    def to_tum(self, path: str | Path) -> None:
+        """Write the trajectory in the TUM format, which ``evo`` reads: a line ``stamp x y z 0 0 0 1`` an estimate.
+
+        Stamps are those of the log's clock [s], with all digits; positions are in m; the rotation is always none.
+
+        Args:
+            path: The file; an earlier one is replaced.
+
+        Raises:
+            RunError: The run has no x, y and z, neither as axes nor by a frame; or its clock was set back.
+            FolderError: The file cannot be written.
+        """
+        position = {axis: one.position for axis, one in self.axes.items()}
+        track = ReferenceTrack(self.time, position, {}, self.segment, self.cartesian)
+        write_tum(track, self.config.arm, self.origin, f"run '{self.run}'", Path(path))
+
     def measured_positions(self, sensor: str, axis: str) -> Measurements:
         """A sensor's components with positions for values [m]: (z − estimated bias) / scale; none if not configured."""
         measurements = self.measurements.of(sensor, axis)
@@ -196,3 +217,35 @@ class Estimates:
         ends = np.minimum(np.searchsorted(self.time, self.time + length), len(self.time) - 1)
         start = float(self.time[np.argmax(travelled[ends] - travelled)])
         return start, start + length
+
+
+def write_tum(track: ReferenceTrack, arm: ArmModel, origin: int, where: str, path: Path) -> None:
+    """Write positions in time as a trajectory in the TUM format, see :meth:`Estimates.to_tum`.
+
+    Args:
+        track: What to write; rows without all of x, y, z are left out, and those of a stamp after the first.
+        arm: Its axes say whether x, y, z are positions in space.
+        origin: Stamp of time 0, int ns.
+        where: Whose they are, for errors.
+        path: The file.
+
+    Raises:
+        RunError: See :meth:`Estimates.to_tum`.
+        FolderError: The file cannot be written.
+    """
+    found = track.position if track.cartesian is None and in_space(arm) == CARTESIAN else track.cartesian or {}
+    if not all(name in found for name in CARTESIAN):
+        raise RunError(
+            f"{where}: a trajectory needs x, y and z, as axes of the arm or by a [frame]; there are only"
+            f" {', '.join(found or track.position)}"
+        )
+    if track.segment.any():
+        raise RunError(f"{where}: the log's clock was set back, so that it is no one trajectory; use --from and --to")
+    position = np.column_stack([found[name] for name in CARTESIAN])
+    stamp = origin + np.rint(track.time * 1e9).astype(np.int64)
+    kept = np.isfinite(position).all(axis=1) & (np.diff(stamp, prepend=stamp[:1] - 1) > 0)
+    lines = (
+        f"{Decimal(ns).scaleb(-9):f} {x!r} {y!r} {z!r} 0 0 0 1\n"
+        for ns, (x, y, z) in zip(stamp[kept].tolist(), position[kept].tolist(), strict=True)
+    )
+    folders.write_file(path, "".join(lines))

@@ -25,7 +25,7 @@ from .consistency import sensor_problems
 from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
 from .faults import latency_questions, sensor_faults, starts_in_motion
-from .score import late_rows, reference_track
+from .score import ReferenceTrack, late_rows, reference_track
 from .segments import Segment, build, output_times
 
 S = TypeVar("S", bound=np.generic)
@@ -97,10 +97,10 @@ def fuse(
         run=run.name,
         time=seconds(_joined(times), origin),
         axes=axes,
-        cartesian=None if placed is None else _cartesian(placed, axes),
+        cartesian=_cartesian(placed, {axis: one.position for axis, one in axes.items()}),
         measurements=_measurements(cut, filtered),
         biases=filtered[-1].biases,
-        reference=reference_track(references, origin) if references else None,
+        reference=_reference(references, origin, placed),
         origin=origin,
         last_command=(max(int(part.commands[-1]) for part in cut) - origin) / 1e9,
         segment=np.repeat(np.arange(len(parts)), [len(part) for part in times]),
@@ -148,14 +148,24 @@ def _reference_notes(est: Estimates, sources: Sequence[Source]) -> list[str]:
     return found
 
 
-def _cartesian(placed: Placed, axes: Mapping[str, AxisEstimate]) -> dict[str, FloatArray]:
-    """Estimates in the log's x, y and z [m], those that the axes give."""
+def _cartesian(placed: Placed | None, position: Mapping[str, FloatArray]) -> dict[str, FloatArray] | None:
+    """The log's x, y and z [m] of positions of axes, those that these give; None without a frame."""
+    if placed is None:
+        return None
     found: dict[str, FloatArray] = {}
-    if "tangential" in axes and "radial" in axes:
-        found["x"], found["y"] = placed.to_log(axes["tangential"].position, axes["radial"].position)
-    if "vertical" in axes:
-        found["z"] = axes["vertical"].position.copy()
+    if "tangential" in position and "radial" in position:
+        found["x"], found["y"] = placed.to_log(position["tangential"], position["radial"])
+    if "vertical" in position:
+        found["z"] = position["vertical"].copy()
     return found
+
+
+def _reference(parts: Sequence[Source], origin: int, placed: Placed | None) -> ReferenceTrack | None:
+    """The reference of a run's segments, where it has one."""
+    if not parts:
+        return None
+    track = reference_track(parts, origin)
+    return replace(track, cartesian=_cartesian(placed, track.position))
 
 
 def _highest_speeds(cut: Sequence[Segment], arm: ArmModel) -> dict[Kind, float]:

@@ -20,6 +20,7 @@ from ..folders import FolderError
 from ..logs import tables
 from ..logs.axes import in_axes
 from ..logs.clock import segments
+from ..logs.frames import CARTESIAN
 from ..logs.run import Run
 from ..logs.tables import Table
 from ..model.arm import ArmModel
@@ -50,6 +51,7 @@ class Result:
         time: [s since the first command], (n,).
         segment: (n,).
         axes: Estimates by axis.
+        cartesian: With a frame, the estimates in the log's ``x``, ``y`` and ``z`` [m].
         reference: Its ``reference.parquet``, if there is one.
     """
 
@@ -58,7 +60,14 @@ class Result:
     time: FloatArray
     segment: IntArray
     axes: Mapping[str, AxisEstimate]
+    cartesian: Mapping[str, FloatArray] | None
     reference: ReferenceTrack | None
+
+    @property
+    def track(self) -> ReferenceTrack:
+        """The estimates as positions in time."""
+        position = {axis: one.position for axis, one in self.axes.items()}
+        return ReferenceTrack(self.time, position, {}, self.segment, self.cartesian)
 
     def scores(self, reference: ReferenceTrack) -> dict[str, ScoreSummary]:
         """The score of each axis that the reference has."""
@@ -123,7 +132,7 @@ def read(folder: Path) -> Result:
     }
     path = folder / REFERENCE
     reference = _own_reference(tables.read(path), config.arm) if path.exists() else None
-    return Result(summary, config, *_time_and_segment(table), axes, reference)
+    return Result(summary, config, *_time_and_segment(table), axes, _cartesian(table), reference)
 
 
 def read_reference(path: Path, origin: int, config: FusionConfig) -> ReferenceTrack:
@@ -163,8 +172,7 @@ def _estimates_table(est: Estimates) -> pa.Table:
         kind = est.config.arm.axes[axis].kind
         for name in AxisEstimate.FIELDS:
             columns[_column(axis, name, kind)] = _nullable(getattr(estimate, name) * SCREEN[kind].scale)
-    columns |= {f"{name}_mm": _nullable(position * MM) for name, position in (est.cartesian or {}).items()}
-    return pa.table({"time_s": est.time, **columns, **_segment_column(est.segment)})
+    return pa.table({"time_s": est.time, **columns, **_in_log(est.cartesian), **_segment_column(est.segment)})
 
 
 def _measurements_table(est: Estimates) -> pa.Table:
@@ -195,7 +203,17 @@ def _reference_table(reference: ReferenceTrack, arm: ArmModel) -> pa.Table:
         kind = arm.axes[axis].kind if axis in arm.axes else "length"  # x, y and z
         columns[_column(axis, "position", kind)] = _nullable(position * SCREEN[kind].scale)
         columns[_column(axis, "position_sd", kind)] = reference.sd[axis] * SCREEN[kind].scale
-    return pa.table({**columns, **_segment_column(reference.segment)})
+    return pa.table({**columns, **_in_log(reference.cartesian), **_segment_column(reference.segment)})
+
+
+def _in_log(cartesian: Mapping[str, FloatArray] | None) -> dict[str, pa.Array]:
+    """Columns of the log's x, y and z; none without a frame."""
+    return {f"{name}_mm": _nullable(position * MM) for name, position in (cartesian or {}).items()}
+
+
+def _cartesian(table: Table) -> dict[str, FloatArray] | None:
+    """The log's x, y and z [m] that a table has; None without any."""
+    return {name: table.numbers(f"{name}_mm")[0] for name in CARTESIAN if f"{name}_mm" in table.columns} or None
 
 
 def _own_reference(table: Table, arm: ArmModel) -> ReferenceTrack:
@@ -214,7 +232,7 @@ def _own_reference(table: Table, arm: ArmModel) -> ReferenceTrack:
             f" {', '.join(table.columns)}"
         )
     time, segment = _time_and_segment(table)
-    return ReferenceTrack(time, position, noise, segment)
+    return ReferenceTrack(time, position, noise, segment, _cartesian(table))
 
 
 def _numbers(table: Table, axis: str, column: str, arm: ArmModel) -> FloatArray:

@@ -25,12 +25,14 @@ class ReferenceTrack:
         position: For each axis [m], NaN where it has none, (k,).
         sd: Standard deviation of its own noise on each axis [m], (k,).
         segment: As in :class:`pumafuse.fusion.estimates.Estimates`, (k,).
+        cartesian: With a frame, its ``x``, ``y`` and ``z`` in the log [m], (k,).
     """
 
     time: FloatArray
     position: Mapping[str, FloatArray]
     sd: Mapping[str, FloatArray]
     segment: IntArray
+    cartesian: Mapping[str, FloatArray] | None = None
 
 
 def late_rows(stamp: TimeArray) -> BoolArray:

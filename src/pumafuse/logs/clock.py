@@ -168,5 +168,6 @@ def _jumps(source: Source) -> list[int]:
         found.append(first + int(back[0]))
         if len(found) > _MOST_JUMPS:
             raise RunError(
-                f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock"
+                f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock,"
+                " or many runs in one table (run.toml chooses one by 'where')"
             )

@@ -8,18 +8,76 @@ from typing import Any, Literal, cast
 import msgspec
 
 from .. import toml
-from ..errors import ConfigError
+from ..errors import ConfigError, UnknownNameError
 from ..toml import NotNegative
-from ..units import Kind, ending, kind_of
+from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of
+from .columns import leaf
 from .frames import Frame
+
+_MOST = 2**63  # more than a whole number of a column can be
+
+
+class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A column or field path, and its unit (``mm``) where its name does not end in it."""
+
+    column: str
+    unit: str = ""
+
+    @property
+    def ending(self) -> str:
+        """Its unit as the ending of a name, empty where only its name says it."""
+        return f"_{self.unit}" if self.unit else ""
+
+    @property
+    def kind(self) -> Kind | None:
+        """The kind of axis that it is of, by its unit."""
+        return kind_of(self.ending or leaf(self.column))
+
+
+class Time(Column, frozen=True, forbid_unknown_fields=True):
+    """A column of stamps; with ``nanoseconds`` it is of whole seconds, and these are beside it."""
+
+    nanoseconds: str = ""
+
+    @property
+    def columns(self) -> list[str]:
+        """All columns that it takes."""
+        return [self.column, self.nanoseconds] if self.nanoseconds else [self.column]
 
 
 class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
-    """A source of a run: its ``file``, its ``time`` column, and the columns of each axis, which are added up."""
+    """A source of a run: where its rows are, and its columns.
+
+    Attributes:
+        file: The table or recording, beside ``run.toml``.
+        topic: Which part of an MCAP or a bag.
+        entity: Which part of a Rerun recording.
+        where: Which of the rows: those in which each of these columns has this value.
+        time: Their stamps.
+        axes: For each axis its columns, which are added up.
+    """
 
     file: str
-    time: str
-    axes: dict[str, list[str]]
+    topic: str = ""
+    entity: str = ""
+    where: dict[str, bool | int | float | str] = {}
+    time: Time
+    axes: dict[str, list[Column]]
+
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """Where its rows are: the same for sources that can be read at once."""
+        return self.file, self.topic, self.entity, repr(self.where)
+
+    @property
+    def fields(self) -> list[str]:
+        """All its columns and field paths."""
+        return [*self.time.columns, *(column.column for columns in self.axes.values() for column in columns)]
+
+    @property
+    def label(self) -> str:
+        """What a person calls it."""
+        return self.topic or self.entity or self.file
 
 
 class CommandEntry(SourceEntry, frozen=True, kw_only=True):
@@ -76,17 +134,68 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
         keys["start"] = {axis: keys["start"][key] for key, axis in given.items()}
         kinds = {axis: kind_of(key) for key, axis in given.items()}
     own = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes", "kinds"}
-    axes = {axis: keys.pop(axis) for axis in list(keys) if axis not in own}
-    for axis, columns in axes.items():
-        if not columns or not isinstance(columns, str | list):
-            raise ConfigError(
-                f"{where}: {path}.{axis}: expected a column name or a list of them, as in {axis} = 'x_mm'"
-            )
-        axes[axis] = [columns] if isinstance(columns, str) else columns
+    axes = {axis: _columns(keys.pop(axis), where, f"{path}.{axis}") for axis in list(keys) if axis not in own}
     if not axes:
         raise ConfigError(f"{where}: [{path}] names no column for any axis, as in radial = 'y_mm'")
+    if "time" in keys:
+        keys["time"] = _time(keys["time"], where, f"{path}.time")
+    if "where" in keys:
+        keys["where"] = _where(keys["where"], where, f"{path}.where")
     more = {"kinds": kinds} if kinds else {}
     return toml.struct({**keys, **more, "axes": axes}, kind, where, path)
+
+
+def _columns(given: Any, where: str, path: str) -> list[Any]:
+    """The columns of an axis: one or a list, each by its name or as a table."""
+    listed = cast(list[Any], given if isinstance(given, list) else [given])
+    columns: list[Any] = [{"column": one} if isinstance(one, str) else one for one in listed]
+    if not columns or not all(isinstance(one, dict) and cast(dict[str, Any], one).get("column") for one in columns):
+        axis = path.rpartition(".")[2]
+        raise ConfigError(
+            f"{where}: {path}: expected a column name or a list of them, as in {axis} = 'x_mm', or with its unit"
+            f" {axis} = {{ column = 'pose.position.x', unit = 'm' }}"
+        )
+    for one in columns:
+        toml.check(one, Column, where, path)
+        _check_unit(one, (*LENGTHS, *ANGLES), where, path)
+    return columns
+
+
+def _time(given: Any, where: str, path: str) -> dict[str, Any]:
+    """The column of stamps, or the two of seconds and nanoseconds."""
+    match given:
+        case str() if given:
+            return {"column": given}
+        case [str() as seconds, str() as nanoseconds] if seconds and nanoseconds:
+            return {"column": seconds, "nanoseconds": nanoseconds}
+        case {"column": str() as column, **more} if column and more.keys() <= {"unit"}:
+            _check_unit(more, TIMES, where, path)
+            return {"column": column, **more}
+        case _:
+            raise ConfigError(
+                f"{where}: {path}: expected a column ('t_s', 'header.stamp'), a column with its unit"
+                " ({ column = 't', unit = 's' }), or columns of whole seconds and of nanoseconds (['sec', 'nanosec'])"
+            )
+
+
+def _where(given: Any, where: str, path: str) -> dict[str, Any]:
+    """Values by column, in the unit of the column: they are compared with what is in the file."""
+    values = cast(dict[str, Any], given if isinstance(given, dict) else {})
+    known = (
+        isinstance(value, str) or (isinstance(value, int | float) and abs(value) < _MOST) for value in values.values()
+    )
+    if not values or not all(known):
+        raise ConfigError(
+            f"{where}: {path}: expected a number, a text or a boolean for each column, as in {{ episode_index = 3 }};"
+            " a field path is quoted, as in { 'meta.episode' = 3 }"
+        )
+    return from_si(values)
+
+
+def _check_unit(column: dict[str, Any], accepted: tuple[str, ...], where: str, path: str) -> None:
+    names = [unit.removeprefix("_") for unit in accepted]
+    if "unit" in column and column["unit"] not in names:
+        raise UnknownNameError(f"{where}: {path}", "unit", str(column["unit"]), names)
 
 
 def axis_of(key: str, where: str, path: str) -> str:

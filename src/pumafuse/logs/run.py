@@ -7,23 +7,29 @@ they are. Each measurement gets its outcome when the run is fused.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
-from ..errors import RunError, UnknownNameError
+from ..errors import RunError, UnknownNameError, counted
 from ..model.arm import CANONICAL_AXES
-from ..units import AN, Kind, kind_of, nanoseconds
+from ..units import AN, Kind, ending, nanoseconds
 from . import manifest, tables
 from .frames import CARTESIAN, Frame
 
+if TYPE_CHECKING:
+    from .recordings import Recording
+
 Clock = Literal["stamps", "regular"]
+
+_LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
+_FEW_ROWS = 10  # too few to judge a clock by
 
 
 @dataclass(frozen=True)
@@ -81,6 +87,7 @@ class Run:
         frame: The arm's axes in the log's x, y, z, for sources that give these.
         kinds: Of what kind the axes are, where the units of a log say so.
         notes: What was wrong with the files, a sentence each.
+        recording: The Rerun recording that it was read from, if it was one.
         without_strays: Whether stray stamps are removed already, see :func:`pumafuse.logs.clock.without_strays`.
         since: Where the part to use begins [s after the first command], see :meth:`between`; None: with the log.
         until: Where it ends, likewise.
@@ -95,6 +102,7 @@ class Run:
     frame: Frame | None = None
     kinds: Mapping[str, Kind] = field(default_factory=dict[str, Kind])
     notes: tuple[str, ...] = ()
+    recording: Recording | None = None
     without_strays: bool = False
     since: float | None = None
     until: float | None = None
@@ -214,9 +222,11 @@ class Run:
         Raises:
             RunError: Lengths differ, or there is no command.
         """
-        streams = {sensor: _from_arrays(sensor, *arrays) for sensor, arrays in (sensors or {}).items()}
-        scored = None if reference is None else replace(_from_arrays("reference", *reference), sd=reference_sd)
-        return Run(name, _from_arrays("command", time, command), streams, scored, dict(start or {}), clock, frame)
+        notes = list[str]()
+        commands = _from_arrays("command", time, command, notes)
+        streams = {sensor: _from_arrays(sensor, *arrays, notes) for sensor, arrays in (sensors or {}).items()}
+        scored = None if reference is None else replace(_from_arrays("reference", *reference, notes), sd=reference_sd)
+        return Run(name, commands, streams, scored, dict(start or {}), clock, frame, notes=tuple(notes))
 
 
 def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: str = "") -> None:
@@ -227,7 +237,55 @@ def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: s
         notes.append(f"{label}: {len(found)} {plural} {what} (first: row {found[0] + 1}{first})")
 
 
-def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.ArrayLike]) -> Source:
+def _note_standing_clock(notes: list[str], source: Source, advice: str) -> None:
+    """Append a note on rows with the stamp of the row before and another value; refuse a clock that stands still.
+
+    Real logs have such rows: clocks tick every 1 ms, 10 ms, or 15.6 ms (Windows), a sensor is asked several times.
+    Refused is a clock that ticks every 0.1 s or more, where most values of an axis change within a tick, and not by
+    far less than from one tick to the next, as a measurement that is repeated at a standstill does. Measured on scan1
+    and trunk-servo, their commands or measurements stamped by such clocks: ticks up to 15.6 ms raise the RMSE by a
+    quarter at most, 50 ms double it, 0.1 s raise it up to 4 times, 1 s up to 10 times. As recorded, no row of theirs,
+    nor of any other run at hand, has the stamp of the row before.
+
+    Args:
+        notes: Gets the note.
+        source: The rows.
+        advice: What to do, if the clock is refused.
+
+    Raises:
+        RunError: The clock stands still.
+    """
+    if not (np.diff(source.stamp) == 0).any():
+        return
+    changes = {axis: _changes(source, axis) for axis in source.values}
+    axis = max(changes, key=lambda axis: changes[axis].sum())
+    most = changes[axis].sum()
+    if not most:
+        return
+    known = np.isfinite(source.values[axis]) & (source.stamp != NO_STAMP)
+    step, tick = np.abs(np.diff(source.values[axis][known])), np.diff(source.stamp[known])
+    ticks = int((tick != 0).sum()) + 1
+    period = np.median(tick[tick > 0]) / 1e9 if (tick > 0).any() else np.inf
+    going_on = 2.0 * step[tick == 0].mean() >= (step[tick != 0].mean() if ticks > 1 else 0.0)
+    if most > ticks and most >= _FEW_ROWS and period >= _LONGEST_TICK and going_on:
+        stands = f", one every {period:.3g} s" if np.isfinite(period) else ""
+        raise RunError(
+            f"{source.label}: {counted(ticks, 'distinct stamp')}{stands}, in {len(step) + 1} rows with {axis}, which"
+            f" goes on while the clock stands still; {advice}"
+        )
+    what = f"the stamp of the row before and another {axis} (of commands, the last of a stamp counts)"
+    note_rows(notes, source.label, changes[axis], what)
+
+
+def _changes(source: Source, axis: str) -> BoolArray:
+    """Rows with the stamp of the row before that has a value of the axis, and another value, (rows,)."""
+    value, found = source.values[axis], np.zeros(len(source.stamp), dtype=np.bool_)
+    known = np.flatnonzero(np.isfinite(value) & (source.stamp != NO_STAMP))
+    found[known[1:]] = (np.diff(source.stamp[known]) == 0) & (np.diff(value[known]) != 0)
+    return found
+
+
+def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.ArrayLike], notes: list[str]) -> Source:
     try:
         stamp = _stamps(np.array(time))
         columns = {axis: np.array(value, dtype=np.float64) for axis, value in values.items()}
@@ -242,7 +300,9 @@ def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.Array
             )
     if not columns or not len(stamp):
         raise RunError(f"{label}: no values")
-    return Source(stamp, columns, label)
+    source = Source(stamp, columns, label)
+    _note_standing_clock(notes, source, "give stamps as fine as the rows")
+    return source
 
 
 def _stamps(time: npt.NDArray[Any]) -> TimeArray:
@@ -267,27 +327,50 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
 
 def _read_manifest(path: Path) -> Run:
     listed = manifest.load(path)
-    notes, units = list[str](), dict(listed.command.kinds)
+    scored, notes, units = listed.reference, list[str](), dict(listed.command.kinds)
+    entries = {"command": listed.command, **{f"sensor {name}": entry for name, entry in listed.sensors.items()}}
+    if scored is not None:
+        entries["reference"] = scored
+    fields, read = defaultdict[tuple[str, ...], list[str]](list), dict[tuple[str, ...], tables.Table]()
+    for entry in entries.values():
+        fields[entry.rows] += entry.fields
+    naive, zoned = list[str](), list[str]()
 
-    @cache
-    def table_of(file: str) -> tables.Table:
-        table = tables.read(path.parent / file, growing=True)
-        notes.extend(table.notes)
-        return table
+    def source(name: str) -> Source:
+        entry = entries[name]
+        if entry.rows not in read:
+            file, chosen = path.parent / entry.file, {"topic": entry.topic, "entity": entry.entity}
+            table = tables.read(file, growing=True, fields=fields[entry.rows], where=entry.where, **chosen)
+            notes.extend(note for note in table.notes if note not in notes)
+            read[entry.rows] = table
+        known = read[entry.rows].zoned(entry.time.column)
+        if known is not None:
+            (zoned if known else naive).append(name)
+        return _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units)
 
-    def source(entry: manifest.SourceEntry) -> Source:
-        return _source(table_of(entry.file), entry.time, entry.axes, entry.file, notes, units)
-
-    command = source(listed.command)
-    sensors = {name: source(entry) for name, entry in listed.sensors.items()}
-    scored = listed.reference
-    reference = None if scored is None else source(scored)
+    command = source("command")
+    sensors = {name: source(f"sensor {name}") for name in listed.sensors}
+    reference = None if scored is None else source("reference")
     if reference is not None and scored is not None:
         of_kind = {"length": scored.sd, "angle": scored.angular_sd}
         sds = {axis: of_kind[units[axis]] for axis in reference.values}
         reference = replace(reference, sd=sds if len(set(sds.values())) > 1 else next(iter(sds.values())))
+    if naive and zoned:
+        notes.append(f"{naive[0]}: dates without a time zone, beside {zoned[0]} with one: taken as UTC")
     name, start, clock = listed.name or path.parent.resolve().name, listed.command.start, listed.command.clock
-    return Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
+    run = Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
+    return replace(run, recording=_recording(path.parent, entries.values()))
+
+
+def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recording | None:
+    """The first of the Rerun recordings that sources are in."""
+    found = next((entry for entry in entries if entry.entity), None)
+    if found is None:
+        return None
+    from .recordings import recording_of
+
+    time = found.time
+    return recording_of(folder / found.file, found.entity, time.column, time.ending or ending(time.column) or "")
 
 
 def _read_single(path: Path) -> Run:
@@ -297,19 +380,19 @@ def _read_single(path: Path) -> Run:
     clocks = [name for name in table.columns if name.startswith("time_")]
     if len(clocks) != 1:
         raise RunError(f"{path}: a single table needs one time column, 'time_s'; it has: {listed}")
-    groups: dict[str, dict[str, list[str]]] = {}
+    groups: dict[str, dict[str, list[manifest.Column]]] = {}
     for column in table.columns:
         source, dot, rest = column.partition(".")
         if dot:
             axis = rest.rpartition("_")[0]
             if axis in groups.setdefault(source, {}):
                 raise RunError(f"{path}: two columns for {source}.{axis}; give one")
-            groups[source][axis] = [column]
+            groups[source][axis] = [manifest.Column(column)]
     if "command" not in groups:
         raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {listed}")
     notes, sources, units = list(table.notes), dict[str, Source](), dict[str, Kind]()
     for name, axes in groups.items():
-        source = _source(table, clocks[0], axes, name, notes, units)
+        source = _source(table, manifest.Time(clocks[0]), axes, name, notes, units)
         sources[name] = source.rows(np.any(~np.isnan(list(source.values.values())), axis=0))
     if left := [column for column in table.columns if "." not in column and column != clocks[0]]:
         notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
@@ -319,24 +402,28 @@ def _read_single(path: Path) -> Run:
 
 def _source(
     table: tables.Table,
-    time: str,
-    axes: Mapping[str, Sequence[str]],
+    time: manifest.Time,
+    axes: Mapping[str, Sequence[manifest.Column]],
     label: str,
     notes: list[str],
     units: dict[str, Kind],
 ) -> Source:
     """A source from its columns, those of an axis added up; new notes and new kinds of axes are put in."""
-    stamp, note = table.stamps(time)
+    stamp, note = table.stamps(time.column, time.nanoseconds, time.ending)
     values, found = dict[str, FloatArray](), [note]
     for axis, columns in axes.items():
-        parts = [table.numbers(column) for column in columns]
+        parts = [table.numbers(column.column, column.ending) for column in columns]
         for column in columns:
-            kind = kind_of(column) or "length"
+            kind = column.kind or "length"
             if units.setdefault(axis, kind) != kind:
                 raise RunError(
-                    f"{table.path}: column '{column}' is {AN[kind]}, but {axis} is {AN[units[axis]]} elsewhere"
+                    f"{table.path}: column '{column.column}' is {AN[kind]}, but {axis} is {AN[units[axis]]} elsewhere"
                 )
         values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
         found.extend(note for _, note in parts)
     notes.extend(note for note in found if note is not None and note not in notes)
-    return Source(stamp, values, label)
+    source = Source(stamp, values, label)
+    beside = None if time.nanoseconds else table.nanoseconds_beside(time.column)
+    advice = f"write time = ['{time.column}', '{beside}']" if beside else "name a finer column of time"
+    _note_standing_clock(notes, source, advice)
+    return source

@@ -1,175 +1,76 @@
-"""Tables on disk, CSV or Parquet: columns as SI arrays, whatever state the log is in.
+"""Tables on disk, CSV or Parquet: which columns and rows of them are read.
 
-A cell that is empty or no number becomes NaN, a line that does not fit the header is left out; both are counted and
-noted in one sentence each.
+A line that does not fit the header is left out, and noted in a sentence.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 import pyarrow.parquet as papq
 
-from .. import units
-from ..arrays import NO_STAMP, REACH_NS, FloatArray, TimeArray
-from ..errors import RunError, UnknownNameError, counted
+from ..errors import RunError, UnknownNameError, counted, shortened
+from .columns import BLANK, Table, find, longest, prefixes
+
+Where: TypeAlias = Mapping[str, bool | int | float | str]  # rows in which each of these columns has this value
 
 _COMPRESSED = {".gz", ".bz2", ".lz4", ".zst", ".br"}  # a torn one cannot be read at all
-_WHOLE = r"^[+-]?\d{1,19}$"
-_NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
-_BLANK = ("", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None")
-_NUMBERS = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
-_NEITHER_NUMBERS_NOR_TEXT = (pa.types.is_boolean, pa.types.is_temporal, pa.types.is_nested)
+_RECORDINGS = {".mcap", ".bag", ".db3", ".rrd"}
+_BATCH = 1 << 16  # rows of Parquet that are in memory before rows are chosen
+_READ_AHEAD = 1 << 20  # bytes of a column of Parquet
+_SOME = 8  # values in an error
 
 
-@dataclass(frozen=True)
-class Table:
-    """One table file.
-
-    Attributes:
-        path: Where it was read from.
-        columns: Its columns by name.
-        rows: Number of rows.
-        notes: What was wrong with the file as a whole, a sentence each.
-    """
-
-    path: Path
-    columns: dict[str, pa.ChunkedArray]
-    rows: int
-    notes: tuple[str, ...]
-
-    def numbers(self, name: str) -> tuple[FloatArray, str | None]:
-        """A column of positions [m or rad], NaN where a cell is empty or no number, and a note on cells that were text.
-
-        Raises:
-            RunError: The column is absent, its name ends in no unit of a length or an angle, or it holds something else
-                than numbers.
-        """
-        unit = self._unit(name, (*units.LENGTHS, *units.ANGLES), "_mm")
-        values, note = self.plain(name)
-        return units.si_of(values, unit), note
-
-    def plain(self, name: str) -> tuple[FloatArray, str | None]:
-        """A column of numbers without conversion, with NaN and note as in :meth:`numbers`.
-
-        Raises:
-            RunError: The column is absent or holds something else than numbers.
-        """
-        column, note = self._numeric(name)
-        return _filled(column.cast(pa.float64(), safe=False), np.nan), note
-
-    def texts(self, name: str) -> list[str]:
-        """A column as trimmed text, empty where a cell is; whole numbers without a point.
-
-        Raises:
-            RunError: The column is absent or has no text.
-        """
-        column = self._column(name)
-        if pa.types.is_floating(column.type):
-            whole = pc.and_(pc.less(pc.abs(column), 1e15), pc.equal(column, pc.round(column)))
-            column = column.cast(pa.int64()) if pc.all(whole).as_py() else column
-        return [(cell or "").strip() for cell in self._cast(name, column, pa.string()).to_pylist()]
-
-    def stamps(self, name: str) -> tuple[TimeArray, str | None]:
-        """A time column in int64 ns, ``NO_STAMP`` where a cell is empty or no time, and a note on cells that were text.
-
-        Whole numbers are exact, also beside cells of text.
-
-        Raises:
-            RunError: The column is absent, its name ends in no unit of time, or a stamp is beyond reach of int64 ns.
-        """
-        column, note, per_unit = self._column(name), None, 1
-        if pa.types.is_timestamp(column.type):
-            column = self._cast(name, column, pa.timestamp("ns")).cast(pa.int64())
-        else:
-            per_unit = 10 ** (9 - 3 * units.TIMES.index(self._unit(name, units.TIMES, "_s")))
-            column, note = self._numeric(name)
-        rough = _filled(column.cast(pa.float64(), safe=False), np.nan) * per_unit
-        beyond = np.flatnonzero(np.isfinite(rough) & (np.abs(rough) >= REACH_NS))
-        if len(beyond):
-            raise RunError(
-                f"{self.path}: column '{name}', row {beyond[0] + 1}: a stamp beyond the year 2110; is its unit what its"
-                " name says?"
-            )
-        found = np.where(np.isfinite(rough), np.rint(rough), NO_STAMP).astype(np.int64)
-        if pa.types.is_string(column.type):
-            column = pc.if_else(pc.match_substring_regex(column, _WHOLE), column, pa.scalar(None, pa.string()))
-        if pa.types.is_string(column.type) or pa.types.is_integer(column.type):
-            whole = _filled(self._cast(name, column, pa.int64()), NO_STAMP)
-            found = np.where(whole == NO_STAMP, found, whole * per_unit)
-        return found, note
-
-    def _cast(self, name: str, column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
-        try:
-            return column.cast(kind)
-        except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-            raise RunError(f"{self.path}: column '{name}': {str(error).splitlines()[0]}") from None
-
-    def _unit(self, name: str, accepted: tuple[str, ...], example: str) -> str:
-        self._column(name)
-        unit = units.ending(name)
-        if unit is None or unit not in accepted:
-            raise RunError(
-                f"{self.path}: column '{name}' has no unit in its name; it must end in {', '.join(accepted)}"
-                f" (for instance '{name}{example}')"
-            )
-        return unit
-
-    def _column(self, name: str) -> pa.ChunkedArray:
-        if name not in self.columns:
-            raise UnknownNameError(str(self.path), "column", name, self.columns)
-        return self.columns[name]
-
-    def _numeric(self, name: str) -> tuple[pa.ChunkedArray, str | None]:
-        """A column of numbers, or of text that is numbers; cells of other text are null, and counted in a note."""
-        column = self._column(name)
-        if any(is_kind(column.type) for is_kind in _NUMBERS):
-            return column, None
-        if any(is_kind(column.type) for is_kind in _NEITHER_NUMBERS_NOR_TEXT):
-            raise RunError(f"{self.path}: column '{name}' holds {column.type}, not numbers")
-        column = self._cast(name, column, pa.string())
-        trimmed = pc.utf8_trim_whitespace(column)
-        numeric = pc.match_substring_regex(trimmed, _NUMBER)
-        words = pc.and_(pc.is_valid(column), pc.invert(pc.or_(numeric, pc.is_in(trimmed, value_set=pa.array(_BLANK)))))
-        count, note = pc.sum(words).as_py() or 0, None
-        if count:
-            row = pc.index(words, value=True).as_py()
-            note = (
-                f"{self.path.name}: {counted(count, 'cell')} of column '{name}' without a number, first"
-                f" {column[row].as_py()[:40]!r} in row {row + 1}: taken as missing"
-            )
-        return pc.if_else(numeric, trimmed, pa.scalar(None, pa.string())), note
-
-
-def read(path: Path, *, growing: bool = False) -> Table:
-    """Read a CSV or Parquet table, gzip allowed for CSV (``.csv.gz``).
+def read(
+    path: Path,
+    *,
+    growing: bool = False,
+    fields: Sequence[str] | None = None,
+    where: Where | None = None,
+    topic: str = "",
+    entity: str = "",
+) -> Table:
+    """Read a CSV or Parquet table, gzip allowed for CSV (``.csv.gz``), or a part of a recording.
 
     Args:
-        path: The file.
+        path: The file, or the folder of a bag.
         growing: Whether it may still be growing, or its writer may have been killed. A last line of a CSV without its
             line break may then be torn within a number: it is left out, and noted.
+        fields: Columns and field paths that will be asked for; only of CSV others are read, too. All for None.
+        where: Which rows to read; of Parquet, parts of the file that can have none are skipped.
+        topic: Which part of a recording is the table.
+        entity: The same in a Rerun recording.
 
     Raises:
-        RunError: The file is absent, empty, or neither CSV nor Parquet inside.
+        RunError: The file is absent, empty, or not inside what its ending says; or ``where`` leaves no row.
     """
+    where = where or {}
+    if is_recording(path):
+        return _recording(path, topic, entity, fields, where)
+    if topic or entity:
+        key = "topic" if topic else "entity"
+        raise RunError(
+            f"{path}: a table has no {key}; leave the key out: 'topic' is for MCAP and bags (.mcap, .bag, .db3 or"
+            " their folder), 'entity' for .rrd; rows are chosen by 'where'"
+        )
     try:
-        with pa.input_stream(str(path)) as stream:
-            content = stream.read()
-        if not content:
-            raise RunError(f"{path}: the file is empty")
         if path.suffix == ".parquet":
-            # Without threads: one that outlives the interpreter aborts it (apache/arrow issue 34314).
-            whole = papq.read_table(pa.BufferReader(content), use_threads=False, pre_buffer=False)
-            table, notes = whole, list[str]()
+            (table, names), notes = _parquet(path, fields, where), list[str]()
         else:
-            table, notes = _parsed(path, content, growing)
-        names: list[str] = table.column_names
+            with pa.input_stream(str(path)) as stream:
+                content = stream.read()
+            if not content:
+                raise RunError(f"{path}: the file is empty")
+            whole, notes = _parsed(path, content, growing)
+            table, names = _only(path, whole, where), whole.column_names
     except UnicodeDecodeError:
         raise RunError(f"{path}: not a table that can be read: its text is not UTF-8") from None
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
@@ -181,10 +82,12 @@ def read(path: Path, *, growing: bool = False) -> Table:
         raise RunError(f"{path}: cannot be read: {error.strerror or str(error).splitlines()[0]}") from None
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
-    repeated = next((name for name in names if names.count(name) > 1), None)
-    if repeated is not None:
-        raise RunError(f"{path}: two columns are named '{repeated}'")
-    return Table(path, dict(zip(names, table.columns, strict=True)), table.num_rows, tuple(notes))
+    return Table(path, _named(path, table), table.num_rows, tuple(notes), tuple(names))
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file or folder is an MCAP, a bag or a Rerun recording, which has topics or entities."""
+    return path.suffix in _RECORDINGS or os.path.isdir(path)  # noqa: PTH112 - raises on a long name
 
 
 def write(table: pa.Table, path: Path) -> None:
@@ -193,6 +96,29 @@ def write(table: pa.Table, path: Path) -> None:
         pacsv.write_csv(table, path, pacsv.WriteOptions(quoting_style="needed"))
     else:
         papq.write_table(table, path, compression="zstd")
+
+
+def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None, where: Where) -> Table:
+    """A topic or entity of a recording."""
+    from . import recordings
+
+    key, name, wrong, other = "topic", topic, "entity", entity
+    if path.suffix == ".rrd":
+        key, name, wrong, other = wrong, other, key, name
+    if other:
+        raise RunError(f"{path}: of such a file the key is '{key}', not '{wrong}'")
+    asked = None if fields is None else [*fields, *where]
+    found = recordings.read(path, name, None if asked is None else prefixes(asked))
+    for one in asked or ():
+        if longest(found.names, one) is None:
+            raise UnknownNameError(str(path), "column", one, found.names)
+    if not where:
+        return found
+    whole = pa.table(dict(found.columns))
+    table = _chosen(path, whole, _conditions(path, whole, where))
+    if not table.num_rows:
+        raise _no_row(path, [whole], where)
+    return replace(found, columns=_named(path, table), rows=table.num_rows)
 
 
 def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]]:
@@ -212,7 +138,7 @@ def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]
         return pacsv.read_csv(
             pa.BufferReader(text),
             read_options=pacsv.ReadOptions(use_threads=False),
-            convert_options=pacsv.ConvertOptions(null_values=_BLANK, strings_can_be_null=True),
+            convert_options=pacsv.ConvertOptions(null_values=BLANK, strings_can_be_null=True),
             **options,
         )
 
@@ -232,9 +158,125 @@ def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]
     return table, [note, *notes]
 
 
-def _filled(column: pa.ChunkedArray, missing: float) -> Any:
-    """The numbers of a column, ``missing`` where it has none. Pyarrow's ``to_numpy`` would import pandas (0.2 s)."""
-    whole = column.combine_chunks()
-    found = np.full(len(whole), missing)
-    found[np.from_dlpack(pc.is_valid(whole).cast(pa.uint8())) > 0] = np.from_dlpack(pc.drop_null(whole))
-    return found
+def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
+    """The columns asked for and the rows, some at a time; and the names of all that the file has.
+
+    Without threads: one that outlives the interpreter aborts it (apache/arrow issue 34314). So pyarrow's data sets,
+    which filter by themselves, are no way.
+    """
+    with papq.ParquetFile(str(path), pre_buffer=False, buffer_size=_READ_AHEAD) as file:
+        empty = file.schema_arrow.empty_table()
+        columns, conditions = _named(path, empty), _conditions(path, empty, where)
+        for field in fields or ():
+            find(columns, field, str(path))  # what is absent is told now, while all names are known
+        wanted = None if fields is None else prefixes([*fields, *where])
+        groups = [
+            place for place in range(file.num_row_groups) if _may_hold(file.metadata.row_group(place), conditions)
+        ]
+        kept = [_chosen(path, part, conditions) for part in _parts(file, wanted, groups)]
+        if where and not any(part.num_rows for part in kept):
+            raise _no_row(path, _parts(file, prefixes(list(where)), None), where)
+        names = [file.schema.column(place).path for place in range(len(file.schema))]
+        return pa.concat_tables(kept) if kept else empty, names
+
+
+def _parts(file: papq.ParquetFile, columns: list[str] | None, groups: list[int] | None) -> Iterator[pa.Table]:
+    """Some columns of a Parquet file, some rows at a time."""
+    for batch in file.iter_batches(_BATCH, row_groups=groups, columns=columns, use_threads=False):
+        yield pa.Table.from_batches([batch])
+
+
+def _only(path: Path, whole: pa.Table, where: Where) -> pa.Table:
+    """The rows of a table that ``where`` chooses.
+
+    Raises:
+        RunError: There is none.
+    """
+    chosen = _chosen(path, whole, _conditions(path, whole, where))
+    if where and not chosen.num_rows:
+        raise _no_row(path, [whole], where)
+    return chosen
+
+
+def _conditions(path: Path, table: pa.Table, where: Where) -> dict[str, pa.Scalar]:
+    """What the columns of ``where`` are compared with.
+
+    Raises:
+        RunError: A column is absent, or of a type that cannot have such a value.
+    """
+    columns = _named(path, table)
+    return {name: _like(path, name, find(columns, name, str(path)).type, value) for name, value in where.items()}
+
+
+def _like(path: Path, name: str, kind: pa.DataType, value: bool | float | str) -> pa.Scalar:
+    """A value to compare a column of a type with."""
+    numeric = pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind)
+    if isinstance(value, str) and (pa.types.is_string(kind) or pa.types.is_large_string(kind)):
+        return pa.scalar(value, kind)
+    if isinstance(value, bool) and pa.types.is_boolean(kind):
+        return pa.scalar(value)
+    if not isinstance(value, str | bool) and numeric:
+        # In the column's own precision: 0.1 is found among float32, too.
+        return pa.scalar(value, kind) if pa.types.is_floating(kind) else pa.scalar(value)
+    raise RunError(f"{path}: where: column '{shortened(name)}' holds {shortened(str(kind))}, never {_written(value)}")
+
+
+def _chosen(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.Table:
+    """The rows of a table that meet all conditions; what is null meets none."""
+    columns = _named(path, rows)
+    met = [pc.equal(find(columns, name, str(path), part=True), value) for name, value in conditions.items()]
+    return rows.filter(reduce(pc.and_, met)) if met else rows
+
+
+def _may_hold(group: Any, conditions: Mapping[str, pa.Scalar]) -> bool:
+    """Whether a part of Parquet may have rows that meet all conditions, by the least and the greatest of its values."""
+    columns = [group.column(place) for place in range(group.num_columns)]
+    for name, value in conditions.items():
+        known = [column.statistics for column in columns if column.path_in_schema == name and column.is_stats_set]
+        if len(known) == 1 and known[0].has_min_max and not known[0].min <= value.as_py() <= known[0].max:
+            return False
+    return True
+
+
+def _no_row(path: Path, parts: Iterable[Any], where: Where) -> RunError:
+    """What to say when no row is left: what the columns hold, their range or some of it."""
+    held: dict[str, list[Any]] = {name: [] for name in where}
+    for part in parts:
+        columns = _named(path, part)
+        for name, values in held.items():
+            found = {*values, *pc.unique(find(columns, name, str(path), part=True).drop_null()).to_pylist()}
+            known = sorted(found)
+            held[name] = known[:_SOME] if isinstance(where[name], str) else known[:1] + known[1:][-1:]
+    wanted = " and ".join(f"{shortened(name)} = {_written(value)}" for name, value in where.items())
+    ranges = ", ".join(f"{shortened(name)} {_held(values)}" for name, values in held.items())
+    return RunError(f"{path}: no row has {wanted}; in this file {ranges}")
+
+
+def _held(values: Sequence[Any]) -> str:
+    """Which values a column holds, by its least and its greatest number, or by some of its texts."""
+    if not values:
+        return "has no value"
+    if isinstance(values[0], str):
+        return f"is {', '.join(map(_written, values))}{', …' if len(values) == _SOME else ''}"
+    first, last = _written(values[0]), _written(values[-1])
+    return f"is {first}" if first == last else f"goes from {first} to {last}"
+
+
+def _written(value: Any) -> str:
+    """A value as it is written in run.toml."""
+    return shortened(
+        str(value).lower() if isinstance(value, bool) else repr(value) if isinstance(value, str) else str(value)
+    )
+
+
+def _named(path: Path, table: pa.Table) -> dict[str, pa.ChunkedArray]:
+    """The columns of a table by name.
+
+    Raises:
+        RunError: Two have one name.
+    """
+    names: list[str] = table.column_names
+    if len(set(names)) < len(names):
+        repeated = next(name for name in names if names.count(name) > 1)
+        raise RunError(f"{path}: two columns are named '{repeated}'")
+    return dict(zip(names, table.columns, strict=True))

@@ -32,6 +32,11 @@ def points(colour: str, label: str, marker: Marker = "Circle") -> rr.SeriesPoint
     return rr.SeriesPoints(colors=[colours.rgb(colour)], marker_sizes=[size], names=label, markers=[marker])
 
 
+def timeline(time: FloatArray) -> list[rr.TimeColumn]:
+    """The timeline of seconds since the first command, (n,)."""
+    return [rr.TimeColumn(TIMELINE, duration=time)]
+
+
 def send(stream: rr.RecordingStream, path: str, time: FloatArray, value: FloatArray) -> None:
     """Send the finite values of a series.
 
@@ -43,5 +48,4 @@ def send(stream: rr.RecordingStream, path: str, time: FloatArray, value: FloatAr
     """
     there = np.isfinite(time) & np.isfinite(value)
     if there.any():
-        columns = rr.Scalars.columns(scalars=value[there])
-        rr.send_columns(path, [rr.TimeColumn(TIMELINE, duration=time[there])], columns, recording=stream)
+        rr.send_columns(path, timeline(time[there]), rr.Scalars.columns(scalars=value[there]), recording=stream)

@@ -1,0 +1,417 @@
+"""Columns of a table, also nested ones, as SI arrays, whatever state the log is in.
+
+A column is called by its name or by a field path: ``pose.position.x`` is a field of structs, ``position[2]`` an element
+of lists, ``position[elbow]`` the element whose place is that of ``elbow`` in the list ``name`` beside ``position``, as
+in ROS's ``sensor_msgs/JointState``. A cell that is empty, no number, or not there in its row becomes NaN.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from .. import units
+from ..arrays import NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
+from ..errors import RunError, UnknownNameError, counted, shortened
+
+Columns: TypeAlias = Mapping[str, pa.ChunkedArray]
+
+NAMES = "name"  # the list beside another one that says what its elements are
+# Seconds and nanoseconds in a struct: ROS 2, ROS 1, Foxglove's JSON schemas, google.protobuf.Timestamp.
+_SPLIT_STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("seconds", "nanos"))
+_NANOSECONDS = re.compile(r"^[^.]*(nano|nsec)[^.]*$", re.IGNORECASE)
+_GIGA = 10**9
+_WHOLE = r"^[+-]?\d{1,19}$"
+_NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
+_DATE = r"^\d{4}-\d\d-\d\d[T ]\d\d(:\d\d){1,2}([.,]\d{1,9})?([Zz]|[+-]\d\d(:?\d\d)?)?$"  # ISO 8601
+_ZONE = r"\d([Zz]|[+-]\d\d(:?\d\d)?)$"  # behind a time
+BLANK = ("", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None")
+_NUMBERS = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
+_NEITHER_NUMBERS_NOR_TEXT = (pa.types.is_boolean, pa.types.is_temporal, pa.types.is_nested, pa.types.is_union)
+_LISTS = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
+_TEXTS = (pa.types.is_string, pa.types.is_large_string)
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table: a file, or a topic of one.
+
+    Attributes:
+        path: Where it was read from.
+        columns: Its columns by name; they may be nested.
+        rows: Number of rows.
+        notes: What was wrong with the file as a whole, a sentence each.
+        names: Names and field paths of all that the file has, also where ``columns`` are only some of it.
+    """
+
+    path: Path
+    columns: Columns
+    rows: int
+    notes: tuple[str, ...]
+    names: tuple[str, ...] = ()
+
+    def numbers(self, name: str, unit: str = "") -> tuple[FloatArray, str | None]:
+        """A column of positions [m or rad], NaN where a cell is empty or no number, and a note on cells that were text.
+
+        Args:
+            name: The column, or a field path.
+            unit: The ending of its unit (``_mm``); empty: what the name ends in.
+
+        Raises:
+            RunError: The column is absent, its name ends in no unit of a length or an angle, or it holds something else
+                than numbers.
+        """
+        self._plain_column(name)
+        unit = unit or self._ending(name, (*units.LENGTHS, *units.ANGLES), "mm")
+        values, note = self.plain(name)
+        return units.si_of(values, unit), note
+
+    def plain(self, name: str) -> tuple[FloatArray, str | None]:
+        """A column of numbers without conversion, with NaN and note as in :meth:`numbers`.
+
+        Raises:
+            RunError: The column is absent or holds something else than numbers.
+        """
+        column, note = self._numeric(name)
+        return _filled(column.cast(pa.float64(), safe=False), np.nan), note
+
+    def texts(self, name: str) -> list[str]:
+        """A column as trimmed text, empty where a cell is; whole numbers without a point.
+
+        Raises:
+            RunError: The column is absent or has no text.
+        """
+        column = self.column(name)
+        if pa.types.is_floating(column.type):
+            whole = pc.and_(pc.less(pc.abs(column), 1e15), pc.equal(column, pc.round(column)))
+            column = column.cast(pa.int64()) if pc.all(whole).as_py() else column
+        return [(cell or "").strip() for cell in self._cast(name, column, pa.string()).to_pylist()]
+
+    def stamps(self, name: str, nanoseconds: str = "", unit: str = "") -> tuple[TimeArray, str | None]:
+        """Stamps in int64 ns, ``NO_STAMP`` where a cell is empty or no time, and a note on cells that were text.
+
+        Whole numbers, also beside cells of text, decimals, dates and Arrow's timestamps are exact, and so are seconds
+        and nanoseconds apart. A date without a time zone is in UTC.
+
+        Args:
+            name: A column, or a field path: numbers, timestamps, ISO 8601 text, or structs of seconds and nanoseconds.
+            nanoseconds: A column beside it: then both are whole numbers, and ``name`` is of seconds.
+            unit: The ending of the unit of numbers (``_ms``); empty: what the name ends in.
+
+        Raises:
+            RunError: The column is absent, its unit is not known, it holds no time, dates are mixed with numbers, or
+                with and without a zone, or a stamp is beyond reach of int64 ns.
+        """
+        column = self.column(name)
+        if pa.types.is_struct(column.type):
+            fields = {field.name for field in column.type}
+            split = next((pair for pair in _SPLIT_STAMPS if fields.issuperset(pair)), None)
+            if split is not None and not nanoseconds:
+                return self.stamps(f"{name}.{split[0]}", f"{name}.{split[1]}")
+        if nanoseconds:
+            return self._of_two(name, nanoseconds)
+        if _is_any(column.type, (pa.types.is_timestamp, pa.types.is_duration)):
+            return self._within_reach(name, self._of_clock(name, column)), None
+        dates = self._dates(name, column)
+        if dates is not None:
+            return self._within_reach(name, self._of_clock(name, dates[0])), dates[1]
+        self._plain_column(name)
+        exponent = 9 - 3 * units.TIMES.index(unit or self._ending(name, units.TIMES, "s"))
+        return self._of_numbers(name, 10**exponent)
+
+    def zoned(self, name: str) -> bool | None:
+        """Whether a column of dates says its time zone; None for a column of anything else."""
+        column = self.column(name)
+        if pa.types.is_timestamp(column.type):
+            return column.type.tz is not None
+        if not _is_any(column.type, _TEXTS):
+            return None
+        found = column.filter(pc.match_substring_regex(pc.utf8_trim_whitespace(column), _DATE))
+        return pc.any(pc.match_substring_regex(found, _ZONE)).as_py()
+
+    def nanoseconds_beside(self, name: str) -> str | None:
+        """A column beside one of seconds that by its name has their nanoseconds; None without one."""
+        table, dot, _ = name.rpartition(".")
+        beside = (path for path in self.names if path.startswith(table + dot) and path != name)
+        return next((path for path in beside if _NANOSECONDS.search(path.removeprefix(table + dot))), None)
+
+    def column(self, path: str) -> pa.ChunkedArray:
+        """The column of a name or a field path, nothing converted. A column that has the whole path as its name wins.
+
+        Raises:
+            RunError: There is none; says what there is.
+        """
+        return find(self.columns, path, str(self.path))
+
+    def _of_numbers(self, name: str, per_unit: int) -> tuple[TimeArray, str | None]:
+        column, note = self._numeric(name)
+        if pa.types.is_decimal(column.type):
+            exact = pc.multiply(
+                column.cast(pa.decimal256(50, column.type.scale)), pa.scalar(per_unit, pa.decimal256(11))
+            )
+            column, per_unit = pc.round(exact), 1
+        rough = _filled(column.cast(pa.float64(), safe=False), np.nan) * per_unit
+        self._refuse_beyond(name, np.isfinite(rough) & (np.abs(rough) >= REACH_NS))
+        found = np.where(np.isfinite(rough), np.rint(rough), NO_STAMP).astype(np.int64)
+        if _is_any(column.type, _TEXTS):
+            column = pc.if_else(pc.match_substring_regex(column, _WHOLE), column, pa.scalar(None, pa.string()))
+        if not pa.types.is_floating(column.type):
+            whole = _filled(self._cast(name, column, pa.int64()), NO_STAMP)
+            found = np.where(whole == NO_STAMP, found, whole * per_unit)
+        return found, note
+
+    def _of_two(self, name: str, nanoseconds: str) -> tuple[TimeArray, str | None]:
+        """Stamps of whole seconds and nanoseconds apart."""
+        (seconds, note), (rest, other) = self._whole(name), self._whole(nanoseconds)
+        missing = (seconds == NO_STAMP) | (rest == NO_STAMP)
+        self._refuse_beyond(name, ~missing & (np.abs(seconds * 1e9) >= REACH_NS))
+        wrong = np.flatnonzero(~missing & ((rest < 0) | (rest >= _GIGA)))
+        if len(wrong):
+            raise RunError(
+                f"{self.path}: column '{shortened(nanoseconds)}', row {wrong[0] + 1}: {rest[wrong[0]]} is no number of"
+                f" nanoseconds within a second, 0 to {_GIGA - 1}"
+            )
+        return np.where(missing, NO_STAMP, np.where(missing, 0, seconds) * _GIGA + rest), note or other
+
+    def _whole(self, name: str) -> tuple[IntArray, str | None]:
+        """Whole numbers of a column, ``NO_STAMP`` where it has none, and a note on cells that were text."""
+        column, note = self._numeric(name)
+        if pa.types.is_floating(column.type):
+            column = pc.if_else(pc.is_finite(column), column, pa.scalar(None, column.type))
+            if pc.any(pc.not_equal(column, pc.round(column))).as_py():
+                raise RunError(
+                    f"{self.path}: column '{shortened(name)}' is beside another of one time: it must be whole"
+                )
+        return _filled(self._cast(name, column, pa.int64()), NO_STAMP), note
+
+    def _of_clock(self, name: str, column: pa.ChunkedArray) -> TimeArray:
+        """Int64 ns of Arrow's timestamps, in any unit and zone, and durations."""
+        kind = pa.duration("ns") if pa.types.is_duration(column.type) else pa.timestamp("ns", column.type.tz)
+        return _filled(self._cast(name, column, kind).cast(pa.int64()), NO_STAMP)
+
+    def _dates(self, name: str, column: pa.ChunkedArray) -> tuple[pa.ChunkedArray, str | None] | None:
+        """A column of ISO 8601 text as timestamps, and a note on other text; None for a column without dates.
+
+        Raises:
+            RunError: It has numbers, too, or dates with and without a time zone.
+        """
+        if not _is_any(column.type, _TEXTS):
+            return None
+        text = pc.utf8_upper(pc.utf8_trim_whitespace(column))
+        dated = pc.match_substring_regex(text, _DATE)
+        if not pc.any(dated).as_py():
+            return None
+        zoned = pc.and_(dated, pc.match_substring_regex(text, _ZONE))
+        kinds = {
+            "a date with a time zone": zoned,
+            "a date without one": pc.and_(dated, pc.invert(zoned)),
+            "a number": pc.match_substring_regex(text, _NUMBER),
+        }
+        rows = {kind: pc.index(mask, value=True).as_py() + 1 for kind, mask in kinds.items() if pc.any(mask).as_py()}
+        if len(rows) > 1:
+            found = ", ".join(f"{kind} in row {row}" for kind, row in rows.items())
+            raise RunError(f"{self.path}: column '{shortened(name)}' mixes stamps: {found}; write all in one way")
+        text = pc.replace_substring(pc.if_else(dated, text, pa.scalar(None, text.type)), ",", ".")
+        kind = pa.timestamp("ns", "UTC" if "a date with a time zone" in rows else None)
+        return self._cast(name, text, kind), self._words(name, column, dated, "a date")
+
+    def _within_reach(self, name: str, stamp: TimeArray) -> TimeArray:
+        self._refuse_beyond(name, (stamp != NO_STAMP) & ((stamp >= int(REACH_NS)) | (stamp <= -int(REACH_NS))))
+        return stamp
+
+    def _refuse_beyond(self, name: str, rows: BoolArray) -> None:
+        if rows.any():
+            raise RunError(
+                f"{self.path}: column '{shortened(name)}', row {rows.argmax() + 1}: a stamp beyond the year 2110; is it"
+                " of the unit that its name or run.toml says?"
+            )
+
+    def _cast(self, name: str, column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
+        try:
+            return column.cast(kind)
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+            raise RunError(f"{self.path}: column '{shortened(name)}': {str(error).splitlines()[0]}") from None
+
+    def _ending(self, name: str, accepted: tuple[str, ...], example: str) -> str:
+        """The unit in which a name ends."""
+        unit = units.ending(leaf(name))
+        if unit is None or unit not in accepted:
+            short = shortened(name)
+            raise RunError(
+                f"{self.path}: column '{short}' has no unit in its name; it must end in {', '.join(accepted)} (for"
+                f" instance '{short}_{example}'), or run.toml says it: {{ column = '{short}', unit = '{example}' }}"
+            )
+        return unit
+
+    def _plain_column(self, name: str) -> pa.ChunkedArray:
+        """A column of numbers or text."""
+        column = self.column(name)
+        if _is_any(column.type, _NEITHER_NUMBERS_NOR_TEXT):
+            raise RunError(f"{self.path}: column '{shortened(name)}' holds {_in_words(column.type)}, not numbers")
+        return column
+
+    def _numeric(self, name: str) -> tuple[pa.ChunkedArray, str | None]:
+        """A column of numbers, or of text that is numbers; cells of other text are null, and counted in a note."""
+        column = self._plain_column(name)
+        if _is_any(column.type, _NUMBERS):
+            return column, None
+        column = self._cast(name, column, pa.string())
+        trimmed = pc.utf8_trim_whitespace(column)
+        numeric = pc.match_substring_regex(trimmed, _NUMBER)
+        note = self._words(name, column, numeric, "a number")
+        return pc.if_else(numeric, trimmed, pa.scalar(None, pa.string())), note
+
+    def _words(self, name: str, column: pa.ChunkedArray, good: pa.ChunkedArray, what: str) -> str | None:
+        """A note on the cells of a column of text that are neither good nor blank; None without any."""
+        blank = pc.is_in(pc.utf8_trim_whitespace(column), value_set=pa.array(BLANK, column.type))
+        words = pc.and_(pc.is_valid(column), pc.invert(pc.or_(good, blank)))
+        count = pc.sum(words).as_py() or 0
+        if not count:
+            return None
+        row = pc.index(words, value=True).as_py()
+        return (
+            f"{self.path.name}: {counted(count, 'cell')} of column '{shortened(name)}' without {what}, first"
+            f" {column[row].as_py()[:40]!r} in row {row + 1}: taken as missing"
+        )
+
+
+def leaf(path: str) -> str:
+    """A field path without the choice of an element at its end: the name that may carry a unit."""
+    return re.sub(r"(\[[^\]]*\])+$", "", path)
+
+
+def prefixes(paths: Sequence[str]) -> list[str]:
+    """Names of columns, whole or to a field, of which field paths are parts: what has to be read for them.
+
+    ``joints.position[elbow]`` needs ``joints.position`` and the names beside it, ``joints.name``. Some may not exist.
+    """
+    found: dict[str, None] = {}
+    for path in paths:
+        found[path] = None
+        for bracket in re.finditer(r"\[", path):
+            whole = path[: bracket.start()]
+            beside, dot, _ = whole.rpartition(".")
+            found |= {whole: None, f"{beside}{dot}{NAMES}": None}
+    return list(found)
+
+
+def find(columns: Columns, path: str, where: str, *, part: bool = False) -> pa.ChunkedArray:
+    """What a name or a field path leads to among columns, nothing converted.
+
+    The longest name that fits wins: flat tables have columns that are called ``a.b`` or ``a[0]``.
+
+    Args:
+        columns: By name.
+        path: The name or field path.
+        where: The file, for errors.
+        part: Whether there are more rows than these: then these alone need not have the element of a list.
+
+    Raises:
+        RunError: It leads nowhere; says where it ends and what is there.
+    """
+    name = longest(columns, path)
+    if name is None:
+        raise UnknownNameError(where, "column", path, columns)
+    label = f"{where}: column '{shortened(path)}'"
+    return _inside(columns[name], path[len(name) :], columns.get(NAMES), label, part)
+
+
+def longest(columns: Iterable[str], path: str) -> str | None:
+    """The longest name that is the path, or that the path goes on from."""
+    fits = (name for name in columns if path.startswith(name) and path[len(name) : len(name) + 1] in ("", ".", "["))
+    return max(fits, key=len, default=None)
+
+
+def _inside(
+    column: pa.ChunkedArray, rest: str, names: pa.ChunkedArray | None, label: str, part: bool
+) -> pa.ChunkedArray:
+    """What the rest of a field path, ``[2].x``, leads to in a column; ``names`` is the list of names beside it."""
+    if not rest:
+        return column.cast(column.type.value_type) if pa.types.is_dictionary(column.type) else column
+    if rest.startswith("["):
+        key, closed, rest = rest[1:].partition("]")
+        if not closed:
+            raise RunError(f"{label}: '[' without ']'; an element is written position[2] or position[elbow]")
+        return _inside(_element(column, key, names, label, part), rest, None, label, part)
+    if not rest.startswith("."):
+        raise RunError(f"{label}: '.' or '[' is missing before '{shortened(rest)}'")
+    if not pa.types.is_struct(column.type):
+        raise RunError(f"{label}: no field '{shortened(rest[1:])}' in {_in_words(column.type)}")
+    fields = {field.name: pc.struct_field(column, [place]) for place, field in enumerate(column.type)}
+    name = longest(fields, rest[1:])
+    if name is None:
+        raise UnknownNameError(label, "field", rest[1:], fields)
+    return _inside(fields[name], rest[1 + len(name) :], fields.get(NAMES), label, part)
+
+
+def _element(
+    column: pa.ChunkedArray, key: str, names: pa.ChunkedArray | None, label: str, part: bool
+) -> pa.ChunkedArray:
+    """An element of the list in each row, by its place or its name; null in a row that has none."""
+    if not _is_any(column.type, _LISTS):
+        raise RunError(f"{label}: no element '{shortened(key)}' in {_in_words(column.type)}")
+    elements, lengths, starts = _elements(column)
+    if key.isascii() and key.isdigit():
+        place = int(key) if len(key) < 10 else _GIGA
+    elif names is None or not _is_any(names.type, _LISTS) or not _is_any(names.type.value_type, _TEXTS):
+        raise RunError(
+            f"{label}: no list '{NAMES}' of text beside it says which element is '{shortened(key)}'; by their place"
+            " they are 0, 1, 2"
+        )
+    else:
+        place = _places(names, key)
+    there = (place >= 0) & (place < lengths)
+    if len(there) and not there.any() and not part:
+        what = f"at most {lengths.max()} elements" if names is None or isinstance(place, int) else _some_of(names)
+        raise RunError(f"{label}: no row has an element '{shortened(key)}'; they have {what}")
+    return pa.chunked_array([elements.take(pa.array(starts + place, mask=~there))])
+
+
+def _elements(column: pa.ChunkedArray) -> tuple[pa.Array, IntArray, IntArray]:
+    """The elements of all lists of a column, one after the other; how many each row has, and where its first is."""
+    lengths = _filled(pc.list_value_length(column).cast(pa.int64()), 0)
+    return pc.list_flatten(column).combine_chunks(), lengths, np.cumsum(lengths) - lengths
+
+
+def _places(names: pa.ChunkedArray, key: str) -> IntArray:
+    """Place of a name in the list of each row, −1 where it is not there, (rows,)."""
+    elements, lengths, starts = _elements(names)
+    found = np.flatnonzero(_filled(pc.equal(elements, key).cast(pa.uint8()), 0))
+    rows = np.repeat(np.arange(len(lengths)), lengths)[found]
+    places = np.full(len(lengths), -1)
+    places[rows[::-1]] = (found - starts[rows])[::-1]  # the first of several
+    return places
+
+
+def _some_of(names: pa.ChunkedArray) -> str:
+    """Names in a sentence."""
+    known = [shortened(name) for name in pc.unique(pc.list_flatten(names).drop_null()).to_pylist()[:20]]
+    return ", ".join(known) or "no names"
+
+
+def _is_any(kind: pa.DataType, kinds: Sequence[Callable[[pa.DataType], bool]]) -> bool:
+    return any(is_kind(kind) for is_kind in kinds)
+
+
+def _in_words(kind: pa.DataType) -> str:
+    """A type as errors call it, and the way into it where it has an inside."""
+    if pa.types.is_struct(kind) and kind.num_fields:
+        return f"structs of {', '.join(field.name for field in kind)} (as in .{kind.field(0).name})"
+    if _is_any(kind, _LISTS):
+        return "lists (an element is written [0])"
+    return shortened(str(kind))
+
+
+def _filled(column: Any, missing: float) -> Any:
+    """The numbers of a column, ``missing`` where it has none. Pyarrow's ``to_numpy`` would import pandas (0.2 s)."""
+    whole = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+    found = np.full(len(whole), missing)
+    found[np.from_dlpack(pc.is_valid(whole).cast(pa.uint8())) > 0] = np.from_dlpack(pc.drop_null(whole))
+    return found

@@ -1,0 +1,249 @@
+"""Field paths and stamps: what pure Python finds in the rows and on the clock, and one line for anything else."""
+
+from __future__ import annotations
+
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pumafuse.arrays import NO_STAMP
+from pumafuse.errors import PumafuseError, RunError
+from pumafuse.logs.columns import Table
+from refusals import one_line
+
+GIGA = 10**9
+LAST = 4_599_999_999 * GIGA  # ns, within reach
+EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)  # noqa: UP017 - beside timezone(…)
+properties = settings(derandomize=True, deadline=None, max_examples=50)
+
+names = st.sampled_from(["x", "position", "höhe", "a b", "0"])
+shapes: st.SearchStrategy[Any] = st.recursive(
+    st.just(float),
+    lambda inner: st.one_of(
+        st.dictionaries(names, inner, min_size=1, max_size=3),
+        st.lists(inner, min_size=1, max_size=1),  # a list of this
+        st.tuples(inner, st.integers(1, 3)),  # a list of this and so many
+    ),
+    max_leaves=6,
+)
+
+
+def kind(shape: Any) -> pa.DataType:
+    if isinstance(shape, dict):
+        return pa.struct([(name, kind(inner)) for name, inner in shape.items()])
+    if isinstance(shape, list):
+        return pa.list_(kind(shape[0]))
+    return pa.list_(kind(shape[0]), shape[1]) if isinstance(shape, tuple) else pa.float64()
+
+
+def cells(shape: Any) -> st.SearchStrategy[Any]:
+    """What a row may hold, nothing at any depth included."""
+    if isinstance(shape, dict):
+        found: st.SearchStrategy[Any] = st.fixed_dictionaries({name: cells(inner) for name, inner in shape.items()})
+    elif isinstance(shape, list):
+        found = st.lists(cells(shape[0]), max_size=3)
+    elif isinstance(shape, tuple):
+        found = st.lists(cells(shape[0]), min_size=shape[1], max_size=shape[1])
+    else:
+        found = st.floats(-1e3, 1e3)
+    return st.none() | found
+
+
+def walk(data: st.DataObject, shape: Any) -> tuple[str, list[str | int]]:
+    """A path from a column to a number, as text and in steps."""
+    text, steps = "column", list[str | int]()
+    while shape is not float:
+        if isinstance(shape, dict):
+            steps.append(data.draw(st.sampled_from(sorted(shape))))
+            text, shape = f"{text}.{steps[-1]}", shape[steps[-1]]
+        else:
+            steps.append(data.draw(st.integers(0, 3)))
+            text, shape = f"{text}[{steps[-1]}]", shape[0]
+    return text, steps
+
+
+def reached(cell: Any, steps: list[str | int]) -> Any:
+    for step in steps:
+        if cell is None or (isinstance(step, int) and step >= len(cell)):
+            return None
+        cell = cell[step]
+    return cell
+
+
+def chunked(values: list[Any], of: pa.DataType, cut: int) -> pa.ChunkedArray:
+    return pa.chunked_array([pa.array(values[:cut], of), pa.array(values[cut:], of)], of)
+
+
+@properties
+@given(st.data(), shapes)
+def test_a_path_finds_what_python_finds_in_each_row(data: st.DataObject, shape: Any) -> None:
+    """At any depth of structs and lists, in any chunks; null, or a list that is too short, is missing."""
+    rows = data.draw(st.lists(cells(shape), max_size=6))
+    path, steps = walk(data, shape)
+    columns = {"column": chunked(rows, kind(shape), data.draw(st.integers(0, len(rows))))}
+    wanted = [reached(row, steps) for row in rows]
+    try:
+        found = Table(Path("log"), columns, len(rows), ()).column(path).to_pylist()
+    except RunError as error:
+        assert "no row has an element" in str(error)
+        assert set(wanted) == {None}
+    else:
+        assert found == wanted
+
+
+@properties
+@given(st.data(), st.lists(st.lists(st.sampled_from("abc"), unique=True, max_size=3), min_size=1, max_size=8))
+def test_an_element_by_name_is_the_one_at_the_place_of_its_name(data: st.DataObject, rows: list[list[str]]) -> None:
+    """In each row anew; a row without the name, or with fewer values than names, has none."""
+    values = [data.draw(st.lists(st.floats(-1, 1), max_size=3)) for _ in rows]
+    cut = data.draw(st.integers(0, len(rows)))
+    of = {"name": pa.list_(pa.string()), "position": pa.list_(pa.float64())}
+    columns = {"name": chunked(rows, of["name"], cut), "position": chunked(values, of["position"], len(rows) - cut)}
+    known = [dict(zip(row, value, strict=False)).get("b") for row, value in zip(rows, values, strict=True)]
+    table = Table(Path("log"), columns, len(rows), ())
+    if set(known) == {None}:
+        assert "no row has an element 'b'" in one_line(RunError, lambda: table.column("position[b]"))
+    else:
+        assert table.column("position[b]").to_pylist() == known
+
+
+NESTED = pa.table(
+    {
+        "t_s": [0.0, 1.0],
+        "a": [{"b": [1.0, 2.0], "name": ["x", "y"]}, None],
+        "a.b": pa.array([None, None], pa.list_(pa.float64())),
+        "name": [["x"], ["y", "x"]],
+        "position": [[1.0], [2.0, 3.0]],
+        "word": ["a", None],
+        "map": pa.array([[("k", 1)], []], pa.map_(pa.string(), pa.int64())),
+        "none": pa.nulls(2),
+    }
+)
+WHOLE = Table(Path("log"), dict(zip(NESTED.column_names, NESTED.columns, strict=True)), 2, ())
+
+
+@properties
+@given(
+    st.text(alphabet="ab.[]01xyname_s", max_size=12)
+    | st.sampled_from(sorted(WHOLE.columns)).flatmap(
+        lambda name: st.text(alphabet=".[]01xnb", max_size=8).map(name.__add__)
+    )
+)
+def test_whatever_a_path_is_it_is_a_column_or_one_line(path: str) -> None:
+    """Nothing else comes out, whoever asks for it."""
+    for ask in (WHOLE.column, WHOLE.numbers, WHOLE.stamps, WHOLE.zoned, lambda name: WHOLE.numbers(name, "_m")):
+        try:
+            ask(path)
+        except PumafuseError as error:
+            assert len(str(error).splitlines()) == 1
+
+
+def one_column(values: Any, of: pa.DataType | None = None) -> Table:
+    return Table(Path("log"), {"t": pa.chunked_array([pa.array(values, of)])}, len(values), ())
+
+
+@properties
+@given(st.data(), st.sampled_from(["", "Z", "z", "offset"]), st.sampled_from([0, 1, 3, 6, 9]))
+def test_iso_dates_are_what_the_standard_library_says(data: st.DataObject, zone: str, digits: int) -> None:
+    """With and without a zone, with any number of decimals; a blank cell is missing, a word is noted."""
+    cells, wanted = list[str](), list[int]()
+    for ns in data.draw(st.lists(st.integers(-LAST, LAST), min_size=1, max_size=5)):
+        ns -= ns % 10 ** (9 - digits)
+        hours, minutes = data.draw(st.tuples(st.integers(-12, 14), st.sampled_from([0, 30])))
+        offset = timedelta(hours=hours, minutes=minutes) if zone == "offset" else timedelta()
+        local = EPOCH + timedelta(seconds=ns // GIGA) + offset
+        fraction = f"{ns % GIGA:09d}"[:digits]
+        point = data.draw(st.sampled_from(".,")) if digits else ""
+        text = f"{local:%Y-%m-%d}{data.draw(st.sampled_from('T '))}{local:%H:%M:%S}{point}{fraction}"
+        total = int(offset.total_seconds()) // 60
+        colon = data.draw(st.sampled_from([":", ""]))
+        sign = "-" if total < 0 else "+"
+        suffix = f"{sign}{abs(total) // 60:02d}{colon}{abs(total) % 60:02d}" if zone == "offset" else zone
+        cells.append(f" {text}{suffix}")
+        wanted.append(ns)
+    found, note = one_column([*cells, "", None]).stamps("t")
+    assert found.tolist() == [*wanted, NO_STAMP, NO_STAMP]
+    assert note is None
+    _, note = one_column([*cells, "tomorrow"]).stamps("t")
+    assert "1 cell of column 't' without a date, first 'tomorrow'" in str(note)
+    assert one_column(cells).zoned("t") is (zone != "")
+
+
+@pytest.mark.parametrize("zone", [None, "UTC", "Europe/Berlin", "+05:30"])
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+@properties
+@given(st.data())
+def test_arrow_timestamps_are_exact(unit: str, zone: str | None, data: st.DataObject) -> None:
+    """In any unit; a zone changes how they are shown, not when they are."""
+    per = {"s": GIGA, "ms": 10**6, "us": 10**3, "ns": 1}[unit]
+    ticks = data.draw(st.lists(st.none() | st.integers(-LAST // per, LAST // per), min_size=1, max_size=5))
+    wanted = [NO_STAMP if tick is None else tick * per for tick in ticks]
+    table = one_column(ticks, pa.timestamp(unit, zone))
+    assert table.stamps("t")[0].tolist() == wanted
+    assert table.zoned("t") is (zone is not None)
+
+
+SIGNED = (pa.int64(), pa.decimal128(20, 0), pa.string())
+
+
+@properties
+@given(
+    st.lists(st.none() | st.integers(-LAST, LAST), min_size=1, max_size=6),
+    st.sampled_from(SIGNED),
+    st.sampled_from([pa.uint32(), pa.int64(), pa.float64()]),
+)
+def test_seconds_and_nanoseconds_apart_are_exact(
+    stamps: list[int | None], first: pa.DataType, second: pa.DataType
+) -> None:
+    """Of any type of whole numbers; if either is missing, so is the stamp."""
+    seconds = [None if one is None else one // GIGA for one in stamps]
+    rest = [None if one is None else one % GIGA for one in stamps]
+    of = {"sec": pa.array(seconds, pa.int64()).cast(first), "nanosec": pa.array(rest, pa.int64()).cast(second)}
+    table = Table(Path("log"), {name: pa.chunked_array([array]) for name, array in of.items()}, len(stamps), ())
+    found, note = table.stamps("sec", "nanosec")
+    assert found.tolist() == [NO_STAMP if one is None else one for one in stamps]
+    assert note is None
+
+
+@pytest.mark.parametrize("names", [("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("seconds", "nanos")])
+def test_a_struct_of_seconds_and_nanoseconds_is_a_stamp(names: tuple[str, str]) -> None:
+    """ROS 2, ROS 1, and Foxglove's schemas in JSON and Protobuf; a null struct is missing."""
+    rows = [dict(zip(names, (1_700_000_000, 123_456_789), strict=True)), None]
+    assert one_column(rows).stamps("t")[0].tolist() == [1_700_000_000_123_456_789, NO_STAMP]
+
+
+@pytest.mark.parametrize(
+    "cells",
+    [
+        ["2024-01-01T00:00:00Z", "1.5"],
+        ["2024-01-01T00:00:00", "2024-01-01T00:00:00Z"],
+        ["2024-01-01T00:00:00+01:00", "2024-01-01 00:00:00"],
+    ],
+)
+def test_stamps_written_in_two_ways_are_refused(cells: list[str]) -> None:
+    """Dates and numbers, and dates with and without a zone, would be of two clocks; both rows are named."""
+    text = one_line(RunError, lambda: one_column(cells).stamps("t"))
+    assert "row 1" in text and "row 2" in text
+
+
+@pytest.mark.parametrize(
+    "cell", ["2024-02-30T00:00:00", "2024-01-01T25:00:00", "9999-01-01T00:00:00", "1800-01-01T00:00:00"]
+)
+def test_dates_that_are_none_are_refused(cell: str) -> None:
+    """A day, an hour or a century too many is one line with the column."""
+    assert "'t'" in one_line(RunError, lambda: one_column([cell]).stamps("t"))
+
+
+@properties
+@given(st.lists(st.decimals(-(10**9), 10**9, places=9), min_size=1, max_size=5))
+def test_decimal_seconds_are_exact(stamps: list[Any]) -> None:
+    """A Parquet column of decimals has every nanosecond of today, which float64 has not."""
+    table = one_column(stamps, pa.decimal128(20, 9))
+    assert table.stamps("t", unit="_s")[0].tolist() == [int(stamp * GIGA) for stamp in stamps]
+    np.testing.assert_allclose(table.numbers("t", "_m")[0], [float(stamp) for stamp in stamps], rtol=1e-15)

@@ -1,0 +1,632 @@
+"""Sources as they are: the same log in any layout gives the same run, bit for bit, and a wrong one gives one line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime, timedelta, timezone
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.csv as pacsv
+import pyarrow.parquet as papq
+import pytest
+
+from pumafuse.arrays import NO_STAMP
+from pumafuse.errors import PumafuseError
+from pumafuse.logs.run import Run, Source
+from refusals import one_line
+
+ROWS = 500
+GIGA = 10**9
+RNG = np.random.default_rng(21)
+STAMP = 1_700_000_000_000_000_000 + np.cumsum(
+    RNG.integers(5_000_000, 15_000_000, ROWS)
+)  # of today: beyond float's grid
+X, ANGLE = RNG.normal(0.0, 0.1, ROWS), RNG.normal(0.0, 1.0, ROWS)  # m, rad
+X[3] = np.nan
+JOINTS = ("elbow", "wrist", "gripper")
+refusal = partial(one_line, PumafuseError)
+
+
+def nullable(values: npt.ArrayLike) -> pa.Array:
+    return pa.array(np.asarray(values), from_pandas=True)
+
+
+def split(stamp: npt.NDArray[np.int64] = STAMP) -> tuple[pa.Array, pa.Array]:
+    return pa.array(stamp // GIGA, pa.int32()), pa.array(stamp % GIGA, pa.uint32())
+
+
+def header(names: tuple[str, str] = ("sec", "nanosec")) -> pa.Array:
+    return pa.StructArray.from_arrays([pa.StructArray.from_arrays(split(), names)], ["stamp"])
+
+
+def pose(x: npt.ArrayLike = X) -> pa.Array:
+    position = pa.StructArray.from_arrays([nullable(x), nullable(np.zeros(ROWS))], ["x", "y"])
+    return pa.StructArray.from_arrays([position], ["position"])
+
+
+def joint_states() -> tuple[pa.Array, pa.Array]:
+    """Names and positions in an order that changes; the elbow is an extra name in some rows, absent in row 7."""
+    names, positions = list[list[str]](), list[list[float]]()
+    for row in range(ROWS):
+        order = RNG.permutation(JOINTS).tolist()
+        if row == 7:
+            order.remove("elbow")
+        names.append(order)
+        positions.append([ANGLE[row] if name == "elbow" else 99.0 for name in order])
+    return pa.array(names), pa.array(positions)
+
+
+def read(folder: Path, command: str, columns: Mapping[str, Any] | pa.Table, name: str = "log.parquet") -> Run:
+    table = columns if isinstance(columns, pa.Table) else pa.table(dict(columns))
+    if name.endswith(".csv"):
+        pacsv.write_csv(table, folder / name)
+    else:
+        papq.write_table(table, folder / name, row_group_size=64)
+    (folder / "run.toml").write_text(f'[command]\nfile = "{name}"\n{command}\n', encoding="utf-8")
+    return Run.read(folder)
+
+
+def same(source: Source, stamp: npt.NDArray[np.int64], **values: npt.NDArray[np.float64]) -> None:
+    np.testing.assert_array_equal(source.stamp, stamp)
+    assert set(source.values) == set(values)
+    for axis, wanted in values.items():
+        assert source.values[axis].tobytes() == wanted.tobytes(), axis  # bit for bit, NaN too
+
+
+def texts(zone: str) -> list[str]:
+    """ISO 8601 to the ns, by the standard library, of local time in a zone ahead of UTC by 5 h 30 min, or of UTC."""
+    ahead = timezone(timedelta(hours=5, minutes=30)) if zone == "+05:30" else UTC
+    whole = [datetime.fromtimestamp(int(stamp) // GIGA, ahead) for stamp in STAMP]
+    return [f"{at:%Y-%m-%dT%H:%M:%S}.{stamp % GIGA:09d}{zone}" for at, stamp in zip(whole, STAMP, strict=True)]
+
+
+X_M = 'x = { column = "x", unit = "m" }'
+LAYOUTS: dict[str, tuple[str, Callable[[], dict[str, Any]]]] = {
+    "flat": ('time = "t_ns"\nx = "x_m"', lambda: {"t_ns": STAMP, "x_m": nullable(X)}),
+    "unit beside": (f'time = {{ column = "t", unit = "ns" }}\n{X_M}', lambda: {"t": STAMP, "x": nullable(X)}),
+    "unit overrules the name": (
+        'time = { column = "t_s", unit = "ns" }\nx = { column = "x_mm", unit = "m" }',
+        lambda: {"t_s": STAMP, "x_mm": nullable(X)},
+    ),
+    "ISO": (f'time = "t"\n{X_M}', lambda: {"t": texts(""), "x": nullable(X)}),
+    "ISO with Z": (f'time = "t"\n{X_M}', lambda: {"t": texts("Z"), "x": nullable(X)}),
+    "ISO of another zone": (f'time = "t"\n{X_M}', lambda: {"t": texts("+05:30"), "x": nullable(X)}),
+    "ISO with blank and comma": (
+        f'time = "t"\n{X_M}',
+        lambda: {"t": [text.replace("T", " ").replace(".", ",") for text in texts("")], "x": nullable(X)},
+    ),
+    "timestamp": (f'time = "t"\n{X_M}', lambda: {"t": pa.array(STAMP, pa.timestamp("ns")), "x": nullable(X)}),
+    "timestamp of a zone": (
+        f'time = "t"\n{X_M}',
+        lambda: {"t": pa.array(STAMP, pa.timestamp("ns", "+05:30")), "x": nullable(X)},
+    ),
+    "duration": (f'time = "t"\n{X_M}', lambda: {"t": pa.array(STAMP, pa.duration("ns")), "x": nullable(X)}),
+    "decimal": (
+        f'time = {{ column = "t", unit = "s" }}\n{X_M}',
+        lambda: {"t": decimals(), "x": nullable(X)},
+    ),
+    "two columns": (
+        f'time = ["sec", "nanosec"]\n{X_M}',
+        lambda: {"sec": split()[0], "nanosec": split()[1], "x": nullable(X)},
+    ),
+    "two field paths": (
+        'time = ["header.stamp.sec", "header.stamp.nanosec"]\nx = { column = "pose.position.x", unit = "m" }',
+        lambda: {"header": header(), "pose": pose()},
+    ),
+    "ROS 2 header": (
+        'time = "header.stamp"\nx = { column = "pose.position.x", unit = "m" }',
+        lambda: {"header": header(), "pose": pose()},
+    ),
+    "ROS 1 header": (
+        'time = "header.stamp"\nx = { column = "pose.position.x", unit = "m" }',
+        lambda: {"header": header(("secs", "nsecs")), "pose": pose()},
+    ),
+    "lists": (
+        'time = "t_ns"\nx = { column = "state[1]", unit = "m" }',
+        lambda: {"t_ns": STAMP, "state": pa.array([[0.0, None if np.isnan(x) else x] for x in X])},
+    ),
+    "lists, some too short": (
+        'time = "t_ns"\nx = { column = "state[1]", unit = "m" }',
+        lambda: {"t_ns": STAMP, "state": pa.array([[] if np.isnan(x) else [0.0, x, 1.0] for x in X])},
+    ),
+    "lists of fixed size": (
+        'time = "t_ns"\nx = { column = "observation.state[1]", unit = "m" }',
+        lambda: {"t_ns": STAMP, "observation.state": fixed(X)},
+    ),
+    "names with dots and brackets": (
+        'time = "t_ns"\nx = { column = "a.b[1]", unit = "m" }',
+        lambda: {"t_ns": STAMP, "a.b[1]": nullable(X), "a.b": pa.array([[0.0, 0.0]] * ROWS)},
+    ),
+    "structs in lists": (
+        'time = "t_ns"\nx = { column = "points[1].position.x", unit = "m" }',
+        lambda: {"t_ns": STAMP, "points": pa.array([[{"position": {"x": 9.0}}, point(x)] for x in X])},
+    ),
+}
+
+
+def decimals() -> pa.Array:
+    return pa.array([f"{stamp // GIGA}.{stamp % GIGA:09d}" for stamp in STAMP]).cast(pa.decimal128(20, 9))
+
+
+def fixed(x: npt.NDArray[np.float64]) -> pa.Array:
+    flat = np.column_stack([np.zeros(len(x)), x]).ravel()
+    return pa.FixedSizeListArray.from_arrays(nullable(flat), 2)
+
+
+def point(x: float) -> dict[str, Any] | None:
+    return None if np.isnan(x) else {"position": {"x": x}}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_of_a_log_gives_the_same_run(tmp_path: Path, layout: str) -> None:
+    """Stamps are exact to the ns, values are the numbers in the file, and what is null anywhere is missing."""
+    command, columns = LAYOUTS[layout]
+    run = read(tmp_path, command, columns())
+    same(run.command, STAMP, x=X)
+    assert run.notes == ()
+
+
+def test_elements_are_found_by_their_names_in_any_order(tmp_path: Path) -> None:
+    """A joint keeps its values though messages list joints in changing order; where it is absent, it is missing."""
+    names, positions = joint_states()
+    command = 'time = "t_ns"\nelbow = { column = "joints.position[elbow]", unit = "rad" }'
+    joints = pa.StructArray.from_arrays([names, positions], ["name", "position"])
+    wanted = np.where(np.arange(ROWS) == 7, np.nan, ANGLE)
+    same(read(tmp_path, command, {"t_ns": STAMP, "joints": joints}).command, STAMP, elbow=wanted)
+    command = command.replace("joints.", "")
+    same(read(tmp_path, command, {"t_ns": STAMP, "name": names, "position": positions}).command, STAMP, elbow=wanted)
+
+
+@pytest.mark.parametrize(
+    ("unit", "kind", "factor"),
+    [("m", "length", 1), ("mm", "length", 1e3), ("um", "length", 1e6), ("rad", "angle", 1), ("mrad", "angle", 1e3)],
+)
+def test_a_unit_beside_the_column_is_the_unit_of_its_name(tmp_path: Path, unit: str, kind: str, factor: float) -> None:
+    """The same numbers, and the same kind of axis, as under a name that ends in the unit."""
+    named = read(tmp_path, f'time = "t_ns"\na = "x_{unit}"', {"t_ns": STAMP, f"x_{unit}": X})
+    beside = read(tmp_path, f'time = "t_ns"\na = {{ column = "x", unit = "{unit}" }}', {"t_ns": STAMP, "x": X})
+    same(named.command, STAMP, a=X / factor)
+    same(beside.command, STAMP, a=X / factor)
+    assert named.kinds == beside.kinds == {"a": kind}
+
+
+def test_degrees_in_a_list_with_a_unit_in_its_name(tmp_path: Path) -> None:
+    """``state_deg[1]`` ends in a unit before its bracket."""
+    state = pa.array([[0.0, value] for value in np.rad2deg(ANGLE)])
+    run = read(tmp_path, 'time = "t_ns"\na = "state_deg[1]"', {"t_ns": STAMP, "state_deg": state})
+    np.testing.assert_allclose(run.command.values["a"], ANGLE, rtol=1e-15)
+    assert run.kinds == {"a": "angle"}
+
+
+def test_columns_of_one_axis_are_added_up_whatever_their_units(tmp_path: Path) -> None:
+    """A nominal path in m, nested, and a correction in mm by its name."""
+    axis = 'x = [{ column = "pose.position.x", unit = "m" }, "correction_mm"]'
+    run = read(tmp_path, f'time = "t_ns"\n{axis}', {"t_ns": STAMP, "pose": pose(), "correction_mm": ANGLE})
+    same(run.command, STAMP, x=X + ANGLE / 1e3)
+
+
+@pytest.mark.parametrize("zone", ["", "Z", "+05:30"])
+def test_a_csv_says_what_parquet_says(tmp_path: Path, zone: str) -> None:
+    """Dates, and seconds and nanoseconds apart, are as exact in text."""
+    command = 'time = "t"\nx = "x_m"\n[sensors.s]\nfile = "log.csv"\ntime = ["sec", "nanosec"]\nx = "x_m"'
+    seconds, rest = split()
+    columns = {"t": texts(zone), "sec": seconds, "nanosec": rest, "x_m": nullable(X)}
+    run = read(tmp_path, command, columns, "log.csv")
+    same(run.command, STAMP, x=X)
+    same(run.sensors["s"], STAMP, x=X)
+
+
+EPISODES = 4
+FRAMES = 200
+
+
+def lerobot(folder: Path) -> dict[int, tuple[npt.NDArray[np.float32], ...]]:
+    """A data set as LeRobot 3 lays it out: Parquet of many episodes, vectors of float32, a stamp since each began."""
+    episodes = {
+        episode: (
+            np.arange(FRAMES, dtype=np.float32) / np.float32(30.0),
+            RNG.normal(size=(FRAMES, 2)).cumsum(axis=0).astype(np.float32),
+            RNG.normal(size=(FRAMES, 2)).cumsum(axis=0).astype(np.float32),
+        )
+        for episode in range(EPISODES)
+    }
+    stamp, action, state = (np.concatenate(parts) for parts in zip(*episodes.values(), strict=True))
+    table = pa.table(
+        {
+            "action": pa.FixedSizeListArray.from_arrays(pa.array(action.ravel()), 2),
+            "observation.state": pa.FixedSizeListArray.from_arrays(pa.array(state.ravel()), 2),
+            "timestamp": stamp,
+            "frame_index": np.tile(np.arange(FRAMES), EPISODES),
+            "episode_index": np.repeat(np.arange(EPISODES), FRAMES),
+            "index": np.arange(EPISODES * FRAMES),
+            "task_index": np.zeros(EPISODES * FRAMES, dtype=np.int64),
+        }
+    )
+    path = folder / "data/chunk-000/file-000.parquet"
+    path.parent.mkdir(parents=True)
+    papq.write_table(table, path, row_group_size=FRAMES // 2)
+    return episodes
+
+
+LEROBOT = """
+[command]
+file = "data/chunk-000/file-000.parquet"
+where = { episode_index = 2 }
+time = { column = "timestamp", unit = "s" }
+shoulder = { column = "action[0]", unit = "deg" }
+wrist = { column = "action[1]", unit = "deg" }
+
+[sensors.encoder]
+file = "data/chunk-000/file-000.parquet"
+where = { episode_index = 2 }
+time = { column = "timestamp", unit = "s" }
+shoulder = { column = "observation.state[0]", unit = "deg" }
+wrist = { column = "observation.state[1]", unit = "deg" }
+"""
+FLAT = """
+[command]
+file = "log.csv"
+time = "t_s"
+shoulder = "a_deg"
+wrist = "b_deg"
+
+[sensors.encoder]
+file = "log.csv"
+time = "t_s"
+shoulder = "c_deg"
+wrist = "d_deg"
+"""
+CONFIG = """
+arm = "arm.toml"
+[sensors.encoder]
+sd_deg = 0.1
+"""
+ARM = """
+name = "two joints"
+update_period_ms = 33.333
+delay_ms = 50.0
+[axes.shoulder]
+kind = "angle"
+plant = "first-order"
+time_constant_ms = 60.0
+[axes.wrist]
+kind = "angle"
+plant = "first-order"
+time_constant_ms = 40.0
+"""
+
+
+def test_an_episode_of_lerobot_fuses_like_the_same_data_in_a_csv(tmp_path: Path) -> None:
+    """The executable writes the same estimates, bit for bit, straight from the data set."""
+    dataset, flat = tmp_path / "dataset", tmp_path / "flat"
+    dataset.mkdir()
+    flat.mkdir()
+    stamp, action, state = (part.astype(np.float64) for part in lerobot(dataset)[2])
+    columns = {"t_s": stamp, "a_deg": action[:, 0], "b_deg": action[:, 1], "c_deg": state[:, 0], "d_deg": state[:, 1]}
+    pacsv.write_csv(pa.table(columns), flat / "log.csv")
+    for folder, manifest in ((dataset, LEROBOT), (flat, FLAT)):
+        (folder / "run.toml").write_text(manifest, encoding="utf-8")
+        (folder / "fusion.toml").write_text(CONFIG, encoding="utf-8")
+        (folder / "arm.toml").write_text(ARM, encoding="utf-8")
+        command = [sys.executable, "-m", "pumafuse", "fuse", str(folder), "-c", str(folder / "fusion.toml")]
+        subprocess.run([*command, "-o", str(folder / "result")], check=True, capture_output=True)
+    one, other = (papq.read_table(folder / "result" / "estimates.parquet") for folder in (dataset, flat))
+    assert one.num_rows == FRAMES
+    assert one.equals(other)
+    assert Run.read(dataset).axes == ("shoulder", "wrist")
+
+
+def test_lerobot_without_its_episode_is_refused_or_told(tmp_path: Path) -> None:
+    """All episodes at once set the clock back from one to the next."""
+    from pumafuse.logs.clock import segments
+
+    lerobot(tmp_path)
+    (tmp_path / "run.toml").write_text(LEROBOT.replace("where =", "#"), encoding="utf-8")
+    parts, notes = segments(Run.read(tmp_path))
+    assert (len(parts), len(notes)) == (EPISODES, EPISODES - 1)
+
+
+def episodes(**more: object) -> dict[str, Any]:
+    group = np.arange(ROWS) // 50  # 0 to 9
+    meta = pa.StructArray.from_arrays([pa.array(group)], ["run"])
+    columns = {"t_ns": STAMP, "x_m": X, "group": group, "even": pa.array(group % 2 == 0), "meta": meta}
+    columns["tags"] = pa.array([[0, one] if one > 2 else [] for one in group.tolist()])
+    return {**columns, "name": [f"run{one}" for one in group], "part": (group / 10).astype(np.float32), **more}
+
+
+AXIS = 'time = "t_ns"\nx = "x_m"'
+
+
+@pytest.mark.parametrize(
+    ("where", "rows"),
+    [
+        ("group = 3", (150, 200)),
+        ("group = 3.0", (150, 200)),
+        ("name = 'run3'", (150, 200)),
+        ("'meta.run' = 3", (150, 200)),
+        ("'tags[1]' = 3", (150, 200)),
+        ("part = 0.3", (150, 200)),
+        ("group = 4, even = true", (200, 250)),
+    ],
+)
+@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
+def test_where_chooses_rows(tmp_path: Path, where: str, rows: tuple[int, int], name: str) -> None:
+    """Equality on one column or more, of numbers, texts and booleans."""
+    columns = episodes()
+    if name == "log.csv":
+        del columns["meta"], columns["tags"]
+        where = where.replace("'meta.run'", "group").replace("'tags[1]'", "group")
+    run = read(tmp_path, f"{AXIS}\nwhere = {{ {where} }}", columns, name)
+    same(run.command, STAMP[slice(*rows)], x=X[slice(*rows)])
+
+
+def test_sources_of_one_file_have_rows_of_their_own(tmp_path: Path) -> None:
+    """Two sources may read different runs of one table, and 1 is not true."""
+    sensor = '[sensors.s]\nfile = "log.parquet"\ntime = "t_ns"\nx = "x_m"\nwhere = { even = true }'
+    columns = episodes(even=pa.array(np.arange(ROWS) % 2 == 0), one=pa.array(np.ones(ROWS, np.int64)))
+    run = read(tmp_path, f"{AXIS}\nwhere = {{ one = 1 }}\n{sensor}", columns)
+    same(run.command, STAMP, x=X)
+    same(run.sensors["s"], STAMP[::2], x=X[::2])
+
+
+def test_a_value_of_where_is_in_the_unit_of_its_column(tmp_path: Path) -> None:
+    """``height_mm = 250`` finds the rows with 250 in them, though Python is in metres."""
+    run = read(tmp_path, f"{AXIS}\nwhere = {{ height_mm = 250 }}", episodes(height_mm=np.arange(ROWS) // 50 * 50))
+    same(run.command, STAMP[250:300], x=X[250:300])
+
+
+@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
+@pytest.mark.parametrize(
+    ("where", "said"),
+    [
+        ("group = 30", ("no row has group = 30", "group goes from 0 to 9")),
+        ("group = 3.5", ("no row has group = 3.5", "0 to 9")),
+        ("name = 'walk'", ("no row has name = 'walk'", "'run0', 'run1'", "…")),
+        ("group = 3, even = true", ("no row has group = 3 and even = true", "even goes from false to true")),
+        ("group = '3'", ("column 'group' holds int64, never '3'",)),
+        ("name = 3", ("column 'name' holds string, never 3",)),
+        ("group = true", ("column 'group' holds int64, never true",)),
+        ("even = 1", ("column 'even' holds bool, never 1",)),
+        ("gruop = 3", ("unknown column 'gruop'", "did you mean 'group'", "t_ns")),
+        (f"group = {2**70}", ("command.where", "expected a number")),
+    ],
+)
+def test_where_that_leaves_no_row_is_refused_with_what_there_is(
+    tmp_path: Path, name: str, where: str, said: tuple[str, ...]
+) -> None:
+    """One line with the range of the column, some of its values, or its type."""
+    columns = episodes()
+    del columns["meta"], columns["tags"]
+    text = refusal(lambda: read(tmp_path, f"{AXIS}\nwhere = {{ {where} }}", columns, name))
+    assert all(words in text for words in said), text
+
+
+def test_only_what_is_asked_for_is_read_of_parquet(tmp_path: Path) -> None:
+    """Columns and parts of the file that are not needed may be destroyed: nobody sees it."""
+    run = f"{AXIS}\nwhere = {{ group = 3 }}"
+    columns = episodes(group=np.arange(ROWS) // 64, image=pa.array([RNG.bytes(1000) for _ in range(ROWS)]))
+    read(tmp_path, run, columns)
+    path = tmp_path / "log.parquet"
+    content = bytearray(path.read_bytes())
+    metadata = papq.read_metadata(path)
+    for place in range(metadata.num_row_groups):
+        for number in range(metadata.num_columns):
+            chunk = metadata.row_group(place).column(number)
+            if place != 3 or chunk.path_in_schema not in ("t_ns", "x_m", "group"):
+                first = min(chunk.data_page_offset, chunk.dictionary_page_offset or chunk.data_page_offset)
+                content[first : first + chunk.total_compressed_size] = b"\xff" * chunk.total_compressed_size
+    path.write_bytes(content)
+    same(Run.read(tmp_path).command, STAMP[192:256], x=X[192:256])
+    (tmp_path / "run.toml").write_text(f'[command]\nfile = "log.parquet"\n{AXIS}', encoding="utf-8")
+    assert "log.parquet" in refusal(lambda: Run.read(tmp_path))
+
+
+def test_dates_with_and_without_a_zone_are_told_of_two_sources_and_refused_in_one(tmp_path: Path) -> None:
+    """Without a zone is UTC: beside another clock that says its zone it may be an error of hours."""
+    sensor = '[sensors.s]\nfile = "log.parquet"\ntime = "other"\nx = "x_m"'
+    columns = {"t": texts(""), "other": texts("Z"), "x_m": X}
+    run = read(tmp_path, f'time = "t"\nx = "x_m"\n{sensor}', columns)
+    same(run.sensors["s"], STAMP, x=X)
+    same(run.command, STAMP, x=X)
+    assert run.notes == ("command: dates without a time zone, beside sensor s with one: taken as UTC",)
+    columns["t"] = [*texts("")[:-1], texts("Z")[-1]]
+    text = refusal(lambda: read(tmp_path, 'time = "t"\nx = "x_m"', columns))
+    assert f"a date with a time zone in row {ROWS}" in text and "a date without one in row 1" in text
+
+
+def moving(ticks: npt.NDArray[np.float64], rows: int = 7500, rate: float = 125.0) -> tuple[Any, Any]:
+    """Stamps [ns] of a clock that ticks as given, and a sine of 5 Hz, on which a second begins and ends alike."""
+    time = np.arange(rows) / rate
+    stamp = np.floor(time / ticks) * ticks
+    return np.rint(stamp * 1e9).astype(np.int64), 0.1 * np.sin(2 * np.pi * 5.0 * time)
+
+
+@pytest.mark.parametrize("source", ["command", "sensor"])
+@pytest.mark.parametrize(
+    ("tick", "rate"), [(1.0, 125.0), (0.1, 125.0), (1.0, 5.0), (128.0, 1000.0), (1e6, 10.0)], ids=str
+)
+def test_a_clock_that_stands_still_is_refused(tmp_path: Path, source: str, tick: float, rate: float) -> None:
+    """Whole seconds, one decimal of them, today in float32, or all 0: the line has how many stamps there are."""
+    stamp, x = moving(tick, rate=rate)
+    fine, _ = moving(1e-9, rate=rate)
+    stamps = {"command": (stamp, fine), "sensor": (fine, stamp)}[source]
+    columns = {"a_ns": stamps[0], "b_ns": stamps[1], "x_m": x}
+    sensor = '[sensors.s]\nfile = "log.parquet"\ntime = "b_ns"\nx = "x_m"'
+    text = refusal(lambda: read(tmp_path, f'time = "a_ns"\nx = "x_m"\n{sensor}', columns))
+    distinct = len(np.unique(stamp))
+    assert f"{distinct} distinct stamp" in text and "7500 rows" in text and "finer" in text
+    assert "distinct stamp" in refusal(lambda: Run.from_arrays(stamp, {"x": x}))
+
+
+@pytest.mark.parametrize(
+    "names", [("sec_s", "nanosec"), ("header.stamp.sec", "header.stamp.nanosec"), ("t_s", "t_nsecs")]
+)
+@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
+def test_seconds_without_their_nanoseconds_are_refused_with_the_line_to_write(
+    tmp_path: Path, names: tuple[str, str], name: str
+) -> None:
+    """Who writes the line that the refusal has fuses all commands."""
+    stamp, x = moving(1e-9)
+    columns = {names[0]: stamp // GIGA, "x_m": x, names[1]: stamp % GIGA}
+    seconds = f'time = {{ column = "{names[0]}", unit = "s" }}\nx = "x_m"'
+    text = refusal(lambda: read(tmp_path, seconds, columns, name))
+    assert text.startswith(name) and "60 distinct stamps, one every 1 s, in 7500 rows" in text
+    line = text.partition("write ")[2]
+    same(read(tmp_path, f'{line}\nx = "x_m"', columns, name).command, stamp, x=x)
+
+
+@pytest.mark.parametrize(
+    ("tick", "rate", "rows"),
+    [(1e-3, 4000.0, 5624), (0.01, 1000.0, 6749), (0.015625, 1000.0, 7019), (0.05, 125.0, 6299), (1.0, 1.0, 0)],
+)
+def test_a_coarse_clock_is_told(tick: float, rate: float, rows: int) -> None:
+    """Whole ms at 4 kHz, jiffies, Windows: fused, and the rows that share a stamp are counted."""
+    stamp, x = moving(tick, rate=rate)
+    x += np.linspace(0.0, 1.0, len(x))  # no two in a row alike
+    run = Run.from_arrays(stamp, {"x": x})
+    counted = np.count_nonzero(np.diff(stamp) == 0)
+    assert abs(counted - rows) < 80
+    if rows:
+        assert f"command: {counted} rows have the stamp of the row before and another x" in run.notes[0]
+    else:
+        assert run.notes == ()
+
+
+def honest() -> dict[str, tuple[npt.NDArray[np.int64], dict[str, npt.NDArray[np.float64]]]]:
+    """Logs with many rows a stamp that lose nothing, or that say what a stamp is."""
+    seconds = np.repeat(np.arange(100), 10) * GIGA
+    level = np.repeat(RNG.normal(0.0, 0.1, 100), 10)
+    odd = np.arange(1000) % 2 == 0
+    return {
+        "rows repeated": (seconds, {"x": level}),
+        "a row for each axis": (
+            seconds[::5],
+            {"x": np.where(odd, X[0], np.nan)[:200], "y": np.where(odd, np.nan, 1.0)[:200]},
+        ),
+        "measured ten times at each place": (seconds, {"x": level + RNG.normal(0.0, 1e-4, 1000)}),
+        "few rows": (np.zeros(9, np.int64), {"x": np.arange(9.0)}),
+        "one row": (np.zeros(1, np.int64), {"x": np.zeros(1)}),
+        "without stamps": (np.full(50, NO_STAMP), {"x": np.arange(50.0)}),
+    }
+
+
+@pytest.mark.parametrize("case", honest())
+def test_honest_rows_with_one_stamp_are_not_refused(case: str) -> None:
+    """Repeated rows, rows of an axis each, measurements repeated at a standstill, and logs too short to judge."""
+    stamp, values = honest()[case]
+    fine = (np.arange(20) * 10_000_000, {axis: np.arange(20.0) for axis in values})
+    run = Run.from_arrays(*fine, sensors={"s": (stamp, values)})
+    assert len(run.sensors["s"].stamp) == len(stamp)
+
+
+REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "unit of time for an axis": (
+        'time = "t_ns"\nx = { column = "x_m", unit = "s" }',
+        ("command.x", "'s'", "m, mm, um, rad"),
+    ),
+    "unknown unit": (
+        'time = "t_ns"\nx = { column = "x_m", unit = "furlong" }',
+        ("command.x", "'furlong'", "m, mm, um"),
+    ),
+    "unit of length for time": (
+        'time = { column = "t", unit = "mm" }\nx = "x_m"',
+        ("command.time", "'mm'", "s, ms, us, ns"),
+    ),
+    "unit is a number": ('time = "t_ns"\nx = { column = "x_m", unit = 3 }', ("command.x.unit", "str")),
+    "no unit": ('time = "t_ns"\nx = "plain"', ("'plain'", "_mm", "unit = 'mm'")),
+    "time without unit": ('time = "plain"\nx = "x_m"', ("'plain'", "_ms", "unit = 's'")),
+    "table without column": ('time = "t_ns"\nx = { unit = "m" }', ("command.x", "column")),
+    "unknown key of a column": (
+        'time = "t_ns"\nx = { column = "x_m", scale = 2 }',
+        ("'command.x.scale'", "column, unit"),
+    ),
+    "empty column": ('time = "t_ns"\nx = { column = "" }', ("command.x", "column")),
+    "empty list": ('time = "t_ns"\nx = []', ("command.x", "column")),
+    "list of numbers": ('time = "t_ns"\nx = [1, 2]', ("command.x", "column")),
+    "empty time": ('time = ""\nx = "x_m"', ("command.time", "column")),
+    "one time in a list": ('time = ["t_ns"]\nx = "x_m"', ("command.time", "['sec', 'nanosec']")),
+    "three times": ('time = ["a", "b", "c"]\nx = "x_m"', ("command.time", "['sec', 'nanosec']")),
+    "time is a number": ('time = 3\nx = "x_m"', ("command.time", "column")),
+    "two times with a unit": ('time = { column = ["a", "b"], unit = "s" }\nx = "x_m"', ("command.time", "column")),
+    "where is a text": ('where = "group"\n' + AXIS, ("command.where", "episode_index = 3")),
+    "where is empty": ("where = {}\n" + AXIS, ("command.where", "expected")),
+    "where is nested": ("where = { meta.run = 3 }\n" + AXIS, ("command.where", "quoted")),
+    "where is a list": ("where = { group = [1, 2] }\n" + AXIS, ("command.where", "number")),
+    "where is a date": ("where = { group = 2024-01-01 }\n" + AXIS, ("command.where", "number")),
+    "topic of a table": ('topic = "/servo"\n' + AXIS, ("log.parquet", "no topic", ".mcap", "'where'")),
+    "entity of a table": ('entity = "/servo"\n' + AXIS, ("log.parquet", "no entity", ".rrd", "'where'")),
+    "topic is a number": ("topic = 3\n" + AXIS, ("command.topic", "str")),
+    "field of a number": ('time = "t_ns"\nx = "x_m.y_m"', ("'x_m.y_m'", "no field 'y_m'", "double")),
+    "element of a number": (
+        'time = "t_ns"\nx = { column = "x_m[0]", unit = "m" }',
+        ("'x_m[0]'", "no element '0'", "double"),
+    ),
+    "a whole struct": (
+        'time = "t_ns"\nx = { column = "pose", unit = "m" }',
+        ("'pose'", "structs of position", "not numbers"),
+    ),
+    "a whole list": ('time = "t_ns"\nx = { column = "list", unit = "m" }', ("'list'", "lists", "[0]", "not numbers")),
+    "field that is not there": (
+        'time = "t_ns"\nx = { column = "pose.positoin.x", unit = "m" }',
+        ("'pose.positoin.x'", "did you mean 'position'"),
+    ),
+    "element too far": (
+        'time = "t_ns"\nx = { column = "list[2]", unit = "m" }',
+        ("'list[2]'", "no row has", "at most 2 elements"),
+    ),
+    "element far too far": (
+        f'time = "t_ns"\nx = {{ column = "list[{9**99}]", unit = "m" }}',
+        ("no row has", "at most 2"),
+    ),
+    "negative element": ('time = "t_ns"\nx = { column = "list[-1]", unit = "m" }', ("'-1'", "0, 1, 2")),
+    "element without names": ('time = "t_ns"\nx = { column = "list[elbow]", unit = "m" }', ("'elbow'", "'name'")),
+    "unknown name of an element": (
+        'time = "t_ns"\nx = { column = "joints.position[ellbow]", unit = "m" }',
+        ("'ellbow'", "elbow"),
+    ),
+    "bracket without end": ('time = "t_ns"\nx = { column = "list[0", unit = "m" }', ("'list[0'", "without ']'")),
+    "bracket and more": (
+        'time = "t_ns"\nx = { column = "list[0]x", unit = "m" }',
+        ("'list[0]x'", "missing before 'x'"),
+    ),
+    "empty bracket": ('time = "t_ns"\nx = { column = "list[]", unit = "m" }', ("'list[]'", "0, 1, 2")),
+    "only dots": ('time = "t_ns"\nx = { column = "...", unit = "m" }', ("'...'", "t_ns")),
+    "a deep path": (
+        f'time = "t_ns"\nx = {{ column = "pose{".position" * 3000}", unit = "m" }}',
+        ("unknown field", "accepted: x, y"),
+    ),
+    "a path of brackets": (
+        f'time = "t_ns"\nx = {{ column = "list{"[0]" * 3000}", unit = "m" }}',
+        ("no element '0'", "double"),
+    ),
+    "an endless name": (f'time = "t_ns"\nx = {{ column = "{"x" * 10_000}", unit = "m" }}', ("unknown column", "…")),
+    "booleans": ('time = "t_ns"\nx = { column = "yes", unit = "m" }', ("'yes'", "bool", "not numbers")),
+    "time is booleans": ('time = { column = "yes", unit = "s" }\nx = "x_m"', ("'yes'", "bool")),
+    "time is a struct without stamps": ('time = "pose.position"\nx = "x_m"', ("'pose.position'", "structs of x, y")),
+    "nanoseconds beyond a second": ('time = ["plain", "t_ns"]\nx = "x_m"', ("'t_ns'", "row 1", "999999999")),
+    "seconds with decimals": ('time = ["half", "plain"]\nx = "x_m"', ("'half'", "whole")),
+    "a recording": (
+        'time = "t_ns"\nx = "x_m"\n[sensors.s]\nfile = "a.mcap"\ntime = "log_time"\nx = "x_m"',
+        ("a.mcap",),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_a_wrong_source_is_refused_in_one_line(tmp_path: Path, case: str) -> None:
+    """What is asked for and is not there, or of another kind, is one line that has what there is."""
+    command, named = REFUSALS[case]
+    names, positions = joint_states()
+    joints = pa.StructArray.from_arrays([names, positions], ["name", "position"])
+    columns = {"t_ns": STAMP, "x_m": X, "plain": np.arange(ROWS), "half": np.full(ROWS, 0.5), "joints": joints}
+    more = {"pose": pose(), "list": pa.array([[0.0, 1.0]] * ROWS), "yes": pa.array([True] * ROWS)}
+    text = refusal(lambda: read(tmp_path, command, {**columns, **more}))
+    assert all(words in text for words in named), text
+    assert len(text) < 700
