@@ -163,7 +163,12 @@ def identify(
         int | None, Option(metavar="N", min=8, help="Samples used from each step; default: all.")
     ] = None,
     paper: Annotated[bool, Option("--paper", help="Read delay and gain off each trial, as published.")] = False,
-    tolerance: Annotated[float, Option(metavar="MM", help="RMS beyond which the model is not called valid.")] = 1.0,
+    tolerance: Annotated[
+        float | None,
+        Option(
+            metavar="MM", help="RMS beyond which the model is not called valid, in degrees of angles; default: 1, 0.1."
+        ),
+    ] = None,
     report: Report = None,
     json: Json = False,
     force: Force = False,
@@ -172,7 +177,7 @@ def identify(
     from . import identify as command
 
     _check_positive(period=period, tolerance=tolerance)
-    command.run(trials, output, period and _si(period), samples, paper, _si(tolerance), report, json, force)
+    command.run(trials, output, period and _si(period), samples, paper, tolerance, report, json, force)
 
 
 @app.command()
@@ -181,7 +186,8 @@ def verify(
     arm: Annotated[str, Option("--arm", metavar="ARM", help="An arm.toml, or the name of a preset.")],
     sensors: Annotated[str | None, Option(metavar="A,B", help="Default: the reference, else every sensor.")] = None,
     start: Annotated[
-        list[str] | None, Option(metavar="AXIS=MM", help="Start level; default: the run's, else chosen by RMS.")
+        list[str] | None,
+        Option(metavar="AXIS=VALUE", help="Start level, mm or degrees; default: the run's, else chosen by RMS."),
     ] = None,
     report: Report = None,
     json: Json = False,
@@ -312,12 +318,12 @@ def _numbers(listed: str, option: str) -> tuple[float, ...]:
 
 
 def _level(text: str) -> tuple[str, float]:
-    """``radial=560`` as an axis and its level [m]."""
+    """``radial=560`` as an axis and its level, in mm or degrees."""
     axis, _, level = text.partition("=")
     try:
-        return axis.strip(), _si(float(level))
+        return axis.strip(), float(level)
     except ValueError:
-        raise BadParameter(f"expected AXIS=MM, not '{text}'", param_hint="--start") from None
+        raise BadParameter(f"expected AXIS=VALUE, not '{text}'", param_hint="--start") from None
 
 
 def _si(value: float) -> float:
