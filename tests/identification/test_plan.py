@@ -127,7 +127,7 @@ def test_what_will_spoil_a_campaign_is_warned_of(changes: dict[str, Any], words:
         ({"axes": ("radial", "radial")}, "each once"),
         ({"axes": ("reach_mm",)}, "must not end in a unit"),
         ({"speeds": ()}, "at least one speed"),
-        ({"speeds": (0.1, -0.1)}, "speeds must make steps of 0.001 mm to 10 m"),
+        ({"speeds": (0.1, -0.1)}, "speeds must make steps of 0.001 mm to 10000 mm"),
         ({"speeds": (1e-300,)}, "speeds must make steps"),
         ({"speeds": (0.07, 0.07000000001)}, "two speeds make the same step"),
         ({"amplitudes": (np.inf,)}, "amplitudes must make steps"),
