@@ -54,6 +54,7 @@ LENGTHS = ("_m", "_mm", "_um")
 ANGLES = ("_rad", "_mrad", "_deg")
 TIMES = ("_s", "_ms", "_us", "_ns")
 OF_KIND: dict[Kind, tuple[str, ...]] = {"length": LENGTHS, "angle": ANGLES}
+SPEEDS: dict[Kind, tuple[str, ...]] = {"length": ("_m_s", "_mm_s"), "angle": ("_deg_s", "_rad_s")}  # first: on screens
 _EXPONENTS = {  # power of ten to SI -> endings of names
     0: ("_m", "_s", "_m_s", "_rad_s", "_s_m", "_rad", "_s_rad", "_deg_rtHz_per_deg_s", "_deg_rts_per_deg_s"),
     -3: ("_mm", "_ms", "_mm_s", "_mm_rtHz", "_mm_rts", "_mm_rtHz_per_m_s", "_mm_rts_per_m_s", "_mrad"),

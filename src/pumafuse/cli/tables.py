@@ -58,7 +58,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
         if not set(cells) <= {"", "–"}:
             numbers = all(cell[:1] in "+-–…<0123456789" for cell in cells)
             whole = numbers or any("\n" in cell for cell in cells)
-            made.add_column(heading, justify="right" if numbers else "left", overflow="fold", no_wrap=whole)
+            made.add_column(escape(heading), justify="right" if numbers else "left", overflow="fold", no_wrap=whole)
             kept.append([escape(cell) for cell in cells])
     for row in zip(*kept, strict=True):
         made.add_row(*row)
