@@ -157,7 +157,7 @@ def test_presets_are_table_ii(preset: str, delay: float) -> None:
 
 REFUSED = {
     "unknown key": ("[validity]", "colour = 3\n[validity]", "'colour'", TOP),
-    "unknown key below": ("max_speed_m_s", "speed_m_s", "'validity.speed_m_s'", "max_speed_m_s, max_speed_deg_s, max_radius_mm"),
+    "unknown key below": ("max_speed_m_s", "speed_m_s", "'validity.speed_m_s'", "max_speed_deg_s, max_radius_mm"),
     "unknown gain key": ("slope_s_m", "slope", "'axes.radial.gain.slope'; did you mean 'slope_s_m'", "intercept_ci95"),
     "missing unit of a plant": ("natural_frequency_rad_s", "natural_frequency", "'axes.tangential.natural_frequency'",
                                 "natural_frequency_rad_s"),
