@@ -119,9 +119,9 @@ def reported(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
     return from_si(msgspec.to_builtins(_of_kind(value, axis), enc_hook=float))
 
 
-def as_lengths(tree: Any, kind: type[msgspec.Struct] | None = None) -> Any:
+def as_lengths(tree: Any, kind: Any = None) -> Any:
     """Tables with the key names for lengths, which are those of structs; names of fields of ``kind`` stay."""
-    own = () if kind is None else {field.encode_name for field in msgspec.structs.fields(kind)}
+    own = {field.encode_name for field in msgspec.structs.fields(kind)} if isinstance(kind, type) else ()
     return _renamed(tree, lambda name: name if name in own else as_length(name))
 
 
