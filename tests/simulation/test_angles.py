@@ -103,7 +103,7 @@ def test_error_bars_of_a_simulated_angle_hold(tmp_path: Path) -> None:
     for seed in range(5):
         made = pf.simulate(scenario, seed)
         score = pf.summarise(pf.fuse(made.run, made.config)).axes["yaw"].score
-        assert score is not None and score.rmse_deg < 0.3
+        assert score is not None and score.rmse_deg < 0.7
         inside.append(score.coverage)
     assert 0.90 < np.mean(inside) < 0.98
 
