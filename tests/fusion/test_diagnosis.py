@@ -197,23 +197,6 @@ def test_stamps_in_another_unit_are_refused(log: str, factor: float, taken: str)
     assert "commands come every" in refusal(run.each(lambda _, one: clocked(factor)(one)), log)
 
 
-def test_most_commands_lost_at_few_stamps_is_refused() -> None:
-    """Seconds without their nanoseconds: 60 stamps for 2143 rows. A few are told and counted."""
-    run, config = logged("scan1")
-    whole = replace(run.command, stamp=run.command.stamp // 10**9 * 10**9)
-    line = refusal(replace(run, command=whole), "scan1")
-    assert (
-        number_before(" of 2143 commands have the stamp of a later one", line) > 2000
-        and "61 stamps for 2143 rows" in line
-    )
-    stamp = run.command.stamp.copy()
-    stamp[100:104] = stamp[104]
-    few = replace(run, command=replace(run.command, stamp=stamp))
-    segment = build(few, config)
-    assert any("4 of 2143 commands have the stamp of a later one" in note for note in segment.notes)
-    assert segment.command_counts == {"used": 2139, "duplicate": 4}
-
-
 @pytest.mark.parametrize("log", LOGS)
 def test_a_zero_that_differs_is_told_with_the_key(log: str) -> None:
     """As far as the commands lead an axis to and fro, and more."""
@@ -225,6 +208,22 @@ def test_a_zero_that_differs_is_told_with_the_key(log: str) -> None:
     note = next(one for one in notes(moved, log) if "where the commands lead" in one)
     assert number_before(f" {screen.unit} from where", note) == pytest.approx(far * screen.scale, rel=0.05)
     assert f"bias_sd_{screen.unit} = {float(f'{far * screen.scale:.1g}'):g}," in note
+
+
+def test_a_sensor_that_measures_within_a_turn_is_no_other_zero_and_may_have_a_sign() -> None:
+    """An angle that goes round, by a sensor that begins in another turn; the same the other way round."""
+    period, plant = 0.01, pf.FirstOrder(time_constant=0.05)
+    time, rng = np.arange(0.0, 20.0, period), np.random.default_rng(1)
+    u = 4.0 * np.sin(0.7 * time) + 3.0 * np.sin(0.31 * time)
+    axis = pf.AxisModel(kind="angle", plant=plant)
+    stamp = np.rint(time * 1e9).astype(np.int64)
+    position = response(axis, period, 0.02, stamp, u, 0.0, stamp) + rng.normal(0.0, 1e-3, len(time))
+    turn = 2.0 * np.pi
+    arm = pf.ArmModel(name="a turntable", update_period=period, delay=0.02, axes={"yaw": axis})
+    config = pf.FusionConfig(arm=arm, sensors={"imu": pf.Sensor(sd=1e-3, turn=turn, bias_sd=0.2)})
+    for sign, words in ((1.0, []), (-1.0, ["sensor 'imu' moves against the commands of yaw"])):
+        run = pf.Run.from_arrays(time, {"yaw": u}, {"imu": (time, {"yaw": (sign * position - 0.1) % turn})})
+        assert [one.split(" (")[0] for one in sensor_faults(build(run, config), config)] == words
 
 
 def test_a_misspelt_sensor_is_named_with_the_other_name() -> None:

@@ -29,7 +29,6 @@ from .config import FusionConfig
 from .setup import at_rest, filter_model, filter_sensors
 
 _MOST_ESTIMATES = 10_000_000
-_MOST_LOST = 0.5  # share of the commands
 
 # What may become of a row, besides its outcome: a command that says again what is in force; outside of --from and --to;
 # without a stamp, or with a stray one; of a sensor that is not among those to use.
@@ -197,7 +196,7 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     used = (*(name for name in chosen if name in run.sensors), *strangers)
     policy = _policy(config, run.axes, used)
     rows = _command_rows(run, policy, notes)
-    command_counts = _command_counts(run.command, rows, notes)
+    command_counts = _command_counts(run.command, rows)
     rows = _on_ticks(run, config, rows, notes)
     origin = int(rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)][0])
     ends = run.ends(origin)
@@ -322,30 +321,16 @@ def _command_rows(run: Run, policy: _Policy, notes: list[str]) -> Events:
     return rows
 
 
-def _command_counts(source: Source, rows: Events, notes: list[str]) -> dict[str, int]:
-    """How many rows of the commands are what, all of them; ``notes`` gets those that a later one of their stamp hides.
-
-    Raises:
-        RunError: These are most of them.
-    """
-    best, stamped = _best(rows.known), len(rows.stamp)
-    again, same = best == Outcome.DUPLICATE, np.diff(rows.stamp, append=NEVER) == 0
-    hidden = again & same
-    other = np.append((rows.value[1:] != rows.value[:-1]).any(axis=1), False)
-    if lost := np.count_nonzero(hidden & other):
-        what = f"{lost} of {stamped} commands have the stamp of a later one, which replaces them"
-        if lost > _MOST_LOST * stamped:
-            raise RunError(
-                f"{source.label}: {what}: {len(np.unique(rows.stamp))} stamps for {stamped} rows; has its time too few"
-                " digits, or a second column of nanoseconds?"
-            )
-        notes.append(f"{source.label}: {what}: {Outcome.DUPLICATE.word}")
+def _command_counts(source: Source, rows: Events) -> dict[str, int]:
+    """How many rows of the commands are what, all of them; of a stamp the last one counts."""
+    best = _best(rows.known)
+    again, hidden = best == Outcome.DUPLICATE, np.diff(rows.stamp, append=NEVER) == 0
     return {
         "used": int(np.count_nonzero(best == Outcome.FUSED)),
-        Outcome.DUPLICATE.word: int(np.count_nonzero(hidden)),
-        REPETITION: int(np.count_nonzero(again & ~same)),
+        Outcome.DUPLICATE.word: int(np.count_nonzero(again & hidden)),
+        REPETITION: int(np.count_nonzero(again & ~hidden)),
         Outcome.INVALID.word: int(np.count_nonzero(best == Outcome.INVALID)),
-        NO_STAMP_WORD: len(source.stamp) - stamped,
+        NO_STAMP_WORD: len(source.stamp) - len(rows.stamp),
     }
 
 
