@@ -44,19 +44,19 @@ _Cause: TypeAlias = Literal["unit", "columns", "sign", "clock", "nothing"]
 
 @dataclass(frozen=True)
 class Fault:
-    """Why a sensor is not where the commands lead.
+    """Why a sensor, or all, are not where the commands lead.
 
     Attributes:
-        sensor: Its name.
-        axes: On which it is not.
-        cause: What is wrong with it, or with the commands if it is wrong with all sensors.
-        size: How late it is [s], or how many times as far it moves.
+        sensors: Which; all that measure these axes if it is the commands that are wrong.
+        axes: On which they are not.
+        cause: What is wrong.
+        size: How late they are [s], or how many times as far they move.
         sentence: What shows it, and what to write instead.
         refused: Whether estimates would be wrong by construction.
-        lost: Whether it follows the commands so little that nothing can be fitted to it.
+        lost: Whether they follow the commands so little that nothing can be fitted to them.
     """
 
-    sensor: str
+    sensors: tuple[str, ...]
     axes: tuple[str, ...]
     cause: _Cause
     size: float
@@ -65,7 +65,7 @@ class Fault:
     lost: bool
 
     def is_like(self, other: Fault) -> bool:
-        """Whether the other fault, of another sensor, may come from the same commands."""
+        """Whether the other fault, also of another sensor, may come from the same commands."""
         alike = math.isclose(self.size, other.size, rel_tol=_ALIKE_SIZE, abs_tol=SMALL_SHIFT * (self.cause == "clock"))
         return self.cause == other.cause and alike and not set(self.axes).isdisjoint(other.axes)
 
@@ -80,7 +80,7 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
     faults = _not_following(segment, config, paths)
     if refused := [one.sentence for one in faults if one.refused]:
         raise RunError(refused[0])
-    found, told = [one.sentence for one in faults if one.sentence], {one.sensor for one in faults}
+    found, told = [one.sentence for one in faults], {name for one in faults for name in one.sensors}
     for name, rows in segment.rows_by_sensor().items():
         times = max((_times_each(value) for _, value in _given(segment, rows).values()), default=1)
         if name in paths and times > 1:
@@ -320,7 +320,7 @@ def _faults(config: FusionConfig, name: str, paths: Mapping[str, _Path], causes:
     def fault(axes: Sequence[str], cause: _Cause, size: float, words: str, refused: bool = False) -> None:
         lost = cause == "nothing" or any(paths[axis].correlation < _LOST for axis in axes)
         lost |= cause == "unit" and not 1.0 / _SCALE < size < _SCALE
-        found.append(Fault(name, tuple(axes), cause, size, f"sensor '{name}' {words}", refused, lost))
+        found.append(Fault((name,), tuple(axes), cause, size, f"sensor '{name}' {words}", refused, lost))
 
     clear = {axis: one for axis, one in causes.items() if one.is_steady and abs(one.correlation) >= _CLEAR}
     if late := [axis for axis, one in clear.items() if one.shift != 0.0]:
@@ -380,7 +380,7 @@ def _unit(kind: Kind, factor: float) -> tuple[bool, str]:
         return False, "is its scale in fusion.toml right, or a unit?"
     taken = " or ".join(f"{true} called {called}" for true, called in pairs)
     if any(f"_{true}" in OF_KIND[kind] for true, _ in pairs):
-        return True, f"are its values {taken}, or those of the commands the reverse? Correct the unit in run.toml"
+        return True, f"are its values {taken}, or the commands the reverse? Correct the unit in run.toml, or the scale"
     return False, f"are its values {taken}, or is its scale in fusion.toml another one?"
 
 
@@ -405,10 +405,11 @@ def _of_commands(faults: Sequence[Fault], paths: _Paths) -> list[Fault]:
         measuring = [name for name, mine in paths.items() if not mine.keys().isdisjoint(one.axes)]
         if len(alike) < max(len(measuring), 2) or one.cause == "nothing":
             found.append(one)
-        else:
-            others = ", ".join(f"'{other.sensor}'" for other in alike if other is not one)
-            asked = f"{one.sentence} ({others} too: is it the {one.cause} of the commands?)"
-            found.append(replace(one, sentence=asked if one is alike[0] else ""))
+        elif one is alike[0]:
+            names = [name for other in alike for name in other.sensors]
+            others = ", ".join(f"'{name}'" for name in names[1:])
+            sentence = f"{one.sentence} ({others} too: is it the {one.cause} of the commands?)"
+            found.append(replace(one, sensors=tuple(names), sentence=sentence))
     return found
 
 

@@ -86,7 +86,7 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
                 " stamped by one clock?"
             )
     for fault in likelihood.faults(config):
-        if fault.lost and fault.sentence and not set(fault.axes).isdisjoint(found):
+        if fault.lost and not set(fault.axes).isdisjoint(found):
             raise TuneError(fault.sentence)
     return found
 
