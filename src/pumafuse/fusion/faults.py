@@ -328,7 +328,7 @@ def _faults(config: FusionConfig, name: str, paths: Mapping[str, _Path], causes:
         lost |= cause == "unit" and not 1.0 / _SCALE < size < _SCALE
         found.append(Fault((name,), tuple(axes), cause, size, f"sensor '{name}' {words}", refused, lost))
 
-    clear = {axis: one for axis, one in causes.items() if one.is_steady and abs(one.correlation) >= _CLEAR}
+    clear = {axis: one for axis, one in causes.items() if _is_clear(axis, one, paths[axis])}
     if late := [axis for axis, one in clear.items() if one.shift != 0.0]:
         best = max(late, key=lambda axis: clear[axis].correlation)
         fault(list(paths), "clock", clear[best].shift, _late(config, name, best, paths[best], clear[best]))
@@ -350,6 +350,14 @@ def _faults(config: FusionConfig, name: str, paths: Mapping[str, _Path], causes:
         if axis not in told and abs(causes[axis].correlation) < _LOST and paths[axis].lacks_motion:
             fault([axis], "nothing", 1.0, _nothing(axis, paths[axis]))
     return found
+
+
+def _is_clear(axis: str, cause: Match, path: _Path) -> bool:
+    """Whether what explains a motion does so well: two causes at once must do better, another time better than now."""
+    other_size = not 1.0 / _GAIN < abs(cause.slope) < _GAIN
+    causes = (cause.axis != axis) + (cause.shift != 0.0) + (cause.slope < 0.0) + other_size
+    least = max(_FOLLOWS if causes > 1 else _CLEAR, path.correlation if cause.shift else 0.0)
+    return cause.is_steady and abs(cause.correlation) >= least
 
 
 def _late(config: FusionConfig, name: str, axis: str, path: _Path, cause: Match) -> str:
