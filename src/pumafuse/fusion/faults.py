@@ -406,8 +406,8 @@ def _digits(number: float, count: int) -> str:
 def _nothing(axis: str, path: _Path) -> str:
     rests = "" if np.ptp(path.measured) > 0.0 else "rests and "
     return (
-        f"{rests}does not follow the commands of {axis} (correlation {path.correlation:+.2f}), nor those of another axis or"
-        " another time: is it that axis, are both stamped by one clock, is arm.toml that of this arm?"
+        f"{rests}does not follow the commands of {axis} (correlation {path.correlation:+.2f}), nor those of"
+        " another axis or another time: is it that axis, are both stamped by one clock, is arm.toml that of this arm?"
     )
 
 
