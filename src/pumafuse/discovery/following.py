@@ -11,10 +11,12 @@ from ..arrays import NO_STAMP, FloatArray, TimeArray
 
 _EARLIEST, _LATEST = -1.0, 2.0  # s, of a lag
 _COARSE, _FINE = 0.01, 0.001  # s, steps of a lag
-_SPANS = (0.1, 0.5, 2.0)  # s, over which changes are taken: long where noise is large
+# s, over which changes are taken: long where noise is large; from the mean where it is most of the run, as on a path at
+# constant speed, which says more of the lag than its ends do.
+_SPANS = (0.1, 0.5, 2.0, math.inf)
 _MOST = 3000  # changes
 _FEWEST = 20
-_OUTLYING = 8.0  # sds
+_OUTLYING, _AGREEING = 8.0, 2.0  # sds
 _NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
 _MIRRORED = 0.1  # a negative correlation must be stronger by this than any positive one
 
@@ -55,25 +57,23 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
     s, z = s[inside], z[inside]
     if len(t) < _FEWEST or len(s) < _FEWEST:
         return None
-    found: tuple[float, float, float] | None = None
-    for span in _SPANS:
-        one = _at_span(t, u, s, z, span)
-        if one is not None and (found is None or abs(one[1]) > abs(found[1])):
-            found = one
-    if found is None:
+    candidates = [one for span in _SPANS if (one := _at_span(t, u, s, z, span)) is not None]
+
+    def rest(one: tuple[float, float, float]) -> FloatArray:
+        return z - one[2] * np.interp(s - one[0], t, u)
+
+    best = min(candidates, key=lambda one: _robust_sd(rest(one)), default=None)
+    if best is None:
         return None
-    lag, correlation, slope = found
-    delayed = np.interp(s - lag, t, u)
-    scale = math.copysign(1.0, slope)
-    rest = z - slope * delayed
+    lag, correlation, slope = best
     return Following(
         lag=lag,
         correlation=correlation,
         slope=slope,
-        offset=float(np.median(z - scale * delayed)),
-        scatter=max(min(_scatter(z), _scatter(rest)), _resolution(z)),
-        misfit=_robust_sd(rest),
-        outliers=_outliers(rest),
+        offset=float(np.median(z - math.copysign(1.0, slope) * np.interp(s - lag, t, u))),
+        scatter=max(min(_scatter(z), _scatter(rest(best))), _resolution(z)),
+        misfit=_robust_sd(rest(best)),
+        outliers=_outliers(rest(best)),
     )
 
 
@@ -88,16 +88,21 @@ def _at_span(
     t: FloatArray, u: FloatArray, s: FloatArray, z: FloatArray, span: float
 ) -> tuple[float, float, float] | None:
     """Lag, correlation and slope by the changes over a span [s]."""
-    rows = max(1, round(span / max(float(np.median(np.diff(s))), 1e-6)))
+    rows = 0 if span == math.inf else max(1, round(span / max(float(np.median(np.diff(s))), 1e-6)))
     if len(s) - rows < _FEWEST:
         return None
     some = np.unique(np.linspace(0, len(s) - rows - 1, min(_MOST, len(s) - rows)).astype(np.int64))
-    begin, end, change = s[some], s[some + rows], z[some + rows] - z[some]
+    begin, end = s[some], s[some + rows]
+
+    def changes(at_begin: FloatArray, at_end: FloatArray) -> FloatArray:
+        return at_end - (at_begin if rows else at_end.mean())
+
+    change = changes(z[some], z[some + rows])
     low, high = np.quantile(change, [0.01, 0.99])  # outliers
     change = np.clip(change, low, high)
 
     def moves(lag: float) -> FloatArray:
-        return np.interp(end - lag, t, u) - np.interp(begin - lag, t, u)
+        return changes(np.interp(begin - lag, t, u), np.interp(end - lag, t, u))
 
     def correlation(lag: float) -> float:
         other = moves(lag)
@@ -109,10 +114,9 @@ def _at_span(
     if not np.abs(found).any():
         return None
     sign = -1.0 if -found.min() > found.max() + _MIRRORED else 1.0
-    near = coarse[sign * found >= _NEARLY * (sign * found).max()]
-    peak = near[np.abs(near).argmin()]
-    own = (coarse >= peak - 0.1) & (coarse <= peak + 0.1)
-    best = coarse[own][(sign * found[own]).argmax()]
+    found = np.pad(sign * found, 1, constant_values=-1.0)
+    peaks = (found[1:-1] >= np.maximum(found[:-2], found[2:])) & (found[1:-1] >= _NEARLY * found.max())
+    best = min(coarse[peaks], key=abs)
     fine = np.arange(best - 1.5 * _COARSE, best + 1.5 * _COARSE, _FINE)
     lag = float(fine[int(np.argmax([sign * correlation(one) for one in fine]))])
     other = moves(lag)
@@ -132,8 +136,10 @@ def _resolution(value: FloatArray) -> float:
 
 
 def _outliers(value: FloatArray) -> float:
-    away = value[1:-1] - 0.5 * (value[:-2] + value[2:])
-    return float((np.abs(away) > _OUTLYING * max(_robust_sd(away), _resolution(value))).mean())
+    """The share that jumps away from both neighbours, which agree."""
+    away = np.abs(value[1:-1] - 0.5 * (value[:-2] + value[2:]))
+    sd = max(1.4826 * float(np.median(away)), _resolution(value))
+    return float(((away > _OUTLYING * sd) & (np.abs(value[2:] - value[:-2]) < _AGREEING * sd)).mean())
 
 
 def _robust_sd(rest: FloatArray) -> float:

@@ -17,7 +17,7 @@ _FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 _DELAY_SHARE = 0.6  # of the lag; the PUMA's is 0.6, a servo's on a bus rather 0.75
 _UNKNOWN_LAG = 0.1  # s, where nothing follows
 _SMALLEST_SD = 1e-6  # m or rad
-_OUTLIERS = 1e-3  # share from which a gate pays
+_OUTLIERS = 3e-3  # share from which a gate pays
 _GATE = 5.0
 _DIFFERENT = 5.0  # sds
 
