@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from kinematic import GATE, ORDERS, Array, axes_of
+from kinematic import ORDERS, Array, axes_of
 
 import pumafuse as pf
 
@@ -60,9 +60,8 @@ class Case:
 
 
 def with_sensors(config: pf.FusionConfig, names: Sequence[str]) -> pf.FusionConfig:
-    """The configuration with these sensors, each rejected like the generic filters', axis by axis."""
-    sensors = {name: sensor for name, sensor in config.sensors.items() if name in names}
-    return change(config, sensors={n: change(sensor, gate=GATE, gate_rows=False) for n, sensor in sensors.items()})
+    """The configuration with these sensors, and their own gates."""
+    return change(config, sensors={name: sensor for name, sensor in config.sensors.items() if name in names})
 
 
 def beginning(run: pf.Run, config: pf.FusionConfig, until: float) -> pf.Run:

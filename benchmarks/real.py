@@ -31,7 +31,9 @@ FIT = ["noise", "delay", "plant", "gain"]
 LEARNT = 100.0  # s of trunk-servo
 MARKS = ("<!-- made by benchmarks/real.py -->", "<!-- until here -->")
 
-Errors = Mapping[str, tuple[float, float]]  # of each method: RMSE [mm], coverage (NaN where there are no bars)
+Errors = Mapping[
+    str, tuple[float, float]
+]  # of each method: RMSE [mm or degrees], coverage (NaN where there are no bars)
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Log:
-    """One axis of a run in s since the first command and mm: commands, and measurements when they were valid."""
+    """One axis of a run, in s since the first command and mm or degrees: commands, and measurements when valid."""
 
     time: Array
     command: Array
@@ -106,7 +108,8 @@ def log(run: pf.Run, config: pf.FusionConfig, axis: str) -> Log:
     (name, sensor), origin = next(iter(config.sensors.items())), int(run.command.stamp.min())
     source = run.sensors[name]
     time, stamp = ((stamps - origin) / 1e9 for stamps in (run.command.stamp, source.stamp))
-    return Log(time, 1e3 * run.command.values[axis], stamp - sensor.latency, 1e3 * source.values[axis])
+    scale = config.arm.screen_of(axis).scale
+    return Log(time, scale * run.command.values[axis], stamp - sensor.latency, scale * source.values[axis])
 
 
 def held(seen: Log, at: Array, late: float) -> list[Array]:
@@ -163,7 +166,8 @@ def row(
     """All methods at the instants of the reference at which there is a command, and so an estimate of pumafuse."""
     seen = log(run, recording.config, axis)
     assert est.reference is not None
-    true, at = 1e3 * est.reference.position[axis], est.reference.time
+    scale = recording.config.arm.screen_of(axis).scale
+    true, at = scale * est.reference.position[axis], est.reference.time
     scored = (at > recording.skip) & (at < seen.valid[-1]) & np.isin(at, est.time) & np.isfinite(true)
     true, at = true[scored], at[scored]
     here, at = np.searchsorted(est.time, at), at + 1e-9  # rounding makes no measurement of that instant a later one
@@ -174,7 +178,7 @@ def row(
         made.errors["held"] = score(*held(seen, at, late), true)
     for name, method in found.items():
         made.errors[name] = score(*method(seen, at, late, mode == "smoothed"), true)
-    made.errors["pumafuse"] = score(1e3 * est[axis].position[here], 1e3 * est[axis].position_sd[here], true)
+    made.errors["pumafuse"] = score(scale * est[axis].position[here], scale * est[axis].position_sd[here], true)
     return made
 
 

@@ -10,6 +10,7 @@ import pytest
 
 import pumafuse as pf
 from pages import ROOT
+from pumafuse.units import DEG
 
 SHARED = ROOT.parent / "shared" / "data" / "trunk-servo"
 
@@ -66,7 +67,7 @@ def test_least_squares_find_what_the_commands_lead_to(ungated: ModuleType) -> No
 
 @pytest.mark.parametrize("name", ["0g", "100g"])
 def test_the_example_is_the_recording(name: str) -> None:
-    """Values and stamps of examples/trunk-servo are those of the recording, to the digit."""
+    """Values and stamps of examples/trunk-servo are those of the recording, which is in degrees, to the digit."""
     if not SHARED.exists():
         pytest.skip("the recordings that the example was made from are not at hand")
     run = pf.Run.read(ROOT / "examples" / "trunk-servo" / name)
@@ -75,4 +76,4 @@ def test_the_example_is_the_recording(name: str) -> None:
         table = np.loadtxt(SHARED / name / f"{file}.csv.gz", delimiter=",", skiprows=1)
         assert np.array_equal(source.stamp, np.rint(table[:, 0] * 1e9).astype(np.int64))
         for number, values in enumerate(source.values.values(), 1):
-            assert np.array_equal(values, table[:, number] / 1e3)
+            assert np.array_equal(values, table[:, number] / DEG)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
@@ -74,7 +74,7 @@ def struct(tree: Any, kind: type[S], where: str, path: str = "", axis: Kind = "l
     if axis != "length" and (problem := next(_problems(tree, kind, path, axis), None)):
         raise ConfigError(f"{where}: {problem}")
     try:
-        return msgspec.convert(tree if axis == "length" else _renamed(tree, as_length), kind)
+        return msgspec.convert(tree if axis == "length" else as_lengths(tree, kind), kind)
     except msgspec.ValidationError as error:
         problem = next(_problems(tree, kind, path, axis), f"{path}: {error}" if path else str(error))
         raise ConfigError(f"{where}: {problem}") from None
@@ -105,8 +105,8 @@ def builtins(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
         axis: What the axes are to which it belongs: its keys get the units of that.
     """
     dates = (datetime.datetime, datetime.date, datetime.time)
-    tree = _without_none(msgspec.to_builtins(value, builtin_types=dates, enc_hook=float))  # numpy's numbers are floats
-    return tree if axis == "length" else _renamed(tree, lambda name: of_kind(name, axis))
+    tree = msgspec.to_builtins(_of_kind(value, axis), builtin_types=dates, enc_hook=float)  # numpy's numbers are floats
+    return _without_none(tree)
 
 
 def reported(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
@@ -116,12 +116,13 @@ def reported(value: msgspec.Struct, axis: Kind = "length") -> dict[str, Any]:
         value: The struct.
         axis: What the axes are to which it belongs: its keys have the units of that.
     """
-    return from_si(_renamed(msgspec.to_builtins(value, enc_hook=float), lambda name: of_kind(name, axis)))
+    return from_si(msgspec.to_builtins(_of_kind(value, axis), enc_hook=float))
 
 
-def from_report(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """The inverse of :func:`reported`: tables in SI with the key names for lengths."""
-    return _renamed(to_si(tree), as_length)
+def as_lengths(tree: Any, kind: Any = None) -> Any:
+    """Tables with the key names for lengths, which are those of structs; names of fields of ``kind`` stay."""
+    own = {field.encode_name for field in msgspec.structs.fields(kind)} if isinstance(kind, type) else ()
+    return _renamed(tree, lambda name: name if name in own else as_length(name))
 
 
 def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
@@ -130,6 +131,23 @@ def _without_none(tree: dict[str, Any]) -> dict[str, Any]:
         for key, value in tree.items()
         if value is not None
     }
+
+
+def _of_kind(value: Any, axis: Kind) -> Any:
+    """A tree in which structs are tables with the keys of a kind of axis; the keys of a dict are names, and stay."""
+    if axis == "length":
+        return value
+    if isinstance(value, msgspec.Struct):
+        tag = value.__struct_config__
+        found = {} if tag.tag_field is None else {tag.tag_field: tag.tag}
+        for field in msgspec.structs.fields(value):
+            found[of_kind(field.encode_name, axis)] = _of_kind(getattr(value, field.name), axis)
+        return found
+    if isinstance(value, Mapping):
+        return {key: _of_kind(item, axis) for key, item in cast(Mapping[str, Any], value).items()}
+    if isinstance(value, list | tuple):
+        return [_of_kind(item, axis) for item in cast(Sequence[Any], value)]
+    return value
 
 
 def _renamed(tree: Any, name: Callable[[str], str]) -> Any:

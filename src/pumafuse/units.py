@@ -11,7 +11,7 @@ screens have those of the axis's kind (``sd_deg``): :func:`of_kind`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from decimal import Context, Decimal
 from typing import Any, Literal, TypeAlias, cast
@@ -54,12 +54,15 @@ LENGTHS = ("_m", "_mm", "_um")
 ANGLES = ("_rad", "_mrad", "_deg")
 TIMES = ("_s", "_ms", "_us", "_ns")
 OF_KIND: dict[Kind, tuple[str, ...]] = {"length": LENGTHS, "angle": ANGLES}
+SPEEDS: dict[Kind, tuple[str, ...]] = {"length": ("_m_s", "_mm_s"), "angle": ("_deg_s", "_rad_s")}  # first: on screens
 _EXPONENTS = {  # power of ten to SI -> endings of names
     0: ("_m", "_s", "_m_s", "_rad_s", "_s_m", "_rad", "_s_rad", "_deg_rtHz_per_deg_s", "_deg_rts_per_deg_s"),
     -3: ("_mm", "_ms", "_mm_s", "_mm_rtHz", "_mm_rts", "_mm_rtHz_per_m_s", "_mm_rts_per_m_s", "_mrad"),
     -6: ("_um", "_us"),
     -9: ("_ns",),
 }
+_UNNAMED = {"cm": 0.01, "inch": 0.0254}  # lengths that no name may end in, and that people write all the same
+_SAME = 1.2  # tolerance of a factor between two units
 _DEGREES = ("_deg", "_deg_s", "_deg_rtHz", "_deg_rts")
 _UNITS: dict[str, int | None] = {  # of names; None: degrees
     **{ending: exponent for exponent, endings in _EXPONENTS.items() for ending in endings},
@@ -129,6 +132,23 @@ def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
 def from_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     """The inverse of :func:`to_si`: SI numbers in the units of their names."""
     return _converted(tree, "", "", _in_unit)
+
+
+def mistaken(factor: float, endings: Iterable[str]) -> list[tuple[str, str]]:
+    """The units that numbers may be in, each with the one that they are taken to be in, if they come out wrong.
+
+    Args:
+        factor: How many times too large they come out, within a fifth.
+        endings: The units that a name can have, ``LENGTHS``, ``ANGLES`` or ``TIMES``.
+    """
+    named = {unit[1:]: si(1.0, unit) for unit in endings}
+    every = named | _UNNAMED if "mm" in named else named
+    return [
+        (true, called)
+        for true, size in every.items()
+        for called, taken in named.items()
+        if true != called and abs(math.log(factor * size / taken)) < math.log(_SAME)
+    ]
 
 
 def refuse_unit(kind: str, name: str) -> None:

@@ -43,7 +43,18 @@ def test_json_has_the_numbers_of_python(run: Path, found: list[dict[str, object]
     assert len(found) == 4
     for one, other in zip(found, expected, strict=True):
         assert set(one) == {
-            *("run", "axis", "source", "lag_ms", "measurements", "amplitude_mm", "start_mm", "start_from", "model"),
+            *(
+                "run",
+                "axis",
+                "kind",
+                "source",
+                "lag_ms",
+                "measurements",
+                "amplitude_mm",
+                "start_mm",
+                "start_from",
+                "model",
+            ),
             *("without_recovery", "with_recovery", "recovery_ms", "best_in_class", "outlying", "verdict", "notes"),
         }
         assert [one[key] for key in ("axis", "source", "verdict")] == [other.axis, other.source, other.verdict]

@@ -99,7 +99,7 @@ def test_compare_takes_the_reference_of_a_framed_run(tmp_path):
     results.write(quiet(pf.Run.read(tmp_path), pf.FusionConfig(arm=ARM)), tmp_path / "out", False)
     result = results.read(tmp_path / "out")
     assert set(result.scores(result.reference)) == {"tangential", "radial"}
-    reference = results.read_reference(tmp_path / "run.toml", result.summary.origin_ns)
+    reference = results.read_reference(tmp_path / "run.toml", result.summary.origin_ns, result.config)
     assert set(result.scores(reference)) == {"tangential", "radial"}
 
 

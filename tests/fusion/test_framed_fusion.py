@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -146,7 +147,12 @@ def test_the_radius_is_the_largest_of_the_run_and_not_that_of_its_start(
 
 
 @pytest.mark.parametrize(
-    "frame", [Cylindrical(base=(0.1, -0.2), positive="clockwise"), Rotated(azimuth=33.3, positive="clockwise"), None]
+    "frame",
+    [
+        Cylindrical(base=(0.1, -0.2), positive="clockwise"),
+        Rotated(azimuth=math.radians(33.3), positive="clockwise"),
+        None,
+    ],
 )
 def test_the_configuration_as_used_keeps_the_frame(frame: Cylindrical | Rotated | None, tmp_path: Path) -> None:
     """fusion.toml of a result folder is read back with the frame that it had, to the last bit."""

@@ -103,7 +103,7 @@ def test_summary_table_and_compare_show_the_velocity(tmp_path: Path) -> None:
     assert compared["axes"]["radial"]["velocity_rmse_mm_s"] == pytest.approx(2.0, rel=1e-6)
     assert compared["axes"]["radial"]["velocity_coverage"] == 0.0
     shown = Console(width=160, file=io.StringIO(), record=True)
-    shown.print(score_table([("made", {"radial": found})]))
+    shown.print(score_table([("made", summary, {"radial": found})], "length"))
     text = shown.export_text()
     assert "velocity" in text
     assert text.split()[-2:] == ["2.000", "0.0%"]

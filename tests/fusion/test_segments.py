@@ -234,7 +234,7 @@ def test_an_axis_has_its_own_commands_and_start() -> None:
     stamp = [ORIGIN, ORIGIN + TICK, ORIGIN + 2 * TICK]
     values = {"vertical": [nan, 0.2, 0.3], "radial": [0.5, nan, 0.7]}
     segment = build(Run.from_arrays(stamp, values, start={"radial": 0.4}), config())
-    assert segment.axes == ("radial", "vertical")
+    assert segment.axes == ("vertical", "radial")
     assert segment.start == {"radial": 0.4, "vertical": 0.2}
     assert [part.tolist() for part in segment.given("radial")] == [[stamp[0], stamp[2]], [0.5, 0.7]]
     assert [part.tolist() for part in segment.given("vertical")] == [stamp[1:], [0.2, 0.3]]
@@ -337,13 +337,15 @@ def test_commands_that_are_no_positions_are_refused(clock: Clock) -> None:
         build(run, config())
 
 
-def test_the_speed_is_the_fastest_step_of_any_axis() -> None:
+def test_the_speed_of_an_axis_is_its_fastest_step() -> None:
     """Highest commanded speed: the largest step over the period, the one from the start level included."""
     stamp = [ORIGIN, ORIGIN + TICK, ORIGIN + 10 * TICK]
     values = {"radial": [0.5, 0.501, 0.501], "vertical": [0.1, 0.1, 0.098]}
-    assert build(Run.from_arrays(stamp, values), config()).highest_speed(PERIOD) == pytest.approx(2e-3 / PERIOD)
+    segment = build(Run.from_arrays(stamp, values), config())
+    assert segment.highest_speed("radial", PERIOD) == pytest.approx(1e-3 / PERIOD)
+    assert segment.highest_speed("vertical", PERIOD) == pytest.approx(2e-3 / PERIOD)
     started = build(Run.from_arrays(stamp, values, start={"radial": 0.4}), config())
-    assert started.highest_speed(PERIOD) == pytest.approx(0.1 / PERIOD)
+    assert started.highest_speed("radial", PERIOD) == pytest.approx(0.1 / PERIOD)
 
 
 # ---- output times

@@ -117,12 +117,12 @@ def errors(values: list[float]) -> PredictionError:
     half = len(ordered) // 2
     median = ordered[half] if len(ordered) % 2 else (ordered[half - 1] + ordered[half]) / 2.0
     mean_square = sum(value * value for value in values) / len(values)
-    return PredictionError(rms_mm=1e3 * math.sqrt(mean_square), median_mm=1e3 * median)
+    return PredictionError(rms=math.sqrt(mean_square), median=median)
 
 
 def check(got: PredictionError, values: list[float], rel: float = 1e-9) -> None:
     wanted = errors(values)
-    assert (got.rms_mm, got.median_mm) == (pytest.approx(wanted.rms_mm, rel), pytest.approx(wanted.median_mm, rel))
+    assert (got.rms, got.median) == (pytest.approx(wanted.rms, rel), pytest.approx(wanted.median, rel))
 
 
 @pytest.mark.parametrize(("sensor", "axis"), PAIRS)
@@ -210,7 +210,7 @@ def test_values_that_do_not_change():
     still = {axis: np.full(50, 0.3) for axis in ARM.axes}
     run = pf.Run.from_arrays(time, still, {"camera": (time + 0.03, still)})
     got = found(fused(run, config(camera=SENSORS["camera"])), "camera", "radial")
-    assert got.last_held == PredictionError(rms_mm=0.0, median_mm=0.0)
+    assert got.last_held == PredictionError(rms=0.0, median=0.0)
     assert got.of_best_other is None
 
 
@@ -250,11 +250,11 @@ def test_a_constant_velocity_filter_is_nested():
         sensors={"camera": pf.Sensor(sd=SD, gate=0.0)},
     )
     got = found(fused(run, of), "camera", "vertical")
-    assert got.filter.rms_mm == pytest.approx(got.constant_velocity.rms_mm, 1e-3)
-    assert got.filter.median_mm == pytest.approx(got.constant_velocity.median_mm, 1e-3)
+    assert got.filter.rms == pytest.approx(got.constant_velocity.rms, 1e-3)
+    assert got.filter.median == pytest.approx(got.constant_velocity.median, 1e-3)
     assert got.of_best_other == pytest.approx(1.0, abs=1e-3)
-    assert got.last_held.rms_mm > 1.5 * got.filter.rms_mm
-    assert got.command_alone.rms_mm > 1.5 * got.filter.rms_mm
+    assert got.last_held.rms > 1.5 * got.filter.rms
+    assert got.command_alone.rms > 1.5 * got.filter.rms
 
 
 def test_files_and_screens_have_it(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -155,12 +156,16 @@ def test_factors_are_what_varies_and_no_counter() -> None:
         )
         for k in range(8)
     ]  # fmt: skip
-    assert factors_of(trials, 0.028) == {
+    expected = {
         "axis": ["radial", "radial", "vertical", "vertical"] * 2,
         "speed_m_s": ["0.1"] * 4 + ["0.5"] * 4,
         "sense": ["-", "+"] * 4,
         "pose": ["a"] * 4 + ["b"] * 4,
     }
+    assert factors_of(trials, 0.028, "length") == expected
+    del expected["speed_m_s"]
+    turning = [replace(one, speed=np.deg2rad(1e3 * one.speed)) for one in trials]
+    assert factors_of(turning, 0.028, "angle") == expected | {"speed_deg_s": ["100"] * 4 + ["500"] * 4}
 
 
 def test_levels_are_in_the_order_of_their_values() -> None:

@@ -43,7 +43,7 @@ def joined(trials: Sequence[Trial], order: int) -> JointFit:
 
 def combined(trials: Sequence[Trial]) -> CombinedAxis:
     fitted = [Fitted(one, *pair, onset(one)) for one, pair in zip(trials, fit_steps(trials), strict=True)]
-    found = combine(fitted, 0.028, False)
+    found = combine(fitted, 0.028, False, "length")
     assert not isinstance(found, str)
     return found[0]
 

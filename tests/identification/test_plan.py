@@ -127,7 +127,7 @@ def test_what_will_spoil_a_campaign_is_warned_of(changes: dict[str, Any], words:
         ({"axes": ("radial", "radial")}, "each once"),
         ({"axes": ("reach_mm",)}, "must not end in a unit"),
         ({"speeds": ()}, "at least one speed"),
-        ({"speeds": (0.1, -0.1)}, "speeds must make steps of 0.001 mm to 10 m"),
+        ({"speeds": (0.1, -0.1)}, "speeds must make steps of 0.001 mm to 10000 mm"),
         ({"speeds": (1e-300,)}, "speeds must make steps"),
         ({"speeds": (0.07, 0.07000000001)}, "two speeds make the same step"),
         ({"amplitudes": (np.inf,)}, "amplitudes must make steps"),
@@ -137,6 +137,9 @@ def test_what_will_spoil_a_campaign_is_warned_of(changes: dict[str, Any], words:
         ({"positions": ({"axis": "1"},)}, "cannot have a column 'axis'"),
         ({"axes": ("a/b",)}, "cannot be called 'a/b'"),
         ({"axes": ("tick",)}, "cannot be called 'tick'"),
+        ({"kind": "angle", "speeds": (400.0,)}, "speeds must make steps of 0.0001 deg to 360 deg"),
+        ({"kind": "angle", "amplitudes": (1e-7,)}, "amplitudes must make steps of 0.0001 deg"),
+        ({"positions": ({"step_deg": "1"},)}, "cannot have a column 'step_deg'"),
     ],
 )
 def test_a_design_that_cannot_be_carried_out_is_refused(changes: dict[str, Any], words: str) -> None:

@@ -6,6 +6,8 @@ the true one, found from the run alone.
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
+from pumafuse import toml
 from pumafuse.arrays import FloatArray
 from pumafuse.identification.best_in_class import Fit
 from pumafuse.identification.verify import Trace
@@ -136,6 +139,32 @@ def test_the_numbers_are_what_their_names_say() -> None:
     assert best.fit.fit == pytest.approx(100.0 * (1.0 - np.std(left) / np.std(measured)), rel=1e-6)
 
 
+def test_one_mm_and_one_degree_are_verified_alike() -> None:
+    """Every number of a run relabelled from mm to degrees, in the units of its keys; lags and gains are the same."""
+    to_angle, encoded = np.deg2rad(1.0) / 1e-3, msgspec.json.Encoder(decimal_format="number").encode
+    length, plant, gain = (
+        run_of(moved(arm(SECOND)) + noise()),
+        pf.SecondOrder(natural_frequency=48.0, damping=1.0),
+        GAIN,
+    )
+    turned = pf.Gain(slope=gain.slope / to_angle, intercept=gain.intercept)
+    joint = pf.AxisModel(kind="angle", plant=plant, gain=turned)
+    scaled = run_of((moved(arm(SECOND)) + noise()) * to_angle, BINARY * to_angle)
+    one = only(length, arm(plant))
+    other = only(scaled, pf.ArmModel(name="joint", update_period=PERIOD, delay=DELAY, axes={"tip": joint}))
+    assert (one.kind, other.kind) == ("length", "angle")
+    ours, theirs = (json.loads(encoded(toml.reported(each, each.kind))) for each in (other, one))
+    assert ours["model"]["rms_deg"] == pytest.approx(theirs["model"]["rms_mm"], rel=1e-9)
+    assert [ours["amplitude_deg"], ours["start_deg"]] == pytest.approx([8.0, 556.0], rel=1e-9)
+    assert ours["lag_ms"] == pytest.approx(theirs["lag_ms"], rel=1e-9)
+    best = [each["best_in_class"] for each in (ours, theirs)]
+    for key in ("lag_ms", "lag_ms_ci95", "delay_ms", "gain"):
+        assert best[0][key] == pytest.approx(best[1][key], rel=1e-5), key
+    assert best[0]["fit"]["rms_deg"] == pytest.approx(best[1]["fit"]["rms_mm"], rel=1e-7)
+    assert best[0]["plant"]["plant"] == "second-order"
+    assert one.verdict == other.verdict.replace(" deg are left", " mm are left")
+
+
 # ---- the best in class ----------------------------------------------------------------------------------------------
 
 TRUE_GAIN = 0.9 + 0.1 * (HIGH - LOW) / PERIOD
@@ -250,7 +279,7 @@ def test_a_log_in_world_coordinates_is_verified_in_the_arms() -> None:
         "x": np.cos(angle) * BINARY - np.sin(angle) * other,
         "y": np.sin(angle) * BINARY + np.cos(angle) * other,
     }
-    run = pf.Run.from_arrays(TIME, commands, {"scope": (SAMPLED, turned)}, frame=Rotated(azimuth=30.0))
+    run = pf.Run.from_arrays(TIME, commands, {"scope": (SAMPLED, turned)}, frame=Rotated(azimuth=math.radians(30.0)))
     axes = {"radial": arm().axes["tip"], "tangential": arm(SECOND).axes["tip"]}
     model = pf.ArmModel(name="turned", update_period=PERIOD, delay=DELAY, axes=axes)
     start = {"radial": LOW, "tangential": float(other[0])}

@@ -197,7 +197,7 @@ def test_what_is_wrong_at_the_start_is_refused(wrong: dict) -> None:
         pf.LiveEstimator(CONFIG, **wrong)
 
 
-@pytest.mark.parametrize("frame", [Cylindrical(positive="clockwise"), Rotated(azimuth=90.0)])
+@pytest.mark.parametrize("frame", [Cylindrical(positive="clockwise"), Rotated(azimuth=math.radians(90.0))])
 def test_x_y_z_in_and_out(frame: Cylindrical | Rotated) -> None:
     """With a frame events come in x, y, z and estimates go back there."""
     live = pf.LiveEstimator(msgspec.structs.replace(CONFIG, frame=frame))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import shutil
 import time
@@ -217,12 +218,12 @@ def test_a_cylindrical_stream_is_recorded_with_its_frame(tmp_path: Path) -> None
     assert offline["tangential"].position[-1] == recorded.live.estimate(49 * T)["tangential"].position
 
 
-@given(
-    value=st.floats(-10.0, 10.0).map(lambda mm: mm / 1e3) | st.integers(-(10**9), 10**9).map(lambda um: um / 1e3 / 1e3)
-)
-def test_every_float_comes_back(value: float) -> None:
-    """What came as mm is read back from the record as the same float of m."""
-    assert float(record._cell(value)) / 1e3 == value
+@given(shown=st.floats(-10.0, 10.0) | st.integers(-(10**9), 10**9).map(lambda um: um / 1e3))
+@pytest.mark.parametrize("scale", [1e3, 180.0 / math.pi])
+def test_every_float_comes_back(shown: float, scale: float) -> None:
+    """What came as mm or degrees is read back from the record as the same float of m or rad."""
+    value = shown / scale
+    assert float(record._cell(value, scale)) / scale == value
 
 
 def test_a_full_disk_is_reported_and_nothing_is_written_twice(

@@ -11,7 +11,7 @@ import pumafuse as pf
 from pumafuse.live.wire import BadLine, Event, LineDecoder, encode
 from pumafuse.logs.frames import Cylindrical
 
-DECODER = LineDecoder(("radial", "vertical"), framed=True)
+DECODER = LineDecoder({"radial": "length", "vertical": "length"}, framed=True)
 
 
 def test_the_lines_of_the_design() -> None:
@@ -69,7 +69,7 @@ def test_what_is_no_event_has_a_reason(line: bytes, reason: str) -> None:
 def test_an_axis_may_not_be_called_as_a_part_of_a_line() -> None:
     """An arm with an axis 't' cannot be told from a stamp."""
     with pytest.raises(pf.ConfigError, match="axis 't'"):
-        LineDecoder(("t",), framed=False)
+        LineDecoder({"t": "length"}, framed=False)
 
 
 def test_an_estimate_is_one_line() -> None:
@@ -81,7 +81,7 @@ def test_an_estimate_is_one_line() -> None:
     for step in range(40):
         live.command(0.028 * step, x=0.1 + 1e-3 * step, y=0.5, z=-0.1)
     estimate = live.estimate(1.5)
-    text = encode(estimate, with_ns=True)
+    text = encode(estimate, config.arm.kind_of, with_ns=True)
     assert text.endswith(b"}\n")
     line = json.loads(text)
     assert (line["t"], line["t_ns"], set(line["stale"])) == (1.5, 1_500_000_000, {"tangential", "radial", "vertical"})
@@ -91,6 +91,6 @@ def test_an_estimate_is_one_line() -> None:
     assert estimate.cartesian is not None
     assert {name: line[f"{name}_mm"] / 1e3 for name in "xyz"} == pytest.approx(estimate.cartesian)
     assert 0.11 < estimate.cartesian["x"] < 0.14  # not where z or y is
-    moving = json.loads(encode(live.estimate(1.0), with_ns=False))
+    moving = json.loads(encode(live.estimate(1.0), config.arm.kind_of, with_ns=False))
     assert "t_ns" not in moving
     assert abs(moving["tangential"]["velocity_mm_s"]) == pytest.approx(1e3 * 1e-3 / 0.028, rel=0.1)

@@ -103,7 +103,7 @@ def test_cylindrical_axes_are_radius_and_arc(drawn: tuple[Path2D, Path2D], posit
 def test_rotated_axes_are_a_fixed_rotation(drawn: tuple[Path2D, Path2D], positive: str, azimuth: float) -> None:
     """(x + iy)·e^(−i·azimuth) = radial ± i·tangential: to the left of radial, or to its right; and back to x, y."""
     path, seen = drawn
-    run, placed = in_axes(logged(path, seen, Rotated(azimuth=azimuth, positive=positive)), None)
+    run, placed = in_axes(logged(path, seen, Rotated(azimuth=math.radians(azimuth), positive=positive)), None)
     turn = math.cos(math.radians(azimuth)) - 1j * math.sin(math.radians(azimuth))
     for source, wanted in ((run.command, path), (run.sensors["camera"], seen)):
         turned = (wanted.x + 1j * wanted.y) * turn
@@ -200,7 +200,10 @@ def test_commands_in_x_y_z_without_a_frame_are_refused_with_what_is_missing() ->
     """One line that names the file and says to give [frame]."""
     run = pf.Run.from_arrays(stamps(2), {"x": X, "y": Y, "z": Z})
     message = refusal(lambda: pf.fuse(run, config()))
-    assert message == "command: commands are in x, y, z; give a [frame] in run.toml or fusion.toml"
+    assert message == (
+        "command: commands are in x, y, z, the arm 'PUMA 560, internal ALTER' has tangential, radial, vertical: write"
+        " an arm.toml with axes x, y, z, or give a [frame] in run.toml or fusion.toml"
+    )
 
 
 @pytest.mark.parametrize(

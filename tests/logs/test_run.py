@@ -143,7 +143,7 @@ def test_a_path_without_a_run_is_refused(tmp_path: Path) -> None:
 def test_a_single_table_holds_every_source(tmp_path: Path) -> None:
     """Each source has the rows where it says something, in the units of its columns."""
     run = single(tmp_path, SINGLE)
-    assert (run.name, run.axes) == ("log", ("radial", "vertical"))
+    assert (run.name, run.axes) == ("log", ("vertical", "radial"))
     check_source(run.command, [0, 28_000_000], radial=[0.56, np.nan], vertical=[0.01, 0.02])
     assert list(run.sensors) == ["tracker"]
     check_source(run.sensors["tracker"], [10_000_000], radial=[0.5695])

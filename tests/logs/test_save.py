@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -80,7 +81,7 @@ def plain(**different: object) -> Run:
         None,
         Cylindrical(),
         Cylindrical(base=(0.0123456789, -1.1), positive="clockwise"),
-        Rotated(azimuth=37.25, positive="clockwise"),
+        Rotated(azimuth=math.radians(37.25), positive="clockwise"),
     ],
 )
 def test_frame_start_clock_and_reference_come_back(frame: Cylindrical | Rotated | None) -> None:

@@ -111,16 +111,16 @@ def test_of_an_axis_at_rest_only_the_noise_is_fitted() -> None:
 
 # ---- sensors that do not follow the commands ------------------------------------------------------------------------
 
-AGAINST = "moves against the commands of tangential (correlation -1.00): is it that axis, is its scale right (-1 for"
+AGAINST = "moves against the commands of tangential, vertical (correlation -1.000): scale = -1 turns it"
 FAULTS: dict[str, tuple[str, Callable[[Source], Source], str]] = {
     "sign": ("vision", scaled(-1.0), AGAINST),
     "sign of the better one": ("tracker", scaled(-1.0), AGAINST),
-    "metres as mm": ("tracker", scaled(1e-3), "moves 0.001 times as far as the commands of tangential"),
-    "cm as m": ("tracker", scaled(100.0), "moves 100 times as far as the commands of tangential"),
-    "axes exchanged": ("vision", exchanged, "does not follow the commands of"),
-    "frozen": ("vision", scaled(0.0), "does not follow the commands of tangential"),
-    "clock 2 s behind": ("vision", delayed(-2.0), "are both stamped by one clock?"),
-    "clock 1 s ahead": ("vision", delayed(1.0), "are both stamped by one clock?"),
+    "metres as mm": ("tracker", scaled(1e-3), "are its values m called mm"),
+    "cm as m": ("tracker", scaled(100.0), "(correlation +1.000): are its values cm called m"),
+    "axes exchanged": ("vision", exchanged, "follows on tangential the commands of vertical"),
+    "frozen": ("vision", scaled(0.0), "rests and does not follow the commands of tangential"),
+    "clock 2 s behind": ("vision", delayed(-2.0), "are both stamped by one clock"),
+    "clock 1 s ahead": ("vision", delayed(1.0), "are both stamped by one clock"),
 }
 
 

@@ -318,7 +318,7 @@ def test_scatter_is_the_noise_whatever_the_motion(share: float) -> None:
     run = pf.Run.from_arrays(time[::3], {"radial": swing[::3]}, read)
     arm = pf.ArmModel.load("puma560-internal")
     likelihood = Likelihood([run], pf.FusionConfig(arm=arm, sensors={name: pf.Sensor(sd=7.0) for name in noise}))
-    wanted = {f"sensors.{name}.sd_mm.radial": sd for name, sd in noise.items()}
+    wanted = {(name, "radial"): sd for name, sd in noise.items()}
     assert likelihood.scatter == pytest.approx(wanted, rel=0.2 if share else 0.08)
 
 
@@ -342,9 +342,9 @@ def test_a_sensor_that_froze_in_a_run_has_no_scatter() -> None:
     """In one of two runs: it is left out, and a sensor that scatters in both is not."""
     well, config = at_rest(1, {"tracker": 1e-4, "camera": 5e-3})
     frozen, _ = at_rest(2, {"tracker": 1e-4, "camera": 0.0})
-    both = {f"sensors.{name}.sd_mm.radial" for name in ("tracker", "camera")}
+    both = {(name, "radial") for name in ("tracker", "camera")}
     assert set(Likelihood([well], config).scatter) == both
-    assert set(Likelihood([well, frozen], config).scatter) == {"sensors.tracker.sd_mm.radial"}
+    assert set(Likelihood([well, frozen], config).scatter) == {("tracker", "radial")}
 
 
 def test_the_response_of_the_noiseless_arm_is_that_of_the_oracle() -> None:

@@ -121,6 +121,25 @@ def test_the_path_in_space_is_in_the_logs_own_coordinates(
         assert np.allclose(series(path, "/tangential/command")[1], np.linspace(0.0, -400.0, 80))
 
 
+def test_x_y_z_of_an_arm_are_a_path_in_space(tmp_path: Path) -> None:
+    """Without a frame, in the arm's own order of axes; an axis that is an angle is no part of it."""
+    axis, turning = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05)), pf.FirstOrder(time_constant=0.04)
+    axes = {"z": axis, "yaw": pf.AxisModel(kind="angle", plant=turning), "x": axis, "y": axis}
+    arm = pf.ArmModel(name="gantry", update_period=0.02, delay=0.03, axes=axes)
+    time = np.arange(100) * 0.02
+    command = {name: 0.1 * number * np.sin(time) for number, name in enumerate(axes, 1)}
+    run = pf.Run.from_arrays(time, command)
+    est = pf.fuse(run, pf.FusionConfig(arm=arm))
+    assert tuple(est.axes) == tuple(axes)
+    pf.to_rerun(est, run, tmp_path / "fused.rrd")
+    (chunk,) = columns(tmp_path / "fused.rrd", "/path/tool")
+    shown = np.array([row.as_py()[0] for row in chunk["Points3D:positions"]])
+    wanted = np.column_stack([1e3 * est[name].position for name in "xyz"])
+    np.testing.assert_allclose(shown, wanted, atol=1e-4)
+    _, degrees = series(tmp_path / "fused.rrd", "/yaw/estimate")
+    np.testing.assert_allclose(degrees, np.rad2deg(est["yaw"].position), atol=1e-9)
+
+
 def test_measurements_are_shown_where_they_put_the_tool(tmp_path: Path) -> None:
     """A sensor 300 mm off, upside down and doubled: its estimated bias and its scale are taken off, ν is left alone."""
     stamps = np.arange(0.01, 1.6, 0.01)

@@ -81,4 +81,7 @@ def _reported(folder: str, summary: Summary, scores: Mapping[str, ScoreSummary])
         for axis, part in summary.axes.items()
     }
     axes = {axis: toml.reported(one, summary.axes[axis].kind) for axis, one in scores.items()}
-    return {"folder": folder, "run": summary.run, "mode": summary.mode, "axes": axes, "skill": skill}
+    return {"folder": folder, "run": summary.run, "mode": summary.mode, "axes": axes, "skill": skill} | {
+        "commands": summary.commands,
+        "rows": summary.rows,
+    }

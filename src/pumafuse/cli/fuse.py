@@ -9,8 +9,11 @@ from importlib.resources import as_file, files
 from itertools import chain, count
 from pathlib import Path
 
+import numpy as np
 import typer
 
+from ..errors import RunError
+from ..filter.outcome import Outcome
 from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Estimates
@@ -19,7 +22,7 @@ from ..fusion.summary import Summary
 from ..logs.run import Run
 from ..units import KINDS
 from .many import progress_bar, report_failures, run_jobs
-from .tables import outcome_table, print_tables, runs_table, score_table, skill_table
+from .tables import left_out, outcome_table, print_tables, runs_table, score_table, skill_table
 
 
 def run(
@@ -42,8 +45,8 @@ def run(
         PumafuseError: The configuration is wrong, or at least one run failed.
     """
     given = FusionConfig.load(config)
-    names = given.sensor_names(sensors)
-    how = partial(fuse, config=given, sensors=names, rate=rate, smooth=smooth, as_live=as_live, engine=engine)
+    given.sensor_names(sensors)  # before any run is read
+    how = partial(fuse, config=given, sensors=sensors, rate=rate, smooth=smooth, as_live=as_live, engine=engine)
     job = partial(_fuse, how, part=part, rrd=rrd, figures=figures, force=force)
     if len(runs) == 1:
         with progress_bar(str(runs[0])) as progress:
@@ -104,6 +107,8 @@ def _fuse(
     results.check_writable(folder, force)
     recorded = Run.read(path).between(*part)
     est = how(recorded, progress=progress)
+    if not np.isin(est.measurements.outcome, [Outcome.FUSED, Outcome.REACQUIRED]).any():
+        raise RunError(f"nothing was fused, nothing is written: {_why_nothing(est)}")
 
     def extras(new: Path) -> None:
         if rrd:
@@ -121,6 +126,16 @@ def _fuse(
     return results.write(est, folder, force, extras)
 
 
+def _why_nothing(est: Estimates) -> str:
+    """What became of all measurements of a run of which none was fused, and which configured sensors it lacks."""
+    rows = [
+        f"'{name}' has {', '.join(f'{count} {word}' for word, count in counts.items())}"
+        for name, counts in est.counts.items()
+    ]
+    absent = [f"'{name}' of fusion.toml is not in the run" for name in est.config.sensors if name not in est.counts]
+    return "; ".join([*rows, *absent]) or "neither the run nor fusion.toml has a sensor"
+
+
 def _show(summary: Summary) -> None:
     """Print the tables of one fusion."""
     part = "" if summary.from_s is None else f" from {summary.from_s:g} s on"
@@ -128,6 +143,8 @@ def _show(summary: Summary) -> None:
         f"{summary.run}: {summary.estimates} estimates over {summary.duration_s:.1f} s{part}, {summary.mode},"
         f" arm {summary.arm}"
     )
+    if without := left_out(summary):
+        typer.echo(f"left out: {without}")
     scores = {axis: part.score for axis, part in summary.axes.items() if part.score is not None}
     print_tables(outcome_table(summary, kind) for kind in KINDS)
     print_tables(skill_table([("", summary)], kind) for kind in KINDS)

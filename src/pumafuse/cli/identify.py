@@ -13,6 +13,7 @@ from ..folders import FolderError, write_file
 from ..identification.identify import Identification, identify
 from ..identification.trials import StepTrials
 from ..model.arm import ArmModel
+from ..units import SCREEN, si
 from ..views import report as reports
 from .tables import console, table
 
@@ -23,12 +24,12 @@ def run(
     period: float | None,
     samples: int | None,
     paper: bool,
-    tolerance: float,
+    tolerance: float | None,
     report: Path | None,
     json: bool,
     force: bool,
 ) -> None:
-    """Identify an arm from the step trials in ``folder``; period [s] and tolerance [m].
+    """Identify an arm from the step trials in ``folder``; period [s], tolerance in the screen's unit of its axes.
 
     Raises:
         PumafuseError: The trials cannot be used, or what is to be written is in the way.
@@ -38,7 +39,8 @@ def run(
     if report is not None:
         reports.check_writable(report, force)
     trials, name = StepTrials.read(folder), folder.resolve().name
-    found = identify(trials, period=period, samples=samples, paper=paper, tolerance=tolerance, name=name)
+    most = None if tolerance is None else si(tolerance, f"_{SCREEN[trials.kind].unit}")
+    found = identify(trials, period=period, samples=samples, paper=paper, tolerance=most, name=name)
     for note in found.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=1)
     write_file(output, found.arm.to_toml())

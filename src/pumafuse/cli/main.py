@@ -145,17 +145,30 @@ def plan(
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the sequences go.")],
     axes: Annotated[str | None, Option(metavar="A,B", help="Default: the arm's, or the paper's three.")] = None,
     speeds: Annotated[
-        str, Option(metavar="M_S,...", help="Speeds of the steps; a step is its speed times the period.")
-    ] = "0.071,0.14,0.28,0.68",
+        str | None,
+        Option(
+            metavar="M_S,...",
+            help="Speeds of the steps, each the step over the period; default: 0.071,0.14,0.28,0.68. Of an --arm whose"
+            " axes are angles in degrees/s; default: 7.1,14,28,68.",
+        ),
+    ] = None,
     positions: Annotated[Path | None, Option(metavar="TABLE", help="Where to step, a position a row.")] = None,
     replicates: Annotated[int, Option(metavar="N", min=1, help="How often each combination is tried.")] = 2,
     period: Annotated[float | None, Option(metavar="MS", help="Update period; default: the arm's, or 28.")] = None,
     hold: Annotated[float, Option(metavar="S", help="How long a step is held.")] = 0.5,
     rest: Annotated[float, Option(metavar="S", help="How long the arm rests before and after it.")] = 0.5,
-    noise: Annotated[str, Option(metavar="MM,...", help="Amplitudes of the white noise; empty: none.")] = "4,8,14",
+    noise: Annotated[
+        str | None,
+        Option(
+            metavar="MM,...",
+            help="Amplitudes of the white noise; empty: none; default: 4,8,14, of angles 0.4,0.8,1.4 degrees.",
+        ),
+    ] = None,
     noise_duration: Annotated[float, Option(metavar="S", help="Of each white-noise sequence.")] = 4.2,
     arm: Annotated[str | None, Option(metavar="ARM", help="Check the plan for this arm: arm.toml or preset.")] = None,
-    max_speed: Annotated[float | None, Option(metavar="M_S", help="Limit; default: the arm's validity.")] = None,
+    max_speed: Annotated[
+        float | None, Option(metavar="M_S", help="Limit, of angles in degrees/s; default: the arm's validity.")
+    ] = None,
     seed: Annotated[int, Option(metavar="N", min=0, help="Of the order and of the noise.")] = 1,
     force: Force = False,
 ) -> None:
@@ -163,10 +176,10 @@ def plan(
     from . import plan as command
 
     _check_positive(period=period, hold=hold, rest=rest, noise_duration=noise_duration, max_speed=max_speed)
-    steps = {"speeds": _numbers(speeds, "--speeds"), "replicates": replicates, "hold": hold, "rest": rest, "seed": seed}
-    white = {"amplitudes": tuple(map(_si, _numbers(noise, "--noise"))), "noise_duration": noise_duration}
-    named, period_s = _names(axes, "--axes"), period and _si(period)
-    command.run(output, named, period_s, positions, arm, max_speed, force, **steps, **white)
+    named, period_s = _names(axes, "--axes"), period and _seconds(period)
+    sizes = _numbers(speeds, "--speeds"), _numbers(noise, "--noise")
+    steps = {"replicates": replicates, "hold": hold, "rest": rest, "noise_duration": noise_duration, "seed": seed}
+    command.run(output, named, period_s, positions, arm, max_speed, *sizes, force, **steps)
 
 
 @app.command()
@@ -178,7 +191,13 @@ def identify(
         int | None, Option(metavar="N", min=8, help="Samples used from each step; default: all.")
     ] = None,
     paper: Annotated[bool, Option("--paper", help="Read delay and gain off each trial, as published.")] = False,
-    tolerance: Annotated[float, Option(metavar="MM", help="RMS beyond which the model is not called valid.")] = 1.0,
+    tolerance: Annotated[
+        float | None,
+        Option(
+            metavar="MM",
+            help="RMS beyond which the model is not called valid, of angles in degrees; default: 1 or 0.1.",
+        ),
+    ] = None,
     report: Report = None,
     json: Json = False,
     force: Force = False,
@@ -187,7 +206,7 @@ def identify(
     from . import identify as command
 
     _check_positive(period=period, tolerance=tolerance)
-    command.run(trials, output, period and _si(period), samples, paper, _si(tolerance), report, json, force)
+    command.run(trials, output, period and _seconds(period), samples, paper, tolerance, report, json, force)
 
 
 @app.command()
@@ -196,7 +215,8 @@ def verify(
     arm: Annotated[str, Option("--arm", metavar="ARM", help="An arm.toml, or the name of a preset.")],
     sensors: Annotated[str | None, Option(metavar="A,B", help="Default: the reference, else every sensor.")] = None,
     start: Annotated[
-        list[str] | None, Option(metavar="AXIS=MM", help="Start level; default: the run's, else chosen by RMS.")
+        list[str] | None,
+        Option(metavar="AXIS=VALUE", help="Start level, mm or degrees; default: the run's, else chosen by RMS."),
     ] = None,
     report: Report = None,
     json: Json = False,
@@ -319,7 +339,10 @@ def _names(listed: str | None, option: str = "--sensors") -> list[str] | None:
     return names
 
 
-def _numbers(listed: str, option: str) -> tuple[float, ...]:
+def _numbers(listed: str | None, option: str) -> tuple[float, ...] | None:
+    """Numbers with commas between; None if the option is not given."""
+    if listed is None:
+        return None
     try:
         return tuple(float(number) for number in listed.split(",") if number.strip())
     except ValueError:
@@ -327,19 +350,19 @@ def _numbers(listed: str, option: str) -> tuple[float, ...]:
 
 
 def _level(text: str) -> tuple[str, float]:
-    """``radial=560`` as an axis and its level [m]."""
+    """``radial=560`` as an axis and its level, in mm or degrees."""
     axis, _, level = text.partition("=")
     try:
-        return axis.strip(), _si(float(level))
+        return axis.strip(), float(level)
     except ValueError:
-        raise BadParameter(f"expected AXIS=MM, not '{text}'", param_hint="--start") from None
+        raise BadParameter(f"expected AXIS=VALUE, not '{text}'", param_hint="--start") from None
 
 
-def _si(value: float) -> float:
-    """Milliseconds or millimetres of the command line in s or m, without a binary rounding in between."""
+def _seconds(milliseconds: float) -> float:
+    """Milliseconds of the command line in s, without a binary rounding in between."""
     from ..units import si  # imports numpy, which no --help needs
 
-    return si(value, "_mm")
+    return si(milliseconds, "_ms")
 
 
 def _check_interval(since: float | None, until: float | None) -> None:

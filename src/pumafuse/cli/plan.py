@@ -14,8 +14,12 @@ from ..identification import plan as plans
 from ..identification.plan import Design
 from ..logs import tables
 from ..model.arm import CANONICAL_AXES, ArmModel
+from ..units import SCREEN, SPEEDS, Kind, si
 
 _PERIOD = 0.028  # s, the paper's
+# m/s and mm, the paper's; degrees/s and degrees, which are as far at 0.57 m from the joint
+_SPEEDS: dict[Kind, tuple[float, ...]] = {"length": (0.071, 0.14, 0.28, 0.68), "angle": (7.1, 14.0, 28.0, 68.0)}
+_AMPLITUDES: dict[Kind, tuple[float, ...]] = {"length": (4.0, 8.0, 14.0), "angle": (0.4, 0.8, 1.4)}
 
 
 def run(
@@ -25,10 +29,12 @@ def run(
     positions: Path | None,
     arm: str | None,
     max_speed: float | None,
+    speeds: Sequence[float] | None,
+    amplitudes: Sequence[float] | None,
     force: bool,
     **design: Any,
 ) -> None:
-    """Lay out a campaign and write it.
+    """Lay out a campaign and write it. Speeds are in m/s or degrees/s, amplitudes in mm or degrees.
 
     Args:
         output: Where it goes.
@@ -36,7 +42,9 @@ def run(
         period: Update period [s]; None: that of the arm.
         positions: Table of the positions to step at; None: where the arm is.
         arm: What is known of the arm, to check the plan.
-        max_speed: Its limit [m/s]; None: the arm's validity.
+        max_speed: Its limit; None: the arm's validity.
+        speeds: Of the steps; None: the paper's.
+        amplitudes: Of the white noise; None: the paper's.
         force: Replace an earlier campaign.
         design: The other attributes of :class:`Design`.
 
@@ -45,15 +53,21 @@ def run(
     """
     plans.check_writable(output, force)
     model = None if arm is None else ArmModel.load(arm)
+    stepped = tuple(axes or (CANONICAL_AXES if model is None else model.axes))
+    kind = "length" if model is None else plans.kind_of(stepped, model)
+    size, speed = f"_{SCREEN[kind].unit}", SPEEDS[kind][0]
     planned = plans.plan(
         Design(
-            axes=tuple(axes or (CANONICAL_AXES if model is None else model.axes)),
+            axes=stepped,
+            speeds=tuple(si(one, speed) for one in (_SPEEDS[kind] if speeds is None else speeds)),
             period=period or (_PERIOD if model is None else model.update_period),
             positions=({},) if positions is None else _positions(positions),
+            amplitudes=tuple(si(one, size) for one in (_AMPLITUDES[kind] if amplitudes is None else amplitudes)),
+            kind=kind,
             **design,
         ),
         model,
-        max_speed,
+        None if max_speed is None else si(max_speed, speed),
     )
     for warning in planned.warnings:
         warnings.warn(warning, PumafuseWarning, stacklevel=1)

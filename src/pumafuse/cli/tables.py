@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from ..fusion.score import Z95
+from ..fusion.segments import NOT_SELECTED
 from ..fusion.skill import PredictionError
 from ..fusion.summary import ScoreSummary, Summary
 from ..units import SCREEN, Kind
@@ -22,6 +23,7 @@ from ..units import SCREEN, Kind
 # By heading: an attribute, its format, and what it is multiplied by; None: what positions are on the screen.
 Columns = Mapping[str, tuple[str, str, float | None]]
 
+_GIVEN = {"used", "fused", "rejected", "reacquired", NOT_SELECTED}  # what is no surprise
 _FEW_RUNS = 20  # that get lines of their own
 _SCORE: Columns = {
     "RMSE, {unit}": ("rmse", ".3f", None),
@@ -58,7 +60,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
         if not set(cells) <= {"", "–"}:
             numbers = all(cell[:1] in "+-–…<0123456789" for cell in cells)
             whole = numbers or any("\n" in cell for cell in cells)
-            made.add_column(heading, justify="right" if numbers else "left", overflow="fold", no_wrap=whole)
+            made.add_column(escape(heading), justify="right" if numbers else "left", overflow="fold", no_wrap=whole)
             kept.append([escape(cell) for cell in cells])
     for row in zip(*kept, strict=True):
         made.add_row(*row)
@@ -122,6 +124,16 @@ def outcome_table(summary: Summary, kind: Kind) -> Table:
     unit = SCREEN[kind].unit
     of_positions = (f"innovation, {unit}", f"expected, {unit}", f"bias, {unit}")
     return table(["axis", "sensor", *words, *of_positions, "verdict"], rows)
+
+
+def left_out(summary: Summary) -> str:
+    """In words how many rows of which source the filter was not given, and why; empty where it was given all."""
+    sources = [("commands", summary.commands), *summary.rows.items()]
+    return "; ".join(
+        f"{', '.join(f'{count} {word}' for word, count in without.items())} of {sum(counts.values())} {name}"
+        for name, counts in sources
+        if (without := {word: count for word, count in counts.items() if word not in _GIVEN})
+    )
 
 
 def skill_table(results: Iterable[tuple[str, Summary]], kind: Kind) -> Table:

@@ -7,14 +7,14 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import msgspec
 import typer
 
-from .. import units
+from .. import toml
 from ..errors import PumafuseWarning
 from ..identification.verify import verify
 from ..logs.run import Run
 from ..model.arm import ArmModel
+from ..units import si
 from ..views import formatting
 from ..views import report as reports
 from .tables import console, print_json, table
@@ -29,7 +29,7 @@ def run(
     json: bool,
     force: bool,
 ) -> None:
-    """Compare a model with runs that it was not made from.
+    """Compare a model with runs that it was not made from; start levels are in mm, or degrees.
 
     Raises:
         PumafuseError: The arm or a run cannot be read, or they do not fit together.
@@ -37,7 +37,8 @@ def run(
     if report is not None:
         reports.check_writable(report, force)
     model = ArmModel.load(arm)
-    found = [one for path in paths for one in verify(Run.read(path), model, sensors=sensors, start=start)]
+    levels = {axis: si(level, f"_{model.screen_of(axis).unit}") for axis, level in start.items()}
+    found = [one for path in paths for one in verify(Run.read(path), model, sensors=sensors, start=levels)]
     if report is not None:
         reports.write_verification(found, model, report, force)
     verified = [verification for verification, _ in found]
@@ -45,9 +46,10 @@ def run(
         for note in one.notes:
             warnings.warn(f"run '{one.run}': {note}", PumafuseWarning, stacklevel=1)
     if json:
-        print_json([units.from_si(msgspec.to_builtins(one, enc_hook=float)) for one in verified])
+        print_json([toml.reported(one, one.kind) for one in verified])
         return
-    console(sys.stdout).print(table(*reports.verifications(verified)))
+    for of_kind in reports.verifications(verified):
+        console(sys.stdout).print(table(*of_kind))
     typer.echo("\n".join([formatting.lag(model.update_period), *map(reports.verdict, verified)]))
     if report is not None:
         typer.echo(f"written to {report}")

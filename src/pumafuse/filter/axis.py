@@ -68,6 +68,7 @@ class Sensors(NamedTuple):
         gate: In standard deviations, 0 for none, (S,).
         gate_rows: Whether one axis rejected rejects the row, (S,).
         bias: Which states are its drifting and its constant bias on each axis, −1 for none, (S, A, 2).
+        turn: After which angle a measurement is the same again [rad], 0 for never, (S, A).
     """
 
     scale: FloatArray
@@ -76,6 +77,7 @@ class Sensors(NamedTuple):
     gate: FloatArray
     gate_rows: BoolArray
     bias: IntArray
+    turn: FloatArray
 
 
 class State(NamedTuple):
@@ -214,13 +216,23 @@ def noise(model: Model, sensors: Sensors, state: State, axis: int, sensor: int, 
 def innovation(
     model: Model, sensors: Sensors, state: State, axis: int, sensor: int, z: float, R: float
 ) -> tuple[float, float]:
-    """ν = z − H x and S = H P Hᵀ + R of a measurement ``z`` [m] as logged, here and now; H stays in ``work``."""
+    """ν = z − H x and S = H P Hᵀ + R of a measurement ``z`` [m] as logged, here and now; H stays in ``work``.
+
+    An angle that is measured within a turn is the nearest of all turns.
+    """
     work, scale, states = state.work, sensors.scale[sensor], model.kind[axis, STATES]
     observation(model, sensors, axis, sensor, work, axis)
     nu = z - scale * state.drive[axis, START]
     for i in range(states):
         nu -= work[axis, 0, i] * state.x[axis, i]
+    nu = nearest(nu, sensors.turn[sensor, axis])
     return nu, variance_along(state.P, axis, states, R, work, axis)
+
+
+@compiled
+def nearest(difference: float, turn: float) -> float:
+    """A difference of measurements, less the whole turns in it; ``turn`` 0: as it is."""
+    return difference - turn * math.floor(difference / turn + 0.5) if turn > 0.0 else difference
 
 
 @compiled

@@ -208,7 +208,7 @@ class _Gate:
         self.unsettled: dict[int, int] = {}
 
     def agreement(
-        self, key: tuple[int, int], nu: float, R: float, time: int, gate: float, axis: _Axis, scale: float
+        self, key: tuple[int, int], nu: float, R: float, time: int, gate: float, axis: _Axis, scale: float, turn: float
     ) -> int:
         """1 if a rejected measurement agrees with the one before, 0 if not, −1 if that is less than T ago."""
         if key not in self.rejected:
@@ -221,7 +221,7 @@ class _Gate:
         row = h @ (F - np.eye(len(F)))
         row[axis.biases :] = 0.0
         motion = row @ axis.kf.P @ row + h @ Q @ h
-        return int(abs(nu - nu_then) <= gate * np.sqrt(R_then + R + scale**2 * motion))
+        return int(abs(_nearest(nu - nu_then, turn)) <= gate * np.sqrt(R_then + R + scale**2 * motion))
 
     def contradicted(self, sensor: int, axis: int, time: int) -> int:
         """The sensor that stands for what is believed; −1 for none."""
@@ -283,6 +283,11 @@ def filter_events(
         state.P[number, rest, rest] = axis.kf.P[axis.rest : axis.error, axis.rest : axis.error]
 
 
+def _nearest(difference: float, turn: float) -> float:
+    """A difference of angles without whole turns; ``turn`` 0: as it is."""
+    return difference - turn * round(difference / turn) if turn else difference
+
+
 def _add(
     axes: Sequence[_Axis],
     sensors: Sensors,
@@ -306,12 +311,17 @@ def _add(
         sd = sensors.sd[sensor, number] * (events.spread[row, number] if len(events.spread) else 1.0)
         R = float(sd**2 + (scale * axis.speed * sensors.latency_sd[sensor]) ** 2)
         z = float(events.value[row, number] - scale * state.drive[number, START])
-        nu, S = z - (H @ axis.kf.x).item(), (H @ axis.kf.P @ H.T).item() + R
+        predicted, S = (H @ axis.kf.x).item(), (H @ axis.kf.P @ H.T).item() + R
+        nu = _nearest(z - predicted, float(sensors.turn[sensor, number]))
+        z = predicted + nu if sensors.turn[sensor, number] else z
         met[number] = z, H, R, nu, S
         results.innovation[row, number], results.innovation_sd[row, number] = nu, np.sqrt(S)
     limit = float(sensors.gate[sensor])
     beyond = [n for n, (_, _, _, nu, S) in met.items() if limit > 0.0 and abs(nu) > limit * np.sqrt(S)]
-    agreements = [gate.agreement((sensor, n), met[n][3], met[n][2], time, limit, axes[n], scale) for n in beyond]
+    turns = sensors.turn[sensor].tolist()
+    agreements = [
+        gate.agreement((sensor, n), met[n][3], met[n][2], time, limit, axes[n], scale, turns[n]) for n in beyond
+    ]
     other = max((gate.contradicted(sensor, n, time) for n in beyond), default=-1)
     agreed = all(one == 1 for one in agreements)
     if beyond and agreed and other >= 0:

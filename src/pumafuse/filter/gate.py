@@ -15,7 +15,7 @@ import math
 
 from ..arrays import ALWAYS
 from ..compiled import compiled
-from .axis import OFFSET, PERIOD, Model, Sensors, State, noise_of_motion, variance_of_motion
+from .axis import OFFSET, PERIOD, Model, Sensors, State, nearest, noise_of_motion, variance_of_motion
 
 NU, R_THEN = range(2)  # of State.rejected
 REJECTED_AT, FUSED_AT = range(2)  # of State.gate_time
@@ -40,7 +40,8 @@ def agrees(model: Model, sensors: Sensors, state: State, axis: int, sensor: int,
     dt, scale = between / 1e9, sensors.scale[sensor]
     motion = variance_of_motion(model, state, axis, axis, dt) + noise_of_motion(model, state, axis, dt)
     variance = state.rejected[axis, sensor, R_THEN] + R + scale * scale * motion
-    return int(abs(nu - state.rejected[axis, sensor, NU]) <= sensors.gate[sensor] * math.sqrt(variance))
+    apart = nearest(nu - state.rejected[axis, sensor, NU], sensors.turn[sensor, axis])
+    return int(abs(apart) <= sensors.gate[sensor] * math.sqrt(variance))
 
 
 @compiled

@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, cast
+from typing import Annotated, Any, Literal, cast
 
 import msgspec
 
@@ -22,34 +22,49 @@ from ..model.presets import PRESETS
 from ..toml import NotNegative, Positive, Time
 from ..units import AN, KINDS, Kind, of_kind, refuse_unit
 
-S = TypeVar("S", bound=msgspec.Struct)
 PerAxis = (
     NotNegative | Annotated[dict[str, NotNegative], msgspec.Meta(min_length=1)]
 )  # one number, or one for each axis
 
 SD_BOUNDS = (1e-7, 1.0)  # m or rad; of a sensor's noise that is fitted
 _LONGEST_LATENCY = 3600.0  # s
-_OFFSET_SD = 5e-3  # m or rad
+_OFFSET_SD: dict[Kind, float] = {"length": 5e-3, "angle": math.radians(5.0)}
 _PER_AXIS = ("sd_mm", "bias_sd_mm", "bias_drift_sd_mm")  # keys of a sensor that may differ from axis to axis
 ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
 
 
+def of_axis(value: float | Mapping[str, float], axis: str, absent: float = 0.0) -> float:
+    """A number of all axes, or that of one axis; ``absent`` where there is none of it."""
+    return value.get(axis, absent) if isinstance(value, Mapping) else value
+
+
 class Start(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Prior uncertainty at the start: ``offset_sd`` is that of the offset [m or rad], for all axes or for each."""
+    """Prior uncertainty at the start.
 
-    offset_sd: PerAxis = msgspec.field(name="offset_sd_mm", default=_OFFSET_SD)
+    Attributes:
+        offset_sd: That of the offset [m or rad], for all axes or for each; None: 5 mm or 5°, by a configuration's arm.
+    """
 
-    def offset_sd_of(self, axis: str) -> float:
+    offset_sd: PerAxis | None = msgspec.field(name="offset_sd_mm", default=None)
+
+    def offset_sd_of(self, axis: str, kind: Kind = "length") -> float:
         """The uncertainty of one axis's offset [m or rad]."""
-        return self.offset_sd.get(axis, _OFFSET_SD) if isinstance(self.offset_sd, dict) else self.offset_sd
+        default = _OFFSET_SD[kind]
+        return default if self.offset_sd is None else of_axis(self.offset_sd, axis, default)
+
+    def of_arm(self, arm: ArmModel) -> Start:
+        """The same with a number for every axis: one, where it is the same for all."""
+        each = {axis: self.offset_sd_of(axis, one.kind) for axis, one in arm.axes.items()}
+        return Start(offset_sd=each if len(set(each.values())) > 1 else next(iter(each.values())))
 
 
 class Process(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Process noise of one axis, m being rad for an angle; the variances of the two parts of each density add up.
 
     Attributes:
-        input_noise: Density of the white noise at the plant's input [m/√Hz].
-        drift: Density of the offset's random walk [m/√s].
+        input_noise: Density of the white noise at the plant's input [m/√Hz]. The default in a file is 0.03 mm/√Hz, or
+            that in degrees for an angle.
+        drift: Density of the offset's random walk [m/√s]. The default in a file is 0.4 mm/√s, or that in degrees.
         maneuver_noise: More input noise per m/s of change in commanded speed [m/√Hz per m/s].
         maneuver_drift: More drift per m/s of change in commanded speed [m/√s per m/s].
         disturbance_sd: Standard deviation of a disturbance that reverts to 0 [m]; 0: there is none.
@@ -66,6 +81,12 @@ class Process(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     disturbance_kind: Literal["matern", "ou"] = "matern"
 
 
+PROCESS: dict[Kind, Process] = {  # what is not configured
+    "length": Process(),
+    "angle": Process(input_noise=math.radians(0.03), drift=math.radians(0.4)),
+}
+
+
 class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """z = scale · p(stamp − latency) + bias + noise.
 
@@ -78,8 +99,10 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             estimated.
         bias_drift_sd: Standard deviation of a bias that drifts and reverts to 0, beside the constant one, likewise.
         bias_time: How long such a drift lasts [s].
+        turn: After which it measures an angle again [rad]: a measurement is the nearest of all turns; 0: never.
         gate: A measurement beyond this many standard deviations is rejected; 0: never.
-        gate_rows: Whether one rejected axis rejects the whole row.
+        gate_rows: Whether one rejected axis rejects the whole row; None: unless all its axes are angles, as of an
+            encoder each.
     """
 
     sd: Positive | Annotated[dict[str, Positive], msgspec.Meta(min_length=1)] = msgspec.field(name="sd_mm")
@@ -89,8 +112,9 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     bias_sd: PerAxis = msgspec.field(name="bias_sd_mm", default=0.0)
     bias_drift_sd: PerAxis = msgspec.field(name="bias_drift_sd_mm", default=0.0)
     bias_time: Time = msgspec.field(name="bias_time_s", default=10.0)
+    turn: NotNegative = msgspec.field(name="turn_deg", default=0.0)
     gate: NotNegative = 50.0
-    gate_rows: bool = True
+    gate_rows: bool | None = None
 
     def sd_of(self, axis: str) -> float | None:
         """The noise on one axis [m or rad]; None where the sensor has none and so is not used."""
@@ -98,11 +122,17 @@ class Sensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def bias_sd_of(self, axis: str) -> float:
         """The uncertainty of its constant bias on one axis [m or rad]; 0 where none is estimated."""
-        return self.bias_sd.get(axis, 0.0) if isinstance(self.bias_sd, dict) else self.bias_sd
+        return of_axis(self.bias_sd, axis)
 
     def bias_drift_sd_of(self, axis: str) -> float:
         """The standard deviation of its drifting bias on one axis [m or rad]; 0 where there is none."""
-        return self.bias_drift_sd.get(axis, 0.0) if isinstance(self.bias_drift_sd, dict) else self.bias_drift_sd
+        return of_axis(self.bias_drift_sd, axis)
+
+    def gates_rows(self, arm: ArmModel) -> bool:
+        """Whether one rejected axis rejects the whole row."""
+        if self.gate_rows is not None:
+            return self.gate_rows
+        return any(one.kind == "length" for axis, one in arm.axes.items() if self.sd_of(axis) is not None)
 
     def is_biased(self, axis: str) -> bool:
         """Whether it has a bias on one axis, constant or drifting."""
@@ -144,10 +174,13 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
                     _known_axes(f"sensors.{name}.{key}", value, self.arm)
             if abs(sensor.latency) > _LONGEST_LATENCY:
                 raise ConfigError(f"sensors.{name}.latency_ms: more than an hour; is it in ms?")
+            if sensor.turn and "angle" not in self.arm.kinds:
+                raise ConfigError(f"sensors.{name}.turn_deg: no axis of the arm is an angle")
             if sensor.scale == 0.0:
                 raise ConfigError(f"sensors.{name}.scale: must not be 0: measurements would not depend on the position")
-        complete = {axis: self.process.get(axis, Process()) for axis in self.arm.axes}
+        complete = {axis: self.process.get(axis, PROCESS[one.kind]) for axis, one in self.arm.axes.items()}
         msgspec.structs.force_setattr(self, "process", complete)
+        msgspec.structs.force_setattr(self, "start", self.start.of_arm(self.arm))
 
     def _parts(self) -> Iterator[tuple[str, msgspec.Struct, Kind]]:
         """Its tables with their places in the file, and of which kind of axis they are."""
@@ -167,15 +200,9 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         path = Path(path)
         tree, where = toml.read(path), str(path)
         tree["arm"] = load_arm(tree, path)
+        tree = with_names_of_lengths(tree, tree["arm"], where)
         if isinstance(tree.get("process"), dict):
-            tree["process"] = by_axis(tree["process"], Process, tree["arm"], where, "process")
-        if isinstance(tree.get("start"), dict):
-            tree["start"] = of_all_axes(tree["start"], Start, tree["arm"], where, "start", ["offset_sd_mm"])
-        if isinstance(tree.get("sensors"), dict):
-            tree["sensors"] = {
-                name: of_all_axes(table, Sensor, tree["arm"], where, f"sensors.{name}", _PER_AXIS)
-                for name, table in tree["sensors"].items()
-            }
+            tree["process"] = with_defaults(tree["process"], tree["arm"])
         return toml.struct(tree, FusionConfig, where)
 
     def save(self, folder: Path) -> None:
@@ -224,8 +251,38 @@ def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
     return ArmModel.load(beside)
 
 
-def by_axis(table: Mapping[str, Any], kind: type[S], arm: ArmModel, where: str, path: str) -> dict[str, S]:
-    """A struct for each axis of the arm: ``[process]`` is for all axes, ``[process.radial]`` overrides it for one.
+def with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str, path: str = "") -> dict[str, Any]:
+    """The tables of a ``fusion.toml`` (SI numbers) with the key names for lengths, where those of angles are.
+
+    Args:
+        tree: All of them, or some.
+        arm: Says of which kind its axes are.
+        where: The file, for errors.
+        path: The place of the tables in the file, with a point behind it.
+
+    Raises:
+        ConfigError: A key is of a kind that no axis has, or its value is out of range.
+    """
+    found = dict(tree)
+    if isinstance(found.get("process"), dict):
+        found["process"] = by_axis(found["process"], Process, arm, where, f"{path}process")
+    if "start" in found:
+        found["start"] = of_all_axes(found["start"], Start, arm, where, f"{path}start", ["offset_sd_mm"])
+    if isinstance(sensors := found.get("sensors"), dict):
+        named = cast(dict[str, Any], sensors)
+        found["sensors"] = {
+            name: of_all_axes(table, Sensor, arm, where, f"{path}sensors.{name}", _PER_AXIS)
+            for name, table in named.items()
+        }
+    return found
+
+
+def by_axis(
+    table: Mapping[str, Any], kind: type[msgspec.Struct], arm: ArmModel, where: str, path: str
+) -> dict[str, dict[str, Any]]:
+    """A table for each axis of the arm: ``[process]`` is for all axes, ``[process.radial]`` overrides it for one.
+
+    They have the key names for lengths.
 
     Args:
         table: The table with the tables in it, in SI.
@@ -251,13 +308,17 @@ def by_axis(table: Mapping[str, Any], kind: type[S], arm: ArmModel, where: str, 
     }
     for of, shared in of_kinds.items():
         toml.struct(shared, kind, where, path, of)
-    return {
-        axis: toml.struct({**of_kinds[one.kind], **own.get(axis, {})}, kind, where, f"{path}.{axis}", one.kind)
-        for axis, one in arm.axes.items()
-    }
+    found: dict[str, dict[str, Any]] = {}
+    for axis, one in arm.axes.items():
+        mine = {**of_kinds[one.kind], **own.get(axis, {})}
+        toml.struct(mine, kind, where, f"{path}.{axis}", one.kind)
+        found[axis] = toml.as_lengths(mine, kind)
+    return found
 
 
-def of_all_axes(table: Any, kind: type[S], arm: ArmModel, where: str, path: str, per_axis: Sequence[str]) -> Any:
+def of_all_axes(
+    table: Any, kind: type[msgspec.Struct], arm: ArmModel, where: str, path: str, per_axis: Sequence[str]
+) -> Any:
     """A table for all axes of the arm as one of lengths; where axes are of both kinds, with a number for each axis.
 
     Args:
@@ -294,22 +355,29 @@ def of_all_axes(table: Any, kind: type[S], arm: ArmModel, where: str, path: str,
                 mine = [axis for axis, one in arm.axes.items() if one.kind == of]
                 each |= cast(dict[str, Any], value) if isinstance(value, dict) else dict.fromkeys(mine, value)
         if each:
-            found[key] = each
+            same = len(each) == len(arm.axes) and len(set(each.values())) == 1
+            found[key] = next(iter(each.values())) if same else each
     return found
+
+
+def with_defaults(process: Mapping[str, Mapping[str, Any]], arm: ArmModel) -> dict[str, dict[str, Any]]:
+    """The tables of axes, with the key names for lengths, with what they leave out."""
+    return {axis: {**toml.builtins(PROCESS[arm.axes[axis].kind]), **table} for axis, table in process.items()}
 
 
 def with_kinds(table: Mapping[str, Any], arm: ArmModel, per_axis: Sequence[str]) -> dict[str, Any]:
     """The inverse of :func:`of_all_axes`: a table of lengths with a key for each kind of the arm's axes."""
-    found = dict(table)
-    for key in per_axis:
-        value: Any = found.pop(key, None)
-        for of in arm.kinds if value is not None else ():
-            if not isinstance(value, dict):
-                found[of_kind(key, of)] = value
-                continue
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        if key not in per_axis:
+            found[key] = value
+        elif not isinstance(value, dict):
+            found.update((of_kind(key, of), value) for of in arm.kinds)
+        else:
             each = cast(dict[str, Any], value)
-            if mine := {axis: one for axis, one in each.items() if arm.axes[axis].kind == of}:
-                found[of_kind(key, of)] = mine
+            for of in KINDS:
+                if mine := {axis: one for axis, one in each.items() if arm.kind_of.get(axis, "length") == of}:
+                    found[of_kind(key, of)] = mine
     return found
 
 

@@ -18,7 +18,6 @@ from ..units import MM, Kind, of_kind
 from .config import Sensor
 from .estimates import Estimates, Measurements
 from .score import Z95
-from .segments import LONGEST_TAIL_NS
 
 LAGS = 20
 _FEW = 30  # fewer components get no verdict
@@ -28,7 +27,6 @@ _NEVER = 1e-6  # expected number below which chance is no explanation
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
 _MANY_REJECTED = 0.1  # share of rejected components beyond which the others are a selection
 _TOO_SMALL = "rejected: {sd}, latency_ms or the process noise too small"
-_ONE_CLOCK = "are both stamped by one clock?"
 _CAUSES = {  # by whether the NIS is above its band, and the sign of a notable correlation
     (True, 1): ", innovations positively correlated: the process noise too small, or latency_ms wrong",
     (True, 0): ": {sd} or the process noise too small",
@@ -130,21 +128,17 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
 
 
 def sensor_problems(est: Estimates) -> list[str]:
-    """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows, other clocks, frozen."""
-    found, given, end = list[str](), est.measurements, est.last_command
+    """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows, frozen."""
+    found, given = list[str](), est.measurements
     for number, name in enumerate(given.sensors):
         mine = np.flatnonzero(given.sensor == number)
         if not len(mine):
             continue
         outcome, time, axis, value = given.outcome[mine], given.time[mine], given.axis[mine], given.value[mine]
-        early, rejected = (
-            np.count_nonzero(outcome == int(kind)) / len(mine) for kind in (Outcome.BEFORE_START, Outcome.REJECTED)
-        )
+        rejected = np.count_nonzero(outcome == int(Outcome.REJECTED)) / len(mine)
         reacquired = len(np.unique(time[outcome == Outcome.REACQUIRED]))
         times = "once" if reacquired == 1 else f"{reacquired} times"
-        width, tail = _width_of_prior(est, name), float(np.fmax.reduce(time)) - end
-        hours_later = tail > LONGEST_TAIL_NS / 1e9
-        later = np.count_nonzero(time > end + 1.0) > 0.5 * len(mine)
+        width = _width_of_prior(est, name)
         frozen = {each: _frozen(value[axis == column]) for column, each in enumerate(given.axes)}
         of_axes = [given.axes[column] for column in set[int](axis.tolist())]
         kinds: dict[Kind, None] = {est.config.arm.axes[each].kind: None for each in of_axes}
@@ -166,9 +160,6 @@ def sensor_problems(est: Estimates) -> list[str]:
                     else f"the model; {sd}, latency_ms or the process noise may be wrong"
                 ),
             ),
-            (early > 0.5, f"most measurements lie before the first command: {_ONE_CLOCK}"),
-            (hours_later, f"measurements go on for {tail / 3600.0:.1f} hours after the last command: {_ONE_CLOCK}"),
-            (later and not hours_later, f"most measurements lie after the last command: {_ONE_CLOCK}"),
             (rejected > _MANY_REJECTED, f"{rejected:.0%} of its components were {_TOO_SMALL.format(sd=sd)}"),
             *(
                 (count > 0, f"{count} {each} measurements in a row have the same value: it froze")

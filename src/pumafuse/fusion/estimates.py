@@ -20,6 +20,7 @@ from ..units import Kind
 from .config import FusionConfig
 from .score import ReferenceTrack
 from .segments import Segment
+from .setup import turn_of
 
 Mode = Literal["filtered", "as-live", "smoothed"]
 
@@ -132,7 +133,6 @@ class Estimates:
         biases: By sensor and axis, estimated from all measurements (of the last segment, if there are several).
         reference: The run's reference, where it has one.
         origin: Stamp of the first command, int ns.
-        last_command: Time of the last command [s since the first].
         segment: 0, and one more after each time the log's clock was set back.
         segments: Commands and measurements of each segment as the filter was given them.
         mode: Which measurements an estimate uses: all that are valid by then (``filtered``), only those that had
@@ -141,6 +141,9 @@ class Estimates:
         config: The configuration as used.
         speed: Highest commanded speed for each kind of axis [m/s or rad/s].
         radius: Greatest distance of a command from the base's axis [m]; None without a cylindrical frame.
+        command_counts: How many rows of the commands were ``used``, and of the others how many were left out for what.
+        counts: How many rows of each sensor were ``fused``, ``rejected``, ``reacquired`` or left out for what; of a row
+            of several axes the best that became of any.
         notes: What was noticed, a sentence each.
         since: Where the part of the run that was used begins [s]; None: with the run.
         until: Where it ends [s], likewise.
@@ -154,7 +157,6 @@ class Estimates:
     biases: Mapping[str, Mapping[str, Bias]]
     reference: ReferenceTrack | None
     origin: int
-    last_command: float
     segment: IntArray
     segments: tuple[Segment, ...]
     mode: Mode
@@ -162,6 +164,8 @@ class Estimates:
     config: FusionConfig
     speed: Mapping[Kind, float]
     radius: float | None
+    command_counts: Mapping[str, int]
+    counts: Mapping[str, Mapping[str, int]]
     notes: tuple[str, ...]
     since: float | None = None
     until: float | None = None
@@ -199,7 +203,13 @@ class Estimates:
             return measurements.where(np.zeros(len(measurements.value), dtype=bool))
         bias = self.biases.get(sensor, {}).get(axis)
         position = measurements.value if bias is None else measurements.value - bias.value
-        return replace(measurements, value=position / self.config.sensors[sensor].scale)
+        known, turn = self.config.sensors[sensor], turn_of(self.config, sensor, axis)
+        position = position / known.scale
+        if turn:  # the nearest to the estimate
+            turn /= abs(known.scale)
+            away = position - np.interp(measurements.time, self.time, self[axis].position)
+            position = position - turn * np.round(away / turn)
+        return replace(measurements, value=position)
 
     def busiest(self, length: float) -> tuple[float, float]:
         """Start and end of the interval of ``length`` with the most motion [s]; every axis has the same weight."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar, get_args
@@ -15,7 +16,7 @@ from ..errors import PumafuseWarning
 from ..filter.events import COMMAND
 from ..filter.outcome import ABSENT, Outcome
 from ..logs.axes import in_axes
-from ..logs.clock import segments
+from ..logs.clock import clock_faults, segments
 from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run, Source
 from ..model.arm import ArmModel
@@ -26,7 +27,7 @@ from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
 from .faults import latency_questions, sensor_faults, starts_in_motion
 from .score import ReferenceTrack, late_rows, reference_track
-from .segments import Segment, build, output_times
+from .segments import NO_STAMP_WORD, Segment, added, build, output_times
 
 S = TypeVar("S", bound=np.generic)
 
@@ -76,9 +77,12 @@ def fuse(
     chosen = None if sensors is None else tuple(sensors)
     in_place, placed = in_axes(run, config.frame)
     logged, jumps = segments(in_place)
-    parts: list[tuple[Segment, TimeArray, Filtered]] = []
+    parts, faults = list[tuple[Segment, TimeArray, Filtered]](), list[str]()
     for number, part in enumerate(logged):
+        asked = [name for name in config.sensor_names(chosen) if name in part.sensors]
+        faults += clock_faults(part, config.arm.update_period, asked)
         segment = build(part, config, chosen)
+        faults += sensor_faults(segment, config)
         times = output_times(segment, config, rate)
         share = None if progress is None else _share(progress, number, len(logged))
         parts.append((segment, times, filter_segment(segment, config, times, mode, engine, share)))
@@ -102,7 +106,6 @@ def fuse(
         biases=filtered[-1].biases,
         reference=_reference(references, origin, placed),
         origin=origin,
-        last_command=(max(int(part.commands[-1]) for part in cut) - origin) / 1e9,
         segment=np.repeat(np.arange(len(parts)), [len(part) for part in times]),
         segments=cut,
         mode=mode,
@@ -110,12 +113,22 @@ def fuse(
         config=config,
         speed=_highest_speeds(cut, config.arm),
         radius=_highest_radius(in_place, placed),
+        command_counts=_without_strays([part.command_counts for part in cut], run.command, in_place.command),
+        counts={
+            name: _without_strays(
+                [_row_counts(segment, part, name) for segment, part in zip(cut, filtered, strict=True)],
+                source,
+                in_place.sensors[name],
+            )
+            for name, source in run.sensors.items()
+        },
         notes=(),
         since=run.since,
         until=run.until,
     )
-    notes = [note for part in parts for note in (*part[0].notes, *_contradictions(part[0], config, part[2], origin))]
-    notes += [note for segment in cut for note in (*starts_in_motion(segment, config), *sensor_faults(segment, config))]
+    notes = [*faults, *(note for part in cut for note in part.notes)]
+    notes += [note for part in parts for note in _contradictions(part[0], config, part[2], origin)]
+    notes += [note for segment in cut for note in starts_in_motion(segment, config)]
     notes += latency_questions(config, cut[0].sensors)
     notes += [*jumps, *_reference_notes(est, references), *config.arm.validity.excess(est.speed, est.radius)]
     est = replace(est, notes=(*notes, *sensor_problems(est)))
@@ -206,6 +219,24 @@ def _contradictions(segment: Segment, config: FusionConfig, filtered: Filtered, 
             " its measurements are rejected; which of the two is wrong?"
         )
     return found
+
+
+def _row_counts(segment: Segment, filtered: Filtered, name: str) -> Mapping[str, int]:
+    """What became of the rows of a sensor in one segment, those included that the filter decided on."""
+    before = dict(segment.counts[name])
+    if before.pop(Outcome.FUSED.word, 0):
+        mine = filtered.events.source == segment.sensors.index(name)
+        decided = mine & (filtered.events.known == Outcome.FUSED).any(axis=1)
+        found = np.bincount(filtered.results.outcome[decided].min(axis=1), minlength=len(Outcome)).tolist()
+        before |= {outcome.word: found[outcome] for outcome in Outcome if found[outcome]}
+    return before
+
+
+def _without_strays(parts: Sequence[Mapping[str, int]], logged: Source, mended: Source) -> dict[str, int]:
+    """The sum of the segments' counts of a source, stray stamps apart from none."""
+    found = Counter(added(parts))
+    stray = min(int(np.count_nonzero(logged.stamp != mended.stamp)), found[NO_STAMP_WORD])
+    return dict(found - Counter({NO_STAMP_WORD: stray}) + Counter(stray=stray))
 
 
 def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measurements:

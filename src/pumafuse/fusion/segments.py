@@ -6,8 +6,10 @@ Delays and latencies only say when events are, so another configuration's times 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from functools import reduce
 from typing import TypeAlias
 
@@ -18,7 +20,7 @@ from ..errors import RunError, UnknownNameError
 from ..filter.axis import Model, Sensors, State
 from ..filter.events import COMMAND, Events, classify_all, joined
 from ..filter.outcome import ABSENT, Outcome
-from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
+from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
 from ..logs.run import Run, Source, note_rows
@@ -26,8 +28,11 @@ from ..units import AN
 from .config import FusionConfig
 from .setup import at_rest, filter_model, filter_sensors
 
-LONGEST_TAIL_NS = 3_600_000_000_000  # measurements this long after the last command no longer belong to the run
 _MOST_ESTIMATES = 10_000_000
+
+# What may become of a row, besides its outcome: a command that says again what is in force; outside of --from and --to;
+# without a stamp, or with a stray one; of a sensor that is not among those to use.
+REPETITION, OUTSIDE, NO_STAMP_WORD, NOT_SELECTED = "repetition", "outside", "no_stamp", "not_selected"
 
 _REASONS = {
     Outcome.DUPLICATE: "the stamp and values of an earlier row",
@@ -50,6 +55,9 @@ class Segment:
         command_rows: Rows of the commands by stamp, with time = stamp.
         measurement_rows: Rows of all sensors, one sensor after the other, each by stamp.
         notes: Every anomaly once: how many, where first.
+        turn: After which angle each sensor's measurements of an axis are the same again [rad], 0 for never, (S, A).
+        command_counts: How many rows of the commands are ``used``, and of the others how many are left out for what.
+        counts: Likewise of each sensor of the run, ``fused`` being those that the filter decides on.
         ends: First and last stamp of the part that is used, int ns; before it there are commands only.
     """
 
@@ -61,6 +69,9 @@ class Segment:
     command_rows: Events
     measurement_rows: Events
     notes: tuple[str, ...]
+    turn: FloatArray
+    command_counts: Mapping[str, int]
+    counts: Mapping[str, Mapping[str, int]]
     ends: tuple[int, int] = (ALWAYS, NEVER)
     _latest: dict[tuple[int, ...], tuple[Events, IntArray]] = field(
         default_factory=dict[tuple[int, ...], tuple[Events, IntArray]], init=False, repr=False, compare=False
@@ -97,10 +108,21 @@ class Segment:
         return rows.stamp[chosen], rows.value[chosen, number]
 
     def rows_by_sensor(self) -> dict[str, Events]:
-        """The rows of each sensor that has any, by stamp."""
-        rows = self.measurement_rows
+        """The rows of each sensor that has any, by stamp; angles go on beyond a turn."""
+        rows = self.measurement_rows._replace(value=self.unwrapped())
         found = {name: rows.rows(np.flatnonzero(rows.source == number)) for number, name in enumerate(self.sensors)}
         return {name: part for name, part in found.items() if len(part.time)}
+
+    def unwrapped(self) -> FloatArray:
+        """Values of ``measurement_rows`` without the jumps of a sensor that measures within a turn, (rows, A)."""
+        rows = self.measurement_rows
+        if not self.turn.any():
+            return rows.value
+        value = rows.value.copy()
+        for sensor, axis in np.argwhere(self.turn > 0.0).tolist():
+            mine = (rows.source == sensor) & np.isfinite(value[:, axis])
+            value[mine, axis] = np.unwrap(value[mine, axis], period=float(self.turn[sensor, axis]))
+        return value
 
     def of_axis(self, axis: str, rows: IntArray) -> Segment:
         """The segment with one axis alone, and some of its measurements' ``rows``."""
@@ -111,6 +133,7 @@ class Segment:
             axes=(axis,),
             command_rows=self.command_rows.rows(commands).columns(column),
             measurement_rows=self.measurement_rows.rows(rows).columns(column),
+            turn=self.turn[:, column],
         )
 
     def highest_speed(self, axis: str, period: float) -> float:
@@ -172,12 +195,16 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     strangers = [name for name in run.sensors if name not in config.sensors] if sensors is None else []
     used = (*(name for name in chosen if name in run.sensors), *strangers)
     policy = _policy(config, run.axes, used)
-    rows = _command_rows(run, config, policy, notes)
+    rows = _command_rows(run, policy, notes)
+    command_counts = _command_counts(run.command, rows)
+    rows = _on_ticks(run, config, rows, notes)
     origin = int(rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)][0])
     ends = run.ends(origin)
-    rows = rows.rows(np.flatnonzero(rows.stamp <= ends[1]))
-    silent = [name for name in chosen if name not in run.sensors]
-    notes.extend(f"sensor '{name}' of the configuration has no measurements in this run" for name in silent)
+    within = rows.stamp <= ends[1]
+    outside = int(np.count_nonzero(_on_any_axis(rows.known, Outcome.FUSED) & ~within))
+    command_counts = _counted(command_counts | {"used": command_counts["used"] - outside, OUTSIDE: outside})
+    rows = rows.rows(np.flatnonzero(within))
+    notes += _unmatched([name for name in chosen if name not in run.sensors], strangers)
     commands = rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)]
     commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
     if late := [axis for axis, known in zip(run.axes, rows.known.T, strict=True) if Outcome.FUSED not in known]:
@@ -185,10 +212,25 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     given = {axis: (rows.known[:, number] == Outcome.FUSED).argmax() for number, axis in enumerate(run.axes)}
     first = {axis: float(rows.value[row, number]) for number, (axis, row) in enumerate(given.items())}
     parts = [_measurement_rows(run, config, number, used, policy, origin, notes) for number in range(len(used))]
-    measured = joined([Events.empty(len(run.axes)), *parts])
+    measured = joined([Events.empty(len(run.axes)), *(part for part, _ in parts)])
+    counts = {name: {NOT_SELECTED: len(source.stamp)} for name, source in run.sensors.items()}
+    counts |= {name: found for name, (_, found) in zip(used, parts, strict=True)}
     if run.interval and not (measured.known == Outcome.FUSED).any():
         raise RunError(f"run '{run.name}': no measurement to use is stamped {run.interval} after the first command")
-    return Segment(run.axes, used, origin, {**first, **run.start}, commands, rows, measured, tuple(notes), ends)
+    return Segment(
+        axes=run.axes,
+        sensors=used,
+        origin=origin,
+        start={**first, **run.start},
+        commands=commands,
+        command_rows=rows,
+        measurement_rows=measured,
+        notes=tuple(notes),
+        turn=policy[1].turn,
+        command_counts=command_counts,
+        counts=counts,
+        ends=ends,
+    )
 
 
 def output_times(segment: Segment, config: FusionConfig, rate: float | None) -> TimeArray:
@@ -231,7 +273,7 @@ def as_commanded(run: Run, config: FusionConfig) -> Source:
     """
     if run.clock == "stamps":
         return run.command
-    rows = _command_rows(run, config, _policy(config, run.axes, ()), [])
+    rows = _on_ticks(run, config, _command_rows(run, _policy(config, run.axes, ()), []), [])
     value = np.where(rows.known == Outcome.FUSED, rows.value, np.nan)
     return Source(rows.stamp, dict(zip(run.axes, value.T, strict=True)), run.command.label)
 
@@ -242,18 +284,26 @@ def _policy(config: FusionConfig, axes: Sequence[str], sensors: Sequence[str]) -
     return filter_model(config, axes, none), filter_sensors(config, sensors, axes, none), state
 
 
-def _command_rows(run: Run, config: FusionConfig, policy: _Policy, notes: list[str]) -> Events:
+def _unmatched(silent: Sequence[str], strangers: Sequence[str]) -> list[str]:
+    """A sentence on each configured sensor that the run does not have: one of another name may be the same."""
+    found: list[str] = []
+    for name in silent:
+        close = strangers if len(silent) == len(strangers) == 1 else get_close_matches(name, strangers, n=1)
+        like = f"; is '{close[0]}', which the configuration does not have, the same? One name must do" if close else ""
+        found.append(f"sensor '{name}' of the configuration has no measurements in this run{like}")
+    return found
+
+
+def _command_rows(run: Run, policy: _Policy, notes: list[str]) -> Events:
     """The stamped command rows of a segment in order, with time = stamp, each value classified.
 
     Args:
         run: One segment of a recorded run.
-        config: Its period T says what grid the stamps follow where the run's clock is regular.
         policy: What classifies the values.
         notes: Gets a sentence on everything that is wrong with the rows.
 
     Raises:
-        RunError: No command of an axis is possible, or the run's clock is regular and the stamps do not follow ticks
-            of T.
+        RunError: No command of an axis is possible.
     """
     source = run.command
     missing, label = source.stamp == NO_STAMP, source.label
@@ -268,8 +318,41 @@ def _command_rows(run: Run, config: FusionConfig, policy: _Policy, notes: list[s
         note_rows(notes, label, hollow, f"no finite {axis} command: not used")
         if not (known == Outcome.FUSED).any():
             raise RunError(f"{label}: no command for axis '{axis}' is a position within 1000 km")
+    return rows
+
+
+def _command_counts(source: Source, rows: Events) -> dict[str, int]:
+    """How many rows of the commands are what, all of them; of a stamp the last one counts."""
+    best = _best(rows.known)
+    again, hidden = best == Outcome.DUPLICATE, np.diff(rows.stamp, append=NEVER) == 0
+    return {
+        "used": int(np.count_nonzero(best == Outcome.FUSED)),
+        Outcome.DUPLICATE.word: int(np.count_nonzero(again & hidden)),
+        REPETITION: int(np.count_nonzero(again & ~hidden)),
+        Outcome.INVALID.word: int(np.count_nonzero(best == Outcome.INVALID)),
+        NO_STAMP_WORD: len(source.stamp) - len(rows.stamp),
+    }
+
+
+def added(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """The sums of several counts."""
+    return dict(sum(map(Counter[str], counts), Counter[str]()))
+
+
+def _counted(counts: Mapping[str, int]) -> dict[str, int]:
+    """The counts that are not 0."""
+    return {word: count for word, count in counts.items() if count}
+
+
+def _on_ticks(run: Run, config: FusionConfig, rows: Events, notes: list[str]) -> Events:
+    """The command rows; where the run's clock is regular those that are used, on a grid of T.
+
+    Raises:
+        RunError: The stamps do not follow ticks of T.
+    """
     if run.clock == "stamps":
         return rows
+    label = run.command.label
     rows = rows.rows(np.flatnonzero(_on_any_axis(rows.known, Outcome.FUSED)))
     distinct, place = np.unique(rows.stamp, return_inverse=True)
     grid, note = regular_grid(distinct, config.arm.update_period, label)
@@ -279,8 +362,8 @@ def _command_rows(run: Run, config: FusionConfig, policy: _Policy, notes: list[s
 
 def _measurement_rows(
     run: Run, config: FusionConfig, number: int, names: Sequence[str], policy: _Policy, origin: int, notes: list[str]
-) -> Events:
-    """The rows of one of the sensors ``names`` by stamp, each value classified."""
+) -> tuple[Events, dict[str, int]]:
+    """The rows of one of the sensors ``names`` by stamp, each value classified, and how many are what."""
     name = names[number]
     source, sensor = run.sensors[name], config.sensors.get(name)
     label, used = source.label_for(name), run.within(source.stamp, origin)
@@ -290,13 +373,14 @@ def _measurement_rows(
     rows = _classified(rows, policy, origin, lag[order] > TOLERATED_STEP_BACK_NS)
     rows.known[~used[order]] = ABSENT
     kept = rows.rows(np.flatnonzero(used[order]))
+    counts = _measurement_counts(kept, source)
     note_rows(notes, label, lag > 0, "a stamp that steps back: sorted")
     if sensor is None:
         note_rows(notes, label, used, "no sensor of this name in the configuration: unknown")
-        return kept
+        return kept, counts
     note_rows(notes, label, missing, f"no stamp: {Outcome.INVALID.word}")
     if ((rows.known == int(Outcome.FUSED)) | (rows.known == ABSENT)).all():
-        return kept
+        return kept, counts
     known = np.empty_like(rows.known)
     known[order] = rows.known
     for kind, reason in _REASONS.items():
@@ -306,7 +390,15 @@ def _measurement_rows(
             notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
         hollow = (known[:, column] == Outcome.INVALID) & ~missing
         note_rows(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
-    return kept
+    return kept, counts
+
+
+def _measurement_counts(kept: Events, source: Source) -> dict[str, int]:
+    """How many rows of a sensor are what, all of them, of which ``kept`` are in the part to use."""
+    unstamped = int(np.count_nonzero(source.stamp == NO_STAMP))
+    best = _best(kept.known)[kept.stamp != NO_STAMP]
+    of_outcomes = {outcome.word: int(np.count_nonzero(best == outcome)) for outcome in Outcome}
+    return _counted({**of_outcomes, NO_STAMP_WORD: unstamped, OUTSIDE: len(source.stamp) - unstamped - len(best)})
 
 
 def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int | np.int64, latency: int = 0) -> Events:
@@ -328,6 +420,11 @@ def _classified(rows: Events, policy: _Policy, origin: int, too_late: BoolArray)
     known = np.empty_like(rows.known)
     classify_all(model, sensors, rows, state, origin, too_late, known)
     return rows._replace(known=known)
+
+
+def _best(known: CodeArray) -> CodeArray:
+    """Of each row the outcome of the value that got farthest, (n,)."""
+    return reduce(np.minimum, known.T)
 
 
 def _on_any_axis(known: CodeArray, kind: Outcome) -> BoolArray:

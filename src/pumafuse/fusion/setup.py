@@ -98,9 +98,16 @@ def filter_sensors(
         sd=np.array(sd).reshape(bias.shape[:2]),
         latency_sd=np.array([0.0 if one is None else one.latency_sd for one in known]),
         gate=np.array([0.0 if one is None else one.gate for one in known]),
-        gate_rows=np.array([one is None or one.gate_rows for one in known], dtype=np.bool_),
+        gate_rows=np.array([one is None or one.gates_rows(config.arm) for one in known], dtype=np.bool_),
         bias=bias,
+        turn=np.array([[turn_of(config, name, axis) for axis in axes] for name in names]).reshape(bias.shape[:2]),
     )
+
+
+def turn_of(config: FusionConfig, sensor: str, axis: str) -> float:
+    """After which angle a sensor's measurements of an axis are the same again [rad]; 0: never."""
+    known = config.sensors.get(sensor)
+    return known.turn if known is not None and config.arm.axes[axis].kind == "angle" else 0.0
 
 
 def at_rest(

@@ -18,6 +18,7 @@ first of each segment, before which the others know nothing. All but the command
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -28,6 +29,7 @@ from ..compiled import kernel
 from ..filter.outcome import Outcome
 from ..model.response import response
 from .estimates import Estimates, Measurements
+from .setup import turn_of
 
 _DENSITIES = np.logspace(-8.0, 2.0, 11)  # of the acceleration, over R and the cube of the median interval
 _UNKNOWN = 1e6  # variance of the rate at the start, over R and the square of the median interval
@@ -73,6 +75,8 @@ def skill(est: Estimates, measured: Measurements) -> Skill | None:
     """
     predicted = np.isfinite(measured.innovation)
     parts = [measured.where(predicted & (measured.segment == number)) for number in range(len(est.segments))]
+    if turn := _turn(est, measured):
+        parts = [replace(part, value=np.unwrap(part.value, period=turn)) for part in parts]
     parts = [part for part in parts if len(part.value) > 1]
     if not parts:
         return None
@@ -83,6 +87,13 @@ def skill(est: Estimates, measured: Measurements) -> Skill | None:
         command_alone=_summed_up(np.concatenate([_by_command(est, part) for part in parts])),
         filter=_summed_up(np.concatenate([part.innovation[1:] for part in parts])),
     )
+
+
+def _turn(est: Estimates, measured: Measurements) -> float:
+    """After which angle the measurements are the same again [rad]; 0: never."""
+    if not len(measured.value):
+        return 0.0
+    return turn_of(est.config, measured.sensors[int(measured.sensor[0])], measured.axes[int(measured.axis[0])])
 
 
 def _summed_up(error: FloatArray) -> PredictionError:
@@ -97,6 +108,8 @@ def _by_command(est: Estimates, measured: Measurements) -> FloatArray:
     stamp, command = segment.given(axis)
     moved = response(arm.axes[axis], arm.update_period, arm.delay_of(axis), stamp, command, start, time)
     left = measured.value - known.scale * (start + moved)
+    if turn := _turn(est, measured):
+        left = left - turn * round(float(left[0]) / turn)
     if known.bias_sd_of(axis) == 0.0:
         return left[1:]
     passed = measured.outcome != Outcome.REJECTED

@@ -136,6 +136,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         duration_s: From the first to the last estimate.
         estimates: How many.
         segments: 1, and one more for each time the log's clock was set back.
+        commands: How many rows of the commands were ``used``, and of the others how many were left out for what.
+        rows: Of each sensor how many rows were ``fused``, ``rejected``, ``reacquired`` or left out for what; of a row
+            of several axes the best that became of any.
         axes: By axis.
         validity: Commands against the arm model's limits.
         notes: What was noticed, a sentence each.
@@ -152,6 +155,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     duration_s: float
     estimates: int
     segments: int
+    commands: dict[str, int] = {}
+    rows: dict[str, dict[str, int]] = {}
     axes: dict[str, AxisSummary]
     validity: ValiditySummary
     notes: list[str]
@@ -172,7 +177,7 @@ def decode(text: bytes) -> Summary:
     """
     tree = msgspec.json.decode(text, type=dict[str, Any])
     parts = msgspec.convert(tree, _InUnits)
-    axes = {axis: toml.from_report(one) for axis, one in parts.axes.items()}
+    axes = {axis: toml.as_lengths(to_si(one)) for axis, one in parts.axes.items()}
     return msgspec.convert(tree | {"axes": axes, "validity": to_si(parts.validity)}, Summary)
 
 
@@ -198,6 +203,8 @@ def summarise(est: Estimates) -> Summary:
         duration_s=float(np.ptp(est.time)),
         estimates=len(est.time),
         segments=int(est.segment[-1]) + 1,
+        commands=dict(est.command_counts),
+        rows={name: dict(counts) for name, counts in est.counts.items()},
         axes={axis: _axis_summary(est, axis) for axis in est.axes},
         validity=ValiditySummary(
             max_speed=limits.max_speed,

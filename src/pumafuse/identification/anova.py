@@ -15,9 +15,9 @@ from itertools import product
 import msgspec
 import numpy as np
 
-from .. import units
 from ..arrays import BoolArray, FloatArray
 from ..model.arm import Validity
+from ..units import MM, SCREEN, Kind, of_kind
 from .trials import Trial
 
 _COUNTERS = frozenset({"replicate", "repetition", "repeat", "rep", "run", "observation"})  # columns that only count
@@ -87,7 +87,7 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         factor: What was varied.
-        levels: RMS [mm] of the trials at each level.
+        levels: RMS [mm or degrees] of the trials at each level.
         limit: Where the mean RMS passes the tolerance, in the factor's unit; null where it does not.
         verdict: In words.
     """
@@ -98,14 +98,16 @@ class Performance(msgspec.Struct, frozen=True, kw_only=True):
     verdict: str
 
 
-def factors_of(trials: Sequence[Trial], period: float) -> dict[str, list[str]]:
+def factors_of(trials: Sequence[Trial], period: float, kind: Kind) -> dict[str, list[str]]:
     """The level of each trial for every factor that varies and is no mere counter.
 
     Args:
         trials: All that are analysed together.
         period: T [s], for a speed that is not recorded.
+        kind: What the axes are.
     """
-    columns = {"axis": [trial.axis for trial in trials], "speed_m_s": speed_levels(trials, period)}
+    speeds = speed_levels(trials, period, kind)
+    columns = {"axis": [trial.axis for trial in trials], of_kind("speed_m_s", kind): speeds}
     for name in trials[0].factors:
         if name not in _COUNTERS:
             columns[name] = _levels([trial.factors[name] for trial in trials])
@@ -115,9 +117,10 @@ def factors_of(trials: Sequence[Trial], period: float) -> dict[str, list[str]]:
     return {name: levels for name, levels in columns.items() if 1 < len(set(levels)) <= max(len(trials) // 2, 2)}
 
 
-def speed_levels(trials: Sequence[Trial], period: float) -> list[str]:
-    """Each trial's speed [m/s] to two digits."""
-    return [f"{trial.speed_at(period):.2g}" for trial in trials]
+def speed_levels(trials: Sequence[Trial], period: float, kind: Kind) -> list[str]:
+    """Each trial's speed in m/s or degrees/s, to two digits."""
+    shown = (f"{trial.speed_at(period) * SCREEN[kind].fast_scale:.2g}" for trial in trials)
+    return [f"{float(speed):g}" for speed in shown]  # 140, not 1.4e+02
 
 
 def numbers(cells: Sequence[str]) -> list[float] | None:
@@ -207,16 +210,20 @@ def outlying(values: FloatArray, sd: FloatArray) -> BoolArray:
     return np.abs(values - middle) > _OUTLYING * np.hypot(spread, sd)
 
 
-def performances(factors: Mapping[str, Sequence[str]], rms: FloatArray, tolerance: float) -> list[Performance]:
+def performances(
+    factors: Mapping[str, Sequence[str]], rms: FloatArray, tolerance: float, kind: Kind
+) -> list[Performance]:
     """Error of a model by each factor.
 
     Args:
         factors: By name, the level of each trial, (n,).
-        rms: Of the model's residuals in each trial [m], (n,).
-        tolerance: RMS beyond which it is not called valid [m].
+        rms: Of the model's residuals in each trial [m or rad], (n,).
+        tolerance: RMS beyond which it is not called valid [m or rad].
+        kind: What the axes are.
     """
-    every = {factor: levels_of(rms * units.MM, cells) for factor, cells in factors.items()}
-    limits = {factor: _limit(levels, tolerance * units.MM) for factor, levels in every.items()}
+    screen = SCREEN[kind]
+    every = {factor: levels_of(rms * screen.scale, cells) for factor, cells in factors.items()}
+    limits = {factor: _limit(levels, tolerance * screen.scale, screen.unit) for factor, levels in every.items()}
     return [
         Performance(factor=factor, levels=every[factor], limit=limit, verdict=verdict)
         for factor, (limit, verdict) in limits.items()
@@ -233,17 +240,21 @@ def _levels(cells: Sequence[str]) -> list[str]:
     return [middles[part] for part in quarter.tolist()]
 
 
-def validity(performance: Sequence[Performance], fastest: float) -> Validity:
+def validity(performance: Sequence[Performance], fastest: float, kind: Kind) -> Validity:
     """Limits that `fuse` can check: speed, and distance from the base where a factor is called radius_mm.
 
     Args:
         performance: By each factor.
-        fastest: Speed of the fastest trial [m/s], the limit where no factor gives one.
+        fastest: Speed of the fastest trial [m/s or rad/s], the limit where no factor gives one.
+        kind: What the axes are.
     """
     limits = {one.factor: one.limit for one in performance}
-    radius = limits.get("radius_mm")
+    radius, found = limits.get("radius_mm"), limits.get(of_kind("speed_m_s", kind))
+    speed = found / SCREEN[kind].fast_scale if found else fastest
     return Validity(
-        max_speed=limits.get("speed_m_s") or fastest, max_radius=None if radius is None else radius / units.MM
+        max_speed=speed if kind == "length" else None,
+        max_angular_speed=speed if kind == "angle" else None,
+        max_radius=None if radius is None else radius / MM,
     )
 
 
@@ -321,15 +332,15 @@ def _verdict(ratio: float | None, welch: float | None, adjusted: float | None, a
     return found
 
 
-def _limit(levels: Sequence[Level], tolerance: float) -> tuple[float | None, str]:
-    """Where the mean RMS passes the tolerance, and in words. RMS and tolerance in mm."""
+def _limit(levels: Sequence[Level], tolerance: float, unit: str) -> tuple[float | None, str]:
+    """Where the mean RMS passes the tolerance, and in words. RMS and tolerance in ``unit``."""
     within = [level.mean <= tolerance for level in levels]
     if len(set(within)) == 1:
-        return None, f"{'within' if within[0] else 'beyond'} {tolerance:g} mm at every level tried"
+        return None, f"{'within' if within[0] else 'beyond'} {tolerance:g} {unit} at every level tried"
     at, first = numbers([level.level for level in levels]), within.index(False)
     if at is None or not first or any(within[first:]):
         good = ", ".join(level.level for level in levels if level.mean <= tolerance)
-        return None, f"within {tolerance:g} mm at {good} only"
+        return None, f"within {tolerance:g} {unit} at {good} only"
     low, high = levels[first - 1 : first + 1]
     limit = float(np.interp(tolerance, [low.mean, high.mean], at[first - 1 : first + 1]))
-    return limit, f"within {tolerance:g} mm up to {limit:.3g} (between the levels {low.level} and {high.level})"
+    return limit, f"within {tolerance:g} {unit} up to {limit:.3g} (between the levels {low.level} and {high.level})"

@@ -28,7 +28,7 @@ class Fit(msgspec.Struct, frozen=True, kw_only=True):
     """Error of a simulated position against the measured one.
 
     Attributes:
-        rms: Of the difference, without its mean [m].
+        rms: Of the difference, without its mean [m or rad].
         percent: Of the amplitude of the commands.
         fit: 100 (1 − ‖difference‖ / ‖measured‖), both without their means.
     """
@@ -66,7 +66,7 @@ class Measured:
         run: The run's name.
         source: The sensor, or ``reference``.
         time: Of each, int64 ns, ascending.
-        position: As logged [m].
+        position: As logged [m or rad].
     """
 
     run: str
@@ -89,7 +89,7 @@ class Measured:
         return replace(self, time=self.time[kept], position=self.position[kept])
 
     def fit(self, modelled: FloatArray, amplitude: float) -> Fit:
-        """Error of ``modelled`` [m] (n,) without its mean, beside the ``amplitude`` of the commands [m]."""
+        """Error of ``modelled`` (n,) without its mean, beside the ``amplitude`` of the commands [both m or rad]."""
         rms, signal = float(np.std(self.position - modelled)), float(np.std(self.position))
         return Fit(
             rms=rms,
@@ -104,7 +104,7 @@ class Commands:
 
     Attributes:
         time: Of each, int64 ns, ascending.
-        value: u [m].
+        value: u [m or rad].
         period: T [s].
     """
 
@@ -114,16 +114,16 @@ class Commands:
 
     @property
     def amplitude(self) -> float:
-        """From the lowest to the highest [m]."""
+        """From the lowest to the highest [m or rad]."""
         return float(np.ptp(self.value))
 
     @property
     def speeds(self) -> FloatArray:
-        """Of the commands that move [m/s]."""
+        """Of the commands that move [m/s or rad/s]."""
         return commanded_speed(np.diff(self.value)[np.diff(self.value) != 0.0], self.period)
 
     def moved(self, axis: AxisModel, delay: float, start: float, time: TimeArray) -> FloatArray:
-        """Where the axis is at ``time`` [ns], relative to ``start`` [m], (n,)."""
+        """Where the axis is at ``time`` [ns], relative to ``start`` [m or rad], (n,)."""
         return response(axis, self.period, delay, self.time, self.value, start, time)
 
 
@@ -135,7 +135,7 @@ def best_in_class(measured: Measured, command: Commands, model: AxisModel, delay
         command: Of the axis.
         model: Its order and recovery stay; its plant is one start of the search.
         delay: Its Td, also a start [s].
-        start: Level before the first command [m].
+        start: Level before the first command [m or rad].
     """
     from scipy.optimize import least_squares
 

@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..model.arm import AxisModel, Gain
 from ..model.plants import PLANTS, FirstOrder
-from ..units import MS
+from ..units import MS, SCREEN, Kind
 from .anova import ordered, outlying, speed_levels
 from .batch import Order
 from .estimate import Estimate, common, mean, regression, robust
@@ -42,8 +42,8 @@ class OrderChoice(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         order: The choice.
-        first_rms: Root mean square residual of first order over all trials [m].
-        second_rms: Of second order [m].
+        first_rms: Root mean square residual of first order over all trials [m or rad].
+        second_rms: Of second order [m or rad].
         f: Of the F-test of the additional parameters of second order.
         p: Of that F.
         aicc_gain: By how much second order lowers AICc; negative: it raises it. Null: too few samples.
@@ -130,13 +130,14 @@ class Common:
     gain_sd: FloatArray
 
 
-def combine(fitted: Sequence[Fitted], period: float, paper: bool) -> tuple[CombinedAxis, Common] | str:
+def combine(fitted: Sequence[Fitted], period: float, paper: bool, kind: Kind) -> tuple[CombinedAxis, Common] | str:
     """Combine the trials of one axis.
 
     Args:
         fitted: The trials with their fits.
         period: T [s].
         paper: Average as the paper does, with all outliers, and with delay and gain as read off.
+        kind: What the axis is.
 
     Returns:
         The model, or why there is none.
@@ -150,8 +151,8 @@ def combine(fitted: Sequence[Fitted], period: float, paper: bool) -> tuple[Combi
     if len(used) < _FEWEST:
         why = "; ".join(f"trial '{name}' {reason}" for name, reason in list(left_out.items())[:3])
         return f"{len(used)} usable trials, at least {_FEWEST} are needed" + (f" ({why})" if why else "")
-    found = _published(used) if paper else _fitted_together(used)
-    gain, lack, words = _gain_line(found, period)
+    found = _published(used, kind) if paper else _fitted_together(used, kind)
+    gain, lack, words = _gain_line(found, period, kind)
     delay = common(found.delay, found.delay_sd)
     tau = np.array([one.first.shape.q for one in used])
     seen = np.array([one.onset for one in used if np.isfinite(one.onset)])
@@ -159,7 +160,7 @@ def combine(fitted: Sequence[Fitted], period: float, paper: bool) -> tuple[Combi
         trials=len(used),
         left_out=left_out,
         choice=found.choice,
-        model=AxisModel(plant=found.plant, gain=gain, delay=delay.value, delay_ci95=delay.ci95),
+        model=AxisModel(kind=kind, plant=found.plant, gain=gain, delay=delay.value, delay_ci95=delay.ci95),
         time_constant_mean=mean(tau),
         time_constant_robust=robust(tau),
         delays=Delays(
@@ -176,7 +177,7 @@ def combine(fitted: Sequence[Fitted], period: float, paper: bool) -> tuple[Combi
 
 
 def combined_rms(trial: Trial, model: AxisModel, delay: float, period: float) -> float:
-    """Equation 10 of one trial under a combined model [m], its zero free."""
+    """Equation 10 of one trial under a combined model [m or rad], its zero free."""
     gain = float(model.gain.at(np.array(trial.speed_at(period))))
     return float(np.std(trial.position - gain * trial.step * model.plant.step_response(trial.time - delay)))
 
@@ -211,7 +212,7 @@ def _outlying(fitted: Sequence[Fitted]) -> dict[str, str]:
     return found
 
 
-def _fitted_together(used: Sequence[Fitted]) -> Common:
+def _fitted_together(used: Sequence[Fitted], kind: Kind) -> Common:
     """The common plant by least squares over all trials, and delays and gains under it."""
     trials, own = [one.trial for one in used], [one.second for one in used]
     joints: tuple[JointFit, JointFit] = (fit_together(trials, own, 1), fit_together(trials, own, 2))
@@ -222,6 +223,7 @@ def _fitted_together(used: Sequence[Fitted]) -> Common:
         samples=int(count.sum()),
         rms=[float(np.sqrt(np.average(joint.rms**2, weights=count))) for joint in joints],
         inverse_square=inverse_square(*joints),
+        kind=kind,
     )
     best = joints[choice.order - 1]
     return Common(
@@ -237,7 +239,7 @@ def _fitted_together(used: Sequence[Fitted]) -> Common:
     )
 
 
-def _published(used: Sequence[Fitted]) -> Common:
+def _published(used: Sequence[Fitted], kind: Kind) -> Common:
     """The paper's combination: averages of what was read off and of τ; equation 10 over all trials for ω and ζ."""
     trials, n = [one.trial for one in used], len(used)
     count = sum(one.first.samples for one in used)
@@ -248,6 +250,7 @@ def _published(used: Sequence[Fitted]) -> Common:
         samples=count,
         rms=[float(np.sqrt(square / count)) for square in squares],
         inverse_square=mean(np.array([one.second.shape.p for one in used])),
+        kind=kind,
     )
     own = [one.first if choice.order == 1 else one.second for one in used]
     lags = np.array([fit.shape.q for fit in own])
@@ -288,6 +291,7 @@ def _choose(
     samples: int,
     rms: Sequence[float],
     inverse_square: Estimate,
+    kind: Kind,
 ) -> OrderChoice:
     """Choose the order by F-test, AICc and the interval of 1/ω².
 
@@ -298,8 +302,9 @@ def _choose(
         squares: Sum of squared residuals of first and second order, in units of noise or not.
         parameters: How many each has.
         samples: In all trials.
-        rms: Of the residuals of each [m].
+        rms: Of the residuals of each [m or rad].
         inverse_square: 1/ω² [s²].
+        kind: What the axis is.
     """
     from scipy.stats import f as fisher
 
@@ -314,9 +319,10 @@ def _choose(
         words = f"AICc {abs(gain):.3g} {'lower' if gain > 0.0 else 'higher'}"
     preferred = p < 0.05 and gain is not None and gain > 0.0
     order: Order = 2 if preferred and inverse_square.ci95[0] > 0.0 else 1
+    unit, (first, second) = SCREEN[kind].unit, [one * SCREEN[kind].scale for one in rms]
     why = (
-        f"{'second' if order == 2 else 'first'} order: first order leaves {1e3 * rms[0]:.3g} mm, second"
-        f" {1e3 * rms[1]:.3g} (each trial weighted by its noise: F({more}, {freedom}) = {F:.3g},"
+        f"{'second' if order == 2 else 'first'} order: first order leaves {first:.3g} {unit}, second"
+        f" {second:.3g} (each trial weighted by its noise: F({more}, {freedom}) = {F:.3g},"
         f" p {'< 0.001' if p < 1e-3 else f'= {p:.2g}'}; {words})"
     )
     if preferred:
@@ -335,15 +341,17 @@ def _choose(
     )
 
 
-def _gain_line(found: Common, period: float) -> tuple[Gain, float | None, str]:
+def _gain_line(found: Common, period: float, kind: Kind) -> tuple[Gain, float | None, str]:
     """K = a·speed + b with intervals, the p of its lack of fit, and what the line shows."""
     from statsmodels.regression.linear_model import WLS
 
-    speed, levels = np.array([one.speed_at(period) for one in found.trials]), speed_levels(found.trials, period)
+    speed, levels = np.array([one.speed_at(period) for one in found.trials]), speed_levels(found.trials, period, kind)
     distinct = ordered(set(levels))
     if len(distinct) == 1 or len(speed) < 4:
         level = common(found.gain, found.gain_sd)
-        why = f"one speed only ({distinct[0]} m/s)" if len(distinct) == 1 else "too few trials for a line"
+        why = (
+            f"one speed only ({distinct[0]} {SCREEN[kind].fast})" if len(distinct) == 1 else "too few trials for a line"
+        )
         return Gain(slope=0.0, intercept=level.value, intercept_ci95=level.ci95), None, f"slope 0: {why}"
     line = regression(found.gain, found.gain_sd, np.column_stack((np.ones(len(speed)), speed)))
     (b_low, b_high), (a_low, a_high) = line.conf_int().tolist()

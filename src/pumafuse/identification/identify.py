@@ -9,9 +9,10 @@ from importlib.metadata import version
 import msgspec
 import numpy as np
 
-from .. import units
+from .. import toml, units
 from ..model.arm import ArmModel
 from ..toml import Interval
+from ..units import Kind
 from . import anova
 from .combine import CombinedAxis, Common, Fitted, coefficients, combine, combined_rms, usual_gain
 from .estimate import common
@@ -19,7 +20,8 @@ from .fit import StepFit, fit_steps, flags
 from .paper import fit_as_published, onset
 from .trials import StepTrials, Trial, TrialsError, first_few
 
-TOLERANCE = 1e-3  # m, the paper's
+# m, the paper's; rad, of 0.1 degrees, which are a millimetre at 0.57 m from the joint
+TOLERANCE: dict[Kind, float] = {"length": 1e-3, "angle": units.si(0.1, "_deg")}
 _BATCH = 100  # trials a job
 _DIGITS = 6
 _PLAUSIBLE = (0.1, 10.0)  # gains
@@ -42,7 +44,7 @@ class OrderFit(msgspec.Struct, frozen=True, kw_only=True):
         natural_frequency_ci95: Its interval.
         damping: ζ.
         damping_ci95: Its interval.
-        rms: Of the residuals, eq. 10 [m].
+        rms: Of the residuals, eq. 10 [m or rad].
         rms_percent: Of the step.
         fit_percent: 100 (1 − ‖residuals‖ / ‖position without its mean‖).
         flags: What to know before trusting it.
@@ -72,15 +74,15 @@ class TrialResult(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         trial: Its name.
         axis: Which was stepped.
-        step: By how much [m].
-        speed: [m/s].
+        step: By how much [m or rad].
+        speed: [m/s or rad/s].
         factors: What else was varied.
         onset: When the arm was first seen to move [s]; null: never.
         first: First-order fit.
         second: Second-order fit.
         common_delay: Td under the plant that its axis's trials have in common [s]; null when left out.
         common_gain: K under it.
-        combined_rms: Of the combined model's residuals [m]; null without one.
+        combined_rms: Of the combined model's residuals [m or rad]; null without one.
         left_out: Why it is not in the combined model; null when it is.
     """
 
@@ -105,7 +107,7 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True):
         arm: The combined model.
         method: ``fitted``, or ``published`` as in the paper.
         samples: How many from the step on were used; null: all.
-        tolerance: RMS up to which the model is called valid [m].
+        tolerance: RMS up to which the model is called valid [m or rad].
         trials: Every usable trial.
         axes: The combined model of each axis, with how it came about.
         one_delay: Whether all axes share one delay, in words.
@@ -127,9 +129,18 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True):
     performance: list[anova.Performance]
     notes: list[str]
 
+    @property
+    def kind(self) -> Kind:
+        """What its axes are: all of one kind, as those of a campaign."""
+        return next(iter(self.arm.axes.values())).kind
+
     def to_json(self) -> str:
         """All of it as JSON, in the units of the names."""
-        tree = units.from_si(msgspec.to_builtins(self, enc_hook=float))
+        arm = toml.reported(self.arm) | {
+            "axes": {name: toml.reported(axis, axis.kind) for name, axis in self.arm.axes.items()},
+            "provenance": self.arm.provenance,
+        }
+        tree = toml.reported(self, self.kind) | {"arm": arm}
         return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode()
 
 
@@ -139,7 +150,7 @@ def identify(
     period: float | None = None,
     samples: int | None = None,
     paper: bool = False,
-    tolerance: float = TOLERANCE,
+    tolerance: float | None = None,
     name: str = "identified arm",
 ) -> Identification:
     """Identify an arm from step trials.
@@ -149,19 +160,20 @@ def identify(
         period: T [s]; None: step over speed, where all trials agree on it.
         samples: Use only so many from each step on, as the paper's 30; None: all.
         paper: Read delay and gain off each trial, as the paper does, instead of fitting them.
-        tolerance: RMS [m] beyond which the model is not called valid.
+        tolerance: RMS [m or rad] beyond which the model is not called valid; None: 1 mm, or 0.1 degrees.
         name: Of the arm.
 
     Raises:
         TrialsError: The period is not known, or no axis has trials enough for a model.
     """
-    period = trials.period(period)
+    period, kind = trials.period(period), trials.kind
+    tolerance = TOLERANCE[kind] if tolerance is None else tolerance
     fitted = _fit_all(trials.trials, samples, paper)
     by_axis = {axis: [one for one in fitted if one.trial.axis == axis] for axis in trials.axes}
     usual = {axis: usual_gain(of_axis) for axis, of_axis in by_axis.items()}
     notes, axes, commons = list[str](), dict[str, CombinedAxis](), dict[str, Common]()
     for axis, of_axis in by_axis.items():
-        found = combine(of_axis, period, paper)
+        found = combine(of_axis, period, paper, kind)
         if isinstance(found, str):
             notes.append(f"{axis}: no model: {found}")
         else:
@@ -183,8 +195,8 @@ def identify(
         for trial, delay, gain in zip(one.trials, one.delay.tolist(), one.gain.tolist(), strict=True)
     }
     used = [one for one in fitted if one.trial.name in own]
-    factors = anova.factors_of([one.trial for one in used], period)
-    performance = anova.performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance)
+    factors = anova.factors_of([one.trial for one in used], period, kind)
+    performance = anova.performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance, kind)
     fastest = max(one.trial.speed_at(period) for one in used)
     provenance = {
         "made_by": f"pumafuse identify {version('pumafuse')}",
@@ -198,7 +210,7 @@ def identify(
         "samples": "all" if samples is None else samples,
         "method": "delay and gain read off each trial (--paper)" if paper else "all parameters fitted",
     }
-    arm = msgspec.structs.replace(arm, validity=anova.validity(performance, fastest), provenance=provenance)
+    arm = msgspec.structs.replace(arm, validity=anova.validity(performance, fastest, kind), provenance=provenance)
     return Identification(
         arm=_rounded(arm),
         method="published" if paper else "fitted",
@@ -260,9 +272,10 @@ def _arm(
 
 
 def _rounded(arm: ArmModel) -> ArmModel:
-    """The arm in six digits: more would suggest a precision that it has not."""
-    text = json.dumps(msgspec.to_builtins(arm))
-    return msgspec.convert(json.loads(text, parse_float=lambda number: float(f"{float(number):.{_DIGITS}g}")), ArmModel)
+    """The arm in six digits of the file's units: more would suggest a precision that it has not."""
+    text = json.dumps(units.from_si(msgspec.to_builtins(arm)), default=float)
+    tree = json.loads(text, parse_float=lambda number: float(f"{float(number):.{_DIGITS}g}"))
+    return msgspec.convert(units.to_si(tree), ArmModel)
 
 
 def _result(

@@ -7,11 +7,11 @@ during the day does not look like a factor, and a campaign that is cut short aft
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,15 +23,28 @@ from ..errors import ConfigError
 from ..logs import tables
 from ..model.arm import ArmModel
 from ..simulation.trajectory import WhiteNoise, ticks
-from ..units import MM, MS, refuse_unit
+from ..units import DEG, MS, SCREEN, SPEEDS, Kind, in_unit, of_kind, refuse_unit
 
 TRIALS, STEPS = "trials.csv", "steps.csv"
 _NOISE = "white-noise-"
 _SETTLED = 0.98  # share of the final value
 _MOST_TRIALS, _MOST_ROWS = 100_000, 5_000_000
-_FASTEST, _SHORTEST = 10.0, 50e-6  # m/s that no arm reaches; m that no sensor of an arm resolves
-_LEAST, _MOST = 1e-6, 10.0  # m, that a step can be
-_TAKEN = frozenset({"trial", "axis", "step_mm", "speed_m_s", "replicate", "tick", "time_s"})
+_TAKEN = frozenset({"trial", "axis", "step_mm", "step_deg", "speed_m_s", "speed_deg_s", "replicate", "tick", "time_s"})
+
+
+class _Sizes(NamedTuple):
+    """Sizes of steps [m or rad], and a speed [m/s or rad/s]."""
+
+    least: float  # that a step can be
+    most: float
+    shortest: float  # less than this no sensor of an arm resolves
+    fastest: float  # that no arm reaches
+
+
+_SIZES: dict[Kind, _Sizes] = {
+    "length": _Sizes(1e-6, 10.0, 50e-6, 10.0),
+    "angle": _Sizes(1e-4 / DEG, 360.0 / DEG, 3e-3 / DEG, 3e3 / DEG),
+}
 
 
 @dataclass(frozen=True)
@@ -40,16 +53,17 @@ class Design:
 
     Attributes:
         axes: To step, one at a time.
-        speeds: Of the steps [m/s]; a step is its speed times the update period.
+        speeds: Of the steps [m/s or rad/s]; a step is its speed times the update period.
         period: T [s].
         positions: A row of coordinates for each place where steps are made, as they are to be written; one empty row
             where the arm stays.
         replicates: Blocks.
         hold: How long a step is held [s].
         rest: How long the arm rests at 0 before and after each step [s].
-        amplitudes: Of the white noise, a sequence for each axis [m].
+        amplitudes: Of the white noise, a sequence for each axis [m or rad].
         noise_duration: Of each sequence [s].
         seed: Of the order and of the noise.
+        kind: What the axes are.
     """
 
     axes: tuple[str, ...]
@@ -62,6 +76,7 @@ class Design:
     amplitudes: tuple[float, ...]
     noise_duration: float
     seed: int
+    kind: Kind = "length"
 
     def __post_init__(self) -> None:
         if not self.axes or len(set(self.axes)) < len(self.axes):
@@ -72,11 +87,12 @@ class Design:
                 raise ConfigError(f"plan: an axis cannot be called '{axis}'")
         if not self.speeds:
             raise ConfigError("plan: at least one speed")
-        steps = [speed * self.period for speed in self.speeds]
-        for name, lengths in (("speeds", steps), ("amplitudes", self.amplitudes)):
-            if any(not _LEAST <= length <= _MOST for length in lengths):
-                raise ConfigError(f"plan: {name} must make steps of {_LEAST * MM:g} mm to {_MOST:g} m")
-            if len({_written(length) for length in lengths}) < len(lengths):
+        steps, sizes = [speed * self.period for speed in self.speeds], _SIZES[self.kind]
+        for name, of_these in (("speeds", steps), ("amplitudes", self.amplitudes)):
+            if any(not sizes.least <= size <= sizes.most for size in of_these):
+                limits = (_written(limit, self.kind) for limit in (sizes.least, sizes.most))
+                raise ConfigError(f"plan: {name} must make steps of {' to '.join(limits)}")
+            if len({_written(size, self.kind) for size in of_these}) < len(of_these):
                 raise ConfigError(f"plan: two {name} make the same step")
         if taken := sorted(_TAKEN & set(self.positions[0])):
             raise ConfigError(f"plan: positions cannot have a column '{taken[0]}': trials.csv needs it itself")
@@ -104,7 +120,7 @@ class Plan:
     Attributes:
         design: What it was made for.
         trials: In the order in which they are to be made.
-        noise: White noise [m] by axis and amplitude, tick by tick, (n,).
+        noise: White noise [m or rad] by axis and amplitude, tick by tick, (n,).
         duration: Of all sequences [s], without the moves between positions.
         warnings: What is wrong with it, a sentence each.
     """
@@ -116,13 +132,26 @@ class Plan:
     warnings: tuple[str, ...]
 
 
+def kind_of(axes: Iterable[str], arm: ArmModel) -> Kind:
+    """What the axes of a campaign are: all of one kind.
+
+    Raises:
+        PumafuseError: They are not, or the arm has no such axis.
+    """
+    kinds: dict[Kind, str] = {arm.axis(axis).kind: axis for axis in axes}
+    if len(kinds) > 1:
+        words = f"{kinds['length']} is a length, {kinds['angle']} an angle"
+        raise ConfigError(f"plan: {words}: plan a campaign for each, with --axes")
+    return "angle" if "angle" in kinds else "length"
+
+
 def plan(design: Design, arm: ArmModel | None = None, max_speed: float | None = None) -> Plan:
     """A campaign in random order, with its warnings.
 
     Args:
         design: What it is to vary.
         arm: What is known of the arm so far, for warnings; None: nothing.
-        max_speed: The arm's limit [m/s]; None: the arm's validity, where it is known.
+        max_speed: The arm's limit [m/s or rad/s]; None: the arm's validity, where it is known.
     """
     rng = np.random.default_rng(design.seed)
     cells = list(product(design.positions, design.axes, design.speeds))
@@ -159,11 +188,12 @@ def write(planned: Plan, folder: Path, force: bool) -> None:
     """
     check_writable(folder, force)
     design, trials, step = planned.design, planned.trials, _one_step(planned.design)
+    kind = design.kind
     listed = {
         "trial": range(1, len(trials) + 1),
         "axis": [trial.axis for trial in trials],
-        "step_mm": _millimetres(np.array([trial.speed for trial in trials]) * design.period),
-        "speed_m_s": [trial.speed for trial in trials],
+        of_kind("step_mm", kind): _shown(np.array([trial.speed for trial in trials]) * design.period, kind),
+        of_kind("speed_m_s", kind): [float(in_unit(trial.speed, SPEEDS[kind][0])) for trial in trials],
         **{name: [trial.position[name] for trial in trials] for name in design.positions[0]},
         "replicate": [trial.replicate for trial in trials],
     }
@@ -171,12 +201,12 @@ def write(planned: Plan, folder: Path, force: bool) -> None:
         axis: np.outer([trial.speed * design.period * (trial.axis == axis) for trial in trials], step).ravel()
         for axis in design.axes
     }
-    steps = _sequence(np.tile(np.arange(len(step)), len(trials)), design.period, offsets)
+    steps = _sequence(np.tile(np.arange(len(step)), len(trials)), design, offsets)
     files = {
         TRIALS: listed,
         STEPS: {"trial": np.repeat(listed["trial"], len(step)), **steps},
         **{
-            f"{_NOISE}{axis}-{_written(size)}mm.csv": _sequence(np.arange(len(noise)), design.period, {axis: noise})
+            f"{_NOISE}{axis}-{_written(size, kind, '')}.csv": _sequence(np.arange(len(noise)), design, {axis: noise})
             for (axis, size), noise in planned.noise.items()
         },
     }
@@ -185,13 +215,14 @@ def write(planned: Plan, folder: Path, force: bool) -> None:
             tables.write(pa.table(columns), new / name)
 
 
-def _written(length: float) -> str:
-    """In mm, to the nanometre, as files have it."""
-    return f"{_millimetres(length):.10g}"
+def _written(size: float, kind: Kind, between: str = " ") -> str:
+    """A size as files have it, with its unit."""
+    return f"{_shown(size, kind):.10g}{between}{SCREEN[kind].unit}"
 
 
-def _millimetres(length: FloatArray | float) -> FloatArray:
-    return np.round(np.asarray(length) * MM, 6)
+def _shown(size: FloatArray | float, kind: Kind) -> FloatArray:
+    """In mm to the nanometre, or in degrees to a millionth."""
+    return np.round(np.asarray(size) * SCREEN[kind].scale, 6)
 
 
 def _ticks(duration: float, period: float) -> int:
@@ -204,10 +235,10 @@ def _one_step(design: Design) -> FloatArray:
     return np.repeat([0.0, 1.0, 0.0], [rest, hold, rest])
 
 
-def _sequence(tick: IntArray, period: float, offsets: Mapping[str, FloatArray]) -> dict[str, npt.NDArray[Any]]:
-    """Columns of a sequence of commands [m], tick by tick."""
-    columns = {f"{axis}_mm": _millimetres(values) for axis, values in offsets.items()}
-    return {"tick": tick, "time_s": np.round(tick * period, 9), **columns}
+def _sequence(tick: IntArray, design: Design, offsets: Mapping[str, FloatArray]) -> dict[str, npt.NDArray[Any]]:
+    """Columns of a sequence of commands [m or rad], tick by tick."""
+    columns = {of_kind(f"{axis}_mm", design.kind): _shown(values, design.kind) for axis, values in offsets.items()}
+    return {"tick": tick, "time_s": np.round(tick * design.period, 9), **columns}
 
 
 def _warnings(design: Design, arm: ArmModel | None, max_speed: float | None) -> list[str]:
@@ -218,15 +249,17 @@ def _warnings(design: Design, arm: ArmModel | None, max_speed: float | None) -> 
         found.append("no replicates: scatter from trial to trial cannot be separated from the factors' effects")
     if not design.amplitudes:
         found.append("no white noise: there will be nothing to verify the model with")
-    limit = arm.validity.max_speed if max_speed is None and arm is not None else max_speed
+    limit = arm.validity.limit_of(design.kind) if max_speed is None and arm is not None else max_speed
+    screen, known = SCREEN[design.kind], _SIZES[design.kind]
     sizes = [*(speed * design.period for speed in design.speeds), *design.amplitudes]
     longest, fastest = max(sizes), max(sizes) / design.period
-    if fastest > _FASTEST or longest < _SHORTEST:
-        found.append(f"steps are {longest * MM:.3g} mm at most, {fastest:.3g} m/s at T; is a unit wrong?")
+    top = f"{fastest * screen.fast_scale:.3g} {screen.fast}"
+    if fastest > known.fastest or longest < known.shortest:
+        found.append(f"steps are {longest * screen.scale:.3g} {screen.unit} at most, {top} at T; is a unit wrong?")
     if len({tuple(place.items()) for place in design.positions}) < len(design.positions):
         found.append("positions: one is listed twice: it is tried twice as often as the others")
     if limit is not None and fastest > limit * (1.0 + 1e-9):
-        found.append(f"commanded speeds reach {fastest:.3g} m/s, the limit is {limit:.3g} m/s")
+        found.append(f"commanded speeds reach {top}, the limit is {limit * screen.fast_scale:.3g} {screen.fast}")
     if arm is None:
         return [*found, "not checked: whether steps settle within the hold; give --arm"]
     between = {"the hold": design.hold, "the rest between steps": 2.0 * design.rest + design.period}

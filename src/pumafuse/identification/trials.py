@@ -13,15 +13,15 @@ import numpy as np
 from ..arrays import FloatArray
 from ..errors import PumafuseError, RunError
 from ..logs import tables
-from ..units import ending, seconds
+from ..units import KINDS, OF_KIND, SPEEDS, Kind, ending, seconds, si_of
 
 _FEWEST = 8  # samples from the step on: a second-order fit with delay, gain and zero has five unknowns
 _AGREE = 0.03  # relative difference of step over speed between trials that is still one update period
 _PERIODS = (0.001, 0.2)  # s, range of an update period found from the trials
 _GIVEN = (1e-4, 10.0)  # s, range of an update period given by the user
-_LATEST, _FARTHEST = 3600.0, 1e6  # s and m that a sample can be away from its command and from 0
+_LATEST, _FARTHEST = 3600.0, 1e6  # s and m or rad that a sample can be away from its command and from 0
 _SHOWN = 4  # sentences in the line of an error
-_STEPS = (1e-9, 1e3)  # m, range of a step
+_STEPS = (1e-9, 1e3)  # m or rad, range of a step
 
 
 class TrialsError(PumafuseError):
@@ -35,11 +35,11 @@ class Trial:
     Attributes:
         name: Of the trial.
         axis: Which axis was stepped.
-        step: Signed size of the step [m].
-        speed: Step size over the update period [m/s]; NaN where it is not recorded.
+        step: Signed size of the step [m or rad].
+        speed: Step size over the update period [m/s or rad/s]; NaN where it is not recorded.
         factors: What else was varied, as written.
         time: Of each sample since the step's command [s], ascending.
-        position: Of each sample [m]; its zero is the sensor's.
+        position: Of each sample [m or rad]; its zero is the sensor's.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Trial:
     position: FloatArray
 
     def speed_at(self, period: float) -> float:
-        """The speed as recorded, or step over ``period`` [s] where it is not [m/s]."""
+        """The speed as recorded, or step over ``period`` [s] where it is not [m/s or rad/s]."""
         return self.speed if self.speed > 0.0 else abs(self.step) / period
 
     def cut(self, samples: int | None) -> Trial:
@@ -67,10 +67,12 @@ class StepTrials:
     Attributes:
         trials: Those that can be fitted, in the order of the list.
         notes: Every trial that was left out and every repair, a sentence each.
+        kind: Whether the axes are lengths or angles; a campaign has one kind.
     """
 
     trials: tuple[Trial, ...]
     notes: tuple[str, ...]
+    kind: Kind = "length"
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -107,19 +109,20 @@ class StepTrials:
 
         Args:
             folder: Where they are. ``trials``: ``trial``, ``axis``, ``step_mm``, ``speed_m_s``; any further column is a
-                factor. ``samples``: ``trial``, ``time_s`` since the command, ``position_mm``. Other units by name.
+                factor. ``samples``: ``trial``, ``time_s`` since the command, ``position_mm``. Of angles ``step_deg``,
+                ``speed_deg_s``, ``position_deg``. Other units by name.
 
         Raises:
             RunError: A table is absent or cannot be read.
-            TrialsError: No trial is left.
+            TrialsError: No trial is left, or it is a campaign of lengths and of angles.
         """
         listed, sampled = _table(Path(folder), "trials"), _table(Path(folder), "samples")
         notes = [*listed.notes, *sampled.notes]
+        kind = _kind(listed, sampled)
         step = _noted(listed.numbers(_column(listed, "step")), notes)
-        has_speed = "speed_m_s" in listed.columns
-        speed = _noted(listed.plain("speed_m_s"), notes) if has_speed else np.full(listed.rows, np.nan)
+        speed, speed_column = _speed(listed, kind, notes)
         names, axes = listed.texts("trial"), listed.texts("axis")
-        own = {"trial", "axis", "speed_m_s", _column(listed, "step")}
+        own = {"trial", "axis", speed_column, _column(listed, "step")}
         factors = {column: listed.texts(column) for column in listed.columns if column not in own}
         samples = _samples(sampled, notes)
         listings = Counter(names)
@@ -146,7 +149,7 @@ class StepTrials:
             trials.append(Trial(name, axes[row], float(step[row]), float(speed[row]), of, time, position))
         if not trials:
             raise TrialsError("; ".join([f"{folder}: no trial can be used", *first_few(notes)]))
-        return StepTrials(tuple(trials), tuple(notes))
+        return StepTrials(tuple(trials), tuple(notes), kind)
 
 
 def first_few(notes: Sequence[str]) -> list[str]:
@@ -174,11 +177,38 @@ def _table(folder: Path, stem: str) -> tables.Table:
     raise RunError(f"{folder}: no {stem}.csv (or .csv.gz, .parquet) in it")
 
 
+def _named(table: tables.Table, stem: str) -> list[str]:
+    """The columns of this name with any unit."""
+    return [name for name in table.columns if name.removesuffix(ending(name) or "") == stem]
+
+
 def _column(table: tables.Table, stem: str) -> str:
-    """The column of this name with any unit."""
-    if named := [name for name in table.columns if name.removesuffix(ending(name) or "") == stem]:
+    """The first column of this name with any unit."""
+    if named := _named(table, stem):
         return named[0]
     raise RunError(f"{table.path}: no column '{stem}' with a unit in its name; it has {', '.join(table.columns)}")
+
+
+def _kind(listed: tables.Table, sampled: tables.Table) -> Kind:
+    """The kind of the axes, of which all columns of steps, speeds and positions must be."""
+    columns = [*_named(listed, "step"), *_named(listed, "speed"), *_named(sampled, "position")]
+    length, angle = (
+        next((name for name in columns if ending(name) in (*OF_KIND[kind], *SPEEDS[kind])), None) for kind in KINDS
+    )
+    if length and angle:
+        raise TrialsError(
+            f"{listed.path.parent}: {length} is of a length, {angle} of an angle: identify lengths and angles in two"
+            " campaigns, then put the axes into one arm.toml"
+        )
+    return "angle" if angle else "length"
+
+
+def _speed(listed: tables.Table, kind: Kind, notes: list[str]) -> tuple[FloatArray, str | None]:
+    """The speed of each trial [m/s or rad/s], NaN where it is not recorded, and its column."""
+    column = next((name for name in _named(listed, "speed") if ending(name) in SPEEDS[kind]), None)
+    if column is None:
+        return np.full(listed.rows, np.nan), None
+    return si_of(_noted(listed.plain(column), notes), ending(column) or ""), column
 
 
 def _noted(column: tuple[Any, str | None], notes: list[str]) -> Any:
@@ -188,7 +218,7 @@ def _noted(column: tuple[Any, str | None], notes: list[str]) -> Any:
 
 
 def _samples(table: tables.Table, notes: list[str]) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Times [s] and positions [m] of each trial, in the order of the file."""
+    """Times [s] and positions [m or rad] of each trial, in the order of the file."""
     time = seconds(_noted(table.stamps(_column(table, "time")), notes))
     position = _noted(table.numbers(_column(table, "position")), notes)
     rows: defaultdict[str, list[int]] = defaultdict(list)

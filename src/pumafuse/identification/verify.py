@@ -23,6 +23,7 @@ from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import Run
 from ..model.arm import ArmModel, AxisModel
+from ..units import Kind
 from .best_in_class import BestInClass, Commands, Fit, Measured, best_in_class
 
 RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
@@ -30,7 +31,7 @@ REFERENCE = "reference"
 _FEWEST = 20  # measurements
 _MOST_LEVELS = 8  # of a run whose start level is searched among them
 _AS_GOOD, _FAR = 1.2, 3.0  # times the error of the best in class
-_FARTHEST, _SLOWEST = 1e6, 1e4  # m, from the start level; s
+_FARTHEST, _SLOWEST = 1e6, 1e4  # m or rad, from the start level; s
 _HOLDS = 50.0  # % fit
 _BETTER = 0.8  # share of the error below which a recovery is recommended
 
@@ -41,11 +42,12 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         run: Its name.
         axis: The axis.
+        kind: Whether it is a length or an angle.
         source: The sensor, or ``reference``.
         lag: The model's, behind the held command at constant velocity, at the commands' mean speed [s].
         measurements: How many were compared.
-        amplitude: From the lowest to the highest command [m].
-        start: Level at which the arm was taken to rest before the first command [m].
+        amplitude: From the lowest to the highest command [m or rad].
+        start: Level at which the arm was taken to rest before the first command [m or rad].
         start_from: Where that level comes from, in words.
         model: The model as it is.
         without_recovery: With a gain that never recovers.
@@ -59,6 +61,7 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
 
     run: str
     axis: str
+    kind: Kind
     source: str
     lag: float = msgspec.field(name="lag_ms")
     measurements: int
@@ -81,8 +84,8 @@ class Trace:
 
     Attributes:
         time: [s] since the first command.
-        measured: [m].
-        modelled: [m].
+        measured: [m or rad].
+        modelled: [m or rad].
     """
 
     time: FloatArray
@@ -99,8 +102,8 @@ def verify(
         run: With measurements or a reference whose stamps are right.
         arm: The model.
         sensors: Which sensors, or ``reference``; None: the reference where there is one, else every sensor.
-        start: Level [m] before the first command by axis; where it is not known from here or the run, it is chosen
-            among the run's levels by RMS.
+        start: Level [m or rad] before the first command by axis; where it is not known from here or the run, it is
+            chosen among the run's levels by RMS.
 
     Returns:
         The verification of each axis and source, and its traces.
@@ -179,6 +182,7 @@ def _verified(
     verification = AxisVerification(
         run=measured.run,
         axis=axis,
+        kind=model.kind,
         source=measured.source,
         lag=lag,
         measurements=len(measured.time),
@@ -191,7 +195,7 @@ def _verified(
         recovery=recovery,
         best_in_class=best,
         outlying=count - len(measured.time),
-        verdict=_verdict(as_it_is, lag, best) + _recovers(as_it_is, recovering, recovery),
+        verdict=_verdict(as_it_is, lag, best) + _recovers(as_it_is, recovering, recovery, model.kind),
         notes=notes,
     )
     return verification, trace
@@ -200,7 +204,7 @@ def _verified(
 def _start(
     measured: Measured, command: Commands, first: float, model: AxisModel, delay: float, given: bool
 ) -> tuple[float, str]:
-    """Level before the first command [m], and where it comes from."""
+    """Level before the first command [m or rad], and where it comes from."""
     levels = np.unique(command.value)
     if given or len(levels) > _MOST_LEVELS:
         return first, "given" if given else "the first command"
@@ -224,7 +228,8 @@ def _verdict(model: Fit, lag: float, best: BestInClass) -> str:
     )
 
 
-def _recovers(model: Fit, recovering: Fit, recovery: float) -> str:
+def _recovers(model: Fit, recovering: Fit, recovery: float, kind: Kind) -> str:
     if recovering.rms > _BETTER * model.rms:
         return ""
-    return f"; with gain_recovery_ms = {recovery * units.MS:g} {recovering.rms * units.MM:.3g} mm are left"
+    left = f"{recovering.rms * units.SCREEN[kind].scale:.3g} {units.SCREEN[kind].unit}"
+    return f"; with gain_recovery_ms = {recovery * units.MS:g} {left} are left"

@@ -1,8 +1,11 @@
-"""Faults of a log's clock: stray stamps, and clocks set back, which cut a run into segments."""
+"""Faults of a log's clock.
+
+Stray stamps, clocks set back, which cut a run into segments, stamps in another unit, clocks that are far apart.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -10,11 +13,18 @@ import numpy as np
 
 from ..arrays import NO_STAMP, IntArray, TimeArray
 from ..errors import RunError
+from ..units import TIMES, mistaken
 from .run import Run, Source, note_rows
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
 _NEW_CLOCK = 3  # so many rows in a row with another time: the clock was set anew; fewer are stray
 _MOST_JUMPS = 100
+_FEW, _MANY = 30, 10_000  # stamps, below which nothing is said about their unit, and from which it is clear
+_EVEN = 0.1  # spread of intervals over the usual one, up to which commands are a steady stream
+_HOUR_NS = 3_600_000_000_000
+_LONG_NS = 87_660 * _HOUR_NS  # ten years: no log is as long
+LONGEST_TAIL_NS = _HOUR_NS  # measurements this long after the last command no longer belong to the run
+_TAIL_NS = 1_000_000_000  # that belong to the motion after the last command
 
 
 def behind(stamp: TimeArray) -> TimeArray:
@@ -171,3 +181,90 @@ def _jumps(source: Source) -> list[int]:
                 f"{source.label}: the stamps step back by more than 1 s over {_MOST_JUMPS} times: not one clock,"
                 " or many runs in one table (run.toml chooses one by 'where')"
             )
+
+
+def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
+    """A sentence on each sensor whose stamps are not of the commands' time.
+
+    Args:
+        run: One segment of a recorded run.
+        period: The arm's update period T [s].
+        sensors: Those that are asked about.
+
+    Raises:
+        RunError: The stamps of a source are in another unit than they are taken to be in.
+    """
+    command = _ascending(run.command.stamp)
+    _check_period(run.command.label, command, period)
+    found: list[str] = []
+    for name in sensors:
+        stamp = _ascending(run.sensors[name].stamp)
+        if len(stamp):
+            _check_span(run.sensors[name].label_for(name), stamp, command)
+            found += [f"{name}: {one}" for one in _apart(stamp, int(command[0]), int(command[-1]))]
+    return found
+
+
+def _ascending(stamp: TimeArray) -> TimeArray:
+    """The stamps that there are, in order."""
+    known = stamp[stamp != NO_STAMP]
+    return known if (np.diff(known) >= 0).all() else np.sort(known)
+
+
+def _check_period(label: str, stamp: TimeArray, period: float) -> None:
+    """Refuse a steady stream of commands whose interval is the update period in another unit."""
+    intervals = np.diff(stamp[:_MANY])
+    intervals = intervals[intervals > 0]
+    if len(intervals) < _FEW:
+        return
+    early, usual, late = np.quantile(intervals, [0.25, 0.5, 0.75]) / 1e9
+    units = mistaken(usual / period, TIMES)
+    if units and late - early <= _EVEN * usual:
+        raise RunError(
+            f"{label}: commands come every {usual:.4g} s, {usual / period:.4g} times the arm's update_period_ms ="
+            f" {period * 1e3:g}: {_taken(units)}"
+        )
+
+
+def _check_span(label: str, stamp: TimeArray, command: TimeArray) -> None:
+    """Refuse measurements that last as long as the commands in another unit."""
+    span, commanded = (float(part[-1] - part[0]) / 1e9 for part in (stamp, command))
+    if min(len(stamp), len(command)) >= _FEW and (units := mistaken(span / max(commanded, 1e-9), TIMES)):
+        raise RunError(
+            f"{label}: measurements go on for {span:.4g} s, the commands for {commanded:.4g} s: {_taken(units)}"
+        )
+
+
+def _taken(units: Sequence[tuple[str, str]]) -> str:
+    words = " or ".join(f"{true} that are called {called}" for true, called in units)
+    return f"are its stamps {words}? Correct the unit of its time in run.toml"
+
+
+def _apart(stamp: TimeArray, first: int, last: int) -> list[str]:
+    """A sentence if most stamps, ascending, are before the first command or after the last, or hours after it."""
+    middle, tail = int(stamp[len(stamp) // 2]), int(stamp[-1]) - last
+    if first <= middle <= last + _TAIL_NS:
+        if tail <= LONGEST_TAIL_NS:
+            return []
+        return [f"measurements go on for {_duration(tail)} after the last command: are both stamped by one clock?"]
+    every = stamp[-1] < first or stamp[0] > last
+    side, apart = "before the first" if middle < first else "after the last", int(stamp[0]) - first
+    return [
+        f"{'all' if every else 'most'} measurements lie {side} command, their stamps begin {_duration(abs(apart))}"
+        f" {'before' if apart < 0 else 'after'} those of the commands: are both stamped by one clock?{_why(abs(apart))}"
+    ]
+
+
+def _why(apart: int) -> str:
+    """What two clocks that differ by that [ns] may be; empty without an idea."""
+    if apart > _LONG_NS:
+        return " One may count from 1970, the other from when a computer was switched on"
+    hours = round(apart / _HOUR_NS)
+    return " Is one of another time zone?" if hours and abs(apart - hours * _HOUR_NS) < 60 * _TAIL_NS else ""
+
+
+def _duration(time: int) -> str:
+    """A time [ns] for people."""
+    units = {"years": 8766 * _HOUR_NS, "days": 24 * _HOUR_NS, "hours": _HOUR_NS, "s": _TAIL_NS}
+    unit = next((name for name, size in units.items() if time >= size), "s")
+    return f"{time / units[unit]:.4g} {unit}"

@@ -353,7 +353,8 @@ def _read_manifest(path: Path) -> Run:
     reference = None if scored is None else source("reference")
     if reference is not None and scored is not None:
         of_kind = {"length": scored.sd, "angle": scored.angular_sd}
-        reference = replace(reference, sd={axis: of_kind[units[axis]] for axis in reference.values})
+        sds = {axis: of_kind[units[axis]] for axis in reference.values}
+        reference = replace(reference, sd=sds if len(set(sds.values())) > 1 else next(iter(sds.values())))
     if naive and zoned:
         notes.append(f"{naive[0]}: dates without a time zone, beside {zoned[0]} with one: taken as UTC")
     name, start, clock = listed.name or path.parent.resolve().name, listed.command.start, listed.command.clock

@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from ..arrays import FloatArray, TimeArray
 from ..logs.run import Source
-from ..units import MM
+from ..units import of_kind
 from .scenario import Scenario
 from .trajectory import Steps
 
@@ -25,7 +25,7 @@ def cut_trials(
     Args:
         scenario: What was simulated.
         tick: When each command was given, int64 ns, (n,).
-        commands: The commands by axis [m], (n,).
+        commands: The commands by axis [m or rad], (n,).
         sensors: The measurements of the run, among them the scope's.
     """
     campaign = scenario.trajectory
@@ -37,20 +37,21 @@ def cut_trials(
     trials, samples = list[pa.Table](), list[pa.Table]()
     for number, at in enumerate(range(pause, len(tick), pause), 1):
         axis = next(axis for axis, command in commands.items() if command[at] != command[at - 1])
-        step = float(commands[axis][at] - commands[axis][at - 1])
+        step, screen = float(commands[axis][at] - commands[axis][at - 1]), scenario.arm.screen_of(axis)
+        kind = scenario.arm.axes[axis].kind
         since = valid - tick[at] / 1e9
         inside = (since >= -_BEFORE) & (since <= campaign.window)
         trial = {
             "trial": number,
             "axis": axis,
-            "step_mm": round(step * MM, 6),
-            "speed_m_s": round(abs(step) / period, 6),
+            of_kind("step_mm", kind): round(step * screen.scale, 6),
+            of_kind("speed_m_s", kind): round(abs(step) / period * screen.fast_scale, 6),
             "direction": "up" if step > 0.0 else "down",
         }
         sampled: dict[str, Sequence[int] | FloatArray] = {
             "trial": [number] * int(inside.sum()),
             "time_s": np.round(since[inside], 9),
-            "position_mm": np.round(scope.values[axis][inside] * MM, 6),
+            of_kind("position_mm", kind): np.round(scope.values[axis][inside] * screen.scale, 6),
         }
         trials.append(pa.Table.from_pylist([trial]))
         samples.append(pa.table(sampled))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -11,17 +11,30 @@ import numpy as np
 
 from .. import toml, units
 from ..errors import ConfigError, PumafuseError, UnknownNameError
-from ..fusion.config import FusionConfig, Process, by_axis, load_arm
+from ..fusion.config import (
+    PROCESS,
+    FusionConfig,
+    PerAxis,
+    Process,
+    by_axis,
+    load_arm,
+    of_all_axes,
+    of_axis,
+    with_defaults,
+    with_kinds,
+    with_names_of_lengths,
+)
 from ..logs import save
 from ..logs.frames import CARTESIAN, Frame
 from ..logs.manifest import axis_of
 from ..logs.run import Clock
 from ..model.arm import ArmModel
 from ..toml import NotNegative
+from ..units import of_kind
 from .grid import POINTS
 from .trajectory import TRAJECTORIES, PathFromFile, Steps
 from .true_arm import TrueArm, TrueAxis
-from .true_sensor import TrueSensor
+from .true_sensor import OF_OUTLIERS, PER_AXIS, Outliers, TrueSensor
 
 _OVERRIDES = ("start", "process", "sensors")
 _SMALLEST, _LARGEST_LENGTH, _LARGEST = 1e-12, 1e5, 4e9  # SI; 100 km, 127 years
@@ -44,22 +57,22 @@ class ReferenceLog(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     Attributes:
         rows_per_command: Rows in each update period, the first at the command's own instant.
-        sd: Standard deviation of its noise [m].
+        sd: Standard deviation of its noise [m or rad], of all axes or of each.
     """
 
     rows_per_command: Annotated[int, msgspec.Meta(gt=0, le=POINTS)] = 5
-    sd: NotNegative = msgspec.field(name="sd_mm", default=0.0)
+    sd: PerAxis = msgspec.field(name="sd_mm", default=0.0)
 
 
 class TrueStart(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Where the arm rests before the first command.
 
     Attributes:
-        offset_sd: Standard deviation of the offset there, drawn for each run and axis [m].
-        level: By axis [m]; 0 where absent.
+        offset_sd: Standard deviation of the offset there, drawn for each run and axis [m or rad].
+        level: By axis [m or rad]; 0 where absent.
     """
 
-    offset_sd: NotNegative = msgspec.field(name="offset_sd_mm", default=0.0)
+    offset_sd: PerAxis = msgspec.field(name="offset_sd_mm", default=0.0)
     level: dict[str, float] = msgspec.field(default_factory=dict[str, float])
 
 
@@ -79,7 +92,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         reference: How the true motion is recorded.
         sensors: How each sensor measures.
         frame: With one, commands, sensors and reference are logged in x, y, z.
-        start_azimuth: Direction of the start level from the base, counterclockwise from x [degrees, as in the file].
+        start_azimuth: Direction of the start level from the base, counterclockwise from x [rad].
         filter: Tables of ``fusion.toml`` in which the filter's configuration differs from what is simulated.
     """
 
@@ -120,21 +133,24 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def _check(self, where: str, sensor: TrueSensor) -> None:
         logged, fastest = self._logged_axes(sensor), POINTS / self.arm.update_period
-        for key, named in (("axes", sensor.axes), ("sd_mm", sensor.sd), ("bias_mm", sensor.bias)):
+        sd, bias = (of_kind(key, self.arm.kinds[0]) for key in ("sd_mm", "bias_mm"))
+        for key, named in (("axes", sensor.axes), (sd, sensor.sd), (bias, sensor.bias)):
             for name in named if isinstance(named, list | dict) else ():
                 if name not in logged:
                     raise UnknownNameError(f"{where}.{key}", "axis", name, logged)
         if isinstance(sensor.sd, dict):
             if logged is CARTESIAN:
-                raise ConfigError(f"{where}.sd_mm: one number for a sensor in x, y, z")
+                raise ConfigError(f"{where}.{sd}: one number for a sensor in x, y, z")
             for axis in self.trajectory.moving:
                 if axis in (sensor.axes or logged) and axis not in sensor.sd:
-                    raise ConfigError(f"{where}.sd_mm: no entry for '{axis}', which it measures")
+                    raise ConfigError(f"{where}.{sd}: no entry for '{axis}', which it measures")
         if sensor.rate > fastest:
             limit = f"at most {fastest:g} on this arm ({POINTS} rows a command)"
             raise ConfigError(f"{where}.rate_hz: {limit}, got {sensor.rate:g}")
-        if sensor.outliers is not None and sensor.outliers.largest < sensor.outliers.smallest:
-            raise ConfigError(f"{where}.outliers: to_mm is smaller than from_mm")
+        for axis, one in self.arm.axes.items():
+            if (wrong := sensor.outliers) and of_axis(wrong.largest, axis) < of_axis(wrong.smallest, axis):
+                smaller, larger = (of_kind(key, one.kind) for key in OF_OUTLIERS)
+                raise ConfigError(f"{where}.outliers: {larger} is smaller than {smaller}")
         for start, end in sensor.outages:
             if end <= start:
                 raise ConfigError(f"{where}.outages_s: [{start:g}, {end:g}] ends before it begins")
@@ -164,12 +180,12 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """The filter's configuration: what is simulated, overridden by ``filter``."""
         simulated: dict[str, Any] = {
             "start": {"offset_sd_mm": self.start.offset_sd},
-            "process": {axis: toml.builtins(self.process.get(axis, Process())) for axis in self.arm.axes},
+            "process": {
+                axis: toml.builtins(self.process.get(axis, PROCESS[one.kind])) for axis, one in self.arm.axes.items()
+            },
             "sensors": {name: sensor.to_config() for name, sensor in self.sensors.items()},
         }
-        override = dict(self.filter)
-        if isinstance(override.get("process"), dict):
-            override["process"] = by_axis(override["process"], Process, self.arm, "filter", "process")
+        override = with_names_of_lengths(self.filter, self.arm, "filter")
         if isinstance(override.get("sensors"), dict):
             for name in override["sensors"]:
                 if name not in self.sensors:
@@ -178,9 +194,19 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def to_toml(self, seed: int, arm: str) -> str:
         """The text of a ``scenario.toml`` with this ``seed``, and its arm in the file ``arm``."""
-        tree = toml.builtins(self)
+        tree, own = toml.builtins(self), self.arm.axes
         tree["arm"], tree["seed"] = arm, seed
-        tree["start"]["level"] = {f"{axis}_mm": level for axis, level in self.start.level.items()}
+        for key, parts in (("true_arm", self.true_arm), ("process", self.process)):
+            tree[key] = {axis: toml.builtins(one, own[axis].kind) for axis, one in parts.items()}
+        tree["trajectory"] = toml.builtins(self.trajectory, _kind_of(self.trajectory.moving, self.arm))
+        tree["start"] = with_kinds(tree["start"], self.arm, ["offset_sd_mm"])
+        screens = {axis: self.arm.screen_of(axis) for axis in self.start.level}
+        tree["start"]["level"] = {f"{axis}_{screens[axis].unit}": level for axis, level in self.start.level.items()}
+        tree["reference"] = with_kinds(tree["reference"], self.arm, ["sd_mm"])
+        for name, sensor in tree["sensors"].items():
+            tree["sensors"][name] = with_kinds(sensor, self.arm, PER_AXIS)
+            if "outliers" in sensor:
+                tree["sensors"][name]["outliers"] = with_kinds(sensor["outliers"], self.arm, OF_OUTLIERS)
         return toml.text({key: value for key, value in tree.items() if value != {}})
 
     @staticmethod
@@ -195,16 +221,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         tree, where = toml.read(path), str(path)
         _check_magnitudes({key: value for key, value in tree.items() if key != "seed"}, where)
         tree["arm"] = load_arm(tree, path)
-        for key, kind in (("true_arm", TrueArm), ("process", Process)):
-            if isinstance(tree.get(key), dict):
-                tree[key] = by_axis(tree[key], kind, tree["arm"], where, key)
-        start = tree.get("start")
-        if isinstance(start, dict) and isinstance(levels := cast(dict[str, Any], start).get("level"), dict):
-            named = cast(dict[str, Any], levels)
-            start["level"] = {axis_of(key, where, "start.level"): level for key, level in named.items()}
-            if len(start["level"]) < len(named):
-                raise ConfigError(f"{where}: start.level gives an axis twice")
-        scenario = toml.struct(tree, Scenario, where)
+        scenario = toml.struct(_with_names_of_lengths(tree, tree["arm"], where), Scenario, where)
         trajectory = scenario.trajectory
         if isinstance(trajectory, PathFromFile):
             beside = msgspec.structs.replace(trajectory, file=str(path.parent / trajectory.file))
@@ -214,6 +231,62 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         except PumafuseError as error:
             raise ConfigError(f"{where}: {error}") from None
         return scenario
+
+
+def _with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
+    """The tables of a file (SI numbers) with the key names for lengths, where those of angles are."""
+    found = dict(tree)
+    for key, kind in (("true_arm", TrueArm), ("process", Process)):
+        if isinstance(found.get(key), dict):
+            found[key] = by_axis(found[key], kind, arm, where, key)
+    if isinstance(found.get("process"), dict):
+        found["process"] = with_defaults(found["process"], arm)
+    if isinstance(start := found.get("start"), dict):
+        found["start"] = _start(cast(dict[str, Any], start), arm, where)
+    if "reference" in found:
+        found["reference"] = of_all_axes(found["reference"], ReferenceLog, arm, where, "reference", ["sd_mm"])
+    if isinstance(sensors := found.get("sensors"), dict):
+        named = cast(dict[str, Any], sensors)
+        found["sensors"] = {name: _sensor(table, arm, where, f"sensors.{name}") for name, table in named.items()}
+    if isinstance(trajectory := found.get("trajectory"), dict):
+        table = cast(dict[str, Any], trajectory)
+        axes: Any = table.get("axes", [table.get(key) for key in ("along", "across")])
+        kind = _kind_of(cast(list[Any], axes) if isinstance(axes, list) else [], arm)
+        found["trajectory"] = toml.struct(table, cast(Any, TRAJECTORIES), where, "trajectory", kind)
+    return found
+
+
+def _start(table: Mapping[str, Any], arm: ArmModel, where: str) -> dict[str, Any]:
+    found = of_all_axes(table, TrueStart, arm, where, "start", ["offset_sd_mm"])
+    if isinstance(levels := found.get("level"), dict):
+        named, found["level"] = cast(dict[str, Any], levels), dict[str, Any]()
+        for key, level in named.items():
+            axis = axis_of(key, where, "start.level")
+            if axis in found["level"]:
+                raise ConfigError(f"{where}: start.level gives an axis twice")
+            if axis in arm.axes and arm.axes[axis].kind != units.kind_of(key):
+                raise ConfigError(f"{where}: start.level.{key}: {axis} is {units.AN[arm.axes[axis].kind]}")
+            found["level"][axis] = level
+    return found
+
+
+def _sensor(table: Any, arm: ArmModel, where: str, path: str) -> Any:
+    found = of_all_axes(table, TrueSensor, arm, where, path, PER_AXIS)
+    if isinstance(found, dict) and "outliers" in found:
+        found["outliers"] = of_all_axes(found["outliers"], Outliers, arm, where, f"{path}.outliers", OF_OUTLIERS)
+    return found  # pyright: ignore[reportUnknownVariableType]
+
+
+def _kind_of(moving: Iterable[object], arm: ArmModel) -> units.Kind:
+    """The kind of the axes that a trajectory moves.
+
+    Raises:
+        ConfigError: They are of both.
+    """
+    kinds: list[units.Kind] = [arm.axes[axis].kind for axis in moving if isinstance(axis, str) and axis in arm.axes]
+    if len(set(kinds)) > 1:
+        raise ConfigError("trajectory: moves lengths and angles; its sizes would have two units")
+    return kinds[0] if kinds else "length"
 
 
 def _check_magnitudes(tree: Mapping[str, Any], where: str, path: str = "", inherited: str | None = None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray, TimeArray
+from ..fusion.config import of_axis
 from ..logs.run import Source
 from . import reverting
 from .true_sensor import TrueSensor
@@ -29,7 +30,7 @@ def measure(
         sensor: How it measures.
         name: Its name.
         valid: When it measures, int64 ns, (rows,).
-        position: True positions then, in the coordinates in which the sensor is logged [m], (rows,) each.
+        position: True positions then, in the coordinates in which the sensor is logged [m or rad], (rows,) each.
         rng: Draws everything random of this sensor.
     """
     noises = rng.spawn(7)  # so that one kind of fault changes no other
@@ -37,13 +38,12 @@ def measure(
     outlier = _outliers(sensor, count, list(position), noises[1])
     values: dict[str, FloatArray] = {}
     for axis, true in position.items():
-        sd = sensor.sd[axis] if isinstance(sensor.sd, dict) else sensor.sd
-        bias = sensor.bias.get(axis, 0.0) if isinstance(sensor.bias, dict) else sensor.bias
-        bias += sensor.bias_sd * noises[2].standard_normal()
-        if sensor.bias_drift_sd:
-            bias = bias + reverting.rough(valid, sensor.bias_drift_sd, sensor.bias_time, noises[6])
+        sd, step = of_axis(sensor.sd, axis), of_axis(sensor.quantisation, axis)
+        bias = of_axis(sensor.bias, axis) + of_axis(sensor.bias_sd, axis) * noises[2].standard_normal()
+        if drift := of_axis(sensor.bias_drift_sd, axis):
+            bias = bias + reverting.rough(valid, drift, sensor.bias_time, noises[6])
         z = sensor.scale * true + bias + sd * noises[0].standard_normal(count) + outlier[axis]
-        values[axis] = np.rint(z / sensor.quantisation) * sensor.quantisation if sensor.quantisation else z
+        values[axis] = np.rint(z / step) * step if step else z
     late = sensor.latency + sensor.latency_sd * noises[3].standard_normal(count)
     own_clock = (seconds + late) * (1.0 + sensor.clock_drift * 1e-6) + sensor.clock_offset
     logged = (noises[4].random(count) >= sensor.dropouts) & ~_lost(sensor, seconds, noises[5])
@@ -52,13 +52,13 @@ def measure(
 
 
 def _outliers(sensor: TrueSensor, count: int, axes: list[str], rng: np.random.Generator) -> dict[str, FloatArray]:
-    """The error that is added to each row [m], by axis: 0 for rows that are no outliers."""
+    """The error that is added to each row [m or rad], by axis: 0 for rows that are no outliers."""
     if sensor.outliers is None:
         return dict.fromkeys(axes, np.zeros(count))
     chosen = rng.random(count) < sensor.outliers.share
     errors: dict[str, FloatArray] = {}
     for axis in axes:
-        size = rng.uniform(sensor.outliers.smallest, sensor.outliers.largest, count)
+        size = rng.uniform(of_axis(sensor.outliers.smallest, axis), of_axis(sensor.outliers.largest, axis), count)
         errors[axis] = chosen * size * rng.choice([-1.0, 1.0], count)
     return errors
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import zlib
 from collections.abc import Mapping
@@ -16,11 +15,11 @@ import pyarrow as pa
 from .. import folders, toml
 from ..arrays import FloatArray
 from ..errors import ConfigError
-from ..fusion.config import ARM_FILE, FusionConfig, Process
+from ..fusion.config import ARM_FILE, PROCESS, FusionConfig, of_axis
 from ..logs import save, tables
 from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run, Source
-from ..units import MM
+from ..units import MM, SCREEN
 from . import campaign, sensing
 from .grid import POINTS, grid
 from .motion import Motion, simulate_axis
@@ -72,9 +71,10 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
     tick = np.rint(np.arange(count) * (period * 1e9)).astype(np.int64)
     instants = grid(count, period)
     true_axes, motions = scenario.true_axes, dict[str, Motion]()
+    scales = {axis: SCREEN[kind].scale for axis, kind in scenario.arm.kind_of.items()}
     for axis, command in commands.items():
-        process, draws = scenario.process.get(axis, Process()), _stream(seed, "axis", axis)
-        offset_sd = scenario.start.offset_sd
+        process, draws = scenario.process.get(axis, PROCESS[scenario.arm.axes[axis].kind]), _stream(seed, "axis", axis)
+        offset_sd = of_axis(scenario.start.offset_sd, axis)
         motions[axis] = simulate_axis(true_axes[axis], process, offset_sd, tick, command, period, draws)
 
     sensors: dict[str, Source] = {}
@@ -83,12 +83,13 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
         if measured:
             valid = sensing.valid_times(sensor, instants, _stream(seed, "rate", name))
             true = _logged(scenario, {axis: motions[axis].at(valid) for axis in measured}, in_axes=bool(sensor.axes))
-            sensors[name] = _rounded(sensing.measure(sensor, name, valid, true, _stream(seed, "sensor", name)))
+            source = sensing.measure(sensor, name, valid, true, _stream(seed, "sensor", name))
+            sensors[name] = _rounded(source, scales)
     parts = scenario.reference.rows_per_command
     rows = instants[np.rint(np.arange(count * parts) * (POINTS / parts)).astype(np.int64)]
     noise = _stream(seed, "reference")
     reference = {
-        axis: true + scenario.reference.sd * noise.standard_normal(len(rows))
+        axis: true + of_axis(scenario.reference.sd, axis) * noise.standard_normal(len(rows))
         for axis, true in _logged(scenario, {axis: motion.at(rows) for axis, motion in motions.items()}).items()
     }
     jitter = scenario.command.stamp_jitter * _stream(seed, "stamps").standard_normal(count)
@@ -96,12 +97,13 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
     start = _logged(scenario, {axis: np.zeros(1) for axis in axes})
     run = Run(
         name=f"{scenario.name}, seed {seed}",
-        command=_rounded(Source(stamp, _logged(scenario, commands), "command")),
+        command=_rounded(Source(stamp, _logged(scenario, commands), "command"), scales),
         sensors=sensors,
-        reference=_rounded(Source(rows, reference, "reference", sd=scenario.reference.sd)),
-        start={axis: float(_nanometres(level)[0]) for axis, level in start.items()},
+        reference=_rounded(Source(rows, reference, "reference", sd=scenario.reference.sd), scales),
+        start={axis: float(_as_in_files(level, scales.get(axis, MM))[0]) for axis, level in start.items()},
         clock=scenario.command.clock,
         frame=scenario.frame,
+        kinds={axis: kind for axis, kind in scenario.arm.kind_of.items() if axis in start},
     )
     return Simulated(scenario, seed, run, scenario.config, campaign.cut_trials(scenario, tick, commands, sensors))
 
@@ -160,9 +162,9 @@ def _logged(scenario: Scenario, moved: Mapping[str, FloatArray], *, in_axes: boo
     if frame is None or in_axes:
         return positions
     if isinstance(frame, Cylindrical):
-        placed = Placed(frame, level["radial"], math.radians(scenario.start_azimuth))
+        placed = Placed(frame, level["radial"], scenario.start_azimuth)
     else:
-        placed = Placed(frame, 1.0, math.radians(frame.azimuth))
+        placed = Placed(frame, 1.0, frame.azimuth)
     x, y = placed.to_log(positions["tangential"], positions["radial"])
     return {"x": x, "y": y} | ({"z": positions["vertical"]} if "vertical" in positions else {})
 
@@ -183,10 +185,11 @@ def _commands(scenario: Scenario, seed: int) -> dict[str, FloatArray]:
     return commands
 
 
-def _nanometres(value: FloatArray) -> FloatArray:
-    """Lengths [m] rounded as files have them, so that a run is the same in memory and read back."""
-    return np.round(value * MM, 6) / MM
+def _as_in_files(value: FloatArray, scale: float) -> FloatArray:
+    """Positions [m or rad] rounded as files have them, so that a run is the same in memory and read back."""
+    return np.round(value * scale, 6) / scale
 
 
-def _rounded(source: Source) -> Source:
-    return replace(source, values={axis: _nanometres(value) for axis, value in source.values.items()})
+def _rounded(source: Source, scales: Mapping[str, float]) -> Source:
+    values = {axis: _as_in_files(value, scales.get(axis, MM)) for axis, value in source.values.items()}
+    return replace(source, values=values)

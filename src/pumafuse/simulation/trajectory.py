@@ -12,7 +12,7 @@ from ..arrays import FloatArray, IntArray
 from ..errors import ConfigError
 from ..logs import tables
 from ..toml import NotNegative, Positive
-from ..units import seconds
+from ..units import ending, seconds
 
 _MOST_TICKS = 200_000  # 93 minutes at 28 ms; a gigabyte of work
 
@@ -24,8 +24,8 @@ Count: TypeAlias = Annotated[int, msgspec.Meta(gt=0, le=10_000)]
 class Trajectory(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", forbid_unknown_fields=True):
     """Base of the trajectories; axes that one does not move hold their start level.
 
-    ``moving`` names the axes that move. ``offsets(period, rng)`` are the commands [m] relative to the start level at
-    ticks 0, T, 2T, …, by axis, all of one length (ticks,).
+    ``moving`` names the axes that move. ``offsets(period, rng)`` are the commands [m or rad] relative to the start
+    level at ticks 0, T, 2T, …, by axis, all of one length (ticks,).
     """
 
 
@@ -195,7 +195,7 @@ class PathFromFile(OnAxes, frozen=True, kw_only=True, tag="path"):
     """A path from a table, linear between its rows, relative to its first row.
 
     Attributes:
-        file: A CSV or Parquet table beside the scenario with ``time_s`` and ``<axis>_mm``.
+        file: A CSV or Parquet table beside the scenario with ``time_s`` and ``<axis>_mm`` (or any unit).
     """
 
     file: str
@@ -211,9 +211,10 @@ class PathFromFile(OnAxes, frozen=True, kw_only=True, tag="path"):
         at = ticks(float(time[-1] - time[0]), period) * period + time[0]
         found: Offsets = {}
         for axis in self.axes:
-            values, _ = table.numbers(f"{axis}_mm")
+            column = next((name for name in table.columns if name.removesuffix(ending(name) or "") == axis), None)
+            values, _ = table.numbers(column or f"{axis}_mm")
             if not np.isfinite(values).all():
-                raise ConfigError(f"{self.file}: {axis}_mm has a cell without a number")
+                raise ConfigError(f"{self.file}: {column} has a cell without a number")
             found[axis] = np.interp(at, time, values) - values[0]
         return found
 

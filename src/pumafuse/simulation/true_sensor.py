@@ -7,10 +7,12 @@ from typing import Annotated, Any, TypeAlias
 
 import msgspec
 
+from ..fusion.config import PerAxis, of_axis
 from ..toml import NotNegative, Positive
 
 Share: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1)]
-PerAxis: TypeAlias = float | dict[str, float]
+PER_AXIS = ("sd_mm", "bias_mm", "bias_sd_mm", "bias_drift_sd_mm", "quantisation_mm")  # keys that axes may have apart
+OF_OUTLIERS = ("from_mm", "to_mm")  # likewise
 
 
 class Bursts(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -33,13 +35,13 @@ class Outliers(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     Attributes:
         share: Share of the rows.
-        smallest: Smallest error [m].
-        largest: Largest error [m]; either sign.
+        smallest: Smallest error [m or rad], for all axes or for each.
+        largest: Largest error [m or rad]; either sign.
     """
 
     share: Share
-    smallest: NotNegative = msgspec.field(name="from_mm")
-    largest: NotNegative = msgspec.field(name="to_mm")
+    smallest: PerAxis = msgspec.field(name="from_mm")
+    largest: PerAxis = msgspec.field(name="to_mm")
 
 
 class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -50,15 +52,15 @@ class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         rate_jitter: Standard deviation of each row's instant around an even grid [s].
         axes: What it measures. Absent: everything, in x, y, z if the scenario has a frame; a sensor that names its
             axes is logged in them.
-        sd: Standard deviation of the noise [m], one number or one for each axis.
+        sd: Standard deviation of the noise [m or rad], one number or one for each axis; likewise all in that unit.
         latency: From the valid time to the stamp [s].
         latency_sd: Standard deviation of each row's own latency [s].
         scale: Factor on the position.
-        bias: Constant [m].
-        bias_sd: Standard deviation of one more bias, drawn for each run and axis [m].
-        bias_drift_sd: Standard deviation of one more bias that drifts and reverts to 0, on each axis [m]; 0: none.
+        bias: Constant [m or rad].
+        bias_sd: Standard deviation of one more bias, drawn for each run and axis [m or rad].
+        bias_drift_sd: Standard deviation of one more bias, which drifts and reverts to 0 [m or rad]; 0: none.
         bias_time: How long such a drift lasts [s].
-        quantisation: Step between two values [m]; 0: none.
+        quantisation: Step between two values [m or rad]; 0: none.
         dropouts: Share of rows lost, one by one.
         bursts: Rows lost together.
         outliers: Rows with a large error.
@@ -74,11 +76,11 @@ class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     latency: float = msgspec.field(name="latency_ms", default=0.0)
     latency_sd: NotNegative = msgspec.field(name="latency_sd_ms", default=0.0)
     scale: float = 1.0
-    bias: PerAxis = msgspec.field(name="bias_mm", default=0.0)
-    bias_sd: NotNegative = msgspec.field(name="bias_sd_mm", default=0.0)
-    bias_drift_sd: NotNegative = msgspec.field(name="bias_drift_sd_mm", default=0.0)
+    bias: float | dict[str, float] = msgspec.field(name="bias_mm", default=0.0)
+    bias_sd: PerAxis = msgspec.field(name="bias_sd_mm", default=0.0)
+    bias_drift_sd: PerAxis = msgspec.field(name="bias_drift_sd_mm", default=0.0)
     bias_time: Positive = msgspec.field(name="bias_time_s", default=10.0)
-    quantisation: NotNegative = msgspec.field(name="quantisation_mm", default=0.0)
+    quantisation: PerAxis = msgspec.field(name="quantisation_mm", default=0.0)
     dropouts: Share = 0.0
     bursts: Bursts | None = None
     outliers: Outliers | None = None
@@ -88,16 +90,22 @@ class TrueSensor(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
     def to_config(self) -> dict[str, Any]:
         """The sensor's keys of ``fusion.toml``, in SI: exactly what it does, the unknown biases as ``bias_sd_mm``."""
-        sds = self.sd if isinstance(self.sd, dict) else dict.fromkeys(self.axes or [""], self.sd)  # "": of any axis
-        sds = {axis: math.hypot(sd, self.quantisation / math.sqrt(12.0)) for axis, sd in sds.items()}
+        sds = (
+            dict(self.sd) if isinstance(self.sd, dict) else dict.fromkeys(self.axes or [""], self.sd)
+        )  # "": of any axis
+        sds = {axis: math.hypot(sd, of_axis(self.quantisation, axis) / math.sqrt(12.0)) for axis, sd in sds.items()}
         gate = {} if self.outliers is None else {"gate": _GATE}
         biases = self.bias.values() if isinstance(self.bias, dict) else [self.bias]
+        if isinstance(self.bias_sd, float):
+            bias_sd: Any = math.hypot(self.bias_sd, *biases)
+        else:  # of axes of both kinds
+            bias_sd = {axis: math.hypot(of_axis(self.bias_sd, axis), of_axis(self.bias, axis)) for axis in sds}
         return {
             "sd_mm": sds.get("", sds),
             "latency_ms": self.latency,
             "latency_sd_ms": self.latency_sd,
             "scale": self.scale,
-            "bias_sd_mm": math.hypot(self.bias_sd, *biases),
+            "bias_sd_mm": bias_sd,
             "bias_drift_sd_mm": self.bias_drift_sd,
             "bias_time_s": self.bias_time,
             **gate,

@@ -15,11 +15,8 @@ from .likelihood import Likelihood
 from .maximise import Point, derivatives
 from .parameters import Parameter, smallest_sd
 
-_FEWEST = 30  # components of an axis, or of a sensor whose correlation with the commands is tested
+_FEWEST = 30  # components of an axis
 _EXCITED = 3.0  # commanded motion over noise from which an axis moves
-_FOLLOWS = 0.5  # least correlation of measurements with the response to the commands
-_RATIO = (0.1, 10.0)  # bounds of a sensor's motion over the commanded one
-_TESTED = 10.0  # motion over scatter from which a sensor is tested
 _HIGH = 0.9  # a correlation worth reporting
 _MEMBER = 0.3  # share of the largest weight, from which a parameter belongs to a combination
 _FIXED_FIRST = ("latency", "scale", "gain", "plant", "delay")  # which kind of a combination is fixed before the next
@@ -88,33 +85,10 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
                 f"sensor '{name}': {share:.0%} of its measurements lie more than 1 s after the last command: are both"
                 " stamped by one clock?"
             )
-    for (name, axis), (expected, measured) in likelihood.responses(config).items():
-        scatter = likelihood.scatter.get((name, axis), 0.0)
-        if axis in found and len(measured) >= _FEWEST and np.ptp(expected) >= _TESTED * scatter:
-            _check_follows(name, axis, expected, measured)
+    for fault in likelihood.faults(config):
+        if fault.lost and not set(fault.axes).isdisjoint(found):
+            raise TuneError(fault.sentence)
     return found
-
-
-def _check_follows(name: str, axis: str, expected: FloatArray, measured: FloatArray) -> None:
-    """Refuse a sensor that does not follow the response to its commands, or moves much more or less, (m,)."""
-    distance = np.abs(measured - expected)
-    # Without outliers. At rest all is near: what is off while it moves, as a wrong delay makes it, is no outlier.
-    near = distance <= max(10.0 * float(np.median(distance)), float(np.ptp(expected))) + 1e-12
-    expected, measured = expected[near], measured[near]
-    power = float(np.sqrt(np.sum(expected**2) * np.sum(measured**2)))
-    correlation = float(np.sum(expected * measured)) / power if power > 0.0 else 0.0
-    if correlation < _FOLLOWS:
-        what = "moves against" if correlation < -_FOLLOWS else "does not follow"
-        raise TuneError(
-            f"sensor '{name}' {what} the commands of {axis} (correlation {correlation:+.2f}): is it that axis, is its"
-            " scale right (-1 for a distance that falls), are both stamped by one clock?"
-        )
-    ratio = correlation * float(np.sqrt(np.sum(measured**2) / np.sum(expected**2)))
-    if not _RATIO[0] < ratio < _RATIO[1]:
-        raise TuneError(
-            f"sensor '{name}' moves {ratio:.3g} times as far as the commands of {axis} and its scale say: is a unit"
-            " wrong?"
-        )
 
 
 # ---- identifiability ------------------------------------------------------------------------------------------------

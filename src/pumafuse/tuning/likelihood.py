@@ -27,10 +27,10 @@ from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations
-from ..fusion.faults import starts_in_motion
-from ..fusion.segments import Segment, build
+from ..fusion.faults import Fault, not_following, starts_in_motion
+from ..fusion.segments import Segment, added, build
 from ..logs.axes import in_axes
-from ..logs.clock import segments
+from ..logs.clock import clock_faults, segments
 from ..logs.run import Run
 from .parameters import Parameter
 
@@ -113,6 +113,8 @@ class Likelihood:
         sensors: For each axis with measurements the sensors that have them.
         count: The number of components of each axis, (A,).
         notes: Every anomaly of the runs, a sentence each.
+        commands: By run, how many rows of its commands are ``used``, and how many are left out for what.
+        rows: By run and sensor, how many rows the filter decides on (``fused``), and how many are left out for what.
     """
 
     def __init__(
@@ -139,12 +141,20 @@ class Likelihood:
         """
         chosen = config.sensor_names(sensors)
         named = [(run.name, part) for run in runs for part in segments(in_axes(run, config.frame)[0])[0]]
-        built = [build(part, config, chosen) for _, part in named]
-        self.notes = [
-            f"run '{name}': {note}"
-            for (name, _), segment in zip(named, built, strict=True)
-            for note in (*segment.notes, *starts_in_motion(segment, config))
-        ]
+        built = list[Segment]()
+        self.notes, counted = list[str](), dict[str, list[Segment]]()
+        for name, part in named:
+            asked = [one for one in chosen if one in part.sensors]
+            clocks = clock_faults(part, config.arm.update_period, asked)
+            built.append(build(part, config, chosen))
+            notes = (*clocks, *built[-1].notes, *starts_in_motion(built[-1], config))
+            self.notes += [f"run '{name}': {note}" for note in notes]
+            counted.setdefault(name, []).append(built[-1])
+        self.commands = {name: added(one.command_counts for one in parts) for name, parts in counted.items()}
+        self.rows = {
+            name: {sensor: added(one.counts[sensor] for one in parts) for sensor in parts[0].counts}
+            for name, parts in counted.items()
+        }
         self.config = config
         self.axes = tuple(axis for axis in config.arm.axes if any(axis in segment.axes for segment in built))
         self._segments = [_decided(segment, until, latest) for segment in built]
@@ -236,13 +246,13 @@ class Likelihood:
         )
         found: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
         for part in self._parts:
-            rows = part.segment.measurement_rows
-            predicted = rows.value[:, 0] - innovations(part.segment, certain).innovation[:, 0]
+            rows, value = part.segment.measurement_rows, part.segment.unwrapped()[:, 0]
+            predicted = value - innovations(part.segment, certain).innovation[:, 0]
             for number, name in enumerate(part.segment.sensors):
                 mine = rows.source == number
                 if not mine.any():
                     continue
-                expected, measured = predicted[mine], rows.value[mine, 0]
+                expected, measured = predicted[mine], value[mine]
                 if centred:
                     expected, measured = expected - np.median(expected), measured - np.median(measured)
                 found.setdefault((name, self.axes[part.axis]), []).append((expected, measured))
@@ -258,6 +268,10 @@ class Likelihood:
             apart = 1.4826 * float(np.median(np.abs(measured - expected)))
             found[axis].append(max(apart / abs(config.sensors[name].scale), _SMALLEST))
         return {axis: min(apart, default=_SMALLEST) for axis, apart in found.items()}
+
+    def faults(self, config: FusionConfig) -> list[Fault]:
+        """Why sensors do not follow the commands, those that do not."""
+        return [fault for segment in self._segments for fault in not_following(segment, config)]
 
     def evaluate(self, config: FusionConfig, outcomes: Sequence[CodeArray] | None = None) -> LogLikelihood:
         """The log-likelihood of the measurements under a configuration.

@@ -168,7 +168,7 @@ def maximise_with_gates(
     A row that a gate newly rejects costs more than a step gains, so a search that applied the gates at every step would
     stop at the first one. Where the maximum with the old outcomes turns out worse, a part of the way there is tried.
     """
-    if all(not sensor.gate_rows for sensor in start.sensors.values()):
+    if not any(sensor.gates_rows(start.arm) for sensor in start.sensors.values()):
         best = maximise_by_axis(likelihood, start, free, notify, _TOLERANCE)
     else:
         best = maximise(likelihood, start, free, notify)

@@ -387,6 +387,6 @@ def with_gates(config: FusionConfig, given: FusionConfig, wider: float | None = 
     """The configuration with the gates of another; with ``wider`` so many times as wide, each component for itself."""
     sensors: dict[str, Sensor] = {}
     for name, sensor in config.sensors.items():
-        gate, rows = given.sensors[name].gate, given.sensors[name].gate_rows and wider is None
+        gate, rows = given.sensors[name].gate, given.sensors[name].gate_rows if wider is None else False
         sensors[name] = _replace(sensor, gate=(wider or 1.0) * gate, gate_rows=rows)
     return _replace(config, sensors=sensors)

@@ -98,6 +98,8 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
         pumafuse: Version that wrote it.
         runs: Names of the runs fitted on.
         parts: Of those that only a part was used of, from and to [s after the first command]; null: from or to the end.
+        commands: By run, how many rows of its commands are ``used``, and how many are left out for what.
+        rows: By run and sensor, how many rows the filter decides on (``fused``), and how many are left out for what.
         fit: The kinds of parameters fitted.
         fixed: Names that were fixed, as asked.
         trusted: The trusted sensor, if there is one.
@@ -118,6 +120,8 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
     pumafuse: str
     runs: list[str]
     parts: dict[str, tuple[float | None, float | None]] = {}
+    commands: dict[str, dict[str, int]] = {}
+    rows: dict[str, dict[str, dict[str, int]]] = {}
     fit: list[str]
     fixed: list[str]
     trusted: str | None

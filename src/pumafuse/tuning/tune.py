@@ -143,6 +143,8 @@ def tune(
         pumafuse=version("pumafuse"),
         runs=names,
         parts={run.name: (run.since, run.until) for run in runs if run.interval},
+        commands=pipeline.whole.commands,
+        rows=pipeline.whole.rows,
         fit=list(kinds),
         fixed=fixed,
         trusted=trust,

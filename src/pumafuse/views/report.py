@@ -14,7 +14,7 @@ from ..identification.trials import StepTrials
 from ..identification.verify import AxisVerification, Trace
 from ..model.arm import ArmModel
 from ..model.plants import FirstOrder
-from ..units import MM, MS
+from ..units import KINDS, MS, SCREEN, Kind, Screen
 from . import formatting, step_figures
 from .canvas import render
 
@@ -22,6 +22,7 @@ PAGE = "report.html"
 _TEXT = frozenset({"axis", "coefficient", "factor", "level: mean ± sd (trials)", "verdict", "outlying trials"}) | {
     "plant", "trial", "flags", "run", "source",
 }  # fmt: skip
+_SPEED: dict[Kind, str] = {"length": "m/s", "angle": "rad/s"}  # the s of a gain line: slopes are per that in arm.toml
 T = TypeVar("T")
 
 
@@ -44,7 +45,7 @@ def _table(items: Iterable[T], cells: Mapping[str, Callable[[T], str]]) -> TextT
 
 def models(found: Identification) -> TextTable:
     """The combined model of each axis (the paper's Table II)."""
-    rows: list[list[str]] = []
+    rows, screen = list[list[str]](), SCREEN[found.kind]
     for axis, one in found.axes.items():
         delays, plant = one.delays, one.model.plant
         described = formatting.plant(plant).replace(", ", "\n")
@@ -53,8 +54,9 @@ def models(found: Identification) -> TextTable:
             described += f"\ntrials' mean {own[0]},\nrobust {own[1]} ms"
         gain = formatting.gain(one.model.gain).replace(" + ", "\n+ ")
         times = [formatting.milliseconds(delay) for delay in (delays.lag, delays.fitted, delays.onset)]
-        rows.append([axis, str(one.trials), *times, described, gain, f"{_rms(found, axis) * MM:.3f}"])
-    headings = ("axis", "trials", "lag, ms", "Td, ms", "onset, ms", "plant", "K at speed s [m/s]", "RMS, mm")
+        rows.append([axis, str(one.trials), *times, described, gain, f"{_rms(found, axis) * screen.scale:.3f}"])
+    line = f"K at speed s [{_SPEED[found.kind]}]"
+    headings = ("axis", "trials", "lag, ms", "Td, ms", "onset, ms", "plant", line, f"RMS, {screen.unit}")
     return TextTable(headings, rows)
 
 
@@ -103,33 +105,40 @@ def sentences(found: Identification) -> list[str]:
     return [*lines, found.one_delay]
 
 
-def verifications(verified: Sequence[AxisVerification]) -> TextTable:
-    """Errors of the model on each run, axis and source (the paper's Table III)."""
+def verifications(verified: Sequence[AxisVerification]) -> list[TextTable]:
+    """Errors of the model on each run, axis and source (the paper's Table III), a table for each kind of axis."""
+    return [
+        _verifications(of_kind, kind) for kind in KINDS if (of_kind := [one for one in verified if one.kind == kind])
+    ]
+
+
+def _verifications(verified: Sequence[AxisVerification], kind: Kind) -> TextTable:
+    screen = SCREEN[kind]
     return _table(
         verified,
         {
             "run": lambda one: one.run,
             "axis": lambda one: one.axis,
             "source": lambda one: one.source,
-            "signal, mm": lambda one: f"{one.amplitude * MM:.4g}",
-            "RMS, mm": lambda one: f"{one.model.rms * MM:.3f}",
+            f"signal, {screen.unit}": lambda one: f"{one.amplitude * screen.scale:.4g}",
+            f"RMS, {screen.unit}": lambda one: f"{one.model.rms * screen.scale:.3f}",
             "of signal": lambda one: f"{one.model.percent:.1f} %",
             "fit": lambda one: f"{one.model.fit:.1f} %" if np.isfinite(one.model.fit) else "–",
-            "no recovery": lambda one: f"{one.without_recovery.rms * MM:.3f}",
-            "recovery": lambda one: f"{one.with_recovery.rms * MM:.3f}",
-            "best, mm": lambda one: f"{one.best_in_class.fit.rms * MM:.3f}",
+            "no recovery": lambda one: f"{one.without_recovery.rms * screen.scale:.3f}",
+            "recovery": lambda one: f"{one.with_recovery.rms * screen.scale:.3f}",
+            f"best, {screen.unit}": lambda one: f"{one.best_in_class.fit.rms * screen.scale:.3f}",
         },
     )
 
 
 def verdict(one: AxisVerification) -> str:
     """The lag of one axis by the model and by the best in class, the verdict, and the start level."""
-    best = one.best_in_class
+    best, screen = one.best_in_class, SCREEN[one.kind]
     left_out = f"; {one.outlying} outlying measurements left out" if one.outlying else ""
     return (
         f"{one.run}, {one.axis}: lag {one.lag * MS:.1f} ms, here"
         f" {formatting.with_interval(best.lag, best.lag_ci95, MS)} ms; {one.verdict}; start level"
-        f" {one.start * MM:g} mm ({one.start_from}); gain recovery"
+        f" {one.start * screen.scale:g} {screen.unit} ({one.start_from}); gain recovery"
         f" tried with {one.recovery * MS:g} ms; the best in class is K {best.gain:.3f}, Td {best.delay * MS:.1f} ms,"
         f" {formatting.plant(best.plant)}{left_out}"
     )
@@ -159,7 +168,8 @@ def write_identification(found: Identification, trials: StepTrials, folder: Path
     valleys, contours = step_figures.valleys(found, trials)
     content = {
         "found": found,
-        "rms_mm": _rms(found) * MM,
+        "rms": _rms(found) * SCREEN[found.kind].scale,
+        "unit": SCREEN[found.kind].unit,
         "models": models(found),
         "sentences": sentences(found),
         "jittering": [axis for axis, one in found.axes.items() if one.delay_spread > 2.0 * one.delay_noise > 0.0],
@@ -212,27 +222,28 @@ def write_verification(
 
 
 def _rms(found: Identification, axis: str | None = None) -> float:
-    """Of the combined model over the trials that it is made of [m]; of all axes for None."""
+    """Of the combined model over the trials that it is made of [m or rad]; of all axes for None."""
     used = [one for one in found.trials if one.left_out is None and axis in (None, one.axis)]
     return float(np.sqrt(np.mean([one.combined_rms**2 for one in used if one.combined_rms is not None])))
 
 
 def _trials(found: Identification) -> TextTable:
-    factors = list(found.trials[0].factors)
+    factors, screen = list(found.trials[0].factors), SCREEN[found.kind]
     rows = [
         [
-            *(one.trial, one.axis, f"{one.step * MM:g}", f"{one.speed:.3g}"),
+            *(one.trial, one.axis, f"{one.step * screen.scale:g}", f"{one.speed * screen.fast_scale:.3g}"),
             *(one.factors[name] for name in factors),
-            *_coefficients(one.first),
-            *_coefficients(one.second),
-            *("–" if one.combined_rms is None else f"{one.combined_rms * MM:.3f}", _flags(one)),
+            *_coefficients(one.first, screen),
+            *_coefficients(one.second, screen),
+            *("–" if one.combined_rms is None else f"{one.combined_rms * screen.scale:.3f}", _flags(one)),
         ]
         for one in found.trials
     ]
-    first = ("lag, ms", "K", "Td, ms", "τ, ms", "RMS, mm")
-    second = ("lag, ms", "K", "Td, ms", "ω, rad/s", "ζ", "RMS, mm")
-    settings = ("trial", "axis", "step, mm", "speed, m/s", *factors)
-    return TextTable((*settings, *first, *second, "combined RMS, mm", "flags"), rows)
+    rms = f"RMS, {screen.unit}"
+    first = ("lag, ms", "K", "Td, ms", "τ, ms", rms)
+    second = ("lag, ms", "K", "Td, ms", "ω, rad/s", "ζ", rms)
+    settings = ("trial", "axis", f"step, {screen.unit}", f"speed, {screen.fast}", *factors)
+    return TextTable((*settings, *first, *second, f"combined {rms}", "flags"), rows)
 
 
 def _flags(one: TrialResult) -> str:
@@ -242,12 +253,12 @@ def _flags(one: TrialResult) -> str:
     return "; ".join([*found, *(f"{flag} (second order)" for flag in second if flag not in first)])
 
 
-def _coefficients(fit: OrderFit) -> list[str]:
+def _coefficients(fit: OrderFit, screen: Screen) -> list[str]:
     values = [(fit.lag, fit.lag_ci95, MS), (fit.gain, fit.gain_ci95, 1.0), (fit.delay, fit.delay_ci95, MS)]
     values += [(fit.time_constant, fit.time_constant_ci95, MS)]
     values += [(fit.natural_frequency, fit.natural_frequency_ci95, 1.0), (fit.damping, fit.damping_ci95, 1.0)]
     found = [formatting.with_interval(value, ci95, unit) for value, ci95, unit in values if value is not None]
-    return [*found, f"{fit.rms * MM:.3f} ({fit.rms_percent:.1f} %)"]
+    return [*found, f"{fit.rms * screen.scale:.3f} ({fit.rms_percent:.1f} %)"]
 
 
 def _write(template: str, content: Mapping[str, Any], folder: Path, force: bool) -> None:

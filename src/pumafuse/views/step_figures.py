@@ -13,7 +13,7 @@ from ..identification.batch import Batch
 from ..identification.identify import Identification, TrialResult
 from ..identification.trials import StepTrials, Trial
 from ..identification.verify import AxisVerification, Trace
-from ..units import MM, MS
+from ..units import MM, MS, SCREEN
 from . import colours
 from .canvas import drawing
 
@@ -58,15 +58,17 @@ def delays(found: Identification) -> str:
 
 def gains(found: Identification) -> str:
     """K of each trial against speed, with the line."""
+    screen = SCREEN[found.kind]
 
     def draw(axes: Axes, axis: str) -> None:
         used = [one for one in found.trials if one.axis == axis and one.common_gain is not None]
         speed = np.array([one.speed for one in used])
-        axes.plot(speed, [one.common_gain or np.nan for one in used], ".", color=colours.ESTIMATE, ms=4)
+        gain = [one.common_gain or np.nan for one in used]
+        axes.plot(speed * screen.fast_scale, gain, ".", color=colours.ESTIMATE, ms=4)
         at = np.linspace(0.0, 1.05 * float(speed.max()), 50)
-        axes.plot(at, found.axes[axis].model.gain.at(at), color=colours.REFERENCE, lw=1.0)
+        axes.plot(at * screen.fast_scale, found.axes[axis].model.gain.at(at), color=colours.REFERENCE, lw=1.0)
 
-    return _panels(found.axes, draw, "gain K", "speed [m/s]")
+    return _panels(found.axes, draw, "gain K", f"speed [{screen.fast}]")
 
 
 def histograms(found: Identification) -> str:
@@ -89,10 +91,11 @@ def fits_by_factor(found: Identification, trials: StepTrials) -> str:
     """RMS of both orders by each factor, with two standard deviations (the paper's Fig. 6); empty without factors."""
     used = [one for one in found.trials if one.left_out is None]
     names = {one.trial for one in used}
-    factors = factors_of([trial for trial in trials.trials if trial.name in names], found.arm.update_period)
+    period, screen = found.arm.update_period, SCREEN[found.kind]
+    factors = factors_of([trial for trial in trials.trials if trial.name in names], period, found.kind)
     orders = {
-        "first order": (np.array([one.first.rms for one in used]) * MM, colours.COMMAND, -0.15),
-        "second order": (np.array([one.second.rms for one in used]) * MM, colours.ESTIMATE, 0.15),
+        "first order": (np.array([one.first.rms for one in used]) * screen.scale, colours.COMMAND, -0.15),
+        "second order": (np.array([one.second.rms for one in used]) * screen.scale, colours.ESTIMATE, 0.15),
     }
 
     def draw(axes: Axes, factor: str) -> None:
@@ -102,21 +105,22 @@ def fits_by_factor(found: Identification, trials: StepTrials) -> str:
         if factor == next(iter(factors)):
             axes.legend(frameon=False)
 
-    return _panels(factors, draw, "RMS of each trial's own fit [mm]")
+    return _panels(factors, draw, f"RMS of each trial's own fit [{screen.unit}]")
 
 
 def performance(found: Identification) -> str:
     """RMS of the combined model by each factor (the paper's Fig. 7); empty without factors."""
-    levels = {one.factor: one.levels for one in found.performance}
+    levels, screen = {one.factor: one.levels for one in found.performance}, SCREEN[found.kind]
+    tolerance = found.tolerance * screen.scale
 
     def draw(axes: Axes, factor: str) -> None:
         _levels(axes, levels[factor], colours.ESTIMATE, "combined model", 0.0)
         top = max(level.mean + 2.0 * (level.sd or 0.0) for level in levels[factor])
-        if found.tolerance * MM < 3.0 * top:
-            axes.axhline(found.tolerance * MM, color=colours.REJECTED, lw=0.8, ls="--")
+        if tolerance < 3.0 * top:
+            axes.axhline(tolerance, color=colours.REJECTED, lw=0.8, ls="--")
         axes.set_ylim(bottom=0.0)
 
-    return _panels(levels, draw, "RMS of the combined model [mm]")
+    return _panels(levels, draw, f"RMS of the combined model [{screen.unit}]")
 
 
 def valleys(found: Identification, trials: StepTrials) -> tuple[str, list[str]]:
@@ -142,14 +146,16 @@ def valleys(found: Identification, trials: StepTrials) -> tuple[str, list[str]]:
 
 def verification(verified: AxisVerification, trace: Trace) -> str:
     """Measured and modelled position, without means: the first second in detail (the paper's Figs. 8 and 9)."""
+    screen = SCREEN[verified.kind]
     with drawing(1, width=9.0) as canvas:
         axes = canvas.axes[0]
         shown = trace.time <= trace.time[0] + _SECONDS
-        axes.plot(trace.time[shown], trace.measured[shown] * MM, color=colours.REFERENCE, lw=1.0, label="measured")
-        axes.plot(trace.time[shown], trace.modelled[shown] * MM, "--", color=colours.ESTIMATE, lw=1.2, label="model")
+        time, scale = trace.time[shown], screen.scale
+        axes.plot(time, trace.measured[shown] * scale, color=colours.REFERENCE, lw=1.0, label="measured")
+        axes.plot(time, trace.modelled[shown] * scale, "--", color=colours.ESTIMATE, lw=1.2, label="model")
         axes.set_title(f"{verified.run}: {verified.axis}, {verified.source}", loc="left")
         axes.set_xlabel("time since the first command [s]")
-        axes.set_ylabel("position without its mean [mm]")
+        axes.set_ylabel(f"position without its mean [{screen.unit}]")
         axes.legend(frameon=False, ncols=2, loc="upper right")
         return canvas.svg()
 

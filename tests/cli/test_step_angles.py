@@ -1,0 +1,198 @@
+"""`pumafuse identify`, `verify` and `plan` by the executable on joints: angles in degrees, also beside a length."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from executable import names, pumafuse, refused
+
+DEGREE = math.pi / 180.0
+PERIOD, DELAY, SLOPE, INTERCEPT, NOISE = 0.02, 0.05, 0.1, 0.93, 0.002  # s, s, s/rad, 1, degrees
+PLANTS = {
+    "shoulder": pf.FirstOrder(time_constant=0.04),
+    "wrist": pf.SecondOrder(natural_frequency=60.0, damping=0.9),
+}
+TICKS = np.arange(300)
+SAMPLED = np.arange(0.0, 6.2, 0.004)  # s
+RAIL = '[axes.rail]\nplant = "first-order"\ntime_constant_ms = 40.0\n'
+
+
+def gain(step: float) -> float:
+    """K of a step in degrees."""
+    return SLOPE * abs(step) * DEGREE / PERIOD + INTERCEPT
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign in degrees, and the arm identified from it."""
+    made, rng, times = tmp_path_factory.mktemp("joints"), np.random.default_rng(3), np.arange(-4, 60) * 0.005
+    (made / "steps").mkdir()
+    listed, sampled = ["trial,axis,step_deg,speed_deg_s"], ["trial,time_s,position_deg"]
+    for axis, plant in PLANTS.items():
+        for step in (0.2, -0.5, 1.0, -2.0) * 3:
+            listed.append(f"{len(listed)},{axis},{step},{abs(step) / PERIOD}")
+            answer = plant.step_response(times - DELAY - 0.002 * rng.standard_normal())
+            position = gain(step) * step * answer + NOISE * rng.standard_normal(len(times))
+            rows = zip(times.tolist(), position.tolist(), strict=True)
+            sampled += [f"{len(listed) - 1},{time:.4f},{value:.6f}" for time, value in rows]
+    (made / "steps" / "trials.csv").write_text("\n".join(listed) + "\n")
+    (made / "steps" / "samples.csv").write_text("\n".join(sampled) + "\n")
+    options = ("--tolerance", 0.2, "--report", made / "page", "--json")
+    done = pumafuse("identify", made / "steps", "-o", made / "arm.toml", *options)
+    assert done.stderr == ""
+    (made / "found.json").write_text(done.stdout)
+    return made
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path) -> Path:
+    """White noise of 1 degree on the joints from 30 and -10 degrees, and of 4 mm on a rail, superposed by hand."""
+    made, rng = folder / "run", np.random.default_rng(8)
+    made.mkdir()
+    commands, measured, time = {"time_s": TICKS * PERIOD}, {"time_s": SAMPLED}, TICKS * PERIOD
+    axes = {**dict.fromkeys(PLANTS, (1.0, "deg")), "rail": (4.0, "mm")}
+    for (axis, (size, unit)), start in zip(axes.items(), (30.0, -10.0, 500.0), strict=True):
+        command = start + size * rng.integers(0, 2, len(TICKS))
+        command[:2] = start + size, start
+        plant = PLANTS.get(axis, pf.FirstOrder(time_constant=0.04))
+        position = np.full(len(SAMPLED), start)
+        for at, step in zip(time, np.diff(command, prepend=start), strict=True):
+            factor = 1.0 if axis == "rail" else gain(step)
+            position += factor * step * plant.step_response(SAMPLED - at - DELAY)
+        commands[f"{axis}_{unit}"] = command
+        measured[f"{axis}_{unit}"] = position + 10.0 * NOISE * rng.standard_normal(len(SAMPLED))
+    for name, columns in (("commands", commands), ("encoder", measured)):
+        rows = [",".join(f"{value:.9g}" for value in row) for row in zip(*columns.values(), strict=True)]
+        (made / f"{name}.csv").write_text("\n".join([",".join(columns), *rows]) + "\n")
+    columns = 'time = "time_s"\nshoulder = "shoulder_deg"\nwrist = "wrist_deg"\nrail = "rail_mm"\n'
+    tables = f'[command]\nfile = "commands.csv"\n{columns}\n[sensors.encoder]\nfile = "encoder.csv"\n{columns}'
+    (made / "run.toml").write_text(f'name = "noise"\n\n{tables}')
+    arm = (folder / "arm.toml").read_text().replace("[axes.shoulder]", f"{RAIL}\n[axes.shoulder]", 1)
+    (folder / "mixed.toml").write_text(arm)
+    return made
+
+
+def test_the_joints_are_the_true_ones(folder: Path) -> None:
+    """Order, plant, delay and the gain's line, each within twice its interval, from the file that was written."""
+    arm = pf.ArmModel.load(folder / "arm.toml")
+    assert (list(arm.axes), arm.update_period) == (["shoulder", "wrist"], 0.02)
+    for axis, model in arm.axes.items():
+        assert (model.kind, type(model.plant)) == ("angle", type(PLANTS[axis]))
+        pairs = [(DELAY, arm.delay, arm.delay_ci95), (SLOPE, model.gain.slope, model.gain.slope_ci95)]
+        pairs += [(INTERCEPT, model.gain.intercept, model.gain.intercept_ci95)]
+        for name in PLANTS[axis].__struct_fields__:
+            if not name.endswith("_ci95"):
+                pairs.append((getattr(PLANTS[axis], name), *(getattr(model.plant, n) for n in (name, f"{name}_ci95"))))
+        for truth, value, (low, high) in pairs:
+            assert abs(value - truth) <= high - low < 0.2 * truth
+    assert arm.validity.max_angular_speed == pytest.approx(100.0 * DEGREE, rel=1e-9)
+    assert "max_speed_deg_s = 100.0\n" in (folder / "arm.toml").read_text()
+
+
+def test_json_and_page_are_in_degrees(folder: Path) -> None:
+    """The noise is found in the RMS, steps and speeds are as listed, the tolerance as given."""
+    found = json.loads((folder / "found.json").read_text())
+    assert found["tolerance_deg"] == 0.2
+    for trial in found["trials"]:
+        assert trial["speed_deg_s"] == pytest.approx(abs(trial["step_deg"]) / PERIOD, rel=1e-9)
+        assert trial["second"]["rms_deg"] == pytest.approx(NOISE, rel=0.4)
+    assert "step, deg" in (folder / "page" / "report.html").read_text()
+
+
+def test_the_terminal_says_units_of_angles(folder: Path, tmp_path: Path) -> None:
+    """Also of the gain's line, in brackets that are no markup; without --tolerance it is 0.1 degrees."""
+    shown = pumafuse("identify", folder / "steps", "-o", tmp_path / "arm.toml").stdout
+    assert "[rad/s]" in shown and "RMS, deg" in shown and " mm" not in shown
+    assert "within 0.1 deg at every level tried" in shown
+
+
+def test_verify_shows_each_axis_in_its_unit(folder: Path, run: Path, tmp_path: Path) -> None:
+    """A table for the rail and one for the joints, on the page too, with the numbers of the JSON: the noise is left."""
+    options = ("verify", run, "--arm", folder / "mixed.toml", "--start", "wrist=-10", "--start", "rail=500")
+    found = {one["axis"]: one for one in json.loads(pumafuse(*options, "--json").stdout)}
+    assert {axis: one["kind"] for axis, one in found.items()} == {
+        "shoulder": "angle",
+        "wrist": "angle",
+        "rail": "length",
+    }
+    units = {"shoulder": "deg", "wrist": "deg", "rail": "mm"}
+    shown = pumafuse(*options, "--report", tmp_path / "page").stdout
+    assert shown.index("RMS, mm") < shown.index(" rail ") < shown.index("RMS, deg") < shown.index(" shoulder ")
+    for axis, one in found.items():
+        unit = units[axis]
+        rms, best = one["model"][f"rms_{unit}"], one["best_in_class"]["fit"][f"rms_{unit}"]
+        assert rms == pytest.approx(10.0 * NOISE, rel=0.1)
+        assert one[f"amplitude_{unit}"] == pytest.approx({"deg": 1.0, "mm": 4.0}[unit])
+        (line,) = [line.split() for line in shown.splitlines() if f" {axis} " in line and "encoder" in line]
+        assert {f"{rms:.3f}", f"{best:.3f}"} <= set(line)
+        assert f"start level {one[f'start_{unit}']:g} {unit} ({one['start_from']})" in shown
+        assert not any(key.endswith({"deg": "_mm", "mm": "_deg"}[unit]) for key in one)
+    assert [found[axis]["start_from"] for axis in ("wrist", "rail")] == ["given", "given"]
+    assert (found["wrist"]["start_deg"], found["rail"]["start_mm"]) == (-10.0, 500.0)
+    assert found["shoulder"]["start_deg"] == pytest.approx(30.0)
+    page = (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
+    assert page.count("<th>RMS, mm</th>") == page.count("<th>RMS, deg</th>") == 1
+    figures = [page.count(f"position without its mean [{unit}]") for unit in ("mm", "deg")]
+    assert figures[1] == 2 * figures[0] > 0
+
+
+def test_fuse_takes_the_arm_with_both_kinds(folder: Path, run: Path, tmp_path: Path) -> None:
+    """The identified joints beside the rail: estimates of each in its unit."""
+    (tmp_path / "fusion.toml").write_text(
+        f'arm = "{folder / "mixed.toml"}"\n[sensors.encoder]\nsd_mm = 0.02\nsd_deg = 0.02\n'
+    )
+    pumafuse("fuse", run, "-c", tmp_path / "fusion.toml", "-o", tmp_path / "out")
+    used = pf.ArmModel.load(tmp_path / "out" / "arm.toml")
+    assert used.axes == pf.ArmModel.load(folder / "mixed.toml").axes
+    axes = json.loads((tmp_path / "out" / "summary.json").read_text())["axes"]
+    assert axes["shoulder"]["sensors"]["encoder"]["innovation_rms_deg"] < 0.2
+    assert axes["rail"]["sensors"]["encoder"]["innovation_rms_mm"] < 0.2
+
+
+def test_plan_for_joints_is_in_degrees(folder: Path, tmp_path: Path) -> None:
+    """Steps of speed times period, files by degrees; what identify reads, of the kind of the arm."""
+    plan = tmp_path / "plan"
+    done = pumafuse("plan", "-o", plan, "--arm", folder / "arm.toml", "--speeds", "15,45", "--noise", "0.5")
+    assert done.stderr == ""
+    joints = {f"white-noise-{axis}-0.5deg.csv" for axis in PLANTS}
+    assert names(plan) == {"trials.csv", "steps.csv", *joints}
+    lines = [line.replace('"', "").split(",") for line in (plan / "trials.csv").read_text().splitlines()]
+    assert lines[0] == ["trial", "axis", "step_deg", "speed_deg_s", "replicate"]
+    assert sorted(tuple(line[2:4]) for line in lines[1:]) == [("0.3", "15")] * 4 + [("0.9", "45")] * 4
+    steps = (plan / "steps.csv").read_text().splitlines()
+    assert steps[0].replace('"', "") == "trial,tick,time_s,shoulder_deg,wrist_deg"
+    assert {float(cell) for row in steps[1:] for cell in row.split(",")[3:]} == {0.0, 0.3, 0.9}
+    pumafuse("plan", "-o", tmp_path / "default", "--arm", folder / "arm.toml", "--axes", "wrist")
+    assert "white-noise-wrist-0.4deg.csv" in names(tmp_path / "default")
+
+
+def test_plan_warns_in_degrees(folder: Path, tmp_path: Path) -> None:
+    """Of the arm's limit and of one that is given; of steps in a wrong unit, which no joint makes."""
+    plan = ("plan", "--arm", folder / "arm.toml", "--noise", "0.5", "-o")
+    beyond = pumafuse(*plan, tmp_path / "a", "--speeds", "50,110").stderr
+    assert beyond == "warning: commanded speeds reach 110 deg/s, the limit is 100 deg/s\n"
+    given = pumafuse(*plan, tmp_path / "b", "--speeds", "15,45", "--max-speed", 40).stderr
+    assert given == "warning: commanded speeds reach 45 deg/s, the limit is 40 deg/s\n"
+    wrong = pumafuse(*plan, tmp_path / "c", "--speeds", "50,5000").stderr
+    assert "steps are 100 deg at most, 5e+03 deg/s at T; is a unit wrong?" in wrong
+
+
+def test_what_mixes_kinds_is_refused_in_a_line(folder: Path, run: Path, tmp_path: Path) -> None:
+    """Axes of both kinds in one plan, steps in degrees with positions in mm, a level of no axis; nothing is written."""
+    mixed = ("plan", "-o", tmp_path / "plan", "--arm", folder / "mixed.toml")
+    assert "is a length" in (line := refused(*mixed)) and line.endswith("plan a campaign for each, with --axes")
+    assert "speeds must make steps of 0.0001 deg to 360 deg" in refused(*mixed, "--axes", "wrist", "--speeds", "1e6")
+    (tmp_path / "half").mkdir()
+    (tmp_path / "half" / "trials.csv").write_bytes((folder / "steps" / "trials.csv").read_bytes())
+    text = (folder / "steps" / "samples.csv").read_text().replace("position_deg", "position_mm")
+    (tmp_path / "half" / "samples.csv").write_text(text)
+    line = refused("identify", tmp_path / "half", "-o", tmp_path / "arm.toml")
+    assert "position_mm is of a length, step_deg of an angle" in line
+    assert "unknown axis 'elbow'" in refused("verify", run, "--arm", folder / "mixed.toml", "--start", "elbow=3")
+    assert names(tmp_path) == {"half"}

@@ -1,0 +1,73 @@
+"""The real executable on a log that somebody got wrong: one line, exit code 1, no folder; or a warning before all."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from executable import pumafuse, refused
+
+MY_RUN = Path(__file__).parents[2] / "examples/my-run"
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(MY_RUN, tmp_path / "log"))
+
+
+def edit(path: Path, *changes: tuple[str, str]) -> None:
+    text = path.read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text, encoding="utf-8")
+
+
+def fuse(log: Path) -> tuple[object, ...]:
+    return "fuse", log, "-c", log / "fusion.toml", "-o", log / "result"
+
+
+WRONG = {
+    "m called mm": ("robot.csv", [("_target_m", "_target_mm")], ["moves 1000 times", "mm called m"]),
+    "us called ns": ("robot.csv", [("stamp_us", "stamp_ns")], ["every 2.8e-05 s", "us that are called ns"]),
+    "camera's us called ms": ("camera.csv", [("arrived_us", "arrived_ms")], ["camera.csv", "2110"]),
+    "misspelt": ("run.toml", [("sensors.camera", "sensors.camra")], ["'camra' has 913 unknown", "'camera'"]),
+    "another year": ("camera.csv", [("\n179", "\n176")], ["nothing was fused", "'camera' has 913 before_start"]),
+}
+
+
+@pytest.mark.parametrize(("name", "changes", "words"), WRONG.values(), ids=WRONG.keys())
+def test_what_would_be_wrong_by_construction_is_refused(
+    log: Path, name: str, changes: list[tuple[str, str]], words: list[str]
+) -> None:
+    """In one line that names what is wrong; nothing is written."""
+    for table in ("run.toml", name) if name != "run.toml" else ("run.toml",):
+        text = (log / table).read_text(encoding="utf-8")
+        edit(log / table, *[(old, new) for old, new in changes if old in text])
+    line = refused(*fuse(log))
+    assert all(word in line for word in words), line
+    assert not (log / "result").exists()
+
+
+def test_what_is_inferred_is_told_before_the_result_and_kept_in_it(log: Path) -> None:
+    """Exchanged columns: the first warning, the first note of the summary, exit code 0."""
+    edit(log / "run.toml", ('tangential = "x_mm"', 'tangential = "z_mm"'), ('vertical = "z_mm"', 'vertical = "x_mm"'))
+    done = pumafuse(*fuse(log))
+    first, summary = done.stderr.splitlines()[0], json.loads((log / "result/summary.json").read_text(encoding="utf-8"))
+    assert "are its columns exchanged in run.toml?" in first and summary["notes"][0] in first
+
+
+def test_rows_that_are_left_out_are_on_the_screen_and_in_json(log: Path) -> None:
+    """Only where there are any; also in what compare prints."""
+    assert "left out" not in pumafuse(*fuse(log)).stdout
+    lines = (log / "camera.csv").read_text(encoding="utf-8").splitlines()
+    lines[10:10] = [lines[9], lines[9].split(",")[0] + ",nan,nan,0.7"]
+    (log / "camera.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    shown = pumafuse(*fuse(log), "--force").stdout
+    assert "left out: 1 duplicate, 1 invalid of 915 camera\n" in shown
+    summary = json.loads((log / "result/summary.json").read_text(encoding="utf-8"))
+    assert summary["commands"] == {"used": 1132}
+    assert summary["rows"]["camera"] == {"fused": 898, "rejected": 15, "duplicate": 1, "invalid": 1}

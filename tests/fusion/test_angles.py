@@ -1,0 +1,395 @@
+"""Axes that are angles: in rad and in degrees the same, mixed with lengths, within a turn, in every file."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pyarrow.parquet as papq
+import pytest
+
+import pumafuse as pf
+from executable import pumafuse
+from pumafuse.cli.tables import outcome_table
+from pumafuse.fusion import results
+from pumafuse.live.stream import Stream
+from pumafuse.units import of_kind
+
+DEG = math.pi / 180.0
+T = 0.02
+ARM = """
+name = "bench"
+update_period_ms = 20.0
+delay_ms = 30.0
+[validity]
+max_speed_{fast} = 1000.0
+[axes.a]
+{kind}plant = "second-order"
+natural_frequency_rad_s = 40.0
+damping = 0.9
+gain = {{ slope_s_{si} = 0.1, intercept = 0.97 }}
+gain_recovery_ms = 120.0
+[axes.b]
+{kind}plant = "first-order"
+time_constant_ms = 50.0
+"""
+FUSION = """
+arm = "arm.toml"
+[start]
+offset_sd_{u} = 2.0
+[process]
+input_noise_{u}_rtHz = 0.1
+drift_{u}_rts = 0.3
+[process.b]
+maneuver_noise_{u}_rtHz_per_{fast} = {per_fast}
+disturbance_sd_{u} = 0.4
+disturbance_time_ms = 200.0
+[sensors.eye]
+sd_{u} = {{ a = 0.2, b = 0.3 }}
+latency_ms = 15.0
+latency_sd_ms = 2.0
+bias_sd_{u} = 1.0
+gate = 4.0
+gate_rows = true
+[sensors.gauge]
+sd_{u} = 0.1
+bias_drift_sd_{u} = 0.2
+bias_time_s = 3.0
+"""
+
+
+def motion(rows: int, seed: int = 3) -> np.ndarray:
+    """Commands that go to and fro, in the unit of the file."""
+    rng = np.random.default_rng(seed)
+    return np.round(20.0 * np.sin(np.arange(rows) * T * 2.0) + np.cumsum(rng.normal(0.0, 0.05, rows)), 6)
+
+
+def write_run(folder: Path, unit: str, values: float = 1.0, rows: int = 300) -> None:
+    """A run with two sensors and a reference, whose numbers are ``values`` times those of degrees."""
+    rng, time = np.random.default_rng(7), np.arange(rows) * T
+    u = motion(rows)
+    columns = {"a": u, "b": 0.5 * u}
+
+    def table(name: str, at: np.ndarray, sd: float) -> None:
+        head = ",".join(["time_s", *(f"{axis}_{unit}" for axis in columns)])
+        noisy = {
+            axis: np.interp(at - 0.08, time, value) + rng.normal(0.0, sd, len(at)) for axis, value in columns.items()
+        }
+        body = [
+            ",".join([repr(float(at[n])), *(repr(float(np.round(part[n], 6) * values)) for part in noisy.values())])
+            for n in range(len(at))
+        ]
+        (folder / f"{name}.csv").write_text("\n".join([head, *body, ""]))
+
+    table("commands", time + 0.08, 0.0)
+    table("eye", np.arange(10, 560) * 0.01, 0.2)
+    table("gauge", np.arange(10, 200) * 0.03, 0.1)
+    table("truth", time + 0.001, 0.02)
+    sources = [("command", "commands"), ("sensors.eye", "eye"), ("sensors.gauge", "gauge"), ("reference", "truth")]
+    text = "".join(
+        f'[{key}]\nfile = "{name}.csv"\ntime = "time_s"\na = "a_{unit}"\nb = "b_{unit}"\n' for key, name in sources
+    )
+    (folder / "run.toml").write_text(text)
+
+
+def write_config(folder: Path, angle: bool) -> None:
+    """The same arm and filter, with each mm for a degree."""
+    fast, si = ("deg_s", "rad") if angle else ("m_s", "m")
+    kind = 'kind = "angle"\n' if angle else ""
+    per_fast = 0.3 / 1000.0 if angle else 0.3
+    slope_per_unit = 0.1 / DEG if angle else 0.1 * 1e3  # s per rad, so that a degree does what a mm does
+    arm = ARM.format(fast=fast, si=si, kind=kind).replace(
+        f"slope_s_{si} = 0.1", f"slope_s_{si} = {slope_per_unit * 1e-3!r}"
+    )
+    (folder / "arm.toml").write_text(arm)
+    (folder / "fusion.toml").write_text(FUSION.format(u="deg" if angle else "mm", fast=fast, per_fast=per_fast))
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One run in mm, in degrees, in rad and in mrad, each with arm and configuration."""
+    found: dict[str, Path] = {}
+    for unit, values in {"mm": 1.0, "deg": 1.0, "rad": DEG, "mrad": 1e3 * DEG}.items():
+        found[unit] = tmp_path_factory.mktemp(unit)
+        write_run(found[unit], unit, values)
+        write_config(found[unit], unit != "mm")
+    return found
+
+
+def quiet(run: pf.Run, config: pf.FusionConfig, **options: Any) -> pf.Estimates:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        return pf.fuse(run, config, **options)
+
+
+def fused(folder: Path, **options: Any) -> pf.Estimates:
+    return quiet(pf.Run.read(folder), pf.FusionConfig.load(folder / "fusion.toml"), **options)
+
+
+@pytest.mark.parametrize("mode", [{}, {"as_live": True}, {"smooth": True}, {"engine": "filterpy"}])
+def test_rad_and_degrees_give_the_same(folders: dict[str, Path], mode: dict[str, Any]) -> None:
+    """Position and sd to 1e-9 of a standard deviation, whichever unit the columns have."""
+    degrees = fused(folders["deg"], **mode)
+    for unit in ("rad", "mrad"):
+        other = fused(folders[unit], **mode)
+        for axis in "ab":
+            sd = degrees[axis].position_sd
+            assert np.max(np.abs(other[axis].position - degrees[axis].position) / sd) < 1e-9
+            assert np.max(np.abs(other[axis].position_sd / sd - 1.0)) < 1e-9
+
+
+def test_an_angle_is_filtered_like_a_length(folders: dict[str, Path]) -> None:
+    """With each mm for a degree, every estimate and every innovation is the same number in its own unit."""
+    length, angle = fused(folders["mm"]), fused(folders["deg"])
+    for axis in "ab":
+        for name in pf.AxisEstimate.FIELDS:
+            inside, wanted = getattr(angle[axis], name) / DEG, getattr(length[axis], name) * 1e3
+            np.testing.assert_allclose(inside, wanted, rtol=1e-8, atol=1e-9)
+    assert (angle.measurements.outcome == length.measurements.outcome).all()
+    np.testing.assert_allclose(angle.measurements.nis, length.measurements.nis, rtol=1e-7)
+
+
+def test_files_and_screens_have_the_units_of_the_axis(folders: dict[str, Path], tmp_path: Path) -> None:
+    """Tables, summary, configuration and screen of an angle say deg, with the numbers that mm have for a length."""
+    shown: dict[str, str] = {}
+    for unit in ("mm", "deg"):
+        given = ["fuse", folders[unit], "-c", folders[unit] / "fusion.toml", "-o", tmp_path / unit, "--figures"]
+        shown[unit] = pumafuse(*given).stdout
+    words = {unit: re.sub(r"─+|\S*/\S*", "", text).replace("deg", "mm").split() for unit, text in shown.items()}
+    assert words["deg"][1:] == words["mm"][1:]  # but for the run's name
+    for file in ("estimates", "measurements", "reference"):
+        tables = {unit: papq.read_table(tmp_path / unit / f"{file}.parquet") for unit in shown}
+        names = [of_kind(name, "angle") for name in tables["mm"].column_names]
+        assert tables["deg"].column_names == names
+        for one, other in zip(tables["mm"].columns, tables["deg"].columns, strict=True):
+            if str(one.type) == "double":
+                np.testing.assert_allclose(one.to_numpy(), other.to_numpy(), rtol=1e-7, atol=1e-9)
+    summaries = {unit: json.loads((tmp_path / unit / "summary.json").read_text()) for unit in shown}
+    length, angle = (summaries[unit]["axes"]["a"] for unit in shown)
+    assert angle["kind"] == "angle" and length["kind"] == "length"
+    assert angle["score"]["rmse_deg"] == pytest.approx(length["score"]["rmse_mm"], rel=1e-8)
+    assert angle["score"]["velocity_rmse_deg_s"] == pytest.approx(length["score"]["velocity_rmse_mm_s"], rel=1e-8)
+    for one, key in ((length, "_mm"), (angle, "_deg")):
+        eye = one["sensors"]["eye"]
+        assert {f"innovation_rms{key}", f"innovation_sd{key}", f"bias{key}", f"bias_sd{key}"} <= set(eye)
+        assert set(eye["skill"]["filter"]) == {f"rms{key}", f"median{key}"}
+    assert summaries["deg"]["validity"]["commanded_speed_deg_s"] > 10.0
+    assert summaries["deg"]["validity"]["commanded_speed_m_s"] is None
+    result = results.read(tmp_path / "deg")
+    again = result.scores(result.reference)
+    assert again["a"].rmse_deg == pytest.approx(angle["score"]["rmse_deg"], rel=1e-9)
+    assert pf.FusionConfig.load(tmp_path / "deg" / "fusion.toml") == fused(folders["deg"]).config
+    compared = json.loads(pumafuse("compare", tmp_path / "deg", tmp_path / "mm", "--json").stdout)
+    assert compared[0]["axes"]["a"]["rmse_deg"] == pytest.approx(compared[1]["axes"]["a"]["rmse_mm"], rel=1e-8)
+
+
+def test_the_wire_is_in_degrees_and_a_record_reads_back(folders: dict[str, Path]) -> None:
+    """Lines give and get degrees; the estimates are those of the recorded run."""
+    config, lines = pf.FusionConfig.load(folders["deg"] / "fusion.toml"), list[bytes]()
+    stream = Stream(pf.LiveEstimator(config), lines.extend, print)
+    stream.take([json.dumps({"t": n * T, "command": {"a": 3.0 * n, "b": 1.0}}).encode() for n in range(60)])
+    last = json.loads(lines[-1])
+    assert set(last["a"]) == {"position_deg", "sd_deg", "velocity_deg_s"}
+    assert last["a"]["velocity_deg_s"] == pytest.approx(3.0 / T, rel=0.2)
+    assert last["a"]["position_deg"] == pytest.approx(stream.live.estimate(59 * T)["a"].position / DEG, rel=1e-14)
+
+
+MIXED = """
+name = "both"
+update_period_ms = 20.0
+delay_ms = 30.0
+[axes.x]
+plant = "first-order"
+time_constant_ms = 50.0
+[axes.yaw]
+kind = "angle"
+plant = "first-order"
+time_constant_ms = 40.0
+"""
+BOTH = """
+arm = "arm.toml"
+[process]
+input_noise_mm_rtHz = 0.5
+input_noise_deg_rtHz = 0.7
+[sensors.camera]
+sd_mm = 0.3
+sd_deg = 0.1
+bias_sd_deg = 2.0
+turn_deg = 360.0
+"""
+
+
+def mixed(folder: Path, turns: float = 0.0) -> tuple[pf.Run, pf.FusionConfig]:
+    """An arm with x and yaw, and a camera that sees both; yaw goes round, measured within a turn or not."""
+    (folder / "arm.toml").write_text(MIXED)
+    (folder / "fusion.toml").write_text(BOTH)
+    rng, time = np.random.default_rng(11), np.arange(400) * T
+    x, yaw = 30.0 * np.sin(time), 150.0 + 60.0 * time
+    seen = np.interp(time - 0.09, time, yaw) + rng.normal(0.0, 0.1, 400)
+    if turns:
+        seen = (seen + 180.0) % 360.0 - 180.0
+    run = pf.Run.from_arrays(
+        time,
+        {"x": x / 1e3, "yaw": yaw * DEG},
+        {
+            "camera": (
+                time + 0.003,
+                {"x": (np.interp(time - 0.08, time, x) + rng.normal(0.0, 0.3, 400)) / 1e3, "yaw": seen * DEG},
+            )
+        },
+        reference=(time, {"x": x / 1e3, "yaw": yaw * DEG}),
+    )
+    return run, pf.FusionConfig.load(folder / "fusion.toml")
+
+
+def test_one_run_may_have_both(tmp_path: Path) -> None:
+    """Columns, keys and tables of each axis are in its own unit, and a configuration reads back."""
+    run, config = mixed(tmp_path)
+    est = quiet(run, config)
+    summary = results.write(est, tmp_path / "out", force=False)
+    table = papq.read_table(tmp_path / "out" / "measurements.parquet").to_pydict()
+    by_axis = {axis: [n for n, one in enumerate(table["axis"]) if one == axis] for axis in ("x", "yaw")}
+    assert all(table["value_deg"][n] is None and table["value_mm"][n] is not None for n in by_axis["x"])
+    assert all(table["value_mm"][n] is None and table["value_deg"][n] is not None for n in by_axis["yaw"])
+    assert {"x.position_mm", "yaw.position_deg"} <= set(
+        papq.read_table(tmp_path / "out" / "estimates.parquet").column_names
+    )
+    assert [len(outcome_table(summary, kind).rows) for kind in ("length", "angle")] == [1, 1]
+    assert pf.FusionConfig.load(tmp_path / "out" / "fusion.toml") == config
+    assert config.sensors["camera"].sd == {"x": 0.3e-3, "yaw": pytest.approx(0.1 * DEG)}
+    assert config.process["yaw"].input_noise == pytest.approx(0.7 * DEG)
+    assert config.start.offset_sd_of("yaw") == pytest.approx(5.0 * DEG)
+    assert results.read(tmp_path / "out").summary.axes["yaw"].score == summary.axes["yaw"].score
+
+
+@pytest.mark.parametrize("mode", [{}, {"as_live": True}, {"smooth": True}, {"engine": "filterpy"}])
+def test_a_sensor_within_a_turn_is_as_good_as_one_that_counts_them(tmp_path: Path, mode: dict[str, Any]) -> None:
+    """Estimates are those of the same measurements without the jumps by 360°, and so is the skill."""
+    whole, within = (quiet(*mixed(tmp_path, turns), **mode) for turns in (0.0, 1.0))
+    assert np.ptp(within.measurements.of("camera", "yaw").value) <= 360.0 * DEG < np.ptp(within["yaw"].position)
+    sd = whole["yaw"].position_sd
+    assert np.max(np.abs(within["yaw"].position - whole["yaw"].position) / sd) < 1e-8
+    assert (within.measurements.outcome == 0).all()
+    one, other = (pf.summarise(est).axes["yaw"].sensors["camera"].skill for est in (whole, within))
+    assert one is not None and other is not None
+    for mine, its in zip(msgspec.structs.astuple(one)[1:], msgspec.structs.astuple(other)[1:], strict=True):
+        assert its.rms == pytest.approx(mine.rms, rel=1e-6)
+    shown = within.measured_positions("camera", "yaw").value
+    np.testing.assert_allclose(shown, whole.measured_positions("camera", "yaw").value, atol=1e-9)
+
+
+def test_two_rejected_measurements_on_both_sides_of_the_turn_agree(tmp_path: Path) -> None:
+    """A slip by about half a turn is seen as +179.5° and −179.5°: one degree apart, so the second is believed."""
+    _, config = mixed(tmp_path)
+    time = np.arange(100) * T
+    yaw = np.full(100, 10.0)
+    seen = yaw.copy()
+    seen[50:] = np.where(np.arange(50) % 2, -169.7, 189.7)  # one direction, logged in two ways
+    still = pf.Run.from_arrays(time, {"x": 0.0 * time, "yaw": yaw * DEG}, {"camera": (time, {"yaw": seen * DEG})})
+    sensor = msgspec.structs.replace(config.sensors["camera"], gate=5.0, bias_sd=0.0, sd=0.5 * DEG)
+    config = msgspec.structs.replace(config, sensors={"camera": sensor})
+    for engine in ("compiled", "filterpy"):
+        est = quiet(still, config, engine=engine)
+        outcome = est.measurements.of("camera", "yaw").outcome
+        assert outcome[50:53].tolist() == [int(pf.Outcome.REJECTED), int(pf.Outcome.REACQUIRED), int(pf.Outcome.FUSED)]
+
+
+def test_an_encoder_for_each_axis_is_gated_apart(tmp_path: Path) -> None:
+    """A sensor of angles alone rejects one axis, one of lengths the row, unless the configuration says otherwise."""
+    _, config = mixed(tmp_path)
+    for sd, gate_rows, wanted in (
+        ({"yaw": 1e-3}, None, False),
+        ({"x": 1e-3}, None, True),
+        (1e-3, None, True),
+        ({"yaw": 1e-3}, True, True),
+        (1e-3, False, False),
+    ):
+        assert pf.Sensor(sd=sd, gate_rows=gate_rows).gates_rows(config.arm) is wanted
+
+
+def test_tune_says_the_keys_of_an_angle(folders: dict[str, Path]) -> None:
+    """Parameters have the names that files of an angle have, and the numbers that mm have for a length."""
+    found = {}
+    for unit in ("mm", "deg"):
+        folder = folders[unit]
+        config = pf.FusionConfig.load(folder / "fusion.toml")
+        run = pf.Run.read(folder)
+        fixed = ["disturbance_sd_mm", "gauge"] if unit == "mm" else ["disturbance_sd_deg", "gauge"]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", pf.PumafuseWarning)
+            tuned = pf.tune([run], config, fit=["noise", "delay"], fix=fixed, sd_prior=False)
+        found[unit] = json.loads(tuned.to_json())
+    length, angle = found["mm"], found["deg"]
+    assert [one["key"] for one in angle["parameters"]] == [
+        ".".join(of_kind(part, "angle") for part in one["key"].split(".")) for one in length["parameters"]
+    ]
+    assert "sensors.eye.sd_deg.a" in [one["key"] for one in angle["parameters"]]
+    for one, other in zip(length["parameters"], angle["parameters"], strict=True):
+        if one["key"].endswith("sd_mm.a") or one["key"].endswith("delay_ms"):
+            assert other["value"] == pytest.approx(one["value"], rel=0.02)
+    assert {bias["axis"]: f"{bias['bias_deg']:.2f}" for bias in angle["biases"]} == {
+        bias["axis"]: f"{bias['bias_mm']:.2f}" for bias in length["biases"]
+    }
+
+
+WRONG = {
+    "sd of lengths": (
+        ("sd_deg = { a", "sd_mm = { a"),
+        "sensors.eye.sd_mm: no axis of the arm is an angle|sensors.eye.sd_mm.*give sd_deg",
+    ),
+    "process of lengths": (
+        ("input_noise_deg_rtHz", "input_noise_mm_rtHz"),
+        "input_noise_mm_rtHz.*input_noise_deg_rtHz",
+    ),
+    "one axis's key of lengths": (
+        ("disturbance_sd_deg", "disturbance_sd_mm"),
+        "process.b.disturbance_sd_mm.*disturbance_sd_deg",
+    ),
+    "start of lengths": (("offset_sd_deg", "offset_sd_mm"), "start.offset_sd_mm.*offset_sd_deg"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_unit_of_the_other_kind_is_refused_with_the_right_one(
+    folders: dict[str, Path], case: str, tmp_path: Path
+) -> None:
+    """One line that names the key and the one to give."""
+    (old, new), message = WRONG[case]
+    (tmp_path / "arm.toml").write_text((folders["deg"] / "arm.toml").read_text())
+    text = (folders["deg"] / "fusion.toml").read_text()
+    assert old in text
+    (tmp_path / "fusion.toml").write_text(text.replace(old, new))
+    with pytest.raises(pf.ConfigError, match=message) as caught:
+        pf.FusionConfig.load(tmp_path / "fusion.toml")
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_columns_of_the_other_kind_are_refused(folders: dict[str, Path], tmp_path: Path) -> None:
+    """A run in mm does not go with an arm of angles, nor a sensor in mm with commands in degrees."""
+    config = pf.FusionConfig.load(folders["deg"] / "fusion.toml")
+    with pytest.raises(pf.RunError, match=r"a is a length, the arm 'bench' says an angle"):
+        quiet(pf.Run.read(folders["mm"]), config)
+    write_run(tmp_path, "deg")
+    for name in ("eye.csv", "run.toml"):
+        text = (tmp_path / name).read_text()
+        (tmp_path / name).write_text(
+            text.replace("a_deg", "a_mm")
+            if name == "eye.csv"
+            else text.replace('"eye.csv"\ntime = "time_s"\na = "a_deg"', '"eye.csv"\ntime = "time_s"\na = "a_mm"')
+        )
+    with pytest.raises(pf.RunError, match=r"column 'a_mm' is a length, but a is an angle elsewhere"):
+        pf.Run.read(tmp_path)
+
+
+def test_a_turn_is_of_angles(folders: dict[str, Path], tmp_path: Path) -> None:
+    """``turn_deg`` of a sensor that measures no angle is refused."""
+    (tmp_path / "arm.toml").write_text((folders["mm"] / "arm.toml").read_text())
+    (tmp_path / "fusion.toml").write_text((folders["mm"] / "fusion.toml").read_text() + "turn_deg = 360\n")
+    with pytest.raises(pf.ConfigError, match=r"sensors\.gauge\.turn_deg: no axis of the arm is an angle"):
+        pf.FusionConfig.load(tmp_path / "fusion.toml")

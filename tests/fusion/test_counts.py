@@ -1,0 +1,133 @@
+"""No row of a log is lost: each source's rows add up to those of its file, by what became of them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+import pumafuse as pf
+from executable import FUSION, SCAN
+from fusion.test_segments import MS, ORIGIN, SECOND, TICK, A, config, crowded_runs, measurements, nan, properties
+from pumafuse.arrays import NO_STAMP
+from pumafuse.fusion.summary import summarise
+
+WORDS = {"fused", "rejected", "reacquired", "duplicate", "before_start", "too_late", "invalid", "unknown"} | {
+    "no_stamp",
+    "stray",
+    "outside",
+    "not_selected",
+}
+OF_COMMANDS = {"used", "duplicate", "repetition", "invalid", "no_stamp", "stray", "outside"}
+
+
+def fused(run: pf.Run, conf: pf.FusionConfig, **how: object) -> pf.Estimates:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        return pf.fuse(run, conf, **how)  # type: ignore[arg-type]
+
+
+@st.composite
+def hostile_commands(draw: st.DrawFn) -> tuple[list[int], dict[str, list[float]]]:
+    """Rows at the same stamps, out of order, stray, without a stamp or a value, that repeat one another."""
+    stamp = st.one_of(
+        st.integers(0, 12).map(lambda step: ORIGIN + step * TICK // 4),
+        st.sampled_from([NO_STAMP, ORIGIN + SECOND * 50, ORIGIN - SECOND * 50]),
+    )
+    value = st.sampled_from([0.0, 0.5, 0.6, nan, 1e9])
+    rows = draw(st.lists(st.tuples(stamp, value, value), min_size=1, max_size=20))
+    return [row[0] for row in rows], {"radial": [row[1] for row in rows], "vertical": [row[2] for row in rows]}
+
+
+@settings(properties, max_examples=60)
+@given(
+    crowded_runs(),
+    hostile_commands(),
+    st.sampled_from([None, ["a"], ["a", "b"]]),
+    st.sampled_from([(None, None), (0.0, 0.05), (0.02, None), (None, 0.03)]),
+    st.booleans(),
+)
+def test_every_row_is_counted_once(
+    case: tuple[pf.Run, pf.FusionConfig],
+    commands: tuple[list[int], dict[str, list[float]]],
+    sensors: list[str] | None,
+    part: tuple[float | None, float | None],
+    as_live: bool,
+) -> None:
+    """Whatever its stamp, whatever part is used, whichever sensors: the counts add up to the rows of the file."""
+    run, conf = case
+    try:
+        run = replace(run, command=pf.Run.from_arrays(*commands).command).between(*part)
+        est = fused(run, conf, sensors=sensors, as_live=as_live)
+    except pf.PumafuseError:
+        assume(False)
+    summary = summarise(est)
+    assert sum(summary.commands.values()) == len(run.command.stamp) and summary.commands.keys() <= OF_COMMANDS
+    assert summary.rows.keys() == run.sensors.keys()
+    for name, counts in summary.rows.items():
+        assert sum(counts.values()) == len(run.sensors[name].stamp), (name, counts)
+        assert min(counts.values()) > 0 and counts.keys() <= WORDS
+
+
+def test_every_reason_by_its_name() -> None:
+    """A row of each kind, of commands and of a sensor; of two axes the better outcome counts."""
+    given_at = [0, 28, 28, 35, 56, 84, 112, 140, 50_000, 168, 196]
+    stamp = [ORIGIN + at * MS for at in given_at] + [NO_STAMP]
+    value = [0.5, 0.51, 0.52, 0.52, nan, 0.53, 0.54, 0.55, 0.56, 0.57, 0.58, 0.59]
+    rows = [(5.0, 0.5), (5.0, 0.5), (-20.0, 0.5), (10.0, nan), (nan, 0.5), (60_000.0, 0.5), (15.0, 0.5), (150.0, 0.5)]
+    rows += [(20.0, 0.5), (25.0, 90.0)]
+    sensors = {"a": measurements(*rows), "stranger": measurements((5.0, 0.5)), "b": measurements((5.0, 0.5))}
+    conf = config(a=msgspec.structs.replace(A, gate=5.0), b=A)
+    run = pf.Run.from_arrays(stamp, {"radial": value}, sensors).between(None, 0.1)
+    est = fused(run, conf)
+    assert est.command_counts == {
+        "used": 3, "duplicate": 1, "repetition": 1, "invalid": 1, "no_stamp": 1, "stray": 1, "outside": 4
+    }  # fmt: skip
+    assert est.counts["a"] == {
+        "fused": 3, "rejected": 1, "duplicate": 1, "before_start": 1, "invalid": 1, "no_stamp": 1, "stray": 1,
+        "outside": 1,
+    }  # fmt: skip
+    assert est.counts["stranger"] == {"unknown": 1} and est.counts["b"] == {"fused": 1}
+    assert fused(run, conf, sensors=["a"]).counts["b"] == {"not_selected": 1}
+
+
+def test_a_row_of_several_axes_counts_by_the_best_of_them() -> None:
+    """One axis of it is enough for the filter."""
+    seen = [ORIGIN + 10 * MS, ORIGIN + 20 * MS], {"radial": [nan, nan], "vertical": [0.5, nan]}
+    run = pf.Run.from_arrays([ORIGIN, ORIGIN + TICK], {"radial": [0.5, 0.5], "vertical": [0.5, 0.5]}, {"a": seen})
+    assert fused(run, config(a=A)).counts["a"] == {"fused": 1, "invalid": 1}
+
+
+def test_rows_of_all_segments_are_added() -> None:
+    """A clock that was set back cuts a run in two: no row falls between."""
+    scan, conf = pf.Run.read(SCAN), pf.FusionConfig.load(FUSION)
+
+    def set_back(_: object, source: object) -> object:
+        half = len(source.stamp) // 2  # type: ignore[attr-defined]
+        stamp = source.stamp.copy()  # type: ignore[attr-defined]
+        stamp[half:] -= 10 * SECOND
+        return replace(source, stamp=stamp)  # type: ignore[type-var]
+
+    run = scan.each(set_back)  # type: ignore[arg-type]
+    est = fused(run, conf)
+    assert len(est.segments) == 2
+    totals: Mapping[str, int] = {name: sum(counts.values()) for name, counts in est.counts.items()}
+    assert totals == {name: len(source.stamp) for name, source in run.sensors.items()}
+    assert sum(est.command_counts.values()) == len(run.command.stamp)
+
+
+@pytest.mark.parametrize("how", [{}, {"smooth": True}, {"as_live": True}, {"engine": "filterpy"}], ids=str)
+def test_counts_agree_with_the_outcomes_of_components(how: dict[str, object]) -> None:
+    """A sensor of one axis: its rows are its components, in every mode of either engine."""
+    scan, conf = pf.Run.read(SCAN).between(0.0, 5.0), pf.FusionConfig.load(FUSION)
+    est = fused(scan, conf, sensors=["range"], **how)
+    components = est.measurements.of("range", "radial")
+    outside = len(scan.sensors["range"].stamp) - len(components.value)
+    assert est.counts["range"] == {**components.counts(), "outside": outside}
+    assert np.count_nonzero(components.outcome == 0) == est.counts["range"]["fused"]

@@ -1,0 +1,343 @@
+"""Logs with one mistake each: named before anything is filtered, with the number that shows it; good ones: nothing."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from pumafuse.arrays import FloatArray
+from pumafuse.fusion.faults import not_following, sensor_faults
+from pumafuse.fusion.segments import build
+from pumafuse.logs.clock import clock_faults
+from pumafuse.logs.run import Source
+from pumafuse.model.response import response
+from tuning_runs import LONG, SCENARIOS, scenario
+
+REPOSITORY = Path(__file__).parents[2]
+DATA = Path(pf.__file__).parent / "data"
+SHARED = REPOSITORY.parent / "shared" / "data"
+LOGS = {
+    "scan1": (DATA / "scan1", DATA / "fusion.toml"),
+    "my-run": (REPOSITORY / "examples/my-run", REPOSITORY / "examples/my-run/fusion.toml"),
+    "trunk-servo": (REPOSITORY / "examples/trunk-servo/0g", REPOSITORY / "examples/trunk-servo/fusion.toml"),
+}
+SENSORS = [("scan1", "tracker"), ("scan1", "vision"), ("my-run", "camera"), ("trunk-servo", "camera")]
+Change = Callable[[Source], Source]
+of_every_log = pytest.mark.parametrize(("log", "sensor"), SENSORS)
+
+
+@cache
+def logged(log: str) -> tuple[pf.Run, pf.FusionConfig]:
+    path, config = LOGS[log]
+    return pf.Run.read(path), pf.FusionConfig.load(config)
+
+
+def of_sensor(log: str, sensor: str, change: Change) -> pf.Run:
+    run, _ = logged(log)
+    return replace(run, sensors={**run.sensors, sensor: change(run.sensors[sensor])})
+
+
+def of_commands(log: str, change: Change) -> pf.Run:
+    run, _ = logged(log)
+    return replace(run, command=change(run.command))
+
+
+def scaled(factor: float, *axes: str) -> Change:
+    """The values of some axes, of all for none, times a factor."""
+    return lambda one: replace(
+        one, values={axis: value * (factor if axis in axes or not axes else 1.0) for axis, value in one.values.items()}
+    )
+
+
+def later(seconds: float) -> Change:
+    return lambda one: replace(one, stamp=one.stamp + round(seconds * 1e9))
+
+
+def clocked(factor: float) -> Change:
+    """Stamps in another unit, beginning where they did."""
+    return lambda one: replace(one, stamp=one.stamp[0] + np.rint((one.stamp - one.stamp[0]) * factor).astype(np.int64))
+
+
+def exchanged(first: str, second: str) -> Change:
+    return lambda one: replace(one, values={**one.values, first: one.values[second], second: one.values[first]})
+
+
+def notes(run: pf.Run, log: str) -> list[str]:
+    """What ``fuse`` says, the cause first."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        return list(pf.fuse(run, logged(log)[1]).notes)
+
+
+def refusal(run: pf.Run, log: str) -> str:
+    with pytest.raises(pf.PumafuseError) as error:
+        notes(run, log)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def number_before(words: str, note: str) -> float:
+    return float(note.split(words)[0].split()[-1])
+
+
+# ---- one mistake each -----------------------------------------------------------------------------------------------
+
+
+@of_every_log
+@pytest.mark.parametrize("small", [False, True])
+def test_another_unit_is_refused_with_both_names(log: str, sensor: str, small: bool) -> None:
+    """Millimetres called metres, or degrees called radians, and the reverse: about 1000 or 57.3 times as far."""
+    run, config = logged(log)
+    kind = config.arm.axes[run.axes[0]].kind
+    factor, units = (1000.0, ("mm", "m")) if kind == "length" else (180.0 / np.pi, ("deg", "rad"))
+    true, called = reversed(units) if small else units
+    line = refusal(of_sensor(log, sensor, scaled(1.0 / factor if small else factor)), log)
+    assert line.startswith(f"sensor '{sensor}' moves ") and f"{true} called {called}" in line and "run.toml" in line
+    times = number_before(" times as far", line)
+    assert 0.9 < times / (1.0 / factor if small else factor) < 1.1
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_commands_in_another_unit_are_told_by_all_sensors(factor: float) -> None:
+    """Two sensors of three axes that agree with each other: it is the commands."""
+    line = refusal(of_commands("scan1", scaled(factor)), "scan1")
+    assert line.startswith("sensor 'tracker' moves") and "'vision' too: is it the unit of the commands?" in line
+
+
+def test_a_scale_that_no_unit_explains_is_a_warning() -> None:
+    """Seven times as far; a hundred times may be cm, or a scale."""
+    (first, *_) = notes(of_sensor("my-run", "camera", scaled(7.0)), "my-run")
+    assert "moves 7 times as far as the commands of tangential" in first and "scale" in first
+    (first, *_) = notes(of_sensor("my-run", "camera", scaled(100.0)), "my-run")
+    assert "cm called m" in first and "scale" in first
+
+
+@of_every_log
+def test_exchanged_columns_are_named_with_both_correlations(log: str, sensor: str) -> None:
+    """Each follows the commands of the other, and not its own."""
+    first, second = (axis for axis in logged(log)[0].axes[:: 2 if log == "scan1" else 1][:2])
+    (note, *_) = notes(of_sensor(log, sensor, exchanged(first, second)), log)
+    assert f"sensor '{sensor}' follows on {first} the commands of {second} (correlation +" in note
+    assert f"on {second} the commands of {first}" in note and "are its columns exchanged" in note
+    ratio = [float(part.split(")")[0].split()[0].rstrip(",")) for part in note.split("(correlation ")[1:]]
+    own = [float(part.split(")")[0].split()[-1]) for part in note.split("with those of ")[1:]]
+    assert min(ratio) > 0.95 and max(map(abs, own)) < 0.5
+
+
+@of_every_log
+def test_a_sign_is_named(log: str, sensor: str) -> None:
+    """All axes: a scale of -1 turns it; one axis: its column."""
+    run, _ = logged(log)
+    (note, *_) = notes(of_sensor(log, sensor, scaled(-1.0)), log)
+    assert note.startswith(f"sensor '{sensor}' moves against the commands of {', '.join(run.axes)} (correlation -")
+    assert "scale = -1 turns it" in note
+    (note, *_) = notes(of_sensor(log, sensor, scaled(-1.0, run.axes[0])), log)
+    assert f"moves against the commands of {run.axes[0]} (" in note and "scale" not in note
+    assert "sign of a column" in note
+
+
+@of_every_log
+@pytest.mark.parametrize("seconds", [0.7, -0.7, 3.0])
+def test_another_clock_is_found_in_both_directions(log: str, sensor: str, seconds: float) -> None:
+    """With its number, and a latency that makes up for it: with that the note is gone."""
+    run = of_sensor(log, sensor, later(seconds))
+    (note, *_) = notes(run, log)
+    assert f"{'late' if seconds > 0 else 'early'}: it follows the commands of " in note
+    assert number_before(" s ", note) == pytest.approx(abs(seconds), abs=0.03)
+    latency = float(note.split("latency_ms = ")[1].split()[0]) / 1e3
+    config = logged(log)[1]
+    told = msgspec.structs.replace(config.sensors[sensor], latency=latency)
+    config = msgspec.structs.replace(config, sensors={**config.sensors, sensor: told})
+    assert not_following(build(run, config), config) == []
+
+
+def test_a_clock_that_all_sensors_contradict_is_the_commands() -> None:
+    """Commands stamped 0.7 s late: once, with the names of the others."""
+    found = [note for note in notes(of_commands("scan1", later(0.7)), "scan1") if "early" in note]
+    assert len(found) == 1 and "('vision', 'range' too: is it the clock of the commands?)" in found[0]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (3600.0, "after the last command, their stamps begin 1 hours after those of the commands"),
+        (-7200.0, "before the first command, their stamps begin 2 hours before those of the commands"),
+        (1.79e9, "One may count from 1970, the other from when a computer was switched on"),
+        (200.0, "all measurements lie after the last command, their stamps begin 200.1 s after"),
+    ],
+)
+def test_clocks_far_apart_are_told_with_their_distance(seconds: float, words: str) -> None:
+    """No overlap at all: hours, a time zone, since 1970 beside since boot."""
+    (note, *_) = notes(of_sensor("scan1", "vision", later(seconds)), "scan1")
+    assert note.startswith("vision: all measurements lie") and words in note and "stamped by one clock?" in note
+    assert ("time zone" in note) == (abs(seconds) in (3600.0, 7200.0))
+
+
+@pytest.mark.parametrize("log", LOGS)
+@pytest.mark.parametrize(
+    ("factor", "taken"), [(1e3, "ms that are called s"), (1e-3, "s that are called ms"), (1e6, "us")]
+)
+def test_stamps_in_another_unit_are_refused(log: str, factor: float, taken: str) -> None:
+    """Of the commands by their interval, of a sensor by how long it lasts, of both by the former."""
+    run, config = logged(log)
+    line = refusal(of_commands(log, clocked(factor)), log)
+    assert "commands come every" in line and f"update_period_ms = {config.arm.update_period * 1e3:g}" in line
+    assert taken in line and "run.toml" in line
+    sensor = "vision" if log == "scan1" else "camera"
+    line = refusal(of_sensor(log, sensor, clocked(factor)), log)
+    assert line.startswith(f"{sensor} (") and "measurements go on for" in line and taken in line
+    assert "commands come every" in refusal(run.each(lambda _, one: clocked(factor)(one)), log)
+
+
+@pytest.mark.parametrize("log", LOGS)
+def test_a_zero_that_differs_is_told_with_the_key(log: str) -> None:
+    """As far as the commands lead an axis to and fro, and more."""
+    run, config = logged(log)
+    sensor, axis = ("vision" if log == "scan1" else "camera"), run.axes[0]
+    far = 0.1 if config.arm.axes[axis].kind == "length" else 2.0
+    screen = config.arm.screen_of(axis)
+    moved = of_sensor(log, sensor, lambda one: replace(one, values={**one.values, axis: one.values[axis] + far}))
+    note = next(one for one in notes(moved, log) if "where the commands lead" in one)
+    assert number_before(f" {screen.unit} from where", note) == pytest.approx(far * screen.scale, rel=0.05)
+    assert f"bias_sd_{screen.unit} = {float(f'{far * screen.scale:.1g}'):g}," in note
+
+
+def test_a_sensor_that_measures_within_a_turn_is_no_other_zero_and_may_have_a_sign() -> None:
+    """An angle that goes round, by a sensor that begins in another turn; the same the other way round."""
+    period, plant = 0.01, pf.FirstOrder(time_constant=0.05)
+    time, rng = np.arange(0.0, 20.0, period), np.random.default_rng(1)
+    u = 4.0 * np.sin(0.7 * time) + 3.0 * np.sin(0.31 * time)
+    axis = pf.AxisModel(kind="angle", plant=plant)
+    stamp = np.rint(time * 1e9).astype(np.int64)
+    position = response(axis, period, 0.02, stamp, u, 0.0, stamp) + rng.normal(0.0, 1e-3, len(time))
+    turn = 2.0 * np.pi
+    arm = pf.ArmModel(name="a turntable", update_period=period, delay=0.02, axes={"yaw": axis})
+    config = pf.FusionConfig(arm=arm, sensors={"imu": pf.Sensor(sd=1e-3, turn=turn, bias_sd=0.2)})
+    for sign, words in ((1.0, []), (-1.0, ["sensor 'imu' moves against the commands of yaw"])):
+        run = pf.Run.from_arrays(time, {"yaw": u}, {"imu": (time, {"yaw": (sign * position - 0.1) % turn})})
+        assert [one.split(" (")[0] for one in sensor_faults(build(run, config), config)] == words
+
+
+def test_a_misspelt_sensor_is_named_with_the_other_name() -> None:
+    """The run has vison, the configuration vision."""
+    run, _ = logged("scan1")
+    sensors = {("vison" if name == "vision" else name): one for name, one in run.sensors.items()}
+    found = notes(replace(run, sensors=sensors), "scan1")
+    assert any("'vision' of the configuration" in note and "'vison'" in note for note in found)
+    assert any("1704 rows have no sensor of this name" in note for note in found)
+
+
+# ---- no false alarm -------------------------------------------------------------------------------------------------
+
+
+def alarms(run: pf.Run, config: pf.FusionConfig) -> list[str]:
+    segment = build(run, config)
+    return [*clock_faults(run, config.arm.update_period, run.sensors), *sensor_faults(segment, config)]
+
+
+@pytest.mark.parametrize("log", LOGS)
+def test_a_good_log_gives_no_alarm(log: str) -> None:
+    """The shipped scan, the example, a real robot: whole, and any part of them."""
+    run, config = logged(log)
+    assert notes(run, log) == []
+    middle = float(np.ptp(run.command.stamp)) / 2e9
+    for part in (run.between(0.0, middle), run.between(middle), run.between(middle, middle + 5.0)):
+        assert sensor_faults(build(part, config), config) == []
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("name", ["panel-vision", "panel-tracker-outage", "mismatched-arm", "wrong-latency"])
+def test_simulated_logs_give_no_alarm(name: str, seed: int) -> None:
+    """Short ones, with outliers, outages, an arm and a latency that are wrong."""
+    sim = pf.simulate(scenario(name, 0.1, 0.02), seed)
+    assert alarms(sim.run, sim.config) == []
+
+
+@LONG
+@pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*.toml")), ids=lambda path: path.stem)
+def test_no_scenario_gives_an_alarm(path: Path) -> None:
+    """As they are shipped, with three seeds."""
+    if "[trajectory]" not in path.read_text(encoding="utf-8"):
+        pytest.skip("an arm")
+    for seed in (1, 2, 3):
+        sim = pf.simulate(pf.Scenario.load(path), seed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", pf.PumafuseWarning)
+            found = pf.fuse(sim.run, sim.config).notes
+        assert not [one for one in found if one.startswith("sensor '") and "contradicts" not in one]
+
+
+@pytest.mark.parametrize("place", ["puma-virtual/scan1", "servo/sin_sin", "servo/sin_time_square"])
+def test_recordings_of_others_give_no_alarm(place: str) -> None:
+    """With an arm and sensors that are guessed: nothing but the distance that falls, which is one."""
+    if not SHARED.exists():
+        pytest.skip("these recordings are not part of this repository")
+    run = pf.Run.read(SHARED / place)
+    period = float(np.median(np.diff(run.command.stamp))) / 1e9
+    plant = pf.FirstOrder(time_constant=0.045)
+    axes = {axis: pf.AxisModel(kind=run.kinds.get(axis, "length"), plant=plant) for axis in run.axes}
+    arm = pf.ArmModel(name="guess", update_period=period, delay=0.06, axes=axes)
+    config = pf.FusionConfig(arm=arm, sensors={name: pf.Sensor(sd=5e-4) for name in run.sensors})
+    assert [one.split(" (")[0] for one in alarms(run, config)] == (
+        ["sensor 'range' moves against the commands of radial"] if place.endswith("scan1") else []
+    )
+
+
+COMMANDS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "to and fro": lambda t: 0.1 * np.abs(t / 4.0 % 2.0 - 1.0),
+    "sine": lambda t: 0.02 * np.sin(2.0 * np.pi * t / 1.5),
+    "mostly rest": lambda t: 0.05 * np.clip(t - 15.0, 0.0, 1.0),
+    "stairs": lambda t: 0.01 * np.floor(t / 3.0),
+    "rest": lambda t: 0.0 * t,
+}
+ODD: dict[str, dict[str, float]] = {
+    "noise": {"sd": 0.05},
+    "noise that is not told": {"sd": 0.01, "told_sd": 1e-4},
+    "short": {"seconds": 2.0},
+    "gain": {"gain": 0.8},
+    "latency that is not told": {"latency": 0.045},
+    "slower arm": {"lag": 0.12},
+    "scale": {"scale": 0.9},
+    "distance": {"scale": -1.0},
+    "bias that is told": {"bias": 0.5},
+    "drift": {"drift": 2e-3},
+    "slow sensor": {"rate": 2.0},
+    "outliers": {"outliers": 0.05},
+}
+
+
+@pytest.mark.parametrize("odd", ODD.values(), ids=ODD.keys())
+@pytest.mark.parametrize("motion", COMMANDS.values(), ids=COMMANDS.keys())
+def test_what_is_odd_but_no_mistake_gives_no_alarm(
+    motion: Callable[[FloatArray], FloatArray], odd: dict[str, float]
+) -> None:
+    """Noise, gain, lag, latency, a scale or a bias that is configured; one axis moves so, another by stairs."""
+    period, plant = 0.028, pf.FirstOrder(time_constant=odd.get("lag", 0.05))
+    true = pf.AxisModel(plant=plant, gain=pf.Gain(intercept=odd.get("gain", 1.0)))
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        seconds, rate, scale = odd.get("seconds", 30.0), odd.get("rate", 30.0), odd.get("scale", 1.0)
+        time, seen = np.arange(0.0, seconds, period), np.arange(0.1, seconds, 1.0 / rate)
+        command = {"x": motion(time), "y": COMMANDS["stairs"](time)}
+        given, valid = (np.rint(part * 1e9).astype(np.int64) for part in (time, seen - odd.get("latency", 0.0)))
+        values: dict[str, FloatArray] = {}
+        for axis, u in command.items():
+            moved = response(true, period, 0.06, given, u, float(u[0]), valid) + u[0]
+            walk = np.cumsum(rng.normal(0.0, odd.get("drift", 1e-4) / np.sqrt(rate), len(seen)))
+            wild = (rng.random(len(seen)) < odd.get("outliers", 0.0)) * rng.uniform(-1.0, 1.0, len(seen))
+            noise = rng.normal(0.0, odd.get("sd", 1e-4), len(seen))
+            values[axis] = scale * (moved + walk) + noise + wild + odd.get("bias", 0.0)
+        run = pf.Run.from_arrays(time, command, {"camera": (seen, values)})
+        axes = {axis: pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05)) for axis in command}
+        arm = pf.ArmModel(name="an arm", update_period=period, delay=0.06, axes=axes)
+        sd, bias = odd.get("told_sd", odd.get("sd", 1e-4)), 2.0 * odd.get("bias", 0.0)
+        config = pf.FusionConfig(arm=arm, sensors={"camera": pf.Sensor(sd=sd, scale=scale, bias_sd=bias)})
+        assert alarms(run, config) == [], seed
