@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as papq
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
-from ..errors import RunError, counted
+from ..errors import RunError
 from ..logs import recordings, tables
 from ..logs.columns import Table, leaf, prefixes
 from ..logs.recordings import LOG_TIME, Topic
@@ -26,17 +26,18 @@ _TABLES = (".csv", ".csv.gz", ".parquet")
 _MOST_PARTS = 200  # files or topics
 _MOST_COLUMNS = 200  # of positions in one of them
 _FEWEST_ROWS = 10
+_GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows of a clock that are not before the row above
 _EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns that tell runs in one table apart
 _EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18, 4e18)}  # from 2001 to 2096
 _INTERVALS = {"s": 2.0, "ms": 2e3, "us": 2e6}  # rows of a robot's log are 2 ms to 2 s apart; shorter: a finer unit
 _METRES = ("Pose", "PoseStamped", "PoseWithCovarianceStamped", "Point", "PointStamped", "Odometry", "TransformStamped")
 _RADIANS = ("JointState", "JointTrajectory")
-_OTHER_TYPES = (
+_OTHER_TYPES = names.words_in(
     "Image CompressedImage CameraInfo PointCloud2 LaserScan Imu TFMessage Log DiagnosticArray Clock Twist TwistStamped"
     " Wrench WrenchStamped ParameterEvent Joy OccupancyGrid MarkerArray Image:buffer EncodedImage:blob VideoStream"
     " Points3D:positions Mesh3D:vertex_positions TextLog:text"
-).split()
+)
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]]) -> Part:
     used = () if clock is None else (clock.column, clock.nanoseconds)
     signals, left_out = list[Signal](), dict[str, str]()
     for path in _numeric_paths(table):
-        if path in used:
+        if path in used or (clock is not None and path.startswith(f"{clock.column}.")):
             continue
         if why := names.no_position(path) or ("another clock" if names.is_time(path) else None):
             left_out[path] = why
@@ -171,9 +172,7 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]]) -> Part:
         elif found:
             left_out[path] = found
     notes = (*place.notes, *table.notes)
-    return replace(
-        place, rows=table.rows, clock=clock, signals=_with_units(signals), left_out=left_out, notes=notes
-    )
+    return replace(place, rows=table.rows, clock=clock, signals=_with_units(signals), left_out=left_out, notes=notes)
 
 
 def _signal(table: Table, path: str, type_: str, labels: list[str]) -> Signal | str:
@@ -188,9 +187,10 @@ def _signal(table: Table, path: str, type_: str, labels: list[str]) -> Signal | 
     if known.min() == known.max() and not names.is_part(path):
         return f"always {known[0]:g}"
     kind = type_.rpartition("/")[2]
-    of_type = "m" if kind in _METRES else "rad" if kind in _RADIANS else ""
+    sliding = kind in _RADIANS and names.is_sliding(path)
+    of_type = "m" if kind in _METRES or sliding else "rad" if kind in _RADIANS else ""
     unit = names.unit_of(path)
-    basis = "name" if unit else "type" if of_type else "range"
+    basis = "name" if unit else "type" if of_type and not sliding else "range"
     return Signal(path, names.axis_of(path, labels), unit or of_type, basis, values)
 
 
@@ -225,8 +225,7 @@ def _numeric_paths(table: Table) -> Iterator[str]:
         else:
             beside = table.columns.get("name")
             labelled = {} if beside is None else {"name": beside[0].as_py()}
-            for path in recordings.numeric_paths({**labelled, name: first[0].as_py()}):
-                yield path
+            yield from recordings.numeric_paths({**labelled, name: first[0].as_py()})
 
 
 # Clocks.
@@ -319,9 +318,11 @@ def _fields(path: Path) -> list[str]:
 def _first_run(table: Table) -> dict[str, Any]:
     """Which rows are the first run, where a column tells several apart."""
     for name in _EPISODES:
-        values = pc.unique(table.columns[name].drop_null()) if name in table.columns else []
+        if name not in table.columns:
+            continue
+        values = pc.unique(table.columns[name].drop_null())
         if 1 < len(values) <= table.rows // _FEWEST_ROWS:
-            value = values[0].as_py()
+            value: Any = values[0].as_py()
             if isinstance(value, int | str | float):
                 return {name: int(value) if isinstance(value, float) and value.is_integer() else value}
     return {}
@@ -381,12 +382,8 @@ def _joint_names(table: Table) -> list[str]:
     return [str(name) for name in cast(list[Any], listed)] if isinstance(listed, list) else []
 
 
-def rate_of(stamp: TimeArray) -> tuple[float, str]:
-    """Median time between stamps [s], and a word on gaps of more than five times that."""
+def rate_of(stamp: TimeArray) -> tuple[float, FloatArray]:
+    """Median time between stamps [s], and the gaps: those that are more than five times that [s]."""
     steps = np.diff(np.sort(stamp[stamp != NO_STAMP])) / 1e9
-    steps = steps[steps > 0.0]
-    if not len(steps):
-        return float("nan"), ""
-    interval = float(np.median(steps))
-    gaps = steps[steps > 5.0 * interval]
-    return interval, f"{counted(len(gaps), 'gap')}, longest {gaps.max():.3g} s" if len(gaps) else ""
+    interval = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else float("nan")
+    return interval, steps[steps > _GAP * interval]

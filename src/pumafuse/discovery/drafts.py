@@ -10,13 +10,15 @@ from typing import Any, cast
 
 import tomli_w
 
-from ..units import MS, SCREEN
+from ..logs.columns import leaf
+from ..units import MS, SCREEN, ending
 from .guesses import ArmGuess, SensorGuess, guess
 from .names import printable
 from .roles import Stream
 from .survey import Survey
 
 FILES = ("run.toml", "arm.toml", "fusion.toml")
+BASES = {"name": "by name", "type": "by type of message", "range": "guessed by range"}
 _COMMENT = 48  # column at which comments begin
 
 
@@ -31,7 +33,7 @@ def drafts(found: Survey, folder: Path) -> dict[str, str]:
     return {
         "run.toml": _run_toml(found, folder),
         "arm.toml": _arm_toml(found, arm),
-        "fusion.toml": _fusion_toml(found, arm, sensors),
+        "fusion.toml": _fusion_toml(arm, sensors),
     }
 
 
@@ -51,7 +53,11 @@ def _run_toml(found: Survey, folder: Path) -> str:
         lines += _source(["reference"], roles.reference, folder)
     for stream, why in roles.left_out:
         table = ["reference"] if stream.role == "reference" else ["sensors", stream.name]
-        lines += ["", f"# Not used: {printable(why, 200)}", *(f"# {line}" for line in _source(table, stream, folder)[1:])]
+        lines += [
+            "",
+            f"# Not used: {printable(why, 200)}",
+            *(f"# {line}" for line in _source(table, stream, folder)[1:]),
+        ]
     return "\n".join([*lines, ""])
 
 
@@ -70,8 +76,8 @@ def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
             one.column if _says_unit(one.column, one.unit) else {"column": one.column, "unit": one.unit}
             for one in signals
         ]
-        how = {"name": "", "type": "unit by the type of the messages", "range": "DECIDE: the unit is a guess"}
-        lines.append(_line(_pair(axis, columns[0] if len(columns) == 1 else columns), how[signals[0].basis]))
+        how = "DECIDE: unit " if signals[0].basis == "range" else "unit "
+        lines.append(_line(_pair(axis, columns[0] if len(columns) == 1 else columns), how + BASES[signals[0].basis]))
     return lines
 
 
@@ -82,7 +88,9 @@ def _rebased(found: Survey, folder: Path) -> str:
     for table in (tree["command"], tree.get("reference"), *tree.get("sensors", {}).values()):
         if table is not None:
             table["file"] = _from(folder, beside / table["file"])
-    return f"# The log's own run.toml ({printable(str(beside))}), with its files named from here.\n{tomli_w.dumps(tree)}"
+    return (
+        f"# The log's own run.toml ({printable(str(beside))}), with its files named from here.\n{tomli_w.dumps(tree)}"
+    )
 
 
 def _arm_toml(found: Survey, arm: ArmGuess) -> str:
@@ -93,26 +101,30 @@ def _arm_toml(found: Survey, arm: ArmGuess) -> str:
         _line(_pair("delay_ms", _digits(arm.delay * MS)), "a guess: 60 % of the shortest lag; the rest is the plant's"),
     ]
     for axis, one in arm.axes.items():
-        screen = SCREEN[one.kind]
         lines += ["", _header(["axes", axis])]
         if one.kind == "angle":
             lines.append(_pair("kind", "angle"))
-        lag = f"with the delay {one.lag * MS:.0f} ms behind the held command, as measured" if one.follows else "a guess: nothing that follows this axis was found"
+        known = f"with the delay {one.lag * MS:.0f} ms behind the held command, as {one.follows} is"
+        lag = known if one.follows else "a guess: nothing follows this axis"
         lines += [_pair("plant", "first-order"), _line(_pair("time_constant_ms", _digits(one.time_constant * MS)), lag)]
         if one.follows and abs(one.gain - 1.0) > 0.05:
             told = f"{one.follows} moves {one.gain:.2f} times as far as commanded: try it, or tune --fit gain"
             lines.append(_line(f"# {_pair('gain', {'intercept': round(one.gain, 2)})}", told))
-        del screen
     return "\n".join([*lines, ""])
 
 
-def _fusion_toml(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess]) -> str:
+def _fusion_toml(arm: ArmGuess, sensors: Mapping[str, SensorGuess]) -> str:
     lines = [
         "# How far the arm and each sensor are trusted. `pumafuse tune` finds better numbers.",
         _pair("arm", "arm.toml"),
         "",
         _header(["start"]),
-        *_by_kind("offset_sd", {axis: one.offset_sd for axis, one in arm.axes.items()}, arm, "how far the arm may be from its command at the start"),
+        *_by_kind(
+            "offset_sd",
+            {axis: one.offset_sd for axis, one in arm.axes.items()},
+            arm,
+            "how far the arm may be from its command at the start",
+        ),
     ]
     for axis, one in arm.axes.items():
         unit, scale = SCREEN[one.kind].unit, SCREEN[one.kind].scale
@@ -128,7 +140,7 @@ def _fusion_toml(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess
         lines += _by_kind("sd", one.sd, arm, "its scatter from one measurement to the next")
         lines.append(_line(_pair("latency_ms", _digits(one.latency * MS, 3)), one.latency_words))
         if one.scale < 0.0:
-            lines.append(_line(_pair("scale", -1.0), "it moves against the commands, as a distance from the front does"))
+            lines.append(_line(_pair("scale", -1.0), "it moves against the commands, as a distance may"))
         if one.bias:
             lines += _by_kind("bias_sd", one.bias, arm, "its zero is another than the commands'")
         if one.gate:
@@ -150,9 +162,6 @@ def _digits(value: float, digits: int = 2) -> float:
 
 
 def _says_unit(column: str, unit: str) -> bool:
-    from ..logs.columns import leaf
-    from ..units import ending
-
     return ending(leaf(column)) == f"_{unit}"
 
 
@@ -165,7 +174,7 @@ def _from(folder: Path, file: Path) -> str:
 
 
 def _line(text: str, comment: str = "") -> str:
-    return f"{text.ljust(_COMMENT)}# {comment}" if comment else text
+    return f"{text.ljust(_COMMENT - 1)} # {comment}" if comment else text
 
 
 def _header(table: Sequence[str]) -> str:

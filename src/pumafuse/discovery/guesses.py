@@ -16,7 +16,7 @@ from .survey import Survey
 _FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 _DELAY_SHARE = 0.6  # of the lag; the PUMA's is 0.6, a servo's on a bus rather 0.75
 _UNKNOWN_LAG = 0.1  # s, where nothing follows
-_SMALLEST_SD = 1e-6  # m or rad
+_UNKNOWN_SD, _SMALLEST_SD = 1e-3, 1e-6  # m or rad
 _OUTLIERS = 3e-3  # share from which a gate pays
 _GATE = 5.0
 _DIFFERENT = 5.0  # sds
@@ -88,15 +88,11 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
     shortest = max(min(lags.values(), default=_UNKNOWN_LAG), 0.0)
     delay = _DELAY_SHARE * shortest
     axes = {axis: _axis(found, axis, leads[axis], lags.get(axis, _UNKNOWN_LAG), delay) for axis in run.axes}
-    sensors = {
-        name: _sensor(found, name, latencies[name], first, leads) for name in run.sensors
-    }
+    sensors = {name: _sensor(found, name, latencies[name], first, leads) for name in run.sensors}
     return ArmGuess(period, delay, axes), sensors
 
 
-def _latencies(
-    found: Survey, relations: Mapping[tuple[str, str], Following]
-) -> tuple[str, dict[str, float]]:
+def _latencies(found: Survey, relations: Mapping[tuple[str, str], Following]) -> tuple[str, dict[str, float]]:
     """The sensor that is earliest, and how much later each is on the axes that both have [s]."""
     lags = {
         name: {axis: relations[name, axis].lag for axis in source.values if (name, axis) in relations}
@@ -108,7 +104,8 @@ def _latencies(
     for name in known:
         both = [lags[name][axis] - lags[first][axis] for axis in lags[name] if axis in lags[first]]
         late[name] = max(float(np.median(both)), 0.0) if both else 0.0
-    return first, late
+    ahead = min((float(np.median(list(lags[name].values()))) for name in known), default=0.0)
+    return first, {name: one + min(ahead, 0.0) for name, one in late.items()}
 
 
 def _axis(found: Survey, axis: str, followers: Mapping[str, Following], lag: float, delay: float) -> AxisGuess:
@@ -138,19 +135,23 @@ def _sensor(
     known = {axis: one for axis, one in relations.items() if one is not None}
     mirrored = [one.slope < 0.0 for one in known.values() if abs(one.correlation) >= _FOLLOWS]
     scale = -1.0 if sum(mirrored) > len(mirrored) / 2 else 1.0
-    bias = {axis: size for axis, one in known.items() if (size := _bias(found, name, axis, one, scale, leads[axis]))}
-    sd = {axis: max(known[axis].scatter if axis in known else 0.0, _SMALLEST_SD) for axis in relations}
+    bias = {axis: size for axis, one in known.items() if (size := _bias(found, axis, one, scale, leads[axis]))}
+    sd = {axis: max(known[axis].scatter, _SMALLEST_SD) if axis in known else _UNKNOWN_SD for axis in relations}
     outliers = max((one.outliers for one in known.values()), default=0.0)
-    words = f"DECIDE: how old a measurement is when it is stamped; 0 as {name} is the earliest"
+    words = "DECIDE: how old a measurement is when it is stamped"
     if first and name != first:
-        words = f"so much later than {first}; DECIDE how old a measurement of that one is"
-    behind = [one.lag - found.relations["reference", axis].lag for axis, one in known.items() if ("reference", axis) in found.relations]
+        words = f"so much later than {first}; add how old a measurement of that one is"
+    behind = [
+        one.lag - found.relations["reference", axis].lag
+        for axis, one in known.items()
+        if ("reference", axis) in found.relations
+    ]
     if behind:
         words += f"; behind the reference: {np.median(behind) * MS:.0f} ms"
     return SensorGuess(sd, bias, latency, words, scale, _GATE if outliers > _OUTLIERS else 0.0)
 
 
-def _bias(found: Survey, name: str, axis: str, one: Following, scale: float, others: Mapping[str, Following]) -> float:
+def _bias(found: Survey, axis: str, one: Following, scale: float, others: Mapping[str, Following]) -> float:
     """The prior sd of a sensor's bias: where its zero is far from the commands', or from a better sensor's; 0: none."""
     value = found.run.command.values[axis]
     travel = float(np.nanmax(value) - np.nanmin(value))

@@ -10,36 +10,48 @@ from ..units import ending, kind_of
 
 Role: TypeAlias = Literal["command", "sensor", "reference"]
 
-# Where words of several roles meet, as in command_pose, the first role wins.
+
+def words_in(text: str) -> frozenset[str]:
+    """The words of a list that is easy to read here."""
+    return frozenset(text.split())
+
+
+# Where words of several roles meet, as in command_state, the first role wins.
 _ROLES: dict[Role, frozenset[str]] = {
-    "reference": frozenset("truth reference ground gt groundtruth".split()),
-    "command": frozenset("command commands commanded cmd goal goals target targets desired setpoint action".split()),
-    "sensor": frozenset(
+    "reference": words_in("truth reference ground gt groundtruth"),
+    "command": words_in("command commands commanded cmd goal goals target targets desired setpoint action"),
+    "sensor": words_in(
         "state states measured measurement measurements meas actual encoder encoders tracker camera vision sensor"
-        " feedback observed observation range laser mocap vicon optitrack recorded reported odom gps".split()
+        " feedback observed observation range laser mocap vicon optitrack recorded reported odom gps"
     ),
 }
-_OF_PLACES = frozenset({"pose", "poses"})  # of a sensor in the name of a topic or file, of nobody in that of a column
-_PARTS = frozenset({"nominal", "correction", "corrections", "base", "delta"})  # a command may be the sum of such
-_GENERIC = frozenset(
-    "pose poses position positions pos point points data translation transform value values scalar scalars joint"
-    " controller robot arm tool tcp ee flange coordinates axis".split()
+_OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
+_OF_PLACES = words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in that of a column
+_PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
+_SILENT = (
+    _OF_ROLES
+    | _PARTS
+    | words_in(
+        "pose poses position positions pos point points data translation transform value values scalar scalars joint"
+        " controller robot arm tool tcp ee flange coordinates axis"
+    )
 )
-_NO_POSITIONS = frozenset(
+_NO_POSITIONS = words_in(
     "velocity velocities vel speed acceleration accelerations acc jerk effort efforts torque force current voltage"
     " temperature temp quality confidence covariance orientation rotation quaternion twist index id seq sequence count"
     " status valid std sd sigma latency duration error header stamp nanosec layout frame done reward task episode tick"
-    " time timestamp".split()
+    " time timestamp"
 )
-_TIMES = frozenset(
-    "t time times stamp stamps timestamp timestamps sec secs seconds date datetime clock ts arrival arrived".split()
+_TIMES = words_in(
+    "t time times stamp stamps timestamp timestamps sec secs seconds date datetime clock ts arrival arrived"
 )
+_SLIDING = words_in("slide slider prismatic linear rail gantry")
 _UNITS = {
-    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), "mm"),
-    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"),
-    **dict.fromkeys(("um", "micrometer", "micrometers", "micrometre", "micrometres"), "um"),
-    **dict.fromkeys(("deg", "degs", "degree", "degrees"), "deg"),
-    **dict.fromkeys(("rad", "rads", "radian", "radians"), "rad"),
+    **dict.fromkeys(words_in("mm millimeter millimeters millimetre millimetres"), "mm"),
+    **dict.fromkeys(words_in("m meter meters metre metres"), "m"),
+    **dict.fromkeys(words_in("um micrometer micrometers micrometre micrometres"), "um"),
+    **dict.fromkeys(words_in("deg degs degree degrees"), "deg"),
+    **dict.fromkeys(words_in("rad rads radian radians"), "rad"),
     "mrad": "mrad",
 }
 _TURNING = re.compile(
@@ -60,8 +72,7 @@ def role_of(name: str) -> Role | None:
 
 def role_words(column: str) -> list[str]:
     """The words of a column's name that say whose it is."""
-    every = frozenset().union(*_ROLES.values())
-    return [word for word in words(leaf(column)) if word in every]
+    return [word for word in words(leaf(column)) if word in _OF_ROLES]
 
 
 def column_role(column: str) -> Role | None:
@@ -100,6 +111,11 @@ def is_turning(axis: str) -> bool:
     return _TURNING.search(axis) is not None
 
 
+def is_sliding(joint: str) -> bool:
+    """Whether a joint is called as those are that slide, in metres, where others turn."""
+    return not _SLIDING.isdisjoint(words(joint))
+
+
 def axis_of(column: str, labels: list[str]) -> str:
     """What a column's axis is called: the words of its name that say nothing else.
 
@@ -116,9 +132,8 @@ def axis_of(column: str, labels: list[str]) -> str:
         return "xyz"[place] if spatial else f"joint{place}"
     if label:
         return plain(label[1])
-    silent = _GENERIC | _PARTS | frozenset().union(*_ROLES.values())
     unit = unit_of(column)
-    kept = [word for word in words(column) if word not in silent]
+    kept = [word for word in words(column) if word not in _SILENT]
     if unit and kept and _UNITS.get(kept[-1]) == unit:
         kept = kept[:-1]
     if kept and all(word.isdigit() for word in kept):

@@ -78,7 +78,7 @@ class Roles:
     def run(self) -> Run:
         """The run as it would be read."""
         sensors = {one.name: one.source for one in self.sensors}
-        kinds = {axis: self.command.kind(axis) for axis in self.command.axes}
+        kinds: dict[str, Kind] = {axis: self.command.kind(axis) for axis in self.command.axes}
         reference = None if self.reference is None else self.reference.source
         return Run("log", self.command.source, sensors, reference, kinds=kinds)
 
@@ -100,16 +100,18 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         if stream is command:
             continue
         if stream.role == "command":
-            left_out.append((stream, "another command: a run has one; to use it instead, exchange the two"))
+            left_out.append((stream, "other commands: a run has one source of them; exchange the two to use these"))
             continue
-        matched, others = _matched(command, stream)
-        if not matched:
-            left_out.append((stream, others))
-        elif stream.role is None and not (lag := _follows(command, replace(stream, axes=matched))):
-            left_out.append((stream, "neither its name nor its motion says what it is: it does not follow the commands"))
+        axes, why_not = _matched(command, stream)
+        matched = replace(stream, axes={axis: axes[axis] for axis in command.axes if axis in axes})
+        if stream.role is None and axes:
+            late = _follows(command, matched)
+            matched = replace(matched, role="sensor" if late else None, why=f"it follows the commands {late}")
+            why_not = "neither its name nor its motion says what it is: it does not follow the commands"
+        if axes and matched.role:
+            kept.append(matched)
         else:
-            told = stream.why if stream.role else f"it follows the commands {lag}"  # pyright: ignore
-            kept.append(replace(stream, role=stream.role or "sensor", why=told, axes=matched))
+            left_out.append((stream, why_not))
     command, *kept = _renamed([replace(command, role="command", why=why), *kept])
     sensors = [one for one in kept if one.role == "sensor"]
     references = [one for one in kept if one.role == "reference"]
@@ -161,7 +163,9 @@ def _axes(signals: Sequence[Signal]) -> dict[str, list[Signal]]:
         if axis in found and not (names.is_part(signal.column) and names.is_part(found[axis][0].column)):
             axis = names.plain(signal.column)
         found.setdefault(axis, []).append(signal)
-    return {axis: some for axis, some in found.items() if any(np.nanmin(one.plain) < np.nanmax(one.plain) for one in some)}
+    return {
+        axis: some for axis, some in found.items() if any(np.nanmin(one.plain) < np.nanmax(one.plain) for one in some)
+    }
 
 
 def _uniquely_named(streams: Iterable[Stream]) -> list[Stream]:
@@ -181,9 +185,9 @@ def _command(streams: Sequence[Stream], log: str) -> tuple[Stream, str]:
     if len(called) == 1:
         return called[0], called[0].why
     # A reference that runs ahead is a set point, as control engineers call it.
-    candidates = called or [one for one in streams if one.role is None] or [
-        one for one in streams if one.role == "reference"
-    ]
+    candidates = (
+        called or [one for one in streams if one.role is None] or [one for one in streams if one.role == "reference"]
+    )
     followers = {one.name: _followers(one, streams) for one in candidates}
     best = max(candidates, key=lambda one: followers[one.name], default=None)
     if best is None or (not called and not followers[best.name]):
