@@ -163,7 +163,7 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]]) -> Part:
     for path in _numeric_paths(table):
         if path in used or (clock is not None and path.startswith(f"{clock.column}.")):
             continue
-        if why := names.no_position(path) or ("another clock" if names.is_time(path) else None):
+        if why := "another clock" if names.is_time(path) else names.no_position(path):
             left_out[path] = why
         elif len(signals) == _MOST_COLUMNS:
             left_out[path] = f"more than {_MOST_COLUMNS} columns"

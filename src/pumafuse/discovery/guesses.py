@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..units import MS, Kind
+from ..units import Kind
 from .contents import rate_of
 from .following import Following
 from .survey import Survey
@@ -75,7 +75,7 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
     run = found.run
     period = rate_of(run.command.stamp)[0]
     relations = {key: one for key, one in found.relations.items() if abs(one.correlation) >= _FOLLOWS}
-    first, latencies = _latencies(found, relations)
+    first, latencies = _latencies(relations)
     leads = {
         axis: {name: relations[name, axis] for name in run.sensors if (name, axis) in relations} for axis in run.axes
     }
@@ -88,24 +88,26 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
     shortest = max(min(lags.values(), default=_UNKNOWN_LAG), 0.0)
     delay = _DELAY_SHARE * shortest
     axes = {axis: _axis(found, axis, leads[axis], lags.get(axis, _UNKNOWN_LAG), delay) for axis in run.axes}
-    sensors = {name: _sensor(found, name, latencies[name], first, leads) for name in run.sensors}
+    sensors = {name: _sensor(found, name, latencies.get(name, 0.0), first, leads) for name in run.sensors}
     return ArmGuess(period, delay, axes), sensors
 
 
-def _latencies(found: Survey, relations: Mapping[tuple[str, str], Following]) -> tuple[str, dict[str, float]]:
-    """The sensor that is earliest, and how much later each is on the axes that both have [s]."""
-    lags = {
-        name: {axis: relations[name, axis].lag for axis in source.values if (name, axis) in relations}
-        for name, source in found.run.sensors.items()
-    }
-    known = [name for name in lags if lags[name]]
-    first = min(known, key=lambda name: float(np.median(list(lags[name].values()))), default="")
-    late = dict.fromkeys(lags, 0.0)
-    for name in known:
-        both = [lags[name][axis] - lags[first][axis] for axis in lags[name] if axis in lags[first]]
-        late[name] = max(float(np.median(both)), 0.0) if both else 0.0
-    ahead = min((float(np.median(list(lags[name].values()))) for name in known), default=0.0)
-    return first, {name: one + min(ahead, 0.0) for name, one in late.items()}
+def _latencies(relations: Mapping[tuple[str, str], Following]) -> tuple[str, dict[str, float]]:
+    """The source that is earliest, the reference if there is one, and how much later each sensor is [s].
+
+    Medians over the axes that both have.
+    """
+    lags: dict[str, dict[str, float]] = {}
+    for (name, axis), one in relations.items():
+        lags.setdefault(name, {})[axis] = one.lag
+    middle = {name: float(np.median(list(mine.values()))) for name, mine in lags.items()}
+    first = "reference" if "reference" in lags else min(middle, key=middle.__getitem__, default="")
+    ahead = min(middle.get(first, 0.0), 0.0)  # by another clock
+    late: dict[str, float] = {}
+    for name, mine in lags.items():
+        both = [mine[axis] - lags[first][axis] for axis in mine if axis in lags[first]]
+        late[name] = ahead + (max(float(np.median(both)), 0.0) if both else 0.0)
+    return first, late
 
 
 def _axis(found: Survey, axis: str, followers: Mapping[str, Following], lag: float, delay: float) -> AxisGuess:
@@ -139,15 +141,10 @@ def _sensor(
     sd = {axis: max(known[axis].scatter, _SMALLEST_SD) if axis in known else _UNKNOWN_SD for axis in relations}
     outliers = max((one.outliers for one in known.values()), default=0.0)
     words = "DECIDE: how old a measurement is when it is stamped"
-    if first and name != first:
+    if first == "reference":
+        words = "so much later than the reference, whose stamps are taken to be right"
+    elif first and name != first:
         words = f"so much later than {first}; add how old a measurement of that one is"
-    behind = [
-        one.lag - found.relations["reference", axis].lag
-        for axis, one in known.items()
-        if ("reference", axis) in found.relations
-    ]
-    if behind:
-        words += f"; behind the reference: {np.median(behind) * MS:.0f} ms"
     return SensorGuess(sd, bias, latency, words, scale, _GATE if outliers > _OUTLIERS else 0.0)
 
 

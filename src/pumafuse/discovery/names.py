@@ -102,7 +102,7 @@ def unit_of(column: str) -> str:
     unit = ending(leaf(column))
     if unit is not None and kind_of(leaf(column)) is not None:
         return unit[1:]
-    *before, last = words(leaf(column)) or [""]
+    *before, last = words(column) or [""]  # also that of `x [mm]`
     return _UNITS.get(last, "") if before else ""
 
 
@@ -123,7 +123,7 @@ def axis_of(column: str, labels: list[str]) -> str:
         column: Its name, or a field path.
         labels: What the elements of lists are, where the log says so.
     """
-    label = re.search(r"\[([^\]]*)\]$", column)
+    label = None if unit_of(column) else re.search(r"\[([^\]]*)\]$", column)
     if label and label[1].isdigit():
         place = int(label[1])
         if place < len(labels):

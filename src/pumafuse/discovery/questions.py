@@ -39,7 +39,7 @@ def questions(found: Survey) -> Iterator[str]:
         units = sorted({signal.unit for one in guessed.values() for some in one.axes.values() for signal in some})
         if guessed:
             yield f"are the numbers of {', '.join(guessed)} in {' and '.join(units)}? No name says it (run.toml)"
-    if lags:
+    if lags and run.reference is None:
         yield (
             "how old is a measurement when it is stamped? Commands and measurements tell only the sum of the arm's lag"
             " and that age (fusion.toml, latency_ms)"

@@ -156,12 +156,13 @@ def _streams(part: Part) -> list[Stream]:
 
 
 def _axes(signals: Sequence[Signal]) -> dict[str, list[Signal]]:
-    """Columns by axis: parts of a sum together, others that would be called the same under their whole names."""
+    """Columns by axis: parts of a sum together; others that would be called the same get a number."""
     found: dict[str, list[Signal]] = {}
     for signal in signals:
-        axis = signal.axis
-        if axis in found and not (names.is_part(signal.column) and names.is_part(found[axis][0].column)):
-            axis = names.plain(signal.column)
+        axis, number = signal.axis, 1
+        while axis in found and not (names.is_part(signal.column) and names.is_part(found[axis][0].column)):
+            number += 1
+            axis = f"{signal.axis}_{number}"
         found.setdefault(axis, []).append(signal)
     return {
         axis: some for axis, some in found.items() if any(np.nanmin(one.plain) < np.nanmax(one.plain) for one in some)
