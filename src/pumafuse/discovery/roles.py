@@ -46,7 +46,7 @@ class Stream:
         assert self.part.clock is not None
         values = {axis: np.sum([one.value for one in signals], axis=0) for axis, signals in self.axes.items()}
         source = Source(self.part.clock.stamp, values, self.part.label)
-        return source.rows(np.any(np.isfinite(list(values.values())), axis=0))
+        return source.rows(source.has_value)
 
     @property
     def guessed(self) -> bool:
