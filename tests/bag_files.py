@@ -147,7 +147,12 @@ def _fields(sample: Sample) -> dict[str, Any]:
 
 def definition(topic: str) -> str:
     """The definition of the messages of a topic, as ROS 2 writes it into a file."""
-    return get_typestore(Stores.ROS2_HUMBLE).generate_msgdef(TYPES[topic], ros_version=2)[0]
+    return definition_of(TYPES[topic])
+
+
+def definition_of(kind: str) -> str:
+    """The definition of a type of messages, likewise."""
+    return get_typestore(Stores.ROS2_HUMBLE).generate_msgdef(kind, ros_version=2)[0]
 
 
 def mcap(path: Path, samples: list[Sample], **options: Any) -> None:

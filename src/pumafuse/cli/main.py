@@ -53,6 +53,20 @@ def _root(  # pyright: ignore[reportUnusedFunction]
 
 
 @app.command()
+def init(
+    log: Annotated[Path, Argument(metavar="LOG", help="A table, MCAP, bag or .rrd, or a folder of them.")],
+    output: Annotated[
+        Path | None, Option("--output", "-o", metavar="DIR", help="Where the files go; default: LOG-fusion.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Look at a log, list what is in it, and write run.toml, arm.toml and fusion.toml to begin with."""
+    from . import init as command
+
+    command.run(log, output, force)
+
+
+@app.command()
 def fuse(
     runs: Runs,
     config: Config,

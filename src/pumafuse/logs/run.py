@@ -66,6 +66,11 @@ class Source:
         _, first = np.unique(np.stack(columns, axis=1), axis=0, return_index=True)
         return ~np.isin(np.arange(len(self.stamp)), first)
 
+    @property
+    def has_value(self) -> BoolArray:
+        """Rows that have a value for any axis, (rows,)."""
+        return np.any(~np.isnan(list(self.values.values())), axis=0)
+
     def rows(self, chosen: BoolArray | IntArray | slice) -> Source:
         """The chosen rows, in the order chosen."""
         values = {axis: value[chosen] for axis, value in self.values.items()}
@@ -348,9 +353,15 @@ def _read_manifest(path: Path) -> Run:
             (zoned if known else naive).append(name)
         return _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units)
 
-    command = source("command")
-    sensors = {name: source(f"sensor {name}") for name in listed.sensors}
-    reference = None if scored is None else source("reference")
+    sources = {name: source(name) for name in entries}
+    shared = {
+        name: [other for other in entries if entries[other].rows == entry.rows] for name, entry in entries.items()
+    }
+    has_value = {name: sources[name].has_value for name in entries if len(shared[name]) > 1}
+    for name, mine in has_value.items():  # where only others of its table have any, a row is theirs
+        sources[name] = sources[name].rows(mine | ~np.any([has_value[other] for other in shared[name]], axis=0))
+    command, reference = sources["command"], sources.get("reference")
+    sensors = {name: sources[f"sensor {name}"] for name in listed.sensors}
     if reference is not None and scored is not None:
         of_kind = {"length": scored.sd, "angle": scored.angular_sd}
         sds = {axis: of_kind[units[axis]] for axis in reference.values}
@@ -393,7 +404,7 @@ def _read_single(path: Path) -> Run:
     notes, sources, units = list(table.notes), dict[str, Source](), dict[str, Kind]()
     for name, axes in groups.items():
         source = _source(table, manifest.Time(clocks[0]), axes, name, notes, units)
-        sources[name] = source.rows(np.any(~np.isnan(list(source.values.values())), axis=0))
+        sources[name] = source.rows(source.has_value)
     if left := [column for column in table.columns if "." not in column and column != clocks[0]]:
         notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
     command, reference = sources.pop("command"), sources.pop("reference", None)

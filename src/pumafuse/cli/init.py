@@ -1,0 +1,115 @@
+"""`pumafuse init`."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from ..discovery.contents import Part, rate_of
+from ..discovery.drafts import BASES, FILES, drafts
+from ..discovery.names import printable
+from ..discovery.questions import questions
+from ..discovery.roles import Stream
+from ..discovery.survey import Survey, survey
+from ..errors import ConfigError, counted
+from ..folders import write_file
+from ..units import MS, SCREEN
+from .tables import print_tables, table
+
+_FEW = 4  # columns that are named
+
+
+def run(log: Path, output: Path | None, force: bool) -> None:
+    """Look at a log, print what it holds, and write three files to begin with.
+
+    Args:
+        log: The log.
+        output: Where they go; None: a new folder named after the log.
+        force: Replace them.
+
+    Raises:
+        PumafuseError: The log cannot be read, has no commands or no sensor, or the files are in the way.
+    """
+    found = survey(log)
+    folder = Path(f"{found.name}-fusion") if output is None else output
+    there = [name for name in FILES if (folder / name).exists()]
+    if there and not force:
+        raise ConfigError(f"{folder}: has {there[0]} already; --force replaces it, or choose another folder")
+    texts = drafts(found, folder)
+    print_tables(_tables(found))
+    for name, text in texts.items():
+        write_file(folder / name, text)
+    for number, question in enumerate(questions(found), 1):
+        typer.echo(f"{number}. {question}" if number > 1 else f"To decide:\n1. {question}")
+    place = shlex.quote(str(folder))
+    typer.echo(f"written to {folder}: {', '.join(FILES)}; what to decide is in their comments, too\nnext:")
+    tuned, fused = f"{place}/tuned", f"{place}/fused"
+    typer.echo(f"  pumafuse tune {place} -c {place}/fusion.toml -o {tuned} --fit noise,delay,plant")
+    typer.echo(f"  pumafuse fuse {place} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
+
+
+def _tables(found: Survey) -> Iterator[Table]:
+    """What the log holds, who is who, and what follows what."""
+    parts = [_part_row(part) for part in found.parts] or _described_rows(found)
+    yield table(["file or topic", "type", "rows", "rate, Hz", "gaps", "clock", "not used"], parts)
+    if found.roles is not None:
+        roles = found.roles
+        named = [("command", roles.command), *((f"sensor {one.name}", one) for one in roles.sensors)]
+        named += [] if roles.reference is None else [("reference", roles.reference)]
+        rows = [row for what, stream in named for row in _axis_rows(what, stream)]
+        rows += [["not used", ", ".join(one.axes), one.part.label, "", "", why] for one, why in roles.left_out]
+        headings = ["what", "axis", "column", "unit", "range", "because"]
+        yield table(headings, [[printable(cell, 200) for cell in row] for row in rows])
+    yield _relations_table(found)
+
+
+def _part_row(part: Part) -> list[str]:
+    interval, gaps = ("", "") if part.clock is None else _rate(part.clock.stamp)
+    clock = "none found" if part.clock is None else f"{part.clock.column} ({part.clock.basis})"
+    named = [f"{name}: {why}" for name, why in part.left_out.items()]
+    more = [f"{len(named) - _FEW} more"] if len(named) > _FEW else []
+    unused = "; ".join([*part.notes, *named[:_FEW], *more])
+    kind = part.type.rpartition("/")[2]
+    return [printable(cell, 200) for cell in (part.label, kind, str(part.rows), interval, gaps, clock, unused)]
+
+
+def _described_rows(found: Survey) -> list[list[str]]:
+    """Of a log whose run.toml says what is where."""
+    run = found.run
+    sources = {"command": run.command, **run.sensors, **({} if run.reference is None else {"reference": run.reference})}
+    return [
+        [printable(source.label_for(name)), "", str(len(source.stamp)), *_rate(source.stamp), "run.toml", ""]
+        for name, source in sources.items()
+    ]
+
+
+def _rate(stamp: np.ndarray) -> tuple[str, str]:
+    interval, gaps = rate_of(stamp)
+    longest = f", longest {gaps.max():.3g} s" if len(gaps) else ""
+    return f"{1.0 / interval:.4g}", f"{counted(len(gaps), 'gap')}{longest}" if len(gaps) else ""
+
+
+def _axis_rows(what: str, stream: Stream) -> Iterator[list[str]]:
+    because = stream.why
+    for axis, signals in stream.axes.items():
+        low, high = (f(signals[0].plain[np.isfinite(signals[0].plain)]) for f in (np.min, np.max))
+        columns = " + ".join(one.column for one in signals)
+        unit = f"{signals[0].unit}, {BASES[signals[0].basis]}"
+        yield [what, axis, columns, unit, f"{low:.4g} … {high:.4g}", because]
+        what = because = ""
+
+
+def _relations_table(found: Survey) -> Table:
+    rows: list[list[str]] = []
+    for (name, axis), one in found.relations.items():
+        screen = SCREEN[found.run.kinds.get(axis, "length")]
+        sizes = [f"{size * screen.scale:.2g} {screen.unit}" for size in (one.offset, one.scatter, one.misfit)]
+        numbers = [f"{one.lag * MS:.0f}", f"{one.correlation:+.3f}", f"{one.slope:.3f}"]
+        rows.append([name, axis, *numbers, *sizes, f"{one.outliers:.1%}"])
+    headings = ["follows the\ncommands", "axis", "lag, ms", "correlation", "gain", "offset", "noise", "left over"]
+    return table([*headings, "outliers"], rows)

@@ -1,0 +1,389 @@
+"""What a log holds: its files or topics, their clocks, and their columns of positions."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as papq
+
+from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..errors import RunError
+from ..logs import recordings, tables
+from ..logs.columns import Table, leaf, prefixes
+from ..logs.recordings import LOG_TIME, Topic
+from ..units import TIMES, ending, si_of
+from . import names
+
+_TABLES = (".csv", ".csv.gz", ".parquet")
+_MOST_PARTS = 200  # files or topics
+_MOST_COLUMNS = 200  # of positions in one of them
+_FEWEST_ROWS = 10
+_GAP = 5.0  # times the typical interval
+_IN_ORDER = 0.95  # share of rows of a clock that are not before the row above
+_EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns that tell runs in one table apart
+_EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18, 4e18)}  # from 2001 to 2096
+_INTERVALS = {"s": 2.0, "ms": 2e3, "us": 2e6}  # rows of a robot's log are 2 ms to 2 s apart; shorter: a finer unit
+_METRES = ("Pose", "PoseStamped", "PoseWithCovarianceStamped", "Point", "PointStamped", "Odometry", "TransformStamped")
+_RADIANS = ("JointState", "JointTrajectory")
+_OTHER_TYPES = names.words_in(
+    "Image CompressedImage CameraInfo PointCloud2 LaserScan Imu TFMessage Log DiagnosticArray Clock Twist TwistStamped"
+    " Wrench WrenchStamped ParameterEvent Joy OccupancyGrid MarkerArray Image:buffer EncodedImage:blob VideoStream"
+    " Points3D:positions Mesh3D:vertex_positions TextLog:text"
+)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The stamps of a part.
+
+    Attributes:
+        column: A column or field path.
+        nanoseconds: A column beside it, where it is of whole seconds; else empty.
+        unit: Of numbers whose name does not say it (``ms``), else empty.
+        basis: How the unit is known, in words.
+        stamp: Int64 ns, (rows,).
+    """
+
+    column: str
+    nanoseconds: str
+    unit: str
+    basis: str
+    stamp: TimeArray
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A column of positions.
+
+    Attributes:
+        column: Its name or field path.
+        axis: What it seems to be called.
+        unit: ``mm``, ``rad``, …
+        basis: How the unit is known: ``name``, ``type``, or ``range``, which is a guess.
+        plain: Its numbers in that unit, (rows,).
+    """
+
+    column: str
+    axis: str
+    unit: str
+    basis: str
+    plain: FloatArray
+
+    @property
+    def value(self) -> FloatArray:
+        """Its numbers in m or rad, (rows,)."""
+        return si_of(self.plain, f"_{self.unit}")
+
+
+@dataclass(frozen=True)
+class Part:
+    """A table of a log: a file, a topic or an entity.
+
+    Attributes:
+        file: Where it is.
+        topic: Which topic of it.
+        entity: Which entity of it.
+        where: Which of its rows.
+        type: Of its messages; empty of a table.
+        rows: How many.
+        clock: Its stamps; None: none was found.
+        signals: Its columns of positions.
+        left_out: Its other columns of numbers, and why they are none.
+        notes: What is to be said of it.
+    """
+
+    file: Path
+    topic: str = ""
+    entity: str = ""
+    where: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    type: str = ""
+    rows: int = 0
+    clock: Clock | None = None
+    signals: tuple[Signal, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict[str, str])
+    notes: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        """What a person calls it."""
+        return self.topic or self.entity or self.file.name
+
+    @property
+    def stem(self) -> str:
+        """Its name without the endings of files."""
+        return self.topic or self.entity or self.file.name.split(".")[0]
+
+
+def parts_of(log: Path) -> list[Part]:
+    """What a log has: a table, a recording, or a folder of them.
+
+    Raises:
+        RunError: There is nothing that can be read.
+    """
+    found: list[Part] = []
+    for path in _files(log):
+        found += _recorded(path) if tables.is_recording(path) else [_tabled(path)]
+        if len(found) > _MOST_PARTS:
+            raise RunError(f"{log}: more than {_MOST_PARTS} tables or topics; give the log of one run")
+    return found
+
+
+def _files(log: Path) -> list[Path]:
+    """The tables and recordings in a folder, or the log itself."""
+    if not os.path.exists(log):  # noqa: PTH110 - Path.exists raises on a name that is too long
+        raise RunError(f"{log}: no such file or folder")
+    if not log.is_dir():
+        if not (log.name.endswith(_TABLES) or tables.is_recording(log)):
+            raise RunError(f"{log}: no log that can be read; accepted: CSV, Parquet, MCAP, bags of ROS, .rrd")
+        return [log]
+    inside = sorted(path for path in log.rglob("*") if path.is_file())
+    if (log / "metadata.yaml").is_file() or (inside and all(path.suffix in (".db3", ".mcap") for path in inside)):
+        return [log]  # a bag
+    if (log / "meta" / "info.json").is_file():  # LeRobot: many files of many episodes
+        inside = [path for path in inside if log / "data" in path.parents][:1]
+    found = [path for path in inside if path.name.endswith(_TABLES) or tables.is_recording(path)]
+    if not found:
+        raise RunError(f"{log}: no log in it that can be read; accepted: CSV, Parquet, MCAP, bags of ROS, .rrd")
+    return found
+
+
+def _part(table: Table, place: Part, labels: Mapping[str, list[str]]) -> Part:
+    """A part with its clock and its columns, from its table."""
+    clock = _clock(table)
+    used = () if clock is None else (clock.column, clock.nanoseconds)
+    signals, left_out = list[Signal](), dict[str, str]()
+    for path in _numeric_paths(table):
+        if path in used or (clock is not None and path.startswith(f"{clock.column}.")):
+            continue
+        if why := "another clock" if names.is_time(path) else names.no_position(path):
+            left_out[path] = why
+        elif len(signals) == _MOST_COLUMNS:
+            left_out[path] = f"more than {_MOST_COLUMNS} columns"
+        elif isinstance(found := _signal(table, path, place.type, labels.get(leaf(path), [])), Signal):
+            signals.append(found)
+        elif found:
+            left_out[path] = found
+    notes = (*place.notes, *table.notes)
+    return replace(place, rows=table.rows, clock=clock, signals=_with_units(signals), left_out=left_out, notes=notes)
+
+
+def _signal(table: Table, path: str, type_: str, labels: list[str]) -> Signal | str:
+    """A column as positions, or why it is none; empty for text."""
+    try:
+        values, _ = table.plain(path)
+    except RunError as error:
+        return names.printable(str(error).removeprefix(f"{table.path}: "))
+    known = values[np.isfinite(values)]
+    if len(known) < _FEWEST_ROWS:
+        return "hardly any number" if len(known) else ""
+    if known.min() == known.max() and not names.is_part(path):
+        return f"always {known[0]:g}"
+    kind = type_.rpartition("/")[2]
+    sliding = kind in _RADIANS and names.is_sliding(path)
+    of_type = "m" if kind in _METRES or sliding else "rad" if kind in _RADIANS else ""
+    unit = names.unit_of(path)
+    basis = "name" if unit else "type" if of_type and not sliding else "range"
+    return Signal(path, names.axis_of(path, labels), unit or of_type, basis, values)
+
+
+def _with_units(signals: list[Signal]) -> tuple[Signal, ...]:
+    """Signals without a unit get the likeliest one for their range, those of joints apart from the others."""
+    found = list[Signal]()
+    for one in signals:
+        if not one.unit:
+            alike = [
+                other
+                for other in signals
+                if not other.unit and names.is_turning(other.axis) == names.is_turning(one.axis)
+            ]
+            largest = max(float(np.nanmax(np.abs(other.plain))) for other in alike)
+            if names.is_turning(one.axis):
+                unit = "deg" if largest > 2.0 * np.pi else "rad"
+            else:
+                unit = "mm" if largest > 10.0 else "m"
+            one = replace(one, unit=unit)
+        found.append(one)
+    return tuple(found)
+
+
+def _numeric_paths(table: Table) -> Iterator[str]:
+    """Paths of all numbers in the first cells of a table, and columns of text, which may be numbers, too."""
+    for name, column in table.columns.items():
+        first = column.drop_null()[:1]
+        if not len(first):
+            continue
+        if pa.types.is_string(first.type):
+            yield name
+        else:
+            beside = table.columns.get("name")
+            labelled = {} if beside is None else {"name": beside[0].as_py()}
+            yield from recordings.numeric_paths({**labelled, name: first[0].as_py()})
+
+
+# Clocks.
+
+
+def _clock(table: Table) -> Clock | None:
+    """The first column that runs like a clock; when it was recorded only where nothing else does."""
+    columns = sorted(_stamp_columns(table), key=lambda name: name == LOG_TIME)
+    return next((clock for name in columns if (clock := _clock_of(table, name)) is not None), None)
+
+
+def _stamp_columns(table: Table) -> Iterator[str]:
+    """Paths of columns that hold stamps by their type or their name."""
+
+    def inside(path: str, kind: pa.DataType, depth: int) -> Iterator[str]:
+        if pa.types.is_struct(kind):
+            fields = {one.name for one in kind}
+            if fields & {"nanosec", "nsecs", "nsec", "nanos"}:
+                yield path
+            else:
+                for one in kind if depth else ():
+                    yield from inside(f"{path}.{one.name}", one.type, depth - 1)
+        elif pa.types.is_timestamp(kind) or (not pa.types.is_nested(kind) and names.is_time(path)):
+            yield path
+
+    for name, column in table.columns.items():
+        yield from inside(name, column.type, 3)
+
+
+def _clock_of(table: Table, name: str) -> Clock | None:
+    """The stamps of a column; None if they do not run like those of a clock."""
+    try:
+        kind = table.column(name).type
+        if pa.types.is_nested(kind) or pa.types.is_temporal(kind) or table.zoned(name) is not None:
+            basis = "a date" if not pa.types.is_nested(kind) else "seconds and nanoseconds"
+            clock = Clock(name, "", "", basis, table.stamps(name)[0])
+        elif pa.types.is_integer(kind) and (beside := table.nanoseconds_beside(name)):
+            clock = Clock(name, beside, "", "seconds and nanoseconds", table.stamps(name, beside)[0])
+        elif (unit := ending(leaf(name))) in TIMES:
+            clock = Clock(name, "", "", f"{unit[1:]} by name", table.stamps(name)[0])
+        else:
+            unit, basis = _time_unit(table.plain(name)[0])
+            clock = Clock(name, "", unit, f"{unit} by {basis}", table.stamps(name, unit=f"_{unit}")[0])
+    except RunError:
+        return None
+    steps = np.diff(clock.stamp[clock.stamp != NO_STAMP])
+    return clock if len(steps) and steps.any() and (steps >= 0).mean() >= _IN_ORDER else None
+
+
+def _time_unit(values: FloatArray) -> tuple[str, str]:
+    """The unit of stamps by what date they would be, or else by the time between rows; and by which."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return "s", "default"
+    middle, steps = float(np.median(known)), np.diff(known)
+    for unit, (low, high) in _EPOCHS.items():
+        if low <= middle <= high:
+            return unit, "range"
+    interval = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
+    return next((unit for unit, longest in _INTERVALS.items() if interval <= longest), "ns"), "interval"
+
+
+# Tables.
+
+
+def _tabled(path: Path) -> Part:
+    """A table; of several runs in it the first."""
+    if path.suffix == ".parquet":
+        fields = _fields(path)
+        some = [name for name in _EPISODES if name in fields]
+        where = _first_run(tables.read(path, fields=some)) if some else {}
+        table = tables.read(path, fields=fields, where=where)
+    else:
+        table = tables.read(path, growing=True)
+        where = _first_run(table)
+        table = tables.read(path, growing=True, where=where) if where else table
+    notes = [f"has several runs: only {key} = {value!r} is used" for key, value in where.items()]
+    return _part(table, Part(path, where=where, notes=tuple(notes)), _labels(path))
+
+
+def _fields(path: Path) -> list[str]:
+    """The columns of a Parquet file that are no images."""
+    try:
+        schema = papq.read_schema(path)
+    except (pa.ArrowInvalid, OSError) as error:
+        raise RunError(f"{path}: not a table that can be read: {str(error).splitlines()[0]}") from None
+    return [one.name for one in schema if "binary" not in str(one.type)]
+
+
+def _first_run(table: Table) -> dict[str, Any]:
+    """Which rows are the first run, where a column tells several apart."""
+    for name in _EPISODES:
+        if name not in table.columns:
+            continue
+        values = pc.unique(table.columns[name].drop_null())
+        if 1 < len(values) <= table.rows // _FEWEST_ROWS:
+            value: Any = values[0].as_py()
+            if isinstance(value, int | str | float):
+                return {name: int(value) if isinstance(value, float) and value.is_integer() else value}
+    return {}
+
+
+def _labels(path: Path) -> dict[str, list[str]]:
+    """What the elements of lists are called, by column, in a data set of LeRobot."""
+    for above in path.resolve().parents[:4]:
+        if (info := above / "meta" / "info.json").is_file():
+            try:
+                return _feature_names(msgspec.json.decode(info.read_bytes()))
+            except (msgspec.DecodeError, OSError):
+                return {}
+    return {}
+
+
+def _feature_names(info: Any) -> dict[str, list[str]]:
+    """``names`` of each feature: a list, or a table with a list in it."""
+    found = dict[str, list[str]]()
+    features: Any = info.get("features") if isinstance(info, dict) else None  # pyright: ignore
+    for key, feature in cast(dict[str, Any], features if isinstance(features, dict) else {}).items():
+        given: Any = cast(dict[str, Any], feature).get("names") if isinstance(feature, dict) else None
+        listed: Any = next(iter(cast(dict[str, Any], given).values()), None) if isinstance(given, dict) else given
+        if isinstance(listed, list):
+            found[key] = [str(label) for label in cast(list[Any], listed)]
+    return found
+
+
+# Topics and entities.
+
+
+def _recorded(path: Path) -> Iterator[Part]:
+    for topic in recordings.topics(path):
+        place = Part(path, "", topic.name) if path.suffix == ".rrd" else Part(path, topic.name)
+        yield _of_topic(replace(place, type=topic.type, rows=topic.count), topic)
+
+
+def _of_topic(place: Part, topic: Topic) -> Part:
+    """A topic or entity; one that has no positions is not read."""
+    wanted = [name for name in topic.fields if not names.no_position(name)]
+    if topic.type.rpartition("/")[2] in _OTHER_TYPES or not wanted:
+        return replace(place, notes=("no positions in messages of this type",))
+    if any(name.startswith("points[1]") for name in wanted):
+        return replace(place, notes=("its trajectories have several points: a plan, not commands that are sent",))
+    fields = None if place.entity else prefixes([*wanted, "header", "timestamp", "stamp", "joint_names"])
+    try:
+        table = recordings.read(place.file, topic.name, fields)
+    except RunError as error:
+        return replace(place, notes=(str(error).removeprefix(f"{place.file}: "),))
+    return _part(table, place, {"points[0].positions": _joint_names(table)})
+
+
+def _joint_names(table: Table) -> list[str]:
+    """The joints of a trajectory."""
+    column = table.columns.get("joint_names")
+    listed: Any = None if column is None or not len(column) else column[0].as_py()
+    return [str(name) for name in cast(list[Any], listed)] if isinstance(listed, list) else []
+
+
+def rate_of(stamp: TimeArray) -> tuple[float, FloatArray]:
+    """Median time between stamps [s], and the gaps: those that are more than five times that [s]."""
+    steps = np.diff(np.sort(stamp[stamp != NO_STAMP])) / 1e9
+    interval = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else float("nan")
+    return interval, steps[steps > _GAP * interval]

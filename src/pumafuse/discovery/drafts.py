@@ -1,0 +1,199 @@
+"""The text of ``run.toml``, ``arm.toml`` and ``fusion.toml`` to begin with, from a survey of a log."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
+from pathlib import Path
+from typing import Any, cast
+
+import tomli_w
+
+from ..logs.columns import leaf
+from ..units import MS, SCREEN, ending
+from .guesses import ArmGuess, SensorGuess, guess
+from .names import printable
+from .roles import Stream
+from .survey import Survey
+
+FILES = ("run.toml", "arm.toml", "fusion.toml")
+BASES = {"name": "by name", "type": "by type of message", "range": "guessed by range"}
+_COMMENT = 48  # column at which comments begin
+
+
+def drafts(found: Survey, folder: Path) -> dict[str, str]:
+    """The three files by name.
+
+    Args:
+        found: What was found in the log.
+        folder: Where they will be: files of the log are named from there.
+    """
+    arm, sensors = guess(found)
+    return {
+        "run.toml": _run_toml(found, folder),
+        "arm.toml": _arm_toml(found, arm),
+        "fusion.toml": _fusion_toml(arm, sensors),
+    }
+
+
+def _run_toml(found: Survey, folder: Path) -> str:
+    if found.manifest is not None:
+        return _rebased(found, folder)
+    assert found.roles is not None
+    roles = found.roles
+    lines = [
+        "# Where things are in the log, as `pumafuse init` found it. Lines that begin with # are not used.",
+        f"name = {_value(found.name)}",
+    ]
+    lines += _source(["command"], roles.command, folder)
+    for one in roles.sensors:
+        lines += _source(["sensors", one.name], one, folder)
+    if roles.reference is not None:
+        lines += _source(["reference"], roles.reference, folder)
+    for stream, why in roles.left_out:
+        table = ["reference"] if stream.role == "reference" else ["sensors", stream.name]
+        lines += [
+            "",
+            f"# Not used: {printable(why, 200)}",
+            *(f"# {line}" for line in _source(table, stream, folder)[1:]),
+        ]
+    return "\n".join([*lines, ""])
+
+
+def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
+    """The table of a source."""
+    part, clock = stream.part, stream.part.clock
+    assert clock is not None
+    lines = ["", _line(_header(table), printable(stream.why, 200)), _line(_pair("file", _from(folder, part.file)))]
+    keys = {"topic": part.topic, "entity": part.entity, "where": dict(part.where)}
+    lines += [_line(_pair(key, value)) for key, value in keys.items() if value]
+    time: Any = [clock.column, clock.nanoseconds] if clock.nanoseconds else clock.column
+    time = {"column": clock.column, "unit": clock.unit} if clock.unit else time
+    lines.append(_line(_pair("time", time), clock.basis))
+    for axis, signals in stream.axes.items():
+        columns: list[Any] = [
+            one.column if _says_unit(one.column, one.unit) else {"column": one.column, "unit": one.unit}
+            for one in signals
+        ]
+        how = "DECIDE: unit " if signals[0].basis == "range" else "unit "
+        lines.append(_line(_pair(axis, columns[0] if len(columns) == 1 else columns), how + BASES[signals[0].basis]))
+    return lines
+
+
+def _rebased(found: Survey, folder: Path) -> str:
+    """The log's own ``run.toml`` for another folder."""
+    tree: Any = deepcopy(dict(found.manifest or {}))
+    beside = found.log if found.log.is_dir() else found.log.parent
+    for table in (tree["command"], tree.get("reference"), *tree.get("sensors", {}).values()):
+        if table is not None:
+            table["file"] = _from(folder, beside / table["file"])
+    return (
+        f"# The log's own run.toml ({printable(str(beside))}), with its files named from here.\n{tomli_w.dumps(tree)}"
+    )
+
+
+def _arm_toml(found: Survey, arm: ArmGuess) -> str:
+    lines = [
+        "# The arm to begin with. `pumafuse tune --fit noise,delay,plant` finds better numbers; `gain` may be added.",
+        f"name = {_value(found.name)}",
+        _line(_pair("update_period_ms", _digits(arm.period * MS, 6)), "median time between commands"),
+        _line(_pair("delay_ms", _digits(arm.delay * MS)), "a guess: 60 % of the shortest lag; the rest is the plant's"),
+    ]
+    for axis, one in arm.axes.items():
+        lines += ["", _header(["axes", axis])]
+        if one.kind == "angle":
+            lines.append(_pair("kind", "angle"))
+        known = f"with the delay {one.lag * MS:.0f} ms behind the held command, as {one.follows} is"
+        lag = known if one.follows else "a guess: nothing follows this axis"
+        lines += [_pair("plant", "first-order"), _line(_pair("time_constant_ms", _digits(one.time_constant * MS)), lag)]
+        if one.follows and abs(one.gain - 1.0) > 0.05:
+            told = f"{one.follows} moves {one.gain:.2f} times as far as commanded: try it, or tune --fit gain"
+            lines.append(_line(f"# {_pair('gain', {'intercept': round(one.gain, 2)})}", told))
+    return "\n".join([*lines, ""])
+
+
+def _fusion_toml(arm: ArmGuess, sensors: Mapping[str, SensorGuess]) -> str:
+    lines = [
+        "# How far the arm and each sensor are trusted. `pumafuse tune` finds better numbers.",
+        _pair("arm", "arm.toml"),
+        "",
+        _header(["start"]),
+        *_by_kind(
+            "offset_sd",
+            {axis: one.offset_sd for axis, one in arm.axes.items()},
+            arm,
+            "how far the arm may be from its command at the start",
+        ),
+    ]
+    for axis, one in arm.axes.items():
+        unit, scale = SCREEN[one.kind].unit, SCREEN[one.kind].scale
+        left = f"a guess: {_digits(one.misfit * scale)} {unit} are left where the command is delayed by the lag"
+        lines += [
+            "",
+            _header(["process", axis]),
+            _line(_pair(f"input_noise_{unit}_rtHz", _digits(one.input_noise * scale)), left),
+            _line(_pair(f"drift_{unit}_rts", _digits(one.drift * scale)), "likewise"),
+        ]
+    for name, one in sensors.items():
+        lines += ["", _header(["sensors", name])]
+        lines += _by_kind("sd", one.sd, arm, "its scatter from one measurement to the next")
+        lines.append(_line(_pair("latency_ms", _digits(one.latency * MS, 3)), one.latency_words))
+        if one.scale < 0.0:
+            lines.append(_line(_pair("scale", -1.0), "it moves against the commands, as a distance may"))
+        if one.bias:
+            lines += _by_kind("bias_sd", one.bias, arm, "its zero is another than the commands'")
+        if one.gate:
+            lines.append(_line(_pair("gate", one.gate), "it has outliers"))
+    return "\n".join([*lines, ""])
+
+
+def _by_kind(key: str, values: Mapping[str, float], arm: ArmGuess, comment: str) -> Iterable[str]:
+    """A key for the axes of each kind, with a number for each axis."""
+    for kind, screen in SCREEN.items():
+        mine = {axis: _digits(value * screen.scale) for axis, value in values.items() if arm.axes[axis].kind == kind}
+        if mine:
+            yield f"# {comment}"
+            yield _pair(f"{key}_{screen.unit}", mine)
+
+
+def _digits(value: float, digits: int = 2) -> float:
+    return float(f"{value:.{digits}g}")
+
+
+def _says_unit(column: str, unit: str) -> bool:
+    return ending(leaf(column)) == f"_{unit}"
+
+
+def _from(folder: Path, file: Path) -> str:
+    """A file as it is named in a folder."""
+    try:
+        return Path(os.path.relpath(file.absolute(), folder.absolute())).as_posix()
+    except ValueError:  # on another drive
+        return file.absolute().as_posix()
+
+
+def _line(text: str, comment: str = "") -> str:
+    return f"{text.ljust(_COMMENT - 1)} # {comment}" if comment else text
+
+
+def _header(table: Sequence[str]) -> str:
+    return f"[{'.'.join(_key(one) for one in table)}]"
+
+
+def _pair(key: str, value: Any) -> str:
+    return f"{_key(key)} = {_value(value)}"
+
+
+def _key(key: str) -> str:
+    return tomli_w.dumps({key: 0}).removesuffix(" = 0\n")
+
+
+def _value(value: Any) -> str:
+    """A value on one line; the library writes tables and lists over several."""
+    if isinstance(value, Mapping):
+        pairs = (_pair(key, one) for key, one in cast(Mapping[str, Any], value).items())
+        return f"{{ {', '.join(pairs)} }}"
+    if isinstance(value, list):
+        return f"[{', '.join(_value(one) for one in cast(list[Any], value))}]"
+    return tomli_w.dumps({"v": value}).removeprefix("v = ").rstrip("\n")

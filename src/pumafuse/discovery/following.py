@@ -1,0 +1,146 @@
+"""Which signal follows which, how late, how far: correlation of changes at a lag."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import NO_STAMP, FloatArray, TimeArray
+
+_EARLIEST, _LATEST = -1.0, 2.0  # s, of a lag
+_COARSE, _FINE = 0.01, 0.001  # s, steps of a lag
+# s, over which changes are taken: long where noise is large; from the mean where it is most of the run, as on a path at
+# constant speed, which says more of the lag than its ends do.
+_SPANS = (0.1, 0.5, 2.0, math.inf)
+_MOST = 3000  # changes
+_FEWEST = 20
+_OUTLYING, _AGREEING = 8.0, 2.0  # sds
+_NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
+_MIRRORED = 0.1  # a negative correlation must be stronger by this than any positive one
+
+
+@dataclass(frozen=True)
+class Following:
+    """How one signal follows another.
+
+    Attributes:
+        lag: How late it is behind the path through the other's points [s].
+        correlation: Of their changes at that lag.
+        slope: By how much it moves when the other moves by 1.
+        offset: How far its level is from slope ± 1 times the other's [m or rad].
+        scatter: Its noise, roughly, [m or rad].
+        misfit: Standard deviation of what the other, delayed and scaled, leaves of it, outliers apart [m or rad].
+        outliers: The share of its values that jump away from their neighbours.
+    """
+
+    lag: float
+    correlation: float
+    slope: float
+    offset: float
+    scatter: float
+    misfit: float
+    outliers: float
+
+
+def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, FloatArray]) -> Following | None:
+    """How the second signal follows the first; None where they do not overlap, or one of them stands still.
+
+    Args:
+        leader: Stamps [ns] and values, (n,).
+        follower: Likewise, (m,).
+    """
+    origin = int(leader[0][leader[0] != NO_STAMP].min(initial=2**62))
+    (t, u), (s, z) = _known(*leader, origin), _known(*follower, origin)
+    inside = (s > t[0] if len(t) else s > np.inf) & (s < t[-1] if len(t) else False)
+    s, z = s[inside], z[inside]
+    if len(t) < _FEWEST or len(s) < _FEWEST:
+        return None
+    candidates = [one for span in _SPANS if (one := _at_span(t, u, s, z, span)) is not None]
+
+    def rest(one: tuple[float, float, float]) -> FloatArray:
+        return z - one[2] * np.interp(s - one[0], t, u)
+
+    best = min(candidates, key=lambda one: _robust_sd(rest(one)), default=None)
+    if best is None:
+        return None
+    lag, correlation, slope = best
+    return Following(
+        lag=lag,
+        correlation=correlation,
+        slope=slope,
+        offset=float(np.median(z - math.copysign(1.0, slope) * np.interp(s - lag, t, u))),
+        scatter=max(min(_scatter(z), _scatter(rest(best))), _resolution(z)),
+        misfit=_robust_sd(rest(best)),
+        outliers=_outliers(rest(best)),
+    )
+
+
+def _known(stamp: TimeArray, value: FloatArray, origin: int) -> tuple[FloatArray, FloatArray]:
+    """Seconds and values of the rows that have both, in order."""
+    there = (stamp != NO_STAMP) & np.isfinite(value)
+    time, order = np.unique((stamp[there] - origin) / 1e9, return_index=True)
+    return time, value[there][order]
+
+
+def _at_span(
+    t: FloatArray, u: FloatArray, s: FloatArray, z: FloatArray, span: float
+) -> tuple[float, float, float] | None:
+    """Lag, correlation and slope by the changes over a span [s]."""
+    rows = 0 if span == math.inf else max(1, round(span / max(float(np.median(np.diff(s))), 1e-6)))
+    if len(s) - rows < _FEWEST:
+        return None
+    some = np.unique(np.linspace(0, len(s) - rows - 1, min(_MOST, len(s) - rows)).astype(np.int64))
+    begin, end = s[some], s[some + rows]
+
+    def changes(at_begin: FloatArray, at_end: FloatArray) -> FloatArray:
+        return at_end - (at_begin if rows else at_end.mean())
+
+    change = changes(z[some], z[some + rows])
+    low, high = np.quantile(change, [0.01, 0.99])  # outliers
+    change = np.clip(change, low, high)
+
+    def moves(lag: float) -> FloatArray:
+        return changes(np.interp(begin - lag, t, u), np.interp(end - lag, t, u))
+
+    def correlation(lag: float) -> float:
+        other = moves(lag)
+        norm = math.sqrt(float(other @ other) * float(change @ change))
+        return float(other @ change) / norm if norm > 0.0 else 0.0
+
+    coarse = np.arange(_EARLIEST, _LATEST, _COARSE)
+    found = np.array([correlation(lag) for lag in coarse])
+    if not np.abs(found).any():
+        return None
+    sign = -1.0 if -found.min() > found.max() + _MIRRORED else 1.0
+    found = np.pad(sign * found, 1, constant_values=-1.0)
+    peaks = (found[1:-1] >= np.maximum(found[:-2], found[2:])) & (found[1:-1] >= _NEARLY * found.max())
+    best = min(coarse[peaks], key=abs)
+    fine = np.arange(best - 1.5 * _COARSE, best + 1.5 * _COARSE, _FINE)
+    lag = float(fine[int(np.argmax([sign * correlation(one) for one in fine]))])
+    other = moves(lag)
+    return lag, correlation(lag), float(other @ change) / float(other @ other)
+
+
+def _scatter(value: FloatArray) -> float:
+    """Noise by third differences, which remove smooth motion: their variance is 20 times the noise's."""
+    third = np.abs(np.diff(value, 3))
+    return 1.4826 * float(np.median(third)) / math.sqrt(20.0) if len(third) else 0.0
+
+
+def _resolution(value: FloatArray) -> float:
+    """Noise of the steps in which values come."""
+    steps = np.diff(np.unique(value))
+    return float(steps.min()) / math.sqrt(12.0) if len(steps) else 0.0
+
+
+def _outliers(value: FloatArray) -> float:
+    """The share that jumps away from both neighbours, which agree."""
+    away = np.abs(value[1:-1] - 0.5 * (value[:-2] + value[2:]))
+    sd = max(1.4826 * float(np.median(away)), _resolution(value))
+    return float(((away > _OUTLYING * sd) & (np.abs(value[2:] - value[:-2]) < _AGREEING * sd)).mean())
+
+
+def _robust_sd(rest: FloatArray) -> float:
+    return 1.4826 * float(np.median(np.abs(rest - np.median(rest))))

@@ -1,0 +1,160 @@
+"""Numbers of an arm and its sensors to begin with, from how the motions of a log follow each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..units import Kind
+from .contents import rate_of
+from .following import Following
+from .survey import Survey
+
+_FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
+_DELAY_SHARE = 0.6  # of the lag; the PUMA's is 0.6, a servo's on a bus rather 0.75
+_UNKNOWN_LAG = 0.1  # s, where nothing follows
+_UNKNOWN_SD, _SMALLEST_SD = 1e-3, 1e-6  # m or rad
+_OUTLIERS = 3e-3  # share from which a gate pays
+_GATE = 5.0
+_DIFFERENT = 5.0  # sds
+
+
+@dataclass(frozen=True)
+class AxisGuess:
+    """An axis: lag [s] behind the held command, plant, and noise [m or rad].
+
+    Attributes:
+        kind: Whether it is a length or an angle.
+        follows: The sensor from which it is known; empty: none.
+        lag: Behind the held command at constant velocity [s].
+        time_constant: Of the plant [s].
+        gain: How far it moves when the command moves by 1.
+        misfit: What the delayed command leaves.
+        offset_sd: For ``[start]``.
+        input_noise: Its density [m/√Hz].
+        drift: Its density [m/√s].
+    """
+
+    kind: Kind
+    follows: str
+    lag: float
+    time_constant: float
+    gain: float
+    misfit: float
+    offset_sd: float
+    input_noise: float
+    drift: float
+
+
+@dataclass(frozen=True)
+class ArmGuess:
+    """Update period and delay [s], and the axes."""
+
+    period: float
+    delay: float
+    axes: Mapping[str, AxisGuess]
+
+
+@dataclass(frozen=True)
+class SensorGuess:
+    """A sensor: noise and biases by axis [m or rad], latency [s] and where it is from, scale, gate (0: none needed)."""
+
+    sd: Mapping[str, float]
+    bias: Mapping[str, float]
+    latency: float
+    latency_words: str
+    scale: float
+    gate: float
+
+
+def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
+    """The arm, and each sensor."""
+    run = found.run
+    period = rate_of(run.command.stamp)[0]
+    relations = {key: one for key, one in found.relations.items() if abs(one.correlation) >= _FOLLOWS}
+    first, latencies = _latencies(relations)
+    leads = {
+        axis: {name: relations[name, axis] for name in run.sensors if (name, axis) in relations} for axis in run.axes
+    }
+    # Behind the path through the commanded points a held command is late by half a period itself.
+    lags = {
+        axis: float(np.median([one.lag - latencies[name] for name, one in mine.items()])) - 0.5 * period
+        for axis, mine in leads.items()
+        if mine
+    }
+    shortest = max(min(lags.values(), default=_UNKNOWN_LAG), 0.0)
+    delay = _DELAY_SHARE * shortest
+    axes = {axis: _axis(found, axis, leads[axis], lags.get(axis, _UNKNOWN_LAG), delay) for axis in run.axes}
+    sensors = {name: _sensor(found, name, latencies.get(name, 0.0), first, leads) for name in run.sensors}
+    return ArmGuess(period, delay, axes), sensors
+
+
+def _latencies(relations: Mapping[tuple[str, str], Following]) -> tuple[str, dict[str, float]]:
+    """The source that is earliest, the reference if there is one, and how much later each sensor is [s].
+
+    Medians over the axes that both have.
+    """
+    lags: dict[str, dict[str, float]] = {}
+    for (name, axis), one in relations.items():
+        lags.setdefault(name, {})[axis] = one.lag
+    middle = {name: float(np.median(list(mine.values()))) for name, mine in lags.items()}
+    first = "reference" if "reference" in lags else min(middle, key=middle.__getitem__, default="")
+    ahead = min(middle.get(first, 0.0), 0.0)  # by another clock
+    late: dict[str, float] = {}
+    for name, mine in lags.items():
+        both = [mine[axis] - lags[first][axis] for axis in mine if axis in lags[first]]
+        late[name] = ahead + (max(float(np.median(both)), 0.0) if both else 0.0)
+    return first, late
+
+
+def _axis(found: Survey, axis: str, followers: Mapping[str, Following], lag: float, delay: float) -> AxisGuess:
+    best = max(followers, key=lambda name: abs(followers[name].correlation), default="")
+    travel = float(np.nanmax(found.run.command.values[axis]) - np.nanmin(found.run.command.values[axis]))
+    one = followers.get(best)
+    misfit = max(one.misfit if one else 0.02 * travel, _SMALLEST_SD)
+    offset = min((abs(one.offset) for one in followers.values()), default=0.0)
+    rest = max(lag - delay, 0.2 * lag, 1e-3)
+    return AxisGuess(
+        kind=found.run.kinds.get(axis, "length"),
+        follows=best,
+        lag=max(lag, delay + rest),
+        time_constant=rest,
+        gain=abs(one.slope) if one else 1.0,
+        misfit=misfit,
+        offset_sd=max(3.0 * misfit, 2.0 * offset if offset < 0.5 * travel else 0.0),
+        input_noise=misfit * math.sqrt(rest),
+        drift=0.5 * misfit,
+    )
+
+
+def _sensor(
+    found: Survey, name: str, latency: float, first: str, leads: Mapping[str, Mapping[str, Following]]
+) -> SensorGuess:
+    relations = {axis: found.relations.get((name, axis)) for axis in found.run.sensors[name].values}
+    known = {axis: one for axis, one in relations.items() if one is not None}
+    mirrored = [one.slope < 0.0 for one in known.values() if abs(one.correlation) >= _FOLLOWS]
+    scale = -1.0 if sum(mirrored) > len(mirrored) / 2 else 1.0
+    bias = {axis: size for axis, one in known.items() if (size := _bias(found, axis, one, scale, leads[axis]))}
+    sd = {axis: max(known[axis].scatter, _SMALLEST_SD) if axis in known else _UNKNOWN_SD for axis in relations}
+    outliers = max((one.outliers for one in known.values()), default=0.0)
+    words = "DECIDE: how old a measurement is when it is stamped"
+    if first == "reference":
+        words = "so much later than the reference, whose stamps are taken to be right"
+    elif first and name != first:
+        words = f"so much later than {first}; add how old a measurement of that one is"
+    return SensorGuess(sd, bias, latency, words, scale, _GATE if outliers > _OUTLIERS else 0.0)
+
+
+def _bias(found: Survey, axis: str, one: Following, scale: float, others: Mapping[str, Following]) -> float:
+    """The prior sd of a sensor's bias: where its zero is far from the commands', or from a better sensor's; 0: none."""
+    value = found.run.command.values[axis]
+    travel = float(np.nanmax(value) - np.nanmin(value))
+    noise = _DIFFERENT * (one.scatter + one.misfit)
+    if scale < 0.0 or abs(one.offset) > max(0.5 * travel, noise):
+        return 2.0 * max(abs(one.offset), noise)
+    best = min((other for other in others.values() if other.slope > 0.0), key=lambda other: other.scatter, default=one)
+    apart = abs(one.offset - best.offset)
+    return 2.0 * apart if apart > noise else 0.0

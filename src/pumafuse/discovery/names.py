@@ -1,0 +1,162 @@
+"""What names say: of columns, topics and files. Role, axis, unit, and which columns are no positions at all."""
+
+from __future__ import annotations
+
+import re
+from typing import Literal, TypeAlias
+
+from ..logs.columns import leaf
+from ..units import ending, kind_of
+
+Role: TypeAlias = Literal["command", "sensor", "reference"]
+
+
+def words_in(text: str) -> frozenset[str]:
+    """The words of a list that is easy to read here."""
+    return frozenset(text.split())
+
+
+# Where words of several roles meet, as in command_state, the first role wins.
+_ROLES: dict[Role, frozenset[str]] = {
+    "reference": words_in("truth reference ground gt groundtruth"),
+    "command": words_in("command commands commanded cmd goal goals target targets desired setpoint action"),
+    "sensor": words_in(
+        "state states measured measurement measurements meas actual encoder encoders tracker camera vision sensor"
+        " feedback observed observation range laser mocap vicon optitrack recorded reported odom gps"
+    ),
+}
+_OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
+_OF_PLACES = words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in that of a column
+_PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
+_SILENT = (
+    _OF_ROLES
+    | _PARTS
+    | words_in(
+        "pose poses position positions pos point points data translation transform value values scalar scalars joint"
+        " controller robot arm tool tcp ee flange coordinates axis"
+    )
+)
+_NO_POSITIONS = words_in(
+    "velocity velocities vel speed acceleration accelerations acc jerk effort efforts torque force current voltage"
+    " temperature temp quality confidence covariance orientation rotation quaternion twist index id seq sequence count"
+    " status valid std sd sigma latency duration error header stamp nanosec layout frame done reward task episode tick"
+    " time timestamp"
+)
+_TIMES = words_in(
+    "t time times stamp stamps timestamp timestamps sec secs seconds date datetime clock ts arrival arrived"
+)
+_SLIDING = words_in("slide slider prismatic linear rail gantry")
+_UNITS = {
+    **dict.fromkeys(words_in("mm millimeter millimeters millimetre millimetres"), "mm"),
+    **dict.fromkeys(words_in("m meter meters metre metres"), "m"),
+    **dict.fromkeys(words_in("um micrometer micrometers micrometre micrometres"), "um"),
+    **dict.fromkeys(words_in("deg degs degree degrees"), "deg"),
+    **dict.fromkeys(words_in("rad rads radian radians"), "rad"),
+    "mrad": "mrad",
+}
+_TURNING = re.compile(
+    r"joint|shoulder|elbow|wrist|angle|theta|yaw|pitch|roll|motor|servo|pan|tilt|lift|flex|gripper|^[mjq]_?\d+$"
+)
+
+
+def words(name: str) -> list[str]:
+    """The words of a name in lower case: ``goalPose_x`` → goal, pose, x."""
+    apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name)
+    return [word.lower() for word in re.split(r"[^A-Za-z0-9]+", apart) if word]
+
+
+def role_of(name: str) -> Role | None:
+    """What the name of a topic or a file says its numbers are."""
+    return _role(words(name), _OF_PLACES)
+
+
+def role_words(column: str) -> list[str]:
+    """The words of a column's name that say whose it is."""
+    return [word for word in words(leaf(column)) if word in _OF_ROLES]
+
+
+def column_role(column: str) -> Role | None:
+    """What the name of a column says its numbers are."""
+    return _role(words(leaf(column)), frozenset())
+
+
+def is_part(column: str) -> bool:
+    """Whether a column is one of several that are added up."""
+    return not _PARTS.isdisjoint(words(column))
+
+
+def is_time(column: str) -> bool:
+    """Whether a column is called as stamps are."""
+    return not _TIMES.isdisjoint(words(column))
+
+
+def no_position(column: str) -> str | None:
+    """What a column is by its name, if that is no position."""
+    kind, unit = kind_of(leaf(column)), ending(leaf(column))
+    found = next((word for word in words(leaf(column)) if word in _NO_POSITIONS), None)
+    return found or (f"in {unit.strip('_').replace('_', '/')}" if unit is not None and kind is None else None)
+
+
+def unit_of(column: str) -> str:
+    """The unit of a position that a name says, ``mm``; empty without one."""
+    unit = ending(leaf(column))
+    if unit is not None and kind_of(leaf(column)) is not None:
+        return unit[1:]
+    *before, last = words(column) or [""]  # also that of `x [mm]`
+    return _UNITS.get(last, "") if before else ""
+
+
+def is_turning(axis: str) -> bool:
+    """Whether an axis is called as joints are."""
+    return _TURNING.search(axis) is not None
+
+
+def is_sliding(joint: str) -> bool:
+    """Whether a joint is called as those are that slide, in metres, where others turn."""
+    return not _SLIDING.isdisjoint(words(joint))
+
+
+def axis_of(column: str, labels: list[str]) -> str:
+    """What a column's axis is called: the words of its name that say nothing else.
+
+    Args:
+        column: Its name, or a field path.
+        labels: What the elements of lists are, where the log says so.
+    """
+    label = None if unit_of(column) else re.search(r"\[([^\]]*)\]$", column)
+    if label and label[1].isdigit():
+        place = int(label[1])
+        if place < len(labels):
+            return plain(re.sub(r"\.pos$", "", labels[place]))
+        spatial = place < 3 and not {"translation", "translations"}.isdisjoint(words(column))
+        return "xyz"[place] if spatial else f"joint{place}"
+    if label:
+        return plain(label[1])
+    unit = unit_of(column)
+    kept = [word for word in words(column) if word not in _SILENT]
+    if unit and kept and _UNITS.get(kept[-1]) == unit:
+        kept = kept[:-1]
+    if kept and all(word.isdigit() for word in kept):
+        kept = ["joint", *kept]
+    return plain("_".join(kept)) or "position"
+
+
+def plain(name: str) -> str:
+    """A name that can be an axis or a sensor: letters, digits, no unit at its end."""
+    made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")[:60]
+    while (unit := ending(made)) is not None:
+        made = made.removesuffix(unit)
+    return made
+
+
+def printable(text: str, longest: int = 80) -> str:
+    """A text from a log for a screen or a comment: one line, no control characters, not too long."""
+    shown = "".join(letter if letter.isprintable() else "?" for letter in text)
+    return shown if len(shown) <= longest else f"{shown[: longest - 1]}…"
+
+
+def _role(found: list[str], more: frozenset[str]) -> Role | None:
+    for role, known in _ROLES.items():
+        if not known.isdisjoint(found):
+            return role
+    return None if more.isdisjoint(found) else "sensor"

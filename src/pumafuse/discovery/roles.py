@@ -1,0 +1,309 @@
+"""Which part of a log is the commands, which are sensors, which is a reference; and which axis is which."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..errors import RunError
+from ..logs.run import Run, Source
+from ..units import AN, OF_KIND, Kind, kind_of
+from . import names
+from .contents import Part, Signal
+from .following import Following, following
+from .names import Role
+
+_FOLLOWS = 0.5  # correlation of changes from which one signal is said to follow another
+_SAME = 0.8  # from which it is taken for the same axis under another name
+_NUMBERED = re.compile(r"joint\d+|position")
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A source of the run to be: columns of a part that belong together.
+
+    Attributes:
+        name: What it is called.
+        role: What it is; None: its names do not say.
+        why: How that is known.
+        part: Where it is.
+        axes: For each axis its columns, which are added up.
+    """
+
+    name: str
+    role: Role | None
+    why: str
+    part: Part
+    axes: Mapping[str, Sequence[Signal]]
+
+    @property
+    def source(self) -> Source:
+        """Its rows that have a value."""
+        assert self.part.clock is not None
+        values = {axis: np.sum([one.value for one in signals], axis=0) for axis, signals in self.axes.items()}
+        source = Source(self.part.clock.stamp, values, self.part.label)
+        return source.rows(source.has_value)
+
+    @property
+    def guessed(self) -> bool:
+        """Whether its units are a guess by their range."""
+        return any(one.basis == "range" for signals in self.axes.values() for one in signals)
+
+    def kind(self, axis: str) -> Kind:
+        """What one of its axes is."""
+        return kind_of(f"_{self.axes[axis][0].unit}") or "length"
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Who is who.
+
+    Attributes:
+        command: The commands.
+        sensors: The sensors.
+        reference: The reference, if there is one.
+        left_out: What is none of them, or not for these axes, and why.
+    """
+
+    command: Stream
+    sensors: Sequence[Stream]
+    reference: Stream | None
+    left_out: Sequence[tuple[Stream, str]]
+
+    @property
+    def run(self) -> Run:
+        """The run as it would be read."""
+        sensors = {one.name: one.source for one in self.sensors}
+        kinds: dict[str, Kind] = {axis: self.command.kind(axis) for axis in self.command.axes}
+        reference = None if self.reference is None else self.reference.source
+        return Run("log", self.command.source, sensors, reference, kinds=kinds)
+
+
+def roles_of(parts: Iterable[Part], log: str) -> Roles:
+    """Who is who among the parts of a log.
+
+    Raises:
+        RunError: There are no positions, or none that can be commands.
+    """
+    streams = [stream for part in parts for stream in _streams(part)]
+    if not streams:
+        raise RunError(f"{log}: no columns of positions with a clock beside them; say in run.toml where they are")
+    streams = _uniquely_named(streams)
+    command, why = _command(streams, log)
+    left_out: list[tuple[Stream, str]] = []
+    kept: list[Stream] = []
+    for stream in streams:
+        if stream is command:
+            continue
+        if stream.role == "command":
+            left_out.append((stream, "other commands: a run has one source of them; exchange the two to use these"))
+            continue
+        axes, why_not = _matched(command, stream)
+        matched = replace(stream, axes={axis: axes[axis] for axis in command.axes if axis in axes})
+        if stream.role is None and axes:
+            late = _follows(command, matched)
+            matched = replace(matched, role="sensor" if late else None, why=f"it follows the commands {late}")
+            why_not = "neither its name nor its motion says what it is: it does not follow the commands"
+        if axes and matched.role:
+            kept.append(matched)
+        else:
+            left_out.append((stream, why_not))
+    command, *kept = _renamed([replace(command, role="command", why=why), *kept])
+    sensors = [one for one in kept if one.role == "sensor"]
+    references = [one for one in kept if one.role == "reference"]
+    left_out += [(one, "a second reference") for one in references[1:]]
+    reports = [one for one in sensors if "reported" in one.name.split("_") and len(sensors) > 1]
+    left_out += [(one, "what the controller itself reports: no measurement of where the tool is") for one in reports]
+    sensors = [one for one in sensors if one not in reports]
+    return _with_units(Roles(command, sensors, references[0] if references else None, left_out))
+
+
+def relations(run: Run) -> dict[tuple[str, str], Following]:
+    """How each sensor, and ``reference``, follows the commands, by its name and the axis."""
+    every = {**run.sensors, **({} if run.reference is None else {"reference": run.reference})}
+    return {
+        (name, axis): found
+        for name, source in every.items()
+        for axis, value in source.values.items()
+        if axis in run.command.values
+        and (found := following((run.command.stamp, run.command.values[axis]), (source.stamp, value))) is not None
+    }
+
+
+def _streams(part: Part) -> list[Stream]:
+    """The columns of a part, those apart whose names say that they are something else."""
+    if part.clock is None:
+        return []
+    groups: dict[str, list[Signal]] = {}
+    for signal in part.signals:
+        groups.setdefault("_".join(dict.fromkeys(names.role_words(signal.column))), []).append(signal)
+    found = list[Stream]()
+    for key, signals in groups.items():
+        own = (names.column_role(signals[0].column), f"its columns are called '{key.replace('_', ' ')}'")
+        file = (names.role_of(part.stem), f"it is called '{names.printable(part.stem)}'")
+        clock = (names.column_role(part.clock.column), f"its clock is called '{names.printable(part.clock.column)}'")
+        by_type = ("command" if part.type.endswith("JointTrajectory") else None, f"its messages are {part.type}")
+        by_state = ("sensor" if part.type.endswith("JointState") else None, f"its messages are {part.type}")
+        order = (own, file, clock) if len(groups) > 1 else (file, own, clock)
+        role, why = next((one for one in (*order, by_type, by_state) if one[0]), (None, ""))
+        name = key if len(groups) > 1 and key else names.plain(part.stem)
+        found.append(Stream(name or "log", role, why, part, _axes(signals)))  # pyright: ignore[reportArgumentType]
+    return found
+
+
+def _axes(signals: Sequence[Signal]) -> dict[str, list[Signal]]:
+    """Columns by axis: parts of a sum together; others that would be called the same get a number."""
+    found: dict[str, list[Signal]] = {}
+    for signal in signals:
+        axis, number = signal.axis, 1
+        while axis in found and not (names.is_part(signal.column) and names.is_part(found[axis][0].column)):
+            number += 1
+            axis = f"{signal.axis}_{number}"
+        found.setdefault(axis, []).append(signal)
+    return {
+        axis: some for axis, some in found.items() if any(np.nanmin(one.plain) < np.nanmax(one.plain) for one in some)
+    }
+
+
+def _uniquely_named(streams: Iterable[Stream]) -> list[Stream]:
+    found: dict[str, Stream] = {}
+    for stream in streams:
+        name, number = stream.name, 1
+        while name in found:
+            number += 1
+            name = f"{stream.name}_{number}"
+        found[name] = replace(stream, name=name)
+    return list(found.values())
+
+
+def _command(streams: Sequence[Stream], log: str) -> tuple[Stream, str]:
+    """The commands, and how they are known: by name, and of several by what follows them; without names by that."""
+    called = [one for one in streams if one.role == "command"]
+    if len(called) == 1:
+        return called[0], called[0].why
+    # A reference that runs ahead is a set point, as control engineers call it.
+    candidates = (
+        called or [one for one in streams if one.role is None] or [one for one in streams if one.role == "reference"]
+    )
+    followers = {one.name: _followers(one, streams) for one in candidates}
+    best = max(candidates, key=lambda one: followers[one.name], default=None)
+    if best is None or (not called and not followers[best.name]):
+        what = ", ".join(names.printable(one.part.label) for one in streams)
+        raise RunError(
+            f"{log}: which numbers are the commands? None is called command, goal, target, desired, setpoint or action,"
+            f" and none runs ahead of others ({what}); say it in run.toml"
+        )
+    return best, best.why or "others follow it"
+
+
+def _followers(leader: Stream, streams: Sequence[Stream]) -> int:
+    """How many axes of others run behind a stream."""
+    count = 0
+    for other in streams:
+        if other is not leader and other.role != "command":
+            for axis in _matched(leader, other)[0]:
+                found = _relation(leader, axis, other, axis)
+                count += found is not None and abs(found.correlation) >= _FOLLOWS and found.lag > 0.0
+    return count
+
+
+def _follows(command: Stream, stream: Stream) -> str:
+    """By how much a stream follows the commands, in words; empty if it does not."""
+    for axis in stream.axes:
+        found = _relation(command, axis, stream, axis)
+        if found is not None and abs(found.correlation) >= _FOLLOWS:
+            return f"{found.lag * 1e3:.0f} ms late"
+    return ""
+
+
+def _relation(leader: Stream, axis: str, follower: Stream, other: str) -> Following | None:
+    if axis not in leader.axes or other not in follower.axes:
+        return None
+    first, second = leader.source, follower.source
+    return following((first.stamp, first.values[axis]), (second.stamp, second.values[other]))
+
+
+def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal]], str]:
+    """Axes of a stream by the names that the commands give them, by name or else by how they move; or why none is."""
+    fits = {axis: signals for axis, signals in stream.axes.items() if axis in command.axes}
+    fits = {axis: signals for axis, signals in fits.items() if _same_kind(command, axis, stream, axis)}
+    best = ("", 0.0)
+    for own, signals in stream.axes.items():
+        if own in fits or own in command.axes:
+            continue
+        found = {
+            axis: abs(one.correlation)
+            for axis in command.axes
+            if axis not in fits and _same_kind(command, axis, stream, own)
+            if (one := _relation(command, axis, stream, own)) is not None
+        }
+        axis = max(found, key=found.__getitem__, default="")
+        if axis and found[axis] >= _SAME:
+            fits[axis] = signals
+        elif axis:
+            best = max(best, (axis, found[axis]), key=lambda one: one[1])
+    if fits or not best[0]:
+        kinds = sorted({AN[stream.kind(axis)] for axis in stream.axes})
+        return fits, f"no command moves {', '.join(stream.axes)} ({' or '.join(kinds)}) at the same time"
+    return fits, f"its axes are called otherwise than the commands', and follow none (at most {best[1]:.2f}, {best[0]})"
+
+
+def _same_kind(command: Stream, axis: str, stream: Stream, own: str) -> bool:
+    """Whether two axes can be the same by their units."""
+    return command.kind(axis) == stream.kind(own) or command.guessed or stream.guessed
+
+
+def _renamed(streams: Sequence[Stream]) -> list[Stream]:
+    """Streams in which axes that the commands only number are called as the first other stream does."""
+    command, *others = streams
+    called = {axis: one.axes[axis][0].axis for one in reversed(others) for axis in one.axes}
+    free = {axis: own for axis, own in called.items() if _NUMBERED.fullmatch(axis) and own not in command.axes}
+    if len(set(free.values())) < len(free):
+        return list(streams)
+    return [replace(one, axes={free.get(axis, axis): one.axes[axis] for axis in one.axes}) for one in streams]
+
+
+def _with_units(roles: Roles) -> Roles:
+    """Units that are guesses are made to fit the motion of a stream whose units are known."""
+    sure = [one for one in (roles.command, *roles.sensors, roles.reference) if one is not None and not one.guessed]
+    if len(sure) == len(roles.sensors) + 1 + (roles.reference is not None):
+        return roles
+    anchor = roles.command if not roles.command.guessed else next(iter(sure), roles.command)
+    fixed: dict[str, Stream] = {}
+    for one in (roles.command, *roles.sensors, roles.reference):
+        if one is not None and one.guessed and one is not anchor:
+            fixed[one.name] = _fitted(one, anchor)
+    reference = roles.reference
+    return replace(
+        roles,
+        command=fixed.get(roles.command.name, roles.command),
+        sensors=[fixed.get(one.name, one) for one in roles.sensors],
+        reference=None if reference is None else fixed.get(reference.name, reference),
+    )
+
+
+def _fitted(stream: Stream, anchor: Stream) -> Stream:
+    """A stream with the units in which it moves as far as another."""
+    made = dict(stream.axes)
+    for axis in made:
+        if axis in anchor.axes:
+            kind = anchor.kind(axis)
+            sizes = {unit: _travel(replace(stream, axes={axis: _in(made[axis], unit)}), axis) for unit in OF_KIND[kind]}
+            wanted = _travel(anchor, axis)
+            unit = min(sizes, key=lambda unit: abs(math.log(max(sizes[unit], 1e-12) / max(wanted, 1e-12))))
+            made[axis] = _in(made[axis], unit)
+    return replace(stream, axes=made)
+
+
+def _in(signals: Sequence[Signal], unit: str) -> list[Signal]:
+    return [replace(one, unit=unit.removeprefix("_")) if one.basis == "range" else one for one in signals]
+
+
+def _travel(stream: Stream, axis: str) -> float:
+    """How far an axis moves, outliers apart [m or rad]."""
+    low, high = np.nanquantile(stream.source.values[axis], [0.02, 0.98])
+    return float(high - low)

@@ -1,0 +1,118 @@
+"""`pumafuse init` by the executable: init, tune and fuse without an edit, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from executable import DATA, names, pumafuse, refused
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+
+
+def scores(folder: Path) -> dict[str, float]:
+    """RMSE of each axis, in its unit."""
+    summary = json.loads((folder / "summary.json").read_text())
+    return {
+        axis: next(value for key, value in part["score"].items() if key.startswith("rmse_"))
+        for axis, part in summary["axes"].items()
+        if part["score"]
+    }
+
+
+def carried_through(log: Path, place: Path, fit: str) -> Path:
+    """The result of init, tune and fuse, none of whose files was touched between them."""
+    made = place / "made"
+    pumafuse("init", log, "-o", made)
+    assert names(made) == {"run.toml", "arm.toml", "fusion.toml"}
+    pumafuse("tune", made, "-c", made / "fusion.toml", "-o", place / "tuned", "--fit", fit)
+    pumafuse("fuse", made, "-c", place / "tuned" / "fusion.toml", "-o", place / "fused")
+    return place / "fused"
+
+
+def test_a_folder_of_tables_goes_through_without_an_edit(tmp_path: Path) -> None:
+    """The example, without its run.toml: axes are called as the columns are; innovations fit their sds."""
+    log = tmp_path / "log"
+    log.mkdir()
+    for name in ("robot.csv", "camera.csv"):
+        shutil.copy(EXAMPLES / "my-run" / name, log)
+    fused = carried_through(log, tmp_path, "noise")
+    summary = json.loads((fused / "summary.json").read_text())
+    assert set(summary["axes"]) == {"x", "z"}
+    for axis in summary["axes"].values():
+        assert axis["sensors"]["camera"]["outcomes"]["fused"] > 880
+        assert 0.8 < axis["sensors"]["camera"]["nis_mean"] < 1.2
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("described", [True, False])
+def test_the_shipped_scan_is_fused_to_a_tenth_of_a_millimetre(described: bool, tmp_path: Path) -> None:
+    """With its run.toml and without: three sensors, one of them mirrored, a command that is a sum."""
+    log = tmp_path / "scan"
+    shutil.copytree(DATA / "scan1", log)
+    if not described:
+        (log / "run.toml").unlink()
+    found = scores(carried_through(log, tmp_path, "noise,delay,plant"))
+    assert set(found) == ({"tangential", "radial", "vertical"} if described else {"x", "y", "z"})
+    assert max(found.values()) < 0.15, found  # mm; the camera's noise is 0.5, and it is 45 ms late at 60 mm/s
+
+
+@pytest.mark.long
+def test_a_real_robot_is_fused_better_than_its_camera(tmp_path: Path) -> None:
+    """Angles, 0.3° of camera noise five times a second: a camera that is held is 2 to 6° off."""
+    found = scores(carried_through(EXAMPLES / "trunk-servo" / "0g", tmp_path, "noise,delay,plant"))
+    assert len(found) == 6
+    assert max(found.values()) < 1.5, found
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not SHARED.exists(), reason="no shared recordings")
+def test_columns_without_units_go_through(tmp_path: Path) -> None:
+    """Degrees by their range; commands, encoder and camera by the names of files."""
+    fused = carried_through(SHARED / "trunk-servo" / "0g", tmp_path, "noise")
+    summary = json.loads((fused / "summary.json").read_text())
+    assert {axis: part["kind"] for axis, part in summary["axes"].items()} == {f"m{n}": "angle" for n in range(1, 7)}
+
+
+def test_files_that_are_there_stay_unless_forced(tmp_path: Path) -> None:
+    """One line says which; other files in the folder do not matter."""
+    made = tmp_path / "made"
+    made.mkdir()
+    (made / "notes.txt").write_text("mine")
+    (made / "arm.toml").write_text("mine")
+    text = refused("init", EXAMPLES / "my-run", "-o", made)
+    assert text.endswith("has arm.toml already; --force replaces it, or choose another folder")
+    assert names(made) == {"notes.txt", "arm.toml"}
+    pumafuse("init", EXAMPLES / "my-run", "-o", made, "--force")
+    assert names(made) == {"notes.txt", "run.toml", "arm.toml", "fusion.toml"}
+
+
+def test_the_folder_is_called_after_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no other is given, below the current one."""
+    monkeypatch.chdir(tmp_path)
+    pumafuse("init", EXAMPLES / "my-run")
+    assert names(tmp_path / "my-run-fusion") == {"run.toml", "arm.toml", "fusion.toml"}
+
+
+def test_names_of_a_log_do_not_reach_the_terminal_as_markup(tmp_path: Path) -> None:
+    """Control characters are shown as ?, brackets as they are."""
+    log = tmp_path / "log"
+    log.mkdir()
+    for name in ("robot.csv", "camera.csv"):
+        text = (EXAMPLES / "my-run" / name).read_text()
+        (log / name).write_text(text.replace("quality", "[red]quality\x1b[31m").replace("x_", "[/red]\x1b]x_"))
+    done = pumafuse("init", log, "-o", tmp_path / "made")
+    assert "\x1b" not in done.stdout
+    assert "[red]quality?[31m" in done.stdout.replace("\n", "")
+
+
+def test_what_is_no_log_is_one_line(tmp_path: Path) -> None:
+    """Nothing is written."""
+    (tmp_path / "a.txt").write_text("no log")
+    assert "no such file or folder" in refused("init", tmp_path / "none")
+    assert "accepted: CSV, Parquet, MCAP" in refused("init", tmp_path / "a.txt", "-o", tmp_path / "made")
+    assert names(tmp_path) == {"a.txt"}

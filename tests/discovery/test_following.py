@@ -1,0 +1,80 @@
+"""Lag, gain and level of one signal behind another, against signals that were made with known ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pumafuse.arrays import FloatArray, TimeArray
+from pumafuse.discovery.following import following
+
+
+def path(t: FloatArray) -> FloatArray:
+    """A smooth motion that does not repeat within a minute [m]."""
+    t = np.maximum(t, 0.0)
+    return 0.1 * (1.0 - np.cos(0.9 * t)) + 0.04 * np.sin(2.3 * t + 0.4 * np.sin(0.17 * t))
+
+
+def stamped(t: FloatArray) -> TimeArray:
+    return 1_790_000_000_000_000_000 + np.rint(t * 1e9).astype(np.int64)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    lag=st.floats(-0.3, 0.8),
+    gain=st.one_of(st.floats(0.5, 2.0), st.floats(-2.0, -0.5)),
+    level=st.floats(-1.0, 1.0),
+    rate=st.sampled_from([5.0, 28.0, 100.0]),
+    seed=st.integers(0, 99),
+)
+def test_lag_gain_and_level_are_found(lag: float, gain: float, level: float, rate: float, seed: int) -> None:
+    """Within the noise, whatever rate, sign and offset; 1 % of outliers do not matter."""
+    draw = np.random.default_rng(seed)
+    t, s = np.arange(0.0, 40.0, 0.02), np.arange(1.0, 39.0, 1.0 / rate)
+    z = gain * path(s - lag) + level + draw.normal(scale=3e-4, size=len(s))
+    z[draw.random(len(s)) < 0.01] += 0.02
+    found = following((stamped(t), path(t)), (stamped(s), z))
+    assert found is not None
+    assert found.lag == pytest.approx(lag, abs=0.006)
+    assert found.slope == pytest.approx(gain, rel=0.02)
+    assert abs(found.correlation) > 0.98
+    if rate > 5.0:
+        assert 2e-4 < found.scatter < 5e-4
+    expected = np.median(z - np.sign(gain) * path(s - lag))
+    assert found.offset == pytest.approx(float(expected), abs=2e-3)
+
+
+def test_of_a_periodic_motion_the_shortest_lag_counts() -> None:
+    """A sine fits at every period, and upside down at every half of one."""
+    t = np.arange(0.0, 30.0, 0.01)
+    u, z = np.sin(2.0 * np.pi * t / 0.5), np.sin(2.0 * np.pi * (t - 0.08) / 0.5)
+    found = following((stamped(t), u), (stamped(t), z))
+    assert found is not None
+    assert found.lag == pytest.approx(0.08, abs=0.002)
+    assert found.slope == pytest.approx(1.0, abs=0.01)
+
+
+def test_outliers_are_counted_and_jerks_are_not() -> None:
+    """A value that both neighbours contradict is an outlier; a step of the motion is none."""
+    draw = np.random.default_rng(1)
+    t = np.arange(0.0, 60.0, 0.02)
+    steps = np.cumsum(draw.random(len(t)) < 0.01) % 2 * 0.05
+    for share in (0.0, 0.02):
+        z = np.interp(t - 0.1, t, path(t) + steps) + draw.normal(scale=1e-4, size=len(t))
+        z[draw.random(len(t)) < share] += 0.03
+        found = following((stamped(t), path(t) + steps), (stamped(t), z))
+        assert found is not None
+        assert found.outliers == pytest.approx(share, abs=0.004)
+
+
+def test_what_cannot_be_compared_has_no_relation() -> None:
+    """Other times, too few rows, or no motion: nothing, and no warning of numpy."""
+    t = np.arange(0.0, 20.0, 0.02)
+    u, still = path(t), np.zeros(len(t))
+    assert following((stamped(t), u), (stamped(t) - 10**18, u)) is None
+    assert following((stamped(t), u), (stamped(t)[:5], u[:5])) is None
+    assert following((stamped(t), still), (stamped(t), u)) is None
+    assert following((stamped(t)[:0], u[:0]), (stamped(t), u)) is None
+    assert following((stamped(t), np.full(len(t), np.nan)), (stamped(t), u)) is None

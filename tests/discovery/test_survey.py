@@ -1,0 +1,380 @@
+"""What is found in logs of many kinds, and that the files written load and fuse."""
+
+from __future__ import annotations
+
+import csv
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as papq
+import pytest
+
+import bag_files
+import pumafuse as pf
+from bag_files import KINDS
+from pumafuse.arrays import FloatArray
+from pumafuse.discovery import names
+from pumafuse.discovery.contents import parts_of
+from pumafuse.discovery.drafts import drafts
+from pumafuse.discovery.questions import questions
+from pumafuse.discovery.survey import Survey, survey
+from pumafuse.errors import RunError
+from refusals import one_line
+
+START = 1_790_000_000  # s
+LAG = 0.1  # s
+
+
+def path(t: FloatArray) -> FloatArray:
+    """Three axes of a smooth motion from rest [m], (n, 3)."""
+    t = np.maximum(t, 0.0)[:, None]
+    return np.array([0.3, 0.2, 0.1]) * (1.0 - np.cos(t * np.array([0.7, 1.1, 1.7])))
+
+
+def write(file: Path, columns: dict[str, Any]) -> None:
+    """A CSV file."""
+    with file.open("w", newline="") as text:
+        writer = csv.writer(text)
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
+
+
+def recorded(count: int = 1000, seed: int = 0) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Times and commands every 20 ms; times and measurements 4 ms later, 0.1 s late, with 0.5 mm of noise."""
+    t = 0.02 * np.arange(count)
+    noise = np.random.default_rng(seed).normal(scale=5e-4, size=(count, 3))
+    return t, path(t), t + 0.004, path(t + 0.004 - LAG) + noise
+
+
+def written(found: Survey, folder: Path) -> tuple[pf.Run, pf.FusionConfig]:
+    """The three files, as the loaders take them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in drafts(found, folder).items():
+        (folder / name).write_text(text)
+    return pf.Run.read(folder), pf.FusionConfig.load(folder / "fusion.toml")
+
+
+def check_fuses(log: Path, folder: Path, axes: tuple[str, ...] = ("x", "y", "z")) -> Survey:
+    """A log of :func:`recorded` fuses as it is, and well."""
+    found = survey(log)
+    run, config = written(found, folder)
+    assert run.axes == axes == tuple(config.arm.axes)
+    assert tuple(run.sensors) == tuple(config.sensors)
+    assert config.arm.update_period == pytest.approx(0.02, rel=0.01)
+    for axis in axes:
+        assert config.arm.lag_of(axis) == pytest.approx(LAG - 0.01, abs=0.01)  # behind the held command
+    est = pf.fuse(run, config)
+    counts = est.measurements.counts()
+    assert counts["fused"] > 0.9 * sum(counts.values()), counts
+    truth = path((est.time - est.time[0]) - LAG)
+    for number, axis in enumerate(axes):
+        error = est[axis].position[50:] - truth[50:, number]
+        assert np.sqrt(np.mean(error**2)) < 5e-4, axis
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "stamps", "unit"),
+    [
+        ("time_s", lambda t: [repr(float(one)) for one in t], ""),
+        ("t", lambda t: [repr(float(one)) for one in t], "s"),
+        ("t", lambda t: [repr(float(1e3 * one)) for one in t], "ms"),
+        ("timestamp", lambda t: [round(1e6 * (START + one)) for one in t], "us"),
+        ("stamp", lambda t: [START * 10**9 + round(1e9 * one) for one in t], "ns"),
+        ("Time [ms]", lambda t: [repr(float(1e3 * (START + one))) for one in t], "ms"),
+        ("date", lambda t: [str(np.datetime64(START * 10**9 + round(1e9 * one), "ns")) for one in t], ""),
+    ],
+)
+def test_clocks_are_known_by_name_by_date_and_by_interval(name: str, stamps: Any, unit: str, tmp_path: Path) -> None:
+    """Whatever the unit of the stamps, and whatever says it, the log is the same one."""
+    t, u, s, z = recorded()
+    log = tmp_path / "log"
+    log.mkdir()
+    write(log / "commands.csv", {name: stamps(t), **{f"{axis}_m": u[:, n] for n, axis in enumerate("xyz")}})
+    write(log / "camera.csv", {name: stamps(s), **{f"{axis}_m": z[:, n] for n, axis in enumerate("xyz")}})
+    found = check_fuses(log, tmp_path / "out")
+    assert {part.clock.unit for part in found.parts if part.clock} == {unit}
+
+
+@pytest.mark.parametrize("unit", ["", "_m", "_mm", "_um"])
+def test_units_without_a_name_are_those_in_which_both_move_alike(unit: str, tmp_path: Path) -> None:
+    """Commands in m by name: measurements without a unit that are 1000 times as large are in mm."""
+    t, u, s, z = recorded()
+    scale = {"": 1e3, "_m": 1.0, "_mm": 1e3, "_um": 1e6}[unit]
+    log = tmp_path / "log"
+    log.mkdir()
+    write(log / "commands.csv", {"time_s": t, **{f"{axis}_m": u[:, n] for n, axis in enumerate("xyz")}})
+    write(log / "camera.csv", {"time_s": s, **{f"{axis}{unit}": scale * z[:, n] for n, axis in enumerate("xyz")}})
+    found = check_fuses(log, tmp_path / "out")
+    assert any("No name says it" in one for one in questions(found)) is (unit == "")
+
+
+def test_one_table_with_everything_needs_no_names(tmp_path: Path) -> None:
+    """What runs ahead is the command, what follows is the sensor."""
+    t, u, _, z = recorded()
+    write(tmp_path / "log.csv", {"t": t, **{f"first.{a}_m": u[:, n] for n, a in enumerate("xyz")}})
+    write(tmp_path / "other.csv", {"t": t + 0.004, **{f"{a}_m": z[:, n] for n, a in enumerate("xyz")}})
+    log = tmp_path / "both"
+    log.mkdir()
+    write(log / "b.csv", {"t": t, **{f"{a}_m": u[:, n] for n, a in enumerate("xyz")}})
+    write(log / "a.csv", {"t": t + 0.004, **{f"{a}_m": z[:, n] for n, a in enumerate("xyz")}})
+    found = check_fuses(log, tmp_path / "out")
+    assert found.roles is not None
+    assert found.roles.command.part.label == "b.csv"
+    assert found.roles.command.why == "others follow it"
+
+
+def test_a_single_table_is_taken_apart_by_the_names_of_its_columns(tmp_path: Path) -> None:
+    """`command.x_mm`, and the columns of other loggers; empty cells are rows of others."""
+    t, u, s, z = recorded()
+    blank = [""] * len(t)
+    for number, (cmd, seen) in enumerate([("command.{}_mm", "camera.{}_mm"), ("{}_goal_mm", "{}_actual_mm")]):
+        order = np.argsort([*t, *s])
+        columns: dict[str, Any] = {"time_s": [*t, *s]}
+        for n, axis in enumerate("xyz"):
+            columns[cmd.format(axis)] = [*(1e3 * u[:, n]), *blank]
+            columns[seen.format(axis)] = [*blank, *(1e3 * z[:, n])]
+        log = tmp_path / f"log{number}.csv"
+        write(log, {key: [column[row] for row in order] for key, column in columns.items()})
+        check_fuses(log, tmp_path / f"out{number}")
+
+
+def test_axes_of_other_names_are_known_by_how_they_move(tmp_path: Path) -> None:
+    """A camera turned by 90° about z, and a range finder that looks along −y from a metre away."""
+    t, u, s, z = recorded()
+    log = tmp_path / "log"
+    log.mkdir()
+    write(log / "goal.csv", {"time_s": t, **{f"{axis}_m": u[:, n] for n, axis in enumerate("xyz")}})
+    write(log / "camera.csv", {"time_s": s, "u_mm": 1e3 * z[:, 2], "v_mm": 1e3 * z[:, 0]})
+    write(log / "range.csv", {"time_s": s, "range_mm": 1e3 * (1.0 - z[:, 1])})
+    found = survey(log)
+    run, config = written(found, tmp_path / "out")
+    assert {name: set(source.values) for name, source in run.sensors.items()} == {"camera": {"x", "z"}, "range": {"y"}}
+    assert config.sensors["range"].scale == -1.0
+    assert config.sensors["range"].bias_sd_of("y") > 1.0
+    est = pf.fuse(run, config)
+    assert np.sqrt(np.mean((est["y"].position[50:] - path(est.time - est.time[0] - LAG)[50:, 1]) ** 2)) < 1e-3
+
+
+def lerobot(folder: Path) -> None:
+    """A data set of three episodes at 50 Hz, joints in degrees."""
+    t, u, _, _ = recorded(600)
+    state = path(t - LAG) + np.random.default_rng(2).normal(scale=5e-4, size=u.shape)
+    kind = pa.list_(pa.float32(), 3)
+    table = pa.table(
+        {
+            "action": pa.array([(200.0 * row).tolist() for row in np.vstack([u, -u, u])], kind),
+            "observation.state": pa.array([(200.0 * row).tolist() for row in np.vstack([state, -state, state])], kind),
+            "timestamp": pa.array([*t, *t, *t], pa.float32()),
+            "frame_index": [*range(600)] * 3,
+            "episode_index": [index for index in range(3) for _ in t],
+        }
+    )
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    (folder / "meta").mkdir()
+    papq.write_table(table, folder / "data" / "chunk-000" / "file-000.parquet")
+    motors = {"names": {"motors": ["shoulder_pan.pos", "elbow_flex.pos", "gripper.pos"]}}
+    info = {"features": {"action": motors, "observation.state": motors}}
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+
+
+def test_a_data_set_of_lerobot_is_read_by_its_layout(tmp_path: Path) -> None:
+    """Action is the command, observation.state the sensor, joints have their names, one episode is the run."""
+    lerobot(tmp_path / "set")
+    found = survey(tmp_path / "set")
+    run, config = written(found, tmp_path / "out")
+    assert run.axes == ("shoulder_pan", "elbow_flex", "gripper")
+    assert run.kinds == dict.fromkeys(run.axes, "angle")
+    assert len(run.command.stamp) == 600
+    assert tuple(run.sensors) == ("observation_state",)
+    tree = tomllib.loads((tmp_path / "out" / "run.toml").read_text())
+    assert tree["command"]["where"] == {"episode_index": 0}
+    est = pf.fuse(run, config)
+    truth = np.radians(200.0 * path(est.time - est.time[0] - LAG))
+    for number, axis in enumerate(run.axes):
+        assert np.sqrt(np.mean((est[axis].position[50:] - truth[50:, number]) ** 2)) < np.radians(0.1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_recordings_of_all_kinds(kind: str, tmp_path: Path) -> None:
+    """The topic called command is that, cameras follow it, poses are in metres by their type."""
+    log = tmp_path / KINDS[kind].name
+    KINDS[kind].write(log, bag_files.motion(300))
+    run, config = written(survey(log), tmp_path / "out")
+    assert {"camera", "level"} <= set(run.sensors)
+    if KINDS[kind].manifest == bag_files.ROS:
+        assert run.axes == ("x", "y", "z")
+        assert set(run.sensors["camera"].values) == {"x", "y", "z"}
+        # a joint called slide is in metres, and moves as z does; a number without any name is in mm as it moves like x
+        assert set(run.sensors["joints"].values) == {"z"}
+        assert set(run.sensors["level"].values) == {"x"}
+        tree = tomllib.loads((tmp_path / "out" / "run.toml").read_text())
+        assert tree["sensors"]["level"]["x"] == {"column": "data", "unit": "mm"}
+        assert tree["sensors"]["camera"]["time"] == "header.stamp"
+        assert config.sensors["camera"].sd_of("x") == pytest.approx(1e-3, rel=0.2)
+    counts = pf.fuse(run, config).measurements.counts()
+    assert counts["fused"] > 0.95 * sum(counts.values())
+
+
+def test_joints_and_a_pose_that_no_command_moves(tmp_path: Path) -> None:
+    """Joints are angles in rad; the pose is there for the user, commented out, with the reason."""
+    log = tmp_path / "drive.mcap"
+    joints(log)
+    found = survey(log)
+    run, config = written(found, tmp_path / "out")
+    assert run.axes == ("shoulder", "elbow")
+    assert run.kinds == {"shoulder": "angle", "elbow": "angle"}
+    assert tuple(run.sensors) == ("joint_states",)
+    text = (tmp_path / "out" / "run.toml").read_text()
+    assert "# Not used: no command moves x, y, z (a length) at the same time" in text
+    assert '# x = { column = "pose.position.x", unit = "m" }' in text
+    assert pf.fuse(run, config).measurements.counts() == {"fused": 800}
+
+
+def joints(log: Path) -> None:
+    """Commands and states of two joints, whose order changes, and the pose of a tool."""
+    from mcap_ros2.writer import Writer
+
+    t = 0.02 * np.arange(400)
+    stores = {"/joint_commands": "sensor_msgs/msg/JointState", "/joint_states": "sensor_msgs/msg/JointState"}
+    with log.open("wb") as file:
+        writer = Writer(file)
+        kinds = {**stores, "/tool/pose": "geometry_msgs/msg/PoseStamped"}
+        schemas = {topic: writer.register_msgdef(kind, bag_files.definition_of(kind)) for topic, kind in kinds.items()}
+        draw = np.random.default_rng(3)
+        for k, (told, there) in enumerate(zip(path(t), path(t - LAG), strict=True)):
+            ns = START * 10**9 + 20_000_000 * k
+            header = {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": "base"}
+            names_, places = (["elbow", "shoulder"], [1, 0]) if k % 2 else (["shoulder", "elbow"], [0, 1])
+            seen = there + draw.normal(scale=2e-4, size=3)
+            for topic, value in (("/joint_commands", told), ("/joint_states", seen)):
+                position = [float(value[place]) for place in places]
+                message = {"header": header, "name": names_, "position": position, "velocity": [], "effort": []}
+                writer.write_message(topic, schemas[topic], message, log_time=ns, publish_time=ns)
+            point = dict(zip("xyz", np.cos(3.0 * there).tolist(), strict=True))
+            pose = {"position": point, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+            message = {"header": header, "pose": pose}
+            writer.write_message("/tool/pose", schemas["/tool/pose"], message, log_time=ns, publish_time=ns)
+        writer.finish()
+
+
+HOSTILE = [
+    'x"]\n[sensors.evil]\nfile = "/etc/passwd',
+    "[bold red]x[/bold red]",
+    "x\x1b[31m",
+    'é x\'\\u0000"""',
+    "[[x",
+    "x.y[0].z",
+    "__proto__",
+    "# x",
+]
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_names_stay_names(name: str, tmp_path: Path) -> None:
+    """Columns and files of any name give valid files that say the same, whatever a name tries to be."""
+    t, u, s, z = recorded(300)
+    log = tmp_path / "log [red]"
+    log.mkdir()
+    write(log / "goal.csv", {"time_s": t, name: u[:, 0], "x_m": u[:, 1]})
+    write(log / "camera [x] \x1b.csv", {"time_s": s, name: z[:, 0], "x_m": z[:, 1]})
+    run, config = written(survey(log), tmp_path / "out")
+    for file in ("run.toml", "arm.toml", "fusion.toml"):
+        text = (tmp_path / "out" / file).read_text()
+        assert all(letter.isprintable() or letter == "\n" for letter in text)
+    tree = tomllib.loads((tmp_path / "out" / "run.toml").read_text())
+    assert len(tree["sensors"]) == 1
+    assert len(run.axes) == 2
+    columns = [
+        one["column"] if isinstance(one, dict) else one for key, one in tree["command"].items() if key in run.axes
+    ]
+    assert columns == [name, "x_m"]
+    pf.fuse(run, config)
+
+
+@pytest.mark.parametrize(
+    ("column", "axis", "unit"),
+    [
+        ("x_mm", "x", "mm"),
+        ("command.shoulder_deg", "shoulder", "deg"),
+        ("x_target_m", "x", "m"),
+        ("pose.pose.position.x", "x", ""),
+        ("position[elbow_joint]", "elbow_joint", ""),
+        ("observation.state[2]", "joint2", ""),
+        ("translation[1]", "y", ""),
+        ("Tool Position X [mm]", "x", "mm"),
+        ("goalPosition1 (rad)", "position1", "rad"),
+        ("m3", "m3", ""),
+        ("range_mm", "position", "mm"),
+    ],
+)
+def test_axes_and_units_by_name(column: str, axis: str, unit: str) -> None:
+    """A name is the axis and the unit, without the words that say anything else."""
+    assert (names.axis_of(column, []), names.unit_of(column)) == (axis, unit)
+
+
+@pytest.mark.parametrize("column", ["speed_m_s", "velocity[0]", "orientation.x", "frame", "quality", "twist.linear.x"])
+def test_what_is_no_position_is_left_out(column: str) -> None:
+    """By a word in the name, or by a unit of something else."""
+    assert names.no_position(column)
+
+
+def test_doubts_are_said_with_their_numbers(tmp_path: Path) -> None:
+    """Exchanged axes, a wrong unit, another clock: a sentence each, and the files are there all the same."""
+    t, u, s, z = recorded()
+    log = tmp_path / "log"
+    log.mkdir()
+    write(log / "goal.csv", {"time_s": t, "x_m": u[:, 0], "y_m": u[:, 1]})
+    write(log / "camera.csv", {"time_s": s, "x_m": z[:, 1], "y_m": z[:, 0]})
+    write(log / "laser.csv", {"time_s": s, "x_m": 1e3 * z[:, 0]})
+    write(log / "encoder.csv", {"time_s": s + 1e6, "x_m": z[:, 0]})
+    found = survey(log)
+    said = "\n".join(questions(found))
+    assert "camera does not follow the commands on x (correlation" in said
+    assert "laser moves 1e+03 times as far as commanded on x: is its unit right?" in said
+    assert (
+        "encoder: its stamps (1000000.004 to 1000019.984 s) are not of the commands' time (0.000 to 19.980 s)" in said
+    )
+    written(found, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({}, "no log in it that can be read"),
+        ({"a.csv": "x_mm,y_mm\n" + "1,2\n3,4\n" * 20}, "no columns of positions with a clock"),
+        ({"a.csv": ""}, "the file is empty"),
+        ({"a.parquet": "PAR1"}, "not a table that can be read"),
+        ({"a.mcap": "no"}, "the recording is empty; the recording was cut off"),
+        ({"goal.csv": "t_s,x_mm\n" + "".join(f"{n},{n % 7}\n" for n in range(50))}, "nothing that measures where they"),
+    ],
+)
+def test_what_is_no_log_is_refused_in_a_line(files: dict[str, str], said: str, tmp_path: Path) -> None:
+    """With what is missing."""
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    assert said in one_line(RunError, lambda: survey(tmp_path))
+
+
+def test_a_log_without_commands_says_how_they_are_known(tmp_path: Path) -> None:
+    """Two sensors that move at once: none runs ahead."""
+    _, _, s, z = recorded()
+    noise = np.random.default_rng(1).normal(scale=5e-4, size=len(s))
+    write(tmp_path / "camera.csv", {"t_s": s, "x_m": z[:, 0]})
+    write(tmp_path / "laser.csv", {"t_s": s, "x_m": z[:, 0] + noise})
+    text = one_line(RunError, lambda: survey(tmp_path))
+    assert "which numbers are the commands? None is called command, goal, target" in text
+
+
+def test_a_folder_with_many_topics_lists_what_it_does_not_use(tmp_path: Path) -> None:
+    """Columns that are no positions are listed with the reason."""
+    t, u, s, z = recorded(100)
+    write(tmp_path / "goal.csv", {"time_s": t, "x_m": u[:, 0], "z_m": np.zeros(100)})
+    write(tmp_path / "camera.csv", {"time_s": s, "x_m": z[:, 0], "quality": np.ones(100), "t_sent_s": s})
+    camera, goal = parts_of(tmp_path)
+    assert dict(camera.left_out) == {"quality": "quality", "t_sent_s": "another clock"}
+    assert dict(goal.left_out) == {"z_m": "always 0"}
