@@ -217,6 +217,9 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         tree["process"] = {axis: toml.builtins(one, self.arm.axes[axis].kind) for axis, one in self.process.items()}
         tree["start"] = with_kinds(tree["start"], self.arm, ["offset_sd_mm"])
         tree["sensors"] = {name: with_kinds(table, self.arm, _PER_AXIS) for name, table in tree["sensors"].items()}
+        for sensor in tree["sensors"].values():
+            if not sensor["turn_deg"]:
+                del sensor["turn_deg"]
         return toml.text(tree)
 
     def sensor_names(self, chosen: Iterable[str] | None) -> tuple[str, ...]:
