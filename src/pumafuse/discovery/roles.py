@@ -272,9 +272,9 @@ def _renamed(streams: Sequence[Stream]) -> list[Stream]:
 def _with_units(roles: Roles) -> Roles:
     """Units that are guesses made to fit: the commands' to sensors whose units are known, then all others' to those."""
     command, reference = roles.command, roles.reference
-    for one in reversed([*roles.sensors, *([] if reference is None else [reference])]):
-        if not one.guessed:
-            command = _fitted(command, one)
+    sure = [one for one in (reference, *reversed(roles.sensors)) if one is not None and not one.guessed]
+    for one in sure:  # the first sensor has the last word
+        command = _fitted(command, one)
     sensors = [_fitted(one, command) for one in roles.sensors]
     return replace(
         roles, command=command, sensors=sensors, reference=None if reference is None else _fitted(reference, command)
