@@ -95,6 +95,8 @@ def test_a_part_from_the_beginning_is_a_file_that_ends_there() -> None:
     assert part["tangential"].position.tolist() == file["tangential"].position.tolist()
     one, other = pf.summarise(part), pf.summarise(file)
     assert (one.from_s, one.to_s) == (None, 2.0)
+    counts = one.commands, *one.rows.values()
+    assert all(count.pop("outside") > 0 for count in counts)  # rows that the shorter file does not have
     assert replace_(one, to_s=None) == other
 
 

@@ -163,8 +163,8 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
 
     def __post_init__(self) -> None:
         _known_axes("process", self.process, self.arm)
-        for path, part, kind in self._parts():  # if made in Python, unchecked
-            toml.struct(toml.builtins(part, kind), type(part), "configuration", path, kind)
+        for path, part, kind in self._parts():
+            _check(path, part, kind)
         for name, sensor in self.sensors.items():
             refuse_unit("sensor", name)
             if not math.isfinite(sensor.scale + sensor.latency + sensor.gate + sensor.latency_sd):
@@ -231,6 +231,14 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         for name in sorted(wanted - set(self.sensors)):
             raise UnknownNameError("sensors", "sensor", name, self.sensors)
         return tuple(name for name in self.sensors if name in wanted)
+
+
+def _check(path: str, part: msgspec.Struct, kind: Kind) -> None:
+    """Refuse a table that was made in Python and is out of range. A search makes thousands: the words come after."""
+    try:
+        msgspec.convert(toml.builtins(part), type(part))
+    except msgspec.ValidationError:
+        toml.struct(toml.builtins(part, kind), type(part), "configuration", path, kind)
 
 
 def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:

@@ -15,7 +15,6 @@ import numpy as np
 
 from ..arrays import FloatArray, TimeArray
 from ..errors import RunError
-from ..filter.events import Events
 from ..filter.outcome import Outcome
 from ..model.following import SMALL_SHIFT, Grid, Match, matches, slope_of_pieces, without_spikes
 from ..model.response import response
@@ -76,14 +75,15 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
     Raises:
         RunError: A sensor, or the commands, are in another unit than their name says.
     """
-    paths = _paths(segment, config)
-    faults = _not_following(segment, config, paths)
+    given = _given(segment, config)
+    paths = _paths(segment, config, given)
+    faults = _not_following(segment, config, given, paths)
     if refused := [one.sentence for one in faults if one.refused]:
         raise RunError(refused[0])
     found, told = [one.sentence for one in faults], {name for one in faults for name in one.sensors}
-    for name, rows in segment.rows_by_sensor().items():
-        times = max((_times_each(value) for _, value in _given(segment, rows).values()), default=1)
-        if name in paths and times > 1:
+    for name, axes in given.items():
+        times = max((_times_each(value) for _, value in axes.values()), default=1)
+        if times > 1:
             found.append(
                 f"sensor '{name}' gives each value {times} times: a sample that is held? Each counts as a measurement"
                 " of its own, at its own stamp; log each once"
@@ -99,7 +99,8 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
 
 def not_following(segment: Segment, config: FusionConfig) -> list[Fault]:
     """What is wrong with sensors whose measurements are not where the commands lead: unit, axis, sign or clock."""
-    return _not_following(segment, config, _paths(segment, config))
+    given = _given(segment, config)
+    return _not_following(segment, config, given, _paths(segment, config, given))
 
 
 def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
@@ -209,30 +210,46 @@ class _Path:
         return slope + 3.0 * error < 0.5 and float(np.std(led)) > self.noise
 
 
-_Paths: TypeAlias = Mapping[str, Mapping[str, _Path]]  # by sensor and axis
+_Given: TypeAlias = Mapping[str, Mapping[str, tuple[TimeArray, FloatArray]]]  # stamps and values, by sensor and axis
+_Paths: TypeAlias = Mapping[str, Mapping[str, _Path]]
 
 
-def _paths(segment: Segment, config: FusionConfig) -> _Paths:
-    """The paths of each configured sensor until 1 s after the last command, without axes of which there is little."""
-    found: dict[str, dict[str, _Path]] = {}
+def _given(segment: Segment, config: FusionConfig) -> _Given:
+    """What the filter is given of each configured sensor, by stamp."""
+    found: dict[str, dict[str, tuple[TimeArray, FloatArray]]] = {}
     for name, rows in segment.rows_by_sensor().items():
         if name not in config.sensors:
             continue
+        known = {axis: rows.known[:, number] == int(Outcome.FUSED) for number, axis in enumerate(segment.axes)}
+        found[name] = {
+            axis: (rows.stamp[mine], rows.value[:, number][mine])
+            for number, (axis, mine) in enumerate(known.items())
+            if mine.any()
+        }
+    return found
+
+
+def _paths(segment: Segment, config: FusionConfig, given: _Given) -> _Paths:
+    """The paths of each sensor until 1 s after the last command, without axes of which there is little."""
+    found: dict[str, dict[str, _Path]] = {}
+    for name, axes in given.items():
         found[name] = {}
-        for axis, (stamp, value) in _given(segment, rows).items():
+        for axis, (stamp, value) in axes.items():
             count = int(np.searchsorted(stamp, int(segment.commands[-1]) + _TAIL_NS, side="right"))
             if count >= _FEW:
                 some = slice(None, count, 1 + count // _ENOUGH)
                 alike = without_spikes(value[some])
-                part = stamp[some][alike], value[some][alike]
-                found[name][axis] = _path(segment, config, name, axis, *part)
+                found[name][axis] = _path(segment, config, name, axis, stamp[some][alike], value[some][alike])
     return found
 
 
 def _path(segment: Segment, config: FusionConfig, name: str, axis: str, stamp: TimeArray, value: FloatArray) -> _Path:
     sensor, process = config.sensors[name], config.process[axis]
     valid = stamp - round(sensor.latency * 1e9)
-    led, before = (_led(segment, config, axis, valid - ago) for ago in (0, round(SMALL_SHIFT * 1e9)))
+    both = np.concatenate([valid, valid - round(SMALL_SHIFT * 1e9)])
+    order, position = np.argsort(both), np.empty(len(both))
+    position[order] = _led(segment, config, axis, both[order])
+    led, before = position[: len(valid)], position[len(valid) :]
     of_sensor = math.hypot(sensor.sd_of(axis) or 0.0, sensor.bias_drift_sd_of(axis)) / abs(sensor.scale)
     walked = process.drift * math.sqrt((int(valid[-1]) - int(valid[0])) / 1e9)
     noise, bias = math.hypot(of_sensor, process.disturbance_sd), sensor.bias_sd_of(axis) / abs(sensor.scale)
@@ -241,16 +258,6 @@ def _path(segment: Segment, config: FusionConfig, name: str, axis: str, stamp: T
     if turn:
         measured -= turn * np.round(np.median(measured - led) / turn)
     return _Path(measured, led, before, noise, expected)
-
-
-def _given(segment: Segment, rows: Events) -> dict[str, tuple[TimeArray, FloatArray]]:
-    """Stamps [int64 ns] and values of a sensor's rows that the filter is given, by axis."""
-    found: dict[str, tuple[TimeArray, FloatArray]] = {}
-    for number, axis in enumerate(segment.axes):
-        known = rows.known[:, number] == int(Outcome.FUSED)
-        if known.any():
-            found[axis] = rows.stamp[known], rows.value[:, number][known]
-    return found
 
 
 def _led(segment: Segment, config: FusionConfig, axis: str, time: TimeArray) -> FloatArray:
@@ -275,27 +282,26 @@ def _off(config: FusionConfig, name: str, axis: str, path: _Path) -> str | None:
 # ---- a sensor that does not follow ----------------------------------------------------------------------------------
 
 
-def _not_following(segment: Segment, config: FusionConfig, paths: _Paths) -> list[Fault]:
-    found, rows = list[Fault](), segment.rows_by_sensor()
+def _not_following(segment: Segment, config: FusionConfig, given: _Given, paths: _Paths) -> list[Fault]:
+    found: list[Fault] = []
     for name, mine in paths.items():
         if odd := [axis for axis, path in mine.items() if not path.follows]:
-            causes = _matches(segment, config, name, rows[name], mine)
+            causes = _matches(segment, config, name, {axis: given[name][axis] for axis in mine})
             found += _faults(config, name, mine, {axis: causes[axis] for axis in odd})
     return _of_commands(found, paths)
 
 
 def _matches(
-    segment: Segment, config: FusionConfig, name: str, rows: Events, paths: Mapping[str, _Path]
+    segment: Segment, config: FusionConfig, name: str, given: Mapping[str, tuple[TimeArray, FloatArray]]
 ) -> dict[str, Match]:
     """What explains the motion that a sensor measures on each axis, without single outliers."""
     sensor, grid = config.sensors[name], _busiest(segment, config.arm.update_period)
     led = {axis: _led(segment, config, axis, grid.time) for axis in segment.axes}
     measured: dict[str, FloatArray] = {}
-    for axis, (stamp, value) in _given(segment, rows).items():
-        if axis in paths:
-            alike = without_spikes(value)
-            valid = stamp[alike] - round(sensor.latency * 1e9)
-            measured[axis] = grid.mean(valid, value[alike] / sensor.scale - segment.start[axis])
+    for axis, (stamp, value) in given.items():
+        alike = without_spikes(value)
+        valid = stamp[alike] - round(sensor.latency * 1e9)
+        measured[axis] = grid.mean(valid, value[alike] / sensor.scale - segment.start[axis])
     return matches(measured, led, grid)
 
 
@@ -322,7 +328,7 @@ def _faults(config: FusionConfig, name: str, paths: Mapping[str, _Path], causes:
         lost |= cause == "unit" and not 1.0 / _SCALE < size < _SCALE
         found.append(Fault((name,), tuple(axes), cause, size, f"sensor '{name}' {words}", refused, lost))
 
-    clear = {axis: one for axis, one in causes.items() if one.is_steady and abs(one.correlation) >= _CLEAR}
+    clear = {axis: one for axis, one in causes.items() if _is_clear(axis, one, paths[axis])}
     if late := [axis for axis, one in clear.items() if one.shift != 0.0]:
         best = max(late, key=lambda axis: clear[axis].correlation)
         fault(list(paths), "clock", clear[best].shift, _late(config, name, best, paths[best], clear[best]))
@@ -344,6 +350,14 @@ def _faults(config: FusionConfig, name: str, paths: Mapping[str, _Path], causes:
         if axis not in told and abs(causes[axis].correlation) < _LOST and paths[axis].lacks_motion:
             fault([axis], "nothing", 1.0, _nothing(axis, paths[axis]))
     return found
+
+
+def _is_clear(axis: str, cause: Match, path: _Path) -> bool:
+    """Whether what explains a motion does so well: two causes at once must do better, another time better than now."""
+    other_size = not 1.0 / _GAIN < abs(cause.slope) < _GAIN
+    causes = (cause.axis != axis) + (cause.shift != 0.0) + (cause.slope < 0.0) + other_size
+    least = max(_FOLLOWS if causes > 1 else _CLEAR, path.correlation if cause.shift else 0.0)
+    return cause.is_steady and abs(cause.correlation) >= least
 
 
 def _late(config: FusionConfig, name: str, axis: str, path: _Path, cause: Match) -> str:
@@ -390,10 +404,10 @@ def _digits(number: float, count: int) -> str:
 
 
 def _nothing(axis: str, path: _Path) -> str:
-    how = "does not follow" if np.ptp(path.measured) > 0.0 else "rests and does not follow"
+    rests = "" if np.ptp(path.measured) > 0.0 else "rests and "
     return (
-        f"{how} the commands of {axis} (correlation {path.correlation:+.2f}), nor those of another axis or another"
-        " time: is it that axis, are both stamped by one clock, is arm.toml that of this arm?"
+        f"{rests}does not follow the commands of {axis} (correlation {path.correlation:+.2f}), nor those of"
+        " another axis or another time: is it that axis, are both stamped by one clock, is arm.toml that of this arm?"
     )
 
 
