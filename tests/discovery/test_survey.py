@@ -310,6 +310,8 @@ def test_hostile_names_stay_names(name: str, tmp_path: Path) -> None:
         ("goalPosition1 (rad)", "position1", "rad"),
         ("m3", "m3", ""),
         ("range_mm", "position", "mm"),
+        ("position[肩]", "position", ""),
+        ("position[start]", "start_axis", ""),
     ],
 )
 def test_axes_and_units_by_name(column: str, axis: str, unit: str) -> None:

@@ -35,8 +35,7 @@ _METRES = ("Pose", "PoseStamped", "PoseWithCovarianceStamped", "Point", "PointSt
 _RADIANS = ("JointState", "JointTrajectory")
 _OTHER_TYPES = names.words_in(
     "Image CompressedImage CameraInfo PointCloud2 LaserScan Imu TFMessage Log DiagnosticArray Clock Twist TwistStamped"
-    " Wrench WrenchStamped ParameterEvent Joy OccupancyGrid MarkerArray Image:buffer EncodedImage:blob VideoStream"
-    " Points3D:positions Mesh3D:vertex_positions TextLog:text"
+    " Wrench WrenchStamped ParameterEvent Joy OccupancyGrid MarkerArray"
 )
 
 
@@ -367,7 +366,7 @@ def _of_topic(place: Part, topic: Topic) -> Part:
         return replace(place, notes=("no positions in messages of this type",))
     if any(name.startswith("points[1]") for name in wanted):
         return replace(place, notes=("its trajectories have several points: a plan, not commands that are sent",))
-    fields = None if place.entity else prefixes([*wanted, "header", "timestamp", "stamp", "joint_names"])
+    fields = prefixes([*wanted, "header", "timestamp", "stamp", "joint_names"])
     try:
         table = recordings.read(place.file, topic.name, fields)
     except RunError as error:

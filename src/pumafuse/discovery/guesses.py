@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import RunError
 from ..units import Kind
 from .contents import rate_of
 from .following import Following
@@ -71,9 +72,15 @@ class SensorGuess:
 
 
 def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
-    """The arm, and each sensor."""
+    """The arm, and each sensor.
+
+    Raises:
+        RunError: There are fewer than two commands.
+    """
     run = found.run
     period = rate_of(run.command.stamp)[0]
+    if math.isnan(period):
+        raise RunError(f"{found.log}: fewer than two commands with stamps of their own")
     relations = {key: one for key, one in found.relations.items() if abs(one.correlation) >= _FOLLOWS}
     first, latencies = _latencies(relations)
     leads = {

@@ -45,6 +45,7 @@ _NO_POSITIONS = words_in(
 _TIMES = words_in(
     "t time times stamp stamps timestamp timestamps sec secs seconds date datetime clock ts arrival arrived"
 )
+_KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
 _SLIDING = words_in("slide slider prismatic linear rail gantry")
 _UNITS = {
     **dict.fromkeys(words_in("mm millimeter millimeters millimetre millimetres"), "mm"),
@@ -131,7 +132,7 @@ def axis_of(column: str, labels: list[str]) -> str:
         spatial = place < 3 and not {"translation", "translations"}.isdisjoint(words(column))
         return "xyz"[place] if spatial else f"joint{place}"
     if label:
-        return plain(label[1])
+        return plain(label[1]) or "position"
     unit = unit_of(column)
     kept = [word for word in words(column) if word not in _SILENT]
     if unit and kept and _UNITS.get(kept[-1]) == unit:
@@ -146,7 +147,7 @@ def plain(name: str) -> str:
     made = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_")[:60]
     while (unit := ending(made)) is not None:
         made = made.removesuffix(unit)
-    return made
+    return f"{made}_axis" if made in _KEYS else made
 
 
 def printable(text: str, longest: int = 80) -> str:

@@ -19,6 +19,7 @@ from .names import Role
 
 _FOLLOWS = 0.5  # correlation of changes from which one signal is said to follow another
 _SAME = 0.8  # from which it is taken for the same axis under another name
+_MOST_PAIRS, _MOST_CANDIDATES = 400, 12  # that are compared, at 0.1 s a pair of axes
 _NUMBERED = re.compile(r"joint\d+|position")
 
 
@@ -189,6 +190,7 @@ def _command(streams: Sequence[Stream], log: str) -> tuple[Stream, str]:
     candidates = (
         called or [one for one in streams if one.role is None] or [one for one in streams if one.role == "reference"]
     )
+    candidates = candidates[:_MOST_CANDIDATES]
     followers = {one.name: _followers(one, streams) for one in candidates}
     best = max(candidates, key=lambda one: followers[one.name], default=None)
     if best is None or (not called and not followers[best.name]):
@@ -233,7 +235,7 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
     fits = {axis: signals for axis, signals in fits.items() if _same_kind(command, axis, stream, axis)}
     best = ("", 0.0)
     for own, signals in stream.axes.items():
-        if own in fits or own in command.axes:
+        if own in fits or own in command.axes or len(command.axes) * len(stream.axes) > _MOST_PAIRS:
             continue
         found = {
             axis: abs(one.correlation)
@@ -268,34 +270,28 @@ def _renamed(streams: Sequence[Stream]) -> list[Stream]:
 
 
 def _with_units(roles: Roles) -> Roles:
-    """Units that are guesses are made to fit the motion of a stream whose units are known."""
-    sure = [one for one in (roles.command, *roles.sensors, roles.reference) if one is not None and not one.guessed]
-    if len(sure) == len(roles.sensors) + 1 + (roles.reference is not None):
-        return roles
-    anchor = roles.command if not roles.command.guessed else next(iter(sure), roles.command)
-    fixed: dict[str, Stream] = {}
-    for one in (roles.command, *roles.sensors, roles.reference):
-        if one is not None and one.guessed and one is not anchor:
-            fixed[one.name] = _fitted(one, anchor)
-    reference = roles.reference
+    """Units that are guesses made to fit: the commands' to sensors whose units are known, then all others' to those."""
+    command, reference = roles.command, roles.reference
+    sure = [one for one in (reference, *reversed(roles.sensors)) if one is not None and not one.guessed]
+    for one in sure:  # the first sensor has the last word
+        command = _fitted(command, one)
+    sensors = [_fitted(one, command) for one in roles.sensors]
     return replace(
-        roles,
-        command=fixed.get(roles.command.name, roles.command),
-        sensors=[fixed.get(one.name, one) for one in roles.sensors],
-        reference=None if reference is None else fixed.get(reference.name, reference),
+        roles, command=command, sensors=sensors, reference=None if reference is None else _fitted(reference, command)
     )
 
 
 def _fitted(stream: Stream, anchor: Stream) -> Stream:
-    """A stream with the units in which it moves as far as another."""
+    """A stream whose guessed units are those in which it moves as far as another."""
     made = dict(stream.axes)
-    for axis in made:
-        if axis in anchor.axes:
-            kind = anchor.kind(axis)
-            sizes = {unit: _travel(replace(stream, axes={axis: _in(made[axis], unit)}), axis) for unit in OF_KIND[kind]}
-            wanted = _travel(anchor, axis)
-            unit = min(sizes, key=lambda unit: abs(math.log(max(sizes[unit], 1e-12) / max(wanted, 1e-12))))
-            made[axis] = _in(made[axis], unit)
+    for axis in made.keys() & anchor.axes.keys() if stream.guessed else ():
+        wanted = _travel(anchor, axis)
+
+        def misfit(unit: str, axis: str = axis, wanted: float = wanted) -> float:
+            found = _travel(replace(stream, axes={axis: _in(made[axis], unit)}), axis)
+            return abs(math.log(max(found, 1e-12) / max(wanted, 1e-12)))
+
+        made[axis] = _in(made[axis], min(OF_KIND[anchor.kind(axis)], key=misfit))
     return replace(stream, axes=made)
 
 
