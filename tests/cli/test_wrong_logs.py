@@ -54,7 +54,7 @@ def test_what_would_be_wrong_by_construction_is_refused(
 
 def test_what_is_inferred_is_told_before_the_result_and_kept_in_it(log: Path) -> None:
     """Exchanged columns: the first warning, the first note of the summary, exit code 0."""
-    edit(log / "run.toml", ('tangential = "x_mm"', 'tangential = "z_mm"'), ('vertical = "z_mm"', 'vertical = "x_mm"'))
+    edit(log / "run.toml", ('\nx = "x_mm"', '\nx = "z_mm"'), ('\nz = "z_mm"', '\nz = "x_mm"'))
     done = pumafuse(*fuse(log))
     first, summary = done.stderr.splitlines()[0], json.loads((log / "result/summary.json").read_text(encoding="utf-8"))
     assert "are its columns exchanged in run.toml?" in first and summary["notes"][0] in first

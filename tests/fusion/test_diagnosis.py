@@ -115,7 +115,7 @@ def test_commands_in_another_unit_are_told_by_all_sensors(factor: float) -> None
 def test_a_scale_that_no_unit_explains_is_a_warning() -> None:
     """Seven times as far; a hundred times may be cm, or a scale."""
     (first, *_) = notes(of_sensor("my-run", "camera", scaled(7.0)), "my-run")
-    assert "moves 7 times as far as the commands of tangential" in first and "scale" in first
+    assert "moves 7 times as far as the commands of x" in first and "scale" in first
     (first, *_) = notes(of_sensor("my-run", "camera", scaled(100.0)), "my-run")
     assert "cm called m" in first and "scale" in first
 
