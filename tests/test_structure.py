@@ -12,9 +12,9 @@ SOURCE = Path(pf.__file__).parent
 ROOMS = [
     "model",
     "logs",
+    "discovery",
     "filter",
     "fusion",
-    "discovery",
     "simulation",
     "identification",
     "tuning",

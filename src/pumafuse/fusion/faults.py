@@ -14,9 +14,9 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from ..arrays import FloatArray, TimeArray
+from ..discovery.matching import SMALL_SHIFT, Grid, Match, matches, slope_of_pieces, without_spikes
 from ..errors import RunError
 from ..filter.outcome import Outcome
-from ..model.following import SMALL_SHIFT, Grid, Match, matches, slope_of_pieces, without_spikes
 from ..model.response import response
 from ..units import OF_KIND, Kind, mistaken
 from .config import FusionConfig

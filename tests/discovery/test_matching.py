@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pumafuse.arrays import FloatArray
-from pumafuse.model.following import Grid, _fits, matches, slope_of_pieces, without_spikes
+from pumafuse.discovery.matching import Grid, _fits, matches, slope_of_pieces, without_spikes
 
 SECOND = 1_000_000_000
 
