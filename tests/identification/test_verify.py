@@ -312,7 +312,10 @@ def test_a_messy_log_gives_what_the_clean_one_gives() -> None:
     expected, found = only(clean, arm()), only(messy, arm())
     assert found.measurements == int(kept.sum())
     assert found.notes and not expected.notes
-    assert msgspec.structs.replace(found, notes=[]) == expected
+    assert msgspec.structs.replace(found, notes=[], commands=expected.commands, rows=expected.rows) == expected
+    again = int(kept[590:600].sum())
+    assert found.rows == {"used": kept.sum(), "before_start": 2, "duplicate": again, "invalid": 160 - again}
+    assert found.commands == {"used": TICKS, "duplicate": 1}
     assert found.model.rms == pytest.approx(np.std(noise()[kept]), rel=1e-9)
 
 

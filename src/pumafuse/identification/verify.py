@@ -55,6 +55,8 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
         recovery: Its time constant [s].
         best_in_class: The best linear model of this order on this run.
         outlying: How many measurements were left out because they jump away from their neighbours.
+        commands: How many rows of the commands were ``used``, and of the others how many were left out for what.
+        rows: Likewise of the source.
         verdict: In words.
         notes: What was wrong with the run, a sentence each; with the first axis and source of each part of it.
     """
@@ -74,6 +76,8 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
     recovery: float = msgspec.field(name="recovery_ms")
     best_in_class: BestInClass
     outlying: int
+    commands: dict[str, int]
+    rows: dict[str, int]
     verdict: str
     notes: list[str]
 
@@ -137,9 +141,15 @@ def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[Ax
             if np.count_nonzero(here) >= _FEWEST and command.amplitude > 0.0:
                 measured = Measured(run.name, source, rows.time[here], rows.value[here, number])
                 notes = [*jumps, *segment.notes] if not found else []
+                counts = dict(segment.command_counts), _used(segment.counts[source])
                 first = segment.start[axis]
-                found.append(_verified(measured, axis, command, first, config.arm, axis in run.start, notes))
+                found.append(_verified(measured, axis, command, first, config.arm, axis in run.start, counts, notes))
     return found
+
+
+def _used(counts: Mapping[str, int]) -> dict[str, int]:
+    """The counts of a source's rows, for which there is no filter here that could fuse them."""
+    return {"used" if outcome == Outcome.FUSED.word else outcome: count for outcome, count in counts.items()}
 
 
 def _with_sources(run: Run, sensors: Sequence[str] | None) -> Run:
@@ -155,7 +165,14 @@ def _with_sources(run: Run, sensors: Sequence[str] | None) -> Run:
 
 
 def _verified(
-    measured: Measured, axis: str, command: Commands, first: float, arm: ArmModel, given: bool, notes: list[str]
+    measured: Measured,
+    axis: str,
+    command: Commands,
+    first: float,
+    arm: ArmModel,
+    given: bool,
+    counts: tuple[dict[str, int], dict[str, int]],
+    notes: list[str],
 ) -> tuple[AxisVerification, Trace]:
     model, delay = arm.axes[axis], arm.delay_of(axis)
     recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
@@ -195,6 +212,8 @@ def _verified(
         recovery=recovery,
         best_in_class=best,
         outlying=count - len(measured.time),
+        commands=counts[0],
+        rows=counts[1],
         verdict=_verdict(as_it_is, lag, best) + _recovers(as_it_is, recovering, recovery, model.kind),
         notes=notes,
     )
