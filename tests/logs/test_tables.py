@@ -241,6 +241,16 @@ def test_a_file_that_is_no_table_is_refused_in_one_line(
     assert capfd.readouterr() == ("", "")
 
 
+def test_a_text_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small file of gzip may hold any amount, and a device file has no end."""
+    monkeypatch.setattr(tables, "_MOST_TEXT", 32 << 20)
+    bomb = gzip.compress(bytes(33 << 20))
+    path = tmp_path / "log.csv.gz"
+    path.write_bytes(bomb)
+    for one in (path, Path("/dev/zero")):
+        assert " of text; as Parquet" in one_line(RunError, partial(tables.read, one))
+
+
 @pytest.mark.parametrize("name", ["log.csv", "log.csv.gz", "log.parquet"])
 def test_a_header_without_rows_is_a_table_of_no_rows(tmp_path: Path, name: str) -> None:
     """Its columns are read as nothing, and a note says so with the file's name."""

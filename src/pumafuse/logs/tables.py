@@ -27,6 +27,7 @@ _RECORDINGS = {".mcap", ".bag", ".db3", ".rrd"}
 _BATCH = 1 << 16  # rows of Parquet that are in memory before rows are chosen
 _READ_AHEAD = 1 << 20  # bytes of a column of Parquet
 _SOME = 8  # values in an error
+_MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
 
 
 def read(
@@ -65,11 +66,7 @@ def read(
         if path.suffix == ".parquet":
             (table, names), notes = _parquet(path, fields, where), list[str]()
         else:
-            with pa.input_stream(str(path)) as stream:
-                content = stream.read()
-            if not content:
-                raise RunError(f"{path}: the file is empty")
-            whole, notes = _parsed(path, content, growing)
+            whole, notes = _parsed(path, _text(path), growing)
             table, names = _only(path, whole, where), whole.column_names
     except UnicodeDecodeError:
         raise RunError(f"{path}: not a table that can be read: its text is not UTF-8") from None
@@ -119,6 +116,17 @@ def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None
     if not table.num_rows:
         raise _no_row(path, [whole], where)
     return replace(found, columns=_named(path, table), rows=table.num_rows)
+
+
+def _text(path: Path) -> bytes:
+    """What a CSV file holds, decompressed."""
+    with pa.input_stream(str(path)) as stream:
+        content = stream.read(_MOST_TEXT + 1)
+    if not content:
+        raise RunError(f"{path}: the file is empty")
+    if len(content) > _MOST_TEXT:
+        raise RunError(f"{path}: more than {_MOST_TEXT >> 30} GB of text; as Parquet it is read some rows at a time")
+    return content
 
 
 def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]]:
