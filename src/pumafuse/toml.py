@@ -15,6 +15,7 @@ import tomli_w
 from .errors import ConfigError, PumafuseError, suggestion
 from .units import AN, KINDS, Kind, as_length, ending, from_si, in_unit, of_kind, to_si
 
+_MOST_TEXT = 16 << 20  # characters; what is longer, a device perhaps, is no configuration
 S = TypeVar("S", bound=msgspec.Struct)
 
 MOST = 1e9  # in SI, of any number: what is larger is no size of an arm, and would overflow
@@ -42,7 +43,11 @@ def read(path: Path) -> dict[str, Any]:
         ConfigError: The file is absent, is not text, is not TOML, or has a number that is not finite.
     """
     try:
-        return to_si(tomllib.loads(path.read_text(encoding="utf-8"), parse_float=Decimal))
+        with path.open(encoding="utf-8") as file:
+            text = file.read(_MOST_TEXT + 1)
+        if len(text) > _MOST_TEXT:
+            raise ConfigError(f"more than {_MOST_TEXT >> 20} MB: no configuration")
+        return to_si(tomllib.loads(text, parse_float=Decimal))
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: not a text file in UTF-8") from None
     except tomllib.TOMLDecodeError as error:

@@ -70,6 +70,10 @@ def exchanged(first: str, second: str) -> Change:
     return lambda one: replace(one, values={**one.values, first: one.values[second], second: one.values[first]})
 
 
+def moved_by(far: float, axis: str) -> Change:
+    return lambda one: replace(one, values={**one.values, axis: one.values[axis] + far})
+
+
 def notes(run: pf.Run, log: str) -> list[str]:
     """What ``fuse`` says, the cause first."""
     with warnings.catch_warnings():
@@ -162,7 +166,7 @@ def test_another_clock_is_found_in_both_directions(log: str, sensor: str, second
 def test_a_clock_that_all_sensors_contradict_is_the_commands() -> None:
     """Commands stamped 0.7 s late: once, with the names of the others."""
     found = [note for note in notes(of_commands("scan1", later(0.7)), "scan1") if "early" in note]
-    assert len(found) == 1 and "('vision', 'range' too: is it the clock of the commands?)" in found[0]
+    assert len(found) == 1 and "('vision', 'range' too: is it the clock of the commands? Else mend each)" in found[0]
 
 
 @pytest.mark.parametrize(
@@ -197,17 +201,59 @@ def test_stamps_in_another_unit_are_refused(log: str, factor: float, taken: str)
     assert "commands come every" in refusal(run.each(lambda _, one: clocked(factor)(one)), log)
 
 
-@pytest.mark.parametrize("log", LOGS)
-def test_a_zero_that_differs_is_told_with_the_key(log: str) -> None:
-    """As far as the commands lead an axis to and fro, and more."""
+@of_every_log
+@pytest.mark.parametrize("far", [0.2, 1.0])
+def test_a_zero_that_differs_is_told_with_the_key(log: str, sensor: str, far: float) -> None:
+    """Whatever the motion: 20 and 100 mm, 23 and 115 degrees, where priors are 5 mm and 5 degrees."""
     run, config = logged(log)
-    sensor, axis = ("vision" if log == "scan1" else "camera"), run.axes[0]
-    far = 0.1 if config.arm.axes[axis].kind == "length" else 2.0
+    axis = run.axes[0]
+    kind = config.arm.axes[axis].kind
+    far *= 0.1 if kind == "length" else 2.0
     screen = config.arm.screen_of(axis)
-    moved = of_sensor(log, sensor, lambda one: replace(one, values={**one.values, axis: one.values[axis] + far}))
+    moved = of_sensor(log, sensor, moved_by(far, axis))
     note = next(one for one in notes(moved, log) if "where the commands lead" in one)
-    assert number_before(f" {screen.unit} from where", note) == pytest.approx(far * screen.scale, rel=0.05)
-    assert f"bias_sd_{screen.unit} = {float(f'{far * screen.scale:.1g}'):g}," in note
+    assert number_before(f" {screen.unit} on {axis} (", note) == pytest.approx(far * screen.scale, rel=0.3, abs=2.0)
+    assert f"bias_sd_{screen.unit} = {{ {axis} = " in note and f"[start] offset_sd_{screen.unit} = {{" in note
+    width = float(note.split(f"bias_sd_{screen.unit} = {{ {axis} = ")[1].split(" }")[0]) / screen.scale
+    told = msgspec.structs.replace(config.sensors[sensor], bias_sd={axis: width})
+    config = msgspec.structs.replace(config, sensors={**config.sensors, sensor: told})
+    assert sensor_faults(build(moved, config), config) == []
+
+
+def test_a_zero_that_all_sensors_contradict_is_the_commands() -> None:
+    """One sentence, and a prior that lets estimates begin where the sensors see the arm: as right as before."""
+    run, config = logged("scan1")
+    moved = of_commands("scan1", moved_by(0.05, "radial"))
+    found = notes(moved, "scan1")
+    assert [one.split(" are ")[0] for one in found if "where the commands lead" in one] == [
+        "sensors 'tracker', 'vision'"
+    ]
+    assert "[start] offset_sd_mm = { radial = 50 }" in found[0] and "bias" not in found[0]
+    start = msgspec.structs.replace(config.start, offset_sd={**dict.fromkeys(run.axes, 0.002), "radial": 0.05})
+    est = pf.fuse(moved, msgspec.structs.replace(config, start=start))
+    assert not [one for one in est.notes if "where the commands lead" in one]
+    scores = [pf.summarise(one).axes["radial"].score for one in (est, pf.fuse(run, config))]
+    assert scores[0] and scores[1] and scores[0].rmse < 1.3 * scores[1].rmse
+
+
+@pytest.mark.parametrize("log", LOGS)
+def test_a_sensor_that_moves_while_its_commands_rest_is_told(log: str) -> None:
+    """A wrong column that is constant."""
+    run, _ = logged(log)
+    axis = run.axes[0]
+    (note, *_) = notes(
+        of_commands(log, lambda one: replace(one, values={**one.values, axis: 0.0 * one.values[axis]})), log
+    )
+    assert f" on {axis}, whose commands rest: is it the right column" in note
+
+
+def test_commands_of_another_run_are_told_once() -> None:
+    """All axes in one sentence."""
+    run, _ = logged("trunk-servo")
+    rolled = {axis: np.roll(value, len(value) // 2) for axis, value in run.command.values.items()}
+    found = notes(of_commands("trunk-servo", lambda one: replace(one, values=rolled)), "trunk-servo")
+    assert [one for one in found if "are the commands of this run" in one] == found[:1]
+    assert sum(f"{axis} (" in found[0] for axis in run.axes) >= 5
 
 
 def test_a_sensor_that_measures_within_a_turn_is_no_other_zero_and_may_have_a_sign() -> None:

@@ -129,7 +129,7 @@ def _fuse(
 def _why_nothing(est: Estimates) -> str:
     """What became of all measurements of a run of which none was fused, and which configured sensors it lacks."""
     rows = [
-        f"'{name}' has {', '.join(f'{count} {word}' for word, count in counts.items())}"
+        f"'{name}' has {', '.join(f'{count} {word}' for word, count in counts.items()) or 'no rows'}"
         for name, counts in est.counts.items()
     ]
     absent = [f"'{name}' of fusion.toml is not in the run" for name in est.config.sensors if name not in est.counts]

@@ -321,6 +321,9 @@ def main() -> None:
     except PumafuseError as error:
         typer.echo(f"pumafuse: {error}", err=True)
         sys.exit(1)
+    except MemoryError:
+        typer.echo("pumafuse: not enough memory: use a part of the log, or fewer columns", err=True)
+        sys.exit(1)
     except BrokenPipeError:
         sys.stderr.close()  # the reader of our output has gone, and Python would report it once more at exit
         sys.exit(1)

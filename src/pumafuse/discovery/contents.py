@@ -354,7 +354,12 @@ def _feature_names(info: Any) -> dict[str, list[str]]:
 
 
 def _recorded(path: Path) -> Iterator[Part]:
-    for topic in recordings.topics(path):
+    topics = recordings.topics(path)
+    if len(topics) > _MOST_PARTS:
+        raise RunError(
+            f"{path}: has {len(topics)} topics or entities, more than {_MOST_PARTS}; describe it in run.toml"
+        )
+    for topic in topics:
         place = Part(path, "", topic.name) if path.suffix == ".rrd" else Part(path, topic.name)
         yield _of_topic(replace(place, type=topic.type, rows=topic.count), topic)
 

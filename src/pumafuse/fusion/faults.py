@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from ..arrays import FloatArray, TimeArray
-from ..discovery.matching import SMALL_SHIFT, Grid, Match, matches, slope_of_pieces, without_spikes
+from ..discovery.matching import SMALL_SHIFT, Grid, Match, matches, without_spikes
+from ..discovery.tracking import FOLLOWS, GAIN, Tracking
 from ..errors import RunError
 from ..filter.outcome import Outcome
 from ..model.response import response
@@ -25,7 +25,6 @@ from .setup import turn_of
 
 _FEW = 30  # rows, or changes of a value, below which nothing is said
 _ENOUGH = 500  # values that tell where a sensor is
-_FAR = 5.0  # sds beyond which chance and priors are no explanation
 _TAIL_NS = 1_000_000_000  # after the last command
 _ALIKE, _UNEQUAL = 3, 0.3  # first steps, and how far they may be from their mean, over it
 _SETTLED = 5.0  # lags of the plant
@@ -33,9 +32,8 @@ _MOVED = 0.5  # share of a motion
 _FEWEST = 4  # measurements of a sensor
 _MOST = 10_000  # commands before the first
 _COARSE = 3.0  # typical over smallest change of a value: below it the sensor counts steps
-_FOLLOWS, _CLEAR, _LOST = 0.95, 0.9, 0.5  # correlations: nothing to ask; a cause is clear; the commands do not show
-_NOISY = 3.0  # times the noise, up to which a distance is noise
-_GAIN, _SCALE = 3.0, 10.0  # factors on a motion up to which it may be a gain, or a scale that can be fitted
+_CLEAR, _LOST = 0.9, 0.5  # correlations: a cause is clear; the commands do not show
+_SCALE = 10.0  # factor on a motion up to which it may be a scale that can be fitted
 _ALIKE_SIZE = 0.2  # by how much, over it, the same fault of two sensors may differ
 
 _Cause: TypeAlias = Literal["unit", "columns", "sign", "clock", "nothing"]
@@ -76,8 +74,8 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
         RunError: A sensor, or the commands, are in another unit than their name says.
     """
     given = _given(segment, config)
-    paths = _paths(segment, config, given)
-    faults = _not_following(segment, config, given, paths)
+    trackings = _trackings(segment, config, given)
+    faults = _not_following(segment, config, given, trackings)
     if refused := [one.sentence for one in faults if one.refused]:
         raise RunError(refused[0])
     found, told = [one.sentence for one in faults], {name for one in faults for name in one.sensors}
@@ -88,19 +86,14 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
                 f"sensor '{name}' gives each value {times} times: a sample that is held? Each counts as a measurement"
                 " of its own, at its own stamp; log each once"
             )
-    off = [
-        _off(config, name, axis, path)
-        for name, mine in paths.items()
-        if name not in told
-        for axis, path in mine.items()
-    ]
-    return [*found, *(one for one in off if one is not None)]
+    quiet = {name: mine for name, mine in trackings.items() if name not in told}
+    return [*found, *_moving_alone(config, quiet), *_off(config, quiet)]
 
 
 def not_following(segment: Segment, config: FusionConfig) -> list[Fault]:
     """What is wrong with sensors whose measurements are not where the commands lead: unit, axis, sign or clock."""
     given = _given(segment, config)
-    return _not_following(segment, config, given, _paths(segment, config, given))
+    return _not_following(segment, config, given, _trackings(segment, config, given))
 
 
 def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
@@ -138,80 +131,8 @@ def latency_questions(config: FusionConfig, names: Iterable[str]) -> list[str]:
 # ---- where the commands lead ----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Path:
-    """Up to 500 positions that a sensor measures on an axis, and where the commands lead, relative to the start.
-
-    Attributes:
-        measured: [m or rad], (n,).
-        led: [m or rad], (n,).
-        before: Where the commands had led ``SMALL_SHIFT`` before each [m or rad], (n,).
-        noise: Standard deviation of what varies [m or rad].
-        expected: That of their distance, by all that is uncertain [m or rad].
-    """
-
-    measured: FloatArray
-    led: FloatArray
-    before: FloatArray
-    noise: float
-    expected: float
-
-    @cached_property
-    def distance(self) -> FloatArray:
-        """From where the commands lead [m or rad], (n,)."""
-        return self.measured - self.led
-
-    @cached_property
-    def median(self) -> float:
-        """Of the distances [m or rad]."""
-        return float(np.median(self.distance))
-
-    @cached_property
-    def spread(self) -> float:
-        """Median distance from their median [m or rad]."""
-        return float(np.median(np.abs(self.distance - self.median)))
-
-    @cached_property
-    def moved(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Measured and commanded motion without outliers, and that shortly before, about zero [m or rad], (k,) each.
-
-        At rest all is near: what is off by no more than the motion, as a wrong delay makes it, is no outlier.
-        """
-        near = np.abs(self.distance - self.median) <= max(10.0 * self.spread, float(np.ptp(self.led))) + 1e-12
-        measured, led, before = (part[near] - part[near].mean() for part in (self.measured, self.led, self.before))
-        return measured, led, before
-
-    @cached_property
-    def correlation(self) -> float:
-        """Of measured and commanded motion; 0 where one of them rests."""
-        measured, led, _ = self.moved
-        power = math.sqrt(float(measured @ measured) * float(led @ led))
-        return float(measured @ led) / power if power > 0.0 else 0.0
-
-    @property
-    def follows(self) -> bool:
-        """Whether there is nothing to ask: it moves about as far as commanded, about then, or is off by its noise."""
-        measured, led, before = self.moved
-        if float(np.std(measured - led)) <= _NOISY * self.noise:
-            return True
-        if self.correlation < _FOLLOWS:
-            return False
-        slope = float(measured @ led) / float(led @ led)
-        left, step = measured - slope * led, led - before
-        along, power = float(left @ step), max(float(step @ step), 1e-30)
-        is_late = abs(along) > 0.5 * slope * power and along**2 > 0.5 * power * float(left @ left)
-        return 1.0 / _GAIN < slope < _GAIN and not is_late
-
-    @property
-    def lacks_motion(self) -> bool:
-        """Whether less than half of the commanded motion is there, by three standard errors."""
-        measured, led, _ = self.moved
-        slope, error = slope_of_pieces(measured, led)
-        return slope + 3.0 * error < 0.5 and float(np.std(led)) > self.noise
-
-
 _Given: TypeAlias = Mapping[str, Mapping[str, tuple[TimeArray, FloatArray]]]  # stamps and values, by sensor and axis
-_Paths: TypeAlias = Mapping[str, Mapping[str, _Path]]
+_Trackings: TypeAlias = Mapping[str, Mapping[str, Tracking]]
 
 
 def _given(segment: Segment, config: FusionConfig) -> _Given:
@@ -229,9 +150,9 @@ def _given(segment: Segment, config: FusionConfig) -> _Given:
     return found
 
 
-def _paths(segment: Segment, config: FusionConfig, given: _Given) -> _Paths:
-    """The paths of each sensor until 1 s after the last command, without axes of which there is little."""
-    found: dict[str, dict[str, _Path]] = {}
+def _trackings(segment: Segment, config: FusionConfig, given: _Given) -> _Trackings:
+    """How each sensor tracks the commands until 1 s after the last command, without axes of which there is little."""
+    found: dict[str, dict[str, Tracking]] = {}
     for name, axes in given.items():
         found[name] = {}
         for axis, (stamp, value) in axes.items():
@@ -239,11 +160,13 @@ def _paths(segment: Segment, config: FusionConfig, given: _Given) -> _Paths:
             if count >= _FEW:
                 some = slice(None, count, 1 + count // _ENOUGH)
                 alike = without_spikes(value[some])
-                found[name][axis] = _path(segment, config, name, axis, stamp[some][alike], value[some][alike])
+                found[name][axis] = _tracking(segment, config, name, axis, stamp[some][alike], value[some][alike])
     return found
 
 
-def _path(segment: Segment, config: FusionConfig, name: str, axis: str, stamp: TimeArray, value: FloatArray) -> _Path:
+def _tracking(
+    segment: Segment, config: FusionConfig, name: str, axis: str, stamp: TimeArray, value: FloatArray
+) -> Tracking:
     sensor, process = config.sensors[name], config.process[axis]
     valid = stamp - round(sensor.latency * 1e9)
     both = np.concatenate([valid, valid - round(SMALL_SHIFT * 1e9)])
@@ -251,13 +174,12 @@ def _path(segment: Segment, config: FusionConfig, name: str, axis: str, stamp: T
     position[order] = _led(segment, config, axis, both[order])
     led, before = position[: len(valid)], position[len(valid) :]
     of_sensor = math.hypot(sensor.sd_of(axis) or 0.0, sensor.bias_drift_sd_of(axis)) / abs(sensor.scale)
-    walked = process.drift * math.sqrt((int(valid[-1]) - int(valid[0])) / 1e9)
-    noise, bias = math.hypot(of_sensor, process.disturbance_sd), sensor.bias_sd_of(axis) / abs(sensor.scale)
-    expected = math.hypot(noise, bias, config.start.offset_sd_of(axis), walked)
+    noise = math.hypot(of_sensor, process.disturbance_sd)
+    zero_sd = math.hypot(noise, sensor.bias_sd_of(axis) / abs(sensor.scale), config.start.offset_sd_of(axis))
     measured, turn = value / sensor.scale - segment.start[axis], turn_of(config, name, axis) / abs(sensor.scale)
     if turn:
         measured -= turn * np.round(np.median(measured - led) / turn)
-    return _Path(measured, led, before, noise, expected)
+    return Tracking((valid - valid[0]) / 1e9, measured, led, before, noise, zero_sd, process.drift)
 
 
 def _led(segment: Segment, config: FusionConfig, axis: str, time: TimeArray) -> FloatArray:
@@ -266,29 +188,74 @@ def _led(segment: Segment, config: FusionConfig, axis: str, time: TimeArray) -> 
     return response(model, period, delay, *segment.given(axis), segment.start[axis], time)
 
 
-def _off(config: FusionConfig, name: str, axis: str, path: _Path) -> str | None:
-    """A sentence if a sensor is where the commands do not lead, by the same distance throughout."""
-    if abs(path.median) <= _FAR * max(1.4826 * path.spread, path.expected):
-        return None
+def _off(config: FusionConfig, trackings: _Trackings) -> list[str]:
+    """A sentence on each sensor that is off by a constant; of all sensors of an axis one, on the commands."""
+    off = {name: {axis: one.zero for axis, one in mine.items() if one.zero} for name, mine in trackings.items()}
+    found: list[str] = []
+    for name, mine in off.items():
+        alone: dict[str, float] = {}
+        for axis, zero in mine.items():
+            measuring = [other for other, axes in trackings.items() if axis in axes and axes[axis].excludes(zero)]
+            alike = [one for one in measuring if math.isclose(off[one].get(axis, 0.0), zero, rel_tol=_ALIKE_SIZE)]
+            if len(alike) == len(measuring) > 1:
+                names = ", ".join(f"'{one}'" for one in alike)
+                told = f"sensors {names} are {_length(config, axis, zero)} from where the commands lead {axis}"
+                width = _width(config, "offset_sd", {axis: zero})
+                ask = f"is the zero of the commands another? Then give [start] {width}"
+                found += [f"{told}, all the time: {ask}"] if name == alike[0] else []
+            else:
+                alone[axis] = zero
+        if alone:
+            told = ", ".join(
+                f"{_length(config, axis, zero)} on {axis} (noise and priors:"
+                f" {_length(config, axis, trackings[name][axis].zero_sd, '.2g')})"
+                for axis, zero in alone.items()
+            )
+            widths = _width(config, "bias_sd", alone), _width(config, "offset_sd", alone)
+            found.append(
+                f"sensor '{name}' is off from where the commands lead, all the time: by {told}; has it another zero?"
+                f" Then give it {widths[0]}. Or have the commands? Then give [start] {widths[1]}"
+            )
+    return found
+
+
+def _length(config: FusionConfig, axis: str, size: float, digits: str = "+.4g") -> str:
+    """A distance on an axis, in the unit of screens."""
     screen = config.arm.screen_of(axis)
-    width = _digits(abs(path.median) * screen.scale, 1)
-    return (
-        f"sensor '{name}' is {path.median * screen.scale:+.4g} {screen.unit} from where the commands lead {axis}, all"
-        f" the time (noise and priors: {path.expected * screen.scale:.2g} {screen.unit}): has it another zero? Give it"
-        f" bias_sd_{screen.unit} = {width}, or say in run.toml where the arm starts"
-    )
+    return f"{size * screen.scale:{digits}} {screen.unit}"
+
+
+def _width(config: FusionConfig, key: str, zeros: Mapping[str, float]) -> str:
+    """The lines that give axes a prior as wide as their zeros, a key for each kind."""
+    found: dict[str, list[str]] = {}
+    for axis, zero in zeros.items():
+        screen = config.arm.screen_of(axis)
+        width = f"{axis} = {_digits(abs(zero) * screen.scale, 1)}"
+        found.setdefault(f"{key}_{screen.unit}", []).append(width)
+    return ", ".join(f"{one} = {{ {', '.join(widths)} }}" for one, widths in found.items())
+
+
+def _moving_alone(config: FusionConfig, trackings: _Trackings) -> list[str]:
+    """A sentence on each sensor that moves while the commands of its axis rest."""
+    return [
+        f"sensor '{name}' moves over {_length(config, axis, one.own_motion, '.3g')} on {axis}, whose commands rest: is"
+        " it the right column of the commands?"
+        for name, mine in trackings.items()
+        for axis, one in mine.items()
+        if one.own_motion
+    ]
 
 
 # ---- a sensor that does not follow ----------------------------------------------------------------------------------
 
 
-def _not_following(segment: Segment, config: FusionConfig, given: _Given, paths: _Paths) -> list[Fault]:
+def _not_following(segment: Segment, config: FusionConfig, given: _Given, trackings: _Trackings) -> list[Fault]:
     found: list[Fault] = []
-    for name, mine in paths.items():
-        if odd := [axis for axis, path in mine.items() if not path.follows]:
+    for name, mine in trackings.items():
+        if odd := [axis for axis, tracking in mine.items() if not tracking.follows]:
             causes = _matches(segment, config, name, {axis: given[name][axis] for axis in mine})
             found += _faults(config, name, mine, {axis: causes[axis] for axis in odd})
-    return _of_commands(found, paths)
+    return _of_commands(found, trackings)
 
 
 def _matches(
@@ -319,61 +286,65 @@ def _busiest(segment: Segment, period: float) -> Grid:
     return Grid.over(begin, min(begin + length, last), period)
 
 
-def _faults(config: FusionConfig, name: str, paths: Mapping[str, _Path], causes: Mapping[str, Match]) -> list[Fault]:
+def _faults(
+    config: FusionConfig, name: str, trackings: Mapping[str, Tracking], causes: Mapping[str, Match]
+) -> list[Fault]:
     """The faults of one sensor, from what explains its motion on the axes that it does not follow."""
     found: list[Fault] = []
 
     def fault(axes: Sequence[str], cause: _Cause, size: float, words: str, refused: bool = False) -> None:
-        lost = cause == "nothing" or any(paths[axis].correlation < _LOST for axis in axes)
+        lost = cause == "nothing" or any(trackings[axis].correlation < _LOST for axis in axes)
         lost |= cause == "unit" and not 1.0 / _SCALE < size < _SCALE
         found.append(Fault((name,), tuple(axes), cause, size, f"sensor '{name}' {words}", refused, lost))
 
-    clear = {axis: one for axis, one in causes.items() if _is_clear(axis, one, paths[axis])}
+    clear = {axis: one for axis, one in causes.items() if _is_clear(axis, one, trackings[axis])}
     if late := [axis for axis, one in clear.items() if one.shift != 0.0]:
         best = max(late, key=lambda axis: clear[axis].correlation)
-        fault(list(paths), "clock", clear[best].shift, _late(config, name, best, paths[best], clear[best]))
+        fault(list(trackings), "clock", clear[best].shift, _late(config, name, best, trackings[best], clear[best]))
     if exchanged := [axis for axis, one in clear.items() if one.axis != axis]:
-        both = list(dict.fromkeys([*exchanged, *(clear[axis].axis for axis in exchanged if clear[axis].axis in paths)]))
-        fault(both, "columns", 1.0, _exchanged({axis: (paths[axis], clear[axis]) for axis in exchanged}))
+        both = list(
+            dict.fromkeys([*exchanged, *(clear[axis].axis for axis in exchanged if clear[axis].axis in trackings)])
+        )
+        fault(both, "columns", 1.0, _exchanged({axis: (trackings[axis], clear[axis]) for axis in exchanged}))
     own = {axis: one for axis, one in clear.items() if one.axis == axis}
     if turned := [axis for axis, one in own.items() if one.slope < 0.0]:
-        fault(turned, "sign", -1.0, _turned(config, name, turned, own, len(paths)))
+        fault(turned, "sign", -1.0, _turned(config, name, turned, own, len(trackings)))
     for axis, one in own.items():
         size = abs(one.slope)
-        if not 1.0 / _GAIN < size < _GAIN:
+        if not 1.0 / GAIN < size < GAIN:
             refused, words = _unit(config.arm.axes[axis].kind, size)
             times, correlation = _digits(size, 3), f"{one.correlation:+.3f}"
             moves = f"moves {times} times as far as the commands of {axis} (correlation {correlation}): {words}"
             fault([axis], "unit", size, moves, refused)
     told = {axis for one in found for axis in one.axes}
-    for axis in causes:
-        if axis not in told and abs(causes[axis].correlation) < _LOST and paths[axis].lacks_motion:
-            fault([axis], "nothing", 1.0, _nothing(axis, paths[axis]))
+    odd = {axis: trackings[axis] for axis in causes if axis not in told and abs(causes[axis].correlation) < _LOST}
+    if lost := {axis: one for axis, one in odd.items() if one.lacks_motion}:
+        fault(list(lost), "nothing", 1.0, _nothing(lost))
     return found
 
 
-def _is_clear(axis: str, cause: Match, path: _Path) -> bool:
+def _is_clear(axis: str, cause: Match, tracking: Tracking) -> bool:
     """Whether what explains a motion does so well: two causes at once must do better, another time better than now."""
-    other_size = not 1.0 / _GAIN < abs(cause.slope) < _GAIN
+    other_size = not 1.0 / GAIN < abs(cause.slope) < GAIN
     causes = (cause.axis != axis) + (cause.shift != 0.0) + (cause.slope < 0.0) + other_size
-    least = max(_FOLLOWS if causes > 1 else _CLEAR, path.correlation if cause.shift else 0.0)
+    least = max(FOLLOWS if causes > 1 else _CLEAR, tracking.correlation if cause.shift else 0.0)
     return cause.is_steady and abs(cause.correlation) >= least
 
 
-def _late(config: FusionConfig, name: str, axis: str, path: _Path, cause: Match) -> str:
+def _late(config: FusionConfig, name: str, axis: str, tracking: Tracking, cause: Match) -> str:
     side, latency = ("late" if cause.shift > 0.0 else "early"), config.sensors[name].latency + cause.shift
     return (
         f"is {abs(cause.shift):.2f} s {side}: it follows the commands of {axis} with a correlation of"
-        f" {path.correlation:+.3f} as stamped, of {cause.correlation:+.3f} when shifted by that; are both stamped by"
-        f" one clock? latency_ms = {latency * 1e3:.0f} makes up for it"
+        f" {tracking.correlation:+.3f} as stamped, of {cause.correlation:+.3f} when shifted by that; are both stamped"
+        f" by one clock? latency_ms = {latency * 1e3:.0f} makes up for most of it, `tune --fit latency` for the rest"
     )
 
 
-def _exchanged(found: Mapping[str, tuple[_Path, Match]]) -> str:
+def _exchanged(found: Mapping[str, tuple[Tracking, Match]]) -> str:
     follows = [
         f"on {axis} the commands of {cause.axis} (correlation {cause.correlation:+.3f}, with those of {axis}"
-        f" {path.correlation:+.2f})"
-        for axis, (path, cause) in found.items()
+        f" {tracking.correlation:+.2f})"
+        for axis, (tracking, cause) in found.items()
     ]
     return f"follows {' and '.join(follows)}: are its columns exchanged in run.toml?"
 
@@ -403,26 +374,27 @@ def _digits(number: float, count: int) -> str:
     return f"{float(f'{number:.{count}g}'):g}"
 
 
-def _nothing(axis: str, path: _Path) -> str:
-    rests = "" if np.ptp(path.measured) > 0.0 else "rests and "
+def _nothing(trackings: Mapping[str, Tracking]) -> str:
+    rests = "rests and " if all(one.rests for one in trackings.values()) else ""
+    told = ", ".join(f"{axis} ({one.correlation:+.2f})" for axis, one in trackings.items())
     return (
-        f"{rests}does not follow the commands of {axis} (correlation {path.correlation:+.2f}), nor those of"
-        " another axis or another time: is it that axis, are both stamped by one clock, is arm.toml that of this arm?"
+        f"{rests}does not follow the commands, also not another axis's or those of 30 s before or after; correlation on"
+        f" {told}: are the commands of this run, both stamped by one clock, and arm.toml of this arm?"
     )
 
 
-def _of_commands(faults: Sequence[Fault], paths: _Paths) -> list[Fault]:
+def _of_commands(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
     """The faults; one that all of several sensors of its axes have is told once, as one of the commands."""
     found: list[Fault] = []
     for one in faults:
         alike = [other for other in faults if one.is_like(other)]
-        measuring = [name for name, mine in paths.items() if not mine.keys().isdisjoint(one.axes)]
+        measuring = [name for name, mine in trackings.items() if not mine.keys().isdisjoint(one.axes)]
         if len(alike) < max(len(measuring), 2) or one.cause == "nothing":
             found.append(one)
         elif one is alike[0]:
             names = [name for other in alike for name in other.sensors]
             others = ", ".join(f"'{name}'" for name in names[1:])
-            sentence = f"{one.sentence} ({others} too: is it the {one.cause} of the commands?)"
+            sentence = f"{one.sentence} ({others} too: is it the {one.cause} of the commands? Else mend each)"
             found.append(replace(one, sensors=tuple(names), sentence=sentence))
     return found
 

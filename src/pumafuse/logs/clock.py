@@ -17,6 +17,7 @@ from ..units import TIMES, mistaken
 from .run import Run, Source, note_rows
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
+_OTHER_PERIOD = 2.0  # times the update period from which an interval of commands is another one
 _NEW_CLOCK = 3  # so many rows in a row with another time: the clock was set anew; fewer are stray
 _MOST_JUMPS = 100
 _FEW, _MANY = 30, 10_000  # stamps, below which nothing is said about their unit, and from which it is clear
@@ -195,8 +196,7 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
         RunError: The stamps of a source are in another unit than they are taken to be in.
     """
     command = _ascending(run.command.stamp)
-    _check_period(run.command.label, command, period)
-    found: list[str] = []
+    found = _other_period(run.command.label, command, period)
     for name in sensors:
         stamp = _ascending(run.sensors[name].stamp)
         if len(stamp):
@@ -211,12 +211,16 @@ def _ascending(stamp: TimeArray) -> TimeArray:
     return known if (np.diff(known) >= 0).all() else np.sort(known)
 
 
-def _check_period(label: str, stamp: TimeArray, period: float) -> None:
-    """Refuse a steady stream of commands whose interval is the update period in another unit."""
+def _other_period(label: str, stamp: TimeArray, period: float) -> list[str]:
+    """A sentence if the interval of the commands is far from the update period.
+
+    Raises:
+        RunError: They come steadily, and it is the update period in another unit.
+    """
     intervals = np.diff(stamp[:_MANY])
     intervals = intervals[intervals > 0]
     if len(intervals) < _FEW:
-        return
+        return []
     early, usual, late = np.quantile(intervals, [0.25, 0.5, 0.75]) / 1e9
     units = mistaken(usual / period, TIMES)
     if units and late - early <= _EVEN * usual:
@@ -224,6 +228,13 @@ def _check_period(label: str, stamp: TimeArray, period: float) -> None:
             f"{label}: commands come every {usual:.4g} s, {usual / period:.4g} times the arm's update_period_ms ="
             f" {period * 1e3:g}: {_taken(units)}"
         )
+    if 1.0 / _OTHER_PERIOD < usual / period < _OTHER_PERIOD:
+        return []
+    lost = "are most of them lost, or is it another one?" if usual > period else "is it another one?"
+    return [
+        f"{label}: commands come every {usual * 1e3:.4g} ms, {usual / period:.3g} times the arm's update_period_ms ="
+        f" {period * 1e3:g}: {lost}"
+    ]
 
 
 def _check_span(label: str, stamp: TimeArray, command: TimeArray) -> None:

@@ -157,7 +157,8 @@ class Table:
                 column.cast(pa.decimal256(50, column.type.scale)), pa.scalar(per_unit, pa.decimal256(11))
             )
             column, per_unit = pc.round(exact), 1
-        rough = _filled(column.cast(pa.float64(), safe=False), np.nan) * per_unit
+        with np.errstate(over="ignore"):  # refused below
+            rough = _filled(column.cast(pa.float64(), safe=False), np.nan) * per_unit
         self._refuse_beyond(name, np.isfinite(rough) & (np.abs(rough) >= REACH_NS))
         found = np.where(np.isfinite(rough), np.rint(rough), NO_STAMP).astype(np.int64)
         if _is_any(column.type, _TEXTS):

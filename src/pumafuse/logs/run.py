@@ -122,7 +122,7 @@ class Run:
         for what, values in {**named, "start": self.start}.items():
             for axis in values:
                 if axis not in accepted:
-                    raise UnknownNameError(f"{where}, {what}", "axis", axis, accepted)
+                    raise UnknownNameError(f"{where}: {what} and the commands have other axes", "axis", axis, accepted)
         if self.clock not in get_args(Clock):
             raise UnknownNameError(where, "clock", str(self.clock), get_args(Clock))
         for axis, level in self.start.items():
