@@ -289,9 +289,7 @@ def _unmatched(silent: Sequence[str], strangers: Sequence[str]) -> list[str]:
     found: list[str] = []
     for name in silent:
         close = strangers if len(silent) == len(strangers) == 1 else get_close_matches(name, strangers, n=1)
-        like = (
-            f"; is '{close[0]}', which the configuration does not have, the same? Give both one name" if close else ""
-        )
+        like = f"; is '{close[0]}', which the configuration does not have, the same? One name for both" if close else ""
         found.append(f"sensor '{name}' of the configuration has no measurements in this run{like}")
     return found
 
