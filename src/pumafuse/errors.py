@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 _LONGEST_NAME = 120
@@ -78,3 +79,22 @@ def reason(error: Exception) -> str:
     """What an error says, without the file that it names, in a line that is short enough for a screen."""
     text = re.sub(r"^Failed to read RRD file at .*?\.rrd: ", "", str(error))
     return " ".join(text.split())[:160].rstrip(". :") or type(error).__name__
+
+
+@contextmanager
+def one_line(path: Path, libraries: str) -> Generator[None]:
+    """Turn what libraries raise while they read a file into an error of one line; pip installs ``libraries``."""
+    try:
+        yield
+    except RunError:
+        raise
+    except ModuleNotFoundError:
+        raise RunError(f"{path}: this format needs more libraries: pip install {libraries}") from None
+    except FileNotFoundError:
+        raise RunError(f"{path}: no such file") from None
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror or reason(error)}") from None
+    except MemoryError:
+        raise RunError(f"{path}: cannot be read: not enough memory") from None
+    except Exception as error:
+        raise RunError(f"{path}: cannot be read: {reason(error)}") from None

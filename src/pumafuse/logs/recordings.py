@@ -7,8 +7,7 @@ recorded.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from ..errors import RunError, reason, unknown_part
+from ..errors import one_line, reason, unknown_part
 from . import bags, entities
 from .bags import Channel, Faults, Message, Record
 from .columns import LOG_TIME, Table, Topic, joined, numeric_paths, wanted
@@ -35,7 +34,7 @@ def read(path: Path, name: str, fields: Sequence[str] | None = None) -> Table:
     Raises:
         RunError: It is no such recording, has no such topic or nothing on it, or is too damaged.
     """
-    with _one_line(path):
+    with one_line(path, "'pumafuse[bags]'"):
         return (entities.read if path.suffix == ".rrd" else _read_topic)(path, name, fields)
 
 
@@ -48,27 +47,8 @@ def topics(path: Path) -> tuple[Topic, ...]:
     Raises:
         RunError: It is no such recording, or too damaged.
     """
-    with _one_line(path):
+    with one_line(path, "'pumafuse[bags]'"):
         return (entities.topics if path.suffix == ".rrd" else _topics)(path)
-
-
-@contextmanager
-def _one_line(path: Path) -> Generator[None]:
-    """Turn what libraries raise while they read a file into an error of one line."""
-    try:
-        yield
-    except RunError:
-        raise
-    except ModuleNotFoundError:
-        raise RunError(f"{path}: this format needs more libraries: pip install 'pumafuse[bags]'") from None
-    except FileNotFoundError:
-        raise RunError(f"{path}: no such file") from None
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read: {error.strerror or reason(error)}") from None
-    except MemoryError:
-        raise RunError(f"{path}: cannot be read: not enough memory") from None
-    except Exception as error:
-        raise RunError(f"{path}: cannot be read: {reason(error)}") from None
 
 
 # Topics.
