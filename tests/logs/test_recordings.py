@@ -7,6 +7,7 @@ import sqlite3
 import struct
 import subprocess
 import sys
+import tracemalloc
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -500,3 +501,20 @@ def test_a_large_recording_takes_little_memory(tmp_path: Path) -> None:
         lines, peak = _peak(path, topic, field)
         assert lines == [rows]
         assert peak < 200e6
+
+
+def test_stamps_of_images_in_a_rerun_recording_take_little_memory(tmp_path: Path) -> None:
+    """Of 30 MB of images, their stamps alone stay in memory."""
+    path, draw = tmp_path / "images.rrd", np.random.default_rng(1)
+    with rr.RecordingStream("cell") as stream:
+        stream.save(str(path))
+        for k in range(30):
+            stream.set_time("t", duration=k)
+            stream.log("/camera", rr.Image(draw.integers(0, 256, (1000, 1000), dtype=np.uint8)))
+    tracemalloc.start()
+    try:
+        assert recordings.read(path, "/camera", ["t"]).rows == 30
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 10e6

@@ -138,7 +138,8 @@ def _parts(
         known.setdefault(name, set()).update(components)
         if name == place:
             unwanted = [one for one in components if not (wanted(one, fields) or wanted(_last(one), fields))]
-            yield chunk.drop_columns(unwanted)
+            kept = chunk.drop_columns(unwanted)
+            yield kept.take(pc.sort_indices(kept[_ROW]))  # a copy: what was dropped leaves the memory
 
 
 def _place(entity: str) -> str:
