@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import re
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 
 _LONGEST_NAME = 120
 
@@ -57,3 +60,41 @@ def shortened(name: str) -> str:
 def counted(number: int, what: str) -> str:
     """``1 cell``, ``2 cells``."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def unknown_part(path: Path, key: str, name: str, known: Mapping[str, str], notes: Sequence[str]) -> RunError:
+    """What to say where a recording has nothing of a name: what it has, with the types."""
+    why = "".join(f"; {note.removeprefix(f'{path.name}: ')}" for note in notes)
+    if not known:
+        return RunError(f"{path}: the recording is empty{why}")
+    if name in known:
+        return RunError(f"{path}: {key} '{name}' has nothing that can be read{why}")
+    guess, near, _ = suggestion(name, known).partition("?")
+    asked = f"no {key} '{name}'" if name else f"the key '{key}' is missing"
+    listed = ", ".join(f"{one} ({kind})" for one, kind in known.items())
+    return RunError(f"{path}: {asked}; {f'{guess}? ' if near else ''}it has: {listed}{why}")
+
+
+def reason(error: Exception) -> str:
+    """What an error says, without the file that it names, in a line that is short enough for a screen."""
+    text = re.sub(r"^Failed to read RRD file at .*?\.rrd: ", "", str(error))
+    return " ".join(text.split())[:160].rstrip(". :") or type(error).__name__
+
+
+@contextmanager
+def one_line(path: Path, libraries: str) -> Generator[None]:
+    """Turn what libraries raise while they read a file into an error of one line; pip installs ``libraries``."""
+    try:
+        yield
+    except RunError:
+        raise
+    except ModuleNotFoundError:
+        raise RunError(f"{path}: this format needs more libraries: pip install {libraries}") from None
+    except FileNotFoundError:
+        raise RunError(f"{path}: no such file") from None
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror or reason(error)}") from None
+    except MemoryError:
+        raise RunError(f"{path}: cannot be read: not enough memory") from None
+    except Exception as error:
+        raise RunError(f"{path}: cannot be read: {reason(error)}") from None

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import struct
 import subprocess
 import sys
+import tracemalloc
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -24,8 +26,10 @@ from mcap.records import Channel, Chunk, DataEnd, Header, Message, Schema
 import bag_files
 import pumafuse as pf
 from bag_files import KINDS, motion, written
+from executable import refused
 from pumafuse.errors import PumafuseError, RunError
 from pumafuse.logs import recordings, tables
+from pumafuse.logs.entities import recording_of
 from refusals import one_line
 
 
@@ -155,6 +159,19 @@ def test_components_of_an_entity_are_called_by_the_last_part_of_their_names(tmp_
     assert tables.read(path, entity="tool").numbers("translation[1]", "_m")[0].tolist() == [2.0]
 
 
+def test_a_recording_that_no_pipe_holds_at_once_is_read_right(tmp_path: Path) -> None:
+    """Rows of 1000 numbers, 8 MB of them, come through bit for bit, whatever is logged beside them."""
+    path, numbers = tmp_path / "wide.rrd", np.random.default_rng(3).normal(size=(1000, 1000))
+    with rr.RecordingStream("cell") as stream:
+        stream.save(str(path))
+        for k in range(100):
+            times, scalars = [rr.TimeColumn("t", duration=[0.0])], rr.Scalars.columns(scalars=[k])
+            rr.send_columns(f"other/{k}", times, scalars, recording=stream)
+        rows = rr.Scalars.columns(scalars=numbers.ravel()).partition([1000] * 1000)
+        rr.send_columns("/wide", [rr.TimeColumn("t", duration=np.arange(1000))], rows, recording=stream)
+    assert np.array_equal(tables.read(path, entity="/wide").columns["scalars"].to_pylist(), numbers)
+
+
 CUT_OFF = {
     "mcap": ("mcap-lz4", lambda path: path),
     "bag": ("bag-lz4", lambda path: path),
@@ -199,7 +216,13 @@ def test_a_database_that_ends_within_a_page_says_how_to_read_what_is_there(tmp_p
     assert recordings.read(path, "/level").rows > 50
 
 
-@pytest.mark.parametrize("kind", ["mcap-lz4", "mcap-plain", "json", "protobuf", "bag-bz2", "bag-lz4", "db3", "rrd"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("mcap-lz4", "mcap-plain", "json", "protobuf", "bag-bz2", "bag-lz4", "db3"),
+        pytest.param("rrd", marks=pytest.mark.long),  # a process for each example
+    ],
+)
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(derandomize=True, deadline=None, max_examples=40, suppress_health_check=list(HealthCheck))
 def test_bytes_that_are_wrong_are_never_more_than_a_line(kind: str, seed: int, tmp_path_factory: Any) -> None:
@@ -225,6 +248,60 @@ def test_bytes_that_are_wrong_are_never_more_than_a_line(kind: str, seed: int, t
     if "mcap" in kind:
         mine = {sample.numbers[0] for sample in motion(30)}
         assert mine.issuperset(table.columns["data"].to_pylist())
+
+
+def test_a_file_that_aborts_the_reader_of_rerun_is_a_line(tmp_path: Path) -> None:
+    """Rerun's reader ends its process on this file, the first 1147 bytes of a recording with byte 487 replaced."""
+    damaged = Path(__file__).parent / "data" / "damaged.rrd"
+    assert refused("init", damaged, "-o", tmp_path / "new").startswith(f"pumafuse: {damaged}: damaged: Rerun's reader ")
+
+
+@pytest.fixture
+def readers(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
+    """The processes that are started."""
+    found, start = [], subprocess.Popen
+
+    def noted(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
+        found.append(start(*arguments, **options))
+        return found[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", noted)
+    return found
+
+
+def test_no_process_outlives_what_it_reads(
+    readers: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It ends where all is read, where a part is enough, and at Ctrl-C."""
+    path = written(tmp_path, KINDS["rrd"], motion(5000))  # more than a pipe holds
+    recordings.read(path, "/level")
+    assert recording_of(path, "/level", "robot_time", "").id == "take-7"
+
+    def interrupted(_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pa.ipc, "open_stream", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        recordings.read(path, "/level")
+    assert len(readers) == 3
+    assert all(reader.returncode is not None for reader in readers)
+
+
+def test_the_process_that_reads_imports_what_pumafuse_does(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Files of the folder that one works in are not taken for libraries; a library that is missing is named."""
+    path, paths = written(tmp_path, KINDS["rrd"], motion(5)), os.environ.get("PYTHONPATH", "")
+    for name in ("numpy", "pyarrow", "rerun", "pumafuse"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit")
+    monkeypatch.chdir(tmp_path)
+    assert recordings.read(path, "/level").rows == 5
+    (tmp_path / "old" / "rerun").mkdir(parents=True)
+    (tmp_path / "old" / "rerun" / "__init__.py").touch()
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "old"), *filter(None, [paths])]))
+    assert "pip install --upgrade rerun-sdk" in one_line(RunError, lambda: recordings.read(path, "/level"))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert "its reader does not start" in one_line(RunError, lambda: recordings.read(path, "/level"))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    assert "does not start: No such file" in one_line(RunError, lambda: recordings.read(path, "/level"))
 
 
 def _mcap(
@@ -424,3 +501,20 @@ def test_a_large_recording_takes_little_memory(tmp_path: Path) -> None:
         lines, peak = _peak(path, topic, field)
         assert lines == [rows]
         assert peak < 200e6
+
+
+def test_stamps_of_images_in_a_rerun_recording_take_little_memory(tmp_path: Path) -> None:
+    """Of 30 MB of images, their stamps alone stay in memory."""
+    path, draw = tmp_path / "images.rrd", np.random.default_rng(1)
+    with rr.RecordingStream("cell") as stream:
+        stream.save(str(path))
+        for k in range(30):
+            stream.set_time("t", duration=k)
+            stream.log("/camera", rr.Image(draw.integers(0, 256, (1000, 1000), dtype=np.uint8)))
+    tracemalloc.start()
+    try:
+        assert recordings.read(path, "/camera", ["t"]).rows == 30
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 10e6

@@ -17,8 +17,7 @@ import pyarrow.parquet as papq
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError
 from ..logs import recordings, tables
-from ..logs.columns import Table, leaf, prefixes
-from ..logs.recordings import LOG_TIME, Topic
+from ..logs.columns import LOG_TIME, Table, Topic, leaf, numeric_paths, prefixes
 from ..units import TIMES, ending, si_of
 from . import names
 
@@ -224,7 +223,7 @@ def _numeric_paths(table: Table) -> Iterator[str]:
         else:
             beside = table.columns.get("name")
             labelled = {} if beside is None else {"name": beside[0].as_py()}
-            yield from recordings.numeric_paths({**labelled, name: first[0].as_py()})
+            yield from numeric_paths({**labelled, name: first[0].as_py()})
 
 
 # Clocks.

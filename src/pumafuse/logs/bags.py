@@ -26,7 +26,7 @@ from zlib import crc32
 
 import msgspec
 
-from ..errors import RunError, counted
+from ..errors import RunError, counted, reason
 
 _LARGEST = 128 << 20  # bytes of a record or a chunk; recorders make chunks of about 1 MB
 _DEEPEST = 32  # types within types of a message
@@ -87,12 +87,6 @@ DAMAGE = (
     *(ValueError, RuntimeError, LookupError, TypeError, AttributeError, AssertionError, OverflowError),
     *(EOFError, struct.error, msgspec.MsgspecError),
 )
-
-
-def reason(error: Exception) -> str:
-    """What an error says, without the file that it names, in a line that is short enough for a screen."""
-    text = re.sub(r"^Failed to read RRD file at .*?\.rrd: ", "", str(error))
-    return " ".join(text.split())[:160].rstrip(". :") or type(error).__name__
 
 
 # Decoders: from bytes to fields.

@@ -8,10 +8,11 @@ in ROS's ``sensor_msgs/JointState``. A cell that is empty, no number, or not the
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import pyarrow as pa
@@ -19,10 +20,11 @@ import pyarrow.compute as pc
 
 from .. import units
 from ..arrays import NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
-from ..errors import RunError, UnknownNameError, counted, shortened
+from ..errors import RunError, UnknownNameError, counted, reason, shortened
 
 Columns: TypeAlias = Mapping[str, pa.ChunkedArray]
 
+LOG_TIME = "log_time"  # when a row was recorded
 NAMES = "name"  # the list beside another one that says what its elements are
 # Seconds and nanoseconds in a struct: ROS 2, ROS 1, Foxglove's JSON schemas, google.protobuf.Timestamp.
 _SPLIT_STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("seconds", "nanos"))
@@ -37,6 +39,8 @@ _NUMBERS = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.t
 _NEITHER_NUMBERS_NOR_TEXT = (pa.types.is_boolean, pa.types.is_temporal, pa.types.is_nested, pa.types.is_union)
 _LISTS = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
 _TEXTS = (pa.types.is_string, pa.types.is_large_string)
+_LONGEST_LIST = 64  # elements of a list that are listed one by one
+_MOST_BYTES = 1 << 30  # of a table
 
 
 @dataclass(frozen=True)
@@ -283,6 +287,27 @@ class Table:
         )
 
 
+@dataclass(frozen=True)
+class Topic:
+    """What a recording has of one topic, or of one entity.
+
+    Attributes:
+        name: The topic, or the entity.
+        type: Of its messages, such as ``sensor_msgs/msg/JointState``, or the names of its components.
+        count: Number of messages, or of rows.
+        first: When the first was recorded, int ns; None: not known.
+        last: When the last was.
+        fields: Field paths of the numbers in its first message; of an entity, also its timelines.
+    """
+
+    name: str
+    type: str
+    count: int
+    first: int | None
+    last: int | None
+    fields: tuple[str, ...]
+
+
 def leaf(path: str) -> str:
     """A field path without the choice of an element at its end: the name that may carry a unit."""
     return re.sub(r"(\[[^\]]*\])+$", "", path)
@@ -301,6 +326,25 @@ def prefixes(paths: Sequence[str]) -> list[str]:
             beside, dot, _ = whole.rpartition(".")
             found |= {whole: None, f"{beside}{dot}{NAMES}": None}
     return list(found)
+
+
+def wanted(name: str, fields: Sequence[str] | None) -> bool:
+    """Whether a column is, or holds, one of the fields that are asked for."""
+    return fields is None or any(path == name or path.startswith((f"{name}.", f"{name}[")) for path in fields)
+
+
+def numeric_paths(value: Any, path: str = "", names: Any = None) -> Iterator[str]:
+    """Field paths of the numbers in a message; elements of lists by ``names``, if there are as many, else by index."""
+    if isinstance(value, Mapping):
+        message = cast(Mapping[str, Any], value)
+        for key, part in message.items():
+            yield from numeric_paths(part, f"{path}.{key}" if path else key, message.get("name"))
+    elif isinstance(value, list | np.ndarray) and len(elements := cast(Sequence[Any], value)) <= _LONGEST_LIST:
+        labels = cast(list[Any], names) if isinstance(names, list) else []
+        for label, part in zip(labels if len(labels) == len(elements) else count(), elements, strict=False):
+            yield from numeric_paths(part, f"{path}[{label}]")
+    elif isinstance(value, int | float | np.number) and not isinstance(value, bool):
+        yield path
 
 
 def find(columns: Columns, path: str, where: str, *, part: bool = False) -> pa.ChunkedArray:
@@ -328,6 +372,24 @@ def longest(columns: Iterable[str], path: str) -> str | None:
     """The longest name that is the path, or that the path goes on from."""
     fits = (name for name in columns if path.startswith(name) and path[len(name) : len(name) + 1] in ("", ".", "["))
     return max(fits, key=len, default=None)
+
+
+def joined(tables: Iterable[pa.Table], what: str) -> pa.Table | None:
+    """One table of many, whose columns may differ; None of none.
+
+    Raises:
+        ValueError: They do not fit each other, or are too large.
+    """
+    parts, size = list[pa.Table](), 0
+    for table in tables:
+        parts.append(table)
+        size += table.nbytes
+        if size > _MOST_BYTES:
+            raise ValueError(f"the fields asked for of {what} hold more than {_MOST_BYTES >> 30} GB")
+    try:
+        return pa.concat_tables(parts, promote_options="permissive") if parts else None
+    except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
+        raise ValueError(f"{what} changes its type: {reason(error)}") from None
 
 
 def _inside(

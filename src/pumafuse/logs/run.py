@@ -24,7 +24,7 @@ from . import manifest, tables
 from .frames import CARTESIAN, Frame
 
 if TYPE_CHECKING:
-    from .recordings import Recording
+    from .entities import Recording
 
 Clock = Literal["stamps", "regular"]
 
@@ -378,7 +378,7 @@ def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recordi
     found = next((entry for entry in entries if entry.entity), None)
     if found is None:
         return None
-    from .recordings import recording_of
+    from .entities import recording_of
 
     time = found.time
     return recording_of(folder / found.file, found.entity, time.column, time.ending or ending(time.column) or "")

@@ -24,9 +24,8 @@ from ..fusion.config import (
     with_kinds,
     with_names_of_lengths,
 )
-from ..logs import save
 from ..logs.frames import CARTESIAN, Frame
-from ..logs.manifest import axis_of
+from ..logs.manifest import axis_of, check_axis, check_name
 from ..logs.run import Clock
 from ..model.arm import ArmModel
 from ..toml import NotNegative
@@ -115,9 +114,9 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         for name in (*self.trajectory.moving, *self.start.level):
             self.arm.axis(name)
         for name in self.arm.axes:
-            save.check_axis(name)
+            check_axis(name)
         for name, sensor in self.sensors.items():
-            save.check_name(name)
+            check_name(name)
             self._check(f"sensors.{name}", sensor)
         if isinstance(self.trajectory, Steps):
             self._check_scope(self.trajectory)

@@ -22,8 +22,8 @@ from ..arrays import FloatArray
 from ..filter.outcome import Outcome
 from ..fusion.estimates import Estimates
 from ..logs.axes import in_axes
+from ..logs.entities import Recording
 from ..logs.frames import CARTESIAN, in_space
-from ..logs.recordings import Recording
 from ..logs.run import Run
 from ..units import MM, Screen, seconds
 from . import colours, styles

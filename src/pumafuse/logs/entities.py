@@ -1,0 +1,313 @@
+"""Entities of Rerun recordings (``.rrd``) as tables.
+
+A row is what was logged of an entity at once, a column one of its timelines or of its components. A component is called
+by the last part of its name (``scalars`` for ``Scalars:scalars``), by all of it where two would be called the same. It
+is a list of instances, ``scalars[1]``; where there never was more than one, that one.
+
+Some damaged files make Rerun's reader abort its process. So it has one of its own: ``python -m pumafuse.logs.entities
+FILE ENTITY`` writes one stream of Arrow's IPC format after the other. The metadata of their schemas say what they are:
+the ids of the recording, then chunks of entities, and at the end what is wrong. If that is missing, it was aborted.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from collections import Counter
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from ..errors import RunError, one_line, unknown_part
+from ..units import TIMES
+from .columns import LOG_TIME, Table, Topic, joined, numeric_paths, wanted
+
+_LARGE_CELL = 4096  # bytes: images and the like hold no positions
+_ROW = "rerun.controls.RowId"  # in the order of logging
+_READER = "pumafuse.logs.entities"
+_NO_ROWS = pa.record_batch({})
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The Rerun recording that a run was read from.
+
+    Attributes:
+        application: Its application id.
+        id: Its recording id.
+        timeline: The timeline of the run's stamps; empty: they are on none.
+        kind: What it holds: ``timestamp[ns]``, ``duration[ns]``, or whole numbers (``int64``).
+        unit: What one of these is [ns].
+    """
+
+    application: str
+    id: str
+    timeline: str
+    kind: str
+    unit: int
+
+
+def read(path: Path, entity: str, fields: Sequence[str] | None) -> Table:
+    """An entity, its rows in the order in which they were logged.
+
+    Raises:
+        RunError: It is no such recording, has no such entity or nothing on it, or is damaged.
+    """
+    place, known = _place(entity), dict[str, set[str]]()
+    with _opened(path, place) as opened:
+        table = joined(_parts(opened.chunks, place, fields, known), f"entity '{place}'")
+    if table is None:
+        listed = {one: ", ".join(sorted(components)) for one, components in sorted(known.items())}
+        raise unknown_part(path, "entity", entity and place, listed, opened.notes)
+    table = table.take(pc.sort_indices(table[_ROW])).drop_columns(_ROW)
+    timelines = [name for name in table.column_names if name not in known[place]]
+    names = _names(known[place], timelines)
+    there = [
+        pc.greater(pc.fill_null(pc.list_value_length(table[name]), 0), 0)
+        for name in names
+        if name in table.column_names
+    ]
+    table = table.filter(reduce(pc.or_, there)) if there else table
+    columns = {name: table[name] for name in table.column_names if name not in names}
+    columns |= {short: _single(table[name]) for name, short in names.items() if name in table.column_names}
+    return Table(path, columns, table.num_rows, opened.notes, (*timelines, *names.values()))
+
+
+def topics(path: Path) -> tuple[Topic, ...]:
+    """The entities of a recording.
+
+    Raises:
+        RunError: It is no such recording, or damaged.
+    """
+    components, fields = dict[str, set[str]](), dict[str, dict[str, None]]()
+    rows, ends = Counter[str](), dict[str, list[int]]()
+    with _opened(path) as opened:
+        for name, chunk in opened.chunks:
+            components.setdefault(name, set()).update(_components(chunk))
+            rows[name] += chunk.num_rows
+            if LOG_TIME in chunk.column_names and pa.types.is_timestamp(chunk[LOG_TIME].type):
+                ends.setdefault(name, []).extend(pc.min_max(chunk[LOG_TIME].cast(pa.int64())).as_py().values())
+            fields.setdefault(name, {}).update(dict.fromkeys(_numbers_of(chunk)))
+    return tuple(
+        Topic(
+            name,
+            ", ".join(sorted(found)),
+            rows[name],
+            min(ends.get(name, ()), default=None),
+            max(ends.get(name, ()), default=None),
+            tuple(fields[name]),
+        )
+        for name, found in sorted(components.items())
+    )
+
+
+def recording_of(path: Path, entity: str, time: str, unit: str) -> Recording:
+    """What a result needs to open on top of the Rerun recording that it was made from.
+
+    Args:
+        path: The file.
+        entity: The entity whose stamps are those of the run.
+        time: What they are called.
+        unit: The ending of their unit, if they are numbers.
+
+    Raises:
+        RunError: It is no recording.
+    """
+    place = _place(entity)
+    with _opened(path, place) as opened:
+        chunk = next(chunk for name, chunk in opened.chunks if name == place)
+    is_timeline = time in chunk.column_names and time not in _components(chunk)
+    kind = chunk[time].type if is_timeline else pa.null()
+    count = 10 ** (9 - 3 * TIMES.index(unit)) if pa.types.is_integer(kind) else 1
+    return Recording(opened.application, opened.id, time if is_timeline else "", str(kind), count)
+
+
+def _parts(
+    chunks: Iterable[tuple[str, pa.Table]], place: str, fields: Sequence[str] | None, known: dict[str, set[str]]
+) -> Iterator[pa.Table]:
+    """The chunks of an entity, with the fields asked for; the components of all entities go into ``known``."""
+    for name, chunk in chunks:
+        components = _components(chunk)
+        known.setdefault(name, set()).update(components)
+        if name == place:
+            unwanted = [one for one in components if not (wanted(one, fields) or wanted(_last(one), fields))]
+            kept = chunk.drop_columns(unwanted)
+            yield kept.take(pc.sort_indices(kept[_ROW]))  # a copy: what was dropped leaves the memory
+
+
+def _place(entity: str) -> str:
+    return f"/{entity.strip('/')}"
+
+
+def _components(chunk: pa.Table) -> list[str]:
+    """The columns of a chunk that are components; the others are timelines and the row's id."""
+    return [one.name for one in chunk.schema if (one.metadata or {}).get(b"rerun:kind") == b"data"]
+
+
+def _last(component: str) -> str:
+    return component.rpartition(":")[2]
+
+
+def _names(components: Iterable[str], timelines: Sequence[str]) -> dict[str, str]:
+    """What the components of an entity are called: the last part of their names, where that is nothing else's."""
+    called = Counter([*map(_last, components), *timelines])
+    return {one: _last(one) if called[_last(one)] == 1 else one for one in sorted(components)}
+
+
+def _single(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """A column of lists of instances, or of instances where there never is more than one."""
+    lists = column.combine_chunks()
+    length = pc.fill_null(pc.list_value_length(lists), 0)
+    if (pc.max(length).as_py() or 0) > 1:
+        return column
+    place = pc.if_else(
+        pc.equal(length, 1), pc.subtract(pc.cumulative_sum(length), length), pa.scalar(None, length.type)
+    )
+    return pa.chunked_array([lists.flatten().take(place)])
+
+
+def _numbers_of(chunk: pa.Table) -> Iterator[str]:
+    """Timelines, and field paths of numbers in the components of the first row that has any."""
+    components = _components(chunk)
+    timelines = [name for name in chunk.column_names if name not in (*components, _ROW)]
+    yield from timelines
+    for component, name in _names(components, timelines).items():
+        some = chunk[component].drop_null()[:1]
+        if len(some) and some.nbytes < _LARGE_CELL:
+            instances = some[0].as_py()
+            yield from numeric_paths(instances[0] if len(instances) == 1 else instances, name)
+
+
+# The process that reads, from outside.
+
+
+class _Opened(NamedTuple):
+    """A recording: its ids, what is wrong with it in a sentence each, and its chunks as they come, by entity."""
+
+    application: str
+    id: str
+    notes: tuple[str, ...]
+    chunks: Iterator[tuple[str, pa.Table]]
+
+
+@contextmanager
+def _opened(path: Path, entity: str = "") -> Generator[_Opened]:
+    """A recording, read by a process that ends with the context.
+
+    Args:
+        path: The file.
+        entity: Of other entities come the columns without rows; empty: all rows come.
+
+    Raises:
+        RunError: It is no such recording, or damaged; or there is no such process.
+    """
+    with _start(path, entity) as reader:
+        assert reader.stdout is not None
+        try:
+            if not reader.stdout.read(1):
+                command = f"{sys.executable} -P -m {_READER}"
+                raise RunError(f"{path}: cannot be read: its reader does not start; to see why, run: {command}")
+            messages = _messages(path, reader.stdout)
+            about, _ = next(messages)
+            notes = (about["note"],) if about["note"] else ()
+            yield _Opened(about["application"], about["id"], notes, ((one["entity"], rows) for one, rows in messages))
+        finally:
+            reader.kill()
+
+
+def _start(path: Path, entity: str) -> subprocess.Popen[bytes]:
+    """The process, in a session of its own: Ctrl-C is for this one, which then ends the other."""
+    command = [sys.executable, "-P", "-m", _READER, str(path), entity]
+    nothing, pipe = subprocess.DEVNULL, subprocess.PIPE
+    try:
+        return subprocess.Popen(command, stdin=nothing, stdout=pipe, stderr=nothing, start_new_session=True)
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {sys.executable} does not start: {error.strerror}") from None
+
+
+def _messages(path: Path, pipe: IO[bytes]) -> Iterator[tuple[dict[str, str], pa.Table]]:
+    """What the process sends: metadata and rows.
+
+    Raises:
+        RunError: It says that something is wrong, or ends without a word.
+    """
+    while True:
+        try:
+            with pa.ipc.open_stream(pipe) as stream:
+                about, rows = _decoded(stream.schema.metadata), stream.read_all()
+        except (pa.ArrowInvalid, OSError):
+            raise RunError(f"{path}: damaged: Rerun's reader fails on it; take another copy, or record anew") from None
+        if "end" not in about:
+            yield about, rows
+        elif about["end"]:
+            raise RunError(about["end"])
+        else:
+            return
+
+
+def _decoded(metadata: Mapping[bytes, bytes]) -> dict[str, str]:
+    return {key.decode(): value.decode(errors="surrogateescape") for key, value in metadata.items()}
+
+
+# The process that reads, from inside.
+
+
+def _main(path: Path, entity: str) -> None:
+    """Write a recording to standard output."""
+    sys.stdout.buffer.write(b"\n")  # it has started: if it is aborted from now on, that is the recording's fault
+    sys.stdout.buffer.flush()
+    fault = ""
+    try:
+        with one_line(path, "--upgrade rerun-sdk"):
+            for about, rows in _recorded(path, entity):
+                _send(about, rows)
+    except RunError as error:
+        fault = str(error)
+    _send({"end": fault}, _NO_ROWS)
+
+
+def _recorded(path: Path, entity: str) -> Iterator[tuple[dict[str, str], pa.RecordBatch]]:
+    """The ids of a recording, then what was logged in time, chunk by chunk: metadata and rows."""
+    path.stat()  # of a file that is not there, that is what is to be said
+    from rerun.chunk import RrdReader
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            reader = RrdReader(path)
+            found = reader.recordings()
+        except RuntimeError as error:
+            if "exceeds file size" not in str(error):
+                raise
+            raise RunError(
+                f"{path}: the recording was cut off; this saves what is there: rerun rrd merge {path} -o saved.rrd"
+            ) from None
+    if len(found) != 1:
+        raise RunError(f"{path}: the file has {len(found)} recordings; a file with one is needed")
+    note = f"{path.name}: the recording has no end (cut off, or of an old Rerun): read as far as it goes"
+    ids = {"application": found[0].application_id, "id": found[0].recording_id}
+    yield {**ids, "note": note if caught else ""}, _NO_ROWS
+    for chunk in reader.stream(store=found[0]):
+        if not chunk.is_static:
+            batch = chunk.to_record_batch()
+            names = batch.schema.names  # a component may be called what a timeline is: it cannot be had
+            rows = batch.select([names.index(name) for name in dict.fromkeys(names)])
+            yield {"entity": chunk.entity_path}, rows if entity in ("", chunk.entity_path) else rows[:0]
+
+
+def _send(about: Mapping[str, str], rows: pa.RecordBatch) -> None:
+    rows = rows.replace_schema_metadata({key: text.encode(errors="surrogateescape") for key, text in about.items()})
+    with pa.ipc.new_stream(sys.stdout.buffer, rows.schema) as stream:
+        stream.write_batch(rows)
+    sys.stdout.buffer.flush()
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]), sys.argv[2])
