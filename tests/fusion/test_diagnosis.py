@@ -202,13 +202,13 @@ def test_stamps_in_another_unit_are_refused(log: str, factor: float, taken: str)
 
 
 @of_every_log
-@pytest.mark.parametrize("far", [0.2, 1.0])
+@pytest.mark.parametrize("far", [0.05, 0.1])
 def test_a_zero_that_differs_is_told_with_the_key(log: str, sensor: str, far: float) -> None:
-    """Whatever the motion: 20 and 100 mm, 23 and 115 degrees, where priors are 5 mm and 5 degrees."""
+    """Whatever the motion: 50 and 100 mm, 23 and 46 degrees, where priors are 5 mm and 5 degrees."""
     run, config = logged(log)
     axis = run.axes[0]
     kind = config.arm.axes[axis].kind
-    far *= 0.1 if kind == "length" else 2.0
+    far *= 1.0 if kind == "length" else 8.0
     screen = config.arm.screen_of(axis)
     moved = of_sensor(log, sensor, moved_by(far, axis))
     note = next(one for one in notes(moved, log) if "where the commands lead" in one)

@@ -28,7 +28,7 @@ import pumafuse as pf
 from bag_files import KINDS, motion, written
 from executable import refused
 from pumafuse.errors import PumafuseError, RunError
-from pumafuse.logs import recordings, tables
+from pumafuse.logs import entities, recordings, tables
 from pumafuse.logs.entities import recording_of
 from refusals import one_line
 
@@ -272,8 +272,12 @@ def readers(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
 def test_no_process_outlives_what_it_reads(
     readers: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """It ends where all is read, where a part is enough, and at Ctrl-C."""
+    """It ends where all is read, where a part is enough, and at Ctrl-C; a small recording needs one only once."""
     path = written(tmp_path, KINDS["rrd"], motion(5000))  # more than a pipe holds
+    recordings.read(path, "/level")
+    assert recording_of(path, "/level", "robot_time", "").id == "take-7"
+    assert len(readers) == 1
+    monkeypatch.setattr(entities, "_SMALL", 0)
     recordings.read(path, "/level")
     assert recording_of(path, "/level", "robot_time", "").id == "take-7"
 
@@ -283,7 +287,7 @@ def test_no_process_outlives_what_it_reads(
     monkeypatch.setattr(pa.ipc, "open_stream", interrupted)
     with pytest.raises(KeyboardInterrupt):
         recordings.read(path, "/level")
-    assert len(readers) == 3
+    assert len(readers) == 4
     assert all(reader.returncode is not None for reader in readers)
 
 
@@ -293,6 +297,7 @@ def test_the_process_that_reads_imports_what_pumafuse_does(monkeypatch: pytest.M
     for name in ("numpy", "pyarrow", "rerun", "pumafuse"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(entities, "_SMALL", 0)
     assert recordings.read(path, "/level").rows == 5
     (tmp_path / "old" / "rerun").mkdir(parents=True)
     (tmp_path / "old" / "rerun" / "__init__.py").touch()

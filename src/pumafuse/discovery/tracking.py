@@ -16,6 +16,7 @@ GAIN = 3.0  # factor on a motion up to which it may be a gain
 _NOISY = 3.0  # times the noise, up to which a distance is noise
 _FAR = 5.0  # sds beyond which chance is no explanation
 _UNLIKELY = 3.0  # sds of priors beyond which they are none
+_MODEL = 0.01  # share of a motion that a wrong model makes look like another zero
 _PIECES = 20  # of a run; where their means scatter, the zero wanders and is not another one
 _SMOOTH = 0.0  # correlation of one step and the next from which they are a motion; that of noise is −0.5
 
@@ -119,7 +120,8 @@ class Tracking:
         left = measured - led - known @ found
         wanders = float(np.std([piece.mean() for piece in np.array_split(left, _PIECES)]))
         # at a distance from the start that hardly changes, the constant is as uncertain as the slope
-        error = wanders * math.sqrt(len(left) * float(np.linalg.inv(known.T @ known)[0, 0]))
+        chance = wanders * math.sqrt(len(left) * float(np.linalg.inv(known.T @ known)[0, 0]))
+        error = max(chance, _MODEL * float(np.ptp(led)))
         return float(found[0]) if abs(found[0]) > _FAR * error and self.excludes(float(found[0])) else 0.0
 
     def excludes(self, zero: float) -> bool:

@@ -18,7 +18,7 @@ from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache, reduce
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -32,6 +32,7 @@ from .columns import LOG_TIME, Table, Topic, joined, numeric_paths, wanted
 _LARGE_CELL = 4096  # bytes: images and the like hold no positions
 _ROW = "rerun.controls.RowId"  # in the order of logging
 _READER = "pumafuse.logs.entities"
+_SMALL = 16 << 20  # bytes of a file that is read once for all its entities, as a process takes half a second
 _NO_ROWS = pa.record_batch({})
 
 
@@ -194,11 +195,38 @@ class _Opened(NamedTuple):
     application: str
     id: str
     notes: tuple[str, ...]
-    chunks: Iterator[tuple[str, pa.Table]]
+    chunks: Iterable[tuple[str, pa.Table]]
 
 
 @contextmanager
 def _opened(path: Path, entity: str = "") -> Generator[_Opened]:
+    """A recording, from memory where it is small.
+
+    Args:
+        path: The file.
+        entity: Of others the columns may come without rows; empty: all rows come.
+
+    Raises:
+        RunError: It is no such recording, or damaged.
+    """
+    with one_line(path, "rerun-sdk"):
+        found = path.stat()
+    if found.st_size > _SMALL:
+        with _read(path, entity) as opened:
+            yield opened
+    else:
+        yield _kept(path, found.st_mtime_ns, found.st_size)
+
+
+@lru_cache(maxsize=1)
+def _kept(path: Path, *_: int) -> _Opened:
+    """All of a recording, until another one or a later version of it is read."""
+    with _read(path, "") as opened:
+        return opened._replace(chunks=list(opened.chunks))
+
+
+@contextmanager
+def _read(path: Path, entity: str) -> Generator[_Opened]:
     """A recording, read by a process that ends with the context.
 
     Args:
@@ -275,7 +303,6 @@ def _main(path: Path, entity: str) -> None:
 
 def _recorded(path: Path, entity: str) -> Iterator[tuple[dict[str, str], pa.RecordBatch]]:
     """The ids of a recording, then what was logged in time, chunk by chunk: metadata and rows."""
-    path.stat()  # of a file that is not there, that is what is to be said
     from rerun.chunk import RrdReader
 
     with warnings.catch_warnings(record=True) as caught:
