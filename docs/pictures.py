@@ -21,7 +21,7 @@ from pumafuse.views import colours, step_figures
 
 HERE = Path(__file__).parent
 DATA = Path(pf.__file__).parent / "data"
-SCAN = HERE.parent / "examples" / "scan"
+SCAN = DATA / "scan"
 SD, GATE = 0.5e-3, 4.0  # m, sigma: the camera's, the same for both filters
 STRETCH = (33.6, 36.2)  # s of the scan, with an outlier and dropouts
 COLOURS = ["#c2c6cc", "#8a8f98", "#e8890c", colours.ESTIMATE, "#0a3d7a"]
