@@ -21,6 +21,7 @@ from pumafuse.views import colours, step_figures
 
 HERE = Path(__file__).parent
 DATA = Path(pf.__file__).parent / "data"
+SCAN = DATA / "scan"
 SD, GATE = 0.5e-3, 4.0  # m, sigma: the camera's, the same for both filters
 STRETCH = (33.6, 36.2)  # s of the scan, with an outlier and dropouts
 COLOURS = ["#c2c6cc", "#8a8f98", "#e8890c", colours.ESTIMATE, "#0a3d7a"]
@@ -81,13 +82,13 @@ def errors(axes, methods, reference):
 
 
 def stretch(axes, est, methods, reference):
-    """A few seconds of the radial axis: the camera's measurements, each filter's estimate, and the reference."""
+    """A few seconds of the y axis: the camera's measurements, each filter's estimate, and the reference."""
     start, end = STRETCH
     shown = (est.time >= start) & (est.time <= end)
-    time, reference = est.time[shown], reference["radial"][shown] * 1e3
+    time, reference = est.time[shown], reference["y"][shown] * 1e3
     middle, span = np.median(reference), 1.9 * np.ptp(reference)
     low, high = middle - 0.5 * span, middle + 0.5 * span
-    seen = est.measurements.of("vision", "radial")
+    seen = est.measurements.of("vision", "y")
     seen = seen.where((seen.time >= start) & (seen.time <= end))
     fused, value = seen.outcome == pf.Outcome.FUSED, seen.value * 1e3
     axes.plot(seen.time[fused], value[fused], "o", ms=3.5, color=COLOURS[1], label="camera measurements")
@@ -102,14 +103,14 @@ def stretch(axes, est, methods, reference):
             color=colours.REJECTED,
             fontsize=8,
         )
-    radial = methods["radial"]
+    on_y = methods["y"]
     other = "constant-velocity filter, tuned"
-    axes.plot(time, radial[other][shown] * 1e3, color=COLOURS[2], lw=1.2, label=other)
-    position, sd = est["radial"].position[shown] * 1e3, est["radial"].position_sd[shown] * 1e3
+    axes.plot(time, on_y[other][shown] * 1e3, color=COLOURS[2], lw=1.2, label=other)
+    position, sd = est["y"].position[shown] * 1e3, est["y"].position_sd[shown] * 1e3
     axes.fill_between(time, position - 1.96 * sd, position + 1.96 * sd, color=colours.ESTIMATE, alpha=0.22, lw=0)
     axes.plot(time, position, color=colours.ESTIMATE, lw=1.8, label="pumafuse, with its 95 % error bars")
     axes.plot(time, reference, "k--", lw=1.1, label="reference, used by no filter")
-    axes.set(xlim=STRETCH, ylim=(low, high), xlabel="time [s]", ylabel="radial position [mm]")
+    axes.set(xlim=STRETCH, ylim=(low, high), xlabel="time [s]", ylabel="y [mm]")
     axes.set_title("a camera with 0.5 mm noise, 45 ms late, and two filters", loc="left")
     axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper right")
 
@@ -117,7 +118,7 @@ def stretch(axes, est, methods, reference):
 def main() -> None:
     """Write the pictures and print the numbers of the comparison."""
     warnings.simplefilter("ignore", pf.PumafuseWarning)
-    run, config = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
+    run, config = pf.Run.read(SCAN), pf.FusionConfig.load(SCAN / "fusion.toml")
     est = pf.fuse(run, config, sensors=["vision"], rate=200.0)
     smooth = pf.fuse(run, config, sensors=["vision"], rate=200.0, smooth=True)
     methods = {axis: {**rows(est, axis), "pumafuse --smooth (afterwards)": smooth[axis].position} for axis in est.axes}

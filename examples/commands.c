@@ -54,13 +54,12 @@ int main(int argc, char **argv)
         sleep_until(begin + tick * PERIOD_NS);
         const int64_t stamp = now_ns(CLOCK_REALTIME); /* when the arm gets it, on the clock of the sensor's stamps */
         /* The command: here 20 mm to and fro in 10 s. */
-        const double radial_mm = 560.0 + 20.0 * sin(0.2 * PI * stamp / 1e9);
+        const double x_mm = 560.0 + 20.0 * sin(0.2 * PI * stamp / 1e9);
         /* ... give the position to the arm here ... */
         char line[256];
         const int length = snprintf(line, sizeof line,
-                                    "{\"t_ns\": %" PRId64 ", \"command\": {\"tangential\": 0.0, \"radial\": %.6f, "
-                                    "\"vertical\": -100.0}}",
-                                    stamp, radial_mm);
+                                    "{\"t_ns\": %" PRId64 ", \"command\": {\"x\": %.6f, \"y\": 0.0, \"z\": -100.0}}",
+                                    stamp, x_mm);
         sendto(link, line, (size_t)length, MSG_DONTWAIT, place->ai_addr, place->ai_addrlen); /* the robot must go on */
     }
     freeaddrinfo(place);

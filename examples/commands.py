@@ -17,8 +17,8 @@ PERIOD = 0.028  # s
 
 
 def next_position(t: float) -> dict[str, float]:
-    """The command at a time [s], in mm by axis: here 20 mm to and fro in 10 s."""
-    return {"tangential": 0.0, "radial": 560.0 + 20.0 * math.sin(0.2 * math.pi * t), "vertical": -100.0}
+    """The command at a time [s], in mm or degrees by axis: here 20 mm to and fro in 10 s."""
+    return {"x": 560.0 + 20.0 * math.sin(0.2 * math.pi * t), "y": 0.0, "z": -100.0}
 
 
 def main() -> None:

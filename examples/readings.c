@@ -64,12 +64,12 @@ int main(int argc, char **argv)
         sleep_until(begin + row * PERIOD_NS);
         const int64_t stamp = now_ns(CLOCK_REALTIME); /* when it arrives; it is valid latency_ms of fusion.toml before */
         /* The measurement: here where commands.c sent the arm 0.1 s ago, with noise. */
-        const double radial_mm = 560.0 + 20.0 * sin(0.2 * PI * (stamp / 1e9 - 0.1)) + noise_mm();
+        const double x_mm = 560.0 + 20.0 * sin(0.2 * PI * (stamp / 1e9 - 0.1)) + noise_mm();
         char line[256];
         const int length = snprintf(line, sizeof line,
-                                    "{\"t_ns\": %" PRId64 ", \"sensor\": \"" SENSOR "\", \"tangential\": %.6f, "
-                                    "\"radial\": %.6f, \"vertical\": %.6f}",
-                                    stamp, noise_mm(), radial_mm, -100.0 + noise_mm());
+                                    "{\"t_ns\": %" PRId64 ", \"sensor\": \"" SENSOR "\", "
+                                    "\"x\": %.6f, \"y\": %.6f, \"z\": %.6f}",
+                                    stamp, x_mm, noise_mm(), -100.0 + noise_mm());
         sendto(link, line, (size_t)length, MSG_DONTWAIT, place->ai_addr, place->ai_addrlen); /* the next one may do */
     }
     freeaddrinfo(place);

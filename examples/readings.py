@@ -18,8 +18,8 @@ SENSOR, PERIOD = "tracker", 0.01  # its name in fusion.toml, s
 
 
 def read_sensor(t: float) -> dict[str, float]:
-    """The measurement at a time [s], in mm by axis: here where `commands` sent the arm 0.1 s ago, with noise."""
-    place = {"tangential": 0.0, "radial": 560.0 + 20.0 * math.sin(0.2 * math.pi * (t - 0.1)), "vertical": -100.0}
+    """The measurement at a time [s], in mm or degrees by axis: here where commands.py was 0.1 s ago, with noise."""
+    place = {"x": 560.0 + 20.0 * math.sin(0.2 * math.pi * (t - 0.1)), "y": 0.0, "z": -100.0}
     return {axis: position + random.gauss(0.0, 0.05) for axis, position in place.items()}
 
 

@@ -48,5 +48,5 @@ def test_commands_and_measurements_are_fused(tmp_path: Path, language: str) -> N
     assert sum(periods) / len(periods) == pytest.approx(28e6, rel=0.05)
     for found in estimates[36:]:  # the tracker measures what was 8 ms before its stamp
         seen = 560.0 + 20.0 * math.sin(0.2 * math.pi * (found["t_ns"] / 1e9 - 0.1 + 0.008))
-        assert found["radial"]["position_mm"] == pytest.approx(seen, abs=0.5)
+        assert found["x"]["position_mm"] == pytest.approx(seen, abs=0.5)
         assert "stale" not in found

@@ -69,7 +69,7 @@ def struct(tree: Any, kind: type[S], where: str, path: str = "", axis: Kind = "l
         tree: The result of :func:`read`, or a table of it.
         kind: The struct that declares the accepted keys.
         where: The file, for errors.
-        path: The table's path in the file, such as ``axes.radial``.
+        path: The table's path in the file, such as ``axes.x``.
         axis: What the axes are to which the table belongs: its keys have the units of that.
 
     Raises:

@@ -121,7 +121,7 @@ def si_of(values: FloatArray, unit: str) -> FloatArray:
 def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     """A parsed TOML table with every number that has a unit in SI; the names stay as they are.
 
-    A unit holds for lists and for the entries of a sub-table: ``sd_mm = { radial = 0.05 }``. Provenance is kept as is.
+    A unit holds for lists and for the entries of a sub-table: ``sd_mm = { x = 0.05 }``. Provenance is kept as is.
 
     Raises:
         ConfigError: A number outside an interval (``_ci95``) is not finite.

@@ -287,8 +287,8 @@ def live(
     SOURCE is stdin, udp://HOST:PORT, tcp-listen://HOST:PORT, tcp://HOST:PORT, or a recorded run: replay:RUN?speed=4
     (speed=max: as fast as it can be).
 
-    One JSON object a line, in mm and s. In: {"t": 12.345, "command": {"radial": 570.0}} and {"t": 12.351, "sensor":
-    "tracker", "radial": 569.7}. Out: {"t": ..., "radial": {"position_mm": ..., "sd_mm": ..., "velocity_mm_s": ...}}.
+    One JSON object a line, in s and mm (of angles degrees). In: {"t": 12.345, "command": {"x": 570.0}} and {"t": 12.35,
+    "sensor": "tracker", "x": 569.7}. Out: {"t": ..., "x": {"position_mm": ..., "sd_mm": ..., "velocity_mm_s": ...}}.
     """
     from . import live as command
 
@@ -353,7 +353,7 @@ def _numbers(listed: str | None, option: str) -> tuple[float, ...] | None:
 
 
 def _level(text: str) -> tuple[str, float]:
-    """``radial=560`` as an axis and its level, in mm or degrees."""
+    """``x=560`` as an axis and its level, in mm or degrees."""
     axis, _, level = text.partition("=")
     try:
         return axis.strip(), float(level)

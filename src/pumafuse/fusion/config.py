@@ -291,7 +291,7 @@ def with_names_of_lengths(tree: Mapping[str, Any], arm: ArmModel, where: str, pa
 def by_axis(
     table: Mapping[str, Any], kind: type[msgspec.Struct], arm: ArmModel, where: str, path: str
 ) -> dict[str, dict[str, Any]]:
-    """A table for each axis of the arm: ``[process]`` is for all axes, ``[process.radial]`` overrides it for one.
+    """A table for each axis of the arm: ``[process]`` is for all axes, ``[process.x]`` overrides it for one.
 
     They have the key names for lengths.
 

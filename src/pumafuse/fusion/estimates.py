@@ -127,7 +127,7 @@ class Estimates:
     Attributes:
         run: The run's name.
         time: [s since the run's first command].
-        axes: Estimates by axis; ``est["radial"]`` is the short way.
+        axes: Estimates by axis; ``est["x"]`` is the short way.
         cartesian: With a frame, the estimates in the log's ``x``, ``y`` and ``z`` [m].
         measurements: Every component with its innovation and outcome.
         biases: By sensor and axis, estimated from all measurements (of the last segment, if there are several).

@@ -249,7 +249,7 @@ def _check_kind(path: Path, axis: str, kind: Kind, arm: ArmModel) -> None:
 
 
 def _column(axis: str, name: str, kind: Kind) -> str:
-    """The column of an :class:`AxisEstimate`'s array: ``radial.velocity_sd_mm_s``."""
+    """The column of an :class:`AxisEstimate`'s array: ``x.velocity_sd_mm_s``."""
     return of_kind(f"{axis}.{name}_mm_s" if name.startswith("velocity") else f"{axis}.{name}_mm", kind)
 
 

@@ -74,7 +74,7 @@ class AxisNow(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LiveEstimate:
-    """The estimate of every axis at one instant; ``est["radial"]`` is one axis.
+    """The estimate of every axis at one instant; ``est["x"]`` is one axis.
 
     Attributes:
         stamp: The instant, int ns.

@@ -149,7 +149,7 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
     own = _keys(kind)
     axes = {axis: _columns(keys.pop(axis), where, f"{path}.{axis}") for axis in list(keys) if axis not in own}
     if not axes:
-        raise ConfigError(f"{where}: [{path}] names no column for any axis, as in radial = 'y_mm'")
+        raise ConfigError(f"{where}: [{path}] names no column for any axis, as in x = 'x_mm'")
     if "time" in keys:
         keys["time"] = _time(keys["time"], where, f"{path}.time")
     if "where" in keys:
@@ -217,7 +217,7 @@ def _check_unit(column: dict[str, Any], accepted: tuple[str, ...], where: str, p
 
 
 def axis_of(key: str, where: str, path: str) -> str:
-    """``radial_mm`` → ``radial``; the number itself is already in m or rad.
+    """``x_mm`` → ``x``; the number itself is already in m or rad.
 
     Raises:
         ConfigError: The key ends in no unit of a length or an angle.
