@@ -31,6 +31,7 @@ def covariance(order: int, density: float, time: float, prior: np.ndarray, s: np
     return density**2 * noise[order] + sum(variance * power for variance, power in zip(prior, powers, strict=True))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("order", [1, 2, 3])
 @pytest.mark.parametrize(("late", "smooth"), [(0.0, False), (0.07, False), (0.0, True)])
 def test_estimates_are_those_of_a_gaussian_process(ungated: ModuleType, order: int, late: float, smooth: bool) -> None:

@@ -92,6 +92,7 @@ def test_a_result_is_reproduced_and_scored_by_any_reference(demo: Path, tmp_path
             assert score == pytest.approx(own[axis], rel=1e-6)
 
 
+@pytest.mark.long
 def test_as_live_has_fewer_measurements(demo: Path, tmp_path: Path) -> None:
     """Vision is 45 ms late: an estimate that waits for it beats one that cannot, and the summary says which."""
     pumafuse(*FUSE_SCAN, "-o", tmp_path / "live", "--sensors", "vision", "--as-live")
@@ -100,6 +101,7 @@ def test_as_live_has_fewer_measurements(demo: Path, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "live" / "summary.json").read_text())["mode"] == "as-live"
 
 
+@pytest.mark.long
 def test_a_part_of_a_run_is_fused_with_pictures(with_tracker: Path, tmp_path: Path) -> None:
     """Only its estimates, measurements and reference, of several runs as well; the summary and the screen say which."""
     out = pumafuse(*FUSE_SCAN, "-o", tmp_path / "part", "--from", 20, "--to", 21.5, "--figures", "--rrd").stdout
@@ -117,6 +119,7 @@ def test_a_part_of_a_run_is_fused_with_pictures(with_tracker: Path, tmp_path: Pa
     assert names(tmp_path / "two") == {"scan1", "scan1_2"}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("command", ["fuse", "tune"])
 def test_a_part_that_is_none_is_refused(command: str, tmp_path: Path) -> None:
     """An option that is no time is a wrong usage; a part without measurements is one line about the data."""

@@ -34,6 +34,7 @@ def carried_through(log: Path, place: Path, fit: str) -> Path:
     return place / "fused"
 
 
+@pytest.mark.long
 def test_a_folder_of_tables_goes_through_without_an_edit(tmp_path: Path) -> None:
     """The example, without its run.toml: axes are called as the columns are; innovations fit their sds."""
     log = tmp_path / "log"

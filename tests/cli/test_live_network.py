@@ -57,6 +57,7 @@ def test_datagrams_in_and_out_and_a_record_of_them(scan: list[bytes], tmp_path: 
     assert len(recorded.command.stamp) + sum(len(one.stamp) for one in recorded.sensors.values()) == len(scan)
 
 
+@pytest.mark.long
 def test_twenty_thousand_rows_over_tcp() -> None:
     """A connection that gives all it can: every row is taken in, every command answered."""
     sent = lines(20_000 * 0.014)

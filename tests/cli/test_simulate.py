@@ -261,6 +261,7 @@ def test_an_output_that_fails_half_way_leaves_the_old_one_and_no_trace(
     assert names(tmp_path) == {"run"} and (run / "run.toml").read_text() == "new"
 
 
+@pytest.mark.long
 def test_a_simulated_run_is_replaced_only_with_force(scenario: Path, tmp_path: Path) -> None:
     """What was there is untouched when it is refused, and a table of the user's own is never replaced."""
     run = tmp_path / "run"

@@ -112,6 +112,7 @@ def test_the_terminal_says_units_of_angles(folder: Path, tmp_path: Path) -> None
     assert "within 0.1 deg at every level tried" in shown
 
 
+@pytest.mark.long
 def test_verify_shows_each_axis_in_its_unit(folder: Path, run: Path, tmp_path: Path) -> None:
     """A table for the rail and one for the joints, on the page too, with the numbers of the JSON: the noise is left."""
     options = ("verify", run, "--arm", folder / "mixed.toml", "--start", "wrist=-10", "--start", "rail=500")
@@ -183,6 +184,7 @@ def test_plan_warns_in_degrees(folder: Path, tmp_path: Path) -> None:
     assert "steps are 100 deg at most, 5e+03 deg/s at T; is a unit wrong?" in wrong
 
 
+@pytest.mark.long
 def test_what_mixes_kinds_is_refused_in_a_line(folder: Path, run: Path, tmp_path: Path) -> None:
     """Axes of both kinds in one plan, steps in degrees with positions in mm, a level of no axis; nothing is written."""
     mixed = ("plan", "-o", tmp_path / "plan", "--arm", folder / "mixed.toml")

@@ -142,6 +142,7 @@ def interrupted(words: list[str], until: str) -> tuple[int, str, str]:
     return process.returncode, output, shown
 
 
+@pytest.mark.long
 def test_ctrl_c_keeps_the_best_so_far(tmp_path: Path) -> None:
     """In the middle of the search: exit code 130, the folder is whole, loads, and is likelier than before.
 

@@ -55,7 +55,8 @@ def test_json_has_the_numbers_of_python(run: Path, found: list[dict[str, object]
                 "start_from",
                 "model",
             ),
-            *("without_recovery", "with_recovery", "recovery_ms", "best_in_class", "outlying", "verdict", "notes"),
+            *("without_recovery", "with_recovery", "recovery_ms", "best_in_class", "outlying", "commands", "rows"),
+            *("verdict", "notes"),
         }
         assert [one[key] for key in ("axis", "source", "verdict")] == [other.axis, other.source, other.verdict]
         assert set(one["model"]) == {"rms_mm", "percent_of_signal", "fit_percent"}

@@ -159,7 +159,7 @@ def test_files_and_screens_have_the_units_of_the_axis(folders: dict[str, Path], 
     """Tables, summary, configuration and screen of an angle say deg, with the numbers that mm have for a length."""
     shown: dict[str, str] = {}
     for unit in ("mm", "deg"):
-        given = ["fuse", folders[unit], "-c", folders[unit] / "fusion.toml", "-o", tmp_path / unit, "--figures"]
+        given = ["fuse", folders[unit], "-c", folders[unit] / "fusion.toml", "-o", tmp_path / unit]
         shown[unit] = pumafuse(*given).stdout
     words = {unit: re.sub(r"─+|\S*/\S*", "", text).replace("deg", "mm").split() for unit, text in shown.items()}
     assert words["deg"][1:] == words["mm"][1:]  # but for the run's name
@@ -313,6 +313,7 @@ def test_an_encoder_for_each_axis_is_gated_apart(tmp_path: Path) -> None:
         assert pf.Sensor(sd=sd, gate_rows=gate_rows).gates_rows(config.arm) is wanted
 
 
+@pytest.mark.long
 def test_tune_says_the_keys_of_an_angle(folders: dict[str, Path]) -> None:
     """Parameters have the names that files of an angle have, and the numbers that mm have for a length."""
     found = {}

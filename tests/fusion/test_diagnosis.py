@@ -252,7 +252,7 @@ def test_commands_of_another_run_are_told_once() -> None:
     run, _ = logged("trunk-servo")
     rolled = {axis: np.roll(value, len(value) // 2) for axis, value in run.command.values.items()}
     found = notes(of_commands("trunk-servo", lambda one: replace(one, values=rolled)), "trunk-servo")
-    assert [one for one in found if "are the commands of this run" in one] == found[:1]
+    assert [one for one in found if "is it that axis of this run" in one] == found[:1]
     assert sum(f"{axis} (" in found[0] for axis in run.axes) >= 5
 
 

@@ -265,6 +265,7 @@ def edges(draw: st.DrawFn) -> tuple[Edge, float | None]:
     return edge, draw(st.sampled_from([None, None, 1e-3]))
 
 
+@pytest.mark.long
 @settings(derandomize=True, deadline=None, max_examples=100)
 @given(edges())
 def test_extremes_may_meet(made: tuple[Edge, float | None]) -> None:

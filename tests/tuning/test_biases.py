@@ -31,6 +31,7 @@ def found_biases(run: pf.Run, config: pf.FusionConfig) -> dict[tuple[str, str], 
     return {(name, axis): (one.value, one.sd) for name, of in biases.items() for axis, one in of.items()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, later(2), later(3)])
 @pytest.mark.parametrize("off", [3e-4, {"tangential": 3e-4, "vertical": -3e-4}, 0.6, -0.6], ids=str)
 def test_a_constant_on_the_worse_sensor_is_found(off: Off, seed: int) -> None:

@@ -27,6 +27,7 @@ from tuning_runs import (
 )
 
 
+@pytest.mark.long
 def test_where_it_starts_does_not_matter() -> None:
     """From the truth, from noise 30 times too large and too small, and from none: within 0.1 of one another.
 
@@ -92,6 +93,7 @@ def best_of_all(
     return max(-found.fun, maximise_with_gates(likelihood, moved(config, free, found.x), free).log_posterior)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gate_rows", [True, False], ids=["rows", "components"])
 @pytest.mark.parametrize(("seed", "generations"), [(4, 25), later(5, 200), later(6, 200), later(7, 200)])
 def test_nothing_higher_is_found_by_differential_evolution(seed: int, generations: int, gate_rows: bool) -> None:

@@ -76,6 +76,7 @@ def test_the_same_delay_is_found_as_one(seed: int) -> None:
     assert all("delay: shared; an own one gains -" in why for why in found.orders.values())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, later(2), later(3), later(4)])
 def test_another_delay_stays_the_axis_own(seed: int) -> None:
     """An axis that is 12 ms later than the two others is not pressed into their delay, unless it is asked for."""

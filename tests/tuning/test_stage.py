@@ -70,6 +70,7 @@ def test_intervals_of_latencies_over_60_runs() -> None:
     assert abs(np.mean(off)) < 5e-4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("believed", [0.020, later(0.008), later(-0.004)])
 def test_of_delays_and_latencies_one_latency_is_fixed(believed: float) -> None:
     """That of the sensor with the least noise, named with the delays and the other latency, and left as configured.
@@ -136,6 +137,7 @@ def test_a_gain_is_found_where_it_shows() -> None:
 # ---- orders ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, later(2), 3])  # 3: with a delay of its own the second looks like second order
 @pytest.mark.parametrize("begin", [(1, 2), later((1, 1)), later((2, 2))], ids=str)
 def test_the_order_of_a_plant_is_its_own(seed: int, begin: tuple[int, int]) -> None:
@@ -182,6 +184,7 @@ def camera(share: float, seed: int) -> tuple[pf.Run, pf.FusionConfig]:
     return sim.run, spoiled(sim.config)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [1, later(2), later(3)])
 def test_outliers_do_not_count(seed: int) -> None:
     """1 % of measurements 5 to 20 mm off leave the fitted sd within 3 % of the same run's without them.

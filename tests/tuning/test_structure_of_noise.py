@@ -89,6 +89,7 @@ def test_a_disturbance_is_found_with_its_sd_and_time(kind: str, seed: int) -> No
         assert high < 3.0 * low
 
 
+@pytest.mark.long
 def test_no_disturbance_is_invented() -> None:
     """White noise alone, and a random walk beside it: of ten runs each, at most one has a disturbance."""
     config, command, path = moving()

@@ -248,6 +248,7 @@ def calls(trust: str | None) -> int:
     return len(counted.calls)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
 @pytest.mark.parametrize("trust", [None, later("tracker")])
 def test_interrupted_it_gives_the_best_so_far(share: float, trust: str | None, tmp_path: Path) -> None:

@@ -52,6 +52,7 @@ def test_the_page_of_the_recorded_campaign_has_the_papers_tables_and_figures(tmp
     assert "stiction" in text
 
 
+@pytest.mark.long
 def test_names_are_text_and_nothing_else(tmp_path: Path) -> None:
     """Trials and axes named like markup are shown as they are written, and the same trials give the same page."""
     text = page_of(tmp_path / "a", trials("<b>&</b>", axis="<i>tip$x$"))

@@ -217,6 +217,7 @@ def test_the_page_has_the_numbers_of_fusions_and_the_files_as_they_are_written(t
     assert files == [(tmp_path / name).read_text(encoding="utf-8") for name in ("fusion.toml", "arm.toml")]
 
 
+@pytest.mark.long
 def test_names_are_text_and_nothing_else() -> None:
     """Runs, sensors and axes named like markup or mathematics are shown as they are written."""
     found, run = tuned("<i>tip$x^$", "<b>&</b>", "<u>run</u>")

@@ -336,7 +336,7 @@ def _late(config: FusionConfig, name: str, axis: str, tracking: Tracking, cause:
     return (
         f"is {abs(cause.shift):.2f} s {side}: it follows the commands of {axis} with a correlation of"
         f" {tracking.correlation:+.3f} as stamped, of {cause.correlation:+.3f} when shifted by that; are both stamped"
-        f" by one clock? latency_ms = {latency * 1e3:.0f} makes up for most of it, `tune --fit latency` for the rest"
+        f" by one clock? latency_ms = {latency * 1e3:.0f} makes up for it, but for the last ms"
     )
 
 
@@ -376,10 +376,10 @@ def _digits(number: float, count: int) -> str:
 
 def _nothing(trackings: Mapping[str, Tracking]) -> str:
     rests = "rests and " if all(one.rests for one in trackings.values()) else ""
-    told = ", ".join(f"{axis} ({one.correlation:+.2f})" for axis, one in trackings.items())
+    told = ", ".join(f"{axis} (correlation {one.correlation:+.2f})" for axis, one in trackings.items())
     return (
-        f"{rests}does not follow the commands, also not another axis's or those of 30 s before or after; correlation on"
-        f" {told}: are the commands of this run, both stamped by one clock, and arm.toml of this arm?"
+        f"{rests}does not follow the commands of {told}, nor those of other axes or of up to 30 s before or after: is"
+        " it that axis of this run, are both stamped by one clock, is arm.toml that of this arm?"
     )
 
 

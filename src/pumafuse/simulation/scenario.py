@@ -125,7 +125,9 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
                 raise UnknownNameError("filter", "table", key, _OVERRIDES)
         if self.frame is not None:
             if not {"tangential", "radial"} <= set(self.arm.axes):
-                raise ConfigError("frame: an arm in x, y, z needs the axes tangential and radial")
+                raise ConfigError(
+                    "frame: is for an arm with the axes tangential and radial; an arm in x, y, z needs none"
+                )
             if not self.start.level.get("radial", 0.0) > 0.0:
                 raise ConfigError("frame: start.level.radial_mm must say how far from the base's axis the arm starts")
         _ = self.config, self.true_axes  # raise now if something does not fit together
