@@ -97,6 +97,7 @@ def test_many_runs_are_fused_into_one_table(scenario: Path, tmp_path: Path) -> N
         assert float(pooled[axis][4]) == pytest.approx(max(squares) ** 0.5, abs=0.001)
 
 
+@pytest.mark.long
 def test_one_run_that_fails_stops_no_other(scenario: Path, tmp_path: Path) -> None:
     """It is named at the end, one line for it and one in all, and the exit code is 1."""
     out = tmp_path / "many"

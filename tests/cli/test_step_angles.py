@@ -105,6 +105,7 @@ def test_json_and_page_are_in_degrees(folder: Path) -> None:
     assert "step, deg" in (folder / "page" / "report.html").read_text()
 
 
+@pytest.mark.long
 def test_the_terminal_says_units_of_angles(folder: Path, tmp_path: Path) -> None:
     """Also of the gain's line, in brackets that are no markup; without --tolerance it is 0.1 degrees."""
     shown = pumafuse("identify", folder / "steps", "-o", tmp_path / "arm.toml").stdout
@@ -173,6 +174,7 @@ def test_plan_for_joints_is_in_degrees(folder: Path, tmp_path: Path) -> None:
     assert "white-noise-wrist-0.4deg.csv" in names(tmp_path / "default")
 
 
+@pytest.mark.long
 def test_plan_warns_in_degrees(folder: Path, tmp_path: Path) -> None:
     """Of the arm's limit and of one that is given; of steps in a wrong unit, which no joint makes."""
     plan = ("plan", "--arm", folder / "arm.toml", "--noise", "0.5", "-o")

@@ -71,6 +71,7 @@ def test_json_has_the_numbers_of_python(run: Path, found: list[dict[str, object]
         assert (one["recovery_ms"], one["amplitude_mm"]) == pytest.approx((100.0, 8.0))
 
 
+@pytest.mark.long
 def test_the_table_shows_the_same_numbers(run: Path, found: list[dict[str, object]]) -> None:
     """One line a source with the RMS in three digits, then a sentence for each."""
     shown = pumafuse("verify", run, "--arm", run / "arm.toml", *SOURCES).stdout

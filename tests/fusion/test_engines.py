@@ -195,7 +195,7 @@ def test_both_engines_make_the_same_of_any_log() -> None:
     """Random axes, delays, gains, noise, sensors, gates, outliers, gaps: every fate and estimate is the same."""
     seen = dict.fromkeys(Outcome, 0)
 
-    @settings(derandomize=True, deadline=None, max_examples=20)
+    @settings(derandomize=True, deadline=None, max_examples=12)
     @given(logs())
     def check(log: tuple[Run, pf.FusionConfig, float | None]) -> None:
         got, wanted = both(*log)
@@ -227,6 +227,7 @@ def test_a_smooth_disturbance_is_forgotten_in_any_pause(lasts: float, pause: flo
     assert got.position_sd == pytest.approx(wanted.position_sd, rel=1e-9)
 
 
+@pytest.mark.long
 def test_fuse_by_filterpy_says_the_same() -> None:
     """Measurements, notes and estimates of `fuse` by either engine; progress goes up; other modes are refused."""
     scan, config = Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")

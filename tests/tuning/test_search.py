@@ -53,7 +53,14 @@ sensors.tracker = {{ rate_hz = 100.0, sd_mm = 0.1, latency_ms = 8.0 }}
 """
 
 
-@pytest.mark.parametrize(("amplitude", "fastest", "seed"), [(20.0, 1.0, 2), (20.0, 1.0, 7), (5.0, 2.0, 2)])
+@pytest.mark.parametrize(
+    ("amplitude", "fastest", "seed"),
+    [
+        pytest.param(20.0, 1.0, 2, marks=pytest.mark.long),
+        pytest.param(20.0, 1.0, 7, marks=pytest.mark.long),
+        (5.0, 2.0, 2),
+    ],
+)
 def test_delay_and_lag_are_identified(amplitude: float, fastest: float, seed: int, tmp_path: Path) -> None:
     """A sweep, from an arm 21 ms too early and 18 ms too fast: as likely as the truth at least, and within 5 ms of it.
 

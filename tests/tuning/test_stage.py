@@ -208,6 +208,7 @@ def test_outliers_do_not_count(seed: int) -> None:
     assert with_all is not None and without is not None and with_all > 1.3 * without
 
 
+@pytest.mark.long
 def test_a_noise_that_is_not_identifiable_is_fixed() -> None:
     """A gauge of a few micrometres, rare beside a camera: its innovations hardly depend on its sd.
 

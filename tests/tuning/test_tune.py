@@ -109,6 +109,7 @@ def test_what_is_saved_loads_and_is_as_likely(tmp_path: Path) -> None:
     assert {key: arm["provenance"][key] for key in known} == known and arm["provenance"]["tuned_on"] == [run.name]
 
 
+@pytest.mark.long
 def test_a_configuration_that_had_seen_the_part_for_validation_says_so() -> None:
     """Tuned on the whole run in the end, it is no stranger to the run's last third; another run it does not know."""
     run, other = outage(1).run, outage(2).run
@@ -202,6 +203,7 @@ def test_a_run_that_was_fitted_on_is_no_validation() -> None:
 # ---- a trusted sensor -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_arm_is_fitted_on_the_trusted_sensor_and_the_others_after_it() -> None:
     """Arm, process noise and its own noise are as from a run without the others; its latency stays.
 

@@ -35,6 +35,7 @@ def page_of(folder: Path, of: pf.StepTrials) -> str:
     return (folder / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.long
 def test_the_page_of_the_recorded_campaign_has_the_papers_tables_and_figures(tmp_path: Path) -> None:
     """Tables I and II, Figs. 4 to 7, each figure under a sentence; nothing is loaded from elsewhere."""
     of = pf.StepTrials.read(DATA / "steps")

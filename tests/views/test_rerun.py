@@ -171,7 +171,10 @@ def test_the_shipped_scan_makes_a_small_file_that_rerun_accepts(tmp_path: Path) 
         assert sum(entity.endswith(f"/{sensor}") for entity in entities(path)) == 2 * axes
 
 
-@pytest.mark.parametrize("timeline", ["timestamp", "duration", "sequence"])
+@pytest.mark.parametrize(
+    "timeline",
+    ["timestamp", pytest.param("duration", marks=pytest.mark.long), pytest.param("sequence", marks=pytest.mark.long)],
+)
 def test_the_result_of_a_recording_is_a_layer_of_it(timeline: str, tmp_path: Path) -> None:
     """It has the recording's ids and its timeline: merged they are one recording, with the same stamps in both."""
     path = bag_files.written(tmp_path, bag_files.KINDS["rrd"], bag_files.motion())
