@@ -27,6 +27,7 @@ _RECORDINGS = {".mcap", ".bag", ".db3", ".rrd"}
 _BATCH = 1 << 16  # rows of Parquet that are in memory before rows are chosen
 _READ_AHEAD = 1 << 20  # bytes of a column of Parquet
 _SOME = 8  # values in an error
+_HEAD = 4096  # bytes of rows that show how decimals are written
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
 
 
@@ -137,6 +138,7 @@ def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]
         torn = "the last line has no end and may be torn: left out (if it is whole, end it with a line break)"
         notes = [f"{path.name}: {torn}"]
     wrong: list[pacsv.InvalidRow] = []
+    separator, point = _dialect(text)
 
     def leave_out(row: pacsv.InvalidRow) -> str:
         wrong.append(row)
@@ -146,8 +148,8 @@ def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]
         return pacsv.read_csv(
             pa.BufferReader(text),
             read_options=pacsv.ReadOptions(use_threads=False),
-            convert_options=pacsv.ConvertOptions(null_values=BLANK, strings_can_be_null=True),
-            **options,
+            parse_options=pacsv.ParseOptions(delimiter=separator, **options),
+            convert_options=pacsv.ConvertOptions(null_values=BLANK, strings_can_be_null=True, decimal_point=point),
         )
 
     try:
@@ -156,7 +158,7 @@ def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]
         if " columns, got " not in str(error):
             raise
     text.decode("utf-8")  # pyarrow cannot hand over a wrong line that is not UTF-8
-    table = parsed(parse_options=pacsv.ParseOptions(invalid_row_handler=leave_out))
+    table = parsed(invalid_row_handler=leave_out)
     note = (
         f"{path.name}: {counted(len(wrong), 'line')} left out: {wrong[0].actual_columns} cells where the header has"
         f" {wrong[0].expected_columns}, first in line {wrong[0].number}"
@@ -164,6 +166,13 @@ def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]
     if table.num_rows == 0:  # not the kind of table that it should be
         raise RunError(f"{path}: the table has no rows; {note}")
     return table, [note, *notes]
+
+
+def _dialect(text: bytes) -> tuple[str, str]:
+    """What separates the cells of a CSV text, and the point of its decimals: ``1,5;2`` as well as ``1.5,2``."""
+    head, _, rest = text.partition(b"\n")
+    separator = next((one for one in (b",", b";", b"\t") if one in head), b",")
+    return separator.decode(), "," if separator != b"," and b"," in rest[:_HEAD] else "."
 
 
 def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
