@@ -16,7 +16,7 @@ import pytest
 
 import pumafuse as pf
 from executable import EXECUTABLE, names, pumafuse
-from pumafuse.logs.manifest import save
+from pumafuse.logs.save import save
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.summary import TuningSummary
 from tuning_runs import quietly, replaced, scenario, spoiled, spoiled_arm, with_outliers

@@ -22,7 +22,7 @@ from ..folders import FolderError, check_writable, write_file
 from ..fusion.config import FusionConfig
 from ..logs.clock import TOLERATED_STEP_BACK_NS
 from ..logs.frames import CARTESIAN
-from ..logs.manifest import check_axis, check_name
+from ..logs.save import check_axis, check_name
 from ..units import SCREEN
 
 _FLUSHED = 0.5  # s between two writes

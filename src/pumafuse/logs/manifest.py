@@ -1,30 +1,20 @@
-"""``run.toml``: which file and which columns are the commands, the sensors and the reference of a recorded run.
-
-A run is saved as a folder: a CSV file for each source, and ``run.toml``.
-"""
+"""``run.toml``: which file and which columns are the commands, the sensors and the reference of a recorded run."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import Any, Literal, cast
 
 import msgspec
-import numpy as np
-import pyarrow as pa
 
 from .. import toml
-from ..errors import ConfigError, RunError, UnknownNameError
+from ..errors import ConfigError, UnknownNameError
 from ..toml import NotNegative
-from ..units import ANGLES, LENGTHS, SCREEN, TIMES, Kind, Screen, ending, from_si, kind_of, seconds
-from . import tables
+from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of
 from .columns import leaf
 from .frames import Frame
 
-if TYPE_CHECKING:
-    from .run import Run, Source
-
 _MOST = 2**63  # more than a whole number of a column can be
-_TAKEN = ("commands", "truth", "trials", "samples", "path")  # names of other files beside those of sensors
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -115,9 +105,6 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     frame: Frame | None = None
 
 
-# Reading.
-
-
 def load(path: Path) -> Manifest:
     """Read ``run.toml``.
 
@@ -146,7 +133,7 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
         given = {key: axis_of(key, where, f"{path}.start") for key in keys["start"]}
         keys["start"] = {axis: keys["start"][key] for key, axis in given.items()}
         kinds = {axis: kind_of(key) for key, axis in given.items()}
-    own = _keys(kind)
+    own = {field.encode_name for field in msgspec.structs.fields(kind)} - {"axes", "kinds"}
     axes = {axis: _columns(keys.pop(axis), where, f"{path}.{axis}") for axis in list(keys) if axis not in own}
     if not axes:
         raise ConfigError(f"{where}: [{path}] names no column for any axis, as in x = 'x_mm'")
@@ -156,11 +143,6 @@ def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> Sourc
         keys["where"] = _where(keys["where"], where, f"{path}.where")
     more = {"kinds": kinds} if kinds else {}
     return toml.struct({**keys, **more, "axes": axes}, kind, where, path)
-
-
-def _keys(kind: type[SourceEntry]) -> list[str]:
-    """The keys of a source that are no axes."""
-    return [field.encode_name for field in msgspec.structs.fields(kind) if field.name not in ("axes", "kinds")]
 
 
 def _columns(given: Any, where: str, path: str) -> list[Any]:
@@ -226,77 +208,3 @@ def axis_of(key: str, where: str, path: str) -> str:
     if unit is None or kind_of(key) is None:
         raise ConfigError(f"{where}: {path}.{key} has no unit in its name, as in {key}_mm or {key}_deg")
     return key.removesuffix(unit)
-
-
-# Saving.
-
-
-def save(run: Run, folder: Path) -> None:
-    """Write a run that :meth:`Run.read` reads back: stamps to the ns within 26 days of 0, lengths to the nm.
-
-    Args:
-        run: The run; its notes are not written.
-        folder: An existing folder.
-
-    Raises:
-        RunError: See :func:`check_name` and :func:`check_axis`.
-    """
-    for name in run.sensors:
-        check_name(name)
-    for axis in run.axes:
-        check_axis(axis)
-    manifest: dict[str, Any] = {"name": run.name, "command": _entry(run, run.command, "commands.csv", folder)}
-    if run.start:
-        manifest["command"]["start"] = {f"{axis}_{_screen(run, axis).unit}": level for axis, level in run.start.items()}
-    if run.clock != "stamps":
-        manifest["command"]["clock"] = run.clock
-    if run.sensors:
-        manifest["sensors"] = {name: _entry(run, source, f"{name}.csv", folder) for name, source in run.sensors.items()}
-    if run.reference is not None:
-        manifest["reference"] = _entry(run, run.reference, "truth.csv", folder)
-        noise = {f"sd_{_screen(run, axis).unit}": run.reference.sd_of(axis) for axis in run.reference.values}
-        manifest["reference"] |= {key: sd for key, sd in noise.items() if sd}
-    if run.frame is not None:
-        manifest["frame"] = toml.builtins(run.frame)
-    (folder / "run.toml").write_text(toml.text(manifest), encoding="utf-8")
-
-
-def check_name(sensor: str) -> None:
-    """Refuse a sensor whose name cannot be that of its file.
-
-    Raises:
-        RunError: It has characters of a path, or is the name of another table.
-    """
-    plain = sensor.isprintable() and Path(sensor).name == sensor and not sensor.startswith(".")
-    if not plain or not sensor or sensor in _TAKEN:
-        raise RunError(
-            f"sensor '{sensor}': its rows go into a file of its name, which must not be a path or one of"
-            f" {', '.join(_TAKEN)}"
-        )
-
-
-def check_axis(axis: str) -> None:
-    """Refuse an axis whose name is a key of run.toml.
-
-    Raises:
-        RunError: It is.
-    """
-    keys = _keys(CommandEntry)
-    if axis in keys:
-        raise RunError(f"axis '{axis}': run.toml uses this word itself; no axis can be called {', '.join(keys)}")
-
-
-def _screen(run: Run, axis: str) -> Screen:
-    return SCREEN[run.kinds.get(axis, "length")]
-
-
-def _entry(run: Run, source: Source, file: str, folder: Path) -> dict[str, Any]:
-    """Write one source and return its table of ``run.toml``."""
-    screens = {axis: _screen(run, axis) for axis in source.values}
-    columns = {
-        f"{axis}_{screen.unit}": pa.array(np.round(source.values[axis] * screen.scale, 6), from_pandas=True)
-        for axis, screen in screens.items()
-    }
-    stamp = pa.array(seconds(source.stamp), from_pandas=True)
-    tables.write(pa.table({"time_s": stamp, **columns}), folder / file)
-    return {"file": file, "time": "time_s", **{axis: f"{axis}_{screen.unit}" for axis, screen in screens.items()}}

@@ -24,8 +24,9 @@ from ..fusion.config import (
     with_kinds,
     with_names_of_lengths,
 )
+from ..logs import save
 from ..logs.frames import CARTESIAN, Frame
-from ..logs.manifest import axis_of, check_axis, check_name
+from ..logs.manifest import axis_of
 from ..logs.run import Clock
 from ..model.arm import ArmModel
 from ..toml import NotNegative
@@ -114,9 +115,9 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         for name in (*self.trajectory.moving, *self.start.level):
             self.arm.axis(name)
         for name in self.arm.axes:
-            check_axis(name)
+            save.check_axis(name)
         for name, sensor in self.sensors.items():
-            check_name(name)
+            save.check_name(name)
             self._check(f"sensors.{name}", sensor)
         if isinstance(self.trajectory, Steps):
             self._check_scope(self.trajectory)

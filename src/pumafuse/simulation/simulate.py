@@ -16,7 +16,7 @@ from .. import folders, toml
 from ..arrays import FloatArray
 from ..errors import ConfigError
 from ..fusion.config import ARM_FILE, PROCESS, FusionConfig, of_axis
-from ..logs import manifest, tables
+from ..logs import save, tables
 from ..logs.frames import Cylindrical, Placed
 from ..logs.run import Run, Source
 from ..units import MM, SCREEN
@@ -128,7 +128,7 @@ def write(simulated: Simulated, folder: Path, force: bool) -> None:
     check_writable(folder, force)
     scenario = simulated.scenario
     with folders.replacing(folder) as new:
-        manifest.save(simulated.run, new)
+        save.save(simulated.run, new)
         simulated.config.save(new)
         if isinstance(trajectory := scenario.trajectory, PathFromFile):
             name = next((name for name in _PATHS if trajectory.file.endswith(name[4:])), _PATHS[0])

@@ -1,0 +1,96 @@
+"""Saving of a recorded run as a folder: a CSV file for each source, and ``run.toml``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from .. import toml
+from ..errors import RunError
+from ..units import SCREEN, Screen, seconds
+from . import tables
+from .run import Run, Source
+
+_KEYS = (
+    "file",
+    "topic",
+    "entity",
+    "where",
+    "time",
+    "start",
+    "clock",
+)  # keys of a source in run.toml; every other key is an axis
+_TAKEN = ("commands", "truth", "trials", "samples", "path")
+
+
+def save(run: Run, folder: Path) -> None:
+    """Write a run that :meth:`Run.read` reads back: stamps to the ns within 26 days of 0, lengths to the nm.
+
+    Args:
+        run: The run; its notes are not written.
+        folder: An existing folder.
+
+    Raises:
+        RunError: See :func:`check_name` and :func:`check_axis`.
+    """
+    for name in run.sensors:
+        check_name(name)
+    for axis in run.axes:
+        check_axis(axis)
+    manifest: dict[str, Any] = {"name": run.name, "command": _entry(run, run.command, "commands.csv", folder)}
+    if run.start:
+        manifest["command"]["start"] = {f"{axis}_{_screen(run, axis).unit}": level for axis, level in run.start.items()}
+    if run.clock != "stamps":
+        manifest["command"]["clock"] = run.clock
+    if run.sensors:
+        manifest["sensors"] = {name: _entry(run, source, f"{name}.csv", folder) for name, source in run.sensors.items()}
+    if run.reference is not None:
+        manifest["reference"] = _entry(run, run.reference, "truth.csv", folder)
+        noise = {f"sd_{_screen(run, axis).unit}": run.reference.sd_of(axis) for axis in run.reference.values}
+        manifest["reference"] |= {key: sd for key, sd in noise.items() if sd}
+    if run.frame is not None:
+        manifest["frame"] = toml.builtins(run.frame)
+    (folder / "run.toml").write_text(toml.text(manifest), encoding="utf-8")
+
+
+def check_name(sensor: str) -> None:
+    """Refuse a sensor whose name cannot be that of its file.
+
+    Raises:
+        RunError: It has characters of a path, or is the name of another table.
+    """
+    plain = sensor.isprintable() and Path(sensor).name == sensor and not sensor.startswith(".")
+    if not plain or not sensor or sensor in _TAKEN:
+        raise RunError(
+            f"sensor '{sensor}': its rows go into a file of its name, which must not be a path or one of"
+            f" {', '.join(_TAKEN)}"
+        )
+
+
+def check_axis(axis: str) -> None:
+    """Refuse an axis whose name is a key of run.toml.
+
+    Raises:
+        RunError: It is.
+    """
+    if axis in _KEYS:
+        raise RunError(f"axis '{axis}': run.toml uses this word itself; no axis can be called {', '.join(_KEYS)}")
+
+
+def _screen(run: Run, axis: str) -> Screen:
+    return SCREEN[run.kinds.get(axis, "length")]
+
+
+def _entry(run: Run, source: Source, file: str, folder: Path) -> dict[str, Any]:
+    """Write one source and return its table of ``run.toml``."""
+    screens = {axis: _screen(run, axis) for axis in source.values}
+    columns = {
+        f"{axis}_{screen.unit}": pa.array(np.round(source.values[axis] * screen.scale, 6), from_pandas=True)
+        for axis, screen in screens.items()
+    }
+    stamp = pa.array(seconds(source.stamp), from_pandas=True)
+    tables.write(pa.table({"time_s": stamp, **columns}), folder / file)
+    return {"file": file, "time": "time_s", **{axis: f"{axis}_{screen.unit}" for axis, screen in screens.items()}}
