@@ -97,7 +97,7 @@ class Placed:
             finite = np.isfinite(x) & np.isfinite(y)
             x, y = np.where(finite, x, np.nan), np.where(finite, y, np.nan)
             return self._sign * (y * cos - x * sin), x * cos + y * sin, np.ones(len(x))
-        from .frame_kernels import to_cylinder
+        from ..model.cylindrical import to_cylinder
 
         out = np.empty(len(x)), np.empty(len(x)), np.empty(len(x))
         nearby = np.empty(0) if near is None else near
@@ -110,7 +110,7 @@ class Placed:
             across = self._sign * tangential
             cos, sin = math.cos(self.angle), math.sin(self.angle)
             return radial * cos - across * sin, radial * sin + across * cos
-        from .frame_kernels import from_cylinder
+        from ..model.cylindrical import from_cylinder
 
         x, y = np.empty(len(tangential)), np.empty(len(tangential))
         from_cylinder(tangential, radial, *self.frame.base, self.radius, self.angle, self._sign, x, y)
