@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
+import warnings
+from contextlib import redirect_stderr, redirect_stdout
 from importlib.resources import files
 from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from pumafuse.cli.main import main
 
 EXECUTABLE = Path(sys.executable).parent / "pumafuse"
 DATA = Path(str(files("pumafuse") / "data"))
@@ -13,12 +21,31 @@ SCAN, FUSION = DATA / "scan1", DATA / "fusion.toml"
 
 
 def pumafuse(*arguments: object, code: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run the command line; its exit code must be ``code`` and it must never show a traceback."""
+    """Run the command line; its exit code must be ``code`` and it must never show a traceback.
+
+    What is to be refused is refused in this process, which saves the start of another one.
+    """
     words = [str(EXECUTABLE), *map(str, arguments)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
+    if code in (1, 2):
+        done = _here(words)
+    else:
+        done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     return done
+
+
+def _here(words: list[str]) -> subprocess.CompletedProcess[str]:
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        warnings.catch_warnings(),
+        mock.patch.object(sys, "argv", words),
+        redirect_stdout(out),
+        redirect_stderr(err),
+        pytest.raises(SystemExit) as ended,
+    ):
+        main()
+    return subprocess.CompletedProcess(words, int(ended.value.code or 0), out.getvalue(), err.getvalue())
 
 
 def refused(*arguments: object) -> str:
