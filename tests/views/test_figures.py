@@ -13,7 +13,7 @@ from PIL import Image
 import pumafuse as pf
 from pumafuse.fusion.consistency import consistency
 from pumafuse.logs.frames import Cylindrical
-from pumafuse.views.figures import error_figure, fused_figure, validation_figure
+from pumafuse.views.figures import error_figure, fused_figure, path_figure, validation_figure
 
 NAMES = ("tangential", "radial", "vertical")
 
@@ -92,6 +92,16 @@ def test_every_figure_is_drawn_for_every_kind_of_run(what: dict, rows: int, vali
         error_figure(est, tmp_path / "error.png")
     found = [panels(tmp_path / f"{name}.png") for name in ("fused", "validation", "error")]
     assert found == [rows, validated, 0 if est.reference is None else rows]
+
+
+def test_a_path_is_drawn_where_there_are_x_y_and_z(drawn: list[Figure], tmp_path: Path) -> None:
+    """With a frame, and of an arm with such axes; of tangential, radial, vertical, or of two axes, there is none."""
+    for what, count in (({"frame": True}, 2), ({"frame": True, "axes": 2}, 0), ({}, 0)):
+        path_figure(*case(**what), tmp_path / "path.png")
+        assert [len(axes.lines) for figure in drawn for axes in figure.axes] == [count][:count]
+        if count:
+            command, estimate = (np.array(line.get_data_3d()) for line in drawn.pop().axes[0].lines)
+            assert np.abs(estimate[:, -1] - command[:, -1]).max() < 3.0  # mm
 
 
 @pytest.fixture

@@ -116,10 +116,11 @@ def _fuse(
 
             to_rerun(est, recorded, new / "fused.rrd")
         if figures:
-            from ..views.figures import error_figure, fused_figure, validation_figure
+            from ..views.figures import error_figure, fused_figure, path_figure, validation_figure
 
             fused_figure(est, recorded, new / "fused.png")
             validation_figure(est, new / "validation.png")
+            path_figure(est, recorded, new / "path.png")
             if est.reference is not None:
                 error_figure(est, new / "error.png")
 

@@ -37,6 +37,7 @@ _FILES = {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, "fusion.toml", "arm.toml"
     "fused.png",
     "error.png",
     "validation.png",
+    "path.png",
 }  # a folder with anything else in it is never replaced
 _REFERENCE_PREFIX = "reference."
 

@@ -44,6 +44,7 @@ def drawing(
     height: float = 2.9,
     ratios: Sequence[float] | None = None,
     sharex: Literal["none", "col"] = "none",
+    projection: Literal["3d"] | None = None,
 ) -> Generator[Canvas]:
     """A canvas of ``rows`` by ``columns`` axes; what is drawn and saved in the block is in our style.
 
@@ -54,6 +55,7 @@ def drawing(
         height: Height of a row [inch].
         ratios: Relative widths of the columns; None: all alike.
         sharex: Whether the axes of a column have one scale.
+        projection: ``3d`` for axes in space.
     """
     with matplotlib.rc_context(
         {
@@ -65,6 +67,7 @@ def drawing(
             "text.parse_math": False,  # a name with $ in it is a name
         }
     ):
+        subplot = {} if projection is None else {"projection": projection}
         figure = Figure(figsize=(width or 3.6 * columns, height * rows), layout="constrained")
-        grid = figure.subplots(rows, columns, squeeze=False, sharex=sharex, width_ratios=ratios)
+        grid = figure.subplots(rows, columns, squeeze=False, sharex=sharex, width_ratios=ratios, subplot_kw=subplot)
         yield Canvas(figure, grid.ravel().tolist())

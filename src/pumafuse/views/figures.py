@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 
 from ..arrays import FloatArray
 from ..filter.outcome import Outcome
@@ -15,8 +16,9 @@ from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates
 from ..fusion.score import Z95, interpolated
 from ..logs.axes import in_axes
+from ..logs.frames import CARTESIAN, in_space
 from ..logs.run import Run
-from ..units import seconds
+from ..units import SCREEN, seconds
 from . import colours
 from .canvas import drawing
 
@@ -53,6 +55,37 @@ def fused_figure(est: Estimates, run: Run, path: Path) -> None:
             if est.since is not None or est.until is not None:
                 whole.set_xlim(est.time[0], max(est.time[-1], est.time[0] + 1e-3))
         panels[1].legend(loc="best", ncols=2, frameon=False)
+
+
+def path_figure(est: Estimates, run: Run, path: Path) -> None:
+    """Draw where the tool was commanded to be and was, in the log's x, y, z; nothing where it has not all three.
+
+    Args:
+        est: The estimates.
+        run: The run that they were made from.
+        path: Where the picture goes.
+    """
+    own = {name: axis.position for name, axis in est.axes.items()} if in_space(est.config.arm) == CARTESIAN else {}
+    estimated, command = est.cartesian or own, run.command.values
+    if not all(name in estimated for name in CARTESIAN):
+        return
+    with drawing(1, width=8.0, height=7.0, projection="3d") as canvas:
+        (axes,) = canvas.axes
+        lines = {"command": (command, colours.COMMAND, 1.0), "estimate": (estimated, colours.ESTIMATE, 1.2)}
+        for label, (values, colour, width) in lines.items():
+            if all(name in values for name in CARTESIAN):
+                x, y, z = (values[name] * SCREEN["length"].scale for name in CARTESIAN)
+                axes.plot(x, y, z, color=colour, lw=width, label=label)
+        axes.set(aspect="equal")
+        travel = {name: float(np.ptp(estimated[name])) for name in CARTESIAN}
+        for name, far in travel.items():
+            axis = getattr(axes, f"{name}axis")
+            axis.set_major_locator(MaxNLocator(max(round(8.0 * far / max(*travel.values(), 1e-6)), 1)))
+            axis.set_label_text(f"{name} [{SCREEN['length'].unit}]")
+            axis.labelpad = 12.0
+        axes.legend(loc="upper left", frameon=False)
+        canvas.figure.suptitle(f"{est.run}: path, {est.mode}, arm {est.config.arm.name}")
+        canvas.figure.savefig(path, dpi=130)
 
 
 def error_figure(est: Estimates, path: Path) -> None:
