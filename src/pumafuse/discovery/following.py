@@ -71,7 +71,7 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
         correlation=correlation,
         slope=slope,
         offset=float(np.median(z - math.copysign(1.0, slope) * np.interp(s - lag, t, u))),
-        scatter=max(min(_scatter(z), _scatter(rest(best))), _resolution(z)),
+        scatter=max(min(scatter(z), scatter(rest(best))), _resolution(z)),
         misfit=_robust_sd(rest(best)),
         outliers=_outliers(rest(best)),
     )
@@ -123,8 +123,12 @@ def _at_span(
     return lag, correlation(lag), float(other @ change) / float(other @ other)
 
 
-def _scatter(value: FloatArray) -> float:
-    """Noise by third differences, which remove smooth motion: their variance is 20 times the noise's."""
+def scatter(value: FloatArray) -> float:
+    """Rough noise of a sensor on a moving axis, (n,), in the unit of ``value``; 0 of fewer than four.
+
+    From third differences, which remove smooth motion: their variance is 20 times the noise's. Their median is robust
+    against outliers.
+    """
     third = np.abs(np.diff(value, 3))
     return 1.4826 * float(np.median(third)) / math.sqrt(20.0) if len(third) else 0.0
 

@@ -11,7 +11,6 @@ stay as they are:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
@@ -23,6 +22,7 @@ import msgspec
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray, IntArray
+from ..discovery.following import scatter
 from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
@@ -191,18 +191,12 @@ class Likelihood:
 
     @cached_property
     def scatter(self) -> dict[tuple[str, str], float]:
-        """Rough noise of each sensor on each axis [m or rad], by the names of both.
-
-        From third differences, which remove smooth motion: their variance is 20 times the noise's. Their median is
-        robust against outliers.
-        """
+        """Rough noise of each sensor on each axis [m or rad], by the names of both."""
         found: dict[tuple[str, str], list[float]] = {}
         for part in self._parts:
             for name, rows in part.segment.rows_by_sensor().items():
-                third = np.diff(rows.value[:, 0], 3)
-                if len(third):
-                    sd = 1.4826 * float(np.median(np.abs(third))) / math.sqrt(20.0)
-                    found.setdefault((name, self.axes[part.axis]), []).append(sd)
+                if len(rows.time) > 3:
+                    found.setdefault((name, self.axes[part.axis]), []).append(scatter(rows.value[:, 0]))
         return {key: float(np.median(sds)) for key, sds in found.items() if min(sds) > 0.0}
 
     @cached_property
