@@ -250,6 +250,14 @@ def test_cells_may_be_separated_otherwise(tmp_path: Path, text: str, separator: 
     assert np.isnan(table.numbers("y_mm")[0][0])
 
 
+def test_a_comma_in_a_text_is_no_decimal(tmp_path: Path) -> None:
+    """Nor does one in the header separate cells where semicolons do."""
+    table = csv(tmp_path, "t_s;x_mm;what, if anything\n0.5;1.25;at rest, cold\n1;2,5;1,2 or 3\n")
+    assert table.stamps("t_s")[0].tolist() == [500_000_000, 1_000_000_000]
+    values, note = table.numbers("x_mm")
+    assert values[0] == 1.25e-3 and np.isnan(values[1]) and note is not None
+
+
 def test_a_text_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small file of gzip may hold any amount, and a device file has no end."""
     monkeypatch.setattr(tables, "_MOST_TEXT", 32 << 20)

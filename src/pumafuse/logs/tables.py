@@ -6,6 +6,7 @@ A line that does not fit the header is left out, and noted in a sentence.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import reduce
@@ -28,6 +29,7 @@ _BATCH = 1 << 16  # rows of Parquet that are in memory before rows are chosen
 _READ_AHEAD = 1 << 20  # bytes of a column of Parquet
 _SOME = 8  # values in an error
 _HEAD = 4096  # bytes of rows that show how decimals are written
+_DECIMAL_COMMA = re.compile(rb"(?:^|[;\t\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[;\t\r\n]|$)")
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
 
 
@@ -171,8 +173,8 @@ def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]
 def _dialect(text: bytes) -> tuple[str, str]:
     """What separates the cells of a CSV text, and the point of its decimals: ``1,5;2`` as well as ``1.5,2``."""
     head, _, rest = text.partition(b"\n")
-    separator = next((one for one in (b",", b";", b"\t") if one in head), b",")
-    return separator.decode(), "," if separator != b"," and b"," in rest[:_HEAD] else "."
+    separator = max(",", ";", "\t", key=lambda one: head.count(one.encode()))  # of equals the first
+    return separator, "," if separator != "," and _DECIMAL_COMMA.search(rest[:_HEAD]) else "."
 
 
 def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
