@@ -383,3 +383,20 @@ def test_more_estimates_than_anybody_wants_are_refused() -> None:
     segment = replace(build(recorded(), config()), commands=np.array([ORIGIN, ORIGIN + 365 * 86_400 * SECOND]))
     with pytest.raises(RunError, match="--rate"):
         output_times(segment, config(), 1000.0)
+
+
+class ForgottenAtOnce(dict[Any, Any]):
+    """What a thread sees where another one has asked for other delays in between."""
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        super().clear()
+
+
+def test_threads_may_ask_for_the_events_of_other_delays() -> None:
+    """A search in threads does; the order that is kept for the next one is then another thread's."""
+    given = config(tracker=Sensor(sd=1e-3))
+    segment = build(recorded({"tracker": measurements((1.0, 0.5), (2.0, 0.5))}), given)
+    expected, _ = segment.events(given)
+    object.__setattr__(segment, "_latest", ForgottenAtOnce())
+    found, _ = segment.events(given)
+    np.testing.assert_array_equal(found.time, expected.time)

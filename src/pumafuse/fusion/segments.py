@@ -85,10 +85,12 @@ class Segment:
         """
         delay, latency = [round(config.arm.delay_of(axis) * 1e9) for axis in self.axes], self._latency(config)
         times = (*delay, *latency.tolist())  # a search asks for many configurations of the same times
-        if times not in self._latest:
-            self._latest.clear()
-            self._latest[times] = self._ordered(np.array(delay), latency)
-        return self._latest[times]
+        found = self._latest.get(times)
+        if found is None:
+            found = self._ordered(np.array(delay), latency)
+            self._latest.clear()  # threads share it
+            self._latest[times] = found
+        return found
 
     def _ordered(self, delay: IntArray, latency: IntArray) -> tuple[Events, IntArray]:
         rows, parts = self.command_rows, list[Events]()
