@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .simulation.scenario import Scenario
     from .simulation.simulate import Simulated, simulate
     from .tuning.identifiability import TuneError
+    from .tuning.latency import Latency, latency
     from .tuning.tune import Tuning, tune
     from .views.rerun import to_rerun
 
@@ -49,6 +50,7 @@ _NAMES = {
     "simulation.scenario": ["Scenario"],
     "simulation.simulate": ["Simulated", "simulate"],
     "tuning.identifiability": ["TuneError"],
+    "tuning.latency": ["Latency", "latency"],
     "tuning.tune": ["Tuning", "tune"],
     "views.rerun": ["to_rerun"],
 }
@@ -56,10 +58,10 @@ _HOME = {name: home for home, names in _NAMES.items() for name in names}
 
 __all__ = [
     "ArmModel", "AxisEstimate", "AxisModel", "AxisNow", "AxisVerification", "ConfigError", "DiscreteModel",
-    "Estimates", "FirstOrder", "FusionConfig", "Gain", "Health", "Identification", "LiveEstimate", "LiveEstimator",
+    "Estimates", "FirstOrder", "FusionConfig", "Gain", "Health", "Identification", "Latency", "LiveEstimate", "LiveEstimator",
     "Measurements", "Outcome", "Process", "PumafuseError", "PumafuseWarning", "Run", "RunError", "Scenario", "Score",
     "SecondOrder", "Sensor", "SensorHealth", "Simulated", "Start", "StepTrials", "Summary", "TrialsError",
-    "TuneError", "Tuning", "UnknownNameError", "UpdateResult", "Validity", "discretize", "fuse", "identify", "score",
+    "TuneError", "Tuning", "UnknownNameError", "UpdateResult", "Validity", "discretize", "fuse", "identify", "latency", "score",
     "simulate", "summarise", "to_rerun", "tune", "verify",
 ]  # fmt: skip
 

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from pumafuse.tuning.lag import fitted_lags, lag_intervals
+from pumafuse.tuning.intervals import lag_intervals
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import derivatives, point
 from pumafuse.tuning.parameters import with_own_delays
+from pumafuse.tuning.summary import fitted_lags
 from tuning_runs import fit_stage, free_of, outage, replaced, scenario, spoiled_arm
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
-from pumafuse.tuning.lag import lag_intervals
+from pumafuse.tuning.intervals import lag_intervals
 from pumafuse.tuning.stage import Plan, Stage, run_stage
 from tuning_runs import contains, fit_stage, intervals_of, later, replaced
 

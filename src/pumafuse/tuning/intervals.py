@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -18,11 +18,15 @@ from .likelihood import Likelihood, in_threads
 from .maximise import Point, derivatives, maximise, point
 from .parameters import Parameter, coordinates, moved, rounded
 
+Distances: TypeAlias = tuple[float, float]  # s; to the lower and upper end of an interval, infinite where it is open
+
 _TOLERANCE = 0.02  # log-likelihood to which a profile is maximised
 _SKEWED = 0.05  # relative error of the curvature's drop at an end, beyond which the profile is computed
 _CLOSE = 0.03  # relative, of √(2 drop)
 _FARTHER = 1.5  # times the distance, while an end is not yet between two
 _HALVINGS = 26
+_LAG_STEP = 1e-5  # of a coordinate
+_UNLIMITED = 10.0  # s; an interval of a lag as wide as this is none
 _SHARES = np.array((0.3, 0.65, 1.0, 1.5))  # of the way from the best to an end of the interval: points that are drawn
 
 
@@ -235,3 +239,51 @@ def _end(view: _View, best: Point, one: Parameter, sign: float) -> _End:
 def _root(drop: float) -> float:
     """The standard deviations that a drop of a Gaussian log-likelihood stands for."""
     return float(np.sqrt(2.0 * max(drop, 1e-9)))
+
+
+# ---- lags -----------------------------------------------------------------------------------------------------------
+
+
+def lag_intervals(likelihood: Likelihood, best: Point, free: Sequence[Parameter]) -> dict[str, Distances]:
+    """How far the 95 % interval of each axis's lag reaches down and up, by its gradient and the information.
+
+    Where the score scatters more over pieces of the runs than the information says, the interval is as much wider
+    (White, Econometrica 50, 1982): a real arm's lag wanders a little, and the next recording has another one.
+
+    A delay at its bound of 0 counts as if it were inside: plant and delay make up for each other there, too, and
+    without it the lag would seem to be known as well as the plant alone. Other parameters at a bound stay there. Where
+    all that would move the lag one way are at their bounds, it is open that way.
+    """
+    slopes = lag_slopes(free, best.config)
+    if not slopes:
+        return {}
+    bounds = [one.at_bound(best.config) for one in free]
+    inside = [n for n, (one, bound) in enumerate(zip(free, bounds, strict=True)) if bound is None or one.fit == "delay"]
+    some = [free[n] for n in inside]
+    _, information, scatter = derivatives(likelihood, best, some)
+    cov = covariance(information, some)
+    real = cov @ scatter @ cov
+    found: dict[str, Distances] = {}
+    for axis, slope in slopes.items():
+        inner = slope[inside]
+        half = Z95 * float(np.sqrt(max(inner @ cov @ inner, inner @ real @ inner)))
+        half = half if 0.0 < half < _UNLIMITED else np.inf
+        moving = [(bounds[n], slope[n] > 0.0) for n in np.flatnonzero(slope)]
+        down, up = (
+            all(bound == ("lower" if rises == upwards else "upper") for bound, rises in moving)
+            for upwards in (True, False)
+        )
+        found[axis] = (np.inf if down else half, np.inf if up else half)
+    return found
+
+
+def lag_slopes(free: Sequence[Parameter], config: FusionConfig) -> dict[str, FloatArray]:
+    """The derivatives of each axis's lag by the coordinates (k,), where any is not 0."""
+
+    def slope(one: Parameter, axis: str) -> float:
+        at = one.at(config)
+        up, down = (one.move(config, at + step).arm.lag_of(axis) for step in (_LAG_STEP, -_LAG_STEP))
+        return (up - down) / (2.0 * _LAG_STEP)
+
+    found = {axis: np.array([slope(one, axis) for one in free]) for axis in config.arm.axes}
+    return {axis: slopes for axis, slopes in found.items() if slopes.any()}

@@ -32,11 +32,12 @@ from ..fusion.segments import Segment, added, build
 from ..logs.axes import in_axes
 from ..logs.clock import clock_faults, segments
 from ..logs.run import Run
-from .parameters import Parameter
+from .parameters import Parameter, changed
 
 _LOG_STEP = 1e-4  # of a logarithm, one-sided: the truncation error is half of it, the rounding error 1e-11
 _STEP = 2e-5  # s, or of a gain; central, because the likelihood bends where a measurement passes a command
 _PIECES = 20  # of a run, that a model which is right has independent scores in
+_SHIFT = 1e-4  # s, by which a lag is varied
 _SMALLEST = 1e-6  # m; misfit of a simulated arm without any noise
 
 T = TypeVar("T")
@@ -44,7 +45,9 @@ R = TypeVar("R")
 
 
 def in_threads(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
-    """The results of ``work`` for each item, on all usable cores."""
+    """The results of ``work`` for each item, on all usable cores; of one item without a thread, which only waits."""
+    if len(items) < 2:
+        return [work(one) for one in items]
     import joblib  # takes 0.1 s
 
     cores = int(joblib.cpu_count())  # pyright: ignore
@@ -232,12 +235,7 @@ class Likelihood:
         Returns:
             Both, by sensor and axis.
         """
-        certain = msgspec.structs.replace(
-            config,
-            start=Start(offset_sd=0.0),
-            process=dict.fromkeys(config.process, Process(input_noise=0.0, drift=0.0)),
-            sensors={name: msgspec.structs.replace(one, bias_sd=0.0, gate=0.0) for name, one in config.sensors.items()},
-        )
+        certain = _certain(config)
         found: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
         for part in self._parts:
             rows, value = part.segment.measurement_rows, part.segment.unwrapped()[:, 0]
@@ -254,6 +252,44 @@ class Likelihood:
             key: (np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs]))
             for key, pairs in found.items()
         }
+
+    def shifts(self, axis: str, config: FusionConfig, count: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """How much later an axis is in each of ``count`` parts of its longest recording than on the whole.
+
+        The filter is linear in the measurements: what a lag that is longer in one part alone adds to the innovations
+        is the difference of two runs of it, and the shifts are least squares on those.
+
+        Returns:
+            The middles of the parts [s after the first command], the shifts [s] and their information [1/s²], (n,),
+            (n,) and (n, n); None where there are too few measurements.
+        """
+        part = max(self._of(axis), key=lambda one: len(one.rows), default=None)
+        if part is None or len(part.rows) < 3 * count:
+            return None
+        segment, rows = part.segment, part.segment.measurement_rows
+        found = innovations(segment, config)
+        fused = found.outcome[:, 0] != Outcome.REJECTED
+        delay, certain = config.arm.delay_of(axis), _certain(config)
+
+        def predicted(shift: float) -> FloatArray:
+            moved = changed(certain, ("arm", "axes", axis, "delay"), max(delay + shift, 0.0))
+            return -innovations(segment, moved).innovation[:, 0]
+
+        rate = (predicted(_SHIFT) - predicted(-_SHIFT)) / (_SHIFT + min(_SHIFT, delay))
+        since = (rows.time - segment.origin) / 1e9
+        edges = np.linspace(since.min(), since.max(), count + 1)
+        place = np.clip(np.searchsorted(edges, since, side="right") - 1, 0, count - 1)
+        moved = np.empty((count, len(since)))
+        for number in range(count):
+            value = rows.value + (rate * (place == number))[:, None]
+            later = innovations(replace(segment, measurement_rows=rows._replace(value=value)), config, found.outcome)
+            moved[number] = (later.innovation - found.innovation)[:, 0]
+        moved *= fused / found.innovation_sd[:, 0]
+        information = moved @ moved.T
+        size = np.sqrt(np.maximum(np.diag(information), 1e-3 * max(float(np.diag(information).max()), 1e-12)))
+        scaled = information / np.outer(size, size) + 1e-9 * np.eye(count)
+        shift = np.linalg.solve(scaled, moved @ (found.innovation / found.innovation_sd)[:, 0] / size) / size
+        return 0.5 * (edges[:-1] + edges[1:]), shift, scaled * np.outer(size, size)
 
     def misfit(self, config: FusionConfig) -> dict[str, float]:
         """The median distance of the noiseless arm from the nearest sensor's measurements [m], by axis."""
@@ -328,6 +364,16 @@ class Likelihood:
         pieces = [slice(n * len(r) // _PIECES, (n + 1) * len(r) // _PIECES) for n in range(_PIECES)]
         score = [-d_nu[:, piece] @ r[piece] + 0.5 * d_S[:, piece] @ excess[piece] for piece in pieces]
         return mine, np.array(score).T, d_nu @ d_nu.T + 0.5 * d_S @ d_S.T
+
+
+def _certain(config: FusionConfig) -> FusionConfig:
+    """The configuration of an arm without any noise: no measurement moves its estimate."""
+    sensors = {
+        name: msgspec.structs.replace(one, bias_sd=0.0, bias_drift_sd=0.0, gate=0.0)
+        for name, one in config.sensors.items()
+    }
+    process = dict.fromkeys(config.process, Process(input_noise=0.0, drift=0.0))
+    return msgspec.structs.replace(config, start=Start(offset_sd=0.0), process=process, sensors=sensors)
 
 
 def _decided(segment: Segment, until: float | None, latest: float | None) -> Segment:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias, TypeVar, cast, get_args
 
@@ -52,10 +53,11 @@ def _changed(node: Any, path: Path, value: object, root: Any) -> Any:
     if isinstance(node, dict):
         table = cast("dict[str, Any]", node)
         return {**table, name: _changed(table.get(name), rest, value, root)}
-    changes = {name: _changed(getattr(node, name), rest, value, root)}
+    other = copy(node)  # unchecked: a search moves a configuration thousands of times, within bounds
+    msgspec.structs.force_setattr(other, name, _changed(getattr(node, name), rest, value, root))
     if not rest and hasattr(node, f"{name}_ci95"):
-        changes[f"{name}_ci95"] = None
-    return _replace(node, **changes)
+        msgspec.structs.force_setattr(other, f"{name}_ci95", None)
+    return other
 
 
 @dataclass(frozen=True)

@@ -84,10 +84,10 @@ def search(
 
     start = _times(likelihood, with_gates(config, config, _WIDER), free(config))
     found: list[tuple[Point, Reasons]] = []
-    for model in _models(likelihood, start, rough):
+    for model in noise_models(likelihood, start, rough):
         if found:  # the arm of the first model is near that of the others
             model = _with_arm_of(model, found[0][0].config, free)
-        best = _noise(likelihood, with_gates(model, config, 1.0), rough(model), notify)
+        best = best_noise(likelihood, with_gates(model, config, 1.0), rough(model), notify)
         shared = [one for one in free(best) if one.axis is None]
         if shared:
             best = maximise(likelihood, best, shared, notify, tolerance=_ROUGHLY).config
@@ -95,7 +95,7 @@ def search(
         if any(one.fit != "noise" for one in own(best)):
             best, arm = _arm(likelihood, best, rough, notify, again=bool(found))
         found.append((maximise_by_axis(likelihood, best, rough(best), notify, _ROUGHLY), arm))
-    best, reasons = _most_likely_models(likelihood, found, rough)
+    best, reasons = most_likely_models(likelihood, found, rough)
     best = _without_needless(likelihood, best, own, notify)
     if len(found) > 1:
         best = _past_ticks(likelihood, best, own, notify)
@@ -110,7 +110,7 @@ def search(
     return best, {axis: "; ".join(why.values()) for axis, why in reasons.items() if why}
 
 
-def _models(likelihood: Likelihood, config: FusionConfig, free: FreeOf) -> list[FusionConfig]:
+def noise_models(likelihood: Likelihood, config: FusionConfig, free: FreeOf) -> list[FusionConfig]:
     """Without a disturbance, and where one may be fitted with one of each kind and little other noise."""
     misfit, every = likelihood.misfit(config), config
     for axis in misfit:
@@ -133,7 +133,7 @@ def _models(likelihood: Likelihood, config: FusionConfig, free: FreeOf) -> list[
     return models
 
 
-def _most_likely_models(
+def most_likely_models(
     likelihood: Likelihood, found: Sequence[tuple[Point, Reasons]], free: FreeOf
 ) -> tuple[FusionConfig, Reasons]:
     """The model that is best for each axis after the penalty for its numbers, and why."""
@@ -237,7 +237,7 @@ def _shifted(config: FusionConfig, times: Sequence[Parameter], shift: float) -> 
     return config
 
 
-def _noise(likelihood: Likelihood, config: FusionConfig, free: Sequence[Parameter], notify: Notify) -> FusionConfig:
+def best_noise(likelihood: Likelihood, config: FusionConfig, free: Sequence[Parameter], notify: Notify) -> FusionConfig:
     """The best noise from the best of many starts, with wide gates and with the given ones, by axis."""
     noise = [one for one in free if one.fit == "noise"]
     if not noise:

@@ -6,16 +6,18 @@ Fitted parameters are in the units of their keys; what else belongs to an axis i
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 
 import msgspec
+import numpy as np
 
 from .. import toml
 from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..logs.run import Run
-from ..units import Kind
+from ..units import MS, Kind
 from .identifiability import Correlation
-from .intervals import ConfidenceInterval
+from .intervals import ConfidenceInterval, Distances, lag_slopes
 from .parameters import Parameter
 from .validation import Check, fused
 
@@ -137,6 +139,25 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
     validation: list[Check] | None
     worse: bool
     notes: list[str]
+
+
+def fitted_lags(
+    free: Sequence[Parameter], before: FusionConfig, after: FusionConfig, around: Mapping[str, Distances]
+) -> dict[str, FittedLag]:
+    """The lag of each axis that the free parameters change.
+
+    Args:
+        free: The parameters that were fitted.
+        before: The configuration as given.
+        after: The tuned one.
+        around: From :func:`lag_intervals`; an axis that is not in it gets no interval.
+    """
+    found: dict[str, FittedLag] = {}
+    for axis in lag_slopes(free, after):
+        lag, (below, above) = after.arm.lag_of(axis), around.get(axis, (np.inf, np.inf))
+        ends = [None if np.isinf(end) else end * MS for end in (lag - below, lag + above)]
+        found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag * MS, lag_ms_ci95=(ends[0], ends[1]))
+    return found
 
 
 def encode(summary: TuningSummary) -> str:

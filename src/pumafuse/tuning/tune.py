@@ -16,13 +16,12 @@ from ..fusion.faults import latency_questions
 from ..logs.clock import segments
 from ..logs.run import Run
 from .identifiability import TuneError, correlations, excited_axes
-from .intervals import ConfidenceInterval, Profile, confidence_intervals
-from .lag import Distances, fitted_lags, lag_intervals
+from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
 from .likelihood import Likelihood, LogLikelihood
 from .maximise import Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
 from .stage import Plan, Stage, likelihood_of, run_stage
-from .summary import AxisLikelihood, TuningSummary, encode, fitted, found_biases
+from .summary import AxisLikelihood, TuningSummary, encode, fitted, fitted_lags, found_biases
 from .validation import Check, check
 
 _FITTED_ON = 2.0 / 3.0  # of a single run; the rest is for validation

@@ -1,0 +1,564 @@
+"""How late is it? The arm of recorded runs from their motion alone, and the latency of each sensor: :func:`latency`."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from .. import toml
+from ..arrays import FloatArray
+from ..discovery.guesses import ArmGuess, AxisGuess, SensorGuess, guess
+from ..discovery.roles import relations
+from ..discovery.survey import Survey
+from ..errors import PumafuseWarning, UnknownNameError
+from ..fusion.config import FusionConfig, Process, Sensor, Start
+from ..fusion.score import Z95
+from ..logs.axes import in_axes
+from ..logs.run import Run
+from ..model.arm import ArmModel, AxisModel
+from ..model.plants import FirstOrder
+from ..toml import Interval
+from .identifiability import TuneError, covariance, excited_axes
+from .intervals import lag_slopes
+from .likelihood import Likelihood
+from .maximise import Point, derivatives, ignore, maximise, past_bumps, point
+from .parameters import LATENCIES, Parameter, changed, parameters, with_axis_of, with_own_delays, with_shared_delay
+from .posterior import (
+    LONGEST_DELAY,
+    AxisPosterior,
+    Mixture,
+    Model,
+    Quantity,
+    axis_posterior,
+    chosen_model,
+    fitted_with,
+    shared_delay,
+    sharing,
+)
+from .search import best_noise, most_likely_models, noise_models
+
+REFERENCE = "reference"  # the name of a run's reference among its sensors
+_MARGIN = 1.3  # by which intervals of delay and plant are widened: found by simulation, see docs/benchmarks.md
+_ROUGHLY = 0.1  # tolerance in log-likelihood
+_GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
+_GATE = 5.0
+_PARTS = 10  # of a run, of each of which the lag is told
+_DRIFTS = 3.5  # standard deviations from which a drift is named
+_WANDERS = 1e-4  # probability below which a wandering is named
+_SMALLEST = 1e-3  # s, of a drift or a wandering that is named
+
+
+class AxisLag(msgspec.Struct, frozen=True, kw_only=True):
+    """How late an axis is, and what it is made of.
+
+    Attributes:
+        sensor: The sensor it is told by, whose stamps are taken to be right.
+        lag: Behind the held command at constant velocity [s].
+        lag_ci95: Its 95 % interval.
+        delay: The dead time [s].
+        delay_ci95: Its interval.
+        shared_delay: Whether it is one for several axes.
+        plant: The order of the plant.
+        time_constant: τ of a first-order plant [s].
+        time_constant_ci95: Its interval.
+        natural_frequency: ω of a second-order plant [rad/s].
+        natural_frequency_ci95: Its interval.
+        damping: ζ.
+        damping_ci95: Its interval.
+        gain: K of slow motion.
+        gain_ci95: Its interval; null where it was taken to be 1.
+        gain_recovery: Time constant with which the gain recovers [s]; null: it does not.
+        gain_recovery_ci95: Its interval.
+        drift: How much later it is at the end than at the beginning [s]; null: not told.
+        drift_sd: Its standard deviation [s].
+        drifts: Whether that is more than chance.
+        wander: How far the lag wanders beside that, one standard deviation [s]; 0: not seen to.
+        course: Of each part of the run its middle [s after the first command], by how much later it is there than on
+            the whole [s], and the standard deviation of that [s].
+        notes: What the motion was too poor for, a sentence each.
+    """
+
+    sensor: str
+    lag: float = msgspec.field(name="lag_ms")
+    lag_ci95: Interval = msgspec.field(name="lag_ms_ci95")
+    delay: float = msgspec.field(name="delay_ms")
+    delay_ci95: Interval = msgspec.field(name="delay_ms_ci95")
+    shared_delay: bool
+    plant: str
+    time_constant: float | None = msgspec.field(name="time_constant_ms", default=None)
+    time_constant_ci95: Interval | None = msgspec.field(name="time_constant_ms_ci95", default=None)
+    natural_frequency: float | None = msgspec.field(name="natural_frequency_rad_s", default=None)
+    natural_frequency_ci95: Interval | None = msgspec.field(name="natural_frequency_rad_s_ci95", default=None)
+    damping: float | None = None
+    damping_ci95: Interval | None = None
+    gain: float
+    gain_ci95: Interval | None = None
+    gain_recovery: float | None = msgspec.field(name="gain_recovery_ms", default=None)
+    gain_recovery_ci95: Interval | None = msgspec.field(name="gain_recovery_ms_ci95", default=None)
+    drift: float | None = msgspec.field(name="drift_ms", default=None)
+    drift_sd: float | None = msgspec.field(name="drift_sd_ms", default=None)
+    drifts: bool = False
+    wander: float = msgspec.field(name="wander_ms", default=0.0)
+    course: list[PartLag] = []
+    notes: list[str] = []
+
+
+class PartLag(msgspec.Struct, frozen=True, kw_only=True):
+    """A part of a run: its middle [s], how much later it is than the whole [s], and its standard deviation [s]."""
+
+    time: float = msgspec.field(name="time_s")
+    shift: float = msgspec.field(name="shift_ms")
+    sd: float = msgspec.field(name="sd_ms")
+
+
+class SensorLag(msgspec.Struct, frozen=True, kw_only=True):
+    """How much older a sensor's measurements are when stamped than those of the sensor whose stamps are right.
+
+    Attributes:
+        latency: The latency [s].
+        latency_ci95: Its 95 % interval.
+    """
+
+    latency: float = msgspec.field(name="latency_ms")
+    latency_ci95: Interval = msgspec.field(name="latency_ms_ci95")
+
+
+class LatencySummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What ``latency --json`` prints.
+
+    Attributes:
+        pumafuse: Version that made it.
+        runs: Names of the runs.
+        sensor: The sensor whose stamps are taken to be right.
+        update_period: Between commands [s].
+        axes: By axis.
+        sensors: By sensor, those beside that one.
+        clock_drift: By how much all axes together are later at the end, where they agree: a clock that drifts [s].
+        clock_wander: How far all axes wander together: a clock that wanders [s].
+        notes: Everything noticed, a sentence each.
+    """
+
+    pumafuse: str
+    runs: list[str]
+    sensor: str
+    update_period: float = msgspec.field(name="update_period_ms")
+    axes: dict[str, AxisLag]
+    sensors: dict[str, SensorLag]
+    clock_drift: float | None = msgspec.field(name="clock_drift_ms", default=None)
+    clock_wander: float | None = msgspec.field(name="clock_wander_ms", default=None)
+    notes: list[str]
+
+
+@dataclass(frozen=True)
+class Latency:
+    """The result of :func:`latency`.
+
+    Attributes:
+        config: Arm, noise and sensors, ready for :func:`pumafuse.fuse` or :func:`pumafuse.tune`.
+        summary: What it is in numbers [SI].
+        runs: The runs in the arm's axes; a reference is one of their sensors.
+    """
+
+    config: FusionConfig
+    summary: LatencySummary
+    runs: Sequence[Run]
+
+    @property
+    def arm(self) -> ArmModel:
+        """The arm, for ``arm.toml``."""
+        return self.config.arm
+
+    def to_json(self) -> str:
+        """All of it as JSON, in the units of the names."""
+        tree = toml.reported(self.summary)
+        return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode() + "\n"
+
+
+class _Fit(NamedTuple):
+    """One axis: its likelihood, where its search began, its posterior."""
+
+    likelihood: Likelihood
+    start: FusionConfig
+    posterior: AxisPosterior
+
+
+def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
+    """Tell how late each axis is behind its commands, and each sensor behind another, from recorded motion alone.
+
+    Nothing has to be known beforehand: delay, order, plant and gain of each axis are found by maximum likelihood, from
+    delays of 0 to 0.6 s and lags of 1 ms to 2 s. Intervals are quantiles of the posterior over all models.
+
+    Args:
+        runs: Recorded runs of one arm.
+        sensor: The sensor whose stamps are right, ``reference`` for the runs' reference; None: the reference, or the
+            sensor with the least noise.
+
+    Warns:
+        PumafuseWarning: For each note.
+
+    Raises:
+        PumafuseError: The runs tell nothing: no motion, too few measurements, a sensor that does not follow.
+    """
+    every = [_with_reference(run) for run in ([runs] if isinstance(runs, Run) else runs)]
+    if not every:
+        raise TuneError("no run to look at")
+    config = first_guess(every)
+    trusted = _trusted(config, every, sensor)
+    likelihood = Likelihood(every, _known(config, trusted), [trusted])
+    moving = excited_axes(likelihood, likelihood.config)
+    fits = {axis: _fit(likelihood.of_axis(axis), likelihood.config, axis) for axis in moving}
+    config, lags = _arm(likelihood, fits, trusted)
+    best, sensors = _sensors(every, config, trusted, moving)
+    lags, clock = _with_courses(likelihood, config, lags)
+    still = [axis for axis in config.arm.axes if axis not in moving]
+    notes = [*likelihood.notes, *(f"{axis}: does not move, or {trusted} does not measure it" for axis in still)]
+    summary = LatencySummary(
+        pumafuse=version("pumafuse"),
+        runs=[run.name for run in every],
+        sensor=trusted,
+        update_period=config.arm.update_period,
+        axes=lags,
+        sensors=sensors,
+        clock_drift=clock[0],
+        clock_wander=clock[1],
+        notes=list(dict.fromkeys(notes)),
+    )
+    for note in summary.notes:
+        warnings.warn(note, PumafuseWarning, stacklevel=2)
+    return Latency(best, summary, every)
+
+
+# ---- the first guess ------------------------------------------------------------------------------------------------
+
+
+def _with_reference(run: Run) -> Run:
+    """A run in the arm's axes whose reference is one of its sensors."""
+    run = in_axes(run, None)[0]
+    if run.reference is None:
+        return run
+    return replace(run, sensors={REFERENCE: run.reference, **run.sensors}, reference=None)
+
+
+def first_guess(runs: Sequence[Run]) -> FusionConfig:
+    """A configuration by correlation: lags, noise and latencies of the runs, those with the most motion first.
+
+    Raises:
+        RunError: There are fewer than two commands.
+    """
+    arms, axes, sensors = list[ArmGuess](), dict[str, AxisGuess](), dict[str, SensorGuess]()
+    for run in sorted(runs, key=_motion, reverse=True):
+        arm, found = guess(Survey(Path(run.name), run, relations(run)))
+        arms.append(arm)
+        axes = {**arm.axes, **axes}
+        for name, one in found.items():
+            before = sensors.get(name)
+            sensors[name] = one if before is None else replace(before, sd={**one.sd, **before.sd}, bias={**one.bias, **before.bias})
+    model = ArmModel(
+        name="identified from motion",
+        update_period=arms[0].period,
+        delay=arms[0].delay,
+        axes={
+            name: AxisModel(kind=one.kind, plant=FirstOrder(time_constant=one.time_constant))
+            for name, one in axes.items()
+        },
+    )
+    return FusionConfig(
+        arm=model,
+        start=Start(offset_sd={name: one.offset_sd for name, one in axes.items()}),
+        process={name: Process(input_noise=one.input_noise, drift=one.drift) for name, one in axes.items()},
+        sensors={name: _sensor(one) for name, one in sensors.items()},
+    )
+
+
+def _motion(run: Run) -> float:
+    """How much a run moves: the lengths of its commanded paths, each in units of its range."""
+    found = 0.0
+    for value in run.command.values.values():
+        known = value[np.isfinite(value)]
+        if len(known) > 1 and np.ptp(known) > 0.0:
+            found += float(np.abs(np.diff(known)).sum() / np.ptp(known))
+    return found
+
+
+def _sensor(found: SensorGuess) -> Sensor:
+    bias: float | dict[str, float] = {axis: found.bias.get(axis, 0.0) for axis in found.sd} if found.bias else 0.0
+    return Sensor(sd=dict(found.sd), latency=found.latency, scale=found.scale, bias_sd=bias, gate=_GATE)
+
+
+def _trusted(config: FusionConfig, runs: Sequence[Run], asked: str | None) -> str:
+    """The sensor whose stamps are right: as asked, the reference, or that with the least noise.
+
+    Raises:
+        UnknownNameError: The asked one is not there.
+        TuneError: There is none.
+    """
+    if not config.sensors:
+        raise TuneError("no sensor and no reference: nothing to compare the commands with")
+    if asked is not None:
+        if asked not in config.sensors:
+            raise UnknownNameError("the runs", "sensor", asked, config.sensors)
+        return asked
+    if REFERENCE in config.sensors:
+        return REFERENCE
+
+    def rank(name: str) -> tuple[int, float]:
+        sd = config.sensors[name].sd
+        travel = {axis: max(float(np.ptp(run.command.values[axis][np.isfinite(run.command.values[axis])])) for run in runs if axis in run.command.values) for axis in config.arm.axes}
+        shares = [one / max(travel[axis], 1e-12) for axis, one in sd.items()] if isinstance(sd, dict) else [sd]
+        return -len(shares), float(np.median(shares))
+
+    return min(config.sensors, key=rank)
+
+
+def _known(config: FusionConfig, trusted: str) -> FusionConfig:
+    """The configuration with the trusted sensor's stamps right, and the others' latencies as much shorter."""
+    late = config.sensors[trusted].latency
+    for name, one in config.sensors.items():
+        config = changed(config, ("sensors", name, "latency"), one.latency - late)
+    for axis in config.arm.axes:
+        config = changed(config, ("arm", "axes", axis, "delay"), config.arm.delay_of(axis) + late)
+    return config
+
+
+# ---- axes -----------------------------------------------------------------------------------------------------------
+
+
+def _fit(likelihood: Likelihood, config: FusionConfig, axis: str) -> _Fit:
+    """The posterior of an axis, with the noise that its measurements ask for."""
+    start = _with_noise(likelihood, config, axis)
+    return _Fit(likelihood, start, axis_posterior(likelihood, start, axis))
+
+
+def _with_noise(likelihood: Likelihood, config: FusionConfig, axis: str) -> FusionConfig:
+    """The configuration with the kind of noise of an axis, and its size, beside a first-order arm."""
+
+    def free(at: FusionConfig, fit: Sequence[Any] = ("noise",)) -> list[Parameter]:
+        every = parameters(at, config, {axis: likelihood.sensors[axis]}, fit, ["maneuver_noise_mm_rtHz_per_m_s"], sd_prior=False)
+        wide = [replace(one, bounds=(0.0, LONGEST_DELAY)) if one.fit == "delay" else one for one in every]
+        return [one for one in wide if one.axis == axis and not one.path[-1].startswith("maneuver")]
+
+    def arm(at: FusionConfig) -> list[Parameter]:
+        return free(at, ("noise", "delay", "plant", "gain"))
+
+    found: list[Point] = []
+    for model in noise_models(likelihood, config, free):
+        if found:
+            model = msgspec.structs.replace(model, arm=found[0].config.arm)
+        best = best_noise(likelihood, model, free(model), ignore)
+        found.append(maximise(likelihood, best, arm(best), tolerance=_ROUGHLY))
+    return most_likely_models(likelihood, [(one, {}) for one in found], free)[0]
+
+
+def _arm(
+    likelihood: Likelihood, fits: Mapping[str, _Fit], trusted: str
+) -> tuple[FusionConfig, dict[str, AxisLag]]:
+    """The arm of all axes, and the lag of each with its intervals."""
+    posteriors = {axis: one.posterior for axis, one in fits.items()}
+    shares = sharing(posteriors)
+    delay = shared_delay([posteriors[axis] for axis in shares]) if shares else None
+    config, lags = likelihood.config, dict[str, AxisLag]()
+    for axis, fit in fits.items():
+        others = [posteriors[one] for one in shares if one != axis] if axis in shares else []
+
+        def elsewhere(delays: FloatArray, others: Sequence[AxisPosterior] = others) -> FloatArray:
+            return np.sum([one.log_density(delays) for one in others], axis=0) if others else np.zeros(len(delays))
+
+        mixture = fit.posterior.mixture(elsewhere)
+        model = chosen_model(mixture)
+        best = fitted_with(fit.likelihood, fit.start, fit.posterior, model, delay if axis in shares else None)
+        config = with_axis_of(config, best.config, axis)
+        lags[axis] = _axis_lag(fit.likelihood, best, mixture, model, axis, trusted, axis in shares)
+    if delay is not None:
+        config = with_shared_delay(config, shares, delay)
+    return config, lags
+
+
+def _axis_lag(
+    likelihood: Likelihood, best: Point, mixture: Mixture, model: Model, axis: str, trusted: str, shared: bool
+) -> AxisLag:
+    arm, delay = best.config.arm.axes[axis], best.config.arm.delay_of(axis)
+
+    def interval(quantity: Quantity, value: float, margin: float = 1.0) -> Interval:
+        """Of the models like the chosen one; of a logarithm in the number itself."""
+        log = quantity not in ("lag", "delay", "gain")
+
+        def alike(one: Model) -> bool:
+            if quantity in ("gain", "gain_recovery"):
+                return one.gain == model.gain
+            return quantity in ("lag", "delay") or one.order == model.order
+
+        middle = math.log(value) if log else value
+        low, high = mixture.quantiles(quantity, alike)
+        low, high = middle - margin * max(middle - low, 0.0), middle + margin * max(high - middle, 0.0)
+        if quantity == "delay":
+            low = max(low, 0.0)
+        return (math.exp(low), math.exp(high)) if log else (low, high)
+
+    lag = best.config.arm.lag_of(axis)
+    found = AxisLag(
+        sensor=trusted,
+        lag=lag,
+        lag_ci95=interval("lag", lag, _scattered(likelihood, best, axis)),
+        delay=delay,
+        delay_ci95=interval("delay", delay, _MARGIN),
+        shared_delay=shared,
+        plant="first-order" if model.order == 1 else "second-order",
+        gain=arm.gain.intercept,
+        gain_ci95=None if model.gain == "none" else interval("gain", arm.gain.intercept),
+    )
+    values: dict[str, Any] = {}
+    for name in ("time_constant", "natural_frequency", "damping"):
+        if (value := getattr(arm.plant, name, None)) is not None:
+            values |= {name: value, f"{name}_ci95": interval(name, value, _MARGIN)}
+    if arm.gain_recovery is not None:
+        values |= {
+            "gain_recovery": arm.gain_recovery,
+            "gain_recovery_ci95": interval("gain_recovery", arm.gain_recovery),
+        }
+    return msgspec.structs.replace(found, **values)
+
+
+def _scattered(likelihood: Likelihood, best: Point, axis: str) -> float:
+    """How much more the lag scatters over pieces of the runs than the information says, at least 1 (White, 1982)."""
+    every = parameters(best.config, best.config, {axis: likelihood.sensors[axis]}, ["delay", "plant", "gain"])
+    free = [one for one in every if one.axis == axis and one.at_bound(best.config) is None]
+    slope = lag_slopes(free, best.config).get(axis)
+    if slope is None:
+        return 1.0
+    _, information, scatter = derivatives(likelihood, best, free)
+    cov = covariance(information, free)
+    return max(1.0, math.sqrt(float(slope @ cov @ scatter @ cov @ slope) / float(slope @ cov @ slope)))
+
+
+# ---- sensors --------------------------------------------------------------------------------------------------------
+
+
+def _sensors(
+    runs: Sequence[Run], config: FusionConfig, trusted: str, moving: Sequence[str]
+) -> tuple[FusionConfig, dict[str, SensorLag]]:
+    """The configuration with the noise and latency of the other sensors, and those latencies with intervals."""
+    others = [name for name in config.sensors if name != trusted]
+    if not others:
+        return config, {}
+    latest = LATENCIES[1] + max(one.latency for one in config.sensors.values())
+    likelihood = Likelihood(runs, config, latest=max(latest, 0.0))
+    measured = {axis: names for axis, names in likelihood.sensors.items() if axis in moving}
+    others = [name for name in others if any(name in names for names in measured.values())]
+
+    def free(at: FusionConfig) -> list[Parameter]:
+        every = parameters(at, config, measured, ["noise", "latency"], sd_prior=False)
+        return [one for one in every if one.sensor in others]
+
+    for name in others:
+        config = _nearest_latency(likelihood, config, name)
+    best = maximise(likelihood, config, free(config))
+    best = past_bumps(likelihood, best, free(config))
+    own = with_own_delays(best.config, moving)
+    arm = [
+        one
+        for one in parameters(own, own, measured, ["delay", "plant", "gain"])
+        if one.axis in moving and one.at_bound(own) is None
+    ]
+    late = [one for one in free(own) if one.fit == "latency"]
+    every = [*arm, *late]
+    _, information, scatter = derivatives(likelihood, point(likelihood, own, every), every)
+    cov = covariance(information, every)
+    sd = np.sqrt(np.maximum(np.diag(cov), np.diag(cov @ scatter @ cov)))
+    found: dict[str, SensorLag] = {}
+    for one, half in zip(late, (Z95 * sd[len(arm) :]).tolist(), strict=True):
+        value = one.get(best.config)
+        found[str(one.sensor)] = SensorLag(latency=value, latency_ci95=(value - half, value + half))
+    return best.config, found
+
+
+def _nearest_latency(likelihood: Likelihood, config: FusionConfig, name: str) -> FusionConfig:
+    """The configuration with the most likely latency of a sensor on a grid about the guessed one."""
+    middle = config.sensors[name].latency
+    tried = [changed(config, ("sensors", name, "latency"), middle + shift) for shift in _GRID.tolist()]
+    return max(tried, key=lambda one: likelihood.evaluate(one).total)
+
+
+# ---- the lag over the run -------------------------------------------------------------------------------------------
+
+
+class _Course(NamedTuple):
+    """How much later an axis is in each part of a run: middles [s], shifts [s], their information [1/s²]."""
+
+    time: FloatArray
+    shift: FloatArray
+    information: FloatArray
+
+
+class _Trend(NamedTuple):
+    """A drift over the run and its standard deviation [s], a wandering beside it [s], whether each is significant."""
+
+    drift: float
+    drift_sd: float
+    wander: float
+    drifts: bool
+    wanders: bool
+
+
+def _with_courses(
+    likelihood: Likelihood, config: FusionConfig, lags: Mapping[str, AxisLag]
+) -> tuple[dict[str, AxisLag], tuple[float | None, float | None]]:
+    """The lags with their courses over the longest run, and drift and wandering of a clock that all axes share."""
+    courses = {axis: _Course(*one) for axis in lags if (one := likelihood.shifts(axis, config, _PARTS)) is not None}
+    found = dict(lags)
+    for axis, course in courses.items():
+        trend, sd = _trend(course), np.sqrt(np.diag(np.linalg.inv(course.information)))
+        parts = zip(course.time.tolist(), course.shift.tolist(), sd.tolist(), strict=True)
+        found[axis] = msgspec.structs.replace(
+            found[axis],
+            drift=trend.drift,
+            drift_sd=trend.drift_sd,
+            drifts=trend.drifts,
+            wander=trend.wander if trend.wanders else 0.0,
+            course=[PartLag(time=time, shift=shift, sd=one) for time, shift, one in parts],
+        )
+    return found, _clock(list(courses.values()))
+
+
+def _trend(course: _Course) -> _Trend:
+    """A straight line through the shifts by least squares; its deviation is as large as the rest makes it."""
+    from scipy.special import chdtrc
+
+    G, span = course.information, len(course.time) * float(course.time[1] - course.time[0])
+    X = np.column_stack([np.ones(len(course.time)), (course.time - course.time.mean()) / span])
+    cov = np.linalg.inv(X.T @ G @ X)
+    line = cov @ (X.T @ G @ course.shift)
+    rest = course.shift - X @ line
+    free = len(rest) - 2
+    chi2 = float(rest @ G @ rest)
+    variance = np.diag(np.linalg.inv(G))
+    weight = 1.0 / variance
+    wander = math.sqrt(max(float(weight @ (rest**2 - variance) / weight.sum()), 0.0))
+    drift, sd = float(line[1]), math.sqrt(float(cov[1, 1]) * max(1.0, chi2 / free))
+    return _Trend(
+        drift=drift,
+        drift_sd=sd,
+        wander=wander,
+        drifts=abs(drift) > max(_DRIFTS * sd, _SMALLEST),
+        wanders=wander > _SMALLEST and float(chdtrc(free, chi2)) < _WANDERS,
+    )
+
+
+def _clock(courses: Sequence[_Course]) -> tuple[float | None, float | None]:
+    """By how much all axes drift and wander together; None where they do not, or each for itself."""
+    if len(courses) < 2:
+        return None, None
+    information = np.sum([one.information for one in courses], axis=0)
+    shift = np.linalg.solve(information, np.sum([one.information @ one.shift for one in courses], axis=0))
+    every = sum(float(one.shift @ one.information @ one.shift) for one in courses)
+    if float(shift @ information @ shift) < 0.5 * every:
+        return None, None
+    trend = _trend(_Course(courses[0].time, shift, information))
+    return trend.drift if trend.drifts else None, trend.wander if trend.wanders else None

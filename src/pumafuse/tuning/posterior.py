@@ -1,0 +1,489 @@
+"""The posterior of an axis's arm, averaged over models and delays: how late it is, and how sure that is.
+
+Neither the order of a plant nor the kind of its gain is known, and along a delay the likelihood has many maxima, also
+whole update periods away. An interval from one maximum is too narrow. So each model is maximised at delays on both
+sides of its maxima, and weighed by what Laplace's approximation makes of the other numbers there (Rue, Martino &
+Chopin, "Approximate Bayesian inference by integrated nested Laplace approximations", JRSS B 71, 2009). Intervals are
+quantiles of the mixture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..fusion.config import FusionConfig
+from .identifiability import covariance
+from .likelihood import Likelihood
+from .maximise import Point, derivatives, maximise, past_bumps
+from .parameters import Parameter, changed, coordinates, moved, parameters, with_lag, with_order, with_recovery
+
+Quantity: TypeAlias = Literal[
+    "lag", "delay", "gain", "gain_recovery", "time_constant", "natural_frequency", "damping"
+]  # s, but for the gain, ω [rad/s] and ζ
+QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
+GainKind: TypeAlias = Literal["none", "static", "recovering"]
+
+LONGEST_DELAY = 0.6  # s
+_PLANT_BOUNDS = {"time_constant": (1e-3, 2.0), "natural_frequency": (0.5, 2e3), "damping": (0.2, 8.0)}
+_INTERCEPTS = (0.4, 1.6)
+_DAMPING_PRIOR = (0.0, 0.7)  # of ln ζ: what is sold as an axis neither rings for ever nor has two lags far apart
+_LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each as likely
+_SHARES = (0.3, 0.6, 0.9)  # of the lag that is delay: starts
+_GAINS = ((0.9, 0.1), (1.1, 0.1), (1.0, 0.3))  # starts: gain and recovery [s]
+_ROUGHLY = 0.1  # tolerance in log-likelihood
+_FORLORN = 8.0  # log-likelihood behind the best, after the penalty, from which a model or a delay counts for nothing
+_STEP = 0.5  # standard deviations, between delays
+_SHORTEST, _LONGEST = 2e-5, 0.03  # s, of a step
+_MOST = 16  # steps away from a maximum
+_GRID = 2000
+_REFINED = 8  # points between two delays, along which everything is interpolated
+_AS_LIKELY = 0.2  # of the most likely model's probability: the simplest of such models is taken
+_OWN_WIDTH = 0.05  # s: how far apart the delays of axes that do not share one are a priori
+
+
+class Model(NamedTuple):
+    """An order of the plant with a kind of gain."""
+
+    order: int
+    gain: GainKind
+
+    @property
+    def size(self) -> int:
+        """How many numbers it has beside the delay."""
+        return self.order + ("none", "static", "recovering").index(self.gain)
+
+
+MODELS = tuple(Model(*one) for one in product((1, 2), ("none", "static", "recovering")))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """The most likely arm of a model with one delay.
+
+    Attributes:
+        delay: The delay [s].
+        config: The configuration.
+        log_density: Of the delay and the model, with Laplace's approximation for the other numbers.
+        means: Of each quantity that the model has.
+        sds: Their standard deviations at this delay.
+    """
+
+    delay: float
+    config: FusionConfig
+    log_density: float
+    means: Mapping[Quantity, float]
+    sds: Mapping[Quantity, float]
+
+
+@dataclass(frozen=True)
+class Branch:
+    """The entries of a model about one of its maxima, by delay."""
+
+    model: Model
+    entries: Sequence[Entry]
+
+    @property
+    def delays(self) -> FloatArray:
+        """Of the entries [s], (n,)."""
+        return np.array([one.delay for one in self.entries])
+
+    @property
+    def log_density(self) -> FloatArray:
+        """Of the entries, (n,)."""
+        return np.array([one.log_density for one in self.entries])
+
+    def at(self, delays: FloatArray) -> FloatArray:
+        """The log-density at delays, as it falls at the ends beyond them, (m,)."""
+        known, found = self.delays, self.log_density
+        if len(known) < 2:
+            return np.where(np.abs(delays - known[0]) < _SHORTEST, found[0], -np.inf)
+        middle = np.interp(delays, known, found)
+        low, high = (found[1] - found[0]) / (known[1] - known[0]), (found[-1] - found[-2]) / (known[-1] - known[-2])
+        below = found[0] + max(low, 0.0) * (delays - known[0])
+        above = found[-1] + min(high, 0.0) * (delays - known[-1])
+        return np.where(delays < known[0], below, np.where(delays > known[-1], above, middle))
+
+
+class Interval(NamedTuple):
+    """A number and its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+class Mixture(NamedTuple):
+    """Points of all branches between their entries, (n,).
+
+    Attributes:
+        weight: Their probabilities.
+        model: Numbers in :data:`MODELS`.
+        delay: Their delays [s].
+        mean: Of each quantity there; NaN where the model does not have it.
+        sd: Its standard deviation there.
+    """
+
+    weight: FloatArray
+    model: FloatArray
+    delay: FloatArray
+    mean: Mapping[Quantity, FloatArray]
+    sd: Mapping[Quantity, FloatArray]
+
+    def quantiles(self, quantity: Quantity, chosen: Callable[[Model], bool], share: float = 0.95) -> tuple[float, ...]:
+        """The ends of the middle ``share`` of a quantity under the models that are chosen."""
+        models = np.array([chosen(one) for one in MODELS])
+        mine = models[self.model.astype(np.int64)] & np.isfinite(self.mean[quantity]) & (self.weight > 1e-9)
+        mean, sd, weight = self.mean[quantity][mine], self.sd[quantity][mine], self.weight[mine]
+        from scipy.special import ndtr  # takes a while to import
+
+        sd = np.maximum(sd, 1e-12)
+        grid = np.unique(np.concatenate([mean + times * sd for times in np.linspace(-4.0, 4.0, 33)]))
+        if len(grid) > _GRID:
+            grid = grid[np.linspace(0, len(grid) - 1, _GRID).astype(np.int64)]
+        below = ndtr((grid[:, None] - mean) / sd) @ weight / weight.sum()
+        return tuple(float(np.interp(0.5 + sign * 0.5 * share, below, grid)) for sign in (-1.0, 1.0))
+
+
+@dataclass(frozen=True)
+class AxisPosterior:
+    """The posterior of one axis.
+
+    Attributes:
+        axis: Its name.
+        branches: Of all models that count.
+    """
+
+    axis: str
+    branches: Sequence[Branch]
+
+    def log_density(self, delays: FloatArray) -> FloatArray:
+        """The log-density of the delay, all models together, (m,)."""
+        found = np.full(len(delays), -np.inf)
+        for model in {branch.model for branch in self.branches}:
+            each = [branch.at(delays) for branch in self.branches if branch.model == model]
+            found = np.logaddexp(found, np.max(each, axis=0))
+        return found
+
+    def mixture(self, others: Callable[[FloatArray], FloatArray]) -> Mixture:
+        """The mixture, with the log-density of the delay by other axes."""
+        parts = [self._points(branch) for branch in self.branches]
+        logs = np.concatenate([log for log, _, _, _, _ in parts])
+        delay = np.concatenate([delay for _, _, delay, _, _ in parts])
+        logs = logs + others(delay)
+        weight = np.exp(logs - logs.max())
+        means, sds = (
+            {name: np.concatenate([part[place].get(name, np.full(len(part[0]), np.nan)) for part in parts])
+             for name in QUANTITIES}
+            for place in (3, 4)
+        )
+        return Mixture(weight / weight.sum(), np.concatenate([part[1] for part in parts]), delay, means, sds)
+
+    def _points(
+        self, branch: Branch
+    ) -> tuple[FloatArray, FloatArray, FloatArray, dict[Quantity, FloatArray], dict[Quantity, FloatArray]]:
+        """Log-weights, models, delays, means and deviations at points between the entries of a branch."""
+        known = branch.delays
+        place = np.linspace(0.0, len(known) - 1.0, _REFINED * (len(known) - 1) + 1)
+        index = np.arange(len(known))
+        delay = np.interp(place, index, known)
+        width = np.gradient(delay) if len(delay) > 1 else np.array([_SHORTEST])
+        log = branch.at(delay) + np.log(width)
+        for other in self.branches:  # of two maxima that meet, each counts where it is the higher one
+            if other is not branch and other.model == branch.model:
+                log = np.where(other.at(delay) > branch.at(delay) + 1e-9, -np.inf, log)
+        means, sds = (
+            {name: np.interp(place, index, [getattr(one, field)[name] for one in branch.entries])
+             for name in branch.entries[0].means}
+            for field in ("means", "sds")
+        )
+        return log, np.full(len(delay), MODELS.index(branch.model)), delay, means, sds
+
+
+# ---- one axis -------------------------------------------------------------------------------------------------------
+
+
+def axis_posterior(likelihood: Likelihood, start: FusionConfig, axis: str) -> AxisPosterior:
+    """The posterior of an axis's arm.
+
+    Args:
+        likelihood: Of this axis alone.
+        start: A configuration with its lag and its noise roughly right, and a delay of its own for the axis.
+        axis: The axis.
+    """
+    search = _AxisSearch(likelihood, start, axis)
+    peaks = search.peaks()
+    best = max(search.evidence(model, peak) for model, peak in peaks)
+    branches: list[Branch] = []
+    for model, peak in peaks:
+        if search.evidence(model, peak) > best - _FORLORN and not _walked(branches, model, search.delay_of(peak)):
+            branches.append(search.walk(model, peak))
+    return AxisPosterior(axis, branches)
+
+
+def _walked(branches: Sequence[Branch], model: Model, delay: float) -> bool:
+    return any(one.model == model and one.delays[0] <= delay <= one.delays[-1] for one in branches)
+
+
+class _AxisSearch:
+    """Maxima of each model of an axis, and the walk from one along the delay."""
+
+    def __init__(self, likelihood: Likelihood, start: FusionConfig, axis: str) -> None:
+        self.likelihood, self.start, self.axis = likelihood, start, axis
+        self._lag = start.arm.lag_of(axis)
+
+    def delay_of(self, peak: Point) -> float:
+        return peak.config.arm.delay_of(self.axis)
+
+    def free(self, config: FusionConfig, model: Model, fits: Sequence[str]) -> list[Parameter]:
+        """The free parameters of a model, of these kinds; a noise that has vanished stays so."""
+        every = parameters(
+            config, self.start, {self.axis: self.likelihood.sensors[self.axis]}, ["noise", "delay", "plant", "gain"]
+        )
+        found: list[Parameter] = []
+        for one in every:
+            field = one.path[-1]
+            if one.axis != self.axis or one.fit not in fits or field.startswith("maneuver"):
+                continue
+            if field == "intercept" and model.gain == "none":
+                continue
+            if one.fit == "noise":
+                one = replace(one, prior=None)
+            elif one.fit == "delay":
+                one = replace(one, bounds=(0.0, LONGEST_DELAY))
+            elif field in _PLANT_BOUNDS:
+                one = replace(one, bounds=_PLANT_BOUNDS[field], prior=_DAMPING_PRIOR if field == "damping" else None)
+            elif field == "intercept":
+                one = replace(one, bounds=_INTERCEPTS)
+            found.append(one)
+        return found
+
+    def everything(self, config: FusionConfig, model: Model) -> list[Parameter]:
+        """All free parameters but the noises that have vanished."""
+        found = self.free(config, model, ("noise", "delay", "plant", "gain"))
+        return [one for one in found if not (one.vanishes and one.at_bound(config) == "lower")]
+
+    def maximum(self, model: Model, starts: Sequence[FusionConfig]) -> Point:
+        """The best of the maxima nearest to several starts."""
+        found = [
+            maximise(self.likelihood, start, self.everything(start, model), tolerance=_ROUGHLY) for start in starts
+        ]
+        best = max(found, key=lambda one: one.log_posterior)
+        return past_bumps(self.likelihood, best, self.everything(best.config, model))
+
+    def with_model(self, config: FusionConfig, model: Model, gain: float = 1.0, recovery: float = 0.1) -> FusionConfig:
+        """A configuration with another model that responds alike, as far as it can."""
+        config = with_order(config, self.axis, model.order)
+        now = config.arm.axes[self.axis]
+        if model.gain != "recovering":
+            config = with_recovery(config, self.axis, None)
+        elif now.gain_recovery is None:
+            config = with_recovery(config, self.axis, recovery)
+        kept = now.gain.intercept if (now.gain_recovery is None) == (model.gain == "static") else gain
+        return changed(config, ("arm", "axes", self.axis, "gain", "intercept"), 1.0 if model.gain == "none" else kept)
+
+    def with_delay(self, config: FusionConfig, delay: float) -> FusionConfig:
+        """A configuration with another delay, and so much less or more lag of the plant."""
+        now = config.arm
+        delay = min(max(delay, 0.0), LONGEST_DELAY)
+        rest = now.axes[self.axis].plant.lag - (delay - now.delay_of(self.axis))
+        config = changed(config, ("arm", "axes", self.axis, "delay"), delay)
+        return with_lag(config, self.axis, min(max(rest, 0.002, 0.1 * self._lag), 2.0))
+
+    def peaks(self) -> list[tuple[Model, Point]]:
+        """The maxima of every model: from several delays and gains, from each other, and an update period away."""
+        first = Model(1, "none")
+        plain = self.with_model(self.start, first)
+        best = {first: self.maximum(first, [self.with_delay(plain, share * self._lag) for share in _SHARES])}
+        for model in MODELS[1:]:
+            simpler = [Model(order, model.gain) for order in range(1, model.order)] or [first]
+            start = best[simpler[-1]].config
+            starts = [self.with_model(start, model)]
+            if model.gain == "recovering" and model.order == 1:
+                starts = [self.with_model(start, model, gain, recovery) for gain, recovery in _GAINS]
+            if model.order == 2:
+                lag = start.arm.axes[self.axis].plant.lag
+                starts.append(self.with_delay(starts[0], self.delay_of(best[simpler[-1]]) - 0.4 * lag))
+            best[model] = self.maximum(model, starts)
+        found = [(model, peak) for model, peak in best.items()]
+        highest = max(self.evidence(model, peak) for model, peak in found)
+        period = self.start.arm.update_period
+        for model, peak in list(found):
+            if self.evidence(model, peak) < highest - _FORLORN:
+                continue
+            for ticks in (-1.0, 1.0):
+                beside = self.with_delay(peak.config, self.delay_of(peak) + ticks * period)
+                found.append((model, self.maximum(model, [beside])))
+        return sorted(found, key=lambda one: -self.evidence(*one))
+
+    def evidence(self, model: Model, peak: Point) -> float:
+        """The log-density of a maximum with the penalty for the model's numbers, roughly."""
+        arm = [one for one in self.free(peak.config, model, ("delay", "plant", "gain")) if one.at_bound(peak.config) is None]
+        information = derivatives(self.likelihood, peak, arm).information
+        return _laplace(peak.log_posterior, information, arm) if arm else peak.log_posterior
+
+    def walk(self, model: Model, peak: Point) -> Branch:
+        """The entries of a model about a maximum, until they count for nothing."""
+        arm = self.free(peak.config, model, ("delay", "plant", "gain"))
+        cov = covariance(derivatives(self.likelihood, peak, arm).information, arm)
+        place = next(number for number, one in enumerate(arm) if one.fit == "delay")
+        others = [one for one in arm if one.fit != "delay"]
+        sd = float(np.sqrt(cov[place, place]))
+        slope = np.delete(cov[:, place] / cov[place, place], place)
+        step = min(max(_STEP * sd, _SHORTEST), _LONGEST)
+        middle = self._entry(model, peak, others)
+        sides = [list(self._side(model, peak, others, sign * step, sign * step * slope, middle)) for sign in (-1.0, 1.0)]
+        return Branch(model, [*reversed(sides[0]), middle, *sides[1]])
+
+    def _side(
+        self, model: Model, peak: Point, others: Sequence[Parameter], step: float, move: FloatArray, middle: Entry
+    ) -> Iterator[Entry]:
+        low, high = np.array([one.range for one in others]).reshape(-1, 2).T
+        before, top = peak.config, middle.log_density
+        at = coordinates(before, others)
+        for _ in range(_MOST):
+            delay = before.arm.delay_of(self.axis) + step
+            if not -abs(step) < delay <= LONGEST_DELAY:
+                return
+            there = changed(before, ("arm", "axes", self.axis, "delay"), max(delay, 0.0))
+            there = moved(there, others, np.clip(at + move, low, high))
+            found = maximise(self.likelihood, there, others, tolerance=_ROUGHLY)
+            entry = self._entry(model, found, others)
+            yield entry
+            top = max(top, entry.log_density)
+            if entry.log_density < top - _FORLORN or delay <= 0.0:
+                return
+            before, after = found.config, coordinates(found.config, others)
+            move, at = after - at, after
+
+    def _entry(self, model: Model, found: Point, others: Sequence[Parameter]) -> Entry:
+        """An entry from the most likely configuration with its delay."""
+        inside = [one for one in others if one.at_bound(found.config) is None]
+        information = derivatives(self.likelihood, found, inside).information if inside else np.zeros((0, 0))
+        cov = covariance(information, inside) if inside else information
+        means, sds = dict[Quantity, float](), dict[Quantity, float]()
+        for name, measure in _measures(self.axis, found.config).items():
+            at = measure(found.config)
+            slope = np.array([(measure(one.move(found.config, one.at(found.config) + 1e-5)) - at) / 1e-5 for one in inside])
+            means[name], sds[name] = at, float(np.sqrt(max(slope @ cov @ slope, 0.0))) if inside else 0.0
+        density = _laplace(found.log_posterior, information, inside)
+        return Entry(found.config.arm.delay_of(self.axis), found.config, density, means, sds)
+
+
+def _laplace(log_posterior: float, information: FloatArray, free: Sequence[Parameter]) -> float:
+    """The log-density with the free numbers integrated out, each with its prior's constant."""
+    log = log_posterior
+    for one in free:
+        if one.prior is not None:
+            log -= math.log(one.prior[1] * math.sqrt(2.0 * math.pi))
+        elif one.fit == "plant":
+            log -= _LOG_RANGE
+        elif one.fit == "delay":
+            log -= math.log(LONGEST_DELAY)
+    if len(free):
+        size = np.sqrt(np.maximum(np.diag(information), 1e-9))
+        _, determinant = np.linalg.slogdet(information / np.outer(size, size) + 1e-9 * np.eye(len(free)))
+        log -= 0.5 * (float(determinant) + 2.0 * float(np.log(size).sum())) - 0.5 * len(free) * math.log(2.0 * math.pi)
+    return log
+
+
+def _measures(axis: str, config: FusionConfig) -> dict[Quantity, Callable[[FusionConfig], float]]:
+    """How each quantity is computed from a configuration; those that can only be positive as logarithms."""
+    arm = config.arm.axes[axis]
+    found: dict[Quantity, Callable[[FusionConfig], float]] = {
+        "lag": lambda at: at.arm.lag_of(axis),
+        "delay": lambda at: at.arm.delay_of(axis),
+        "gain": lambda at: at.arm.axes[axis].gain.intercept,
+    }
+    for name in ("time_constant", "natural_frequency", "damping"):
+        if hasattr(arm.plant, name):
+            found[name] = lambda at, name=name: math.log(getattr(at.arm.axes[axis].plant, name))
+    if arm.gain_recovery is not None:
+        found["gain_recovery"] = lambda at: math.log(at.arm.axes[axis].gain_recovery or 1.0)
+    return found
+
+
+# ---- axes together --------------------------------------------------------------------------------------------------
+
+
+def sharing(posteriors: Mapping[str, AxisPosterior]) -> list[str]:
+    """The axes that share one delay: all but those whose measurements are likelier with one of their own.
+
+    The delays of axes that do not share one are taken to lie within some 50 ms of each other.
+    """
+    if len(posteriors) < 2:
+        return []
+    grid = _grid(posteriors.values())
+    width = np.gradient(grid)
+    logs = {axis: one.log_density(grid) for axis, one in posteriors.items()}
+
+    def evidence(log: FloatArray) -> float:
+        top = float(log.max())
+        return top + math.log(float(np.exp(log - top) @ width)) if np.isfinite(top) else -np.inf
+
+    alone = {axis: evidence(log) for axis, log in logs.items()}
+
+    def gain(axes: Sequence[str]) -> float:
+        """How much likelier one delay for these axes is than one each."""
+        price = (len(axes) - 1) * math.log(_OWN_WIDTH)
+        return evidence(np.sum([logs[axis] for axis in axes], axis=0)) - sum(alone[axis] for axis in axes) + price
+
+    shares = list(posteriors)
+    while len(shares) > 1:
+        fewer = [[axis for axis in shares if axis != one] for one in shares]
+        best = max(fewer, key=lambda axes: gain(axes) if len(axes) > 1 else 0.0)
+        if gain(shares) >= (gain(best) if len(best) > 1 else 0.0):
+            return shares
+        shares = best
+    return []
+
+
+def shared_delay(posteriors: Sequence[AxisPosterior]) -> float:
+    """The most likely delay of axes that share one [s]."""
+    grid = _grid(posteriors)
+    return float(grid[int(np.argmax(np.sum([one.log_density(grid) for one in posteriors], axis=0)))])
+
+
+def _grid(posteriors: Iterable[AxisPosterior]) -> FloatArray:
+    """Delays that resolve the densities of all axes [s], ascending."""
+    known = np.unique(np.concatenate([branch.delays for one in posteriors for branch in one.branches]))
+    if len(known) < 2:
+        return known[0] + _SHORTEST * np.arange(-1.0, 2.0)
+    place = np.linspace(0.0, len(known) - 1.0, _REFINED * (len(known) - 1) + 1)
+    return np.interp(place, np.arange(len(known)), known)
+
+
+def chosen_model(mixture: Mixture) -> Model:
+    """The simplest of the models that are about as likely as the most likely one."""
+    shares = [float(mixture.weight[mixture.model == number].sum()) for number in range(len(MODELS))]
+    likely = [model for model, share in zip(MODELS, shares, strict=True) if share >= _AS_LIKELY * max(shares)]
+    return min(likely, key=lambda model: model.size)
+
+
+def fitted_with(
+    likelihood: Likelihood, start: FusionConfig, posterior: AxisPosterior, model: Model, delay: float | None
+) -> Point:
+    """The most likely configuration of a model with this delay, or at its best.
+
+    Args:
+        likelihood: Of this axis alone.
+        start: What the posterior was found from.
+        posterior: The posterior.
+        model: The model.
+        delay: The delay [s]; None: the best.
+    """
+    search = _AxisSearch(likelihood, start, posterior.axis)
+    entries = [one for branch in posterior.branches if branch.model == model for one in branch.entries]
+    if delay is None:
+        best = max(entries, key=lambda one: one.log_density).config
+        free = search.everything(best, model)
+        return past_bumps(likelihood, maximise(likelihood, best, free), free)
+    near = min(entries, key=lambda one: abs(one.delay - delay)).config
+    there = changed(near, ("arm", "axes", posterior.axis, "delay"), delay)
+    return maximise(likelihood, there, [one for one in search.everything(there, model) if one.fit != "delay"])
