@@ -32,18 +32,18 @@ from .likelihood import Likelihood
 from .maximise import Point, derivatives, ignore, maximise, past_bumps, point
 from .parameters import LATENCIES, Parameter, changed, parameters, with_axis_of, with_own_delays, with_shared_delay
 from .posterior import (
-    LONGEST_DELAY,
     AxisPosterior,
     Mixture,
     Model,
     Quantity,
+    arms,
     axis_posterior,
     chosen_model,
     fitted_with,
     shared_delay,
     sharing,
 )
-from .search import best_noise, most_likely_models, noise_models
+from .search import most_likely_models, noise_models
 
 REFERENCE = "reference"  # the name of a run's reference among its sensors
 _MARGIN = 1.3  # by which intervals of delay and plant are widened: found by simulation, see docs/benchmarks.md
@@ -332,28 +332,23 @@ def _known(config: FusionConfig, trusted: str) -> FusionConfig:
 
 
 def _fit(likelihood: Likelihood, config: FusionConfig, axis: str) -> _Fit:
-    """The posterior of an axis, with the noise that its measurements ask for."""
-    start = _with_noise(likelihood, config, axis)
-    return _Fit(likelihood, start, axis_posterior(likelihood, start, axis))
+    """The posterior of an axis, with the noise that its measurements ask for beside the best arm."""
+    found = arms(likelihood, _with_noise(likelihood, config, axis, ["ou"]), axis)
+    start = _with_noise(likelihood, found[0][1], axis, ["none", "matern", "ou"])
+    return _Fit(likelihood, start, axis_posterior(likelihood, start, axis, found))
 
 
-def _with_noise(likelihood: Likelihood, config: FusionConfig, axis: str) -> FusionConfig:
-    """The configuration with the kind of noise of an axis, and its size, beside a first-order arm."""
+def _with_noise(likelihood: Likelihood, config: FusionConfig, axis: str, kinds: Sequence[str]) -> FusionConfig:
+    """The configuration with the most likely noise of an axis, with a disturbance of one of these kinds."""
 
-    def free(at: FusionConfig, fit: Sequence[Any] = ("noise",)) -> list[Parameter]:
-        every = parameters(at, config, {axis: likelihood.sensors[axis]}, fit, ["maneuver_noise_mm_rtHz_per_m_s"], sd_prior=False)
-        wide = [replace(one, bounds=(0.0, LONGEST_DELAY)) if one.fit == "delay" else one for one in every]
-        return [one for one in wide if one.axis == axis and not one.path[-1].startswith("maneuver")]
-
-    def arm(at: FusionConfig) -> list[Parameter]:
-        return free(at, ("noise", "delay", "plant", "gain"))
+    def free(at: FusionConfig) -> list[Parameter]:
+        every = parameters(at, config, {axis: likelihood.sensors[axis]}, ["noise"], sd_prior=False)
+        return [one for one in every if one.axis == axis and not one.path[-1].startswith("maneuver")]
 
     found: list[Point] = []
-    for model in noise_models(likelihood, config, free):
-        if found:
-            model = msgspec.structs.replace(model, arm=found[0].config.arm)
-        best = best_noise(likelihood, model, free(model), ignore)
-        found.append(maximise(likelihood, best, arm(best), tolerance=_ROUGHLY))
+    for kind, model in zip(("none", "matern", "ou"), noise_models(likelihood, config, free), strict=True):
+        if kind in kinds:
+            found.append(maximise(likelihood, model, free(model), tolerance=_ROUGHLY))
     return most_likely_models(likelihood, [(one, {}) for one in found], free)[0]
 
 

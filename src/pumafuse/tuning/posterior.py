@@ -21,8 +21,9 @@ from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
 from .identifiability import covariance
 from .likelihood import Likelihood
-from .maximise import Point, derivatives, maximise, past_bumps
-from .parameters import Parameter, changed, coordinates, moved, parameters, with_lag, with_order, with_recovery
+from ..model.plants import FirstOrder, SecondOrder
+from .maximise import Point, derivatives, maximise, past_bumps, point
+from .parameters import Fit, Parameter, changed, coordinates, moved, parameters, with_lag, with_order, with_recovery
 
 Quantity: TypeAlias = Literal[
     "lag", "delay", "gain", "gain_recovery", "time_constant", "natural_frequency", "damping"
@@ -32,11 +33,16 @@ GainKind: TypeAlias = Literal["none", "static", "recovering"]
 
 LONGEST_DELAY = 0.6  # s
 _PLANT_BOUNDS = {"time_constant": (1e-3, 2.0), "natural_frequency": (0.5, 2e3), "damping": (0.2, 8.0)}
-_INTERCEPTS = (0.4, 1.6)
+_INTERCEPTS, _INTERCEPT_PRIOR = (0.4, 1.6), (1.0, 0.1)
+_RECOVERIES = (0.005, 2.0)  # s
 _DAMPING_PRIOR = (0.0, 0.7)  # of ln ζ: what is sold as an axis neither rings for ever nor has two lags far apart
 _LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each as likely
 _SHARES = (0.3, 0.6, 0.9)  # of the lag that is delay: starts
-_GAINS = ((0.9, 0.1), (1.1, 0.1), (1.0, 0.3))  # starts: gain and recovery [s]
+_ERRORS, _RECOVERING = (-0.12, -0.05, 0.05), (0.05, 0.12, 0.3)  # starts: gains less 1, recoveries [s]
+_EARLIER, _DAMPINGS = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no delay, ζ
+_CLIMBED = 2  # starts from which a maximum is looked for
+_SAME = 2e-4  # s, between delays of maxima that are one
+_ARM: tuple[Fit, ...] = ("delay", "plant", "gain")
 _ROUGHLY = 0.1  # tolerance in log-likelihood
 _FORLORN = 8.0  # log-likelihood behind the best, after the penalty, from which a model or a delay counts for nothing
 _STEP = 0.5  # standard deviations, between delays
@@ -209,8 +215,8 @@ class AxisPosterior:
 # ---- one axis -------------------------------------------------------------------------------------------------------
 
 
-def axis_posterior(likelihood: Likelihood, start: FusionConfig, axis: str) -> AxisPosterior:
-    """The posterior of an axis's arm.
+def arms(likelihood: Likelihood, start: FusionConfig, axis: str) -> list[tuple[Model, FusionConfig]]:
+    """The most likely arm of every model with its noise, and those an update period of delay away, the best first.
 
     Args:
         likelihood: Of this axis alone.
@@ -218,11 +224,26 @@ def axis_posterior(likelihood: Likelihood, start: FusionConfig, axis: str) -> Ax
         axis: The axis.
     """
     search = _AxisSearch(likelihood, start, axis)
-    peaks = search.peaks()
-    best = max(search.evidence(model, peak) for model, peak in peaks)
+    return [(model, peak.config) for model, peak in search.peaks()]
+
+
+def axis_posterior(
+    likelihood: Likelihood, start: FusionConfig, axis: str, found: Sequence[tuple[Model, FusionConfig]]
+) -> AxisPosterior:
+    """The posterior of an axis's arm.
+
+    Args:
+        likelihood: Of this axis alone.
+        start: A configuration with the kind of noise of the axis, and its size near the best.
+        axis: The axis.
+        found: Near which arms to look, from :func:`arms`.
+    """
+    search = _AxisSearch(likelihood, start, axis)
+    peaks = [(model, search.polished(model, search.with_arm_of(config))) for model, config in found]
+    ranked = sorted(((search.evidence(*one), *one) for one in peaks), key=lambda one: -one[0])
     branches: list[Branch] = []
-    for model, peak in peaks:
-        if search.evidence(model, peak) > best - _FORLORN and not _walked(branches, model, search.delay_of(peak)):
+    for evidence, model, peak in ranked:
+        if evidence > ranked[0][0] - _FORLORN and not _walked(branches, model, search.delay_of(peak)):
             branches.append(search.walk(model, peak))
     return AxisPosterior(axis, branches)
 
@@ -241,17 +262,13 @@ class _AxisSearch:
     def delay_of(self, peak: Point) -> float:
         return peak.config.arm.delay_of(self.axis)
 
-    def free(self, config: FusionConfig, model: Model, fits: Sequence[str]) -> list[Parameter]:
-        """The free parameters of a model, of these kinds; a noise that has vanished stays so."""
-        every = parameters(
-            config, self.start, {self.axis: self.likelihood.sensors[self.axis]}, ["noise", "delay", "plant", "gain"]
-        )
+    def free(self, config: FusionConfig, model: Model, fits: Sequence[Fit]) -> list[Parameter]:
+        """The free parameters of a model, of these kinds."""
+        every = parameters(config, self.start, {self.axis: self.likelihood.sensors[self.axis]}, fits)
         found: list[Parameter] = []
         for one in every:
             field = one.path[-1]
-            if one.axis != self.axis or one.fit not in fits or field.startswith("maneuver"):
-                continue
-            if field == "intercept" and model.gain == "none":
+            if one.axis != self.axis or field.startswith("maneuver") or (field == "intercept" and model.gain == "none"):
                 continue
             if one.fit == "noise":
                 one = replace(one, prior=None)
@@ -260,58 +277,98 @@ class _AxisSearch:
             elif field in _PLANT_BOUNDS:
                 one = replace(one, bounds=_PLANT_BOUNDS[field], prior=_DAMPING_PRIOR if field == "damping" else None)
             elif field == "intercept":
-                one = replace(one, bounds=_INTERCEPTS)
+                one = replace(one, bounds=_INTERCEPTS, prior=_INTERCEPT_PRIOR)
+            elif field == "gain_recovery":
+                one = replace(one, bounds=_RECOVERIES)
             found.append(one)
         return found
 
     def everything(self, config: FusionConfig, model: Model) -> list[Parameter]:
         """All free parameters but the noises that have vanished."""
-        found = self.free(config, model, ("noise", "delay", "plant", "gain"))
+        found = self.free(config, model, ("noise", *_ARM))
         return [one for one in found if not (one.vanishes and one.at_bound(config) == "lower")]
 
-    def maximum(self, model: Model, starts: Sequence[FusionConfig]) -> Point:
-        """The best of the maxima nearest to several starts."""
-        found = [
-            maximise(self.likelihood, start, self.everything(start, model), tolerance=_ROUGHLY) for start in starts
-        ]
-        best = max(found, key=lambda one: one.log_posterior)
+    def polished(self, model: Model, config: FusionConfig) -> Point:
+        """The maximum next to a configuration, arm and noise together."""
+        best = maximise(self.likelihood, config, self.everything(config, model), tolerance=_ROUGHLY)
         return past_bumps(self.likelihood, best, self.everything(best.config, model))
 
-    def with_model(self, config: FusionConfig, model: Model, gain: float = 1.0, recovery: float = 0.1) -> FusionConfig:
-        """A configuration with another model that responds alike, as far as it can."""
-        config = with_order(config, self.axis, model.order)
-        now = config.arm.axes[self.axis]
-        if model.gain != "recovering":
-            config = with_recovery(config, self.axis, None)
-        elif now.gain_recovery is None:
-            config = with_recovery(config, self.axis, recovery)
-        kept = now.gain.intercept if (now.gain_recovery is None) == (model.gain == "static") else gain
-        return changed(config, ("arm", "axes", self.axis, "gain", "intercept"), 1.0 if model.gain == "none" else kept)
+    def maximum(self, model: Model, starts: Iterable[FusionConfig]) -> Point:
+        """The best of the maxima of the arm next to the best starts, polished."""
+        tried = [point(self.likelihood, start, self.free(start, model, _ARM)) for start in starts]
+        tried.sort(key=lambda one: -one.log_posterior)
+        peaks = [
+            maximise(self.likelihood, one.config, self.free(one.config, model, _ARM), tolerance=_ROUGHLY)
+            for one in tried[:_CLIMBED]
+        ]
+        return self.polished(model, max(peaks, key=lambda one: one.log_posterior).config)
+
+    def with_arm_of(self, other: FusionConfig) -> FusionConfig:
+        """The configuration to start from with the arm of another one."""
+        return changed(self.start, ("arm", "axes", self.axis), other.arm.axes[self.axis])
+
+    def with_gain(self, config: FusionConfig, gain: float, recovery: float | None) -> FusionConfig:
+        """A configuration with another gain, and a plant that makes up for the lag that it brings."""
+        now, total = config.arm.axes[self.axis], config.arm.lag_of(self.axis)
+        config = with_recovery(config, self.axis, recovery)
+        config = changed(config, ("arm", "axes", self.axis, "gain", "intercept"), gain)
+        lag = now.plant.lag + total - config.arm.lag_of(self.axis)
+        return with_lag(config, self.axis, min(max(lag, 0.1 * now.plant.lag), 2.0))
 
     def with_delay(self, config: FusionConfig, delay: float) -> FusionConfig:
         """A configuration with another delay, and so much less or more lag of the plant."""
-        now = config.arm
-        delay = min(max(delay, 0.0), LONGEST_DELAY)
+        now, delay = config.arm, min(max(delay, 0.0), LONGEST_DELAY)
         rest = now.axes[self.axis].plant.lag - (delay - now.delay_of(self.axis))
         config = changed(config, ("arm", "axes", self.axis, "delay"), delay)
         return with_lag(config, self.axis, min(max(rest, 0.002, 0.1 * self._lag), 2.0))
 
+    def starts(self, model: Model, config: FusionConfig) -> Iterator[FusionConfig]:
+        """Configurations of a model that lag as much as another one does."""
+        now = config.arm.axes[self.axis]
+        kind = "none" if now.gain.intercept == 1.0 else "static" if now.gain_recovery is None else "recovering"
+        order = 1 if isinstance(now.plant, FirstOrder) else 2
+        if model.gain == "none":
+            gains: list[tuple[float, float | None]] = [(1.0, None)]
+        elif model.gain == "static":
+            gains = [(now.gain.intercept if kind == "static" else 1.0, None)]
+        elif kind == "recovering":
+            gains = [(now.gain.intercept, now.gain_recovery)]
+        else:
+            gains = [(1.0 + error, recovery) for error, recovery in product(_ERRORS, _RECOVERING)]
+        for gain, recovery in gains:
+            there = self.with_gain(config, gain, recovery)
+            if model.order == order:
+                yield there
+                continue
+            there = with_order(there, self.axis, model.order)
+            delay, lag = there.arm.delay_of(self.axis), there.arm.axes[self.axis].plant.lag
+            shapes = product(_EARLIER, _DAMPINGS if model.order == 2 else (1.0,))
+            for earlier, damping in shapes if len(gains) == 1 else ((0.3, 1.0),):
+                shaped = self.with_delay(there, delay + (earlier if model.order == 2 else -earlier) * -lag)
+                yield shaped if model.order == 1 else self._damped(shaped, damping)
+
+    def _damped(self, config: FusionConfig, damping: float) -> FusionConfig:
+        """A configuration with another damping, of the same lag."""
+        lag = config.arm.axes[self.axis].plant.lag
+        plant = SecondOrder(natural_frequency=2.0 * damping / lag, damping=damping)
+        return changed(config, ("arm", "axes", self.axis, "plant"), plant)
+
     def peaks(self) -> list[tuple[Model, Point]]:
         """The maxima of every model: from several delays and gains, from each other, and an update period away."""
         first = Model(1, "none")
-        plain = self.with_model(self.start, first)
+        plain = self.with_gain(with_order(self.start, self.axis, 1), 1.0, None)
         best = {first: self.maximum(first, [self.with_delay(plain, share * self._lag) for share in _SHARES])}
         for model in MODELS[1:]:
-            simpler = [Model(order, model.gain) for order in range(1, model.order)] or [first]
-            start = best[simpler[-1]].config
-            starts = [self.with_model(start, model)]
-            if model.gain == "recovering" and model.order == 1:
-                starts = [self.with_model(start, model, gain, recovery) for gain, recovery in _GAINS]
-            if model.order == 2:
-                lag = start.arm.axes[self.axis].plant.lag
-                starts.append(self.with_delay(starts[0], self.delay_of(best[simpler[-1]]) - 0.4 * lag))
-            best[model] = self.maximum(model, starts)
-        found = [(model, peak) for model, peak in best.items()]
+            near = [one for one in best if one.order <= model.order]
+            start = max(near, key=lambda one: self.evidence(one, best[one]))
+            best[model] = self.maximum(model, self.starts(model, best[start].config))
+        for model in MODELS:  # each from the best of all
+            other = max(best, key=lambda one: self.evidence(one, best[one]))
+            if other != model:
+                again = self.maximum(model, self.starts(model, best[other].config))
+                if again.log_posterior > best[model].log_posterior:
+                    best[model] = again
+        found = list(best.items())
         highest = max(self.evidence(model, peak) for model, peak in found)
         period = self.start.arm.update_period
         for model, peak in list(found):
@@ -319,18 +376,20 @@ class _AxisSearch:
                 continue
             for ticks in (-1.0, 1.0):
                 beside = self.with_delay(peak.config, self.delay_of(peak) + ticks * period)
-                found.append((model, self.maximum(model, [beside])))
+                again = self.maximum(model, [beside])
+                if all(abs(self.delay_of(again) - self.delay_of(one)) > _SAME for other, one in found if other == model):
+                    found.append((model, again))
         return sorted(found, key=lambda one: -self.evidence(*one))
 
     def evidence(self, model: Model, peak: Point) -> float:
         """The log-density of a maximum with the penalty for the model's numbers, roughly."""
-        arm = [one for one in self.free(peak.config, model, ("delay", "plant", "gain")) if one.at_bound(peak.config) is None]
+        arm = [one for one in self.free(peak.config, model, _ARM) if one.at_bound(peak.config) is None]
         information = derivatives(self.likelihood, peak, arm).information
         return _laplace(peak.log_posterior, information, arm) if arm else peak.log_posterior
 
     def walk(self, model: Model, peak: Point) -> Branch:
         """The entries of a model about a maximum, until they count for nothing."""
-        arm = self.free(peak.config, model, ("delay", "plant", "gain"))
+        arm = self.free(peak.config, model, _ARM)
         cov = covariance(derivatives(self.likelihood, peak, arm).information, arm)
         place = next(number for number, one in enumerate(arm) if one.fit == "delay")
         others = [one for one in arm if one.fit != "delay"]
