@@ -36,14 +36,12 @@ from .posterior import (
     Mixture,
     Model,
     Quantity,
-    arms,
     axis_posterior,
     chosen_model,
     fitted_with,
     shared_delay,
     sharing,
 )
-from .search import most_likely_models, noise_models
 
 REFERENCE = "reference"  # the name of a run's reference among its sensors
 _MARGIN = 1.3  # by which intervals of delay and plant are widened: found by simulation, see docs/benchmarks.md
@@ -183,10 +181,9 @@ class Latency:
 
 
 class _Fit(NamedTuple):
-    """One axis: its likelihood, where its search began, its posterior."""
+    """One axis: its likelihood and its posterior."""
 
     likelihood: Likelihood
-    start: FusionConfig
     posterior: AxisPosterior
 
 
@@ -214,7 +211,8 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     trusted = _trusted(config, every, sensor)
     likelihood = Likelihood(every, _known(config, trusted), [trusted])
     moving = excited_axes(likelihood, likelihood.config)
-    fits = {axis: _fit(likelihood.of_axis(axis), likelihood.config, axis) for axis in moving}
+    parts = {axis: likelihood.of_axis(axis) for axis in moving}
+    fits = {axis: _Fit(mine, axis_posterior(mine, likelihood.config, axis)) for axis, mine in parts.items()}
     config, lags = _arm(likelihood, fits, trusted)
     best, sensors = _sensors(every, config, trusted, moving)
     lags, clock = _with_courses(likelihood, config, lags)
@@ -331,27 +329,6 @@ def _known(config: FusionConfig, trusted: str) -> FusionConfig:
 # ---- axes -----------------------------------------------------------------------------------------------------------
 
 
-def _fit(likelihood: Likelihood, config: FusionConfig, axis: str) -> _Fit:
-    """The posterior of an axis, with the noise that its measurements ask for beside the best arm."""
-    found = arms(likelihood, _with_noise(likelihood, config, axis, ["ou"]), axis)
-    start = _with_noise(likelihood, found[0][1], axis, ["none", "matern", "ou"])
-    return _Fit(likelihood, start, axis_posterior(likelihood, start, axis, found))
-
-
-def _with_noise(likelihood: Likelihood, config: FusionConfig, axis: str, kinds: Sequence[str]) -> FusionConfig:
-    """The configuration with the most likely noise of an axis, with a disturbance of one of these kinds."""
-
-    def free(at: FusionConfig) -> list[Parameter]:
-        every = parameters(at, config, {axis: likelihood.sensors[axis]}, ["noise"], sd_prior=False)
-        return [one for one in every if one.axis == axis and not one.path[-1].startswith("maneuver")]
-
-    found: list[Point] = []
-    for kind, model in zip(("none", "matern", "ou"), noise_models(likelihood, config, free), strict=True):
-        if kind in kinds:
-            found.append(maximise(likelihood, model, free(model), tolerance=_ROUGHLY))
-    return most_likely_models(likelihood, [(one, {}) for one in found], free)[0]
-
-
 def _arm(
     likelihood: Likelihood, fits: Mapping[str, _Fit], trusted: str
 ) -> tuple[FusionConfig, dict[str, AxisLag]]:
@@ -368,7 +345,7 @@ def _arm(
 
         mixture = fit.posterior.mixture(elsewhere)
         model = chosen_model(mixture)
-        best = fitted_with(fit.likelihood, fit.start, fit.posterior, model, delay if axis in shares else None)
+        best = fitted_with(fit.likelihood, likelihood.config, fit.posterior, model, delay if axis in shares else None)
         config = with_axis_of(config, best.config, axis)
         lags[axis] = _axis_lag(fit.likelihood, best, mixture, model, axis, trusted, axis in shares)
     if delay is not None:

@@ -23,7 +23,20 @@ from .identifiability import covariance
 from .likelihood import Likelihood
 from ..model.plants import FirstOrder, SecondOrder
 from .maximise import Point, derivatives, maximise, past_bumps, point
-from .parameters import Fit, Parameter, changed, coordinates, moved, parameters, with_lag, with_order, with_recovery
+from .parameters import (
+    Fit,
+    Parameter,
+    changed,
+    coordinates,
+    moved,
+    parameters,
+    with_axis_of,
+    with_disturbance,
+    with_lag,
+    with_order,
+    with_recovery,
+)
+from .search import most_likely_models, noise_models
 
 Quantity: TypeAlias = Literal[
     "lag", "delay", "gain", "gain_recovery", "time_constant", "natural_frequency", "damping"
@@ -40,6 +53,9 @@ _LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each as likely
 _SHARES = (0.3, 0.6, 0.9)  # of the lag that is delay: starts
 _ERRORS, _RECOVERING = (-0.12, -0.05, 0.05), (0.05, 0.12, 0.3)  # starts: gains less 1, recoveries [s]
 _EARLIER, _DAMPINGS = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no delay, ζ
+_ROUNDS = 2  # of least squares
+_NEARLY = 40.0  # log-likelihood that a better noise may gain
+_WORSE = 2.0  # log-likelihood behind the best of all, from which a model is looked for again
 _CLIMBED = 2  # starts from which a maximum is looked for
 _SAME = 2e-4  # s, between delays of maxima that are one
 _ARM: tuple[Fit, ...] = ("delay", "plant", "gain")
@@ -215,35 +231,20 @@ class AxisPosterior:
 # ---- one axis -------------------------------------------------------------------------------------------------------
 
 
-def arms(likelihood: Likelihood, start: FusionConfig, axis: str) -> list[tuple[Model, FusionConfig]]:
-    """The most likely arm of every model with its noise, and those an update period of delay away, the best first.
-
-    Args:
-        likelihood: Of this axis alone.
-        start: A configuration with its lag and its noise roughly right, and a delay of its own for the axis.
-        axis: The axis.
-    """
-    search = _AxisSearch(likelihood, start, axis)
-    return [(model, peak.config) for model, peak in search.peaks()]
-
-
-def axis_posterior(
-    likelihood: Likelihood, start: FusionConfig, axis: str, found: Sequence[tuple[Model, FusionConfig]]
-) -> AxisPosterior:
+def axis_posterior(likelihood: Likelihood, start: FusionConfig, axis: str) -> AxisPosterior:
     """The posterior of an axis's arm.
 
     Args:
         likelihood: Of this axis alone.
-        start: A configuration with the kind of noise of the axis, and its size near the best.
+        start: A configuration with its lag roughly right, and a delay of its own for the axis.
         axis: The axis.
-        found: Near which arms to look, from :func:`arms`.
     """
     search = _AxisSearch(likelihood, start, axis)
-    peaks = [(model, search.polished(model, search.with_arm_of(config))) for model, config in found]
-    ranked = sorted(((search.evidence(*one), *one) for one in peaks), key=lambda one: -one[0])
+    peaks = search.peaks()
+    best = peaks[0][0]
     branches: list[Branch] = []
-    for evidence, model, peak in ranked:
-        if evidence > ranked[0][0] - _FORLORN and not _walked(branches, model, search.delay_of(peak)):
+    for evidence, model, peak in peaks:
+        if evidence > best - _FORLORN and not _walked(branches, model, search.delay_of(peak)):
             branches.append(search.walk(model, peak))
     return AxisPosterior(axis, branches)
 
@@ -294,18 +295,38 @@ class _AxisSearch:
         return past_bumps(self.likelihood, best, self.everything(best.config, model))
 
     def maximum(self, model: Model, starts: Iterable[FusionConfig]) -> Point:
-        """The best of the maxima of the arm next to the best starts, polished."""
+        """The best of the maxima of the arm next to the best starts, the noise as it is."""
         tried = [point(self.likelihood, start, self.free(start, model, _ARM)) for start in starts]
         tried.sort(key=lambda one: -one.log_posterior)
         peaks = [
             maximise(self.likelihood, one.config, self.free(one.config, model, _ARM), tolerance=_ROUGHLY)
             for one in tried[:_CLIMBED]
         ]
-        return self.polished(model, max(peaks, key=lambda one: one.log_posterior).config)
+        return max(peaks, key=lambda one: one.log_posterior)
 
-    def with_arm_of(self, other: FusionConfig) -> FusionConfig:
-        """The configuration to start from with the arm of another one."""
-        return changed(self.start, ("arm", "axes", self.axis), other.arm.axes[self.axis])
+    def with_white_noise(self, config: FusionConfig) -> FusionConfig:
+        """The configuration with all that the arm leaves over as noise of the sensors: for least squares."""
+        left = self.likelihood.misfit(config)[self.axis]
+        for one in self.free(config, MODELS[0], ["noise"]):
+            config = one.put(config, one.clipped(left) if one.sensor else one.bounds[0])
+        return with_disturbance(config, self.axis, 0.0, config.process[self.axis].disturbance_time)
+
+    def with_noise(self, config: FusionConfig, kinds: Sequence[str]) -> FusionConfig:
+        """The configuration with the most likely noise, with a disturbance of one of these kinds."""
+
+        def free(at: FusionConfig) -> list[Parameter]:
+            return self.free(at, MODELS[0], ["noise"])
+
+        models = zip(("none", "matern", "ou"), noise_models(self.likelihood, config, free), strict=True)
+        found = [
+            maximise(self.likelihood, model, free(model), tolerance=_ROUGHLY) for kind, model in models if kind in kinds
+        ]
+        return most_likely_models(self.likelihood, [(one, {}) for one in found], free)[0]
+
+    def with_noise_of(self, config: FusionConfig, other: FusionConfig) -> FusionConfig:
+        """The configuration with the noise of another one."""
+        arm = config.arm.axes[self.axis]
+        return changed(with_axis_of(config, other, self.axis), ("arm", "axes", self.axis), arm)
 
     def with_gain(self, config: FusionConfig, gain: float, recovery: float | None) -> FusionConfig:
         """A configuration with another gain, and a plant that makes up for the lag that it brings."""
@@ -353,33 +374,57 @@ class _AxisSearch:
         plant = SecondOrder(natural_frequency=2.0 * damping / lag, damping=damping)
         return changed(config, ("arm", "axes", self.axis, "plant"), plant)
 
-    def peaks(self) -> list[tuple[Model, Point]]:
-        """The maxima of every model: from several delays and gains, from each other, and an update period away."""
-        first = Model(1, "none")
-        plain = self.with_gain(with_order(self.start, self.axis, 1), 1.0, None)
-        best = {first: self.maximum(first, [self.with_delay(plain, share * self._lag) for share in _SHARES])}
+    def peaks(self) -> list[tuple[float, Model, Point]]:
+        """The maxima of every model with their evidence, the best first.
+
+        By least squares at first: noise that is fitted to a poor arm explains what a better one would. Then with the
+        noise that the best arm leaves, each model from the best of all, too; and an update period of delay away.
+        """
+        plain = self.with_white_noise(self.with_gain(with_order(self.start, self.axis, 1), 1.0, None))
+        best = {MODELS[0]: self.maximum(MODELS[0], [self.with_delay(plain, share * self._lag) for share in _SHARES])}
         for model in MODELS[1:]:
-            near = [one for one in best if one.order <= model.order]
-            start = max(near, key=lambda one: self.evidence(one, best[one]))
-            best[model] = self.maximum(model, self.starts(model, best[start].config))
-        for model in MODELS:  # each from the best of all
-            other = max(best, key=lambda one: self.evidence(one, best[one]))
-            if other != model:
-                again = self.maximum(model, self.starts(model, best[other].config))
-                if again.log_posterior > best[model].log_posterior:
-                    best[model] = again
-        found = list(best.items())
-        highest = max(self.evidence(model, peak) for model, peak in found)
-        period = self.start.arm.update_period
-        for model, peak in list(found):
-            if self.evidence(model, peak) < highest - _FORLORN:
-                continue
-            for ticks in (-1.0, 1.0):
-                beside = self.with_delay(peak.config, self.delay_of(peak) + ticks * period)
-                again = self.maximum(model, [beside])
-                if all(abs(self.delay_of(again) - self.delay_of(one)) > _SAME for other, one in found if other == model):
-                    found.append((model, again))
-        return sorted(found, key=lambda one: -self.evidence(*one))
+            best[model] = self.maximum(model, self.starts(model, self._best(best).config))
+        for _ in range(_ROUNDS):
+            noise = self.with_white_noise(self._best(best).config)
+            best = self._again(best, noise)
+        for kinds in (["ou"], ["none", "matern", "ou"]):
+            best = self._again(best, self.with_noise(self._best(best).config, kinds))
+        found: list[tuple[float, Model, Point]] = []
+        for model, peak in best.items():
+            if self.evidence(model, peak) > self.evidence(*self._most_evident(best)) - _NEARLY:
+                found.append(self._weighed(model, self.polished(model, peak.config)))
+        highest, period = max(one[0] for one in found), self.start.arm.update_period
+        for evidence, model, peak in list(found):
+            for ticks in (-1.0, 1.0) if evidence > highest - _FORLORN else ():
+                beside = self.maximum(model, [self.with_delay(peak.config, self.delay_of(peak) + ticks * period)])
+                known = [self.delay_of(one) for _, other, one in found if other == model]
+                if min(abs(self.delay_of(beside) - delay) for delay in known) > _SAME:
+                    found.append(self._weighed(model, self.polished(model, beside.config)))
+        return sorted(found, key=lambda one: -one[0])
+
+    def _again(self, best: Mapping[Model, Point], noise: FusionConfig) -> dict[Model, Point]:
+        """The maximum of each model with another noise, from where it was and from the best of all."""
+        known = {model: self.with_noise_of(peak.config, noise) for model, peak in best.items()}
+        top = self._best(best).config
+        found = {
+            model: self.maximum(model, [config, *self.starts(model, self.with_noise_of(top, noise))])
+            for model, config in known.items()
+        }
+        other = self._best(found)
+        return {
+            model: max(peak, self.maximum(model, self.starts(model, other.config)), key=lambda one: one.log_posterior)
+            if other.log_posterior > peak.log_posterior + _WORSE else peak
+            for model, peak in found.items()
+        }
+
+    def _best(self, found: Mapping[Model, Point]) -> Point:
+        return max(found.values(), key=lambda one: one.log_posterior)
+
+    def _most_evident(self, found: Mapping[Model, Point]) -> tuple[Model, Point]:
+        return max(found.items(), key=lambda one: self.evidence(*one))
+
+    def _weighed(self, model: Model, peak: Point) -> tuple[float, Model, Point]:
+        return self.evidence(model, peak), model, peak
 
     def evidence(self, model: Model, peak: Point) -> float:
         """The log-density of a maximum with the penalty for the model's numbers, roughly."""
