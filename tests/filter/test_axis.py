@@ -122,7 +122,7 @@ def test_two_intervals_are_one(axis: int) -> None:
     predict(model, state, axis, axis, 7_000_001)
     predict(model, state, axis, axis, 40_000_000)
     predict(model, whole, axis, axis, 40_000_000)
-    for part, other in zip(state, whole, strict=True):
+    for part, other in zip(state[:-1], whole[:-1], strict=True):  # the last are the intervals themselves
         np.testing.assert_allclose(part, other, rtol=1e-11, atol=1e-18)
     before = state.x.copy()
     predict(model, state, axis, axis, 30_000_000)

@@ -14,7 +14,7 @@ _COARSE, _FINE = 0.01, 0.001  # s, steps of a lag
 # s, over which changes are taken: long where noise is large; from the mean where it is most of the run, as on a path at
 # constant speed, which says more of the lag than its ends do.
 _SPANS = (0.1, 0.5, 2.0, math.inf)
-_MOST = 3000  # changes
+_MOST, _FEW = 3000, 500  # changes, and for a first look
 _FEWEST = 20
 _OUTLYING, _AGREEING = 8.0, 2.0  # sds
 _NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
@@ -101,16 +101,16 @@ def _at_span(
     low, high = np.quantile(change, [0.01, 0.99])  # outliers
     change = np.clip(change, low, high)
 
-    def moves(lag: float) -> FloatArray:
-        return changes(np.interp(begin - lag, t, u), np.interp(end - lag, t, u))
+    def moves(lag: float, every: int = 1) -> FloatArray:
+        return changes(np.interp(begin[::every] - lag, t, u), np.interp(end[::every] - lag, t, u))
 
-    def correlation(lag: float) -> float:
-        other = moves(lag)
-        norm = math.sqrt(float(other @ other) * float(change @ change))
-        return float(other @ change) / norm if norm > 0.0 else 0.0
+    def correlation(lag: float, every: int = 1) -> float:
+        other, mine = moves(lag, every), change[::every]
+        norm = math.sqrt(float(other @ other) * float(mine @ mine))
+        return float(other @ mine) / norm if norm > 0.0 else 0.0
 
-    coarse = np.arange(_EARLIEST, _LATEST, _COARSE)
-    found = np.array([correlation(lag) for lag in coarse])
+    coarse, every = np.arange(_EARLIEST, _LATEST, _COARSE), max(1, len(change) // _FEW)
+    found = np.array([correlation(lag, every) for lag in coarse])
     if not np.abs(found).any():
         return None
     sign = -1.0 if -found.min() > found.max() + _MIRRORED else 1.0

@@ -34,6 +34,12 @@ REVERTING, VARIANCE = range(2)  # of a state of the rest
 START, U, STEP, ERROR, NOISE, DRIFT = range(6)  # of a drive
 SLOPE, INTERCEPT, DECAY, PERIOD = range(4)  # of a gain
 INPUT_NOISE, RANDOM_WALK, MANEUVER_NOISE, MANEUVER_DRIFT = range(4)  # of a process
+(
+    LENGTH, F11, F12, F21, F22, Q11, Q12, Q22, ERROR_POSITION, ERROR_RATE, ERROR_LEFT,
+    D11, D12, D21, D22, N11, N12, N22,
+) = range(18)  # of what is known of an interval
+FIRST_REST = 18 - 2 * REST  # of its numbers for each state of the rest
+KEPT = 7  # intervals: a prime, or 5 and 10 ms would be in each other's place
 POSITION_, REST_ = np.int64(POSITION), np.int64(REST)  # as arguments: a literal would compile what is called once more
 _ROUNDING = 1e-15  # of the variances that S is made of: S cannot be known to be smaller
 
@@ -94,6 +100,8 @@ class State(NamedTuple):
         gate_count: Rejections in a row, and re-acquisitions, (r, S, 2).
         unsettled: When sensors last disagreed while re-acquisitions were counted, int64 ns, ``ALWAYS`` for never, (r,).
         work: Room for the vectors of an update: H, K, P Hᵀ and (I − K H) P Hᵀ, (A, 4, s).
+        intervals: What an axis does in an interval [ns], of the latest few: plant, gain error and disturbance,
+            (A, ``KEPT``, 18 + 2 (s − 3)).
     """
 
     x: FloatArray
@@ -105,6 +113,7 @@ class State(NamedTuple):
     gate_count: IntArray
     unsettled: TimeArray
     work: FloatArray
+    intervals: FloatArray
 
 
 @compiled
@@ -112,49 +121,73 @@ def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
     """Bring row ``row`` of the state, which is of ``axis``, to ``time`` [ns] with its input held."""
     if time <= state.clock[row]:
         return
-    x, P, drive, dt = state.x, state.P, state.drive, (time - state.clock[row]) / 1e9
-    f11, f12, f21, f22, q11, q12, q22 = transition(model.kind[axis, ORDER], model.constants, axis, dt)
+    x, P, drive, known = state.x, state.P, state.drive, state.intervals
+    interval = time - state.clock[row]
+    at = interval % KEPT
+    if known[axis, at, LENGTH] != interval:
+        respond(model, known, axis, at, interval)
+    f11, f12, f21, f22 = known[axis, at, F11], known[axis, at, F12], known[axis, at, F21], known[axis, at, F22]
     u, q = drive[row, U], drive[row, NOISE]
     gap, rate = x[row, POSITION] - u, x[row, RATE]
     x[row, POSITION] = u + (f11 * gap + f12 * rate)
     x[row, RATE] = f21 * gap + f22 * rate
     if drive[row, ERROR] != 0.0:
-        decay = model.gain[axis, DECAY]
-        order = model.kind[axis, ORDER]
-        position, rate, left = decaying_response(order, model.constants, axis, decay, dt, f11, f12, f22)
-        x[row, POSITION] += position * drive[row, ERROR]
-        x[row, RATE] += rate * drive[row, ERROR]
-        drive[row, ERROR] *= left
+        x[row, POSITION] += known[axis, at, ERROR_POSITION] * drive[row, ERROR]
+        x[row, RATE] += known[axis, at, ERROR_RATE] * drive[row, ERROR]
+        drive[row, ERROR] *= known[axis, at, ERROR_LEFT]
     size = model.kind[axis, STATES]
     move_pair(P, row, POSITION_, size, f11, f12, f21, f22)
-    add_to_pair(P, row, POSITION_, q * q11, q * q12, q * q22)
-    P[row, OFFSET, OFFSET] += drive[row, DRIFT] * dt
+    add_to_pair(P, row, POSITION_, q * known[axis, at, Q11], q * known[axis, at, Q12], q * known[axis, at, Q22])
+    P[row, OFFSET, OFFSET] += drive[row, DRIFT] * (interval / 1e9)
     if size > REST:
-        revert(model, state, axis, row, dt)
+        revert(model, state, axis, row, at)
     state.clock[row] = time
 
 
 @compiled_apart
-def revert(model: Model, state: State, axis: int, row: int, dt: float) -> None:
-    """Bring disturbance and drifting biases ``dt`` [s] on: they revert to 0, and what they lose comes back as noise."""
-    x, P, size, first = state.x, state.P, model.kind[axis, STATES], REST
+def respond(model: Model, known: FloatArray, axis: int, at: int, interval: int) -> None:
+    """Compute what an axis does in an interval [ns]: the same few come again and again."""
+    dt, order = interval / 1e9, model.kind[axis, ORDER]
+    known[axis, at, LENGTH] = interval
+    f11, f12, f21, f22, q11, q12, q22 = transition(order, model.constants, axis, dt)
+    known[axis, at, F11], known[axis, at, F12], known[axis, at, F21], known[axis, at, F22] = f11, f12, f21, f22
+    known[axis, at, Q11], known[axis, at, Q12], known[axis, at, Q22] = q11, q12, q22
+    if model.gain[axis, SLOPE] != 0.0 or model.gain[axis, INTERCEPT] != 1.0:
+        position, rate, left = decaying_response(
+            order, model.constants, axis, model.gain[axis, DECAY], dt, f11, f12, f22
+        )
+        known[axis, at, ERROR_POSITION], known[axis, at, ERROR_RATE], known[axis, at, ERROR_LEFT] = position, rate, left
+    for i in range(REST, model.kind[axis, STATES]):
+        fading = -model.rest[axis, i, REVERTING] * dt
+        known[axis, at, FIRST_REST + 2 * i] = math.exp(fading)
+        known[axis, at, FIRST_REST + 2 * i + 1] = model.rest[axis, i, VARIANCE] * math.expm1(2.0 * fading)
+    if model.kind[axis, DISTURBANCE] == SMOOTH:
+        f11, f12, f21, f22, q11, q12, q22 = matern(model.rest[axis, REST, REVERTING], dt)
+        known[axis, at, D11], known[axis, at, D12], known[axis, at, D21], known[axis, at, D22] = f11, f12, f21, f22
+        known[axis, at, N11], known[axis, at, N12], known[axis, at, N22] = q11, q12, q22
+
+
+@compiled_apart
+def revert(model: Model, state: State, axis: int, row: int, at: int) -> None:
+    """Bring disturbance and drifting biases an interval on: they revert to 0, and what they lose comes back as noise."""
+    x, P, size, first, known = state.x, state.P, model.kind[axis, STATES], REST, state.intervals
     if model.kind[axis, DISTURBANCE] == SMOOTH:
         variance = model.rest[axis, REST, VARIANCE]
-        f11, f12, f21, f22, q11, q12, q22 = matern(model.rest[axis, REST, REVERTING], dt)
+        f11, f12, f21, f22 = known[axis, at, D11], known[axis, at, D12], known[axis, at, D21], known[axis, at, D22]
         d, rate = x[row, REST], x[row, REST + 1]
         x[row, REST], x[row, REST + 1] = f11 * d + f12 * rate, f21 * d + f22 * rate
         move_pair(P, row, REST_, size, f11, f12, f21, f22)
+        q11, q12, q22 = known[axis, at, N11], known[axis, at, N12], known[axis, at, N22]
         add_to_pair(P, row, REST_, variance * q11, variance * q12, variance * q22)
         first = REST + 2
     for i in range(first, size):
         if model.rest[axis, i, REVERTING] > 0.0:
-            fading = -model.rest[axis, i, REVERTING] * dt
-            left = math.exp(fading)
+            left = known[axis, at, FIRST_REST + 2 * i]
             x[row, i] *= left
             for j in range(size):
                 P[row, i, j] *= left
                 P[row, j, i] *= left
-            P[row, i, i] -= model.rest[axis, i, VARIANCE] * math.expm1(2.0 * fading)
+            P[row, i, i] -= known[axis, at, FIRST_REST + 2 * i + 1]
 
 
 @compiled

@@ -521,7 +521,7 @@ def with_rows(memory: Memory, rows: int) -> Memory:
     return memory._replace(
         events=Events(*(of_rows(part) for part in memory.events)),
         results=Results(*(of_rows(part) for part in memory.results)),
-        state=State(*(of_state(part) for part in memory.state[:-1]), work=memory.state.work),
+        state=State(*(of_state(part) for part in memory.state[:-2]), *memory.state[-2:]),
         arrived=np.ones(rows, dtype=np.bool_),
         incoming=memory.incoming._replace(span=span),
     )

@@ -8,7 +8,22 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..arrays import ALWAYS, FloatArray
-from ..filter.axis import DRIFT, NOISE, NONE, OFFSET, REST, ROUGH, SMOOTH, START, VARIANCE, Model, Sensors, State
+from ..filter.axis import (
+    DRIFT,
+    FIRST_REST,
+    KEPT,
+    NOISE,
+    NONE,
+    OFFSET,
+    REST,
+    ROUGH,
+    SMOOTH,
+    START,
+    VARIANCE,
+    Model,
+    Sensors,
+    State,
+)
 from ..model import closed
 from ..model.plants import FirstOrder
 from .config import FusionConfig
@@ -150,4 +165,5 @@ def at_rest(
         gate_count=np.zeros((rows, sensors, 2), dtype=np.int64),
         unsettled=np.full(rows, ALWAYS),
         work=np.zeros((count, 4, width)),
+        intervals=np.zeros((count, KEPT, FIRST_REST + 2 * width)),
     )

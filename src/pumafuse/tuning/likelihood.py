@@ -23,6 +23,7 @@ import numpy as np
 
 from ..arrays import CodeArray, FloatArray, IntArray
 from ..discovery.following import scatter
+from ..filter.events import Results
 from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
@@ -159,6 +160,7 @@ class Likelihood:
             for name, parts in counted.items()
         }
         self.config = config
+        self._latest: tuple[FusionConfig | None, Sequence[CodeArray], Sequence[Results]] = None, (), ()
         self.axes = tuple(axis for axis in config.arm.axes if any(axis in segment.axes for segment in built))
         self._segments = [_decided(segment, until, latest) for segment in built]
         self._parts = [
@@ -311,13 +313,16 @@ class Likelihood:
             outcomes: The outcome of each component, to be repeated; None: the configuration's gates decide.
         """
         axes, decided, densities = np.zeros(len(self.axes)), list[CodeArray](), list[FloatArray]()
+        every = list[Results]()
         for number, segment in enumerate(self._segments):
             found = innovations(segment, config, None if outcomes is None else outcomes[number])
             gates = np.array([config.sensors[name].gate for name in segment.sensors])[segment.measurement_rows.source]
             densities.append(log_density(found.innovation, found.innovation_sd, found.outcome, gates[:, None]))
             decided.append(found.outcome)
+            every.append(found)
         for part in self._parts:
             axes[part.axis] += float(densities[part.whole][part.rows, part.column].sum())
+        self._latest = config, decided, every
         return LogLikelihood(axes, decided)
 
     def derivatives(
@@ -331,7 +336,7 @@ class Likelihood:
         )
 
         def of(part: _Part) -> tuple[list[int], FloatArray, FloatArray]:
-            return self._part_derivatives(part, outcomes[part.whole][part.rows, part.column], config, parameters)
+            return self._part_derivatives(part, outcomes, config, parameters)
 
         for part, (mine, pieces, square) in zip(self._parts, in_threads(of, self._parts), strict=True):
             scores[part.whole, mine] += pieces
@@ -339,15 +344,22 @@ class Likelihood:
         return Derivatives(scores.sum(axis=(0, 2)), information, np.einsum("nip,njp->ij", scores, scores))
 
     def _part_derivatives(
-        self, part: _Part, outcome: CodeArray, config: FusionConfig, parameters: Sequence[Parameter]
+        self, part: _Part, outcomes: Sequence[CodeArray], config: FusionConfig, parameters: Sequence[Parameter]
     ) -> tuple[list[int], FloatArray, FloatArray]:
+        outcome = outcomes[part.whole][part.rows, part.column]
+
         def innovated(at: FusionConfig) -> tuple[FloatArray, FloatArray]:
             """ν and S of the measurements, whose outcomes are known."""
             found = innovations(part.segment, at, outcome[:, None])
             return found.innovation[:, 0], found.innovation_sd[:, 0] ** 2
 
         mine = [number for number, one in enumerate(parameters) if one.axis in (None, self.axes[part.axis])]
-        nu, S = innovated(config)
+        latest, decided, every = self._latest
+        if latest is config and decided is outcomes:  # as a search asks: at the point that it has just evaluated
+            known = every[part.whole]
+            nu, S = known.innovation[part.rows, part.column], known.innovation_sd[part.rows, part.column] ** 2
+        else:
+            nu, S = innovated(config)
         fused = outcome != Outcome.REJECTED
         d_nu, d_S = np.empty((len(mine), len(nu))), np.empty((len(mine), len(nu)))
         for place, number in enumerate(mine):

@@ -215,5 +215,8 @@ def _step(found: Derivatives, low: FloatArray, high: FloatArray, damping: FloatA
     matrix = found.information[np.ix_(known, known)] * np.outer(size, size) + np.diag(damping[known] + _ROUNDING)
     root = np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
     aim = solve_triangular(root, size * found.score[known], lower=True)
-    step[known] = size * lsq_linear(root.T, aim, (low[known] / size, high[known] / size), method="bvls").x
+    inner, lowest, highest = solve_triangular(root.T, aim), low[known] / size, high[known] / size
+    if not ((inner >= lowest) & (inner <= highest)).all():
+        inner = lsq_linear(root.T, aim, (lowest, highest), method="bvls").x
+    step[known] = size * inner
     return step

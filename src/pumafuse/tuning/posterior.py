@@ -53,13 +53,11 @@ _LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each as likely
 _SHARES = (0.3, 0.6, 0.9)  # of the lag that is delay: starts
 _ERRORS, _RECOVERING = (-0.12, -0.05, 0.05), (0.05, 0.12, 0.3)  # starts: gains less 1, recoveries [s]
 _EARLIER, _DAMPINGS = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no delay, ζ
-_ROUNDS = 2  # of least squares
 _NEARLY = 40.0  # log-likelihood that a better noise may gain
 _WORSE = 2.0  # log-likelihood behind the best of all, from which a model is looked for again
-_CLIMBED = 2  # starts from which a maximum is looked for
 _SAME = 2e-4  # s, between delays of maxima that are one
 _ARM: tuple[Fit, ...] = ("delay", "plant", "gain")
-_ROUGHLY = 0.1  # tolerance in log-likelihood
+_ROUGHLY, _VERY_ROUGHLY = 0.1, 0.5  # tolerances in log-likelihood
 _FORLORN = 8.0  # log-likelihood behind the best, after the penalty, from which a model or a delay counts for nothing
 _STEP = 0.5  # standard deviations, between delays
 _SHORTEST, _LONGEST = 2e-5, 0.03  # s, of a step
@@ -259,12 +257,20 @@ class _AxisSearch:
     def __init__(self, likelihood: Likelihood, start: FusionConfig, axis: str) -> None:
         self.likelihood, self.start, self.axis = likelihood, start, axis
         self._lag = start.arm.lag_of(axis)
+        self._free: dict[tuple[object, ...], list[Parameter]] = {}
 
     def delay_of(self, peak: Point) -> float:
         return peak.config.arm.delay_of(self.axis)
 
     def free(self, config: FusionConfig, model: Model, fits: Sequence[Fit]) -> list[Parameter]:
         """The free parameters of a model, of these kinds."""
+        arm, process = config.arm.axes[self.axis], config.process[self.axis]
+        key = type(arm.plant), arm.gain_recovery is None, process.disturbance_sd > 0.0, model.gain, tuple(fits)
+        if key not in self._free:
+            self._free[key] = self._listed(config, model, fits)
+        return self._free[key]
+
+    def _listed(self, config: FusionConfig, model: Model, fits: Sequence[Fit]) -> list[Parameter]:
         every = parameters(config, self.start, {self.axis: self.likelihood.sensors[self.axis]}, fits)
         found: list[Parameter] = []
         for one in every:
@@ -294,13 +300,13 @@ class _AxisSearch:
         best = maximise(self.likelihood, config, self.everything(config, model), tolerance=_ROUGHLY)
         return past_bumps(self.likelihood, best, self.everything(best.config, model))
 
-    def maximum(self, model: Model, starts: Iterable[FusionConfig]) -> Point:
+    def maximum(self, model: Model, starts: Iterable[FusionConfig], climbed: int = 2) -> Point:
         """The best of the maxima of the arm next to the best starts, the noise as it is."""
         tried = [point(self.likelihood, start, self.free(start, model, _ARM)) for start in starts]
         tried.sort(key=lambda one: -one.log_posterior)
         peaks = [
-            maximise(self.likelihood, one.config, self.free(one.config, model, _ARM), tolerance=_ROUGHLY)
-            for one in tried[:_CLIMBED]
+            maximise(self.likelihood, one.config, self.free(one.config, model, _ARM), tolerance=_VERY_ROUGHLY)
+            for one in tried[:climbed]
         ]
         return max(peaks, key=lambda one: one.log_posterior)
 
@@ -384,15 +390,10 @@ class _AxisSearch:
         best = {MODELS[0]: self.maximum(MODELS[0], [self.with_delay(plain, share * self._lag) for share in _SHARES])}
         for model in MODELS[1:]:
             best[model] = self.maximum(model, self.starts(model, self._best(best).config))
-        for _ in range(_ROUNDS):
-            noise = self.with_white_noise(self._best(best).config)
-            best = self._again(best, noise)
+        best = self._again(best, self.with_white_noise(self._best(best).config))
         for kinds in (["ou"], ["none", "matern", "ou"]):
-            best = self._again(best, self.with_noise(self._best(best).config, kinds))
-        found: list[tuple[float, Model, Point]] = []
-        for model, peak in best.items():
-            if self.evidence(model, peak) > self.evidence(*self._most_evident(best)) - _NEARLY:
-                found.append(self._weighed(model, self.polished(model, peak.config)))
+            best = self._likely(self._again(best, self.with_noise(self._best(best).config, kinds)))
+        found = [self._weighed(model, self.polished(model, peak.config)) for model, peak in best.items()]
         highest, period = max(one[0] for one in found), self.start.arm.update_period
         for evidence, model, peak in list(found):
             for ticks in (-1.0, 1.0) if evidence > highest - _FORLORN else ():
@@ -403,25 +404,27 @@ class _AxisSearch:
         return sorted(found, key=lambda one: -one[0])
 
     def _again(self, best: Mapping[Model, Point], noise: FusionConfig) -> dict[Model, Point]:
-        """The maximum of each model with another noise, from where it was and from the best of all."""
-        known = {model: self.with_noise_of(peak.config, noise) for model, peak in best.items()}
-        top = self._best(best).config
-        found = {
-            model: self.maximum(model, [config, *self.starts(model, self.with_noise_of(top, noise))])
-            for model, config in known.items()
-        }
+        """The maximum of each model with another noise, from where it was or from the best of all."""
+        top, found = self.with_noise_of(self._best(best).config, noise), dict[Model, Point]()
+        for model in sorted(best, key=lambda one: -best[one].log_posterior):
+            own = self.with_noise_of(best[model].config, noise)
+            found[model] = self.maximum(model, [own, *self.starts(model, top)], climbed=1)
         other = self._best(found)
-        return {
-            model: max(peak, self.maximum(model, self.starts(model, other.config)), key=lambda one: one.log_posterior)
-            if other.log_posterior > peak.log_posterior + _WORSE else peak
-            for model, peak in found.items()
-        }
+        for model, peak in found.items():
+            if peak.log_posterior < other.log_posterior - _WORSE:
+                starts = list(self.starts(model, other.config))
+                again = self.maximum(model, starts, climbed=1)
+                found[model] = max(peak, again, key=lambda one: one.log_posterior)
+        return found
+
+    def _likely(self, found: Mapping[Model, Point]) -> dict[Model, Point]:
+        """Those models that a better noise could still bring near the best."""
+        evidence = {model: self.evidence(model, peak) for model, peak in found.items()}
+        least = max(evidence.values()) - _NEARLY
+        return {model: peak for model, peak in found.items() if evidence[model] > least}
 
     def _best(self, found: Mapping[Model, Point]) -> Point:
         return max(found.values(), key=lambda one: one.log_posterior)
-
-    def _most_evident(self, found: Mapping[Model, Point]) -> tuple[Model, Point]:
-        return max(found.items(), key=lambda one: self.evidence(*one))
 
     def _weighed(self, model: Model, peak: Point) -> tuple[float, Model, Point]:
         return self.evidence(model, peak), model, peak
