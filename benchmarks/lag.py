@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import warnings
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -241,6 +242,7 @@ def main() -> None:
     parser.add_argument("--drift", type=float, default=0.0, help="of the lag over each run [ms]")
     parser.add_argument("--json", type=Path, help="keep every number")
     asked = parser.parse_args()
+    os.environ["LOKY_MAX_CPU_COUNT"] = "1"  # a process for each run, not for each axis of it
     jobs = [(seed, asked.axes, 1e-3 * asked.drift) for seed in range(asked.first, asked.first + asked.runs)]
     numbers, errors, named = list[tuple[int, Found]](), list[tuple[float, float]](), list[list[str]]()
     with ProcessPoolExecutor() as pool:

@@ -28,9 +28,9 @@ from ..model.plants import FirstOrder
 from ..toml import Interval
 from .identifiability import TuneError, covariance, excited_axes
 from .intervals import lag_slopes
-from .likelihood import Likelihood
+from .likelihood import Derivatives, Likelihood
 from .maximise import Point, derivatives, ignore, maximise, past_bumps, point
-from .parameters import LATENCIES, Parameter, changed, parameters, with_axis_of, with_own_delays, with_shared_delay
+from .parameters import LATENCIES, Parameter, changed, moved, parameters, with_axis_of, with_own_delays, with_shared_delay
 from .posterior import (
     AxisPosterior,
     Mixture,
@@ -48,6 +48,7 @@ _MARGIN = 1.3  # by which intervals of delay and plant are widened: found by sim
 _ROUGHLY = 0.1  # tolerance in log-likelihood
 _GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
 _GATE = 5.0
+_BESIDE = 3e-4  # s, beside a latency where its interval is taken
 _PARTS = 10  # of a run, of each of which the lag is told
 _DRIFTS = 3.5  # standard deviations from which a drift is named
 _WANDERS = 1e-4  # probability below which a wandering is named
@@ -212,7 +213,7 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     likelihood = Likelihood(every, _known(config, trusted), [trusted])
     moving = excited_axes(likelihood, likelihood.config)
     parts = {axis: likelihood.of_axis(axis) for axis in moving}
-    fits = {axis: _Fit(mine, axis_posterior(mine, likelihood.config, axis)) for axis, mine in parts.items()}
+    fits = {axis: _Fit(parts[axis], one) for axis, one in _posteriors(parts, likelihood.config).items()}
     config, lags = _arm(likelihood, fits, trusted)
     best, sensors = _sensors(every, config, trusted, moving)
     lags, clock = _with_courses(likelihood, config, lags)
@@ -329,6 +330,15 @@ def _known(config: FusionConfig, trusted: str) -> FusionConfig:
 # ---- axes -----------------------------------------------------------------------------------------------------------
 
 
+def _posteriors(parts: Mapping[str, Likelihood], config: FusionConfig) -> dict[str, AxisPosterior]:
+    """The posterior of each axis, several at a time."""
+    from joblib import Parallel, cpu_count, delayed
+
+    jobs = [delayed(axis_posterior)(mine, config, axis) for axis, mine in parts.items()]  # pyright: ignore
+    cores = min(int(cpu_count()), len(jobs))  # pyright: ignore
+    return dict(zip(parts, Parallel(n_jobs=cores)(jobs), strict=True))  # pyright: ignore
+
+
 def _arm(
     likelihood: Likelihood, fits: Mapping[str, _Fit], trusted: str
 ) -> tuple[FusionConfig, dict[str, AxisLag]]:
@@ -441,8 +451,15 @@ def _sensors(
     ]
     late = [one for one in free(own) if one.fit == "latency"]
     every = [*arm, *late]
-    _, information, scatter = derivatives(likelihood, point(likelihood, own, every), every)
-    cov = covariance(information, every)
+
+    def beside(shift: float) -> Derivatives:
+        """Where the stamps of two sensors coincide, the likelihood has a cusp that says nothing of its width."""
+        there = moved(own, late, [one.at(own) + shift for one in late])
+        return derivatives(likelihood, point(likelihood, there, every), every)
+
+    both = [beside(sign * _BESIDE) for sign in (-1.0, 1.0)]
+    cov = covariance(0.5 * (both[0].information + both[1].information), every)
+    scatter = 0.5 * (both[0].scatter + both[1].scatter)
     sd = np.sqrt(np.maximum(np.diag(cov), np.diag(cov @ scatter @ cov)))
     found: dict[str, SensorLag] = {}
     for one, half in zip(late, (Z95 * sd[len(arm) :]).tolist(), strict=True):
