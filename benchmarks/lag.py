@@ -130,6 +130,7 @@ class Wander:
         self.value = lfilter([1.0], [1.0, -left], white)
 
     def __call__(self, time: Array) -> Array:
+        """Its value at times [s], (n,)."""
         return np.interp(time, 1e-3 * np.arange(len(self.value)) - 0.5, self.value)
 
 
@@ -158,7 +159,7 @@ def _motion(rng: np.random.Generator, kind: str, time: Array) -> Array:
     return begin * sum(np.sin(2.0 * np.pi * f * time + phase) / (1.0 + 2.0 * f) for f, phase in parts)
 
 
-def _response(axis: Axis, time: Array, u: Array, duration: float):  # noqa: ANN202 - a function of the time
+def _response(axis: Axis, time: Array, u: Array, duration: float):
     """The noiseless position as a function of the time."""
     grid = np.arange(0.0, duration + 0.5, STEP)
     acting = time + axis.delay
@@ -257,7 +258,9 @@ def main() -> None:
     print("\n".join(report(numbers, errors, named)))
 
 
-def report(numbers: Iterable[tuple[int, Found]], errors: list[tuple[float, float]], named: list[list[str]]) -> Iterator[str]:
+def report(
+    numbers: Iterable[tuple[int, Found]], errors: list[tuple[float, float]], named: list[list[str]]
+) -> Iterator[str]:
     """What holds, by kind; how far the lag is off; in how many runs a drift or a wandering is named."""
     holds = defaultdict[str, list[bool]](list)
     for _, one in numbers:

@@ -58,11 +58,11 @@ _HOME = {name: home for home, names in _NAMES.items() for name in names}
 
 __all__ = [
     "ArmModel", "AxisEstimate", "AxisModel", "AxisNow", "AxisVerification", "ConfigError", "DiscreteModel",
-    "Estimates", "FirstOrder", "FusionConfig", "Gain", "Health", "Identification", "Latency", "LiveEstimate", "LiveEstimator",
-    "Measurements", "Outcome", "Process", "PumafuseError", "PumafuseWarning", "Run", "RunError", "Scenario", "Score",
-    "SecondOrder", "Sensor", "SensorHealth", "Simulated", "Start", "StepTrials", "Summary", "TrialsError",
-    "TuneError", "Tuning", "UnknownNameError", "UpdateResult", "Validity", "discretize", "fuse", "identify", "latency", "score",
-    "simulate", "summarise", "to_rerun", "tune", "verify",
+    "Estimates", "FirstOrder", "FusionConfig", "Gain", "Health", "Identification", "Latency", "LiveEstimate",
+    "LiveEstimator", "Measurements", "Outcome", "Process", "PumafuseError", "PumafuseWarning", "Run", "RunError",
+    "Scenario", "Score", "SecondOrder", "Sensor", "SensorHealth", "Simulated", "Start", "StepTrials", "Summary",
+    "TrialsError", "TuneError", "Tuning", "UnknownNameError", "UpdateResult", "Validity", "discretize", "fuse",
+    "identify", "latency", "score", "simulate", "summarise", "to_rerun", "tune", "verify",
 ]  # fmt: skip
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import typer
@@ -19,8 +20,9 @@ from .tables import console, table
 
 
 def run(
-    folder: Path,
+    paths: Sequence[Path],
     output: Path,
+    sensor: str | None,
     period: float | None,
     samples: int | None,
     paper: bool,
@@ -29,23 +31,46 @@ def run(
     json: bool,
     force: bool,
 ) -> None:
-    """Identify an arm from the step trials in ``folder``; period [s], tolerance in the screen's unit of its axes.
+    """Identify an arm from the step trials in a folder, or from recorded runs.
+
+    Args:
+        paths: One folder of trials, or runs.
+        output: Where the model goes.
+        sensor: Of runs: whose stamps are right.
+        period: Of trials: T [s].
+        samples: Of trials: how many of each are used.
+        paper: Of trials: whether to do as the paper did.
+        tolerance: Of trials: RMS up to which the model is valid, in the screen's unit of their axes.
+        report: Where a page goes.
+        json: Whether to print JSON.
+        force: Whether to replace what is there.
 
     Raises:
-        PumafuseError: The trials cannot be used, or what is to be written is in the way.
+        PumafuseError: The trials or runs cannot be used, or what is to be written is in the way.
     """
     if output.exists():
         _check_replaceable(output, force)
+    trials = [path for path in paths if (path / "trials.csv").exists()]
+    if not trials:
+        from . import latency
+
+        if period is not None or samples is not None or paper or tolerance is not None:
+            raise ConfigError("--period, --samples, --paper and --tolerance are for step trials, not for recorded runs")
+        latency.identify(paths, output, sensor, report, json, force)
+        return
+    if len(paths) > 1 or sensor is not None:
+        raise ConfigError(f"{trials[0]}: has step trials: give this folder alone, and no --sensor")
+    (folder,) = trials
     if report is not None:
         reports.check_writable(report, force)
-    trials, name = StepTrials.read(folder), folder.resolve().name
-    most = None if tolerance is None else si(tolerance, f"_{SCREEN[trials.kind].unit}")
-    found = identify(trials, period=period, samples=samples, paper=paper, tolerance=most, name=name)
+    campaign, name = StepTrials.read(folder), folder.resolve().name
+    most = None if tolerance is None else si(tolerance, f"_{SCREEN[campaign.kind].unit}")
+    found = identify(campaign, period=period, samples=samples, paper=paper, tolerance=most, name=name)
     for note in found.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=1)
     write_file(output, found.arm.to_toml())
     if report is not None:
-        reports.write_identification(found, trials, report, force)
+        reports.write_identification(found, campaign, report, force)
     if json:
         typer.echo(found.to_json())
         return

@@ -32,6 +32,10 @@ From = Annotated[
     float | None, Option("--from", metavar="S", help="Begin S seconds after the first command; earlier commands count.")
 ]
 To = Annotated[float | None, Option("--to", metavar="S", help="End S seconds after the first command.")]
+Sensor = Annotated[
+    str | None,
+    Option(metavar="NAME", help="Whose stamps are right; default: the reference, or the sensor with the least noise."),
+]
 Report = Annotated[Path | None, Option(metavar="DIR", help="Also write tables and figures as one HTML page.")]
 Json = Annotated[bool, Option("--json", help="Print JSON instead of a table.")]
 Force = Annotated[bool, Option("--force", help="Replace an earlier result.")]
@@ -184,29 +188,58 @@ def plan(
 
 @app.command()
 def identify(
-    trials: Annotated[Path, Argument(metavar="TRIALS", help="Folder with trials.csv and samples.csv.")],
+    source: Annotated[
+        list[Path],
+        Argument(metavar="TRIALS|RUN...", help="A folder with trials.csv and samples.csv, or recorded runs."),
+    ],
     output: Annotated[Path, Option("--output", "-o", metavar="ARM.TOML", help="Where the model goes.")],
-    period: Annotated[float | None, Option(metavar="MS", help="Update period; default: step over speed.")] = None,
-    samples: Annotated[
-        int | None, Option(metavar="N", min=8, help="Samples used from each step; default: all.")
+    sensor: Sensor = None,
+    period: Annotated[
+        float | None, Option(metavar="MS", help="Of trials: update period; default: step over speed.")
     ] = None,
-    paper: Annotated[bool, Option("--paper", help="Read delay and gain off each trial, as published.")] = False,
+    samples: Annotated[
+        int | None, Option(metavar="N", min=8, help="Of trials: samples used from each step on; default: all.")
+    ] = None,
+    paper: Annotated[
+        bool, Option("--paper", help="Of trials: read delay and gain off each trial, as published.")
+    ] = False,
     tolerance: Annotated[
         float | None,
         Option(
             metavar="MM",
-            help="RMS beyond which the model is not called valid, of angles in degrees; default: 1 or 0.1.",
+            help="Of trials: RMS beyond which the model is not called valid, of angles in degrees; default: 1 or 0.1.",
         ),
     ] = None,
     report: Report = None,
     json: Json = False,
     force: Force = False,
 ) -> None:
-    """Make a model of an arm from step trials: order, gain, delay and plant of each axis, with intervals."""
+    """Make a model of an arm from step trials or any recorded motion: order, gain, delay and plant, with intervals."""
     from . import identify as command
 
     _check_positive(period=period, tolerance=tolerance)
-    command.run(trials, output, period and _seconds(period), samples, paper, tolerance, report, json, force)
+    options = period and _seconds(period), samples, paper, tolerance
+    command.run(source, output, sensor, *options, report, json, force)
+
+
+@app.command()
+def latency(
+    runs: Runs,
+    sensor: Sensor = None,
+    since: From = None,
+    until: To = None,
+    report: Report = None,
+    json: Json = False,
+    force: Force = False,
+) -> None:
+    """Tell how late the arm and each sensor are, from any recorded motion, with 95 % intervals.
+
+    Nothing has to be known of the arm.
+    """
+    from . import latency as command
+
+    _check_interval(since, until)
+    command.run(runs, sensor, report, json, force, (since, until))
 
 
 @app.command()

@@ -35,8 +35,24 @@ START, U, STEP, ERROR, NOISE, DRIFT = range(6)  # of a drive
 SLOPE, INTERCEPT, DECAY, PERIOD = range(4)  # of a gain
 INPUT_NOISE, RANDOM_WALK, MANEUVER_NOISE, MANEUVER_DRIFT = range(4)  # of a process
 (
-    LENGTH, F11, F12, F21, F22, Q11, Q12, Q22, ERROR_POSITION, ERROR_RATE, ERROR_LEFT,
-    D11, D12, D21, D22, N11, N12, N22,
+    LENGTH,
+    F11,
+    F12,
+    F21,
+    F22,
+    Q11,
+    Q12,
+    Q22,
+    ERROR_POSITION,
+    ERROR_RATE,
+    ERROR_LEFT,
+    D11,
+    D12,
+    D21,
+    D22,
+    N11,
+    N12,
+    N22,
 ) = range(18)  # of what is known of an interval
 FIRST_REST = 18 - 2 * REST  # of its numbers for each state of the rest
 KEPT = 7  # intervals: a prime, or 5 and 10 ms would be in each other's place
@@ -169,7 +185,7 @@ def respond(model: Model, known: FloatArray, axis: int, at: int, interval: int) 
 
 @compiled_apart
 def revert(model: Model, state: State, axis: int, row: int, at: int) -> None:
-    """Bring disturbance and drifting biases an interval on: they revert to 0, and what they lose comes back as noise."""
+    """Bring disturbance and drifting biases an interval on: they revert to 0; what they lose comes back as noise."""
     x, P, size, first, known = state.x, state.P, model.kind[axis, STATES], REST, state.intervals
     if model.kind[axis, DISTURBANCE] == SMOOTH:
         variance = model.rest[axis, REST, VARIANCE]

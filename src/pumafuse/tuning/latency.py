@@ -26,11 +26,22 @@ from ..logs.run import Run
 from ..model.arm import ArmModel, AxisModel
 from ..model.plants import FirstOrder
 from ..toml import Interval
+from ..units import MS
 from .identifiability import TuneError, covariance, excited_axes
 from .intervals import lag_slopes
 from .likelihood import Derivatives, Likelihood
-from .maximise import Point, derivatives, ignore, maximise, past_bumps, point
-from .parameters import LATENCIES, Parameter, changed, moved, parameters, with_axis_of, with_own_delays, with_shared_delay
+from .maximise import Point, derivatives, maximise, past_bumps, point
+from .parameters import (
+    LATENCIES,
+    Parameter,
+    changed,
+    moved,
+    parameters,
+    rounded,
+    with_axis_of,
+    with_own_delays,
+    with_shared_delay,
+)
 from .posterior import (
     AxisPosterior,
     Mixture,
@@ -49,6 +60,7 @@ _ROUGHLY = 0.1  # tolerance in log-likelihood
 _GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
 _GATE = 5.0
 _BESIDE = 3e-4  # s, beside a latency where its interval is taken
+_WIDE, _WIDE_LAG, _WIDE_GAIN = 0.3, 0.02, 0.1  # of the lag, s, of 1: intervals from which a number is not known
 _PARTS = 10  # of a run, of each of which the lag is told
 _DRIFTS = 3.5  # standard deviations from which a drift is named
 _WANDERS = 1e-4  # probability below which a wandering is named
@@ -172,8 +184,18 @@ class Latency:
 
     @property
     def arm(self) -> ArmModel:
-        """The arm, for ``arm.toml``."""
-        return self.config.arm
+        """The arm with its intervals and where it is from, for ``arm.toml``."""
+        arm = self.config.arm
+        for axis, one in self.summary.axes.items():
+            for name in ("time_constant", "natural_frequency", "damping"):
+                if hasattr(arm.axes[axis].plant, name):
+                    arm = changed(arm, ("axes", axis, "plant", f"{name}_ci95"), getattr(one, f"{name}_ci95"))
+            arm = changed(arm, ("axes", axis, "gain", "intercept_ci95"), one.gain_ci95)
+            arm = changed(arm, ("axes", axis, "gain_recovery_ci95"), one.gain_recovery_ci95)
+            own = arm.axes[axis].delay is not None
+            arm = changed(arm, ("axes", axis, "delay_ci95") if own else ("delay_ci95",), one.delay_ci95)
+        provenance = {"identified_on": self.summary.runs, "sensor": self.summary.sensor}
+        return msgspec.structs.replace(arm, provenance=provenance)
 
     def to_json(self) -> str:
         """All of it as JSON, in the units of the names."""
@@ -259,11 +281,13 @@ def first_guess(runs: Sequence[Run]) -> FusionConfig:
         axes = {**arm.axes, **axes}
         for name, one in found.items():
             before = sensors.get(name)
-            sensors[name] = one if before is None else replace(before, sd={**one.sd, **before.sd}, bias={**one.bias, **before.bias})
+            sensors[name] = (
+                one if before is None else replace(before, sd={**one.sd, **before.sd}, bias={**one.bias, **before.bias})
+            )
     model = ArmModel(
         name="identified from motion",
-        update_period=arms[0].period,
-        delay=arms[0].delay,
+        update_period=float(f"{arms[0].period:.4g}"),
+        delay=rounded(arms[0].delay),
         axes={
             name: AxisModel(kind=one.kind, plant=FirstOrder(time_constant=one.time_constant))
             for name, one in axes.items()
@@ -310,7 +334,14 @@ def _trusted(config: FusionConfig, runs: Sequence[Run], asked: str | None) -> st
 
     def rank(name: str) -> tuple[int, float]:
         sd = config.sensors[name].sd
-        travel = {axis: max(float(np.ptp(run.command.values[axis][np.isfinite(run.command.values[axis])])) for run in runs if axis in run.command.values) for axis in config.arm.axes}
+        travel = {
+            axis: max(
+                float(np.ptp(run.command.values[axis][np.isfinite(run.command.values[axis])]))
+                for run in runs
+                if axis in run.command.values
+            )
+            for axis in config.arm.axes
+        }
         shares = [one / max(travel[axis], 1e-12) for axis, one in sd.items()] if isinstance(sd, dict) else [sd]
         return -len(shares), float(np.median(shares))
 
@@ -339,9 +370,7 @@ def _posteriors(parts: Mapping[str, Likelihood], config: FusionConfig) -> dict[s
     return dict(zip(parts, Parallel(n_jobs=cores)(jobs), strict=True))  # pyright: ignore
 
 
-def _arm(
-    likelihood: Likelihood, fits: Mapping[str, _Fit], trusted: str
-) -> tuple[FusionConfig, dict[str, AxisLag]]:
+def _arm(likelihood: Likelihood, fits: Mapping[str, _Fit], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:
     """The arm of all axes, and the lag of each with its intervals."""
     posteriors = {axis: one.posterior for axis, one in fits.items()}
     shares = sharing(posteriors)
@@ -356,11 +385,40 @@ def _arm(
         mixture = fit.posterior.mixture(elsewhere)
         model = chosen_model(mixture)
         best = fitted_with(fit.likelihood, likelihood.config, fit.posterior, model, delay if axis in shares else None)
-        config = with_axis_of(config, best.config, axis)
+        free = parameters(
+            best.config, best.config, {axis: likelihood.sensors[axis]}, ["noise", "delay", "plant", "gain"]
+        )
+        config = with_axis_of(config, _rounded(best.config, [one for one in free if one.axis == axis]), axis)
         lags[axis] = _axis_lag(fit.likelihood, best, mixture, model, axis, trusted, axis in shares)
     if delay is not None:
-        config = with_shared_delay(config, shares, delay)
+        config = with_shared_delay(config, shares, rounded(delay))
     return config, lags
+
+
+def _rounded(config: FusionConfig, free: Sequence[Parameter]) -> FusionConfig:
+    """The configuration with numbers that can be read: more digits would only look exact."""
+    for one in free:
+        config = one.put(config, rounded(one.get(config)))
+    return config
+
+
+def _notes(one: AxisLag) -> list[str]:
+    """What the motion was too poor for, and what to record instead."""
+    found: list[str] = []
+    width = one.lag_ci95[1] - one.lag_ci95[0]
+    if width > max(_WIDE * abs(one.lag), _WIDE_LAG):
+        found.append(
+            "the motion is too poor for the lag: it is known to"
+            f" ± {0.5 * width * MS:.0f} ms; record faster or longer motion"
+        )
+    elif one.delay_ci95[1] - one.delay_ci95[0] > max(_WIDE * one.lag, 2.0 * width):
+        found.append(
+            "the lag is known, its parts are not: dead time and plant make up for each other in motion this slow;"
+            " record steps, or reversals within the lag, to tell them apart"
+        )
+    if one.gain_ci95 is not None and one.gain_ci95[1] - one.gain_ci95[0] > _WIDE_GAIN:
+        found.append("the motion is too poor for the gain; record motion over more of the range")
+    return found
 
 
 def _axis_lag(
@@ -405,7 +463,8 @@ def _axis_lag(
             "gain_recovery": arm.gain_recovery,
             "gain_recovery_ci95": interval("gain_recovery", arm.gain_recovery),
         }
-    return msgspec.structs.replace(found, **values)
+    found = msgspec.structs.replace(found, **values)
+    return msgspec.structs.replace(found, notes=_notes(found))
 
 
 def _scattered(likelihood: Likelihood, best: Point, axis: str) -> float:

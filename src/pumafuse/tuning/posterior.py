@@ -19,9 +19,9 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
+from ..model.plants import FirstOrder, SecondOrder
 from .identifiability import covariance
 from .likelihood import Likelihood
-from ..model.plants import FirstOrder, SecondOrder
 from .maximise import Point, derivatives, maximise, past_bumps, point
 from .parameters import (
     Fit,
@@ -46,7 +46,7 @@ GainKind: TypeAlias = Literal["none", "static", "recovering"]
 
 LONGEST_DELAY = 0.6  # s
 _PLANT_BOUNDS = {"time_constant": (1e-3, 2.0), "natural_frequency": (0.5, 2e3), "damping": (0.2, 8.0)}
-_INTERCEPTS, _INTERCEPT_PRIOR = (0.4, 1.6), (1.0, 0.1)
+_INTERCEPTS, _INTERCEPT_PRIOR = (0.7, 1.3), (1.0, 0.1)
 _RECOVERIES = (0.02, 0.5)  # s; what takes longer is hardly told from a gain that stays
 _DAMPING_PRIOR = (0.0, 0.7)  # of ln ζ: what is sold as an axis neither rings for ever nor has two lags far apart
 _LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each as likely
@@ -131,14 +131,6 @@ class Branch:
         return np.where(delays < known[0], below, np.where(delays > known[-1], above, middle))
 
 
-class Interval(NamedTuple):
-    """A number and its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-
 class Mixture(NamedTuple):
     """Points of all branches between their entries, (n,).
 
@@ -194,36 +186,38 @@ class AxisPosterior:
     def mixture(self, others: Callable[[FloatArray], FloatArray]) -> Mixture:
         """The mixture, with the log-density of the delay by other axes."""
         parts = [self._points(branch) for branch in self.branches]
-        logs = np.concatenate([log for log, _, _, _, _ in parts])
-        delay = np.concatenate([delay for _, _, delay, _, _ in parts])
-        logs = logs + others(delay)
+        delay = np.concatenate([part.delay for part in parts])
+        logs = np.concatenate([part.weight for part in parts]) + others(delay)
         weight = np.exp(logs - logs.max())
-        means, sds = (
-            {name: np.concatenate([part[place].get(name, np.full(len(part[0]), np.nan)) for part in parts])
-             for name in QUANTITIES}
-            for place in (3, 4)
+        return Mixture(
+            weight / weight.sum(),
+            np.concatenate([part.model for part in parts]),
+            delay,
+            {name: np.concatenate([part.mean[name] for part in parts]) for name in QUANTITIES},
+            {name: np.concatenate([part.sd[name] for part in parts]) for name in QUANTITIES},
         )
-        return Mixture(weight / weight.sum(), np.concatenate([part[1] for part in parts]), delay, means, sds)
 
-    def _points(
-        self, branch: Branch
-    ) -> tuple[FloatArray, FloatArray, FloatArray, dict[Quantity, FloatArray], dict[Quantity, FloatArray]]:
-        """Log-weights, models, delays, means and deviations at points between the entries of a branch."""
-        known = branch.delays
-        place = np.linspace(0.0, len(known) - 1.0, _REFINED * (len(known) - 1) + 1)
-        index = np.arange(len(known))
+    def _points(self, branch: Branch) -> Mixture:
+        """Points between the entries of a branch; the logarithms of their weights."""
+        known, count = branch.delays, len(branch.entries)
+        place, index = np.linspace(0.0, count - 1.0, _REFINED * (count - 1) + 1), np.arange(count)
         delay = np.interp(place, index, known)
         width = np.gradient(delay) if len(delay) > 1 else np.array([_SHORTEST])
         log = branch.at(delay) + np.log(width)
         for other in self.branches:  # of two maxima that meet, each counts where it is the higher one
             if other is not branch and other.model == branch.model:
                 log = np.where(other.at(delay) > branch.at(delay) + 1e-9, -np.inf, log)
-        means, sds = (
-            {name: np.interp(place, index, [getattr(one, field)[name] for one in branch.entries])
-             for name in branch.entries[0].means}
-            for field in ("means", "sds")
+
+        def between(values: list[float]) -> FloatArray:
+            return np.asarray(np.interp(place, index, values), dtype=np.float64)
+
+        return Mixture(
+            np.asarray(log, dtype=np.float64),
+            np.full(len(delay), float(MODELS.index(branch.model))),
+            np.asarray(delay, dtype=np.float64),
+            {name: between([one.means.get(name, np.nan) for one in branch.entries]) for name in QUANTITIES},
+            {name: between([one.sds.get(name, np.nan) for one in branch.entries]) for name in QUANTITIES},
         )
-        return log, np.full(len(delay), MODELS.index(branch.model)), delay, means, sds
 
 
 # ---- one axis -------------------------------------------------------------------------------------------------------
@@ -444,8 +438,10 @@ class _AxisSearch:
         sd = float(np.sqrt(cov[place, place]))
         slope = np.delete(cov[:, place] / cov[place, place], place)
         step = min(max(_STEP * sd, _SHORTEST), _LONGEST)
-        middle = self._entry(model, peak, others)
-        sides = [list(self._side(model, peak, others, sign * step, sign * step * slope, middle)) for sign in (-1.0, 1.0)]
+        middle = self._entry(peak, others)
+        sides = [
+            list(self._side(model, peak, others, sign * step, sign * step * slope, middle)) for sign in (-1.0, 1.0)
+        ]
         return Branch(model, [*reversed(sides[0]), middle, *sides[1]])
 
     def _side(
@@ -461,7 +457,7 @@ class _AxisSearch:
             there = changed(before, ("arm", "axes", self.axis, "delay"), max(delay, 0.0))
             there = moved(there, others, np.clip(at + move, low, high))
             found = maximise(self.likelihood, there, others, tolerance=_ROUGHLY)
-            entry = self._entry(model, found, others)
+            entry = self._entry(found, others)
             yield entry
             top = max(top, entry.log_density)
             if entry.log_density < top - _FORLORN or delay <= 0.0:
@@ -469,7 +465,7 @@ class _AxisSearch:
             before, after = found.config, coordinates(found.config, others)
             move, at = after - at, after
 
-    def _entry(self, model: Model, found: Point, others: Sequence[Parameter]) -> Entry:
+    def _entry(self, found: Point, others: Sequence[Parameter]) -> Entry:
         """An entry from the most likely configuration with its delay."""
         inside = [one for one in others if one.at_bound(found.config) is None]
         information = derivatives(self.likelihood, found, inside).information if inside else np.zeros((0, 0))
@@ -477,7 +473,9 @@ class _AxisSearch:
         means, sds = dict[Quantity, float](), dict[Quantity, float]()
         for name, measure in _measures(self.axis, found.config).items():
             at = measure(found.config)
-            slope = np.array([(measure(one.move(found.config, one.at(found.config) + 1e-5)) - at) / 1e-5 for one in inside])
+            slope = np.array(
+                [(measure(one.move(found.config, one.at(found.config) + 1e-5)) - at) / 1e-5 for one in inside]
+            )
             means[name], sds[name] = at, float(np.sqrt(max(slope @ cov @ slope, 0.0))) if inside else 0.0
         density = _laplace(found.log_posterior, information, inside)
         return Entry(found.config.arm.delay_of(self.axis), found.config, density, means, sds)
@@ -541,9 +539,9 @@ def sharing(posteriors: Mapping[str, AxisPosterior]) -> list[str]:
         price = (len(axes) - 1) * math.log(_OWN_WIDTH)
         return evidence(np.sum([logs[axis] for axis in axes], axis=0)) - sum(alone[axis] for axis in axes) + price
 
-    shares = list(posteriors)
+    shares: list[str] = list(posteriors)
     while len(shares) > 1:
-        fewer = [[axis for axis in shares if axis != one] for one in shares]
+        fewer: list[list[str]] = [[axis for axis in shares if axis != one] for one in shares]
         best = max(fewer, key=lambda axes: gain(axes) if len(axes) > 1 else 0.0)
         if gain(shares) >= (gain(best) if len(best) > 1 else 0.0):
             return shares

@@ -7,10 +7,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from ..arrays import FloatArray
+from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..filter.outcome import Outcome
 from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates
@@ -18,7 +19,9 @@ from ..fusion.score import Z95, interpolated
 from ..logs.axes import in_axes
 from ..logs.frames import CARTESIAN, in_space
 from ..logs.run import Run
-from ..units import SCREEN, seconds
+from ..model.response import response
+from ..tuning.latency import Latency
+from ..units import MS, SCREEN, seconds
 from . import colours
 from .canvas import drawing
 
@@ -156,6 +159,77 @@ def validation_figure(est: Estimates, path: Path) -> None:
             histogram.set_ylabel("density")
             correlations(correlation, [found], [by_sensor[sensor]])
             correlation.set_ylabel("autocorrelation")
+
+
+def lag_figures(found: Latency) -> Markup:
+    """A row for each axis: command, measurements and model where most happens, and the lag over the run.
+
+    Args:
+        found: How late everything is; the run with the most measurements is drawn.
+    """
+    summary, arm = found.summary, found.config.arm
+    run = max(
+        found.runs, key=lambda one: len(one.sensors[summary.sensor].stamp) if summary.sensor in one.sensors else 0
+    )
+    source, origin = run.sensors[summary.sensor], int(np.min(run.command.stamp[run.command.stamp != NO_STAMP]))
+    axes = [axis for axis in summary.axes if axis in source.values and axis in run.axes]
+    with drawing(2, len(axes), width=12.0, height=2.6, ratios=[3.0, 1.4]) as canvas:
+        for axis, motion, course in zip(axes, canvas.axes[::2], canvas.axes[1::2], strict=True):
+            screen, one = SCREEN[run.kinds.get(axis, "length")], summary.axes[axis]
+            given, command = _known(run.command.stamp, run.command.values[axis])
+            stamp, value = _known(source.stamp, source.values[axis])
+            fine = np.unique(np.concatenate([given, stamp]))
+            model = arm.axes[axis]
+            moved = (
+                response(model, arm.update_period, arm.delay_of(axis), given, command, command[0], fine) + command[0]
+            )
+            scale = found.config.sensors[summary.sensor].scale
+            off = float(np.median(value - scale * np.interp(stamp, fine, moved)))
+            value = (value - off) / scale
+            begin = _busiest(seconds(given, origin), command, max(_ZOOM_S, 8.0 * one.lag))
+            end = begin + max(_ZOOM_S, 8.0 * one.lag)
+            time = seconds(given, origin)
+            motion.step(time, command * screen.scale, where="post", color=colours.COMMAND, lw=1, label="command")
+            motion.plot(
+                seconds(stamp, origin),
+                value * screen.scale,
+                ".",
+                ms=4,
+                color=_measured(summary.sensor),
+                label=summary.sensor,
+            )
+            motion.plot(seconds(fine, origin), moved * screen.scale, color=colours.ESTIMATE, lw=1.2, label="model")
+            shown = command[(time >= begin - 1.0) & (time <= end)] * screen.scale
+            margin = 0.08 * float(np.ptp(shown)) + 1e-3
+            motion.set(xlim=(begin, end), ylim=(float(shown.min()) - margin, float(shown.max()) + margin))
+            motion.set_title(f"{axis}: {one.lag * MS:.1f} ms late", loc="left")
+            motion.set_ylabel(f"{axis} [{screen.unit}]")
+            if one.course:
+                t, shift, sd = np.array([(part.time, part.shift, part.sd) for part in one.course]).T
+                course.errorbar(t, (one.lag + shift) * MS, Z95 * sd * MS, fmt="o", ms=3, color=colours.ESTIMATE, lw=1)
+                course.axhspan(*(end * MS for end in one.lag_ci95), color=colours.ESTIMATE, alpha=0.2, lw=0)
+            course.set_ylabel("lag [ms]")
+        for column in canvas.axes[-2:]:
+            column.set_xlabel(_TIME)
+        canvas.axes[0].legend(loc="best", ncols=3, frameon=False)
+        return canvas.svg()
+
+
+def _measured(sensor: str) -> str:
+    return colours.REFERENCE if sensor == "reference" else colours.sensor_colours([sensor])[sensor]
+
+
+def _known(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, FloatArray]:
+    """Stamps and values of the rows that have both, in order, one a stamp."""
+    there = (stamp != NO_STAMP) & np.isfinite(value)
+    time, place = np.unique(stamp[there], return_index=True)
+    return time, value[there][place]
+
+
+def _busiest(time: FloatArray, value: FloatArray, length: float) -> float:
+    """Where the part of a length [s] begins in which a command moves most."""
+    travel = np.append(0.0, np.cumsum(np.abs(np.diff(value))))
+    return float(time[int(np.argmax(np.interp(time + length, time, travel) - travel))])
 
 
 def innovations(axes: Axes, est: Estimates, sensor: str, axis: str, colour: str) -> FloatArray:

@@ -27,6 +27,15 @@ def with_interval(value: float, interval: Interval | None, unit: float = 1.0) ->
     return f"{value * unit:.{digits}f} ± {half:.{digits}f}"
 
 
+def between(value: float, interval: Interval | None, unit: float = 1.0) -> str:
+    """``value (low to high)``, all times ``unit``, rounded to two digits of the interval; without it the value alone."""
+    if interval is None:
+        return f"{value * unit:.4g}"
+    width = max((interval[1] - interval[0]) * unit, 1e-6 * abs(value * unit), 1e-12)
+    digits = min(max(1 - int(np.floor(np.log10(width))), 0), 6)
+    return f"{value * unit:.{digits}f} ({interval[0] * unit:.{digits}f} to {interval[1] * unit:.{digits}f})"
+
+
 def milliseconds(estimate: Estimate | None) -> str:
     """An estimate [s] with its interval in milliseconds; a dash without one."""
     return "–" if estimate is None else with_interval(estimate.value, estimate.ci95, MS)

@@ -1,26 +1,32 @@
-"""Tables, sentences and an HTML page of an identification or a verification."""
+"""Tables, sentences and an HTML page of an identification, a verification, or of how late everything is."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from .. import folders
+from .. import folders, toml
+from ..fusion.score import Z95
 from ..identification.identify import Identification, OrderFit, TrialResult
 from ..identification.trials import StepTrials
 from ..identification.verify import AxisVerification, Trace
 from ..model.arm import ArmModel
-from ..model.plants import FirstOrder
+from ..model.plants import PLANTS, FirstOrder
+from ..tuning.latency import AxisLag, Latency, LatencySummary
+from ..tuning.parameters import rounded
 from ..units import KINDS, MS, SCREEN, Kind, Screen
 from . import formatting, step_figures
 from .canvas import render
+from .figures import lag_figures
 
 PAGE = "report.html"
+_PHYSICS = 0.005  # s: a usual step of simulators
 _TEXT = frozenset({"axis", "coefficient", "factor", "level: mean ± sd (trials)", "verdict", "outlying trials"}) | {
-    "plant", "trial", "flags", "run", "source",
+    "plant", "trial", "flags", "run", "source", "axis,\nsensor",
 }  # fmt: skip
 _SPEED: dict[Kind, str] = {"length": "m/s", "angle": "rad/s"}  # the s of a gain line: slopes are per that in arm.toml
 T = TypeVar("T")
@@ -120,28 +126,172 @@ def _verifications(verified: Sequence[AxisVerification], kind: Kind) -> TextTabl
             "run": lambda one: one.run,
             "axis": lambda one: one.axis,
             "source": lambda one: one.source,
-            f"signal, {screen.unit}": lambda one: f"{one.amplitude * screen.scale:.4g}",
-            f"RMS, {screen.unit}": lambda one: f"{one.model.rms * screen.scale:.3f}",
-            "of signal": lambda one: f"{one.model.percent:.1f} %",
-            "fit": lambda one: f"{one.model.fit:.1f} %" if np.isfinite(one.model.fit) else "–",
-            "no recovery": lambda one: f"{one.without_recovery.rms * screen.scale:.3f}",
-            "recovery": lambda one: f"{one.with_recovery.rms * screen.scale:.3f}",
-            f"best, {screen.unit}": lambda one: f"{one.best_in_class.fit.rms * screen.scale:.3f}",
+            f"motion, {screen.unit}": lambda one: f"{one.amplitude * screen.scale:.4g}",
+            f"error,\n{screen.unit} RMS": lambda one: f"{one.model.rms * screen.scale:.3f}",
+            "of the\nmotion": lambda one: f"{one.model.percent:.1f} %",
+            "explained": lambda one: f"{one.model.fit:.1f} %" if np.isfinite(one.model.fit) else "–",
+            "gain that\nstays": lambda one: f"{one.without_recovery.rms * screen.scale:.3f}",
+            "gain that\nrecovers": lambda one: f"{one.with_recovery.rms * screen.scale:.3f}",
+            "best\npossible": lambda one: f"{one.best_in_class.fit.rms * screen.scale:.3f}",
         },
     )
 
 
 def verdict(one: AxisVerification) -> str:
-    """The lag of one axis by the model and by the best in class, the verdict, and the start level."""
+    """How far off the model is on one axis, how late the arm is here, and what the best model would be."""
     best, screen = one.best_in_class, SCREEN[one.kind]
-    left_out = f"; {one.outlying} outlying measurements left out" if one.outlying else ""
+    left_out = f"; {one.outlying} outlying measurements are left out" if one.outlying else ""
     return (
-        f"{one.run}, {one.axis}: lag {one.lag * MS:.1f} ms, here"
-        f" {formatting.with_interval(best.lag, best.lag_ci95, MS)} ms; {one.verdict}; start level"
-        f" {one.start * screen.scale:g} {screen.unit} ({one.start_from}); gain recovery"
-        f" tried with {one.recovery * MS:g} ms; the best in class is K {best.gain:.3f}, Td {best.delay * MS:.1f} ms,"
-        f" {formatting.plant(best.plant)}{left_out}"
+        f"{one.run}, {one.axis}: the model is off by {one.model.rms * screen.scale:.3f} {screen.unit} RMS,"
+        f" {one.model.percent:.1f} % of the motion; the best model of its order would be off by"
+        f" {best.fit.rms * screen.scale:.3f}: {one.verdict}; by the model the arm is {one.lag * MS:.1f} ms late,"
+        f" here it is {formatting.with_interval(best.lag, best.lag_ci95, MS)} ms; the best model has a gain of"
+        f" {best.gain:.3f}, a dead time of {best.delay * MS:.1f} ms and {_plant_words(best.plant)}; the start level is"
+        f" {one.start * screen.scale:g} {screen.unit} ({one.start_from}){left_out}"
     )
+
+
+def _plant_words(plant: PLANTS) -> str:
+    if isinstance(plant, FirstOrder):
+        return f"a time constant of {formatting.with_interval(plant.time_constant, plant.time_constant_ci95, MS)} ms"
+    frequency = formatting.with_interval(plant.natural_frequency, plant.natural_frequency_ci95)
+    damping = formatting.with_interval(plant.damping, plant.damping_ci95)
+    return f"a natural frequency of {frequency} rad/s with damping {damping}"
+
+
+# ---- how late -------------------------------------------------------------------------------------------------------
+
+
+def answers(found: LatencySummary) -> list[str]:
+    """How late each axis and each sensor is, whether that changes, and what the motion was too poor for."""
+    lines = [f"{axis} is {formatting.between(one.lag, one.lag_ci95, MS)} ms late." for axis, one in found.axes.items()]
+    for name, one in found.sensors.items():
+        late = formatting.between(abs(one.latency), _turned(one.latency_ci95, one.latency), MS)
+        lines.append(f"{name} is {late} ms {'later' if one.latency >= 0.0 else 'earlier'} than {found.sensor}.")
+    lines.append(
+        "An axis is late behind the held command, at constant velocity; behind the commanded path it is"
+        f" {0.5 * found.update_period * MS:.3g} ms more. The stamps of {found.sensor} are taken to be right: by as much"
+        " as they are late, every axis is less late."
+    )
+    return [*lines, *_changes(found), *(f"{axis}: {note}" for axis, one in found.axes.items() for note in one.notes)]
+
+
+def _turned(interval: tuple[float, float], value: float) -> tuple[float, float]:
+    """The interval of the absolute value."""
+    return interval if value >= 0.0 else (-interval[1], -interval[0])
+
+
+def _changes(found: LatencySummary) -> list[str]:
+    """What is said of the lag over the run."""
+    lines: list[str] = []
+    if found.clock_drift is not None:
+        lines.append(
+            f"All axes together become {found.clock_drift * MS:+.1f} ms later over the run: a clock drifts, that of the"
+            f" commands or that of {found.sensor}."
+        )
+    if found.clock_wander is not None:
+        lines.append(
+            f"All axes wander together by ± {found.clock_wander * MS:.1f} ms (one standard deviation): a clock, not"
+            " the arm."
+        )
+    for axis, one in found.axes.items():
+        if one.drifts and one.drift is not None and found.clock_drift is None:
+            lines.append(
+                f"{axis} becomes {one.drift * MS:+.1f} ms later over the run"
+                f" (± {Z95 * (one.drift_sd or 0.0) * MS:.1f})."
+            )
+        if one.wander and found.clock_wander is None:
+            lines.append(f"The lag of {axis} wanders by ± {one.wander * MS:.1f} ms (one standard deviation).")
+    told = any(one.course for one in found.axes.values())
+    return lines or (["The lag stays the same over the run, as far as can be told."] if told else [])
+
+
+def lags(found: LatencySummary) -> TextTable:
+    """A row for each axis and each sensor."""
+
+    def time(value: float, interval: tuple[float, float], shared: bool = False) -> str:
+        return formatting.between(value, interval, MS).replace(" (", f"{' *' if shared else ''}\n(", 1)
+
+    rows = [
+        [
+            axis,
+            time(one.lag, one.lag_ci95),
+            time(one.delay, one.delay_ci95, one.shared_delay),
+            _plant_of(one),
+            _gain_of(one),
+        ]
+        for axis, one in found.axes.items()
+    ]
+    rows += [[name, time(one.latency, one.latency_ci95), "", "", ""] for name, one in found.sensors.items()]
+    return TextTable(("axis,\nsensor", "late, ms", "dead time, ms", "plant", "gain"), rows)
+
+
+def _plant_of(one: AxisLag) -> str:
+    if one.time_constant is not None:
+        return f"τ {formatting.between(one.time_constant, one.time_constant_ci95, MS)} ms"
+    frequency = formatting.between(one.natural_frequency or 0.0, one.natural_frequency_ci95)
+    return f"ω {frequency} rad/s\nζ {formatting.between(one.damping or 0.0, one.damping_ci95)}"
+
+
+def _gain_of(one: AxisLag) -> str:
+    gain = "1" if one.gain_ci95 is None else formatting.between(one.gain, one.gain_ci95)
+    if one.gain_recovery is None:
+        return gain
+    return f"{gain}\nrecovers: {formatting.between(one.gain_recovery, one.gain_recovery_ci95, MS)} ms"
+
+
+def settings(found: Latency) -> str:
+    """The lines for ``fusion.toml`` and ``arm.toml``."""
+    lines = [
+        toml.text({"sensors": {name: {"latency_ms": rounded(one.latency)}}})
+        for name, one in found.summary.sensors.items()
+    ]
+    return "\n".join([*lines, found.config.arm.to_toml()])
+
+
+def elsewhere(found: LatencySummary) -> list[str]:
+    """What to write for other programs, in their units."""
+    latest = max(one.lag for one in found.axes.values()) + 0.5 * found.update_period
+    steps, plants, dead = list[str](), list[str](), list[str]()
+    for axis, one in found.axes.items():
+        low, high = math.floor(one.delay_ci95[0] / _PHYSICS), math.ceil(one.delay_ci95[1] / _PHYSICS)
+        steps.append(f"{axis} {max(low, 0)} to {high}")
+        plants.append(f"{axis} {max(one.lag - one.delay, 0.0):.4f}")
+        dead.append(f"{axis} {one.delay:.4f}")
+    every = f"{_PHYSICS * MS:g} ms"
+    lines = [
+        f"MoveIt Servo, max_expected_latency [s]: {latest:.3f}, of the axis that is latest",
+        f"Isaac Lab, DelayedPDActuatorCfg(min_delay, max_delay) [physics steps of {every}]: {', '.join(steps)}",
+        f"mjlab, delay_min_lag and delay_max_lag of an actuator [physics steps of {every}]: the same",
+        f'MuJoCo, dynprm of dyntype="filterexact" [s]: {", ".join(plants)}; actuator_delay [s]: {", ".join(dead)}',
+    ]
+    return lines + [
+        f"LeRobot, {name}: a frame shows what was {one.latency:.3f} s before its stamp; shift its delta_timestamps by"
+        " that, in multiples of 1/fps"
+        for name, one in found.sensors.items()
+    ]
+
+
+def write_latency(found: Latency, folder: Path, force: bool) -> None:
+    """Write ``report.html`` with the answers, a picture of each axis, and what to write where.
+
+    Args:
+        found: From :func:`pumafuse.latency`.
+        folder: Where the page goes.
+        force: Whether an earlier report may be replaced.
+
+    Raises:
+        FolderError: See :func:`check_writable`, or the disk refuses.
+    """
+    content = {
+        "summary": found.summary,
+        "answers": answers(found.summary),
+        "lags": lags(found.summary),
+        "figures": lag_figures(found),
+        "settings": settings(found),
+        "elsewhere": elsewhere(found.summary),
+    }
+    _write("latency.html", content, folder, force)
 
 
 def check_writable(folder: Path, force: bool) -> None:

@@ -1,0 +1,91 @@
+"""`pumafuse latency`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+from rich.console import Console
+
+from ..errors import ConfigError
+from ..folders import write_file
+from ..logs.run import Run
+from ..tuning.latency import Latency, latency
+from ..views import report as reports
+from .tables import console, table
+
+
+def run(
+    paths: Sequence[Path],
+    sensor: str | None,
+    report: Path | None,
+    json: bool,
+    force: bool,
+    part: tuple[float | None, float | None] = (None, None),
+) -> None:
+    """Tell how late everything is; the arguments are the options of the command.
+
+    Raises:
+        PumafuseError: The runs tell nothing, or the report is in the way.
+    """
+    if report is not None:
+        reports.check_writable(report, force)
+    found = _found(paths, sensor, part)
+    if report is not None:
+        reports.write_latency(found, report, force)
+    if json:
+        typer.echo(found.to_json(), nl=False)
+        return
+    show(found)
+    typer.echo("\nto write into fusion.toml and arm.toml (pumafuse identify RUN -o arm.toml writes the latter):\n")
+    typer.echo(reports.settings(found))
+    typer.echo("elsewhere:")
+    for line in reports.elsewhere(found.summary):
+        typer.echo(f"  {line}")
+    if report is not None:
+        typer.echo(f"written to {report}")
+
+
+def identify(
+    paths: Sequence[Path], output: Path, sensor: str | None, report: Path | None, json: bool, force: bool
+) -> None:
+    """Make a model of an arm from recorded motion.
+
+    Raises:
+        PumafuseError: The runs tell nothing, or the report is in the way.
+    """
+    if report is not None:
+        reports.check_writable(report, force)
+    found = _found(paths, sensor)
+    write_file(output, found.arm.to_toml())
+    if report is not None:
+        reports.write_latency(found, report, force)
+    if json:
+        typer.echo(found.to_json(), nl=False)
+        return
+    show(found)
+    typer.echo(f"written to {output}" + (f" and {report}" if report is not None else ""))
+    typer.echo(f"next: pumafuse verify RUN --arm {output}, with a run that it was not made from")
+
+
+def show(found: Latency) -> None:
+    """Print the answers and a table on stdout."""
+    for line in reports.answers(found.summary):
+        typer.echo(line)
+    console(sys.stdout).print(table(*reports.lags(found.summary)))
+    if any(one.shared_delay for one in found.summary.axes.values()):
+        typer.echo("* one dead time for several axes")
+
+
+def _found(
+    paths: Sequence[Path], sensor: str | None, part: tuple[float | None, float | None] = (None, None)
+) -> Latency:
+    runs: list[Run] = []
+    for path in paths:
+        if path.is_dir() and not (path / "run.toml").exists():
+            raise ConfigError(f"{path}: has no run.toml; `pumafuse init {path}` looks at the log and writes one")
+        runs.append(Run.read(path).between(*part))
+    with Console(stderr=True).status("looking at how motion follows the commands"):
+        return latency(runs, sensor=sensor)
