@@ -174,7 +174,8 @@ def _response(axis: Axis, time: Array, u: Array, duration: float):
         drive = axis.gain * step
     else:
         left = np.exp(-STEP / axis.recovery)
-        drive = step + lfilter([axis.gain - 1.0], [1.0, -left], jump[:-1])
+        mean = (1.0 - left) * axis.recovery / STEP  # over a step of the simulation, of an error that is 1 at its start
+        drive = step + mean * lfilter([axis.gain - 1.0], [1.0, -left], jump[:-1])
     if axis.order == 1:
         left = np.exp(-STEP / axis.lag)
         moved = lfilter([0.0, 1.0 - left], [1.0, -left], drive)

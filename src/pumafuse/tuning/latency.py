@@ -185,7 +185,7 @@ class Latency:
     @property
     def arm(self) -> ArmModel:
         """The arm with its intervals and where it is from, for ``arm.toml``."""
-        arm = self.config.arm
+        arm: ArmModel = self.config.arm
         for axis, one in self.summary.axes.items():
             for name in ("time_constant", "natural_frequency", "damping"):
                 if hasattr(arm.axes[axis].plant, name):
@@ -363,10 +363,11 @@ def _known(config: FusionConfig, trusted: str) -> FusionConfig:
 
 def _posteriors(parts: Mapping[str, Likelihood], config: FusionConfig) -> dict[str, AxisPosterior]:
     """The posterior of each axis, several at a time."""
-    from joblib import Parallel, cpu_count, delayed
+    import joblib
+    from joblib import Parallel, delayed
 
     jobs = [delayed(axis_posterior)(mine, config, axis) for axis, mine in parts.items()]  # pyright: ignore
-    cores = min(int(cpu_count()), len(jobs))  # pyright: ignore
+    cores = min(int(joblib.cpu_count()), len(jobs))  # pyright: ignore
     return dict(zip(parts, Parallel(n_jobs=cores)(jobs), strict=True))  # pyright: ignore
 
 
@@ -437,7 +438,8 @@ def _axis_lag(
 
         middle = math.log(value) if log else value
         low, high = mixture.quantiles(quantity, alike)
-        low, high = middle - margin * max(middle - low, 0.0), middle + margin * max(high - middle, 0.0)
+        centre, half = 0.5 * (low + high), 0.5 * margin * (high - low)
+        low, high = min(centre - half, middle), max(centre + half, middle)
         if quantity == "delay":
             low = max(low, 0.0)
         return (math.exp(low), math.exp(high)) if log else (low, high)
@@ -603,8 +605,9 @@ def _clock(courses: Sequence[_Course]) -> tuple[float | None, float | None]:
     """By how much all axes drift and wander together; None where they do not, or each for itself."""
     if len(courses) < 2:
         return None, None
-    information = np.sum([one.information for one in courses], axis=0)
-    shift = np.linalg.solve(information, np.sum([one.information @ one.shift for one in courses], axis=0))
+    information: FloatArray = np.sum([one.information for one in courses], axis=0)
+    moved: FloatArray = np.sum([one.information @ one.shift for one in courses], axis=0)
+    shift = np.linalg.inv(information) @ moved
     every = sum(float(one.shift @ one.information @ one.shift) for one in courses)
     if float(shift @ information @ shift) < 0.5 * every:
         return None, None

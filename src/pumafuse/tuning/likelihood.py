@@ -279,7 +279,7 @@ class Likelihood:
 
         rate = (predicted(_SHIFT) - predicted(-_SHIFT)) / (_SHIFT + min(_SHIFT, delay))
         since = (rows.time - segment.origin) / 1e9
-        edges = np.linspace(since.min(), since.max(), count + 1)
+        edges = np.linspace(float(since.min()), float(since.max()), count + 1)
         place = np.clip(np.searchsorted(edges, since, side="right") - 1, 0, count - 1)
         moved = np.empty((count, len(since)))
         for number in range(count):
@@ -290,7 +290,9 @@ class Likelihood:
         information = moved @ moved.T
         size = np.sqrt(np.maximum(np.diag(information), 1e-3 * max(float(np.diag(information).max()), 1e-12)))
         scaled = information / np.outer(size, size) + 1e-9 * np.eye(count)
-        shift = np.linalg.solve(scaled, moved @ (found.innovation / found.innovation_sd)[:, 0] / size) / size
+        shift: FloatArray = (
+            np.linalg.solve(scaled, moved @ (found.innovation / found.innovation_sd)[:, 0] / size) / size
+        )
         return 0.5 * (edges[:-1] + edges[1:]), shift, scaled * np.outer(size, size)
 
     def misfit(self, config: FusionConfig) -> dict[str, float]:
@@ -357,9 +359,10 @@ class Likelihood:
         latest, decided, every = self._latest
         if latest is config and decided is outcomes:  # as a search asks: at the point that it has just evaluated
             known = every[part.whole]
-            nu, S = known.innovation[part.rows, part.column], known.innovation_sd[part.rows, part.column] ** 2
+            base = known.innovation[part.rows, part.column], known.innovation_sd[part.rows, part.column] ** 2
         else:
-            nu, S = innovated(config)
+            base = innovated(config)
+        nu, S = base
         fused = outcome != Outcome.REJECTED
         d_nu, d_S = np.empty((len(mine), len(nu))), np.empty((len(mine), len(nu)))
         for place, number in enumerate(mine):

@@ -215,7 +215,7 @@ def _step(found: Derivatives, low: FloatArray, high: FloatArray, damping: FloatA
     matrix = found.information[np.ix_(known, known)] * np.outer(size, size) + np.diag(damping[known] + _ROUNDING)
     root = np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
     aim = solve_triangular(root, size * found.score[known], lower=True)
-    inner, lowest, highest = solve_triangular(root.T, aim), low[known] / size, high[known] / size
+    inner, lowest, highest = solve_triangular(root.T, aim, lower=False), low[known] / size, high[known] / size
     if not ((inner >= lowest) & (inner <= highest)).all():
         inner = lsq_linear(root.T, aim, (lowest, highest), method="bvls").x
     step[known] = size * inner

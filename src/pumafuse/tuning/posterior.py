@@ -50,14 +50,15 @@ _INTERCEPTS, _INTERCEPT_PRIOR = (0.7, 1.3), (1.0, 0.1)
 _RECOVERIES = (0.02, 0.5)  # s; what takes longer is hardly told from a gain that stays
 _DAMPING_PRIOR = (0.0, 0.7)  # of ln ζ: what is sold as an axis neither rings for ever nor has two lags far apart
 _LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each as likely
-_SHARES = (0.3, 0.6, 0.9)  # of the lag that is delay: starts
+_DELAYS = 12  # that are tried at first, at most
+_SHARE = 0.98  # of the measurements that least squares are of; the rest may be outliers
 _ERRORS, _RECOVERING = (-0.12, -0.05, 0.05), (0.05, 0.12, 0.3)  # starts: gains less 1, recoveries [s]
 _EARLIER, _DAMPINGS = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no delay, ζ
 _NEARLY = 40.0  # log-likelihood that a better noise may gain
 _WORSE = 2.0  # log-likelihood behind the best of all, from which a model is looked for again
 _SAME = 2e-4  # s, between delays of maxima that are one
 _ARM: tuple[Fit, ...] = ("delay", "plant", "gain")
-_ROUGHLY, _VERY_ROUGHLY = 0.1, 0.5  # tolerances in log-likelihood
+_ROUGHLY = 0.1  # tolerance in log-likelihood
 _FORLORN = 8.0  # log-likelihood behind the best, after the penalty, from which a model or a delay counts for nothing
 _STEP = 0.5  # standard deviations, between delays
 _SHORTEST, _LONGEST = 2e-5, 0.03  # s, of a step
@@ -150,11 +151,11 @@ class Mixture(NamedTuple):
 
     def quantiles(self, quantity: Quantity, chosen: Callable[[Model], bool], share: float = 0.95) -> tuple[float, ...]:
         """The ends of the middle ``share`` of a quantity under the models that are chosen."""
+        from scipy.special import ndtr  # takes a while to import
+
         models = np.array([chosen(one) for one in MODELS])
         mine = models[self.model.astype(np.int64)] & np.isfinite(self.mean[quantity]) & (self.weight > 1e-9)
         mean, sd, weight = self.mean[quantity][mine], self.sd[quantity][mine], self.weight[mine]
-        from scipy.special import ndtr  # takes a while to import
-
         sd = np.maximum(sd, 1e-12)
         grid = np.unique(np.concatenate([mean + times * sd for times in np.linspace(-4.0, 4.0, 33)]))
         if len(grid) > _GRID:
@@ -299,14 +300,16 @@ class _AxisSearch:
         tried = [point(self.likelihood, start, self.free(start, model, _ARM)) for start in starts]
         tried.sort(key=lambda one: -one.log_posterior)
         peaks = [
-            maximise(self.likelihood, one.config, self.free(one.config, model, _ARM), tolerance=_VERY_ROUGHLY)
+            maximise(self.likelihood, one.config, self.free(one.config, model, _ARM), tolerance=_ROUGHLY)
             for one in tried[:climbed]
         ]
         return max(peaks, key=lambda one: one.log_posterior)
 
     def with_white_noise(self, config: FusionConfig) -> FusionConfig:
         """The configuration with all that the arm leaves over as noise of the sensors: for least squares."""
-        left = self.likelihood.misfit(config)[self.axis]
+        pairs = self.likelihood.responses(config).values()
+        left = np.sort(np.abs(np.concatenate([measured - expected for expected, measured in pairs])))
+        left = float(np.sqrt(np.mean(left[: math.ceil(_SHARE * len(left))] ** 2)))
         for one in self.free(config, MODELS[0], ["noise"]):
             config = one.put(config, one.clipped(left) if one.sensor else one.bounds[0])
         return with_disturbance(config, self.axis, 0.0, config.process[self.axis].disturbance_time)
@@ -381,17 +384,18 @@ class _AxisSearch:
         noise that the best arm leaves, each model from the best of all, too; and an update period of delay away.
         """
         plain = self.with_white_noise(self.with_gain(with_order(self.start, self.axis, 1), 1.0, None))
-        best = {MODELS[0]: self.maximum(MODELS[0], [self.with_delay(plain, share * self._lag) for share in _SHARES])}
+        delays = np.arange(0.0, self._lag, max(0.5 * self.start.arm.update_period, self._lag / _DELAYS))
+        best = {MODELS[0]: self.maximum(MODELS[0], [self.with_delay(plain, delay) for delay in delays.tolist()])}
         for model in MODELS[1:]:
             best[model] = self.maximum(model, self.starts(model, self._best(best).config))
         best = self._again(best, self.with_white_noise(self._best(best).config))
         for kinds in (["ou"], ["none", "matern", "ou"]):
             best = self._likely(self._again(best, self.with_noise(self._best(best).config, kinds)))
         found = [self._weighed(model, self.polished(model, peak.config)) for model, peak in best.items()]
-        highest, period = max(one[0] for one in found), self.start.arm.update_period
+        highest = max(one[0] for one in found)
         for evidence, model, peak in list(found):
-            for ticks in (-1.0, 1.0) if evidence > highest - _FORLORN else ():
-                beside = self.maximum(model, [self.with_delay(peak.config, self.delay_of(peak) + ticks * period)])
+            for start in self._ticks_away(peak.config) if evidence > highest - _FORLORN else ():
+                beside = self.maximum(model, [start])
                 known = [self.delay_of(one) for _, other, one in found if other == model]
                 if min(abs(self.delay_of(beside) - delay) for delay in known) > _SAME:
                     found.append(self._weighed(model, self.polished(model, beside.config)))
@@ -403,6 +407,10 @@ class _AxisSearch:
         for model in sorted(best, key=lambda one: -best[one].log_posterior):
             own = self.with_noise_of(best[model].config, noise)
             found[model] = self.maximum(model, [own, *self.starts(model, top)], climbed=1)
+            if len(found) == 1:  # the best until now: with commands a period apart a wrong period fits well, too
+                again = self.maximum(model, self._ticks_away(found[model].config))
+                if again.log_posterior > found[model].log_posterior:
+                    found[model], top = again, again.config
         other = self._best(found)
         for model, peak in found.items():
             if peak.log_posterior < other.log_posterior - _WORSE:
@@ -410,6 +418,11 @@ class _AxisSearch:
                 again = self.maximum(model, starts, climbed=1)
                 found[model] = max(peak, again, key=lambda one: one.log_posterior)
         return found
+
+    def _ticks_away(self, config: FusionConfig) -> Iterator[FusionConfig]:
+        """The configuration with a delay that is an update period shorter, and one that is longer."""
+        for ticks in (-1.0, 1.0):
+            yield self.with_delay(config, config.arm.delay_of(self.axis) + ticks * config.arm.update_period)
 
     def _likely(self, found: Mapping[Model, Point]) -> dict[Model, Point]:
         """Those models that a better noise could still bring near the best."""
@@ -439,13 +452,11 @@ class _AxisSearch:
         slope = np.delete(cov[:, place] / cov[place, place], place)
         step = min(max(_STEP * sd, _SHORTEST), _LONGEST)
         middle = self._entry(peak, others)
-        sides = [
-            list(self._side(model, peak, others, sign * step, sign * step * slope, middle)) for sign in (-1.0, 1.0)
-        ]
+        sides = [list(self._side(peak, others, sign * step, sign * step * slope, middle)) for sign in (-1.0, 1.0)]
         return Branch(model, [*reversed(sides[0]), middle, *sides[1]])
 
     def _side(
-        self, model: Model, peak: Point, others: Sequence[Parameter], step: float, move: FloatArray, middle: Entry
+        self, peak: Point, others: Sequence[Parameter], step: float, move: FloatArray, middle: Entry
     ) -> Iterator[Entry]:
         low, high = np.array([one.range for one in others]).reshape(-1, 2).T
         before, top = peak.config, middle.log_density
@@ -550,9 +561,12 @@ def sharing(posteriors: Mapping[str, AxisPosterior]) -> list[str]:
 
 
 def shared_delay(posteriors: Sequence[AxisPosterior]) -> float:
-    """The most likely delay of axes that share one [s]."""
+    """The delay of axes that share one [s]: the median of what they say together."""
     grid = _grid(posteriors)
-    return float(grid[int(np.argmax(np.sum([one.log_density(grid) for one in posteriors], axis=0)))])
+    log: FloatArray = np.sum([one.log_density(grid) for one in posteriors], axis=0)
+    weight = np.exp(log - log.max()) * np.gradient(grid)
+    below = np.cumsum(weight) - 0.5 * weight
+    return float(np.interp(0.5 * weight.sum(), below, grid))
 
 
 def _grid(posteriors: Iterable[AxisPosterior]) -> FloatArray:

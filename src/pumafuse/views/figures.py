@@ -178,14 +178,11 @@ def lag_figures(found: Latency) -> Markup:
             screen, one = SCREEN[run.kinds.get(axis, "length")], summary.axes[axis]
             given, command = _known(run.command.stamp, run.command.values[axis])
             stamp, value = _known(source.stamp, source.values[axis])
-            fine = np.unique(np.concatenate([given, stamp]))
-            model = arm.axes[axis]
-            moved = (
-                response(model, arm.update_period, arm.delay_of(axis), given, command, command[0], fine) + command[0]
-            )
+            fine, model, start = np.union1d(given, stamp), arm.axes[axis], float(command[0])
+            moved = start + response(model, arm.update_period, arm.delay_of(axis), given, command, start, fine)
             scale = found.config.sensors[summary.sensor].scale
-            off = float(np.median(value - scale * np.interp(stamp, fine, moved)))
-            value = (value - off) / scale
+            apart = value - scale * moved[np.searchsorted(fine, stamp)]
+            value = (value - float(np.median(apart))) / scale
             begin = _busiest(seconds(given, origin), command, max(_ZOOM_S, 8.0 * one.lag))
             end = begin + max(_ZOOM_S, 8.0 * one.lag)
             time = seconds(given, origin)

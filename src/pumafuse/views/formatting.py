@@ -28,7 +28,7 @@ def with_interval(value: float, interval: Interval | None, unit: float = 1.0) ->
 
 
 def between(value: float, interval: Interval | None, unit: float = 1.0) -> str:
-    """``value (low to high)``, all times ``unit``, rounded to two digits of the interval; without it the value alone."""
+    """``value (low to high)``, all times ``unit``, to two digits of the interval; without it the value alone."""
     if interval is None:
         return f"{value * unit:.4g}"
     width = max((interval[1] - interval[0]) * unit, 1e-6 * abs(value * unit), 1e-12)
