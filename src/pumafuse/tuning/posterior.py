@@ -564,7 +564,7 @@ def shared_delay(posteriors: Sequence[AxisPosterior]) -> float:
     """The delay of axes that share one [s]: the median of what they say together."""
     grid = _grid(posteriors)
     log: FloatArray = np.sum([one.log_density(grid) for one in posteriors], axis=0)
-    weight = np.exp(log - log.max()) * np.gradient(grid)
+    weight: FloatArray = np.exp(log - log.max()) * np.asarray(np.gradient(grid), dtype=np.float64)
     below = np.cumsum(weight) - 0.5 * weight
     return float(np.interp(0.5 * weight.sum(), below, grid))
 
