@@ -291,7 +291,8 @@ class Likelihood:
         size = np.sqrt(np.maximum(np.diag(information), 1e-3 * max(float(np.diag(information).max()), 1e-12)))
         scaled = information / np.outer(size, size) + 1e-9 * np.eye(count)
         innovation = (found.innovation / found.innovation_sd)[:, 0]
-        shift = np.linalg.inv(scaled) @ (moved @ innovation / size) / size
+        inverse: FloatArray = np.asarray(np.linalg.inv(scaled), dtype=np.float64)
+        shift: FloatArray = inverse @ (moved @ innovation / size) / size
         return 0.5 * (edges[:-1] + edges[1:]), shift, scaled * np.outer(size, size)
 
     def misfit(self, config: FusionConfig) -> dict[str, float]:

@@ -565,8 +565,8 @@ def shared_delay(posteriors: Sequence[AxisPosterior]) -> float:
     grid = _grid(posteriors)
     log: FloatArray = np.sum([one.log_density(grid) for one in posteriors], axis=0)
     weight: FloatArray = np.exp(log - log.max()) * np.asarray(np.gradient(grid), dtype=np.float64)
-    below = np.cumsum(weight) - 0.5 * weight
-    return float(np.interp(0.5 * weight.sum(), below, grid))
+    below: FloatArray = np.cumsum(weight) - 0.5 * weight
+    return float(np.interp(0.5 * float(weight.sum()), below, grid))
 
 
 def _grid(posteriors: Iterable[AxisPosterior]) -> FloatArray:
