@@ -59,6 +59,7 @@ _MARGIN = 1.3  # by which intervals of delay and plant are widened: found by sim
 _ROUGHLY = 0.1  # tolerance in log-likelihood
 _GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
 _GATE = 5.0
+_AHEAD = 0.02  # s, by which a sensor may seem to be ahead of the commands where it is noisy
 _BESIDE = 3e-4  # s, beside a latency where its interval is taken
 _WIDE, _WIDE_LAG, _WIDE_GAIN = 0.3, 0.02, 0.1  # of the lag, s, of 1: intervals from which a number is not known
 _PARTS = 10  # of a run, of each of which the lag is told
@@ -349,8 +350,16 @@ def _trusted(config: FusionConfig, runs: Sequence[Run], asked: str | None) -> st
 
 
 def _known(config: FusionConfig, trusted: str) -> FusionConfig:
-    """The configuration with the trusted sensor's stamps right, and the others' latencies as much shorter."""
+    """The configuration with the trusted sensor's stamps right, and the others' latencies as much shorter.
+
+    Raises:
+        TuneError: It moves before its commands.
+    """
     late = config.sensors[trusted].latency
+    if late < -_AHEAD:
+        raise TuneError(
+            f"sensor '{trusted}' moves {-late * MS:.0f} ms before its commands: are both stamped by one clock?"
+        )
     for name, one in config.sensors.items():
         config = changed(config, ("sensors", name, "latency"), one.latency - late)
     for axis in config.arm.axes:

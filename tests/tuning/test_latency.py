@@ -1,0 +1,171 @@
+"""How late is it? Lags, latencies, drifts and gains that were simulated are found, and what cannot be told is said."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+import pumafuse as pf
+from pumafuse.tuning.latency import Latency
+from pumafuse.tuning.likelihood import Likelihood
+
+Array = NDArray[np.float64]
+STEP, PERIOD, LENGTH = 2e-4, 0.02, 20.0  # s
+DELAY, TAU, GAIN, LATENCY = 0.083, 0.041, 0.93, 0.037
+
+
+def path(kind: str) -> tuple[Array, Array]:
+    """Commands of one axis [s], [m]: a smooth motion, or steps."""
+    time = np.arange(0.0, LENGTH, PERIOD)
+    if kind == "steps":
+        level = np.random.default_rng(3).uniform(-0.05, 0.05, 40)
+        return time, level[(time / 0.7).astype(np.int64)]
+    return time, 0.05 * np.minimum(time, 1.0) * np.sin(2.0 * np.pi * (0.2 + 0.05 * time) * time)
+
+
+def moved(time: Array, command: Array, at: Array) -> Array:
+    """A first-order arm with a gain that stays, on a grid: delayed commands, each for its share of a step."""
+    change, acting = np.diff(command, prepend=command[0]), (time + DELAY) / STEP
+    jump, cell = np.zeros(int(LENGTH / STEP) + 4000), acting.astype(np.int64)
+    np.add.at(jump, cell, change * (1.0 - acting + cell))
+    np.add.at(jump, cell + 1, change * (acting - cell))
+    left = math.exp(-STEP / TAU)
+    position = lfilter([0.0, 1.0 - left], [1.0, -left], GAIN * np.cumsum(jump))
+    return command[0] + np.interp(at, STEP * np.arange(len(position)), position)
+
+
+def recorded(kind: str = "smooth", *, drift: float = 0.0, camera: bool = False, scale: float = 1.0) -> pf.Run:
+    """A tracker at 50 Hz, 0.1 mm; its lag grows by ``drift`` [s]; and a camera at 20 Hz that is late."""
+    rng, (time, command) = np.random.default_rng(5), path(kind)
+    stamp = np.arange(0.3, LENGTH - 0.3, 0.02) + rng.uniform(0.0, 0.001, 970)
+    late = drift * (stamp / LENGTH - 0.5)
+    sensors = {"tracker": (stamp, {"x": scale * moved(time, command, stamp - late) + rng.normal(0.0, 1e-4, len(stamp))})}
+    if camera:
+        seen = np.arange(0.5, LENGTH - 0.5, 0.05)
+        sensors["camera"] = (seen, {"x": moved(time, command, seen - LATENCY) + rng.normal(0.0, 3e-4, len(seen))})
+    return pf.Run.from_arrays(time, {"x": command}, sensors, name=kind)
+
+
+@pytest.fixture(scope="module")
+def found() -> Latency:
+    """The smooth motion, with a camera."""
+    return pf.latency(recorded(camera=True), sensor="tracker")
+
+
+def holds(interval: tuple[float, float] | None, truth: float) -> bool:
+    return interval is not None and interval[0] <= truth <= interval[1]
+
+
+def test_lag_gain_and_plant_are_those_simulated(found: Latency) -> None:
+    """Each interval holds the truth; the lag is Td + τ, to a millisecond."""
+    axis = found.summary.axes["x"]
+    assert axis.lag == pytest.approx(DELAY + TAU, abs=1e-3)
+    assert holds(axis.lag_ci95, DELAY + TAU)
+    assert holds(axis.delay_ci95, DELAY)
+    assert holds(axis.gain_ci95, GAIN)
+    assert axis.gain_recovery is None
+    assert axis.plant == "first-order"
+    assert holds(axis.time_constant_ci95, TAU)
+
+
+def test_a_second_sensor_s_latency_is_found(found: Latency) -> None:
+    """The camera is 37 ms late, beside the tracker, whose stamps are right."""
+    camera = found.summary.sensors["camera"]
+    assert camera.latency == pytest.approx(LATENCY, abs=2e-3)
+    assert holds(camera.latency_ci95, LATENCY)
+    assert found.config.sensors["camera"].latency == pytest.approx(camera.latency)
+
+
+def test_nothing_is_named_in_a_steady_run(found: Latency) -> None:
+    """No drift, no wandering, no clock; the parts of the run scatter about 0 as their deviations say."""
+    axis = found.summary.axes["x"]
+    assert not axis.drifts
+    assert axis.wander == 0.0
+    assert found.summary.clock_drift is None
+    shares = [part.shift / part.sd for part in axis.course]
+    assert 0.3 < np.sqrt(np.mean(np.square(shares))) < 2.0  # of ten: 95 % of such means lie in 0.57 to 1.43
+
+
+def test_the_arm_is_ready_for_use(found: Latency) -> None:
+    """Written and read again it is the same, with intervals; the configuration fuses the run."""
+    arm = found.arm
+    assert arm.lag_of("x") == pytest.approx(found.summary.axes["x"].lag, abs=1e-6)
+    assert arm.provenance == {"identified_on": ["smooth"], "sensor": "tracker"}
+    plant = arm.axes["x"].plant
+    assert isinstance(plant, pf.FirstOrder)
+    assert plant.time_constant_ci95 == found.summary.axes["x"].time_constant_ci95
+    est = pf.fuse(found.runs[0], found.config)
+    assert np.isfinite(est["x"].position).all()
+
+
+def test_a_drift_of_the_lag_is_named() -> None:
+    """20 ms over the run of steps; its size to a quarter, for a part of it looks like noise of the arm."""
+    axis = pf.latency(recorded("steps", drift=0.02)).summary.axes["x"]
+    assert axis.drifts
+    assert axis.drift == pytest.approx(0.02, rel=0.25)
+
+
+def test_shifts_of_parts_are_those_of_a_dense_regression() -> None:
+    """Least squares on the columns ∂z/∂lag of each part, whitened by the joint covariance of all measurements."""
+    run = recorded()
+    arm = pf.ArmModel(
+        name="arm",
+        update_period=PERIOD,
+        delay=DELAY + 0.004,
+        axes={"x": pf.AxisModel(plant=pf.FirstOrder(time_constant=TAU), gain=pf.Gain(intercept=GAIN))},
+    )
+    process, sensor = pf.Process(input_noise=0.0, drift=2e-4), pf.Sensor(sd=1e-4, gate=0.0)
+    config = pf.FusionConfig(
+        arm=arm, start=pf.Start(offset_sd=1e-3), process={"x": process}, sensors={"tracker": sensor}
+    )
+    _, shift, information = Likelihood([run], config).shifts("x", config, 5) or (None, None, None)
+    assert shift is not None and information is not None
+    stamp, z = run.sensors["tracker"].stamp / 1e9, run.sensors["tracker"].values["x"]
+    time, command = path("smooth")
+
+    def response(late: float) -> Array:
+        return moved(time, command, stamp - 0.004 - late) - command[0]
+
+    slope = (response(1e-3) - response(-1e-3)) / 2e-3
+    cov = 1e-6 + process.drift**2 * np.minimum(stamp[:, None], stamp) + 1e-8 * np.eye(len(stamp))
+    place = np.minimum(((stamp - stamp[0]) / (stamp[-1] - stamp[0]) * 5).astype(np.int64), 4)
+    X = np.where(place[:, None] == np.arange(5), slope[:, None], 0.0)
+    weighted = np.linalg.solve(cov, X)
+    expected = np.linalg.solve(X.T @ weighted, weighted.T @ (z - command[0] - response(0.0)))
+    assert information == pytest.approx(X.T @ weighted, rel=2e-2, abs=1e-3 * float(information.max()))
+    assert shift == pytest.approx(expected, abs=1e-4)
+    assert shift == pytest.approx(-0.004, abs=1e-3)
+
+
+def test_a_mirrored_sensor_is_followed() -> None:
+    """A distance that falls while the axis moves on: the same lag."""
+    found = pf.latency(recorded("steps", scale=-1.0))
+    assert found.config.sensors["tracker"].scale == -1.0
+    assert holds(found.summary.axes["x"].lag_ci95, DELAY + TAU)
+
+
+def test_a_reference_is_trusted_where_there_is_one() -> None:
+    """By default its stamps are right; another sensor can be asked for, an unknown one is refused by name."""
+    run = recorded()
+    known = replace(run, reference=run.sensors["tracker"], sensors={})
+    assert pf.latency(known).summary.sensor == "reference"
+    with pytest.raises(pf.UnknownNameError, match="laser"):
+        pf.latency(run, sensor="laser")
+
+
+def test_what_tells_nothing_is_refused() -> None:
+    """An arm at rest; no sensor; a sensor that moves before its commands."""
+    run = recorded()
+    rest = replace(run.command, values={"x": 1e-7 * run.command.values["x"]})
+    with pytest.raises(pf.PumafuseError):
+        pf.latency(replace(run, command=rest))
+    with pytest.raises(pf.TuneError, match="no sensor"):
+        pf.latency(replace(run, sensors={}))
+    early = replace(run.sensors["tracker"], stamp=run.sensors["tracker"].stamp - 400_000_000)
+    with pytest.raises(pf.TuneError, match="before its commands"):
+        pf.latency(replace(run, sensors={"tracker": early}))

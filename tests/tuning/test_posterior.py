@@ -1,0 +1,91 @@
+"""The posterior over models and delays: its quantiles, shared delays, and that it finds what was simulated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import pumafuse as pf
+from pumafuse.tuning.posterior import (
+    MODELS,
+    QUANTITIES,
+    AxisPosterior,
+    Branch,
+    Entry,
+    Mixture,
+    Model,
+    chosen_model,
+    shared_delay,
+    sharing,
+)
+
+FIRST, SECOND = Model(1, "none"), Model(2, "static")
+
+
+def branch(delay: float, sd: float, height: float = 0.0, model: Model = FIRST, lag_sd: float = 1e-3) -> Branch:
+    """A Gaussian density of the delay, with a lag of 0.1 s that does not depend on it."""
+    at = delay + sd * np.linspace(-5.0, 5.0, 41)
+    log = height + norm.logpdf(at, delay, sd)
+    config = pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal"))
+    pairs = zip(at.tolist(), log.tolist(), strict=True)
+    entries = [Entry(t, config, one, {"lag": 0.1, "delay": t}, {"lag": lag_sd, "delay": 0.0}) for t, one in pairs]
+    return Branch(model, entries)
+
+
+def alone(delays: np.ndarray) -> np.ndarray:
+    return np.zeros(len(delays))
+
+
+def test_quantiles_of_one_maximum_are_those_of_its_density() -> None:
+    """A normal density of the delay: 1.96 standard deviations each way, and the lag's own."""
+    found = AxisPosterior("x", [branch(0.08, 2e-3)]).mixture(alone)
+    assert found.quantiles("delay", lambda _: True) == pytest.approx((0.08 - 1.96 * 2e-3, 0.08 + 1.96 * 2e-3), abs=3e-5)
+    assert found.quantiles("lag", lambda _: True) == pytest.approx((0.1 - 1.96e-3, 0.1 + 1.96e-3), abs=1e-5)
+    assert found.weight.sum() == pytest.approx(1.0)
+
+
+def test_quantiles_over_models_are_those_of_the_mixture() -> None:
+    """Two models with odds of 3 to 1: the ends solve 0.75 Φ₁ + 0.25 Φ₂ = 2.5 % and 97.5 %."""
+    posterior = AxisPosterior("x", [branch(0.08, 2e-3, math.log(3.0)), branch(0.09, 4e-3, 0.0, SECOND)])
+    ends = posterior.mixture(alone).quantiles("delay", lambda _: True)
+    below = [0.75 * norm.cdf(end, 0.08, 2e-3) + 0.25 * norm.cdf(end, 0.09, 4e-3) for end in ends]
+    assert below == pytest.approx([0.025, 0.975], abs=2e-3)
+
+
+def test_maxima_of_one_model_that_meet_do_not_count_twice() -> None:
+    """The same maximum found from two starts is one."""
+    once, twice = (AxisPosterior("x", [branch(0.08, 2e-3)] * times) for times in (1, 2))
+    delays = np.linspace(0.07, 0.09, 50)
+    assert twice.log_density(delays) == pytest.approx(once.log_density(delays))
+
+
+def test_axes_that_agree_share_a_delay_and_others_do_not() -> None:
+    """Delays 1 ms apart, known to 2 ms, are one; one that is 20 ms away is another; at most one is told apart."""
+    near = {name: AxisPosterior(name, [branch(at, 2e-3)]) for name, at in (("a", 0.080), ("b", 0.081), ("c", 0.1))}
+    assert sharing(near) == ["a", "b"]
+    assert sharing({name: near[name] for name in "ac"}) == []
+    assert sharing({"a": near["a"]}) == []
+
+
+def test_a_shared_delay_weighs_the_axes_by_what_they_know() -> None:
+    """The product of two normal densities: the mean weighted by 1/sd²."""
+    posteriors = [AxisPosterior("a", [branch(0.080, 1e-3)]), AxisPosterior("b", [branch(0.083, 2e-3)])]
+    assert shared_delay(posteriors) == pytest.approx((0.080 / 1.0 + 0.083 / 4.0) / 1.25, abs=2e-5)
+    together = posteriors[1].mixture(posteriors[0].log_density).quantiles("delay", lambda _: True)
+    assert together[1] - together[0] == pytest.approx(2.0 * 1.96 * 1e-3 / math.sqrt(1.25), rel=0.02)
+
+
+def test_the_simplest_of_the_likely_models_is_taken() -> None:
+    """A model that is a fifth as likely as the best is preferred where it has fewer numbers, a less likely one not."""
+
+    def mixture(share: float) -> Mixture:
+        weight = np.array([share, 1.0 - share])
+        model = np.array([MODELS.index(FIRST), MODELS.index(SECOND)], dtype=np.float64)
+        none = {name: np.zeros(2) for name in QUANTITIES}
+        return Mixture(weight, model, np.zeros(2), none, none)
+
+    assert chosen_model(mixture(0.3)) == FIRST
+    assert chosen_model(mixture(0.1)) == SECOND
