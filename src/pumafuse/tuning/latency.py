@@ -55,7 +55,8 @@ from .posterior import (
 )
 
 REFERENCE = "reference"  # the name of a run's reference among its sensors
-_MARGIN = 1.3  # by which intervals of delay and plant are widened: found by simulation, see docs/benchmarks.md
+_MARGIN = 1.15  # by which intervals of all but the lag are widened: found by simulation, see docs/benchmarks.md
+_FINEST = 2e-5  # s: no stamp of a log is better, whatever the likelihood says where measurements pass commands
 _ROUGHLY = 0.1  # tolerance in log-likelihood
 _GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
 _GATE = 5.0
@@ -436,7 +437,7 @@ def _axis_lag(
 ) -> AxisLag:
     arm, delay = best.config.arm.axes[axis], best.config.arm.delay_of(axis)
 
-    def interval(quantity: Quantity, value: float, margin: float = 1.0) -> Interval:
+    def interval(quantity: Quantity, value: float, margin: float = _MARGIN) -> Interval:
         """Of the models like the chosen one; of a logarithm in the number itself."""
         log = quantity not in ("lag", "delay", "gain")
 
@@ -448,6 +449,8 @@ def _axis_lag(
         middle = math.log(value) if log else value
         low, high = mixture.quantiles(quantity, alike)
         centre, half = 0.5 * (low + high), 0.5 * margin * (high - low)
+        if quantity in ("lag", "delay"):
+            half = max(half, _FINEST)
         low, high = min(centre - half, middle), max(centre + half, middle)
         if quantity == "delay":
             low = max(low, 0.0)
@@ -459,7 +462,7 @@ def _axis_lag(
         lag=lag,
         lag_ci95=interval("lag", lag, _scattered(likelihood, best, axis)),
         delay=delay,
-        delay_ci95=interval("delay", delay, _MARGIN),
+        delay_ci95=interval("delay", delay),
         shared_delay=shared,
         plant="first-order" if model.order == 1 else "second-order",
         gain=arm.gain.intercept,
@@ -468,7 +471,7 @@ def _axis_lag(
     values: dict[str, Any] = {}
     for name in ("time_constant", "natural_frequency", "damping"):
         if (value := getattr(arm.plant, name, None)) is not None:
-            values |= {name: value, f"{name}_ci95": interval(name, value, _MARGIN)}
+            values |= {name: value, f"{name}_ci95": interval(name, value)}
     if arm.gain_recovery is not None:
         values |= {
             "gain_recovery": arm.gain_recovery,
