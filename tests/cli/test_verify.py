@@ -79,9 +79,10 @@ def test_the_table_shows_the_same_numbers(run: Path, found: list[dict[str, objec
     for row, one in zip(rows, found, strict=True):
         best = one["best_in_class"]
         assert {f"{one['model']['rms_mm']:.3f}", f"{best['fit']['rms_mm']:.3f}"} <= set(row)
-        assert f"start level {one['start_mm']:g} mm ({one['start_from']})" in shown
-        assert f"{one['run']}, {one['axis']}: lag {one['lag_ms']:.1f} ms, here {best['lag_ms']:.0f}"[:-1] in shown
-        assert f"the best in class is K {best['gain']:.3f}, Td {best['delay_ms']:.1f} ms" in shown
+        assert f"start level is {one['start_mm']:g} mm ({one['start_from']})" in shown
+        assert f"{one['run']}, {one['axis']}: the model is off by {one['model']['rms_mm']:.3f} mm RMS" in shown
+        assert f"by the model the arm is {one['lag_ms']:.1f} ms late, here it is {best['lag_ms']:.0f}"[:-1] in shown
+        assert f"a gain of {best['gain']:.3f}, a dead time of {best['delay_ms']:.1f} ms" in shown
 
 
 @pytest.mark.long

@@ -314,16 +314,14 @@ class _AxisSearch:
             config = one.put(config, one.clipped(left) if one.sensor else one.bounds[0])
         return with_disturbance(config, self.axis, 0.0, config.process[self.axis].disturbance_time)
 
-    def with_noise(self, config: FusionConfig, kinds: Sequence[str]) -> FusionConfig:
-        """The configuration with the most likely noise, with a disturbance of one of these kinds."""
+    def with_noise(self, config: FusionConfig) -> FusionConfig:
+        """The configuration with the most likely noise, with or without a disturbance of either kind."""
 
         def free(at: FusionConfig) -> list[Parameter]:
             return self.free(at, MODELS[0], ["noise"])
 
-        models = zip(("none", "matern", "ou"), noise_models(self.likelihood, config, free), strict=True)
-        found = [
-            maximise(self.likelihood, model, free(model), tolerance=_ROUGHLY) for kind, model in models if kind in kinds
-        ]
+        models = noise_models(self.likelihood, config, free)
+        found = [maximise(self.likelihood, model, free(model), tolerance=_ROUGHLY) for model in models]
         return most_likely_models(self.likelihood, [(one, {}) for one in found], free)[0]
 
     def with_noise_of(self, config: FusionConfig, other: FusionConfig) -> FusionConfig:
@@ -389,8 +387,7 @@ class _AxisSearch:
         for model in MODELS[1:]:
             best[model] = self.maximum(model, self.starts(model, self._best(best).config))
         best = self._again(best, self.with_white_noise(self._best(best).config))
-        for kinds in (["ou"], ["none", "matern", "ou"]):
-            best = self._likely(self._again(best, self.with_noise(self._best(best).config, kinds)))
+        best = self._likely(self._again(best, self.with_noise(self._best(best).config)))
         found = [self._weighed(model, self.polished(model, peak.config)) for model, peak in best.items()]
         highest = max(one[0] for one in found)
         for evidence, model, peak in list(found):
@@ -437,7 +434,13 @@ class _AxisSearch:
         return self.evidence(model, peak), model, peak
 
     def evidence(self, model: Model, peak: Point) -> float:
-        """The log-density of a maximum with the penalty for the model's numbers, roughly."""
+        """The log-density of a maximum with the penalty for the model's numbers, roughly.
+
+        A gain that recovers sooner or later than can be told is none: then another model says the same.
+        """
+        recovery = [one for one in self.free(peak.config, model, ["gain"]) if one.path[-1] == "gain_recovery"]
+        if any(one.at_bound(peak.config) for one in recovery):
+            return -np.inf
         arm = [one for one in self.free(peak.config, model, _ARM) if one.at_bound(peak.config) is None]
         information = derivatives(self.likelihood, peak, arm).information
         return _laplace(peak.log_posterior, information, arm) if arm else peak.log_posterior
