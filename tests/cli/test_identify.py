@@ -184,7 +184,7 @@ def test_what_is_not_there_is_one_line(trials: Path, tmp_path: Path) -> None:
     half.mkdir()
     (half / "trials.csv").write_text("trial,axis,step_mm\n1,radial,8\n")
     file.write_text("mine")
-    assert "no trials.csv" in refused("identify", tmp_path / "none", "-o", out)
+    assert "no such file" in refused("identify", tmp_path / "none", "-o", out)
     assert "no samples.csv" in refused("identify", half, "-o", out)
     assert "cannot be written" in refused("identify", trials, "-o", file / "arm.toml")
     assert file.read_text() == "mine" and not out.exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import re
 from pathlib import Path
@@ -13,37 +14,46 @@ from executable import pumafuse, refused
 from pages import ROOT
 
 TRUNK = ROOT / "examples" / "trunk-servo"
+LENGTH = 60.0  # s that are used
 
 
 @pytest.fixture(scope="module")
 def trunk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run without payload, of two of its axes."""
+    """A minute of the run without payload, of one of its axes."""
     folder = tmp_path_factory.mktemp("latency") / "run"
     folder.mkdir()
     text = re.sub(r"^m[2-6] = .*\n", "", (TRUNK / "0g" / "run.toml").read_text(encoding="utf-8"), flags=re.MULTILINE)
-    text = re.sub(r'"(?:\.\./)?(\w+\.csv\.gz)"', lambda found: f'"{place(found[1])}"', text)
-    (folder / "run.toml").write_text(text, encoding="utf-8")
+    (folder / "run.toml").write_text(text.replace("../", ""), encoding="utf-8")
+    for name in ("commands", "camera", "encoder"):
+        source = TRUNK / ("" if name == "commands" else "0g") / f"{name}.csv.gz"
+        lines = gzip.decompress(source.read_bytes()).decode().splitlines()
+        rows = [line for line in lines[1:] if float(line.split(",")[0]) < LENGTH]
+        with gzip.open(folder / f"{name}.csv.gz", "wt", encoding="utf-8") as written:
+            written.write("\n".join([lines[0], *rows]) + "\n")
     return folder
-
-
-def place(name: str) -> str:
-    return str((TRUNK if name.startswith("commands") else TRUNK / "0g") / name)
 
 
 @pytest.fixture(scope="module")
 def told(trunk: Path) -> tuple[str, Path]:
     """What is printed, and the page."""
     page = trunk.parent / "page"
-    return pumafuse("latency", trunk, "--to", 40, "--report", page).stdout, page / "report.html"
+    return pumafuse("latency", trunk, "--report", page).stdout, page / "report.html"
 
 
 def test_it_says_how_late_the_arm_and_the_camera_are(told: tuple[str, Path]) -> None:
-    """The README of the recording: m1 is 202 to 209 ms late, the camera 45."""
+    """The README of the recording: m1 is 202 to 209 ms late, the camera 45; both lie in their intervals."""
     text, _ = told
-    lag = float(re.search(r"^m1 is ([\d.]+)", text, re.MULTILINE)[1])  # pyright: ignore
-    camera = float(re.search(r"^camera is ([\d.]+)", text, re.MULTILINE)[1])  # pyright: ignore
-    assert 195.0 < lag < 215.0
-    assert camera == pytest.approx(45.0, abs=1.0)
+    numbers = r"([\d.]+) \(([\d.]+) to ([\d.]+)\) ms l"
+    lag, camera = (
+        tuple(map(float, found.groups()))
+        for found in (re.search(f"{name} is {numbers}", text) for name in ("m1", "camera"))
+        if found
+    )
+    assert lag[1] < 209.0
+    assert lag[2] > 202.0
+    assert lag[2] - lag[1] < 20.0
+    assert camera[1] < 45.0 < camera[2]
+    assert camera[2] - camera[1] < 6.0
     assert "The stamps of reference are taken to be right" in text
 
 
@@ -77,7 +87,7 @@ def test_identify_writes_an_arm_with_intervals(trunk: Path, tmp_path: Path) -> N
     assert arm.lag_of("m1") * 1e3 == pytest.approx(one["lag_ms"], abs=1e-2)
     assert one["lag_ms_ci95"][0] < one["lag_ms"] < one["lag_ms_ci95"][1]
     assert arm.axes["m1"].delay_ci95 is not None
-    assert summary["sensors"]["camera"]["latency_ms"] == pytest.approx(45.0, abs=1.0)
+    assert summary["sensors"]["camera"]["latency_ms"] == pytest.approx(45.0, abs=3.0)
     assert "--force" in refused("identify", trunk, "-o", path)
 
 

@@ -44,7 +44,9 @@ def recorded(kind: str = "smooth", *, drift: float = 0.0, camera: bool = False, 
     rng, (time, command) = np.random.default_rng(5), path(kind)
     stamp = np.arange(0.3, LENGTH - 0.3, 0.02) + rng.uniform(0.0, 0.001, 970)
     late = drift * (stamp / LENGTH - 0.5)
-    sensors = {"tracker": (stamp, {"x": scale * moved(time, command, stamp - late) + rng.normal(0.0, 1e-4, len(stamp))})}
+    sensors = {
+        "tracker": (stamp, {"x": scale * moved(time, command, stamp - late) + rng.normal(0.0, 1e-4, len(stamp))})
+    }
     if camera:
         seen = np.arange(0.5, LENGTH - 0.5, 0.05)
         sensors["camera"] = (seen, {"x": moved(time, command, seen - LATENCY) + rng.normal(0.0, 3e-4, len(seen))})

@@ -131,6 +131,11 @@ class State(NamedTuple):
     work: FloatArray
     intervals: FloatArray
 
+    @property
+    def by_row(self) -> tuple[np.ndarray, ...]:
+        """The arrays that have a row for each axis and checkpoint."""
+        return self[:-2]
+
 
 @compiled
 def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:

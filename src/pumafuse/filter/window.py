@@ -427,14 +427,14 @@ class Window:
         rows = Events(*(part.copy() for part in rows))
         if begin_row < span[DONE]:
             here = axes + 1 + axes * begin_row
-            for part in state[:-1]:
+            for part in state.by_row:
                 part[:axes] = part[here : here + axes]
         span[[END, DONE, RUN]] = begin_row
         span[ORIGIN] = NEVER if span[ORIGIN] > after else span[ORIGIN]
         rest = len(state.clock) - axes
         for axis in np.flatnonzero((times[:, FIRST] > after) & (times[:, FIRST] < NEVER)).tolist():
             times[axis, FIRST] = NEVER  # it had only just begun
-            for part in state[:-1]:
+            for part in state.by_row:
                 part[axis] = part[rest + axis]
             state.drive[axis, START] = self.memory.incoming.values[axis, KNOWN_START]
             state.clock[axis] = span[ORIGIN]
@@ -521,7 +521,7 @@ def with_rows(memory: Memory, rows: int) -> Memory:
     return memory._replace(
         events=Events(*(of_rows(part) for part in memory.events)),
         results=Results(*(of_rows(part) for part in memory.results)),
-        state=State(*(of_state(part) for part in memory.state[:-2]), *memory.state[-2:]),
+        state=memory.state._replace(**dict(zip(State._fields, map(of_state, memory.state.by_row), strict=False))),
         arrived=np.ones(rows, dtype=np.bool_),
         incoming=memory.incoming._replace(span=span),
     )

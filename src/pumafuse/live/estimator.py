@@ -511,7 +511,7 @@ def empty_window(
         for axis in axes
     ]
     state = at_rest(config, axes, len(names), biases, NEVER, start, FIRST_ROWS + 2)
-    for part in state[:-1]:
+    for part in state.by_row:
         part[-count:] = part[:count]  # at rest
     counted = Counters.none(len(names))
     if counters is not None:
