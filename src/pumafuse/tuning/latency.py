@@ -551,12 +551,26 @@ def _nearest_latency(likelihood: Likelihood, config: FusionConfig, name: str) ->
 # ---- the lag over the run -------------------------------------------------------------------------------------------
 
 
+def _free_arm(likelihood: Likelihood, config: FusionConfig, axis: str) -> list[Parameter]:
+    """The numbers of an axis's arm that were fitted."""
+    config = with_own_delays(config, [axis])
+    every = parameters(config, config, {axis: likelihood.sensors[axis]}, ["delay", "plant", "gain"])
+    fixed = config.arm.axes[axis].gain.intercept == 1.0
+    return [one for one in every if one.axis == axis and not (fixed and one.path[-1] == "intercept")]
+
+
 class _Course(NamedTuple):
     """How much later an axis is in each part of a run: middles [s], shifts [s], their information [1/s²]."""
 
     time: FloatArray
     shift: FloatArray
     information: FloatArray
+
+    @property
+    def variance(self) -> FloatArray:
+        """Of the shifts [s²], (n,): what all have in common was fitted away."""
+        inverse = np.asarray(np.linalg.pinv(self.information, 1e-6, hermitian=True), dtype=np.float64)
+        return np.diag(inverse)
 
 
 class _Trend(NamedTuple):
@@ -573,20 +587,24 @@ def _with_courses(
     likelihood: Likelihood, config: FusionConfig, lags: Mapping[str, AxisLag]
 ) -> tuple[dict[str, AxisLag], tuple[float | None, float | None]]:
     """The lags with their courses over the longest run, and drift and wandering of a clock that all axes share."""
-    courses = {axis: _Course(*one) for axis in lags if (one := likelihood.shifts(axis, config, _PARTS)) is not None}
-    found = dict(lags)
+    courses: dict[str, _Course] = {}
+    for axis in lags:
+        found = likelihood.shifts(axis, with_own_delays(config, [axis]), _PARTS, _free_arm(likelihood, config, axis))
+        if found is not None:
+            courses[axis] = _Course(*found)
+    told = dict(lags)
     for axis, course in courses.items():
-        trend, sd = _trend(course), np.sqrt(np.diag(np.linalg.inv(course.information)))
+        trend, sd = _trend(course), np.sqrt(course.variance)
         parts = zip(course.time.tolist(), course.shift.tolist(), sd.tolist(), strict=True)
-        found[axis] = msgspec.structs.replace(
-            found[axis],
+        told[axis] = msgspec.structs.replace(
+            told[axis],
             drift=trend.drift,
             drift_sd=trend.drift_sd,
             drifts=trend.drifts,
             wander=trend.wander if trend.wanders else 0.0,
             course=[PartLag(time=time, shift=shift, sd=one) for time, shift, one in parts],
         )
-    return found, _clock(list(courses.values()))
+    return told, _clock(list(courses.values()))
 
 
 def _trend(course: _Course) -> _Trend:
@@ -594,16 +612,16 @@ def _trend(course: _Course) -> _Trend:
     from scipy.special import chdtrc
 
     G, span = course.information, len(course.time) * float(course.time[1] - course.time[0])
-    X = np.column_stack([np.ones(len(course.time)), (course.time - course.time.mean()) / span])
-    cov = np.linalg.inv(X.T @ G @ X)
-    line = cov @ (X.T @ G @ course.shift)
-    rest = course.shift - X @ line
+    x = (course.time - course.time.mean()) / span
+    power = float(x @ G @ x)
+    drift = float(x @ G @ course.shift) / power
+    rest = course.shift - drift * x
     free = len(rest) - 2
     chi2 = float(rest @ G @ rest)
-    variance = np.diag(np.linalg.inv(G))
-    weight = 1.0 / variance
+    variance = course.variance
+    weight = 1.0 / np.maximum(variance, 1e-18)
     wander = math.sqrt(max(float(weight @ (rest**2 - variance) / weight.sum()), 0.0))
-    drift, sd = float(line[1]), math.sqrt(float(cov[1, 1]) * max(1.0, chi2 / free))
+    sd = math.sqrt(max(1.0, chi2 / free) / power)
     return _Trend(
         drift=drift,
         drift_sd=sd,
@@ -619,7 +637,7 @@ def _clock(courses: Sequence[_Course]) -> tuple[float | None, float | None]:
         return None, None
     information: FloatArray = np.sum([one.information for one in courses], axis=0)
     moved: FloatArray = np.sum([one.information @ one.shift for one in courses], axis=0)
-    shift = np.linalg.inv(information) @ moved
+    shift = np.asarray(np.linalg.pinv(information, 1e-6, hermitian=True) @ moved, dtype=np.float64)
     every = sum(float(one.shift @ one.information @ one.shift) for one in courses)
     if float(shift @ information @ shift) < 0.5 * every:
         return None, None

@@ -39,6 +39,7 @@ _LOG_STEP = 1e-4  # of a logarithm, one-sided: the truncation error is half of i
 _STEP = 2e-5  # s, or of a gain; central, because the likelihood bends where a measurement passes a command
 _PIECES = 20  # of a run, that a model which is right has independent scores in
 _SHIFT = 1e-4  # s, by which a lag is varied
+_SINGULAR = 1e-6  # of the largest eigenvalue: what is less was fitted away
 _SMALLEST = 1e-6  # m; misfit of a simulated arm without any noise
 
 T = TypeVar("T")
@@ -255,11 +256,19 @@ class Likelihood:
             for key, pairs in found.items()
         }
 
-    def shifts(self, axis: str, config: FusionConfig, count: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    def shifts(
+        self, axis: str, config: FusionConfig, count: int, free: Sequence[Parameter] = ()
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """How much later an axis is in each of ``count`` parts of its longest recording than on the whole.
 
         The filter is linear in the measurements: what a lag that is longer in one part alone adds to the innovations
         is the difference of two runs of it, and the shifts are least squares on those.
+
+        Args:
+            axis: The axis.
+            config: The configuration.
+            count: How many parts.
+            free: What was fitted to the same measurements, which may have explained a part of the shifts.
 
         Returns:
             The middles of the parts [s after the first command], the shifts [s] and their information [1/s²], (n,),
@@ -270,30 +279,33 @@ class Likelihood:
             return None
         segment, rows = part.segment, part.segment.measurement_rows
         found = innovations(segment, config)
-        fused = found.outcome[:, 0] != Outcome.REJECTED
+        weight = ((found.outcome != Outcome.REJECTED) / found.innovation_sd)[:, 0]
         delay, certain = config.arm.delay_of(axis), _certain(config)
 
         def predicted(shift: float) -> FloatArray:
             moved = changed(certain, ("arm", "axes", axis, "delay"), max(delay + shift, 0.0))
             return -innovations(segment, moved).innovation[:, 0]
 
+        def changes(part: Segment, at: FusionConfig) -> FloatArray:
+            """What becomes of the innovations, over their deviations, the outcomes being the same."""
+            return weight * (innovations(part, at, found.outcome).innovation - found.innovation)[:, 0]
+
         rate = (predicted(_SHIFT) - predicted(-_SHIFT)) / (_SHIFT + min(_SHIFT, delay))
         since = (rows.time - segment.origin) / 1e9
         edges = np.linspace(float(since.min()), float(since.max()), count + 1)
         place = np.clip(np.searchsorted(edges, since, side="right") - 1, 0, count - 1)
-        moved = np.empty((count, len(since)))
-        for number in range(count):
-            value = rows.value + (rate * (place == number))[:, None]
-            later = innovations(replace(segment, measurement_rows=rows._replace(value=value)), config, found.outcome)
-            moved[number] = (later.innovation - found.innovation)[:, 0]
-        moved *= fused / found.innovation_sd[:, 0]
+        later = [rows.value + (rate * (place == number))[:, None] for number in range(count)]
+        moved = np.array(
+            [changes(replace(segment, measurement_rows=rows._replace(value=one)), config) for one in later]
+        )
+        if free:
+            steps = [one.move(config, one.at(config) + (_LOG_STEP if one.log else _STEP)) for one in free]
+            fitted, _ = np.linalg.qr(np.array([moved.sum(axis=0), *(changes(segment, step) for step in steps)]).T)
+            moved -= (moved @ fitted) @ fitted.T
         information = moved @ moved.T
-        size = np.sqrt(np.maximum(np.diag(information), 1e-3 * max(float(np.diag(information).max()), 1e-12)))
-        scaled = information / np.outer(size, size) + 1e-9 * np.eye(count)
-        innovation = (found.innovation / found.innovation_sd)[:, 0]
-        inverse: FloatArray = np.asarray(np.linalg.inv(scaled), dtype=np.float64)
-        shift: FloatArray = inverse @ (moved @ innovation / size) / size
-        return 0.5 * (edges[:-1] + edges[1:]), shift, scaled * np.outer(size, size)
+        inverse = np.asarray(np.linalg.pinv(information, _SINGULAR, hermitian=True), dtype=np.float64)
+        shift = np.asarray(inverse @ moved @ (weight * found.innovation[:, 0]), dtype=np.float64)
+        return 0.5 * (edges[:-1] + edges[1:]), shift, information
 
     def misfit(self, config: FusionConfig) -> dict[str, float]:
         """The median distance of the noiseless arm from the nearest sensor's measurements [m], by axis."""
