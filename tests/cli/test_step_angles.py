@@ -125,7 +125,7 @@ def test_verify_shows_each_axis_in_its_unit(folder: Path, run: Path, tmp_path: P
     }
     units = {"shoulder": "deg", "wrist": "deg", "rail": "mm"}
     shown = pumafuse(*options, "--report", tmp_path / "page").stdout
-    assert shown.index("RMS, mm") < shown.index(" rail ") < shown.index("RMS, deg") < shown.index(" shoulder ")
+    assert shown.index("mm RMS") < shown.index(" rail ") < shown.index("deg RMS") < shown.index(" shoulder ")
     for axis, one in found.items():
         unit = units[axis]
         rms, best = one["model"][f"rms_{unit}"], one["best_in_class"]["fit"][f"rms_{unit}"]
@@ -133,13 +133,13 @@ def test_verify_shows_each_axis_in_its_unit(folder: Path, run: Path, tmp_path: P
         assert one[f"amplitude_{unit}"] == pytest.approx({"deg": 1.0, "mm": 4.0}[unit])
         (line,) = [line.split() for line in shown.splitlines() if f" {axis} " in line and "encoder" in line]
         assert {f"{rms:.3f}", f"{best:.3f}"} <= set(line)
-        assert f"start level {one[f'start_{unit}']:g} {unit} ({one['start_from']})" in shown
+        assert f"start level is {one[f'start_{unit}']:g} {unit} ({one['start_from']})" in shown
         assert not any(key.endswith({"deg": "_mm", "mm": "_deg"}[unit]) for key in one)
     assert [found[axis]["start_from"] for axis in ("wrist", "rail")] == ["given", "given"]
     assert (found["wrist"]["start_deg"], found["rail"]["start_mm"]) == (-10.0, 500.0)
     assert found["shoulder"]["start_deg"] == pytest.approx(30.0)
     page = (tmp_path / "page" / "report.html").read_text(encoding="utf-8")
-    assert page.count("<th>RMS, mm</th>") == page.count("<th>RMS, deg</th>") == 1
+    assert page.count("mm RMS</th>") == page.count("deg RMS</th>") == 1
     figures = [page.count(f"position without its mean [{unit}]") for unit in ("mm", "deg")]
     assert figures[1] == 2 * figures[0] > 0
 
