@@ -43,6 +43,7 @@ from .parameters import (
     with_shared_delay,
 )
 from .posterior import (
+    INTERCEPTS,
     AxisPosterior,
     Mixture,
     Model,
@@ -429,6 +430,11 @@ def _notes(one: AxisLag) -> list[str]:
         )
     if one.gain_ci95 is not None and one.gain_ci95[1] - one.gain_ci95[0] > _WIDE_GAIN:
         found.append("the motion is too poor for the gain; record motion over more of the range")
+    if one.gain in INTERCEPTS:
+        found.append(
+            f"the gain lies at the end of what is believed, {one.gain:g}: the arm is of a higher order than these"
+            " models; the lag holds, the gain and its recovery mean little"
+        )
     return found
 
 

@@ -46,7 +46,7 @@ GainKind: TypeAlias = Literal["none", "static", "recovering"]
 
 LONGEST_DELAY = 0.6  # s
 _PLANT_BOUNDS = {"time_constant": (1e-3, 2.0), "natural_frequency": (0.5, 2e3), "damping": (0.2, 8.0)}
-_INTERCEPTS, _INTERCEPT_PRIOR = (0.7, 1.3), (1.0, 0.1)
+INTERCEPTS, _INTERCEPT_PRIOR = (0.7, 1.3), (1.0, 0.1)  # of the gain
 _RECOVERIES = (0.02, 0.5)  # s; what takes longer is hardly told from a gain that stays
 _DAMPING_PRIOR = (0.0, 0.7)  # of ln ζ: what is sold as an axis neither rings for ever nor has two lags far apart
 _LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each as likely
@@ -55,6 +55,7 @@ _SHARE = 0.98  # of the measurements that least squares are of; the rest may be 
 _ERRORS, _RECOVERING = (-0.12, -0.05, 0.05), (0.05, 0.12, 0.3)  # starts: gains less 1, recoveries [s]
 _EARLIER, _DAMPINGS = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no delay, ζ
 _NEARLY = 40.0  # log-likelihood that a better noise may gain
+_DOUBT = 20.0  # log-likelihood that a recovery at a bound must gain
 _WORSE = 2.0  # log-likelihood behind the best of all, from which a model is looked for again
 _SAME = 2e-4  # s, between delays of maxima that are one
 _ARM: tuple[Fit, ...] = ("delay", "plant", "gain")
@@ -279,7 +280,7 @@ class _AxisSearch:
             elif field in _PLANT_BOUNDS:
                 one = replace(one, bounds=_PLANT_BOUNDS[field], prior=_DAMPING_PRIOR if field == "damping" else None)
             elif field == "intercept":
-                one = replace(one, bounds=_INTERCEPTS, prior=_INTERCEPT_PRIOR)
+                one = replace(one, bounds=INTERCEPTS, prior=_INTERCEPT_PRIOR)
             elif field == "gain_recovery":
                 one = replace(one, bounds=_RECOVERIES)
             found.append(one)
@@ -436,14 +437,13 @@ class _AxisSearch:
     def evidence(self, model: Model, peak: Point) -> float:
         """The log-density of a maximum with the penalty for the model's numbers, roughly.
 
-        A gain that recovers sooner or later than can be told is none: then another model says the same.
+        A gain that recovers sooner or later than can be told is hardly one: mostly another model says the same.
         """
         recovery = [one for one in self.free(peak.config, model, ["gain"]) if one.path[-1] == "gain_recovery"]
-        if any(one.at_bound(peak.config) for one in recovery):
-            return -np.inf
+        doubt = _DOUBT if any(one.at_bound(peak.config) for one in recovery) else 0.0
         arm = [one for one in self.free(peak.config, model, _ARM) if one.at_bound(peak.config) is None]
         information = derivatives(self.likelihood, peak, arm).information
-        return _laplace(peak.log_posterior, information, arm) if arm else peak.log_posterior
+        return (_laplace(peak.log_posterior, information, arm) if arm else peak.log_posterior) - doubt
 
     def walk(self, model: Model, peak: Point) -> Branch:
         """The entries of a model about a maximum, until they count for nothing."""

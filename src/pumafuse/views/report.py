@@ -167,7 +167,11 @@ def answers(found: LatencySummary) -> list[str]:
     lines = [f"{axis} is {formatting.between(one.lag, one.lag_ci95, MS)} ms late." for axis, one in found.axes.items()]
     for name, one in found.sensors.items():
         late = formatting.between(abs(one.latency), _turned(one.latency_ci95, one.latency), MS)
-        lines.append(f"{name} is {late} ms {'later' if one.latency >= 0.0 else 'earlier'} than {found.sensor}.")
+        word = "later" if one.latency >= 0.0 else "earlier"
+        same = one.latency_ci95[0] < 0.0 < one.latency_ci95[1]
+        lines.append(
+            f"{name} is {late} ms {word} than {found.sensor}{': as late, as far as can be told' if same else ''}."
+        )
     lines.append(
         "An axis is late behind the held command, at constant velocity; behind the commanded path it is"
         f" {0.5 * found.update_period * MS:.3g} ms more. The stamps of {found.sensor} are taken to be right: by as much"
