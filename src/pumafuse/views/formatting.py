@@ -31,9 +31,7 @@ def between(value: float, interval: Interval | None, unit: float = 1.0) -> str:
     """``value (low to high)``, all times ``unit``, to two digits of the interval; without it the value alone."""
     if interval is None:
         return f"{value * unit:.4g}"
-    width = max(
-        (interval[1] - interval[0]) * unit, 1e-2 * abs(value * unit) if interval[0] == interval[1] else 0.0, 1e-12
-    )
+    width = max((interval[1] - interval[0]) * unit, 1e-5 * abs(value * unit), 1e-12)
     digits = min(max(1 - int(np.floor(np.log10(width))), 0), 6)
     return f"{value * unit:.{digits}f} ({interval[0] * unit:.{digits}f} to {interval[1] * unit:.{digits}f})"
 
