@@ -106,7 +106,7 @@ def test_the_arm_is_ready_for_use(found: Latency) -> None:
 
 
 def test_a_drift_of_the_lag_is_named() -> None:
-    """20 ms over the run of steps: later, and by several ms; how much plant and noise explain of it is in the limits."""
+    """20 ms over the run of steps: later, and by several ms; plant and noise explain some of it (docs/limits.md)."""
     axis = pf.latency(recorded("steps", drift=0.02)).summary.axes["x"]
     assert axis.drifts
     assert axis.drift is not None
