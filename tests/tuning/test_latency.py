@@ -162,13 +162,16 @@ def test_a_reference_is_trusted_where_there_is_one() -> None:
 
 
 def test_what_tells_nothing_is_refused() -> None:
-    """An arm at rest; no sensor; a sensor that moves before its commands."""
+    """An arm at rest; no sensor; a sensor in another unit; a sensor that moves before its commands."""
     run = recorded()
     rest = replace(run.command, values={"x": 1e-7 * run.command.values["x"]})
     with pytest.raises(pf.PumafuseError):
         pf.latency(replace(run, command=rest))
     with pytest.raises(pf.TuneError, match="no sensor"):
         pf.latency(replace(run, sensors={}))
+    metres = replace(run.sensors["tracker"], values={"x": 1e3 * run.sensors["tracker"].values["x"]})
+    with pytest.raises(pf.PumafuseError, match="unit|times as far"):
+        pf.latency(replace(run, sensors={"tracker": metres}))
     early = replace(run.sensors["tracker"], stamp=run.sensors["tracker"].stamp - 400_000_000)
     with pytest.raises(pf.TuneError, match="before its commands"):
         pf.latency(replace(run, sensors={"tracker": early}))

@@ -72,6 +72,8 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
         if likelihood.travel[axis] > _EXCITED * noise:
             found.append(axis)
     if not found:
+        if refused := [fault.sentence for fault in likelihood.faults(config) if fault.refused]:
+            raise TuneError(refused[0])  # in another unit the noise seems large
         widest = max(likelihood.travel, key=likelihood.travel.__getitem__)
         screen = config.arm.screen_of(widest)
         farthest = f"{likelihood.travel[widest] * screen.scale:.3g} {screen.unit}"
