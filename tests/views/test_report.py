@@ -13,6 +13,7 @@ import pumafuse as pf
 from outline import outline
 from pumafuse.folders import FolderError
 from pumafuse.identification.trials import Trial
+from pumafuse.tuning.latency import AxisLag, LatencySummary, SensorLag
 from pumafuse.views import report
 
 DATA = Path(pf.__file__).parent / "data"
@@ -94,3 +95,31 @@ def test_a_report_is_replaced_only_when_asked_and_never_with_what_is_not_ours(tm
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(FolderError, match=r"holds 'mine\.txt'"):
         report.check_writable(tmp_path, True)
+
+
+def test_lags_are_said_with_their_sign_and_in_the_units_of_each_program() -> None:
+    """By hand: 84 ms are 16.8 steps of 5 ms; behind the path T/2 = 10 ms more; an earlier sensor is not a later one."""
+    axis = AxisLag(
+        sensor="tracker",
+        lag=0.124,
+        lag_ci95=(0.120, 0.128),
+        delay=0.084,
+        delay_ci95=(0.081, 0.087),
+        shared_delay=False,
+        plant="first-order",
+        time_constant=0.04,
+        time_constant_ci95=(0.036, 0.044),
+        gain=1.0,
+    )
+    sensors = {"eye": SensorLag(latency=-0.037, latency_ci95=(-0.039, -0.035))}
+    found = LatencySummary(
+        pumafuse="", runs=["run"], sensor="tracker", update_period=0.02, axes={"x": axis}, sensors=sensors, notes=[]
+    )
+    said = " ".join(report.answers(found))
+    assert "x is 124.0 (120.0 to 128.0) ms late" in said
+    assert "eye is 37.0 (35.0 to 39.0) ms earlier than tracker." in said
+    assert "behind the commanded path it is 10 ms more" in said
+    programs = " ".join(report.elsewhere(found))
+    assert "max_expected_latency [s]: 0.134" in programs
+    assert "x 16 to 18" in programs
+    assert "x 0.0400; actuator_delay [s]: x 0.0840" in programs

@@ -30,15 +30,9 @@ def run(
     Raises:
         PumafuseError: The runs tell nothing, or the report is in the way.
     """
-    if report is not None:
-        reports.check_writable(report, force)
-    found = _found(paths, sensor, part)
-    if report is not None:
-        reports.write_latency(found, report, force)
-    if json:
-        typer.echo(found.to_json(), nl=False)
+    found = _told(paths, sensor, report, json, force, part=part)
+    if found is None:
         return
-    show(found)
     typer.echo("\nto write into fusion.toml and arm.toml (pumafuse identify RUN -o arm.toml writes the latter):\n")
     typer.echo(reports.settings(found))
     typer.echo("elsewhere:")
@@ -56,21 +50,37 @@ def identify(
     Raises:
         PumafuseError: The runs tell nothing, or the report is in the way.
     """
-    if report is not None:
-        reports.check_writable(report, force)
-    found = _found(paths, sensor)
-    write_file(output, found.arm.to_toml())
-    if report is not None:
-        reports.write_latency(found, report, force)
-    if json:
-        typer.echo(found.to_json(), nl=False)
+    if _told(paths, sensor, report, json, force, output=output) is None:
         return
-    show(found)
     typer.echo(f"written to {output}" + (f" and {report}" if report is not None else ""))
     typer.echo(f"next: pumafuse verify RUN --arm {output}, with a run that it was not made from")
 
 
-def show(found: Latency) -> None:
+def _told(
+    paths: Sequence[Path],
+    sensor: str | None,
+    report: Path | None,
+    json: bool,
+    force: bool,
+    part: tuple[float | None, float | None] = (None, None),
+    output: Path | None = None,
+) -> Latency | None:
+    """What was found, after it is written and its answers printed; None if that was JSON, which is all then."""
+    if report is not None:
+        reports.check_writable(report, force)
+    found = _found(paths, sensor, part)
+    if output is not None:
+        write_file(output, found.arm.to_toml())
+    if report is not None:
+        reports.write_latency(found, report, force)
+    if json:
+        typer.echo(found.to_json(), nl=False)
+        return None
+    _show(found)
+    return found
+
+
+def _show(found: Latency) -> None:
     """Print the answers and a table on stdout."""
     for line in reports.answers(found.summary):
         typer.echo(line)
@@ -79,9 +89,7 @@ def show(found: Latency) -> None:
         typer.echo("* one dead time for several axes")
 
 
-def _found(
-    paths: Sequence[Path], sensor: str | None, part: tuple[float | None, float | None] = (None, None)
-) -> Latency:
+def _found(paths: Sequence[Path], sensor: str | None, part: tuple[float | None, float | None]) -> Latency:
     runs: list[Run] = []
     for path in paths:
         if path.is_dir() and not (path / "run.toml").exists():
