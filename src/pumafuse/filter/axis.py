@@ -108,7 +108,8 @@ class State(NamedTuple):
     Attributes:
         x: Mean, (r, s).
         P: Covariance, (r, s, s).
-        clock: The instant of x and P, int64 ns, (r,).
+        clock: The instant of the plant's mean and e, int64 ns, (r,).
+        settled: The instant of P and of what no command moves: they may stay behind until a measurement, (r,).
         drive: Start level u₀ (``START``, NaN before it is known), command in force ``U`` relative to it, its ``STEP``,
             the gain ``ERROR`` e now [m], and densities squared in force: ``NOISE`` [m²·s], ``DRIFT`` [m²/s], (r, 6).
         rejected: Of each sensor innovation and R of a rejected measurement that another may agree with, (r, S, 2).
@@ -123,6 +124,7 @@ class State(NamedTuple):
     x: FloatArray
     P: FloatArray
     clock: TimeArray
+    settled: TimeArray
     drive: FloatArray
     rejected: FloatArray
     gate_time: TimeArray
@@ -140,29 +142,63 @@ class State(NamedTuple):
 @compiled
 def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
     """Bring row ``row`` of the state, which is of ``axis``, to ``time`` [ns] with its input held."""
+    predict_plant(model, state, axis, row, time)
+    predict_rest(model, state, axis, row)
+
+
+@compiled
+def predict_plant(model: Model, state: State, axis: int, row: int, time: int) -> None:
+    """Bring the plant's mean and e to ``time`` [ns], all that commands move; the rest stays behind."""
     if time <= state.clock[row]:
         return
-    x, P, drive, known = state.x, state.P, state.drive, state.intervals
-    interval = time - state.clock[row]
-    at = interval % KEPT
-    if known[axis, at, LENGTH] != interval:
-        respond(model, known, axis, at, interval)
+    x, drive = state.x, state.drive
+    at = interval_of(model, state.intervals, axis, time - state.clock[row])
+    x[row, POSITION], x[row, RATE], drive[row, ERROR] = moved(
+        state.intervals, axis, at, x[row, POSITION], x[row, RATE], drive[row, U], drive[row, ERROR]
+    )
+    state.clock[row] = time
+
+
+@compiled
+def moved(
+    known: FloatArray, axis: int, at: int, position: float, rate: float, u: float, error: float
+) -> tuple[float, float, float]:
+    """Position, rate and e after an interval with the input u held."""
+    gap = position - u
+    position = u + (known[axis, at, F11] * gap + known[axis, at, F12] * rate)
+    rate = known[axis, at, F21] * gap + known[axis, at, F22] * rate
+    if error != 0.0:
+        position += known[axis, at, ERROR_POSITION] * error
+        rate += known[axis, at, ERROR_RATE] * error
+        error *= known[axis, at, ERROR_LEFT]
+    return position, rate, error
+
+
+@compiled
+def predict_rest(model: Model, state: State, axis: int, row: int) -> None:
+    """Bring P and what no command moves to where the plant's mean is; noise densities were the same all the way."""
+    if state.settled[row] == state.clock[row]:
+        return
+    P, drive, known = state.P, state.drive, state.intervals
+    interval = state.clock[row] - state.settled[row]
+    at, q = interval_of(model, known, axis, interval), drive[row, NOISE]
     f11, f12, f21, f22 = known[axis, at, F11], known[axis, at, F12], known[axis, at, F21], known[axis, at, F22]
-    u, q = drive[row, U], drive[row, NOISE]
-    gap, rate = x[row, POSITION] - u, x[row, RATE]
-    x[row, POSITION] = u + (f11 * gap + f12 * rate)
-    x[row, RATE] = f21 * gap + f22 * rate
-    if drive[row, ERROR] != 0.0:
-        x[row, POSITION] += known[axis, at, ERROR_POSITION] * drive[row, ERROR]
-        x[row, RATE] += known[axis, at, ERROR_RATE] * drive[row, ERROR]
-        drive[row, ERROR] *= known[axis, at, ERROR_LEFT]
     size = model.kind[axis, STATES]
     move_pair(P, row, POSITION_, size, f11, f12, f21, f22)
     add_to_pair(P, row, POSITION_, q * known[axis, at, Q11], q * known[axis, at, Q12], q * known[axis, at, Q22])
     P[row, OFFSET, OFFSET] += drive[row, DRIFT] * (interval / 1e9)
     if size > REST:
         revert(model, state, axis, row, at)
-    state.clock[row] = time
+    state.settled[row] = state.clock[row]
+
+
+@compiled
+def interval_of(model: Model, known: FloatArray, axis: int, interval: int) -> int:
+    """Where what an axis does in an interval [ns] is kept."""
+    at = interval % KEPT
+    if known[axis, at, LENGTH] != interval:
+        respond(model, known, axis, at, interval)
+    return at
 
 
 @compiled_apart
@@ -234,6 +270,12 @@ def add_to_pair(P: FloatArray, at: int, i: int, q11: float, q12: float, q22: flo
     P[at, i, i + 1] += q12
     P[at, i + 1, i] += q12
     P[at, i + 1, i + 1] += q22
+
+
+@compiled
+def is_steady(model: Model, axis: int) -> bool:
+    """Whether commands of an axis change no noise, so that P may stay behind."""
+    return model.process[axis, MANEUVER_NOISE] == 0.0 and model.process[axis, MANEUVER_DRIFT] == 0.0
 
 
 @compiled
@@ -399,7 +441,7 @@ def noise_of_motion(model: Model, state: State, axis: int, dt: float) -> float:
 @compiled
 def copy_estimate(state: State, here: int, there: int) -> None:
     """Copy a row of the state to another, but for what the gate remembers."""
-    state.clock[there] = state.clock[here]
+    state.clock[there], state.settled[there] = state.clock[here], state.settled[here]
     for k in range(state.drive.shape[1]):
         state.drive[there, k] = state.drive[here, k]
     for i in range(state.x.shape[1]):

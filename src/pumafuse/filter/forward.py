@@ -17,25 +17,39 @@ import numpy as np
 
 from ..arrays import NEVER, BoolArray, FloatArray, IntArray, TimeArray
 from ..compiled import compiled, kernel
+from ..model.closed import gain_error
 from .axis import (
     DISTURBANCE,
     DRIFT,
+    ERROR,
+    INTERCEPT,
     NOISE,
     NONE,
     OFFSET,
     PERIOD,
+    POSITION,
+    RATE,
     REST,
+    SLOPE,
+    START,
     STATES,
+    STEP,
     Model,
     Sensors,
     State,
+    U,
     apply_command,
     copy_estimate,
     copy_rows,
     innovation,
+    interval_of,
+    is_steady,
+    moved,
     noise,
     position_of,
     predict,
+    predict_plant,
+    predict_rest,
     update,
     variance_of_motion,
 )
@@ -141,7 +155,8 @@ def filter_events(
             copy_rows(state, checkpoint_of(model, begin, places), ZERO, len(model.kind))
         while done < end and events.time[done] <= until:
             done += 1
-        run_events(model, sensors, events, state, begin, done, given, results, history, arrived, places)
+        lazily = len(times) == 0
+        run_events(model, sensors, events, state, begin, done, given, results, history, arrived, places, lazily)
         if n < len(times):
             estimate(model, events, state, done, end, times[n], history, outputs, n)
 
@@ -159,28 +174,94 @@ def run_events(
     history: History,
     arrived: BoolArray,
     places: int,
+    lazily: bool,
 ) -> None:
     """Rows ``begin`` to ``end`` that have arrived: apply commands, gate measurements, update with what passes.
 
     Before each row the state is kept in one of its ``places``; with none, nothing can be taken back, all have arrived.
+    ``lazily``: a command that changes no noise moves the plant's mean alone; the rest follows at a measurement.
     """
-    axes = len(model.kind)
-    for row in range(begin, end):
+    axes, row = len(model.kind), begin
+    while row < end:
+        if lazily and events.source[row] == COMMAND:
+            row = run_commands(model, events, state, row, end, history)
+            continue
         if places > 0:
             copy_rows(state, ZERO, checkpoint_of(model, row, places), axes)
-            if not arrived[row]:
-                continue
-        source = events.source[row]
-        results.contradicts[row] = NOBODY
-        first = ZERO
-        while first < axes:
-            last = axes if source != COMMAND and sensors.gate_rows[source] else first + 1
-            if source != COMMAND:
-                add_measurement(model, sensors, events, state, row, first, last, given, results, history)
-            elif events.known[row, first] == FUSED:
-                advance(model, state, first, events.time[row], history)
-                apply_command(model, state, first, first, events.value[row, first])
-            first = last
+        if places == 0 or arrived[row]:
+            run_event(model, sensors, events, state, row, given, results, history)
+        row += 1
+
+
+@compiled
+def run_event(
+    model: Model,
+    sensors: Sensors,
+    events: Events,
+    state: State,
+    row: int,
+    given: bool,
+    results: Results,
+    history: History,
+) -> None:
+    """One row: a command of some axes, or a measurement."""
+    source, axes = events.source[row], len(model.kind)
+    results.contradicts[row] = NOBODY
+    first = ZERO
+    while first < axes:
+        last = axes if source != COMMAND and sensors.gate_rows[source] else first + 1
+        if source != COMMAND:
+            add_measurement(model, sensors, events, state, row, first, last, given, results, history)
+        else:
+            add_command(model, events, state, row, first, history)
+        first = last
+
+
+@compiled
+def run_commands(model: Model, events: Events, state: State, first: int, end: int, history: History) -> int:
+    """The commands from row ``first`` to the next measurement, whose row it returns."""
+    until = first
+    while until < end and events.source[until] == COMMAND:
+        until += 1
+    for axis in range(len(model.kind)):
+        if is_steady(model, axis):
+            follow_plant(model, events, state, axis, first, until)
+        else:
+            for row in range(first, until):
+                add_command(model, events, state, row, axis, history)
+    return until
+
+
+@compiled
+def add_command(model: Model, events: Events, state: State, row: int, axis: int, history: History) -> None:
+    """One axis of one row."""
+    if events.known[row, axis] == FUSED:
+        advance(model, state, axis, events.time[row], history)
+        apply_command(model, state, axis, axis, events.value[row, axis])
+
+
+@compiled
+def follow_plant(model: Model, events: Events, state: State, axis: int, first: int, end: int) -> None:
+    """Rows ``first`` to ``end``, all of them commands, through the plant's mean alone, of a steady axis."""
+    x, drive, gain, known = state.x, state.drive, model.gain, state.intervals
+    slope, intercept, period = gain[axis, SLOPE], gain[axis, INTERCEPT], gain[axis, PERIOD]
+    position, rate, u, error = x[axis, POSITION], x[axis, RATE], drive[axis, U], drive[axis, ERROR]
+    clock, step, level = state.clock[axis], drive[axis, STEP], drive[axis, START]
+    latest, at = 0, 0
+    for row in range(first, end):
+        if events.known[row, axis] != FUSED:
+            continue
+        if events.time[row] > clock:
+            if events.time[row] - clock != latest:
+                latest = events.time[row] - clock
+                at = interval_of(model, known, axis, latest)
+            position, rate, error = moved(known, axis, at, position, rate, u, error)
+            clock = events.time[row]
+        command = events.value[row, axis] - level
+        step, u = command - u, command
+        error += gain_error(step, slope, intercept, period)
+    x[axis, POSITION], x[axis, RATE], drive[axis, U], drive[axis, ERROR] = position, rate, u, error
+    state.clock[axis], drive[axis, STEP] = clock, step
 
 
 @compiled
@@ -269,9 +350,10 @@ def noise_of(model: Model, sensors: Sensors, events: Events, state: State, row: 
 @compiled
 def advance(model: Model, state: State, axis: int, time: int, history: History) -> None:
     """Predict one axis to ``time`` [ns], and keep the interval for the smoother."""
-    if time > state.clock[axis]:
+    predict_plant(model, state, axis, axis, time)
+    if state.clock[axis] > state.settled[axis]:
         write_history(history, axis, time, INTERVAL, state.drive[axis, NOISE], state.drive[axis, DRIFT], state.work)
-        predict(model, state, axis, axis, time)
+        predict_rest(model, state, axis, axis)
 
 
 @compiled

@@ -202,7 +202,7 @@ def catch_up(m: Memory) -> None:
     span, places = m.incoming.span, len(m.events.time)
     if span[DONE] < span[RUN]:
         first, end = span[DONE], span[RUN]
-        run_events(m.model, m.sensors, m.events, m.state, first, end, NO, m.results, m.history, m.arrived, places)
+        run_events(m.model, m.sensors, m.events, m.state, first, end, NO, m.results, m.history, m.arrived, places, NO)
         span[DONE] = span[RUN]
 
 
@@ -307,7 +307,8 @@ def begin(m: Memory, axis: int, stamp: int) -> None:
                     level = events.value[row, other]
         places = len(events.time) + 2
         copy_rows(state, checkpoint_of(m.model, places - 1, places) + other, np.int64(other), ONE)
-        state.drive[other, START], state.clock[other] = level, span[ORIGIN]
+        state.drive[other, START] = level
+        state.clock[other] = state.settled[other] = span[ORIGIN]
         reclassify(m, other, span[BEGIN], np.int64(NEVER))
 
 
@@ -437,7 +438,7 @@ class Window:
             for part in state.by_row:
                 part[axis] = part[rest + axis]
             state.drive[axis, START] = self.memory.incoming.values[axis, KNOWN_START]
-            state.clock[axis] = span[ORIGIN]
+            state.clock[axis] = state.settled[axis] = span[ORIGIN]
         first = times[:, FIRST].copy()
         times[first < NEVER, FIRST] = ALWAYS  # it has begun: what left the window since then stays
         bits = 1 << np.arange(axes)

@@ -29,6 +29,7 @@ from .config import FusionConfig
 from .setup import at_rest, filter_model, filter_sensors
 
 _MOST_ESTIMATES = 10_000_000
+_KEPT = 3  # orders of the events: those of a search's point, and a little earlier and later
 
 # What may become of a row, besides its outcome: a command that says again what is in force; outside of --from and --to;
 # without a stamp, or with a stray one; of a sensor that is not among those to use.
@@ -76,6 +77,9 @@ class Segment:
     _latest: dict[tuple[int, ...], tuple[Events, IntArray]] = field(
         default_factory=dict[tuple[int, ...], tuple[Events, IntArray]], init=False, repr=False, compare=False
     )
+    _tables: dict[tuple[int, ...], tuple[Events, IntArray]] = field(
+        default_factory=dict[tuple[int, ...], tuple[Events, IntArray]], init=False, repr=False, compare=False
+    )
 
     def events(self, config: FusionConfig) -> tuple[Events, IntArray]:
         """The events in their total order, by the delays and latencies of ``config``.
@@ -87,21 +91,34 @@ class Segment:
         times = (*delay, *latency.tolist())  # a search asks for many configurations of the same times
         found = self._latest.get(times)
         if found is None:
-            found = self._ordered(np.array(delay), latency)
-            self._latest.clear()  # threads share it
-            self._latest[times] = found
+            found = self._latest[times] = self._ordered(delay, latency)
+            for oldest in list(self._latest)[:-_KEPT]:
+                self._latest.pop(oldest, None)  # threads share it
         return found
 
-    def _ordered(self, delay: IntArray, latency: IntArray) -> tuple[Events, IntArray]:
-        rows, parts = self.command_rows, list[Events]()
-        for one in sorted(set(delay.tolist())):  # a command is one event for each distinct delay
-            known = np.where(delay == one, rows.known, np.uint8(ABSENT))
-            given = np.flatnonzero(_on_any_axis(known, Outcome.FUSED))
-            parts.append(rows._replace(time=rows.stamp + one, known=known).rows(given))
-        commands = sum(len(part.time) for part in parts)
-        unordered = joined([*parts, self._measured(latency)])
-        order = np.argsort(unordered.time, kind="stable")  # each source is in its order: commands, then the sensors'
-        return unordered.rows(order), np.where(order < commands, -1, order - commands)
+    def _ordered(self, delay: Sequence[int], latency: IntArray) -> tuple[Events, IntArray]:
+        distinct = sorted(set(delay))
+        unordered, moves = self._joined(tuple(distinct.index(one) for one in delay))
+        missing, shift = unordered.stamp == NO_STAMP, np.concatenate([distinct, -latency])
+        time = np.where(missing, NO_STAMP, unordered.stamp + shift[moves])
+        order = np.argsort(time, kind="stable")  # each source is in its order: commands, then the sensors'
+        commands = len(time) - len(self.measurement_rows.time)
+        return unordered._replace(time=time).rows(order), np.where(order < commands, -1, order - commands)
+
+    def _joined(self, groups: tuple[int, ...]) -> tuple[Events, IntArray]:
+        """Commands, one event for each group of axes that share a delay, then measurements; which time moves each."""
+        if (found := self._tables.get(groups)) is not None:
+            return found
+        rows, measured, parts, moves = self.command_rows, self.measurement_rows, list[Events](), list[IntArray]()
+        for group in sorted(set(groups)):
+            known = np.where(np.array(groups) == group, rows.known, np.uint8(ABSENT))
+            parts.append(rows._replace(known=known).rows(np.flatnonzero(_on_any_axis(known, Outcome.FUSED))))
+            moves.append(np.full(len(parts[-1].time), group))
+        sensors = max(groups) + 1 + measured.source.astype(np.int64)
+        found = joined([*parts, measured]), np.concatenate([*moves, sensors])
+        self._tables.clear()  # threads share it
+        self._tables[groups] = found
+        return found
 
     def given(self, axis: str) -> tuple[TimeArray, FloatArray]:
         """Stamps [int64 ns] and values [m] of the commands of one axis, (n,)."""

@@ -159,6 +159,7 @@ def at_rest(
         x=np.zeros((rows, width)),
         P=P,
         clock=np.full(rows, origin),
+        settled=np.full(rows, origin),
         drive=drive,
         rejected=np.zeros((rows, sensors, 2)),
         gate_time=np.full((rows, sensors, 2), ALWAYS),

@@ -29,7 +29,7 @@ from ..toml import Interval
 from ..units import MS
 from .identifiability import TuneError, covariance, excited_axes
 from .intervals import lag_slopes
-from .likelihood import Derivatives, Likelihood
+from .likelihood import Derivatives, Likelihood, in_threads
 from .maximise import Point, derivatives, maximise, past_bumps, point
 from .parameters import (
     LATENCIES,
@@ -375,12 +375,11 @@ def _known(config: FusionConfig, trusted: str) -> FusionConfig:
 
 def _posteriors(parts: Mapping[str, Likelihood], config: FusionConfig) -> dict[str, AxisPosterior]:
     """The posterior of each axis, several at a time."""
-    import joblib
-    from joblib import Parallel, delayed
 
-    jobs = [delayed(axis_posterior)(mine, config, axis) for axis, mine in parts.items()]  # pyright: ignore
-    cores = min(int(joblib.cpu_count()), len(jobs))  # pyright: ignore
-    return dict(zip(parts, Parallel(n_jobs=cores)(jobs), strict=True))  # pyright: ignore
+    def of(axis: str) -> AxisPosterior:
+        return axis_posterior(parts[axis], config, axis)
+
+    return dict(zip(parts, in_threads(of, list(parts)), strict=True))
 
 
 def _arm(likelihood: Likelihood, fits: Mapping[str, _Fit], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:

@@ -24,6 +24,7 @@ _FIRST_DAMPING = 1e-4
 _ROUNDING = 1e-10  # of a matrix with a diagonal of 1, below which its eigenvalues mean nothing
 _LAST_DAMPING = 1e8  # at which the search gives up
 _DOUBLES = (2.0, 4.0, 8.0)
+_MORE = 1.1  # of the expected gain, from which a longer step is tried
 _GATE_ROUNDS = 12  # times that the gates decide again
 _BUMPS = tuple(sign * shift for shift in (2e-4, 5e-4, 1e-3, 2e-3) for sign in (-1.0, 1.0))  # s
 _SHARES = (1.0, 0.5, 0.2)
@@ -128,7 +129,7 @@ def maximise(
             failed = True
             if expected < tolerance:
                 return best
-        for double in _DOUBLES:  # along a curved ridge the information predicts steps that are too short
+        for double in _DOUBLES if gained > _MORE * expected else ():  # along a ridge steps turn out too short
             there = moved(best.config, free, np.clip(at + double * step, low, high))
             longer = point(likelihood, there, free, outcomes)
             if longer.log_posterior < trial.log_posterior + _TOLERANCE:

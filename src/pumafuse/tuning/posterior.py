@@ -61,9 +61,9 @@ _SAME = 2e-4  # s, between delays of maxima that are one
 _ARM: tuple[Fit, ...] = ("delay", "plant", "gain")
 _ROUGHLY = 0.1  # tolerance in log-likelihood
 _FORLORN = 8.0  # log-likelihood behind the best, after the penalty, from which a model or a delay counts for nothing
-_STEP = 0.5  # standard deviations, between delays
+_STEP = 0.7  # standard deviations, between delays
 _SHORTEST, _LONGEST = 2e-5, 0.03  # s, of a step
-_MOST = 16  # steps away from a maximum
+_MOST = 12  # steps away from a maximum
 _GRID = 2000  # points of a distribution, at most
 _REFINED = 8  # points between two delays, along which everything is interpolated
 _AS_LIKELY = 0.2  # of the most likely model's probability: the simplest of such models is taken
@@ -239,7 +239,8 @@ def axis_posterior(likelihood: Likelihood, start: FusionConfig, axis: str) -> Ax
     branches: list[Branch] = []
     for evidence, model, peak in peaks:
         if evidence > best - _FORLORN and not _walked(branches, model, search.delay_of(peak)):
-            branches.append(search.walk(model, peak))
+            highest = max((float(one.log_density.max()) for one in branches), default=-np.inf)
+            branches.append(search.walk(model, peak, highest - _FORLORN))
     return AxisPosterior(axis, branches)
 
 
@@ -445,8 +446,8 @@ class _AxisSearch:
         information = derivatives(self.likelihood, peak, arm).information
         return (_laplace(peak.log_posterior, information, arm) if arm else peak.log_posterior) - doubt
 
-    def walk(self, model: Model, peak: Point) -> Branch:
-        """The entries of a model about a maximum, until they count for nothing."""
+    def walk(self, model: Model, peak: Point, least: float) -> Branch:
+        """The entries of a model about a maximum, until they count for nothing: below the log-density ``least``, too."""
         arm = self.free(peak.config, model, _ARM)
         cov = covariance(derivatives(self.likelihood, peak, arm).information, arm)
         place = next(number for number, one in enumerate(arm) if one.fit == "delay")
@@ -455,14 +456,17 @@ class _AxisSearch:
         slope = np.delete(cov[:, place] / cov[place, place], place)
         step = min(max(_STEP * sd, _SHORTEST), _LONGEST)
         middle = self._entry(peak, others)
-        sides = [list(self._side(peak, others, sign * step, sign * step * slope, middle)) for sign in (-1.0, 1.0)]
+        sides = [
+            list(self._side(peak, others, sign * step, sign * step * slope, max(least, middle.log_density - _FORLORN)))
+            for sign in (-1.0, 1.0)
+        ]
         return Branch(model, [*reversed(sides[0]), middle, *sides[1]])
 
     def _side(
-        self, peak: Point, others: Sequence[Parameter], step: float, move: FloatArray, middle: Entry
+        self, peak: Point, others: Sequence[Parameter], step: float, move: FloatArray, least: float
     ) -> Iterator[Entry]:
         low, high = np.array([one.range for one in others]).reshape(-1, 2).T
-        before, top = peak.config, middle.log_density
+        before = peak.config
         at = coordinates(before, others)
         for _ in range(_MOST):
             delay = before.arm.delay_of(self.axis) + step
@@ -473,8 +477,8 @@ class _AxisSearch:
             found = maximise(self.likelihood, there, others, tolerance=_ROUGHLY)
             entry = self._entry(found, others)
             yield entry
-            top = max(top, entry.log_density)
-            if entry.log_density < top - _FORLORN or delay <= 0.0:
+            least = max(least, entry.log_density - _FORLORN)
+            if entry.log_density < least or delay <= 0.0:
                 return
             before, after = found.config, coordinates(found.config, others)
             move, at = after - at, after
