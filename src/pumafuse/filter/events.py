@@ -56,15 +56,12 @@ class Events(NamedTuple):
 
     def rows(self, chosen: IntArray | slice) -> Events:
         """Some of the events, in the order of ``chosen``."""
-        spread = self.spread[chosen] if len(self.spread) else self.spread
-        return Events(
-            self.time[chosen],
-            self.source[chosen],
-            self.stamp[chosen],
-            self.value[chosen],
-            spread,
-            self.known[chosen],
-        )
+
+        def of(part: np.ndarray) -> np.ndarray:
+            return part[chosen] if isinstance(chosen, slice) else part.take(chosen, axis=0)  # twice as fast
+
+        spread = of(self.spread) if len(self.spread) else self.spread
+        return Events(of(self.time), of(self.source), of(self.stamp), of(self.value), spread, of(self.known))
 
     def columns(self, axes: list[int]) -> Events:
         """The events with the values of some axes alone."""

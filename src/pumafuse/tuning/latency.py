@@ -376,10 +376,13 @@ def _known(config: FusionConfig, trusted: str) -> FusionConfig:
 def _posteriors(parts: Mapping[str, Likelihood], config: FusionConfig) -> dict[str, AxisPosterior]:
     """The posterior of each axis, several at a time."""
 
-    def of(axis: str) -> AxisPosterior:
-        return axis_posterior(parts[axis], config, axis)
-
-    return dict(zip(parts, in_threads(of, list(parts)), strict=True))
+    import os
+    if os.environ.get('SER'):
+        return {a: axis_posterior(p, config, a) for a,p in parts.items()}
+    import joblib
+    from joblib import Parallel, delayed
+    jobs = [delayed(axis_posterior)(mine, config, axis) for axis, mine in parts.items()]
+    return dict(zip(parts, Parallel(n_jobs=2)(jobs), strict=True))
 
 
 def _arm(likelihood: Likelihood, fits: Mapping[str, _Fit], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:

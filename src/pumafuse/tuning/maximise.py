@@ -24,6 +24,8 @@ _FIRST_DAMPING = 1e-4
 _ROUNDING = 1e-10  # of a matrix with a diagonal of 1, below which its eigenvalues mean nothing
 _LAST_DAMPING = 1e8  # at which the search gives up
 _DOUBLES = (2.0, 4.0, 8.0)
+_CREEPING = 3  # steps in a row that gain less: at a cusp, where the score promises what is not there
+_POOR = 0.1  # of the expected gain, from which a step was too long
 _MORE = 1.1  # of the expected gain, from which a longer step is tried
 _GATE_ROUNDS = 12  # times that the gates decide again
 _BUMPS = tuple(sign * shift for shift in (2e-4, 5e-4, 1e-3, 2e-3) for sign in (-1.0, 1.0))  # s
@@ -109,7 +111,7 @@ def maximise(
     low, high = np.array([one.range for one in free]).T
     reach = _REACH * np.array([one.scale for one in free])
     axis = np.array([-1 if one.axis is None else likelihood.axes.index(one.axis) for one in free])
-    damping = np.full(len(free), _FIRST_DAMPING)
+    damping, small = np.full(len(free), _FIRST_DAMPING), 0
     for _ in range(_ITERATIONS):
         at = coordinates(best.config, free)
         found = derivatives(likelihood, best, free)
@@ -123,7 +125,8 @@ def maximise(
             gained = trial.log_posterior - best.log_posterior
             worse = np.append(trial.axes < best.axes, gained < 0.0)[axis]
             if gained > 0.0:
-                damping = np.where(worse, 10.0 * damping, 0.1 * damping)
+                less = worse | (gained < _POOR * expected)
+                damping = np.where(less, 10.0 * damping, 0.1 * damping)
                 break
             damping = np.where(worse | failed, 10.0 * np.maximum(damping, _FIRST_DAMPING), damping)
             failed = True
@@ -137,7 +140,8 @@ def maximise(
             trial = longer
         best = trial
         notify(best)
-        if expected < tolerance and gained < tolerance:
+        small = small + 1 if gained < tolerance else 0
+        if small == _CREEPING or (small and expected < tolerance):
             return best
     return best
 
@@ -207,17 +211,16 @@ def _step(found: Derivatives, low: FloatArray, high: FloatArray, damping: FloatA
 
     The matrix is scaled to a diagonal of 1 + λ. A parameter without any information does not move.
     """
-    from scipy.linalg import solve_triangular
-    from scipy.optimize import lsq_linear
-
     diagonal = np.diag(found.information)
     known = diagonal > 0.0
     step, size = np.zeros(len(diagonal)), 1.0 / np.sqrt(diagonal[known])
     matrix = found.information[np.ix_(known, known)] * np.outer(size, size) + np.diag(damping[known] + _ROUNDING)
     root = np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
-    aim = solve_triangular(root, size * found.score[known], lower=True)
-    inner, lowest, highest = solve_triangular(root.T, aim, lower=False), low[known] / size, high[known] / size
+    aim = np.linalg.solve(root, size * found.score[known])
+    inner, lowest, highest = np.linalg.solve(root.T, aim), low[known] / size, high[known] / size
     if not ((inner >= lowest) & (inner <= highest)).all():
+        from scipy.optimize import lsq_linear  # takes a while to import, and is seldom needed
+
         inner = lsq_linear(root.T, aim, (lowest, highest), method="bvls").x
     step[known] = size * inner
     return step

@@ -60,6 +60,7 @@ _WORSE = 2.0  # log-likelihood behind the best of all, from which a model is loo
 _SAME = 2e-4  # s, between delays of maxima that are one
 _ARM: tuple[Fit, ...] = ("delay", "plant", "gain")
 _ROUGHLY = 0.1  # tolerance in log-likelihood
+_COARSELY = 1.0  # where only the valley is looked for
 _FORLORN = 8.0  # log-likelihood behind the best, after the penalty, from which a model or a delay counts for nothing
 _STEP = 0.7  # standard deviations, between delays
 _SHORTEST, _LONGEST = 2e-5, 0.03  # s, of a step
@@ -302,7 +303,7 @@ class _AxisSearch:
         tried = [point(self.likelihood, start, self.free(start, model, _ARM)) for start in starts]
         tried.sort(key=lambda one: -one.log_posterior)
         peaks = [
-            maximise(self.likelihood, one.config, self.free(one.config, model, _ARM), tolerance=_ROUGHLY)
+            maximise(self.likelihood, one.config, self.free(one.config, model, _ARM), tolerance=_COARSELY)
             for one in tried[:climbed]
         ]
         return max(peaks, key=lambda one: one.log_posterior)
