@@ -40,8 +40,7 @@ def same(found: Results, est: Estimates, segment: Segment, config: FusionConfig)
 
     Rounding is up to 1e-16 of a prior's variance, which is 10⁶ times that of the noise and more.
     """
-    place = segment.events(config)[1]
-    order = place[place >= 0]
+    order = np.argsort(segment.events(config)[1])
     given = segment.measurement_rows.known[order] != ABSENT
     sd, expected = found.innovation_sd[order][given], est.measurements
     np.testing.assert_array_equal(found.outcome[order][given], expected.outcome)
@@ -100,8 +99,7 @@ def test_given_outcomes_are_repeated_whatever_the_gates_would_say() -> None:
     assert (innovations(segment, other).outcome != outcome).any()
     repeated = innovations(segment, other, outcome)
     assert (repeated.outcome == outcome).all()
-    source, order = segment.measurement_rows.source, segment.events(other)[1]
-    order = order[order >= 0]
+    source, order = segment.measurement_rows.source, np.argsort(segment.events(other)[1])
     names = [(segment.sensors[of], int(np.sum(source[:row] == of))) for row, of in enumerate(source)]
     for column, axis in enumerate(run.axes):
         out, reacquired = (

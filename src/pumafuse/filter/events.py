@@ -91,6 +91,16 @@ class Results(NamedTuple):
         nothing = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, ABSENT, dtype=np.uint8)
         return Results(*nothing, np.full(events, -1, dtype=np.int16))
 
+    def rows(self, chosen: IntArray) -> Results:
+        """What became of some of the events, in the order of ``chosen``."""
+        innovation, sd, outcome, contradicts = self
+        return Results(
+            innovation.take(chosen, axis=0),
+            sd.take(chosen, axis=0),
+            outcome.take(chosen, axis=0),
+            contradicts.take(chosen),
+        )
+
 
 def joined(parts: Sequence[Events]) -> Events:
     """The events of several tables, one after the other."""

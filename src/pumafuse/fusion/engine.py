@@ -99,17 +99,14 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
     """
     events, place = segment.events(config)
     model, sensors, state = arranged(segment, config, biased_sensors(segment, config))
-    axes, measured = len(segment.axes), np.flatnonzero(place >= 0)
+    axes = len(segment.axes)
     results = Results.room(len(events.time), axes)
     if outcome is not None:
-        results.outcome[measured] = outcome[place[measured]]
+        results.outcome[place] = outcome
     none, outputs = np.empty(0, dtype=np.int64), np.empty((len(Output), axes, 0))
     given, history, arrived = outcome is not None, no_history(axes, state.x.shape[1]), np.zeros(0, dtype=np.bool_)
     filter_events(model, sensors, events, state, given, none, none, none, results, history, arrived, 0, outputs)
-    found = Results.room(len(measured), axes)
-    for part, whole in zip(found, results, strict=True):
-        part[place[measured]] = whole[measured]
-    return found
+    return results.rows(place)
 
 
 def arranged(

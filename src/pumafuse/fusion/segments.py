@@ -85,7 +85,7 @@ class Segment:
         """The events in their total order, by the delays and latencies of ``config``.
 
         Returns:
-            The events; and of each measurement, in this order, its place among ``measurement_rows``, −1 for a command.
+            The events; and where among them each of ``measurement_rows`` is.
         """
         delay, latency = [round(config.arm.delay_of(axis) * 1e9) for axis in self.axes], self._latency(config)
         times = (*delay, *latency.tolist())  # a search asks for many configurations of the same times
@@ -102,8 +102,9 @@ class Segment:
         missing, shift = unordered.stamp == NO_STAMP, np.concatenate([distinct, -latency])
         time = np.where(missing, NO_STAMP, unordered.stamp + shift[moves])
         order = np.argsort(time, kind="stable")  # each source is in its order: commands, then the sensors'
-        commands = len(time) - len(self.measurement_rows.time)
-        return unordered._replace(time=time).rows(order), np.where(order < commands, -1, order - commands)
+        place = np.empty(len(order), dtype=np.int64)
+        place[order] = np.arange(len(order))
+        return unordered._replace(time=time).rows(order), place[len(order) - len(self.measurement_rows.time) :]
 
     def _joined(self, groups: tuple[int, ...]) -> tuple[Events, IntArray]:
         """Commands, one event for each group of axes that share a delay, then measurements; which time moves each."""

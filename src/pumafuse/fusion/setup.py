@@ -28,6 +28,8 @@ from ..model import closed
 from ..model.plants import FirstOrder
 from .config import FusionConfig
 
+_NOTHING = np.zeros((0, 2))
+
 
 def _rest(config: FusionConfig, axis: str, biased: Sequence[str]) -> tuple[FloatArray, list[tuple[str, bool]]]:
     """The states of an axis behind the offset.
@@ -51,7 +53,7 @@ def _rest(config: FusionConfig, axis: str, biased: Sequence[str]) -> tuple[Float
         if constant > 0.0:
             found.append((0.0, constant**2))
             owners.append((name, True))
-    return np.array(found).reshape(-1, 2), owners
+    return np.array(found).reshape(-1, 2) if found else _NOTHING, owners
 
 
 def _disturbance(config: FusionConfig, axis: str) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -29,7 +30,7 @@ from ..toml import Interval
 from ..units import MS
 from .identifiability import TuneError, covariance, excited_axes
 from .intervals import lag_slopes
-from .likelihood import Derivatives, Likelihood, in_threads
+from .likelihood import Derivatives, Likelihood
 from .maximise import Point, derivatives, maximise, past_bumps, point
 from .parameters import (
     LATENCIES,
@@ -375,14 +376,15 @@ def _known(config: FusionConfig, trusted: str) -> FusionConfig:
 
 def _posteriors(parts: Mapping[str, Likelihood], config: FusionConfig) -> dict[str, AxisPosterior]:
     """The posterior of each axis, several at a time."""
-
-    import os
-    if os.environ.get('SER'):
-        return {a: axis_posterior(p, config, a) for a,p in parts.items()}
     import joblib
     from joblib import Parallel, delayed
-    jobs = [delayed(axis_posterior)(mine, config, axis) for axis, mine in parts.items()]
-    return dict(zip(parts, Parallel(n_jobs=2)(jobs), strict=True))
+
+    jobs = [delayed(axis_posterior)(mine, config, axis) for axis, mine in parts.items()]  # pyright: ignore
+    cores = min(int(joblib.cpu_count()), len(jobs))  # pyright: ignore
+    try:
+        return dict(zip(parts, Parallel(n_jobs=cores)(jobs), strict=True))  # pyright: ignore
+    except BrokenProcessPool:
+        raise TuneError("a worker process died (out of memory?): a shorter part, with --from and --to?") from None
 
 
 def _arm(likelihood: Likelihood, fits: Mapping[str, _Fit], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:

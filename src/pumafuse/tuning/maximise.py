@@ -216,7 +216,7 @@ def _step(found: Derivatives, low: FloatArray, high: FloatArray, damping: FloatA
     step, size = np.zeros(len(diagonal)), 1.0 / np.sqrt(diagonal[known])
     matrix = found.information[np.ix_(known, known)] * np.outer(size, size) + np.diag(damping[known] + _ROUNDING)
     root = np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
-    aim = np.linalg.solve(root, size * found.score[known])
+    aim = np.asarray(np.linalg.solve(root, size * found.score[known]), dtype=np.float64)
     inner, lowest, highest = np.linalg.solve(root.T, aim), low[known] / size, high[known] / size
     if not ((inner >= lowest) & (inner <= highest)).all():
         from scipy.optimize import lsq_linear  # takes a while to import, and is seldom needed

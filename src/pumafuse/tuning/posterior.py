@@ -448,7 +448,7 @@ class _AxisSearch:
         return (_laplace(peak.log_posterior, information, arm) if arm else peak.log_posterior) - doubt
 
     def walk(self, model: Model, peak: Point, least: float) -> Branch:
-        """The entries of a model about a maximum, until they count for nothing: below the log-density ``least``, too."""
+        """The entries of a model about a maximum, until they count for nothing or less than ``least``."""
         arm = self.free(peak.config, model, _ARM)
         cov = covariance(derivatives(self.likelihood, peak, arm).information, arm)
         place = next(number for number, one in enumerate(arm) if one.fit == "delay")
