@@ -214,7 +214,7 @@ def examined(job: tuple[int, int, float]) -> tuple[list[Found], list[tuple[float
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PumafuseWarning)
         try:
-            found = pf.latency(case.run, sensor="tracker").summary
+            found = pf.latency(case.run, sensor="tracker").details
         except PumafuseError as error:
             return [], [], [f"refused: {error}"]
     numbers, errors, named = list[Found](), list[tuple[float, float]](), list[str]()

@@ -253,8 +253,8 @@ def first_use(_repeats: int) -> list[Row]:
 
 CASES: dict[str, Callable[[int], list[Row]]] = {
     "pumafuse.fuse": partial(fuse, "filter"),
-    "pumafuse.fuse, as_live": partial(fuse, "as live", as_live=True),
-    "pumafuse.fuse, smooth": partial(fuse, "smooth", smooth=True),
+    "pumafuse.fuse, as_live": partial(fuse, "as live", mode="as-live"),
+    "pumafuse.fuse, smooth": partial(fuse, "smooth", mode="smoothed"),
     "pumafuse, likelihood": likelihood,
     "LiveEstimator.measurement": live,
     "pumafuse live stdin": stdin,

@@ -24,7 +24,7 @@ from ungated import Regression, likeliest
 
 import pumafuse as pf
 
-MODES: dict[str, dict[str, Any]] = {"filtered": {}, "as live": {"as_live": True}, "smoothed": {"smooth": True}}
+MODES: dict[str, dict[str, Any]] = {"filtered": {}, "as live": {"mode": "as-live"}, "smoothed": {"mode": "smoothed"}}
 KINDS = [f"constant {kind}" for kind in ORDERS]
 METHODS = ["held", *KINDS, "LSQ+OU", "pumafuse"]
 FIT = ["noise", "delay", "plant", "gain"]

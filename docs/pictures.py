@@ -120,7 +120,7 @@ def main() -> None:
     warnings.simplefilter("ignore", pf.PumafuseWarning)
     run, config = pf.Run.read(SCAN), pf.FusionConfig.load(SCAN / "fusion.toml")
     est = pf.fuse(run, config, sensors=["vision"], rate=200.0)
-    smooth = pf.fuse(run, config, sensors=["vision"], rate=200.0, smooth=True)
+    smooth = pf.fuse(run, config, sensors=["vision"], rate=200.0, mode="smoothed")
     methods = {axis: {**rows(est, axis), "pumafuse --smooth (afterwards)": smooth[axis].position} for axis in est.axes}
     reference = {axis: interpolated(est.time, est.segment, est.reference, axis) for axis in est.axes}
     figure, (left, right) = plt.subplots(1, 2, figsize=(13.0, 4.4), layout="constrained", width_ratios=[5, 4])

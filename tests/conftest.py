@@ -16,7 +16,7 @@ data = {str(SOURCE / "data")!r}
 run, config = pf.Run.read(data + "/scan1"), pf.FusionConfig.load(data + "/fusion.toml")
 """
 RECORDED = """
-for how in ({}, {"as_live": True}, {"smooth": True}):
+for how in ({}, {"mode": "as-live"}, {"mode": "smoothed"}):
     pf.fuse(run, config, **how)
 """
 STREAM = """

@@ -1,6 +1,7 @@
 """The rooms of the package and which way they import."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -82,3 +83,9 @@ def test_public_names_exist_and_are_lazy() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = pf.nothing
+
+
+def test_every_public_name_is_documented() -> None:
+    """Each has its place on the page of the API."""
+    page = (SOURCE.parents[1] / "docs" / "api.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^::: pumafuse\.(\w+)$", page, re.MULTILINE)) == sorted(pf.__all__)

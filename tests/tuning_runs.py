@@ -128,4 +128,4 @@ def later(*values: object) -> object:
 
 def fitted(found: pf.Tuning) -> dict[str, Fitted]:
     """The fitted parameters by key."""
-    return {one.key: one for one in found.summary.parameters}
+    return {one.key: one for one in found.details.parameters}

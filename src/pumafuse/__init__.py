@@ -10,59 +10,75 @@ if TYPE_CHECKING:
     from .errors import ConfigError, PumafuseError, PumafuseWarning, RunError, UnknownNameError
     from .filter.outcome import Outcome
     from .fusion.config import FusionConfig, Process, Sensor, Start
-    from .fusion.estimates import AxisEstimate, Estimates, Measurements
+    from .fusion.estimates import AxisEstimate, Bias, Estimates, Measurements
     from .fusion.offline import fuse
-    from .fusion.score import Score, score
-    from .fusion.summary import Summary, summarise
-    from .identification.identify import Identification, identify
-    from .identification.trials import StepTrials, TrialsError
-    from .identification.verify import AxisVerification, verify
+    from .fusion.score import ReferenceTrack, Score, score
+    from .fusion.segments import Segment
+    from .fusion.skill import Skill
+    from .fusion.summary import AxisSummary, ScoreSummary, SensorSummary, Summary, ValiditySummary, summarise
+    from .identification.identify import CombinedAxis, Identification, TrialResult, identify
+    from .identification.plan import Design, Plan, PlannedTrial, plan
+    from .identification.trials import StepTrials, Trial, TrialsError
+    from .identification.verify import AxisVerification, BestInClass, Trace, verify
     from .live.estimator import LiveEstimator
     from .live.results import AxisNow, Health, LiveEstimate, SensorHealth, UpdateResult
-    from .logs.run import Run
+    from .logs.frames import Cylindrical, Rotated
+    from .logs.run import Run, Source
     from .model.arm import ArmModel, AxisModel, Gain, Validity
     from .model.discrete import DiscreteModel, discretize
     from .model.plants import FirstOrder, SecondOrder
     from .simulation.scenario import Scenario
     from .simulation.simulate import Simulated, simulate
     from .tuning.identifiability import TuneError
-    from .tuning.latency import Latency, latency
+    from .tuning.latency import AxisLag, Latency, LatencySummary, PartLag, SensorLag, latency
+    from .tuning.summary import Fitted, FittedLag, TuningSummary
     from .tuning.tune import Tuning, tune
+    from .views.figures import error_figure, fused_figure, validation_figure
     from .views.rerun import to_rerun
 
 _NAMES = {
     "errors": ["ConfigError", "PumafuseError", "PumafuseWarning", "RunError", "UnknownNameError"],
     "filter.outcome": ["Outcome"],
     "fusion.config": ["FusionConfig", "Process", "Sensor", "Start"],
-    "fusion.estimates": ["AxisEstimate", "Estimates", "Measurements"],
+    "fusion.estimates": ["AxisEstimate", "Bias", "Estimates", "Measurements"],
     "fusion.offline": ["fuse"],
-    "fusion.score": ["Score", "score"],
-    "fusion.summary": ["Summary", "summarise"],
-    "identification.identify": ["Identification", "identify"],
-    "identification.trials": ["StepTrials", "TrialsError"],
-    "identification.verify": ["AxisVerification", "verify"],
+    "fusion.score": ["ReferenceTrack", "Score", "score"],
+    "fusion.segments": ["Segment"],
+    "fusion.skill": ["Skill"],
+    "fusion.summary": ["AxisSummary", "ScoreSummary", "SensorSummary", "Summary", "ValiditySummary", "summarise"],
+    "identification.identify": ["CombinedAxis", "Identification", "TrialResult", "identify"],
+    "identification.plan": ["Design", "Plan", "PlannedTrial", "plan"],
+    "identification.trials": ["StepTrials", "Trial", "TrialsError"],
+    "identification.verify": ["AxisVerification", "BestInClass", "Trace", "verify"],
     "live.estimator": ["LiveEstimator"],
     "live.results": ["AxisNow", "Health", "LiveEstimate", "SensorHealth", "UpdateResult"],
-    "logs.run": ["Run"],
+    "logs.frames": ["Cylindrical", "Rotated"],
+    "logs.run": ["Run", "Source"],
     "model.arm": ["ArmModel", "AxisModel", "Gain", "Validity"],
     "model.discrete": ["DiscreteModel", "discretize"],
     "model.plants": ["FirstOrder", "SecondOrder"],
     "simulation.scenario": ["Scenario"],
     "simulation.simulate": ["Simulated", "simulate"],
     "tuning.identifiability": ["TuneError"],
-    "tuning.latency": ["Latency", "latency"],
+    "tuning.latency": ["AxisLag", "Latency", "LatencySummary", "PartLag", "SensorLag", "latency"],
+    "tuning.summary": ["Fitted", "FittedLag", "TuningSummary"],
     "tuning.tune": ["Tuning", "tune"],
+    "views.figures": ["error_figure", "fused_figure", "validation_figure"],
     "views.rerun": ["to_rerun"],
 }
 _HOME = {name: home for home, names in _NAMES.items() for name in names}
 
 __all__ = [
-    "ArmModel", "AxisEstimate", "AxisModel", "AxisNow", "AxisVerification", "ConfigError", "DiscreteModel",
-    "Estimates", "FirstOrder", "FusionConfig", "Gain", "Health", "Identification", "Latency", "LiveEstimate",
-    "LiveEstimator", "Measurements", "Outcome", "Process", "PumafuseError", "PumafuseWarning", "Run", "RunError",
-    "Scenario", "Score", "SecondOrder", "Sensor", "SensorHealth", "Simulated", "Start", "StepTrials", "Summary",
-    "TrialsError", "TuneError", "Tuning", "UnknownNameError", "UpdateResult", "Validity", "discretize", "fuse",
-    "identify", "latency", "score", "simulate", "summarise", "to_rerun", "tune", "verify",
+    "ArmModel", "AxisEstimate", "AxisLag", "AxisModel", "AxisNow", "AxisSummary", "AxisVerification", "BestInClass",
+    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "FirstOrder",
+    "Fitted", "FittedLag", "FusionConfig", "Gain", "Health", "Identification", "Latency", "LatencySummary",
+    "LiveEstimate", "LiveEstimator", "Measurements", "Outcome", "PartLag", "Plan", "PlannedTrial", "Process",
+    "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Rotated", "Run", "RunError", "Scenario", "Score",
+    "ScoreSummary", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated",
+    "Skill", "Source", "Start", "StepTrials", "Summary", "Trace", "Trial", "TrialResult", "TrialsError",
+    "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary",
+    "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "score", "simulate",
+    "summarise", "to_rerun", "tune", "validation_figure", "verify",
 ]  # fmt: skip
 
 

@@ -68,7 +68,7 @@ def replacing(folder: Path) -> Generator[Path]:
             raise
 
 
-def write_file(path: Path, text: str) -> None:
+def write_file(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all, in the place of an earlier one.
 
     Raises:
@@ -77,7 +77,7 @@ def write_file(path: Path, text: str) -> None:
     path = path.resolve()
     with _beside(path) as place:
         new = place / "new"
-        new.write_text(text, encoding="utf-8")
+        new.write_bytes(content.encode() if isinstance(content, str) else content)
         new.replace(path)
 
 

@@ -44,22 +44,37 @@ def read(path: Path) -> dict[str, Any]:
     """
     try:
         with path.open(encoding="utf-8") as file:
-            text = file.read(_MOST_TEXT + 1)
-        if len(text) > _MOST_TEXT:
-            raise ConfigError(f"more than {_MOST_TEXT >> 20} MB: no configuration")
-        return to_si(tomllib.loads(text, parse_float=Decimal))
+            return parsed(file.read(_MOST_TEXT + 1), str(path))
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: not a text file in UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from None
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def parsed(source: str | Mapping[str, Any], where: str) -> dict[str, Any]:
+    """The tables of a TOML text, or of a dict that has what such a text would have, with every number in SI.
+
+    Args:
+        source: The text, or the dict.
+        where: What it is, for errors.
+
+    Raises:
+        ConfigError: The text is not TOML, or there is a number that is not finite.
+    """
+    try:
+        if not isinstance(source, str):
+            return to_si(source)
+        if len(source) > _MOST_TEXT:
+            raise ConfigError(f"more than {_MOST_TEXT >> 20} MB: no configuration")
+        return to_si(tomllib.loads(source, parse_float=Decimal))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{where}: not valid TOML: {error}") from None
     except (ArithmeticError, ValueError, RecursionError):
-        raise ConfigError(f"{path}: not valid TOML: a number is out of range, or it nests too deeply") from None
+        raise ConfigError(f"{where}: not valid TOML: a number is out of range, or it nests too deeply") from None
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
+        raise ConfigError(f"{where}: {error}") from None
 
 
 def struct(tree: Any, kind: type[S], where: str, path: str = "", axis: Kind = "length") -> S:

@@ -49,6 +49,7 @@ SCREEN: dict[Kind, Screen] = {
     "length": Screen("mm", MM, "m/s", 1.0),
     "angle": Screen("deg", DEG, "deg/s", DEG),
 }
+SI: dict[Kind, Screen] = {"length": Screen("m", 1.0, "m/s", 1.0), "angle": Screen("rad", 1.0, "rad/s", 1.0)}
 AN: dict[Kind, str] = {"length": "a length", "angle": "an angle"}
 LENGTHS = ("_m", "_mm", "_um")
 ANGLES = ("_rad", "_mrad", "_deg")

@@ -28,7 +28,7 @@ AT_ONCE = f"replay:{SCAN}?speed=max"
 def test_a_replay_gives_what_as_live_gives() -> None:
     """The demo's run, as fast as it can be: one line a command, the numbers of `fuse --as-live`, and a summary."""
     done = pumafuse("live", AT_ONCE, "-c", FUSION)
-    offline = pf.fuse(pf.Run.read(SCAN), pf.FusionConfig.load(FUSION), as_live=True)
+    offline = pf.fuse(pf.Run.read(SCAN), pf.FusionConfig.load(FUSION), mode="as-live")
     found = [json.loads(line) for line in done.stdout.splitlines()]
     for axis, track in offline.axes.items():
         assert [line[axis]["position_mm"] for line in found] == (track.position * 1e3).tolist()

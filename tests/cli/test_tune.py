@@ -59,8 +59,8 @@ def test_the_folder_holds_the_result(
     assert names(out) == FILES
     wanted = quietly(lambda: pf.tune([run], known))
     assert (out / "tuning.json").read_text() == done.stdout == wanted.to_json()
-    assert [line.removeprefix("warning: ") for line in done.stderr.splitlines()] == wanted.summary.notes
-    assert msgspec.json.decode(done.stdout, type=TuningSummary) == wanted.summary
+    assert [line.removeprefix("warning: ") for line in done.stderr.splitlines()] == wanted.details.notes
+    assert msgspec.json.decode(done.stdout, type=TuningSummary) == wanted.details
     found = pf.FusionConfig.load(out / "fusion.toml")
     likelihood = Likelihood([run], found)
     assert likelihood.evaluate(found).total == pytest.approx(likelihood.evaluate(wanted.config).total, abs=1e-6)

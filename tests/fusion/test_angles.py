@@ -132,7 +132,7 @@ def fused(folder: Path, **options: Any) -> pf.Estimates:
     return quiet(pf.Run.read(folder), pf.FusionConfig.load(folder / "fusion.toml"), **options)
 
 
-@pytest.mark.parametrize("mode", [{}, {"as_live": True}, {"smooth": True}, {"engine": "filterpy"}])
+@pytest.mark.parametrize("mode", [{}, {"mode": "as-live"}, {"mode": "smoothed"}, {"engine": "filterpy"}])
 def test_rad_and_degrees_give_the_same(folders: dict[str, Path], mode: dict[str, Any]) -> None:
     """Position and sd to 1e-9 of a standard deviation, whichever unit the columns have."""
     degrees = fused(folders["deg"], **mode)
@@ -268,7 +268,7 @@ def test_one_run_may_have_both(tmp_path: Path) -> None:
     assert results.read(tmp_path / "out").summary.axes["yaw"].score == summary.axes["yaw"].score
 
 
-@pytest.mark.parametrize("mode", [{}, {"as_live": True}, {"smooth": True}, {"engine": "filterpy"}])
+@pytest.mark.parametrize("mode", [{}, {"mode": "as-live"}, {"mode": "smoothed"}, {"engine": "filterpy"}])
 def test_a_sensor_within_a_turn_is_as_good_as_one_that_counts_them(tmp_path: Path, mode: dict[str, Any]) -> None:
     """Estimates are those of the same measurements without the jumps by 360°, and so is the skill."""
     whole, within = (quiet(*mixed(tmp_path, turns), **mode) for turns in (0.0, 1.0))

@@ -110,9 +110,9 @@ def test_tuning_on_a_part_is_tuning_on_its_measurements() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", pf.PumafuseWarning)
         found = pf.tune([part], sim.config, fix=["process"])
-    assert found.summary.parts == {sim.run.name: (1.0, 3.0)}
-    assert {check.since_s for check in found.summary.validation or []} == {1.0 + 2.0 / 3.0 * 2.0}
-    assert len({check.axis for check in found.summary.validation or []}) == 2
+    assert found.details.parts == {sim.run.name: (1.0, 3.0)}
+    assert {check.since_s for check in found.details.validation or []} == {1.0 + 2.0 / 3.0 * 2.0}
+    assert len({check.axis for check in found.details.validation or []}) == 2
 
 
 def test_a_part_that_cannot_be_used_is_one_line() -> None:

@@ -17,6 +17,7 @@ from fusion.test_oracle import LAG, MS, PANEL, TRACKER, UNDER, Case, Seen, cases
 from fusion_oracle import AxisOracle
 from pumafuse.errors import PumafuseWarning
 from pumafuse.fusion.config import FusionConfig, Process
+from pumafuse.fusion.estimates import Mode
 from pumafuse.fusion.offline import fuse
 from pumafuse.logs.run import Run
 from pumafuse.model.arm import AxisModel
@@ -24,11 +25,11 @@ from pumafuse.model.arm import AxisModel
 # ---- biases ---------------------------------------------------------------------------------------------------------
 
 
-def check(case: Case, *, smooth: bool = False) -> None:
+def check(case: Case, *, mode: Mode = "filtered") -> None:
     """The biases are those of the joint Gaussian: means to 1e-9 sd + 1e-12 m, variances to 1e-9."""
     run, config = case.made()
     with warned(run, config):
-        estimates = fuse(run, config, rate=case.rate, smooth=smooth)
+        estimates = fuse(run, config, rate=case.rate, mode=mode)
     wanted = {axis: AxisOracle(run, config, axis).biases() for axis in estimates.axes}
     named = {(name, axis) for axis, found in wanted.items() for name in found}
     assert {(name, axis) for name, of in estimates.biases.items() for axis in of} == named
@@ -53,11 +54,11 @@ BIASED = {
 }
 
 
-@pytest.mark.parametrize("smooth", [False, True], ids=["filtered", "smoothed"])
+@pytest.mark.parametrize("mode", ["filtered", "smoothed"])
 @pytest.mark.parametrize("case", BIASED.values(), ids=BIASED.keys())
-def test_biases_are_conditional_means(case: Case, smooth: bool) -> None:
+def test_biases_are_conditional_means(case: Case, mode: Mode) -> None:
     """Each sensor with a bias_sd has its bias on each axis it measures, given all measurements; smoothed or not."""
-    check(case, smooth=smooth)
+    check(case, mode=mode)
 
 
 @settings(derandomize=True, deadline=None, max_examples=60)

@@ -242,7 +242,7 @@ def test_innovations_are_looked_at_beyond_the_next_one(moving: pf.Run) -> None:
 
 def test_the_verdict_on_smoothed_estimates_takes_the_velocity_from_their_positions(moving: pf.Run) -> None:
     """They have no velocity of their own; a latency 30 ms too long is still found on every axis."""
-    est = pf.fuse(moving, World(latency=0.050).config(moving), smooth=True)
+    est = pf.fuse(moving, World(latency=0.050).config(moving), mode="smoothed")
     nothing = np.full(len(est.time), np.nan)
     smoothed = replace(est, axes={name: replace(axis, velocity=nothing) for name, axis in est.axes.items()})
     for axis in est.axes:

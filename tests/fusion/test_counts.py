@@ -51,20 +51,20 @@ def hostile_commands(draw: st.DrawFn) -> tuple[list[int], dict[str, list[float]]
     hostile_commands(),
     st.sampled_from([None, ["a"], ["a", "b"]]),
     st.sampled_from([(None, None), (0.0, 0.05), (0.02, None), (None, 0.03)]),
-    st.booleans(),
+    st.sampled_from(["filtered", "as-live"]),
 )
 def test_every_row_is_counted_once(
     case: tuple[pf.Run, pf.FusionConfig],
     commands: tuple[list[int], dict[str, list[float]]],
     sensors: list[str] | None,
     part: tuple[float | None, float | None],
-    as_live: bool,
+    mode: str,
 ) -> None:
     """Whatever its stamp, whatever part is used, whichever sensors: the counts add up to the rows of the file."""
     run, conf = case
     try:
         run = replace(run, command=pf.Run.from_arrays(*commands).command).between(*part)
-        est = fused(run, conf, sensors=sensors, as_live=as_live)
+        est = fused(run, conf, sensors=sensors, mode=mode)
     except pf.PumafuseError:
         assume(False)
     summary = summarise(est)
@@ -122,7 +122,7 @@ def test_rows_of_all_segments_are_added() -> None:
     assert sum(est.command_counts.values()) == len(run.command.stamp)
 
 
-@pytest.mark.parametrize("how", [{}, {"smooth": True}, {"as_live": True}, {"engine": "filterpy"}], ids=str)
+@pytest.mark.parametrize("how", [{}, {"mode": "smoothed"}, {"mode": "as-live"}, {"engine": "filterpy"}], ids=str)
 def test_counts_agree_with_the_outcomes_of_components(how: dict[str, object]) -> None:
     """A sensor of one axis: its rows are its components, in every mode of either engine."""
     scan, conf = pf.Run.read(SCAN).between(0.0, 5.0), pf.FusionConfig.load(FUSION)

@@ -249,7 +249,7 @@ def test_fuse_by_filterpy_says_the_same() -> None:
     for axis in wanted.axes:
         np.testing.assert_allclose(got[axis].position, wanted[axis].position, rtol=0.0, atol=1e-11)
     assert done == sorted(done)
-    for mode in ({"smooth": True}, {"as_live": True}):
+    for mode in ({"mode": "smoothed"}, {"mode": "as-live"}):
         with pytest.raises(ValueError, match="filterpy"):
             pf.fuse(run, config, engine="filterpy", **mode)
 
@@ -299,7 +299,7 @@ def test_estimates_are_right_while_priors_are_wide(kind: str, ratio: float, tole
     """
     run, config = wide(kind, ratio)
     agree(*both(run, config, 110.0), tolerance)
-    estimates = pf.fuse(run, config, rate=110.0, smooth=True)
+    estimates = pf.fuse(run, config, rate=110.0, mode="smoothed")
     belief = AxisOracle(run, config, "radial").smoothed(nanoseconds(estimates))
     for field in ("position", "offset"):
         mean, sd, right, right_sd = (

@@ -23,7 +23,7 @@ from pumafuse.model.plants import Plant
 MS = 1_000_000  # ns
 DAY = 86_400_000 * MS
 T = 28 * MS
-MODES = {"filtered": {}, "smoothed": {"smooth": True}, "as-live": {"as_live": True}}
+MODES = {"filtered": {}, "smoothed": {"mode": "smoothed"}, "as-live": {"mode": "as-live"}}
 FIELDS = ("position", "velocity", "offset")
 
 PLANTS = {

@@ -375,7 +375,7 @@ def logs(draw: st.DrawFn) -> tuple[list[Row], dict[str, Sensor]]:
 def check_log(rows: list[Row], sensors: dict[str, Sensor], as_live: bool) -> None:
     judge = judged(rows, sensors)
     assume(judge.closest > 1e-6)
-    estimates = fused(rows, sensors, as_live=as_live)
+    estimates = fused(rows, sensors, mode="as-live" if as_live else "filtered")
     if not as_live:
         decided = estimates.measurements.where(estimates.measurements.outcome <= REACQUIRED)
         name, outcome, nu, S = zip(*judge.components, strict=True)

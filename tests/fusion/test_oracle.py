@@ -117,7 +117,7 @@ def warned(run: Run, config: FusionConfig) -> AbstractContextManager[object]:
     return pytest.warns(PumafuseWarning) if anomalous(run, config) else nullcontext()
 
 
-MODES = {"filtered": {}, "as_live": {"as_live": True}, "smoothed": {"smooth": True}}
+MODES = {"filtered": {}, "as_live": {"mode": "as-live"}, "smoothed": {"mode": "smoothed"}}
 
 
 def check(case: Case, mode: str = "filtered", engine: str = "compiled") -> None:

@@ -86,10 +86,10 @@ def test_any_run_is_smoothed_like_the_conditional_gaussian(case: Case) -> None:
 # ---- without the oracle ------------------------------------------------------------------------
 
 
-def test_smoothed_as_live_is_refused() -> None:
-    """All measurements, and only those that had arrived: a contradiction."""
-    with pytest.raises(ValueError, match="as_live"):
-        fuse(*Case().made(), smooth=True, as_live=True)
+def test_an_unknown_mode_is_refused() -> None:
+    """With what there is."""
+    with pytest.raises(ValueError, match="no mode 'as live'; there are: filtered, as-live, smoothed"):
+        fuse(*Case().made(), mode="as live")  # pyright: ignore
 
 
 def test_smoothing_does_not_reach_across_a_clock_that_was_set_back() -> None:
@@ -104,9 +104,9 @@ def test_smoothing_does_not_reach_across_a_clock_that_was_set_back() -> None:
     command = joined(*(run.command for run, _ in parts))
     tracker = joined(*(run.sensors["tracker"] for run, _ in parts))
     with pytest.warns(PumafuseWarning):
-        both = fuse(Run.from_arrays(*command, {"tracker": tracker}), config, smooth=True)
+        both = fuse(Run.from_arrays(*command, {"tracker": tracker}), config, mode="smoothed")
     for number, (run, _) in enumerate(parts):
-        alone, here = fuse(run, config, smooth=True)["radial"], both.segment == number
+        alone, here = fuse(run, config, mode="smoothed")["radial"], both.segment == number
         np.testing.assert_array_equal(both["radial"].position[here], alone.position)
         np.testing.assert_array_equal(both["radial"].position_sd[here], alone.position_sd)
 
@@ -185,7 +185,7 @@ def test_the_scan_is_smoothed_as_well_as_promised() -> None:
     run, config = pf.Run.read(DATA / "scan1"), pf.FusionConfig.load(DATA / "fusion.toml")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PumafuseWarning)  # of the scan's own faults
-        est = pf.fuse(run, config, sensors=["tracker", "vision"], rate=200.0, smooth=True)
+        est = pf.fuse(run, config, sensors=["tracker", "vision"], rate=200.0, mode="smoothed")
     for axis, limit in LIMITS.items():
         found = pf.score(est.time, est.segment, est[axis].position, est[axis].position_sd, est.reference, axis)
         assert found.rows > 11_000

@@ -103,7 +103,7 @@ def test_a_stray_row_changes_no_estimate_and_is_noted(case: str, framed: bool) -
     assert not any("stray" in note for note in wanted.notes)
 
 
-@pytest.mark.parametrize("more", [{}, {"as_live": True}, {"smooth": True}, {"engine": "filterpy"}], ids=str)
+@pytest.mark.parametrize("more", [{}, {"mode": "as-live"}, {"mode": "smoothed"}, {"engine": "filterpy"}], ids=str)
 def test_stray_rows_change_no_estimate_in_any_mode_of_either_engine(more: dict[str, Any]) -> None:
     """Filtered, as live and smoothed, and filtered by filterpy."""
     strays = [("command", 50, 9.0), ("tracker", 0, 40.0), ("tracker", 80, 40.0), ("camera", 5, 5.0)]

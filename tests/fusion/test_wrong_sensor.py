@@ -125,7 +125,7 @@ FAULTS: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_wrong_camera_beside_a_good_tracker_does_no_harm(fault: str, order: tuple[str, ...]) -> None:
     """At most 1.2 times the error without the fault, as live, too."""
-    for mode in ({}, {"as_live": True}):
+    for mode in ({}, {"mode": "as-live"}):
         assert rms(error_of(order, **FAULTS[fault], **mode)) < 1.2 * rms(error_of(**mode))
 
 

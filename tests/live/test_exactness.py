@@ -50,7 +50,7 @@ def test_in_any_order(name: str, longest: float) -> None:
 def test_estimates_at_the_time_are_as_live(name: str) -> None:
     """Fed in order, the estimate at each command is that of `fuse --as-live`."""
     run, config = recorded(name)
-    offline, live = pf.fuse(run, config, as_live=True), pf.LiveEstimator(config, start=run.start)
+    offline, live = pf.fuse(run, config, mode="as-live"), pf.LiveEstimator(config, start=run.start)
     found = [
         live.estimate(event.stamp)
         for event in events_of(run)

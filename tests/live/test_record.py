@@ -96,7 +96,7 @@ def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
         recorded.tick()
     found = recorded.close()
     assert found.notes == ()
-    offline = pf.fuse(found, config, as_live=True)
+    offline = pf.fuse(found, config, mode="as-live")
     given = [json.loads(line) for line in written]
     for axis, track in offline.axes.items():
         assert [one[axis]["position_mm"] for one in given] == (track.position * 1e3).tolist()

@@ -37,7 +37,7 @@ def test_an_even_grid_is_as_live() -> None:
     data = files("pumafuse") / "data"
     run, config = pf.Run.read(str(data / "scan1")), pf.FusionConfig.load(str(data / "fusion.toml"))
     rate = 33.3
-    offline, both = pf.fuse(run, config, rate=rate, as_live=True), Both(config, rate)
+    offline, both = pf.fuse(run, config, rate=rate, mode="as-live"), Both(config, rate)
     for events in replayed(run, config, np.inf):
         both.stream.take(events)
     both.end()
@@ -191,7 +191,7 @@ def test_a_replay_follows_the_controllers_grid() -> None:
         {"tracker": (np.arange(0.0, 5.5, 0.01), {"radial": np.full(550, 0.57)})},
         clock="regular",
     )
-    offline, both = pf.fuse(run, TRACKED, as_live=True), Both()
+    offline, both = pf.fuse(run, TRACKED, mode="as-live"), Both()
     for events in replayed(run, TRACKED, np.inf):
         both.stream.take(events)
     assert [found["radial"]["position_mm"] for found in both.estimates] == (offline["radial"].position * 1e3).tolist()

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 import pumafuse as pf
+from pumafuse.fusion.estimates import Mode
 from pumafuse.fusion.offline import Engine
 
 pytestmark = pytest.mark.long
@@ -93,14 +94,14 @@ class Fused:
     bias: NDArray[np.float64]
 
 
-def fused(scenario: pf.Scenario, runs: int = RUNS, engine: Engine = "compiled", **mode: bool) -> Fused:
+def fused(scenario: pf.Scenario, runs: int = RUNS, engine: Engine = "compiled", mode: Mode = "filtered") -> Fused:
     errors, velocities, biases = [], [], []
     nis: dict[tuple[str, str], list[float]] = {}
     for seed in range(1, runs + 1):
         simulated = pf.simulate(scenario, seed)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", pf.PumafuseWarning)
-            est = pf.fuse(simulated.run, simulated.config, engine=engine, **mode)
+            est = pf.fuse(simulated.run, simulated.config, engine=engine, mode=mode)
         reference = est.reference
         assert reference is not None
         there = np.searchsorted(reference.time, est.time - 1e-9)
@@ -198,23 +199,23 @@ def test_an_estimated_bias_is_as_large_as_its_prior_says(filtered: Fused) -> Non
     assert low < square.min() and square.max() < high
 
 
-@pytest.mark.parametrize("mode", ["smooth", "as_live"])
-def test_smoothed_and_live_estimates_are_consistent_too(scenario: pf.Scenario, mode: str) -> None:
+@pytest.mark.parametrize("mode", ["smoothed", "as-live"])
+def test_smoothed_and_live_estimates_are_consistent_too(scenario: pf.Scenario, mode: Mode) -> None:
     """ANEES and coverage hold for estimates that know every measurement and for those that know what had arrived."""
-    found = fused(scenario, **{mode: True})
+    found = fused(scenario, mode=mode)
     check_anees(found)
     check_coverage(found.error)
 
 
-@pytest.mark.parametrize("mode", ["filtered", "smooth", "as_live"])
-def test_error_bars_hold_with_a_disturbance_and_a_drifting_bias(tmp_path: Path, mode: str) -> None:
+@pytest.mark.parametrize("mode", ["filtered", "smoothed", "as-live"])
+def test_error_bars_hold_with_a_disturbance_and_a_drifting_bias(tmp_path: Path, mode: Mode) -> None:
     """ANEES, 95 ± 1 % of the positions and NIS: Matérn on one axis, Ornstein-Uhlenbeck on the other, with true numbers.
 
     A filter that is not told of either is seen at once.
     """
     path = tmp_path / "disturbed.toml"
     path.write_text(DISTURBED)
-    found = fused(pf.Scenario.load(path), smooth=mode == "smooth", as_live=mode == "as_live")
+    found = fused(pf.Scenario.load(path), mode=mode)
     check_anees(found)
     check_coverage(found.error)
     for nis in found.nis.values():

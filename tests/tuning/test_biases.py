@@ -102,7 +102,7 @@ def test_each_run_has_its_own_constant() -> None:
     """Two runs with 0.3 and 0.8 mm: one width for both, in each its own value in the summary, and a note."""
     (one, config), (two, _) = recorded(3e-4, 1), recorded(8e-4, 2)
     two = replace(two, name="another run")
-    summary = quietly(lambda: pf.tune([one, two], config, fix=["process"])).summary
+    summary = quietly(lambda: pf.tune([one, two], config, fix=["process"])).details
     biases = summary.biases
     assert [note for note in summary.notes if note.startswith("sensor 'vision' is off by a constant")]
     assert {(each.run, each.sensor, each.axis) for each in biases} == {

@@ -136,7 +136,7 @@ def test_a_sensor_whose_clock_is_far_off_is_named(seconds: float) -> None:
     """All its measurements before the first or after the last command: refused, or a note with the reason."""
     run = changed("vision", delayed(seconds))
     try:
-        notes = quietly(lambda: pf.tune([run], outage(1).config, fix=["process"])).summary.notes
+        notes = quietly(lambda: pf.tune([run], outage(1).config, fix=["process"])).details.notes
     except pf.PumafuseError as error:
         notes = [str(error)]
     assert any("vision" in note and "command" in note for note in notes), notes
@@ -198,6 +198,6 @@ def test_an_axis_without_measurements_is_left_as_it_is() -> None:
     run, config = outage(1).run, spoiled(outage(1).config)
     sensors = {name: replace(one, values={"tangential": one.values["tangential"]}) for name, one in run.sensors.items()}
     found = quietly(lambda: pf.tune([replace(run, sensors=sensors)], config))
-    assert not [one.key for one in found.summary.parameters if "vertical" in one.key]
+    assert not [one.key for one in found.details.parameters if "vertical" in one.key]
     assert found.config.process["vertical"] == config.process["vertical"]
     assert found.config.arm.axes["vertical"] == config.arm.axes["vertical"]

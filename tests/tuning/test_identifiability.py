@@ -42,13 +42,13 @@ def test_a_parameter_at_a_bound_is_reported() -> None:
         for key in ("input_noise_mm_rtHz", "drift_mm_rts")
     ]
     found = quietly(lambda: pf.tune([sim.run], sim.config, fix=[*still, "sd_mm"]))
-    none = [one for one in found.summary.parameters if one.value == 0.0]
+    none = [one for one in found.details.parameters if one.value == 0.0]
     assert none and all(one.notes == "not significant" and one.ci95[0] == 0.0 for one in none)
     assert all(one.ci95[1] is not None and one.ci95[1] > 0.0 for one in none)
     sim = pf.simulate(scenario("panel-vision", 0.1, 0.06), 1)
     early = with_sensors(sim.config, latency=0.12)  # by more than the arm is late
     found = quietly(lambda: pf.tune([sim.run], early, fit=["delay"]))
-    for one in found.summary.parameters:
+    for one in found.details.parameters:
         assert one.ci95[0] is None and one.notes.startswith("at its lower bound (0"), one
 
 

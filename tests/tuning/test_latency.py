@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 import pumafuse as pf
+from pumafuse.tuning import latency as module
 from pumafuse.tuning.latency import Latency
 from pumafuse.tuning.likelihood import Likelihood
 
@@ -65,7 +67,7 @@ def holds(interval: tuple[float, float] | None, truth: float) -> bool:
 
 def test_lag_gain_and_plant_are_those_simulated(found: Latency) -> None:
     """Each interval holds the truth; the lag is Td + τ, to a millisecond."""
-    axis = found.summary.axes["x"]
+    axis = found.details.axes["x"]
     assert axis.lag == pytest.approx(DELAY + TAU, abs=1e-3)
     assert holds(axis.lag_ci95, DELAY + TAU)
     assert holds(axis.delay_ci95, DELAY)
@@ -77,7 +79,7 @@ def test_lag_gain_and_plant_are_those_simulated(found: Latency) -> None:
 
 def test_a_second_sensor_s_latency_is_found(found: Latency) -> None:
     """The camera is 37 ms late, beside the tracker, whose stamps are right."""
-    camera = found.summary.sensors["camera"]
+    camera = found.details.sensors["camera"]
     assert camera.latency == pytest.approx(LATENCY, abs=2e-3)
     assert holds(camera.latency_ci95, LATENCY)
     assert found.config.sensors["camera"].latency == pytest.approx(camera.latency)
@@ -85,10 +87,10 @@ def test_a_second_sensor_s_latency_is_found(found: Latency) -> None:
 
 def test_nothing_is_named_in_a_steady_run(found: Latency) -> None:
     """No drift, no wandering, no clock; the parts of the run scatter about 0 as their deviations say."""
-    axis = found.summary.axes["x"]
+    axis = found.details.axes["x"]
     assert not axis.drifts
     assert axis.wander == 0.0
-    assert found.summary.clock_drift is None
+    assert found.details.clock_drift is None
     shares = [part.shift / part.sd for part in axis.course]
     assert 0.3 < np.sqrt(np.mean(np.square(shares))) < 2.0  # of ten: 95 % of such means lie in 0.57 to 1.43
 
@@ -96,18 +98,18 @@ def test_nothing_is_named_in_a_steady_run(found: Latency) -> None:
 def test_the_arm_is_ready_for_use(found: Latency) -> None:
     """Written and read again it is the same, with intervals; the configuration fuses the run."""
     arm = found.arm
-    assert arm.lag_of("x") == pytest.approx(found.summary.axes["x"].lag, abs=1e-6)
+    assert arm.lag_of("x") == pytest.approx(found.details.axes["x"].lag, abs=1e-6)
     assert arm.provenance == {"identified_on": ["smooth"], "sensor": "tracker"}
     plant = arm.axes["x"].plant
     assert isinstance(plant, pf.FirstOrder)
-    assert plant.time_constant_ci95 == found.summary.axes["x"].time_constant_ci95
+    assert plant.time_constant_ci95 == found.details.axes["x"].time_constant_ci95
     est = pf.fuse(found.runs[0], found.config)
     assert np.isfinite(est["x"].position).all()
 
 
 def test_a_drift_of_the_lag_is_named() -> None:
     """20 ms over the run of steps: later, and by several ms; plant and noise explain some of it (docs/limits.md)."""
-    axis = pf.latency(recorded("steps", drift=0.02)).summary.axes["x"]
+    axis = pf.latency(recorded("steps", drift=0.02)).details.axes["x"]
     assert axis.drifts
     assert axis.drift is not None
     assert 0.005 < axis.drift < 0.03
@@ -150,7 +152,7 @@ def test_the_held_command_is_half_a_period_late_itself() -> None:
     time, command = path("smooth")
     stamp = np.arange(0.5, LENGTH - 0.5, 0.013)
     value = np.interp(stamp - 0.1, time, command) + np.random.default_rng(7).normal(0.0, 1e-5, len(stamp))
-    axis = pf.latency(pf.Run.from_arrays(time, {"x": command}, {"tracker": (stamp, {"x": value})})).summary.axes["x"]
+    axis = pf.latency(pf.Run.from_arrays(time, {"x": command}, {"tracker": (stamp, {"x": value})})).details.axes["x"]
     assert axis.lag == pytest.approx(0.1 - 0.5 * PERIOD, abs=1e-3)
 
 
@@ -158,14 +160,14 @@ def test_a_mirrored_sensor_is_followed() -> None:
     """A distance that falls while the axis moves on: the same lag."""
     found = pf.latency(recorded("steps", scale=-1.0))
     assert found.config.sensors["tracker"].scale == -1.0
-    assert holds(found.summary.axes["x"].lag_ci95, DELAY + TAU)
+    assert holds(found.details.axes["x"].lag_ci95, DELAY + TAU)
 
 
 def test_a_reference_is_trusted_where_there_is_one() -> None:
     """By default its stamps are right; another sensor can be asked for, an unknown one is refused by name."""
     run = recorded()
     known = replace(run, reference=run.sensors["tracker"], sensors={})
-    assert pf.latency(known).summary.sensor == "reference"
+    assert pf.latency(known).details.sensor == "reference"
     with pytest.raises(pf.UnknownNameError, match="laser"):
         pf.latency(run, sensor="laser")
 
@@ -184,3 +186,19 @@ def test_what_tells_nothing_is_refused() -> None:
     early = replace(run.sensors["tracker"], stamp=run.sensors["tracker"].stamp - 400_000_000)
     with pytest.raises(pf.TuneError, match="before its commands"):
         pf.latency(replace(run, sensors={"tracker": early}))
+
+
+def killed(*_: object) -> None:
+    """What a system that runs out of memory does to a process."""
+    os._exit(9)
+
+
+def test_a_worker_that_dies_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The axes are looked at in processes of their own; one that is killed is an error, not a traceback."""
+    run = recorded()
+    both = dict.fromkeys(("x", "y"), run.command.values["x"])
+    seen = dict.fromkeys(both, run.sensors["tracker"].values["x"])
+    tracker = replace(run.sensors["tracker"], values=seen)
+    monkeypatch.setattr(module, "axis_posterior", killed)
+    with pytest.raises(pf.TuneError, match="a worker process died"):
+        pf.latency(replace(run, command=replace(run.command, values=both), sensors={"tracker": tracker}))

@@ -187,7 +187,7 @@ def test_the_scale_of_a_sensor_is_found() -> None:
     config, command, path = moving()
     found = quietly(lambda: pf.tune([measured(command, 1.04 * path, 1)], config, fit=["noise", "scale"]))
     assert found.config.sensors["camera"].scale == pytest.approx(1.04, abs=0.003)
-    (one,) = [each for each in found.summary.parameters if each.key == "sensors.camera.scale"]
+    (one,) = [each for each in found.details.parameters if each.key == "sensors.camera.scale"]
     assert one.ci95[0] is not None and one.ci95[1] is not None and one.ci95[0] < 1.04 < one.ci95[1]
 
 
@@ -214,7 +214,7 @@ def test_the_prior_of_a_noise_can_be_turned_off() -> None:
         with_sensors(config, sd=3e-3),
     )
     with_prior, without = (quietly(lambda on=on: pf.tune([run], config, sd_prior=on)) for on in (True, False))
-    assert with_prior.summary.sd_prior and not without.summary.sd_prior
+    assert with_prior.details.sd_prior and not without.details.sd_prior
     sds = [found.config.sensors["camera"].sd_of("tip") for found in (with_prior, without)]
     assert sds[0] is not None and sds[1] is not None and sds[0] > sds[1] == pytest.approx(3e-4, rel=0.1)
 
@@ -225,7 +225,7 @@ def test_a_verdict_tells_a_noise_at_its_bound() -> None:
     run = measured(command, path, 1, sd=0.0)
     found = quietly(lambda: pf.tune([run], config, sd_prior=False))
     assert found.config.sensors["camera"].sd_of("tip") == 1e-7
-    (check,) = found.summary.validation or []
+    (check,) = found.details.validation or []
     assert check.verdict.startswith("better, but its error bars do not hold (sd_mm of camera is at its bound")
     assert not check.holds
     verdict = pf.summarise(quietly(lambda: pf.fuse(run, found.config))).axes["tip"].sensors["camera"].verdict

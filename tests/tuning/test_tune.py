@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -41,7 +42,7 @@ ARM: tuple[Fit, ...] = ("noise", "delay", "plant")
 @cache
 def tuned() -> pf.Tuning:
     """Noise, delays and plants from one run of tracker and camera, all of them spoiled."""
-    return quietly(lambda: pf.tune([outage(1).run], spoiled_arm(outage(1).config), fit=ARM))
+    return quietly(lambda: pf.tune(outage(1).run, spoiled_arm(outage(1).config), fit=ARM))
 
 
 def total(run: pf.Run, config: pf.FusionConfig) -> float:
@@ -51,13 +52,28 @@ def total(run: pf.Run, config: pf.FusionConfig) -> float:
 # ---- the result -----------------------------------------------------------------------------------------------------
 
 
+def test_numbers_and_intervals_are_there_as_statisticians_have_them() -> None:
+    """By key, as in the files: each number inside its interval, an end that is open infinite; a table in plain text."""
+    found = tuned()
+    params, intervals, lines = found.params, found.conf_int(), found.summary().splitlines()
+    assert params.keys() == intervals.keys() == {one.key for one in found.details.parameters}
+    assert params["delay_ms"] == pytest.approx(1e3 * found.config.arm.delay, rel=1e-6)
+    for one in found.details.parameters:
+        low, high = intervals[one.key]
+        assert low <= params[one.key] <= high
+        assert (math.isinf(low), math.isinf(high)) == tuple(end is None for end in one.ci95)
+        (line,) = [line for line in lines if line.startswith(f"{one.key} ")]
+        assert line.split()[-3:] == [f"{number:.4g}" for number in (params[one.key], low, high)]
+    assert repr(found) == f"Tuning({outage(1).run.name}: {len(params)} parameters)"
+
+
 def test_the_result_is_likelier_and_reports_by_how_much() -> None:
     """By axis, before and after; values before and after are those of the configurations."""
     found, run = tuned(), outage(1).run
     for config, name in ((found.before, "before"), (found.config, "after")):
         likelihood = Likelihood([run], config)
         axes = likelihood.evaluate(config).axes
-        reported = found.summary.likelihood
+        reported = found.details.likelihood
         assert [getattr(reported[axis], name) for axis in AXES] == pytest.approx(axes.tolist(), rel=1e-9)
         assert [reported[axis].components for axis in AXES] == likelihood.count.tolist()
     assert total(run, found.config) > total(run, found.before) + 200.0
@@ -69,10 +85,10 @@ def test_the_result_is_likelier_and_reports_by_how_much() -> None:
         assert one.value == pytest.approx(keys[key].get(found.config) / keys[key].unit)
         low, high = one.ci95
         assert (low is None or low <= one.value) and (high is None or one.value <= high), one
-    assert found.summary.orders.keys() == set(AXES)
-    assert (found.summary.pumafuse, found.summary.runs) == (version("pumafuse"), [run.name])
-    assert (found.summary.fit, found.summary.fixed, found.summary.trusted) == (list(ARM), [], None)
-    assert not found.summary.interrupted
+    assert found.details.orders.keys() == set(AXES)
+    assert (found.details.pumafuse, found.details.runs) == (version("pumafuse"), [run.name])
+    assert (found.details.fit, found.details.fixed, found.details.trusted) == (list(ARM), [], None)
+    assert not found.details.interrupted
 
 
 def test_the_truth_is_near_and_the_rest_stays() -> None:
@@ -115,15 +131,15 @@ def test_a_configuration_that_had_seen_the_part_for_validation_says_so() -> None
     run, other = outage(1).run, outage(2).run
     first = sds_alone([run], outage(1).config)
     assert first.config.arm.provenance["tuned_on"] == [run.name]
-    assert not [note for note in first.summary.notes if "fitted on '" in note]
+    assert not [note for note in first.details.notes if "fitted on '" in note]
     again = sds_alone([run], first.config)
     assert [
         note
-        for note in again.summary.notes
+        for note in again.details.notes
         if note.startswith(f"the configuration as given was fitted on '{run.name}'")
     ]
     elsewhere = sds_alone([run], first.config, validate=other)
-    assert not [note for note in elsewhere.summary.notes if "was fitted on '" in note]
+    assert not [note for note in elsewhere.details.notes if "was fitted on '" in note]
     assert sds_alone([other], first.config).config.arm.provenance["tuned_on"] == [run.name, other.name]
 
 
@@ -173,8 +189,8 @@ def test_the_last_third_is_validated_on_and_fitted_on_after() -> None:
     until = 2.0 / 3.0 * float(stamp[-1] - stamp[0]) / 1e9
     early = cut(sim.run, until, {"vision": 0.045})
     other = sds_alone([early], config, validate=sim.run, sd_prior=False)
-    assert found.summary.validation == check(sim.run, config, other.config, since=until)
-    for one in found.summary.validation or []:
+    assert found.details.validation == check(sim.run, config, other.config, since=until)
+    for one in found.details.validation or []:
         assert one.since_s == until
         assert one.components == np.sum(sim.run.sensors["vision"].stamp - stamp[0] >= until * 1e9)
     whole = sds_alone([sim.run], config, validate=sim.run, sd_prior=False)
@@ -186,18 +202,18 @@ def test_a_run_to_validate_on_is_compared_whole() -> None:
     """By its name and from its beginning; the numbers are those of a check of the result."""
     one, two = outage(1), outage(2)
     found = sds_alone([one.run], with_sensors(one.config, sd=1e-3), validate=two.run)
-    assert found.summary.validation == check(two.run, found.before, found.config)
-    assert {(part.run, part.since_s) for part in found.summary.validation or []} == {(two.run.name, 0.0)}
-    assert not found.summary.worse
-    assert not [note for note in found.summary.notes if "fitted on" in note]
+    assert found.details.validation == check(two.run, found.before, found.config)
+    assert {(part.run, part.since_s) for part in found.details.validation or []} == {(two.run.name, 0.0)}
+    assert not found.details.worse
+    assert not [note for note in found.details.notes if "fitted on" in note]
 
 
 def test_a_run_that_was_fitted_on_is_no_validation() -> None:
     """It is compared as asked for, with a note."""
     one = outage(1)
     found = sds_alone([one.run], one.config, validate=replace(one.run, name="another name"))
-    (note,) = [note for note in found.summary.notes if note.startswith("validated on a run that was fitted on")]
-    assert note.endswith("whether the numbers hold elsewhere is not known") and found.summary.validation
+    (note,) = [note for note in found.details.notes if note.startswith("validated on a run that was fitted on")]
+    assert note.endswith("whether the numbers hold elsewhere is not known") and found.details.validation
 
 
 # ---- a trusted sensor -----------------------------------------------------------------------------------------------
@@ -224,7 +240,7 @@ def test_the_arm_is_fitted_on_the_trusted_sensor_and_the_others_after_it() -> No
         assert found.config.sensors["vision"].sd_of(axis) == pytest.approx(5e-4, rel=0.2)
     second = {one.key for one in found.stages[1].free}
     assert second == {"sensors.vision.latency_ms", *(f"sensors.vision.sd_mm.{axis}" for axis in AXES)}
-    assert found.summary.trusted == "tracker"
+    assert found.details.trusted == "tracker"
 
 
 # ---- Ctrl-C ---------------------------------------------------------------------------------------------------------
@@ -263,7 +279,7 @@ def test_interrupted_it_gives_the_best_so_far(share: float, trust: str | None, t
     stop = Stop(1 + int(share * calls(trust)))
     with pytest.warns(pf.PumafuseWarning, match="interrupted: these are the best numbers until then"):
         found = pf.tune([sim.run], config, trust=trust, progress=stop)
-    assert found.summary.interrupted and len(stop.calls) == stop.at
+    assert found.details.interrupted and len(stop.calls) == stop.at
     assert total(sim.run, found.config) >= total(sim.run, config)
     for name, sensor in found.config.sensors.items():
         assert (sensor.gate, sensor.gate_rows) == (config.sensors[name].gate, config.sensors[name].gate_rows)
@@ -271,7 +287,7 @@ def test_interrupted_it_gives_the_best_so_far(share: float, trust: str | None, t
     assert found.config.start == config.start
     written = json.loads(found.to_json())
     assert set(written) == set(TuningSummary.__struct_fields__) and written["interrupted"]
-    assert [one["value"] for one in written["parameters"]] == [one.value for one in found.summary.parameters]
+    assert [one["value"] for one in written["parameters"]] == [one.value for one in found.details.parameters]
     found.config.save(tmp_path)
     assert total(sim.run, pf.FusionConfig.load(tmp_path / "fusion.toml")) == pytest.approx(
         total(sim.run, found.config), abs=1e-6

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from PIL import Image
 
 import pumafuse as pf
 from pumafuse.fusion.consistency import consistency
@@ -62,14 +61,13 @@ def case(
     return pf.fuse(run, config), run
 
 
-def panels(path: Path) -> float:
-    """How many rows of 2.4 inch a picture of 13 inch at 130 dpi has, beside its 0.8 inch of title; 0 for none."""
-    if not path.exists():
+def panels(figure: Figure | None) -> float:
+    """How many rows of 2.4 inch a picture of 13 inch has, beside its 0.8 inch of title; 0 for none."""
+    if figure is None:
         return 0
-    with Image.open(path) as picture:
-        width, height = picture.size
-    assert width == pytest.approx(13.0 * 130, abs=1)
-    return round((height / 130 - 0.8) / 2.4, 2)
+    width, height = figure.get_size_inches()
+    assert width == pytest.approx(13.0)
+    return round((float(height) - 0.8) / 2.4, 2)
 
 
 @pytest.mark.parametrize(
@@ -82,34 +80,26 @@ def panels(path: Path) -> float:
 )
 def test_every_figure_is_drawn_for_every_kind_of_run(what: dict, rows: int, validated: int, tmp_path: Path) -> None:
     """With and without reference, sensors, frame and bias: a whole picture each, and none where there is nothing."""
-    est, run = case(**what)
-    fused_figure(est, run, tmp_path / "fused.png")
-    validation_figure(est, tmp_path / "validation.png")
+    est, _ = case(**what)
+    drawn = [fused_figure(est), validation_figure(est)]
     if est.reference is None:
         with pytest.raises(ValueError, match="no reference"):
-            error_figure(est, tmp_path / "error.png")
+            error_figure(est)
     else:
-        error_figure(est, tmp_path / "error.png")
-    found = [panels(tmp_path / f"{name}.png") for name in ("fused", "validation", "error")]
-    assert found == [rows, validated, 0 if est.reference is None else rows]
+        drawn.append(error_figure(est))
+    assert list(map(panels, drawn)) == [2 * rows, validated, *([rows] if est.reference is not None else [])]
+    for figure in filter(None, drawn):
+        figure.savefig(tmp_path / "any.png")
 
 
-def test_a_path_is_drawn_where_there_are_x_y_and_z(drawn: list[Figure], tmp_path: Path) -> None:
+def test_a_path_is_drawn_where_there_are_x_y_and_z() -> None:
     """With a frame, and of an arm with such axes; of tangential, radial, vertical, or of two axes, there is none."""
-    for what, count in (({"frame": True}, 2), ({"frame": True, "axes": 2}, 0), ({}, 0)):
-        path_figure(*case(**what), tmp_path / "path.png")
-        assert [len(axes.lines) for figure in drawn for axes in figure.axes] == [count][:count]
-        if count:
-            command, estimate = (np.array(line.get_data_3d()) for line in drawn.pop().axes[0].lines)
-            assert np.abs(estimate[:, -1] - command[:, -1]).max() < 3.0  # mm
-
-
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """The figures that were saved, kept to look into them; no file is written."""
-    figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: figures.append(self))
-    return figures
+    for what in ({"frame": True, "axes": 2}, {}):
+        assert path_figure(*case(**what)) is None
+    drawn = path_figure(*case(frame=True))
+    assert drawn is not None
+    command, estimate = (np.array(line.get_data_3d()) for line in drawn.axes[0].lines)
+    assert np.abs(estimate[:, -1] - command[:, -1]).max() < 3.0  # mm
 
 
 def line(axes: Axes, label: str) -> tuple[np.ndarray, np.ndarray]:
@@ -118,32 +108,52 @@ def line(axes: Axes, label: str) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(found.get_xdata()), np.asarray(found.get_ydata())
 
 
-def test_the_fused_figure_shows_command_estimate_and_measurements(drawn: list[Figure], tmp_path: Path) -> None:
-    """In mm against seconds since the first command; each axis twice; an outlier's row alone carries a cross."""
+def test_the_fused_figure_shows_command_estimate_measurements_and_reference() -> None:
+    """In mm against seconds since the first command; each axis twice; a cross where the axis itself was rejected."""
     est, run = case(axes=2, outlier=True)
-    fused_figure(est, run, tmp_path / "none.png")
-    for number, axes in enumerate(drawn[0].axes):
-        name = NAMES[number // 2]
-        seen = run.sensors["camera"]
-        good = np.arange(len(seen.stamp)) != len(seen.stamp) // 2  # the whole row of an outlier is rejected
-        for label, wanted_time, wanted in (
-            ("command", 0.028 * np.arange(60), run.command.values[name]),
-            ("estimate", est.time, est[name].position),
-            ("camera", seen.stamp[good] / 1e9 - 10.0, seen.values[name][good]),
-        ):
-            time, value = line(axes, label)
-            np.testing.assert_allclose(time, wanted_time, atol=1e-9)
-            np.testing.assert_allclose(value, wanted * 1e3)
-        assert line(axes, "camera, rejected")[1] == pytest.approx(seen.values[name][~good] * 1e3)
+    every = fused_figure(est).axes
+    for number, name in enumerate(NAMES[:2]):
+        for axes in every[4 * number : 4 * number + 2]:
+            seen = run.sensors["camera"]
+            good = np.arange(len(seen.stamp)) != len(seen.stamp) // 2  # the whole row of an outlier is rejected
+            assert est.reference is not None
+            for label, wanted_time, wanted in (
+                ("command", 0.028 * np.arange(60), run.command.values[name]),
+                ("estimate", est.time, est[name].position),
+                ("reference", est.reference.time, est.reference.position[name]),
+                ("camera", seen.stamp[good] / 1e9 - 10.0, seen.values[name][good]),
+            ):
+                time, value = line(axes, label)
+                np.testing.assert_allclose(time, wanted_time, atol=1e-9)
+                np.testing.assert_allclose(value, wanted * 1e3)
+            label = "camera, rejected" if number == 0 else "camera, with its row"
+            assert line(axes, label)[1] == pytest.approx(seen.values[name][~good] * 1e3)
 
 
-def test_the_error_figure_draws_and_names_the_error(drawn: list[Figure], tmp_path: Path) -> None:
-    """Its line is estimate − reference, its title the root mean square that `score` finds."""
+def test_below_it_is_what_each_measurement_leaves() -> None:
+    """Measurement − estimate; the band of the estimate; what the sensor's sd claims."""
+    est, _ = case(axes=1, scale=-1.0)
+    for axes in fused_figure(est).axes[2:4]:
+        _, left = line(axes, "camera")
+        measured = est.measured_positions("camera", NAMES[0])
+        expected = measured.value - np.interp(measured.time, est.time, est[NAMES[0]].position)
+        np.testing.assert_allclose(left, expected * 1e3)
+        claimed = sorted(one.get_ydata()[0] for one in axes.lines if one.get_linestyle() == ":")
+        assert claimed == pytest.approx([-1.96 * 0.5, 1.96 * 0.5], rel=1e-3)
+        assert axes.get_ylim()[1] < 5.0  # not flattened by the first sample
+
+
+def test_the_error_figure_draws_and_names_the_error() -> None:
+    """Its line is estimate − reference, its title the root mean square and the coverage that `score` finds."""
     est, _ = case()
-    error_figure(est, tmp_path / "none.png")
-    for axes, name in zip(drawn[0].axes, NAMES, strict=True):
+    figure = error_figure(est)
+    assert figure is not None
+    for axes, name in zip(figure.axes, NAMES, strict=True):
         found = pf.score(est.time, est.segment, est[name].position, est[name].position_sd, est.reference, name)
-        assert axes.get_title(loc="left") == f"{name}: RMS error {found.rmse * 1e3:.3f} mm"
+        assert axes.get_title(loc="left") == (
+            f"{name}: RMS error {found.rmse * 1e3:.3f} mm; the 95 % band holds {found.coverage:.1%} of"
+            f" {found.rows} errors"
+        )
         _, error = line(axes, "estimate")
         true = np.interp(est.time, est.reference.time, est.reference.position[name])
         known = np.isfinite(error)
@@ -151,12 +161,13 @@ def test_the_error_figure_draws_and_names_the_error(drawn: list[Figure], tmp_pat
         np.testing.assert_allclose(error[known], (est[name].position - true)[known] * 1e3, atol=1e-9)
 
 
-def test_the_validation_figure_draws_what_it_judges(drawn: list[Figure], tmp_path: Path) -> None:
+def test_the_validation_figure_draws_what_it_judges() -> None:
     """Each row: the fused components' ν/√S, their autocorrelation as bars, and the verdict above."""
     est, run = case(axes=2, outlier=True)
-    validation_figure(est, tmp_path / "none.png")
+    figure = validation_figure(est)
+    assert figure is not None
     for number, name in enumerate(NAMES[:2]):
-        series, _, correlation = drawn[0].axes[3 * number : 3 * number + 3]
+        series, _, correlation = figure.axes[3 * number : 3 * number + 3]
         found = consistency(est, "camera", name)
         (dots,) = series.lines
         mine = est.measurements.of("camera", name)

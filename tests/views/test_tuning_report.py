@@ -94,8 +94,8 @@ def test_every_part_of_the_page_has_its_heading_and_sentence_and_nothing_is_load
 def test_the_table_has_every_number_with_its_interval() -> None:
     """Key, before, fitted and both ends of each parameter, in its row."""
     (found, _), text = tuned(), shown()
-    assert len(found.summary.parameters) == 5
-    for one in found.summary.parameters:
+    assert len(found.details.parameters) == 5
+    for one in found.details.parameters:
         row = re.search(rf"<tr><td>{re.escape(one.key)}</td>(.*)</tr>", text)
         assert row is not None, one.key
         low, high = ("…" if end is None else f"{end:.4g}" for end in one.ci95)
@@ -202,7 +202,7 @@ def test_the_page_has_the_numbers_of_fusions_and_the_files_as_they_are_written(t
     sentence = outline(text).sentences["Innovations before and after"]
     assert f"tip, camera: NIS {before.nis:.2f} → {after.nis:.2f}" in sentence
     assert "came nearer to it for 1 of 1; 0 → 1 of 1 are white" in sentence
-    (check,) = found.summary.validation or ()
+    (check,) = found.details.validation or ()
     old, new = check.before, check.after
     for part in (
         f"{old.sensors['camera'].nis:.2f} → {new.sensors['camera'].nis:.2f}",
@@ -239,6 +239,6 @@ def test_an_interrupted_tuning_has_a_page_too(after: str) -> None:
 
     found = quietly(lambda: pf.tune([run], known("tip", "camera"), fit=["noise"], progress=interrupt))
     seen = outline(page(found, [run]))
-    assert found.summary.interrupted
+    assert found.details.interrupted
     assert "Profiles of the likelihood" not in seen.headings
     assert seen.pictures == ["Innovations before and after"]

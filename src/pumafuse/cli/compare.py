@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import io
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import msgspec
+import numpy as np
 import typer
+from rich.table import Table
 
 from .. import folders, toml
 from ..errors import RunError
@@ -15,40 +20,181 @@ from ..fusion import results
 from ..fusion.estimates import write_tum
 from ..fusion.results import Result
 from ..fusion.score import ReferenceTrack
-from ..fusion.summary import ScoreSummary, Summary
+from ..fusion.summary import ScoreSummary
 from ..logs.frames import CARTESIAN
-from ..units import KINDS
-from .tables import print_json, print_tables, score_table, skill_table
+from ..units import KINDS, SCREEN, Kind
+from .tables import (
+    consistency_table,
+    position,
+    print_json,
+    print_tables,
+    score_table,
+    share_rejected,
+    skill_table,
+    table,
+)
+
+FIGURE = "pumafuse-comparison.png"
+_EQUAL = 2.0  # log-likelihood by which a result must be ahead
+_EQUALLY = 0.01  # of an error, likewise
 
 
-def run(given: Sequence[Path], reference: Path | None, json: bool, tum: Path | None = None) -> None:
-    """Score result folders; write their trajectories and references into the folder ``tum``.
+class Compared(NamedTuple):
+    """A result with its scores, where it has a reference, and by how much it differs from the first of the same run."""
+
+    name: str
+    result: Result
+    track: ReferenceTrack | None
+    scores: Mapping[str, ScoreSummary]
+    differences: Mapping[str, Difference]
+
+
+class Difference(toml.Reported, frozen=True, kw_only=True):
+    """Positions less those of the first result [m or rad]: root mean square, the largest, and when that is."""
+
+    rms: float = msgspec.field(name="rms_mm")
+    largest: float = msgspec.field(name="largest_mm")
+    at: float = msgspec.field(name="at_s")
+
+
+def run(given: Sequence[Path], reference: Path | None, json: bool, tum: Path | None = None, draw: bool = False) -> None:
+    """Compare result folders; write their trajectories and references into the folder ``tum``.
 
     Raises:
-        PumafuseError: A folder holds no results, nothing can be scored, or there is no trajectory.
+        PumafuseError: A folder holds no results, a reference covers none of them, or there is no trajectory.
     """
     if tum is not None:
         _write_trajectories(given, reference, tum, quiet=json)
-    compared = list[tuple[str, Summary, Mapping[str, ScoreSummary]]]()
+    compared = list[Compared]()
     for folder in given:
         result = results.read(folder)
         track = _reference(result, reference)
-        if track is None and tum is not None:
-            continue  # evo can compare results with each other
-        if track is None:
-            raise RunError(f"{folder}: the run had no reference; give one with --reference")
-        scores = result.scores(track)
-        if not scores:
+        scores = {} if track is None else result.scores(track)
+        if track is not None and not scores:
             raise RunError(
                 f"{folder}: the reference covers no estimate on any axis; do its axes ({', '.join(track.position)})"
                 " and its clock fit the run?"
             )
-        compared.append((str(folder), result.summary, scores))
+        first = compared[0].result if compared else result
+        compared.append(Compared(str(folder), result, track, scores, _differences(first, result)))
+    best, why = verdict(compared)
+    if draw:
+        _draw(compared, why)
     if json:
-        print_json([_reported(*one) for one in compared])
+        print_json([{**_reported(one), "take": one.name == best} for one in compared])
         return
-    print_tables(score_table(compared, kind) for kind in KINDS)
-    print_tables(skill_table([(folder, summary) for folder, summary, _ in compared], kind) for kind in KINDS)
+    scored = [(one.name, one.result.summary, one.scores) for one in compared if one.scores]
+    every = [(one.name, one.result.summary) for one in compared]
+    print_tables(score_table(scored, kind) for kind in KINDS)
+    print_tables(consistency_table(every, kind) for kind in KINDS)
+    print_tables(skill_table(every, kind) for kind in KINDS)
+    print_tables(_difference_table(compared, kind) for kind in KINDS)
+    if why:
+        typer.echo(why)
+
+
+def _differences(first: Result, other: Result) -> dict[str, Difference]:
+    """By axis of both; none of the first itself, nor of another run."""
+    same = first.summary.run == other.summary.run and first.summary.origin_ns == other.summary.origin_ns
+    if other is first or not same or first.segment.any() or other.segment.any():
+        return {}
+    time = first.time[(first.time >= other.time[0]) & (first.time <= other.time[-1])]
+    found = dict[str, Difference]()
+    for axis in (axis for axis in first.axes if axis in other.axes and len(time)):
+        mine, yours = (np.interp(time, one.time, one.axes[axis].position) for one in (first, other))
+        apart = yours - mine
+        at = int(np.argmax(np.abs(apart)))
+        found[axis] = Difference(rms=float(np.sqrt(np.mean(apart**2))), largest=float(apart[at]), at=float(time[at]))
+    return found
+
+
+def verdict(compared: Sequence[Compared]) -> tuple[str | None, str]:
+    """Which result to take, None where none is ahead, and why in a sentence; empty of one alone or of several runs.
+
+    By the error where all have a reference; else by the log-likelihood if all have the same measurements; else by how
+    well the next measurement of the sensors is predicted that all have.
+    """
+    if len(compared) < 2 or len({(one.result.summary.run, one.result.summary.origin_ns) for one in compared}) > 1:
+        return None, ""
+    by_error = _shared([_errors(one.scores) for one in compared])
+    if by_error is not None:
+        return _least(compared, by_error, "its error against the reference (RMSE, mean over the axes) is")
+    if len({str(_components(one.result)) for one in compared}) == 1:
+        likelihood = [sum(axis.log_likelihood for axis in one.result.summary.axes.values()) for one in compared]
+        order = sorted(range(len(compared)), key=lambda number: -likelihood[number])
+        best, second = (compared[number].name for number in order[:2])
+        ahead = likelihood[order[0]] - likelihood[order[1]]
+        if ahead < _EQUAL:
+            return None, f"no result is ahead: the log-likelihoods of {best} and {second} differ by {ahead:.1f} only"
+        why = "the log-likelihood of the same measurements, each before it is used, is"
+        return best, f"take {best}: {why} {ahead:.1f} higher than that of {second}"
+    predictions = _shared([_predictions(one.result) for one in compared])
+    if predictions is None:
+        return None, "nothing to choose by: the results have no reference, and no sensor in common"
+    return _least(compared, predictions, "its error of predicting the next measurement (RMS, mean over the sensors) is")
+
+
+def _least(compared: Sequence[Compared], logs: Sequence[float], what: str) -> tuple[str | None, str]:
+    order = sorted(range(len(compared)), key=lambda number: logs[number])
+    best, second = (compared[number].name for number in order[:2])
+    less = -math.expm1(logs[order[0]] - logs[order[1]])
+    if less < _EQUALLY:
+        return None, f"no result is ahead: {best} and {second} differ by {less:.1%} only; {what} what was compared"
+    return best, f"take {best}: {what} {less:.0%} smaller than that of {second}"
+
+
+def _shared(each: Sequence[Mapping[str, float]]) -> list[float] | None:
+    """The means over the keys that all have; None without any."""
+    keys = set(each[0]).intersection(*each[1:])
+    return [sum(one[key] for key in keys) / len(keys) for one in each] if keys else None
+
+
+def _components(result: Result) -> dict[str, int]:
+    """How many components of which sensor on which axis were fused or rejected."""
+    return {
+        f"{axis}, {name}": sum(one.outcomes.get(word, 0) for word in ("fused", "rejected", "reacquired"))
+        for axis, part in result.summary.axes.items()
+        for name, one in part.sensors.items()
+    }
+
+
+def _errors(scores: Mapping[str, ScoreSummary]) -> dict[str, float]:
+    """Logarithms of the errors against the reference, by axis."""
+    return {axis: math.log(one.rmse) for axis, one in scores.items() if one.rmse > 0.0}
+
+
+def _predictions(result: Result) -> dict[str, float]:
+    """Logarithms of the errors of prediction, by axis and sensor."""
+    return {
+        f"{axis}, {name}": math.log(one.skill.filter.rms)
+        for axis, part in result.summary.axes.items()
+        for name, one in part.sensors.items()
+        if one.skill is not None and one.skill.filter.rms > 0.0
+    }
+
+
+def _difference_table(compared: Sequence[Compared], kind: Kind) -> Table:
+    unit = SCREEN[kind].unit
+    rows = [
+        [each.name, axis, position(one.rms, kind), position(one.largest, kind), f"{one.at:.2f}"]
+        for each in compared
+        for axis, one in each.differences.items()
+        if each.result.summary.axes[axis].kind == kind
+    ]
+    headings = ["result", "axis", f"RMS, {unit}", f"largest, {unit}", "at, s"]
+    made = table(headings, rows)
+    made.title, made.title_justify, made.title_style = f"Positions less those of {compared[0].name}", "left", ""
+    return made
+
+
+def _draw(compared: Sequence[Compared], why: str) -> None:
+    from ..views.figures import comparison_figure
+
+    drawn = comparison_figure({one.name: one.result for one in compared}, compared[0].track, why)
+    picture = io.BytesIO()
+    drawn.savefig(picture, format="png", dpi=130)
+    folders.write_file(Path(FIGURE), picture.getvalue())
+    typer.echo(f"drawn in {FIGURE}", err=True)
 
 
 def _reference(result: Result, path: Path | None) -> ReferenceTrack | None:
@@ -74,14 +220,25 @@ def _write_trajectories(given: Sequence[Path], reference: Path | None, output: P
         typer.echo(f"trajectories written to {output}")
 
 
-def _reported(folder: str, summary: Summary, scores: Mapping[str, ScoreSummary]) -> dict[str, Any]:
+def _reported(one: Compared) -> dict[str, Any]:
     """A result as JSON, in the units of its axes."""
+    summary, of = one.result.summary, one.result.summary.axes
     skill = {
-        axis: {name: one.skill and toml.reported(one.skill, part.kind) for name, one in part.sensors.items()}
-        for axis, part in summary.axes.items()
+        axis: {name: each.skill and toml.reported(each.skill, part.kind) for name, each in part.sensors.items()}
+        for axis, part in of.items()
     }
-    axes = {axis: toml.reported(one, summary.axes[axis].kind) for axis, one in scores.items()}
-    return {"folder": folder, "run": summary.run, "mode": summary.mode, "axes": axes, "skill": skill} | {
+    return {
+        "folder": one.name,
+        "run": summary.run,
+        "mode": summary.mode,
+        "axes": {axis: toml.reported(each, of[axis].kind) for axis, each in one.scores.items()},
+        "log_likelihood": {axis: part.log_likelihood for axis, part in of.items()},
+        "nis": {axis: {name: each.nis_mean for name, each in part.sensors.items()} for axis, part in of.items()},
+        "rejected": {
+            axis: {name: share_rejected(each) for name, each in part.sensors.items()} for axis, part in of.items()
+        },
+        "skill": skill,
+        "difference": {axis: toml.reported(each, of[axis].kind) for axis, each in one.differences.items()},
         "commands": summary.commands,
         "rows": summary.rows,
     }

@@ -16,7 +16,7 @@ from ..errors import RunError
 from ..filter.outcome import Outcome
 from ..fusion import results
 from ..fusion.config import FusionConfig
-from ..fusion.estimates import Estimates
+from ..fusion.estimates import Estimates, Mode
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
 from ..logs.run import Run
@@ -31,8 +31,7 @@ def run(
     output: Path,
     sensors: Sequence[str] | None = None,
     rate: float | None = None,
-    smooth: bool = False,
-    as_live: bool = False,
+    mode: Mode = "filtered",
     rrd: bool = False,
     figures: bool = False,
     engine: Engine = "compiled",
@@ -46,7 +45,7 @@ def run(
     """
     given = FusionConfig.load(config)
     given.sensor_names(sensors)  # before any run is read
-    how = partial(fuse, config=given, sensors=sensors, rate=rate, smooth=smooth, as_live=as_live, engine=engine)
+    how = partial(fuse, config=given, sensors=sensors, rate=rate, mode=mode, engine=engine)
     job = partial(_fuse, how, part=part, rrd=rrd, figures=figures, force=force)
     if len(runs) == 1:
         with progress_bar(str(runs[0])) as progress:
@@ -118,11 +117,15 @@ def _fuse(
         if figures:
             from ..views.figures import error_figure, fused_figure, path_figure, validation_figure
 
-            fused_figure(est, recorded, new / "fused.png")
-            validation_figure(est, new / "validation.png")
-            path_figure(est, recorded, new / "path.png")
-            if est.reference is not None:
-                error_figure(est, new / "error.png")
+            drawn = {
+                "fused": fused_figure(est),
+                "validation": validation_figure(est),
+                "path": path_figure(est, recorded),
+                "error": None if est.reference is None else error_figure(est),
+            }
+            for name, figure in drawn.items():
+                if figure is not None:
+                    figure.savefig(new / f"{name}.png", dpi=130)
 
     return results.write(est, folder, force, extras)
 

@@ -36,7 +36,7 @@ def run(
     typer.echo("\nto write into fusion.toml and arm.toml (pumafuse identify RUN -o arm.toml writes the latter):\n")
     typer.echo(reports.settings(found))
     typer.echo("elsewhere:")
-    for line in reports.elsewhere(found.summary):
+    for line in reports.elsewhere(found.details):
         typer.echo(f"  {line}")
     if report is not None:
         typer.echo(f"written to {report}")
@@ -82,10 +82,10 @@ def _told(
 
 def _show(found: Latency) -> None:
     """Print the answers and a table on stdout."""
-    for line in reports.answers(found.summary):
+    for line in reports.answers(found.details):
         typer.echo(line)
-    console(sys.stdout).print(table(*reports.lags(found.summary)))
-    if any(one.shared_delay for one in found.summary.axes.values()):
+    console(sys.stdout).print(table(*reports.lags(found.details)))
+    if any(one.shared_delay for one in found.details.axes.values()):
         typer.echo("* one dead time for several axes")
 
 

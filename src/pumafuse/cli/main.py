@@ -100,8 +100,9 @@ def fuse(
         raise BadParameter("--engine filterpy gives filtered estimates only: without --smooth and --as-live")
     _check_positive(rate=rate)
     _check_interval(since, until)
+    mode = "smoothed" if smooth else "as-live" if as_live else "filtered"
     part = since, until
-    command.run(runs, config, output, _names(sensors), rate, smooth, as_live, rrd, figures, engine, force, part)
+    command.run(runs, config, output, _names(sensors), rate, mode, rrd, figures, engine, force, part)
 
 
 @app.command()
@@ -110,11 +111,12 @@ def compare(
     reference: Annotated[Path | None, Option(metavar="FILE_OR_RUN", help="Default: each folder's own.")] = None,
     tum: Annotated[Path | None, Option(metavar="OUT", help="A new folder for trajectories in the TUM format.")] = None,
     json: Json = False,
+    figures: Annotated[bool, Option("--figures", help="Also draw pumafuse-comparison.png, in this folder.")] = False,
 ) -> None:
-    """Score results against a reference: RMSE, 95 % coverage, bias and mean NEES of each axis, and of its velocity."""
+    """Compare results, with a reference or without: errors, log-likelihood, NIS, prediction, and which one to take."""
     from . import compare as command
 
-    command.run(folders, reference, json, tum)
+    command.run(folders, reference, json, tum, figures)
 
 
 @app.command()

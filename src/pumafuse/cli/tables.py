@@ -17,7 +17,7 @@ from rich.table import Table
 from ..fusion.score import Z95
 from ..fusion.segments import NOT_SELECTED
 from ..fusion.skill import PredictionError
-from ..fusion.summary import ScoreSummary, Summary
+from ..fusion.summary import ScoreSummary, SensorSummary, Summary
 from ..units import SCREEN, Kind
 
 # By heading: an attribute, its format, and what it is multiplied by; None: what positions are on the screen.
@@ -157,6 +157,32 @@ def skill_table(results: Iterable[tuple[str, Summary]], kind: Kind) -> Table:
         "",
     )
     return made
+
+
+def consistency_table(results: Iterable[tuple[str, Summary]], kind: Kind) -> Table:
+    """What each result says of itself on axes of a kind: likelihood, and of each sensor NIS and the share rejected."""
+    rows = [
+        [
+            name,
+            axis,
+            number(part.log_likelihood, ".1f"),
+            sensor,
+            number(one.nis_mean),
+            number(share_rejected(one), ".1%"),
+        ]
+        for name, summary in results
+        for axis, part in summary.axes.items()
+        for sensor, one in part.sensors.items()
+        if part.kind == kind
+    ]
+    return table(["result", "axis", "log-likelihood", "sensor", "NIS", "rejected"], rows)
+
+
+def share_rejected(sensor: SensorSummary) -> float | None:
+    """The share of a sensor's components that were rejected; None where none was decided on."""
+    rejected = sensor.outcomes.get("rejected", 0)
+    every = rejected + sensor.outcomes.get("fused", 0) + sensor.outcomes.get("reacquired", 0)
+    return rejected / every if every else None
 
 
 def score_table(results: Iterable[tuple[str, Summary, Mapping[str, ScoreSummary]]], kind: Kind) -> Table:

@@ -84,11 +84,11 @@ def run(
     if json:
         typer.echo(found.to_json(), nl=False)
     else:
-        _show(found.summary, found.config.arm.update_period)
+        _show(found.details, found.config.arm.update_period)
         typer.echo(f"written to {output}\nnext: pumafuse fuse RUN -c {output / 'fusion.toml'} -o DIR")
-    if found.summary.interrupted:
+    if found.details.interrupted:
         raise typer.Exit(_INTERRUPTED)
-    if found.summary.worse:
+    if found.details.worse:
         raise typer.Exit(_WORSE)
 
 

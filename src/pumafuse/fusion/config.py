@@ -17,7 +17,7 @@ import msgspec
 from .. import toml
 from ..errors import ConfigError, UnknownNameError
 from ..logs.frames import Frame
-from ..model.arm import ArmModel
+from ..model.arm import ArmModel, arm_of
 from ..model.presets import PRESETS
 from ..toml import NotNegative, Positive, Time
 from ..units import AN, KINDS, Kind, of_kind, refuse_unit
@@ -182,6 +182,10 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         msgspec.structs.force_setattr(self, "process", complete)
         msgspec.structs.force_setattr(self, "start", self.start.of_arm(self.arm))
 
+    def __repr__(self) -> str:
+        sensors = ", ".join(self.sensors) or "no sensor"
+        return f"FusionConfig(arm {self.arm.name!r} with {', '.join(self.arm.axes)}; {sensors})"
+
     def _parts(self) -> Iterator[tuple[str, msgspec.Struct, Kind]]:
         """Its tables with their places in the file, and of which kind of axis they are."""
         yield "start", self.start, self.arm.kinds[0]
@@ -199,11 +203,30 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         """
         path = Path(path)
         tree, where = toml.read(path), str(path)
-        tree["arm"] = load_arm(tree, path)
-        tree = with_names_of_lengths(tree, tree["arm"], where)
-        if isinstance(tree.get("process"), dict):
-            tree["process"] = with_defaults(tree["process"], tree["arm"])
-        return toml.struct(tree, FusionConfig, where)
+        return _config(tree, load_arm(tree, path), where)
+
+    @staticmethod
+    def parse(source: str | Mapping[str, Any], arm: ArmModel | None = None) -> FusionConfig:
+        """Make a configuration of the text of a ``fusion.toml``, or of a dict with the same keys.
+
+        Args:
+            source: The text or the dict. Its ``arm`` is the name of a preset, a table with the keys of an
+                ``arm.toml``, or left out where an arm is given.
+            arm: The arm.
+
+        Raises:
+            ConfigError: It is not as declared; names the key and the accepted ones.
+        """
+        where = "configuration"
+        tree = toml.parsed(source, where)
+        named = tree.get("arm")
+        if arm is None and isinstance(named, Mapping):
+            arm = arm_of(cast(Mapping[str, Any], named), f"{where}: arm")
+        elif arm is None and isinstance(named, str) and named in PRESETS:
+            arm = ArmModel.load(named)
+        elif arm is None:
+            raise ConfigError(f"{where}: 'arm' must be a preset ({', '.join(PRESETS)}), a table, or given as arm=")
+        return _config(tree, arm, where)
 
     def save(self, folder: Path) -> None:
         """Write ``fusion.toml`` and the arm as ``arm.toml`` beside it."""
@@ -234,6 +257,14 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         for name in sorted(wanted - set(self.sensors)):
             raise UnknownNameError("sensors", "sensor", name, self.sensors)
         return tuple(name for name in self.sensors if name in wanted)
+
+
+def _config(tree: Mapping[str, Any], arm: ArmModel, where: str) -> FusionConfig:
+    """The configuration of parsed tables (SI numbers)."""
+    tree = with_names_of_lengths({**tree, "arm": arm}, arm, where)
+    if isinstance(tree.get("process"), dict):
+        tree["process"] = with_defaults(tree["process"], arm)
+    return toml.struct(tree, FusionConfig, where)
 
 
 def _check(path: str, part: msgspec.Struct, kind: Kind) -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal
+from importlib import import_module
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -22,10 +23,14 @@ from .score import ReferenceTrack
 from .segments import Segment
 from .setup import turn_of
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from matplotlib.figure import Figure
+
 Mode = Literal["filtered", "as-live", "smoothed"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class AxisEstimate:
     """Estimates of one axis in the log's coordinates, SI units, arrays (n,).
 
@@ -60,6 +65,9 @@ class AxisEstimate:
         "disturbance_sd",
     )
 
+    def __repr__(self) -> str:
+        return f"AxisEstimate({len(self.position):,} of position, velocity, offset, disturbance and their sd)"
+
 
 @dataclass(frozen=True)
 class Bias:
@@ -69,7 +77,7 @@ class Bias:
     sd: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Measurements:
     """Every component of every sensor used, in the order of processing; arrays are (m,).
 
@@ -101,6 +109,10 @@ class Measurements:
 
     ARRAYS = ("time", "stamp", "sensor", "axis", "segment", "value", "innovation", "innovation_sd", "outcome")
 
+    def __repr__(self) -> str:
+        outcomes = ", ".join(f"{count:,} {word}" for word, count in self.counts().items()) or "none"
+        return f"Measurements({', '.join(self.sensors)} on {', '.join(self.axes)}: {outcomes})"
+
     @property
     def nis(self) -> FloatArray:
         """ν²/S, (m,)."""
@@ -120,7 +132,7 @@ class Measurements:
         return {outcome.word: found[outcome] for outcome in Outcome if found[outcome]}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Estimates:
     """What :func:`pumafuse.fuse` returns. Arrays are (n,), one entry for each estimate.
 
@@ -179,6 +191,57 @@ class Estimates:
         if axis not in self.axes:
             raise UnknownNameError(f"run '{self.run}'", "axis", str(axis), self.axes)
         return self.axes[axis]
+
+    def __repr__(self) -> str:
+        span = f"{self.time[0]:.4g} to {self.time[-1]:.4g} s" if len(self.time) else "no time"
+        return f"Estimates({self.run!r}, {self.mode}: {len(self.time):,} of {', '.join(self.axes)}; {span})"
+
+    def to_arrow(self) -> pa.Table:
+        """All estimates as an Arrow table in SI.
+
+        Columns are ``time_s`` since the first command, ``x.position_m`` and so on (``_rad`` of an angle), the log's
+        ``x_m``, ``y_m`` and ``z_m`` with a frame, and ``segment`` where the clock was set back; null where there is no
+        number, as of smoothed velocities.
+        """
+        from .results import estimates_table
+
+        return estimates_table(self, files=False)
+
+    def to_pandas(self) -> Any:
+        """What :meth:`to_arrow` gives, as a data frame of pandas.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        return self.to_arrow().to_pandas()
+
+    def to_polars(self) -> Any:
+        """What :meth:`to_arrow` gives, as a data frame of polars.
+
+        Raises:
+            ImportError: polars is not installed.
+        """
+        import polars  # pyright: ignore  (not among what is installed with pumafuse)
+
+        return polars.from_arrow(self.to_arrow())  # pyright: ignore
+
+    def plot(self) -> Figure:
+        """Draw each axis with its measurements, the 95 % band and a reference, as ``fused.png`` has it."""
+        return import_module("pumafuse.views.figures").fused_figure(self)  # of a room above: looked up when asked for
+
+    def save(self, folder: str | Path, *, force: bool = False) -> None:
+        """Write a result folder, complete or not at all: what ``pumafuse fuse -o`` writes and ``compare`` reads.
+
+        Args:
+            folder: Where to; its parents are made.
+            force: Replace an earlier result there.
+
+        Raises:
+            FolderError: There is something that must not be replaced, or the disk refuses.
+        """
+        from .results import write
+
+        write(self, Path(folder), force)
 
     def to_tum(self, path: str | Path) -> None:
         """Write the trajectory in the TUM format, which ``evo`` reads: a line ``stamp x y z 0 0 0 1`` an estimate.

@@ -38,8 +38,7 @@ def fuse(
     *,
     sensors: Iterable[str] | None = None,
     rate: float | None = None,
-    smooth: bool = False,
-    as_live: bool = False,
+    mode: Mode = "filtered",
     engine: Engine = "compiled",
     progress: Callable[[float], None] | None = None,
 ) -> Estimates:
@@ -50,8 +49,8 @@ def fuse(
         config: Arm, noise and sensors.
         sensors: Which of the configured sensors to use; all of them for None.
         rate: Estimates on an even grid [Hz] from the first command on; one for each command for None.
-        smooth: An estimate knows every measurement of the run, later ones too.
-        as_live: An estimate knows only the measurements that had arrived by then, as a live user would have had.
+        mode: What an estimate knows: ``filtered``, all measurements that are valid by then; ``as-live``, only those
+            that had arrived by then, as a live user would have had; ``smoothed``, every measurement of the run.
         engine: ``compiled``, or ``filterpy``, the reference: the same meaning, hundreds of times slower.
         progress: Called now and then by the reference engine with the share done, 0 to 1.
 
@@ -63,17 +62,16 @@ def fuse(
 
     Raises:
         PumafuseError: Run and configuration do not fit together.
-        ValueError: ``rate`` is not positive, there is no such engine, or ``smooth`` and ``as_live`` are both asked for.
+        ValueError: ``rate`` is not positive, or there is no such mode or engine.
     """
     if rate is not None and not 0.0 < rate < np.inf:
         raise ValueError(f"rate must be positive and finite, got {rate}")
     if engine not in get_args(Engine):
         raise ValueError(f"no engine '{engine}'; there are: {', '.join(get_args(Engine))}")
-    if smooth and as_live:
-        raise ValueError("smooth uses every measurement and as_live only those that had arrived; choose one")
-    if engine == "filterpy" and (smooth or as_live):
-        raise ValueError("the filterpy engine gives filtered estimates only; smooth and as_live need the compiled one")
-    mode: Mode = "smoothed" if smooth else "as-live" if as_live else "filtered"
+    if mode not in get_args(Mode):
+        raise ValueError(f"no mode '{mode}'; there are: {', '.join(get_args(Mode))}")
+    if engine == "filterpy" and mode != "filtered":
+        raise ValueError(f"the filterpy engine gives filtered estimates only; mode '{mode}' needs the compiled one")
     chosen = None if sensors is None else tuple(sensors)
     in_place, placed = in_axes(run, config.frame)
     logged, jumps = segments(in_place)

@@ -24,7 +24,7 @@ from ..logs.frames import CARTESIAN
 from ..logs.run import Run
 from ..logs.tables import Table
 from ..model.arm import ArmModel
-from ..units import AN, KINDS, MM, SCREEN, Kind, kind_of, of_kind, seconds
+from ..units import AN, KINDS, SCREEN, SI, Kind, Screen, kind_of, of_kind, seconds
 from .config import FusionConfig
 from .estimates import AxisEstimate, Estimates
 from .score import ReferenceTrack, reference_track
@@ -104,7 +104,7 @@ def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], No
     check_writable(folder, force)
     summary = summarise(est)
     with folders.replacing(folder) as new:
-        tables.write(_estimates_table(est), new / ESTIMATES)
+        tables.write(estimates_table(est), new / ESTIMATES)
         tables.write(_measurements_table(est), new / MEASUREMENTS)
         if est.reference is not None:
             tables.write(_reference_table(est.reference, est.config.arm), new / REFERENCE)
@@ -167,13 +167,16 @@ def read_reference(path: Path, origin: int, config: FusionConfig) -> ReferenceTr
     return ReferenceTrack(time, position, exact, np.zeros(len(time), dtype=np.int64))
 
 
-def _estimates_table(est: Estimates) -> pa.Table:
+def estimates_table(est: Estimates, *, files: bool = True) -> pa.Table:
+    """The estimates as a table, in the units of files (mm or degrees) or in SI (m or rad); null where there is none."""
     columns: dict[str, pa.Array] = {}
     for axis, estimate in est.axes.items():
-        kind = est.config.arm.axes[axis].kind
+        screen = est.config.arm.screen_of(axis) if files else SI[est.config.arm.axes[axis].kind]
         for name in AxisEstimate.FIELDS:
-            columns[_column(axis, name, kind)] = _nullable(getattr(estimate, name) * SCREEN[kind].scale)
-    return pa.table({"time_s": est.time, **columns, **_in_log(est.cartesian), **_segment_column(est.segment)})
+            unit = f"{screen.unit}_s" if name.startswith("velocity") else screen.unit
+            columns[f"{axis}.{name}_{unit}"] = _nullable(getattr(estimate, name) * screen.scale)
+    in_log = _in_log(est.cartesian, SCREEN["length"] if files else SI["length"])
+    return pa.table({"time_s": est.time, **columns, **in_log, **_segment_column(est.segment)})
 
 
 def _measurements_table(est: Estimates) -> pa.Table:
@@ -207,9 +210,9 @@ def _reference_table(reference: ReferenceTrack, arm: ArmModel) -> pa.Table:
     return pa.table({**columns, **_in_log(reference.cartesian), **_segment_column(reference.segment)})
 
 
-def _in_log(cartesian: Mapping[str, FloatArray] | None) -> dict[str, pa.Array]:
+def _in_log(cartesian: Mapping[str, FloatArray] | None, screen: Screen = SCREEN["length"]) -> dict[str, pa.Array]:
     """Columns of the log's x, y and z; none without a frame."""
-    return {f"{name}_mm": _nullable(position * MM) for name, position in (cartesian or {}).items()}
+    return {f"{name}_{screen.unit}": _nullable(x * screen.scale) for name, x in (cartesian or {}).items()}
 
 
 def _cartesian(table: Table) -> dict[str, FloatArray] | None:

@@ -16,7 +16,7 @@ Z95 = 1.959963984540054  # a normal variable lies within ± this in 95 % of case
 _SHORTEST_GAP = 0.050  # s; a reference is interpolated at least across this
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ReferenceTrack:
     """The reference in the run's own time.
 
@@ -33,6 +33,9 @@ class ReferenceTrack:
     sd: Mapping[str, FloatArray]
     segment: IntArray
     cartesian: Mapping[str, FloatArray] | None = None
+
+    def __repr__(self) -> str:
+        return f"ReferenceTrack({len(self.time):,} of {', '.join(self.position)})"
 
 
 def late_rows(stamp: TimeArray) -> BoolArray:

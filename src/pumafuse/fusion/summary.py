@@ -161,6 +161,9 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     validity: ValiditySummary
     notes: list[str]
 
+    def __repr__(self) -> str:
+        return f"Summary({self.run!r}, {self.mode}: {', '.join(self.axes)}; {len(self.notes)} notes)"
+
 
 def encode(summary: Summary) -> bytes:
     """The text of ``summary.json``."""

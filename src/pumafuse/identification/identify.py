@@ -129,6 +129,9 @@ class Identification(msgspec.Struct, frozen=True, kw_only=True):
     performance: list[anova.Performance]
     notes: list[str]
 
+    def __repr__(self) -> str:
+        return f"Identification({len(self.trials)} trials: {self.arm!r})"
+
     @property
     def kind(self) -> Kind:
         """What its axes are: all of one kind, as those of a campaign."""

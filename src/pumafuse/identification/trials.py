@@ -28,7 +28,7 @@ class TrialsError(PumafuseError):
     """Step trials cannot be read or used as they are."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trial:
     """One step; arrays are (n,).
 
@@ -50,6 +50,9 @@ class Trial:
     time: FloatArray
     position: FloatArray
 
+    def __repr__(self) -> str:
+        return f"Trial({self.name!r}: {self.axis}, step {self.step:.4g}, {len(self.time):,} samples)"
+
     def speed_at(self, period: float) -> float:
         """The speed as recorded, or step over ``period`` [s] where it is not [m/s or rad/s]."""
         return self.speed if self.speed > 0.0 else abs(self.step) / period
@@ -60,7 +63,7 @@ class Trial:
         return replace(self, time=self.time[:end], position=self.position[:end])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StepTrials:
     """A campaign.
 
@@ -73,6 +76,9 @@ class StepTrials:
     trials: tuple[Trial, ...]
     notes: tuple[str, ...]
     kind: Kind = "length"
+
+    def __repr__(self) -> str:
+        return f"StepTrials({len(self.trials)} trials of {', '.join(self.axes)}; {len(self.notes)} notes)"
 
     @property
     def axes(self) -> tuple[str, ...]:

@@ -81,6 +81,9 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
     verdict: str
     notes: list[str]
 
+    def __repr__(self) -> str:
+        return f"AxisVerification({self.run!r}, {self.axis} by {self.source}: {self.verdict})"
+
 
 @dataclass(frozen=True)
 class Trace:

@@ -32,7 +32,7 @@ _LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
 _FEW_ROWS = 10  # too few to judge a clock by
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Source:
     """One stream of rows, in the order of the file.
 
@@ -58,6 +58,9 @@ class Source:
         """The name of the source in notes, with its label where that is another one."""
         return name if name == self.label else f"{name} ({self.label})"
 
+    def __repr__(self) -> str:
+        return f"Source({self.label!r}: {len(self.stamp):,} rows of {', '.join(self.values)})"
+
     def repeated(self) -> BoolArray:
         """Rows whose stamp and values are all those of an earlier row, (rows,)."""
         if (np.diff(self.stamp) > 0).all():
@@ -78,7 +81,7 @@ class Source:
         return replace(self, stamp=self.stamp[chosen], values=values, spread=spread)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Run:
     """A recorded run.
 
@@ -111,6 +114,13 @@ class Run:
     without_strays: bool = False
     since: float | None = None
     until: float | None = None
+
+    def __repr__(self) -> str:
+        sources = {"commands": self.command, **self.sensors}
+        if self.reference is not None:
+            sources["reference"] = self.reference
+        counts = ", ".join(f"{len(source.stamp):,} {name}" for name, source in sources.items())
+        return f"Run({self.name!r} of {', '.join(self.axes)}: {counts})"
 
     def __post_init__(self) -> None:
         where = f"run '{self.name}'"

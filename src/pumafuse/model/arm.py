@@ -14,7 +14,7 @@ from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError, suggestion
 from ..toml import Interval, Positive
-from ..units import KINDS, MM, SCREEN, Kind, Screen, refuse_unit
+from ..units import KINDS, MM, MS, SCREEN, Kind, Screen, refuse_unit
 from .plants import PLANTS, Delay
 from .presets import PRESETS
 
@@ -144,6 +144,10 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         for name in self.axes:
             refuse_unit("axis", name)
 
+    def __repr__(self) -> str:
+        lags = ", ".join(f"{axis} {self.lag_of(axis) * MS:.4g} ms" for axis in self.axes)
+        return f"ArmModel({self.name!r}, T {self.update_period * MS:g} ms; lags: {lags})"
+
     @staticmethod
     def load(source: str | Path) -> ArmModel:
         """Read ``arm.toml``, or take a preset by its name.
@@ -154,11 +158,16 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         path = PRESETS.get(str(source), Path(source))
         if not os.path.exists(path):  # noqa: PTH110 - Path.exists raises on a name that is too long
             raise ConfigError(f"{source}: no such arm file, and not a preset ({', '.join(PRESETS)})")
-        tree, where = toml.read(path), str(source)
-        axes = tree.get("axes")
-        if isinstance(axes, dict):
-            tree["axes"] = {name: _axis(table, where, f"axes.{name}") for name, table in axes.items()}  # pyright: ignore
-        return toml.struct(tree, ArmModel, where)
+        return arm_of(toml.read(path), str(source))
+
+    @staticmethod
+    def parse(source: str | Mapping[str, Any]) -> ArmModel:
+        """Make an arm of the text of an ``arm.toml``, or of a dict with the same keys.
+
+        Raises:
+            ConfigError: It is not an arm; names the key and the accepted ones.
+        """
+        return arm_of(toml.parsed(source, "arm"), "arm")
 
     def save(self, path: str | Path) -> None:
         """Write ``arm.toml``; reading it back gives the same model, to the last bit."""
@@ -210,6 +219,19 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 def commanded_speed(step: FloatArray, period: float) -> FloatArray:
     """Speed of each command: its step over the update period [s] (the paper's "speed" of a step)."""
     return np.abs(step) / period
+
+
+def arm_of(tree: Mapping[str, Any], where: str) -> ArmModel:
+    """The arm of the tables of an ``arm.toml`` (SI numbers).
+
+    Raises:
+        ConfigError: They are not an arm; names the key and the accepted ones.
+    """
+    axes = tree.get("axes")
+    if isinstance(axes, dict):
+        made = {name: _axis(table, where, f"axes.{name}") for name, table in axes.items()}  # pyright: ignore
+        tree = {**tree, "axes": made}
+    return toml.struct(tree, ArmModel, where)
 
 
 def _axis(table: Any, where: str, path: str) -> AxisModel:

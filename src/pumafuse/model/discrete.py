@@ -65,7 +65,7 @@ def transition(plant: Plant, interval: npt.ArrayLike) -> Transition:
     return Transition(Phi, Gamma, 0.5 * (Q + Q.swapaxes(-1, -2)))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class DiscreteModel:
     """x[n+1] = F x[n] + B v[n] + w, p[n] = H x[n], w of covariance Q, at one update period.
 
@@ -86,6 +86,9 @@ class DiscreteModel:
     period: float
     delay: float
     states: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return f"DiscreteModel(T {self.period:g} s, delay {self.delay:g} s: {', '.join(self.states)})"
 
     @property
     def poles(self) -> npt.NDArray[np.complex128]:

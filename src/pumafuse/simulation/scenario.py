@@ -111,6 +111,10 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     start_azimuth: float = msgspec.field(name="start_azimuth_deg", default=0.0)
     filter: dict[str, Any] = {}
 
+    def __repr__(self) -> str:
+        sensors = ", ".join(self.sensors) or "no sensor"
+        return f"Scenario(arm {self.arm.name!r} with {', '.join(self.arm.axes)}; {sensors})"
+
     def __post_init__(self) -> None:
         for name in (*self.trajectory.moving, *self.start.level):
             self.arm.axis(name)

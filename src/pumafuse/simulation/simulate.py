@@ -32,7 +32,7 @@ _ALWAYS_WRITTEN = frozenset({SCENARIO, MANIFEST, "fusion.toml", ARM_FILE})
 _PATHS = ("path.csv", "path.csv.gz", "path.parquet")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Simulated:
     """What :func:`simulate` returns.
 
@@ -49,6 +49,9 @@ class Simulated:
     run: Run
     config: FusionConfig
     trials: Mapping[str, pa.Table]
+
+    def __repr__(self) -> str:
+        return f"Simulated(seed {self.seed}: {self.run!r})"
 
 
 def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:

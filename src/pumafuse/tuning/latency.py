@@ -57,7 +57,7 @@ from .posterior import (
 )
 
 REFERENCE = "reference"  # the name of a run's reference among its sensors
-_MARGIN = 1.15  # by which intervals of all but the lag are widened: found by simulation, see docs/benchmarks.md
+_MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/benchmarks.md
 _FINEST = 2e-5  # s: no stamp of a log is better, whatever the likelihood says where measurements pass commands
 _ROUGHLY = 0.1  # tolerance in log-likelihood
 _GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
@@ -171,26 +171,33 @@ class LatencySummary(msgspec.Struct, frozen=True, kw_only=True):
     clock_wander: float | None = msgspec.field(name="clock_wander_ms", default=None)
     notes: list[str]
 
+    def __repr__(self) -> str:
+        return f"LatencySummary({', '.join(self.runs)} by {self.sensor}: {', '.join(self.axes)})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Latency:
     """The result of :func:`latency`.
 
     Attributes:
         config: Arm, noise and sensors, ready for :func:`pumafuse.fuse` or :func:`pumafuse.tune`.
-        summary: What it is in numbers [SI].
+        details: What it is in numbers [SI].
         runs: The runs in the arm's axes; a reference is one of their sensors.
     """
 
     config: FusionConfig
-    summary: LatencySummary
+    details: LatencySummary
     runs: Sequence[Run]
+
+    def __repr__(self) -> str:
+        lags = ", ".join(f"{axis} {one.lag * MS:.4g} ms" for axis, one in self.details.axes.items())
+        return f"Latency({', '.join(self.details.runs)} by {self.details.sensor}: {lags})"
 
     @property
     def arm(self) -> ArmModel:
         """The arm with its intervals and where it is from, for ``arm.toml``."""
         arm: ArmModel = self.config.arm
-        for axis, one in self.summary.axes.items():
+        for axis, one in self.details.axes.items():
             for name in ("time_constant", "natural_frequency", "damping"):
                 if hasattr(arm.axes[axis].plant, name):
                     arm = changed(arm, ("axes", axis, "plant", f"{name}_ci95"), getattr(one, f"{name}_ci95"))
@@ -198,12 +205,12 @@ class Latency:
             arm = changed(arm, ("axes", axis, "gain_recovery_ci95"), one.gain_recovery_ci95)
             own = arm.axes[axis].delay is not None
             arm = changed(arm, ("axes", axis, "delay_ci95") if own else ("delay_ci95",), one.delay_ci95)
-        provenance = {"identified_on": self.summary.runs, "sensor": self.summary.sensor}
+        provenance = {"identified_on": self.details.runs, "sensor": self.details.sensor}
         return msgspec.structs.replace(arm, provenance=provenance)
 
     def to_json(self) -> str:
         """All of it as JSON, in the units of the names."""
-        tree = toml.reported(self.summary)
+        tree = toml.reported(self.details)
         return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode() + "\n"
 
 

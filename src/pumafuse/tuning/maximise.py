@@ -140,8 +140,8 @@ def maximise(
             trial = longer
         best = trial
         notify(best)
-        small = small + 1 if gained < tolerance else 0
-        if small == _CREEPING or (small and expected < tolerance):
+        small = small + 1 if gained < _TOLERANCE else 0
+        if small == _CREEPING or max(gained, expected) < tolerance:
             return best
     return best
 

@@ -140,6 +140,9 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
     worse: bool
     notes: list[str]
 
+    def __repr__(self) -> str:
+        return f"TuningSummary({', '.join(self.runs)}: {len(self.parameters)} parameters, {len(self.notes)} notes)"
+
 
 def fitted_lags(
     free: Sequence[Parameter], before: FusionConfig, after: FusionConfig, around: Mapping[str, Distances]
@@ -158,6 +161,30 @@ def fitted_lags(
         ends = [None if np.isinf(end) else end * MS for end in (lag - below, lag + above)]
         found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag * MS, lag_ms_ci95=(ends[0], ends[1]))
     return found
+
+
+def open_interval(ci95: tuple[float | None, float | None]) -> tuple[float, float]:
+    """An interval with an infinite end where it has none."""
+    low, high = ci95
+    return -math.inf if low is None else low, math.inf if high is None else high
+
+
+def text(found: TuningSummary) -> str:
+    """A tuning as plain text, as statistical packages print their results."""
+    width = max([len(one.key) for one in found.parameters], default=0)
+    lines = [f"tuned on {', '.join(found.runs)}: {', '.join(found.fit)}", ""]
+    for axis, one in found.likelihood.items():
+        lines.append(f"{axis}: log-likelihood {one.before:.1f} -> {one.after:.1f} of {one.components:,} components")
+    for axis, lag in found.lags.items():
+        low, high = open_interval(lag.lag_ms_ci95)
+        lines.append(f"{axis}: lag {lag.before_ms:.4g} -> {lag.lag_ms:.4g} ms ({low:.4g} to {high:.4g})")
+    lines += ["", f"{'':{width}}  {'before':>10}  {'value':>10}  {'[0.025':>10}  {'0.975]':>10}"]
+    for one in found.parameters:
+        before = "" if one.before is None else f"{one.before:.4g}"
+        low, high = open_interval(one.ci95)
+        lines.append(f"{one.key:{width}}  {before:>10}  {one.value:>10.4g}  {low:>10.4g}  {high:>10.4g}")
+    notes = [*found.notes, *found.not_identifiable]
+    return "\n".join([*lines, *(["", *notes] if notes else [])])
 
 
 def encode(summary: TuningSummary) -> str:

@@ -21,7 +21,7 @@ from .likelihood import Likelihood, LogLikelihood
 from .maximise import Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
 from .stage import Plan, Stage, likelihood_of, run_stage
-from .summary import AxisLikelihood, TuningSummary, encode, fitted, fitted_lags, found_biases
+from .summary import AxisLikelihood, TuningSummary, encode, fitted, fitted_lags, found_biases, open_interval, text
 from .validation import Check, check
 
 _FITTED_ON = 2.0 / 3.0  # of a single run; the rest is for validation
@@ -30,31 +30,47 @@ _NOTHING = 0.01  # log-likelihood by which the configuration as given must be ah
 Progress: TypeAlias = Callable[[str, Point], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Tuning:
     """The result of :func:`tune`.
 
     Attributes:
         config: The tuned configuration, ready for :func:`pumafuse.fuse`.
         before: The configuration as given.
-        summary: What ``tuning.json`` holds, in the units of files.
+        details: What ``tuning.json`` holds, in the units of files.
         stages: The stages of the fit: one, or two with a trusted sensor; none if it is the configuration as given.
         profiles: The likelihood along each parameter that has an interval.
     """
 
     config: FusionConfig
     before: FusionConfig
-    summary: TuningSummary
+    details: TuningSummary
     stages: Sequence[Stage]
     profiles: Sequence[Profile]
 
+    def __repr__(self) -> str:
+        return f"Tuning({', '.join(self.details.runs)}: {len(self.details.parameters)} parameters)"
+
+    @property
+    def params(self) -> dict[str, float]:
+        """The fitted numbers by their keys as in the files, in the units of these: ``sensors.camera.latency_ms``."""
+        return {one.key: one.value for one in self.details.parameters}
+
+    def conf_int(self) -> dict[str, tuple[float, float]]:
+        """The 95 % interval of each of :attr:`params`, infinite at an end that the measurements do not limit."""
+        return {one.key: open_interval(one.ci95) for one in self.details.parameters}
+
+    def summary(self) -> str:
+        """The result as a table in plain text: likelihood, lag of each axis, parameters with intervals, notes."""
+        return text(self.details)
+
     def to_json(self) -> str:
         """The text of ``tuning.json``."""
-        return encode(self.summary)
+        return encode(self.details)
 
 
 def tune(
-    runs: Sequence[Run],
+    runs: Run | Sequence[Run],
     config: FusionConfig,
     *,
     fit: Iterable[Fit] = ("noise",),
@@ -68,7 +84,7 @@ def tune(
     """Fit noise, delays, plants, gains, latencies, scales and drifts to runs by maximum likelihood, without references.
 
     Args:
-        runs: The recorded runs to fit on.
+        runs: The recorded run to fit on, or several.
         config: The configuration to start from.
         fit: What to fit: any of ``noise``, ``delay``, ``plant``, ``gain``, ``latency``, ``scale``, ``bias``.
         fix: What of that stays as it is: names as in the files, or parts of them (``sensors.tracker``,
@@ -84,7 +100,7 @@ def tune(
         progress: Called with what is being done and the best point so far.
 
     Returns:
-        The tuned configuration and its summary. Interrupted by Ctrl-C, the best until then.
+        The tuned configuration and how sure it is. Interrupted by Ctrl-C, the best until then.
 
     Warns:
         PumafuseWarning: For each note.
@@ -92,6 +108,7 @@ def tune(
     Raises:
         PumafuseError: Nothing can be fitted to the runs, or they and the configuration do not fit together.
     """
+    runs = [runs] if isinstance(runs, Run) else runs
     if not runs:
         raise TuneError("no run to fit on")
     for number, run in enumerate(runs):

@@ -28,6 +28,11 @@ class Canvas:
     figure: Figure
     axes: list[Axes]
 
+    def legend(self, number: int) -> None:
+        """Say below all axes what the lines of one are: inside they would cover data."""
+        handles, labels = self.axes[number].get_legend_handles_labels()
+        self.figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+
     def svg(self) -> Markup:
         """The picture as text for a page."""
         text = io.StringIO()

@@ -18,6 +18,12 @@ def sensor_colours(sensors: Sequence[str]) -> dict[str, str]:
     return {name: _SENSORS[number % len(_SENSORS)] for number, name in enumerate(sensors)}
 
 
+def several(count: int) -> list[str]:
+    """A colour for each of several lines that are alike."""
+    every = (ESTIMATE, *_SENSORS)
+    return [every[number % len(every)] for number in range(count)]
+
+
 def rgb(colour: str) -> tuple[int, int, int]:
     """``#rrggbb`` as three bytes."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

@@ -2,76 +2,135 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..filter.outcome import Outcome
 from ..fusion.consistency import LAGS, Consistency, consistency
-from ..fusion.estimates import Estimates
-from ..fusion.score import Z95, interpolated
-from ..logs.axes import in_axes
+from ..fusion.estimates import Estimates, Measurements
+from ..fusion.results import Result
+from ..fusion.score import Z95, ReferenceTrack, interpolated, score
 from ..logs.frames import CARTESIAN, in_space
 from ..logs.run import Run
 from ..model.response import response
 from ..tuning.latency import Latency
 from ..units import MS, SCREEN, seconds
 from . import colours
-from .canvas import drawing
+from .canvas import Canvas, drawing
 
 _ZOOM_S = 2.0  # length of the detail in which the band and single measurements can be seen
+_NEARLY_ALL, _LEAST = 0.99, 1e-9  # of what is drawn; m or rad
 _TIME = "time since the first command [s]"
 
 
-def fused_figure(est: Estimates, run: Run, path: Path) -> None:
-    """Draw the fused run: per axis the whole of it, and its busiest two seconds with measurements and 95 % band.
+def fused_figure(est: Estimates) -> Figure:
+    """Draw the fused run: each axis as a whole and its busiest two seconds, and below what each measurement leaves.
+
+    Left the whole run, right the busiest part of it. Above positions with the 95 % band; below measurement − estimate
+    on the same times, with the band of the estimate and the spread that each sensor's sd claims.
 
     Args:
         est: The estimates.
-        run: The run that they were made from.
-        path: Where the picture goes; its ending says which format.
     """
-    commanded = in_axes(run, est.config.frame)[0].command
-    time = seconds(commanded.stamp, est.origin)
     start, end = est.busiest(_ZOOM_S)
     zoomed = (est.time >= start) & (est.time <= end)
-    with _figure(est, path, len(est.axes), [_TIME, _TIME], [1.0, 1.0]) as panels:
-        for name, whole, zoom in zip(est.axes, panels[::2], panels[1::2], strict=True):
+    with _figure(est, 2 * len(est.axes), [_TIME, _TIME], [1.0, 1.0]) as canvas:
+        for number, name in enumerate(est.axes):
+            whole, zoom, left, left_zoom = canvas.axes[4 * number : 4 * number + 4]
             position, screen = est[name].position, est.config.arm.screen_of(name)
-            command = commanded.values[name] * screen.scale
             for axes, shown in ((whole, position), (zoom, position[zoomed])):
-                axes.step(time, command, where="post", color=colours.COMMAND, lw=1, label="command")
+                _commands(axes, est, name)
                 _measurements(axes, est, name)
                 _band(axes, est, name, position)
                 axes.plot(est.time, position * screen.scale, color=colours.ESTIMATE, lw=1.0, label="estimate")
+                _reference(axes, est, name)
                 axes.set_ylabel(f"{name} [{screen.unit}]")
                 low, high = float(shown.min()) * screen.scale, float(shown.max()) * screen.scale
                 margin = 0.1 * (high - low) + 0.5
                 axes.set_ylim(low - margin, high + margin)
-            zoom.set_xlim(start, end)
+            for axes in (left, left_zoom):
+                _residuals(axes, est, name)
+                axes.set_ylabel(f"{name}: measured\n− estimate [{screen.unit}]")
+            for axes in (zoom, left_zoom):
+                axes.set_xlim(start, end)
             if est.since is not None or est.until is not None:
-                whole.set_xlim(est.time[0], max(est.time[-1], est.time[0] + 1e-3))
-        panels[1].legend(loc="best", ncols=2, frameon=False)
+                for axes in (whole, left):
+                    axes.set_xlim(est.time[0], max(est.time[-1], est.time[0] + 1e-3))
+        canvas.legend(0)
+    return canvas.figure
 
 
-def path_figure(est: Estimates, run: Run, path: Path) -> None:
-    """Draw where the tool was commanded to be and was, in the log's x, y, z; nothing where it has not all three.
+def comparison_figure(results: Mapping[str, Result], reference: ReferenceTrack | None, why: str) -> Figure:
+    """Draw results on top of each other, and below their errors, or without a reference how they differ.
+
+    Left the whole run, right the busiest two seconds of the first result; differences are from the first result.
+
+    Args:
+        results: By name, of one run.
+        reference: The reference of that run, if it has one.
+        why: What to write above.
+    """
+    first = next(iter(results.values()))
+    start = _busiest(first.time, _travelled(first), _ZOOM_S)
+    colour = dict(zip(results, colours.several(len(results)), strict=True))
+    with drawing(2, 2 * len(first.axes), width=13.0, height=2.4, sharex="col") as canvas:
+        for number, axis in enumerate(first.axes):
+            screen = first.config.arm.screen_of(axis)
+            whole, zoom, left, left_zoom = canvas.axes[4 * number : 4 * number + 4]
+            for axes in (whole, zoom):
+                for name, one in results.items():
+                    if axis in one.axes:
+                        position = one.axes[axis].position * screen.scale
+                        axes.plot(one.time, position, lw=1.0, color=colour[name], label=name)
+                if reference is not None and axis in reference.position:
+                    value = reference.position[axis] * screen.scale
+                    axes.plot(reference.time, value, color=colours.REFERENCE, lw=0.8, ls="--", label="reference")
+                axes.set_ylabel(f"{axis} [{screen.unit}]")
+            shown: list[FloatArray] = []
+            for name, one in results.items():
+                if axis not in one.axes or (reference is None and one is first):
+                    continue
+                if reference is not None and axis in reference.position:
+                    rest = one.axes[axis].position - interpolated(one.time, one.segment, reference, axis)
+                else:
+                    rest = one.axes[axis].position - np.interp(one.time, first.time, first.axes[axis].position)
+                shown.append(rest)
+                for axes in (left, left_zoom):
+                    axes.plot(one.time, rest * screen.scale, lw=0.8, color=colour[name])
+            limit = _reach(np.concatenate([np.zeros(1), *shown])) * screen.scale
+            for axes in (left, left_zoom):
+                axes.set_ylim(-limit, limit)
+                what = "error" if reference is not None and axis in reference.position else "difference"
+                axes.set_ylabel(f"{axis}: {what} [{screen.unit}]")
+            for axes in (zoom, left_zoom):
+                axes.set_xlim(start, start + _ZOOM_S)
+            _fit_height(zoom, start, start + _ZOOM_S)
+        for axes in canvas.axes[-2:]:
+            axes.set_xlabel(_TIME)
+        canvas.legend(0)
+        canvas.figure.suptitle(why)
+    return canvas.figure
+
+
+def path_figure(est: Estimates, run: Run) -> Figure | None:
+    """Draw where the tool was commanded to be and was, in the log's x, y, z; None where it has not all three.
 
     Args:
         est: The estimates.
         run: The run that they were made from.
-        path: Where the picture goes.
     """
     own = {name: axis.position for name, axis in est.axes.items()} if in_space(est.config.arm) == CARTESIAN else {}
     estimated, command = est.cartesian or own, run.command.values
     if not all(name in estimated for name in CARTESIAN):
-        return
+        return None
     with drawing(1, width=8.0, height=7.0, projection="3d") as canvas:
         (axes,) = canvas.axes
         lines = {"command": (command, colours.COMMAND, 1.0), "estimate": (estimated, colours.ESTIMATE, 1.2)}
@@ -88,68 +147,73 @@ def path_figure(est: Estimates, run: Run, path: Path) -> None:
             axis.labelpad = 12.0
         axes.legend(loc="upper left", frameon=False)
         canvas.figure.suptitle(f"{est.run}: path, {est.mode}, arm {est.config.arm.name}")
-        canvas.figure.savefig(path, dpi=130)
+    return canvas.figure
 
 
-def error_figure(est: Estimates, path: Path) -> None:
+def error_figure(est: Estimates) -> Figure | None:
     """Draw the error against the reference with its 95 % band, over the errors of the measurements.
+
+    Above each axis its root mean square, and how many of the errors the band holds. None where no estimate has a
+    reference near enough.
 
     Args:
         est: Estimates of a run that has a reference.
-        path: Where the picture goes.
 
     Raises:
         ValueError: The run has no reference.
     """
     if est.reference is None:
         raise ValueError("the run has no reference")
-    errors = {
-        name: est[name].position - interpolated(est.time, est.segment, est.reference, name)
-        for name in est.axes
-        if name in est.reference.position
+    scores = {
+        name: score(est.time, est.segment, one.position, one.position_sd, est.reference, name)
+        for name, one in est.axes.items()
     }
-    errors = {name: error for name, error in errors.items() if np.isfinite(error).any()}
-    if not errors:
-        return
-    with _figure(est, path, len(errors), [_TIME], [1.0]) as panels:
-        for axes, (name, error) in zip(panels, errors.items(), strict=True):
+    found = {name: one for name, one in scores.items() if one is not None}
+    if not found:
+        return None
+    with _figure(est, len(found), [_TIME], [1.0]) as canvas:
+        for axes, (name, one) in zip(canvas.axes, found.items(), strict=True):
             screen = est.config.arm.screen_of(name)
+            error = est[name].position - interpolated(est.time, est.segment, est.reference, name)
             for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
                 measured = est.measured_positions(sensor, name)
-                first = np.zeros(len(measured.time), dtype=np.int64)  # only the first segment: enough for a picture
-                raw = measured.value - interpolated(measured.time, first, est.reference, name)
+                raw = measured.value - interpolated(measured.time, measured.segment, est.reference, name)
                 label = f"{sensor}, latency removed"
                 axes.plot(measured.time, raw * screen.scale, ".", ms=1.5, color=colour, alpha=0.6, label=label)
             _band(axes, est, name, np.zeros(len(est.time)))
             axes.plot(est.time, error * screen.scale, color=colours.REFERENCE, lw=0.8, label="estimate")
-            rms = float(np.sqrt(np.nanmean(error**2))) * screen.scale
-            axes.set_title(f"{name}: RMS error {rms:.3f} {screen.unit}", loc="left")
+            axes.set_title(
+                f"{name}: RMS error {one.rmse * screen.scale:.3f} {screen.unit}; the 95 % band holds"
+                f" {one.coverage:.1%} of {one.rows} errors",
+                loc="left",
+            )
             axes.set_ylabel(f"error [{screen.unit}]")
-            limit = max(1.3 * float(np.nanmax(np.abs(error))) * screen.scale, 1e-6)
+            limit = _reach(np.concatenate([error, Z95 * est[name].position_sd])) * screen.scale
             axes.set_ylim(-limit, limit)
-        panels[0].legend(loc="upper right", ncols=3, frameon=False)
+        canvas.legend(0)
+    return canvas.figure
 
 
-def validation_figure(est: Estimates, path: Path) -> None:
+def validation_figure(est: Estimates) -> Figure | None:
     """Draw the innovations of each sensor and axis, three panels a row, with the verdict above them.
 
     Left: normalised innovations, 95 % of which lie within the band. Middle: their histogram and the normal density
-    that they should have. Right: their autocorrelation, which lies within its band if they are white.
+    that they should have. Right: their autocorrelation, which lies within its band if they are white. None where
+    nothing was fused.
 
     Args:
         est: The estimates.
-        path: Where the picture goes.
     """
     by_sensor = colours.sensor_colours(est.measurements.sensors)
     pairs = [(sensor, axis) for axis in est.axes for sensor in by_sensor]
     rows = [(sensor, axis, found) for sensor, axis in pairs if (found := consistency(est, sensor, axis)) is not None]
     if not rows:
-        return
+        return None
     at = np.linspace(-4.5, 4.5, 91)
     labels = ["time [s]", "innovation / sd", "lag [measurements]"]
-    with _figure(est, path, len(rows), labels, [3.0, 1.0, 1.0]) as panels:
+    with _figure(est, len(rows), labels, [3.0, 1.0, 1.0]) as canvas:
         for number, (sensor, axis, found) in enumerate(rows):
-            series, histogram, correlation = panels[3 * number : 3 * number + 3]
+            series, histogram, correlation = canvas.axes[3 * number : 3 * number + 3]
             normalised = innovations(series, est, sensor, axis, by_sensor[sensor])
             series.set_title(f"{axis}, {sensor}. {found.verdict}", loc="left")
             series.set_ylabel("innovation / sd")
@@ -159,6 +223,7 @@ def validation_figure(est: Estimates, path: Path) -> None:
             histogram.set_ylabel("density")
             correlations(correlation, [found], [by_sensor[sensor]])
             correlation.set_ylabel("autocorrelation")
+    return canvas.figure
 
 
 def lag_figures(found: Latency) -> Markup:
@@ -167,7 +232,7 @@ def lag_figures(found: Latency) -> Markup:
     Args:
         found: How late everything is; the run with the most measurements is drawn.
     """
-    summary, arm = found.summary, found.config.arm
+    summary, arm = found.details, found.config.arm
     run = max(
         found.runs, key=lambda one: len(one.sensors[summary.sensor].stamp) if summary.sensor in one.sensors else 0
     )
@@ -254,17 +319,55 @@ def correlations(axes: Axes, tests: Sequence[Consistency | None], by_test: Seque
 
 
 @contextmanager
-def _figure(
-    est: Estimates, path: Path, rows: int, labels: Sequence[str], ratios: Sequence[float]
-) -> Generator[list[Axes]]:
-    """Axes row by row, a column for each label below; written to ``path`` on leaving the block."""
+def _figure(est: Estimates, rows: int, labels: Sequence[str], ratios: Sequence[float]) -> Generator[Canvas]:
+    """A canvas with a column for each label below, and above it what is drawn."""
     with drawing(len(labels), rows, width=13.0, height=2.4 + 0.8 / rows, ratios=ratios, sharex="col") as canvas:
-        yield canvas.axes
+        yield canvas
         for axes, label in zip(canvas.axes[-len(labels) :], labels, strict=True):
             axes.set_xlabel(label)
         sensors = ", ".join(est.measurements.sensors) or "commands only"
         canvas.figure.suptitle(f"{est.run}: {sensors}, {est.mode}, arm {est.config.arm.name}")
-        canvas.figure.savefig(path, dpi=130)
+
+
+def _travelled(result: Result) -> FloatArray:
+    """How far all axes have moved until each estimate, each in units of its range."""
+    parts = [one.position / max(float(np.ptp(one.position)), 1e-12) for one in result.axes.values()]
+    return np.sum([np.cumsum(np.abs(np.diff(part, prepend=part[0]))) for part in parts], axis=0)
+
+
+def _fit_height(axes: Axes, start: float, end: float) -> None:
+    """Let an axis reach as far as its lines do between two times."""
+    shown = list[FloatArray]()
+    for line in axes.lines:
+        time, value = np.asarray(line.get_xdata(), dtype=np.float64), np.asarray(line.get_ydata(), dtype=np.float64)
+        shown.append(value[(time >= start) & (time <= end)])
+    inside = np.concatenate(shown)
+    inside = inside[np.isfinite(inside)]
+    if len(inside):
+        margin = 0.1 * float(np.ptp(inside)) + 0.5
+        axes.set_ylim(float(inside.min()) - margin, float(inside.max()) + margin)
+
+
+def _reach(values: FloatArray) -> float:
+    """How far an axis has to reach for nearly all of the values: a few at the start would flatten the others."""
+    found = np.abs(values[np.isfinite(values)])
+    if not len(found):
+        return _LEAST
+    most, usual = np.quantile(found, [_NEARLY_ALL, 0.75]).tolist()
+    return max(min(1.4 * most, 6.0 * usual) if usual > 0.0 else 1.4 * most, _LEAST)
+
+
+def _commands(axes: Axes, est: Estimates, name: str) -> None:
+    given = [(seconds(time, est.origin), value) for time, value in (one.given(name) for one in est.segments)]
+    time, value = (np.concatenate(part) for part in zip(*given, strict=True))
+    scale = est.config.arm.screen_of(name).scale
+    axes.step(time, value * scale, where="post", color=colours.COMMAND, lw=1, label="command")
+
+
+def _reference(axes: Axes, est: Estimates, name: str) -> None:
+    if est.reference is not None and name in est.reference.position:
+        value = est.reference.position[name] * est.config.arm.screen_of(name).scale
+        axes.plot(est.reference.time, value, color=colours.REFERENCE, lw=0.8, ls="--", label="reference")
 
 
 def _band(axes: Axes, est: Estimates, name: str, centre: FloatArray) -> None:
@@ -274,11 +377,40 @@ def _band(axes: Axes, est: Estimates, name: str, centre: FloatArray) -> None:
 
 
 def _measurements(axes: Axes, est: Estimates, name: str) -> None:
+    """Measurements; a cross where the axis itself was beyond the gate, pale where another one of its row was."""
     scale = est.config.arm.screen_of(name).scale
     for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
+        _dots(axes, est, sensor, est.measured_positions(sensor, name), scale, colour)
+
+
+def _residuals(axes: Axes, est: Estimates, name: str) -> None:
+    """Measurement − estimate, the band of the estimate, and what each sensor's sd claims."""
+    scale, shown = est.config.arm.screen_of(name).scale, [Z95 * est[name].position_sd]
+    _band(axes, est, name, np.zeros(len(est.time)))
+    for sensor, colour in colours.sensor_colours(est.measurements.sensors).items():
         measured = est.measured_positions(sensor, name)
-        rejected = measured.outcome == Outcome.REJECTED
-        axes.plot(measured.time[~rejected], measured.value[~rejected] * scale, ".", ms=2.5, color=colour, label=sensor)
-        if rejected.any():
-            time, value = measured.time[rejected], measured.value[rejected] * scale
-            axes.plot(time, value, "x", ms=4, color=colours.REJECTED, label=f"{sensor}, rejected")
+        left = measured.value.copy()
+        for number in np.unique(measured.segment).tolist():
+            mine, here = measured.segment == number, est.segment == number
+            left[mine] -= np.interp(measured.time[mine], est.time[here], est[name].position[here])
+        _dots(axes, est, sensor, replace(measured, value=left), scale, colour)
+        shown.append(left[measured.outcome != Outcome.REJECTED])
+        if sensor in est.config.sensors and (sd := est.config.sensors[sensor].sd_of(name)) is not None:
+            for sign in (-1.0, 1.0):
+                spread = sign * Z95 * sd / abs(est.config.sensors[sensor].scale)
+                axes.axhline(spread * scale, color=colour, lw=0.8, ls=":")
+    limit = _reach(np.concatenate(shown)) * scale
+    axes.set_ylim(-limit, limit)
+
+
+def _dots(axes: Axes, est: Estimates, sensor: str, measured: Measurements, scale: float, colour: str) -> None:
+    rejected = measured.outcome == Outcome.REJECTED
+    gate = est.config.sensors[sensor].gate if sensor in est.config.sensors else 0.0
+    itself = rejected & (np.abs(measured.innovation) > gate * measured.innovation_sd)
+    time, value = measured.time, measured.value * scale
+    axes.plot(time[~rejected], value[~rejected], ".", ms=2.5, color=colour, label=sensor)
+    if itself.any():
+        axes.plot(time[itself], value[itself], "x", ms=4, color=colours.REJECTED, label=f"{sensor}, rejected")
+    if (rejected & ~itself).any():
+        others = rejected & ~itself
+        axes.plot(time[others], value[others], "x", ms=3, color=colour, alpha=0.5, label=f"{sensor}, with its row")

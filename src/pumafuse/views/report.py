@@ -248,7 +248,7 @@ def settings(found: Latency) -> str:
     """The lines for ``fusion.toml`` and ``arm.toml``."""
     lines = [
         toml.text({"sensors": {name: {"latency_ms": rounded(one.latency)}}})
-        for name, one in found.summary.sensors.items()
+        for name, one in found.details.sensors.items()
     ]
     return "\n".join([*lines, found.config.arm.to_toml()])
 
@@ -288,12 +288,12 @@ def write_latency(found: Latency, folder: Path, force: bool) -> None:
         FolderError: See :func:`check_writable`, or the disk refuses.
     """
     content = {
-        "summary": found.summary,
-        "answers": answers(found.summary),
-        "lags": lags(found.summary),
+        "summary": found.details,
+        "answers": answers(found.details),
+        "lags": lags(found.details),
         "figures": lag_figures(found),
         "settings": settings(found),
-        "elsewhere": elsewhere(found.summary),
+        "elsewhere": elsewhere(found.details),
     }
     _write("latency.html", content, folder, force)
 

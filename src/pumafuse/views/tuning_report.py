@@ -40,7 +40,7 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
         found: The tuning.
         runs: The runs that it was fitted on; innovations are shown on the first.
     """
-    summary = found.summary
+    summary = found.details
     fitted = {one.key: one for one in summary.parameters}
     before, after = (fused(runs[0], config) for config in (found.before, found.config))
     pairs = [(sensor, axis) for axis in after.axes for sensor in after.measurements.sensors]

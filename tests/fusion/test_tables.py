@@ -1,0 +1,126 @@
+"""Estimates leave Python as tables, folders and figures, and say in a line what they are."""
+
+from __future__ import annotations
+
+import math
+import sys
+import warnings
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import pumafuse as pf
+from pumafuse.fusion import results
+
+COMMANDS = 1.0 + 0.02 * np.arange(100)
+ARM = {
+    "name": "arm",
+    "update_period_ms": 20,
+    "delay_ms": 30,
+    "axes": {
+        "x": {"plant": "first-order", "time_constant_ms": 40},
+        "yaw": {"kind": "angle", "plant": "first-order", "time_constant_ms": 20},
+    },
+}
+CONFIG = {"arm": ARM, "sensors": {"camera": {"sd_mm": 0.5, "sd_deg": 0.1}}}
+
+
+@pytest.fixture(scope="module")
+def run() -> pf.Run:
+    rng, x, yaw = np.random.default_rng(1), 0.05 * np.sin(3.0 * COMMANDS), 0.2 * np.cos(2.0 * COMMANDS)
+    seen = {"x": x + rng.normal(0.0, 5e-4, 100), "yaw": yaw + rng.normal(0.0, 2e-3, 100)}
+    return pf.Run.from_arrays(COMMANDS, {"x": x, "yaw": yaw}, {"camera": (COMMANDS + 0.07, seen)}, name="a run")
+
+
+def fused(run: pf.Run, **how: Any) -> pf.Estimates:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        return pf.fuse(run, pf.FusionConfig.parse(CONFIG), **how)
+
+
+def test_tables_are_in_si_with_the_units_in_their_names(run: pf.Run) -> None:
+    """In m and rad; the files have mm and degrees; what there is not is null, not NaN."""
+    est = fused(run, mode="smoothed")
+    table = est.to_arrow()
+    assert table.column_names[:3] == ["time_s", "x.position_m", "x.position_sd_m"]
+    for axis, unit in (("x", "m"), ("yaw", "rad")):
+        for name in ("position", "position_sd", "offset", "offset_sd"):
+            np.testing.assert_array_equal(table[f"{axis}.{name}_{unit}"], getattr(est[axis], name))
+        assert table[f"{axis}.velocity_{unit}_s"].null_count == len(est.time)
+    files = results.estimates_table(est)
+    np.testing.assert_allclose(files["x.position_mm"], 1e3 * est["x"].position)
+    np.testing.assert_allclose(files["yaw.position_deg"], np.degrees(est["yaw"].position))
+
+
+def test_data_frames_have_the_table(run: pf.Run) -> None:
+    """What pandas makes of the table."""
+    est = fused(run)
+    frame = est.to_pandas()
+    assert list(frame) == est.to_arrow().column_names
+    np.testing.assert_array_equal(frame["yaw.velocity_rad_s"], est["yaw"].velocity)
+
+
+def test_polars_gets_the_table_where_it_is_installed(run: pf.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own function for Arrow tables makes the data frame; without it, Python says what is missing."""
+    est, polars = fused(run), ModuleType("polars")
+    polars.from_arrow = lambda table: ("a frame", table)  # pyright: ignore
+    monkeypatch.setitem(sys.modules, "polars", polars)
+    assert est.to_polars() == ("a frame", est.to_arrow())
+    monkeypatch.setitem(sys.modules, "polars", None)
+    with pytest.raises(ImportError, match="polars"):
+        est.to_polars()
+
+
+def test_a_saved_folder_is_read_again(run: pf.Run, tmp_path: Path) -> None:
+    """What the command line writes; not over something else, and over an earlier result only by force."""
+    est = fused(run)
+    est.save(tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"estimates.parquet", "summary.json", "arm.toml"}
+    np.testing.assert_allclose(results.read(tmp_path / "out").axes["x"].position, est["x"].position, rtol=1e-12)
+    with pytest.raises(pf.PumafuseError):
+        est.save(tmp_path / "out")
+    est.save(str(tmp_path / "out"), force=True)
+
+
+def test_a_plot_is_the_figure_of_the_run(run: pf.Run) -> None:
+    """Four panels an axis; a notebook shows what it gets."""
+    drawn = fused(run).plot()
+    assert isinstance(drawn, Figure)
+    assert len(drawn.axes) == 8
+    assert isinstance(pf.validation_figure(fused(run)), Figure)
+
+
+def test_everything_says_in_a_line_what_it_is(run: pf.Run) -> None:
+    """No array, no page of defaults."""
+    est = fused(run)
+    arm = est.config.arm
+    things = [est, est["x"], est.measurements, run, run.command, est.config, arm, pf.summarise(est)]
+    things += [pf.discretize(arm.axes["x"], 0.02, 0.03), pf.LiveEstimator(est.config)]
+    for one in things:
+        assert len(repr(one)) < 120, repr(one)
+        assert "\n" not in repr(one)
+    assert repr(est) == "Estimates('a run', filtered: 100 of x, yaw; 0 to 1.98 s)"
+    assert repr(run) == "Run('a run' of x, yaw: 100 commands, 100 camera)"
+    assert repr(arm) == "ArmModel('arm', T 20 ms; lags: x 70 ms, yaw 50 ms)"
+
+
+def test_a_configuration_is_made_of_a_dict_or_a_text() -> None:
+    """With the keys and units of the files; what is wrong is said as of a file."""
+    config = pf.FusionConfig.parse(CONFIG)
+    assert config.sensors["camera"].sd_of("yaw") == pytest.approx(math.radians(0.1), rel=1e-15)
+    assert pf.FusionConfig.parse(config.to_toml(), config.arm) == config
+    assert pf.ArmModel.parse(config.arm.to_toml()) == config.arm == pf.ArmModel.parse(ARM)
+    assert pf.FusionConfig.parse({"arm": "puma560-internal"}).arm == pf.ArmModel.load("puma560-internal")
+    for wrong, said in (
+        ({**CONFIG, "sensors": {"camera": {"sd": 1.0}}}, r"unknown key 'sensors.camera.sd'; accepted: sd_mm"),
+        ({"sensors": {}}, r"'arm' must be a preset \(puma560-internal, .*\), a table, or given as arm="),
+        ({"arm": {**ARM, "update_period_ms": math.nan}}, r"arm.update_period_ms: nan is not a finite number"),
+        ({"arm": {**ARM, "axes": {"x": {"plant": "lag"}}}}, r"arm: axes.x.plant: unknown plant 'lag'"),
+        ("arm = ", "not valid TOML"),
+    ):
+        with pytest.raises(pf.ConfigError, match=said):
+            pf.FusionConfig.parse(wrong)
