@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 import msgspec
+import numpy as np
 import tomli_w
 
 from .errors import ConfigError, PumafuseError, suggestion
@@ -61,11 +62,13 @@ def parsed(source: str | Mapping[str, Any], where: str) -> dict[str, Any]:
         where: What it is, for errors.
 
     Raises:
-        ConfigError: The text is not TOML, or there is a number that is not finite.
+        ConfigError: The text is not TOML, the dict holds what no TOML can, or a number is not finite.
     """
+    if not isinstance(source, str | Mapping):
+        raise ConfigError(f"{where}: expected a text or a dict, got {type(source).__name__}")
     try:
         if not isinstance(source, str):
-            return to_si(source)
+            return to_si(_plain(source, ""))
         if len(source) > _MOST_TEXT:
             raise ConfigError(f"more than {_MOST_TEXT >> 20} MB: no configuration")
         return to_si(tomllib.loads(source, parse_float=Decimal))
@@ -75,6 +78,29 @@ def parsed(source: str | Mapping[str, Any], where: str) -> dict[str, Any]:
         raise ConfigError(f"{where}: not valid TOML: a number is out of range, or it nests too deeply") from None
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
+
+
+def _plain(value: Any, path: str) -> Any:
+    """A value of a dict as TOML has it: numbers of numpy are numbers, tuples lists.
+
+    Raises:
+        ConfigError: It is none that TOML has.
+    """
+    if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and not value.shape):  # pyright: ignore
+        value = cast(Any, value).item()
+    if isinstance(value, Mapping):
+        tree, ahead = cast(Mapping[Any, Any], value), f"{path}." if path else ""
+        for key in tree:
+            if not isinstance(key, str):
+                raise ConfigError(f"{path or 'the dict'}: a key is {key!r:.40}, not a text")
+        return {str(key): _plain(one, f"{ahead}{key}") for key, one in tree.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one, path) for one in cast(Sequence[Any], value)]
+    if isinstance(value, str):
+        return value.encode("utf-8", "replace").decode()
+    if isinstance(value, bool | int | float | Decimal | datetime.date | datetime.time):
+        return value
+    raise ConfigError(f"{path}: expected a number, a text, a list or a table, got {type(value).__name__}")
 
 
 def struct(tree: Any, kind: type[S], where: str, path: str = "", axis: Kind = "length") -> S:

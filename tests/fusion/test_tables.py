@@ -121,6 +121,30 @@ def test_a_configuration_is_made_of_a_dict_or_a_text() -> None:
         ({"arm": {**ARM, "update_period_ms": math.nan}}, r"arm.update_period_ms: nan is not a finite number"),
         ({"arm": {**ARM, "axes": {"x": {"plant": "lag"}}}}, r"arm: axes.x.plant: unknown plant 'lag'"),
         ("arm = ", "not valid TOML"),
+        (None, "expected a text or a dict, got NoneType"),
+        (b"arm = 1", "expected a text or a dict, got bytes"),
+        ({"arm": ARM, "sensors": {1: {"sd_mm": 1.0}}}, "sensors: a key is 1, not a text"),
+        ({"arm": {**ARM, "provenance": {"file": Path("x")}}}, "arm.provenance.file: expected a number, a text"),
+        ({"arm": ARM, "sensors": {"camera": {"sd_mm": np.zeros(2)}}}, "sensors.camera.sd_mm: expected a number"),
     ):
         with pytest.raises(pf.ConfigError, match=said):
-            pf.FusionConfig.parse(wrong)
+            pf.FusionConfig.parse(wrong)  # pyright: ignore
+    for arm in ("puma560-internal", ARM):
+        with pytest.raises(pf.ConfigError, match="arm= takes what"):
+            pf.FusionConfig.parse({}, arm)  # pyright: ignore
+
+
+@pytest.mark.parametrize("number", [np.float64(0.5), np.float32(0.5), np.int64(1), np.array(0.5), 1, 0.5])
+def test_numbers_of_numpy_are_numbers(number: Any) -> None:
+    """As `np.std` gives them; what is parsed can be written."""
+    arm = {**ARM, "name": np.str_("arm"), "provenance": {"sd": number}}
+    config = pf.FusionConfig.parse({"arm": arm, "sensors": {"camera": {"sd_mm": number, "sd_deg": number}}})
+    assert config.sensors["camera"].sd_of("x") == pytest.approx(1e-3 * float(number), rel=1e-15)
+    assert pf.ArmModel.parse(config.arm.to_toml()) == config.arm
+
+
+def test_one_sensor_needs_no_list(run: pf.Run) -> None:
+    """A name is a name, not its letters."""
+    assert fused(run, sensors="camera").measurements.sensors == ("camera",)
+    with pytest.raises(pf.UnknownNameError, match="'cam'"):
+        fused(run, sensors="cam")

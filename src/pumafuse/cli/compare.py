@@ -111,19 +111,26 @@ def _differences(first: Result, other: Result) -> dict[str, Difference]:
 def verdict(compared: Sequence[Compared]) -> tuple[str | None, str]:
     """Which result to take, None where none is ahead, and why in a sentence; empty of one alone or of several runs.
 
-    By the error where all have a reference; else by the log-likelihood if all have the same measurements; else by how
-    well the next measurement of the sensors is predicted that all have.
+    By the error where all have a reference; else by the log-likelihood if all have the same measurements and gates: a
+    narrow gate would gain by rejecting; else by how well the next measurement of the sensors is predicted that all
+    have.
     """
-    if len(compared) < 2 or len({(one.result.summary.run, one.result.summary.origin_ns) for one in compared}) > 1:
+    every = [one.result.summary for one in compared]
+    if len(every) < 2 or len({(one.run, one.origin_ns) for one in every}) > 1:
         return None, ""
+    if len({(one.from_s, one.to_s) for one in every}) > 1:
+        return None, "nothing is chosen: the results are of different parts of the run"
     by_error = _shared([_errors(one.scores) for one in compared])
     if by_error is not None:
         return _least(compared, by_error, "its error against the reference (RMSE, mean over the axes) is")
-    if len({str(_components(one.result)) for one in compared}) == 1:
-        likelihood = [sum(axis.log_likelihood for axis in one.result.summary.axes.values()) for one in compared]
+    if len({str((_components(one.result), _gates(one.result))) for one in compared}) == 1:
+        likelihood = [sum(axis.log_likelihood for axis in one.axes.values()) for one in every]
         order = sorted(range(len(compared)), key=lambda number: -likelihood[number])
         best, second = (compared[number].name for number in order[:2])
         ahead = likelihood[order[0]] - likelihood[order[1]]
+        if ahead < _EQUAL and len({one.mode for one in every}) > 1:
+            why = "innovations are those of one filter, and only a reference could tell how much a smoothed one gains"
+            return None, f"no result is ahead: they differ in mode; {why}"
         if ahead < _EQUAL:
             return None, f"no result is ahead: the log-likelihoods of {best} and {second} differ by {ahead:.1f} only"
         why = "the log-likelihood of the same measurements, each before it is used, is"
@@ -156,6 +163,12 @@ def _components(result: Result) -> dict[str, int]:
         for axis, part in result.summary.axes.items()
         for name, one in part.sensors.items()
     }
+
+
+def _gates(result: Result) -> dict[str, float]:
+    """The gates of the sensors that have components."""
+    names = {name for part in result.summary.axes.values() for name in part.sensors}
+    return {name: one.gate for name, one in result.config.sensors.items() if name in names}
 
 
 def _errors(scores: Mapping[str, ScoreSummary]) -> dict[str, float]:

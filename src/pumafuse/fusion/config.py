@@ -226,6 +226,8 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
             arm = ArmModel.load(named)
         elif arm is None:
             raise ConfigError(f"{where}: 'arm' must be a preset ({', '.join(PRESETS)}), a table, or given as arm=")
+        elif not isinstance(arm, ArmModel):  # pyright: ignore  (who is not checked may give its name)
+            raise ConfigError(f"{where}: arm= takes what ArmModel.load or ArmModel.parse gives, not {arm!r:.40}")
         return _config(tree, arm, where)
 
     def save(self, folder: Path) -> None:
@@ -253,7 +255,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         """
         if chosen is None:
             return tuple(self.sensors)
-        wanted = set(chosen)
+        wanted = {chosen} if isinstance(chosen, str) else set(map(str, chosen))
         for name in sorted(wanted - set(self.sensors)):
             raise UnknownNameError("sensors", "sensor", name, self.sensors)
         return tuple(name for name in self.sensors if name in wanted)

@@ -72,7 +72,7 @@ def fuse(
         raise ValueError(f"no mode '{mode}'; there are: {', '.join(get_args(Mode))}")
     if engine == "filterpy" and mode != "filtered":
         raise ValueError(f"the filterpy engine gives filtered estimates only; mode '{mode}' needs the compiled one")
-    chosen = None if sensors is None else tuple(sensors)
+    chosen = None if sensors is None else config.sensor_names(sensors)
     in_place, placed = in_axes(run, config.frame)
     logged, jumps = segments(in_place)
     parts, faults = list[tuple[Segment, TimeArray, Filtered]](), list[str]()

@@ -131,9 +131,23 @@ def read(folder: Path) -> Result:
         axis: AxisEstimate(*(_plain(table, axis, name, part.kind) for name in AxisEstimate.FIELDS))
         for axis, part in summary.axes.items()
     }
+    time, segment = _time_and_segment(table)
+    _check_read(folder / ESTIMATES, time, segment, axes)
     path = folder / REFERENCE
     reference = _own_reference(tables.read(path), config.arm) if path.exists() else None
-    return Result(summary, config, *_time_and_segment(table), axes, _cartesian(table), reference)
+    return Result(summary, config, time, segment, axes, _cartesian(table), reference)
+
+
+def _check_read(path: Path, time: FloatArray, segment: IntArray, axes: Mapping[str, AxisEstimate]) -> None:
+    """Refuse estimates that were changed: a comparison would take them for what they are not."""
+    if not len(time) or not axes:
+        raise FolderError(f"{path}: no estimates")
+    within = np.diff(segment) == 0
+    if not np.isfinite(time).all() or (np.diff(time)[within] < 0.0).any() or (np.diff(segment) < 0).any():
+        raise FolderError(f"{path}: time_s is not ascending; the file was changed")
+    for axis, one in axes.items():
+        if not np.isfinite([one.position, one.position_sd]).all():
+            raise FolderError(f"{path}: positions of '{axis}' are missing; the file was changed")
 
 
 def read_reference(path: Path, origin: int, config: FusionConfig) -> ReferenceTrack:
@@ -271,7 +285,10 @@ def _time_and_segment(table: Table) -> tuple[FloatArray, IntArray]:
     time = seconds(table.stamps("time_s")[0])
     if "segment" not in table.columns:
         return time, np.zeros(table.rows, dtype=np.int64)
-    return time, table.columns["segment"].to_numpy().astype(np.int64)
+    segment, _ = table.plain("segment")
+    if not np.isfinite(segment).all():
+        raise RunError(f"{table.path}: segment is not a whole number in every row")
+    return time, segment.astype(np.int64)
 
 
 def _segment_column(segment: IntArray) -> dict[str, IntArray]:
