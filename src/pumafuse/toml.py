@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 import msgspec
-import numpy as np
 import tomli_w
 
 from .errors import ConfigError, PumafuseError, suggestion
@@ -86,8 +85,8 @@ def _plain(value: Any, path: str) -> Any:
     Raises:
         ConfigError: It is none that TOML has.
     """
-    if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and not value.shape):  # pyright: ignore
-        value = cast(Any, value).item()
+    if getattr(value, "shape", None) == ():
+        value = value.item()
     if isinstance(value, Mapping):
         tree, ahead = cast(Mapping[Any, Any], value), f"{path}." if path else ""
         for key in tree:
