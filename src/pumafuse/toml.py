@@ -63,7 +63,7 @@ def parsed(source: str | Mapping[str, Any], where: str) -> dict[str, Any]:
     Raises:
         ConfigError: The text is not TOML, the dict holds what no TOML can, or a number is not finite.
     """
-    if not isinstance(source, str | Mapping):
+    if not isinstance(source, str | Mapping):  # pyright: ignore  (who is not checked may give anything)
         raise ConfigError(f"{where}: expected a text or a dict, got {type(source).__name__}")
     try:
         if not isinstance(source, str):
