@@ -24,7 +24,7 @@ _FIRST_DAMPING = 1e-4
 _ROUNDING = 1e-10  # of a matrix with a diagonal of 1, below which its eigenvalues mean nothing
 _LAST_DAMPING = 1e8  # at which the search gives up
 _DOUBLES = (2.0, 4.0, 8.0)
-_CREEPING = 3  # steps in a row that gain less: at a cusp, where the score promises what is not there
+_NOTHING, _CREEPING = 2e-4, 3  # log-likelihood; steps in a row that gain less: at a cusp, the score promises too much
 _POOR = 0.1  # of the expected gain, from which a step was too long
 _MORE = 1.1  # of the expected gain, from which a longer step is tried
 _GATE_ROUNDS = 12  # times that the gates decide again
@@ -140,7 +140,7 @@ def maximise(
             trial = longer
         best = trial
         notify(best)
-        small = small + 1 if gained < _TOLERANCE else 0
+        small = small + 1 if gained < _NOTHING else 0
         if small == _CREEPING or max(gained, expected) < tolerance:
             return best
     return best
