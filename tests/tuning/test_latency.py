@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ import pumafuse as pf
 from pumafuse.tuning import latency as module
 from pumafuse.tuning.latency import Latency
 from pumafuse.tuning.likelihood import Likelihood
+from pumafuse.tuning.posterior import AxisPosterior, axis_posterior
 
 Array = NDArray[np.float64]
 STEP, PERIOD, LENGTH = 2e-4, 0.02, 20.0  # s
@@ -188,9 +191,11 @@ def test_what_tells_nothing_is_refused() -> None:
         pf.latency(replace(run, sensors={"tracker": early}))
 
 
-def killed(*_: object) -> None:
-    """What a system that runs out of memory does to a process."""
-    os._exit(9)
+def killed(parent: int, *given: Any) -> AxisPosterior:
+    """What a system that runs out of memory does to a process, but to this one."""
+    if os.getpid() != parent:
+        os._exit(9)
+    return axis_posterior(*given)
 
 
 def test_a_worker_that_dies_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,6 +204,6 @@ def test_a_worker_that_dies_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch)
     both = dict.fromkeys(("x", "y"), run.command.values["x"])
     seen = dict.fromkeys(both, run.sensors["tracker"].values["x"])
     tracker = replace(run.sensors["tracker"], values=seen)
-    monkeypatch.setattr(module, "axis_posterior", killed)
+    monkeypatch.setattr(module, "axis_posterior", partial(killed, os.getpid()))
     with pytest.raises(pf.TuneError, match="a worker process died"):
         pf.latency(replace(run, command=replace(run.command, values=both), sensors={"tracker": tracker}))

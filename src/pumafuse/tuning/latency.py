@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -241,12 +245,14 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     every = [_with_reference(run) for run in ([runs] if isinstance(runs, Run) else runs)]
     if not every:
         raise TuneError("no run to look at")
-    config = first_guess(every)
-    trusted = _trusted(config, every, sensor)
-    likelihood = Likelihood(every, _known(config, trusted), [trusted])
-    moving = excited_axes(likelihood, likelihood.config)
-    parts = {axis: likelihood.of_axis(axis) for axis in moving}
-    fits = {axis: _Fit(parts[axis], one) for axis, one in _posteriors(parts, likelihood.config).items()}
+    with _workers(len({axis for run in every for axis in run.command.values})) as workers:
+        config = first_guess(every)
+        trusted = _trusted(config, every, sensor)
+        likelihood = Likelihood(every, _known(config, trusted), [trusted])
+        moving = excited_axes(likelihood, likelihood.config)
+        parts = {axis: likelihood.of_axis(axis) for axis in moving}
+        posteriors = _posteriors(parts, likelihood.config, workers)
+    fits = {axis: _Fit(parts[axis], one) for axis, one in posteriors.items()}
     config, lags = _arm(likelihood, fits, trusted)
     best, sensors = _sensors(every, config, trusted, moving)
     lags, clock = _with_courses(likelihood, config, lags)
@@ -381,17 +387,49 @@ def _known(config: FusionConfig, trusted: str) -> FusionConfig:
 # ---- axes -----------------------------------------------------------------------------------------------------------
 
 
-def _posteriors(parts: Mapping[str, Likelihood], config: FusionConfig) -> dict[str, AxisPosterior]:
-    """The posterior of each axis, several at a time."""
-    import joblib
-    from joblib import Parallel, delayed
+@contextmanager
+def _workers(axes: int) -> Generator[Sequence[Executor]]:
+    """Processes beside this one, a core each, that begin at once with what takes longest: importing this package."""
+    from joblib import cpu_count
+    from joblib.externals.loky import ProcessPoolExecutor
 
-    jobs = [delayed(axis_posterior)(mine, config, axis) for axis, mine in parts.items()]  # pyright: ignore
-    cores = min(int(joblib.cpu_count()), len(jobs))  # pyright: ignore
+    workers = [ProcessPoolExecutor(1) for _ in range(min(cpu_count(), axes) - 1)]
     try:
-        return dict(zip(parts, Parallel(n_jobs=cores)(jobs), strict=True))  # pyright: ignore
+        for worker in workers:
+            worker.submit(import_module, __name__)
+        yield workers
     except BrokenProcessPool:
         raise TuneError("a worker process died (out of memory?): a shorter part, with --from and --to?") from None
+    finally:
+        for worker in workers:
+            worker.shutdown(kill_workers=True)
+
+
+def _posteriors(
+    parts: Mapping[str, Likelihood], config: FusionConfig, workers: Sequence[Executor]
+) -> dict[str, AxisPosterior]:
+    """The posterior of each axis, by this process and the workers, each taking the next axis when it is ready."""
+    waiting, found = deque(parts), dict[str, AxisPosterior]()
+
+    def take(run: Callable[[Likelihood, FusionConfig, str], AxisPosterior]) -> None:
+        with suppress(IndexError):
+            while True:
+                axis = waiting.popleft()
+                found[axis] = run(parts[axis], config, axis)
+
+    def feed(worker: Executor) -> None:
+        take(lambda mine, config, axis: worker.submit(axis_posterior, mine, config, axis).result())
+
+    threads = ThreadPoolExecutor(max(len(workers), 1))
+    try:
+        fed = [threads.submit(feed, worker) for worker in workers]
+        take(axis_posterior)
+        for one in fed:
+            one.result()
+    finally:
+        waiting.clear()
+        threads.shutdown(wait=False)
+    return {axis: found[axis] for axis in parts}
 
 
 def _arm(likelihood: Likelihood, fits: Mapping[str, _Fit], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:

@@ -52,7 +52,7 @@ def in_threads(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
         return [work(one) for one in items]
     import joblib  # takes 0.1 s
 
-    cores = int(joblib.cpu_count())  # pyright: ignore
+    cores = joblib.cpu_count()
     with ThreadPoolExecutor(cores) as pool:
         return list(pool.map(work, items))
 
