@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +12,14 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.stats import multivariate_normal
 
 import pumafuse as pf
-from pumafuse.tuning.intervals import ConfidenceInterval, confidence_intervals
+from pumafuse.tuning.intervals import ConfidenceInterval, Profile, confidence_intervals
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import maximise, maximise_with_gates, point
 from pumafuse.tuning.parameters import Fit, moved, rounded, with_own_delays
-from tuning_runs import contains, fit_stage, free_of, intervals_of, outage, scenario, spoiled, spoiled_arm
+from tuning_runs import contains, fit_stage, free_of, intervals_of, outage, quietly, scenario, spoiled, spoiled_arm
 
 ROOT = 1.96  # √(2 · 1.92): the root of twice the drop at an end
+TRUNK = Path(__file__).parents[2] / "examples" / "trunk-servo"
 ARM = pf.ArmModel(
     name="at rest", update_period=0.02, delay=0.0, axes={"tip": pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04))}
 )
@@ -46,6 +48,28 @@ def intervals(
     free = [one for one in free_of(likelihood, config, ("noise", "latency"), sd_prior=sd_prior) if one.key in keys]
     best = maximise(likelihood, config, free)
     return best.config, confidence_intervals(likelihood, best, free)
+
+
+def test_a_profile_that_falls_and_rises_again_has_two_maxima() -> None:
+    """Valleys of less than what the search leaves open, 0.3, are none."""
+    values = np.arange(5.0)
+    for inner, two in ((-0.6, False), (-0.2, False), (-1.2, True)):
+        drop = np.array([-3.0, -0.5, inner, 0.0, -2.0])
+        assert Profile("a key", None, False, values, drop).bimodal == two
+
+
+@pytest.mark.long
+def test_a_profile_is_followed_from_the_inside() -> None:
+    """A recorded axis whose likelihood has another maximum far off, as high along all of its disturbance's sd.
+
+    Next to the best one it falls by less than 1.5 to the 1.3-fold; from the other one the interval ended at once.
+    """
+    run = pf.Run.read(TRUNK / "0g").between(None, 60.0)
+    config = pf.FusionConfig.load(TRUNK / "fusion.toml")
+    others = [axis for axis in config.arm.axes if axis != "m2"]
+    found = quietly(lambda: pf.tune(run, config, fit=["noise", "delay", "plant"], fix=others))
+    (one,) = [one for one in found.details.parameters if one.key == "process.m2.disturbance_sd_deg"]
+    assert one.ci95[1] is not None and one.ci95[1] > 1.3 * one.value
 
 
 # ---- against likelihoods without a filter ---------------------------------------------------------------------------

@@ -77,7 +77,7 @@ def test_every_part_of_the_page_has_its_heading_and_sentence_and_nothing_is_load
     seen = outline(text)
     parts = [
         "Tuning: a run",
-        "What to know first",
+        "What to know",
         "What was fitted",
         "Profiles of the likelihood",
         "Validation",
@@ -211,7 +211,9 @@ def test_the_page_has_the_numbers_of_fusions_and_the_files_as_they_are_written(t
         check.verdict,
     ):
         assert part in text
-    assert "fitted on, tip is better." in outline(text).sentences["Validation"]
+    (answer,) = re.findall('<p class="says answer">(.*)</p>', text)
+    assert "Better on 1 of 1 axis, on measurements that nothing had been fitted on." in answer
+    assert "The error bars hold on 1 of 1." in answer
     found.config.save(tmp_path)
     files = [html.unescape(text) for text in re.findall(r"<pre>(.*?)</pre>", text, re.DOTALL)]
     assert files == [(tmp_path / name).read_text(encoding="utf-8") for name in ("fusion.toml", "arm.toml")]

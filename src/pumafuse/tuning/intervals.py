@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -27,7 +27,11 @@ _FARTHER = 1.5  # times the distance, while an end is not yet between two
 _HALVINGS = 26
 _LAG_STEP = 1e-5  # of a coordinate
 _UNLIMITED = 10.0  # s; an interval of a lag as wide as this is none
-_SHARES = np.array((0.3, 0.65, 1.0, 1.5))  # of the way from the best to an end of the interval: points that are drawn
+_SHARES = (0.5, 1.0, 1.5)  # of the way from the best to an end of the interval: points that are drawn
+_SAME = 1e-6  # relative, of distances
+_VALLEY = 0.3  # log-likelihood between two maxima below the lower one, from which they are two
+_NEXT_TO_NONE = 1e-2  # of the upper end, from which a noise's interval is drawn from 0
+_FALLEN = 1.2  # times 1.96 standard deviations, from which a maximum may be another one than that inside
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,12 @@ class Profile:
     log: bool
     values: FloatArray
     drop: FloatArray
+
+    @property
+    def bimodal(self) -> bool:
+        """Whether the curve falls and rises again, by more than the search leaves open."""
+        left, right = np.maximum.accumulate(self.drop), np.maximum.accumulate(self.drop[::-1])[::-1]
+        return bool(np.max(np.minimum(left, right) - self.drop) > _VALLEY)
 
 
 @dataclass(frozen=True)
@@ -104,7 +114,7 @@ def confidence_intervals(
         low, high = (_end(views[one.axis], best, one, sign) for sign in (-1.0, 1.0))
         peak = one.value(one.at(best.config))
         value, at = one.clipped(rounded(one.get(result))), one.at_bound(result)
-        log = one.log and not (one.vanishes and low.value <= one.bounds[0])
+        log = one.log and not (one.vanishes and low.value <= max(one.bounds[0], _NEXT_TO_NONE * high.value))
         values, drop = np.array(sorted([*low.curve, (peak, 0.0), *high.curve])).T
         return ConfidenceInterval(
             ci95=(
@@ -156,7 +166,7 @@ def _view(likelihood: Likelihood, outcomes: Sequence[CodeArray], best: Point, fr
 
 
 class _End(NamedTuple):
-    """An end of an interval: where it is [SI], whether it is profiled, whether it is open, and points to draw."""
+    """An end of an interval: where it is [SI], whether it is profiled, whether it is open, and points of the curve."""
 
     value: float
     profiled: bool
@@ -165,75 +175,132 @@ class _End(NamedTuple):
 
 
 def _end(view: _View, best: Point, one: Parameter, sign: float) -> _End:
-    """The lower (−1) or upper (+1) end of an interval.
+    """The lower (−1) or upper (+1) end of an interval."""
+    if one.at_bound(best.config) == ("lower" if sign < 0.0 else "upper"):
+        return _End(one.get(best.config), True, True, [])
+    side = _Side(view, best, one, sign)
+    end, profiled = side.end()
+    value = one.clipped(side.value(end))
+    return _End(value, profiled, profiled and end >= side.limit and side.root(end) < Z95, side.curve(end, profiled))
+
+
+class _Side:
+    """The likelihood along a parameter, one way from the maximum.
 
     Distances are in standard deviations of the coordinate. From a bound they are in the coordinate, from a noise of 0
     in the noise itself.
+
+    Attributes:
+        limit: The distance to the parameter's bound.
     """
-    from scipy.optimize import brentq
 
-    bound, start = one.at_bound(best.config), one.at(best.config)
-    if bound == ("lower" if sign < 0.0 else "upper"):
-        return _End(one.value(start), True, True, [])
-    others, more = [other for other in view.free if other.key != one.key], [] if bound is None else [one]
-    at, slope, sd = coordinates(best.config, others), np.zeros(len(others)), 1.0
-    for place, other in enumerate(view.free):
-        if other.key == one.key:  # by regression, Cov(·, a) / Var a
-            slope = np.delete(view.covariance[:, place] / view.covariance[place, place], place)
-            sd = float(np.sqrt(view.covariance[place, place]))
-    low, high = np.array([other.range for other in others]).reshape(-1, 2).T
-    vanishing = bound is not None and one.vanishes
-    unit = sign * sd
-    direction = unit * slope
-    top = point(view.likelihood, best.config, [*view.free, *more], view.outcomes).log_posterior
+    def __init__(self, view: _View, best: Point, one: Parameter, sign: float) -> None:
+        self._view, self._best, self._one, self._bound = view, best, one, one.at_bound(best.config)
+        self._others = [other for other in view.free if other.key != one.key]
+        self._every = [*view.free, *([] if self._bound is None else [one])]
+        slope, sd = np.zeros(len(self._others)), 1.0
+        for place, other in enumerate(view.free):
+            if other.key == one.key:  # by regression, Cov(·, a) / Var a
+                slope = np.delete(view.covariance[:, place] / view.covariance[place, place], place)
+                sd = float(np.sqrt(view.covariance[place, place]))
+        self._unit, self._start = sign * sd, one.at(best.config)
+        self._slope = self._unit * slope
+        self._vanishing = self._bound is not None and one.vanishes
+        self._range = np.array([other.range for other in self._others]).reshape(-1, 2).T
+        self._known = {0.0: (0.0, coordinates(best.config, self._others))}  # by distance: drop, the other coordinates
+        self._top = point(view.likelihood, best.config, self._every, view.outcomes).log_posterior
+        self.limit = self._distance(one.bounds[0 if sign < 0.0 else 1])
 
-    def distance_to(value: float) -> float:
-        return value - one.bounds[0] if vanishing else (one.coordinate(value) - start) / unit
+    def value(self, distance: float) -> float:
+        """The parameter at a distance [SI]."""
+        if self._vanishing:
+            return self._one.bounds[0] + distance
+        return self._one.value(self._start + distance * self._unit)
 
-    def value_at(distance: float) -> float:
-        return one.bounds[0] + distance if vanishing else one.value(start + distance * unit)
+    def end(self) -> tuple[float, bool]:
+        """The distance at which the profile has dropped by 1.92, or the limit; whether it is from the profile."""
+        from scipy.optimize import brentq
 
-    def along(distance: float) -> FusionConfig:
-        there = np.clip(at + distance * direction, low, high)
-        return moved(one.put(best.config, one.clipped(value_at(distance))), others, there)
+        end = min(Z95, self.limit)
+        if self._bound is not None:
+            end = self.limit
+            for _ in range(_HALVINGS):
+                if _root(self._drop(end)) < Z95:
+                    break
+                end *= 0.5
+        elif self.limit > Z95 and abs(self._drop(Z95) / (0.5 * Z95**2) - 1.0) < _SKEWED:
+            return Z95, False
+        inner = 0.0
+        while self._missing(end) < 0.0 and end < self.limit:
+            inner, end = end, min(_FARTHER * end, self.limit)
+        if self._missing(end) > 0.0:
+            end = float(brentq(self._missing, inner, end, rtol=_CLOSE))
+        return end, True
 
-    def drop(distance: float) -> float:
-        return top - point(view.likelihood, along(distance), [*view.free, *more], view.outcomes).log_posterior
+    def root(self, distance: float) -> float:
+        """The standard deviations that the drop of the profile at a distance stands for."""
+        distance = next((one for one in self._known if math.isclose(one, distance, rel_tol=_SAME)), distance)
+        if distance not in self._known:
+            inner = max(one for one in self._known if one < distance)
+            found = self._maximum(distance, self._expected(distance))
+            if _root(found[0]) > _FALLEN * Z95:  # another maximum, perhaps: the one inside goes on
+                found = min(found, self._maximum(distance, self._known[inner][1]), key=lambda one: one[0])
+            self._known[distance] = found
+        return _root(self._known[distance][0])
 
-    @cache
-    def missing(distance: float) -> float:
-        """The root of the profile's drop less 1.96 standard deviations; 0 where that is next to none."""
-        nonlocal direction
-        if distance == 0.0:
-            return -Z95
-        peak = maximise(view.likelihood, along(distance), others, outcomes=view.outcomes, tolerance=_TOLERANCE)
-        direction = (coordinates(peak.config, others) - at) / distance
-        root = _root(top - peak.log_posterior - one.log_prior(peak.config))
+    def curve(self, end: float, profiled: bool) -> list[tuple[float, float]]:
+        """Points of the profile to one and a half times the end: values [SI] and what the likelihood drops by."""
+        middle, value = self.value(0.0), self.value(end)
+        if self._one.log and min(middle, value) > _NEXT_TO_NONE * max(middle, value) and not self._vanishing:
+            places = [share * end for share in _SHARES]
+        else:
+            places = [self._distance(middle + share * (value - middle)) for share in _SHARES]
+        places = [place for place in places if place <= self.limit]
+        if profiled:
+            for place in places:
+                self.root(place)
+            drops = {place: drop for place, (drop, _) in self._known.items() if 0.0 < place <= max(places)}
+        else:
+            drops = {place: self._drop(place) for place in places}
+        return [(self._one.clipped(self.value(at)), -drop) for at, drop in drops.items()]
+
+    def _distance(self, value: float) -> float:
+        low, high = self._one.bounds
+        if self._vanishing:
+            return value - low
+        if not low <= value <= high:
+            return np.inf
+        return (self._one.coordinate(value) - self._start) / self._unit
+
+    def _missing(self, distance: float) -> float:
+        """The root at a distance less 1.96; 0 where that is next to none."""
+        root = self.root(distance)
         return 0.0 if abs(root / Z95 - 1.0) < _CLOSE else root - Z95
 
-    limit = distance_to(one.bounds[0 if sign < 0.0 else 1])
-    end, profiled, beyond = min(Z95, limit), True, False
-    if bound is not None:
-        end = limit
-        for _ in range(_HALVINGS):
-            if _root(drop(end)) < Z95:
-                break
-            end *= 0.5
-    elif limit > Z95:
-        profiled = abs(drop(Z95) / (0.5 * Z95**2) - 1.0) >= _SKEWED
-    if profiled:
-        inner = 0.0
-        while missing(end) < 0.0 and not beyond:
-            inner, end, beyond = end, min(_FARTHER * end, limit), end >= limit
-        if not beyond and missing(end) > 0.0:
-            end = brentq(missing, inner, end, rtol=_CLOSE)
-    value, middle = one.clipped(value_at(end)), one.value(start)
-    linear = not one.log or (one.vanishes and (vanishing or value <= one.bounds[0]))
-    points = middle + (value - middle) * _SHARES if linear else middle * (value / middle) ** _SHARES
-    drawn = [one.clipped(there) for there in points[:-1].tolist()]
-    if one.bounds[0] <= points[-1] <= one.bounds[1]:  # it lies beyond the end
-        drawn.append(float(points[-1]))
-    return _End(value, profiled, beyond, [(there, -drop(distance_to(there))) for there in drawn])
+    def _expected(self, distance: float) -> FloatArray:
+        """The other coordinates at a distance by those that are known: between two, or onwards from the last."""
+        inner, outer = ([one for one in sorted(self._known) if (one > distance) == beyond] for beyond in (False, True))
+        last, at = inner[-1], self._known[inner[-1]][1]
+        if outer:
+            return at + (distance - last) / (outer[0] - last) * (self._known[outer[0]][1] - at)
+        slope = self._slope if last == 0.0 else (at - self._known[0.0][1]) / last
+        return at + (distance - last) * slope
+
+    def _along(self, distance: float, others: FloatArray) -> FusionConfig:
+        there = self._one.put(self._best.config, self._one.clipped(self.value(distance)))
+        return moved(there, self._others, np.clip(others, *self._range))
+
+    def _drop(self, distance: float) -> float:
+        """What the likelihood drops by with the others where they are expected."""
+        there = self._along(distance, self._known[0.0][1] + distance * self._slope)
+        return self._top - point(self._view.likelihood, there, self._every, self._view.outcomes).log_posterior
+
+    def _maximum(self, distance: float, others: FloatArray) -> tuple[float, FloatArray]:
+        """The drop at the maximum next to these other coordinates, and that maximum's."""
+        view, start = self._view, self._along(distance, others)
+        peak = maximise(view.likelihood, start, self._others, outcomes=view.outcomes, tolerance=_TOLERANCE)
+        drop = self._top - peak.log_posterior - self._one.log_prior(peak.config)
+        return drop, coordinates(peak.config, self._others)
 
 
 def _root(drop: float) -> float:

@@ -230,7 +230,7 @@ def _notes(one: Parameter, interval: ConfidenceInterval) -> str:
     low, high = interval.ci95
     if one.sensor and one.prior and math.log(high / low) > _FROM_PRIOR * 2.0 * Z95 * one.prior[1]:
         return "mostly by its prior, as configured within a factor of 1.5: the measurements hardly tell it"
-    return ""
+    return "the likelihood has two maxima along it" if interval.profile.bimodal else ""
 
 
 def found_biases(run: Run, config: FusionConfig) -> list[FoundBias]:

@@ -28,7 +28,7 @@ _WHITE = 0.01  # p-value from which innovations count as white
 _COLUMNS = 5  # of profiles
 _WIDTH = 11.0  # inch; as wide as a page
 _TITLE = 32  # letters over a panel
-_WITHIN_REACH = 4.0  # last over first of a log scale, up to which its ticks are evenly spaced
+_WITHIN_REACH = 10.0  # last over first of a log scale, up to which its ticks are evenly spaced
 _SMOOTH = 100  # points of a profile's curve
 _DEEPEST = -6.2  # of a profile; what lies below −5 has room for the number before
 
@@ -47,8 +47,12 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
     tests = {pair: (consistency(before, *pair), consistency(after, *pair)) for pair in pairs}
     tests = {pair: both for pair, both in tests.items() if any(both)}
     known = [one for one in summary.parameters if one.before is not None]
+    validated = [one.axis for one in summary.validation or ()]
     content = {
         "title": f"Tuning: {', '.join(summary.runs)}",
+        "answer": _answer(summary),
+        "axes": [_axis(summary, axis) for axis in dict.fromkeys([*summary.lags, *validated])],
+        "predicted": any(one.after.rmse is None for one in summary.validation or ()),
         "tuning": summary,
         "notes": _notes(summary),
         "lags": [
@@ -61,6 +65,7 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
         "outside": sum(not _contains(one.ci95, one.before) for one in known),
         "zero": sum(one.value == 0.0 for one in summary.parameters),
         "open": not summary.interrupted and any(None in one.ci95 for one in summary.parameters),
+        "two_maxima": [one.key for one in found.profiles if one.bimodal],
         "profiles": profile_figure(found.profiles, fitted) if found.profiles else None,
         "validation": [_check(one) for one in summary.validation or ()],
         "innovations": [
@@ -76,6 +81,43 @@ def page(found: Tuning, runs: Sequence[Run]) -> str:
         "arm": found.config.arm.to_toml(),
     }
     return render("tuning.html", content)
+
+
+def _answer(summary: TuningSummary) -> str:
+    """What the tuning is good for, in a sentence or two."""
+    checks = summary.validation
+    if not checks:
+        gain = sum(one.after - one.before for one in summary.likelihood.values())
+        return f"Not validated: the log-likelihood of what it was fitted on rose by {gain:.1f}."
+    better, worse = ([one for one in checks if one.verdict.startswith(word)] for word in ("better", "worse"))
+    holding = sum(one.holds for one in checks)
+    axes = "axis" if len(checks) == 1 else "axes"
+    found = f"Better on {len(better)} of {len(checks)} {axes}, on measurements that nothing had been fitted on"
+    found += f", worse on {len(worse)}" if worse else ""
+    return f"{found}. The error bars hold on {holding} of {len(checks)}."
+
+
+def _axis(summary: TuningSummary, axis: str) -> Mapping[str, Any]:
+    """An axis's error and lag before and after, and what the validation says."""
+    check = next((one for one in summary.validation or () if one.axis == axis), None)
+    lag = summary.lags.get(axis)
+    error, verdict = "–", "not validated"
+    if check is not None:
+        pair, verdict = (check.before, check.after), check.verdict.partition(":")[0]
+        names = [name for name, one in check.after.sensors.items() if one.skill is not None]
+        if check.after.rmse is not None:
+            error = formatting.change_of_positions([one.rmse for one in pair], check.kind)
+        elif names:
+            skills = [[getattr(one.sensors.get(name), "skill", None) for one in pair] for name in names]
+            error = "; ".join(
+                f"{name} {formatting.change(both, '.2f')}" for name, both in zip(names, skills, strict=True)
+            )
+    late = "–"
+    if lag is not None:
+        before, after, interval = _numbers(lag.before_ms, lag.lag_ms, lag.lag_ms_ci95)
+        late = f"{before} → {after} ({interval})"
+    doubtful = check is not None and (check.worse or not check.holds)
+    return {"axis": axis, "numbers": [error, late], "verdict": verdict, "doubtful": doubtful}
 
 
 def _notes(summary: TuningSummary) -> list[str]:
