@@ -28,7 +28,9 @@ def times(chunks: list[dict[str, object]]) -> np.ndarray:
     return np.concatenate([np.empty(0), *(one / np.timedelta64(1, "s") for one in moments)])
 
 
-def series(path: Path, entity: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times [s] and values of one entity."""
+def series(path: Path, entity: str, of: str = "values") -> tuple[np.ndarray, np.ndarray]:
+    """Times [s] and values of one entity; of one that has a variance, these or its ``variances``."""
     found = columns(path, entity)
-    return times(found), np.concatenate([np.empty(0), *(c["Scalars:scalars"].flatten().to_numpy() for c in found)])
+    names = [f"Measurements:{of}" if f"Measurements:{of}" in one else "Scalars:scalars" for one in found]
+    every = (one[name].flatten().to_numpy() for one, name in zip(found, names, strict=True))
+    return times(found), np.concatenate([np.empty(0), *every])

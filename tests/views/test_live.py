@@ -128,10 +128,10 @@ def test_events_and_estimates_arrive(recorder: tuple[subprocess.Popen[bytes], Pa
     time_, value = series(path, "/radial/command")
     assert np.allclose(time_, 0.028 * np.arange(60), atol=1e-6)
     assert np.allclose(value, 500.0)
-    upper, lower = (series(path, f"/radial/estimate/{edge}")[1] for edge in ("upper", "lower"))
-    assert np.allclose((upper + lower) / 2.0, series(path, "/radial/estimate")[1])
-    half = 2e3 * driven.live.estimate(100.0 + 0.028 * 59)["radial"].position_sd
-    assert np.isclose((upper - lower)[-1] / 2.0, half, rtol=1e-6)
+    variance = (1e3 * driven.live.estimate(100.0 + 0.028 * 59)["radial"].position_sd) ** 2
+    for entity in ("/radial/estimate", "/residual/radial/estimate"):
+        assert np.isclose(series(path, entity, "variances")[1][-1], variance, rtol=1e-6)
+    assert not series(path, "/residual/radial/estimate")[1].any()
     time_, value = series(path, "/vertical/tracker")
     assert np.allclose(time_, np.delete(0.002 + 0.028 * np.arange(59), 20), atol=1e-6)
     assert np.allclose(value, 500.0)

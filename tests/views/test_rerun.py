@@ -58,31 +58,75 @@ def strip(path: Path, entity: str) -> np.ndarray:
 
 
 def test_everything_is_in_mm_on_one_clock(fused: tuple[pf.Estimates, pf.Run], recorded: Path) -> None:
-    """Seconds since the first command: commands, reference, measurements at stamp − latency, what the filter says."""
+    """Seconds since the first command: commands, reference, measurements at stamp − latency, what the filter says.
+
+    But innovations: these are in units of their standard deviation.
+    """
     (est, run), measurements = fused, fused[0].measurements
     position, sd = est["radial"].position, est["radial"].position_sd
     used = np.isfinite(measurements.innovation)
     late = 0.01 * np.arange(140) - 0.005
     bad = np.isin(np.arange(140), (0, 70))  # before the first command, and the outlier
     sight = run.sensors["camera"].values["radial"]
+    there, good = np.interp(late, est.time, position), ~bad & (late <= est.time[-1])
+    innovation = measurements.innovation[used]
     wanted = {
         "radial/command": (0.028 * np.arange(50), run.command.values["radial"]),
         "radial/reference": (0.01 * np.arange(140), np.full(140, 0.5)),
         "radial/camera": (late[~bad], sight[~bad]),
         "radial/camera/rejected": (late[bad], sight[bad]),
         "radial/estimate": (est.time, position),
-        "radial/estimate/upper": (est.time, position + 2.0 * sd),
-        "radial/estimate/lower": (est.time, position - 2.0 * sd),
-        "innovation/radial/camera": (measurements.time[used], measurements.innovation[used]),
-        "innovation/radial/camera/upper": (measurements.time[used], 2.0 * measurements.innovation_sd[used]),
-        "innovation/radial/camera/lower": (measurements.time[used], -2.0 * measurements.innovation_sd[used]),
+        "residual/radial/camera": (late[good], (sight - there)[good]),
+        "residual/radial/camera/rejected": (late[[70]], (sight - there)[[70]]),
+        "residual/radial/estimate": (est.time, np.zeros(len(est.time))),
+    }
+    plain = {
+        "innovation/radial/camera": (measurements.time[used], np.sign(innovation) * np.sqrt(measurements.nis)[used]),
+        "innovation/radial/upper": (est.time[[0, -1]], np.full(2, 2.0)),
+        "innovation/radial/lower": (est.time[[0, -1]], np.full(2, -2.0)),
     }
     assert used.sum() == 139
-    assert entities(recorded) == {f"/{name}" for name in wanted}  # and no path: a point in space needs three axes
-    for name, (time, value) in wanted.items():
+    every = {*wanted, *plain, "outcome/camera"}
+    assert entities(recorded) == {f"/{name}" for name in every}  # and no path: a position in space needs two axes
+    for name, (time, value) in {**plain, **{one: (at, of * 1e3) for one, (at, of) in wanted.items()}}.items():
         found = series(recorded, f"/{name}")
         np.testing.assert_allclose(found[0], time, atol=2e-9, rtol=0, err_msg=name)
-        np.testing.assert_allclose(found[1], value * 1e3, err_msg=name)
+        np.testing.assert_allclose(found[1], value, err_msg=name, atol=1e-9)
+    for name in ("radial/estimate", "residual/radial/estimate"):
+        np.testing.assert_allclose(series(recorded, f"/{name}", "variances")[1], (sd * 1e3) ** 2)
+
+
+def test_outcomes_are_states_and_silence_is_one(tmp_path: Path) -> None:
+    """A camera at 50 Hz, its 30th frame wild, quiet for 2 s: fused, rejected, fused, silent, fused, silent."""
+    stamp = np.concatenate([0.5 + 0.02 * np.arange(50), 3.5 + 0.02 * np.arange(50)])
+    seen = np.where(np.arange(100) == 30, 0.6, 0.5)
+    run = pf.Run.from_arrays(
+        0.028 * np.arange(200), {"radial": np.full(200, 0.5)}, {"camera": (stamp, {"radial": seen})}
+    )
+    sensors = {"camera": pf.Sensor(sd=1e-3, gate=5.0)}
+    est = pf.fuse(run, pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal"), sensors=sensors))
+    pf.to_rerun(est, run, tmp_path / "fused.rrd")
+    chunks = columns(tmp_path / "fused.rrd", "/outcome/camera")
+    states = [state for chunk in chunks for (state,) in chunk["StateChange:state"].to_pylist()]
+    assert states == ["fused", "rejected", "fused", "silent", "fused", "silent"]
+    np.testing.assert_allclose(times(chunks)[[0, 1, 2, 4]], stamp[[0, 30, 31, 50]], atol=1e-9)
+    assert stamp[49] < times(chunks)[3] < stamp[50]
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_lengths_of_any_names_are_a_path(count: int, tmp_path: Path) -> None:
+    """Two are a position in a plane; of more than three the first three are one in space."""
+    names = ["slide", "lift", "reach", "rail"][:count]
+    axis = pf.AxisModel(plant=pf.FirstOrder(time_constant=0.05))
+    arm = pf.ArmModel(name="gantry", update_period=0.02, delay=0.03, axes=dict.fromkeys(names, axis))
+    time = np.arange(100) * 0.02
+    run = pf.Run.from_arrays(time, {name: 0.1 * number * np.sin(time) for number, name in enumerate(names, 1)})
+    est = pf.fuse(run, pf.FusionConfig(arm=arm))
+    pf.to_rerun(est, run, tmp_path / "fused.rrd")
+    wanted = np.zeros((len(est.time), 3))
+    for number, name in enumerate(names[:3]):
+        wanted[:, number] = 1e3 * est[name].position
+    np.testing.assert_allclose(strip(tmp_path / "fused.rrd", "/path/estimate"), wanted, atol=1e-4)
 
 
 def test_a_stream_of_the_caller_gets_the_same(
@@ -155,7 +199,8 @@ def test_measurements_are_shown_where_they_put_the_tool(tmp_path: Path) -> None:
     bias = est.biases["range"]["radial"].value
     assert np.allclose(value, (run.sensors["range"].values["radial"] - bias) / -2.0 * 1e3)
     assert abs(np.mean(value) - 500.0) < 5.0
-    assert np.allclose(series(tmp_path / "range.rrd", "/innovation/radial/range")[1], est.measurements.innovation * 1e3)
+    _, shown = series(tmp_path / "range.rrd", "/innovation/radial/range")
+    assert np.allclose(shown, est.measurements.innovation / est.measurements.innovation_sd)
 
 
 def test_the_shipped_scan_makes_a_small_file_that_rerun_accepts(tmp_path: Path) -> None:
@@ -168,7 +213,7 @@ def test_the_shipped_scan_makes_a_small_file_that_rerun_accepts(tmp_path: Path) 
     done = subprocess.run([str(rerun), "rrd", "verify", str(path)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     for sensor, axes in (("tracker", 3), ("vision", 3), ("range", 1)):
-        assert sum(entity.endswith(f"/{sensor}") for entity in entities(path)) == 2 * axes
+        assert sum(entity.endswith(f"/{sensor}") for entity in entities(path)) == 3 * axes + 1
 
 
 @pytest.mark.parametrize(

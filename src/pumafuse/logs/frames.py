@@ -52,9 +52,13 @@ Frame: TypeAlias = Cylindrical | Rotated
 
 
 def in_space(arm: ArmModel) -> tuple[str, ...]:
-    """The three axes that are a position in space: x, y, z or tangential, radial, vertical; empty without such."""
-    lengths = {name for name, axis in arm.axes.items() if axis.kind == "length"}
-    return next((names for names in (CARTESIAN, CANONICAL_AXES) if lengths.issuperset(names)), ())
+    """The axes that are a position in space, empty without such.
+
+    x, y, z; tangential, radial, vertical; or else the first three lengths, or two that are a position in a plane.
+    """
+    lengths = [name for name, axis in arm.axes.items() if axis.kind == "length"]
+    known = next((names for names in (CARTESIAN, CANONICAL_AXES) if set(lengths).issuperset(names)), None)
+    return known or (tuple(lengths[:3]) if len(lengths) > 1 else ())
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,9 @@ COMMAND = "#8a8f98"
 ESTIMATE = "#0b6bcb"
 BAND = "#7fb2ea"
 REFERENCE = "#1a1c1f"
-REFERENCE_3D = "#c9ccd1"  # the viewer is dark
+REFERENCE_3D = "#17a2b8"  # seen on the dark and on the light of the viewer
 REJECTED = "#d1242f"
+OUTCOMES = {"fused": "#2da44e", "reacquired": "#e8890c", "rejected": REJECTED, "silent": "#30343a"}  # all others: grey
 _SENSORS = ("#e8890c", "#2da44e", "#8250df", "#bf3989", "#1b7c83", "#9a6700")
 
 

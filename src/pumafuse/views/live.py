@@ -4,12 +4,11 @@ The drawing is done by a process of its own (:mod:`pumafuse.views.live_drawer`),
 through a pipe. Whatever becomes of it, of the viewer or of the connection between them, the estimator does not wait:
 a frame that does not fit into the pipe is left out.
 
-Entities: ``<axis>/command``, ``/estimate`` with ``/upper`` and ``/lower`` at ±2σ, ``/<sensor>`` and
-``/<sensor>/rejected``; ``residual/<axis>/<sensor>``, the measurement minus the estimate, between ``/upper`` and
-``/lower`` of the estimate; ``path/command``, ``path/estimate``, ``path/tool`` in 3D, and with a frame
-``path/<sensor>``; ``nis/<sensor>``, ``rate/<sensor>``. All against seconds since the first event, positions in mm or
-degrees. With
-a frame, commands and measurements in x, y, z are in 3D only. A sensor with a bias is drawn less its mean distance from
+Entities: ``<axis>/command``, ``/estimate`` with its variance, ``/<sensor>`` and ``/<sensor>/rejected``;
+``residual/<axis>/<sensor>``, the measurement minus the estimate, about ``residual/<axis>/estimate``, 0 with the
+estimate's variance; ``path/command``, ``path/estimate``, ``path/tool`` in 3D, and with a frame ``path/<sensor>``;
+``nis/<sensor>``, ``rate/<sensor>``. All against seconds since the first event, positions in mm or degrees. With a
+frame, commands and measurements in x, y, z are in 3D only. A sensor with a bias is drawn less its mean distance from
 the estimate.
 """
 
@@ -207,7 +206,8 @@ class LiveView:
     def _add_position(self, frame: Frame, name: str, moment: float, place: Mapping[str, float]) -> None:
         """Add a position in space to a path, if it is one."""
         if self._space and all(coordinate in place for coordinate in self._space):
-            row = moment, *(float(place[coordinate]) for coordinate in self._space)
+            plane = (0.0,) * (3 - len(self._space))
+            row = moment, *(float(place[coordinate]) for coordinate in self._space), *plane
             frame.setdefault(f"path/{name}", []).append(row)
 
     def _add_health(self, frame: Frame, health: Health) -> None:

@@ -69,10 +69,8 @@ class Picture:
             self._plot(f"{axis}/command", styles.line(colours.COMMAND, "command", step=True), time, command * scale)
             time, position, sd = estimates = _columns(frame, f"estimate/{axis}", 3)
             known.add(estimates)
-            self._plot(f"{axis}/estimate", styles.line(colours.ESTIMATE, "estimate"), time, position * scale)
-            for edge, label, half in (("upper", "+2σ", 2.0 * sd), ("lower", "−2σ", -2.0 * sd)):
-                self._plot(f"{axis}/estimate/{edge}", styles.edge(label), time, (position + half) * scale)
-                self._plot(f"residual/{axis}/{edge}", styles.edge(label), time, half * scale)
+            self._band(f"{axis}/estimate", "estimate ± sd", time, position * scale, sd * scale, axis)
+            self._band(f"residual/{axis}/estimate", "estimate's sd", time, np.zeros(len(time)), sd * scale, axis)
         for (axis, name), residuals in self._residuals.items():
             residuals.add(_columns(frame, f"measurement/{axis}/{name}", 3))
             time, position, residual, rejected = residuals.take()
@@ -114,10 +112,21 @@ class Picture:
 
     def _plot(self, path: str, style: styles.Style, time: FloatArray, value: FloatArray) -> None:
         """Send the values of an entity, with the first of them its style."""
-        if path not in self._styled and len(time):
+        there = np.isfinite(time) & np.isfinite(value)
+        self._send(path, style, time[there], rr.Scalars.columns(scalars=value[there]))
+
+    def _band(self, path: str, label: str, time: FloatArray, value: FloatArray, sd: FloatArray, axis: str) -> None:
+        """Send values with their standard deviations, with the first of them their style."""
+        style = styles.banded(label, self._screens[axis].unit)
+        self._send(path, style, time, rr.Measurements.columns(values=value, variances=sd**2))
+
+    def _send(self, path: str, style: styles.Style, time: FloatArray, columns: rr.ComponentColumnList) -> None:
+        if not len(time):
+            return
+        if path not in self._styled:
             self._styled.add(path)
             self._stream.log(path, style, static=True)
-        styles.send(self._stream, path, time, value)
+        rr.send_columns(path, styles.timeline(time), columns, recording=self._stream)
 
 
 class Recent:

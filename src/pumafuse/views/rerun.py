@@ -1,8 +1,10 @@
 """Rerun recordings of a fusion.
 
-Entities: ``<axis>/command``, ``/reference``, ``/estimate`` with ``/upper`` and ``/lower`` at ±2σ, ``/<sensor>`` and
-``/<sensor>/rejected``; ``innovation/<axis>/<sensor>`` with its ±2σ band; ``path/command`` and ``path/estimate`` in 3D.
-All against seconds since the run's first command, positions in mm or degrees.
+Entities: ``<axis>/command``, ``/estimate`` with its variance, ``/<sensor>`` and ``/<sensor>/rejected``, and the
+``/reference``; ``innovation/<axis>/<sensor>``, divided by its standard deviation, with the band of ±2;
+``residual/<axis>/<sensor>``, the measurement minus the estimate, about ``residual/<axis>/estimate``, 0 with the
+estimate's variance; ``outcome/<sensor>``, a state; ``path/command`` and ``path/estimate`` in 3D. All against seconds
+since the run's first command, positions in mm or degrees.
 
 The result of a run that was read from a Rerun recording is a layer of that: it has the same ids, so that the viewer
 shows both as one. Its entities are below ``pumafuse/``, on the recording's timeline, too; the path is in m.
@@ -10,8 +12,9 @@ shows both as one. Its entities are below ``pumafuse/``, on the recording's time
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +32,19 @@ from ..units import MM, Screen, seconds
 from . import colours, styles
 
 _OPENING_S = 4.0
+_LEGEND = (0.35, 0.6)  # of a plot's width and height, that a legend covers
+_TWO_COLUMNS = 4  # axes
+_SILENT, _SILENT_S = 10.0, 0.5  # times the median interval, and s: a sensor that is quiet for longer is silent
+_BY_GRAVITY = (
+    Outcome.FUSED,
+    Outcome.REACQUIRED,
+    Outcome.DUPLICATE,
+    Outcome.BEFORE_START,
+    Outcome.TOO_LATE,
+    Outcome.INVALID,
+    Outcome.UNKNOWN,
+    Outcome.REJECTED,
+)
 _PATH_POINTS = 20_000  # a 3D path needs no more, whatever the rate of the estimates
 
 
@@ -111,92 +127,183 @@ def _send(est: Estimates, run: Run, sink: _Sink) -> None:
             _series(sink, f"{name}/reference", line, est.reference.time, est.reference.position[name], screen)
         for sensor in est.measurements.sensors:
             _sensor(sink, est, sensor, name, by_sensor[sensor])
-        _band(sink, f"{name}/estimate", est.time, axis.position, 2.0 * axis.position_sd, screen)
-        line = styles.line(colours.ESTIMATE, "estimate")
-        _series(sink, f"{name}/estimate", line, est.time, axis.position, screen)
+        _estimate(sink, f"{name}/estimate", "estimate ± sd", est.time, axis.position, axis.position_sd, screen)
+        if name not in _measured(est):
+            continue
+        nothing = np.zeros(len(est.time))
+        _estimate(sink, f"residual/{name}/estimate", "estimate's sd", est.time, nothing, axis.position_sd, screen)
+        for edge in (2.0, -2.0):
+            path = f"innovation/{name}/{'upper' if edge > 0.0 else 'lower'}"
+            _series(sink, path, styles.edge(f"{edge:+.0f}"), est.time[[0, -1]], np.full(2, edge))
+    for sensor in est.measurements.sensors:
+        _outcomes(sink, est, sensor)
     _paths(sink, est, run)
+
+
+def _measured(est: Estimates) -> list[str]:
+    """The axes that sensors give values for."""
+    return [est.measurements.axes[place] for place in np.unique(est.measurements.axis)]
 
 
 def _sensor(sink: _Sink, est: Estimates, sensor: str, axis: str, colour: str) -> None:
     measured, screen = est.measured_positions(sensor, axis), est.config.arm.screen_of(axis)
     fused = (measured.outcome == Outcome.FUSED) | (measured.outcome == Outcome.REACQUIRED)
-    points = styles.points(colour, sensor)
-    _series(sink, f"{axis}/{sensor}", points, measured.time[fused], measured.value[fused], screen)
-    crosses = styles.points(colours.REJECTED, "rejected", "Cross")
-    _series(sink, f"{axis}/{sensor}/rejected", crosses, measured.time[~fused], measured.value[~fused], screen)
-    path = f"innovation/{axis}/{sensor}"
-    _series(sink, path, points, measured.time, measured.innovation, screen)
-    _band(sink, path, measured.time, np.zeros(len(measured.time)), 2.0 * measured.innovation_sd, screen)
+    points, crosses = styles.points(colour, sensor), styles.points(colours.REJECTED, "rejected", "Cross")
+    position = np.interp(measured.time, est.time, est[axis].position, left=np.nan, right=np.nan)
+    for path, value in ((axis, measured.value), (f"residual/{axis}", measured.value - position)):
+        _series(sink, f"{path}/{sensor}", points, measured.time[fused], value[fused], screen)
+        _series(sink, f"{path}/{sensor}/rejected", crosses, measured.time[~fused], value[~fused], screen)
+    normalised = measured.innovation / measured.innovation_sd
+    _series(sink, f"innovation/{axis}/{sensor}", points, measured.time, normalised)
+
+
+def _outcomes(sink: _Sink, est: Estimates, sensor: str) -> None:
+    """Send what became of a sensor's rows: the worst of its axes, where that changes; and when it falls silent."""
+    mine = est.measurements.where(est.measurements.sensor == est.measurements.sensors.index(sensor))
+    mine = mine.where(np.isfinite(mine.stamp))
+    if not len(mine.stamp):
+        return
+    time, row = np.unique(mine.stamp, return_inverse=True)
+    worst = np.zeros(len(time), dtype=np.int64)
+    np.maximum.at(worst, row, np.argsort(_BY_GRAVITY)[mine.outcome])
+    gap = np.diff(time, append=np.inf)
+    usual = float(np.median(gap[:-1])) if len(gap) > 1 else 0.0
+    silent = gap > max(_SILENT_S, _SILENT * usual)
+    begins = np.flatnonzero((np.diff(worst, prepend=-1) != 0) | np.append(False, silent[:-1]))
+    words = [*(one.word for one in _BY_GRAVITY), "silent"]
+    states = [(float(time[one]), words[int(worst[one])]) for one in begins]
+    states = sorted([*states, *((float(time[one]) + usual, "silent") for one in np.flatnonzero(silent))])
+    shades = [colours.rgb(colours.OUTCOMES.get(word, colours.COMMAND)) for word in words]
+    sink.log(f"outcome/{sensor}", rr.StateConfiguration(values=words, colors=shades))
+    changes = rr.StateChange.columns(state=[word for _, word in states])
+    sink.columns(f"outcome/{sensor}", np.array([at for at, _ in states]), changes)
 
 
 def _paths(sink: _Sink, est: Estimates, run: Run) -> None:
-    """Send command and estimate in 3D: the log's x, y, z, or without them tangential, radial, vertical."""
+    """Send command and estimate in 3D: the log's x, y, z, or the lengths among the axes."""
     names = in_space(est.config.arm) if est.cartesian is None else CARTESIAN
     estimated = est.cartesian or {name: axis.position for name, axis in est.axes.items()}
     command = run.command.values
     if not names or not all(name in estimated for name in names):
         return
     if all(name in command for name in names):
-        _strip(sink, "path/command", [command[name] for name in names], colours.COMMAND, 0.3e-3)
-    _strip(sink, "path/estimate", [estimated[name] for name in names], colours.ESTIMATE, 0.6e-3)
+        _strip(sink, "path/command", [command[name] for name in names], colours.COMMAND, -0.7)
+    _strip(sink, "path/estimate", [estimated[name] for name in names], colours.ESTIMATE, -1.2)
     every = max(1, len(est.time) // _PATH_POINTS)
-    position = np.column_stack([estimated[name] for name in names])[::every] * sink.scale
-    style = rr.Points3D.from_fields(colors=[colours.rgb(colours.REJECTED)], radii=[2.5e-3 * sink.scale])
+    position = _points([estimated[name][::every] for name in names]) * sink.scale
+    style = rr.Points3D.from_fields(colors=[colours.rgb(colours.REJECTED)], radii=[-5.0])
     sink.log("path/tool", style)
     sink.columns("path/tool", est.time[::every], rr.Points3D.columns(positions=position))
 
 
 def _strip(sink: _Sink, path: str, coordinates: list[FloatArray], colour: str, radius: float) -> None:
-    points = np.column_stack(coordinates) * sink.scale
+    """Send a path; a negative radius is in points of the screen, right for a path of any size."""
+    points = _points(coordinates) * sink.scale
     points = points[np.isfinite(points).all(axis=1)]
     points = points[:: max(1, len(points) // _PATH_POINTS)]
-    line = rr.LineStrips3D([points], colors=[colours.rgb(colour)], radii=[radius * sink.scale])
+    line = rr.LineStrips3D([points], colors=[colours.rgb(colour)], radii=[radius])
     sink.log(path, line)
 
 
-def _band(sink: _Sink, path: str, time: FloatArray, centre: FloatArray, half: FloatArray, screen: Screen) -> None:
-    _series(sink, f"{path}/upper", styles.edge("+2σ"), time, centre + half, screen)
-    _series(sink, f"{path}/lower", styles.edge("−2σ"), time, centre - half, screen)
+def _points(coordinates: list[FloatArray]) -> FloatArray:
+    """Positions in space of two or three coordinates, (n, 3)."""
+    found = np.zeros((len(coordinates[0]), 3))
+    found[:, : len(coordinates)] = np.column_stack(coordinates)
+    return found
 
 
-def _series(sink: _Sink, path: str, style: styles.Style, time: FloatArray, value: FloatArray, screen: Screen) -> None:
-    """Send the style and the finite values [SI] of an entity; nothing where there are none."""
+def _estimate(
+    sink: _Sink, path: str, label: str, time: FloatArray, value: FloatArray, sd: FloatArray, screen: Screen
+) -> None:
+    """Send values [SI] with their variances."""
+    sink.log(path, styles.banded(label, screen.unit))
+    scale = screen.scale
+    sink.columns(path, time, rr.Measurements.columns(values=value * scale, variances=(sd * scale) ** 2))
+
+
+def _series(
+    sink: _Sink, path: str, style: styles.Style, time: FloatArray, value: FloatArray, screen: Screen | None = None
+) -> None:
+    """Send the style and the finite values of an entity, with a screen from SI; nothing where there are none."""
     there = np.isfinite(time) & np.isfinite(value)
     if there.any():
         sink.log(path, style)
-        sink.columns(path, time[there], rr.Scalars.columns(scalars=value[there] * screen.scale))
+        scale = 1.0 if screen is None else screen.scale
+        sink.columns(path, time[there], rr.Scalars.columns(scalars=value[there] * scale))
 
 
 def _blueprint(est: Estimates) -> rrb.Blueprint:
-    """A layout that opens on the busiest seconds: positions on the left, the path and innovations on the right."""
+    """A layout that opens on the busiest seconds: positions on the left; the path, residuals and outcomes right."""
     start, end = est.busiest(_OPENING_S)
-    bounds = [rrb.TimeRangeBoundary.absolute(seconds=edge) for edge in (start, end)]
-    legend = rrb.PlotLegend(rrb.Corner2D.RightTop)
-    positions, innovations = list[rrb.TimeSeriesView](), list[rrb.TimeSeriesView]()
-    for name, axis in est.axes.items():
-        screen = est.config.arm.screen_of(name)
-        opening = axis.position[(est.time >= start) & (est.time <= end)]
-        positions.append(
-            rrb.TimeSeriesView(
-                origin=f"/{name}",
-                name=f"{name} [{screen.unit}]",
-                plot_legend=legend,
-                axis_x=rrb.TimeAxis(view_range=rrb.TimeRange(*bounds)),
-                axis_y=rrb.ScalarAxis(range=_span(opening, screen)),
-            )
-        )
-        innovations.append(
-            rrb.TimeSeriesView(
-                origin=f"/innovation/{name}",
-                name=f"{name}: innovations and ±2σ [{screen.unit}]",
-                plot_legend=legend,
-                axis_y=rrb.ScalarAxis(range=_innovation_span(est, name)),
-            )
-        )
-    left, right = rrb.Vertical(*positions), rrb.Tabs(*innovations)
+    whole = float(est.time[0]), float(est.time[-1])
+    spans = {
+        name: _span(axis.position[(est.time >= start) & (est.time <= end)], est.config.arm.screen_of(name))
+        for name, axis in est.axes.items()
+    }
+    legend = _free_corner(est, start, end, spans)
+    positions, innovations, residuals = (list[rrb.TimeSeriesView]() for _ in range(3))
+    for name, span in spans.items():
+        unit, limit = est.config.arm.screen_of(name).unit, _residual_span(est, name)
+        corner = legend[1] if name == legend[0] else None
+        positions.append(_plot(f"/{name}", f"{name} [{unit}]", (start, end), span, corner))
+        if name not in _measured(est):
+            continue
+        title = f"{name}: innovation / its standard deviation, ±2"
+        innovations.append(_plot(f"/innovation/{name}", title, whole, (-5.0, 5.0)))
+        title = f"{name}: measurement − estimate [{unit}]"
+        residuals.append(_plot(f"/residual/{name}", title, whole, (-limit, limit)))
+    layout: rrb.Container = rrb.Grid(*positions, grid_columns=1 if len(positions) < _TWO_COLUMNS else 2)
+    right, shares = list[rrb.View | rrb.Container](), list[float]()
     if est.cartesian is not None or in_space(est.config.arm):
-        right = rrb.Vertical(rrb.Spatial3DView(origin="/path", name="path [mm]"), right)
-    return rrb.Blueprint(rrb.Horizontal(left, right, column_shares=[3, 2]), collapse_panels=True)
+        right.append(rrb.Spatial3DView(origin="/path", name="path [mm]"))
+        shares.append(3.0)
+    if innovations:
+        tabs = rrb.Tabs(rrb.Vertical(*innovations, name="innovations"), rrb.Vertical(*residuals, name="residuals"))
+        time = rrb.TimeAxis(view_range=_range(whole))
+        right += [tabs, rrb.StateTimelineView(origin="/outcome", name="outcomes", time_view=time)]
+        shares += [4.0, 0.6 + 0.4 * len(est.measurements.sensors)]
+    if right:
+        layout = rrb.Horizontal(layout, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2])
+    return rrb.Blueprint(layout, collapse_panels=True)
+
+
+def _plot(
+    origin: str,
+    name: str,
+    time: tuple[float, float],
+    span: tuple[float, float],
+    legend: rrb.Corner2D | None = None,
+) -> rrb.TimeSeriesView:
+    """A plot over a time [s], with its legend in a corner if there is one."""
+    return rrb.TimeSeriesView(
+        origin=origin,
+        name=name,
+        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+        axis_x=rrb.TimeAxis(view_range=_range(time)),
+        axis_y=rrb.ScalarAxis(range=span),
+    )
+
+
+def _range(time: tuple[float, float]) -> rrb.TimeRange:
+    return rrb.TimeRange(*(rrb.TimeRangeBoundary.absolute(seconds=edge) for edge in time))
+
+
+def _free_corner(
+    est: Estimates, start: float, end: float, spans: Mapping[str, tuple[float, float]]
+) -> tuple[str, rrb.Corner2D]:
+    """The axis and the corner of its plot in which a legend covers the least of the estimates."""
+    shown = (est.time >= start) & (est.time <= end)
+    across = (est.time[shown] - start) / max(end - start, 1e-9)
+
+    def covered(axis: str, corner: rrb.Corner2D) -> int:
+        low, high = spans[axis]
+        up = (est[axis].position[shown] * est.config.arm.screen_of(axis).scale - low) / (high - low)
+        beside = across > 1.0 - _LEGEND[0] if "Right" in corner.name else across < _LEGEND[0]
+        level = up > 1.0 - _LEGEND[1] if "Top" in corner.name else up < _LEGEND[1]
+        return int(np.count_nonzero(beside & level))
+
+    corners = (rrb.Corner2D.RightTop, rrb.Corner2D.LeftTop, rrb.Corner2D.RightBottom, rrb.Corner2D.LeftBottom)
+    return min(product(spans, corners), key=lambda one: covered(*one))
 
 
 def _span(position: FloatArray, screen: Screen) -> tuple[float, float]:
@@ -206,9 +313,8 @@ def _span(position: FloatArray, screen: Screen) -> tuple[float, float]:
     return low - margin, high + margin
 
 
-def _innovation_span(est: Estimates, axis: str) -> tuple[float, float]:
-    """Limits of an innovation plot, in the unit of the screen: they show the band and leave out far outliers."""
-    mine = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
-    known = mine.innovation_sd[np.isfinite(mine.innovation_sd)]
-    limit = 6.0 * float(np.median(known)) * est.config.arm.screen_of(axis).scale if len(known) else 1.0
-    return -limit, limit
+def _residual_span(est: Estimates, axis: str) -> float:
+    """The limit of a plot of measurements less the estimate, in the unit of the screen: far outliers are left out."""
+    sds = [est.measurements.of(sensor, axis).innovation_sd for sensor in est.measurements.sensors]
+    known = [float(np.median(one[np.isfinite(one)])) for one in sds if np.isfinite(one).any()]
+    return 4.0 * max(known, default=1e-3) * est.config.arm.screen_of(axis).scale

@@ -1,10 +1,9 @@
-"""Styles of Rerun entities, and sending of their values; recordings and the live view share them."""
+"""Styles and the timeline of Rerun entities, which recordings and the live view share."""
 
 from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
-import numpy as np
 import rerun as rr
 
 from ..arrays import FloatArray
@@ -12,7 +11,7 @@ from . import colours
 
 TIMELINE = "time"
 Marker = Literal["Circle", "Cross"]
-Style: TypeAlias = rr.SeriesLines | rr.SeriesPoints
+Style: TypeAlias = rr.SeriesLines | rr.SeriesPoints | rr.Measurements
 
 
 def line(colour: str, label: str, *, width: float = 1.5, step: bool = False) -> rr.SeriesLines:
@@ -26,6 +25,11 @@ def edge(label: str) -> rr.SeriesLines:
     return line(colours.BAND, label, width=0.7)
 
 
+def banded(label: str, unit: str) -> rr.Measurements:
+    """A line with a translucent band of a standard deviation each way."""
+    return rr.Measurements.from_fields(colors=[colours.rgb(colours.ESTIMATE)], widths=[1.8], names=label, units=unit)
+
+
 def points(colour: str, label: str, marker: Marker = "Circle") -> rr.SeriesPoints:
     """Points; crosses are larger."""
     size = 3.0 if marker == "Cross" else 1.2
@@ -35,17 +39,3 @@ def points(colour: str, label: str, marker: Marker = "Circle") -> rr.SeriesPoint
 def timeline(time: FloatArray) -> list[rr.TimeColumn]:
     """The timeline of seconds since the first command, (n,)."""
     return [rr.TimeColumn(TIMELINE, duration=time)]
-
-
-def send(stream: rr.RecordingStream, path: str, time: FloatArray, value: FloatArray) -> None:
-    """Send the finite values of a series.
-
-    Args:
-        stream: Where to.
-        path: The entity.
-        time: [s], (n,).
-        value: In the unit of the screen, so positions in mm, (n,).
-    """
-    there = np.isfinite(time) & np.isfinite(value)
-    if there.any():
-        rr.send_columns(path, timeline(time[there]), rr.Scalars.columns(scalars=value[there]), recording=stream)
