@@ -3,7 +3,7 @@
     python benchmarks/real.py [--servo DIR [--write]]
 
 Everything is tuned on one recording and scored on another, at the instants of the reference; in brackets the share of
-errors within 95 % bars, in %. All but the last table is for docs/generic-filters.md, which is the README's: ``--write``
+errors within 95 % bars, in %. All but the last table is for docs/comparison.md, which is the README's: ``--write``
 puts them there.
 """
 
@@ -240,7 +240,7 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--servo", type=Path, metavar="DIR", help="recordings of a real servo, not in this repository")
-    parser.add_argument("--write", action="store_true", help="put it into README.md and docs/generic-filters.md")
+    parser.add_argument("--write", action="store_true", help="put it into README.md and docs/comparison.md")
     given = parser.parse_args()
     if given.write and given.servo is None:
         parser.error("the pages have the servo, too: --servo DIR")
@@ -251,7 +251,7 @@ def main() -> None:
     compared = f"{table(['recording', 'axis', 'mode', *METHODS], lines, 3)}\n\n{listed}"
     print(compared, readme(rows), sep="\n\n")
     if given.write:
-        put(REPOSITORY / "docs" / "generic-filters.md", compared)
+        put(REPOSITORY / "docs" / "comparison.md", compared)
         put(REPOSITORY / "README.md", readme(rows))
 
 

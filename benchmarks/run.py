@@ -109,7 +109,7 @@ def machine() -> str:
 
 
 def markdown(rows: list[Row]) -> str:
-    """The tables of docs/benchmarks.md."""
+    """The tables of docs/comparison.md."""
     lines = [machine()]
     for job in dict.fromkeys(row["job"] for row in rows):
         found = [cells(row) for row in rows if row["job"] == job]
@@ -129,7 +129,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="calls in each process")
     parser.add_argument("--rounds", type=int, default=1, help="processes of each case")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all numbers there")
-    parser.add_argument("--markdown", action="store_true", help="print the tables of docs/benchmarks.md")
+    parser.add_argument("--markdown", action="store_true", help="print the tables of docs/comparison.md")
     given = parser.parse_args()
     seen: Any = sys.stderr if given.markdown else sys.stdout
     print(f"{machine()}\n{'':<48}" + "".join(f"{name:>15}" for name in HEAD[1:]), file=seen, flush=True)

@@ -1,4 +1,4 @@
-"""The pictures and the numbers of the README, made anew from the shipped data: ``python docs/pictures.py``.
+"""The pictures of README and documentation, made anew from the shipped data: ``python docs/pictures.py``.
 
 Side by side, with the camera alone: its raw measurements, the measurements interpolated, a constant-velocity Kalman
 filter tuned by maximum likelihood, and pumafuse. All have the camera's latency removed; errors are those on the
@@ -115,6 +115,39 @@ def stretch(axes, est, methods, reference):
     axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper right")
 
 
+def lateness() -> None:
+    """The four ways of being late, at constant velocity: the glossary's drawing."""
+    period, dead, tau, latency = 40.0, 60.0, 55.0, 70.0  # ms
+    time, level = np.linspace(0.0, 420.0, 2000), 3.5
+    figure, axes = plt.subplots(figsize=(9.0, 4.0), layout="constrained")
+    axes.plot(time, time / period, "--", color=COLOURS[0], lw=1.2, label="the path through the commanded points")
+    axes.plot(time, np.floor(time / period), color=COLOURS[1], lw=1.5, label="commands, held")
+    axes.plot(time, (time - period / 2) / period, color=COLOURS[1], lw=0.7)
+    late = period / 2 + dead + tau
+    axes.plot(time, (time - late) / period, color=colours.ESTIMATE, lw=2.0, label="the arm")
+    begin, edges = level * period, np.cumsum([0.0, period / 2, dead, tau])
+    names = ["T/2", "dead time (delay)", "plant"]
+    for name, start, end in zip(names, edges[:-1], edges[1:], strict=True):
+        between(axes, begin + start, begin + end, level, name, COLOURS[1])
+    between(axes, begin + period / 2, begin + late, level - 0.75, "lag", colours.ESTIMATE)
+    valid = begin + late + 45.0
+    seen = (valid - late) / period
+    axes.plot(valid, seen, "o", color=COLOURS[2], label="what a sensor sees, and when it is stamped")
+    axes.plot(valid + latency, seen, "s", color=COLOURS[2])
+    between(axes, valid, valid + latency, seen, "latency", COLOURS[2])
+    axes.set(xlim=(100.0, 420.0), ylim=(1.6, 7.2), xlabel="time", ylabel="position", xticks=[], yticks=[])
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=9, loc="upper left")
+    figure.savefig(HERE / "images" / "lag.svg", metadata={"Date": None})
+
+
+def between(axes, start, end, level, name, colour):
+    """An arrow from one instant to another with its name above."""
+    arrow = {"arrowstyle": "<->", "color": colour, "shrinkA": 0.0, "shrinkB": 0.0}
+    axes.annotate("", (end, level), (start, level), arrowprops=arrow)
+    axes.text((start + end) / 2, level + 0.08, name, ha="center", va="bottom", fontsize=9, color=colour)
+
+
 def main() -> None:
     """Write the pictures and print the numbers of the comparison."""
     warnings.simplefilter("ignore", pf.PumafuseWarning)
@@ -133,6 +166,7 @@ def main() -> None:
     trials = pf.StepTrials.read(DATA / "steps")
     picture = step_figures.responses(pf.identify(trials), trials)
     (HERE / "images" / "steps.svg").write_text(picture, encoding="utf-8")
+    lateness()
 
 
 if __name__ == "__main__":

@@ -111,7 +111,7 @@ def test_the_arm_is_ready_for_use(found: Latency) -> None:
 
 
 def test_a_drift_of_the_lag_is_named() -> None:
-    """20 ms over the run of steps: later, and by several ms; plant and noise explain some of it (docs/limits.md)."""
+    """20 ms over the run of steps: later, and by several ms; plant and noise explain some of it (docs/symptoms.md)."""
     axis = pf.latency(recorded("steps", drift=0.02)).details.axes["x"]
     assert axis.drifts
     assert axis.drift is not None

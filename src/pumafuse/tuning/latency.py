@@ -61,7 +61,7 @@ from .posterior import (
 )
 
 REFERENCE = "reference"  # the name of a run's reference among its sensors
-_MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/benchmarks.md
+_MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/comparison.md
 _FINEST = 2e-5  # s: no stamp of a log is better, whatever the likelihood says where measurements pass commands
 _ROUGHLY = 0.1  # tolerance in log-likelihood
 _GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
