@@ -156,8 +156,8 @@ def test_the_order_of_a_plant_is_its_own(seed: int, begin: tuple[int, int]) -> N
     assert second.damping == pytest.approx(0.864, rel=0.2)
     assert first.time_constant == pytest.approx(0.0356, rel=0.2)
     for axis, word, sign in zip(AXES, ("second", "first"), (1.0, -1.0), strict=True):
-        assert found.orders[axis].startswith(f"{word} order: ")
-        gain, ahead = map(float, re.findall(r"[-+]?\d+\.\d", found.orders[axis].partition(";")[0]))
+        assert found.orders[axis].startswith(f"order: {word} (second ")
+        ahead, gain = map(float, re.findall(r"[-+]?\d+\.\d", found.orders[axis].partition(";")[0]))
         count = found.likelihood.count[found.likelihood.axes.index(axis)]
         assert gain - ahead == pytest.approx(0.5 * np.log(count), abs=0.11)
         assert sign * ahead > 0.0

@@ -149,7 +149,7 @@ def test_noise_that_is_correlated_for_ten_milliseconds_is_no_disturbance() -> No
     run = pf.Run.from_arrays(time, {"tip": command}, {"camera": (time, {"tip": path + noise + white})})
     found, process = fitted(run, with_sensors(config, sd=1e-4))
     assert process.disturbance_sd == 0.0
-    assert "disturbance: none; one would be forgotten within 40 ms, too soon for an arm" in found.orders["tip"]
+    assert "disturbance: none (one would be forgotten within 40 ms, too soon for an arm)" in found.orders["tip"]
 
 
 # ---- gains and scales -----------------------------------------------------------------------------------------------

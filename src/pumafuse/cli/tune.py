@@ -98,7 +98,7 @@ def _show(summary: TuningSummary, period: float) -> None:
     out.print(_parameters(summary))
     if summary.lags:
         typer.echo(formatting.lag(period))
-    lines = [f"{axis}: {why}" for axis, why in summary.orders.items()] + summary.not_identifiable
+    lines = [*formatting.chosen(summary.orders), *summary.not_identifiable]
     lines += [formatting.together(pair) for pair in summary.correlations]
     for one in summary.biases:
         off = f"{interval(one.bias, one.sd, one.kind)} {SCREEN[one.kind].unit}"

@@ -152,12 +152,11 @@ def most_likely_models(
         reasons[axis] = dict(found[chosen][1].get(axis, {}))
         if len(found) > 1 and axis in likelihood.sensors:
             gain = max(mine[1:]) - mine[0]
-            why = f"one gains {gain:+.1f} after the penalty (BIC)"
+            why = f"(one {gain:+.1f})"
             if np.isinf(gain):
-                why = (
-                    f"one would be forgotten within {1e3 * quickest(peaks[chosen].config):.0f} ms, too soon for an arm"
-                )
-            reasons[axis]["disturbance"] = f"disturbance: {_DISTURBANCES[chosen]}; {why}"
+                soon = 1e3 * quickest(peaks[chosen].config)
+                why = f"(one would be forgotten within {soon:.0f} ms, too soon for an arm)"
+            reasons[axis]["disturbance"] = f"disturbance: {_DISTURBANCES[chosen]} {why}"
     return _best_by_axis(likelihood, peaks, scores), reasons
 
 
@@ -330,11 +329,8 @@ def _orders(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: 
     for number, axis in enumerate(likelihood.axes):
         if axis in whole:
             ahead = float(scores[0][number] - scores[1][number])
-            order = (
-                f"{'second' if ahead >= 0.0 else 'first'} order: second gains {gained[number]:.1f} in log-likelihood,"
-                f" {ahead:+.1f} after the penalty for numbers (BIC)"
-            )
-            reasons[axis] = {"order": order}
+            order = f"order: {'second' if ahead >= 0.0 else 'first'}"
+            reasons[axis] = {"order": f"{order} (second {ahead:+.1f}, before its penalty {gained[number]:+.1f})"}
     return _best_by_axis(likelihood, pair, scores), reasons
 
 
@@ -393,8 +389,7 @@ def _with_one_delay(
         shares, peak = [], point(likelihood, config, free(config))
     reasons = {
         axis: {
-            "delay": f"delay: {'shared' if axis in shares else 'its own'}"
-            + ("" if whatever else f"; an own one gains {gain:+.1f} after the penalty")
+            "delay": f"delay: {'shared' if axis in shares else 'its own'}" + ("" if whatever else f" (own {gain:+.1f})")
         }
         for axis, gain in gains.items()
     }
@@ -429,7 +424,7 @@ def _kinds_of_gain(likelihood: Likelihood, peaks: Sequence[Point], scores: Seque
         if len(best) > 1:
             ahead = best[True] - best[False]
             kind = "recovering" if ahead > 0.0 else "constant"
-            found[axis] = f"gain: {kind}; a recovering one gains {ahead:+.1f} after the penalty (BIC)"
+            found[axis] = f"gain: {kind} (recovering {ahead:+.1f})"
     return found
 
 

@@ -113,7 +113,8 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
         biases: Of the sensors that have one to estimate.
         correlations: Pairs beyond ± 0.9.
         not_identifiable: Combinations that the measurements do not determine, a sentence each.
-        orders: The reasons for the order of each axis's plant, for its gain and for its disturbance, where chosen.
+        orders: What was chosen for each axis: the order of its plant, its gain, its disturbance, its delay; in brackets
+            what the alternative gains in log-likelihood less the penalty for its numbers (BIC).
         validation: Before and after on what was validated on; null where nothing was.
         worse: Whether any axis got worse there.
         notes: Everything noticed, a sentence each.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,6 +47,14 @@ def lag(period: float) -> str:
         "lag: behind the held command at constant velocity (dead time, plant and a gain that recovers); behind the path"
         f" through the commanded points it is T/2 = {0.5 * period * MS:g} ms more"
     )
+
+
+def chosen(orders: Mapping[str, str]) -> list[str]:
+    """What was chosen for each axis, a line each, below one that says what the numbers are; none for none."""
+    head = (
+        "chosen, and in brackets what the alternative gains in log-likelihood less the penalty for its numbers (BIC):"
+    )
+    return [head, *(f"{axis}: {why}" for axis, why in orders.items())] if orders else []
 
 
 def p_value(value: float | None) -> str:

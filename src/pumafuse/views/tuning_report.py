@@ -122,8 +122,7 @@ def _axis(summary: TuningSummary, axis: str) -> Mapping[str, Any]:
 
 def _notes(summary: TuningSummary) -> list[str]:
     together = [formatting.together(pair) for pair in summary.correlations]
-    orders = [f"{axis}: {why}" for axis, why in summary.orders.items()]
-    return [*summary.notes, *summary.not_identifiable, *together, *orders]
+    return [*summary.notes, *summary.not_identifiable, *together, *formatting.chosen(summary.orders)]
 
 
 def _parameter(one: Fitted, interrupted: bool) -> Mapping[str, Any]:
