@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from .identification.identify import CombinedAxis, Identification, TrialResult, identify
     from .identification.plan import Design, Plan, PlannedTrial, plan
     from .identification.trials import StepTrials, Trial, TrialsError
-    from .identification.verify import AxisVerification, BestInClass, Trace, verify
+    from .identification.verify import AxisVerification, BestInClass, ModelFit, Trace, verify
     from .live.estimator import LiveEstimator
     from .live.results import AxisNow, Health, LiveEstimate, SensorHealth, UpdateResult
     from .logs.frames import Cylindrical, Rotated
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from .simulation.scenario import Scenario
     from .simulation.simulate import Simulated, simulate
     from .tuning.identifiability import TuneError
+    from .tuning.intervals import Profile
     from .tuning.latency import AxisLag, Latency, LatencySummary, PartLag, SensorLag, latency
     from .tuning.summary import Fitted, FittedLag, TuningSummary
     from .tuning.tune import Tuning, tune
@@ -49,7 +50,7 @@ _NAMES = {
     "identification.identify": ["CombinedAxis", "Identification", "TrialResult", "identify"],
     "identification.plan": ["Design", "Plan", "PlannedTrial", "plan"],
     "identification.trials": ["StepTrials", "Trial", "TrialsError"],
-    "identification.verify": ["AxisVerification", "BestInClass", "Trace", "verify"],
+    "identification.verify": ["AxisVerification", "BestInClass", "ModelFit", "Trace", "verify"],
     "live.estimator": ["LiveEstimator"],
     "live.results": ["AxisNow", "Health", "LiveEstimate", "SensorHealth", "UpdateResult"],
     "logs.frames": ["Cylindrical", "Rotated"],
@@ -60,6 +61,7 @@ _NAMES = {
     "simulation.scenario": ["Scenario"],
     "simulation.simulate": ["Simulated", "simulate"],
     "tuning.identifiability": ["TuneError"],
+    "tuning.intervals": ["Profile"],
     "tuning.latency": ["AxisLag", "Latency", "LatencySummary", "PartLag", "SensorLag", "latency"],
     "tuning.summary": ["Fitted", "FittedLag", "TuningSummary"],
     "tuning.tune": ["Tuning", "tune"],
@@ -72,13 +74,13 @@ __all__ = [
     "ArmModel", "AxisEstimate", "AxisLag", "AxisModel", "AxisNow", "AxisSummary", "AxisVerification", "BestInClass",
     "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "FirstOrder",
     "Fitted", "FittedLag", "FusionConfig", "Gain", "Health", "Identification", "Latency", "LatencySummary",
-    "LiveEstimate", "LiveEstimator", "Measurements", "Outcome", "PartLag", "Plan", "PlannedTrial", "Process",
-    "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Rotated", "Run", "RunError", "Scenario", "Score",
-    "ScoreSummary", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag", "SensorSummary", "Simulated",
-    "Skill", "Source", "Start", "StepTrials", "Summary", "Trace", "Trial", "TrialResult", "TrialsError",
-    "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary",
-    "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency", "plan", "score", "simulate",
-    "summarise", "to_rerun", "tune", "validation_figure", "verify",
+    "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "Outcome", "PartLag", "Plan", "PlannedTrial",
+    "Process", "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Rotated", "Run", "RunError",
+    "Scenario", "Score", "ScoreSummary", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag",
+    "SensorSummary", "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary", "Trace", "Trial",
+    "TrialResult", "TrialsError", "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult",
+    "Validity", "ValiditySummary", "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency",
+    "plan", "score", "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
 ]  # fmt: skip
 
 

@@ -19,7 +19,7 @@ import pytest
 import pumafuse as pf
 from pumafuse import toml
 from pumafuse.arrays import FloatArray
-from pumafuse.identification.best_in_class import Fit
+from pumafuse.identification.best_in_class import ModelFit
 from pumafuse.identification.verify import Trace
 from pumafuse.logs.frames import Rotated
 from pumafuse.model.plants import PLANTS
@@ -121,7 +121,7 @@ def test_the_numbers_are_what_their_names_say() -> None:
     ((found, trace),) = pf.verify(run_of(measured), model)
     left = (measured - measured.mean()) - (modelled - modelled.mean())
     rms = np.sqrt(np.mean(left**2))
-    expected = Fit(
+    expected = ModelFit(
         rms=rms,
         percent=100.0 * rms / (HIGH - LOW),
         fit=100.0 * (1.0 - np.linalg.norm(left) / np.linalg.norm(measured - measured.mean())),

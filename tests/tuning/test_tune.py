@@ -18,13 +18,13 @@ import pytest
 import pumafuse as pf
 from pumafuse.logs.run import Source
 from pumafuse.tuning.likelihood import Likelihood
-from pumafuse.tuning.maximise import Point
 from pumafuse.tuning.parameters import Fit, with_order
 from pumafuse.tuning.summary import TuningSummary
 from pumafuse.tuning.tune import Pipeline, plans
 from pumafuse.tuning.validation import check
 from tuning_runs import (
     fitted,
+    free_of,
     later,
     outage,
     quietly,
@@ -77,8 +77,7 @@ def test_the_result_is_likelier_and_reports_by_how_much() -> None:
         assert [getattr(reported[axis], name) for axis in AXES] == pytest.approx(axes.tolist(), rel=1e-9)
         assert [reported[axis].components for axis in AXES] == likelihood.count.tolist()
     assert total(run, found.config) > total(run, found.before) + 200.0
-    keys = {one.key: one for stage in found.stages for one in stage.free}
-    assert keys.keys() == fitted(found).keys()
+    keys = {one.key: one for one in free_of(Likelihood([run], found.config), found.config, ARM)}
     for key, one in fitted(found).items():
         known = keys[key].given(found.before)
         assert one.before == (None if known is None else pytest.approx(known / keys[key].unit))
@@ -238,8 +237,10 @@ def test_the_arm_is_fitted_on_the_trusted_sensor_and_the_others_after_it() -> No
     assert low is not None and high is not None and low < 45.0 < high
     for axis in AXES:
         assert found.config.sensors["vision"].sd_of(axis) == pytest.approx(5e-4, rel=0.2)
-    second = {one.key for one in found.stages[1].free}
-    assert second == {"sensors.vision.latency_ms", *(f"sensors.vision.sd_mm.{axis}" for axis in AXES)}
+    assert {key for key in fitted(found) if "vision" in key} == {
+        "sensors.vision.latency_ms",
+        *(f"sensors.vision.sd_mm.{axis}" for axis in AXES),
+    }
     assert found.details.trusted == "tracker"
 
 
@@ -250,10 +251,10 @@ class Stop:
     """Ctrl-C at the n-th call of the progress; with all calls until then."""
 
     def __init__(self, at: int) -> None:
-        self.at, self.calls = at, list[tuple[str, Point]]()
+        self.at, self.calls = at, list[tuple[str, float]]()
 
-    def __call__(self, what: str, point: Point) -> None:
-        self.calls.append((what, point))
+    def __call__(self, what: str, log_likelihood: float) -> None:
+        self.calls.append((what, log_likelihood))
         if len(self.calls) == self.at:
             raise KeyboardInterrupt
 

@@ -15,7 +15,6 @@ from .. import folders
 from ..errors import ConfigError
 from ..fusion.config import FusionConfig
 from ..logs.run import Run
-from ..tuning.maximise import Point
 from ..tuning.parameters import kinds_of
 from ..tuning.summary import TuningSummary
 from ..tuning.tune import tune
@@ -60,8 +59,8 @@ def run(
     other = None if validate is None else Run.read(validate)
     with Console(stderr=True).status("preparing") as status:
 
-        def progress(what: str, at: Point) -> None:
-            status.update(f"{what}: log-likelihood {at.log_likelihood:.1f} (Ctrl-C keeps the best so far)")
+        def progress(what: str, log_likelihood: float) -> None:
+            status.update(f"{what}: log-likelihood {log_likelihood:.1f} (Ctrl-C keeps the best so far)")
 
         found = tune(
             runs,

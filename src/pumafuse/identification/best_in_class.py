@@ -24,7 +24,7 @@ _STEP = 1e-4  # of the derivatives for the lag's interval
 _BOUNDS = -12.0, 6.0  # of √Td, log q and log √p
 
 
-class Fit(msgspec.Struct, frozen=True, kw_only=True):
+class ModelFit(msgspec.Struct, frozen=True, kw_only=True):
     """Error of a simulated position against the measured one.
 
     Attributes:
@@ -50,7 +50,7 @@ class BestInClass(msgspec.Struct, frozen=True, kw_only=True):
         plant: Of unit gain.
     """
 
-    fit: Fit
+    fit: ModelFit
     lag: float = msgspec.field(name="lag_ms")
     lag_ci95: Interval = msgspec.field(name="lag_ms_ci95")
     delay: float = msgspec.field(name="delay_ms")
@@ -88,10 +88,10 @@ class Measured:
         kept = np.abs(jump) <= _SPIKE * max(float(median_abs_deviation(residual, scale="normal")), 1e-9)
         return replace(self, time=self.time[kept], position=self.position[kept])
 
-    def fit(self, modelled: FloatArray, amplitude: float) -> Fit:
+    def fit(self, modelled: FloatArray, amplitude: float) -> ModelFit:
         """Error of ``modelled`` (n,) without its mean, beside the ``amplitude`` of the commands [both m or rad]."""
         rms, signal = float(np.std(self.position - modelled)), float(np.std(self.position))
-        return Fit(
+        return ModelFit(
             rms=rms,
             percent=100.0 * rms / amplitude if amplitude > 0.0 else np.inf,
             fit=100.0 * (1.0 - rms / signal) if signal > 0.0 else -np.inf,

@@ -24,7 +24,7 @@ from ..logs.clock import segments
 from ..logs.run import Run
 from ..model.arm import ArmModel, AxisModel
 from ..units import Kind
-from .best_in_class import BestInClass, Commands, Fit, Measured, best_in_class
+from .best_in_class import BestInClass, Commands, Measured, ModelFit, best_in_class
 
 RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
 REFERENCE = "reference"
@@ -70,9 +70,9 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
     amplitude: float = msgspec.field(name="amplitude_mm")
     start: float = msgspec.field(name="start_mm")
     start_from: str
-    model: Fit
-    without_recovery: Fit
-    with_recovery: Fit
+    model: ModelFit
+    without_recovery: ModelFit
+    with_recovery: ModelFit
     recovery: float = msgspec.field(name="recovery_ms")
     best_in_class: BestInClass
     outlying: int
@@ -187,7 +187,7 @@ def _verified(
     measured = measured.without_spikes(command.moved(model, delay, start, measured.time))
     modelled = command.moved(model, delay, start, measured.time)
 
-    def fitted(gain_recovery: float | None) -> Fit:
+    def fitted(gain_recovery: float | None) -> ModelFit:
         other = msgspec.structs.replace(model, gain_recovery=gain_recovery)
         return measured.fit(command.moved(other, delay, start, measured.time), command.amplitude)
 
@@ -234,7 +234,7 @@ def _start(
     return float(levels[np.argmin(rms)]), f"chosen among the run's {len(levels)} levels by RMS"
 
 
-def _verdict(model: Fit, lag: float, best: BestInClass) -> str:
+def _verdict(model: ModelFit, lag: float, best: BestInClass) -> str:
     """The model's error beside that of the best of its order, and where the two differ; lag [s]."""
     if max(best.fit.fit, model.fit) < _HOLDS:
         return "no linear model of this order fits: look at the log"
@@ -250,7 +250,7 @@ def _verdict(model: Fit, lag: float, best: BestInClass) -> str:
     )
 
 
-def _recovers(model: Fit, recovering: Fit, recovery: float, kind: Kind) -> str:
+def _recovers(model: ModelFit, recovering: ModelFit, recovery: float, kind: Kind) -> str:
     if recovering.rms > _BETTER * model.rms:
         return ""
     left = f"{recovering.rms * units.SCREEN[kind].scale:.3g} {units.SCREEN[kind].unit}"

@@ -27,7 +27,7 @@ from .validation import Check, check
 _FITTED_ON = 2.0 / 3.0  # of a single run; the rest is for validation
 _NOTHING = 0.01  # log-likelihood by which the configuration as given must be ahead to be kept
 
-Progress: TypeAlias = Callable[[str, Point], None]
+Progress: TypeAlias = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, repr=False)
@@ -38,14 +38,12 @@ class Tuning:
         config: The tuned configuration, ready for :func:`pumafuse.fuse`.
         before: The configuration as given.
         details: What ``tuning.json`` holds, in the units of files.
-        stages: The stages of the fit: one, or two with a trusted sensor; none if it is the configuration as given.
         profiles: The likelihood along each parameter that has an interval.
     """
 
     config: FusionConfig
     before: FusionConfig
     details: TuningSummary
-    stages: Sequence[Stage]
     profiles: Sequence[Profile]
 
     def __repr__(self) -> str:
@@ -97,7 +95,7 @@ def tune(
             standard deviation); else the measurements alone decide, which may be too few to.
         share: ``delay``: all axes share one whatever the measurements say. Else those share one to which an own one is
             not worth its number (Bayesian information criterion).
-        progress: Called with what is being done and the best point so far.
+        progress: Called with what is being done and the best log-likelihood so far.
 
     Returns:
         The tuned configuration and how sure it is. Interrupted by Ctrl-C, the best until then.
@@ -137,7 +135,7 @@ def tune(
         if validate is not None:
             validation = check(validate, config, pipeline.result())
         for stage in pipeline.stages:
-            progress("computing intervals", stage.best)
+            progress("computing intervals", stage.best.log_likelihood)
             around |= lag_intervals(stage.likelihood, stage.best, stage.free)
             intervals |= confidence_intervals(stage.likelihood, stage.best, stage.free)
     except KeyboardInterrupt:
@@ -179,7 +177,7 @@ def tune(
     )
     for note in summary.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=2)
-    return Tuning(tuned, config, summary, tuple(stages), [one.profile for one in intervals.values()])
+    return Tuning(tuned, config, summary, [one.profile for one in intervals.values()])
 
 
 def plans(
@@ -236,7 +234,7 @@ class Pipeline:
         def notify(found: Point) -> None:
             if not again:
                 self.best, self.stages = found.config, stages
-            self.progress("fitting on the whole run" if again else "searching", found)
+            self.progress("fitting on the whole run" if again else "searching", found.log_likelihood)
 
         for plan in self.plans:
             stages.append(run_stage(self.runs, config, plan, until, notify))
