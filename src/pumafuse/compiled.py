@@ -18,6 +18,10 @@ if TYPE_CHECKING:
         """A function compiled to machine code once, for all kernels that call it. Not to be called from Python."""
         ...
 
+    def inlined(function: Callable[P, R]) -> Callable[P, R]:
+        """A function that stands, before anything is compiled, in the place of its only call. Not for Python."""
+        ...
+
     def kernel(function: Callable[P, R]) -> Callable[P, R]:
         """A function compiled to machine code that is called from Python."""
         ...
@@ -46,6 +50,7 @@ else:
     _OPTIONS = {"cache": _KEPT, "nogil": True, "error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
     compiled = numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)
     compiled_apart = numba.njit(no_cpython_wrapper=True, **_OPTIONS)
+    inlined = numba.njit(inline="always", no_cpython_wrapper=True, **_OPTIONS)
     kernel = numba.njit(**_OPTIONS)
     _HOW_OFTEN = (
         "once for each part of it (some 10 s)"

@@ -13,7 +13,7 @@ import pumafuse as pf
 from pumafuse.arrays import CodeArray, FloatArray, TimeArray
 from pumafuse.filter.axis import Model, Sensors, State
 from pumafuse.filter.events import COMMAND, Events, Results, joined
-from pumafuse.filter.forward import Output, filter_events, no_history
+from pumafuse.filter.forward import ALL_THERE, Filter, Output, filter_events, no_history
 from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.engine import arranged, biased_sensors
 from pumafuse.fusion.segments import Segment, build
@@ -75,10 +75,9 @@ class Pass:
         )
         if outcome is not None:
             results.outcome[:] = outcome
-        history, arrived = no_history(len(AXES), self.state.x.shape[1]), np.zeros(0, dtype=np.bool_)
-        given, known = outcome is not None, (self.model, self.sensors, events, self.state)
-        none = np.zeros(0, dtype=np.int64)
-        filter_events(*known, given, none, none, times, results, history, arrived, 0, outputs)
+        count, history = len(events.time), no_history(len(AXES), self.state.x.shape[1])
+        arrays = Filter(self.model, self.sensors, events, self.state, results, history).flat()
+        filter_events(arrays, outcome is not None, 0, count, count, *ALL_THERE, 0, times, outputs)
         self.results.append(results)
         self.outputs.append(outputs)
 
@@ -136,8 +135,8 @@ def test_late_events_end_as_events_in_time(seed: int) -> None:
     results, outputs = Results.room(count, 2), np.zeros((len(Output), 2, len(times)))
     arrived, history = np.zeros(count, dtype=np.bool_), no_history(len(AXES), live.state.x.shape[1])
     queue = np.argsort(arrival, kind="stable")
-    known = live.model, live.sensors, events, live.state
-    filter_events(*known, False, arrival, queue, times, results, history, arrived, count + 1, outputs)
+    arrays = Filter(live.model, live.sensors, events, live.state, results, history).flat()
+    filter_events(arrays, False, 0, count, count, arrival, queue, arrived, count + 1, times, outputs)
     live.results.append(results)
     live.outputs.append(outputs[:, :, -1:])
     whole.run(events, times[-1:])

@@ -17,7 +17,7 @@ from fusion_oracle import AxisOracle, check_estimates, check_innovations, nanose
 from pumafuse.errors import PumafuseWarning
 from pumafuse.filter.axis import Model, Sensors, State
 from pumafuse.filter.events import Events, Results
-from pumafuse.filter.forward import Output, filter_events, no_history
+from pumafuse.filter.forward import ALL_THERE, NO_ESTIMATES, Filter, filter_events, no_history
 from pumafuse.filter.outcome import Outcome
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.engine import arranged, biased_sensors
@@ -340,10 +340,9 @@ def arranged_for(case: Case) -> tuple[Model, Sensors, State, Events]:
 
 def filtered(model: Model, sensors: Sensors, state: State, events: Events) -> None:
     """The state after the events."""
-    none, results = np.zeros(0, dtype=np.int64), Results.room(len(events.time), 1)
-    outputs, arrived = np.empty((len(Output), 1, 0)), np.zeros(0, dtype=np.bool_)
-    history = no_history(1, state.x.shape[1])
-    filter_events(model, sensors, events, state, False, none, none, none, results, history, arrived, 0, outputs)
+    count = len(events.time)
+    arrays = Filter(model, sensors, events, state, Results.room(count, 1), no_history(1, state.x.shape[1])).flat()
+    filter_events(arrays, False, 0, count, count, *ALL_THERE, 0, *NO_ESTIMATES)
 
 
 @pytest.mark.parametrize("plant", [LAG, UNDER])

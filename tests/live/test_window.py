@@ -32,7 +32,7 @@ def run_of(seconds: float, command_hz: float, measurement_hz: float) -> pf.Run:
 
 def rows(live: pf.LiveEstimator) -> int:
     """How many events the window has room for."""
-    return len(live._window.memory.events.time)
+    return len(live._window.memory.filter.events.time)
 
 
 def held(live: pf.LiveEstimator) -> int:

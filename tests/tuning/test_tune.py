@@ -294,7 +294,7 @@ def test_interrupted_it_gives_the_best_so_far(share: float, trust: str | None, t
         total(sim.run, found.config), abs=1e-6
     )
     if stop.calls[-1][0] == "computing intervals":
-        assert total(sim.run, found.config) == pytest.approx(stop.calls[-1][1].log_likelihood, abs=0.05)
+        assert total(sim.run, found.config) == pytest.approx(stop.calls[-1][1], abs=0.05)
 
 
 def test_what_is_as_likely_at_first_is_kept() -> None:

@@ -11,38 +11,38 @@ that fuses a recorded run. Commands that act later than the newest measurement w
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import ALWAYS, NEVER, BoolArray, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
+from ..arrays import ALWAYS, NEVER, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
 from ..compiled import compiled, compiled_apart, kernel
 from .axis import PERIOD, START, STEP, Model, Sensors, State, U, copy_rows
 from .counters import Counters, count_duplicate, count_rows, forget_after
 from .events import COMMAND, DUPLICATE, FUSED, Events, Results, classify, repeats_earlier
-from .forward import NO, ONE, ZERO, History, Output, checkpoint_of, estimate, run_events
-from .gate import FUSED_AT
+from .forward import ALL_THERE, NO_TIMES, ONE, ZERO, Filter, Flat, Output, checkpoint_of, filter_events
+from .gate import FUSED_AT, NOBODY
 from .outcome import ABSENT, Outcome
 
 MOST_ROWS = 65_536  # events; what is more shortens the window
 FIRST_ROWS = 4096  # at first
-BEGIN, END, DONE, RUN, ORIGIN, CONTRADICTS = range(6)  # of a window's span
-FIRST, DELAY, LAST_FUSED = range(3)  # of the times of an axis
-VALUE, SPREAD, KNOWN_START, INNOVATION = range(4)  # of the values of an axis
-ADDED, REPEATED, NO_ROOM = range(3)
+BEGIN, END, DONE, RUN, ORIGIN = range(5)  # of a window's span
+FIRST, DELAY = range(2)  # of the times of an axis
+VALUE, SPREAD, KNOWN_START = range(3)  # of the values of an axis
+NO_ROOM, REPEATED = -1, -2  # in place of a row
 
 
 class Incoming(NamedTuple):
     """What goes in and comes out of a window, and where it stands.
 
     Attributes:
-        span: The first row (``BEGIN``), after the last one (``END``), after the last one in the state (``DONE``) and
-            after the last one that is to be in it (``RUN``), the first command's stamp [ns] (``ORIGIN``, or
-            ``NEVER``), and the sensor that a rejected measurement ``CONTRADICTS`` (−1 for none), (6,).
-        times: For each axis the stamp of its ``FIRST`` command (``NEVER`` without one), its ``DELAY`` Td, and when the
-            last measurement was valid that an estimate knows of (``LAST_FUSED``), int64 ns, (A, 3).
-        values: For each axis the ``VALUE`` [m] of the event that comes in, the ``SPREAD`` that scales its noise, the
-            level u₀ [m] at rest where it is known beforehand (``KNOWN_START``), and the ``INNOVATION`` [m], (A, 4).
+        span: The first row (``BEGIN``), after the last one (``END``), after the last one in the state (``DONE``), after
+            the last one that is to be in it (``RUN``), and the first command's stamp [ns] (``ORIGIN``, or ``NEVER``),
+            (5,).
+        times: For each axis the stamp of its ``FIRST`` command (``NEVER`` without one) and its ``DELAY`` Td, int64 ns,
+            (A, 2).
+        values: For each axis the ``VALUE`` [m] of the event that comes in, the ``SPREAD`` that scales its noise, and
+            the level u₀ [m] at rest where it is known beforehand (``KNOWN_START``), (A, 3).
         outcome: What became of the values, ``ABSENT`` for an axis that the event does not give, (A,).
         latency: Of each sensor, int64 ns, (S,).
     """
@@ -57,139 +57,126 @@ class Incoming(NamedTuple):
 class Memory(NamedTuple):
     """All arrays of a window. Of the places for checkpoints the last two are for the state aside and at rest."""
 
+    filter: Filter
+    incoming: Incoming
+
+
+class Tables(NamedTuple):
+    """A :class:`Memory` within a kernel."""
+
     model: Model
     sensors: Sensors
     events: Events
     state: State
-    results: Results
-    history: History
-    arrived: BoolArray
     incoming: Incoming
-
-    def flat(self) -> Flat:
-        """As plain tuples, which a kernel takes a hundred times faster from Python."""
-        return tuple(tuple(part) if isinstance(part, tuple) else part for part in self)
-
-
-Flat: TypeAlias = tuple[Any, ...]
 
 
 @compiled
-def opened(flat: Flat) -> Memory:
+def opened(flat: Flat, incoming: Flat) -> Tables:
     """The names again."""
-    return Memory(
-        Model(*flat[0]),
-        Sensors(*flat[1]),
-        Events(*flat[2]),
-        State(*flat[3]),
-        Results(*flat[4]),
-        History(*flat[5]),
-        flat[6],
-        Incoming(*flat[7]),
-    )
+    return Tables(Model(*flat[0]), Sensors(*flat[1]), Events(*flat[2]), State(*flat[3]), Incoming(*incoming))
 
 
 @kernel
-def add_measurement(flat: Flat, stamp: int, sensor: int, given: int, horizon: int) -> int:
-    """Take in the measurement in ``incoming.values``, of the axes that are bits of ``given``.
+def put_measurement(flat: Flat, incoming: Flat, stamp: int, sensor: int, given: int, horizon: int) -> int:
+    """Put the measurement in ``incoming.values``, of the axes that are bits of ``given``, in its place.
 
-    Events before ``horizon`` [ns] leave the window. ``REPEATED``: its stamp and values are those of one before.
+    Events before ``horizon`` [ns] leave the window once they are in the state.
+
+    Returns:
+        Its row, which is then to be run; ``NO_ROOM``; or ``REPEATED``: its stamp and values are those of one before.
     """
-    m = opened(flat)
-    span, incoming, events = m.incoming.span, m.incoming, m.events
+    m = opened(flat, incoming)
+    span, events, outcome = m.incoming.span, m.events, m.incoming.outcome
     retire(m, horizon)
     if span[END] == len(events.time):
         return NO_ROOM
-    at = insert(m, stamp - incoming.latency[sensor], sensor, stamp, given)
-    span[CONTRADICTS] = -1
+    at = insert(m, stamp - m.incoming.latency[sensor], sensor, stamp, given)
     duplicate = repeats_earlier(events, at, span[BEGIN])
     whole = DUPLICATE if duplicate else FUSED
-    for axis in range(len(incoming.outcome)):
-        incoming.outcome[axis] = events.known[at, axis] = classified(m, at, axis, whole)
+    for axis in range(len(outcome)):
+        outcome[axis] = events.known[at, axis] = classified(m, at, axis, whole)
     if duplicate:
         remove(events, span, at)
-        catch_up(m)
         return REPEATED
     span[RUN] = max(span[RUN], at + 1)
-    catch_up(m)
-    span[CONTRADICTS] = m.results.contradicts[at]
-    for axis in range(len(incoming.outcome)):
-        incoming.outcome[axis] = m.results.outcome[at, axis]
-        incoming.values[axis, INNOVATION] = m.results.innovation[at, axis]
-    return ADDED
+    return at
 
 
 @kernel
-def add_command(flat: Flat, stamp: int, given: int, horizon: int) -> int:
-    """Take in the command in ``incoming.values``, of the axes that are bits of ``given``: an event for each delay."""
-    m = opened(flat)
-    span, incoming, events, axes = m.incoming.span, m.incoming, m.events, len(m.incoming.outcome)
+def put_command(flat: Flat, incoming: Flat, stamp: int, given: int, horizon: int) -> int:
+    """Put the command in ``incoming.values``, of the axes that are bits of ``given``, in its places: for each delay.
+
+    Events before ``horizon`` [ns] leave the window once they are in the state. ``NO_ROOM``: it was not put anywhere.
+    """
+    m = opened(flat, incoming)
+    span, events, times, outcome = m.incoming.span, m.events, m.incoming.times, m.incoming.outcome
+    axes, left = len(outcome), given
     retire(m, horizon)
     if span[END] + axes > len(events.time):
         return NO_ROOM
-    left = given
     for axis in range(axes):
-        incoming.outcome[axis] = ABSENT
+        outcome[axis] = ABSENT
     for axis in range(axes):
         together = ZERO  # the axes of this delay
         for other in range(axis, axes):
-            if left >> other & 1 and incoming.times[other, DELAY] == incoming.times[axis, DELAY]:
+            if left >> other & 1 and times[other, DELAY] == times[axis, DELAY]:
                 together |= 1 << other
         if not left >> axis & 1:
             continue
         left &= ~together
-        time = stamp + incoming.times[axis, DELAY]
+        time = stamp + times[axis, DELAY]
         at = insert(m, time, COMMAND, stamp, together)
         duplicate = repeats_earlier(events, at, span[BEGIN])
         if duplicate:
             remove(events, span, at)
         for other in range(axis, axes):
             if together >> other & 1 and duplicate:
-                incoming.outcome[other] = DUPLICATE
+                outcome[other] = DUPLICATE
             elif together >> other & 1:
                 first = first_at(events, span, time)
                 reclassify(m, other, first, time + int(m.model.gain[other, PERIOD] * 0.5e9))
-                incoming.outcome[other] = events.known[at, other]
+                outcome[other] = events.known[at, other]
     for axis in range(axes):
-        if incoming.outcome[axis] == FUSED and stamp <= incoming.times[axis, FIRST]:
+        if outcome[axis] == FUSED and stamp <= times[axis, FIRST]:
             begin(m, axis, stamp)
-    catch_up(m)
-    return ADDED
+    return ZERO
 
 
 @kernel
-def estimate_at(flat: Flat, outputs: FloatArray, time: int) -> None:
-    """Every axis at ``time`` [ns] by all measurements valid until then, into ``outputs``; nothing changes."""
-    m = opened(flat)
-    span, incoming, axes = m.incoming.span, m.incoming, len(m.incoming.outcome)
-    pending, aside = span[DONE], checkpoint_of(m.model, len(m.events.time), len(m.events.time) + 1)
-    while pending > span[BEGIN] and m.events.time[pending - 1] > time:
-        pending -= 1
-    copy_rows(m.state, ZERO, aside, axes)
-    if pending < span[DONE]:
-        copy_rows(m.state, checkpoint_of(m.model, pending, len(m.events.time)), ZERO, axes)
-    estimate(m.model, m.events, m.state, pending, span[END], time, m.history, outputs, ZERO)
-    for axis in range(axes):
-        incoming.times[axis, LAST_FUSED] = span[ORIGIN]
-        for sensor in range(len(incoming.latency)):
-            fused = m.state.gate_time[axis, sensor, FUSED_AT]
-            incoming.times[axis, LAST_FUSED] = max(incoming.times[axis, LAST_FUSED], fused)
-    copy_rows(m.state, aside, ZERO, axes)
+def set_back(flat: Flat, incoming: Flat, time: int) -> int:
+    """Put the state aside and bring it to before all that is after ``time`` [ns], which begins at the row returned."""
+    m = opened(flat, incoming)
+    span, places = m.incoming.span, len(m.events.time)
+    row = span[DONE]
+    while row > span[BEGIN] and m.events.time[row - 1] > time:
+        row -= 1
+    copy_rows(m.state, ZERO, checkpoint_of(m.model, places, places + 1), len(m.model.kind))
+    if row < span[DONE]:
+        copy_rows(m.state, checkpoint_of(m.model, row, places), ZERO, len(m.model.kind))
+    return row
+
+
+@kernel
+def put_back(flat: Flat, incoming: Flat) -> None:
+    """Bring the state to where it was before :func:`set_back`."""
+    m = opened(flat, incoming)
+    places = len(m.events.time)
+    copy_rows(m.state, checkpoint_of(m.model, places, places + 1), ZERO, len(m.model.kind))
 
 
 @compiled
-def retire(m: Memory, horizon: int) -> None:
-    """Let go of events that nothing can change any more."""
+def retire(m: Tables, horizon: int) -> None:
+    """Let go of events that nothing can change any more; those that are not in the state yet are to be run first."""
     span, time = m.incoming.span, m.events.time
-    while span[RUN] < span[END] and time[span[RUN]] < horizon:
-        span[RUN] += 1
-    catch_up(m)
     while span[BEGIN] < span[DONE] and time[span[BEGIN]] < horizon:
         span[BEGIN] += 1
+    while span[RUN] < span[END] and time[span[RUN]] < horizon:
+        span[RUN] += 1
 
 
 @compiled
-def go_back(m: Memory, row: int) -> None:
+def go_back(m: Tables, row: int) -> None:
     """Bring the state to before a row, if it is past it."""
     if row < m.incoming.span[DONE]:
         copy_rows(m.state, checkpoint_of(m.model, row, len(m.events.time)), ZERO, len(m.incoming.outcome))
@@ -197,17 +184,7 @@ def go_back(m: Memory, row: int) -> None:
 
 
 @compiled_apart
-def catch_up(m: Memory) -> None:
-    """Bring the state to where it is to be."""
-    span, places = m.incoming.span, len(m.events.time)
-    if span[DONE] < span[RUN]:
-        first, end = span[DONE], span[RUN]
-        run_events(m.model, m.sensors, m.events, m.state, first, end, NO, m.results, m.history, m.arrived, places, NO)
-        span[DONE] = span[RUN]
-
-
-@compiled_apart
-def insert(m: Memory, time: int, source: int, stamp: int, given: int) -> int:
+def insert(m: Tables, time: int, source: int, stamp: int, given: int) -> int:
     """Put the axes of ``incoming`` that are bits of ``given`` in their place; returns the row."""
     span, values, events = m.incoming.span, m.incoming.values, m.events
     at = span[END]
@@ -258,14 +235,14 @@ def move(events: Events, here: int, there: int) -> None:
 
 
 @compiled
-def classified(m: Memory, row: int, axis: int, whole: int) -> int:
+def classified(m: Tables, row: int, axis: int, whole: int) -> int:
     """What a value of the window is before the filter sees it."""
     span = m.incoming.span
     return classify(m.model, m.sensors, m.events, m.state, span[ORIGIN], row, axis, span[BEGIN], span[END], whole)
 
 
 @compiled_apart
-def reclassify(m: Memory, axis: int, first: int, until: int) -> None:
+def reclassify(m: Tables, axis: int, first: int, until: int) -> None:
     """Look again at the values of an axis from row ``first`` on that are not after ``until`` [ns]."""
     span, events = m.incoming.span, m.events
     for row in range(first, span[END]):
@@ -288,7 +265,7 @@ def first_at(events: Events, span: IntArray, time: int) -> int:
 
 
 @compiled_apart
-def begin(m: Memory, axis: int, stamp: int) -> None:
+def begin(m: Tables, axis: int, stamp: int) -> None:
     """Let an axis rest until its first command, which is that of ``stamp`` [ns]; all of them if none was before it."""
     span, incoming, state, events = m.incoming.span, m.incoming, m.state, m.events
     incoming.times[axis, FIRST] = stamp
@@ -338,15 +315,19 @@ class Window:
         spread: By what the noise of each of its values is scaled, 1 if nobody says otherwise, (A,).
         outcome: What became of its axes: codes of Outcome, or ``ABSENT`` for an axis that it does not give, (A,).
         innovation: ν of each value of a measurement [m], (A,).
+        contradicts: The sensor that the measurement just added contradicts, where it is rejected time after time; −1
+            for none.
         floor: What is stamped before it [ns] can no longer be taken, because the stream was too dense for the window.
     """
 
     def __init__(self, memory: Memory, counters: Counters) -> None:
         """Empty; ``memory`` has room for ``FIRST_ROWS`` events, ``counters`` what was counted before."""
-        self.floor = ALWAYS
+        self.floor, self.contradicts = ALWAYS, NOBODY
         self._counters, self._counted = counters, 0
-        self._behind = int(memory.incoming.latency.max(initial=0)) + int(memory.model.gain[:, PERIOD].max() * 1e9)
-        self._outputs = np.zeros((len(Output), len(memory.incoming.outcome), 1))
+        model, axes = memory.filter.model, len(memory.incoming.outcome)
+        self._behind = int(memory.incoming.latency.max(initial=0)) + int(model.gain[:, PERIOD].max() * 1e9)
+        self.innovation = np.zeros(axes)
+        self._time, self._outputs = np.zeros(1, dtype=np.int64), np.zeros((len(Output), axes, 1))
         self._set(memory)
 
     @property
@@ -355,19 +336,15 @@ class Window:
         origin = self._span.item(ORIGIN)
         return None if origin == NEVER else origin
 
-    @property
-    def contradicts(self) -> int:
-        """The sensor that the measurement just added contradicts, where it is rejected time after time; −1 for none."""
-        return self._span.item(CONTRADICTS)
-
     def add_measurement(self, stamp: int, sensor: int, given: int, newest: int, oldest: int) -> bool:
         """Take in a measurement; ``newest`` [ns] is the newest stamp of all. See :meth:`add_command`."""
-        while (added := add_measurement(self._flat, stamp, sensor, given, oldest - self._behind)) == NO_ROOM:
+        while (row := put_measurement(*self._flat, stamp, sensor, given, oldest - self._behind)) == NO_ROOM:
             self._make_room()
             if stamp < self.floor:
                 return False
+        self._run(row)
         self._count(sensor, stamp, newest)
-        if added == REPEATED:
+        if row == REPEATED:
             count_duplicate(self._counters, sensor, self.outcome)
         return True
 
@@ -382,25 +359,34 @@ class Window:
         Returns:
             False if to make room the window had to let go of its time.
         """
-        while add_command(self._flat, stamp, given, oldest - self._behind) == NO_ROOM:
+        while put_command(*self._flat, stamp, given, oldest - self._behind) == NO_ROOM:
             self._make_room()
             if stamp < self.floor:
                 return False
+        self._run()
         if self._span.item(BEGIN) > self._counted:
             self._count(-1, 0, 0)
         return True
 
     def estimate(self, time: int) -> list[tuple[list[float], int] | None]:
-        """Every axis at an instant [ns].
+        """Every axis at an instant [ns] by all measurements valid until then; nothing changes.
 
         Returns:
             For each axis what :class:`.forward.Output` has, in the stream's own coordinates and SI, and when the last
             measurement was valid that it knows of [ns]; None as long as the axis has no start level.
         """
-        estimate_at(self._flat, self._outputs, time)
+        (begin, end, row, _, origin), known, events = self._span.tolist(), self.memory.filter, self.memory.filter.events
+        earlier = row > begin and events.time.item(row - 1) > time
+        if earlier:
+            row = set_back(*self._flat, time)
+        self._time[0] = time
+        filter_events(self._flat[0], False, row, row, end, *ALL_THERE, len(events.time), self._time, self._outputs)
+        axes = len(self.outcome)  # the rows of the state behind them are checkpoints
+        fused = np.maximum(known.state.gate_time[:axes, :, FUSED_AT].max(axis=1, initial=ALWAYS), origin).tolist()
+        if earlier:
+            put_back(*self._flat)
         found: list[tuple[list[float], int] | None] = []
-        fused = self.memory.incoming.times[:, LAST_FUSED].tolist()
-        levels = self.memory.state.drive[: len(fused), START].tolist()  # the rows behind are checkpoints
+        levels = known.state.drive[:axes, START].tolist()
         for number, outputs in enumerate(self._outputs[:, :, 0].T.tolist()):
             outputs[0] += levels[number]
             found.append(None if math.isnan(levels[number]) else (outputs, fused[number]))
@@ -410,7 +396,7 @@ class Window:
         """Stamp [ns], value and step [m] of an axis's last command stamped by ``stamp`` [ns]; None for none."""
         if self.memory.incoming.times[axis, FIRST] == NEVER:
             return None
-        events, drive, span = self.memory.events, self.memory.state.drive[axis], self._span
+        events, drive, span = self.memory.filter.events, self.memory.filter.state.drive[axis], self._span
         last, before = last_commands(events.source, events.stamp, events.known, span[BEGIN], span[END], axis, stamp)
         earlier = float(drive[START] + drive[U])  # of those that have left the window
         if last < 0:
@@ -422,9 +408,9 @@ class Window:
     def forget(self, after: int) -> None:
         """Take back all that is stamped after ``after`` [ns]: it was of another clock. The rest is added again."""
         forget_after(self._counters, after)
-        span, times, state = self._span, self.memory.incoming.times, self.memory.state
+        span, times, state = self._span, self.memory.incoming.times, self.memory.filter.state
         begin_row, end_row, axes = int(span[BEGIN]), int(span[END]), len(self.outcome)
-        rows = self.memory.events.rows(slice(begin_row, end_row))
+        rows = self.memory.filter.events.rows(slice(begin_row, end_row))
         rows = Events(*(part.copy() for part in rows))
         if begin_row < span[DONE]:
             here = axes + 1 + axes * begin_row
@@ -450,16 +436,19 @@ class Window:
                 continue
             self.value[:], self.spread[:] = rows.value[row], rows.spread[row]
             if sensor == COMMAND:
-                add_command(self._flat, int(rows.stamp[row]), given, ALWAYS)
+                put_command(*self._flat, int(rows.stamp[row]), given, ALWAYS)
             else:
-                add_measurement(self._flat, int(rows.stamp[row]), sensor, given, ALWAYS)
+                put_measurement(*self._flat, int(rows.stamp[row]), sensor, given, ALWAYS)
                 self._counters.last[sensor] = max(self._counters.last[sensor], rows.stamp[row])
+        self._run()
         times[first < NEVER, FIRST] = first[first < NEVER]
         self.spread[:] = 1.0
 
     def warm_up(self) -> None:
         """Have every kernel compiled and in memory; on a window that nobody needs."""
         self.estimate(0)
+        set_back(*self._flat, 0)
+        put_back(*self._flat)
         self.memory.incoming.times[0, FIRST] = 0
         self.command_at(0)
         self.forget(0)
@@ -477,33 +466,48 @@ class Window:
         count_rows(self._flat_counters, *self._counting, self._counted, left, sensor, stamp, newest)
         self._counted = left
 
+    def _run(self, row: int = NO_ROOM) -> None:
+        """Bring the state to where it is to be; what became of a ``row`` that is a measurement is known then."""
+        done, end, known = self._span.item(DONE), self._span.item(RUN), self.memory.filter
+        if done < end:
+            places = len(known.events.time)
+            filter_events(self._flat[0], False, done, end, end, *ALL_THERE, places, NO_TIMES, self._outputs)
+            self._span[DONE] = end
+        self.contradicts = NOBODY
+        if row >= 0:
+            self.outcome[:], self.innovation[:] = known.results.outcome[row], known.results.innovation[row]
+            self.contradicts = known.results.contradicts.item(row)
+
     def _rows(self) -> tuple[Any, ...]:
-        events, results = self.memory.events, self.memory.results
+        events, results = self.memory.filter.events, self.memory.filter.results
         return events.source, events.stamp, results.outcome, results.innovation, results.innovation_sd
 
     def _make_room(self) -> None:
         """Move what is in the window to the front, into more memory if it needs it; at the limit give up its oldest."""
-        span, rows = self._span, len(self.memory.events.time)
-        crowded = span[END] - span[BEGIN] > rows // 2
-        if rows == MOST_ROWS and span[END] - span[BEGIN] > rows - rows // 8:
-            self.floor = int(self.memory.events.time[span[BEGIN] + rows // 8]) + 1 + self._behind
-            add_command(self._flat, 0, 0, self.floor - self._behind)
+        span, time = self._span, self.memory.filter.events.time
+        rows, used = len(time), int(span[END] - span[BEGIN])
+        if rows == MOST_ROWS and used > rows - rows // 8:
+            oldest = span[BEGIN] + rows // 8
+            self.floor = int(time[oldest]) + 1 + self._behind
+            span[RUN] = max(span[RUN], oldest + 1)
+            self._run()
+            span[BEGIN] = oldest + 1
         self._count(-1, 0, 0)
-        self._set(with_rows(self.memory, 2 * rows if crowded and rows < MOST_ROWS else rows))
+        self._set(with_rows(self.memory, 2 * rows if used > rows // 2 and rows < MOST_ROWS else rows))
         self._counted = 0
 
     def _set(self, memory: Memory) -> None:
-        self.memory, self._flat, self._span = memory, memory.flat(), memory.incoming.span
-        values = memory.incoming.values
-        self.value, self.spread, self.innovation = values[:, VALUE], values[:, SPREAD], values[:, INNOVATION]
-        self.outcome = memory.incoming.outcome
+        self.memory, self._span, self.outcome = memory, memory.incoming.span, memory.incoming.outcome
+        self._flat = memory.filter.flat(), tuple(memory.incoming)
+        self.value, self.spread = memory.incoming.values[:, VALUE], memory.incoming.values[:, SPREAD]
         self._flat_counters, self._counting = tuple(self._counters), self._rows()
 
 
 def with_rows(memory: Memory, rows: int) -> Memory:
     """The same window at the front of room for ``rows`` events."""
-    held, axes = len(memory.events.time), len(memory.incoming.outcome)
-    first, used = int(memory.incoming.span[BEGIN]), int(memory.incoming.span[END] - memory.incoming.span[BEGIN])
+    known, span = memory.filter, memory.incoming.span.copy()
+    held, axes = len(known.events.time), len(memory.incoming.outcome)
+    first, used = int(span[BEGIN]), int(span[END] - span[BEGIN])
 
     def of_rows(part: np.ndarray) -> np.ndarray:
         found = np.zeros((rows, *part.shape[1:]), dtype=part.dtype)
@@ -517,12 +521,12 @@ def with_rows(memory: Memory, rows: int) -> Memory:
         found[now : now + axes * used] = part[now + axes * first : now + axes * (first + used)]
         return found
 
-    span = memory.incoming.span.copy()
     span[[BEGIN, END, DONE, RUN]] -= first
-    return memory._replace(
-        events=Events(*(of_rows(part) for part in memory.events)),
-        results=Results(*(of_rows(part) for part in memory.results)),
-        state=memory.state._replace(**dict(zip(State._fields, map(of_state, memory.state.by_row), strict=False))),
-        arrived=np.ones(rows, dtype=np.bool_),
-        incoming=memory.incoming._replace(span=span),
+    return Memory(
+        known._replace(
+            events=Events(*(of_rows(part) for part in known.events)),
+            results=Results(*(of_rows(part) for part in known.results)),
+            state=known.state._replace(**dict(zip(State._fields, map(of_state, known.state.by_row), strict=False))),
+        ),
+        memory.incoming._replace(span=span),
     )

@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import CodeArray, TimeArray
 from ..filter.axis import Model, Sensors, State
 from ..filter.events import COMMAND, Events, Results
-from ..filter.forward import History, Output, filter_events, no_history
+from ..filter.forward import ALL_THERE, NO_ESTIMATES, Filter, History, Output, filter_events, no_history
 from ..filter.outcome import Outcome
 from ..filter.smoother import smooth
 from .config import FusionConfig
@@ -70,14 +70,14 @@ def filter_segment(
     results = Results.room(count, axes)
     results.outcome[:] = events.known
     outputs = np.zeros((len(Output), axes, len(times)))
-    known = model, sensors, events, state
     if engine == "filterpy":
         from ..filter import filterpy_engine
 
         plants = [config.arm.axes[axis] for axis in segment.axes]
-        filterpy_engine.filter_events(plants, *known, times, results, outputs, progress)
+        filterpy_engine.filter_events(plants, model, sensors, events, state, times, results, outputs, progress)
     else:
-        filter_events(*known, False, arrival, queue, times, results, history, arrived, places, outputs)
+        arrays = Filter(model, sensors, events, state, results, history).flat()
+        filter_events(arrays, False, 0, count, count, arrival, queue, arrived, places, times, outputs)
     if mode == "smoothed":
         room = np.empty((2, width)), np.empty((2, width, width)), np.empty((1, 4, width)), np.empty((width + 1, width))
         smooth(model, sensors, events, results, history, segment.origin, times, room, outputs)
@@ -99,13 +99,12 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
     """
     events, place = segment.events(config)
     model, sensors, state = arranged(segment, config, biased_sensors(segment, config))
-    axes = len(segment.axes)
-    results = Results.room(len(events.time), axes)
+    axes, count = len(segment.axes), len(events.time)
+    results = Results.room(count, axes)
     if outcome is not None:
         results.outcome[place] = outcome
-    none, outputs = np.empty(0, dtype=np.int64), np.empty((len(Output), axes, 0))
-    given, history, arrived = outcome is not None, no_history(axes, state.x.shape[1]), np.zeros(0, dtype=np.bool_)
-    filter_events(model, sensors, events, state, given, none, none, none, results, history, arrived, 0, outputs)
+    arrays = Filter(model, sensors, events, state, results, no_history(axes, state.x.shape[1])).flat()
+    filter_events(arrays, outcome is not None, 0, count, count, *ALL_THERE, 0, *NO_ESTIMATES)
     return results.rows(place)
 
 

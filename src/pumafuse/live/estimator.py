@@ -13,7 +13,7 @@ from ..arrays import NEVER, FloatArray
 from ..errors import ConfigError, RunError, suggestion
 from ..filter.counters import Counters
 from ..filter.events import Events, Results
-from ..filter.forward import no_history
+from ..filter.forward import Filter, no_history
 from ..filter.outcome import ABSENT, FARTHEST, Outcome
 from ..filter.window import FIRST_ROWS, MOST_ROWS, Incoming, Memory, Window
 from ..fusion.config import FusionConfig
@@ -518,23 +518,22 @@ def empty_window(
         counted.number[:], counted.usual[:] = counters.number, counters.usual
     level = [start.get(axis, np.nan) for axis in axes]
     delay = [round(config.arm.delay_of(axis) * 1e9) for axis in axes]
-    memory = Memory(
+    arrays = Filter(
         model=filter_model(config, axes, biases),
         sensors=filter_sensors(config, names, axes, biases),
         events=Events.empty(count, FIRST_ROWS)._replace(spread=np.ones((FIRST_ROWS, count))),
         state=state,
         results=Results.room(FIRST_ROWS, count),
         history=no_history(count, state.x.shape[1]),
-        arrived=np.ones(FIRST_ROWS, dtype=np.bool_),
-        incoming=Incoming(
-            span=np.array([0, 0, 0, 0, NEVER, -1]),
-            times=np.array([[NEVER, one, 0] for one in delay]),
-            values=np.array([[0.0, 1.0, one, 0.0] for one in level]),
-            outcome=np.zeros(count, dtype=np.uint8),
-            latency=np.array([round(sensor.latency * 1e9) for sensor in config.sensors.values()], dtype=np.int64),
-        ),
     )
-    return Window(memory, counted)
+    incoming = Incoming(
+        span=np.array([0, 0, 0, 0, NEVER]),
+        times=np.array([[NEVER, one] for one in delay]),
+        values=np.array([[0.0, 1.0, one] for one in level]),
+        outcome=np.zeros(count, dtype=np.uint8),
+        latency=np.array([round(sensor.latency * 1e9) for sensor in config.sensors.values()], dtype=np.int64),
+    )
+    return Window(Memory(arrays, incoming), counted)
 
 
 def _number(value: object) -> float:
