@@ -262,7 +262,7 @@ from pumafuse.filter import forward, window
 arm, sensors = pf.ArmModel.load("puma560-internal"), {"tracker": pf.Sensor(sd=1e-4)}
 live = pf.LiveEstimator(pf.FusionConfig(arm=arm, sensors=sensors))
 live.warm_up()
-called = [getattr(window, name) for name in ("put_measurement", "put_command", "set_back", "put_back", "last_commands")]
+called = [getattr(window, name) for name in ("put_measurement", "put_command", "last_commands")]
 called.append(forward.filter_events)
 assert all(len(one.signatures) == 1 for one in called)
 for row in range(70_000):

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
-from ..compiled import compiled, compiled_apart
+from ..compiled import compiled, compiled_apart, inlined
 from ..model.closed import decaying_response, gain_error, transition
 from ..model.matern import matern
 
@@ -272,10 +272,13 @@ def add_to_pair(P: FloatArray, at: int, i: int, q11: float, q12: float, q22: flo
     P[at, i + 1, i + 1] += q22
 
 
-@compiled
-def is_steady(model: Model, axis: int) -> bool:
-    """Whether commands of an axis change no noise, so that P may stay behind."""
-    return model.process[axis, MANEUVER_NOISE] == 0.0 and model.process[axis, MANEUVER_DRIFT] == 0.0
+@inlined
+def is_steady(model: Model) -> bool:
+    """Whether commands change no noise, so that P may stay behind."""
+    for axis in range(len(model.kind)):
+        if model.process[axis, MANEUVER_NOISE] != 0.0 or model.process[axis, MANEUVER_DRIFT] != 0.0:
+            return False
+    return True
 
 
 @compiled

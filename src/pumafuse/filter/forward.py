@@ -172,7 +172,7 @@ def filter_events(
         outputs: Gets the estimates.
     """
     f = opened(flat)
-    due, done = ZERO, begin
+    due, done, lazily = ZERO, begin, places == 0 and len(times) == 0 and is_steady(f.model)
     for n in range(len(times) + 1):
         until = times[n] if n < len(times) else NEVER
         first = done
@@ -184,7 +184,7 @@ def filter_events(
             copy_rows(f.state, checkpoint_of(f.model, first, places), ZERO, len(f.model.kind))
         while done < end and f.events.time[done] <= until:
             done += 1
-        run_events(f, first, done, given, arrived, places, places == 0 and len(times) == 0)
+        run_events(f, first, done, given, arrived, places, lazily)
         if n < len(times):
             estimate(f, done, filled, times[n], outputs, n)
 
@@ -194,12 +194,16 @@ def run_events(f: Filter, begin: int, end: int, given: bool, arrived: BoolArray,
     """Rows ``begin`` to ``end`` that have arrived: apply commands, gate measurements, update with what passes.
 
     Before each row the state is kept in one of its ``places``; with none, nothing can be taken back.
-    ``lazily``: a command that changes no noise moves the plant's mean alone; the rest follows at a measurement.
+    ``lazily``, where commands change no noise: they move the plants' means alone, the rest follows at a measurement.
     """
     row = begin
     while row < end:
         if lazily and f.events.source[row] == COMMAND:
-            row = run_commands(f, row, end)
+            first = row
+            while row < end and f.events.source[row] == COMMAND:
+                row += 1
+            for axis in range(len(f.model.kind)):
+                follow_plant(f, axis, first, row)
             continue
         if places > 0:
             copy_rows(f.state, ZERO, checkpoint_of(f.model, row, places), len(f.model.kind))
@@ -223,21 +227,6 @@ def run_event(f: Filter, row: int, given: bool) -> None:
         first = last
 
 
-@inlined
-def run_commands(f: Filter, first: int, end: int) -> int:
-    """The commands from row ``first`` to the next measurement, whose row it returns."""
-    until = first
-    while until < end and f.events.source[until] == COMMAND:
-        until += 1
-    for axis in range(len(f.model.kind)):
-        if is_steady(f.model, axis):
-            follow_plant(f.model, f.events, f.state, axis, first, until)
-        else:
-            for row in range(first, until):
-                add_command(f.model, f.events, f.state, row, axis, f.history)
-    return until
-
-
 @compiled
 def add_command(model: Model, events: Events, state: State, row: int, axis: int, history: History) -> None:
     """One axis of one row."""
@@ -246,28 +235,28 @@ def add_command(model: Model, events: Events, state: State, row: int, axis: int,
         apply_command(model, state, axis, axis, events.value[row, axis])
 
 
-@compiled
-def follow_plant(model: Model, events: Events, state: State, axis: int, first: int, end: int) -> None:
-    """Rows ``first`` to ``end``, all of them commands, through the plant's mean alone, of a steady axis."""
-    x, drive, gain, known = state.x, state.drive, model.gain, state.intervals
+@inlined
+def follow_plant(f: Filter, axis: int, first: int, end: int) -> None:
+    """Rows ``first`` to ``end``, all of them commands, through the plant's mean alone."""
+    x, drive, gain, known = f.state.x, f.state.drive, f.model.gain, f.state.intervals
     slope, intercept, period = gain[axis, SLOPE], gain[axis, INTERCEPT], gain[axis, PERIOD]
     position, rate, u, error = x[axis, POSITION], x[axis, RATE], drive[axis, U], drive[axis, ERROR]
-    clock, step, level = state.clock[axis], drive[axis, STEP], drive[axis, START]
+    clock, step, level = f.state.clock[axis], drive[axis, STEP], drive[axis, START]
     latest, at = 0, 0
     for row in range(first, end):
-        if events.known[row, axis] != FUSED:
+        if f.events.known[row, axis] != FUSED:
             continue
-        if events.time[row] > clock:
-            if events.time[row] - clock != latest:
-                latest = events.time[row] - clock
-                at = interval_of(model, known, axis, latest)
+        if f.events.time[row] > clock:
+            if f.events.time[row] - clock != latest:
+                latest = f.events.time[row] - clock
+                at = interval_of(f.model, known, axis, latest)
             position, rate, error = moved(known, axis, at, position, rate, u, error)
-            clock = events.time[row]
-        command = events.value[row, axis] - level
+            clock = f.events.time[row]
+        command = f.events.value[row, axis] - level
         step, u = command - u, command
         error += gain_error(step, slope, intercept, period)
     x[axis, POSITION], x[axis, RATE], drive[axis, U], drive[axis, ERROR] = position, rate, u, error
-    state.clock[axis], drive[axis, STEP] = clock, step
+    f.state.clock[axis], drive[axis, STEP] = clock, step
 
 
 @compiled
@@ -435,14 +424,18 @@ def follow_commands(
     stamped: int,
 ) -> None:
     """Predict a row of the state to ``until`` [ns] by commands that act ``after`` … and are ``stamped`` by …."""
-    for event in range(pending, end):
-        if events.time[event] > until:
-            break
-        given = events.source[event] == COMMAND and events.known[event, axis] == FUSED
-        if given and events.time[event] > after and events.stamp[event] <= stamped:
-            predict(model, state, axis, row, events.time[event])
+    event, over = pending, False
+    while not over:
+        over = event >= end or events.time[event] > until
+        if not over:
+            given = events.source[event] == COMMAND and events.known[event, axis] == FUSED
+            if not given or events.time[event] <= after or events.stamp[event] > stamped:
+                event += 1
+                continue
+        predict(model, state, axis, row, until if over else events.time[event])
+        if not over:
             apply_command(model, state, axis, row, events.value[event, axis])
-    predict(model, state, axis, row, until)
+            event += 1
 
 
 @compiled

@@ -24,7 +24,7 @@ import math
 import numpy as np
 
 from ..arrays import FloatArray, TimeArray
-from ..compiled import compiled, kernel
+from ..compiled import compiled, compiled_apart, inlined, kernel
 from ..model.closed import transition
 from ..model.matern import matern
 from .axis import (
@@ -86,29 +86,32 @@ def smooth(
                 N[0, i, j] = 0.0
         entry = history.first[axis] + history.used[axis] - 1
         until = history.time[entry] if entry >= history.first[axis] else origin
-        while n >= 0 and times[n] >= until:
-            smoothed_estimate(model, axis, n, history, eta, N, ZERO, work, factor, outputs)
+        while n >= 0 and times[n] >= until:  # nothing later is known: the filter's estimate
             n -= 1
         while entry >= history.first[axis]:
             until = history.time[entry]
             start = history.time[entry - 1] if entry > history.first[axis] else origin
             if history.row[entry] == INTERVAL:
                 q, d = history.noise[entry], history.drift[entry]
-                while n >= 0 and times[n] >= start:
-                    for i in range(states):
-                        eta[1, i] = eta[0, i]
-                        for j in range(states):
-                            N[1, i, j] = N[0, i, j]
-                    over_interval(model, axis, eta, N, ONE, until - times[n], q, d, work)
+                while True:
+                    asked = n >= 0 and times[n] >= start  # for an estimate, aside, before the interval is over
+                    here, at = (times[n], ONE) if asked else (start, ZERO)
+                    if asked:
+                        for i in range(states):
+                            eta[1, i] = eta[0, i]
+                            for j in range(states):
+                                N[1, i, j] = N[0, i, j]
+                    over_interval(model, axis, eta, N, at, until - here, q, d, work)
+                    if not asked:
+                        break
                     smoothed_estimate(model, axis, n, history, eta, N, ONE, work, factor, outputs)
                     n -= 1
-                over_interval(model, axis, eta, N, ZERO, until - start, q, d, work)
             else:
                 over_update(model, sensors, events, results, history, axis, entry, eta, N, work)
             entry -= 1
 
 
-@compiled
+@inlined
 def over_update(
     model: Model,
     sensors: Sensors,
@@ -135,7 +138,7 @@ def over_update(
     through_noise(eta, N, ZERO, states, OFFSET_, math.sqrt(history.drift[entry]), 0.0, work)  # what re-acquiring added
 
 
-@compiled
+@inlined
 def over_interval(
     model: Model, axis: int, eta: FloatArray, N: FloatArray, at: int, ns: int, q: float, d: float, work: FloatArray
 ) -> None:
@@ -183,7 +186,7 @@ def pair_through_noise(
     through_noise(eta, N, at, states, i + 1, math.sqrt(max(q22 - both * both, 0.0)), 0.0, work)
 
 
-@compiled
+@compiled_apart
 def through_noise(
     eta: FloatArray, N: FloatArray, at: int, states: int, enters: int, first: float, second: float, work: FloatArray
 ) -> None:
@@ -203,7 +206,7 @@ def through_noise(
         eta[at, i] -= work[0, 1, i] * seen
 
 
-@compiled
+@inlined
 def smoothed_estimate(
     model: Model,
     axis: int,
@@ -233,7 +236,7 @@ def smoothed_estimate(
     write_outputs(model.kind[axis, DISTURBANCE], x, P, n, outputs, axis, n)
 
 
-@compiled
+@inlined
 def root(N: FloatArray, eta: FloatArray, at: int, states: int, L: FloatArray, left: FloatArray) -> None:
     """N[at] = L Lᵀ and η[at] = L y: as columns, measurements with unit noise; y is the last row of L (s + 1, s).
 

@@ -55,7 +55,7 @@ class Incoming(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """All arrays of a window. Of the places for checkpoints the last two are for the state aside and at rest."""
+    """All arrays of a window. Of the places for checkpoints the last one is for the state at rest."""
 
     filter: Filter
     incoming: Incoming
@@ -141,28 +141,6 @@ def put_command(flat: Flat, incoming: Flat, stamp: int, given: int, horizon: int
         if outcome[axis] == FUSED and stamp <= times[axis, FIRST]:
             begin(m, axis, stamp)
     return ZERO
-
-
-@kernel
-def set_back(flat: Flat, incoming: Flat, time: int) -> int:
-    """Put the state aside and bring it to before all that is after ``time`` [ns], which begins at the row returned."""
-    m = opened(flat, incoming)
-    span, places = m.incoming.span, len(m.events.time)
-    row = span[DONE]
-    while row > span[BEGIN] and m.events.time[row - 1] > time:
-        row -= 1
-    copy_rows(m.state, ZERO, checkpoint_of(m.model, places, places + 1), len(m.model.kind))
-    if row < span[DONE]:
-        copy_rows(m.state, checkpoint_of(m.model, row, places), ZERO, len(m.model.kind))
-    return row
-
-
-@kernel
-def put_back(flat: Flat, incoming: Flat) -> None:
-    """Bring the state to where it was before :func:`set_back`."""
-    m = opened(flat, incoming)
-    places = len(m.events.time)
-    copy_rows(m.state, checkpoint_of(m.model, places, places + 1), ZERO, len(m.model.kind))
 
 
 @compiled
@@ -282,7 +260,7 @@ def begin(m: Tables, axis: int, stamp: int) -> None:
                 commands = events.source[row] == COMMAND and events.known[row, other] == FUSED
                 if commands and events.stamp[row] == incoming.times[other, FIRST]:
                     level = events.value[row, other]
-        places = len(events.time) + 2
+        places = len(events.time) + 1
         copy_rows(state, checkpoint_of(m.model, places - 1, places) + other, np.int64(other), ONE)
         state.drive[other, START] = level
         state.clock[other] = state.settled[other] = span[ORIGIN]
@@ -375,18 +353,19 @@ class Window:
             For each axis what :class:`.forward.Output` has, in the stream's own coordinates and SI, and when the last
             measurement was valid that it knows of [ns]; None as long as the axis has no start level.
         """
-        (begin, end, row, _, origin), known, events = self._span.tolist(), self.memory.filter, self.memory.filter.events
-        earlier = row > begin and events.time.item(row - 1) > time
-        if earlier:
-            row = set_back(*self._flat, time)
+        (begin, end, row, _, origin), known, axes = self._span.tolist(), self.memory.filter, len(self.outcome)
+        events, aside = known.events, list[np.ndarray]()
+        if row > begin and events.time.item(row - 1) > time:  # earlier than the state is
+            aside = [part[:axes].copy() for part in known.state.by_row]
+            row = begin + int(np.searchsorted(events.time[begin:row], time, side="right"))
+            self._go_back(row)
         self._time[0] = time
         filter_events(self._flat[0], False, row, row, end, *ALL_THERE, len(events.time), self._time, self._outputs)
-        axes = len(self.outcome)  # the rows of the state behind them are checkpoints
         fused = np.maximum(known.state.gate_time[:axes, :, FUSED_AT].max(axis=1, initial=ALWAYS), origin).tolist()
-        if earlier:
-            put_back(*self._flat)
+        for part, before in zip(known.state.by_row, aside, strict=False):
+            part[:axes] = before
         found: list[tuple[list[float], int] | None] = []
-        levels = known.state.drive[:axes, START].tolist()
+        levels = known.state.drive[:axes, START].tolist()  # the rows behind are checkpoints
         for number, outputs in enumerate(self._outputs[:, :, 0].T.tolist()):
             outputs[0] += levels[number]
             found.append(None if math.isnan(levels[number]) else (outputs, fused[number]))
@@ -413,9 +392,7 @@ class Window:
         rows = self.memory.filter.events.rows(slice(begin_row, end_row))
         rows = Events(*(part.copy() for part in rows))
         if begin_row < span[DONE]:
-            here = axes + 1 + axes * begin_row
-            for part in state.by_row:
-                part[:axes] = part[here : here + axes]
+            self._go_back(begin_row)
         span[[END, DONE, RUN]] = begin_row
         span[ORIGIN] = NEVER if span[ORIGIN] > after else span[ORIGIN]
         rest = len(state.clock) - axes
@@ -447,8 +424,6 @@ class Window:
     def warm_up(self) -> None:
         """Have every kernel compiled and in memory; on a window that nobody needs."""
         self.estimate(0)
-        set_back(*self._flat, 0)
-        put_back(*self._flat)
         self.memory.incoming.times[0, FIRST] = 0
         self.command_at(0)
         self.forget(0)
@@ -465,6 +440,13 @@ class Window:
         left = self._span.item(BEGIN)
         count_rows(self._flat_counters, *self._counting, self._counted, left, sensor, stamp, newest)
         self._counted = left
+
+    def _go_back(self, row: int) -> None:
+        """Bring the state to the checkpoint before a row."""
+        axes = len(self.outcome)
+        first = axes + 1 + axes * row
+        for part in self.memory.filter.state.by_row:
+            part[:axes] = part[first : first + axes]
 
     def _run(self, row: int = NO_ROOM) -> None:
         """Bring the state to where it is to be; what became of a ``row`` that is a measurement is known then."""
@@ -506,8 +488,7 @@ class Window:
 def with_rows(memory: Memory, rows: int) -> Memory:
     """The same window at the front of room for ``rows`` events."""
     known, span = memory.filter, memory.incoming.span.copy()
-    held, axes = len(known.events.time), len(memory.incoming.outcome)
-    first, used = int(span[BEGIN]), int(span[END] - span[BEGIN])
+    axes, first, used = len(memory.incoming.outcome), int(span[BEGIN]), int(span[END] - span[BEGIN])
 
     def of_rows(part: np.ndarray) -> np.ndarray:
         found = np.zeros((rows, *part.shape[1:]), dtype=part.dtype)
@@ -515,9 +496,9 @@ def with_rows(memory: Memory, rows: int) -> Memory:
         return found
 
     def of_state(part: np.ndarray) -> np.ndarray:
-        now, end = axes + 1, axes * 2
-        found = np.zeros((now + axes * (rows + 2), *part.shape[1:]), dtype=part.dtype)
-        found[:now], found[-end:] = part[:now], part[now + axes * held :]
+        now = axes + 1
+        found = np.zeros((now + axes * (rows + 1), *part.shape[1:]), dtype=part.dtype)
+        found[:now], found[-axes:] = part[:now], part[-axes:]
         found[now : now + axes * used] = part[now + axes * first : now + axes * (first + used)]
         return found
 

@@ -510,7 +510,7 @@ def empty_window(
         [name for name, sensor in config.sensors.items() if sensor.is_biased(axis) and sensor.sd_of(axis) is not None]
         for axis in axes
     ]
-    state = at_rest(config, axes, len(names), biases, NEVER, start, FIRST_ROWS + 2)
+    state = at_rest(config, axes, len(names), biases, NEVER, start, FIRST_ROWS + 1)
     for part in state.by_row:
         part[-count:] = part[:count]  # at rest
     counted = Counters.none(len(names))
