@@ -1,5 +1,6 @@
 """numba keeps compiled kernels on disk and does not notice that a kernel which another file calls has changed."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,19 +10,6 @@ import pytest
 import pumafuse
 
 SOURCE = Path(pumafuse.__file__).parent
-READ = f"""
-import warnings, numpy as np, pumafuse as pf
-warnings.simplefilter("ignore")
-data = {str(SOURCE / "data")!r}
-run, config = pf.Run.read(data + "/scan1"), pf.FusionConfig.load(data + "/fusion.toml")
-"""
-RECORDED = """
-for how in ({}, {"mode": "as-live"}, {"mode": "smoothed"}):
-    pf.fuse(run, config, **how)
-"""
-STREAM = """
-pf.LiveEstimator(config).warm_up()
-"""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -32,6 +20,9 @@ def pytest_configure(config: pytest.Config) -> None:
         if kept.stat().st_mtime < newest:
             kept.unlink(missing_ok=True)
     if getattr(config.option, "numprocesses", None) and not hasattr(config, "workerinput"):
-        halves = [subprocess.Popen([sys.executable, "-c", READ + kernels]) for kernels in (RECORDED, STREAM)]
-        if any(half.wait() for half in halves):
+        first_use = [sys.executable, "-m", "pumafuse.live.first_use"]
+        alone = os.environ | {"PUMAFUSE_COMPILES_BESIDE": "1"}
+        if any(
+            half.wait() for half in [subprocess.Popen([*first_use, part], env=alone) for part in ("forward", "rest")]
+        ):
             raise pytest.UsageError("the kernels cannot be compiled")

@@ -1,4 +1,4 @@
-"""How kernels are compiled: by numba, kept on disk, without fast-math, and announced to who waits the first time."""
+"""How kernels are compiled: by numba, kept on disk, without fast-math; all at the first use, which is said."""
 
 from __future__ import annotations
 
@@ -27,14 +27,19 @@ if TYPE_CHECKING:
         ...
 
 else:
+    import os
+    import subprocess
     import sys
+    from pathlib import Path
 
     import numba
     from numba.core import event
 
     # Kernels own no arrays, so nothing in them is counted (`_nrt`), and calls within the algebra vanish
     # (`forceinline`): together that is a factor of twenty. What is called less often is compiled apart, once: a copy in
-    # each caller would cost more time than it saves. Only kernels can be called from Python (`no_cpython_wrapper`):
+    # each caller would cost more time than it saves. numba compiles each function for itself and again in each that
+    # calls it; what it puts in the place of a call before (`inline`) it compiles once, but many of these at one place
+    # make slower code. Only kernels can be called from Python (`no_cpython_wrapper`), and only they are kept on disk:
     # to take so many arrays out of Python's objects takes longer to compile than most of them. A division by zero gives
     # an infinity, as in numpy.
     # A product and a sum stay two roundings: contracted to one, variances of extreme priors fall below 0.
@@ -47,29 +52,47 @@ else:
         return True
 
     _KEPT = _kept()
-    _OPTIONS = {"cache": _KEPT, "nogil": True, "error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
+    _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
     compiled = numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)
     compiled_apart = numba.njit(no_cpython_wrapper=True, **_OPTIONS)
     inlined = numba.njit(inline="always", no_cpython_wrapper=True, **_OPTIONS)
-    kernel = numba.njit(**_OPTIONS)
+    kernel = numba.njit(cache=_KEPT, **_OPTIONS)
     _HOW_OFTEN = (
-        "once for each part of it (some 10 s)"
+        "once (some 15 s)"
         if _KEPT
-        else "at each start (some 10 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
+        else "at each start (some 15 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
     )
+    _BESIDE = "PUMAFUSE_COMPILES_BESIDE"  # set in the environment of processes that compile for another one
 
-    class _Announcer(event.Listener):
-        """Says once in a process that kernels are compiled; those found on disk are no event."""
+    class _FirstUse(event.Listener):
+        """Where a kernel is compiled and not found on disk, says so and has all the others compiled, too.
 
-        announced = False
+        So nothing is left to wait for when another command is used for the first time.
+        """
+
+        def __init__(self) -> None:
+            self.begun, self.depth = _BESIDE in os.environ, 0
+            self.others: list[subprocess.Popen[bytes]] = []
 
         def on_start(self, event: event.Event) -> None:
-            ours = event.data["dispatcher"].py_func.__module__.startswith(__package__)
-            if ours and not self.announced:
-                self.announced = True
-                print(f"compiling the filter for this machine, {_HOW_OFTEN} ...", file=sys.stderr, flush=True)
+            """The first time, start two processes that compile all."""
+            self.depth += 1
+            if self.begun or not event.data["dispatcher"].py_func.__module__.startswith(f"{__package__}."):
+                return
+            self.begun = True
+            print(f"compiling the filter for this machine, {_HOW_OFTEN} ...", file=sys.stderr, flush=True)
+            if not _KEPT or not Path(sys.executable).stem.startswith("python"):  # within another program
+                return
+            environment = os.environ | {_BESIDE: "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+            nothing = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+            for part in ("forward", "rest"):
+                words = [sys.executable, "-m", f"{__package__}.live.first_use", part]
+                self.others.append(subprocess.Popen(words, env=environment, **nothing))
 
-        def on_end(self, event: event.Event) -> None:
-            """Nothing to say."""
+        def on_end(self, _event: event.Event) -> None:
+            """Wait for the others: what they compile is found on disk then. What they do not, is compiled here."""
+            self.depth -= 1
+            while self.depth == 0 and self.others:
+                self.others.pop().wait()
 
-    event.register("numba:compile", _Announcer())
+    event.register("numba:compile", _FirstUse())

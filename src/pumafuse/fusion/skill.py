@@ -123,16 +123,16 @@ def _by_constant_velocity(parts: Sequence[Measurements]) -> FloatArray:
     unit = float(np.median(intervals[intervals > 0.0])) if (intervals > 0.0).any() else 1.0
     square, found, end = np.zeros(len(_DENSITIES)), np.empty(len(intervals)), 0
     for part in parts:
-        _filter(part.time / unit, part.value, _DENSITIES, np.empty((5, len(square))), square, found[:0])
+        constant_velocity(part.time / unit, part.value, _DENSITIES, np.empty((5, len(square))), square, found[:0])
     best = _DENSITIES[[np.argmin(square)]]
     for part in parts:
         begin, end = end, end + len(part.value) - 1
-        _filter(part.time / unit, part.value, best, np.empty((5, 1)), np.zeros(1), found[begin:end])
+        constant_velocity(part.time / unit, part.value, best, np.empty((5, 1)), np.zeros(1), found[begin:end])
     return found
 
 
 @kernel
-def _filter(
+def constant_velocity(
     time: FloatArray, value: FloatArray, density: FloatArray, room: FloatArray, square: FloatArray, found: FloatArray
 ) -> None:
     """Constant-velocity filters with R = 1.
