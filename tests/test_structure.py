@@ -1,8 +1,12 @@
 """The rooms of the package and which way they import."""
 
 import ast
+import inspect
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, get_args, get_type_hints
 
 import pytest
 
@@ -89,3 +93,30 @@ def test_every_public_name_is_documented() -> None:
     """Each has its place on the page of the API."""
     page = (SOURCE.parents[1] / "docs" / "api.md").read_text(encoding="utf-8")
     assert sorted(re.findall(r"^::: pumafuse\.(\w+)$", page, re.MULTILINE)) == sorted(pf.__all__)
+
+
+def test_what_public_functions_take_and_return_is_public() -> None:
+    """Also methods and properties of public classes: nobody needs a private import to say what a variable is."""
+    foreign = SimpleNamespace(Table=object, StateSpace=object, TransferFunction=object)  # imported where they are used
+    known = {"pa": foreign, "control": foreign, "Figure": object, "KalmanFilter": object, "Recording": object}
+    public = {getattr(pf, name) for name in pf.__all__}
+    found: dict[str, set[type]] = {}
+    for name in pf.__all__:
+        one = getattr(pf, name)
+        members = inspect.getmembers_static(one) if inspect.isclass(one) else [("", one)]
+        for member, value in members:
+            function = getattr(value, "fget", getattr(value, "__func__", value))
+            if inspect.isfunction(function) and (member == "__init__" or not member.startswith("_")):
+                hints = get_type_hints(function, localns=known)
+                found[f"{name}.{member}"] = {part for hint in hints.values() for part in classes_of(hint)}
+    assert len(found) > 100
+    own = {key: {part for part in parts if part.__module__.startswith("pumafuse")} for key, parts in found.items()}
+    assert {key: parts - public for key, parts in own.items() if parts - public} == {}
+
+
+def classes_of(hint: Any) -> Iterator[type]:
+    """The classes that a type hint is made of."""
+    if inspect.isclass(hint):
+        yield hint
+    for part in get_args(hint):
+        yield from classes_of(part)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .errors import ConfigError, PumafuseError, PumafuseWarning, RunError, UnknownNameError
+    from .filter.events import Events
     from .filter.outcome import Outcome
     from .fusion.config import FusionConfig, Process, Sensor, Start
     from .fusion.estimates import AxisEstimate, Bias, Estimates, Measurements
@@ -20,25 +21,28 @@ if TYPE_CHECKING:
     from .identification.plan import Design, Plan, PlannedTrial, plan
     from .identification.trials import StepTrials, Trial, TrialsError
     from .identification.verify import AxisVerification, BestInClass, ModelFit, Trace, verify
-    from .live.estimator import LiveEstimator
+    from .live.estimator import EventLog, LiveEstimator
     from .live.results import AxisNow, Health, LiveEstimate, SensorHealth, UpdateResult
     from .logs.frames import Cylindrical, Rotated
     from .logs.run import Run, Source
     from .model.arm import ArmModel, AxisModel, Gain, Validity
     from .model.discrete import DiscreteModel, discretize
-    from .model.plants import FirstOrder, SecondOrder
+    from .model.plants import FirstOrder, Plant, SecondOrder
     from .simulation.scenario import Scenario
     from .simulation.simulate import Simulated, simulate
+    from .simulation.true_arm import TrueAxis
     from .tuning.identifiability import TuneError
     from .tuning.intervals import Profile
     from .tuning.latency import AxisLag, Latency, LatencySummary, PartLag, SensorLag, latency
     from .tuning.summary import Fitted, FittedLag, TuningSummary
     from .tuning.tune import Tuning, tune
+    from .units import Screen
     from .views.figures import error_figure, fused_figure, validation_figure
     from .views.rerun import to_rerun
 
 _NAMES = {
     "errors": ["ConfigError", "PumafuseError", "PumafuseWarning", "RunError", "UnknownNameError"],
+    "filter.events": ["Events"],
     "filter.outcome": ["Outcome"],
     "fusion.config": ["FusionConfig", "Process", "Sensor", "Start"],
     "fusion.estimates": ["AxisEstimate", "Bias", "Estimates", "Measurements"],
@@ -51,20 +55,22 @@ _NAMES = {
     "identification.plan": ["Design", "Plan", "PlannedTrial", "plan"],
     "identification.trials": ["StepTrials", "Trial", "TrialsError"],
     "identification.verify": ["AxisVerification", "BestInClass", "ModelFit", "Trace", "verify"],
-    "live.estimator": ["LiveEstimator"],
+    "live.estimator": ["EventLog", "LiveEstimator"],
     "live.results": ["AxisNow", "Health", "LiveEstimate", "SensorHealth", "UpdateResult"],
     "logs.frames": ["Cylindrical", "Rotated"],
     "logs.run": ["Run", "Source"],
     "model.arm": ["ArmModel", "AxisModel", "Gain", "Validity"],
     "model.discrete": ["DiscreteModel", "discretize"],
-    "model.plants": ["FirstOrder", "SecondOrder"],
+    "model.plants": ["FirstOrder", "Plant", "SecondOrder"],
     "simulation.scenario": ["Scenario"],
     "simulation.simulate": ["Simulated", "simulate"],
+    "simulation.true_arm": ["TrueAxis"],
     "tuning.identifiability": ["TuneError"],
     "tuning.intervals": ["Profile"],
     "tuning.latency": ["AxisLag", "Latency", "LatencySummary", "PartLag", "SensorLag", "latency"],
     "tuning.summary": ["Fitted", "FittedLag", "TuningSummary"],
     "tuning.tune": ["Tuning", "tune"],
+    "units": ["Screen"],
     "views.figures": ["error_figure", "fused_figure", "validation_figure"],
     "views.rerun": ["to_rerun"],
 }
@@ -72,15 +78,16 @@ _HOME = {name: home for home, names in _NAMES.items() for name in names}
 
 __all__ = [
     "ArmModel", "AxisEstimate", "AxisLag", "AxisModel", "AxisNow", "AxisSummary", "AxisVerification", "BestInClass",
-    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "FirstOrder",
-    "Fitted", "FittedLag", "FusionConfig", "Gain", "Health", "Identification", "Latency", "LatencySummary",
-    "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "Outcome", "PartLag", "Plan", "PlannedTrial",
-    "Process", "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Rotated", "Run", "RunError",
-    "Scenario", "Score", "ScoreSummary", "SecondOrder", "Segment", "Sensor", "SensorHealth", "SensorLag",
-    "SensorSummary", "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary", "Trace", "Trial",
-    "TrialResult", "TrialsError", "TuneError", "Tuning", "TuningSummary", "UnknownNameError", "UpdateResult",
-    "Validity", "ValiditySummary", "discretize", "error_figure", "fuse", "fused_figure", "identify", "latency",
-    "plan", "score", "simulate", "summarise", "to_rerun", "tune", "validation_figure", "verify",
+    "Bias", "CombinedAxis", "ConfigError", "Cylindrical", "Design", "DiscreteModel", "Estimates", "EventLog",
+    "Events", "FirstOrder", "Fitted", "FittedLag", "FusionConfig", "Gain", "Health", "Identification", "Latency",
+    "LatencySummary", "LiveEstimate", "LiveEstimator", "Measurements", "ModelFit", "Outcome", "PartLag", "Plan",
+    "PlannedTrial", "Plant", "Process", "Profile", "PumafuseError", "PumafuseWarning", "ReferenceTrack", "Rotated",
+    "Run", "RunError", "Scenario", "Score", "ScoreSummary", "Screen", "SecondOrder", "Segment", "Sensor",
+    "SensorHealth", "SensorLag", "SensorSummary", "Simulated", "Skill", "Source", "Start", "StepTrials", "Summary",
+    "Trace", "Trial", "TrialResult", "TrialsError", "TrueAxis", "TuneError", "Tuning", "TuningSummary",
+    "UnknownNameError", "UpdateResult", "Validity", "ValiditySummary", "discretize", "error_figure", "fuse",
+    "fused_figure", "identify", "latency", "plan", "score", "simulate", "summarise", "to_rerun", "tune",
+    "validation_figure", "verify",
 ]  # fmt: skip
 
 
