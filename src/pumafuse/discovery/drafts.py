@@ -108,8 +108,8 @@ def _arm_toml(found: Survey, arm: ArmGuess) -> str:
         lag = known if one.follows else "a guess: nothing follows this axis"
         lines += [_pair("plant", "first-order"), _line(_pair("time_constant_ms", _digits(one.time_constant * MS)), lag)]
         if one.follows and abs(one.gain - 1.0) > 0.05:
-            told = f"{one.follows} moves {one.gain:.2f} times as far as commanded: try it, or tune --fit gain"
-            lines.append(_line(f"# {_pair('gain', {'intercept': round(one.gain, 2)})}", told))
+            why = f"{one.follows} moves {one.gain:.2f} times as far as commanded: try it, or tune --fit gain"
+            lines.append(_line(f"# {_pair('gain', {'intercept': round(one.gain, 2)})}", why))
     return "\n".join([*lines, ""])
 
 

@@ -145,7 +145,7 @@ def count_interval(counters: Counters, sensor: int, stamp: int) -> None:
 
 @compiled
 def slot_of(counters: Counters, sensor: int, stamp: int) -> int:
-    """Where the second of a stamp is tallied, −1 if it is over a minute old."""
+    """Where the second of a stamp is counted, −1 if it is over a minute old."""
     second = stamp // 1_000_000_000
     slot = second % SECONDS
     if second < counters.second[sensor, slot]:

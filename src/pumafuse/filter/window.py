@@ -154,7 +154,7 @@ def retire(m: Tables, horizon: int) -> None:
 
 
 @compiled
-def go_back(m: Tables, row: int) -> None:
+def restore(m: Tables, row: int) -> None:
     """Bring the state to before a row, if it is past it."""
     if row < m.incoming.span[DONE]:
         copy_rows(m.state, checkpoint_of(m.model, row, len(m.events.time)), ZERO, len(m.incoming.outcome))
@@ -168,7 +168,7 @@ def insert(m: Tables, time: int, source: int, stamp: int, given: int) -> int:
     at = span[END]
     while at > span[BEGIN] and comes_after(events, at - 1, time, source, stamp):
         at -= 1
-    go_back(m, at)
+    restore(m, at)
     for row in range(span[END], at, -1):
         move(events, row - 1, row)
     span[END] += 1
@@ -229,7 +229,7 @@ def reclassify(m: Tables, axis: int, first: int, until: int) -> None:
         if events.known[row, axis] != ABSENT:
             known = classified(m, row, axis, FUSED)
             if known != events.known[row, axis]:
-                go_back(m, row)
+                restore(m, row)
                 events.known[row, axis] = known
 
 
@@ -249,7 +249,7 @@ def begin(m: Tables, axis: int, stamp: int) -> None:
     incoming.times[axis, FIRST] = stamp
     earlier = stamp < span[ORIGIN]
     span[ORIGIN] = min(stamp, span[ORIGIN])
-    go_back(m, span[BEGIN])
+    restore(m, span[BEGIN])
     for other in range(len(incoming.outcome)):
         level = incoming.values[other, KNOWN_START]
         if not earlier and (other != axis or not math.isnan(level)):  # where it rested was known before
@@ -358,7 +358,7 @@ class Window:
         if row > begin and events.time.item(row - 1) > time:  # earlier than the state is
             aside = [part[:axes].copy() for part in known.state.by_row]
             row = begin + int(np.searchsorted(events.time[begin:row], time, side="right"))
-            self._go_back(row)
+            self._restore(row)
         self._time[0] = time
         filter_events(self._flat[0], False, row, row, end, *ALL_THERE, len(events.time), self._time, self._outputs)
         fused = np.maximum(known.state.gate_time[:axes, :, FUSED_AT].max(axis=1, initial=ALWAYS), origin).tolist()
@@ -392,7 +392,7 @@ class Window:
         rows = self.memory.filter.events.rows(slice(begin_row, end_row))
         rows = Events(*(part.copy() for part in rows))
         if begin_row < span[DONE]:
-            self._go_back(begin_row)
+            self._restore(begin_row)
         span[[END, DONE, RUN]] = begin_row
         span[ORIGIN] = NEVER if span[ORIGIN] > after else span[ORIGIN]
         rest = len(state.clock) - axes
@@ -441,7 +441,7 @@ class Window:
         count_rows(self._flat_counters, *self._counting, self._counted, left, sensor, stamp, newest)
         self._counted = left
 
-    def _go_back(self, row: int) -> None:
+    def _restore(self, row: int) -> None:
         """Bring the state to the checkpoint before a row."""
         axes = len(self.outcome)
         first = axes + 1 + axes * row

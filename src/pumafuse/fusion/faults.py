@@ -78,7 +78,7 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
     faults = _not_following(segment, config, given, trackings)
     if refused := [one.sentence for one in faults if one.refused]:
         raise RunError(refused[0])
-    found, told = [one.sentence for one in faults], {name for one in faults for name in one.sensors}
+    found, named = [one.sentence for one in faults], {name for one in faults for name in one.sensors}
     for name, axes in given.items():
         times = max((_times_each(value) for _, value in axes.values()), default=1)
         if times > 1:
@@ -86,7 +86,7 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
                 f"sensor '{name}' gives each value {times} times: a sample that is held? Each counts as a measurement"
                 " of its own, at its own stamp; log each once"
             )
-    quiet = {name: mine for name, mine in trackings.items() if name not in told}
+    quiet = {name: mine for name, mine in trackings.items() if name not in named}
     return [*found, *_moving_alone(config, quiet), *_off(config, quiet)]
 
 
@@ -199,21 +199,21 @@ def _off(config: FusionConfig, trackings: _Trackings) -> list[str]:
             alike = [one for one in measuring if math.isclose(off[one].get(axis, 0.0), zero, rel_tol=_ALIKE_SIZE)]
             if len(alike) == len(measuring) > 1:
                 names = ", ".join(f"'{one}'" for one in alike)
-                told = f"sensors {names} are {_length(config, axis, zero)} from where the commands lead {axis}"
+                where = f"sensors {names} are {_length(config, axis, zero)} from where the commands lead {axis}"
                 width = _width(config, "offset_sd", {axis: zero})
                 ask = f"is the zero of the commands another? Then give [start] {width}"
-                found += [f"{told}, all the time: {ask}"] if name == alike[0] else []
+                found += [f"{where}, all the time: {ask}"] if name == alike[0] else []
             else:
                 alone[axis] = zero
         if alone:
-            told = ", ".join(
+            offsets = ", ".join(
                 f"{_length(config, axis, zero)} on {axis} (noise and priors:"
                 f" {_length(config, axis, trackings[name][axis].zero_sd, '.2g')})"
                 for axis, zero in alone.items()
             )
             widths = _width(config, "bias_sd", alone), _width(config, "offset_sd", alone)
             found.append(
-                f"sensor '{name}' is off from where the commands lead, all the time: by {told}; has it another zero?"
+                f"sensor '{name}' is off from where the commands lead, all the time: by {offsets}; has it another zero?"
                 f" Then give it {widths[0]}. Or have the commands? Then give [start] {widths[1]}"
             )
     return found
@@ -316,8 +316,8 @@ def _faults(
             times, correlation = _digits(size, 3), f"{one.correlation:+.3f}"
             moves = f"moves {times} times as far as the commands of {axis} (correlation {correlation}): {words}"
             fault([axis], "unit", size, moves, refused)
-    told = {axis for one in found for axis in one.axes}
-    odd = {axis: trackings[axis] for axis in causes if axis not in told and abs(causes[axis].correlation) < _LOST}
+    faulty = {axis for one in found for axis in one.axes}
+    odd = {axis: trackings[axis] for axis in causes if axis not in faulty and abs(causes[axis].correlation) < _LOST}
     if lost := {axis: one for axis, one in odd.items() if one.lacks_motion}:
         fault(list(lost), "nothing", 1.0, _nothing(lost))
     return found
@@ -376,15 +376,15 @@ def _digits(number: float, count: int) -> str:
 
 def _nothing(trackings: Mapping[str, Tracking]) -> str:
     rests = "rests and " if all(one.rests for one in trackings.values()) else ""
-    told = ", ".join(f"{axis} (correlation {one.correlation:+.2f})" for axis, one in trackings.items())
+    axes = ", ".join(f"{axis} (correlation {one.correlation:+.2f})" for axis, one in trackings.items())
     return (
-        f"{rests}does not follow the commands of {told}, nor those of other axes or of up to 30 s before or after: is"
+        f"{rests}does not follow the commands of {axes}, nor those of other axes or of up to 30 s before or after: is"
         " it that axis of this run, are both stamped by one clock, is arm.toml that of this arm?"
     )
 
 
 def _of_commands(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
-    """The faults; one that all of several sensors of its axes have is told once, as one of the commands."""
+    """The faults; one that all of several sensors of its axes have is reported once, as one of the commands."""
     found: list[Fault] = []
     for one in faults:
         alike = [other for other in faults if one.is_like(other)]

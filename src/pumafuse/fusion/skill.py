@@ -1,4 +1,4 @@
-"""Skill: how well a sensor's next measurement is predicted, without a truth; by the filter, and by simpler means.
+"""Skill: how well a sensor's next measurement is predicted, without a reference; by the filter, and by simpler means.
 
 Every predictor has the same measurements to predict: those that the filter decided on, rejected ones too, but for the
 first of each segment, before which the others know nothing. All but the command alone know the sensor's earlier ones:

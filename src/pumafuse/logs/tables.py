@@ -187,7 +187,7 @@ def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa
         empty = file.schema_arrow.empty_table()
         columns, conditions = _named(path, empty), _conditions(path, empty, where)
         for field in fields or ():
-            find(columns, field, str(path))  # what is absent is told now, while all names are known
+            find(columns, field, str(path))  # what is absent is reported now, while all names are known
         wanted = None if fields is None else prefixes([*fields, *where])
         groups = [
             place for place in range(file.num_row_groups) if _may_hold(file.metadata.row_group(place), conditions)

@@ -69,7 +69,7 @@ _GATE = 8.0  # standard deviations, of a sensor that has outliers: what jerks is
 _AHEAD = 0.02  # s, by which a sensor may seem to be ahead of the commands where it is noisy
 _BESIDE = 3e-4  # s, beside a latency where its interval is taken
 _WIDE, _WIDE_LAG, _WIDE_GAIN = 0.3, 0.02, 0.1  # of the lag, s, of 1: intervals from which a number is not known
-_PARTS = 10  # of a run, of each of which the lag is told
+_PARTS = 10  # of a run, the lag of each of which is reported
 _DRIFTS = 3.5  # standard deviations from which a drift is named
 _WANDERS = 1e-4  # probability below which a wandering is named
 _SMALLEST = 1e-3  # s, of a drift or a wandering that is named
@@ -79,7 +79,7 @@ class AxisLag(msgspec.Struct, frozen=True, kw_only=True):
     """How late an axis is, and what it is made of.
 
     Attributes:
-        sensor: The sensor it is told by, whose stamps are taken to be right.
+        sensor: The sensor it is known by, whose stamps are taken to be right.
         lag: Behind the held command at constant velocity [s].
         lag_ci95: Its 95 % interval.
         delay: The dead time [s].
@@ -96,7 +96,7 @@ class AxisLag(msgspec.Struct, frozen=True, kw_only=True):
         gain_ci95: Its interval; null where it was taken to be 1.
         gain_recovery: Time constant with which the gain recovers [s]; null: it does not.
         gain_recovery_ci95: Its interval.
-        drift: How much later it is at the end than at the beginning [s]; null: not told.
+        drift: How much later it is at the end than at the beginning [s]; null: not known.
         drift_sd: Its standard deviation [s].
         drifts: Whether that is more than chance.
         wander: How far the lag wanders beside that, one standard deviation [s]; 0: not seen to.
@@ -648,19 +648,19 @@ def _with_courses(
         found = likelihood.shifts(axis, with_own_delays(config, [axis]), _PARTS, _free_arm(likelihood, config, axis))
         if found is not None and np.trace(found[2]) > 0.0:
             courses[axis] = _Course(*found)
-    told = dict(lags)
+    known = dict(lags)
     for axis, course in courses.items():
         trend, sd = _trend(course), np.sqrt(course.variance)
         parts = zip(course.time.tolist(), course.shift.tolist(), sd.tolist(), strict=True)
-        told[axis] = msgspec.structs.replace(
-            told[axis],
+        known[axis] = msgspec.structs.replace(
+            known[axis],
             drift=trend.drift,
             drift_sd=trend.drift_sd,
             drifts=trend.drifts,
             wander=trend.wander if trend.wanders else 0.0,
             course=[PartLag(time=time, shift=shift, sd=one) for time, shift, one in parts],
         )
-    return told, _clock(list(courses.values()))
+    return known, _clock(list(courses.values()))
 
 
 def _trend(course: _Course) -> _Trend:

@@ -21,7 +21,7 @@ from .intervals import ConfidenceInterval, Distances, lag_slopes
 from .parameters import Parameter
 from .validation import Check, fused
 
-_FROM_PRIOR = 0.8  # of the prior's interval, from which the measurements have told hardly anything
+_FROM_PRIOR = 0.8  # of the prior's interval, from which the measurements say hardly anything
 
 
 class Fitted(msgspec.Struct, frozen=True, kw_only=True):
