@@ -205,6 +205,20 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_fusing_imports_nothing_that_it_does_not_need(tmp_path: Path) -> None:
+    """The like of pandas, which pyarrow would import, where there is one, for any list that is made a column."""
+    words = ["fuse", str(SCAN), "-c", str(FUSION), "-o", str(tmp_path / "out")]
+    code = (
+        "import sys; from pumafuse.cli.main import app\n"
+        f"try: app({words})\n"
+        "except SystemExit as end: assert not end.code\n"
+        "heavy = {'pandas', 'control', 'rerun', 'filterpy', 'matplotlib', 'statsmodels'} & set(sys.modules)\n"
+        "sys.exit(str(heavy) if heavy else 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "limit"), [("sin_sin", 1.4), ("sin_time_square", 5.4)])
 def test_a_real_servo_is_followed_between_rare_measurements(name: str, limit: float, tmp_path: Path) -> None:

@@ -188,9 +188,9 @@ def estimates_table(est: Estimates, *, files: bool = True) -> pa.Table:
         screen = est.config.arm.screen_of(axis) if files else SI[est.config.arm.axes[axis].kind]
         for name in AxisEstimate.FIELDS:
             unit = f"{screen.unit}_s" if name.startswith("velocity") else screen.unit
-            columns[f"{axis}.{name}_{unit}"] = _nullable(getattr(estimate, name) * screen.scale)
+            columns[f"{axis}.{name}_{unit}"] = _column_of(getattr(estimate, name) * screen.scale)
     in_log = _in_log(est.cartesian, SCREEN["length"] if files else SI["length"])
-    return pa.table({"time_s": est.time, **columns, **in_log, **_segment_column(est.segment)})
+    return pa.table({"time_s": _column_of(est.time), **columns, **in_log, **_segment_column(est.segment)})
 
 
 def _measurements_table(est: Estimates) -> pa.Table:
@@ -200,15 +200,15 @@ def _measurements_table(est: Estimates) -> pa.Table:
     for kind in known:  # columns for each: null on axes of the other
         mine, screen = np.array([kinds[axis] == kind for axis in r.axes])[r.axis], SCREEN[kind]
         for name in ("value", "innovation", "innovation_sd"):
-            positions[f"{name}_{screen.unit}"] = _nullable(np.where(mine, getattr(r, name) * screen.scale, np.nan))
+            positions[f"{name}_{screen.unit}"] = _column_of(np.where(mine, getattr(r, name) * screen.scale, np.nan))
     return pa.table(
         {
-            "time_s": _nullable(r.time),
-            "stamp_s": _nullable(r.stamp),
+            "time_s": _column_of(r.time),
+            "stamp_s": _column_of(r.stamp),
             "sensor": _names(r.sensor, r.sensors),
             "axis": _names(r.axis, r.axes),
             **positions,
-            "nis": _nullable(r.nis),
+            "nis": _column_of(r.nis),
             "outcome": _names(r.outcome, [outcome.word for outcome in Outcome]),
             **_segment_column(r.segment),
         }
@@ -216,17 +216,17 @@ def _measurements_table(est: Estimates) -> pa.Table:
 
 
 def _reference_table(reference: ReferenceTrack, arm: ArmModel) -> pa.Table:
-    columns: dict[str, pa.Array | FloatArray] = {"time_s": reference.time}
+    columns = {"time_s": _column_of(reference.time)}
     for axis, position in reference.position.items():
         kind = arm.axes[axis].kind if axis in arm.axes else "length"  # x, y and z
-        columns[_column(axis, "position", kind)] = _nullable(position * SCREEN[kind].scale)
-        columns[_column(axis, "position_sd", kind)] = reference.sd[axis] * SCREEN[kind].scale
+        columns[_column(axis, "position", kind)] = _column_of(position * SCREEN[kind].scale)
+        columns[_column(axis, "position_sd", kind)] = _column_of(reference.sd[axis] * SCREEN[kind].scale)
     return pa.table({**columns, **_in_log(reference.cartesian), **_segment_column(reference.segment)})
 
 
 def _in_log(cartesian: Mapping[str, FloatArray] | None, screen: Screen = SCREEN["length"]) -> dict[str, pa.Array]:
     """Columns of the log's x, y and z; none without a frame."""
-    return {f"{name}_{screen.unit}": _nullable(x * screen.scale) for name, x in (cartesian or {}).items()}
+    return {f"{name}_{screen.unit}": _column_of(x * screen.scale) for name, x in (cartesian or {}).items()}
 
 
 def _cartesian(table: Table) -> dict[str, FloatArray] | None:
@@ -278,7 +278,10 @@ def _plain(table: Table, axis: str, name: str, kind: Kind) -> FloatArray:
 
 def _names(index: npt.NDArray[np.integer[Any]], names: Sequence[str]) -> pa.Array:
     """The name of each index as a column of text."""
-    return pa.DictionaryArray.from_arrays(index.astype(np.int32), list(names)).cast(pa.string())
+    texts = [name.encode() for name in names]
+    ends = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+    words = pa.StringArray.from_buffers(len(texts), pa.py_buffer(ends), pa.py_buffer(b"".join(texts)))
+    return pa.DictionaryArray.from_arrays(_column_of(index.astype(np.int32)), words).cast(pa.string())
 
 
 def _time_and_segment(table: Table) -> tuple[FloatArray, IntArray]:
@@ -291,10 +294,18 @@ def _time_and_segment(table: Table) -> tuple[FloatArray, IntArray]:
     return time, segment.astype(np.int64)
 
 
-def _segment_column(segment: IntArray) -> dict[str, IntArray]:
+def _segment_column(segment: IntArray) -> dict[str, pa.Array]:
     """A column only where the log's clock was set back: most runs are one segment."""
-    return {"segment": segment} if segment.any() else {}
+    return {"segment": _column_of(segment)} if segment.any() else {}
 
 
-def _nullable(values: FloatArray) -> pa.Array:
-    return pa.array(values, from_pandas=True)
+def _column_of(values: npt.NDArray[Any]) -> pa.Array:
+    """Numbers as a column, NaN as null.
+
+    ``pa.array`` would import pandas wherever there is one, which takes longer than to fuse.
+    """
+    known = ~np.isnan(values)
+    bits = None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
+    return pa.Array.from_buffers(
+        pa.from_numpy_dtype(values.dtype), len(values), [bits, pa.py_buffer(np.ascontiguousarray(values))]
+    )
