@@ -115,7 +115,7 @@ def test_estimates_leave_no_trace() -> None:
     without, dense, sparse = (Pass.over(segment) for _ in range(3))
     without.run(events, np.empty(0, dtype=np.int64))
     dense.run(events, GRID)
-    sparse.run(events, GRID[::7])
+    sparse.run(events, GRID[::7].copy())
     np.testing.assert_array_equal(dense.results[0].outcome, without.results[0].outcome)
     np.testing.assert_array_equal(dense.state.x[:2], without.state.x[:2])
     np.testing.assert_array_equal(dense.outputs[0][:, :, ::7], sparse.outputs[0])
