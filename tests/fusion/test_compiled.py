@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import pumafuse as pf
+
 CODE = """
 import numpy as np
 from pumafuse.model.arm import AxisModel
@@ -43,6 +45,9 @@ def test_compiling_is_said_once_on_a_machine(tmp_path: Path) -> None:
     assert first.stderr.splitlines() == ["compiling the filter for this machine, once (some 15 s) ..."]
     assert again.stderr == others.stderr == ""
     assert first.stdout == again.stdout
+    source = Path(pf.__file__).parent.rglob("*.py")
+    kernels = sum(path.read_text(encoding="utf-8").count("\n@kernel\n") for path in source)
+    assert len(list(tmp_path.rglob("*.nbi"))) == kernels > 10
 
 
 @pytest.mark.long
