@@ -78,6 +78,7 @@ def test_the_page_has_a_picture_and_the_answers(told: tuple[str, Path]) -> None:
     assert not re.search(r'(src|href)="http', html)
 
 
+@pytest.mark.long
 def test_identify_writes_an_arm_with_intervals(trunk: Path, tmp_path: Path) -> None:
     """From motion, without a guess; JSON in the units of its names; an arm file in the way is refused."""
     path = tmp_path / "arm.toml"

@@ -59,6 +59,7 @@ def test_a_run_is_written_whole_and_the_next_command_works(scenario: Path, tmp_p
     assert names(tmp_path / "result") == RESULT
 
 
+@pytest.mark.long
 def test_the_executable_gives_the_bytes_that_python_gives(scenario: Path, tmp_path: Path) -> None:
     """And `--runs` those of single runs with the seeds in a row, on however many cores."""
     printed = pumafuse("simulate", scenario, "-o", tmp_path / "many", "--runs", 3).stdout

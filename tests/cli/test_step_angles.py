@@ -12,6 +12,8 @@ import pytest
 import pumafuse as pf
 from executable import names, pumafuse, refused
 
+pytestmark = pytest.mark.long  # the same numbers by Python: tests/identification/test_angles.py
+
 DEGREE = math.pi / 180.0
 PERIOD, DELAY, SLOPE, INTERCEPT, NOISE = 0.02, 0.05, 0.1, 0.93, 0.002  # s, s, s/rad, 1, degrees
 PLANTS = {

@@ -204,6 +204,7 @@ def test_a_limit_is_in_the_unit_of_its_factor() -> None:
     assert validity(found[1:], 7.0, "angle").max_angular_speed == 7.0
 
 
+@pytest.mark.long
 def test_the_default_tolerance_is_a_millimetre_or_a_tenth_of_a_degree(trials: dict[str, StepTrials]) -> None:
     """As JSON shows it."""
     shown = {unit: json.loads(pf.identify(trials[unit]).to_json()) for unit in ("_mm", "_deg")}

@@ -103,6 +103,7 @@ def test_a_recorded_stream_fuses_to_what_live_gave(tmp_path: Path) -> None:
         assert [one[axis]["sd_mm"] for one in given] == (track.position_sd * 1e3).tolist()
 
 
+@pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(drawn=any_stream())
 def test_a_record_fuses_to_the_last_estimates(tmp_path_factory, drawn) -> None:

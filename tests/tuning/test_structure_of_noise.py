@@ -155,6 +155,7 @@ def test_noise_that_is_correlated_for_ten_milliseconds_is_no_disturbance() -> No
 # ---- gains and scales -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_constant_gain_is_found() -> None:
     """0.9 for ever, configured as 1: constant, within 1 %; delay and lag are not bent to make up for it."""
     config, command, path = moving(gain=0.9)
