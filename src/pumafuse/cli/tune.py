@@ -25,6 +25,7 @@ from .tables import console, interval, number, table
 SUMMARY = "tuning.json"
 PAGE = "report.html"
 OURS = frozenset({SUMMARY, PAGE, "fusion.toml", "arm.toml"})
+_PAIRS = 3  # of correlated parameters that are shown
 _WORSE, _INTERRUPTED = 3, 130
 
 
@@ -98,7 +99,10 @@ def _show(summary: TuningSummary, period: float) -> None:
     if summary.lags:
         typer.echo(formatting.lag(period))
     lines = [*formatting.chosen(summary.orders), *summary.not_identifiable]
-    lines += [formatting.together(pair) for pair in summary.correlations]
+    pairs = sorted(summary.correlations, key=lambda pair: -abs(pair.correlation))
+    lines += [formatting.together(pair) for pair in pairs[:_PAIRS]]
+    if len(pairs) > _PAIRS:
+        lines.append(f"and {len(pairs) - _PAIRS} more pairs: `correlations` in {SUMMARY}")
     for one in summary.biases:
         off = f"{interval(one.bias, one.sd, one.kind)} {SCREEN[one.kind].unit}"
         lines.append(f"{one.run}: {one.sensor} is off by {off} on {one.axis}")
