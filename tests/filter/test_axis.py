@@ -24,7 +24,7 @@ from pumafuse.filter.axis import (
     U,
 )
 from pumafuse.fusion.config import FusionConfig, Process, Sensor
-from pumafuse.fusion.setup import at_rest, filter_model, filter_sensors
+from pumafuse.fusion.setup import at_rest, columns_of, filter_model, filter_sensors
 from pumafuse.model.arm import ArmModel, AxisModel, Gain
 from pumafuse.model.plants import FirstOrder, SecondOrder
 
@@ -63,8 +63,8 @@ def arranged(places: int = 0) -> tuple[Model, Sensors, State]:
     }
     arm = ArmModel(name="an arm", update_period=T, delay=0.06, axes=axes)
     config = FusionConfig(arm=arm, process=dict.fromkeys(AXES, PROCESS), sensors=SENSORS)
-    biases = [["biased", "other"]] * 3
-    state = at_rest(config, AXES, 3, biases, 0, dict.fromkeys(AXES, 0.5), places)
+    columns = columns_of(config, AXES, [["biased", "other"]] * 3)
+    state = at_rest(columns, 3, 0, dict.fromkeys(AXES, 0.5), places)
     rng = np.random.default_rng(1)
     for axis, plant in enumerate(PLANTS):
         root = rng.normal(0.0, 1e-3, state.P[axis].shape)
@@ -73,7 +73,7 @@ def arranged(places: int = 0) -> tuple[Model, Sensors, State]:
             root[1] = state.x[axis, 1] = 0.0
         state.P[axis] = root @ root.T
         state.drive[axis, 1:] = rng.normal(0.0, 1e-2, 5) ** 2
-    return filter_model(config, AXES, biases), filter_sensors(config, list(SENSORS), AXES, biases), state
+    return filter_model(columns), filter_sensors(columns, list(SENSORS)), state
 
 
 def plant_matrices(axis: int) -> tuple[FloatArray, FloatArray]:

@@ -28,7 +28,7 @@ from ..model.closed import decaying_response, gain_error, transition
 from ..model.matern import matern
 
 POSITION, RATE, OFFSET, REST = range(4)  # of a state; the disturbance, if there is one, is the first of the rest
-ORDER, DISTURBANCE, STATES = range(3)  # of a kind
+ORDER, DISTURBANCE, STATES, ANSWERS = range(4)  # of a kind
 NONE, ROUGH, SMOOTH = range(3)  # disturbances, by how many states they have
 REVERTING, VARIANCE = range(2)  # of a state of the rest
 START, U, STEP, ERROR, NOISE, DRIFT = range(6)  # of a drive
@@ -65,7 +65,8 @@ class Model(NamedTuple):
 
     Attributes:
         kind: ``ORDER`` of the plant, 1 or 2, ``DISTURBANCE``: ``NONE``, ``ROUGH`` (Ornstein-Uhlenbeck) or ``SMOOTH``
-            (Matérn), and how many ``STATES`` there are, (A, 3).
+            (Matérn), how many ``STATES`` there are, and the first axis that ``ANSWERS`` as this one does: what they do
+            in an interval is kept once, (A, 4).
         constants: Of the plant, see :mod:`pumafuse.model.closed`, (A, c).
         rest: How fast each of the state's entries reverts to 0 [1/s] and its stationary variance [m²]: λ and σ² of the
             disturbance; 0 and 0 of what is constant, (A, s, 2).
@@ -117,8 +118,8 @@ class State(NamedTuple):
         gate_count: Rejections in a row, and re-acquisitions, (r, S, 2).
         unsettled: When sensors last disagreed while re-acquisitions were counted, int64 ns, ``ALWAYS`` for never, (r,).
         work: Room for the vectors of an update: H, K, P Hᵀ and (I − K H) P Hᵀ, (A, 4, s).
-        intervals: What an axis does in an interval [ns], of the latest few: plant, gain error and disturbance,
-            (A, ``KEPT``, 18 + 2 (s − 3)).
+        intervals: What an axis does in an interval [ns], of the latest few: plant, gain error, disturbance and what
+            reverts, in the row of the first axis that ``ANSWERS`` so, (A, ``KEPT``, 18 + 2 (s − 3)).
     """
 
     x: FloatArray
@@ -151,26 +152,26 @@ def predict_plant(model: Model, state: State, axis: int, row: int, time: int) ->
     """Bring the plant's mean and e to ``time`` [ns], all that commands move; the rest stays behind."""
     if time <= state.clock[row]:
         return
-    x, drive = state.x, state.drive
-    at = interval_of(model, state.intervals, axis, time - state.clock[row])
+    x, drive, like = state.x, state.drive, model.kind[axis, ANSWERS]
+    at = interval_of(model, state.intervals, like, time - state.clock[row])
     x[row, POSITION], x[row, RATE], drive[row, ERROR] = moved(
-        state.intervals, axis, at, x[row, POSITION], x[row, RATE], drive[row, U], drive[row, ERROR]
+        state.intervals, like, at, x[row, POSITION], x[row, RATE], drive[row, U], drive[row, ERROR]
     )
     state.clock[row] = time
 
 
 @compiled
 def moved(
-    known: FloatArray, axis: int, at: int, position: float, rate: float, u: float, error: float
+    known: FloatArray, like: int, at: int, position: float, rate: float, u: float, error: float
 ) -> tuple[float, float, float]:
     """Position, rate and e after an interval with the input u held."""
     gap = position - u
-    position = u + (known[axis, at, F11] * gap + known[axis, at, F12] * rate)
-    rate = known[axis, at, F21] * gap + known[axis, at, F22] * rate
+    position = u + (known[like, at, F11] * gap + known[like, at, F12] * rate)
+    rate = known[like, at, F21] * gap + known[like, at, F22] * rate
     if error != 0.0:
-        position += known[axis, at, ERROR_POSITION] * error
-        rate += known[axis, at, ERROR_RATE] * error
-        error *= known[axis, at, ERROR_LEFT]
+        position += known[like, at, ERROR_POSITION] * error
+        rate += known[like, at, ERROR_RATE] * error
+        error *= known[like, at, ERROR_LEFT]
     return position, rate, error
 
 
@@ -179,25 +180,25 @@ def predict_rest(model: Model, state: State, axis: int, row: int) -> None:
     """Bring P and what no command moves to where the plant's mean is; noise densities were the same all the way."""
     if state.settled[row] == state.clock[row]:
         return
-    P, drive, known = state.P, state.drive, state.intervals
+    P, drive, known, like = state.P, state.drive, state.intervals, model.kind[axis, ANSWERS]
     interval = state.clock[row] - state.settled[row]
-    at, q = interval_of(model, known, axis, interval), drive[row, NOISE]
-    f11, f12, f21, f22 = known[axis, at, F11], known[axis, at, F12], known[axis, at, F21], known[axis, at, F22]
+    at, q = interval_of(model, known, like, interval), drive[row, NOISE]
+    f11, f12, f21, f22 = known[like, at, F11], known[like, at, F12], known[like, at, F21], known[like, at, F22]
     size = model.kind[axis, STATES]
     move_pair(P, row, POSITION_, size, f11, f12, f21, f22)
-    add_to_pair(P, row, POSITION_, q * known[axis, at, Q11], q * known[axis, at, Q12], q * known[axis, at, Q22])
+    add_to_pair(P, row, POSITION_, q * known[like, at, Q11], q * known[like, at, Q12], q * known[like, at, Q22])
     P[row, OFFSET, OFFSET] += drive[row, DRIFT] * (interval / 1e9)
     if size > REST:
-        revert(model, state, axis, row, at)
+        revert(model, state, axis, row, like, at)
     state.settled[row] = state.clock[row]
 
 
 @compiled
-def interval_of(model: Model, known: FloatArray, axis: int, interval: int) -> int:
-    """Where what an axis does in an interval [ns] is kept."""
+def interval_of(model: Model, known: FloatArray, like: int, interval: int) -> int:
+    """Where what an axis does in an interval [ns] is kept; ``like`` is the first that answers so."""
     at = interval % KEPT
-    if known[axis, at, LENGTH] != interval:
-        respond(model, known, axis, at, interval)
+    if known[like, at, LENGTH] != interval:
+        respond(model, known, like, at, interval)
     return at
 
 
@@ -217,7 +218,7 @@ def respond(model: Model, known: FloatArray, axis: int, at: int, interval: int) 
     for i in range(REST, model.kind[axis, STATES]):
         fading = -model.rest[axis, i, REVERTING] * dt
         known[axis, at, FIRST_REST + 2 * i] = math.exp(fading)
-        known[axis, at, FIRST_REST + 2 * i + 1] = model.rest[axis, i, VARIANCE] * math.expm1(2.0 * fading)
+        known[axis, at, FIRST_REST + 2 * i + 1] = math.expm1(2.0 * fading)
     if model.kind[axis, DISTURBANCE] == SMOOTH:
         f11, f12, f21, f22, q11, q12, q22 = matern(model.rest[axis, REST, REVERTING], dt)
         known[axis, at, D11], known[axis, at, D12], known[axis, at, D21], known[axis, at, D22] = f11, f12, f21, f22
@@ -225,26 +226,26 @@ def respond(model: Model, known: FloatArray, axis: int, at: int, interval: int) 
 
 
 @compiled_apart
-def revert(model: Model, state: State, axis: int, row: int, at: int) -> None:
+def revert(model: Model, state: State, axis: int, row: int, like: int, at: int) -> None:
     """Bring disturbance and drifting biases an interval on: they revert to 0; what they lose comes back as noise."""
     x, P, size, first, known = state.x, state.P, model.kind[axis, STATES], REST, state.intervals
     if model.kind[axis, DISTURBANCE] == SMOOTH:
         variance = model.rest[axis, REST, VARIANCE]
-        f11, f12, f21, f22 = known[axis, at, D11], known[axis, at, D12], known[axis, at, D21], known[axis, at, D22]
+        f11, f12, f21, f22 = known[like, at, D11], known[like, at, D12], known[like, at, D21], known[like, at, D22]
         d, rate = x[row, REST], x[row, REST + 1]
         x[row, REST], x[row, REST + 1] = f11 * d + f12 * rate, f21 * d + f22 * rate
         move_pair(P, row, REST_, size, f11, f12, f21, f22)
-        q11, q12, q22 = known[axis, at, N11], known[axis, at, N12], known[axis, at, N22]
+        q11, q12, q22 = known[like, at, N11], known[like, at, N12], known[like, at, N22]
         add_to_pair(P, row, REST_, variance * q11, variance * q12, variance * q22)
         first = REST + 2
     for i in range(first, size):
         if model.rest[axis, i, REVERTING] > 0.0:
-            left = known[axis, at, FIRST_REST + 2 * i]
+            left = known[like, at, FIRST_REST + 2 * i]
             x[row, i] *= left
             for j in range(size):
                 P[row, i, j] *= left
                 P[row, j, i] *= left
-            P[row, i, i] -= known[axis, at, FIRST_REST + 2 * i + 1]
+            P[row, i, i] -= model.rest[axis, i, VARIANCE] * known[like, at, FIRST_REST + 2 * i + 1]
 
 
 @compiled

@@ -63,6 +63,11 @@ class Events(NamedTuple):
         spread = of(self.spread) if len(self.spread) else self.spread
         return Events(of(self.time), of(self.source), of(self.stamp), of(self.value), spread, of(self.known))
 
+    def repeated(self, times: int) -> Events:
+        """The events with their axes so many times, one set after the other."""
+        value, spread, known = (np.tile(part, times) for part in (self.value, self.spread, self.known))
+        return self._replace(value=value, spread=spread, known=known)
+
     def columns(self, axes: list[int]) -> Events:
         """The events with the values of some axes alone."""
         value, spread, known = (np.ascontiguousarray(part[:, axes]) for part in (self.value, self.spread, self.known))
@@ -90,6 +95,11 @@ class Results(NamedTuple):
         shape = (events, axes)
         nothing = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, ABSENT, dtype=np.uint8)
         return Results(*nothing, np.full(events, -1, dtype=np.int16))
+
+    def split(self, times: int) -> list[Results]:
+        """The parts of as many sets of axes, one after the other."""
+        parts = zip(*(np.split(part, times, axis=1) for part in self[:3]), strict=True)
+        return [Results(*part, self.contradicts) for part in parts]
 
     def rows(self, chosen: IntArray) -> Results:
         """What became of some of the events, in the order of ``chosen``."""

@@ -19,6 +19,7 @@ from ..arrays import NEVER, BoolArray, FloatArray, IntArray, TimeArray
 from ..compiled import compiled, inlined, kernel
 from ..model.closed import gain_error
 from .axis import (
+    ANSWERS,
     DISTURBANCE,
     DRIFT,
     ERROR,
@@ -242,15 +243,15 @@ def follow_plant(f: Filter, axis: int, first: int, end: int) -> None:
     slope, intercept, period = gain[axis, SLOPE], gain[axis, INTERCEPT], gain[axis, PERIOD]
     position, rate, u, error = x[axis, POSITION], x[axis, RATE], drive[axis, U], drive[axis, ERROR]
     clock, step, level = f.state.clock[axis], drive[axis, STEP], drive[axis, START]
-    latest, at = 0, 0
+    latest, at, like = 0, 0, f.model.kind[axis, ANSWERS]
     for row in range(first, end):
         if f.events.known[row, axis] != FUSED:
             continue
         if f.events.time[row] > clock:
             if f.events.time[row] - clock != latest:
                 latest = f.events.time[row] - clock
-                at = interval_of(f.model, known, axis, latest)
-            position, rate, error = moved(known, axis, at, position, rate, u, error)
+                at = interval_of(f.model, known, like, latest)
+            position, rate, error = moved(known, like, at, position, rate, u, error)
             clock = f.events.time[row]
         command = f.events.value[row, axis] - level
         step, u = command - u, command

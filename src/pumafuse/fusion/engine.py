@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,7 +17,7 @@ from ..filter.smoother import smooth
 from .config import FusionConfig
 from .estimates import AxisEstimate, Bias, Mode
 from .segments import Segment
-from .setup import at_rest, filter_model, filter_sensors
+from .setup import Column, at_rest, columns_of, filter_model, filter_sensors
 
 Engine = Literal["compiled", "filterpy"]
 
@@ -97,13 +97,45 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
         outcome: What became of each measurement in an earlier fusion, (m, A), to be repeated whatever the gates would
             say; None: they say.
     """
+    columns = columns_of(config, segment.axes, biased_sensors(segment, config))
+    return _innovations(segment, config, columns, outcome)
+
+
+def innovations_of_each(segment: Segment, configs: Sequence[FusionConfig], outcome: CodeArray) -> list[Results]:
+    """The same of several configurations, while the outcomes are repeated.
+
+    Those of one time and scale go through the filter side by side: its rows are read once, and what several of them do
+    in an interval is computed once.
+    """
+    alike: dict[Hashable, list[int]] = {}
+    for number, config in enumerate(configs):
+        sensors = [config.sensors[name] for name in segment.sensors if name in config.sensors]
+        shared = tuple((one.scale, one.latency_sd) for one in sensors)
+        alike.setdefault((segment.times(config), shared), []).append(number)
+    found: dict[int, Results] = {}
+    for numbers in alike.values():
+        columns: list[Column] = []
+        for number in numbers:
+            columns += columns_of(configs[number], segment.axes, biased_sensors(segment, configs[number]))
+        together = _innovations(segment, configs[numbers[0]], columns, outcome)
+        found |= zip(numbers, together.split(len(numbers)), strict=True)
+    return [found[number] for number in range(len(configs))]
+
+
+def _innovations(
+    segment: Segment, config: FusionConfig, columns: Sequence[Column], outcome: CodeArray | None
+) -> Results:
+    """Innovations by ``measurement_rows``; columns are the axes, once or more often, at the times of ``config``."""
     events, place = segment.events(config)
-    model, sensors, state = arranged(segment, config, biased_sensors(segment, config))
-    axes, count = len(segment.axes), len(events.time)
-    results = Results.room(count, axes)
+    count, times = len(events.time), len(columns) // len(segment.axes)
+    if times > 1:
+        events = events.repeated(times)
+    model, sensors = filter_model(columns), filter_sensors(columns, segment.sensors)
+    state = at_rest(columns, len(segment.sensors), segment.origin, segment.start)
+    results = Results.room(count, len(columns))
     if outcome is not None:
-        results.outcome[place] = outcome
-    arrays = Filter(model, sensors, events, state, results, no_history(axes, state.x.shape[1])).flat()
+        results.outcome[place] = np.tile(outcome, times)
+    arrays = Filter(model, sensors, events, state, results, no_history(len(columns), state.x.shape[1])).flat()
     filter_events(arrays, outcome is not None, 0, count, count, *ALL_THERE, 0, *NO_ESTIMATES)
     return results.rows(place)
 
@@ -112,11 +144,9 @@ def arranged(
     segment: Segment, config: FusionConfig, biases: list[list[str]], places: int = 0
 ) -> tuple[Model, Sensors, State]:
     """The filter's arrays for a segment, and the state at rest."""
-    return (
-        filter_model(config, segment.axes, biases),
-        filter_sensors(config, segment.sensors, segment.axes, biases),
-        at_rest(config, segment.axes, len(segment.sensors), biases, segment.origin, segment.start, places),
-    )
+    columns = columns_of(config, segment.axes, biases)
+    state = at_rest(columns, len(segment.sensors), segment.origin, segment.start, places)
+    return filter_model(columns), filter_sensors(columns, segment.sensors), state
 
 
 def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:

@@ -26,7 +26,7 @@ from ..logs.grid import regular_grid
 from ..logs.run import Run, Source, note_rows
 from ..units import AN
 from .config import FusionConfig
-from .setup import at_rest, filter_model, filter_sensors
+from .setup import at_rest, columns_of, filter_model, filter_sensors
 
 _MOST_ESTIMATES = 10_000_000
 _KEPT = 3  # orders of the events: those of a search's point, and a little earlier and later
@@ -87,14 +87,17 @@ class Segment:
         Returns:
             The events; and where among them each of ``measurement_rows`` is.
         """
-        delay, latency = [round(config.arm.delay_of(axis) * 1e9) for axis in self.axes], self._latency(config)
-        times = (*delay, *latency.tolist())  # a search asks for many configurations of the same times
+        times = self.times(config)  # a search asks for many configurations of the same times
         found = self._latest.get(times)
         if found is None:
-            found = self._latest[times] = self._ordered(delay, latency)
+            found = self._latest[times] = self._ordered(times[: len(self.axes)], np.array(times[len(self.axes) :]))
             for oldest in list(self._latest)[:-_KEPT]:
                 self._latest.pop(oldest, None)  # threads share it
         return found
+
+    def times(self, config: FusionConfig) -> tuple[int, ...]:
+        """All that the order of the events depends on: the delay of each axis, the latency of each sensor, int ns."""
+        return (*(round(config.arm.delay_of(axis) * 1e9) for axis in self.axes), *self._latency(config).tolist())
 
     def _ordered(self, delay: Sequence[int], latency: IntArray) -> tuple[Events, IntArray]:
         distinct = sorted(set(delay))
@@ -299,9 +302,9 @@ def as_commanded(run: Run, config: FusionConfig) -> Source:
 
 
 def _policy(config: FusionConfig, axes: Sequence[str], sensors: Sequence[str]) -> _Policy:
-    none = [()] * len(axes)
-    state = at_rest(config, axes, 0, none, 0, dict.fromkeys(axes, 0.0))
-    return filter_model(config, axes, none), filter_sensors(config, sensors, axes, none), state
+    columns = columns_of(config, axes, [()] * len(axes))
+    state = at_rest(columns, 0, 0, dict.fromkeys(axes, 0.0))
+    return filter_model(columns), filter_sensors(columns, sensors), state
 
 
 def _unmatched(silent: Sequence[str], strangers: Sequence[str]) -> list[str]:

@@ -18,7 +18,7 @@ from ..filter.outcome import ABSENT, FARTHEST, Outcome
 from ..filter.window import FIRST_ROWS, MOST_ROWS, Incoming, Memory, Window
 from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS
-from ..fusion.setup import at_rest, filter_model, filter_sensors
+from ..fusion.setup import at_rest, columns_of, filter_model, filter_sensors
 from ..logs.frames import CARTESIAN, Cylindrical
 from ..model.arm import Validity
 from ..units import Kind
@@ -510,7 +510,8 @@ def empty_window(
         [name for name, sensor in config.sensors.items() if sensor.is_biased(axis) and sensor.sd_of(axis) is not None]
         for axis in axes
     ]
-    state = at_rest(config, axes, len(names), biases, NEVER, start, FIRST_ROWS + 1)
+    columns = columns_of(config, axes, biases)
+    state = at_rest(columns, len(names), NEVER, start, FIRST_ROWS + 1)
     for part in state.by_row:
         part[-count:] = part[:count]  # at rest
     counted = Counters.none(len(names))
@@ -519,8 +520,8 @@ def empty_window(
     level = [start.get(axis, np.nan) for axis in axes]
     delay = [round(config.arm.delay_of(axis) * 1e9) for axis in axes]
     arrays = Filter(
-        model=filter_model(config, axes, biases),
-        sensors=filter_sensors(config, names, axes, biases),
+        model=filter_model(columns),
+        sensors=filter_sensors(columns, names),
         events=Events.empty(count, FIRST_ROWS)._replace(spread=np.ones((FIRST_ROWS, count))),
         state=state,
         results=Results.room(FIRST_ROWS, count),

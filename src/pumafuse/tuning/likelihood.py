@@ -23,11 +23,10 @@ import numpy as np
 
 from ..arrays import CodeArray, FloatArray, IntArray
 from ..discovery.following import scatter
-from ..filter.events import Results
 from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
-from ..fusion.engine import innovations
+from ..fusion.engine import innovations, innovations_of_each
 from ..fusion.faults import Fault, not_following, starts_in_motion
 from ..fusion.segments import Segment, added, build
 from ..logs.axes import in_axes
@@ -161,7 +160,6 @@ class Likelihood:
             for name, parts in counted.items()
         }
         self.config = config
-        self._latest: tuple[FusionConfig | None, Sequence[CodeArray], Sequence[Results]] = None, (), ()
         self.axes = tuple(axis for axis in config.arm.axes if any(axis in segment.axes for segment in built))
         self._segments = [_decided(segment, until, latest) for segment in built]
         self._parts = [
@@ -327,16 +325,13 @@ class Likelihood:
             outcomes: The outcome of each component, to be repeated; None: the configuration's gates decide.
         """
         axes, decided, densities = np.zeros(len(self.axes)), list[CodeArray](), list[FloatArray]()
-        every = list[Results]()
         for number, segment in enumerate(self._segments):
             found = innovations(segment, config, None if outcomes is None else outcomes[number])
             gates = np.array([config.sensors[name].gate for name in segment.sensors])[segment.measurement_rows.source]
             densities.append(log_density(found.innovation, found.innovation_sd, found.outcome, gates[:, None]))
             decided.append(found.outcome)
-            every.append(found)
         for part in self._parts:
             axes[part.axis] += float(densities[part.whole][part.rows, part.column].sum())
-        self._latest = config, decided, every
         return LogLikelihood(axes, decided)
 
     def derivatives(
@@ -361,28 +356,20 @@ class Likelihood:
         self, part: _Part, outcomes: Sequence[CodeArray], config: FusionConfig, parameters: Sequence[Parameter]
     ) -> tuple[list[int], FloatArray, FloatArray]:
         outcome = outcomes[part.whole][part.rows, part.column]
-
-        def innovated(at: FusionConfig) -> tuple[FloatArray, FloatArray]:
-            """ν and S of the measurements, whose outcomes are known."""
-            found = innovations(part.segment, at, outcome[:, None])
-            return found.innovation[:, 0], found.innovation_sd[:, 0] ** 2
-
         mine = [number for number, one in enumerate(parameters) if one.axis in (None, self.axes[part.axis])]
-        latest, decided, every = self._latest
-        if latest is config and decided is outcomes:  # as a search asks: at the point that it has just evaluated
-            known = every[part.whole]
-            base = known.innovation[part.rows, part.column], known.innovation_sd[part.rows, part.column] ** 2
-        else:
-            base = innovated(config)
-        nu, S = base
+        beside = [config]  # for each parameter a little up, then, but where it is a logarithm, as little down
+        for one in (parameters[number] for number in mine):
+            at = one.at(config)
+            beside += [one.move(config, at + step) for step in ([_LOG_STEP] if one.log else [_STEP, -_STEP])]
+        every = innovations_of_each(part.segment, beside, outcome[:, None])
+        moved = iter([(found.innovation[:, 0], found.innovation_sd[:, 0] ** 2) for found in every])
+        nu, S = next(moved)
         fused = outcome != Outcome.REJECTED
         d_nu, d_S = np.empty((len(mine), len(nu))), np.empty((len(mine), len(nu)))
         for place, number in enumerate(mine):
-            one = parameters[number]
-            step, at = _LOG_STEP if one.log else _STEP, one.at(config)
-            nu_up, S_up = innovated(one.move(config, at + step))
-            nu_down, S_down = (nu, S) if one.log else innovated(one.move(config, at - step))
-            width = step if one.log else 2.0 * step
+            log = parameters[number].log
+            (nu_up, S_up), (nu_down, S_down) = next(moved), (nu, S) if log else next(moved)
+            width = _LOG_STEP if log else 2.0 * _STEP
             d_nu[place], d_S[place] = (nu_up - nu_down) / width, (S_up - S_down) / width
         d_nu *= fused / np.sqrt(S)
         d_S /= S
