@@ -90,7 +90,8 @@ class Segment:
         times = self.times(config)  # a search asks for many configurations of the same times
         found = self._latest.get(times)
         if found is None:
-            found = self._latest[times] = self._ordered(times[: len(self.axes)], np.array(times[len(self.axes) :]))
+            delay, latency = times[: len(self.axes)], np.array(times[len(self.axes) :], dtype=np.int64)
+            found = self._latest[times] = self._ordered(delay, latency)
             for oldest in list(self._latest)[:-_KEPT]:
                 self._latest.pop(oldest, None)  # threads share it
         return found
