@@ -14,8 +14,8 @@ from ..fusion.config import FusionConfig
 from ..fusion.score import Z95
 from ..toml import Interval
 from .identifiability import covariance, within_bounds
-from .likelihood import Likelihood, in_threads
-from .maximise import Point, derivatives, maximise, point
+from .likelihood import Likelihood, Linearised, in_threads
+from .maximise import Ascent, Point, derivatives, maximise, point, with_priors
 from .parameters import Parameter, coordinates, moved, rounded
 
 Distances: TypeAlias = tuple[float, float]  # s; to the lower and upper end of an interval, infinite where it is open
@@ -68,7 +68,7 @@ class ConfidenceInterval:
         profiled: Whether the profile of the likelihood was computed, not only its curvature.
         at: The bound at which the value lies, else None.
         open: Which ends of the interval are open: the measurements do not limit them.
-        profile: The likelihood along it, to one and a half times the interval each way.
+        profile: The likelihood along it: drawn, to one and a half times the interval each way.
     """
 
     ci95: Interval
@@ -85,19 +85,23 @@ class _View(NamedTuple):
         likelihood: The likelihood.
         outcomes: The outcomes of its components, which are repeated.
         free: The free parameters that are not at a bound. The prior of a shared one is the information of other axes.
+        linear: The innovations around the maximum, to first order in these.
         covariance: Of their coordinates, (k, k).
     """
 
     likelihood: Likelihood
     outcomes: Sequence[CodeArray]
     free: Sequence[Parameter]
+    linear: Linearised
     covariance: FloatArray
 
 
 def confidence_intervals(
-    likelihood: Likelihood, best: Point, free: Sequence[Parameter]
+    likelihood: Likelihood, best: Point, free: Sequence[Parameter], *, drawn: bool = False
 ) -> dict[str, ConfidenceInterval]:
     """Compute the 95 % interval of each free parameter, by its key.
+
+    ``drawn``: with profiles to draw, too, which takes half as long again.
 
     From the curvature: 1.96 sd of the coordinate each way. Where the likelihood at an end, the other parameters moved
     along, has not dropped by what that predicts (1.92), the end is where its profile has (Cox & Hinkley, Theoretical
@@ -111,7 +115,7 @@ def confidence_intervals(
     views = _views(likelihood, best, free)
 
     def of(one: Parameter) -> ConfidenceInterval:
-        low, high = (_end(views[one.axis], best, one, sign) for sign in (-1.0, 1.0))
+        low, high = (_end(views[one.axis], best, one, sign, drawn) for sign in (-1.0, 1.0))
         peak = one.value(one.at(best.config))
         value, at = one.clipped(rounded(one.get(result))), one.at_bound(result)
         log = one.log and not (one.vanishes and low.value <= max(one.bounds[0], _NEXT_TO_NONE * high.value))
@@ -162,7 +166,8 @@ def _of_shared(information: FloatArray, own: int) -> FloatArray:
 
 def _view(likelihood: Likelihood, outcomes: Sequence[CodeArray], best: Point, free: Sequence[Parameter]) -> _View:
     there = point(likelihood, best.config, free, outcomes)
-    return _View(likelihood, outcomes, free, covariance(derivatives(likelihood, there, free).information, free))
+    linear = likelihood.linearised(best.config, free, there.outcomes)
+    return _View(likelihood, outcomes, free, linear, covariance(with_priors(linear, there, free).information, free))
 
 
 class _End(NamedTuple):
@@ -174,14 +179,23 @@ class _End(NamedTuple):
     curve: list[tuple[float, float]]
 
 
-def _end(view: _View, best: Point, one: Parameter, sign: float) -> _End:
+def _end(view: _View, best: Point, one: Parameter, sign: float, drawn: bool) -> _End:
     """The lower (−1) or upper (+1) end of an interval."""
     if one.at_bound(best.config) == ("lower" if sign < 0.0 else "upper"):
         return _End(one.get(best.config), True, True, [])
     side = _Side(view, best, one, sign)
     end, profiled = side.end()
     value = one.clipped(side.value(end))
-    return _End(value, profiled, profiled and end >= side.limit and side.root(end) < Z95, side.curve(end, profiled))
+    is_open = profiled and end >= side.limit and side.root(end) < Z95
+    return _End(value, profiled, is_open, side.curve(end, profiled) if drawn else [])
+
+
+class _Known(NamedTuple):
+    """A point of a profile: its drop, where the other coordinates are, and the innovations there to first order."""
+
+    drop: float
+    others: FloatArray
+    linear: Linearised
 
 
 class _Side:
@@ -198,16 +212,17 @@ class _Side:
         self._view, self._best, self._one, self._bound = view, best, one, one.at_bound(best.config)
         self._others = [other for other in view.free if other.key != one.key]
         self._every = [*view.free, *([] if self._bound is None else [one])]
-        slope, sd = np.zeros(len(self._others)), 1.0
+        slope, sd, near = np.zeros(len(self._others)), 1.0, view.linear
         for place, other in enumerate(view.free):
             if other.key == one.key:  # by regression, Cov(·, a) / Var a
+                near = view.linear.without(place)
                 slope = np.delete(view.covariance[:, place] / view.covariance[place, place], place)
                 sd = float(np.sqrt(view.covariance[place, place]))
         self._unit, self._start = sign * sd, one.at(best.config)
         self._slope = self._unit * slope
         self._vanishing = self._bound is not None and one.vanishes
         self._range = np.array([other.range for other in self._others]).reshape(-1, 2).T
-        self._known = {0.0: (0.0, coordinates(best.config, self._others))}  # by distance: drop, the other coordinates
+        self._known = {0.0: _Known(0.0, coordinates(best.config, self._others), near)}  # by distance
         self._top = point(view.likelihood, best.config, self._every, view.outcomes).log_posterior
         self.limit = self._distance(one.bounds[0 if sign < 0.0 else 1])
 
@@ -242,11 +257,13 @@ class _Side:
         distance = next((one for one in self._known if math.isclose(one, distance, rel_tol=_SAME)), distance)
         if distance not in self._known:
             inner = max(one for one in self._known if one < distance)
-            found = self._maximum(distance, self._expected(distance))
-            if _root(found[0]) > _FALLEN * Z95:  # another maximum, perhaps: the one inside goes on
-                found = min(found, self._maximum(distance, self._known[inner][1]), key=lambda one: one[0])
+            near = min(self._known, key=lambda one: abs(one - distance))
+            found = self._maximum(distance, self._expected(distance), self._known[near].linear)
+            if _root(found.drop) > _FALLEN * Z95:  # another maximum, perhaps: the one inside goes on
+                beside = self._maximum(distance, self._known[inner].others, self._known[inner].linear)
+                found = min(found, beside, key=lambda one: one.drop)
             self._known[distance] = found
-        return _root(self._known[distance][0])
+        return _root(self._known[distance].drop)
 
     def curve(self, end: float, profiled: bool) -> list[tuple[float, float]]:
         """Points of the profile to one and a half times the end: values [SI] and what the likelihood drops by."""
@@ -259,7 +276,7 @@ class _Side:
         if profiled:
             for place in places:
                 self.root(place)
-            drops = {place: drop for place, (drop, _) in self._known.items() if 0.0 < place <= max(places)}
+            drops = {place: one.drop for place, one in self._known.items() if 0.0 < place <= max(places)}
         else:
             drops = {place: self._drop(place) for place in places}
         return [(self._one.clipped(self.value(at)), -drop) for at, drop in drops.items()]
@@ -280,10 +297,10 @@ class _Side:
     def _expected(self, distance: float) -> FloatArray:
         """The other coordinates at a distance by those that are known: between two, or onwards from the last."""
         inner, outer = ([one for one in sorted(self._known) if (one > distance) == beyond] for beyond in (False, True))
-        last, at = inner[-1], self._known[inner[-1]][1]
+        last, at = inner[-1], self._known[inner[-1]].others
         if outer:
-            return at + (distance - last) / (outer[0] - last) * (self._known[outer[0]][1] - at)
-        slope = self._slope if last == 0.0 else (at - self._known[0.0][1]) / last
+            return at + (distance - last) / (outer[0] - last) * (self._known[outer[0]].others - at)
+        slope = self._slope if last == 0.0 else (at - self._known[0.0].others) / last
         return at + (distance - last) * slope
 
     def _along(self, distance: float, others: FloatArray) -> FusionConfig:
@@ -292,15 +309,15 @@ class _Side:
 
     def _drop(self, distance: float) -> float:
         """What the likelihood drops by with the others where they are expected."""
-        there = self._along(distance, self._known[0.0][1] + distance * self._slope)
+        there = self._along(distance, self._known[0.0].others + distance * self._slope)
         return self._top - point(self._view.likelihood, there, self._every, self._view.outcomes).log_posterior
 
-    def _maximum(self, distance: float, others: FloatArray) -> tuple[float, FloatArray]:
-        """The drop at the maximum next to these other coordinates, and that maximum's."""
-        view, start = self._view, self._along(distance, others)
-        peak = maximise(view.likelihood, start, self._others, outcomes=view.outcomes, tolerance=_TOLERANCE)
+    def _maximum(self, distance: float, others: FloatArray, near: Linearised) -> _Known:
+        """The maximum next to these other coordinates; ``near``: derivatives by them from nearby."""
+        ascent = Ascent(self._view.likelihood, self._others, self._view.outcomes, _TOLERANCE, near)
+        peak = ascent.maximum(self._along(distance, others))
         drop = self._top - peak.log_posterior - self._one.log_prior(peak.config)
-        return drop, coordinates(peak.config, self._others)
+        return _Known(drop, coordinates(peak.config, self._others), ascent.linear or near)
 
 
 def _root(drop: float) -> float:

@@ -21,8 +21,9 @@ from typing import NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
-from ..arrays import CodeArray, FloatArray, IntArray
+from ..arrays import BoolArray, CodeArray, FloatArray, IntArray
 from ..discovery.following import scatter
+from ..filter.events import Results
 from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
@@ -62,11 +63,16 @@ class LogLikelihood:
 
     Attributes:
         axes: Of each axis's components, with positions in mm or mrad, (A,).
-        outcomes: The outcome of each measurement on each axis, for each segment, (m, A).
+        results: What became of each measurement on each axis, for each segment.
     """
 
     axes: FloatArray
-    outcomes: Sequence[CodeArray]
+    results: Sequence[Results]
+
+    @property
+    def outcomes(self) -> list[CodeArray]:
+        """The outcome of each measurement on each axis, for each segment, (m, A)."""
+        return [one.outcome for one in self.results]
 
     @property
     def total(self) -> float:
@@ -87,6 +93,83 @@ class Derivatives(NamedTuple):
     score: FloatArray
     information: FloatArray
     scatter: FloatArray
+
+
+class _Linear(NamedTuple):
+    """Innovations and variances of one axis of one segment, to first order.
+
+    Attributes:
+        whole: The index of the segment.
+        mine: Which parameters they depend on, (p,).
+        fused: Which measurements were fused, (m,).
+        nu: ν, (m,).
+        S: Their variances, (m,).
+        d_nu: ∂ν/∂a, (p, m).
+        d_s: ∂S/∂a, (p, m).
+    """
+
+    whole: int
+    mine: list[int]
+    fused: BoolArray
+    nu: FloatArray
+    S: FloatArray
+    d_nu: FloatArray
+    d_s: FloatArray
+
+    def moved(self, step: FloatArray, nu: FloatArray, sd: FloatArray) -> _Linear:
+        """After a ``step`` (p,) to where they are ``nu`` and ``sd`` squared.
+
+        The derivatives change by the least, each weighed by its information, that explains these (Broyden's update).
+        """
+        S = sd * sd
+        weight = (self.d_nu**2 @ (1.0 / self.S) + 0.5 * self.d_s**2 @ (1.0 / self.S**2)) * step
+        weight /= max(float(weight @ step), _SMALLEST**2)
+        return self._replace(
+            nu=nu,
+            S=S,
+            d_nu=self.d_nu + np.outer(weight, nu - self.nu - step @ self.d_nu),
+            d_s=self.d_s + np.outer(weight, S - self.S - step @ self.d_s),
+        )
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Innovations and variances around a configuration, to first order in k parameters, with the outcomes there.
+
+    Attributes:
+        parts: By axis and segment.
+        size: How many parameters there are.
+        exact: Whether the derivatives were computed here, not carried along from elsewhere.
+    """
+
+    parts: Sequence[_Linear]
+    size: int
+    exact: bool
+
+    def without(self, number: int) -> Linearised:
+        """Without one of the parameters."""
+        parts = [
+            part._replace(
+                mine=[one - (one > number) for one in part.mine if one != number],
+                **{name: getattr(part, name)[[one != number for one in part.mine]] for name in ("d_nu", "d_s")},
+            )
+            for part in self.parts
+        ]
+        return replace(self, parts=parts, size=self.size - 1)
+
+    def derivatives(self) -> Derivatives:
+        """Score and information."""
+        information = np.zeros((self.size, self.size))
+        scores = np.zeros((1 + max(part.whole for part in self.parts), self.size, _PIECES))
+        for part in self.parts:
+            d_nu, d_s = part.d_nu * (part.fused / np.sqrt(part.S)), part.d_s / part.S
+            r = part.nu / np.sqrt(part.S)
+            excess = np.where(part.fused, r * r - 1.0, -1.0)
+            pieces = [slice(n * len(r) // _PIECES, (n + 1) * len(r) // _PIECES) for n in range(_PIECES)]
+            score = [-d_nu[:, piece] @ r[piece] + 0.5 * d_s[:, piece] @ excess[piece] for piece in pieces]
+            scores[part.whole, part.mine] += np.array(score).T
+            information[np.ix_(part.mine, part.mine)] += d_nu @ d_nu.T + 0.5 * d_s @ d_s.T
+        return Derivatives(scores.sum(axis=(0, 2)), information, np.einsum("nip,njp->ij", scores, scores))
 
 
 @dataclass(frozen=True)
@@ -324,37 +407,51 @@ class Likelihood:
             config: The configuration.
             outcomes: The outcome of each component, to be repeated; None: the configuration's gates decide.
         """
-        axes, decided, densities = np.zeros(len(self.axes)), list[CodeArray](), list[FloatArray]()
+        axes, results, densities = np.zeros(len(self.axes)), list[Results](), list[FloatArray]()
         for number, segment in enumerate(self._segments):
             found = innovations(segment, config, None if outcomes is None else outcomes[number])
             gates = np.array([config.sensors[name].gate for name in segment.sensors])[segment.measurement_rows.source]
             densities.append(log_density(found.innovation, found.innovation_sd, found.outcome, gates[:, None]))
-            decided.append(found.outcome)
+            results.append(found)
         for part in self._parts:
             axes[part.axis] += float(densities[part.whole][part.rows, part.column].sum())
-        return LogLikelihood(axes, decided)
+        return LogLikelihood(axes, results)
 
     def derivatives(
         self, config: FusionConfig, parameters: Sequence[Parameter], outcomes: Sequence[CodeArray]
     ) -> Derivatives:
         """Score and information of parameters while each component's outcome stays as it is."""
-        size = len(parameters)
-        information, scores = (
-            np.zeros((size, size)),
-            np.zeros((1 + max(part.whole for part in self._parts), size, _PIECES)),
-        )
+        return self.linearised(config, parameters, outcomes).derivatives()
 
-        def of(part: _Part) -> tuple[list[int], FloatArray, FloatArray]:
-            return self._part_derivatives(part, outcomes, config, parameters)
+    def linearised(
+        self, config: FusionConfig, parameters: Sequence[Parameter], outcomes: Sequence[CodeArray]
+    ) -> Linearised:
+        """Innovations and variances around a configuration while each component's outcome stays as it is."""
 
-        for part, (mine, pieces, square) in zip(self._parts, in_threads(of, self._parts), strict=True):
-            scores[part.whole, mine] += pieces
-            information[np.ix_(mine, mine)] += square
-        return Derivatives(scores.sum(axis=(0, 2)), information, np.einsum("nip,njp->ij", scores, scores))
+        def of(part: _Part) -> _Linear:
+            return self._linear(part, outcomes, config, parameters)
 
-    def _part_derivatives(
+        return Linearised(in_threads(of, self._parts), len(parameters), exact=True)
+
+    def moved(self, linear: Linearised, step: FloatArray, results: Sequence[Results]) -> Linearised:
+        """The same a ``step`` of the coordinates (k,) away, where the innovations are those in ``results``.
+
+        Derivatives are not computed anew: they change as little as agrees with these innovations and their variances
+        (Broyden, "A class of methods for solving nonlinear simultaneous equations", Mathematics of Computation 19,
+        1965).
+        """
+        parts = [
+            one.moved(
+                step[one.mine], found.innovation[part.rows, part.column], found.innovation_sd[part.rows, part.column]
+            )
+            for part, one in zip(self._parts, linear.parts, strict=True)
+            if (found := results[part.whole])
+        ]
+        return replace(linear, parts=parts, exact=False)
+
+    def _linear(
         self, part: _Part, outcomes: Sequence[CodeArray], config: FusionConfig, parameters: Sequence[Parameter]
-    ) -> tuple[list[int], FloatArray, FloatArray]:
+    ) -> _Linear:
         outcome = outcomes[part.whole][part.rows, part.column]
         mine = [number for number, one in enumerate(parameters) if one.axis in (None, self.axes[part.axis])]
         beside = [config]  # for each parameter a little up, then, but where it is a logarithm, as little down
@@ -364,20 +461,13 @@ class Likelihood:
         every = innovations_of_each(part.segment, beside, outcome[:, None])
         moved = iter([(found.innovation[:, 0], found.innovation_sd[:, 0] ** 2) for found in every])
         nu, S = next(moved)
-        fused = outcome != Outcome.REJECTED
-        d_nu, d_S = np.empty((len(mine), len(nu))), np.empty((len(mine), len(nu)))
+        d_nu, d_s = np.empty((len(mine), len(nu))), np.empty((len(mine), len(nu)))
         for place, number in enumerate(mine):
             log = parameters[number].log
             (nu_up, S_up), (nu_down, S_down) = next(moved), (nu, S) if log else next(moved)
             width = _LOG_STEP if log else 2.0 * _STEP
-            d_nu[place], d_S[place] = (nu_up - nu_down) / width, (S_up - S_down) / width
-        d_nu *= fused / np.sqrt(S)
-        d_S /= S
-        r = nu / np.sqrt(S)
-        excess = np.where(fused, r * r - 1.0, -1.0)
-        pieces = [slice(n * len(r) // _PIECES, (n + 1) * len(r) // _PIECES) for n in range(_PIECES)]
-        score = [-d_nu[:, piece] @ r[piece] + 0.5 * d_S[:, piece] @ excess[piece] for piece in pieces]
-        return mine, np.array(score).T, d_nu @ d_nu.T + 0.5 * d_S @ d_S.T
+            d_nu[place], d_s[place] = (nu_up - nu_down) / width, (S_up - S_down) / width
+        return _Linear(part.whole, mine, outcome != Outcome.REJECTED, nu, S, d_nu, d_s)
 
 
 def _certain(config: FusionConfig) -> FusionConfig:

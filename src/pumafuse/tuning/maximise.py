@@ -14,8 +14,9 @@ from typing import TypeAlias
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray
+from ..filter.events import Results
 from ..fusion.config import FusionConfig
-from .likelihood import Derivatives, Likelihood, in_threads
+from .likelihood import Derivatives, Likelihood, Linearised, in_threads
 from .parameters import Parameter, coordinates, moved, with_axis_of
 
 _ITERATIONS = 60
@@ -26,6 +27,7 @@ _LAST_DAMPING = 1e8  # at which the search gives up
 _DOUBLES = (2.0, 4.0, 8.0)
 _NOTHING, _CREEPING = 2e-4, 3  # log-likelihood; steps in a row that gain less: at a cusp, the score promises too much
 _POOR = 0.1  # of the expected gain, from which a step was too long
+_GOOD = 0.5  # of the expected gain, from which derivatives are carried along to the next step
 _MORE = 1.1  # of the expected gain, from which a longer step is tried
 _GATE_ROUNDS = 12  # times that the gates decide again
 _BUMPS = tuple(sign * shift for shift in (2e-4, 5e-4, 1e-3, 2e-3) for sign in (-1.0, 1.0))  # s
@@ -41,13 +43,18 @@ class Point:
         config: The configuration.
         log_likelihood: Its log-likelihood.
         axes: The log-posterior of each axis but for a constant (shared parameters' priors count for the first), (A,).
-        outcomes: The outcome of each component, for each segment, (m,).
+        results: What became of each component, for each segment.
     """
 
     config: FusionConfig
     log_likelihood: float
     axes: FloatArray
-    outcomes: Sequence[CodeArray]
+    results: Sequence[Results]
+
+    @property
+    def outcomes(self) -> list[CodeArray]:
+        """The outcome of each component, for each segment, (m, A)."""
+        return [one.outcome for one in self.results]
 
     @property
     def log_posterior(self) -> float:
@@ -72,12 +79,17 @@ def point(
     found, prior = likelihood.evaluate(config, outcomes), np.zeros(len(likelihood.axes))
     for one in free:
         prior[0 if one.axis is None else likelihood.axes.index(one.axis)] += one.log_prior(config)
-    return Point(config, found.total, found.axes + prior, found.outcomes)
+    return Point(config, found.total, found.axes + prior, found.results)
 
 
 def derivatives(likelihood: Likelihood, at: Point, free: Sequence[Parameter]) -> Derivatives:
     """Score and information of the log-posterior at a point."""
-    found = likelihood.derivatives(at.config, free, at.outcomes)
+    return with_priors(likelihood.linearised(at.config, free, at.outcomes), at, free)
+
+
+def with_priors(linear: Linearised, at: Point, free: Sequence[Parameter]) -> Derivatives:
+    """Score and information of the log-posterior, from the innovations around a point to first order."""
+    found = linear.derivatives()
     score, information = found.score.copy(), found.information.copy()
     for number, one in enumerate(free):
         if one.prior is not None:
@@ -105,45 +117,114 @@ def maximise(
         outcomes: The outcome of each component, to be repeated; None: the gates decide.
         tolerance: Gain in log-likelihood that is not worth another step.
     """
-    best = point(likelihood, start, free, outcomes)
-    if not free:
-        return best
-    low, high = np.array([one.range for one in free]).T
-    reach = _REACH * np.array([one.scale for one in free])
-    axis = np.array([-1 if one.axis is None else likelihood.axes.index(one.axis) for one in free])
-    damping, small = np.full(len(free), _FIRST_DAMPING), 0
-    for _ in range(_ITERATIONS):
-        at = coordinates(best.config, free)
-        found = derivatives(likelihood, best, free)
-        failed = False
-        while True:
-            step = _step(found, np.maximum(low - at, -reach), np.minimum(high - at, reach), damping)
-            expected = float(found.score @ step) - 0.5 * float(step @ found.information @ step)
-            if not expected > 0.0 or damping.min() > _LAST_DAMPING:
+    return Ascent(likelihood, free, outcomes, tolerance).maximum(start, notify)
+
+
+class Ascent:
+    """Steps from one point to a maximum.
+
+    After a good step the derivatives are carried along (:meth:`Likelihood.moved`): new ones cost a dozen times as much
+    as the step. Where those promise nothing more, or a step by them fails, new ones are computed.
+
+    Attributes:
+        linear: The derivatives at the last point; None before the first one.
+    """
+
+    def __init__(
+        self,
+        likelihood: Likelihood,
+        free: Sequence[Parameter],
+        outcomes: Sequence[CodeArray] | None = None,
+        tolerance: float = _TOLERANCE,
+        near: Linearised | None = None,
+    ) -> None:
+        """Args as for :func:`maximise`; ``near``: derivatives from nearby, which are good enough to stop by."""
+        self._likelihood, self._free, self._outcomes, self._tolerance = likelihood, free, outcomes, tolerance
+        self._low, self._high = np.array([one.range for one in free]).reshape(-1, 2).T
+        self._reach = _REACH * np.array([one.scale for one in free])
+        self._axis = [-1 if one.axis is None else likelihood.axes.index(one.axis) for one in free]
+        self._damping, self._near, self.linear = np.full(len(free), _FIRST_DAMPING), near is not None, near
+
+    def maximum(self, start: FusionConfig, notify: Notify = ignore) -> Point:
+        """The maximum next to a configuration."""
+        best, small = self._point(start), 0
+        if not self._free:
+            return best
+        if self.linear is None:
+            self._renew(best)
+        else:
+            self.linear = self._likelihood.moved(self.linear, np.zeros(len(self._free)), best.results)
+        for _ in range(_ITERATIONS):
+            trial, step, expected = self._better(best)
+            if trial is best:
                 return best
-            trial = point(likelihood, moved(best.config, free, at + step), free, outcomes)
             gained = trial.log_posterior - best.log_posterior
-            worse = np.append(trial.axes < best.axes, gained < 0.0)[axis]
+            trial = self._farther(best, trial, step, gained / expected)
+            notify(trial)
+            small = small + 1 if gained < _NOTHING else 0
+            if small == _CREEPING or (self._may_stop and max(gained, expected) < self._tolerance):
+                return trial
+            self._follow(best, trial, gained > _GOOD * expected)
+            best = trial
+        return best
+
+    @property
+    def _may_stop(self) -> bool:
+        return self._near or (self.linear is not None and self.linear.exact)
+
+    def _point(self, config: FusionConfig) -> Point:
+        return point(self._likelihood, config, self._free, self._outcomes)
+
+    def _renew(self, at: Point) -> None:
+        self.linear = self._likelihood.linearised(at.config, self._free, at.outcomes)
+
+    def _better(self, best: Point) -> tuple[Point, FloatArray, float]:
+        """A better point, the step to it and what it was expected to gain; ``best`` itself if there is none."""
+        at, failed = coordinates(best.config, self._free), False
+        while True:
+            assert self.linear is not None
+            found = with_priors(self.linear, best, self._free)
+            low, high = np.maximum(self._low - at, -self._reach), np.minimum(self._high - at, self._reach)
+            step = _step(found, low, high, self._damping)
+            expected = float(found.score @ step) - 0.5 * float(step @ found.information @ step)
+            if not self._may_stop and expected < self._tolerance:
+                self._renew(best)
+                continue
+            if not expected > 0.0 or self._damping.min() > _LAST_DAMPING:
+                return best, step, expected
+            trial = self._point(moved(best.config, self._free, at + step))
+            gained = trial.log_posterior - best.log_posterior
+            worse = np.append(trial.axes < best.axes, gained < 0.0)[self._axis]
             if gained > 0.0:
                 less = worse | (gained < _POOR * expected)
-                damping = np.where(less, 10.0 * damping, 0.1 * damping)
-                break
-            damping = np.where(worse | failed, 10.0 * np.maximum(damping, _FIRST_DAMPING), damping)
+                self._damping = np.where(less, 10.0 * self._damping, 0.1 * self._damping)
+                return trial, step, expected
+            if not self.linear.exact:
+                self._renew(best)
+                continue
+            self._damping = np.where(worse | failed, 10.0 * np.maximum(self._damping, _FIRST_DAMPING), self._damping)
             failed = True
-            if expected < tolerance:
-                return best
-        for double in _DOUBLES if gained > _MORE * expected else ():  # along a ridge steps turn out too short
-            there = moved(best.config, free, np.clip(at + double * step, low, high))
-            longer = point(likelihood, there, free, outcomes)
+            if expected < self._tolerance:
+                return best, step, expected
+
+    def _farther(self, best: Point, trial: Point, step: FloatArray, share: float) -> Point:
+        """A point beyond ``trial`` that gained a larger ``share`` than expected: along a ridge steps are too short."""
+        at = coordinates(best.config, self._free)
+        for double in _DOUBLES if share > _MORE else ():
+            there = np.clip(at + double * step, self._low, self._high)
+            longer = self._point(moved(best.config, self._free, there))
             if longer.log_posterior < trial.log_posterior + _TOLERANCE:
                 break
             trial = longer
-        best = trial
-        notify(best)
-        small = small + 1 if gained < _NOTHING else 0
-        if small == _CREEPING or max(gained, expected) < tolerance:
-            return best
-    return best
+        return trial
+
+    def _follow(self, before: Point, now: Point, good: bool) -> None:
+        """Carry the derivatives along after a good step that changed no outcome; else compute new ones."""
+        if good and self.linear is not None and all(map(np.array_equal, now.outcomes, before.outcomes)):
+            step = coordinates(now.config, self._free) - coordinates(before.config, self._free)
+            self.linear = self._likelihood.moved(self.linear, step, now.results)
+        else:
+            self._renew(now)
 
 
 def maximise_by_axis(

@@ -59,7 +59,13 @@ Reasons: TypeAlias = dict[str, dict[str, str]]  # by axis, then by what was chos
 
 
 def search(
-    likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify, one_delay: bool = False
+    likelihood: Likelihood,
+    config: FusionConfig,
+    free: FreeOf,
+    notify: Notify,
+    one_delay: bool = False,
+    *,
+    near: bool = False,
 ) -> tuple[Point, dict[str, str]]:
     """Find the most likely configuration.
 
@@ -69,6 +75,8 @@ def search(
         free: The parameters to vary, which depend on the order of the plants.
         notify: Called with each better point.
         one_delay: Whether all axes whose delay is free share one whatever the measurements say.
+        near: Whether the configuration is the most likely one of a part of the measurements: all models are compared
+            again, but each is only looked for near it.
 
     Returns:
         The best point, and for each axis the reasons for the order of its plant, its gain, its disturbance and whether
@@ -82,36 +90,42 @@ def search(
         """Without the bound of a disturbance's time, at which a search from afar would stick."""
         return [replace(one, bounds=_TIMES) if one.path[-1] == "disturbance_time" else one for one in own(at)]
 
-    start = _times(likelihood, with_gates(config, config, _WIDER), free(config))
-    found: list[tuple[Point, Reasons]] = []
-    for model in noise_models(likelihood, start, rough):
-        if found:  # the arm of the first model is near that of the others
-            model = _with_arm_of(model, found[0][0].config, free)
-        best = best_noise(likelihood, with_gates(model, config, 1.0), rough(model), notify)
+    start = config if near else _times(likelihood, with_gates(config, config, _WIDER), free(config))
+    found: list[Point] = []
+    for model in noise_models(likelihood, start, rough, near):
+        first = not (found or near)
+        if found and not near:  # the arm of the first model is near that of the others
+            model = _with_arm_of(model, found[0].config, free)
+        best = with_gates(model, config, 1.0)
+        if not near:
+            best = best_noise(likelihood, best, rough(best), notify)
         shared = [one for one in free(best) if one.axis is None]
         if shared:
             best = maximise(likelihood, best, shared, notify, tolerance=_ROUGHLY).config
-        arm: Reasons = {}
-        if any(one.fit != "noise" for one in own(best)):
-            best, arm = _arm(likelihood, best, rough, notify, again=bool(found))
-        found.append((maximise_by_axis(likelihood, best, rough(best), notify, _ROUGHLY), arm))
+        if first:
+            best, _ = _arm(likelihood, best, rough, notify)
+        found.append(maximise_by_axis(likelihood, best, rough(best), notify, _ROUGHLY))
     best, reasons = most_likely_models(likelihood, found, rough)
+    best, arm = _arm(likelihood, best, own, notify, again=True)
     best = _without_needless(likelihood, best, own, notify)
-    if len(found) > 1:
+    if len(found) > 1 and not near:
         best = _past_ticks(likelihood, best, own, notify)
     best, delays = _with_one_delay(likelihood, best, free, one_delay)
     orders: Reasons = {}
     if any(one.axis is None and one.fit == "delay" for one in free(best)):
         best, orders = _orders(likelihood, best, own, notify)  # an own delay can look like a second order
-    for more in (delays, orders):
+    for more in (arm, delays, orders):
         for axis, why in more.items():
             reasons.setdefault(axis, {}).update(why)
     best = maximise_with_gates(likelihood, with_gates(best, config), free(best), notify)
     return best, {axis: "; ".join(why.values()) for axis, why in reasons.items() if why}
 
 
-def noise_models(likelihood: Likelihood, config: FusionConfig, free: FreeOf) -> list[FusionConfig]:
-    """Without a disturbance, and where one may be fitted with one of each kind and little other noise."""
+def noise_models(likelihood: Likelihood, config: FusionConfig, free: FreeOf, near: bool = False) -> list[FusionConfig]:
+    """Without a disturbance, and where one may be fitted with one of each kind and little other noise.
+
+    ``near``: each axis stays as it is in the model that it has already.
+    """
     misfit, every = likelihood.misfit(config), config
     for axis in misfit:
         every = with_disturbance(every, axis, misfit[axis], _TIME)
@@ -130,14 +144,15 @@ def noise_models(likelihood: Likelihood, config: FusionConfig, free: FreeOf) -> 
             elif one.axis in disturbed and one.path[-1] == "disturbance_time":
                 model = one.put(model, _TIME)
         models.append(model)
+    for axis in disturbed if near else ():
+        known = config.process[axis]
+        own = 0 if known.disturbance_sd == 0.0 else 1 if known.disturbance_kind == "matern" else 2
+        models[own] = with_axis_of(models[own], config, axis)
     return models
 
 
-def most_likely_models(
-    likelihood: Likelihood, found: Sequence[tuple[Point, Reasons]], free: FreeOf
-) -> tuple[FusionConfig, Reasons]:
-    """The model that is best for each axis after the penalty for its numbers, and why."""
-    peaks = [peak for peak, _ in found]
+def most_likely_models(likelihood: Likelihood, peaks: Sequence[Point], free: FreeOf) -> tuple[FusionConfig, Reasons]:
+    """The model of noise that is best for each axis after the penalty for its numbers, and why."""
     scores = [_penalised(likelihood, peak, free(peak.config)) for peak in peaks]
     reasons: Reasons = {}
     for number, axis in enumerate(likelihood.axes):
@@ -149,14 +164,13 @@ def most_likely_models(
                 score[number] -= _SMOOTHER
         mine = [float(score[number]) for score in scores]
         chosen = int(np.argmax(mine))
-        reasons[axis] = dict(found[chosen][1].get(axis, {}))
-        if len(found) > 1 and axis in likelihood.sensors:
+        if len(peaks) > 1 and axis in likelihood.sensors:
             gain = max(mine[1:]) - mine[0]
             why = f"(one {gain:+.1f})"
             if np.isinf(gain):
                 soon = 1e3 * quickest(peaks[chosen].config)
                 why = f"(one would be forgotten within {soon:.0f} ms, too soon for an arm)"
-            reasons[axis]["disturbance"] = f"disturbance: {_DISTURBANCES[chosen]} {why}"
+            reasons[axis] = {"disturbance": f"disturbance: {_DISTURBANCES[chosen]} {why}"}
     return _best_by_axis(likelihood, peaks, scores), reasons
 
 
@@ -283,7 +297,7 @@ def _with_noise(
 
 
 def _arm(
-    likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify, again: bool
+    likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify: Notify, *, again: bool = False
 ) -> tuple[FusionConfig, Reasons]:
     """The best arm and noise from several lags and recoveries, with both orders where the whole plant is free.
 

@@ -24,6 +24,7 @@ from .parameters import (
     parameters,
     smallest_sd,
     with_drifts,
+    with_gates,
     with_own_delays,
 )
 from .search import FreeOf, search
@@ -82,7 +83,12 @@ class Stage:
 
 
 def run_stage(
-    runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float | None = None, notify: Notify = ignore
+    runs: Sequence[Run],
+    config: FusionConfig,
+    plan: Plan,
+    until: float | None = None,
+    notify: Notify = ignore,
+    near: FusionConfig | None = None,
 ) -> Stage:
     """Fit the parameters of a plan; where a combination is not identifiable, fix one of it and go on.
 
@@ -92,6 +98,7 @@ def run_stage(
         plan: What to fit.
         until: Leave out measurements after that [s after the first command].
         notify: Called with each better point.
+        near: What the same plan gave on a part of the measurements, to begin from; None: begin from ``config``.
 
     Raises:
         PumafuseError: Nothing can be fitted to the measurements.
@@ -105,6 +112,8 @@ def run_stage(
         return [one for one in every if _may_vary(one, at, plan, excited)]
 
     start, notes = likelihood.config, list[str]()
+    if near is not None:
+        start = with_gates(near if "bias" in plan.fit else _with_biases_of(near, config), start)
     own = with_own_delays(start, excited)
     if any(one.fit == "delay" for one in free(own)):
         start = own
@@ -114,7 +123,7 @@ def run_stage(
         start, notes = with_large_biases(likelihood, start, plan.fixed)
     if "latency" in plan.fit:
         fixed += shared_times(likelihood.sensors, excited, free(start), start)
-    best, orders = search(likelihood, start, free, notify, plan.one_delay)
+    best, orders = search(likelihood, start, free, notify, plan.one_delay, near=near is not None)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
         if more:
@@ -239,6 +248,13 @@ def with_small_biases(likelihood: Likelihood, best: Point, fixed: Sequence[str])
                     f" {gains[best_width]:.1f} in log-likelihood"
                 )
     return config, notes
+
+
+def _with_biases_of(config: FusionConfig, other: FusionConfig) -> FusionConfig:
+    """The configuration with the constant biases that another one estimates."""
+    for name, sensor in other.sensors.items():
+        config = changed(config, ("sensors", name, "bias_sd"), sensor.bias_sd)
+    return config
 
 
 def _may_be_biased(config: FusionConfig, name: str, kind: Kind, fixed: Sequence[str]) -> bool:

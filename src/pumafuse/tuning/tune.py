@@ -38,7 +38,7 @@ class Tuning:
         config: The tuned configuration, ready for :func:`pumafuse.fuse`.
         before: The configuration as given.
         details: What ``tuning.json`` holds, in the units of files.
-        profiles: The likelihood along each parameter that has an interval.
+        profiles: The likelihood along each parameter that has an interval, if it was asked for.
     """
 
     config: FusionConfig
@@ -77,6 +77,7 @@ def tune(
     validate: Run | None = None,
     sd_prior: bool = True,
     share: Iterable[Literal["delay"]] = (),
+    profiles: bool = False,
     progress: Progress = lambda _, __: None,
 ) -> Tuning:
     """Fit noise, delays, plants, gains, latencies, scales and drifts to runs by maximum likelihood, without references.
@@ -95,6 +96,8 @@ def tune(
             standard deviation); else the measurements alone decide, which may be too few to.
         share: ``delay``: all axes share one whatever the measurements say. Else those share one to which an own one is
             not worth its number (Bayesian information criterion).
+        profiles: Whether to compute the likelihood along each parameter, too, to draw it and to look for a second
+            maximum: that takes about a quarter longer.
         progress: Called with what is being done and the best log-likelihood so far.
 
     Returns:
@@ -137,7 +140,7 @@ def tune(
         for stage in pipeline.stages:
             progress("computing intervals", stage.best.log_likelihood)
             around |= lag_intervals(stage.likelihood, stage.best, stage.free)
-            intervals |= confidence_intervals(stage.likelihood, stage.best, stage.free)
+            intervals |= confidence_intervals(stage.likelihood, stage.best, stage.free, drawn=profiles)
     except KeyboardInterrupt:
         interrupted = True
         pipeline.keep_the_better()
@@ -177,7 +180,7 @@ def tune(
     )
     for note in summary.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=2)
-    return Tuning(tuned, config, summary, [one.profile for one in intervals.values()])
+    return Tuning(tuned, config, summary, [one.profile for one in intervals.values()] if profiles else [])
 
 
 def plans(
@@ -224,12 +227,13 @@ class Pipeline:
     def fit(self, until: float | None) -> None:
         """Run every stage on the measurements until then [s after the first command].
 
-        A second fit counts when it is complete.
+        A second fit begins where the first one ended, and counts when it is complete.
 
         Raises:
             TuneError: No stage has any free parameter.
         """
         config, stages, again = self.config, list[Stage](), bool(self.stages)
+        near = self.stages[0].best.config if again else None
 
         def notify(found: Point) -> None:
             if not again:
@@ -237,8 +241,8 @@ class Pipeline:
             self.progress("fitting on the whole run" if again else "searching", found.log_likelihood)
 
         for plan in self.plans:
-            stages.append(run_stage(self.runs, config, plan, until, notify))
-            config = stages[-1].best.config
+            stages.append(run_stage(self.runs, config, plan, until, notify, near))
+            config, near = stages[-1].best.config, None
         if not any(stage.free for stage in stages):
             why = [str(one) for stage in stages for one in stage.not_identifiable]
             raise TuneError("; ".join([*why, "everything that could be fitted is fixed: nothing to fit"]))
