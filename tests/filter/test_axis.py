@@ -33,9 +33,15 @@ copy_rows = callable_kernel(algebra.copy_rows)
 innovation = callable_kernel(algebra.innovation)
 noise = callable_kernel(algebra.noise)
 position_of = callable_kernel(algebra.position_of)
-predict = callable_kernel(algebra.predict)
+predict_plant, predict_rest = callable_kernel(algebra.predict_plant), callable_kernel(algebra.predict_rest)
 update = callable_kernel(algebra.update)
 checkpoint_of = callable_kernel(forward.checkpoint_of)
+
+
+def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
+    """Bring all of a row to a time."""
+    predict_plant(model, state, axis, row, time)
+    predict_rest(model, state, axis, row)
 
 
 T, DECAY = 0.028, 1.0 / 0.15
@@ -72,7 +78,7 @@ def arranged(places: int = 0) -> tuple[Model, Sensors, State]:
         if isinstance(plant, FirstOrder):
             root[1] = state.x[axis, 1] = 0.0
         state.P[axis] = root @ root.T
-        state.drive[axis, 1:] = rng.normal(0.0, 1e-2, 5) ** 2
+        state.drive[axis, U : DRIFT + 1] = rng.normal(0.0, 1e-2, 5) ** 2
     return filter_model(columns), filter_sensors(columns, list(SENSORS)), state
 
 

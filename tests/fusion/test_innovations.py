@@ -1,8 +1,9 @@
-"""Innovations without estimates: the numbers of a fusion but for rounding, and of one whose outcomes are known."""
+"""Innovations without estimates: the numbers of a fusion, and of one whose outcomes are known."""
 
 from __future__ import annotations
 
 import warnings
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -14,13 +15,16 @@ from pumafuse.errors import PumafuseWarning
 from pumafuse.filter.events import Results
 from pumafuse.filter.outcome import ABSENT, Outcome
 from pumafuse.fusion.config import FusionConfig, Process
-from pumafuse.fusion.engine import innovations
+from pumafuse.fusion.engine import innovations, innovations_of_each
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
 from pumafuse.fusion.segments import Segment, build
 from pumafuse.logs.run import Run
-from pumafuse.model.arm import AxisModel
+from pumafuse.model.arm import AxisModel, Gain
+from pumafuse.model.plants import FirstOrder
 
+KINDS: tuple[Literal["matern", "ou"], ...] = ("matern", "ou")
+changed = msgspec.structs.replace
 GATE = 1.2  # which rejects a good part of measurements that scatter by 1 mm
 
 
@@ -36,17 +40,11 @@ def gated(config: FusionConfig, gate: float = GATE, gate_rows: bool = True) -> F
 
 
 def same(found: Results, est: Estimates, segment: Segment, config: FusionConfig) -> None:
-    """But for rounding, in the order of processing: between measurements P is brought on in one step, not in many.
-
-    Rounding is up to 1e-16 of a prior's variance, which is 10⁶ times that of the noise and more.
-    """
+    """To the bit, in the order of processing: it is the same filter."""
     order = np.argsort(segment.events(config)[1])
     given = segment.measurement_rows.known[order] != ABSENT
-    sd, expected = found.innovation_sd[order][given], est.measurements
-    np.testing.assert_array_equal(found.outcome[order][given], expected.outcome)
-    np.testing.assert_allclose(sd, expected.innovation_sd, rtol=1e-8)
-    apart = found.innovation[order][given] - expected.innovation
-    np.testing.assert_allclose(apart[np.isfinite(sd)] / sd[np.isfinite(sd)], 0.0, atol=1e-8)
+    for part in ("outcome", "innovation", "innovation_sd"):
+        np.testing.assert_array_equal(getattr(found, part)[order][given], getattr(est.measurements, part))
 
 
 def check(run: Run, config: FusionConfig) -> Results:
@@ -110,3 +108,36 @@ def test_given_outcomes_are_repeated_whatever_the_gates_would_say() -> None:
         fused = order[outcome[order, column] != Outcome.REJECTED]
         np.testing.assert_allclose(repeated.innovation[fused, column], nu, rtol=0.0, atol=1e-11)
         np.testing.assert_allclose(repeated.innovation_sd[fused, column], sd, rtol=1e-8)
+
+
+def test_side_by_side_each_configuration_gives_what_it_gives_alone() -> None:
+    """To the bit: with other noise, another plant, gain, latency, delay, scale, disturbance, and with a bias."""
+    run, config = contradicting()
+    segment, arm = build(run, config), config.arm
+    outcome = innovations(segment, config).outcome
+    smooth, rough = (Process(disturbance_sd=2e-3, disturbance_time=0.2, disturbance_kind=kind) for kind in KINDS)
+    radial = msgspec.structs.replace(arm.axes["radial"], plant=FirstOrder(time_constant=0.05))
+    gains = {axis: msgspec.structs.replace(one, gain=Gain(intercept=0.9)) for axis, one in arm.axes.items()}
+    camera = config.sensors["camera"]
+
+    def seen(**changes: float) -> FusionConfig:
+        return changed(config, sensors={**config.sensors, "camera": msgspec.structs.replace(camera, **changes)})
+
+    others = [
+        config,
+        louder(config),
+        changed(config, process={**config.process, "radial": smooth}),
+        changed(config, process={**config.process, "vertical": rough}),
+        changed(config, arm=changed(arm, axes={**arm.axes, "radial": radial})),
+        changed(config, arm=changed(arm, axes=gains)),
+        changed(config, arm=changed(arm, delay=arm.delay + 2e-5)),
+        seen(latency=camera.latency + 2e-5),
+        seen(scale=1.1),
+        seen(latency_sd=3e-3),
+        seen(bias_sd=1e-3),
+        seen(bias_drift_sd=1e-3, bias_time=3.0),
+    ]
+    for other, found in zip(others, innovations_of_each(segment, others, outcome), strict=True):
+        alone = innovations(segment, other, outcome)
+        for part in ("outcome", "innovation", "innovation_sd"):
+            np.testing.assert_array_equal(getattr(found, part), getattr(alone, part))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import re
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import msgspec
@@ -57,7 +57,8 @@ def known(axis: str, sensor: str) -> pf.FusionConfig:
 @cache
 def tuned(axis: str = "tip", sensor: str = "camera", name: str = "a run") -> tuple[pf.Tuning, pf.Run]:
     run = recorded(axis, sensor, name)
-    return quietly(lambda: pf.tune([run], known(axis, sensor), fit=["noise", "delay", "plant"], fix=STEADY)), run
+    given = partial(pf.tune, [run], known(axis, sensor), fit=["noise", "delay", "plant"], fix=STEADY, profiles=True)
+    return quietly(given), run
 
 
 @cache
@@ -125,7 +126,9 @@ def test_an_interval_ends_where_its_profile_has_dropped_by_half_a_chi_square() -
 def test_the_profile_of_a_lone_parameter_is_the_likelihood_of_a_fusion() -> None:
     """With all else fixed, the curve is the log density of what `fuse` reports, less the one at the best."""
     run, config = recorded("tip", "camera", "a run"), known("tip", "camera")
-    found = quietly(lambda: pf.tune([run], with_sd(config, 5e-4, gate=50.0), fix=["process"], sd_prior=False))
+    found = quietly(
+        lambda: pf.tune([run], with_sd(config, 5e-4, gate=50.0), fix=["process"], sd_prior=False, profiles=True)
+    )
     (curve,) = drawn(found).values()
     assert curve.key == "sensors.camera.sd_mm.tip"
     assert curve.log

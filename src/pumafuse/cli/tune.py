@@ -72,6 +72,7 @@ def run(
             trust=trust,
             validate=other,
             sd_prior=sd_prior,
+            profiles=report,
             progress=progress,
         )
     with folders.replacing(output) as new:

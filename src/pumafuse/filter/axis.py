@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
-from ..compiled import compiled, compiled_apart, inlined
+from ..compiled import compiled, compiled_apart
 from ..model.closed import decaying_response, gain_error, transition
 from ..model.matern import matern
 
@@ -31,7 +31,7 @@ POSITION, RATE, OFFSET, REST = range(4)  # of a state; the disturbance, if there
 ORDER, DISTURBANCE, STATES, ANSWERS = range(4)  # of a kind
 NONE, ROUGH, SMOOTH = range(3)  # disturbances, by how many states they have
 REVERTING, VARIANCE = range(2)  # of a state of the rest
-START, U, STEP, ERROR, NOISE, DRIFT = range(6)  # of a drive
+START, U, STEP, ERROR, NOISE, DRIFT, DUE11, DUE12, DUE22, DUE_WALK = range(10)  # of a drive
 SLOPE, INTERCEPT, DECAY, PERIOD = range(4)  # of a gain
 INPUT_NOISE, RANDOM_WALK, MANEUVER_NOISE, MANEUVER_DRIFT = range(4)  # of a process
 (
@@ -112,7 +112,8 @@ class State(NamedTuple):
         clock: The instant of the plant's mean and e, int64 ns, (r,).
         settled: The instant of P and of what no command moves: they may stay behind until a measurement, (r,).
         drive: Start level u₀ (``START``, NaN before it is known), command in force ``U`` relative to it, its ``STEP``,
-            the gain ``ERROR`` e now [m], and densities squared in force: ``NOISE`` [m²·s], ``DRIFT`` [m²/s], (r, 6).
+            the gain ``ERROR`` e now [m], densities squared in force: ``NOISE`` [m²·s], ``DRIFT`` [m²/s], and what P is
+            still due, as it stays behind: noise of the plant, ``DUE11`` to ``DUE22``, and ``DUE_WALK`` [m²], (r, 10).
         rejected: Of each sensor innovation and R of a rejected measurement that another may agree with, (r, S, 2).
         gate_time: When that one was valid, and when the last one was fused, int64 ns, (r, S, 2).
         gate_count: Rejections in a row, and re-acquisitions, (r, S, 2).
@@ -141,53 +142,44 @@ class State(NamedTuple):
 
 
 @compiled
-def predict(model: Model, state: State, axis: int, row: int, time: int) -> None:
-    """Bring row ``row`` of the state, which is of ``axis``, to ``time`` [ns] with its input held."""
-    predict_plant(model, state, axis, row, time)
-    predict_rest(model, state, axis, row)
-
-
-@compiled
 def predict_plant(model: Model, state: State, axis: int, row: int, time: int) -> None:
-    """Bring the plant's mean and e to ``time`` [ns], all that commands move; the rest stays behind."""
+    """Bring the plant's mean and e to ``time`` [ns], with the input held, and note the noise until then.
+
+    P and all that no command moves stay behind, until :func:`predict_rest`.
+    """
     if time <= state.clock[row]:
         return
-    x, drive, like = state.x, state.drive, model.kind[axis, ANSWERS]
-    at = interval_of(model, state.intervals, like, time - state.clock[row])
-    x[row, POSITION], x[row, RATE], drive[row, ERROR] = moved(
-        state.intervals, like, at, x[row, POSITION], x[row, RATE], drive[row, U], drive[row, ERROR]
-    )
+    x, drive, known, like = state.x, state.drive, state.intervals, model.kind[axis, ANSWERS]
+    at = interval_of(model, known, like, time - state.clock[row])
+    f11, f12, f21, f22 = known[like, at, F11], known[like, at, F12], known[like, at, F21], known[like, at, F22]
+    u, error, rate = drive[row, U], drive[row, ERROR], x[row, RATE]
+    gap = x[row, POSITION] - u
+    x[row, POSITION], x[row, RATE] = u + (f11 * gap + f12 * rate), f21 * gap + f22 * rate
+    if error != 0.0:
+        x[row, POSITION] += known[like, at, ERROR_POSITION] * error
+        x[row, RATE] += known[like, at, ERROR_RATE] * error
+        drive[row, ERROR] = error * known[like, at, ERROR_LEFT]
+    a, b, c, q = drive[row, DUE11], drive[row, DUE12], drive[row, DUE22], drive[row, NOISE]
+    d, e = f11 * a + f12 * b, f11 * b + f12 * c
+    drive[row, DUE11] = d * f11 + e * f12 + q * known[like, at, Q11]
+    drive[row, DUE12] = d * f21 + e * f22 + q * known[like, at, Q12]
+    drive[row, DUE22] = (f21 * a + f22 * b) * f21 + (f21 * b + f22 * c) * f22 + q * known[like, at, Q22]
+    drive[row, DUE_WALK] += drive[row, DRIFT] * ((time - state.clock[row]) / 1e9)
     state.clock[row] = time
 
 
 @compiled
-def moved(
-    known: FloatArray, like: int, at: int, position: float, rate: float, u: float, error: float
-) -> tuple[float, float, float]:
-    """Position, rate and e after an interval with the input u held."""
-    gap = position - u
-    position = u + (known[like, at, F11] * gap + known[like, at, F12] * rate)
-    rate = known[like, at, F21] * gap + known[like, at, F22] * rate
-    if error != 0.0:
-        position += known[like, at, ERROR_POSITION] * error
-        rate += known[like, at, ERROR_RATE] * error
-        error *= known[like, at, ERROR_LEFT]
-    return position, rate, error
-
-
-@compiled
 def predict_rest(model: Model, state: State, axis: int, row: int) -> None:
-    """Bring P and what no command moves to where the plant's mean is; noise densities were the same all the way."""
+    """Bring P and what no command moves to where the plant's mean is."""
     if state.settled[row] == state.clock[row]:
         return
     P, drive, known, like = state.P, state.drive, state.intervals, model.kind[axis, ANSWERS]
-    interval = state.clock[row] - state.settled[row]
-    at, q = interval_of(model, known, like, interval), drive[row, NOISE]
+    at, size = interval_of(model, known, like, state.clock[row] - state.settled[row]), model.kind[axis, STATES]
     f11, f12, f21, f22 = known[like, at, F11], known[like, at, F12], known[like, at, F21], known[like, at, F22]
-    size = model.kind[axis, STATES]
     move_pair(P, row, POSITION_, size, f11, f12, f21, f22)
-    add_to_pair(P, row, POSITION_, q * known[like, at, Q11], q * known[like, at, Q12], q * known[like, at, Q22])
-    P[row, OFFSET, OFFSET] += drive[row, DRIFT] * (interval / 1e9)
+    add_to_pair(P, row, POSITION_, drive[row, DUE11], drive[row, DUE12], drive[row, DUE22])
+    P[row, OFFSET, OFFSET] += drive[row, DUE_WALK]
+    drive[row, DUE11] = drive[row, DUE12] = drive[row, DUE22] = drive[row, DUE_WALK] = 0.0
     if size > REST:
         revert(model, state, axis, row, like, at)
     state.settled[row] = state.clock[row]
@@ -271,15 +263,6 @@ def add_to_pair(P: FloatArray, at: int, i: int, q11: float, q12: float, q22: flo
     P[at, i, i + 1] += q12
     P[at, i + 1, i] += q12
     P[at, i + 1, i + 1] += q22
-
-
-@inlined
-def is_steady(model: Model) -> bool:
-    """Whether commands change no noise, so that P may stay behind."""
-    for axis in range(len(model.kind)):
-        if model.process[axis, MANEUVER_NOISE] != 0.0 or model.process[axis, MANEUVER_DRIFT] != 0.0:
-            return False
-    return True
 
 
 @compiled

@@ -98,8 +98,8 @@ class Results(NamedTuple):
 
     def split(self, times: int) -> list[Results]:
         """The parts of as many sets of axes, one after the other."""
-        parts = zip(*(np.split(part, times, axis=1) for part in self[:3]), strict=True)
-        return [Results(*part, self.contradicts) for part in parts]
+        innovation, sd, outcome = (np.split(part, times, axis=1) for part in self[:3])
+        return [Results(*part, self.contradicts) for part in zip(innovation, sd, outcome, strict=True)]
 
     def rows(self, chosen: IntArray) -> Results:
         """What became of some of the events, in the order of ``chosen``."""

@@ -17,38 +17,24 @@ import numpy as np
 
 from ..arrays import NEVER, BoolArray, FloatArray, IntArray, TimeArray
 from ..compiled import compiled, inlined, kernel
-from ..model.closed import gain_error
 from .axis import (
-    ANSWERS,
     DISTURBANCE,
     DRIFT,
-    ERROR,
-    INTERCEPT,
     NOISE,
     NONE,
     OFFSET,
     PERIOD,
-    POSITION,
-    RATE,
     REST,
-    SLOPE,
-    START,
     STATES,
-    STEP,
     Model,
     Sensors,
     State,
-    U,
     apply_command,
     copy_estimate,
     copy_rows,
     innovation,
-    interval_of,
-    is_steady,
-    moved,
     noise,
     position_of,
-    predict,
     predict_plant,
     predict_rest,
     update,
@@ -173,7 +159,7 @@ def filter_events(
         outputs: Gets the estimates.
     """
     f = opened(flat)
-    due, done, lazily = ZERO, begin, places == 0 and len(times) == 0 and is_steady(f.model)
+    due, done = ZERO, begin
     for n in range(len(times) + 1):
         until = times[n] if n < len(times) else NEVER
         first = done
@@ -185,32 +171,22 @@ def filter_events(
             copy_rows(f.state, checkpoint_of(f.model, first, places), ZERO, len(f.model.kind))
         while done < end and f.events.time[done] <= until:
             done += 1
-        run_events(f, first, done, given, arrived, places, lazily)
+        run_events(f, first, done, given, arrived, places)
         if n < len(times):
             estimate(f, done, filled, times[n], outputs, n)
 
 
 @inlined
-def run_events(f: Filter, begin: int, end: int, given: bool, arrived: BoolArray, places: int, lazily: bool) -> None:
+def run_events(f: Filter, begin: int, end: int, given: bool, arrived: BoolArray, places: int) -> None:
     """Rows ``begin`` to ``end`` that have arrived: apply commands, gate measurements, update with what passes.
 
     Before each row the state is kept in one of its ``places``; with none, nothing can be taken back.
-    ``lazily``, where commands change no noise: they move the plants' means alone, the rest follows at a measurement.
     """
-    row = begin
-    while row < end:
-        if lazily and f.events.source[row] == COMMAND:
-            first = row
-            while row < end and f.events.source[row] == COMMAND:
-                row += 1
-            for axis in range(len(f.model.kind)):
-                follow_plant(f, axis, first, row)
-            continue
+    for row in range(begin, end):
         if places > 0:
             copy_rows(f.state, ZERO, checkpoint_of(f.model, row, places), len(f.model.kind))
         if len(arrived) == 0 or arrived[row]:
             run_event(f, row, given)
-        row += 1
 
 
 @inlined
@@ -236,30 +212,6 @@ def add_command(model: Model, events: Events, state: State, row: int, axis: int,
         apply_command(model, state, axis, axis, events.value[row, axis])
 
 
-@inlined
-def follow_plant(f: Filter, axis: int, first: int, end: int) -> None:
-    """Rows ``first`` to ``end``, all of them commands, through the plant's mean alone."""
-    x, drive, gain, known = f.state.x, f.state.drive, f.model.gain, f.state.intervals
-    slope, intercept, period = gain[axis, SLOPE], gain[axis, INTERCEPT], gain[axis, PERIOD]
-    position, rate, u, error = x[axis, POSITION], x[axis, RATE], drive[axis, U], drive[axis, ERROR]
-    clock, step, level = f.state.clock[axis], drive[axis, STEP], drive[axis, START]
-    latest, at, like = 0, 0, f.model.kind[axis, ANSWERS]
-    for row in range(first, end):
-        if f.events.known[row, axis] != FUSED:
-            continue
-        if f.events.time[row] > clock:
-            if f.events.time[row] - clock != latest:
-                latest = f.events.time[row] - clock
-                at = interval_of(f.model, known, like, latest)
-            position, rate, error = moved(known, like, at, position, rate, u, error)
-            clock = f.events.time[row]
-        command = f.events.value[row, axis] - level
-        step, u = command - u, command
-        error += gain_error(step, slope, intercept, period)
-    x[axis, POSITION], x[axis, RATE], drive[axis, U], drive[axis, ERROR] = position, rate, u, error
-    f.state.clock[axis], drive[axis, STEP] = clock, step
-
-
 @compiled
 def add_measurement(
     model: Model,
@@ -280,6 +232,7 @@ def add_measurement(
         if events.known[row, axis] != FUSED:
             continue
         advance(model, state, axis, time, history)
+        predict_rest(model, state, axis, axis)
         R = noise_of(model, sensors, events, state, row, axis)
         nu, S = innovation(model, sensors, state, axis, sensor, events.value[row, axis], R)
         results.innovation[row, axis], results.innovation_sd[row, axis] = nu, math.sqrt(S)
@@ -345,11 +298,10 @@ def noise_of(model: Model, sensors: Sensors, events: Events, state: State, row: 
 
 @compiled
 def advance(model: Model, state: State, axis: int, time: int, history: History) -> None:
-    """Predict one axis to ``time`` [ns], and keep the interval for the smoother."""
-    predict_plant(model, state, axis, axis, time)
-    if state.clock[axis] > state.settled[axis]:
+    """Predict the plant's mean of one axis to ``time`` [ns], and keep the interval for the smoother."""
+    if time > state.clock[axis]:
         write_history(history, axis, time, INTERVAL, state.drive[axis, NOISE], state.drive[axis, DRIFT], state.work)
-        predict_rest(model, state, axis, axis)
+        predict_plant(model, state, axis, axis, time)
 
 
 @compiled
@@ -433,10 +385,11 @@ def follow_commands(
             if not given or events.time[event] <= after or events.stamp[event] > stamped:
                 event += 1
                 continue
-        predict(model, state, axis, row, until if over else events.time[event])
+        predict_plant(model, state, axis, row, until if over else events.time[event])
         if not over:
             apply_command(model, state, axis, row, events.value[event, axis])
             event += 1
+    predict_rest(model, state, axis, row)
 
 
 @compiled

@@ -161,7 +161,7 @@ def at_rest(columns: Sequence[Column], sensors: int, origin: int, start: Mapping
     rest = [one.rest()[0] for one in columns]
     count, width = len(columns), REST + max(map(len, rest), default=0)
     rows = count * (1 + places) + 1
-    P, drive = np.zeros((rows, width, width)), np.zeros((rows, 6))
+    P, drive = np.zeros((rows, width, width)), np.zeros((rows, 10))
     for number, one in enumerate(columns):
         P[number, OFFSET, OFFSET] = one.config.start.offset_sd_of(one.axis) ** 2
         for place, variance in enumerate(rest[number][:, VARIANCE], REST):

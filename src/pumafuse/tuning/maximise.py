@@ -27,7 +27,8 @@ _LAST_DAMPING = 1e8  # at which the search gives up
 _DOUBLES = (2.0, 4.0, 8.0)
 _NOTHING, _CREEPING = 2e-4, 3  # log-likelihood; steps in a row that gain less: at a cusp, the score promises too much
 _POOR = 0.1  # of the expected gain, from which a step was too long
-_GOOD = 0.5  # of the expected gain, from which derivatives are carried along to the next step
+_GOOD = 0.5  # of the expected gain, from which derivatives are carried along to the next step, if that was
+_NEARBY = 2.0  # at most in log-likelihood: farther away they change too much
 _MORE = 1.1  # of the expected gain, from which a longer step is tried
 _GATE_ROUNDS = 12  # times that the gates decide again
 _BUMPS = tuple(sign * shift for shift in (2e-4, 5e-4, 1e-3, 2e-3) for sign in (-1.0, 1.0))  # s
@@ -123,8 +124,8 @@ def maximise(
 class Ascent:
     """Steps from one point to a maximum.
 
-    After a good step the derivatives are carried along (:meth:`Likelihood.moved`): new ones cost a dozen times as much
-    as the step. Where those promise nothing more, or a step by them fails, new ones are computed.
+    After a good small step the derivatives are carried along (:meth:`Likelihood.moved`): new ones cost ten times as
+    much as the step. Where those promise nothing more, or a step by them fails, new ones are computed.
 
     Attributes:
         linear: The derivatives at the last point; None before the first one.
@@ -164,7 +165,7 @@ class Ascent:
             small = small + 1 if gained < _NOTHING else 0
             if small == _CREEPING or (self._may_stop and max(gained, expected) < self._tolerance):
                 return trial
-            self._follow(best, trial, gained > _GOOD * expected)
+            self._follow(best, trial, _GOOD * expected < gained < _NEARBY)
             best = trial
         return best
 

@@ -325,7 +325,7 @@ class _AxisSearch:
 
         models = noise_models(self.likelihood, config, free)
         found = [maximise(self.likelihood, model, free(model), tolerance=_ROUGHLY) for model in models]
-        return most_likely_models(self.likelihood, [(one, {}) for one in found], free)[0]
+        return most_likely_models(self.likelihood, found, free)[0]
 
     def with_noise_of(self, config: FusionConfig, other: FusionConfig) -> FusionConfig:
         """The configuration with the noise of another one."""
