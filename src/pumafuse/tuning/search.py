@@ -17,8 +17,19 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..fusion.config import FusionConfig, Process
+from .identifiability import covariance
 from .likelihood import Likelihood
-from .maximise import Notify, Point, ignore, maximise, maximise_by_axis, maximise_with_gates, past_bumps, point
+from .maximise import (
+    Notify,
+    Point,
+    derivatives,
+    ignore,
+    maximise,
+    maximise_by_axis,
+    maximise_with_gates,
+    past_bumps,
+    point,
+)
 from .parameters import (
     DELAYS,
     LATENCIES,
@@ -49,6 +60,7 @@ _PROCESSES = tuple(  # starts, in units of the distance between the noiseless ar
 
 _WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
 _SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
+_WELL_KNOWN = 1.0 / 8.0  # of a logarithm: without it some ½ · 8² would be lost in log-likelihood
 _TIMES = (1e-3, 1e3)  # s, of a disturbance: bounds far from the best
 _TIME = 0.3  # s, of a disturbance: start
 _QUIET = 0.1  # share of noise that is left beside a disturbance: start
@@ -178,18 +190,29 @@ def _without_needless(likelihood: Likelihood, config: FusionConfig, free: FreeOf
     """The configuration without the noises that are not worth their penalty, one kind after the other.
 
     Beside a disturbance it is twice as high: real arms jerk, and any noise that is large at that moment gains
-    likelihood without being true elsewhere.
+    likelihood without being true elsewhere. One that is known to an eighth of itself is needed, whatever it costs.
     """
+    needed = _well_known(likelihood, config, free(config))
     for field in _PROCESSES[0]:
         without = config
         for one in free(config):
-            if one.path[-1] == field:
+            if one.path[-1] == field and one.key not in needed:
                 without = one.put(without, one.bounds[0])
+        if without == config:
+            continue
         peaks = [point(likelihood, config, free(config))]
         peaks.append(maximise_by_axis(likelihood, without, free(without), notify, _ROUGHLY))
         scores = [_penalised(likelihood, peak, free(peak.config), of_noise=2.0) for peak in peaks]
         config = _best_by_axis(likelihood, peaks, scores)
     return config
+
+
+def _well_known(likelihood: Likelihood, config: FusionConfig, free: Sequence[Parameter]) -> set[str]:
+    """The keys of parameters whose logarithm has a small standard deviation by the information."""
+    inside = [one for one in free if one.log and one.at_bound(config) is None]
+    information = derivatives(likelihood, point(likelihood, config, inside), inside).information
+    sd = np.sqrt(np.diag(covariance(information, inside)))
+    return {one.key for one, known in zip(inside, sd.tolist(), strict=True) if known < _WELL_KNOWN}
 
 
 def _penalised_arms(likelihood: Likelihood, peaks: Sequence[Point], free: FreeOf) -> list[FloatArray]:
