@@ -130,6 +130,7 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
 def sensor_problems(est: Estimates) -> list[str]:
     """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows, frozen."""
     found, given = list[str](), est.measurements
+    alone = np.count_nonzero(np.bincount(given.sensor)) < 2
     for number, name in enumerate(given.sensors):
         mine = np.flatnonzero(given.sensor == number)
         if not len(mine):
@@ -140,7 +141,7 @@ def sensor_problems(est: Estimates) -> list[str]:
         times = "once" if reacquired == 1 else f"{reacquired} times"
         width = _width_of_prior(est, name)
         frozen = {each: _frozen(value[axis == column]) for column, each in enumerate(given.axes)}
-        of_axes = [given.axes[column] for column in set[int](axis.tolist())]
+        of_axes = [given.axes[column] for column in np.flatnonzero(np.bincount(axis)).tolist()]
         kinds: dict[Kind, None] = {est.config.arm.axes[each].kind: None for each in of_axes}
         sd, bias_sd, offset_sd = (
             "/".join(of_kind(key, kind) for kind in kinds) for key in ("sd_mm", "bias_sd_mm", "offset_sd_mm")
@@ -155,9 +156,9 @@ def sensor_problems(est: Estimates) -> list[str]:
                 reacquired > 0,
                 f"its gate reacquired {times}: it contradicts "
                 + (
-                    f"the others or the model; if it is off by a constant, give it {bias_sd}"
-                    if len(set(given.sensor.tolist())) > 1
-                    else f"the model; {sd}, latency_ms or the process noise may be wrong"
+                    f"the model; {sd}, latency_ms or the process noise may be wrong"
+                    if alone
+                    else f"the others or the model; if it is off by a constant, give it {bias_sd}"
                 ),
             ),
             (rejected > _MANY_REJECTED, f"{rejected:.0%} of its components were {_TOO_SMALL.format(sd=sd)}"),
