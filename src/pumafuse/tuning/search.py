@@ -117,7 +117,7 @@ def search(
         if first:
             best, _ = _arm(likelihood, best, rough, notify)
         found.append(maximise_by_axis(likelihood, best, rough(best), notify, _ROUGHLY))
-    best, reasons = most_likely_models(likelihood, found, rough)
+    best, disturbances = most_likely_models(likelihood, found, rough)
     best, arm = _arm(likelihood, best, own, notify, again=True)
     best = _without_needless(likelihood, best, own, notify)
     if len(found) > 1 and not near:
@@ -126,7 +126,8 @@ def search(
     orders: Reasons = {}
     if any(one.axis is None and one.fit == "delay" for one in free(best)):
         best, orders = _orders(likelihood, best, own, notify)  # an own delay can look like a second order
-    for more in (arm, delays, orders):
+    reasons: Reasons = {}
+    for more in (arm, disturbances, delays, orders):
         for axis, why in more.items():
             reasons.setdefault(axis, {}).update(why)
     best = maximise_with_gates(likelihood, with_gates(best, config), free(best), notify)
