@@ -94,16 +94,20 @@ def ours(job: str) -> Callable[[Problem], Callable[[], Any]]:
 # C++
 
 
+SIZES = ("axes", "rows", "estimates", "origin")
+ARRAYS = (
+    *("axis", "scale", "sd", "biased"),
+    *("time", "source", "stamp", "value", "outcome", "times"),
+    *("innovation", "innovation_sd", "outputs"),
+)
+
+
 class Loop(ctypes.Structure):
     """The arguments of loop.cpp."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("axes", "rows", "estimates", "origin")),
-        *(
-            (name, ctypes.c_void_p)
-            for name in ("axis", "scale", "sd", "biased", "time", "source", "stamp", "value", "outcome", "times")
-        ),
-        *((name, ctypes.c_void_p) for name in ("innovation", "innovation_sd", "outputs")),
+        *((name, ctypes.c_int64) for name in SIZES),
+        *((name, ctypes.c_void_p) for name in ARRAYS),
     )
 
 
@@ -433,19 +437,19 @@ class Peer(NamedTuple):
 
 
 MATRICES = "position and sd alone, of what was fused; on one scan"
-TABLE = "a table of rows in, arrays of numbers out: neither classifies rows nor lists outcomes"
+READY = "a table of rows in, arrays of numbers out: neither classifies rows nor lists outcomes"
 GIVEN = "the same in and out; what gates decided is given"
 PEERS: dict[str, Peer] = {
     "C++ loop": Peer("filter", cpp("filter"), project.ROWS, GIVEN),
-    "pumafuse, table ready": Peer("filter", ours("filter"), project.ROWS, TABLE),
+    "pumafuse, table ready": Peer("filter", ours("filter"), project.ROWS, READY),
     "statsmodels": Peer("filter", statsmodels("filter"), 0, MATRICES),
     "dynamax": Peer("filter", dynamax("filter"), 0, MATRICES),
     "fast-kalman": Peer("filter", fast_kalman, 0, MATRICES),
     "filterpy": Peer("filter", filterpy, 0, MATRICES),
     "C++ loop, as live": Peer("as live", cpp("as live"), project.ROWS, GIVEN),
-    "pumafuse, as live, table ready": Peer("as live", ours("as live"), project.ROWS, TABLE),
+    "pumafuse, as live, table ready": Peer("as live", ours("as live"), project.ROWS, READY),
     "C++ loop, smoother": Peer("smooth", cpp("smooth"), project.ROWS, GIVEN),
-    "pumafuse, smoother, table ready": Peer("smooth", ours("smooth"), project.ROWS, TABLE),
+    "pumafuse, smoother, table ready": Peer("smooth", ours("smooth"), project.ROWS, READY),
     "statsmodels, smoother": Peer("smooth", statsmodels("smooth"), 0, MATRICES),
     "dynamax, smoother": Peer("smooth", dynamax("smooth"), 0, MATRICES),
     "C++ loop, likelihood": Peer("likelihood", cpp_likelihood, project.ROWS, "what gates decided is given"),
