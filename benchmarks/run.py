@@ -21,6 +21,7 @@ import statistics
 import subprocess
 import sys
 import tarfile
+import textwrap
 from collections.abc import Callable, Iterable
 from itertools import compress
 from pathlib import Path
@@ -43,7 +44,7 @@ TITLES = {
     "as live": f"As live: {SCAN}",
     "smooth": f"Smoothing {SCAN}",
     "likelihood": "The likelihood of a run, ns a measured value",
-    "live": "Live, three axes, µs of wall time a call or row",
+    "live": "Live, three axes, µs a call or row",
     "process": "Whole processes on the scan, s",
     "tune": "`pumafuse tune --fit noise,delay,plant`, s",
     "compile": "First use on a machine, s of wall time more than the next time",
@@ -139,7 +140,7 @@ def machine() -> str:
         except importlib.metadata.PackageNotFoundError:
             found.append(f"{package} missing")
     here = f"{cpu}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}"
-    return f"{datetime.date.today():%Y-%m-%d}, {here}, {', '.join(found)}."
+    return textwrap.fill(f"{datetime.date.today():%Y-%m-%d}, {here}, {', '.join(found)}.", 120)
 
 
 def tables(rows: list[Row], jobs: Iterable[str]) -> str:
