@@ -14,7 +14,7 @@ help:
 	@echo "make lint       ruff and pyright"
 	@echo "make docs       the documentation as a site (into ./site)"
 	@echo "make notebooks  run the notebooks anew, in place"
-	@echo "make bench      pumafuse against its peers (into .venv-bench; some minutes)"
+	@echo "make bench      pumafuse against its peers and version 0.1 (into .venv-bench and docs; 25 minutes)"
 	@echo "make lock       write requirements.lock anew (needs uv)"
 	@echo "make clean      remove .venv, ./demo and ./site"
 
@@ -57,7 +57,7 @@ notebooks: $(READY)
 	@touch $@
 
 bench: .venv-bench/.ready
-	.venv-bench/bin/python benchmarks/run.py
+	.venv-bench/bin/python benchmarks/run.py --write
 
 # Universal: one lock for every platform and Python. No index address goes into it.
 lock:

@@ -24,13 +24,13 @@ from typing import Any
 
 import msgspec
 from kinematic import ORDERS, Array, axes_of
+from page import REPOSITORY
 
 import pumafuse as pf
 
 Row = dict[str, Any]
 
 DATA = Path(pf.__file__).parent / "data"
-REPOSITORY = Path(__file__).resolve().parents[1]
 SCENARIOS = ("panel-vision", "panel-tracker-outage", "mismatched-arm", "fast-arm", "wrong-latency")
 SEED = 1
 LEARNT = 40.0  # s of the scan, where its end is kept back

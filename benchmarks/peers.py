@@ -1,4 +1,4 @@
-"""The scan through other programs: a loop in C++ on the table of events, and general filters with matrices per event.
+"""The scan through other programs: loops in C++ on the table of events, and general filters with matrices per event.
 
     python benchmarks/peers.py NAME REPEATS    prints the rows of one of PEERS as JSON; run.py calls it
 
@@ -25,7 +25,7 @@ import project
 from project import Row
 
 import pumafuse as pf
-from pumafuse.filter.axis import OFFSET, POSITION, RATE, START
+from pumafuse.filter.axis import OFFSET, ORDER, POSITION, RATE, START, STATES
 from pumafuse.filter.events import COMMAND, Events
 from pumafuse.fusion.engine import Filtered, arranged, biased_sensors, filter_segment, innovations
 from pumafuse.fusion.segments import Segment, build
@@ -35,15 +35,12 @@ Array = npt.NDArray[np.float64]
 Answer = Mapping[str, Array]  # outputs (axes, estimates), innovations (events, axes), or the log_likelihood
 TOLERANCE = 1e-9  # of a standard deviation
 FUSED = pf.Outcome.FUSED
-FIELDS = pf.AxisEstimate.FIELDS
+FILTERED = ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd")
+FIELDS = {"filter": FILTERED, "as live": FILTERED, "smooth": ("position", "position_sd", "offset", "offset_sd")}
+MODES: dict[str, pf.Mode] = {"filter": "filtered", "as live": "as-live", "smooth": "smoothed"}
 SOURCE = Path(__file__).with_name("loop.cpp")
 LIBRARY = SOURCE.parent / ".build" / "loop.so"
 MICRO = 1e6  # dynamax adds 1e-9 to the diagonal of what it inverts: too much in m², nothing in µm²
-
-# Parts of kernels, to be called from Python.
-transition, decaying_response, gain_error = (
-    numba.njit(part.py_func) for part in (closed.transition, closed.decaying_response, closed.gain_error)
-)
 
 
 @dataclass(frozen=True)
@@ -73,9 +70,8 @@ class Problem:
             fused = found.outcome == FUSED
             nu, S = found.innovation[fused], found.innovation_sd[fused] ** 2
             return {"log_likelihood": np.array(-0.5 * np.sum(np.log(2.0 * np.pi * S) + nu**2 / S))}
-        mode = "smoothed" if job == "smooth" else "filtered"
-        filtered = filter_segment(self.segment, self.config, self.times, mode)
-        own = {name: np.array([getattr(axis, name) for axis in filtered.axes.values()]) for name in FIELDS}
+        filtered = filter_segment(self.segment, self.config, self.times, MODES[job])
+        own = {name: np.array([getattr(axis, name) for axis in filtered.axes.values()]) for name in FIELDS[job]}
         return own | {name: getattr(filtered.results, name) for name in ("innovation", "innovation_sd")}
 
 
@@ -98,20 +94,63 @@ def ours(job: str) -> Callable[[Problem], Callable[[], Any]]:
 # C++
 
 
+SIZES = ("axes", "rows", "estimates", "origin")
+ARRAYS = (
+    *("axis", "scale", "sd", "biased"),
+    *("time", "source", "stamp", "value", "outcome", "times"),
+    *("innovation", "innovation_sd", "outputs"),
+)
+
+
+class Loop(ctypes.Structure):
+    """The arguments of loop.cpp."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in SIZES),
+        *((name, ctypes.c_void_p) for name in ARRAYS),
+    )
+
+
 @cache
 def library() -> ctypes.CDLL:
-    """The loop, built anew when its source is younger."""
+    """The loops, built anew when their source is younger."""
     if not LIBRARY.exists() or LIBRARY.stat().st_mtime < SOURCE.stat().st_mtime:
         LIBRARY.parent.mkdir(exist_ok=True)
-        subprocess.run(["g++", "-O3", "-march=native", "-shared", "-fPIC", SOURCE, "-o", LIBRARY], check=True)
+        command = ["g++", "-std=c++20", "-O3", "-march=native", "-shared", "-fPIC", SOURCE, "-o", LIBRARY]
+        subprocess.run(command, check=True)
     return ctypes.CDLL(str(LIBRARY))
 
 
-def cpp(problem: Problem, estimates: bool = True) -> Callable[[], Answer]:
+def cpp(job: str, estimates: bool = True) -> Callable[[Problem], Callable[[], Answer]]:
     """What the gates decided is given: it calculates every innovation and fuses what pumafuse fused."""
-    config, segment, events = problem.config, problem.segment, problem.events
-    biases, period = biased_sensors(segment, config), config.arm.update_period
-    packed: list[list[float]] = []
+
+    def adapter(problem: Problem) -> Callable[[], Answer]:
+        segment, events = problem.segment, problem.events
+        command = (events.source == COMMAND)[:, None]
+        outcome = np.where(command, events.known, problem.filtered.results.outcome).astype(np.uint8)
+        times = problem.times if estimates else problem.times[:0]
+        table = (*constants(problem), events.time, events.source, events.stamp, events.value, outcome, times)
+        order, places = arrivals(problem) if job == "as live" else ((), 0)
+        loop = getattr(library(), job.replace(" ", "_"))
+
+        def run() -> Answer:
+            innovation, innovation_sd = np.full((2, *events.value.shape), np.nan)
+            outputs = np.empty((len(FIELDS[job]), len(segment.axes), len(times)))
+            arrays = map(pointer, (*table, innovation, innovation_sd, outputs))
+            sizes = len(segment.axes), len(events.time), len(times), segment.origin
+            loop(ctypes.byref(Loop(*sizes, *arrays)), *map(pointer, order), ctypes.c_int64(places))
+            found = {"innovation": innovation, "innovation_sd": innovation_sd}
+            return found | dict(zip(FIELDS[job], outputs, strict=True)) if estimates else found
+
+        return run
+
+    return adapter
+
+
+def constants(problem: Problem) -> tuple[npt.NDArray[Any], ...]:
+    """Axes, and of sensors scale, sd and whether they have a bias, as loop.cpp takes them."""
+    config, segment = problem.config, problem.segment
+    biases, packed = biased_sensors(segment, config), list[list[float]]()
     for axis, biased in zip(segment.axes, biases, strict=True):
         model, process = config.arm.axes[axis], config.process[axis]
         plant, gain = model.plant, model.gain
@@ -121,40 +160,27 @@ def cpp(problem: Problem, estimates: bool = True) -> Callable[[], Answer]:
         )
         decay = 0.0 if model.gain_recovery is None else 1.0 / model.gain_recovery
         noise = [process.input_noise, process.drift, process.maneuver_noise, process.maneuver_drift]
-        prior = [segment.start[axis], config.start.offset_sd, 3.0 + len(biased)]
-        prior.append(config.sensors[biased[0]].bias_sd if biased else 0.0)
-        packed.append([*shape, gain.slope, gain.intercept, decay, period, *noise, *prior])
+        prior = [segment.start[axis], config.start.offset_sd_of(axis), 3.0 + len(biased)]
+        prior.append(config.sensors[biased[0]].bias_sd_of(axis) if biased else 0.0)
+        packed.append([*shape, gain.slope, gain.intercept, decay, config.arm.update_period, *noise, *prior])
     sensors = [config.sensors[name] for name in segment.sensors]
-    scale = np.array([sensor.scale for sensor in sensors])
     sd = np.array([[sensor.sd_of(axis) for axis in segment.axes] for sensor in sensors], dtype=np.float64)
     biased = np.array([[int(name in biased) for biased in biases] for name in segment.sensors])
-    command = (events.source == COMMAND)[:, None]
-    outcome = np.where(command, events.known, problem.filtered.results.outcome).astype(np.uint8)
-    times = problem.times if estimates else problem.times[:0]
-    axes, numbers = len(segment.axes), (np.array(packed), scale, sd, biased)
-    table = (events.time, events.source, events.stamp, events.value, outcome)
+    return np.array(packed), np.array([sensor.scale for sensor in sensors]), sd, biased
 
-    def run() -> Answer:
-        innovation, innovation_sd = np.full((2, *events.value.shape), np.nan)
-        outputs = np.empty((len(FIELDS), axes, len(times)))
-        library().filter_events(
-            axes,
-            *map(pointer, numbers),
-            ctypes.c_int64(segment.origin),
-            ctypes.c_int64(len(events.time)),
-            *map(pointer, (*table, innovation, innovation_sd)),
-            ctypes.c_int64(len(times)),
-            *map(pointer, (times, outputs)),
-        )
-        found = {"innovation": innovation, "innovation_sd": innovation_sd}
-        return found | dict(zip(FIELDS, outputs, strict=True)) if estimates else found
 
-    return run
+def arrivals(problem: Problem) -> tuple[tuple[npt.NDArray[np.int64], ...], int]:
+    """When each event arrives [ns] and the rows in that order; how many checkpoints that takes."""
+    events, times = problem.events, np.append(problem.times, np.iinfo(np.int64).max)
+    arrival = np.where(events.source == COMMAND, events.stamp, np.maximum(events.stamp, events.time))
+    seen = np.searchsorted(times, arrival)  # at which estimate
+    back = np.searchsorted(events.time, times[seen], side="right") - np.arange(len(arrival))
+    return (arrival, np.argsort(arrival, kind="stable")), int(back.max()) + 1
 
 
 def cpp_likelihood(problem: Problem) -> Callable[[], Answer]:
     """Without estimates, and the sum."""
-    run = cpp(problem, estimates=False)
+    run = cpp("filter", estimates=False)(problem)
     fused = (problem.filtered.results.outcome == FUSED) & (problem.events.source != COMMAND)[:, None]
 
     def likelihood() -> Answer:
@@ -172,6 +198,13 @@ def pointer(array: npt.NDArray[Any]) -> ctypes.c_void_p:
 
 
 # General filters: x[k] = F[k] x[k-1] + B[k] v[k] + w, z[k] = H[k] x[k] + e
+
+
+@numba.njit(cache=True)
+def interval(order: int, plant: Array, axis: int, decay: float, dt: float) -> tuple[tuple[float, ...], ...]:
+    """What an axis does in an interval [s], to be called from Python: Φ and Q, and what a gain error does."""
+    f = closed.transition(order, plant, axis, dt)
+    return f, closed.decaying_response(order, plant, axis, decay, dt, f[0], f[1], f[3])
 
 
 class Steps(NamedTuple):
@@ -222,15 +255,15 @@ def steps_of(problem: Problem) -> list[Steps]:
         row = np.concatenate((rows, np.full(len(problem.times), -1)))
         order = np.argsort(time, kind="stable")  # at one instant the estimate is the last
         row, dt = row[order], np.diff(time[order], prepend=problem.segment.origin) / 1e9
-        start, m, size = state.drive[axis, START], len(row), int(model.states[axis])
+        start, m, size = state.drive[axis, START], len(row), int(model.kind[axis, STATES])
         F, Q, B = np.zeros((m, size, size)), np.zeros((m, size, size)), np.zeros((m, size, 2))
         v, H, R, z = np.zeros((m, 2)), np.zeros((m, size)), np.ones(m), np.full(m, np.nan)
         F[:] = np.eye(size)
-        kind, plant, (slope, intercept, decay, period) = model.order[axis], model.constants, model.gain[axis]
+        order_of_plant, plant = model.kind[axis, ORDER], model.constants
+        slope, intercept, decay, period = model.gain[axis]
         u, step, e, noise, drift = 0.0, 0.0, 0.0, model.process[axis, 0] ** 2, model.process[axis, 1] ** 2
         for k in range(m):
-            f11, f12, f21, f22, q11, q12, q22 = transition(kind, plant, axis, dt[k])
-            a, b, left = decaying_response(kind, plant, axis, decay, dt[k], f11, f12, f22)
+            (f11, f12, f21, f22, q11, q12, q22), (a, b, left) = interval(order_of_plant, plant, axis, decay, dt[k])
             F[k, :2, :2] = [[f11, f12], [f21, f22]]
             B[k, :2], v[k], e = [[1.0 - f11, a], [-f21, b]], [u, e], e * left
             Q[k, :2, :2], Q[k, OFFSET, OFFSET] = [[noise * q11, noise * q12], [noise * q12, noise * q22]], drift * dt[k]
@@ -240,14 +273,14 @@ def steps_of(problem: Problem) -> list[Steps]:
             if sensor != COMMAND:
                 z[k] = value + start * (1.0 - sensors.scale[sensor])
                 H[k, [POSITION, OFFSET]], R[k] = sensors.scale[sensor], sensors.sd[sensor, axis] ** 2
-                if sensors.bias[sensor, axis] >= 0:
-                    H[k, sensors.bias[sensor, axis]] = 1.0
+                bias = sensors.bias[sensor, axis]
+                H[k, bias[bias >= 0]] = 1.0
                 continue
             maneuver = abs(value - u - step) / period
             u, step = value, value - u
-            e += gain_error(step, slope, intercept, period)
+            e += (slope * abs(step) / period + intercept - 1.0) * step
             noise, drift = (model.process[axis, :2] ** 2 + (model.process[axis, 2:] * maneuver) ** 2).tolist()
-        used = [i for i in range(size) if i != RATE or kind == 2]
+        used = [i for i in range(size) if i != RATE or order_of_plant == 2]
         position = np.zeros(size)
         position[[POSITION, OFFSET]] = 1.0
         F, Q, P0 = F[:, used][:, :, used], Q[:, used][:, :, used], state.P[axis][np.ix_(used, used)]
@@ -273,6 +306,43 @@ def filterpy(problem: Problem) -> Callable[[], Answer]:
             kf.P = s.P0
             mean, cov, _, _ = kf.batch_filter(z, Fs=s.F, Qs=s.Q, Hs=H, Rs=R, Bs=s.B, us=s.v[..., None])
             found.append(s.outputs(mean[..., 0], cov))
+        return joined(found)
+
+    return run
+
+
+def fast_kalman(problem: Problem) -> Callable[[], Answer]:
+    """A loop in Python that sets F and Q and calls its compiled steps.
+
+    It takes no input: what inputs alone do is calculated before, and the filter sees what is left of the measurements.
+    """
+    import kalman
+
+    axes: list[tuple[Steps, int, Array, list[Any], list[float]]] = []
+    for s in steps_of(problem):
+        n, moved = s.F.shape[1], np.zeros(s.F.shape[:2])
+        for k in range(len(moved)):
+            moved[k] = s.F[k] @ moved[k - 1] + s.B[k] @ s.v[k]
+        z = MICRO * (s.z - np.sum(s.H * moved, axis=1))
+        flat = (part.reshape(len(z), -1).tolist() for part in (s.F, MICRO**2 * s.Q, s.H))
+        steps = list(zip(*flat, z.tolist(), (MICRO**2 * s.R).tolist(), s.estimate.tolist(), strict=True))
+        axes.append((s, n, moved, steps, (MICRO**2 * s.P0).ravel().tolist()))
+
+    def run() -> Answer:
+        found: list[tuple[Array, Array]] = []
+        for s, n, moved, steps, prior in axes:
+            kf, mean, cov = kalman.LinearKalmanFilter(n, 1), [], []
+            kf.x, kf.P = [0.0] * n, prior
+            for F, Q, H, z, R, estimate in steps:
+                kf.F, kf.Q = F, Q
+                kf.predict()
+                if z == z:
+                    kf.correct_scalar(z, H, R)
+                if estimate:
+                    mean.append(kf.x)
+                    cov.append(kf.P)
+            x, P = np.array(mean) / MICRO + moved[s.estimate], np.array(cov).reshape(-1, n, n) / MICRO**2
+            found.append((s.start + x @ s.position, np.sqrt(P @ s.position @ s.position)))
         return joined(found)
 
     return run
@@ -367,12 +437,19 @@ class Peer(NamedTuple):
 
 
 MATRICES = "position and sd alone, of what was fused; on one scan"
+READY = "a table of rows in, arrays of numbers out: neither classifies rows nor lists outcomes"
+GIVEN = "the same in and out; what gates decided is given"
 PEERS: dict[str, Peer] = {
-    "pumafuse, table ready": Peer("filter", ours("filter"), project.ROWS, "a table of rows in, arrays of numbers out"),
-    "C++ loop, table ready": Peer("filter", cpp, project.ROWS, "the same out; what gates decided is given"),
+    "C++ loop": Peer("filter", cpp("filter"), project.ROWS, GIVEN),
+    "pumafuse, table ready": Peer("filter", ours("filter"), project.ROWS, READY),
     "statsmodels": Peer("filter", statsmodels("filter"), 0, MATRICES),
     "dynamax": Peer("filter", dynamax("filter"), 0, MATRICES),
+    "fast-kalman": Peer("filter", fast_kalman, 0, MATRICES),
     "filterpy": Peer("filter", filterpy, 0, MATRICES),
+    "C++ loop, as live": Peer("as live", cpp("as live"), project.ROWS, GIVEN),
+    "pumafuse, as live, table ready": Peer("as live", ours("as live"), project.ROWS, READY),
+    "C++ loop, smoother": Peer("smooth", cpp("smooth"), project.ROWS, GIVEN),
+    "pumafuse, smoother, table ready": Peer("smooth", ours("smooth"), project.ROWS, READY),
     "statsmodels, smoother": Peer("smooth", statsmodels("smooth"), 0, MATRICES),
     "dynamax, smoother": Peer("smooth", dynamax("smooth"), 0, MATRICES),
     "C++ loop, likelihood": Peer("likelihood", cpp_likelihood, project.ROWS, "what gates decided is given"),

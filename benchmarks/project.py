@@ -1,4 +1,4 @@
-"""What pumafuse itself takes: `fuse` on the scan, its likelihood, the live estimator, whole processes, memory.
+"""What pumafuse itself takes: `fuse` on the scan, a likelihood, live, whole processes, `tune`, first use, memory.
 
     python benchmarks/project.py NAME REPEATS    prints the rows of one of CASES as JSON; run.py calls it
 
@@ -7,6 +7,7 @@ It measures the pumafuse that Python finds, of version 0.1, too: `run.py --again
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import resource
@@ -20,9 +21,10 @@ from collections.abc import Callable
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from page import REPOSITORY
 
 import pumafuse as pf
 
@@ -30,12 +32,14 @@ Row = dict[str, Any]
 
 DATA = Path(str(files("pumafuse") / "data"))
 SCAN, CONFIG = DATA / "scan1", DATA / "fusion.toml"
-AXES = ("tangential", "radial", "vertical")
+TRUNK = REPOSITORY / "examples" / "trunk-servo"
+OLD = "mode" not in inspect.signature(pf.fuse).parameters  # version 0.1
 START = {"tangential": 0.0, "radial": 0.56, "vertical": -0.1}  # m
 ROWS = 1_000_000
 LENGTH = 60_200_000_000  # ns, from one repetition of the scan to the next
 MS = 1_000_000  # ns
 JITTER = 0.2e-3  # s, so that no repetition has the intervals of another
+FIT = "noise,delay,plant"
 PUMAFUSE = (sys.executable, "-c", "from pumafuse.cli.main import main; main()")
 
 
@@ -72,36 +76,40 @@ def timed(call: Callable[[], Any], repeats: int) -> list[float]:
     return found
 
 
-def row(job: str, name: str, unit: str, values: list[float], note: str = "") -> Row:
-    """One row of a table."""
-    return {"job": job, "name": name, "unit": unit, "values": values, "note": note}
+def row(job: str, name: str, unit: str, values: list[float], note: str = "", **more: list[float]) -> Row:
+    """One row of a table; ``more`` are ``wall``, or what ``high`` values are."""
+    return {"job": job, "name": name, "unit": unit, "values": values, "note": note, **more}
 
 
 # In one process
 
 
-def fuse(job: str, repeats: int, **options: bool) -> list[Row]:
+def fuse(job: str, mode: str, repeats: int) -> list[Row]:
     """One million rows of three axes."""
     run, config = repeated(ROWS), pf.FusionConfig.load(CONFIG)
+    options = (
+        {"filtered": {}, "as-live": {"as_live": True}, "smoothed": {"smooth": True}}[mode] if OLD else {"mode": mode}
+    )
     seconds = timed(lambda: pf.fuse(run, config, **options), repeats)
-    given = "".join(f", {name}=True" for name in options)
-    note = f"everything, from the run to its estimates: {min(seconds):.2f} s for a million rows"
-    return [row(job, f"pumafuse.fuse{given}", "ns", [1e9 * s / values_of(run) for s in seconds], note)]
+    name = "pumafuse.fuse" if mode == "filtered" else f"pumafuse.fuse, {mode}"
+    return [
+        row(job, name, "ns", [1e9 * s / values_of(run) for s in seconds], "everything, from the run to its estimates")
+    ]
 
 
 def likelihood(repeats: int) -> list[Row]:
     """What one step of a search by likelihood takes."""
     from pumafuse.fusion.engine import innovations
 
-    try:
-        from pumafuse.fusion.segments import build
-    except ImportError:  # version 0.1
+    if OLD:
         from pumafuse.fusion.timeline import build
+    else:
+        from pumafuse.fusion.segments import build
     run, config = repeated(ROWS), pf.FusionConfig.load(CONFIG)
     segment = build(run, config)
     seconds = timed(lambda: innovations(segment, config), repeats)
-    name, note = "pumafuse, innovations", "the run's table ready"
-    return [row("likelihood", name, "ns", [1e9 * s / values_of(run) for s in seconds], note)]
+    note = "the run's table ready; the gates decide"
+    return [row("likelihood", "pumafuse, innovations", "ns", [1e9 * s / values_of(run) for s in seconds], note)]
 
 
 def live(repeats: int) -> list[Row]:
@@ -136,7 +144,18 @@ def live(repeats: int) -> list[Row]:
             half, high = np.percentile(times[len(times) // 6 :], [50, 99])
             medians[name].append(float(half))
             highs[name].append(float(high))
-    return [row("live", f"{name}, median", "µs", medians[name], f"99 %: {min(highs[name]):.0f} µs") for name in medians]
+    return [
+        row("live", f"{name}, median", "µs", medians[name], NOTES.get(name, ""), high=highs[name]) for name in medians
+    ]
+
+
+NOTES = {
+    "LiveEstimator.measurement": "rows at 1 kHz, in order",
+    "LiveEstimator.measurement, 100 ms late": "100 rows of 1 kHz are updated again",
+    "LiveEstimator.command": "every 28 ms",
+    "LiveEstimator.estimate": "now",
+    "a filterpy loop": "two states an axis; no delay, lateness or gate",
+}
 
 
 def textbook_filters() -> list[Any]:
@@ -175,21 +194,38 @@ def _peak() -> float:
 # Whole processes
 
 
-def seconds_of(command: list[str], stdin: str = "", cache: str | None = None) -> float:
-    """CPU seconds that a process takes, from start to end; what it compiles goes to ``cache``."""
-    environment = os.environ | ({} if cache is None else {"NUMBA_CACHE_DIR": cache})
+class Spent(NamedTuple):
+    """Seconds that a process took, from start to end."""
+
+    cpu: float
+    wall: float
+
+    def __sub__(self, other: Spent) -> Spent:
+        return Spent(self.cpu - other.cpu, self.wall - other.wall)
+
+
+def seconds_of(command: list[str], stdin: str = "", compiled: str | None = None) -> Spent:
+    """What a process takes, with those that it starts; what it compiles goes to the folder ``compiled``."""
+    environment = os.environ | ({} if compiled is None else {"NUMBA_CACHE_DIR": compiled})
     with tempfile.TemporaryFile("w+") as file:
         file.write(stdin)
         file.seek(0)
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run(command, stdin=file, capture_output=True, check=True, env=environment)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        done = subprocess.run(command, stdin=file, capture_output=True, check=False, env=environment)
+        after, end = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    if done.returncode not in (0, 3):  # 3: done, but what was tuned is no better everywhere
+        sys.exit(done.stderr.decode())
+    return Spent(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, end - begin)
 
 
 def fuse_command(folder: str) -> list[str]:
     """``pumafuse fuse`` on the shipped scan."""
     return [*PUMAFUSE, "fuse", str(SCAN), "--config", str(CONFIG), "--output", f"{folder}/result", "--force"]
+
+
+def tune_command(folder: str, run: Path, config: Path, fit: str, *options: str) -> list[str]:
+    """``pumafuse tune``."""
+    return [*PUMAFUSE, "tune", str(run), "-c", str(config), "-o", f"{folder}/tuned", "--force", "--fit", fit, *options]
 
 
 def live_command(*options: str) -> list[str]:
@@ -215,8 +251,8 @@ def stdin(repeats: int) -> list[Row]:
     for name, options in (("an estimate a command", ()), ("--rate 100", ("--rate", "100"))):
         command = live_command(*options)
         seconds_of(command, few)
-        each = [10.0 * (seconds_of(command, many) - seconds_of(command, few)) for _ in range(min(repeats, 3))]
-        note = f"{1e6 / min(each):,.0f} rows a second, beside the process's start"
+        each = [10.0 * (seconds_of(command, many) - seconds_of(command, few)).cpu for _ in range(min(repeats, 3))]
+        note = "CPU time of a row, beside the process's start"
         found.append(row("live", f"pumafuse live stdin, {name}", "µs", each, note))
     return found
 
@@ -227,38 +263,59 @@ def processes(repeats: int) -> list[Row]:
         commands = {
             "pumafuse fuse": fuse_command(folder),
             "pumafuse --help": [*PUMAFUSE, "--help"],
+            "import numpy, pyarrow, numba": [sys.executable, "-c", "import numpy, pyarrow, numba"],
             "import pumafuse": [sys.executable, "-c", "import pumafuse"],
             "python": [sys.executable, "-c", "pass"],
         }
-        found: dict[str, list[float]] = {name: [] for name in commands}
+        found: dict[str, list[Spent]] = {name: [] for name in commands}
         for _ in range(repeats + 1):
             for name, command in commands.items():
                 found[name].append(seconds_of(command))
-    return [row("process", name, "s", seconds[1:]) for name, seconds in found.items()]
+    cpu = {name: [spent.cpu for spent in seconds[1:]] for name, seconds in found.items()}
+    wall = {name: [spent.wall for spent in seconds[1:]] for name, seconds in found.items()}
+    whole, needed = "pumafuse fuse", "import numpy, pyarrow, numba"
+    for kind in (cpu, wall):
+        kind["pumafuse fuse, more than these imports"] = [min(kind[whole]) - min(kind[needed])]
+    return [row("process", name, "s", cpu[name], wall=wall[name]) for name in cpu]
+
+
+def tune(_repeats: int) -> list[Row]:
+    """The shipped scan; a minute of a servo, which version 0.1 cannot read."""
+    with tempfile.TemporaryDirectory() as folder:
+        commands = {"the scan": tune_command(folder, SCAN, CONFIG, FIT)}
+        if not OLD:
+            minute = tune_command(folder, TRUNK / "0g", TRUNK / "fusion.toml", FIT, "--to", "60")
+            commands["a minute of examples/trunk-servo/0g"] = minute
+        found = {name: seconds_of(command) for name, command in commands.items()}
+    return [row("tune", name, "s", [spent.cpu], wall=[spent.wall]) for name, spent in found.items()]
 
 
 def first_use(_repeats: int) -> list[Row]:
-    """What compiling takes: a process on a machine that has nothing compiled, less the same once more."""
-    found: list[Row] = []
+    """What compiling takes: processes on a machine that has nothing compiled, less the same once more."""
     with tempfile.TemporaryDirectory() as folder:
-        for name, command, text in (
-            ("pumafuse fuse", fuse_command(folder), ""),
-            ("pumafuse live stdin", live_command(), lines(100)),
-        ):
-            cache = f"{folder}/{name}"
-            cold, warm = (seconds_of(command, text, cache) for _ in range(2))
-            found.append(row("compile", f"{name}, compiled for the first time", "s", [cold - warm]))
-    return found
+        fuse, live = (fuse_command(folder), ""), (live_command(), lines(100))
+        tune = tune_command(folder, SCAN, CONFIG, "noise"), ""
+
+        def first(command: tuple[list[str], str], compiled: str) -> float:
+            cold, warm = (seconds_of(*command, f"{folder}/{compiled}") for _ in range(2))
+            return (cold - warm).wall
+
+        found = {"pumafuse fuse": first(fuse, "one"), "pumafuse live stdin": first(live, "other")}
+        found["fuse, tune and live, one after the other"] = (
+            found["pumafuse fuse"] + first(tune, "one") + first(live, "one")
+        )
+    return [row("compile", name, "s", [seconds]) for name, seconds in found.items()]
 
 
 CASES: dict[str, Callable[[int], list[Row]]] = {
-    "pumafuse.fuse": partial(fuse, "filter"),
-    "pumafuse.fuse, as_live": partial(fuse, "as live", mode="as-live"),
-    "pumafuse.fuse, smooth": partial(fuse, "smooth", mode="smoothed"),
+    "pumafuse.fuse": partial(fuse, "filter", "filtered"),
+    "pumafuse.fuse, as-live": partial(fuse, "as live", "as-live"),
+    "pumafuse.fuse, smoothed": partial(fuse, "smooth", "smoothed"),
     "pumafuse, likelihood": likelihood,
     "LiveEstimator.measurement": live,
     "pumafuse live stdin": stdin,
     "processes": processes,
+    "tune": tune,
     "first use": first_use,
     "memory": memory,
 }

@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from generic import REPOSITORY, beginning
+from generic import beginning
 from kinematic import ORDERS, Array
+from page import COMPARISON, REPOSITORY, put, table
 from ungated import Regression, likeliest
 
 import pumafuse as pf
@@ -29,7 +30,6 @@ KINDS = [f"constant {kind}" for kind in ORDERS]
 METHODS = ["held", *KINDS, "LSQ+OU", "pumafuse"]
 FIT = ["noise", "delay", "plant", "gain"]
 LEARNT = 100.0  # s of trunk-servo
-MARKS = ("<!-- made by benchmarks/real.py -->", "<!-- until here -->")
 
 Errors = Mapping[
     str, tuple[float, float]
@@ -182,12 +182,6 @@ def row(
     return made
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], words: int) -> str:
-    """A table of Markdown with so many columns of words."""
-    rule = ["---"] * words + ["---:"] * (len(head) - words)
-    return "\n".join(f"| {' | '.join(line)} |" for line in (head, rule, *rows))
-
-
 def verdicts(rows: Sequence[Row]) -> Iterator[str]:
     """Geometric means of pumafuse's error over that of others, and where it loses."""
     name, others = METHODS[-1], METHODS[1:-1]
@@ -220,13 +214,6 @@ def readme(rows: Sequence[Row]) -> str:
     return table(["axis", *SHOWN], lines, 1)
 
 
-def put(page: Path, text: str) -> None:
-    """Put a text between its marks on a page."""
-    old = page.read_text(encoding="utf-8")
-    head, tail = old[: old.index(MARKS[0])], old[old.index(MARKS[1]) :]
-    page.write_text(f"{head}{MARKS[0]}\n\n{text}\n\n{tail}", encoding="utf-8")
-
-
 SHOWN = {
     "camera, held": ("held", "filtered"),
     "constant velocity": ("constant velocity", "filtered"),
@@ -251,8 +238,8 @@ def main() -> None:
     compared = f"{table(['recording', 'axis', 'mode', *METHODS], lines, 3)}\n\n{listed}"
     print(compared, readme(rows), sep="\n\n")
     if given.write:
-        put(REPOSITORY / "docs" / "comparison.md", compared)
-        put(REPOSITORY / "README.md", readme(rows))
+        put(COMPARISON, "real.py", compared)
+        put(REPOSITORY / "README.md", "real.py", readme(rows))
 
 
 if __name__ == "__main__":

@@ -1,49 +1,78 @@
-"""Times pumafuse on the shipped scan, beside a loop in C++, other filters, and another checkout of itself.
+"""Times pumafuse on real jobs, beside loops in C++, other filters, and another checkout of itself.
 
-    python benchmarks/run.py [--only TEXT] [--against PATH] [--repeats N] [--rounds N] [--json FILE] [--markdown]
+    python benchmarks/run.py [--only TEXT] [--against WHICH] [--repeats N] [--rounds N] [--json FILE] [--write]
 
 Everything runs in a process of its own: what one leaves behind (a grown heap, compiled code) then cannot flatter or
 hurt another. With --against, the two checkouts take turns. Minima of all calls of all rounds are compared: on a
-machine that does other work, too, they say most.
+machine that does other work, too, they say most. ``--write`` measures everything beside version 0.1 and puts the
+tables into the pages.
 """
 
 from __future__ import annotations
 
 import argparse
+import datetime
 import importlib.metadata
+import io
 import json
 import os
 import platform
 import statistics
 import subprocess
 import sys
+import tarfile
+import textwrap
+from collections.abc import Callable, Iterable
+from itertools import compress
 from pathlib import Path
-from typing import Any
 
 import peers
 import project
+from page import COMPARISON, LIVE, REPOSITORY, put, table
 from project import Row
 
 HERE = Path(__file__).parent
-CASES = [*((HERE / "project.py", name) for name in project.CASES), *((HERE / "peers.py", name) for name in peers.PEERS)]
-PACKAGES = ("pumafuse", "numpy", "scipy", "numba", "filterpy", "statsmodels", "dynamax", "jax")
-SCAN = "the shipped scan, three axes, ns a measured value"
+# Version 0.1 was not tagged: this is its last commit; the next one gives its modules and words new names, with which
+# the core was then rebuilt as 0.2.
+VERSION_0_1 = "19fb045"
+CASES = [*((HERE / "peers.py", name) for name in peers.PEERS), *((HERE / "project.py", name) for name in project.CASES)]
+ONCE = ("tune", "first use", "memory")  # what takes long is measured in one round
+PACKAGES = ("numpy", "scipy", "numba", "filterpy", "statsmodels", "dynamax", "jax", "fast-kalman")
+SCAN = "the scan, three axes, ns a measured value (a million rows are 2.56 million values)"
 TITLES = {
-    "filter": f"`filter`: {SCAN}",
-    "as live": f"`as live`: {SCAN}",
-    "smooth": f"`smooth`: {SCAN}",
-    "likelihood": f"`likelihood`: {SCAN}",
-    "live": "`live`: three axes, µs a row",
-    "process": "`process`: whole processes on the shipped scan, s",
-    "compile": "`compile`: the first use on a machine, s more than the next",
-    "memory": "`memory`: the process's peak, GB",
+    "filter": f"Filtering {SCAN}",
+    "as live": f"As live: {SCAN}",
+    "smooth": f"Smoothing {SCAN}",
+    "likelihood": "The likelihood of a run, ns a measured value",
+    "live": "Live, three axes, µs a call or row",
+    "process": "Whole processes on the scan, s",
+    "tune": "`pumafuse tune --fit noise,delay,plant`, s",
+    "compile": "First use on a machine, s of wall time more than the next time",
+    "memory": "Memory at the peak, GB",
 }
-DIGITS = {"ns": 0, "µs": 2, "s": 2, "GB": 2}
+BESIDE = "C++"  # what the ratios of a job are to
+DIGITS = {"ns": 0, "µs": 1, "s": 2, "GB": 2}
 
 
-def in_own_process(script: Path, name: str, repeats: int, checkout: str | None = None) -> list[Row]:
+def checkout(which: str) -> Path:
+    """Another checkout of pumafuse: a folder, or a commit, whose sources are laid down in one that git ignores."""
+    if Path(which).is_dir():
+        return Path(which).resolve()
+    folder = HERE / ".build" / which
+    if not folder.exists():
+        command = ["git", "-C", str(REPOSITORY), "archive", "--format=tar", which, "src"]
+        done = subprocess.run(command, capture_output=True, check=False)
+        if done.returncode:
+            sys.exit(f"no folder and no commit {which}: {done.stderr.decode().strip()}")
+        with tarfile.open(fileobj=io.BytesIO(done.stdout)) as archive:
+            archive.extractall(folder, filter="data")
+    return folder
+
+
+def in_own_process(script: Path, name: str, repeats: int, sources: Path) -> list[Row]:
     """The rows of a case; one that says what went wrong if it failed."""
-    environment = os.environ | ({} if checkout is None else {"PYTHONPATH": str(Path(checkout).resolve() / "src")})
+    path = os.pathsep.join([str(sources / "src"), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = os.environ | {"PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1"}
     command = [sys.executable, str(script), name, str(repeats)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
@@ -54,39 +83,44 @@ def in_own_process(script: Path, name: str, repeats: int, checkout: str | None =
 
 def measured(script: Path, name: str, given: argparse.Namespace) -> list[Row]:
     """The rows of a case over all rounds, with ``against`` where the other checkout was measured."""
-    other = given.against is not None and script.name == "project.py"
     rows: dict[str, Row] = {}
-    for _ in range(given.rounds):
-        for key, checkout in (("values", None), ("against", given.against))[: 1 + other]:
-            for row in in_own_process(script, name, given.repeats, checkout):
-                kept = rows.setdefault(row["name"], row | {"values": []})
-                kept[key] = [*kept.get(key, []), *row["values"]]
+    checkouts = {"values": REPOSITORY} | ({"against": given.against} if name in project.CASES and given.against else {})
+    for _ in range(1 if name in ONCE else given.rounds):
+        for key, sources in checkouts.items():
+            for row in in_own_process(script, name, given.repeats, sources):
+                kept = rows.setdefault(row["name"], row | {"values": [], "wall": [], "high": [], "against": []})
+                kept[key] += row["values"]
+                if key == "values":
+                    kept["wall"] += row.get("wall", [])
+                    kept["high"] += row.get("high", [])
     return list(rows.values())
 
 
-def with_ratios(rows: list[Row]) -> list[Row]:
-    """Of the minimum to that of the first in its job."""
-    first: dict[str, float] = {}
-    for row in rows:
-        if row["values"] and row["job"] in ("filter", "as live", "smooth", "likelihood"):
-            row["ratio"] = min(row["values"]) / first.setdefault(row["job"], min(row["values"]))
-    return rows
+def bases(rows: list[Row]) -> dict[str, float]:
+    """Of each job that has a loop in C++, its minimum."""
+    return {row["job"]: min(row["values"]) for row in rows if row["name"].startswith(BESIDE) and row["values"]}
 
 
-HEAD = ["", "min", "median", "ratio", "against", "this / against", "error", "note"]
+HEAD = ("", "min", "median", f"over {BESIDE}", "wall", "99 %", "0.1", "over 0.1", "error", "note")
 
 
-def cells(row: Row) -> list[str]:
-    """A row as text, as in HEAD."""
-    values, against, digits = row["values"], row.get("against"), DIGITS[row["unit"]]
+def cells(row: Row, base: float | None) -> list[str]:
+    """A row as text, as in HEAD; ``base`` is what its ratio is to."""
+    values, against, digits = row["values"], row["against"], DIGITS[row["unit"]]
+
+    def number(found: list[float], kind: Callable[[list[float]], float] = min) -> str:
+        return f"{kind(found):,.{digits}f}" if found else ""
+
     if not values:
         return [row["name"], *[""] * (len(HEAD) - 2), f"failed: {row['note']}"]
     return [
         row["name"],
-        f"{min(values):,.{digits}f}",
-        f"{statistics.median(values):,.{digits}f}",
-        f"{row['ratio']:.2f}" if "ratio" in row else "",
-        f"{min(against):,.{digits}f}" if against else "",
+        number(values),
+        number(values, statistics.median),
+        f"{min(values) / base:.2f}" if base else "",
+        number(row["wall"]),
+        number(row["high"]),
+        number(against),
         f"{min(values) / min(against):.2f}" if against else "",
         f"{row['error']:.0e}" if "error" in row else "",
         row["note"],
@@ -94,59 +128,69 @@ def cells(row: Row) -> list[str]:
 
 
 def machine() -> str:
-    """It and the versions of all that is compared."""
+    """It, when that was, and the versions of all that is compared."""
     info = Path("/proc/cpuinfo")
     names = [line for line in info.read_text().splitlines() if line.startswith("model name")] if info.exists() else []
     cpu = names[0].split(":", 1)[1].strip() if names else platform.processor() or platform.machine()
-    found: dict[str, str] = {"Python": platform.python_version()}
+    compiler = subprocess.run(["g++", "-dumpfullversion"], capture_output=True, text=True, check=False).stdout.strip()
+    found = [f"Python {platform.python_version()}", f"g++ {compiler} (`-O3 -march=native`)"]
     for package in PACKAGES:
         try:
-            found[package] = importlib.metadata.version(package)
+            found.append(f"{package} {importlib.metadata.version(package)}")
         except importlib.metadata.PackageNotFoundError:
-            found[package] = "missing"
-    versions = ", ".join(f"{name} {version}" for name, version in found.items())
-    return f"{cpu}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}. {versions}."
+            found.append(f"{package} missing")
+    here = f"{cpu}, {os.cpu_count()} cores, {platform.system()} {platform.machine()}"
+    return textwrap.fill(f"{datetime.date.today():%Y-%m-%d}, {here}, {', '.join(found)}.", 120)
 
 
-def markdown(rows: list[Row]) -> str:
-    """The tables of docs/comparison.md."""
-    lines = [machine()]
-    for job in dict.fromkeys(row["job"] for row in rows):
-        found = [cells(row) for row in rows if row["job"] == job]
-        kept = [index for index, name in enumerate(HEAD) if not name or any(row[index] for row in found)]
-        lines += ["", f"**{TITLES.get(job, job)}**", ""]
-        lines += ["| " + " | ".join(HEAD[index] for index in kept) + " |"]
-        lines += ["|" + "|".join("---:" if 0 < index < len(HEAD) - 1 else "---" for index in kept) + "|"]
-        lines += ["| " + " | ".join(row[index] for index in kept) + " |" for row in found]
-    return "\n".join(lines)
+def tables(rows: list[Row], jobs: Iterable[str]) -> str:
+    """The tables of some jobs; beside a loop in C++ the fastest comes first."""
+    base, found = bases(rows), list[str]()
+    for job in jobs:
+        mine = [row for row in rows if row["job"] == job]
+        if job in base:
+            mine.sort(key=lambda row: min(row["values"]))
+        lines = [cells(row, base.get(job)) for row in mine]
+        used = [any(line[column] for line in lines) and HEAD[column] != "median" for column in range(len(HEAD))]
+        head = ["", mine[0]["unit"], *HEAD[2:-1], ""]
+        text = [list(compress(line, used)) for line in (head, *lines)]
+        found += [f"**{TITLES[job]}**", table(text[0], text[1:], 1, notes=int(used[-1]))]
+    return "\n\n".join(found)
 
 
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", metavar="TEXT", help="what has this in its name")
-    parser.add_argument("--against", metavar="PATH", help="another checkout of pumafuse, to be measured in turns")
+    parser.add_argument("--against", metavar="WHICH", help="a folder or a commit of pumafuse, to be measured in turns")
     parser.add_argument("--repeats", type=int, default=5, help="calls in each process")
-    parser.add_argument("--rounds", type=int, default=1, help="processes of each case")
+    parser.add_argument("--rounds", type=int, default=2, help="processes of each case; what takes long has one")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all numbers there")
-    parser.add_argument("--markdown", action="store_true", help="print the tables of docs/comparison.md")
+    parser.add_argument("--write", action="store_true", help="all, beside version 0.1, into the pages")
     given = parser.parse_args()
-    seen: Any = sys.stderr if given.markdown else sys.stdout
-    print(f"{machine()}\n{'':<48}" + "".join(f"{name:>15}" for name in HEAD[1:]), file=seen, flush=True)
+    if given.write and (given.only or given.against):
+        parser.error("--write measures everything, beside version 0.1")
+    if given.write:
+        given.against = VERSION_0_1
+    if given.against is not None:
+        given.against = checkout(given.against)
+    print(f"{machine()}\n{'':<48}" + "".join(f"{name:>12}" for name in HEAD[1:-1]), flush=True)
     rows: list[Row] = []
     for script, name in CASES:
         if given.only in name:
             found = measured(script, name, given)
-            rows = with_ratios([*rows, *found])
+            rows += found
+            base = bases(rows)
             for row in found:
-                label, *numbers, note = cells(row)
-                print(f"{label:<48}" + "".join(f"{n:>15}" for n in numbers) + f"  {note}", file=seen, flush=True)
-    if given.markdown:
-        print(markdown(rows))
+                label, *numbers, note = cells(row, base.get(row["job"]))
+                print(f"{label:<48}" + "".join(f"{n:>12}" for n in numbers) + f"  {note}", flush=True)
     if given.json:
         given.json.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
     if any(not row["values"] for row in rows):
-        sys.exit(1)
+        sys.exit("not all could be measured" + (": the pages stay as they are" if given.write else ""))
+    if given.write:
+        put(COMPARISON, "run.py", f"{machine()}\n\n{tables(rows, TITLES)}")
+        put(LIVE, "run.py", tables(rows, ["live"]))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
-"""Rivals without a gate, which pumafuse is compared with on real recordings."""
+"""What pumafuse is compared with: rivals without a gate on real recordings, lags by correlation, loops in C++."""
 
 from __future__ import annotations
 
 import importlib
+import shutil
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -136,3 +138,27 @@ def test_a_drift_of_20_ms_is_named(lag: ModuleType) -> None:
     for seed in range(500, 506):
         _, _, named = lag.examined((seed, 2, 0.02))
         assert any("drifts" in one for one in named), seed
+
+
+# ---- loops in C++, and where tables go ------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.skipif(shutil.which("g++") is None, reason="there is no g++")
+def test_a_loop_in_cpp_gives_the_numbers_of_pumafuse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the shipped scan, filtered, as live and smoothed, to 1e-9 of a standard deviation."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    peers = importlib.import_module("peers")
+    scan = peers.Problem.of(0)
+    for job in peers.FIELDS:
+        assert peers.error(peers.cpp(job)(scan)(), scan.answer(job)) < 1e-9, job
+
+
+def test_tables_go_between_the_marks_of_who_makes_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The rest of a page stays, also what another one makes."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    page, text = importlib.import_module("page"), tmp_path / "page.md"
+    other, mine = (f"<!-- made by benchmarks/{name}.py -->\n\nold\n\n<!-- until here -->\n" for name in ("a", "b"))
+    text.write_text(f"one\n{other}two\n{mine}three\n")
+    page.put(text, "b.py", "new")
+    assert text.read_text() == f"one\n{other}two\n{mine.replace('old', 'new')}three\n"
