@@ -1,7 +1,5 @@
 """Parsing of the command line. Each command is a module of its own, imported only when it runs."""
 
-from __future__ import annotations
-
 import atexit
 import gc
 import os
@@ -18,6 +16,7 @@ from ..errors import PumafuseError, PumafuseWarning
 # With matrices of 5 by 5 the threads of a BLAS only wait for each other, ten times as long on a busy machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# Without `from __future__ import annotations`: typer would evaluate each of them again, a sixth of `--help`.
 app = typer.Typer(
     name="pumafuse",
     help="Blend a robot arm's commands with measurements of external sensors into the best estimate of its position.",
