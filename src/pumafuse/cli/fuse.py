@@ -20,6 +20,7 @@ from ..fusion.estimates import Estimates, Mode
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
 from ..logs.run import Run
+from ..pieces.writing import MOST_IN_MEMORY, fuse_in_pieces, is_long
 from ..units import KINDS
 from .many import progress_bar, report_failures, run_jobs
 from .tables import left_out, outcome_table, print_tables, runs_table, score_table, skill_table
@@ -46,7 +47,11 @@ def run(
     given = FusionConfig.load(config)
     given.sensor_names(sensors)  # before any run is read
     how = partial(fuse, config=given, sensors=sensors, rate=rate, mode=mode, engine=engine)
-    job = partial(_fuse, how, part=part, rrd=rrd, figures=figures, force=force)
+    whole = partial(_fuse, how, part=part, rrd=rrd, figures=figures, force=force)
+    in_pieces = partial(fuse_in_pieces, config=given, sensors=sensors, rate=rate, force=force)
+    asked = {"--smooth": mode == "smoothed", "--as-live": mode == "as-live", "--engine": engine != "compiled"}
+    asked |= {"--rrd": rrd, "--figures": figures, "--from": part[0] is not None, "--to": part[1] is not None}
+    job = partial(_as_fits, whole, in_pieces, [option for option, given in asked.items() if given])
     if len(runs) == 1:
         with progress_bar(str(runs[0])) as progress:
             summary = job(runs[0], output, progress)
@@ -89,6 +94,25 @@ def demo(output: Path, force: bool) -> None:
         f"  pumafuse fuse {scan} -c {config} --sensors tracker,vision --rate 200 -o with-tracker\n"
         f"  pumafuse compare {output} with-tracker"
     )
+
+
+def _as_fits(
+    whole: Callable[..., Summary],
+    in_pieces: Callable[..., Summary],
+    asked: Sequence[str],
+    path: Path,
+    folder: Path,
+    progress: Callable[[float], None] | None = None,
+) -> Summary:
+    """Fuse a run as a whole, or a long one in pieces, which some of the options ``asked`` for do not go with."""
+    if not is_long(path):
+        return whole(path, folder, progress)
+    if asked:
+        raise RunError(
+            f"{path}: more than {MOST_IN_MEMORY:,} rows are fused in pieces, which {asked[0]} does not go with; leave"
+            " it out, or cut the log"
+        )
+    return in_pieces(path, folder=folder, progress=progress)
 
 
 def _fuse(

@@ -7,15 +7,16 @@ components are left out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray
 from ..filter.outcome import Outcome
 from ..units import MM, Kind, of_kind
-from .config import Sensor
+from .config import FusionConfig, Sensor
 from .estimates import Estimates, Measurements
 from .score import Z95
 
@@ -27,6 +28,7 @@ _NEVER = 1e-6  # expected number below which chance is no explanation
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
 _MANY_REJECTED = 0.1  # share of rejected components beyond which the others are a selection
 _TOO_SMALL = "rejected: {sd}, latency_ms or the process noise too small"
+LATE = ", innovations follow the velocity: latency_ms is wrong"  # how such a verdict ends
 _CAUSES = {  # by whether the NIS is above its band, and the sign of a notable correlation
     (True, 1): ", innovations positively correlated: the process noise too small, or latency_ms wrong",
     (True, 0): ": {sd} or the process noise too small",
@@ -102,16 +104,22 @@ def ljung_box(values: FloatArray, lags: int = LAGS) -> tuple[FloatArray, float]:
 
     Ljung & Box, "On a measure of lack of fit in time series models", Biometrika 65, 1978.
     """
-    from scipy.special import chdtrc
-
     centred, count = values - values.mean(), len(values)
     lags = min(lags, count - 1)
     power = float(centred @ centred)
     if power == 0.0 or lags < 1:
         return np.zeros(max(lags, 0)), 1.0
     correlation = np.array([centred[lag:] @ centred[:-lag] for lag in range(1, lags + 1)]) / power
+    return correlation, whiteness(correlation, count)
+
+
+def whiteness(correlation: FloatArray, count: int) -> float:
+    """The Ljung-Box p-value of autocorrelations at lags 1, 2, … of ``count`` values."""
+    from scipy.special import chdtrc
+
+    lags = len(correlation)
     statistic = count * (count + 2) * float(np.sum(correlation**2 / (count - np.arange(1, lags + 1))))
-    return correlation, float(chdtrc(lags, statistic))
+    return float(chdtrc(lags, statistic))
 
 
 def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
@@ -121,10 +129,11 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
     count = len(fused.value)
     if not count:
         return None
-    whiteness = ljung_box(fused.innovation / fused.innovation_sd)
-    found = Consistency(count, float(np.mean(fused.nis)), chi_square_band(count), *whiteness, verdict="")
+    white = ljung_box(fused.innovation / fused.innovation_sd)
+    found = Consistency(count, float(np.mean(fused.nis)), chi_square_band(count), *white, verdict="")
     rejected = 1.0 - count / np.count_nonzero(measurements.outcome <= Outcome.REACQUIRED)
-    return replace(found, verdict=_verdict(est, sensor, axis, fused, found, rejected))
+    follows = partial(_follows_velocity, est, axis, fused)
+    return replace(found, verdict=verdict(est.config, sensor, axis, found, rejected, follows))
 
 
 def sensor_problems(est: Estimates) -> list[str]:
@@ -199,10 +208,27 @@ def _frozen(values: FloatArray) -> int:
     return longest if longest >= _FROZEN and len(values) * elsewhere ** (longest - 1) < _NEVER else 0
 
 
-def _verdict(est: Estimates, sensor: str, axis: str, fused: Measurements, found: Consistency, rejected: float) -> str:
+def verdict(
+    config: FusionConfig,
+    sensor: str,
+    axis: str,
+    found: Consistency,
+    rejected: float,
+    follows_velocity: Callable[[], bool],
+) -> str:
+    """What the numbers of one sensor on one axis say, with the likely cause and the key to change.
+
+    Args:
+        config: Of the fusion.
+        sensor: The sensor.
+        axis: The axis.
+        found: The numbers.
+        rejected: Share of the components that were rejected or re-acquired.
+        follows_velocity: Whether innovations follow the velocity; asked only where it matters.
+    """
     if found.count < _FEW:
         return f"too few measurements ({found.count}) to tell"
-    (low, high), sd = found.nis_band, of_kind("sd_mm", est.config.arm.axes[axis].kind)
+    (low, high), sd = found.nis_band, of_kind("sd_mm", config.arm.axes[axis].kind)
     digits = next(n for n in range(2, 17) if _beside([found.nis, low, high]) == _beside([found.nis, low, high], n))
     nis = f"NIS {found.nis:.{digits}f}, expected {low:.{digits}f} to {high:.{digits}f}"
     if rejected > _MANY_REJECTED:  # the others were selected to fit
@@ -212,12 +238,12 @@ def _verdict(est: Estimates, sensor: str, axis: str, fused: Measurements, found:
         strongest = int(np.argmax(np.abs(correlation)))
         if coloured and abs(correlation[strongest]) > _NOTABLE:
             return f"{nis}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
-        if est.config.sensors[sensor].is_at_bound(axis):
+        if config.sensors[sensor].is_at_bound(axis):
             return f"{nis}, but {sd} is at a bound of what can be fitted: error bars need not hold; configure it"
         return f"{nis}: consistent"
     sign = int(np.sign(correlation[0])) if coloured and abs(correlation[0]) > _NOTABLE else 0
-    if found.nis > high and sign and _follows_velocity(est, axis, fused):
-        return f"{nis}, innovations follow the velocity: latency_ms is wrong"
+    if found.nis > high and sign and follows_velocity():
+        return f"{nis}{LATE}"
     return nis + _CAUSES[found.nis > high, sign].format(sd=sd)
 
 
@@ -233,6 +259,8 @@ def _follows_velocity(est: Estimates, axis: str, fused: Measurements) -> bool:
     The sign of the correlation does not show which way the latency is wrong: the offset absorbs most of the error, and
     what is left of an accurate sensor's follows the acceleration.
     """
+    if not len(est.time):
+        return False
     inside = (fused.time >= est.time[0]) & (fused.time <= est.time[-1])
     innovation, velocity = fused.innovation[inside], est[axis].velocity
     if np.isnan(velocity).any():  # smoothed estimates have none

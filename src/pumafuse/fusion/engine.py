@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import CodeArray, TimeArray
+from ..arrays import NO_STAMP, CodeArray, TimeArray
 from ..filter.axis import Model, Sensors, State
 from ..filter.events import COMMAND, Events, Results
 from ..filter.forward import ALL_THERE, NO_ESTIMATES, Filter, History, Output, filter_events, no_history
@@ -86,6 +86,42 @@ def filter_segment(
         for number, axis in enumerate(segment.axes)
     }
     return Filtered(estimates, events, results, _known_biases(segment, sensors, state))
+
+
+def filter_piece(
+    segment: Segment,
+    config: FusionConfig,
+    arrays: tuple[Model, Sensors, State],
+    within: tuple[int, int],
+    times: TimeArray,
+) -> Filtered:
+    """Filter the new events of a piece of a longer run.
+
+    Args:
+        segment: The events of the piece; those from before it tell which commands estimates follow.
+        config: Arm, noise and sensors.
+        arrays: As :func:`arranged` makes them for the first piece. The state is carried on.
+        within: New is what is later than the first and not later than the second [int ns], or without a stamp.
+        times: Of the estimates, int64 ns, ascending, within the same interval.
+
+    Returns:
+        The estimates, and the new events with their results.
+    """
+    events, _ = segment.events(config)
+    count, axes = len(events.time), len(segment.axes)
+    unstamped = int(np.searchsorted(events.time, NO_STAMP, side="right"))
+    begin, end = (int(np.searchsorted(events.time, one, side="right")) for one in within)
+    model, sensors, state = arrays
+    results, outputs = Results.room(count, axes), np.zeros((len(Output), axes, len(times)))
+    results.outcome[:] = events.known
+    arrays_of_all = Filter(model, sensors, events, state, results, no_history(axes, state.x.shape[1])).flat()
+    filter_events(arrays_of_all, False, begin, end, count, *ALL_THERE, 0, times, outputs)
+    new = np.concatenate([np.arange(unstamped), np.arange(begin, end)])
+    estimates = {
+        axis: AxisEstimate(segment.start[axis] + outputs[0, number], *outputs[1:, number])
+        for number, axis in enumerate(segment.axes)
+    }
+    return Filtered(estimates, events.rows(new), results.rows(new), _known_biases(segment, sensors, state))
 
 
 def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | None = None) -> Results:

@@ -27,7 +27,7 @@ from .engine import Engine, Filtered, filter_segment
 from .estimates import AxisEstimate, Estimates, Measurements, Mode
 from .faults import latency_questions, sensor_faults, starts_in_motion
 from .score import ReferenceTrack, late_rows, reference_track
-from .segments import NO_STAMP_WORD, Segment, added, build, output_times
+from .segments import NO_STAMP_WORD, STRAY, Segment, added, build, output_times
 
 S = TypeVar("S", bound=np.generic)
 
@@ -84,32 +84,68 @@ def fuse(
         times = output_times(segment, config, rate)
         share = None if progress is None else _share(progress, number, len(logged))
         parts.append((segment, times, filter_segment(segment, config, times, mode, engine, share)))
+    est = gathered(run, config, in_place, placed, logged, parts, mode, engine)
+    cut, origin = est.segments, est.origin
+    notes = [*faults, *(note for part in cut for note in part.notes)]
+    notes += [note for part in parts for note in contradictions(part[0], config, part[2], origin)]
+    notes += [note for segment in cut for note in starts_in_motion(segment, config)]
+    notes += latency_questions(config, cut[0].sensors)
+    notes += [
+        *jumps,
+        *reference_notes(est, references_of(logged, origin)),
+        *config.arm.validity.excess(est.speed, est.radius),
+    ]
+    est = replace(est, notes=(*notes, *sensor_problems(est)))
+    for note in est.notes:
+        warnings.warn(f"run '{run.name}': {note}", PumafuseWarning, stacklevel=2)
+    return est
+
+
+def gathered(
+    run: Run,
+    config: FusionConfig,
+    in_place: Run,
+    placed: Placed | None,
+    logged: Sequence[Run],
+    parts: Sequence[tuple[Segment, TimeArray, Filtered]],
+    mode: Mode,
+    engine: Engine,
+) -> Estimates:
+    """The result of a fusion from what the filter made of each segment, without notes.
+
+    Args:
+        run: The recorded run.
+        config: As used.
+        in_place: The run in axes.
+        placed: The frame of these axes, if there is one.
+        logged: The segments of ``in_place``.
+        parts: Of each its events, the times of its estimates, and what the filter made of them.
+        mode: What an estimate knows.
+        engine: What computed it.
+    """
     cut, times, filtered = zip(*parts, strict=True)
     origin = cut[0].origin
-    references = [
-        source.rows(part.within(source.stamp, origin)) for part in logged if (source := part.reference) is not None
-    ]
     axes = {
         axis: AxisEstimate(
             *(_joined(getattr(part.axes[axis], field) for part in filtered) for field in AxisEstimate.FIELDS)
         )
         for axis in cut[0].axes
     }
-    est = Estimates(
+    return Estimates(
         run=run.name,
         time=seconds(_joined(times), origin),
         axes=axes,
         cartesian=_cartesian(placed, {axis: one.position for axis, one in axes.items()}),
         measurements=_measurements(cut, filtered),
         biases=filtered[-1].biases,
-        reference=_reference(references, origin, placed),
+        reference=_reference(references_of(logged, origin), origin, placed),
         origin=origin,
         segment=np.repeat(np.arange(len(parts)), [len(part) for part in times]),
         segments=cut,
         mode=mode,
         engine=engine,
         config=config,
-        speed=_highest_speeds(cut, config.arm),
+        speed=highest_speeds(cut, config.arm),
         radius=_highest_radius(in_place, placed),
         command_counts=_without_strays([part.command_counts for part in cut], run.command, in_place.command),
         counts={
@@ -124,15 +160,11 @@ def fuse(
         since=run.since,
         until=run.until,
     )
-    notes = [*faults, *(note for part in cut for note in part.notes)]
-    notes += [note for part in parts for note in _contradictions(part[0], config, part[2], origin)]
-    notes += [note for segment in cut for note in starts_in_motion(segment, config)]
-    notes += latency_questions(config, cut[0].sensors)
-    notes += [*jumps, *_reference_notes(est, references), *config.arm.validity.excess(est.speed, est.radius)]
-    est = replace(est, notes=(*notes, *sensor_problems(est)))
-    for note in est.notes:
-        warnings.warn(f"run '{run.name}': {note}", PumafuseWarning, stacklevel=2)
-    return est
+
+
+def references_of(logged: Sequence[Run], origin: int) -> list[Source]:
+    """The references of segments, in the part to use."""
+    return [source.rows(part.within(source.stamp, origin)) for part in logged if (source := part.reference) is not None]
 
 
 def _share(progress: Callable[[float], None], number: int, count: int) -> Callable[[float], None]:
@@ -145,7 +177,7 @@ def _joined(parts: Iterable[npt.NDArray[S]]) -> npt.NDArray[S]:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
-def _reference_notes(est: Estimates, sources: Sequence[Source]) -> list[str]:
+def reference_notes(est: Estimates, sources: Sequence[Source]) -> list[str]:
     """What is wrong with the reference: rows behind a jump of its clock, or no row at the time of any estimate."""
     if est.reference is None:
         return []
@@ -179,7 +211,7 @@ def _reference(parts: Sequence[Source], origin: int, placed: Placed | None) -> R
     return replace(track, cartesian=_cartesian(placed, track.position))
 
 
-def _highest_speeds(cut: Sequence[Segment], arm: ArmModel) -> dict[Kind, float]:
+def highest_speeds(cut: Sequence[Segment], arm: ArmModel) -> dict[Kind, float]:
     """The highest commanded speed of the axes of each kind [m/s or rad/s]."""
     found: dict[Kind, float] = {}
     for axis in cut[0].axes:
@@ -196,7 +228,7 @@ def _highest_radius(run: Run, placed: Placed | None) -> float | None:
     return float(np.max(radial[np.isfinite(radial) & (run.command.stamp != NO_STAMP)]))
 
 
-def _contradictions(segment: Segment, config: FusionConfig, filtered: Filtered, origin: int) -> list[str]:
+def contradictions(segment: Segment, config: FusionConfig, filtered: Filtered, origin: int) -> list[str]:
     """A sentence on each pair of sensors of which one contradicts the other time after time."""
     events, results, found = filtered.events, filtered.results, list[str]()
     rows = np.flatnonzero(results.contradicts >= 0)
@@ -234,7 +266,7 @@ def _without_strays(parts: Sequence[Mapping[str, int]], logged: Source, mended: 
     """The sum of the segments' counts of a source, stray stamps apart from none."""
     found = Counter(added(parts))
     stray = min(int(np.count_nonzero(logged.stamp != mended.stamp)), found[NO_STAMP_WORD])
-    return dict(found - Counter({NO_STAMP_WORD: stray}) + Counter(stray=stray))
+    return dict(found - Counter({NO_STAMP_WORD: stray}) + Counter({STRAY: stray}))
 
 
 def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measurements:

@@ -105,9 +105,9 @@ def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], No
     summary = summarise(est)
     with folders.replacing(folder) as new:
         tables.write(estimates_table(est), new / ESTIMATES)
-        tables.write(_measurements_table(est), new / MEASUREMENTS)
+        tables.write(measurements_table(est), new / MEASUREMENTS)
         if est.reference is not None:
-            tables.write(_reference_table(est.reference, est.config.arm), new / REFERENCE)
+            tables.write(reference_table(est.reference, est.config.arm), new / REFERENCE)
         est.config.save(new)
         (new / SUMMARY).write_bytes(encode(summary))
         if extras is not None:
@@ -193,7 +193,8 @@ def estimates_table(est: Estimates, *, files: bool = True) -> pa.Table:
     return pa.table({"time_s": _column_of(est.time), **columns, **in_log, **_segment_column(est.segment)})
 
 
-def _measurements_table(est: Estimates) -> pa.Table:
+def measurements_table(est: Estimates) -> pa.Table:
+    """Every measured component as a table, in the units of files."""
     r, positions = est.measurements, dict[str, pa.Array]()
     kinds = est.config.arm.kind_of
     known: dict[Kind, None] = {kinds[axis]: None for axis in r.axes}
@@ -215,7 +216,8 @@ def _measurements_table(est: Estimates) -> pa.Table:
     )
 
 
-def _reference_table(reference: ReferenceTrack, arm: ArmModel) -> pa.Table:
+def reference_table(reference: ReferenceTrack, arm: ArmModel) -> pa.Table:
+    """The reference as a table, in the units of files."""
     columns = {"time_s": _column_of(reference.time)}
     for axis, position in reference.position.items():
         kind = arm.axes[axis].kind if axis in arm.axes else "length"  # x, y and z

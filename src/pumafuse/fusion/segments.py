@@ -34,6 +34,7 @@ _KEPT = 3  # orders of the events: those of a search's point, and a little earli
 # What may become of a row, besides its outcome: a command that says again what is in force; outside of --from and --to;
 # without a stamp, or with a stray one; of a sensor that is not among those to use.
 REPETITION, OUTSIDE, NO_STAMP_WORD, NOT_SELECTED = "repetition", "outside", "no_stamp", "not_selected"
+STRAY = "stray"
 
 _REASONS = {
     Outcome.DUPLICATE: "the stamp and values of an earlier row",
@@ -183,13 +184,14 @@ class Segment:
         return rows._replace(time=_valid(rows.stamp, latency[rows.source]))
 
 
-def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) -> Segment:
+def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None, origin: int | None = None) -> Segment:
     """Put a segment of a recorded run into a table of events.
 
     Args:
         run: One segment of a recorded run.
         config: Arm and sensors.
         sensors: Which of the configured sensors to use; all for None.
+        origin: The first command, int64 ns, of a run of which this is a piece; None: it is in this one.
 
     Raises:
         PumafuseError: The run commands an axis that the arm has not, a chosen sensor is not configured, or the part of
@@ -220,9 +222,10 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     used = (*(name for name in chosen if name in run.sensors), *strangers)
     policy = _policy(config, run.axes, used)
     rows = _command_rows(run, policy, notes)
-    command_counts = _command_counts(run.command, rows)
+    command_counts = counts_of_commands(rows, len(run.command.stamp) - len(rows.stamp))
     rows = _on_ticks(run, config, rows, notes)
-    origin = int(rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)][0])
+    first_command = int(rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)][0])
+    origin = first_command if origin is None else origin
     ends = run.ends(origin)
     within = rows.stamp <= ends[1]
     outside = int(np.count_nonzero(_on_any_axis(rows.known, Outcome.FUSED) & ~within))
@@ -267,7 +270,7 @@ def output_times(segment: Segment, config: FusionConfig, rate: float | None) -> 
     if rate is None:
         times = segment.commands[segment.commands >= since]
     else:
-        times = _grid(segment.origin, max(since, segment.origin), min(until, segment.end(config)), rate)
+        times = ticks(segment.origin, max(since, segment.origin), min(until, segment.end(config)), rate)
     if not len(times):
         what = "no command" if rate is None else f"no tick of {rate:g} Hz"
         raise RunError(
@@ -276,7 +279,7 @@ def output_times(segment: Segment, config: FusionConfig, rate: float | None) -> 
     return times
 
 
-def _grid(origin: int, first: int, last: int, rate: float) -> TimeArray:
+def ticks(origin: int, first: int, last: int, rate: float) -> TimeArray:
     """Ticks 0, 1/rate, … [1/Hz] after ``origin`` that lie from ``first`` to ``last``, int64 ns, (n,)."""
     span = last - first
     begin, count = int((first - origin) / 1e9 * rate), int(span / 1e9 * rate) + 2
@@ -345,8 +348,8 @@ def _command_rows(run: Run, policy: _Policy, notes: list[str]) -> Events:
     return rows
 
 
-def _command_counts(source: Source, rows: Events) -> dict[str, int]:
-    """How many rows of the commands are what, all of them; of a stamp the last one counts."""
+def counts_of_commands(rows: Events, unstamped: int) -> dict[str, int]:
+    """How many rows of the commands are what, by stamp, beside those without; of a stamp the last one counts."""
     best = _best(rows.known)
     again, hidden = best == Outcome.DUPLICATE, np.diff(rows.stamp, append=NEVER) == 0
     return {
@@ -354,7 +357,7 @@ def _command_counts(source: Source, rows: Events) -> dict[str, int]:
         Outcome.DUPLICATE.word: int(np.count_nonzero(again & hidden)),
         REPETITION: int(np.count_nonzero(again & ~hidden)),
         Outcome.INVALID.word: int(np.count_nonzero(best == Outcome.INVALID)),
-        NO_STAMP_WORD: len(source.stamp) - len(rows.stamp),
+        NO_STAMP_WORD: unstamped,
     }
 
 
@@ -397,7 +400,7 @@ def _measurement_rows(
     rows = _classified(rows, policy, origin, lag[order] > TOLERATED_STEP_BACK_NS)
     rows.known[~used[order]] = ABSENT
     kept = rows.rows(np.flatnonzero(used[order]))
-    counts = _measurement_counts(kept, source)
+    counts = counts_of_measurements(kept, source.stamp)
     note_rows(notes, label, lag > 0, "a stamp that steps back: sorted")
     if sensor is None:
         note_rows(notes, label, used, "no sensor of this name in the configuration: unknown")
@@ -417,12 +420,12 @@ def _measurement_rows(
     return kept, counts
 
 
-def _measurement_counts(kept: Events, source: Source) -> dict[str, int]:
-    """How many rows of a sensor are what, all of them, of which ``kept`` are in the part to use."""
-    unstamped = int(np.count_nonzero(source.stamp == NO_STAMP))
+def counts_of_measurements(kept: Events, stamp: TimeArray) -> dict[str, int]:
+    """How many rows of a sensor with these stamps are what, all of them, of which ``kept`` are in the part to use."""
+    unstamped = int(np.count_nonzero(stamp == NO_STAMP))
     best = _best(kept.known)[kept.stamp != NO_STAMP]
     of_outcomes = {outcome.word: int(np.count_nonzero(best == outcome)) for outcome in Outcome}
-    return _counted({**of_outcomes, NO_STAMP_WORD: unstamped, OUTSIDE: len(source.stamp) - unstamped - len(best)})
+    return _counted({**of_outcomes, NO_STAMP_WORD: unstamped, OUTSIDE: len(stamp) - unstamped - len(best)})
 
 
 def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int | np.int64, latency: int = 0) -> Events:

@@ -14,6 +14,7 @@ from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of
 from .columns import leaf
 from .frames import Frame
 
+COMMAND, REFERENCE = "command", "reference"  # sources by their names
 _MOST = 2**63  # more than a whole number of a column can be
 
 
@@ -104,6 +105,25 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     reference: ReferenceEntry | None = None
     frame: Frame | None = None
 
+    @property
+    def entries(self) -> dict[str, SourceEntry]:
+        """All sources by name."""
+        found = {COMMAND: self.command, **{sensor(name): entry for name, entry in self.sensors.items()}}
+        return found if self.reference is None else found | {REFERENCE: self.reference}
+
+    @property
+    def fields(self) -> dict[tuple[str, ...], list[str]]:
+        """The columns and field paths of each table."""
+        found: dict[tuple[str, ...], list[str]] = {}
+        for entry in self.entries.values():
+            found.setdefault(entry.rows, []).extend(entry.fields)
+        return found
+
+
+def sensor(name: str) -> str:
+    """A sensor's name among all sources."""
+    return f"sensor {name}"
+
 
 def load(path: Path) -> Manifest:
     """Read ``run.toml``.
@@ -112,7 +132,7 @@ def load(path: Path) -> Manifest:
         ConfigError: The file is no manifest; names the key and the accepted ones.
     """
     tree, where = toml.read(path), str(path)
-    for key, kind in (("command", CommandEntry), ("reference", ReferenceEntry)):
+    for key, kind in ((COMMAND, CommandEntry), (REFERENCE, ReferenceEntry)):
         if key in tree:
             tree[key] = _source(tree[key], kind, where, key)
     sensors: Any = tree.get("sensors", {})

@@ -7,7 +7,6 @@ they are. Each measurement gets its outcome when the run is fused.
 from __future__ import annotations
 
 import os
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -203,9 +202,7 @@ class Run:
         Raises:
             PumafuseError: Nothing there, or not a recorded run; says what, where, and what is accepted.
         """
-        path = Path(path)
-        if os.path.isdir(path):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
-            path = path / "run.toml"
+        path = located(Path(path))
         return _read_manifest(path) if path.suffix == ".toml" else _read_single(path)
 
     @staticmethod
@@ -242,6 +239,11 @@ class Run:
         streams = {sensor: _from_arrays(sensor, *arrays, notes) for sensor, arrays in (sensors or {}).items()}
         scored = None if reference is None else replace(_from_arrays("reference", *reference, notes), sd=reference_sd)
         return Run(name, commands, streams, scored, dict(start or {}), clock, frame, notes=tuple(notes))
+
+
+def located(path: Path) -> Path:
+    """The ``run.toml`` of a folder; any other path as it is."""
+    return path / "run.toml" if os.path.isdir(path) else path  # noqa: PTH112 - Path.is_dir raises on a long name
 
 
 def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: str = "") -> None:
@@ -342,45 +344,72 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
 
 def _read_manifest(path: Path) -> Run:
     listed = manifest.load(path)
-    scored, notes, units = listed.reference, list[str](), dict(listed.command.kinds)
-    entries = {"command": listed.command, **{f"sensor {name}": entry for name, entry in listed.sensors.items()}}
-    if scored is not None:
-        entries["reference"] = scored
-    fields, read = defaultdict[tuple[str, ...], list[str]](list), dict[tuple[str, ...], tables.Table]()
-    for entry in entries.values():
-        fields[entry.rows] += entry.fields
-    naive, zoned = list[str](), list[str]()
+    read, notes, units = dict[tuple[str, ...], tables.Table](), list[str](), dict(listed.command.kinds)
+    fields = listed.fields
 
-    def source(name: str) -> Source:
-        entry = entries[name]
+    def table(entry: manifest.SourceEntry) -> tables.Table:
         if entry.rows not in read:
             file, chosen = path.parent / entry.file, {"topic": entry.topic, "entity": entry.entity}
-            table = tables.read(file, growing=True, fields=fields[entry.rows], where=entry.where, **chosen)
-            notes.extend(note for note in table.notes if note not in notes)
-            read[entry.rows] = table
-        known = read[entry.rows].zoned(entry.time.column)
-        if known is not None:
-            (zoned if known else naive).append(name)
-        return _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units)
+            read[entry.rows] = tables.read(file, growing=True, fields=fields[entry.rows], where=entry.where, **chosen)
+        return read[entry.rows]
 
-    sources = {name: source(name) for name in entries}
+    sources = listed_sources(listed.entries, table, notes, units)
+    notes += zones(listed.entries, read)
+    run = listed_run(listed, path, sources, units, notes)
+    return replace(run, recording=_recording(path.parent, listed.entries.values()))
+
+
+def listed_sources(
+    entries: Mapping[str, manifest.SourceEntry],
+    table: Callable[[manifest.SourceEntry], tables.Table],
+    notes: list[str],
+    units: dict[str, Kind],
+) -> dict[str, Source]:
+    """The sources of a manifest from their tables; new notes and new kinds of axes are put in.
+
+    Args:
+        entries: The sources by name; all that are in the same table.
+        table: What reads the table of one.
+        notes: Gets what was wrong.
+        units: Gets the kinds of axes.
+    """
+
+    def source(entry: manifest.SourceEntry) -> Source:
+        read = table(entry)
+        notes.extend(note for note in read.notes if note not in notes)
+        return _source(read, entry.time, entry.axes, entry.label, notes, units)
+
+    sources = {name: source(entry) for name, entry in entries.items()}
     shared = {
         name: [other for other in entries if entries[other].rows == entry.rows] for name, entry in entries.items()
     }
     has_value = {name: sources[name].has_value for name in entries if len(shared[name]) > 1}
     for name, mine in has_value.items():  # where only others of its table have any, a row is theirs
         sources[name] = sources[name].rows(mine | ~np.any([has_value[other] for other in shared[name]], axis=0))
-    command, reference = sources["command"], sources.get("reference")
-    sensors = {name: sources[f"sensor {name}"] for name in listed.sensors}
+    return sources
+
+
+def listed_run(
+    listed: manifest.Manifest, path: Path, sources: Mapping[str, Source], units: Mapping[str, Kind], notes: list[str]
+) -> Run:
+    """The run of a manifest at ``path`` from its sources."""
+    command, reference, scored = sources[manifest.COMMAND], sources.get(manifest.REFERENCE), listed.reference
+    sensors = {name: sources[manifest.sensor(name)] for name in listed.sensors}
     if reference is not None and scored is not None:
         of_kind = {"length": scored.sd, "angle": scored.angular_sd}
         sds = {axis: of_kind[units[axis]] for axis in reference.values}
         reference = replace(reference, sd=sds if len(set(sds.values())) > 1 else next(iter(sds.values())))
-    if naive and zoned:
-        notes.append(f"{naive[0]}: dates without a time zone, beside {zoned[0]} with one: taken as UTC")
     name, start, clock = listed.name or path.parent.resolve().name, listed.command.start, listed.command.clock
-    run = Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
-    return replace(run, recording=_recording(path.parent, entries.values()))
+    return Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
+
+
+def zones(entries: Mapping[str, manifest.SourceEntry], read: Mapping[tuple[str, ...], tables.Table]) -> list[str]:
+    """A sentence if some sources' dates say their time zone, and others' do not."""
+    known = {name: read[entry.rows].zoned(entry.time.column) for name, entry in entries.items()}
+    naive, zoned = ([name for name, one in known.items() if one is kind] for kind in (False, True))
+    if not (naive and zoned):
+        return []
+    return [f"{naive[0]}: dates without a time zone, beside {zoned[0]} with one: taken as UTC"]
 
 
 def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recording | None:
@@ -397,7 +426,14 @@ def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recordi
 def _read_single(path: Path) -> Run:
     """One table: ``time_s``, ``command.<axis>_mm``, ``<sensor>.<axis>_mm``, ``reference.<axis>_mm``."""
     table = tables.read(path, growing=True)
-    listed = ", ".join(table.columns)
+    notes, units = list(table.notes), dict[str, Kind]()
+    sources = single_sources(table, notes, units)
+    return single_run(path, sources, units, notes)
+
+
+def single_sources(table: tables.Table, notes: list[str], units: dict[str, Kind]) -> dict[str, Source]:
+    """The sources in the columns of one table; new notes and new kinds of axes are put in."""
+    path, listed = table.path, ", ".join(table.columns)
     clocks = [name for name in table.columns if name.startswith("time_")]
     if len(clocks) != 1:
         raise RunError(f"{path}: a single table needs one time column, 'time_s'; it has: {listed}")
@@ -409,16 +445,23 @@ def _read_single(path: Path) -> Run:
             if axis in groups.setdefault(source, {}):
                 raise RunError(f"{path}: two columns for {source}.{axis}; give one")
             groups[source][axis] = [manifest.Column(column)]
-    if "command" not in groups:
+    if manifest.COMMAND not in groups:
         raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {listed}")
-    notes, sources, units = list(table.notes), dict[str, Source](), dict[str, Kind]()
+    sources: dict[str, Source] = {}
     for name, axes in groups.items():
         source = _source(table, manifest.Time(clocks[0]), axes, name, notes, units)
         sources[name] = source.rows(source.has_value)
     if left := [column for column in table.columns if "." not in column and column != clocks[0]]:
-        notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
-    command, reference = sources.pop("command"), sources.pop("reference", None)
-    return Run(path.name.split(".")[0], command, sources, reference, kinds=units, notes=tuple(notes))
+        note = f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}"
+        notes.extend([] if note in notes else [note])
+    return sources
+
+
+def single_run(path: Path, sources: Mapping[str, Source], units: Mapping[str, Kind], notes: list[str]) -> Run:
+    """The run in one table from its sources."""
+    sensors = {name: one for name, one in sources.items() if name not in (manifest.COMMAND, manifest.REFERENCE)}
+    command, reference = sources[manifest.COMMAND], sources.get(manifest.REFERENCE)
+    return Run(path.name.split(".")[0], command, sensors, reference, kinds=units, notes=tuple(notes))
 
 
 def _source(

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import reduce
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -65,24 +67,39 @@ def read(
             f"{path}: a table has no {key}; leave the key out: 'topic' is for MCAP and bags (.mcap, .bag, .db3 or"
             " their folder), 'entity' for .rrd; rows are chosen by 'where'"
         )
-    try:
+    with _readable(path):
         if path.suffix == ".parquet":
             (table, names), notes = _parquet(path, fields, where), list[str]()
         else:
             whole, notes = _parsed(path, _text(path), growing)
             table, names = _only(path, whole, where), whole.column_names
-    except UnicodeDecodeError:
-        raise RunError(f"{path}: not a table that can be read: its text is not UTF-8") from None
-    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        reason = str(error).splitlines()[0].removeprefix("CSV parse error: ")
-        raise RunError(f"{path}: not a table that can be read: {reason}") from None
-    except FileNotFoundError:
-        raise RunError(f"{path}: no such file") from None
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read: {error.strerror or str(error).splitlines()[0]}") from None
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
     return Table(path, _named(path, table), table.num_rows, tuple(notes), tuple(names))
+
+
+def parts(path: Path, fields: Sequence[str] | None, where: Where) -> Iterator[Table]:
+    """A Parquet table as :func:`read` reads it, some rows at a time, the first time none; a part may have no row.
+
+    Raises:
+        RunError: See :func:`read`; but no row has to be left by ``where``.
+    """
+    with _readable(path), _opened(path) as file:
+        groups, conditions = _groups(path, file, fields, where)
+        wanted = None if fields is None else prefixes([*fields, *where])
+        for part in chain([file.schema_arrow.empty_table()], _parts(file, wanted, groups)):
+            chosen = _chosen(path, part, conditions)
+            yield Table(path, _named(path, chosen), chosen.num_rows, ())
+
+
+def rows_of(path: Path) -> int:
+    """How many rows a Parquet table has.
+
+    Raises:
+        RunError: It cannot be read.
+    """
+    with _readable(path), _opened(path) as file:
+        return file.metadata.num_rows
 
 
 def is_recording(path: Path) -> bool:
@@ -96,6 +113,22 @@ def write(table: pa.Table, path: Path) -> None:
         pacsv.write_csv(table, path, pacsv.WriteOptions(quoting_style="needed"))
     else:
         papq.write_table(table, path, compression="zstd")
+
+
+@contextmanager
+def _readable(path: Path) -> Generator[None]:
+    """Errors of reading a table as those of one line."""
+    try:
+        yield
+    except UnicodeDecodeError:
+        raise RunError(f"{path}: not a table that can be read: its text is not UTF-8") from None
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        reason = str(error).splitlines()[0].removeprefix("CSV parse error: ")
+        raise RunError(f"{path}: not a table that can be read: {reason}") from None
+    except FileNotFoundError:
+        raise RunError(f"{path}: no such file") from None
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror or str(error).splitlines()[0]}") from None
 
 
 def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None, where: Where) -> Table:
@@ -183,20 +216,30 @@ def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa
     Without threads: one that outlives the interpreter aborts it (apache/arrow issue 34314). So pyarrow's data sets,
     which filter by themselves, are no way.
     """
-    with papq.ParquetFile(str(path), pre_buffer=False, buffer_size=_READ_AHEAD) as file:
-        empty = file.schema_arrow.empty_table()
-        columns, conditions = _named(path, empty), _conditions(path, empty, where)
-        for field in fields or ():
-            find(columns, field, str(path))  # what is absent is reported now, while all names are known
+    with _opened(path) as file:
+        groups, conditions = _groups(path, file, fields, where)
         wanted = None if fields is None else prefixes([*fields, *where])
-        groups = [
-            place for place in range(file.num_row_groups) if _may_hold(file.metadata.row_group(place), conditions)
-        ]
         kept = [_chosen(path, part, conditions) for part in _parts(file, wanted, groups)]
         if where and not any(part.num_rows for part in kept):
             raise _no_row(path, _parts(file, prefixes(list(where)), None), where)
         names = [file.schema.column(place).path for place in range(len(file.schema))]
-        return pa.concat_tables(kept) if kept else empty, names
+        return pa.concat_tables(kept) if kept else file.schema_arrow.empty_table(), names
+
+
+def _opened(path: Path) -> papq.ParquetFile:
+    return papq.ParquetFile(str(path), pre_buffer=False, buffer_size=_READ_AHEAD)
+
+
+def _groups(
+    path: Path, file: papq.ParquetFile, fields: Sequence[str] | None, where: Where
+) -> tuple[list[int], dict[str, pa.Scalar]]:
+    """The parts of a Parquet file that may have rows to read, and the conditions of ``where``."""
+    empty = file.schema_arrow.empty_table()
+    columns, conditions = _named(path, empty), _conditions(path, empty, where)
+    for field in fields or ():
+        find(columns, field, str(path))  # what is absent is reported now, while all names are known
+    numbers = range(file.num_row_groups)
+    return [place for place in numbers if _may_hold(file.metadata.row_group(place), conditions)], conditions
 
 
 def _parts(file: papq.ParquetFile, columns: list[str] | None, groups: list[int] | None) -> Iterator[pa.Table]:
