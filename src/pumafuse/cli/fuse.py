@@ -20,7 +20,7 @@ from ..fusion.estimates import Estimates, Mode
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
 from ..logs.run import Run
-from ..pieces.writing import MOST_IN_MEMORY, fuse_in_pieces, is_long
+from ..pieces.writing import fuse_in_pieces, is_long
 from ..units import KINDS
 from .many import progress_bar, report_failures, run_jobs
 from .tables import left_out, outcome_table, print_tables, runs_table, score_table, skill_table
@@ -109,7 +109,7 @@ def _as_fits(
         return whole(path, folder, progress)
     if asked:
         raise RunError(
-            f"{path}: more than {MOST_IN_MEMORY:,} rows are fused in pieces, which {asked[0]} does not go with; leave"
+            f"{path}: a run of so many rows is fused in pieces, which {asked[0]} does not go with; leave"
             " it out, or cut the log"
         )
     return in_pieces(path, folder=folder, progress=progress)

@@ -31,6 +31,8 @@ from .segments import NO_STAMP_WORD, STRAY, Segment, added, build, output_times
 
 S = TypeVar("S", bound=np.generic)
 
+NOT_COVERED = "the reference covers no estimate: are both stamped by one clock?"
+
 
 def fuse(
     run: Run,
@@ -92,7 +94,7 @@ def fuse(
     notes += latency_questions(config, cut[0].sensors)
     notes += [
         *jumps,
-        *reference_notes(est, references_of(logged, origin)),
+        *_reference_notes(est, _references_of(logged, origin)),
         *config.arm.validity.excess(est.speed, est.radius),
     ]
     est = replace(est, notes=(*notes, *sensor_problems(est)))
@@ -138,7 +140,7 @@ def gathered(
         cartesian=_cartesian(placed, {axis: one.position for axis, one in axes.items()}),
         measurements=_measurements(cut, filtered),
         biases=filtered[-1].biases,
-        reference=_reference(references_of(logged, origin), origin, placed),
+        reference=_reference(_references_of(logged, origin), origin, placed),
         origin=origin,
         segment=np.repeat(np.arange(len(parts)), [len(part) for part in times]),
         segments=cut,
@@ -162,7 +164,7 @@ def gathered(
     )
 
 
-def references_of(logged: Sequence[Run], origin: int) -> list[Source]:
+def _references_of(logged: Sequence[Run], origin: int) -> list[Source]:
     """The references of segments, in the part to use."""
     return [source.rows(part.within(source.stamp, origin)) for part in logged if (source := part.reference) is not None]
 
@@ -177,7 +179,7 @@ def _joined(parts: Iterable[npt.NDArray[S]]) -> npt.NDArray[S]:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
-def reference_notes(est: Estimates, sources: Sequence[Source]) -> list[str]:
+def _reference_notes(est: Estimates, sources: Sequence[Source]) -> list[str]:
     """What is wrong with the reference: rows behind a jump of its clock, or no row at the time of any estimate."""
     if est.reference is None:
         return []
@@ -187,7 +189,7 @@ def reference_notes(est: Estimates, sources: Sequence[Source]) -> list[str]:
     given = [np.isfinite(value) for axis, value in est.reference.position.items() if axis in est.axes]
     time = est.reference.time[np.any(given, axis=0)] if given else np.empty(0)
     if not len(time) or time.max() < est.time.min() or time.min() > est.time.max():
-        found.append("the reference covers no estimate: are both stamped by one clock?")
+        found.append(NOT_COVERED)
     return found
 
 

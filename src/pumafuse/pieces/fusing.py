@@ -38,7 +38,7 @@ from ..logs.clock import clock_faults
 from ..logs.frames import Cylindrical
 from ..logs.run import Run
 from ..units import Kind
-from .reading import Piece, pieces
+from .reading import LOOK_BACK_NS, Piece, pieces
 
 _PERIODS = 4.0  # of update, for which commands are remembered beside delays
 
@@ -83,6 +83,7 @@ class _Fusing:
         self._first: Segment | None = None
         self._arrays: tuple[Model, Sensors, State] | None = None
         self._has_moved = False
+        self._known = set[tuple[str, str]]()  # biases, by sensor and axis
 
     def part(self, piece: Piece) -> Part:
         """Fuse the next piece."""
@@ -97,8 +98,14 @@ class _Fusing:
         times = self._times(segment, piece)
         filtered = filter_piece(segment, config, self._arrays, (piece.after, piece.until), times)
         segment = _with_counts(segment, run, filtered, piece)
-        known = replace(filtered, biases=filtered.biases if first is None else {})
-        est = gathered(run, config, run, placed, [run], [(segment, times, known)], "filtered", "compiled")
+        of_piece = replace(filtered, biases=self._first_known(filtered, segment))
+        est = gathered(run, config, run, placed, [run], [(segment, times, of_piece)], "filtered", "compiled")
+        notes += [
+            f"{name}: {count} rows come more than {LOOK_BACK_NS / 1e9:g} s behind later ones: too late, and not in"
+            " measurements.parquet"
+            for name, count in piece.unplaced.items()
+            if count
+        ]
         notes += contradictions(segment, config, filtered, segment.origin)
         est = replace(est, speed=_speed(segment, config, first is None), counts=_counts(est.counts, piece))
         est = replace(est, notes=(*notes, *sensor_problems(est)))
@@ -107,6 +114,18 @@ class _Fusing:
             np.inf if piece.until == NEVER else (piece.until - est.origin) / 1e9,
         )
         return Part(est, filtered.biases, within, piece.share)
+
+    def _first_known(self, filtered: Filtered, segment: Segment) -> dict[str, dict[str, Bias]]:
+        """The biases that no measurement before this piece has determined."""
+        fused = filtered.results.outcome == Outcome.FUSED
+        found: dict[str, dict[str, Bias]] = {}
+        for name, biases in filtered.biases.items():
+            mine = fused[filtered.events.source == segment.sensors.index(name)].any(axis=0)
+            for axis, bias in biases.items():
+                if mine[segment.axes.index(axis)] and (name, axis) not in self._known:
+                    self._known.add((name, axis))
+                    found.setdefault(name, {})[axis] = bias
+        return found
 
     def _faults(self, run: Run, segment: Segment) -> list[str]:
         """What the first piece, and the first one in which every axis moves, show of the sensors."""

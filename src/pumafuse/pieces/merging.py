@@ -23,16 +23,14 @@ def merged(
     config: FusionConfig,
     biases: Mapping[str, Mapping[str, Bias]],
     duration: float,
-    notes: list[str],
 ) -> Summary:
-    """One summary of all: counts and likelihoods add up, means are weighted by numbers, verdicts are made anew.
+    """One summary of all, without notes: counts add up, means are weighted by numbers, verdicts are made anew.
 
     Args:
-        parts: The summaries of the pieces, in order; of the first one alone the biases count as estimated.
+        parts: The summaries of the pieces, in order; each with the biases that its measurements determine first.
         config: Of the fusion.
         biases: At the end.
         duration: From the first to the last estimate [s].
-        notes: Of the run.
     """
     first = parts[0]
     return Summary(
@@ -49,7 +47,7 @@ def merged(
         rows={name: added([one.rows[name] for one in parts]) for name in first.rows},
         axes={axis: _axis(parts, axis, config, biases) for axis in first.axes},
         validity=_validity([one.validity for one in parts]),
-        notes=notes,
+        notes=[],
     )
 
 

@@ -143,9 +143,11 @@ class _Log:
                     " stamped by one clock, and every table sorted by time?"
                 )
             for name, one in min(self._tables.values(), key=lambda table: table.reached).read().items():
-                placed = (one.stamp > floor) | (one.stamp == NO_STAMP)
+                placed = (one.stamp > floor) | (one.stamp == NO_STAMP) | (name == COMMAND)  # stray, or refused below
                 unplaced[name] = unplaced.get(name, 0) + int(np.count_nonzero(~placed))
-                parts.setdefault(name, []).append(one if placed.all() else self._only(name, one, placed, parts))
+                parts.setdefault(name, []).append(
+                    one if placed.all() else _only(name, one, placed, parts.get(name, []))
+                )
         self._kept = {name: _joined(sources) for name, sources in parts.items()}
         return _by_sensor(unplaced)
 
@@ -163,7 +165,10 @@ class _Log:
             if found[name]:
                 self._kept[name] = replace(one, stamp=np.where(apart == 0, one.stamp, NO_STAMP))
         if (behind(self._kept[COMMAND].stamp) > TOLERATED_STEP_BACK_NS).any():
-            raise self._set_back()
+            raise RunError(
+                f"{self._kept[COMMAND].label}: the clock is set back by more than 1 s, which a run that is read in"
+                " pieces must not have; cut the log there and fuse the parts one by one"
+            )
         return _by_sensor(found)
 
     def run(self, cut: int) -> Run:
@@ -212,21 +217,13 @@ class _Log:
             for axis in commands[0].values
         )
 
-    def _only(self, name: str, one: Source, placed: BoolArray, parts: Mapping[str, list[Source]]) -> Source:
-        """The rows that still have a place; the others must be late for their own source, too."""
-        if name == COMMAND:
-            raise self._set_back()
-        newest = max((int(part.stamp.max()) for part in parts.get(name, ()) if len(part.stamp)), default=ALWAYS)
-        if newest - int(one.stamp[~placed].max()) <= TOLERATED_STEP_BACK_NS:
-            raise RunError(f"{one.label}: rows of {name} come after later ones of others; sort the table by time")
-        return one.rows(placed)
 
-    def _set_back(self) -> RunError:
-        label = self._kept[COMMAND].label
-        return RunError(
-            f"{label}: the clock is set back by more than 1 s, which a run that is read in pieces must not have; cut"
-            " the log there and fuse the parts one by one"
-        )
+def _only(name: str, one: Source, placed: BoolArray, before: list[Source]) -> Source:
+    """The rows that still have a place; the others must be late for their own source, too."""
+    newest = max((int(part.stamp.max()) for part in before if len(part.stamp)), default=ALWAYS)
+    if newest - int(one.stamp[~placed].max()) <= TOLERATED_STEP_BACK_NS:
+        raise RunError(f"{one.label}: rows of {name} come after later ones of other sources; sort the table by time")
+    return one.rows(placed)
 
 
 def _by_sensor(counts: Mapping[str, int]) -> dict[str, int]:

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as papq
@@ -18,6 +19,7 @@ from ..errors import PumafuseWarning, RunError
 from ..filter.outcome import Outcome
 from ..fusion import results
 from ..fusion.config import FusionConfig
+from ..fusion.offline import NOT_COVERED
 from ..fusion.score import ReferenceTrack
 from ..fusion.summary import Summary, encode, summarise
 from .fusing import Part, parts
@@ -92,11 +94,25 @@ def _written(
             biases = part.biases
             if progress is not None:
                 progress(part.share)
-    summary = merged(summaries, config, biases or {}, ends[-1] - ends[0] if ends else 0.0, notes.sentences())
+    summary = merged(summaries, config, biases or {}, ends[-1] - ends[0] if ends else 0.0)
     if not any({Outcome.FUSED.word, Outcome.REACQUIRED.word} & rows.keys() for rows in summary.rows.values()):
-        rows = ", ".join(f"'{name}' has {counts}" for name, counts in summary.rows.items())
-        raise RunError(f"nothing was fused, nothing is written: {rows or 'there is no sensor'}")
-    return summary
+        raise RunError(f"nothing was fused, nothing is written: {_in_words(summary) or 'the run has no sensor'}")
+    said = notes.sentences()
+    if tables.has(results.REFERENCE) and not any(axis.score for axis in summary.axes.values()):
+        said.append(NOT_COVERED)
+    said.append(
+        f"fused in {len(summaries)} pieces: medians of the errors of predictions, and correlations of innovations, are"
+        " means of those of the pieces"
+    )
+    return msgspec.structs.replace(summary, notes=said)
+
+
+def _in_words(summary: Summary) -> str:
+    """What became of the rows of each sensor."""
+    return "; ".join(
+        f"'{name}' has {', '.join(f'{count} {word}' for word, count in rows.items()) or 'no rows'}"
+        for name, rows in summary.rows.items()
+    )
 
 
 class _Tables:
@@ -104,6 +120,10 @@ class _Tables:
 
     def __init__(self, folder: Path, open_files: ExitStack) -> None:
         self._folder, self._open_files, self._writers = folder, open_files, dict[str, papq.ParquetWriter]()
+
+    def has(self, name: str) -> bool:
+        """Whether anything was added to a file."""
+        return name in self._writers
 
     def add(self, name: str, table: pa.Table) -> None:
         """Add rows to a file of the folder."""
