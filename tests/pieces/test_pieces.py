@@ -184,7 +184,8 @@ def test_stray_stamps_are_taken_for_none(tmp_path: Path) -> None:
     whole, in_pieces = both(run, tmp_path)
     assert_same_tables(tmp_path, "estimates")
     assert in_pieces.rows == whole.rows
-    assert whole.rows["tracker"]["stray"] == 1
+    assert in_pieces.commands == whole.commands
+    assert (whole.rows["tracker"]["stray"], whole.commands["stray"]) == (1, 2)
 
 
 def test_rows_far_behind_are_counted(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from ..fusion.segments import (
     counts_of_measurements,
     ticks,
 )
+from ..logs import manifest
 from ..logs.axes import in_axes
 from ..logs.clock import clock_faults
 from ..logs.frames import Cylindrical
@@ -100,14 +101,8 @@ class _Fusing:
         segment = _with_counts(segment, run, filtered, piece)
         of_piece = replace(filtered, biases=self._first_known(filtered, segment))
         est = gathered(run, config, run, placed, [run], [(segment, times, of_piece)], "filtered", "compiled")
-        notes += [
-            f"{name}: {count} rows come more than {LOOK_BACK_NS / 1e9:g} s behind later ones: too late, and not in"
-            " measurements.parquet"
-            for name, count in piece.unplaced.items()
-            if count
-        ]
-        notes += contradictions(segment, config, filtered, segment.origin)
-        est = replace(est, speed=_speed(segment, config, first is None), counts=_counts(est.counts, piece))
+        notes += [*_unplaced(piece), *contradictions(segment, config, filtered, segment.origin)]
+        est = replace(_counted(est, piece), speed=_speed(segment, config, first is None))
         est = replace(est, notes=(*notes, *sensor_problems(est)))
         within = (
             -np.inf if first is None else (piece.after - est.origin) / 1e9,
@@ -187,14 +182,27 @@ def _with_counts(segment: Segment, run: Run, filtered: Filtered, piece: Piece) -
     return replace(segment, command_counts=counts_of_commands(rows.rows(new), unstamped), counts=counts)
 
 
-def _counts(counts: Mapping[str, Mapping[str, int]], piece: Piece) -> dict[str, dict[str, int]]:
-    """The counts of sensors with the rows that found no place, and stray stamps apart from none."""
-    found: dict[str, dict[str, int]] = {}
-    for name, known in counts.items():
-        late, stray = piece.unplaced.get(name, 0), piece.strays.get(name, 0)
-        more = {Outcome.TOO_LATE.word: late, STRAY: stray, NO_STAMP_WORD: -stray}
-        found[name] = {word: count for word, count in added([known, more]).items() if count}
-    return found
+def _unplaced(piece: Piece) -> list[str]:
+    """A sentence on each sensor with rows that found no place."""
+    return [
+        f"{name}: {count} rows come more than {LOOK_BACK_NS / 1e9:g} s behind later ones: too late, and not in"
+        " measurements.parquet"
+        for name, count in piece.unplaced.items()
+        if count
+    ]
+
+
+def _counted(est: Estimates, piece: Piece) -> Estimates:
+    """The estimates with counts of all rows of the piece that are new."""
+    strays, unplaced = piece.strays, piece.unplaced
+    counts = {name: _counts(one, strays.get(name, 0), unplaced.get(name, 0)) for name, one in est.counts.items()}
+    return replace(est, command_counts=_counts(est.command_counts, strays.get(manifest.COMMAND, 0)), counts=counts)
+
+
+def _counts(known: Mapping[str, int], stray: int, unplaced: int = 0) -> dict[str, int]:
+    """The counts of a source with stray stamps apart from none, and the rows that found no place."""
+    more = {STRAY: stray, NO_STAMP_WORD: -stray, Outcome.TOO_LATE.word: unplaced}
+    return {word: count for word, count in added([known, more]).items() if count}
 
 
 def _speed(segment: Segment, config: FusionConfig, first: bool) -> dict[Kind, float]:
