@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import glob
 import os
 import shutil
 import tempfile
+from collections import defaultdict
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
@@ -83,9 +83,13 @@ def write_file(path: Path, content: str | bytes) -> None:
 
 def sweep(folders: Iterable[Path]) -> None:
     """Remove the temporary folders that killed workers of this process left beside the folders they were writing."""
+    beside, ending = defaultdict[Path, set[str]](set), f".{os.getpid()}"
     for folder in folders:
-        for left in folder.parent.glob(f".{glob.escape(folder.name)}.{os.getpid()}-*"):
-            shutil.rmtree(left, ignore_errors=True)
+        beside[folder.parent].add(f".{folder.name}{ending}")
+    for parent, names in beside.items():
+        for left in parent.glob(f".*{ending}-*"):  # once, however many folders are beside each other
+            if left.name.rpartition("-")[0] in names:
+                shutil.rmtree(left, ignore_errors=True)
 
 
 @contextmanager

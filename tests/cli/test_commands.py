@@ -164,6 +164,7 @@ def test_bad_input_is_one_line_that_says_what_to_do(arguments: tuple[object, ...
         ("fuse",),
         (*FUSE_SCAN, "-o", "out", "--rate", "-5"),
         (*FUSE_SCAN, "-o", "out", "--smooth", "--as-live"),
+        (*FUSE_SCAN, "-o", "out", "--resume", "--force"),
         ("nonsense",),
         ("compare",),
         ("simulate", "short.toml"),

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import pumafuse as pf
-from executable import EXECUTABLE, names, pumafuse
+from executable import EXECUTABLE, FUSION, SCAN, names, pumafuse, refused
 from pumafuse import folders
 from pumafuse.cli import many
 from pumafuse.simulation import simulate as simulation
@@ -202,6 +202,103 @@ def test_an_interrupted_simulation_keeps_whole_runs_and_nothing_else(
     for name in names(out):
         assert names(out / name) == (FILES - {"eye.csv"}) | {"scope.csv", "trials.csv", "samples.csv"}
         assert pf.Run.read(out / name).name.endswith(f"seed {name.removeprefix('seed-')}")
+
+
+@pytest.fixture
+def five(scenario: Path, tmp_path: Path) -> list[Path]:
+    """Five recorded runs, each with the configuration for it."""
+    pumafuse("simulate", scenario, "-o", tmp_path / "runs", "--runs", 5)
+    return [tmp_path / "runs" / f"seed-{seed}" for seed in range(3, 8)]
+
+
+def written(out: Path) -> dict[str, int]:
+    """When each file of each result was written; a folder that is replaced has others."""
+    return {str(path.relative_to(out)): path.stat().st_ctime_ns for path in out.glob("*/*")}
+
+
+@pytest.mark.long
+def test_a_fusion_that_was_interrupted_resumes_where_it_stopped(five: list[Path], tmp_path: Path) -> None:
+    """What is done is not written again, and the results and the table are those of a fusion in one go."""
+    words = ["fuse", *map(str, five), "-c", str(five[0] / "fusion.toml")]
+    whole = pumafuse(*words, "-o", tmp_path / "whole").stdout
+    out = tmp_path / "out"
+    script = tmp_path / "slow.py"  # a run a second, until Ctrl-C
+    script.write_text(
+        "import sys, time\nfrom unittest import mock\nimport joblib\nfrom pumafuse.cli import fuse, main\n"
+        "whole = fuse.results.write\n"
+        "def slow(*given):\n    made = whole(*given)\n    time.sleep(1.0)\n    return made\n"
+        "with mock.patch.object(fuse.results, 'write', slow), joblib.parallel_config('threading', n_jobs=1):\n"
+        "    main.main()\n"
+    )
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    process = subprocess.Popen([sys.executable, str(script), *words, "-o", str(out)], stderr=subprocess.PIPE, text=True)
+    signal.signal(signal.SIGINT, before)
+    give_up = time.monotonic() + 100.0
+    while time.monotonic() < give_up and len(list(out.glob("[!.]*"))) < 2:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, message = process.communicate(timeout=100)
+    assert process.returncode == 130 and "interrupted: " in message
+    done = written(out)
+    first = len(names(out))
+    assert 2 <= first < 5
+    printed = pumafuse(*words, "-o", out, "--resume").stdout
+    assert printed == f"{first} of 5 done before, kept\n{whole.replace('whole', 'out')}"
+    assert {name: when for name, when in written(out).items() if name in done} == done
+    assert all(digests(out / name) == digests(tmp_path / "whole" / name) for name in names(tmp_path / "whole"))
+    done = written(out)
+    assert pumafuse(*words, "-o", out, "--resume").stdout.startswith("5 of 5 done before, kept\n")
+    assert written(out) == done
+
+
+@pytest.mark.long
+def test_only_what_was_made_in_the_same_way_is_kept(five: list[Path], tmp_path: Path) -> None:
+    """Whatever is different is one line that names it, and nothing is fused; --force and --resume do not go together.
+
+    The same run by another path to it is the same; a folder that is no result is refused as without --resume.
+    """
+    run, config, out = five[0], five[0] / "fusion.toml", tmp_path / "out"
+    words = ["fuse", run, "-c", config, "-o", out, "--resume"]
+    assert pumafuse(*words).stdout.startswith("0 of 1 done before, kept\n")
+    assert pumafuse("fuse", run / "run.toml", *words[2:], "--sensors", "eye").stdout.startswith("1 of 1 done before")
+    done = digests(out)
+    for option, what in {
+        "--rate=100": "--rate",
+        "--smooth": "mode",
+        "--engine=filterpy": "--engine",
+        "--from=0.5": "--from or --to",
+        "--figures": "choice of files",
+    }.items():
+        assert refused(*words, option).startswith(f"pumafuse: {out}: made with another {what}: ask for ")
+    assert f"{out}: made with another run: " in refused("fuse", five[1], *words[2:])
+    text = config.read_text()
+    config.write_text(text.replace("offset_sd_mm = 0.0", "offset_sd_mm = 1.0"))
+    assert f"{out}: made with another fusion.toml: " in refused(*words)
+    config.write_text(text)
+    arm = run / "arm.toml"
+    arm.write_text(arm.read_text().replace("delay_ms = ", "delay_ms = 1"))
+    assert f"{out}: made with another arm.toml and another --rate: " in refused(*words, "--rate", 100)
+    assert digests(out) == done
+    assert "choose one of --resume and --force" in pumafuse(*words, "--force", code=2).stderr
+    (out / "summary.json").write_text("{")
+    assert f"{out}: a damaged result (" in refused(*words)
+    (out / "summary.json").unlink()
+    assert "holds no output of pumafuse" in pumafuse(*words, code=1).stderr
+
+
+@pytest.mark.long
+def test_a_result_of_other_sensors_is_not_kept(five: list[Path], tmp_path: Path) -> None:
+    """Sensors that are in no run make no difference, and a result of Python says not of which run it is."""
+    config, out = five[0] / "fusion.toml", tmp_path / "out"
+    config.write_text(config.read_text() + "[sensors.nowhere]\nsd_mm = 1.0\n")
+    words = ["fuse", SCAN, "-c", FUSION, "-o", out, "--resume"]
+    pumafuse(*words, "--sensors", "vision")
+    assert f"{out}: made with another choice of sensors: " in refused(*words)
+    words = ["fuse", five[0], "-c", config, "-o", tmp_path / "other", "--resume"]
+    pumafuse(*words)
+    pumafuse(*words, "--sensors", "eye")
+    pf.fuse(pf.Run.read(five[1]), pf.FusionConfig.load(five[1] / "fusion.toml")).save(tmp_path / "python")
+    assert "another run" in refused("fuse", five[1], *words[2:5], tmp_path / "python", "--resume")
 
 
 # ---- Output folders -------------------------------------------------------------------------------------------------

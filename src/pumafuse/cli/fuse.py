@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.resources import as_file, files
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,7 @@ from ..fusion.summary import Summary
 from ..logs.run import Run
 from ..units import KINDS
 from .many import progress_bar, report_failures, run_jobs
+from .resume import Wanted, results_there, source_of
 from .tables import left_out, outcome_table, print_tables, runs_table, score_table, skill_table
 
 
@@ -37,27 +38,33 @@ def run(
     engine: Engine = "compiled",
     force: bool = False,
     part: tuple[float | None, float | None] = (None, None),
+    resume: bool = False,
 ) -> None:
     """Fuse each run into a result folder; a run that fails is reported and does not stop the others.
 
     Raises:
-        PumafuseError: The configuration is wrong, or at least one run failed.
+        PumafuseError: The configuration is wrong, a result to keep was made otherwise, or at least one run failed.
     """
     given = FusionConfig.load(config)
     given.sensor_names(sensors)  # before any run is read
     how = partial(fuse, config=given, sensors=sensors, rate=rate, mode=mode, engine=engine)
     job = partial(_fuse, how, part=part, rrd=rrd, figures=figures, force=force)
+    folders = [output] if len(runs) == 1 else _folders(runs, output)
+    places = dict(zip(map(str, runs), folders, strict=True))
+    kept = dict[str, Summary]()
+    if resume:
+        extras = ["fused.rrd"] * rrd + ["fused.png"] * figures
+        kept = results_there(places, Wanted(given, sensors, rate, mode, engine, part, extras))
     if len(runs) == 1:
         with progress_bar(str(runs[0])) as progress:
-            summary = job(runs[0], output, progress)
+            (summary,) = kept.values() or [job(runs[0], output, progress)]
         _show(summary)
         typer.echo(f"written to {output}")
         return
-    places = dict(zip(map(str, runs), _folders(runs, output), strict=True))
-    jobs = {path: partial(job, Path(path), place) for path, place in places.items()}
+    jobs = {path: partial(job, Path(path), place) for path, place in places.items() if path not in kept}
     done, failed = run_jobs("fusing", jobs, places.values())
-    if done:
-        summaries = {places[path].name: summary for path, summary in done.items()}
+    summaries = {place.name: known for path, place in places.items() if (known := kept.get(path) or done.get(path))}
+    if summaries:
         print_tables(runs_table(summaries, kind) for kind in KINDS)
         typer.echo(f"written to {output}")
     report_failures(failed, len(places), output)
@@ -127,7 +134,7 @@ def _fuse(
                 if figure is not None:
                     figure.savefig(new / f"{name}.png", dpi=130)
 
-    return results.write(est, folder, force, extras)
+    return results.write(est, folder, force, extras, source_of(path))
 
 
 def _why_nothing(est: Estimates) -> str:
@@ -157,10 +164,16 @@ def _show(summary: Summary) -> None:
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:
     """A folder for each run, named after its path; equal names get a number."""
-    found: list[Path] = []
-    for path in map(Path.resolve, runs):
-        named = path.parent if path.name == "run.toml" else path
+    found, candidates = dict[Path, None](), dict[str, Iterator[Path]]()
+    for named in map(source_of, runs):
         name = named.name if named.is_dir() else re.sub(r"(\.csv|\.parquet)?(\.gz)?$", "", named.name)
-        names = chain([name or "run"], (f"{name or 'run'}_{number}" for number in count(2)))
-        found.append(next(output / name for name in names if output / name not in found))
-    return found
+        free = candidates.setdefault(name, _numbered(output, name or "run"))
+        found[next(folder for folder in free if folder not in found)] = None
+    return list(found)
+
+
+def _numbered(output: Path, name: str) -> Iterator[Path]:
+    """``name``, ``name_2``, ``name_3`` and so on in ``output``."""
+    yield output / name
+    for number in count(2):
+        yield output / f"{name}_{number}"

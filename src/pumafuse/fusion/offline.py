@@ -123,6 +123,7 @@ def fuse(
         notes=(),
         since=run.since,
         until=run.until,
+        rate=rate,
     )
     notes = [*faults, *(note for part in cut for note in part.notes)]
     notes += [note for part in parts for note in _contradictions(part[0], config, part[2], origin)]

@@ -89,7 +89,13 @@ def check_writable(folder: Path, force: bool) -> None:
     folders.check_writable(folder, force, [SUMMARY], _FILES.__contains__)
 
 
-def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], None] | None = None) -> Summary:
+def write(
+    est: Estimates,
+    folder: Path,
+    force: bool,
+    extras: Callable[[Path], None] | None = None,
+    path: Path | None = None,
+) -> Summary:
     """Write a result folder: complete, or not at all.
 
     Args:
@@ -97,12 +103,13 @@ def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], No
         folder: Where to; its parents are made.
         force: Replace an earlier result.
         extras: Writes more files into the folder before it takes its place.
+        path: Where the run was read.
 
     Raises:
         FolderError: See :func:`check_writable`, or the disk refuses.
     """
     check_writable(folder, force)
-    summary = summarise(est)
+    summary = msgspec.structs.replace(summarise(est), path=None if path is None else str(path))
     with folders.replacing(folder) as new:
         tables.write(estimates_table(est), new / ESTIMATES)
         tables.write(_measurements_table(est), new / MEASUREMENTS)

@@ -126,6 +126,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     Attributes:
         pumafuse: Version that wrote it.
         run: The run's name.
+        path: Where `pumafuse fuse` read it; null for a run from Python.
         arm: The arm's name.
         mode: Which measurements an estimate uses: ``filtered`` (all valid by then), ``as-live`` (those that had
             arrived) or ``smoothed`` (all of the run).
@@ -133,6 +134,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         origin_ns: Stamp of the first command: time 0 of every table.
         from_s: Where the part of the run that was used begins, since the first command; null: with the run.
         to_s: Where it ends, likewise.
+        rate: Of an even grid of estimates [Hz]; null: one for each command.
         duration_s: From the first to the last estimate.
         estimates: How many.
         segments: 1, and one more for each time the log's clock was set back.
@@ -146,12 +148,14 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
 
     pumafuse: str
     run: str
+    path: str | None = None
     arm: str
     mode: str
     engine: str
     origin_ns: int
     from_s: float | None = None
     to_s: float | None = None
+    rate: float | None = msgspec.field(name="rate_hz", default=None)
     duration_s: float
     estimates: int
     segments: int
@@ -203,6 +207,7 @@ def summarise(est: Estimates) -> Summary:
         origin_ns=est.origin,
         from_s=est.since,
         to_s=est.until,
+        rate=est.rate,
         duration_s=float(np.ptp(est.time)),
         estimates=len(est.time),
         segments=int(est.segment[-1]) + 1,
