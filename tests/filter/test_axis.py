@@ -121,6 +121,23 @@ def test_predict_is_a_matrix_exponential(axis: int, ns: int) -> None:
 
 
 @every_axis
+def test_p_may_stay_behind_commands(axis: int) -> None:
+    """Brought on once at the end, P is what it is when it is brought on before each command, whose noise differs."""
+    model, _, behind = arranged()
+    _, _, along = arranged()
+    for ns, command in ((5_000_000, 0.51), (33_000_000, 0.49), (34_000_000, 0.53), (80_000_000, 0.52)):
+        predict_plant(model, behind, axis, axis, ns)
+        predict(model, along, axis, axis, ns)
+        for state in (behind, along):
+            apply_command(model, state, axis, axis, command)
+    assert behind.settled[axis] == 0 and not np.array_equal(behind.P[axis], along.P[axis])
+    predict(model, behind, axis, axis, 100_000_000)
+    predict(model, along, axis, axis, 100_000_000)
+    for part, other in zip(behind.by_row, along.by_row, strict=True):
+        np.testing.assert_allclose(part, other, rtol=1e-11, atol=1e-18)
+
+
+@every_axis
 def test_two_intervals_are_one(axis: int) -> None:
     """Stopping on the way changes nothing, and going back in time is no prediction."""
     model, _, state = arranged()
