@@ -20,6 +20,7 @@ ROOMS = [
     "discovery",
     "filter",
     "fusion",
+    "pieces",
     "simulation",
     "identification",
     "tuning",

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import pumafuse as pf
-from executable import EXECUTABLE, names, pumafuse
+from executable import EXECUTABLE, names, pumafuse, refused
 from pumafuse import folders
 from pumafuse.cli import many
 from pumafuse.simulation import simulate as simulation
@@ -96,6 +96,45 @@ def test_many_runs_are_fused_into_one_table(scenario: Path, tmp_path: Path) -> N
         squares = [float(row[2]) ** 2 for row in own if row[1] == axis]
         assert float(pooled[axis][3]) == pytest.approx((sum(squares) / 4) ** 0.5, abs=0.001)
         assert float(pooled[axis][4]) == pytest.approx(max(squares) ** 0.5, abs=0.001)
+
+
+def test_many_runs_are_resumed(scenario: Path, tmp_path: Path) -> None:
+    """After a kill --resume fuses what is left, to the same files; results made otherwise are refused."""
+    runs, out, once = tmp_path / "runs", tmp_path / "out", tmp_path / "once"
+    pumafuse("simulate", scenario, "-o", runs, "--runs", 4)
+    given = [runs / f"seed-{seed}" for seed in range(3, 7)]
+    same = "-c", runs / "seed-3" / "fusion.toml", "--rate", 50
+    whole = pumafuse("fuse", *given, *same, "-o", once).stdout
+    words = [str(EXECUTABLE), "fuse", *map(str, [*given, *same]), "-o", str(out)]
+    process = subprocess.Popen(words, start_new_session=True)
+    while not out.is_dir() or not any(path.name.startswith("seed-") for path in out.iterdir()):
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    kept = {path: path.stat().st_mtime_ns for path in out.glob("seed-*/*")}
+    assert kept
+    resumed = pumafuse("fuse", *given, *same, "-o", out, "--resume").stdout
+    before = len({path.parent for path in kept})
+    assert f"written to {out}; {before} of 4 were there already" in resumed
+    assert resumed.splitlines()[:-1] == whole.splitlines()[:-1]
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert all(digests(out / folder.name) == digests(folder) for folder in once.iterdir())
+    assert "there already: " in pumafuse("fuse", given[0], *same, "-o", out / "seed-3", "--resume").stdout
+    for option, what in (
+        (["--smooth"], "with another mode"),
+        (["--sensors", "eye"], "with other --sensors"),
+        (["--to", 1.0], "with another --from or --to"),
+        (["--figures"], "with no fused.png"),
+    ):
+        assert what in refused("fuse", *given, *same, "-o", out, "--resume", *option)
+    edited = runs / "seed-3" / "fusion.toml"
+    edited.write_text(edited.read_text().replace("[start]", "[start]\n# as before\n"))
+    pumafuse("fuse", *given, *same, "-o", out, "--resume")
+    edited.write_text(edited.read_text().replace("latency_ms = ", "latency_ms = 1"))
+    assert f"{out / 'seed-3'}: an earlier result, with another fusion.toml;" in refused(
+        "fuse", *given, *same, "-o", out, "--resume"
+    )
+    pumafuse("fuse", *given, *same, "-o", out, "--resume", "--force", code=2)
 
 
 @pytest.mark.long

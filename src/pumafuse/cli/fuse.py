@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from importlib.resources import as_file, files
-from itertools import chain, count
+from itertools import count
 from pathlib import Path
 
-import numpy as np
 import typer
 
 from ..errors import RunError
-from ..filter.outcome import Outcome
 from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Estimates, Mode
 from ..fusion.offline import Engine, fuse
 from ..fusion.summary import Summary
 from ..logs.run import Run
+from ..pieces.fusing import fuse_to
+from ..pieces.reading import needs_whole, rows_of
 from ..units import KINDS
 from .many import progress_bar, report_failures, run_jobs
 from .tables import left_out, outcome_table, print_tables, runs_table, score_table, skill_table
+
+SHORT = 5_000_000  # rows of a run, each half a kB in memory; a longer one goes through piece by piece
+MOST_IN_MEMORY = 30_000_000  # rows of one that cannot
 
 
 def run(
@@ -37,29 +40,43 @@ def run(
     engine: Engine = "compiled",
     force: bool = False,
     part: tuple[float | None, float | None] = (None, None),
+    resume: bool = False,
 ) -> None:
     """Fuse each run into a result folder; a run that fails is reported and does not stop the others.
+
+    With ``resume`` results that are there and were made in the same way are kept.
 
     Raises:
         PumafuseError: The configuration is wrong, or at least one run failed.
     """
     given = FusionConfig.load(config)
     given.sensor_names(sensors)  # before any run is read
-    how = partial(fuse, config=given, sensors=sensors, rate=rate, mode=mode, engine=engine)
-    job = partial(_fuse, how, part=part, rrd=rrd, figures=figures, force=force)
+    whole = partial(fuse, config=given, sensors=sensors, rate=rate, mode=mode, engine=engine)
+    long = partial(fuse_to, config=given, sensors=sensors, rate=rate, part=part, force=force)
+    needs = {"--smooth": mode == "smoothed", "--as-live": mode == "as-live", "--engine filterpy": engine != "compiled"}
+    needs |= {"--rrd": rrd, "--figures": figures}
+    in_memory = next((option for option, wanted in needs.items() if wanted), None)
+    job = partial(_fuse, given, whole, long, in_memory, part=part, rrd=rrd, figures=figures, force=force)
+    extras = [name for name, wanted in {"fused.rrd": rrd, "fused.png": figures}.items() if wanted]
+    making = results.Making(given, sensors, rate, mode, engine, part, extras)
     if len(runs) == 1:
-        with progress_bar(str(runs[0])) as progress:
-            summary = job(runs[0], output, progress)
+        summary = making.made(output) if resume else None
+        where = "written to" if summary is None else "there already:"
+        if summary is None:
+            with progress_bar(str(runs[0])) as progress:
+                summary = job(runs[0], output, progress)
         _show(summary)
-        typer.echo(f"written to {output}")
+        typer.echo(f"{where} {output}")
         return
     places = dict(zip(map(str, runs), _folders(runs, output), strict=True))
-    jobs = {path: partial(job, Path(path), place) for path, place in places.items()}
+    there = {path: summary for path, place in places.items() if resume and (summary := making.made(place))}
+    jobs = {path: partial(job, Path(path), place) for path, place in places.items() if path not in there}
     done, failed = run_jobs("fusing", jobs, places.values())
-    if done:
-        summaries = {places[path].name: summary for path, summary in done.items()}
+    if there or done:
+        found = there | done
+        summaries = {place.name: found[path] for path, place in places.items() if path in found}
         print_tables(runs_table(summaries, kind) for kind in KINDS)
-        typer.echo(f"written to {output}")
+        typer.echo(f"written to {output}" + (f"; {len(there)} of {len(found)} were there already" if there else ""))
     report_failures(failed, len(places), output)
 
 
@@ -92,7 +109,10 @@ def demo(output: Path, force: bool) -> None:
 
 
 def _fuse(
-    how: Callable[..., Estimates],
+    config: FusionConfig,
+    whole: Callable[..., Estimates],
+    long: Callable[..., Summary],
+    in_memory: str | None,
     path: Path,
     folder: Path,
     progress: Callable[[float], None] | None = None,
@@ -102,12 +122,23 @@ def _fuse(
     figures: bool,
     force: bool,
 ) -> Summary:
-    """Read a run, fuse a part of it and write its result folder, with ``fused.rrd`` and figures if wanted."""
+    """Fuse a part of a run and write its result folder, with ``fused.rrd`` and figures if wanted.
+
+    A long run goes through piece by piece, where nothing, such as an option, needs it ``in_memory``.
+    """
     results.check_writable(folder, force)
+    if (rows := rows_of(path)) > SHORT:
+        in_memory = in_memory or needs_whole(path, config)
+        if not in_memory:
+            return long(path, folder, progress=progress)
+        if rows > MOST_IN_MEMORY:
+            raise RunError(
+                f"{path}: {in_memory} needs the whole run in memory, and {rows / 1e6:.0f} million rows are too many: do"
+                " without, or cut the log into shorter runs"
+            )
     recorded = Run.read(path).between(*part)
-    est = how(recorded, progress=progress)
-    if not np.isin(est.measurements.outcome, [Outcome.FUSED, Outcome.REACQUIRED]).any():
-        raise RunError(f"nothing was fused, nothing is written: {_why_nothing(est)}")
+    est = whole(recorded, progress=progress)
+    results.check_fused(est.counts, est.config)
 
     def extras(new: Path) -> None:
         if rrd:
@@ -130,16 +161,6 @@ def _fuse(
     return results.write(est, folder, force, extras)
 
 
-def _why_nothing(est: Estimates) -> str:
-    """What became of all measurements of a run of which none was fused, and which configured sensors it lacks."""
-    rows = [
-        f"'{name}' has {', '.join(f'{count} {word}' for word, count in counts.items()) or 'no rows'}"
-        for name, counts in est.counts.items()
-    ]
-    absent = [f"'{name}' of fusion.toml is not in the run" for name in est.config.sensors if name not in est.counts]
-    return "; ".join([*rows, *absent]) or "neither the run nor fusion.toml has a sensor"
-
-
 def _show(summary: Summary) -> None:
     """Print the tables of one fusion."""
     part = "" if summary.from_s is None else f" from {summary.from_s:g} s on"
@@ -157,10 +178,16 @@ def _show(summary: Summary) -> None:
 
 def _folders(runs: Sequence[Path], output: Path) -> list[Path]:
     """A folder for each run, named after its path; equal names get a number."""
-    found: list[Path] = []
+    found, free = dict[str, None](), dict[str, Iterator[str]]()
     for path in map(Path.resolve, runs):
         named = path.parent if path.name == "run.toml" else path
-        name = named.name if named.is_dir() else re.sub(r"(\.csv|\.parquet)?(\.gz)?$", "", named.name)
-        names = chain([name or "run"], (f"{name or 'run'}_{number}" for number in count(2)))
-        found.append(next(output / name for name in names if output / name not in found))
-    return found
+        name = (named.name if named.is_dir() else re.sub(r"(\.csv|\.parquet)?(\.gz)?$", "", named.name)) or "run"
+        names = free.setdefault(name, _numbered(name))
+        found[next(one for one in names if one not in found)] = None
+    return [output / name for name in found]
+
+
+def _numbered(name: str) -> Iterator[str]:
+    """A name, and the same with a number."""
+    yield name
+    yield from (f"{name}_{number}" for number in count(2))

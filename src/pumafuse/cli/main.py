@@ -88,6 +88,7 @@ def fuse(
     since: From = None,
     until: To = None,
     force: Force = False,
+    resume: Annotated[bool, Option("--resume", help="Keep results that are there already; fuse the others.")] = False,
 ) -> None:
     """Fuse recorded runs: estimates, the outcome of each measurement, and a summary.
 
@@ -97,13 +98,15 @@ def fuse(
 
     if smooth and as_live:
         raise BadParameter("choose one of --smooth and --as-live")
+    if resume and force:
+        raise BadParameter("choose one of --resume and --force")
     if engine == "filterpy" and (smooth or as_live):
         raise BadParameter("--engine filterpy gives filtered estimates only: without --smooth and --as-live")
     _check_positive(rate=rate)
     _check_interval(since, until)
     mode = "smoothed" if smooth else "as-live" if as_live else "filtered"
     part = since, until
-    command.run(runs, config, output, _names(sensors), rate, mode, rrd, figures, engine, force, part)
+    command.run(runs, config, output, _names(sensors), rate, mode, rrd, figures, engine, force, part, resume)
 
 
 @app.command()

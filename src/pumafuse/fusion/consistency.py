@@ -7,7 +7,7 @@ components are left out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from ..arrays import CodeArray, FloatArray
 from ..filter.outcome import Outcome
 from ..units import MM, Kind, of_kind
-from .config import Sensor
+from .config import FusionConfig, Sensor
 from .estimates import Estimates, Measurements
 from .score import Z95
 
@@ -102,16 +102,22 @@ def ljung_box(values: FloatArray, lags: int = LAGS) -> tuple[FloatArray, float]:
 
     Ljung & Box, "On a measure of lack of fit in time series models", Biometrika 65, 1978.
     """
-    from scipy.special import chdtrc
-
     centred, count = values - values.mean(), len(values)
     lags = min(lags, count - 1)
     power = float(centred @ centred)
     if power == 0.0 or lags < 1:
         return np.zeros(max(lags, 0)), 1.0
     correlation = np.array([centred[lag:] @ centred[:-lag] for lag in range(1, lags + 1)]) / power
+    return correlation, whiteness_of(correlation, count)
+
+
+def whiteness_of(correlation: FloatArray, count: int) -> float:
+    """Ljung-Box p-value that autocorrelations at lags 1, 2, … of ``count`` values are all zero."""
+    from scipy.special import chdtrc
+
+    lags = len(correlation)
     statistic = count * (count + 2) * float(np.sum(correlation**2 / (count - np.arange(1, lags + 1))))
-    return correlation, float(chdtrc(lags, statistic))
+    return float(chdtrc(lags, statistic))
 
 
 def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
@@ -124,7 +130,7 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
     whiteness = ljung_box(fused.innovation / fused.innovation_sd)
     found = Consistency(count, float(np.mean(fused.nis)), chi_square_band(count), *whiteness, verdict="")
     rejected = 1.0 - count / np.count_nonzero(measurements.outcome <= Outcome.REACQUIRED)
-    return replace(found, verdict=_verdict(est, sensor, axis, fused, found, rejected))
+    return with_verdict(found, est.config, sensor, axis, rejected, lambda: follows_velocity(est, axis, fused))
 
 
 def sensor_problems(est: Estimates) -> list[str]:
@@ -200,10 +206,28 @@ def _frozen(values: FloatArray) -> int:
     return longest if longest >= _FROZEN and len(values) * elsewhere ** (longest - 1) < _NEVER else 0
 
 
-def _verdict(est: Estimates, sensor: str, axis: str, fused: Measurements, found: Consistency, rejected: float) -> str:
+def with_verdict(
+    found: Consistency, config: FusionConfig, sensor: str, axis: str, rejected: float, follow: Callable[[], bool]
+) -> Consistency:
+    """The numbers of one sensor's components on one axis with their verdict.
+
+    Args:
+        found: The numbers.
+        config: As used.
+        sensor: The sensor.
+        axis: The axis.
+        rejected: Share of rejected components.
+        follow: Whether the innovations follow the velocity, asked where it makes a difference.
+    """
+    return replace(found, verdict=_verdict(found, config, sensor, axis, rejected, follow))
+
+
+def _verdict(
+    found: Consistency, config: FusionConfig, sensor: str, axis: str, rejected: float, follow: Callable[[], bool]
+) -> str:
     if found.count < _FEW:
         return f"too few measurements ({found.count}) to tell"
-    (low, high), sd = found.nis_band, of_kind("sd_mm", est.config.arm.axes[axis].kind)
+    (low, high), sd = found.nis_band, of_kind("sd_mm", config.arm.axes[axis].kind)
     digits = next(n for n in range(2, 17) if _beside([found.nis, low, high]) == _beside([found.nis, low, high], n))
     nis = f"NIS {found.nis:.{digits}f}, expected {low:.{digits}f} to {high:.{digits}f}"
     if rejected > _MANY_REJECTED:  # the others were selected to fit
@@ -213,11 +237,11 @@ def _verdict(est: Estimates, sensor: str, axis: str, fused: Measurements, found:
         strongest = int(np.argmax(np.abs(correlation)))
         if coloured and abs(correlation[strongest]) > _NOTABLE:
             return f"{nis}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
-        if est.config.sensors[sensor].is_at_bound(axis):
+        if config.sensors[sensor].is_at_bound(axis):
             return f"{nis}, but {sd} is at a bound of what can be fitted: error bars need not hold; configure it"
         return f"{nis}: consistent"
     sign = int(np.sign(correlation[0])) if coloured and abs(correlation[0]) > _NOTABLE else 0
-    if found.nis > high and sign and _follows_velocity(est, axis, fused):
+    if found.nis > high and sign and follow():
         return f"{nis}, innovations follow the velocity: latency_ms is wrong"
     return nis + _CAUSES[found.nis > high, sign].format(sd=sd)
 
@@ -228,12 +252,14 @@ def _beside(numbers: list[float], digits: int = 16) -> tuple[bool, bool]:
     return value < low, value > high
 
 
-def _follows_velocity(est: Estimates, axis: str, fused: Measurements) -> bool:
+def follows_velocity(est: Estimates, axis: str, fused: Measurements) -> bool:
     """Whether innovations correlate with the velocity, as those of a measurement with the wrong valid time do.
 
     The sign of the correlation does not show which way the latency is wrong: the offset absorbs most of the error, and
     what is left of an accurate sensor's follows the acceleration.
     """
+    if not len(est.time):
+        return False
     inside = (fused.time >= est.time[0]) & (fused.time <= est.time[-1])
     innovation, velocity = fused.innovation[inside], est[axis].velocity
     if np.isnan(velocity).any():  # smoothed estimates have none

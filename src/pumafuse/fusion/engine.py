@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import CodeArray, TimeArray
+from ..arrays import NO_STAMP, CodeArray, TimeArray
 from ..filter.axis import Model, Sensors, State
 from ..filter.events import COMMAND, Events, Results
 from ..filter.forward import ALL_THERE, NO_ESTIMATES, Filter, History, Output, filter_events, no_history
@@ -86,6 +86,44 @@ def filter_segment(
         for number, axis in enumerate(segment.axes)
     }
     return Filtered(estimates, events, results, _known_biases(segment, sensors, state))
+
+
+def filter_piece(
+    segment: Segment,
+    carried: tuple[Model, Sensors, State],
+    config: FusionConfig,
+    times: TimeArray,
+    own: tuple[int, int],
+) -> Filtered:
+    """Filter a piece of a segment as the whole of it would be.
+
+    Args:
+        segment: Its events and those around them.
+        carried: The filter's arrays (:func:`arranged`); the state is that of the pieces before, and after this one in
+            the end.
+        config: Arm, noise and sensors.
+        times: Of the estimates, int64 ns, ascending.
+        own: After which time, and until which, events are the piece's own [int ns].
+
+    Returns:
+        The estimates and what became of its own events; those without a stamp come first.
+    """
+    (model, sensors, state), (events, _) = carried, segment.events(config)
+    begin, end = np.searchsorted(events.time, own, side="right").tolist()
+    count, axes = len(events.time), len(segment.axes)
+    results = Results.room(count, axes)
+    results.outcome[:] = events.known
+    # Where no estimate is asked for the filter rounds otherwise: so one is, of which no use is made.
+    asked = times if len(times) else events.time[begin:end][-1:]
+    outputs = np.zeros((len(Output), axes, len(asked)))
+    arrays = Filter(model, sensors, events, state, results, no_history(axes, state.x.shape[1])).flat()
+    filter_events(arrays, False, begin, end, count, *ALL_THERE, 0, asked, outputs)
+    estimates = {
+        axis: AxisEstimate(segment.start[axis] + outputs[0, number, : len(times)], *outputs[1:, number, : len(times)])
+        for number, axis in enumerate(segment.axes)
+    }
+    mine = np.r_[: np.searchsorted(events.time, NO_STAMP, side="right"), begin:end]
+    return Filtered(estimates, events.rows(mine), results.rows(mine), _known_biases(segment, sensors, state))
 
 
 def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | None = None) -> Results:

@@ -159,6 +159,8 @@ class Estimates:
         notes: What was noticed, a sentence each.
         since: Where the part of the run that was used begins [s]; None: with the run.
         until: Where it ends [s], likewise.
+        rate: Of the even grid of estimates [Hz]; None: one for each command.
+        selected: The sensors that were asked for; None: all that are configured.
     """
 
     run: str
@@ -181,6 +183,8 @@ class Estimates:
     notes: tuple[str, ...]
     since: float | None = None
     until: float | None = None
+    rate: float | None = None
+    selected: tuple[str, ...] | None = None
 
     def __getitem__(self, axis: str) -> AxisEstimate:
         """The estimates of one axis.

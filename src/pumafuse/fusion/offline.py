@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import reduce
-from typing import Any, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,16 @@ from .score import ReferenceTrack, late_rows, reference_track
 from .segments import NO_STAMP_WORD, Segment, added, build, output_times
 
 S = TypeVar("S", bound=np.generic)
+UNCOVERED = "the reference covers no estimate: are both stamped by one clock?"
+
+
+class Part(NamedTuple):
+    """A segment of a run, or a piece of it, that went through the filter."""
+
+    logged: Run
+    segment: Segment
+    times: TimeArray
+    filtered: Filtered
 
 
 def fuse(
@@ -76,7 +86,7 @@ def fuse(
     chosen = None if sensors is None else config.sensor_names(sensors)
     in_place, placed = in_axes(run, config.frame)
     logged, jumps = segments(in_place)
-    parts, faults = list[tuple[Segment, TimeArray, Filtered]](), list[str]()
+    parts, faults = list[Part](), list[str]()
     for number, part in enumerate(logged):
         asked = [name for name in config.sensor_names(chosen) if name in part.sensors]
         faults += clock_faults(part, config.arm.update_period, asked)
@@ -84,19 +94,48 @@ def fuse(
         faults += sensor_faults(segment, config)
         times = output_times(segment, config, rate)
         share = None if progress is None else _share(progress, number, len(logged))
-        parts.append((segment, times, filter_segment(segment, config, times, mode, engine, share)))
-    cut, times, filtered = zip(*parts, strict=True)
+        parts.append(Part(part, segment, times, filter_segment(segment, config, times, mode, engine, share)))
+    est = estimates_of(run, in_place, placed, config, parts, mode, engine)
+    notes = [*faults, *found_by(est, parts)]
+    notes += [note for part in parts for note in starts_in_motion(part.segment, config)]
+    notes += latency_questions(config, parts[0].segment.sensors)
+    notes += [*jumps, *_uncovered(est), *config.arm.validity.excess(est.speed, est.radius)]
+    est = replace(est, notes=(*notes, *sensor_problems(est)), rate=rate, selected=chosen)
+    for note in est.notes:
+        warnings.warn(f"run '{run.name}': {note}", PumafuseWarning, stacklevel=2)
+    return est
+
+
+def estimates_of(
+    run: Run,
+    in_place: Run,
+    placed: Placed | None,
+    config: FusionConfig,
+    parts: Sequence[Part],
+    mode: Mode = "filtered",
+    engine: Engine = "compiled",
+) -> Estimates:
+    """What the segments of a run give together, without notes.
+
+    Args:
+        run: As logged.
+        in_place: In the arm's axes, without stray stamps.
+        placed: The frame, if there is one.
+        config: As used.
+        parts: The segments.
+        mode: What an estimate knows.
+        engine: Which one computed it.
+    """
+    _, cut, times, filtered = zip(*parts, strict=True)
     origin = cut[0].origin
-    references = [
-        source.rows(part.within(source.stamp, origin)) for part in logged if (source := part.reference) is not None
-    ]
+    references = _references(parts, origin)
     axes = {
         axis: AxisEstimate(
             *(_joined(getattr(part.axes[axis], field) for part in filtered) for field in AxisEstimate.FIELDS)
         )
         for axis in cut[0].axes
     }
-    est = Estimates(
+    return Estimates(
         run=run.name,
         time=seconds(_joined(times), origin),
         axes=axes,
@@ -125,15 +164,17 @@ def fuse(
         since=run.since,
         until=run.until,
     )
-    notes = [*faults, *(note for part in cut for note in part.notes)]
-    notes += [note for part in parts for note in _contradictions(part[0], config, part[2], origin)]
-    notes += [note for segment in cut for note in starts_in_motion(segment, config)]
-    notes += latency_questions(config, cut[0].sensors)
-    notes += [*jumps, *_reference_notes(est, references), *config.arm.validity.excess(est.speed, est.radius)]
-    est = replace(est, notes=(*notes, *sensor_problems(est)))
-    for note in est.notes:
-        warnings.warn(f"run '{run.name}': {note}", PumafuseWarning, stacklevel=2)
-    return est
+
+
+def found_by(est: Estimates, parts: Sequence[Part]) -> list[str]:
+    """A sentence on each thing that is wrong with rows, and on sensors that contradict each other."""
+    found = [note for part in parts for note in part.segment.notes]
+    found += [note for part in parts for note in _contradictions(part.segment, est.config, part.filtered, est.origin)]
+    references = _references(parts, est.origin)
+    late = sum(int(np.count_nonzero(late_rows(source.stamp))) for source in references)
+    if late:
+        found.append(f"{references[0].label}: {late} rows are stamped more than 1 s behind an earlier one: not used")
+    return found
 
 
 def _share(progress: Callable[[float], None], number: int, count: int) -> Callable[[float], None]:
@@ -146,18 +187,24 @@ def _joined(parts: Iterable[npt.NDArray[S]]) -> npt.NDArray[S]:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
-def _reference_notes(est: Estimates, sources: Sequence[Source]) -> list[str]:
-    """What is wrong with the reference: rows behind a jump of its clock, or no row at the time of any estimate."""
+def _references(parts: Sequence[Part], origin: int) -> list[Source]:
+    """The rows of the reference in the part of each segment that is used."""
+    return [
+        source.rows(part.logged.within(source.stamp, origin))
+        for part in parts
+        if (source := part.logged.reference) is not None
+    ]
+
+
+def _uncovered(est: Estimates) -> list[str]:
+    """A sentence if the reference has no row at the time of any estimate."""
     if est.reference is None:
         return []
-    found, late = list[str](), sum(int(np.count_nonzero(late_rows(source.stamp))) for source in sources)
-    if late:
-        found.append(f"{sources[0].label}: {late} rows are stamped more than 1 s behind an earlier one: not used")
     given = [np.isfinite(value) for axis, value in est.reference.position.items() if axis in est.axes]
     time = est.reference.time[np.any(given, axis=0)] if given else np.empty(0)
     if not len(time) or time.max() < est.time.min() or time.min() > est.time.max():
-        found.append("the reference covers no estimate: are both stamped by one clock?")
-    return found
+        return [UNCOVERED]
+    return []
 
 
 def _cartesian(placed: Placed | None, position: Mapping[str, FloatArray]) -> dict[str, FloatArray] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from ..logs.tables import Table
 from ..model.arm import ArmModel
 from ..units import AN, KINDS, SCREEN, SI, Kind, Screen, kind_of, of_kind, seconds
 from .config import FusionConfig
-from .estimates import AxisEstimate, Estimates
+from .estimates import AxisEstimate, Estimates, Mode
 from .score import ReferenceTrack, reference_track
 from .summary import ScoreSummary, Summary, decode, encode, score_axis, summarise
 
@@ -89,6 +90,74 @@ def check_writable(folder: Path, force: bool) -> None:
     folders.check_writable(folder, force, [SUMMARY], _FILES.__contains__)
 
 
+@dataclass(frozen=True)
+class Making:
+    """How results are made: all that makes them differ, but for the log.
+
+    Attributes:
+        config: Arm, noise and sensors.
+        sensors: Those that are asked for; None: all.
+        rate: Of the even grid of estimates [Hz]; None: one for each command.
+        mode: What an estimate knows.
+        engine: Which one computes it.
+        part: Where the part of the run to use begins and ends [s].
+        extras: Files that are made beside the usual ones.
+    """
+
+    config: FusionConfig
+    sensors: Sequence[str] | None
+    rate: float | None
+    mode: Mode
+    engine: str
+    part: tuple[float | None, float | None]
+    extras: Sequence[str]
+
+    def made(self, folder: Path) -> Summary | None:
+        """The summary of a result that is there and was made so; None where nothing is.
+
+        Raises:
+            FolderError: It was made otherwise, or something else is there.
+        """
+        if not folder.is_dir() or not any(folder.iterdir()):
+            return None
+        check_writable(folder, force=True)
+        summary = _summary(folder)
+        asked = None if self.sensors is None else list(self.config.sensor_names(self.sensors))
+        differs = {
+            f"pumafuse {summary.pumafuse}": summary.pumafuse != version("pumafuse"),
+            "another fusion.toml": (folder / "fusion.toml").read_text(encoding="utf-8") != self.config.to_toml(),
+            "another arm.toml": (folder / "arm.toml").read_text(encoding="utf-8") != self.config.arm.to_toml(),
+            "another mode": (summary.mode, summary.engine) != (self.mode, self.engine),
+            "another --rate": summary.rate_hz != self.rate,
+            "other --sensors": summary.sensors != asked,
+            "another --from or --to": (summary.from_s, summary.to_s) != self.part,
+            **{f"no {name}": not (folder / name).exists() for name in self.extras},
+        }
+        if how := next((how for how, holds in differs.items() if holds), None):
+            raise FolderError(
+                f"{folder}: an earlier result, with {how}; --resume keeps results that are made alike: choose another"
+                " folder, or use --force, which makes all anew"
+            )
+        return summary
+
+
+def check_fused(counts: Mapping[str, Mapping[str, int]], config: FusionConfig) -> None:
+    """Refuse a fusion of nothing.
+
+    Raises:
+        RunError: No row was fused; says what became of all, and which configured sensors the run lacks.
+    """
+    if any(mine.get(one.word) for mine in counts.values() for one in (Outcome.FUSED, Outcome.REACQUIRED)):
+        return
+    rows = [
+        f"'{name}' has {', '.join(f'{count} {word}' for word, count in mine.items()) or 'no rows'}"
+        for name, mine in counts.items()
+    ]
+    absent = [f"'{name}' of fusion.toml is not in the run" for name in config.sensors if name not in counts]
+    why = "; ".join([*rows, *absent]) or "neither the run nor fusion.toml has a sensor"
+    raise RunError(f"nothing was fused, nothing is written: {why}")
+
+
 def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], None] | None = None) -> Summary:
     """Write a result folder: complete, or not at all.
 
@@ -105,9 +174,9 @@ def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], No
     summary = summarise(est)
     with folders.replacing(folder) as new:
         tables.write(estimates_table(est), new / ESTIMATES)
-        tables.write(_measurements_table(est), new / MEASUREMENTS)
+        tables.write(measurements_table(est), new / MEASUREMENTS)
         if est.reference is not None:
-            tables.write(_reference_table(est.reference, est.config.arm), new / REFERENCE)
+            tables.write(reference_table(est.reference, est.config.arm), new / REFERENCE)
         est.config.save(new)
         (new / SUMMARY).write_bytes(encode(summary))
         if extras is not None:
@@ -121,11 +190,7 @@ def read(folder: Path) -> Result:
     Raises:
         PumafuseError: It is none, or one of its files is damaged.
     """
-    try:
-        summary = decode((folder / SUMMARY).read_bytes())
-    except (OSError, msgspec.MsgspecError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise FolderError(f"{folder}: no result folder of `pumafuse fuse` ({SUMMARY}: {why})") from None
+    summary = _summary(folder)
     config, table = FusionConfig.load(folder / "fusion.toml"), tables.read(folder / ESTIMATES)
     axes = {
         axis: AxisEstimate(*(_plain(table, axis, name, part.kind) for name in AxisEstimate.FIELDS))
@@ -136,6 +201,14 @@ def read(folder: Path) -> Result:
     path = folder / REFERENCE
     reference = _own_reference(tables.read(path), config.arm) if path.exists() else None
     return Result(summary, config, time, segment, axes, _cartesian(table), reference)
+
+
+def _summary(folder: Path) -> Summary:
+    try:
+        return decode((folder / SUMMARY).read_bytes())
+    except (OSError, msgspec.MsgspecError) as error:
+        why = error.strerror if isinstance(error, OSError) else error
+        raise FolderError(f"{folder}: no result folder of `pumafuse fuse` ({SUMMARY}: {why})") from None
 
 
 def _check_read(path: Path, time: FloatArray, segment: IntArray, axes: Mapping[str, AxisEstimate]) -> None:
@@ -193,7 +266,8 @@ def estimates_table(est: Estimates, *, files: bool = True) -> pa.Table:
     return pa.table({"time_s": _column_of(est.time), **columns, **in_log, **_segment_column(est.segment)})
 
 
-def _measurements_table(est: Estimates) -> pa.Table:
+def measurements_table(est: Estimates) -> pa.Table:
+    """Every component of every measurement as a table, in the units of files."""
     r, positions = est.measurements, dict[str, pa.Array]()
     kinds = est.config.arm.kind_of
     known: dict[Kind, None] = {kinds[axis]: None for axis in r.axes}
@@ -215,7 +289,8 @@ def _measurements_table(est: Estimates) -> pa.Table:
     )
 
 
-def _reference_table(reference: ReferenceTrack, arm: ArmModel) -> pa.Table:
+def reference_table(reference: ReferenceTrack, arm: ArmModel) -> pa.Table:
+    """The reference as a table, in the units of files."""
     columns = {"time_s": _column_of(reference.time)}
     for axis, position in reference.position.items():
         kind = arm.axes[axis].kind if axis in arm.axes else "length"  # x, y and z

@@ -34,6 +34,17 @@ class ReferenceTrack:
     segment: IntArray
     cartesian: Mapping[str, FloatArray] | None = None
 
+    def between(self, after: float, until: float) -> ReferenceTrack:
+        """The rows after one instant and until another [s]."""
+        mine = (self.time > after) & (self.time <= until)
+        return ReferenceTrack(
+            self.time[mine],
+            {axis: position[mine] for axis, position in self.position.items()},
+            {axis: sd[mine] for axis, sd in self.sd.items()},
+            self.segment[mine],
+            None if self.cartesian is None else {name: x[mine] for name, x in self.cartesian.items()},
+        )
+
     def __repr__(self) -> str:
         return f"ReferenceTrack({len(self.time):,} of {', '.join(self.position)})"
 

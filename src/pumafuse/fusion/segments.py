@@ -41,6 +41,7 @@ _REASONS = {
     Outcome.TOO_LATE: "a stamp more than 1 s behind an earlier one",
 }
 _Policy: TypeAlias = tuple[Model, Sensors, State]  # what decides on values before the filter does
+WHOLE = ALWAYS, NEVER
 
 
 @dataclass(frozen=True)
@@ -183,13 +184,22 @@ class Segment:
         return rows._replace(time=_valid(rows.stamp, latency[rows.source]))
 
 
-def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) -> Segment:
+def build(
+    run: Run,
+    config: FusionConfig,
+    sensors: Iterable[str] | None = None,
+    begun: Segment | None = None,
+    own: tuple[int, int] = WHOLE,
+) -> Segment:
     """Put a segment of a recorded run into a table of events.
 
     Args:
-        run: One segment of a recorded run.
+        run: One segment of a recorded run, or a piece of it.
         config: Arm and sensors.
         sensors: Which of the configured sensors to use; all for None.
+        begun: Of a piece, the segment of the first one, which has the origin and the start levels of all.
+        own: Of a piece, after which time, and until which, rows are counted [int ns]: the others are those of the
+            pieces before and after, with which its own are compared.
 
     Raises:
         PumafuseError: The run commands an axis that the arm has not, a chosen sensor is not configured, or the part of
@@ -220,32 +230,36 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     used = (*(name for name in chosen if name in run.sensors), *strangers)
     policy = _policy(config, run.axes, used)
     rows = _command_rows(run, policy, notes)
-    command_counts = _command_counts(run.command, rows)
+    unstamped = len(run.command.stamp) - len(rows.stamp)
+    command_counts = _command_counts(rows.rows(_owned(rows.stamp, own)), unstamped)
     rows = _on_ticks(run, config, rows, notes)
-    origin = int(rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)][0])
+    used_rows = _on_any_axis(rows.known, Outcome.FUSED)
+    origin = begun.origin if begun else int(rows.stamp[used_rows][0])
     ends = run.ends(origin)
     within = rows.stamp <= ends[1]
-    outside = int(np.count_nonzero(_on_any_axis(rows.known, Outcome.FUSED) & ~within))
+    outside = int(np.count_nonzero((used_rows & ~within)[_owned(rows.stamp, own)]))
     command_counts = _counted(command_counts | {"used": command_counts["used"] - outside, OUTSIDE: outside})
     rows = rows.rows(np.flatnonzero(within))
     notes += _unmatched([name for name in chosen if name not in run.sensors], strangers)
     commands = rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)]
     commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
-    if late := [axis for axis, known in zip(run.axes, rows.known.T, strict=True) if Outcome.FUSED not in known]:
+    late = [axis for axis, known in zip(run.axes, rows.known.T, strict=True) if Outcome.FUSED not in known]
+    if late and not begun:
         raise RunError(f"{label}: no command for axis '{late[0]}' {run.interval} after the first command")
     given = {axis: (rows.known[:, number] == Outcome.FUSED).argmax() for number, axis in enumerate(run.axes)}
     first = {axis: float(rows.value[row, number]) for number, (axis, row) in enumerate(given.items())}
-    parts = [_measurement_rows(run, config, number, used, policy, origin, notes) for number in range(len(used))]
+    parts = [_measurement_rows(run, config, number, used, policy, origin, own, notes) for number in range(len(used))]
     measured = joined([Events.empty(len(run.axes)), *(part for part, _ in parts)])
-    counts = {name: {NOT_SELECTED: len(source.stamp)} for name, source in run.sensors.items()}
+    stamps = {name: source.stamp[_owned(source.stamp, own)] for name, source in run.sensors.items()}
+    counts = {name: {NOT_SELECTED: len(stamp)} for name, stamp in stamps.items()}
     counts |= {name: found for name, (_, found) in zip(used, parts, strict=True)}
-    if run.interval and not (measured.known == Outcome.FUSED).any():
+    if run.interval and own == WHOLE and not (measured.known == Outcome.FUSED).any():
         raise RunError(f"run '{run.name}': no measurement to use is stamped {run.interval} after the first command")
     return Segment(
         axes=run.axes,
         sensors=used,
         origin=origin,
-        start={**first, **run.start},
+        start=begun.start if begun else {**first, **run.start},
         commands=commands,
         command_rows=rows,
         measurement_rows=measured,
@@ -257,28 +271,38 @@ def build(run: Run, config: FusionConfig, sensors: Iterable[str] | None = None) 
     )
 
 
-def output_times(segment: Segment, config: FusionConfig, rate: float | None) -> TimeArray:
+def output_times(segment: Segment, config: FusionConfig, rate: float | None, own: tuple[int, int] = WHOLE) -> TimeArray:
     """When estimates are asked for: at each command, or on an even grid of ``rate`` [Hz] from the first command on.
 
+    Args:
+        segment: The segment, or a piece of it.
+        config: Arm and sensors.
+        rate: Of the grid [Hz]; None: at each command.
+        own: Of a piece, after which time, and until which [int ns].
+
     Raises:
-        RunError: There are too many, or none in the part of the run to use.
+        RunError: There are too many, or, but for a piece, none in the part of the run to use.
     """
-    since, until = segment.ends
+    since, until = max(segment.ends[0], own[0] + 1), min(segment.ends[1], own[1])
     if rate is None:
-        times = segment.commands[segment.commands >= since]
+        times = segment.commands[(segment.commands >= since) & (segment.commands <= until)]
     else:
-        times = _grid(segment.origin, max(since, segment.origin), min(until, segment.end(config)), rate)
-    if not len(times):
-        what = "no command" if rate is None else f"no tick of {rate:g} Hz"
-        raise RunError(
-            f"there is {what} in the part of the run to use, so no estimate: a longer one, or another --rate"
-        )
+        last = min(until, segment.end(config)) if own[1] >= segment.ends[1] else until
+        times = _grid(segment.origin, max(since, segment.origin), last, rate)
+    if not len(times) and own == WHOLE:
+        raise no_estimates(rate)
     return times
+
+
+def no_estimates(rate: float | None) -> RunError:
+    """The error for a part of a run in which no estimate is asked for."""
+    what = "no command" if rate is None else f"no tick of {rate:g} Hz"
+    return RunError(f"there is {what} in the part of the run to use, so no estimate: a longer one, or another --rate")
 
 
 def _grid(origin: int, first: int, last: int, rate: float) -> TimeArray:
     """Ticks 0, 1/rate, … [1/Hz] after ``origin`` that lie from ``first`` to ``last``, int64 ns, (n,)."""
-    span = last - first
+    span = max(last - first, 0)
     begin, count = int((first - origin) / 1e9 * rate), int(span / 1e9 * rate) + 2
     if count > _MOST_ESTIMATES:
         raise RunError(
@@ -345,8 +369,8 @@ def _command_rows(run: Run, policy: _Policy, notes: list[str]) -> Events:
     return rows
 
 
-def _command_counts(source: Source, rows: Events) -> dict[str, int]:
-    """How many rows of the commands are what, all of them; of a stamp the last one counts."""
+def _command_counts(rows: Events, unstamped: int) -> dict[str, int]:
+    """How many rows of the commands are what, those without a stamp too; of a stamp the last one counts."""
     best = _best(rows.known)
     again, hidden = best == Outcome.DUPLICATE, np.diff(rows.stamp, append=NEVER) == 0
     return {
@@ -354,7 +378,7 @@ def _command_counts(source: Source, rows: Events) -> dict[str, int]:
         Outcome.DUPLICATE.word: int(np.count_nonzero(again & hidden)),
         REPETITION: int(np.count_nonzero(again & ~hidden)),
         Outcome.INVALID.word: int(np.count_nonzero(best == Outcome.INVALID)),
-        NO_STAMP_WORD: len(source.stamp) - len(rows.stamp),
+        NO_STAMP_WORD: unstamped,
     }
 
 
@@ -385,19 +409,28 @@ def _on_ticks(run: Run, config: FusionConfig, rows: Events, notes: list[str]) ->
 
 
 def _measurement_rows(
-    run: Run, config: FusionConfig, number: int, names: Sequence[str], policy: _Policy, origin: int, notes: list[str]
+    run: Run,
+    config: FusionConfig,
+    number: int,
+    names: Sequence[str],
+    policy: _Policy,
+    origin: int,
+    own: tuple[int, int],
+    notes: list[str],
 ) -> tuple[Events, dict[str, int]]:
-    """The rows of one of the sensors ``names`` by stamp, each value classified, and how many are what."""
+    """The rows of one of the sensors ``names`` by stamp, each value classified, and how many of its own are what."""
     name = names[number]
     source, sensor = run.sensors[name], config.sensors.get(name)
     label, used = source.label_for(name), run.within(source.stamp, origin)
     lag, missing = np.where(used, behind(source.stamp), 0), used & (source.stamp == NO_STAMP)
     order = np.argsort(source.stamp, kind="stable")
-    rows = _table(source, run.axes, order, number, 0 if sensor is None else round(sensor.latency * 1e9))
+    latency = 0 if sensor is None else round(sensor.latency * 1e9)
+    rows = _table(source, run.axes, order, number, latency)
     rows = _classified(rows, policy, origin, lag[order] > TOLERATED_STEP_BACK_NS)
     rows.known[~used[order]] = ABSENT
     kept = rows.rows(np.flatnonzero(used[order]))
-    counts = _measurement_counts(kept, source)
+    mine = source.stamp[_owned(_valid(source.stamp, latency), own)]
+    counts = _measurement_counts(kept.rows(_owned(kept.time, own)), mine)
     note_rows(notes, label, lag > 0, "a stamp that steps back: sorted")
     if sensor is None:
         note_rows(notes, label, used, "no sensor of this name in the configuration: unknown")
@@ -417,12 +450,12 @@ def _measurement_rows(
     return kept, counts
 
 
-def _measurement_counts(kept: Events, source: Source) -> dict[str, int]:
-    """How many rows of a sensor are what, all of them, of which ``kept`` are in the part to use."""
-    unstamped = int(np.count_nonzero(source.stamp == NO_STAMP))
+def _measurement_counts(kept: Events, stamp: TimeArray) -> dict[str, int]:
+    """How many rows of a sensor are what, those of every ``stamp``, of which ``kept`` are in the part to use."""
+    unstamped = int(np.count_nonzero(stamp == NO_STAMP))
     best = _best(kept.known)[kept.stamp != NO_STAMP]
     of_outcomes = {outcome.word: int(np.count_nonzero(best == outcome)) for outcome in Outcome}
-    return _counted({**of_outcomes, NO_STAMP_WORD: unstamped, OUTSIDE: len(source.stamp) - unstamped - len(best)})
+    return _counted({**of_outcomes, NO_STAMP_WORD: unstamped, OUTSIDE: len(stamp) - unstamped - len(best)})
 
 
 def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int | np.int64, latency: int = 0) -> Events:
@@ -454,6 +487,13 @@ def _best(known: CodeArray) -> CodeArray:
 def _on_any_axis(known: CodeArray, kind: Outcome) -> BoolArray:
     """Rows of which a value is of a kind, (n,); ``any(axis=1)`` takes twenty times as long for few axes."""
     return reduce(np.logical_or, (known == int(kind)).T)
+
+
+def _owned(time: TimeArray, own: tuple[int, int]) -> IntArray | slice:
+    """Which rows of a piece are its own: those without a stamp too, which no other piece has."""
+    if own == WHOLE:
+        return slice(None)
+    return np.flatnonzero((time > own[0]) & (time <= own[1]) | (time == NO_STAMP))
 
 
 def _valid(stamp: TimeArray, latency: IntArray | int) -> TimeArray:

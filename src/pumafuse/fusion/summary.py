@@ -133,6 +133,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
         origin_ns: Stamp of the first command: time 0 of every table.
         from_s: Where the part of the run that was used begins, since the first command; null: with the run.
         to_s: Where it ends, likewise.
+        rate_hz: Of the even grid of estimates; null: one for each command.
+        sensors: Those that were asked for; null: all that are configured.
         duration_s: From the first to the last estimate.
         estimates: How many.
         segments: 1, and one more for each time the log's clock was set back.
@@ -152,6 +154,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     origin_ns: int
     from_s: float | None = None
     to_s: float | None = None
+    rate_hz: float | None = None
+    sensors: list[str] | None = None
     duration_s: float
     estimates: int
     segments: int
@@ -193,6 +197,11 @@ class _InUnits(msgspec.Struct):
 
 def summarise(est: Estimates) -> Summary:
     """Counts, consistency and scores of a fusion."""
+    return summary_of(est, {axis: axis_summary(est, axis) for axis in est.axes})
+
+
+def summary_of(est: Estimates, axes: dict[str, AxisSummary]) -> Summary:
+    """The summary of a fusion from those of its axes."""
     limits = est.config.arm.validity
     return Summary(
         pumafuse=version("pumafuse"),
@@ -203,12 +212,14 @@ def summarise(est: Estimates) -> Summary:
         origin_ns=est.origin,
         from_s=est.since,
         to_s=est.until,
+        rate_hz=est.rate,
+        sensors=None if est.selected is None else list(est.selected),
         duration_s=float(np.ptp(est.time)),
         estimates=len(est.time),
         segments=int(est.segment[-1]) + 1,
         commands=dict(est.command_counts),
         rows={name: dict(counts) for name, counts in est.counts.items()},
-        axes={axis: _axis_summary(est, axis) for axis in est.axes},
+        axes=axes,
         validity=ValiditySummary(
             max_speed=limits.max_speed,
             commanded_speed=est.speed.get("length"),
@@ -250,7 +261,8 @@ def score_axis(
     )
 
 
-def _axis_summary(est: Estimates, axis: str) -> AxisSummary:
+def axis_summary(est: Estimates, axis: str) -> AxisSummary:
+    """Consistency and scores of one axis."""
     mine = est.measurements.where(est.measurements.axis == est.measurements.axes.index(axis))
     fused = int(np.sum(mine.outcome == Outcome.FUSED))
     found = None

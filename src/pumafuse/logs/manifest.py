@@ -104,6 +104,20 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     reference: ReferenceEntry | None = None
     frame: Frame | None = None
 
+    @property
+    def entries(self) -> dict[str, SourceEntry]:
+        """Its sources by what messages call them."""
+        named = {f"sensor {name}": entry for name, entry in self.sensors.items()}
+        return {"command": self.command, **named, **({"reference": self.reference} if self.reference else {})}
+
+    @property
+    def fields(self) -> dict[tuple[str, ...], list[str]]:
+        """The columns and field paths of all its sources, by where their rows are."""
+        found: dict[tuple[str, ...], list[str]] = {}
+        for entry in self.entries.values():
+            found.setdefault(entry.rows, []).extend(entry.fields)
+        return found
+
 
 def load(path: Path) -> Manifest:
     """Read ``run.toml``.

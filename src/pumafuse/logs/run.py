@@ -7,7 +7,6 @@ they are. Each measurement gets its outcome when the run is fused.
 from __future__ import annotations
 
 import os
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,6 +29,10 @@ Clock = Literal["stamps", "regular"]
 
 _LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
 _FEW_ROWS = 10  # too few to judge a clock by
+
+
+class NoCommandError(RunError):
+    """A run does not command one of its axes."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -144,7 +147,7 @@ class Run:
                     raise RunError(f"{where}: the reference's sd must be finite and not negative")
         for axis, command in self.command.values.items():
             if not (np.isfinite(command) & (self.command.stamp != NO_STAMP)).any():
-                raise RunError(f"{self.command.label}: no command for axis '{axis}' has both a stamp and a value")
+                raise NoCommandError(f"{self.command.label}: no command for axis '{axis}' has both a stamp and a value")
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -206,7 +209,7 @@ class Run:
         path = Path(path)
         if os.path.isdir(path):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
             path = path / "run.toml"
-        return _read_manifest(path) if path.suffix == ".toml" else _read_single(path)
+        return _read_manifest(path) if path.suffix == ".toml" else of_table(tables.read(path, growing=True))
 
     @staticmethod
     def from_arrays(
@@ -342,22 +345,38 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
 
 def _read_manifest(path: Path) -> Run:
     listed = manifest.load(path)
+    fields = listed.fields
+
+    def read(entry: manifest.SourceEntry) -> tables.Table:
+        file, chosen = path.parent / entry.file, {"topic": entry.topic, "entity": entry.entity}
+        return tables.read(file, growing=True, fields=fields[entry.rows], where=entry.where, **chosen)
+
+    run = of_tables(listed, path.parent, read)
+    return replace(run, recording=_recording(path.parent, listed.entries.values()))
+
+
+def of_tables(
+    listed: manifest.Manifest, folder: Path, read_table: Callable[[manifest.SourceEntry], tables.Table]
+) -> Run:
+    """A run from its tables.
+
+    Args:
+        listed: What ``run.toml`` says.
+        folder: Where that is.
+        read_table: Gives the table of a source; it is asked once for sources of one table.
+
+    Raises:
+        RunError: A column is absent or of another type, a clock stands still, or there is no command.
+    """
     scored, notes, units = listed.reference, list[str](), dict(listed.command.kinds)
-    entries = {"command": listed.command, **{f"sensor {name}": entry for name, entry in listed.sensors.items()}}
-    if scored is not None:
-        entries["reference"] = scored
-    fields, read = defaultdict[tuple[str, ...], list[str]](list), dict[tuple[str, ...], tables.Table]()
-    for entry in entries.values():
-        fields[entry.rows] += entry.fields
+    entries, read = listed.entries, dict[tuple[str, ...], tables.Table]()
     naive, zoned = list[str](), list[str]()
 
     def source(name: str) -> Source:
         entry = entries[name]
         if entry.rows not in read:
-            file, chosen = path.parent / entry.file, {"topic": entry.topic, "entity": entry.entity}
-            table = tables.read(file, growing=True, fields=fields[entry.rows], where=entry.where, **chosen)
-            notes.extend(note for note in table.notes if note not in notes)
-            read[entry.rows] = table
+            read[entry.rows] = read_table(entry)
+            notes.extend(note for note in read[entry.rows].notes if note not in notes)
         known = read[entry.rows].zoned(entry.time.column)
         if known is not None:
             (zoned if known else naive).append(name)
@@ -378,9 +397,8 @@ def _read_manifest(path: Path) -> Run:
         reference = replace(reference, sd=sds if len(set(sds.values())) > 1 else next(iter(sds.values())))
     if naive and zoned:
         notes.append(f"{naive[0]}: dates without a time zone, beside {zoned[0]} with one: taken as UTC")
-    name, start, clock = listed.name or path.parent.resolve().name, listed.command.start, listed.command.clock
-    run = Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
-    return replace(run, recording=_recording(path.parent, entries.values()))
+    name, start, clock = listed.name or folder.resolve().name, listed.command.start, listed.command.clock
+    return Run(name, command, sensors, reference, start, clock, listed.frame, units, tuple(notes))
 
 
 def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recording | None:
@@ -394,13 +412,26 @@ def _recording(folder: Path, entries: Iterable[manifest.SourceEntry]) -> Recordi
     return recording_of(folder / found.file, found.entity, time.column, time.ending or ending(time.column) or "")
 
 
-def _read_single(path: Path) -> Run:
-    """One table: ``time_s``, ``command.<axis>_mm``, ``<sensor>.<axis>_mm``, ``reference.<axis>_mm``."""
-    table = tables.read(path, growing=True)
-    listed = ", ".join(table.columns)
+def clock_of(table: tables.Table) -> str:
+    """The column of stamps of a table that is a run.
+
+    Raises:
+        RunError: There is none, or more than one.
+    """
     clocks = [name for name in table.columns if name.startswith("time_")]
     if len(clocks) != 1:
-        raise RunError(f"{path}: a single table needs one time column, 'time_s'; it has: {listed}")
+        listed = ", ".join(table.columns)
+        raise RunError(f"{table.path}: a single table needs one time column, 'time_s'; it has: {listed}")
+    return clocks[0]
+
+
+def of_table(table: tables.Table) -> Run:
+    """A run from one table: ``time_s``, ``command.<axis>_mm``, ``<sensor>.<axis>_mm``, ``reference.<axis>_mm``.
+
+    Raises:
+        RunError: It is none.
+    """
+    path, clock, listed = table.path, clock_of(table), ", ".join(table.columns)
     groups: dict[str, dict[str, list[manifest.Column]]] = {}
     for column in table.columns:
         source, dot, rest = column.partition(".")
@@ -413,9 +444,9 @@ def _read_single(path: Path) -> Run:
         raise RunError(f"{path}: no column 'command.<axis>_mm'; it has: {listed}")
     notes, sources, units = list(table.notes), dict[str, Source](), dict[str, Kind]()
     for name, axes in groups.items():
-        source = _source(table, manifest.Time(clocks[0]), axes, name, notes, units)
+        source = _source(table, manifest.Time(clock), axes, name, notes, units)
         sources[name] = source.rows(source.has_value)
-    if left := [column for column in table.columns if "." not in column and column != clocks[0]]:
+    if left := [column for column in table.columns if "." not in column and column != clock]:
         notes.append(f"{path.name}: columns not of the form <source>.<axis>_mm are not used: {', '.join(left)}")
     command, reference = sources.pop("command"), sources.pop("reference", None)
     return Run(path.name.split(".")[0], command, sources, reference, kinds=units, notes=tuple(notes))

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -27,6 +28,7 @@ _COMPRESSED = {".gz", ".bz2", ".lz4", ".zst", ".br"}  # a torn one cannot be rea
 _RECORDINGS = {".mcap", ".bag", ".db3", ".rrd"}
 _BATCH = 1 << 16  # rows of Parquet that are in memory before rows are chosen
 _READ_AHEAD = 1 << 20  # bytes of a column of Parquet
+_COMPRESSION = "zstd"
 _SOME = 8  # values in an error
 _HEAD = 4096  # bytes of rows that show how decimals are written
 _DECIMAL_COMMA = re.compile(rb"(?:^|[;\t\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[;\t\r\n]|$)")
@@ -65,24 +67,36 @@ def read(
             f"{path}: a table has no {key}; leave the key out: 'topic' is for MCAP and bags (.mcap, .bag, .db3 or"
             " their folder), 'entity' for .rrd; rows are chosen by 'where'"
         )
-    try:
+    with _one_line(path):
         if path.suffix == ".parquet":
             (table, names), notes = _parquet(path, fields, where), list[str]()
         else:
             whole, notes = _parsed(path, _text(path), growing)
             table, names = _only(path, whole, where), whole.column_names
-    except UnicodeDecodeError:
-        raise RunError(f"{path}: not a table that can be read: its text is not UTF-8") from None
-    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        reason = str(error).splitlines()[0].removeprefix("CSV parse error: ")
-        raise RunError(f"{path}: not a table that can be read: {reason}") from None
-    except FileNotFoundError:
-        raise RunError(f"{path}: no such file") from None
-    except OSError as error:
-        raise RunError(f"{path}: cannot be read: {error.strerror or str(error).splitlines()[0]}") from None
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
     return Table(path, _named(path, table), table.num_rows, tuple(notes), tuple(names))
+
+
+def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
+    """A Parquet table, some rows at a time; see :func:`read`.
+
+    Raises:
+        RunError: The file cannot be read.
+    """
+    with _one_line(path), _opened(path) as file:
+        names = tuple(file.schema.column(place).path for place in range(len(file.schema)))
+        wanted = _wanted(path, file, fields, {})
+        for part in _parts(file, wanted, None) if file.metadata.num_rows else [file.schema_arrow.empty_table()]:
+            yield Table(path, _named(path, part), part.num_rows, (), names)
+
+
+def row_count(path: Path) -> int:
+    """How many rows a Parquet table has; 0 for what is none that can be read."""
+    try:
+        return papq.read_metadata(str(path)).num_rows if path.suffix == ".parquet" else 0
+    except (OSError, pa.ArrowInvalid):
+        return 0
 
 
 def is_recording(path: Path) -> bool:
@@ -95,7 +109,38 @@ def write(table: pa.Table, path: Path) -> None:
     if path.suffix == ".csv":
         pacsv.write_csv(table, path, pacsv.WriteOptions(quoting_style="needed"))
     else:
-        papq.write_table(table, path, compression="zstd")
+        papq.write_table(table, path, compression=_COMPRESSION)
+
+
+@contextmanager
+def appending(path: Path) -> Generator[Callable[[pa.Table], None]]:
+    """What writes tables of one schema into a Parquet file, one after the other; without any there is no file."""
+    with ExitStack() as stack:
+        writers: list[papq.ParquetWriter] = []
+
+        def append(table: pa.Table) -> None:
+            if not writers:
+                writer = papq.ParquetWriter(str(path), table.schema, compression=_COMPRESSION)
+                writers.append(stack.enter_context(writer))
+            writers[0].write_table(table)
+
+        yield append
+
+
+@contextmanager
+def _one_line(path: Path) -> Generator[None]:
+    """Turn what pyarrow raises while it reads a table into an error of one line."""
+    try:
+        yield
+    except UnicodeDecodeError:
+        raise RunError(f"{path}: not a table that can be read: its text is not UTF-8") from None
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        reason = str(error).splitlines()[0].removeprefix("CSV parse error: ")
+        raise RunError(f"{path}: not a table that can be read: {reason}") from None
+    except FileNotFoundError:
+        raise RunError(f"{path}: no such file") from None
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror or str(error).splitlines()[0]}") from None
 
 
 def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None, where: Where) -> Table:
@@ -178,17 +223,10 @@ def _dialect(text: bytes) -> tuple[str, str]:
 
 
 def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
-    """The columns asked for and the rows, some at a time; and the names of all that the file has.
-
-    Without threads: one that outlives the interpreter aborts it (apache/arrow issue 34314). So pyarrow's data sets,
-    which filter by themselves, are no way.
-    """
-    with papq.ParquetFile(str(path), pre_buffer=False, buffer_size=_READ_AHEAD) as file:
-        empty = file.schema_arrow.empty_table()
-        columns, conditions = _named(path, empty), _conditions(path, empty, where)
-        for field in fields or ():
-            find(columns, field, str(path))  # what is absent is reported now, while all names are known
-        wanted = None if fields is None else prefixes([*fields, *where])
+    """The columns asked for and the rows, some at a time; and the names of all that the file has."""
+    with _opened(path) as file:
+        empty, wanted = file.schema_arrow.empty_table(), _wanted(path, file, fields, where)
+        conditions = _conditions(path, empty, where)
         groups = [
             place for place in range(file.num_row_groups) if _may_hold(file.metadata.row_group(place), conditions)
         ]
@@ -197,6 +235,27 @@ def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa
             raise _no_row(path, _parts(file, prefixes(list(where)), None), where)
         names = [file.schema.column(place).path for place in range(len(file.schema))]
         return pa.concat_tables(kept) if kept else empty, names
+
+
+def _opened(path: Path) -> papq.ParquetFile:
+    """A Parquet file, to be read without threads.
+
+    One that outlives the interpreter aborts it (apache/arrow issue 34314). So pyarrow's data sets, which filter by
+    themselves, are no way.
+    """
+    return papq.ParquetFile(str(path), pre_buffer=False, buffer_size=_READ_AHEAD)
+
+
+def _wanted(path: Path, file: papq.ParquetFile, fields: Sequence[str] | None, where: Where) -> list[str] | None:
+    """Which columns have to be read; None: all.
+
+    Raises:
+        RunError: A field is absent: that is reported now, while all names are known.
+    """
+    columns = _named(path, file.schema_arrow.empty_table())
+    for field in fields or ():
+        find(columns, field, str(path))
+    return None if fields is None else prefixes([*fields, *where])
 
 
 def _parts(file: papq.ParquetFile, columns: list[str] | None, groups: list[int] | None) -> Iterator[pa.Table]:

@@ -1,0 +1,1 @@
+"""Runs that are too long for memory: read, fused and written piece by piece."""

@@ -1,0 +1,183 @@
+"""Fusion of a long run piece by piece: one filter whose state goes on from piece to piece.
+
+Each piece is a table of events of its own (:func:`pumafuse.fusion.segments.build`) with some rows of the pieces before
+and after it, so that every row has the neighbours that it has in the whole run: estimates and outcomes are the same to
+the last bit. What the neighbourhood of a row says in words (notes, skill) is said piece by piece.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from .. import folders
+from ..arrays import ALWAYS, NEVER
+from ..errors import PumafuseWarning, RunError
+from ..filter.axis import Model, Sensors, State
+from ..fusion import results
+from ..fusion.config import FusionConfig
+from ..fusion.consistency import sensor_problems
+from ..fusion.engine import arranged, filter_piece
+from ..fusion.estimates import Estimates
+from ..fusion.faults import latency_questions, sensor_faults, starts_in_motion
+from ..fusion.offline import Part, estimates_of, found_by
+from ..fusion.segments import Segment, build, no_estimates, output_times
+from ..fusion.summary import Summary, encode
+from ..logs import tables
+from ..logs.axes import in_axes
+from ..logs.clock import TOLERATED_STEP_BACK_NS, behind, clock_faults
+from ..logs.run import Run
+from .merging import Digest, digest, merged
+from .reading import Log
+
+PIECE = 1_000_000  # rows that are read at a time
+_SETTLED = 10.0  # lags after which a motion is over
+
+
+class _Begun(NamedTuple):
+    """What the pieces of a run share: its first segment, and the filter with its state."""
+
+    segment: Segment
+    carried: tuple[Model, Sensors, State]
+
+
+def fuse_to(
+    path: Path,
+    folder: Path,
+    config: FusionConfig,
+    *,
+    sensors: Iterable[str] | None = None,
+    rate: float | None = None,
+    part: tuple[float | None, float | None] = (None, None),
+    force: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Summary:
+    """Fuse a long run, filtered, into a result folder that is written as it goes: complete, or not at all.
+
+    Args:
+        path: The run, see :func:`pumafuse.pieces.reading.rows_of`.
+        folder: The result folder.
+        config: Arm, noise and sensors.
+        sensors: Which of the configured sensors to use; all of them for None.
+        rate: Estimates on an even grid [Hz]; one for each command for None.
+        part: Where the part to use begins and ends [s after the first command].
+        force: Whether an earlier result is replaced.
+        progress: Called after each piece with the share done, 0 to 1.
+
+    Warns:
+        PumafuseWarning: For each anomaly, once.
+
+    Raises:
+        PumafuseError: The run cannot be fused, or the folder cannot be written.
+    """
+    results.check_writable(folder, force)
+    with folders.replacing(folder) as new:
+        digests = list[Digest]()
+        with ExitStack() as files:
+            names = results.ESTIMATES, results.MEASUREMENTS, results.REFERENCE
+            write = [files.enter_context(tables.appending(new / name)) for name in names]
+            for est, own, done in _pieces(Log(path), config, sensors, rate, part):
+                write[0](results.estimates_table(est))
+                write[1](results.measurements_table(est))
+                if est.reference is not None:
+                    write[2](results.reference_table(est.reference.between(*own), config.arm))
+                digests.append(digest(est))
+                if progress is not None:
+                    progress(done)
+        summary = merged(digests)
+        results.check_fused(summary.rows, config)
+        if not summary.estimates:
+            raise no_estimates(rate)
+        config.save(new)
+        (new / results.SUMMARY).write_bytes(encode(summary))
+    for note in summary.notes:
+        warnings.warn(f"run '{summary.run}': {note}", PumafuseWarning, stacklevel=2)
+    return summary
+
+
+def _pieces(
+    log: Log,
+    config: FusionConfig,
+    sensors: Iterable[str] | None,
+    rate: float | None,
+    part: tuple[float | None, float | None],
+) -> Iterator[tuple[Estimates, tuple[float, float], float]]:
+    """The estimates of each piece, its first and last instant [s], and which share of the run is done by then."""
+    chosen = None if sensors is None else config.sensor_names(sensors)
+    ahead, overlap = _margins(config)
+    begun, after, until = None, ALWAYS, ALWAYS
+    while until < NEVER:
+        cut = log.read_on(PIECE)
+        run = log.run()
+        if run is None or cut - ahead <= after:
+            continue
+        run = run.between(*part)
+        begun = begun or _begin(run, config, chosen)
+        over = cut - ahead > run.ends(begun.segment.origin)[1] + overlap
+        until = NEVER if cut == NEVER or over else cut - ahead
+        est = _piece(run, config, chosen, rate, begun, (after, until))
+        span = [(instant - est.origin) / 1e9 for instant in (after, until)]
+        yield est, (span[0], span[1]), 1.0 if until == NEVER else log.done / log.rows
+        given = [est.segments[0].given(axis)[0] for axis in est.axes]
+        log.drop(until - overlap, np.concatenate([stamp[stamp <= until][-1:] for stamp in given]))
+        after = until
+
+
+def _margins(config: FusionConfig) -> tuple[int, int]:
+    """How far a piece must be read ahead, and how far it goes back into the one before [int ns]."""
+    latency = max((abs(sensor.latency) for sensor in config.sensors.values()), default=0.0)
+    lag = max(config.arm.lag_of(axis) for axis in config.arm.axes)
+    ahead = round((latency + 2.0 * config.arm.update_period) * 1e9)
+    return ahead, ahead + TOLERATED_STEP_BACK_NS + round(_SETTLED * lag * 1e9)
+
+
+def _begin(run: Run, config: FusionConfig, chosen: Sequence[str] | None) -> _Begun:
+    """The filter at rest before the first command, by the first rows of a run."""
+    run = in_axes(run.between(), config.frame)[0]
+    segment = build(run, config, chosen)
+    biases = [
+        [
+            name
+            for name in segment.sensors
+            if name in config.sensors and config.sensors[name].is_biased(axis) and axis in run.sensors[name].values
+        ]
+        for axis in segment.axes
+    ]
+    return _Begun(segment, arranged(segment, config, biases))
+
+
+def _piece(
+    run: Run,
+    config: FusionConfig,
+    chosen: tuple[str, ...] | None,
+    rate: float | None,
+    begun: _Begun,
+    own: tuple[int, int],
+) -> Estimates:
+    """The estimates of the rows after and until the instants ``own`` [int ns], with notes."""
+    in_place, placed = in_axes(run, config.frame)
+    lag, label = behind(in_place.command.stamp) / 1e9, run.command.label
+    if lag.max() * 1e9 > TOLERATED_STEP_BACK_NS:
+        raise RunError(
+            f"{label}: the clock is set back by {lag.max():.3f} s; so long a run is fused piece by piece, in the order"
+            " of time: cut the log there"
+        )
+    segment = build(in_place, config, chosen, begun.segment, own)
+    times = output_times(segment, config, rate, own)
+    filtered = filter_piece(segment, begun.carried, config, times, own)
+    first = own[0] == ALWAYS
+    if not first:  # for those who ask where the commands lead: the arm rests at what was commanded before
+        segment = replace(segment, start={axis: float(segment.given(axis)[1][0]) for axis in segment.axes})
+    part = Part(in_place, segment, times, filtered)
+    est = estimates_of(run, in_place, placed, config, [part])
+    notes = [*clock_faults(in_place, config.arm.update_period, []), *sensor_faults(segment, config)]
+    notes += found_by(est, [part])
+    if first:
+        notes += [*starts_in_motion(segment, config), *latency_questions(config, segment.sensors)]
+    return replace(est, notes=(*notes, *sensor_problems(est)), rate=rate, selected=chosen)

@@ -1,0 +1,239 @@
+"""A long run read piece by piece: some rows of each of its Parquet tables at a time, in the order of time.
+
+A piece is a :class:`pumafuse.Run` of the rows at hand, made by the code that reads a whole run. Rows stay at hand as
+long as later ones have to be compared with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from ..arrays import ALWAYS, NEVER, NO_STAMP, BoolArray, TimeArray
+from ..errors import RunError, counted
+from ..fusion.config import FusionConfig
+from ..logs import manifest, tables
+from ..logs.clock import stray_offsets
+from ..logs.frames import CARTESIAN, Cylindrical
+from ..logs.run import NoCommandError, Run, clock_of, of_table, of_tables
+from ..logs.tables import Table
+
+WAIT_NS = 10_000_000_000  # for rows that come late; one that comes later yet is left out
+_MOST_LATE = 100  # rows of a table that are left out; more are no strays
+_UNSETTLED = 2  # rows at the end of what is read, which may prove stray
+
+
+class Log:
+    """A run whose tables are read some rows at a time.
+
+    Attributes:
+        rows: How many rows all of its tables have.
+        done: How many of them are read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open a folder with ``run.toml``, ``run.toml`` itself, or one table; see :func:`rows_of`."""
+        self._listed = None if path.suffix == ".parquet" else manifest.load(_manifest(path))
+        self._folder = path if path.is_dir() else path.parent
+        self.done, self._cut = 0, ALWAYS
+        if self._listed is None:
+            self._tables: dict[tuple[str, ...], _Rows] = {(): _Rows(path)}
+        else:
+            fields, command = self._listed.fields, self._listed.command
+            entries = {entry.rows: entry for entry in self._listed.entries.values()}
+            self._tables = {
+                rows: _Rows(self._folder / entry.file, entry, fields[rows], command if command.rows == rows else None)
+                for rows, entry in entries.items()
+            }
+        self.rows = sum(tables.row_count(one.path) for one in self._tables.values())
+
+    @property
+    def ended(self) -> bool:
+        """Whether everything is read."""
+        return all(one.ended for one in self._tables.values())
+
+    def read_on(self, rows: int) -> int:
+        """Read about as many more ``rows``, from whichever table is behind the others.
+
+        Returns:
+            Before which instant all rows are there, int ns, but for those that come more than 10 s too late; ``NEVER``
+            when everything is read.
+
+        Raises:
+            RunError: A table cannot be read, or is not in the order of time.
+        """
+        until = self.done + rows
+        while not self.ended and self.done < until:
+            behind = min((one for one in self._tables.values() if not one.ended), key=lambda one: one.frontier)
+            self.done += behind.read_on(self._cut)
+        frontier = min(one.frontier for one in self._tables.values())
+        self._cut = NEVER if frontier == NEVER else max(self._cut, frontier - WAIT_NS)
+        return self._cut
+
+    def run(self) -> Run | None:
+        """The run of the rows at hand; None as long as these do not command every axis.
+
+        Raises:
+            RunError: They are no recorded run.
+        """
+        try:
+            if self._listed is None:
+                return of_table(self._tables[()].table())
+            return of_tables(self._listed, self._folder, lambda entry: self._tables[entry.rows].table())
+        except NoCommandError:
+            if self.ended:
+                raise
+            return None
+
+    def drop(self, before: int, but: TimeArray) -> None:
+        """Let go of rows stamped ``before`` an instant [int ns], ``but`` some stamps, and of those without a stamp."""
+        for one in self._tables.values():
+            one.drop(before, but)
+
+
+def rows_of(path: Path) -> int:
+    """How many rows a run has that can be read piece by piece; 0 for one that cannot.
+
+    It can if all its tables are Parquet, each with one column of stamps, and no rows are chosen by ``where``.
+
+    Raises:
+        ConfigError: ``run.toml`` is wrong.
+    """
+    if path.suffix == ".parquet":
+        return tables.row_count(path)
+    if not (listed := _manifest(path)).is_file() or listed.suffix != ".toml":
+        return 0
+    entries = list(manifest.load(listed).entries.values())
+    clocks = {(entry.rows, repr(entry.time)) for entry in entries}
+    files = {entry.rows: listed.parent / entry.file for entry in entries}
+    if len(clocks) > len(files) or any(entry.where or entry.topic or entry.entity for entry in entries):
+        return 0
+    counts = [tables.row_count(file) for file in files.values()]
+    return sum(counts) if all(counts) else 0
+
+
+def needs_whole(path: Path, config: FusionConfig) -> str | None:
+    """What a run has that needs all of it in memory; None without anything.
+
+    A grid of ticks is fitted to all commands, and whole turns about a base are counted from the first row on.
+    """
+    listed = None if path.suffix == ".parquet" else manifest.load(_manifest(path))
+    if listed is not None and listed.command.clock == "regular":
+        return "clock = 'regular'"
+    frame = config.frame if listed is None or listed.frame is None else listed.frame
+    named = {axis for entry in listed.entries.values() for axis in entry.axes} if listed else set(CARTESIAN)
+    return "a cylindrical [frame]" if isinstance(frame, Cylindrical) and not named.isdisjoint(CARTESIAN) else None
+
+
+def _manifest(path: Path) -> Path:
+    return path / "run.toml" if path.is_dir() else path
+
+
+class _Rows:
+    """The rows of one table that are at hand."""
+
+    def __init__(
+        self,
+        path: Path,
+        entry: manifest.SourceEntry | None = None,
+        fields: Sequence[str] | None = None,
+        command: manifest.CommandEntry | None = None,
+    ) -> None:
+        """Open a table: of a source, of which ``fields`` are read and in which may be the commands, or a whole run."""
+        self.path, self.ended, self.frontier = path, False, ALWAYS
+        parts = tables.in_parts(path, fields)
+        self._first = next(parts)
+        self._parts = chain([self._first], parts)
+        self._time = manifest.Time(clock_of(self._first)) if entry is None else entry.time
+        if entry is None:
+            self._commands = [manifest.Column(name) for name in self._first.columns if name.startswith("command.")]
+        else:
+            self._commands = list(chain.from_iterable(command.axes.values() if command else []))
+        self._held, self._stamp = list[pa.Table](), np.empty(0, dtype=np.int64)
+        self._late, self._left_out, self._read = 0, 0, 0
+
+    def read_on(self, cut: int) -> int:
+        """Read on; rows stamped before the ``cut`` [int ns] come too late. Returns how many were read."""
+        part = next(self._parts, None)
+        if part is None:
+            self.ended, self.frontier = True, NEVER
+            return 0
+        stamp, _ = part.stamps(self._time.column, self._time.nanoseconds, self._time.ending)
+        self._held.append(pa.table(dict(part.columns)))
+        self._stamp = np.concatenate([self._stamp, stamp])
+        self._read += part.rows
+        stray = stray_offsets(self._stamp)
+        late = (self._stamp < cut) & (self._stamp != NO_STAMP)
+        late[: len(late) - part.rows] = False
+        if late.any():
+            self._leave_out(late, stray < 0)
+            stray = stray[~late]
+        settled = self._stamp[(stray == 0) & (self._stamp != NO_STAMP)][:-_UNSETTLED]
+        self.frontier = max(self.frontier, int(settled.max(initial=ALWAYS)))
+        return part.rows
+
+    def _leave_out(self, late: BoolArray, stray: BoolArray) -> None:
+        """Leave out rows that come too late, if each is a stray one, and they are few.
+
+        Raises:
+            RunError: They are not.
+        """
+        self._left_out += int(np.count_nonzero(late))
+        rows = np.flatnonzero(late & ~stray if self._left_out <= _MOST_LATE else late)
+        if len(rows):
+            row = self._read - len(late) + int(rows[0]) + 1
+            lag = (self._stamp[: rows[0]].max() - self._stamp[rows[0]]) / 1e9
+            raise RunError(
+                f"{self.path}: row {row} is stamped {lag:.3f} s behind an earlier one, and so are others; so long a run"
+                " is fused piece by piece, in the order of time: sort the table by its stamps, or cut it where its"
+                " clock was set back"
+            )
+        self._late += int(np.count_nonzero(late))
+        self._choose(~late)
+
+    def table(self) -> Table:
+        """The rows at hand."""
+        notes = list[str]()
+        if self._late:
+            rows = counted(self._late, "row")
+            notes = [f"{self.path.name}: {rows} left out, stamped more than 10 s behind an earlier one"]
+        return self._table(self._at_hand(), notes)
+
+    def drop(self, before: int, but: TimeArray) -> None:
+        """See :meth:`Log.drop`.
+
+        Stray rows have had their turn, too: those that are ahead, and commands also behind, are none of any time.
+        """
+        stray = stray_offsets(self._stamp)
+        gone = (stray > 0) | (self._stamp == NO_STAMP) | self._is_command(stray < 0)
+        self._choose(~gone & ((self._stamp >= before) | np.isin(self._stamp, but)))
+        self._late = 0
+
+    def _is_command(self, among: BoolArray) -> BoolArray:
+        """Which of some rows give a command, (rows,)."""
+        found = np.zeros(len(among), dtype=np.bool_)
+        if among.any():
+            some = self._table(self._at_hand().filter(_bits(among)))
+            for column in self._commands:
+                found[among] |= np.isfinite(some.numbers(column.column, column.ending)[0])
+        return found
+
+    def _at_hand(self) -> pa.Table:
+        return pa.concat_tables(self._held) if self._held else pa.table(dict(self._first.columns)).slice(0, 0)
+
+    def _table(self, rows: pa.Table, notes: Sequence[str] = ()) -> Table:
+        columns = dict(zip(rows.column_names, rows.columns, strict=True))
+        return Table(self.path, columns, rows.num_rows, tuple(notes), self._first.names)
+
+    def _choose(self, rows: BoolArray) -> None:
+        self._held = [self._at_hand().filter(_bits(rows))]
+        self._stamp = self._stamp[rows]
+
+
+def _bits(chosen: BoolArray) -> pa.Array:
+    """A mask for Arrow; ``pa.array`` would import pandas."""
+    return pa.Array.from_buffers(pa.bool_(), len(chosen), [None, pa.py_buffer(np.packbits(chosen, bitorder="little"))])
