@@ -356,7 +356,7 @@ def main() -> None:
     warnings.showwarning = _one_line
     warnings.simplefilter("always", PumafuseWarning)
     # What is imported stays: looking through it time and again, and once more at the end, is a quarter of `fuse`.
-    gc.set_threshold(10_000)
+    gc.set_threshold(10_000, 1_000)
     atexit.register(gc.freeze)
     try:
         app()
