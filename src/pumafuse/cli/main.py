@@ -3,6 +3,7 @@
 import atexit
 import gc
 import os
+import signal
 import sys
 import warnings
 from pathlib import Path
@@ -358,6 +359,10 @@ def main() -> None:
     # What is imported stays: looking through it time and again, and once more at the end, is a quarter of `fuse`.
     gc.set_threshold(10_000, 1_000)
     atexit.register(gc.freeze)
+    for stop in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, stop, None)  # Windows has no SIGHUP; nohup ignores it
+        if number is not None and signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, _end)
     try:
         app()
     except PumafuseError as error:
@@ -366,9 +371,16 @@ def main() -> None:
     except MemoryError:
         typer.echo("pumafuse: not enough memory: use a part of the log, or fewer columns", err=True)
         sys.exit(1)
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output has gone, and Python would report it once more at exit
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):  # whoever read our output has what it wanted
+            typer.echo(f"pumafuse: {error.filename or 'standard output'}: {error.strerror}", err=True)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what its buffer holds would fail once more at exit
         sys.exit(1)
+
+
+def _end(number: int, _frame: object) -> None:
+    """End by a signal as after an error, so that nothing half written is left."""
+    sys.exit(128 + number)
 
 
 def _one_line(message: Warning | str, category: type[Warning], *_: object) -> None:
