@@ -12,9 +12,7 @@ shows both as one. Its entities are below ``pumafuse/``, on the recording's time
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -25,7 +23,6 @@ import rerun.blueprint as rrb
 
 from ..arrays import FloatArray
 from ..filter.outcome import Outcome
-from ..folders import FolderError
 from ..fusion.estimates import Estimates
 from ..logs.axes import in_axes
 from ..logs.entities import Recording
@@ -48,7 +45,6 @@ _BY_GRAVITY = (
     Outcome.UNKNOWN,
     Outcome.REJECTED,
 )
-_FOOTER, _MAGIC = 32, b"RRF2FOOT"  # bytes that a whole recording ends with, and what is in them
 _PATH_POINTS = 20_000  # a 3D path needs no more, whatever the rate of the estimates
 
 
@@ -59,37 +55,15 @@ def to_rerun(est: Estimates, run: Run, sink: str | Path | rr.RecordingStream) ->
         est: The estimates.
         run: The run that they were made from.
         sink: A file to write (``.rrd``), or a stream of rerun-sdk.
-
-    Raises:
-        FolderError: The disk refuses; no file is left.
     """
     if isinstance(sink, rr.RecordingStream):
         _send_named(est, run, sink)
     elif run.recording is None:
-        with _written(sink, rr.RecordingStream("pumafuse"), _blueprint(est)) as stream:
+        with rr.RecordingStream("pumafuse") as stream:
+            stream.save(str(sink), default_blueprint=_blueprint(est))
             _send_named(est, run, stream)
     else:
         _save_layer(est, run, run.recording, sink)
-
-
-@contextmanager
-def _written(
-    path: str | Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint | None = None
-) -> Generator[rr.RecordingStream]:
-    """The stream, into a file that is whole on leaving the block, or absent."""
-    try:
-        with stream:
-            stream.save(str(path), default_blueprint=blueprint)
-            yield stream
-            stream.disconnect()
-        with Path(path).open("rb") as file:
-            file.seek(-_FOOTER, os.SEEK_END)
-            if _MAGIC not in file.read():  # of a full disk rerun-sdk says nothing, or a RuntimeError
-                raise OSError
-    except (OSError, RuntimeError) as error:
-        Path(path).unlink(missing_ok=True)
-        why = getattr(error, "strerror", None) or "the disk is full, or refuses"
-        raise FolderError(f"{Path(path).name}: cannot be written: {why}") from None
 
 
 @dataclass(frozen=True)
@@ -135,8 +109,8 @@ def _save_layer(est: Estimates, run: Run, under: Recording, path: str | Path) ->
             case _:
                 return [rr.TimeColumn(under.timeline, sequence=np.rint(stamp / under.unit).astype(np.int64))]
 
-    layer = rr.RecordingStream(under.application, recording_id=under.id, send_properties=False)
-    with _written(path, layer) as stream:
+    with rr.RecordingStream(under.application, recording_id=under.id, send_properties=False) as stream:
+        stream.save(str(path))
         _send(est, run, _Sink(stream, times if under.timeline else styles.timeline, "pumafuse/", 1.0))
 
 
