@@ -142,9 +142,9 @@ def _fuse(
 
     def extras(new: Path) -> None:
         if rrd:
-            from ..views.rerun import to_rerun
+            from ..views.rerun import recording_of
 
-            to_rerun(est, recorded, new / "fused.rrd")
+            (new / "fused.rrd").write_bytes(recording_of(est, recorded))
         if figures:
             from ..views.figures import error_figure, fused_figure, path_figure, validation_figure
 
