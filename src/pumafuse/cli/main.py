@@ -311,7 +311,7 @@ def live(
     source: Annotated[str, Argument(metavar="SOURCE", help="Where events come from, see above.")],
     config: Config,
     rate: Rate = None,
-    window: Annotated[float, Option(metavar="S", help="How late an event may come.")] = 2.0,
+    window: Annotated[float, Option(metavar="S", help="How late an event may come; at least 1 s.")] = 2.0,
     stale_after: Annotated[float, Option(metavar="S", help="Without a measurement so long an axis is stale.")] = 1.0,
     out: Annotated[str | None, Option(metavar="udp://HOST:PORT", help="Where estimates go; default: stdout.")] = None,
     record: Annotated[Path | None, Option(metavar="DIR", help="Record the stream as a run, into a new folder.")] = None,

@@ -85,7 +85,7 @@ class LiveEstimator:
 
         Args:
             config: Arm, noise, sensors, and the frame for sources in x, y, z.
-            window: How late an event may be [s].
+            window: How late an event may be [s]; less than 1 s counts as 1 s.
             stale_after: For how long [s] an axis may go without a fused measurement until it is called stale.
             start: Level [m] of axes that do not rest at their first command before it; x and y with a frame.
             on_notice: Called with a sentence that a user should know: a clock set anew, and the like. Of what happens
