@@ -96,6 +96,17 @@ class Clock:
         """Stamps after it are in doubt [ns]."""
         return self.sure + self.window
 
+    def ends_doubt(self, stamp: int, source: str | None) -> bool:
+        """Whether a stamp that is taken shows that a jump ahead was right."""
+        if self._sure is None or self.newest is None:
+            return False
+        if not self.newest - self.window <= stamp <= self.newest + LONGEST_TAIL_NS:
+            return False
+        return self._agrees(stamp, source, self._commands + (source is None))
+
+    def _agrees(self, stamp: int, source: str | None, commands: int) -> bool:
+        return commands >= 2 or (source == self.ahead_of and stamp - self._jumped >= LEAST_NS)
+
     def start(self, stamp: int) -> None:
         """Set the clock to ``stamp`` [ns], whatever was before."""
         self.other = []
@@ -136,8 +147,7 @@ class Clock:
             self.low, self.high = 1, 0
         self._commands += command
         self.newest = max(self.newest, stamp)
-        agreed = self._commands >= 2 or (source == self.ahead_of and stamp - self._jumped >= LEAST_NS)
-        if agreed or self._sure is None:
+        if self._sure is None or self._agrees(stamp, source, self._commands):
             self.settle(self.newest)
         return Verdict.ACCEPTED
 

@@ -204,16 +204,24 @@ class LiveEstimator:
         """The first command's stamp (of this segment), int ns; None before it."""
         return self._window.origin
 
-    def until(self, t: Time) -> int | None:
+    def estimate_as_live(self, stamp: int) -> LiveEstimate:
+        """The estimate for an instant [ns] in the window by nothing that is stamped later, as if that had not come."""
+        with self._window.hidden(stamp):
+            return self.estimate(stamp)
+
+    def until(self, t: Time, sensor: str | None = None) -> int | None:
         """Up to which instant [ns] a clock may go on before an event stamped ``t`` comes in; None before the first one.
 
-        To the event's own time if its stamp is plainly right, else no farther than it is.
+        To the event's own time if its stamp is plainly right, or shows that a jump ahead was; else no farther than it
+        is.
         """
         try:
             stamp = nanoseconds(t)
         except ValueError:
             return self.sure
-        return stamp if self._clock.low <= stamp <= self._clock.high else self.sure
+        known = sensor is None or sensor in self._sensors
+        right = self._clock.low <= stamp <= self._clock.high or (known and self._clock.ends_doubt(stamp, sensor))
+        return stamp if right else self.sure
 
     def health(self) -> Health:
         """How each sensor does, and what became of everything so far."""
