@@ -1,7 +1,6 @@
 """The real executable on real files: `demo`, `fuse`, `compare`, `discretize`, and refusals of every command."""
 
 import json
-import resource
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -191,18 +190,6 @@ def test_discretize_prints_the_model_it_names() -> None:
         assert all(np.array_equal(axis[letter], getattr(model, letter)) for letter in "FBHQ")
         assert axis["delay_ms"] == 60.45
         assert axis["step_response_mm"][-1] == pytest.approx(1.0, abs=2e-3)
-
-
-def test_a_recording_that_the_disk_refuses_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
-    """The tables have room, the recording has not: no folder without it, and none with a part of it."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, before[1]))
-    try:
-        line = refused("fuse", SCAN, "-c", FUSION, "-o", tmp_path / "out", "--rrd")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert line == f"pumafuse: {tmp_path / 'out'}: cannot be written: File too large"
-    assert names(tmp_path) == set()
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -262,7 +262,10 @@ def verify(
     json: Json = False,
     force: Force = False,
 ) -> None:
-    """Check a model on runs that it was not made from, beside the best that a linear model could do there."""
+    """Check a model on runs that it was not made from, beside the best that a linear model could do there.
+
+    Exit code 3: done, but the model does not hold: it explains less than half of a motion.
+    """
     from . import verify as command
 
     levels = dict(_level(text) for text in start or ())

@@ -160,7 +160,7 @@ class Recorder:
             self._reported, self._troubled = now, True
         elif not trouble and self._troubled:
             self._notify(f"record: is written again; {self._state()}")
-            self._troubled = False
+            self._reported, self._troubled = -math.inf, False
 
     def _state(self) -> str:
         written = self._writer.rows

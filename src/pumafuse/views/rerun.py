@@ -163,13 +163,14 @@ def _measured(est: Estimates) -> list[str]:
 def _sensor(sink: _Sink, est: Estimates, sensor: str, axis: str, colour: str) -> None:
     measured, screen = est.measured_positions(sensor, axis), est.config.arm.screen_of(axis)
     fused = (measured.outcome == Outcome.FUSED) | (measured.outcome == Outcome.REACQUIRED)
+    name = styles.entity(sensor)
     points, crosses = styles.points(colour, sensor), styles.points(colours.REJECTED, "rejected", "Cross")
     position = np.interp(measured.time, est.time, est[axis].position, left=np.nan, right=np.nan)
     for path, value in ((axis, measured.value), (f"residual/{axis}", measured.value - position)):
-        _series(sink, f"{path}/{sensor}", points, measured.time[fused], value[fused], screen)
-        _series(sink, f"{path}/{sensor}/rejected", crosses, measured.time[~fused], value[~fused], screen)
+        _series(sink, f"{path}/{name}", points, measured.time[fused], value[fused], screen)
+        _series(sink, f"{path}/{name}/rejected", crosses, measured.time[~fused], value[~fused], screen)
     normalised = measured.innovation / measured.innovation_sd
-    _series(sink, f"innovation/{axis}/{sensor}", points, measured.time, normalised)
+    _series(sink, f"innovation/{axis}/{name}", points, measured.time, normalised)
 
 
 def _outcomes(sink: _Sink, est: Estimates, sensor: str) -> None:
