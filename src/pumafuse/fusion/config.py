@@ -20,7 +20,7 @@ from ..logs.frames import Frame
 from ..model.arm import ArmModel, arm_of
 from ..model.presets import PRESETS
 from ..toml import NotNegative, Positive, Time
-from ..units import AN, KINDS, Kind, of_kind, refuse_unit
+from ..units import AN, KINDS, Kind, of_kind, refuse_name
 
 PerAxis = (
     NotNegative | Annotated[dict[str, NotNegative], msgspec.Meta(min_length=1)]
@@ -166,7 +166,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         for path, part, kind in self._parts():
             _check(path, part, kind)
         for name, sensor in self.sensors.items():
-            refuse_unit("sensor", name)
+            refuse_name("sensor", name)
             if not math.isfinite(sensor.scale + sensor.latency + sensor.gate + sensor.latency_sd):
                 raise ConfigError(f"sensors.{name}: scale, latency, gate and sds must be finite")
             for key, value in zip(_PER_AXIS, (sensor.sd, sensor.bias_sd, sensor.bias_drift_sd), strict=True):
