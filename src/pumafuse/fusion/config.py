@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, cast
 import msgspec
 
 from .. import toml
-from ..errors import ConfigError, UnknownNameError
+from ..errors import ConfigError, UnknownNameError, shortened
 from ..logs.frames import Frame
 from ..model.arm import ArmModel, arm_of
 from ..model.presets import PRESETS
@@ -291,7 +291,8 @@ def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
     if name in PRESETS and not there:
         return ArmModel.load(name)
     if not there:
-        raise ConfigError(f"{path}: arm = '{name}': no such file beside it, and not a preset ({', '.join(PRESETS)})")
+        known = ", ".join(PRESETS)
+        raise ConfigError(f"{path}: arm = '{shortened(name)}': no such file beside it, and not a preset ({known})")
     return ArmModel.load(beside)
 
 

@@ -17,7 +17,7 @@ from ..units import TIMES, mistaken
 from .run import Run, Source, note_rows
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
-_OTHER_PERIOD = 1.5  # times the update period from which an interval of commands is another one
+_OTHER_PERIOD, _OTHER_BEAT = 2.0, 1.25  # times the update period from which an interval is another one; a steady one
 _NEW_CLOCK = 3  # so many rows in a row with another time: the clock was set anew; fewer are stray
 _MOST_JUMPS = 100
 _FEW, _MANY = 30, 10_000  # stamps, below which nothing is said about their unit, and from which it is clear
@@ -224,13 +224,14 @@ def _other_period(label: str, stamp: TimeArray, period: float) -> list[str]:
     if len(intervals) < _FEW:
         return []
     early, usual, late = np.quantile(intervals, [0.25, 0.5, 0.75]) / 1e9
-    units = mistaken(usual / period, TIMES)
-    if units and late - early <= _EVEN * usual:
+    units, even = mistaken(usual / period, TIMES), late - early <= _EVEN * usual
+    if units and even:
         raise RunError(
             f"{label}: commands come every {usual:.4g} s, {usual / period:.4g} times the arm's update_period_ms ="
-            f" {period * 1e3:g}: {_taken(units)}"
+            f" {period * 1e3:g}: {_taken(units)}, or update_period_ms in arm.toml"
         )
-    if 1.0 / _OTHER_PERIOD < usual / period < _OTHER_PERIOD:
+    far = _OTHER_BEAT if even else _OTHER_PERIOD
+    if 1.0 / far < usual / period < far:
         return []
     lost = "are most of them lost, or is it another one?" if usual > period else "is it another one?"
     return [
