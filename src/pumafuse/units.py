@@ -80,7 +80,6 @@ _AS_ANGLE = {  # endings that carry the kind of an axis
     "_s_m": "_s_rad",
 }
 _AS_LENGTH = {angle: length for length, angle in _AS_ANGLE.items() if length != "_m_s"}
-_REACH = 1e20  # numbers from its inverse to it: squares of products of four are still floats
 _PRECISE = Context(prec=50)
 _RADIANS = Decimal("0.017453292519943295769236907684886127134428718885417254560971914402")  # in a degree
 PROVENANCE = "provenance"  # a table of this name is kept as it is
@@ -126,7 +125,7 @@ def to_si(tree: Mapping[str, Any]) -> dict[str, Any]:
     A unit holds for lists and for the entries of a sub-table: ``sd_mm = { x = 0.05 }``. Provenance is kept as is.
 
     Raises:
-        ConfigError: A number outside an interval (``_ci95``) is not finite, or no quantity of a robot has its size.
+        ConfigError: A number outside an interval (``_ci95``) is not finite.
     """
     return _converted(tree, "", "", _si)
 
@@ -220,12 +219,9 @@ def _converted(value: Any, unit: str | None, path: str, convert: Callable[[Any, 
 
 def _si(value: float | Decimal, unit: str, path: str) -> float:
     number = si(value, unit) if unit else float(value)
-    if path.endswith(INTERVAL) or number == 0.0 or 1.0 / _REACH < abs(number) < _REACH:
-        return number
-    what = (
-        f"out of reach: {1.0 / _REACH:g} to {_REACH:g} in SI units" if math.isfinite(number) else "not a finite number"
-    )
-    raise ConfigError(f"{path}: {str(value)[:24]} is {what}")
+    if not math.isfinite(number) and not path.endswith(INTERVAL):
+        raise ConfigError(f"{path}: {str(value)[:24]} is not a finite number")
+    return number
 
 
 def _in_unit(value: float, unit: str, _: str) -> float | Decimal:
