@@ -2,7 +2,8 @@
 
 Every fenced block is either done or, after a comment ``<!-- not executed: reason -->``, left out:
 
-- ``bash`` is run by ``bash -e``; with *until Ctrl-C* in its title it runs beside the rest of the page;
+- ``bash`` is run by ``bash -e`` and ends with 0, or with what its title says: *exit code 3*; with *until Ctrl-C* in
+  its title it runs beside the rest of the page;
 - ``python`` is run in one namespace for the page, or written to the file that its first line names: ``# name.py``;
 - ``toml`` is written to the file that its first line names;
 - ``text`` is what the block before it printed, lines in a row: ``…`` is anything in a line or, alone, any lines;
@@ -34,6 +35,7 @@ import pumafuse as pf
 ROOT = Path(__file__).parent.parent
 LONGEST = 300.0  # s that any block may take
 _FILE = re.compile(r"# ([\w./-]+\.(?:toml|py))\n")
+_CODE = re.compile(r"exit code (\d+)")
 _LEFT_OUT = re.compile(r"<!-- not executed: (.+) -->")
 _COLOUR = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -56,6 +58,11 @@ class Block:
     @property
     def stays(self) -> bool:
         return "until Ctrl-C" in self.title
+
+    @property
+    def code(self) -> int:
+        said = _CODE.search(self.title)
+        return int(said[1]) if said else 0
 
     @property
     def file(self) -> str | None:
@@ -137,7 +144,7 @@ class Reader:
                     check=False,
                 )
                 self.printed_text = _plain(done.stdout)
-                assert done.returncode == 0, f"{where}: exit code {done.returncode}\n{self.printed_text}"
+                assert done.returncode == block.code, f"{where}: exit code {done.returncode}\n{self.printed_text}"
                 assert "Traceback" not in self.printed_text, f"{where}\n{self.printed_text}"
             case _:
                 raise AssertionError(f"{where}: unknown language '{block.language}'")

@@ -30,10 +30,13 @@ else:
     import os
     import subprocess
     import sys
+    from contextlib import suppress
     from pathlib import Path
+    from typing import Any
 
     import numba
     from numba.core import event
+    from numba.core.caching import FunctionCache
 
     # Kernels own no arrays, so nothing in them is counted (`_nrt`), and calls within the algebra vanish
     # (`forceinline`): together that is a factor of twenty. What is called less often is compiled apart, once: a copy in
@@ -51,12 +54,41 @@ else:
             return False
         return True
 
+    class _Kept(FunctionCache):
+        """What is kept of a kernel on disk. Where that is damaged, or the disk refuses, it is compiled anew."""
+
+        def load_overload(self, sig: Any, target_context: Any) -> Any:
+            """The compiled kernel, or None."""
+            try:
+                return super().load_overload(sig, target_context)
+            except Exception as error:  # whatever a damaged pickle raises
+                self._say("damaged", error)
+                with suppress(OSError):
+                    self.flush()
+            return None
+
+        def save_overload(self, sig: Any, data: Any) -> None:
+            """Keep a kernel, where the disk takes it."""
+            try:
+                super().save_overload(sig, data)
+            except Exception as error:
+                self._say("not kept", error)
+
+        def _say(self, what: str, error: Exception) -> None:
+            print(f"{self.cache_path}: a compiled kernel is {what} ({error})", file=sys.stderr, flush=True)
+
+    def kernel(function):
+        """A kernel whose compiled form is kept on disk, where there is a place."""
+        dispatcher = numba.njit(**_OPTIONS)(function)
+        if _KEPT:
+            dispatcher._cache = _Kept(function)
+        return dispatcher
+
     _KEPT = _kept()
     _OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
     compiled = numba.njit(forceinline=True, no_cpython_wrapper=True, **_OPTIONS)
     compiled_apart = numba.njit(no_cpython_wrapper=True, **_OPTIONS)
     inlined = numba.njit(inline="always", no_cpython_wrapper=True, **_OPTIONS)
-    kernel = numba.njit(cache=_KEPT, **_OPTIONS)
     _HOW_OFTEN = (
         "once (some 15 s)"
         if _KEPT

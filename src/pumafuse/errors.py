@@ -8,14 +8,14 @@ from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-_LONGEST_NAME = 120
+_LONGEST_NAME, _LONGEST = 120, 2000  # characters
 
 
 class PumafuseError(Exception):
     """Base of every error a user can cause; its text is one line fit for a screen."""
 
     def __init__(self, text: str) -> None:
-        super().__init__(" ".join(text.splitlines()))  # a name in a file may hold a line break
+        super().__init__(printable(text, _LONGEST))
 
 
 class ConfigError(PumafuseError):
@@ -41,7 +41,18 @@ class UnknownNameError(PumafuseError):
 
 
 class PumafuseWarning(UserWarning):
-    """A fault of the data or the model that does not stop the work."""
+    """A fault of the data or the model that does not stop the work; one line fit for a screen."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(printable(text, _LONGEST))
+
+
+def printable(text: str, longest: int = 80) -> str:
+    """A text that may have words of a log in it for a screen: one line, no control characters, not too long."""
+    line = " ".join(text.splitlines())
+    if not line.isprintable():
+        line = "".join(letter if letter.isprintable() else "?" for letter in line)
+    return line if len(line) <= longest else f"{line[: longest - 1]}…"
 
 
 def suggestion(name: str, accepted: Iterable[str]) -> str:

@@ -29,7 +29,9 @@ def check_writable(folder: Path, force: bool, markers: Iterable[str], ours: Call
     Raises:
         FolderError: It exists and is not to be replaced, holds something else than our output, or cannot be written.
     """
-    if not folder.exists():
+    with _refused(folder):
+        exists = folder.exists()
+    if not exists:
         above = next(parent for parent in folder.absolute().parents if parent.exists())
         if not above.is_dir() or not os.access(above, os.W_OK):
             raise FolderError(f"{folder}: cannot be written: {above} is no folder that may be written to")
@@ -51,13 +53,18 @@ def replacing(folder: Path) -> Generator[Path]:
     """A new folder to write into, which replaces ``folder`` on leaving the block.
 
     Raises:
-        FolderError: The disk refuses.
+        FolderError: The disk refuses, or another process has written the folder meanwhile.
     """
-    folder = folder.resolve()  # a link stays a link, its target is replaced
+    with _refused(folder):
+        folder = folder.resolve()  # a link stays a link, its target is replaced
     with _beside(folder) as place:
-        new, old = place / "new", place / "old"
+        new, old, before = place / "new", place / "old", _identity(folder)
         new.mkdir()
         yield new
+        if _identity(folder) != before:
+            raise FolderError(
+                f"{folder}: another process has written it meanwhile, and that stays; choose another folder"
+            )
         if folder.exists():
             folder.replace(old)
         try:
@@ -68,13 +75,19 @@ def replacing(folder: Path) -> Generator[Path]:
             raise
 
 
+def _identity(folder: Path) -> int | None:
+    """Which folder is at this path now; None if none is."""
+    return folder.stat().st_ino if folder.exists() else None
+
+
 def write_file(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all, in the place of an earlier one.
 
     Raises:
         FolderError: The disk refuses.
     """
-    path = path.resolve()
+    with _refused(path):
+        path = path.resolve()
     with _beside(path) as place:
         new = place / "new"
         new.write_bytes(content.encode() if isinstance(content, str) else content)
@@ -84,8 +97,13 @@ def write_file(path: Path, content: str | bytes) -> None:
 def sweep(folders: Iterable[Path]) -> None:
     """Remove the temporary folders that killed workers of this process left beside the folders they were writing."""
     for folder in folders:
-        for left in folder.parent.glob(f".{glob.escape(folder.name)}.{os.getpid()}-*"):
+        for left in folder.parent.glob(f"{glob.escape(_prefix(folder, os.getpid()))}*"):
             shutil.rmtree(left, ignore_errors=True)
+
+
+def _prefix(path: Path, process: int) -> str:
+    """What the names of temporary folders beside ``path`` begin with: names may have 255 bytes, letters up to four."""
+    return f".{path.name[:50]}.{process}-"
 
 
 @contextmanager
@@ -94,9 +112,19 @@ def _beside(path: Path) -> Generator[Path]:
 
     Its name has the number of the process above, by which that one can sweep up after its own workers, and no others.
     """
-    try:
+    with _refused(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.{os.getppid()}-", dir=path.parent) as place:
+        with tempfile.TemporaryDirectory(prefix=_prefix(path, os.getppid()), dir=path.parent) as place:
             yield Path(place)
+
+
+@contextmanager
+def _refused(path: Path) -> Generator[None]:
+    """What the disk refuses is a FolderError that names ``path``."""
+    if "\0" in str(path):
+        raise FolderError(f"{path!r:.100}: cannot be written: no name has a NUL")
+    try:
+        yield
     except OSError as error:
-        raise FolderError(f"{path}: cannot be written: {error.strerror}") from None
+        shown = path if len(str(path)) < 200 else f"{path!s:.100} …"
+        raise FolderError(f"{shown}: cannot be written: {error.strerror}") from None

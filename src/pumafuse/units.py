@@ -152,8 +152,8 @@ def mistaken(factor: float, endings: Iterable[str]) -> list[tuple[str, str]]:
     ]
 
 
-def refuse_unit(kind: str, name: str) -> None:
-    """Refuse the name of an axis or a sensor that ends like a unit.
+def refuse_name(kind: str, name: str) -> None:
+    """Refuse the name of an axis or a sensor that ends like a unit, or that no screen can show.
 
     Its table's numbers would be taken to have that unit, and ``<axis>_mm`` would have two.
 
@@ -163,6 +163,8 @@ def refuse_unit(kind: str, name: str) -> None:
     unit = ending(name)
     if unit is not None:
         raise ConfigError(f"{kind} '{name}': a name must not end in a unit ({unit})")
+    if not name.isprintable():
+        raise ConfigError(f"{kind} '{name}': a name must not have control characters")
 
 
 def si(value: float | Decimal, unit: str) -> float:

@@ -56,7 +56,7 @@ def test_json_has_the_numbers_of_python(run: Path, found: list[dict[str, object]
                 "model",
             ),
             *("without_recovery", "with_recovery", "recovery_ms", "best_in_class", "outlying", "commands", "rows"),
-            *("verdict", "notes"),
+            *("holds", "verdict", "notes"),
         }
         assert [one[key] for key in ("axis", "source", "verdict")] == [other.axis, other.source, other.verdict]
         assert set(one["model"]) == {"rms_mm", "percent_of_signal", "fit_percent"}
@@ -106,3 +106,16 @@ def test_what_is_not_there_is_one_line(run: Path, tmp_path: Path) -> None:
     assert "has no sensor 'camera'; it has scope, eye" in refused("verify", run, "--arm", arm, "--sensors", "camera")
     elbow.write_text(arm.read_text().replace("[axes.radial", "[axes.elbow"))
     assert "'radial'" in refused("verify", run, "--arm", elbow)
+
+
+def test_a_model_that_does_not_hold_ends_with_3(run: Path, tmp_path: Path) -> None:
+    """What is printed is complete all the same; a model that holds ends with 0."""
+    arm = run / "arm.toml"
+    slow = tmp_path / "slow.toml"
+    slow.write_text(pf.ArmModel.load(arm).to_toml().replace("delay_ms = ", "delay_ms = 40"))
+    found = json.loads(pumafuse("verify", run, "--arm", slow, "--sensors", "scope", "--json", code=3).stdout)
+    assert not any(one["holds"] for one in found)
+    assert (
+        "written to"
+        in pumafuse("verify", run, "--arm", slow, "--sensors", "scope", "--report", tmp_path / "report", code=3).stdout
+    )

@@ -97,7 +97,7 @@ sensors = st.builds(
     sd=st.one_of(positive, st.dictionaries(st.sampled_from(AXES), positive, min_size=1)),
     latency=st.floats(-3600.0, 3600.0),
     latency_sd=not_negative,
-    scale=st.floats(-1e3, 1e3).filter(bool),
+    scale=st.floats(-1e3, 1e3).filter(lambda scale: abs(scale) >= 1e-9),
     bias_sd=not_negative,
     gate=not_negative,
     gate_rows=st.booleans(),
@@ -159,6 +159,9 @@ REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
         ("sensors.tracker.sd_mm", "'yaw'", "tangential, radial, vertical"),
     ),
     "scale zero": (ARM + TRACKER + "scale = 0", ("sensors.tracker.scale", "0")),
+    "scale of no sensor": (ARM + TRACKER + "scale = 1e160", ("sensors.tracker.scale", "1e+160", "1e9")),
+    "scale next to zero": (ARM + TRACKER + "scale = 1e-320", ("sensors.tracker.scale", "1e-9")),
+    "escape in a name": (ARM + '[sensors."a\\u001b[31m"]\nsd_mm = 1.0\n', ("a?[31m", "control characters")),
     "latency infinite": (ARM + TRACKER + "latency_ms = -inf", ("sensors.tracker.latency_ms", "finite")),
     "latency beyond an hour": (ARM + TRACKER + "latency_ms = 3600001", ("sensors.tracker.latency_ms", "hour")),
 }

@@ -387,3 +387,34 @@ def test_what_is_odd_but_no_mistake_gives_no_alarm(
         sd, bias = odd.get("told_sd", odd.get("sd", 1e-4)), 2.0 * odd.get("bias", 0.0)
         config = pf.FusionConfig(arm=arm, sensors={"camera": pf.Sensor(sd=sd, scale=scale, bias_sd=bias)})
         assert alarms(run, config) == [], seed
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_commands_that_are_missing_in_motion_are_told(share: float) -> None:
+    """With their number, to a few that an end of a motion hides; those that change nothing may be left out."""
+    run, config = logged("scan1")
+    stamps, drawn = run.command.stamp, np.random.default_rng(3).random(len(run.command.stamp))
+    steps = np.any([np.diff(value, append=value[-1]) != 0.0 for value in run.command.values.values()], axis=0)
+    kept = run.command.rows(np.flatnonzero(drawn > share))
+    (note,) = clock_faults(replace(run, command=kept), config.arm.update_period, [])
+    told, moving = int(number_before(" of ", note)), int(np.count_nonzero(steps & (drawn <= share)))
+    assert 0.9 * moving < told <= np.count_nonzero(drawn <= share)
+    assert "are missing while the arm moves" in note
+    changed = run.command.rows(np.flatnonzero(np.append(True, steps[:-1])))
+    assert len(changed.stamp) < 0.99 * len(stamps)
+    assert not clock_faults(replace(run, command=changed), config.arm.update_period, [])
+
+
+def test_a_long_gap_of_commands_is_told_where_they_jump_over_it() -> None:
+    """Eleven seconds of a scan are gone; a controller that is silent while the arm rests jumps nowhere."""
+    run, config = logged("scan1")
+    kept = run.command.rows(np.r_[:500, 900 : len(run.command.stamp)])
+    (note,) = clock_faults(replace(run, command=kept), config.arm.update_period, [])
+    assert "400 of " in note and "the longest gap is 11.2 s" in note
+
+
+def test_every_other_command_alone_is_told() -> None:
+    """Twice the update period is far from it."""
+    run, config = logged("scan1")
+    half = replace(run, command=run.command.rows(np.arange(0, len(run.command.stamp), 2)))
+    assert "2 times the arm's update_period_ms" in " ".join(clock_faults(half, config.arm.update_period, []))

@@ -148,3 +148,20 @@ def test_now_is_not_where_a_sensor_alone_has_run_to() -> None:
     live.command(2.8, radial=0.5)
     camera = live.health().sensors["camera"]
     assert (camera.silent, camera.outcomes["invalid"]) == (None, 1)
+
+
+@pytest.mark.parametrize("window", [1e-3, 0.3, 1.0, 2.0])
+@pytest.mark.parametrize("off", [0.03, 0.6, 0.95, -0.6, 1.5, 3.0])
+def test_one_sensor_ahead_or_behind_never_restarts_the_filter(window: float, off: float) -> None:
+    """Whatever the window: no restart, no command lost, and within a second either way no measurement either."""
+    live = pf.LiveEstimator(CONFIG, window=window, start={"radial": 0.5})
+    for step in range(200):
+        t = 10.0 + 0.028 * step
+        live.command(t, radial=0.5 + 1e-4 * step)
+        live.measurement(t + 0.01, "tracker", radial=0.5 + 1e-4 * step)
+        live.measurement(t + 0.012 + off, "camera", radial=0.5)
+    health = live.health()
+    assert (live.segment, health.commands["fused"]) == (0, 200)
+    bad = {name: health.sensors["camera"].outcomes[name] for name in ("too_late", "invalid")}
+    assert off > 1.0 or not any(bad.values())
+    assert sum(health.sensors["tracker"].outcomes[name] for name in bad) == 0

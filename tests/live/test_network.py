@@ -145,15 +145,33 @@ class TestTcpListener:
         """The connection is closed at once, counted and reported."""
         monkeypatch.setattr(network, "_MOST_CONNECTIONS", 2)
         self.start(lambda host: host != "127.0.0.3")
-        ends = [self.connect(host) for host in ("127.0.0.3", "127.0.0.1", "127.0.0.2", "127.0.0.1")]
-        assert [ends[refused].recv(1) for refused in (0, 3)] == [b"", b""]
+        ends = [self.connect(host) for host in ("127.0.0.3", "127.0.0.1", "127.0.0.2")]
         for accepted in (1, 2):
             ends[accepted].sendall(b"%d\n" % accepted)
             assert until(self.source, bool) == [b"%d" % accepted]
+        ends.append(self.connect("127.0.0.1"))
+        assert [ends[refused].recv(1) for refused in (0, 3)] == [b"", b""]
         for end in ends:
             end.close()
         assert "connections: 2" in self.source.summary()
         assert "2 refused" in self.source.summary()
+
+    def test_silent_connections_lock_nobody_out(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The oldest one on which nothing has come makes room; one that has sent stays."""
+        monkeypatch.setattr(network, "_MOST_CONNECTIONS", 3)
+        self.start(lambda _: True)
+        sending = self.connect("127.0.0.1")
+        sending.sendall(b"0\n")
+        assert until(self.source, bool) == [b"0"]
+        silent = [self.connect("127.0.0.1") for _ in range(2)]
+        new = self.connect("127.0.0.1")
+        new.sendall(b"1\n")
+        assert until(self.source, bool) == [b"1"]
+        assert silent[0].recv(1) == b""
+        sending.sendall(b"2\n")
+        assert until(self.source, bool) == [b"2"]
+        for end in (sending, new, *silent):
+            end.close()
 
 
 class TestTcpClient:

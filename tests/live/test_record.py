@@ -324,3 +324,16 @@ def test_only_an_empty_folder_is_recorded_into(tmp_path: Path) -> None:
     with pytest.raises(pf.RunError, match=r"\.\./tracker"):
         Recorder(tmp_path / "new", pf.FusionConfig(arm=TRACKED.arm, sensors=sensors), {}, print)
     assert not (tmp_path / "new").exists()
+
+
+def test_a_clock_that_is_reset_for_ever_fills_few_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Folders are bounded in number, every row is in one of them, and the last one fuses, too."""
+    monkeypatch.setattr("pumafuse.live.record._MOST_FOLDERS", 3)
+    recorded = Recorded(tmp_path / "record")
+    for segment in range(8):
+        recorded.go(10, begin=(8 - segment) * 1000)
+    recorded.close()
+    runs = [pf.Run.read(folder) for folder in sorted(tmp_path.iterdir())]
+    assert [len(run.command.stamp) for run in runs] == [10, 10, 60]
+    assert len(pf.fuse(runs[-1], TRACKED).segments) == 6
+    assert sum("folders are enough" in text for text in recorded.notices) == 1

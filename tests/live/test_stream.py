@@ -195,3 +195,24 @@ def test_a_replay_follows_the_controllers_grid() -> None:
     for events in replayed(run, TRACKED, np.inf):
         both.stream.take(events)
     assert [found["radial"]["position_mm"] for found in both.estimates] == (offline["radial"].position * 1e3).tolist()
+
+
+@pytest.mark.parametrize("pause", [1.5, 20.0])
+@pytest.mark.parametrize("commands_first", [True, False])
+def test_the_grid_goes_on_over_a_pause(pause: float, commands_first: bool) -> None:
+    """All pause for longer than the window: each point of `fuse --as-live --rate` is there, to the last bit."""
+    rng = np.random.default_rng(0)
+    first, again = (-0.003, 0.5) if commands_first else (1.2, 0.0)
+    command = np.r_[0:2.8:0.028, pause + 2.8 + max(first, 0.0) : pause + 5.6 : 0.028]
+    fast = np.r_[0.003:2.8:0.01, pause + 2.8 + again : pause + 5.6 : 0.01]
+    slow = np.r_[0.11:2.8:0.05, pause + 2.85 + again : pause + 5.6 : 0.05]
+    read = {name: (t, {"radial": 0.57 + 1e-4 * rng.random(len(t))}) for name, t in {"fast": fast, "slow": slow}.items()}
+    run = pf.Run.from_arrays(command, {"radial": 0.57 + 1e-3 * rng.random(len(command))}, read)
+    sensors = {"fast": pf.Sensor(sd=5e-5, latency=0.008), "slow": pf.Sensor(sd=5e-4, latency=0.1)}
+    config = pf.FusionConfig(arm=TRACKED.arm, sensors=sensors)
+    offline, both = pf.fuse(run, config, rate=100.0, mode="as-live"), Both(config, 100.0, window=1.0)
+    for events in replayed(run, config, np.inf):
+        both.stream.take(events)
+    both.end()
+    found = [(one["t"], one["radial"]["position_mm"]) for one in both.estimates[: len(offline.time)]]
+    assert found == list(zip(offline.time.tolist(), (offline.axes["radial"].position * 1e3).tolist(), strict=True))

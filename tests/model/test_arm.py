@@ -72,7 +72,8 @@ provenance = st.fixed_dictionaries(
         "outliers": st.dictionaries(word, word | st.booleans() | st.lists(word, max_size=2), max_size=3),
     },
 )
-axis_names = st.sampled_from(["tangential", "radial", "vertical"]) | word.filter(lambda name: ending(name) is None)
+names = word.filter(lambda name: ending(name) is None and name.isprintable())
+axis_names = st.sampled_from(["tangential", "radial", "vertical"]) | names
 arms = st.builds(
     ArmModel,
     name=word,

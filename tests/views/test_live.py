@@ -220,9 +220,14 @@ def test_the_page_speaks_with_this_machine_only() -> None:
         one.laddr.ip for process in (drawer, server) for one in process.net_connections() if one.status == "LISTEN"
     ]
     assert set(places) == {"127.0.0.1"}
-    with socket.create_connection(("127.0.0.1", live_view.WEB_PORT)) as asked:
-        asked.sendall(b"GET / HTTP/1.0\r\n\r\n")
-        page = b"".join(iter(lambda: asked.recv(1 << 16), b"")).decode()
+
+    def answer(host: str) -> str:
+        with socket.create_connection(("127.0.0.1", live_view.WEB_PORT)) as asked:
+            asked.sendall(f"GET / HTTP/1.0\r\nHost: {host}:{live_view.WEB_PORT}\r\n\r\n".encode())
+            return b"".join(iter(lambda: asked.recv(1 << 16), b"")).decode()
+
+    page = answer("localhost")
+    assert "HTTP/1.0 421 " in answer("elsewhere.example")  # a name of another page's that leads here
     assert f"connect-src 'self' http://127.0.0.1:{live_view.PORT}\r\n" in page
     assert "re_viewer.js" in page
     assert server.environ()["CI"] == "1"  # what Rerun sends no statistics with

@@ -13,6 +13,7 @@ import bag_files
 import pumafuse as pf
 from executable import pumafuse
 from pumafuse.logs.frames import Cylindrical
+from pumafuse.views.rerun import to_rerun
 from recordings import columns, series, times
 
 DATA = Path(pf.__file__).parent / "data"
@@ -239,3 +240,15 @@ def test_the_result_of_a_recording_is_a_layer_of_it(timeline: str, tmp_path: Pat
     stamps = [np.concatenate([chunk["robot_time"].cast("int64").to_numpy() for chunk in chunks]) for chunks in found]
     assert np.array_equal(*stamps)
     assert columns(merged, "/pumafuse/path/tool")
+
+
+def test_a_sensor_called_like_a_line_has_an_entity_of_its_own(tmp_path: Path) -> None:
+    """Its points would be drawn into the estimate's line."""
+    stamps = np.arange(50) * 28_000_000
+    there = {"radial": 0.56 + 1e-3 * np.sin(np.arange(50) / 5.0)}
+    run = pf.Run.from_arrays(stamps, there, {"estimate": (stamps[::5] + 14_000_000, {"radial": there["radial"][::5]})})
+    arm = pf.ArmModel.load("puma560-internal")
+    est = pf.fuse(run, pf.FusionConfig(arm=arm, sensors={"estimate": pf.Sensor(sd=1e-3)}))
+    to_rerun(est, run, tmp_path / "fused.rrd")
+    assert len(series(tmp_path / "fused.rrd", "/radial/estimate")[0]) == 50
+    assert len(series(tmp_path / "fused.rrd", "/radial/estimate_sensor")[0]) == 10

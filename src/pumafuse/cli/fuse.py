@@ -11,7 +11,7 @@ from pathlib import Path
 
 import typer
 
-from ..errors import RunError
+from ..errors import RunError, printable
 from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Estimates, Mode
@@ -142,9 +142,9 @@ def _fuse(
 
     def extras(new: Path) -> None:
         if rrd:
-            from ..views.rerun import to_rerun
+            from ..views.rerun import recording_of
 
-            to_rerun(est, recorded, new / "fused.rrd")
+            (new / "fused.rrd").write_bytes(recording_of(est, recorded))
         if figures:
             from ..views.figures import error_figure, fused_figure, path_figure, validation_figure
 
@@ -164,10 +164,8 @@ def _fuse(
 def _show(summary: Summary) -> None:
     """Print the tables of one fusion."""
     part = "" if summary.from_s is None else f" from {summary.from_s:g} s on"
-    typer.echo(
-        f"{summary.run}: {summary.estimates} estimates over {summary.duration_s:.1f} s{part}, {summary.mode},"
-        f" arm {summary.arm}"
-    )
+    made = f"{summary.estimates} estimates over {summary.duration_s:.1f} s{part}, {summary.mode}"
+    typer.echo(f"{printable(summary.run)}: {made}, arm {printable(summary.arm)}")
     if without := left_out(summary):
         typer.echo(f"left out: {without}")
     scores = {axis: part.score for axis, part in summary.axes.items() if part.score is not None}

@@ -12,11 +12,10 @@ from rich.table import Table
 
 from ..discovery.contents import Part, rate_of
 from ..discovery.drafts import BASES, FILES, drafts
-from ..discovery.names import printable
 from ..discovery.questions import questions
 from ..discovery.roles import Stream
 from ..discovery.survey import Survey, survey
-from ..errors import ConfigError, counted
+from ..errors import ConfigError, counted, printable
 from ..folders import write_file
 from ..units import MS, SCREEN
 from .tables import print_tables, table

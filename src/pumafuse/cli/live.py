@@ -188,7 +188,7 @@ class _Feeder:
 
 @contextlib.contextmanager
 def _caught_signals() -> Generator[list[int]]:
-    """The signals that have asked for an end: Ctrl-C and SIGTERM; a second one ends at once."""
+    """The signals that have asked for an end: Ctrl-C, SIGTERM and SIGHUP; a second one ends at once."""
     caught: list[int] = []
 
     def catch(number: int, _: object) -> None:
@@ -196,7 +196,10 @@ def _caught_signals() -> Generator[list[int]]:
             raise KeyboardInterrupt
         caught.append(number)
 
-    before = {number: signal.signal(number, catch) for number in (signal.SIGINT, signal.SIGTERM)}
+    names = "SIGINT", "SIGTERM", "SIGHUP"  # Windows has no SIGHUP; nohup ignores it
+    numbers = [number for name in names if (number := getattr(signal, name, None)) is not None]
+    ending = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, catch) for number in ending}
     try:
         yield caught
     finally:

@@ -3,6 +3,7 @@
 import atexit
 import gc
 import os
+import signal
 import sys
 import warnings
 from pathlib import Path
@@ -261,7 +262,10 @@ def verify(
     json: Json = False,
     force: Force = False,
 ) -> None:
-    """Check a model on runs that it was not made from, beside the best that a linear model could do there."""
+    """Check a model on runs that it was not made from, beside the best that a linear model could do there.
+
+    Exit code 3: done, but the model does not hold: it explains less than half of a motion.
+    """
     from . import verify as command
 
     levels = dict(_level(text) for text in start or ())
@@ -310,7 +314,7 @@ def live(
     source: Annotated[str, Argument(metavar="SOURCE", help="Where events come from, see above.")],
     config: Config,
     rate: Rate = None,
-    window: Annotated[float, Option(metavar="S", help="How late an event may come.")] = 2.0,
+    window: Annotated[float, Option(metavar="S", help="How late an event may come; at least 1 s.")] = 2.0,
     stale_after: Annotated[float, Option(metavar="S", help="Without a measurement so long an axis is stale.")] = 1.0,
     out: Annotated[str | None, Option(metavar="udp://HOST:PORT", help="Where estimates go; default: stdout.")] = None,
     record: Annotated[Path | None, Option(metavar="DIR", help="Record the stream as a run, into a new folder.")] = None,
@@ -358,6 +362,10 @@ def main() -> None:
     # What is imported stays: looking through it time and again, and once more at the end, is a quarter of `fuse`.
     gc.set_threshold(10_000, 1_000)
     atexit.register(gc.freeze)
+    for stop in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, stop, None)  # Windows has no SIGHUP; nohup ignores it
+        if number is not None and signal.getsignal(number) == signal.SIG_DFL:
+            signal.signal(number, _end)
     try:
         app()
     except PumafuseError as error:
@@ -366,9 +374,16 @@ def main() -> None:
     except MemoryError:
         typer.echo("pumafuse: not enough memory: use a part of the log, or fewer columns", err=True)
         sys.exit(1)
-    except BrokenPipeError:
-        sys.stderr.close()  # the reader of our output has gone, and Python would report it once more at exit
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):  # whoever read our output has what it wanted
+            typer.echo(f"pumafuse: {error.filename or 'standard output'}: {error.strerror}", err=True)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what its buffer holds would fail once more at exit
         sys.exit(1)
+
+
+def _end(number: int, _frame: object) -> None:
+    """End by a signal as after an error, so that nothing half written is left."""
+    sys.exit(128 + number)
 
 
 def _one_line(message: Warning | str, category: type[Warning], *_: object) -> None:

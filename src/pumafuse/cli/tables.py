@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from ..errors import printable
 from ..fusion.score import Z95
 from ..fusion.segments import NOT_SELECTED
 from ..fusion.skill import PredictionError
@@ -24,6 +25,7 @@ from ..units import SCREEN, Kind
 Columns = Mapping[str, tuple[str, str, float | None]]
 
 _GIVEN = {"used", "fused", "rejected", "reacquired", NOT_SELECTED}  # what is no surprise
+_WIDEST = 2000  # characters of a cell
 _FEW_RUNS = 20  # that get lines of their own
 _SCORE: Columns = {
     "RMSE, {unit}": ("rmse", ".3f", None),
@@ -61,7 +63,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
             numbers = all(cell[:1] in "+-–…<0123456789" for cell in cells)
             whole = numbers or any("\n" in cell for cell in cells)
             made.add_column(escape(heading), justify="right" if numbers else "left", overflow="fold", no_wrap=whole)
-            kept.append([escape(cell) for cell in cells])
+            kept.append([escape("\n".join(printable(line, _WIDEST) for line in cell.splitlines())) for cell in cells])
     for row in zip(*kept, strict=True):
         made.add_row(*row)
     return made

@@ -19,6 +19,8 @@ from ..views import formatting
 from ..views import report as reports
 from .tables import console, print_json, table
 
+_FAILED = 3
+
 
 def run(
     paths: Sequence[Path],
@@ -33,6 +35,7 @@ def run(
 
     Raises:
         PumafuseError: The arm or a run cannot be read, or they do not fit together.
+        Exit: With 3 where the model does not hold.
     """
     if report is not None:
         reports.check_writable(report, force)
@@ -47,9 +50,11 @@ def run(
             warnings.warn(f"run '{one.run}': {note}", PumafuseWarning, stacklevel=1)
     if json:
         print_json([toml.reported(one, one.kind) for one in verified])
-        return
-    for of_kind in reports.verifications(verified):
-        console(sys.stdout).print(table(*of_kind))
-    typer.echo("\n".join([formatting.lag(model.update_period), *map(reports.verdict, verified)]))
-    if report is not None:
-        typer.echo(f"written to {report}")
+    else:
+        for of_kind in reports.verifications(verified):
+            console(sys.stdout).print(table(*of_kind))
+        typer.echo("\n".join([formatting.lag(model.update_period), *map(reports.verdict, verified)]))
+        if report is not None:
+            typer.echo(f"written to {report}")
+    if not all(one.holds for one in verified):
+        raise typer.Exit(_FAILED)

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as papq
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
-from ..errors import RunError
+from ..errors import RunError, printable
 from ..logs import recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, numeric_paths, prefixes
 from ..units import TIMES, ending, si_of
@@ -178,7 +178,7 @@ def _signal(table: Table, path: str, type_: str, labels: list[str]) -> Signal | 
     try:
         values, _ = table.plain(path)
     except RunError as error:
-        return names.printable(str(error).removeprefix(f"{table.path}: "))
+        return printable(str(error).removeprefix(f"{table.path}: "))
     known = values[np.isfinite(values)]
     if len(known) < _FEWEST_ROWS:
         return "hardly any number" if len(known) else ""

@@ -10,10 +10,10 @@ from typing import Any, cast
 
 import tomli_w
 
+from ..errors import printable
 from ..logs.columns import leaf
 from ..units import MS, SCREEN, ending
 from .guesses import ArmGuess, SensorGuess, guess
-from .names import printable
 from .roles import Stream
 from .survey import Survey
 

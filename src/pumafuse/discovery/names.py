@@ -150,12 +150,6 @@ def plain(name: str) -> str:
     return f"{made}_axis" if made in _KEYS else made
 
 
-def printable(text: str, longest: int = 80) -> str:
-    """A text from a log for a screen or a comment: one line, no control characters, not too long."""
-    shown = "".join(letter if letter.isprintable() else "?" for letter in text)
-    return shown if len(shown) <= longest else f"{shown[: longest - 1]}…"
-
-
 def _role(found: list[str], more: frozenset[str]) -> Role | None:
     for role, known in _ROLES.items():
         if not known.isdisjoint(found):

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from ..arrays import NO_STAMP
+from ..errors import printable
 from ..units import MS
-from .names import printable
 from .survey import Survey
 
 _FOLLOWS = 0.5  # correlation of changes

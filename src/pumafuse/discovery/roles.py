@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..errors import RunError
+from ..errors import RunError, printable
 from ..logs.run import Run, Source
 from ..units import AN, OF_KIND, Kind, kind_of
 from . import names
@@ -145,8 +145,8 @@ def _streams(part: Part) -> list[Stream]:
     found = list[Stream]()
     for key, signals in groups.items():
         own = (names.column_role(signals[0].column), f"its columns are called '{key.replace('_', ' ')}'")
-        file = (names.role_of(part.stem), f"it is called '{names.printable(part.stem)}'")
-        clock = (names.column_role(part.clock.column), f"its clock is called '{names.printable(part.clock.column)}'")
+        file = (names.role_of(part.stem), f"it is called '{printable(part.stem)}'")
+        clock = (names.column_role(part.clock.column), f"its clock is called '{printable(part.clock.column)}'")
         by_type = ("command" if part.type.endswith("JointTrajectory") else None, f"its messages are {part.type}")
         by_state = ("sensor" if part.type.endswith("JointState") else None, f"its messages are {part.type}")
         order = (own, file, clock) if len(groups) > 1 else (file, own, clock)
@@ -194,7 +194,7 @@ def _command(streams: Sequence[Stream], log: str) -> tuple[Stream, str]:
     followers = {one.name: _followers(one, streams) for one in candidates}
     best = max(candidates, key=lambda one: followers[one.name], default=None)
     if best is None or (not called and not followers[best.name]):
-        what = ", ".join(names.printable(one.part.label) for one in streams)
+        what = ", ".join(printable(one.part.label) for one in streams)
         raise RunError(
             f"{log}: which numbers are the commands? None is called command, goal, target, desired, setpoint or action,"
             f" and none runs ahead of others ({what}); say it in run.toml"

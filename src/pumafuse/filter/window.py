@@ -11,6 +11,8 @@ that fuses a recorded run. Commands that act later than the newest measurement w
 from __future__ import annotations
 
 import math
+from collections.abc import Generator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -370,6 +372,35 @@ class Window:
             outputs[0] += levels[number]
             found.append(None if math.isnan(levels[number]) else (outputs, fused[number]))
         return found
+
+    @contextmanager
+    def hidden(self, after: int) -> Generator[None]:
+        """As if nothing that is stamped after ``after`` [ns] had come yet."""
+        span, events, axes = self._span, self.memory.filter.events, len(self.outcome)
+        begin, end = span.item(BEGIN), span.item(END)
+        later = begin + np.flatnonzero(events.stamp[begin:end] > after)
+        if not len(later):
+            yield
+            return
+        known, first, before = events.known[later], int(later[0]), span.copy()
+        aside = [part[:axes].copy() for part in self.memory.filter.state.by_row]
+        events.known[later] = ABSENT
+        if first < span[DONE]:
+            self._restore(first)
+            span[DONE] = first
+        span[RUN] = max(first, begin + int(np.searchsorted(events.time[begin:end], after, side="right")))
+        ran = span[RUN] > span[DONE]
+        self._run()
+        try:
+            yield
+        finally:
+            events.known[later], span[:] = known, before
+            for part, one in zip(self.memory.filter.state.by_row, aside, strict=False):
+                part[:axes] = one
+            if ran and first < before[DONE]:  # the checkpoints behind are of what was not hidden
+                self._restore(first)
+                span[DONE] = first
+                self._run()
 
     def command_at(self, axis: int, stamp: int = NEVER) -> tuple[int, float, float] | None:
         """Stamp [ns], value and step [m] of an axis's last command stamped by ``stamp`` [ns]; None for none."""

@@ -15,12 +15,12 @@ from typing import Annotated, Any, Literal, cast
 import msgspec
 
 from .. import toml
-from ..errors import ConfigError, UnknownNameError
+from ..errors import ConfigError, UnknownNameError, shortened
 from ..logs.frames import Frame
 from ..model.arm import ArmModel, arm_of
 from ..model.presets import PRESETS
 from ..toml import NotNegative, Positive, Time
-from ..units import AN, KINDS, Kind, of_kind, refuse_unit
+from ..units import AN, KINDS, Kind, of_kind, refuse_name
 
 PerAxis = (
     NotNegative | Annotated[dict[str, NotNegative], msgspec.Meta(min_length=1)]
@@ -28,6 +28,7 @@ PerAxis = (
 
 SD_BOUNDS = (1e-7, 1.0)  # m or rad; of a sensor's noise that is fitted
 _LONGEST_LATENCY = 3600.0  # s
+_LARGEST_SCALE = 1e9  # as high as all numbers of a configuration
 _OFFSET_SD: dict[Kind, float] = {"length": 5e-3, "angle": math.radians(5.0)}
 _PER_AXIS = ("sd_mm", "bias_sd_mm", "bias_drift_sd_mm")  # keys of a sensor that may differ from axis to axis
 ARM_FILE = "arm.toml"  # the name of the arm's file beside a saved configuration
@@ -166,7 +167,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         for path, part, kind in self._parts():
             _check(path, part, kind)
         for name, sensor in self.sensors.items():
-            refuse_unit("sensor", name)
+            refuse_name("sensor", name)
             if not math.isfinite(sensor.scale + sensor.latency + sensor.gate + sensor.latency_sd):
                 raise ConfigError(f"sensors.{name}: scale, latency, gate and sds must be finite")
             for key, value in zip(_PER_AXIS, (sensor.sd, sensor.bias_sd, sensor.bias_drift_sd), strict=True):
@@ -178,6 +179,8 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
                 raise ConfigError(f"sensors.{name}.turn_deg: no axis of the arm is an angle")
             if sensor.scale == 0.0:
                 raise ConfigError(f"sensors.{name}.scale: must not be 0: measurements would not depend on the position")
+            if not 1.0 / _LARGEST_SCALE <= abs(sensor.scale) <= _LARGEST_SCALE:
+                raise ConfigError(f"sensors.{name}.scale: {sensor.scale:g} is no sensor's: 1e-9 to 1e9")
         complete = {axis: self.process.get(axis, PROCESS[one.kind]) for axis, one in self.arm.axes.items()}
         msgspec.structs.force_setattr(self, "process", complete)
         msgspec.structs.force_setattr(self, "start", self.start.of_arm(self.arm))
@@ -291,7 +294,8 @@ def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:
     if name in PRESETS and not there:
         return ArmModel.load(name)
     if not there:
-        raise ConfigError(f"{path}: arm = '{name}': no such file beside it, and not a preset ({', '.join(PRESETS)})")
+        known = ", ".join(PRESETS)
+        raise ConfigError(f"{path}: arm = '{shortened(name)}': no such file beside it, and not a preset ({known})")
     return ArmModel.load(beside)
 
 

@@ -16,8 +16,8 @@ from .. import toml
 from ..arrays import FloatArray, IntArray
 from ..filter.outcome import Outcome
 from ..units import Kind, to_si
-from .consistency import chi_square_band, consistency, log_likelihood
-from .estimates import AxisEstimate, Estimates
+from .consistency import Consistency, chi_square_band, consistency, log_likelihood
+from .estimates import AxisEstimate, Bias, Estimates
 from .score import ReferenceTrack, score, score_velocity
 from .skill import Skill, skill
 
@@ -284,10 +284,23 @@ def _sensor_summary(est: Estimates, sensor: str, axis: str) -> SensorSummary:
     fused = measurements.where(measurements.outcome == Outcome.FUSED)
     bias = est.biases.get(sensor, {}).get(axis)
     first = 1 if bias is not None and len(fused.value) > 1 else 0  # the first measurement determines the bias
+    rms = [float(np.sqrt(np.mean(values[first:] ** 2))) for values in (fused.innovation, fused.innovation_sd)]
+    return sensor_summary(measurements.counts(), found, rms[0], rms[1], bias, skill(est, measurements))
+
+
+def sensor_summary(
+    outcomes: dict[str, int],
+    found: Consistency,
+    innovation_rms: float,
+    innovation_sd: float,
+    bias: Bias | None,
+    skill: Skill | None,
+) -> SensorSummary:
+    """The summary of a sensor on an axis on which it was fused."""
     return SensorSummary(
-        outcomes=measurements.counts(),
-        innovation_rms=float(np.sqrt(np.mean(fused.innovation[first:] ** 2))),
-        innovation_sd=float(np.sqrt(np.mean(fused.innovation_sd[first:] ** 2))),
+        outcomes=outcomes,
+        innovation_rms=innovation_rms,
+        innovation_sd=innovation_sd,
         nis_mean=found.nis,
         nis_band=found.nis_band,
         correlation=found.correlation.tolist(),
@@ -296,5 +309,5 @@ def _sensor_summary(est: Estimates, sensor: str, axis: str) -> SensorSummary:
         verdict=found.verdict,
         bias=None if bias is None else bias.value,
         bias_sd=None if bias is None else bias.sd,
-        skill=skill(est, measurements),
+        skill=skill,
     )

@@ -23,7 +23,7 @@ from ..errors import ConfigError
 from ..logs import tables
 from ..model.arm import ArmModel
 from ..simulation.trajectory import WhiteNoise, ticks
-from ..units import DEG, MS, SCREEN, SPEEDS, Kind, in_unit, of_kind, refuse_unit
+from ..units import DEG, MS, SCREEN, SPEEDS, Kind, in_unit, of_kind, refuse_name
 
 TRIALS, STEPS = "trials.csv", "steps.csv"
 _NOISE = "white-noise-"
@@ -82,7 +82,7 @@ class Design:
         if not self.axes or len(set(self.axes)) < len(self.axes):
             raise ConfigError("plan: at least one axis, and each once")
         for axis in self.axes:
-            refuse_unit("axis", axis)
+            refuse_name("axis", axis)
             if axis in _TAKEN or re.search(r"[^\w -]", axis):
                 raise ConfigError(f"plan: an axis cannot be called '{axis}'")
         if not self.speeds:

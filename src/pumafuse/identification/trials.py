@@ -141,7 +141,7 @@ class StepTrials:
                 continue
             time, position = samples.get(name, (np.zeros(0), np.zeros(0)))
             found = (np.abs(time) < _LATEST) & (np.abs(position) < _FARTHEST)
-            reason = _unusable(listings[name], axes[row], float(step[row]), time[found])
+            reason = _unusable(listings[name], axes[row], float(step[row]), time[found], position[found])
             if reason is not None:
                 notes.append(f"trial '{name}': {reason}: left out")
                 continue
@@ -164,8 +164,8 @@ def first_few(notes: Sequence[str]) -> list[str]:
     return [*notes[:_SHOWN], *([f"and {more} more"] if more > 0 else [])]
 
 
-def _unusable(times_listed: int, axis: str, step: float, time: FloatArray) -> str | None:
-    """Why a trial cannot be fitted; None when it can. ``time`` is of its samples [s]."""
+def _unusable(times_listed: int, axis: str, step: float, time: FloatArray, position: FloatArray) -> str | None:
+    """Why a trial cannot be fitted; None when it can. ``time`` [s] and ``position`` [m or rad] are of its samples."""
     if times_listed > 1:
         return f"listed {times_listed} times"
     if not axis:
@@ -173,7 +173,9 @@ def _unusable(times_listed: int, axis: str, step: float, time: FloatArray) -> st
     if not _STEPS[0] <= abs(step) <= _STEPS[1]:
         return "its step is 0 or no number, or of no size an arm has"
     after = len(np.unique(time[time >= 0.0]))
-    return f"{after} samples from the step on, at least {_FEWEST} are needed" if after < _FEWEST else None
+    if after < _FEWEST:
+        return f"{after} samples from the step on, at least {_FEWEST} are needed"
+    return "its position never changes" if np.ptp(position) == 0.0 else None
 
 
 def _table(folder: Path, stem: str) -> tables.Table:

@@ -57,6 +57,7 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
         outlying: How many measurements were left out because they jump away from their neighbours.
         commands: How many rows of the commands were ``used``, and of the others how many were left out for what.
         rows: Likewise of the source.
+        holds: Whether the model follows the motion at all.
         verdict: In words.
         notes: What was wrong with the run, a sentence each; with the first axis and source of each part of it.
     """
@@ -78,6 +79,7 @@ class AxisVerification(msgspec.Struct, frozen=True, kw_only=True):
     outlying: int
     commands: dict[str, int]
     rows: dict[str, int]
+    holds: bool
     verdict: str
     notes: list[str]
 
@@ -217,6 +219,7 @@ def _verified(
         outlying=count - len(measured.time),
         commands=counts[0],
         rows=counts[1],
+        holds=as_it_is.fit >= _HOLDS,
         verdict=_verdict(as_it_is, lag, best) + _recovers(as_it_is, recovering, recovery, model.kind),
         notes=notes,
     )

@@ -20,7 +20,7 @@ from ..fusion.segments import LONGEST_TAIL_NS
 
 Time: TypeAlias = float | int  # float seconds, or int nanoseconds
 
-AHEAD_NS = 1_000_000_000  # stamps may run ahead of all others by this much, or by the window, without a doubt
+LEAST_NS = 1_000_000_000  # a window is no shorter: the stamps of several senders differ, and commands may pause
 RESET_AFTER = 3  # commands in a row that have another time: the clock was reset
 
 
@@ -55,7 +55,8 @@ class Clock:
     """The newest stamp of a stream, and whether it is in doubt.
 
     Attributes:
-        window: How late an event may be [ns].
+        window: How far a stamp may be behind the newest one, or ahead of it without a doubt [ns]: one limit, or what
+            is plainly right ahead would put all others too far behind. At least a second.
         newest: The newest stamp that is accepted, int ns; None at first.
         low: Stamps from here …
         high: … to here are plainly right [ns]; none is while there is a doubt.
@@ -65,11 +66,10 @@ class Clock:
 
     def __init__(self, window: int) -> None:
         """Begin without a time."""
-        self.window = window
+        self.window = max(window, LEAST_NS)
         self.newest: int | None = None
         self.low, self.high = 1, 0
         self.ahead_of: str | None = None
-        self._ahead = max(window, AHEAD_NS)
         self._sure: int | None = None  # the newest stamp before a jump ahead that is still in doubt
         self._jumped, self._commands = 0, 0  # where it jumped to, and how many commands have confirmed it
         self.other: list[int] = []
@@ -94,7 +94,18 @@ class Clock:
     @property
     def bound(self) -> int:
         """Stamps after it are in doubt [ns]."""
-        return self.sure + self._ahead
+        return self.sure + self.window
+
+    def ends_doubt(self, stamp: int, source: str | None) -> bool:
+        """Whether a stamp that is taken shows that a jump ahead was right."""
+        if self._sure is None or self.newest is None:
+            return False
+        if not self.newest - self.window <= stamp <= self.newest + LONGEST_TAIL_NS:
+            return False
+        return self._agrees(stamp, source, self._commands + (source is None))
+
+    def _agrees(self, stamp: int, source: str | None, commands: int) -> bool:
+        return commands >= 2 or (source == self.ahead_of and stamp - self._jumped >= LEAST_NS)
 
     def start(self, stamp: int) -> None:
         """Set the clock to ``stamp`` [ns], whatever was before."""
@@ -105,7 +116,7 @@ class Clock:
         """Set the newest stamp [ns], without a doubt."""
         self._sure, self._commands = None, 0
         self.newest = newest
-        self.low, self.high = newest - self.window, newest + self._ahead
+        self.low, self.high = newest - self.window, newest + self.window
 
     def confirm(self) -> None:
         """Forget commands that had another time, as one has come that is plainly right."""
@@ -131,13 +142,12 @@ class Clock:
         if stamp < self.newest - self.window or stamp > self.newest + LONGEST_TAIL_NS:
             return self._elsewhere(stamp, command)
         self.other = [] if command else self.other
-        if self._sure is None and stamp > self.newest + self._ahead:
+        if self._sure is None and stamp > self.newest + self.window:
             self._sure, self._jumped, self._commands, self.ahead_of = self.newest, stamp, 0, source
             self.low, self.high = 1, 0
         self._commands += command
         self.newest = max(self.newest, stamp)
-        agreed = self._commands >= 2 or (source == self.ahead_of and stamp - self._jumped >= AHEAD_NS)
-        if agreed or self._sure is None:
+        if self._sure is None or self._agrees(stamp, source, self._commands):
             self.settle(self.newest)
         return Verdict.ACCEPTED
 

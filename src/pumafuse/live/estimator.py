@@ -85,7 +85,7 @@ class LiveEstimator:
 
         Args:
             config: Arm, noise, sensors, and the frame for sources in x, y, z.
-            window: How late an event may be [s].
+            window: How late an event may be [s]; less than 1 s counts as 1 s.
             stale_after: For how long [s] an axis may go without a fused measurement until it is called stale.
             start: Level [m] of axes that do not rest at their first command before it; x and y with a frame.
             on_notice: Called with a sentence that a user should know: a clock set anew, and the like. Of what happens
@@ -204,16 +204,24 @@ class LiveEstimator:
         """The first command's stamp (of this segment), int ns; None before it."""
         return self._window.origin
 
-    def until(self, t: Time) -> int | None:
+    def estimate_as_live(self, stamp: int) -> LiveEstimate:
+        """The estimate for an instant [ns] in the window by nothing that is stamped later, as if that had not come."""
+        with self._window.hidden(stamp):
+            return self.estimate(stamp)
+
+    def until(self, t: Time, sensor: str | None = None) -> int | None:
         """Up to which instant [ns] a clock may go on before an event stamped ``t`` comes in; None before the first one.
 
-        To the event's own time if its stamp is plainly right, else no farther than it is.
+        To the event's own time if its stamp is plainly right, or shows that a jump ahead was; else no farther than it
+        is.
         """
         try:
             stamp = nanoseconds(t)
         except ValueError:
             return self.sure
-        return stamp if self._clock.low <= stamp <= self._clock.high else self.sure
+        known = sensor is None or sensor in self._sensors
+        right = self._clock.low <= stamp <= self._clock.high or (known and self._clock.ends_doubt(stamp, sensor))
+        return stamp if right else self.sure
 
     def health(self) -> Health:
         """How each sensor does, and what became of everything so far."""

@@ -163,12 +163,17 @@ class _Tcp:
                 lines += self._pieces.get(timeout=_HANDED_OVER)
         return lines
 
+    def _heard(self, connection: socket.socket) -> None:
+        """Something has come on a connection for the first time."""
+
     def _read(self, connection: socket.socket) -> bool:
         """Read a connection to its end, a last line without its end, too; whether there was anything."""
         lines, some = Lines(), False
         with connection, contextlib.suppress(OSError):
             _keep_alive(connection)
             while piece := connection.recv(_LARGEST):
+                if not some:
+                    self._heard(connection)
                 some = True
                 if whole := lines.cut(piece):
                     self._pieces.put(whole)
@@ -184,7 +189,7 @@ class TcpListener(_Tcp):
         """Prepare; :meth:`start` listens."""
         super().__init__(notify)
         self._place, self._allowed = place, allowed
-        self._open = set[socket.socket]()
+        self._open, self._silent = set[socket.socket](), dict[socket.socket, None]()
         self._accepted = self._refused = 0
 
     def start(self) -> None:
@@ -213,7 +218,8 @@ class TcpListener(_Tcp):
                 time.sleep(QUIET)
                 continue
             why = "" if self._allowed(peer) else "--allow does not name it"
-            why = f"{_MOST_CONNECTIONS} are open" if not why and len(self._open) >= _MOST_CONNECTIONS else why
+            if not why and len(self._open) >= _MOST_CONNECTIONS and not self._end_a_silent_one():
+                why = f"{_MOST_CONNECTIONS} are open"
             if why:
                 self._refused += 1
                 self._log.write("refused", f"a connection from {peer}: refused, {why}")
@@ -222,10 +228,25 @@ class TcpListener(_Tcp):
             self._accepted += 1
             self._log.write("connected", f"{peer} has connected")
             self._open.add(connection)
+            self._silent[connection] = None
             _in_a_thread(self._serve, connection, peer)
+
+    def _end_a_silent_one(self) -> bool:
+        """End the oldest connection on which nothing has come yet; whether there was one."""
+        for connection in tuple(self._silent):
+            if self._silent.pop(connection, True) is None:
+                self._open.discard(connection)
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
+                return True
+        return False
+
+    def _heard(self, connection: socket.socket) -> None:
+        self._silent.pop(connection, None)
 
     def _serve(self, connection: socket.socket, peer: str) -> None:
         self._read(connection)
+        self._silent.pop(connection, None)
         self._open.discard(connection)
         self._log.write("gone", f"the connection from {peer} has ended")
 

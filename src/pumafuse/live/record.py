@@ -24,10 +24,12 @@ from ..logs.clock import TOLERATED_STEP_BACK_NS
 from ..logs.frames import CARTESIAN
 from ..logs.save import check_axis, check_name
 from ..units import SCREEN
+from .rate_limit import RateLimitedLog
 
 _FLUSHED = 0.5  # s between two writes
 _REPORTED_AGAIN = 60.0  # s until a trouble that lasts is reported again
 _MOST_BEFORE = 65_536  # measurements that are kept until the first command
+_MOST_FOLDERS = 100  # clocks that come after these go on in the last one
 _TRIED_AGAIN = 1.0  # s after the disk refused
 _MOST_WAITING = 64 << 20  # bytes that wait for a disk
 _PATIENCE = 5.0  # s for the disk at the end
@@ -44,7 +46,8 @@ class _Row(NamedTuple):
 class Recorder:
     """Event log of a live estimator that becomes a recorded run; see :class:`pumafuse.live.estimator.EventLog`.
 
-    A clock of the controller that was reset begins another run, beside the first: ``DIR.2``, ``DIR.3``, and so on.
+    A clock of the controller that was reset begins another run, beside the first: ``DIR.2``, ``DIR.3``, and so on, up
+    to a hundred; a controller that is reset for ever fills no disk with folders.
 
     Attributes:
         late: Rows that were left out, as they stood more than 1 s behind an earlier one of their source, which a
@@ -79,7 +82,8 @@ class Recorder:
         self._frame, self._start, self._notify = config.frame, dict(start), notify
         self._first = self._folder = folder = folder.absolute()
         self.late = self.lost = self._given = 0
-        self._segment = 1
+        self._log = RateLimitedLog(notify)
+        self._segment = self._folders = 1
         check_writable(folder, force=False, markers=(), ours=lambda _: False)
         folder.mkdir(parents=True, exist_ok=True)
         self._writer = Writer(",".join((_TIME, *self._columns.values())).encode() + b"\n")
@@ -90,9 +94,14 @@ class Recorder:
         """Write what was before, and begin a new run if there was a command: what comes is on another clock."""
         if self._commanded:
             self._flush(self._pending)
+            if self._folders == _MOST_FOLDERS:
+                self._pending, self._newest = [], {}
+                self._log.write("shared", f"record: {_MOST_FOLDERS} folders are enough, all goes on in {self._folder}")
+                return
+            self._folders += 1
             self._folder = self._next_folder()
             self._start = {}
-            self._notify(f"record: another clock, so it goes on in {self._folder}")
+            self._log.write("clock", f"record: another clock, so it goes on in {self._folder}")
         self._clear()
 
     def append(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> None:
@@ -151,7 +160,7 @@ class Recorder:
             self._reported, self._troubled = now, True
         elif not trouble and self._troubled:
             self._notify(f"record: is written again; {self._state()}")
-            self._troubled = False
+            self._reported, self._troubled = -math.inf, False
 
     def _state(self) -> str:
         written = self._writer.rows

@@ -97,7 +97,7 @@ class Stream:
         live, (t, sensor, values) = self.live, event
         self._with_ns = isinstance(t, int)
         if self._step is not None:
-            self._on_grid(live.until(t))
+            self._on_grid(live.until(t, sensor or None))
         result = live.measurement(t, sensor, **values) if sensor else live.command(t, **values)
         for watcher in self._watchers:
             watcher.event(event, result)
@@ -106,7 +106,7 @@ class Stream:
             became = f"{result.reason} ({result.outcome.word})"
             self._log.write(f"{who} {result.outcome.word}", f"{sensor[:40] or who}{_at(t)}: {became}")
         if self._step is None and not sensor and result.outcome is Outcome.FUSED:
-            self._estimate(nanoseconds(t))
+            self._send(live.estimate(nanoseconds(t)))
 
     def idle(self, now: int) -> None:
         """Go on with the grid until ``now`` [ns] of the stream's own time, as nothing has come for a while."""
@@ -138,11 +138,10 @@ class Stream:
             self._due += missing
             self._log.write("pause", f"a pause of {missing * self._step / 1e9:.0f} s: no estimates on the grid over it")
         while (at := self._grid[1] + round(self._due * self._step)) < before:
-            self._estimate(at)
+            self._send(self.live.estimate_as_live(at))
             self._due += 1
 
-    def _estimate(self, stamp: int) -> None:
-        estimate = self.live.estimate(stamp)
+    def _send(self, estimate: LiveEstimate) -> None:
         if estimate.outcome is Outcome.FUSED:
             self.estimates += 1
             self._out.append(encode(estimate, self._kinds, self._with_ns))

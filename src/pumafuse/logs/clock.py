@@ -11,16 +11,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..arrays import NO_STAMP, IntArray, TimeArray
+from ..arrays import ALWAYS, NO_STAMP, IntArray, TimeArray
 from ..errors import RunError
 from ..units import TIMES, mistaken
 from .run import Run, Source, note_rows
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
-_OTHER_PERIOD = 2.0  # times the update period from which an interval of commands is another one
+_OTHER_PERIOD, _OTHER_BEAT = 2.0, 1.25  # times the update period from which an interval is another one; a steady one
 _NEW_CLOCK = 3  # so many rows in a row with another time: the clock was set anew; fewer are stray
 _MOST_JUMPS = 100
 _FEW, _MANY = 30, 10_000  # stamps, below which nothing is said about their unit, and from which it is clear
+_SCATTERED, _JUMP = 5, 3.0  # periods of a short gap, and steps as large as a usual one that a long one hides
+_MANY_LOST, _OFF_TICK = 0.03, 0.25  # shares: of commands in motion, above which it is said; of a period
 _EVEN = 0.1  # spread of intervals over the usual one, up to which commands are a steady stream
 _HOUR_NS = 3_600_000_000_000
 _LONG_NS = 87_660 * _HOUR_NS  # ten years: no log is as long
@@ -196,7 +198,7 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
         RunError: The stamps of a source are in another unit than they are taken to be in.
     """
     command = _ascending(run.command.stamp)
-    found = _other_period(run.command.label, command, period)
+    found = _other_period(run.command.label, command, period) + _missing(run.command)
     for name in sensors:
         stamp = _ascending(run.sensors[name].stamp)
         if len(stamp):
@@ -222,18 +224,50 @@ def _other_period(label: str, stamp: TimeArray, period: float) -> list[str]:
     if len(intervals) < _FEW:
         return []
     early, usual, late = np.quantile(intervals, [0.25, 0.5, 0.75]) / 1e9
-    units = mistaken(usual / period, TIMES)
-    if units and late - early <= _EVEN * usual:
+    units, even = mistaken(usual / period, TIMES), late - early <= _EVEN * usual
+    if units and even:
         raise RunError(
             f"{label}: commands come every {usual:.4g} s, {usual / period:.4g} times the arm's update_period_ms ="
-            f" {period * 1e3:g}: {_taken(units)}"
+            f" {period * 1e3:g}: {_taken(units)}, or update_period_ms in arm.toml"
         )
-    if 1.0 / _OTHER_PERIOD < usual / period < _OTHER_PERIOD:
+    far = _OTHER_BEAT if even else _OTHER_PERIOD
+    if 1.0 / far < usual / period < far:
         return []
     lost = "are most of them lost, or is it another one?" if usual > period else "is it another one?"
     return [
         f"{label}: commands come every {usual * 1e3:.4g} ms, {usual / period:.3g} times the arm's update_period_ms ="
         f" {period * 1e3:g}: {lost}"
+    ]
+
+
+def _missing(command: Source) -> list[str]:
+    """A sentence if commands of a steady stream are missing where they move.
+
+    Short gaps count in mid-motion, long ones if the command jumps: who sends a command only when it changes leaves the
+    others out on purpose.
+    """
+    rows = np.flatnonzero(command.stamp != NO_STAMP)
+    rows = rows[np.diff(command.stamp[rows], prepend=ALWAYS) > 0]
+    intervals = np.diff(command.stamp[rows]) / 1e9
+    if len(intervals) < _FEW or (intervals <= 0.0).any():
+        return []
+    usual = float(np.median(intervals))
+    ticks = np.rint(intervals / usual)
+    if np.mean(np.abs(intervals / usual - ticks) > _OFF_TICK) > _EVEN:
+        return []
+    steps = np.abs(np.diff([value[rows] for value in command.values.values()], axis=1))
+    largest = np.nanmax(np.where(ticks == 1, steps, 0.0), axis=1, keepdims=True)
+    jumps = np.any(steps > _JUMP * largest, axis=0)
+    moving = np.pad(np.any(steps > 0.0, axis=0), 1)
+    moving, on = moving[1:-1], moving[:-2] & moving[1:-1] & moving[2:]
+    gaps = (ticks > 1) & np.where(ticks > _SCATTERED, jumps, on)
+    missing, sent = int(np.sum(ticks[gaps] - 1)), int(np.count_nonzero(moving))
+    if missing < _FEW or missing <= _MANY_LOST * (missing + sent):
+        return []
+    return [
+        f"{command.label}: {missing} of {missing + sent} commands are missing while the arm moves (one is due every"
+        f" {usual * 1e3:.4g} ms), the longest gap is {intervals[gaps].max():.3g} s: the model holds the one before; log"
+        " every command"
     ]
 
 

@@ -10,7 +10,7 @@ import msgspec
 from .. import toml
 from ..errors import ConfigError, UnknownNameError
 from ..toml import NotNegative
-from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of
+from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of, refuse_name
 from .columns import leaf
 from .frames import Frame
 
@@ -133,6 +133,8 @@ def load(path: Path) -> Manifest:
     if not isinstance(sensors, dict):
         raise ConfigError(f"{where}: sensors: expected a table for each sensor, as in [sensors.tracker]")
     named = cast(dict[str, Any], sensors)
+    for name in named:
+        refuse_name(f"{where}: sensor", name)
     tree["sensors"] = {name: _source(table, SourceEntry, where, f"sensors.{name}") for name, table in named.items()}
     return toml.struct(tree, Manifest, where)
 

@@ -14,7 +14,7 @@ from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError, suggestion
 from ..toml import Interval, Positive
-from ..units import KINDS, MM, MS, SCREEN, Kind, Screen, refuse_unit
+from ..units import KINDS, MM, MS, SCREEN, Kind, Screen, refuse_name
 from .plants import PLANTS, Delay
 from .presets import PRESETS
 
@@ -142,7 +142,7 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     def __post_init__(self) -> None:
         for name in self.axes:
-            refuse_unit("axis", name)
+            refuse_name("axis", name)
 
     def __repr__(self) -> str:
         lags = ", ".join(f"{axis} {self.lag_of(axis) * MS:.4g} ms" for axis in self.axes)

@@ -22,7 +22,7 @@ from ..fusion.estimates import Estimates
 from ..fusion.offline import UNCOVERED
 from ..fusion.segments import added
 from ..fusion.skill import PredictionError, Skill
-from ..fusion.summary import AxisSummary, ScoreSummary, SensorSummary, Summary, axis_summary, summary_of
+from ..fusion.summary import AxisSummary, ScoreSummary, SensorSummary, Summary, axis_summary, sensor_summary, summary_of
 from ..units import Kind
 
 _NUMBER = re.compile(r"\d[\d.,]*(e[+-]?\d+)?")
@@ -153,20 +153,7 @@ def _sensor(digests: Sequence[Digest], axis: str, name: str) -> SensorSummary:
         for each in ([part.innovation_rms for part in parts], [part.innovation_sd for part in parts])
     ]
     bias = digests[-1].est.biases.get(name, {}).get(axis)
-    return SensorSummary(
-        outcomes=outcomes,
-        innovation_rms=math.sqrt(squares[0]),
-        innovation_sd=math.sqrt(squares[1]),
-        nis_mean=found.nis,
-        nis_band=found.nis_band,
-        correlation=found.correlation.tolist(),
-        correlation_band=found.correlation_band,
-        whiteness_p=found.whiteness,
-        verdict=found.verdict,
-        bias=None if bias is None else bias.value,
-        bias_sd=None if bias is None else bias.sd,
-        skill=skill,
-    )
+    return sensor_summary(outcomes, found, math.sqrt(squares[0]), math.sqrt(squares[1]), bias, skill)
 
 
 def _consistency(

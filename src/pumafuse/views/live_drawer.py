@@ -80,9 +80,10 @@ class Picture:
                 styles.points(self._colours[name], name),
                 styles.points(colours.REJECTED, "rejected", "Cross"),
             )
-            self._plot(f"{axis}/{name}", points, time[fused], position[fused] * screen.scale)
-            self._plot(f"{axis}/{name}/rejected", crosses, time[rejected], shown[rejected] * screen.scale)
-            self._plot(f"residual/{axis}/{name}", points, time[fused], residual[fused] * screen.scale)
+            entity = styles.entity(name)
+            self._plot(f"{axis}/{entity}", points, time[fused], position[fused] * screen.scale)
+            self._plot(f"{axis}/{entity}/rejected", crosses, time[rejected], shown[rejected] * screen.scale)
+            self._plot(f"residual/{axis}/{entity}", points, time[fused], residual[fused] * screen.scale)
         for name, colour in self._of_sensors.items():
             for path in (f"nis/{name}", f"rate/{name}"):
                 self._plot(path, styles.line(colour, name), *_columns(frame, path, 2))

@@ -141,8 +141,13 @@ def _serve(port: int, behind: int, viewer: int) -> None:
     allowed = f"'self' http://{HOST}:{viewer}"
     policy = f"default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; connect-src {allowed}"
 
+    ours = {f"{name}:{port}" for name in ("localhost", "127.0.0.1", "[::1]")}
+
     class Page(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
+            if self.headers.get("Host", "").lower() not in ours:  # another page whose name leads here
+                self.send_error(http.HTTPStatus.MISDIRECTED_REQUEST)
+                return
             behind_it = http.client.HTTPConnection(HOST, behind, timeout=_WAIT)
             try:
                 behind_it.request("GET", self.path.partition("?")[0])

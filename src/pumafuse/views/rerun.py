@@ -21,6 +21,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from .. import folders
 from ..arrays import FloatArray
 from ..filter.outcome import Outcome
 from ..fusion.estimates import Estimates
@@ -54,16 +55,29 @@ def to_rerun(est: Estimates, run: Run, sink: str | Path | rr.RecordingStream) ->
     Args:
         est: The estimates.
         run: The run that they were made from.
-        sink: A file to write (``.rrd``), or a stream of rerun-sdk.
+        sink: A file to write (``.rrd``), complete or not at all, or a stream of rerun-sdk.
+
+    Raises:
+        FolderError: The file cannot be written.
     """
     if isinstance(sink, rr.RecordingStream):
         _send_named(est, run, sink)
-    elif run.recording is None:
-        with rr.RecordingStream("pumafuse") as stream:
-            stream.save(str(sink), default_blueprint=_blueprint(est))
-            _send_named(est, run, stream)
     else:
-        _save_layer(est, run, run.recording, sink)
+        folders.write_file(Path(sink), recording_of(est, run))
+
+
+def recording_of(est: Estimates, run: Run) -> bytes:
+    """The content of an ``.rrd`` file of a fusion.
+
+    It is not left to rerun-sdk to write it, which may say nothing where the disk is full.
+    """
+    if run.recording is not None:
+        return _layer(est, run, run.recording)
+    with rr.RecordingStream("pumafuse") as stream:
+        memory = stream.memory_recording()
+        stream.send_blueprint(_blueprint(est), make_active=False, make_default=True)
+        _send_named(est, run, stream)
+        return memory.drain_as_bytes()
 
 
 @dataclass(frozen=True)
@@ -96,8 +110,8 @@ def _send_named(est: Estimates, run: Run, stream: rr.RecordingStream) -> None:
     _send(est, run, _Sink(stream))
 
 
-def _save_layer(est: Estimates, run: Run, under: Recording, path: str | Path) -> None:
-    """Save what opens on top of a recording, whose name, properties and layout stay what they are."""
+def _layer(est: Estimates, run: Run, under: Recording) -> bytes:
+    """What opens on top of a recording, whose name, properties and layout stay what they are."""
 
     def times(time: FloatArray) -> list[rr.TimeColumn]:
         stamp = est.origin + np.rint(time * 1e9).astype(np.int64)
@@ -110,8 +124,9 @@ def _save_layer(est: Estimates, run: Run, under: Recording, path: str | Path) ->
                 return [rr.TimeColumn(under.timeline, sequence=np.rint(stamp / under.unit).astype(np.int64))]
 
     with rr.RecordingStream(under.application, recording_id=under.id, send_properties=False) as stream:
-        stream.save(str(path))
+        memory = stream.memory_recording()
         _send(est, run, _Sink(stream, times if under.timeline else styles.timeline, "pumafuse/", 1.0))
+        return memory.drain_as_bytes()
 
 
 def _send(est: Estimates, run: Run, sink: _Sink) -> None:
@@ -148,13 +163,14 @@ def _measured(est: Estimates) -> list[str]:
 def _sensor(sink: _Sink, est: Estimates, sensor: str, axis: str, colour: str) -> None:
     measured, screen = est.measured_positions(sensor, axis), est.config.arm.screen_of(axis)
     fused = (measured.outcome == Outcome.FUSED) | (measured.outcome == Outcome.REACQUIRED)
+    name = styles.entity(sensor)
     points, crosses = styles.points(colour, sensor), styles.points(colours.REJECTED, "rejected", "Cross")
     position = np.interp(measured.time, est.time, est[axis].position, left=np.nan, right=np.nan)
     for path, value in ((axis, measured.value), (f"residual/{axis}", measured.value - position)):
-        _series(sink, f"{path}/{sensor}", points, measured.time[fused], value[fused], screen)
-        _series(sink, f"{path}/{sensor}/rejected", crosses, measured.time[~fused], value[~fused], screen)
+        _series(sink, f"{path}/{name}", points, measured.time[fused], value[fused], screen)
+        _series(sink, f"{path}/{name}/rejected", crosses, measured.time[~fused], value[~fused], screen)
     normalised = measured.innovation / measured.innovation_sd
-    _series(sink, f"innovation/{axis}/{sensor}", points, measured.time, normalised)
+    _series(sink, f"innovation/{axis}/{name}", points, measured.time, normalised)
 
 
 def _outcomes(sink: _Sink, est: Estimates, sensor: str) -> None:

@@ -13,6 +13,13 @@ TIMELINE = "time"
 Marker = Literal["Circle", "Cross"]
 Style: TypeAlias = rr.SeriesLines | rr.SeriesPoints | rr.Measurements
 
+_NOT_OF_SENSORS = {"command", "estimate", "reference", "upper", "lower"}
+
+
+def entity(sensor: str) -> str:
+    """The entity of a sensor, apart from those that are not a sensor's."""
+    return f"{sensor}_sensor" if sensor in _NOT_OF_SENSORS else sensor
+
 
 def line(colour: str, label: str, *, width: float = 1.5, step: bool = False) -> rr.SeriesLines:
     """A line, or a step line for what holds until the next value."""

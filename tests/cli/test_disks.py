@@ -1,0 +1,115 @@
+"""Full disks, damaged caches, two at once, names that no disk takes: one line, and nothing half written."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import pumafuse as pf
+from executable import EXECUTABLE, FUSION, SCAN, refused
+from pumafuse.folders import FolderError, replacing
+from pumafuse.fusion import results
+
+FUSE = [str(EXECUTABLE), "fuse", str(SCAN), "-c", str(FUSION), "-o"]
+
+
+def test_a_recording_that_the_disk_cuts_short_is_absent(tmp_path: Path) -> None:
+    """The tables have room, the recording has not: no folder without it, and none with a part of it."""
+
+    def limited() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
+
+    words = [*FUSE, str(tmp_path / "out"), "--rrd"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False, preexec_fn=limited)
+    assert done.returncode == 1
+    assert done.stderr == f"pumafuse: {tmp_path / 'out'}: cannot be written: File too large\n"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("words", [[*FUSE, "out"], [str(EXECUTABLE), "--help"], [str(EXECUTABLE), "fuse", "--help"]])
+def test_a_full_standard_output_is_one_line(words: list[str], tmp_path: Path) -> None:
+    """Exit code 1, and what was written stays."""
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            words, stdout=full, stderr=subprocess.PIPE, text=True, timeout=60, check=False, cwd=tmp_path
+        )
+    assert done.returncode == 1
+    assert done.stderr.splitlines() == ["pumafuse: standard output: No space left on device"]
+    if "out" in words:
+        assert len(results.read(tmp_path / "out").time)
+
+
+def test_a_closed_standard_output_is_no_fault(tmp_path: Path) -> None:
+    """Whoever closes it does not want the tables."""
+    line = f'"{EXECUTABLE}" fuse "{SCAN}" -c "{FUSION}" -o out'
+    done = subprocess.run(f"{line} >&-", shell=True, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "out" / "summary.json").exists()
+
+
+@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+def test_a_damaged_kernel_is_compiled_anew(ending: str, tmp_path: Path) -> None:
+    """It is said, the result is right, and the next start finds it whole."""
+    (tmp_path / "some.py").write_text(
+        "from pumafuse.compiled import kernel\n@kernel\ndef double(x):\n    return 2.0 * x\nprint(double(21.0))\n"
+    )
+
+    def shown() -> subprocess.CompletedProcess[str]:
+        words = [sys.executable, "-c", "import some"]
+        return subprocess.run(words, capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path)
+
+    assert shown().stdout == "42.0\n"
+    for kept in tmp_path.rglob(f"*{ending}"):
+        os.truncate(kept, kept.stat().st_size // 2)
+    again = shown()
+    assert again.stdout == "42.0\n"
+    assert "a compiled kernel is damaged" in again.stderr
+    assert (shown().stdout, shown().stderr) == ("42.0\n", "")
+
+
+def test_two_that_write_one_folder_at_once(tmp_path: Path) -> None:
+    """The first one to end wins, the other one says so and leaves nothing."""
+    refuses = pytest.raises(FolderError, match="another process has written it meanwhile")
+    with refuses, replacing(tmp_path / "out") as mine:
+        (mine / "mine").touch()
+        with replacing(tmp_path / "out") as theirs:
+            (theirs / "theirs").touch()
+    assert [path.name for path in tmp_path.rglob("*")] == ["out", "theirs"]
+
+
+def test_names_that_no_disk_takes_are_refused(tmp_path: Path) -> None:
+    """By the command line and from Python, before any work; the longest name that it takes is taken."""
+    long = tmp_path / ("o" * 256)
+    line = refused("fuse", SCAN, "-c", FUSION, "-o", long)
+    assert line.endswith(" …: cannot be written: File name too long")
+    assert len(line) < 250
+    for name in (long, f"{tmp_path}/x\0y"):
+        with pytest.raises(pf.PumafuseError, match="cannot be written"), replacing(Path(name)):
+            pass
+    with replacing(tmp_path / ("o" * 255)):
+        pass
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_nothing_is_left_by_a_signal(number: signal.Signals, tmp_path: Path) -> None:
+    """The command ends as after an error, with 128 and the signal's number."""
+    code = (
+        "import sys, time\nfrom pathlib import Path\nfrom pumafuse import folders\nfrom pumafuse.cli import main\n"
+        "def wait(*_, **__):\n"
+        "    with folders.replacing(Path('out')):\n        print('writing', flush=True)\n        time.sleep(60)\n"
+        "main.app = wait\nmain.main()\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=tmp_path)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "writing\n"
+    assert list(tmp_path.iterdir())
+    process.send_signal(number)
+    assert process.wait(30) == 128 + number
+    process.stdout.close()
+    assert not list(tmp_path.iterdir())
