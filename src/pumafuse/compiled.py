@@ -35,8 +35,7 @@ else:
     from typing import Any
 
     import numba
-    from numba.core import event
-    from numba.core.caching import FunctionCache
+    from numba.core.caching import FunctionCache, NullCache
 
     # Kernels own no arrays, so nothing in them is counted (`_nrt`), and calls within the algebra vanish
     # (`forceinline`): together that is a factor of twenty. What is called less often is compiled apart, once: a copy in
@@ -58,7 +57,14 @@ else:
         """What is kept of a kernel on disk. Where that is damaged, or the disk refuses, it is compiled anew."""
 
         def load_overload(self, sig: Any, target_context: Any) -> Any:
-            """The compiled kernel, or None."""
+            """The compiled kernel, or None where it is to be compiled here."""
+            found = self._found(sig, target_context)
+            if found is None and _first_use(self._py_func):
+                _compile_all()
+                found = self._found(sig, target_context)
+            return found
+
+        def _found(self, sig: Any, target_context: Any) -> Any:
             try:
                 return super().load_overload(sig, target_context)
             except Exception as error:  # whatever a damaged pickle raises
@@ -77,11 +83,41 @@ else:
         def _say(self, what: str, error: Exception) -> None:
             print(f"{self.cache_path}: a compiled kernel is {what} ({error})", file=sys.stderr, flush=True)
 
+    class _NotKept(NullCache):
+        """Where there is no place on disk, each process compiles what it needs."""
+
+        def __init__(self, function: Any) -> None:
+            self.function = function
+
+        def load_overload(self, *_: Any) -> None:
+            """Nothing is ever found."""
+            _first_use(self.function)
+
+    _said: list[bool] = []
+
+    def _first_use(function: Any) -> bool:
+        """Whether this is the first kernel of ours that is not found. It says so."""
+        if _said or _BESIDE in os.environ or not function.__module__.startswith(f"{__package__}."):
+            return False
+        _said.append(True)
+        print(f"compiling the filter for this machine, {_HOW_OFTEN} ...", file=sys.stderr, flush=True)
+        return True
+
+    def _compile_all() -> None:
+        """Compile every kernel in two processes, so that no other command has to wait when it is first used."""
+        if not Path(sys.executable).stem.startswith("python"):  # within another program
+            return
+        environment = os.environ | {_BESIDE: "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+        nothing = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+        words = [sys.executable, "-m", f"{__package__}.live.first_use"]
+        halves = [subprocess.Popen([*words, half], env=environment, **nothing) for half in ("forward", "rest")]
+        for half in halves:
+            half.wait()
+
     def kernel(function):
         """A kernel whose compiled form is kept on disk, where there is a place."""
         dispatcher = numba.njit(**_OPTIONS)(function)
-        if _KEPT:
-            dispatcher._cache = _Kept(function)
+        dispatcher._cache = (_Kept if _KEPT else _NotKept)(function)
         return dispatcher
 
     _KEPT = _kept()
@@ -90,41 +126,8 @@ else:
     compiled_apart = numba.njit(no_cpython_wrapper=True, **_OPTIONS)
     inlined = numba.njit(inline="always", no_cpython_wrapper=True, **_OPTIONS)
     _HOW_OFTEN = (
-        "once (some 15 s)"
+        "once (some 12 s)"
         if _KEPT
-        else "at each start (some 15 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
+        else "at each start (some 12 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
     )
     _BESIDE = "PUMAFUSE_COMPILES_BESIDE"  # set in the environment of processes that compile for another one
-
-    class _FirstUse(event.Listener):
-        """Where a kernel is compiled and not found on disk, says so and has all the others compiled, too.
-
-        So nothing is left to wait for when another command is used for the first time.
-        """
-
-        def __init__(self) -> None:
-            self.begun, self.depth = _BESIDE in os.environ, 0
-            self.others: list[subprocess.Popen[bytes]] = []
-
-        def on_start(self, event: event.Event) -> None:
-            """The first time, start two processes that compile all."""
-            self.depth += 1
-            if self.begun or not event.data["dispatcher"].py_func.__module__.startswith(f"{__package__}."):
-                return
-            self.begun = True
-            print(f"compiling the filter for this machine, {_HOW_OFTEN} ...", file=sys.stderr, flush=True)
-            if not _KEPT or not Path(sys.executable).stem.startswith("python"):  # within another program
-                return
-            environment = os.environ | {_BESIDE: "1", "PYTHONPATH": os.pathsep.join(sys.path)}
-            nothing = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-            for part in ("forward", "rest"):
-                words = [sys.executable, "-m", f"{__package__}.live.first_use", part]
-                self.others.append(subprocess.Popen(words, env=environment, **nothing))
-
-        def on_end(self, _event: event.Event) -> None:
-            """Wait for the others: what they compile is found on disk then. What they do not, is compiled here."""
-            self.depth -= 1
-            while self.depth == 0 and self.others:
-                self.others.pop().wait()
-
-    event.register("numba:compile", _FirstUse())

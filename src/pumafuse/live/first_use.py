@@ -1,6 +1,7 @@
-"""Compiles every kernel for this machine, in two processes beside the one that needs the first of them.
+"""Compiles every kernel for this machine, in two processes for the one that needs the first of them.
 
-``python -m pumafuse.live.first_use forward`` compiles what moves the state, ``… rest`` all others: about as long.
+``python -m pumafuse.live.first_use forward`` compiles the pass forward and what is small, ``… rest`` the smoother and
+the live window: about as long.
 """
 
 from __future__ import annotations
@@ -27,14 +28,20 @@ _AXIS = AxisModel(plant=FirstOrder(time_constant=0.02))
 
 
 def compile_forward(window: Window) -> None:
-    """The forward pass, over no event."""
+    """The forward pass over no event, a response and whatever is small, over nothing."""
     filter_events(window.memory.filter.flat(), False, 0, 0, 0, *ALL_THERE, 0, *NO_ESTIMATES)
+    none = np.zeros(0)
+    response(_AXIS, 0.028, 0.0, NO_TIMES, none, 0.0, NO_TIMES)
+    constant_velocity(np.zeros(1), np.zeros(1), none, np.zeros((5, 0)), none, none)
+    assigned_ticks(np.zeros(2))
+    to_cylinder(none, none, 0.0, 0.0, 1.0, 0.0, 1.0, none, 0.0, none, none, none)
+    from_cylinder(none, none, 0.0, 0.0, 1.0, 0.0, 1.0, none, none)
 
 
 def compile_rest(window: Window) -> None:
-    """All other kernels, over nothing."""
+    """The smoother, over no event, and what the live window needs."""
     (model, sensors, events, state, results, history), incoming = window.memory
-    none, width = np.zeros(0), state.x.shape[1]
+    width = state.x.shape[1]
     room = np.empty((2, width)), np.empty((2, width, width)), np.empty((1, 4, width)), np.empty((width + 1, width))
     smooth(model, sensors, events, results, history, 0, NO_TIMES, room, NO_ESTIMATES[1])
     flat = window.memory.filter.flat(), tuple(incoming)
@@ -45,11 +52,6 @@ def compile_rest(window: Window) -> None:
     window.counters()
     empty = events.rows(slice(0, 0))
     classify_all(model, sensors, empty, state, 0, np.zeros(0, dtype=np.bool_), empty.known)
-    response(_AXIS, 0.028, 0.0, NO_TIMES, none, 0.0, NO_TIMES)
-    constant_velocity(np.zeros(1), np.zeros(1), none, np.zeros((5, 0)), none, none)
-    assigned_ticks(np.zeros(2))
-    to_cylinder(none, none, 0.0, 0.0, 1.0, 0.0, 1.0, none, 0.0, none, none, none)
-    from_cylinder(none, none, 0.0, 0.0, 1.0, 0.0, 1.0, none, none)
 
 
 def main(part: str) -> None:
