@@ -126,8 +126,8 @@ else:
     compiled_apart = numba.njit(no_cpython_wrapper=True, **_OPTIONS)
     inlined = numba.njit(inline="always", no_cpython_wrapper=True, **_OPTIONS)
     _HOW_OFTEN = (
-        "once (some 12 s)"
+        "once (some 15 s)"
         if _KEPT
-        else "at each start (some 12 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
+        else "at each start (some 15 s), as there is no place to keep it: set NUMBA_CACHE_DIR to a folder"
     )
     _BESIDE = "PUMAFUSE_COMPILES_BESIDE"  # set in the environment of processes that compile for another one

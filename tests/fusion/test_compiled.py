@@ -42,7 +42,7 @@ def test_compiling_is_said_once_on_a_machine(tmp_path: Path) -> None:
         )
         for code in (CODE, CODE, ALL)
     )
-    assert first.stderr.splitlines() == ["compiling the filter for this machine, once (some 12 s) ..."]
+    assert first.stderr.splitlines() == ["compiling the filter for this machine, once (some 15 s) ..."]
     assert again.stderr == others.stderr == ""
     assert first.stdout == again.stdout
     source = Path(pf.__file__).parent.rglob("*.py")

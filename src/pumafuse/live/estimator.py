@@ -123,7 +123,7 @@ class LiveEstimator:
         self._begin(None)
 
     def warm_up(self) -> None:
-        """Load now what else takes a second when it is first needed; on a new machine compile it, some 12 s."""
+        """Load now what else takes a second when it is first needed; on a new machine compile it, some 15 s."""
         other = LiveEstimator(self.config)
         place = dict.fromkeys((*self.axes, *(CARTESIAN if self.config.frame is not None else ())), 1.0)
         other.command(0, **place)
