@@ -12,6 +12,8 @@ from pathlib import Path
 
 from .errors import PumafuseError
 
+_MEANWHILE = "another process has written it meanwhile, and that stays; choose another name"
+
 
 class FolderError(PumafuseError):
     """An output folder cannot be written or read."""
@@ -62,9 +64,7 @@ def replacing(folder: Path) -> Generator[Path]:
         new.mkdir()
         yield new
         if _identity(folder) != before:
-            raise FolderError(
-                f"{folder}: another process has written it meanwhile, and that stays; choose another folder"
-            )
+            raise FolderError(f"{folder}: {_MEANWHILE}")
         if folder.exists():
             folder.replace(old)
         try:
@@ -80,17 +80,24 @@ def _identity(folder: Path) -> int | None:
     return folder.stat().st_ino if folder.exists() else None
 
 
-def write_file(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all, in the place of an earlier one.
+def write_file(path: Path, content: str | bytes, *, replace: bool = True) -> None:
+    """Write a file whole or not at all.
+
+    Args:
+        path: The file.
+        content: What is in it.
+        replace: Whether in the place of an earlier one; else there was none when the work began.
 
     Raises:
-        FolderError: The disk refuses.
+        FolderError: The disk refuses, or another process has written the file meanwhile.
     """
     with _refused(path):
         path = path.resolve()
     with _beside(path) as place:
         new = place / "new"
         new.write_bytes(content.encode() if isinstance(content, str) else content)
+        if path.exists() and not replace:
+            raise FolderError(f"{path}: {_MEANWHILE}")
         new.replace(path)
 
 
@@ -127,4 +134,5 @@ def _refused(path: Path) -> Generator[None]:
         yield
     except OSError as error:
         shown = path if len(str(path)) < 200 else f"{path!s:.100} …"
-        raise FolderError(f"{shown}: cannot be written: {error.strerror}") from None
+        why = os.strerror(error.errno) if error.errno else error  # pyarrow's own words say it twice
+        raise FolderError(f"{shown}: cannot be written: {why}") from None

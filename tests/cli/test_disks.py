@@ -13,17 +13,18 @@ import pytest
 
 import pumafuse as pf
 from executable import EXECUTABLE, FUSION, SCAN, refused
-from pumafuse.folders import FolderError, replacing
+from pumafuse.folders import FolderError, replacing, write_file
 from pumafuse.fusion import results
 
 FUSE = [str(EXECUTABLE), "fuse", str(SCAN), "-c", str(FUSION), "-o"]
 
 
-def test_a_recording_that_the_disk_cuts_short_is_absent(tmp_path: Path) -> None:
-    """The tables have room, the recording has not: no folder without it, and none with a part of it."""
+@pytest.mark.parametrize("room", [50_000, 3_000_000])
+def test_a_result_that_the_disk_cuts_short_is_absent(room: int, tmp_path: Path) -> None:
+    """A table has no room, or the recording has not: no folder without it, none with a part of it; one line."""
 
     def limited() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
 
     words = [*FUSE, str(tmp_path / "out"), "--rrd"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False, preexec_fn=limited)
@@ -81,6 +82,16 @@ def test_two_that_write_one_folder_at_once(tmp_path: Path) -> None:
         with replacing(tmp_path / "out") as theirs:
             (theirs / "theirs").touch()
     assert [path.name for path in tmp_path.rglob("*")] == ["out", "theirs"]
+
+
+def test_two_that_write_one_file_at_once(tmp_path: Path) -> None:
+    """Where none was to be replaced, the one that comes second says so, and the first one's stays."""
+    write_file(tmp_path / "arm.toml", "first")
+    with pytest.raises(FolderError, match=r"arm\.toml: another process has written it meanwhile"):
+        write_file(tmp_path / "arm.toml", "second", replace=False)
+    assert (tmp_path / "arm.toml").read_text() == "first"
+    write_file(tmp_path / "arm.toml", "second")
+    assert (tmp_path / "arm.toml").read_text() == "second"
 
 
 def test_names_that_no_disk_takes_are_refused(tmp_path: Path) -> None:

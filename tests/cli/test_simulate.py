@@ -127,6 +127,13 @@ def test_many_runs_are_resumed(scenario: Path, tmp_path: Path) -> None:
         (["--figures"], "with no fused.png"),
     ):
         assert what in refused("fuse", *given, *same, "-o", out, "--resume", *option)
+    recorded = next((runs / "seed-4").glob("*.parquet"))
+    before = recorded.stat().st_mtime
+    os.utime(recorded, (time.time() + 1.0,) * 2)  # as if it had been recorded anew
+    assert f"{out / 'seed-4'}: an earlier result, with the run as it was before;" in refused(
+        "fuse", *given, *same, "-o", out, "--resume"
+    )
+    os.utime(recorded, (before, before))
     edited = runs / "seed-3" / "fusion.toml"
     edited.write_text(edited.read_text().replace("[start]", "[start]\n# as before\n"))
     pumafuse("fuse", *given, *same, "-o", out, "--resume")

@@ -261,6 +261,21 @@ def test_a_full_disk_is_reported_and_nothing_is_written_twice(
     assert len(found.sensors["tracker"].stamp) == 60
 
 
+def test_a_second_full_disk_is_reported_at_once_too(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As soon as the first one, though less than a minute is between them."""
+    monkeypatch.setattr(record, "_TRIED_AGAIN", 0.01)
+    write = os.write
+    for time_of in range(2):
+        recorded.go(10, begin=20 * time_of)
+        recorded.written(20 + 40 * time_of)
+        monkeypatch.setattr(os, "write", full)
+        recorded.go(10, begin=20 * time_of + 10)
+        recorded.tick_until(lambda seen=time_of: sum("No space left" in text for text in recorded.notices) == seen + 1)
+        monkeypatch.setattr(os, "write", write)
+        recorded.tick_until(lambda seen=time_of: sum("written again" in text for text in recorded.notices) == seen + 1)
+    assert recorded.close().command.stamp.tolist() == [step * T for step in range(40)]
+
+
 def test_a_trouble_that_lasts_is_reported_every_minute(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
     """At once, and then once a minute."""
     recorded.go(10)

@@ -221,13 +221,15 @@ def test_the_page_speaks_with_this_machine_only() -> None:
     ]
     assert set(places) == {"127.0.0.1"}
 
-    def answer(host: str) -> str:
-        with socket.create_connection(("127.0.0.1", live_view.WEB_PORT)) as asked:
-            asked.sendall(f"GET / HTTP/1.0\r\nHost: {host}:{live_view.WEB_PORT}\r\n\r\n".encode())
+    def answer(host: str, port: int) -> str:
+        with socket.create_connection(("127.0.0.1", port)) as asked:
+            asked.sendall(f"GET / HTTP/1.0\r\nHost: {host}:{port}\r\n\r\n".encode())
             return b"".join(iter(lambda: asked.recv(1 << 16), b"")).decode()
 
-    page = answer("localhost")
-    assert "HTTP/1.0 421 " in answer("elsewhere.example")  # a name of another page's that leads here
+    page = answer("localhost", live_view.WEB_PORT)
+    for port in (live_view.WEB_PORT, live_view.PORT):
+        assert " 421 " not in answer("localhost", port)
+        assert " 421 Misdirected Request\r\n" in answer("elsewhere.example", port)  # which is made to lead here
     assert f"connect-src 'self' http://127.0.0.1:{live_view.PORT}\r\n" in page
     assert "re_viewer.js" in page
     assert server.environ()["CI"] == "1"  # what Rerun sends no statistics with

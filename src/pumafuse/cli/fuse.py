@@ -60,7 +60,7 @@ def run(
     extras = [name for name, wanted in {"fused.rrd": rrd, "fused.png": figures}.items() if wanted]
     making = results.Making(given, sensors, rate, mode, engine, part, extras)
     if len(runs) == 1:
-        summary = making.made(output) if resume else None
+        summary = making.made(output, runs[0]) if resume else None
         where = "written to" if summary is None else "there already:"
         if summary is None:
             with progress_bar(str(runs[0])) as progress:
@@ -69,7 +69,7 @@ def run(
         typer.echo(f"{where} {output}")
         return
     places = dict(zip(map(str, runs), _folders(runs, output), strict=True))
-    there = {path: summary for path, place in places.items() if resume and (summary := making.made(place))}
+    there = {path: summary for path, place in places.items() if resume and (summary := making.made(place, Path(path)))}
     jobs = {path: partial(job, Path(path), place) for path, place in places.items() if path not in there}
     done, failed = run_jobs("fusing", jobs, places.values())
     if there or done:

@@ -68,7 +68,7 @@ def run(
     found = identify(campaign, period=period, samples=samples, paper=paper, tolerance=most, name=name)
     for note in found.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=1)
-    write_file(output, found.arm.to_toml())
+    write_file(output, found.arm.to_toml(), replace=force)
     if report is not None:
         reports.write_identification(found, campaign, report, force)
     if json:

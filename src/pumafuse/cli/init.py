@@ -42,7 +42,7 @@ def run(log: Path, output: Path | None, force: bool) -> None:
     texts = drafts(found, folder)
     print_tables(_tables(found))
     for name, text in texts.items():
-        write_file(folder / name, text)
+        write_file(folder / name, text, replace=force)
     for number, question in enumerate(questions(found), 1):
         typer.echo(f"{number}. {question}" if number > 1 else f"To decide:\n1. {question}")
     place = shlex.quote(str(folder))

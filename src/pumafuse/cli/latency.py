@@ -70,7 +70,7 @@ def _told(
         reports.check_writable(report, force)
     found = _found(paths, sensor, part)
     if output is not None:
-        write_file(output, found.arm.to_toml())
+        write_file(output, found.arm.to_toml(), replace=force)
     if report is not None:
         reports.write_latency(found, report, force)
     if json:

@@ -18,7 +18,7 @@ from ..arrays import FloatArray, IntArray
 from ..errors import RunError
 from ..filter.outcome import Outcome
 from ..folders import FolderError
-from ..logs import tables
+from ..logs import manifest, tables
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.frames import CARTESIAN
@@ -112,8 +112,8 @@ class Making:
     part: tuple[float | None, float | None]
     extras: Sequence[str]
 
-    def made(self, folder: Path) -> Summary | None:
-        """The summary of a result that is there and was made so; None where nothing is.
+    def made(self, folder: Path, log: Path) -> Summary | None:
+        """The summary of a result that is there and was made so from the log as it is; None where nothing is.
 
         Raises:
             FolderError: It was made otherwise, or something else is there.
@@ -132,6 +132,7 @@ class Making:
             "other --sensors": summary.sensors != asked,
             "another --from or --to": (summary.from_s, summary.to_s) != self.part,
             **{f"no {name}": not (folder / name).exists() for name in self.extras},
+            "the run as it was before": (folder / SUMMARY).stat().st_mtime < manifest.last_written(log),
         }
         if how := next((how for how, holds in differs.items() if holds), None):
             raise FolderError(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import msgspec
 
 from .. import toml
-from ..errors import ConfigError, UnknownNameError
+from ..errors import ConfigError, PumafuseError, UnknownNameError
 from ..toml import NotNegative
 from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of, refuse_name
 from .columns import leaf
@@ -137,6 +138,22 @@ def load(path: Path) -> Manifest:
         refuse_name(f"{where}: sensor", name)
     tree["sensors"] = {name: _source(table, SourceEntry, where, f"sensors.{name}") for name, table in named.items()}
     return toml.struct(tree, Manifest, where)
+
+
+def last_written(run: Path) -> float:
+    """When a run was written last, in s since 1970; infinite where that cannot be told.
+
+    Args:
+        run: As :meth:`Run.read` takes it.
+    """
+    listed, files = run / "run.toml" if run.is_dir() else run, [run]
+    try:
+        if listed.suffix == ".toml":
+            files = [listed, *(listed.parent / entry.file for entry in load(listed).entries.values())]
+        parts = [part for file in files for part in (file.iterdir() if file.is_dir() else [file])]
+        return max(part.stat().st_mtime for part in parts)
+    except (PumafuseError, OSError, ValueError):
+        return math.inf
 
 
 def _source(table: Any, kind: type[SourceEntry], where: str, path: str) -> SourceEntry:

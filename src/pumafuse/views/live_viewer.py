@@ -1,7 +1,10 @@
 """The viewer that a live view draws into: started here, or found running; on this machine's loopback only.
 
+What a browser reaches of the web viewer passes through here, by loopback's names only. A page from elsewhere whose name
+is made to lead to this machine (DNS rebinding) could read it otherwise; its requests carry that name as their Host.
+
 The web viewer's page would send usage statistics, ask for newer versions, examples and fonts, and has no switch for it.
-The browser keeps it from that when the page's policy says so; hence the page passes through :func:`_serve`.
+The browser keeps it from that where the page's policy says so.
 """
 
 from __future__ import annotations
@@ -9,9 +12,11 @@ from __future__ import annotations
 import contextlib
 import http.client
 import importlib.util
+import io
 import os
 import shutil
 import socket
+import socketserver
 import subprocess
 import threading
 import time
@@ -29,7 +34,10 @@ _SERVER_MEMORY = "32MiB"  # what a browser gets that is opened later: more than 
 _OPENED_WITHIN = 30.0  # s
 _PAUSE = 0.5  # s between two tries to find a viewer
 _PASSED_ON = ("Content-Type", "rerun-final-length")  # headers of the page
-_WAIT = 30.0  # s for Rerun's own server
+_WAIT = 30.0  # s for Rerun's own server, or for a request to come whole
+_LONGEST_HEAD = 1 << 16  # bytes
+_HTTP_2 = b"PRI * HTTP/2.0\r\n"  # how rerun-sdk begins; browsers do not, without encryption
+_MISDIRECTED = b"HTTP/1.1 421 Misdirected Request\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
 
 class Viewer:
@@ -43,13 +51,14 @@ class Viewer:
         """Start a viewer or a server, unless one is there; on free ports where the usual ones are taken."""
         self._own: subprocess.Popen[bytes] | None = None
         self._mode, self._report, self._opened = header.mode, report, False
-        self._port = header.port
+        port = header.port if self._mode == "connect" else _free(0 if self._mode == "web" else header.port)
+        self._awaited = [port]
+        if self._mode == "web":
+            self._web_port, self._data_port = _free(header.web_port), _free(header.port)
+            self._awaited.append(_free(0))
         if self._mode != "connect":
-            self._port = _free(header.port)
-            self._web_port, self._behind = _free(header.web_port), _free(0)
-            self._own = _start(_arguments(self._mode, self._port, self._behind), keep=self._mode == "spawn")
-        self._awaited = [self._port, self._behind] if self._mode == "web" else [self._port]
-        self.url = f"rerun+http://{HOST}:{self._port}/proxy"
+            self._own = _start(_arguments(self._mode, *self._awaited), keep=self._mode == "spawn")
+        self.url = _url(port)
 
     def wait(self) -> bool:
         """Wait until the viewer listens, and report where it is; whether it ever will."""
@@ -65,8 +74,9 @@ class Viewer:
                 return False
             time.sleep(_PAUSE)
         if self._mode == "web" and not self._opened:
-            _serve(self._web_port, self._behind, self._port)
-            self._report(f"Rerun: open http://{HOST}:{self._web_port}/?url={quote(self.url, safe='')}")
+            data, page = self._awaited
+            _serve(self._web_port, self._data_port, page, data)
+            self._report(f"Rerun: open http://{HOST}:{self._web_port}/?url={quote(_url(self._data_port), safe='')}")
         elif self._own is None or not self._opened:
             self._report(f"Rerun: drawing into the viewer at {self.url}")
         self._opened = True
@@ -81,7 +91,11 @@ class Viewer:
             self._own.kill()
 
 
-def _arguments(mode: str, port: int, web_port: int) -> list[str]:
+def _url(port: int) -> str:
+    return f"rerun+http://{HOST}:{port}/proxy"
+
+
+def _arguments(mode: str, port: int, web_port: int | None = None) -> list[str]:
     given = ["--bind", HOST, "--port", str(port)]
     if mode == "web":
         server = ["--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _SERVER_MEMORY]
@@ -130,25 +144,38 @@ def _listens(port: int) -> bool:
     return False
 
 
-def _serve(port: int, behind: int, viewer: int) -> None:
-    """Serve the web viewer's page in the background, so that it speaks with nobody but its server on this machine.
+# ---- what a browser reaches ------------------------------------------------------------------------------------------
+
+
+def _serve(web_port: int, port: int, page: int, data: int) -> None:
+    """Serve the page and its data in the background.
 
     Args:
-        port: Where the browser finds it.
-        behind: Where Rerun serves it.
-        viewer: Of the server that the page may speak with.
+        web_port: Where the browser finds the page …
+        port: … and the data.
+        page: Where Rerun serves the page …
+        data: … and takes and gives the data.
     """
-    allowed = f"'self' http://{HOST}:{viewer}"
-    policy = f"default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; connect-src {allowed}"
+    for server in (_page_server(web_port, port, page), _data_server(port, data)):
+        threading.Thread(target=server.serve_forever, daemon=True).start()
 
-    ours = {f"{name}:{port}" for name in ("localhost", "127.0.0.1", "[::1]")}
+
+def _is_ours(host: str | None, port: int) -> bool:
+    return (host or "").lower() in {f"{name}:{port}" for name in ("localhost", HOST, "[::1]")}
+
+
+def _page_server(web_port: int, port: int, page: int) -> socketserver.BaseServer:
+    """The page, which its policy lets speak with nobody but the server of its data."""
+    policy = (
+        f"default-src 'self' 'unsafe-inline' 'wasm-unsafe-eval' data: blob:; connect-src 'self' http://{HOST}:{port}"
+    )
 
     class Page(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            if self.headers.get("Host", "").lower() not in ours:  # another page whose name leads here
+            if not _is_ours(self.headers.get("Host"), web_port):
                 self.send_error(http.HTTPStatus.MISDIRECTED_REQUEST)
                 return
-            behind_it = http.client.HTTPConnection(HOST, behind, timeout=_WAIT)
+            behind_it = http.client.HTTPConnection(HOST, page, timeout=_WAIT)
             try:
                 behind_it.request("GET", self.path.partition("?")[0])
                 answer = behind_it.getresponse()
@@ -167,5 +194,57 @@ def _serve(port: int, behind: int, viewer: int) -> None:
         def log_message(self, format: str, *args: object) -> None:
             """Nothing: standard error is nobody's."""
 
-    server = ThreadingHTTPServer((HOST, port), Page)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
+    return ThreadingHTTPServer((HOST, web_port), Page)
+
+
+def _data_server(port: int, data: int) -> socketserver.BaseServer:
+    """Hands connections on to Rerun's server, byte by byte, once the first request says where it wants to go.
+
+    A browser asks only one host on one connection, so the first request speaks for all.
+    """
+
+    class Data(socketserver.BaseRequestHandler):
+        def handle(self) -> None:
+            with contextlib.suppress(OSError):  # either side has gone
+                self.request.settimeout(_WAIT)
+                head = _head(self.request)
+                if not head.startswith(_HTTP_2) and not _is_ours(_host(head), port):
+                    self.request.sendall(_MISDIRECTED)
+                    return
+                self.request.settimeout(None)
+                with socket.create_connection((HOST, data)) as rerun:
+                    rerun.sendall(head)
+                    threading.Thread(target=_copy, args=(rerun, self.request), daemon=True).start()
+                    _copy(self.request, rerun)
+
+    class Server(socketserver.ThreadingTCPServer):
+        allow_reuse_address = daemon_threads = True
+
+    return Server((HOST, port), Data)
+
+
+def _head(connection: socket.socket) -> bytes:
+    """What comes first, to the end of a request's headers at least."""
+    head = b""
+    while b"\r\n\r\n" not in head and len(head) < _LONGEST_HEAD:
+        if not (more := connection.recv(_LONGEST_HEAD)):
+            break
+        head += more
+    return head
+
+
+def _host(head: bytes) -> str | None:
+    """The Host of a request of HTTP/1; None if it has none."""
+    with contextlib.suppress(http.client.HTTPException):
+        return http.client.parse_headers(io.BytesIO(head.partition(b"\r\n")[2])).get("Host")
+    return None
+
+
+def _copy(source: socket.socket, target: socket.socket) -> None:
+    """Hand on what comes, to its end; then neither side waits for the other any longer."""
+    with contextlib.suppress(OSError):
+        while part := source.recv(1 << 16):
+            target.sendall(part)
+    for one in (source, target):
+        with contextlib.suppress(OSError):
+            one.shutdown(socket.SHUT_RDWR)
