@@ -116,7 +116,12 @@ def test_nothing_is_left_by_a_signal(number: signal.Signals, tmp_path: Path) -> 
         "    with folders.replacing(Path('out')):\n        print('writing', flush=True)\n        time.sleep(60)\n"
         "main.app = wait\nmain.main()\n"
     )
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, cwd=tmp_path)
+
+    def listening() -> None:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # whoever runs the tests may be deaf to it
+
+    words = [sys.executable, "-c", code]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=tmp_path, preexec_fn=listening)
     assert process.stdout is not None
     assert process.stdout.readline() == "writing\n"
     assert list(tmp_path.iterdir())
