@@ -1,6 +1,7 @@
-"""numba keeps compiled kernels on disk and does not notice that a kernel which another file calls has changed."""
+"""What tests need before any of them runs."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,15 @@ SOURCE = Path(pumafuse.__file__).parent
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Remove compiled kernels that are older than any of their sources; workers would each compile all of them anew."""
+    """Make signals heard and the kernels new.
+
+    Who starts the tests in the background, or with nohup, may have made them and all that they start deaf to signals.
+    numba does not notice that a kernel which another file calls has changed: what it keeps on disk is removed if it is
+    older than any of its sources. Workers would each compile all of them anew, so that is done before.
+    """
+    for number in (signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(number) == signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)
     kernels = (path for path in SOURCE.rglob("*.py") if "compiled import" in path.read_text(encoding="utf-8"))
     newest = max(path.stat().st_mtime for path in (SOURCE / "compiled.py", *kernels))
     for kept in SOURCE.rglob("*.nb[ic]"):

@@ -12,6 +12,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as papq
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 import bag_files
 import pumafuse as pf
@@ -360,6 +362,40 @@ def test_what_is_no_log_is_refused_in_a_line(files: dict[str, str], said: str, t
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     assert said in one_line(RunError, lambda: survey(tmp_path))
+
+
+def nested_table(file: Path) -> bytes:
+    """A command and a camera in nested columns of a Parquet file, with the bytes of the file."""
+    t, u, _, z = recorded(300)
+    stamp = [{"stamp": {"sec": int(one), "nanosec": round(one % 1.0 * 1e9)}} for one in t]
+    columns = {"header": stamp, "goal": [{"pos": one} for one in u.tolist()], "camera": z[:, 0]}
+    papq.write_table(pa.table(columns), file)
+    return file.read_bytes()
+
+
+def test_a_column_whose_name_is_damaged_is_a_line(tmp_path: Path) -> None:
+    """Pyarrow gives a table without a word then, or an error of Python's own."""
+    file = tmp_path / "log.parquet"
+    file.write_bytes(nested_table(file).replace(b"goal", b"g\x89al"))
+    assert "not a table that can be read" in one_line(RunError, lambda: survey(file))
+
+
+@pytest.mark.long
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(derandomize=True, deadline=None, max_examples=300, suppress_health_check=list(HealthCheck))
+def test_a_damaged_table_is_surveyed_or_refused_in_a_line(seed: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Bytes of a file with nested columns replaced, its end cut off: never a traceback."""
+    folder = tmp_path_factory.getbasetemp() / "damaged"
+    folder.mkdir(exist_ok=True)
+    file, draw = folder / "log.parquet", np.random.default_rng(seed)
+    content = bytearray(nested_table(file))
+    for place in draw.integers(0, len(content), draw.choice([1, 5, 30])):
+        content[place] = draw.integers(256)
+    file.write_bytes(content[: len(content) if seed % 3 else draw.integers(len(content))])
+    try:
+        drafts(survey(file), folder / "out")
+    except pf.PumafuseError as error:
+        assert len(str(error).splitlines()) == 1
 
 
 def test_a_log_without_commands_says_how_they_are_known(tmp_path: Path) -> None:

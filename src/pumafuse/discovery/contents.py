@@ -308,7 +308,7 @@ def _fields(path: Path) -> list[str]:
     """The columns of a Parquet file that are no images."""
     try:
         schema = papq.read_schema(path)
-    except (pa.ArrowInvalid, OSError) as error:
+    except (ValueError, OSError) as error:
         raise RunError(f"{path}: not a table that can be read: {str(error).splitlines()[0]}") from None
     return [one.name for one in schema if "binary" not in str(one.type)]
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 
 _EARLIEST, _LATEST = -1.0, 2.0  # s, of a lag
+_BEYOND = 1e9  # m or rad, where no robot goes
 _COARSE, _FINE = 0.01, 0.001  # s, steps of a lag
 # s, over which changes are taken: long where noise is large; from the mean where it is most of the run, as on a path at
 # constant speed, which says more of the lag than its ends do.
@@ -78,8 +79,8 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
 
 
 def _known(stamp: TimeArray, value: FloatArray, origin: int) -> tuple[FloatArray, FloatArray]:
-    """Seconds and values of the rows that have both, in order."""
-    there = (stamp != NO_STAMP) & np.isfinite(value)
+    """Seconds and values of the rows that have both, in order, without what no robot reaches."""
+    there = (stamp != NO_STAMP) & (np.abs(value) < _BEYOND)
     time, order = np.unique((stamp[there] - origin) / 1e9, return_index=True)
     return time, value[there][order]
 

@@ -95,7 +95,7 @@ def row_count(path: Path) -> int:
     """How many rows a Parquet table has; 0 for what is none that can be read."""
     try:
         return papq.read_metadata(str(path)).num_rows if path.suffix == ".parquet" else 0
-    except (OSError, pa.ArrowInvalid):
+    except (OSError, ValueError):
         return 0
 
 
