@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from decimal import Context, Decimal
+from functools import lru_cache
 from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
@@ -86,6 +87,7 @@ PROVENANCE = "provenance"  # a table of this name is kept as it is
 INTERVAL = "_ci95"  # `time_constant_ms_ci95` is in ms
 
 
+@lru_cache(4096)  # a search asks time and again
 def ending(name: str) -> str | None:
     """The longest known unit at the end of ``name``, so that ``max_speed_m_s`` is in m/s; None without one."""
     stem = name.removesuffix(INTERVAL)

@@ -130,6 +130,19 @@ def test_the_fused_figure_shows_command_estimate_measurements_and_reference() ->
             assert line(axes, label)[1] == pytest.approx(seen.values[name][~good] * 1e3)
 
 
+def test_bands_are_where_95_percent_of_errors_are() -> None:
+    """1.96 sd each way, in mm; below the estimate about 0."""
+    est, _ = case(axes=1)
+    for axes, centre in zip(fused_figure(est).axes[:4:2], (est["tangential"].position, 0.0), strict=True):
+        (band,) = [one for one in axes.collections if one.get_label() == "95 % band"]
+        edges = band.get_paths()[0].vertices
+        for sign in (-1.0, 1.0):
+            edge = 1e3 * (centre + sign * 1.959964 * est["tangential"].position_sd)
+            wanted = np.column_stack([est.time, edge])
+            apart = np.abs(wanted[:, None, :] - edges[None, :, :]).max(axis=2).min(axis=1)
+            assert apart.max() < 1e-6
+
+
 def test_below_it_is_what_each_measurement_leaves() -> None:
     """Measurement − estimate; the band of the estimate; what the sensor's sd claims."""
     est, _ = case(axes=1, scale=-1.0)

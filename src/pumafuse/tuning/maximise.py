@@ -30,6 +30,7 @@ _POOR = 0.1  # of the expected gain, from which a step was too long
 _GOOD = 0.5  # of the expected gain, from which derivatives are carried along to the next step, if that was
 _NEARBY = 2.0  # at most in log-likelihood: farther away they change too much
 _MORE = 1.1  # of the expected gain, from which a longer step is tried
+_ACTIVE_SETS = 8  # that are tried; they may go round in circles
 _GATE_ROUNDS = 12  # times that the gates decide again
 _BUMPS = tuple(sign * shift for shift in (2e-4, 5e-4, 1e-3, 2e-3) for sign in (-1.0, 1.0))  # s
 _SHARES = (1.0, 0.5, 0.2)
@@ -297,12 +298,32 @@ def _step(found: Derivatives, low: FloatArray, high: FloatArray, damping: FloatA
     known = diagonal > 0.0
     step, size = np.zeros(len(diagonal)), 1.0 / np.sqrt(diagonal[known])
     matrix = found.information[np.ix_(known, known)] * np.outer(size, size) + np.diag(damping[known] + _ROUNDING)
-    root = np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
-    aim = np.asarray(np.linalg.solve(root, size * found.score[known]), dtype=np.float64)
-    inner, lowest, highest = np.linalg.solve(root.T, aim), low[known] / size, high[known] / size
-    if not ((inner >= lowest) & (inner <= highest)).all():
+    lowest, highest = low[known] / size, high[known] / size
+    inner = _between(matrix, size * found.score[known], lowest, highest)
+    if inner is None:
         from scipy.optimize import lsq_linear  # takes a while to import, and is seldom needed
 
+        root = np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
+        aim = np.asarray(np.linalg.solve(root, size * found.score[known]), dtype=np.float64)
         inner = lsq_linear(root.T, aim, (lowest, highest), method="bvls").x
     step[known] = size * inner
     return step
+
+
+def _between(matrix: FloatArray, score: FloatArray, lowest: FloatArray, highest: FloatArray) -> FloatArray | None:
+    """The δ between bounds that minimises ½ δᵀMδ − gᵀδ; None where this does not find it.
+
+    What is beyond a bound is fixed there, and set free again where the score points inside, until nothing changes
+    (Hintermüller, Ito & Kunisch, "The primal-dual active set strategy as a semismooth Newton method", SIAM Journal on
+    Optimization 13, 2002).
+    """
+    at_low = at_high = np.zeros(len(score), dtype=np.bool_)
+    for _ in range(_ACTIVE_SETS):
+        free = ~(at_low | at_high)
+        delta = np.where(at_low, lowest, np.where(at_high, highest, 0.0))
+        delta[free] = np.linalg.solve(matrix[np.ix_(free, free)], (score - matrix @ delta)[free])
+        beyond = delta + np.where(free, 0.0, score - matrix @ delta)  # by what remains of the score
+        before, at_low, at_high = (at_low, at_high), beyond < lowest, beyond > highest
+        if np.array_equal(before, (at_low, at_high)):
+            return delta
+    return None

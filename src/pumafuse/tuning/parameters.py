@@ -221,10 +221,10 @@ def parameters(
         line.of(known, axis, name)
         for axis, names in (*sensors.items(), (None, [name for name in known.sensors if name in used]))
         for line in _TABLE
-        if ("{axis}" in line.key) == (axis is not None)
+        if line.fit in fit and ("{axis}" in line.key) == (axis is not None)
         for name in (names if "{sensor}" in line.key else [None])
     ]
-    free = [one for one in every if one.fit in fit and not is_fixed(one.key, fixed)]
+    free = [one for one in every if not is_fixed(one.key, fixed)]
     free = [one for one in free if _belongs(one, config, sensors)]
     return free if sd_prior else [replace(one, prior=None) if one.fit == "noise" else one for one in free]
 
