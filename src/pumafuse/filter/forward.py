@@ -246,7 +246,7 @@ def add_measurement(
         nu, sd = results.innovation[row, axis], results.innovation_sd[row, axis]
         outcome = results.outcome[row, axis]
         if not given:
-            outcome = FUSED if not beyond else REJECTED if not reacquires else FUSED
+            outcome = REJECTED if beyond and not reacquires else FUSED
             if reacquires and abs(nu) > gate * sd:
                 outcome = REACQUIRED
             results.outcome[row, axis] = outcome
