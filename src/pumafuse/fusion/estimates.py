@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from decimal import Decimal
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -120,11 +121,20 @@ class Measurements:
 
     def of(self, sensor: str, axis: str) -> Measurements:
         """The components of one sensor on one axis."""
-        return self.where((self.sensor == self.sensors.index(sensor)) & (self.axis == self.axes.index(axis)))
+        order, begin = self._grouped
+        group = self.sensors.index(sensor) * len(self.axes) + self.axes.index(axis)
+        return self.where(order[begin[group] : begin[group + 1]])
 
-    def where(self, mask: BoolArray) -> Measurements:
-        """The components that ``mask`` (m,) selects."""
-        return replace(self, **{name: getattr(self, name)[mask] for name in self.ARRAYS})
+    @cached_property
+    def _grouped(self) -> tuple[IntArray, IntArray]:
+        """Components by sensor and axis, (m,), and where each of these groups begins."""
+        group = self.sensor.astype(np.int64) * len(self.axes) + self.axis
+        count = np.bincount(group, minlength=len(self.sensors) * len(self.axes))
+        return np.argsort(group.astype(np.min_scalar_type(len(count))), kind="stable"), np.append(0, np.cumsum(count))
+
+    def where(self, chosen: BoolArray | IntArray) -> Measurements:
+        """The components that a mask (m,) or their places select."""
+        return replace(self, **{name: getattr(self, name)[chosen] for name in self.ARRAYS})
 
     def counts(self) -> dict[str, int]:
         """The number of components with each outcome, without those that do not occur."""

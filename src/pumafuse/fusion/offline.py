@@ -129,6 +129,7 @@ def estimates_of(
     _, cut, times, filtered = zip(*parts, strict=True)
     origin = cut[0].origin
     references = _references(parts, origin)
+    rows = [_row_counts(segment, part) for segment, part in zip(cut, filtered, strict=True)]
     axes = {
         axis: AxisEstimate(
             *(_joined(getattr(part.axes[axis], field) for part in filtered) for field in AxisEstimate.FIELDS)
@@ -153,11 +154,7 @@ def estimates_of(
         radius=_highest_radius(in_place, placed),
         command_counts=_without_strays([part.command_counts for part in cut], run.command, in_place.command),
         counts={
-            name: _without_strays(
-                [_row_counts(segment, part, name) for segment, part in zip(cut, filtered, strict=True)],
-                source,
-                in_place.sensors[name],
-            )
+            name: _without_strays([part[name] for part in rows], source, in_place.sensors[name])
             for name, source in run.sensors.items()
         },
         notes=(),
@@ -267,16 +264,18 @@ def _contradictions(segment: Segment, config: FusionConfig, filtered: Filtered, 
     return found
 
 
-def _row_counts(segment: Segment, filtered: Filtered, name: str) -> Mapping[str, int]:
-    """What became of the rows of a sensor in one segment, those included that the filter decided on."""
-    before = dict(segment.counts[name])
-    if before.pop(Outcome.FUSED.word, 0):
-        mine = filtered.events.source == segment.sensors.index(name)
-        decided = np.flatnonzero(mine & reduce(np.logical_or, (filtered.events.known == Outcome.FUSED).T))
-        best = reduce(np.minimum, filtered.results.outcome.take(decided, axis=0).T)  # by column: ten times as fast
-        found = np.bincount(best, minlength=len(Outcome)).tolist()
-        before |= {outcome.word: found[outcome] for outcome in Outcome if found[outcome]}
-    return before
+def _row_counts(segment: Segment, filtered: Filtered) -> dict[str, dict[str, int]]:
+    """What became of the rows of each sensor in one segment, those included that the filter decided on."""
+    source, known = filtered.events.source, filtered.events.known
+    decided = np.flatnonzero((source != COMMAND) & reduce(np.logical_or, (known == Outcome.FUSED).T))
+    best = reduce(np.minimum, filtered.results.outcome.take(decided, axis=0).T)  # by column: ten times as fast
+    place, size = source[decided].astype(np.int64) * len(Outcome) + best, len(segment.sensors) * len(Outcome)
+    table = np.bincount(place, minlength=size).reshape(-1, len(Outcome)).tolist()
+    found = {name: dict(counts) for name, counts in segment.counts.items()}
+    for name, row in zip(segment.sensors, table, strict=True):
+        if found[name].pop(Outcome.FUSED.word, 0):
+            found[name] |= {outcome.word: row[outcome] for outcome in Outcome if row[outcome]}
+    return found
 
 
 def _without_strays(parts: Sequence[Mapping[str, int]], logged: Source, mended: Source) -> dict[str, int]:

@@ -8,8 +8,9 @@ in ROS's ``sensor_msgs/JointState``. A cell that is empty, no number, or not the
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import Any, TypeAlias, cast
@@ -28,7 +29,7 @@ LOG_TIME = "log_time"  # when a row was recorded
 NAMES = "name"  # the list beside another one that says what its elements are
 # Seconds and nanoseconds in a struct: ROS 2, ROS 1, Foxglove's JSON schemas, google.protobuf.Timestamp.
 _SPLIT_STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("seconds", "nanos"))
-_NANOSECONDS = re.compile(r"^[^.]*(nano|nsec)[^.]*$", re.IGNORECASE)
+_NANOSECONDS = re.compile("nano|nsec", re.IGNORECASE)
 _GIGA = 10**9
 _WHOLE = r"^[+-]?\d{1,19}$"
 _NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
@@ -142,9 +143,18 @@ class Table:
 
     def nanoseconds_beside(self, name: str) -> str | None:
         """A column beside one of seconds that by its name has their nanoseconds; None without one."""
-        table, dot, _ = name.rpartition(".")
-        beside = (path for path in self.names if path.startswith(table + dot) and path != name)
-        return next((path for path in beside if _NANOSECONDS.search(path.removeprefix(table + dot))), None)
+        beside = self._of_nanoseconds.get(name.rpartition(".")[0], [])
+        return next((path for path in beside if path != name), None)
+
+    @cached_property
+    def _of_nanoseconds(self) -> dict[str, list[str]]:
+        """Columns that are nanoseconds by their names, by what is before the last point of these."""
+        found: dict[str, list[str]] = {}
+        for path in self.names:
+            table, _, leaf = path.rpartition(".")
+            if _NANOSECONDS.search(leaf):
+                found.setdefault(table, []).append(path)
+        return found
 
     def column(self, path: str) -> pa.ChunkedArray:
         """The column of a name or a field path, nothing converted. A column that has the whole path as its name wins.
@@ -368,10 +378,10 @@ def find(columns: Columns, path: str, where: str, *, part: bool = False) -> pa.C
     return _inside(columns[name], path[len(name) :], columns.get(NAMES), label, part)
 
 
-def longest(columns: Iterable[str], path: str) -> str | None:
+def longest(columns: Container[str], path: str) -> str | None:
     """The longest name that is the path, or that the path goes on from."""
-    fits = (name for name in columns if path.startswith(name) and path[len(name) : len(name) + 1] in ("", ".", "["))
-    return max(fits, key=len, default=None)
+    ends = [len(path), *(place for place in range(len(path) - 1, -1, -1) if path[place] in ".[")]
+    return next((path[:end] for end in ends if path[:end] in columns), None)
 
 
 def joined(tables: Iterable[pa.Table], what: str) -> pa.Table | None:

@@ -7,6 +7,7 @@ they are. Each measurement gets its outcome when the run is fused.
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -383,12 +384,14 @@ def of_tables(
         return _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units)
 
     sources = {name: source(name) for name in entries}
-    shared = {
-        name: [other for other in entries if entries[other].rows == entry.rows] for name, entry in entries.items()
-    }
-    has_value = {name: sources[name].has_value for name in entries if len(shared[name]) > 1}
+    tables_of = Counter(entry.rows for entry in entries.values())
+    has_value = {name: sources[name].has_value for name, entry in entries.items() if tables_of[entry.rows] > 1}
+    empty: dict[tuple[str, ...], BoolArray] = {}  # rows of a table in which none of its sources has a value
+    for name, mine in has_value.items():
+        table = entries[name].rows
+        empty[table] = empty[table] & ~mine if table in empty else ~mine
     for name, mine in has_value.items():  # where only others of its table have any, a row is theirs
-        sources[name] = sources[name].rows(mine | ~np.any([has_value[other] for other in shared[name]], axis=0))
+        sources[name] = sources[name].rows(mine | empty[entries[name].rows])
     command, reference = sources["command"], sources.get("reference")
     sensors = {name: sources[f"sensor {name}"] for name in listed.sensors}
     if reference is not None and scored is not None:

@@ -154,8 +154,9 @@ def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None
         raise RunError(f"{path}: of such a file the key is '{key}', not '{wrong}'")
     asked = None if fields is None else [*fields, *where]
     found = recordings.read(path, name, None if asked is None else prefixes(asked))
+    known = set(found.names)
     for one in asked or ():
-        if longest(found.names, one) is None:
+        if longest(known, one) is None:
             raise UnknownNameError(str(path), "column", one, found.names)
     if not where:
         return found
