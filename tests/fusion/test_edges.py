@@ -159,6 +159,9 @@ def test_a_reference_s_own_noise_scales_like_a_measurement_s():
     est = quiet(run, pf.FusionConfig(arm=ARM))
     np.testing.assert_allclose(est.reference.sd["tangential"], 1e-3 * 0.5 / x)
     np.testing.assert_allclose(est.reference.sd["radial"], 1e-3)
+    table = results.reference_table(est.reference, ARM)
+    np.testing.assert_allclose(table["tangential.position_sd_mm"], 0.5 / x)
+    np.testing.assert_allclose(table["radial.position_sd_mm"], 1.0)
 
 
 def test_an_axis_that_was_not_fused_is_named_with_those_that_were():

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.stats import t as student_t
 
 import pumafuse as pf
 from pumafuse.identification.trials import Trial
@@ -152,6 +153,18 @@ def test_an_outlying_trial_is_named_and_left_out() -> None:
     as_published = pf.identify(pf.StepTrials(tuple(trials), ()), paper=True)
     assert as_published.axes["radial"].left_out == {}
     assert as_published.axes["radial"].time_constant_mean.value > 1.05 * axis.time_constant_mean.value
+
+
+def test_the_papers_time_constant_has_the_t_interval_of_a_mean() -> None:
+    """Of what was fitted to each trial: half as wide as t · s / √n each way."""
+    trials = Arm(1, noise=0.03e-3).campaign(4)
+    found = pf.identify(pf.StepTrials(tuple(trials), ()), paper=True)
+    fitted = np.array([one.first.time_constant for one in found.trials])
+    half = student_t.ppf(0.975, len(fitted) - 1) * fitted.std(ddof=1) / np.sqrt(len(fitted))
+    plant = found.arm.axes["radial"].plant
+    assert isinstance(plant, pf.FirstOrder)
+    assert plant.time_constant == pytest.approx(fitted.mean(), rel=1e-5)
+    assert plant.time_constant_ci95 == pytest.approx((fitted.mean() - half, fitted.mean() + half), rel=1e-5)
 
 
 @pytest.mark.parametrize("times", [1e3, 1e-3], ids=["ms for s", "ks for s"])
