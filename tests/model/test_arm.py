@@ -41,6 +41,7 @@ date = 2024-05-01
 
 finite = st.floats(-1e9, 1e9)
 positive = st.floats(0.0, 1e9, exclude_min=True)
+not_tiny = st.floats(1e-6, 1e9)
 interval = st.none() | st.tuples(finite, finite)
 word = st.text(max_size=8)
 
@@ -48,7 +49,7 @@ gains = st.builds(Gain, slope=finite, intercept=finite, slope_ci95=interval, int
 first_order = st.builds(FirstOrder, time_constant=positive, time_constant_ci95=interval)
 second_order = st.builds(
     SecondOrder,
-    natural_frequency=positive,
+    natural_frequency=not_tiny,
     damping=positive,
     natural_frequency_ci95=interval,
     damping_ci95=interval,
@@ -57,7 +58,7 @@ axis_models = st.builds(
     AxisModel,
     plant=first_order | second_order,
     gain=gains,
-    gain_recovery=st.none() | positive,
+    gain_recovery=st.none() | not_tiny,
     delay=st.none() | st.floats(0.0, 1e4),
     delay_ci95=interval,
 )
@@ -77,7 +78,7 @@ axis_names = st.sampled_from(["tangential", "radial", "vertical"]) | names
 arms = st.builds(
     ArmModel,
     name=word,
-    update_period=positive,
+    update_period=not_tiny,
     delay=st.floats(0.0, 1e4),
     delay_ci95=interval,
     validity=st.builds(Validity, max_speed=st.none() | positive, max_radius=st.none() | positive),
@@ -182,6 +183,10 @@ REFUSED = {
     "key with a newline": ("42.5", '42.5\n"a\\nb" = 1', "axes.radial", ""),
     "axis named like a unit": ("axes.radial", "axes.rail_mm", "axis 'rail_mm'", "must not end in a unit"),
     "zero": ("42.5", "0.0", "axes.radial.time_constant_ms", "> 0"),
+    "a period of nothing": ("28.0", "1e-160", "update_period_ms", ">= 1e-06"),
+    "a frequency of nothing": ("natural_frequency_rad_s = 53.9", "natural_frequency_rad_s = 1e-160",
+                               "axes.tangential.natural_frequency_rad_s", ">= 1e-06"),
+    "a recovery of nothing": ("100.0", "1e-160", "axes.radial.gain_recovery_ms", ">= 1e-06"),
     "negative": ("60.45", "-1.0", "delay_ms", ">= 0"),
     "not TOML": ("name = ", "name = = ", "not valid TOML", ""),
 }  # fmt: skip

@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 import pumafuse as pf
 from pumafuse.tuning import latency as module
 from pumafuse.tuning.latency import Latency
-from pumafuse.tuning.likelihood import Likelihood
+from pumafuse.tuning.likelihood import Derivatives, Likelihood
 from pumafuse.tuning.posterior import AxisPosterior, axis_posterior
 
 Array = NDArray[np.float64]
@@ -86,6 +86,14 @@ def test_a_second_sensor_s_latency_is_found(found: Latency) -> None:
     assert camera.latency == pytest.approx(LATENCY, abs=2e-3)
     assert holds(camera.latency_ci95, LATENCY)
     assert found.config.sensors["camera"].latency == pytest.approx(camera.latency)
+
+
+def test_half_the_interval_of_a_latency_is_1_96_standard_deviations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Were the variance of every number 10⁻¹², by the information and by the scatter of the score."""
+    monkeypatch.setattr(module, "covariance", lambda _, every: np.diag(np.full(len(every), 1e-12)))
+    monkeypatch.setattr(Derivatives, "scatter", property(lambda found: 1e12 * np.eye(len(found.score))))
+    low, high = pf.latency(recorded(camera=True), sensor="tracker").details.sensors["camera"].latency_ci95
+    assert 0.5 * (high - low) == pytest.approx(1.959964e-6, rel=1e-6)
 
 
 def test_nothing_is_named_in_a_steady_run(found: Latency) -> None:

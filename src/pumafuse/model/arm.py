@@ -13,7 +13,7 @@ import numpy as np
 from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError, suggestion
-from ..toml import Interval, Positive
+from ..toml import Interval, Positive, Time
 from ..units import KINDS, MM, MS, SCREEN, Kind, Screen, refuse_name
 from .plants import PLANTS, Delay
 from .presets import PRESETS
@@ -58,7 +58,7 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     kind: Kind = "length"
     plant: PLANTS
     gain: Gain = Gain()
-    gain_recovery: Positive | None = msgspec.field(name="gain_recovery_ms", default=None)
+    gain_recovery: Time | None = msgspec.field(name="gain_recovery_ms", default=None)
     gain_recovery_ci95: Interval | None = msgspec.field(name="gain_recovery_ms_ci95", default=None)
     delay: Delay | None = msgspec.field(name="delay_ms", default=None)
     delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
@@ -133,7 +133,7 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     """
 
     name: str
-    update_period: Positive = msgspec.field(name="update_period_ms")
+    update_period: Time = msgspec.field(name="update_period_ms")
     delay: Delay = msgspec.field(name="delay_ms")
     delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
     validity: Validity = Validity()

@@ -13,13 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import FloatArray
-from ..toml import Interval, Positive
+from ..toml import MOST, Interval, Positive
 from .unit_response import unit_response
 
 if TYPE_CHECKING:
     import control
 
 Delay = Annotated[float, msgspec.Meta(ge=0, le=1e4)]  # s
+Frequency = Annotated[float, msgspec.Meta(ge=1e-6, le=MOST)]  # rad/s; of a lower one the lag would overflow
 
 
 class Plant(msgspec.Struct, frozen=True, kw_only=True, tag_field="plant", forbid_unknown_fields=True):
@@ -83,7 +84,7 @@ class SecondOrder(Plant, frozen=True, kw_only=True, tag="second-order", forbid_u
         damping_ci95: 95 % interval of ζ.
     """
 
-    natural_frequency: Positive = msgspec.field(name="natural_frequency_rad_s")
+    natural_frequency: Frequency = msgspec.field(name="natural_frequency_rad_s")
     damping: Positive
     natural_frequency_ci95: Interval | None = msgspec.field(name="natural_frequency_rad_s_ci95", default=None)
     damping_ci95: Interval | None = None
