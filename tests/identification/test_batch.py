@@ -133,7 +133,7 @@ def test_fit_shared_finds_the_minimum_of_the_dense_problem(
     for seed in (0, 5, 10, 38):
         trials = campaign(plant, 0.05, seed, delays)
         start = shapes((1.2 * plant[0], 0.8 * plant[1]), np.maximum(delays - 0.004, 0.0))
-        found = Batch.of(trials, WEIGHTS).fit(start, order, together=True)
+        found = Batch.of(trials, WEIGHTS).fit(start, order, size=len(start))
         assert found.shape[:, 0].min() >= 0.0
         x = unpacked(trials, (found.shape[0, 1], found.shape[0, 2]), found.shape[:, 0], order)
         low = np.concatenate(([1e-6, 0.0][:order], np.tile([0.0, -np.inf, -np.inf], 4)))

@@ -21,7 +21,7 @@ from .trials import Trial
 Order = Literal[1, 2]
 
 _ITERATIONS = 200
-_CONVERGED = 1e-13  # relative decrease of the sum of squares
+_CONVERGED = 1e-10  # relative decrease of the sum of squares: less moves nothing by 1e-5 standard deviations
 _MOST_DAMPING = 1e12  # no step helps
 _REACH = 1e-5  # of q: step of the numerical derivatives
 _RIDGE = 1e-12  # of the diagonal, where a parameter has no effect
@@ -153,16 +153,15 @@ class Batch:
         score = np.einsum("kij,ij->ik", slopes[1:], at.residual) - coupling * gradient[:, None]
         return Equations(gradient / own, coupling, information, score, delay_sd)
 
-    def fit(self, start: FloatArray, order: Order, together: bool = False) -> Point:
-        """The nearest minimum from ``start`` (R, 3): of each row by itself, or ``together`` of one plant for all rows.
+    def fit(self, start: FloatArray, order: Order, size: int = 1) -> Point:
+        """The nearest minimum from ``start`` (R, 3): of each row by itself, or of one plant for each ``size`` rows.
 
-        Together, each row keeps a delay of its own.
+        Rows that share a plant keep delays of their own.
         """
         most = float(self.span.max())
         low = np.array([0.0, 1e-3 * float(self.spacing.min()), 0.0])
         high = np.array([most, 20.0 * most, (5.0 * most) ** 2])
         found = self.point(np.clip(start, low, high))
-        size = len(start) if together else 1  # rows that share a plant
         rows, damping = np.arange(len(start)), np.full(len(start) // size, 1e-3)
 
         def grouped(values: FloatArray) -> FloatArray:

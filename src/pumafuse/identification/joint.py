@@ -78,13 +78,13 @@ def fit_together(trials: Sequence[Trial], own: Sequence[StepFit], order: Order) 
     # a trial determines the area over its response best
     lag = np.array([fit.shape.delay + fit.shape.q for fit in own])
     middle = float(np.median([fit.shape.q for fit in own]))
-    found: list[Point] = []
+    n, starts = len(step), list[FloatArray]()
     for ratio in _STARTS[: 1 if order == 1 else None]:
         q = middle if ratio == 0.0 else 1.3 * middle
-        start = np.stack(np.broadcast_arrays(np.maximum(lag - q, 0.0), q, ratio * q * q), axis=1)
-        found.append(batch.fit(start, order, together=True))
-    at = min(found, key=lambda point: float(point.cost.sum()))
-    n = len(step)
+        starts.append(np.stack(np.broadcast_arrays(np.maximum(lag - q, 0.0), q, ratio * q * q), axis=1))
+    found = batch.take(np.tile(np.arange(n), len(starts))).fit(np.concatenate(starts), order, size=n)
+    best = int(found.cost.reshape(-1, n).sum(axis=1).argmin())
+    at = Point(*(every[best * n : (best + 1) * n] for every in found))
     slopes, amplitude_slopes = batch.slopes(at, order)
     equations = batch.equations(at, slopes)
     influence, expected = _influence(equations)
