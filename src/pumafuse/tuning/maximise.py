@@ -31,6 +31,7 @@ _GOOD = 0.5  # of the expected gain, from which derivatives are carried along to
 _NEARBY = 2.0  # at most in log-likelihood: farther away they change too much
 _MORE = 1.1  # of the expected gain, from which a longer step is tried
 _ACTIVE_SETS = 8  # that are tried; they may go round in circles
+_PROMISE = 10.0  # times the gain expected of the last step, beyond which no further steps are hoped to lead
 _GATE_ROUNDS = 12  # times that the gates decide again
 _BUMPS = tuple(sign * shift for shift in (2e-4, 5e-4, 1e-3, 2e-3) for sign in (-1.0, 1.0))  # s
 _SHARES = (1.0, 0.5, 0.2)
@@ -108,6 +109,7 @@ def maximise(
     notify: Notify = ignore,
     outcomes: Sequence[CodeArray] | None = None,
     tolerance: float = _TOLERANCE,
+    worth: float = -np.inf,
 ) -> Point:
     """Find the nearest maximum of the log-posterior.
 
@@ -118,8 +120,9 @@ def maximise(
         notify: Called with each better point.
         outcomes: The outcome of each component, to be repeated; None: the gates decide.
         tolerance: Gain in log-likelihood that is not worth another step.
+        worth: The log-posterior below which a maximum is not wanted: where it is out of reach, the search ends early.
     """
-    return Ascent(likelihood, free, outcomes, tolerance).maximum(start, notify)
+    return Ascent(likelihood, free, outcomes, tolerance).maximum(start, notify, worth)
 
 
 class Ascent:
@@ -147,8 +150,8 @@ class Ascent:
         self._axis = [-1 if one.axis is None else likelihood.axes.index(one.axis) for one in free]
         self._damping, self._near, self.linear = np.full(len(free), _FIRST_DAMPING), near is not None, near
 
-    def maximum(self, start: FusionConfig, notify: Notify = ignore) -> Point:
-        """The maximum next to a configuration."""
+    def maximum(self, start: FusionConfig, notify: Notify = ignore, worth: float = -np.inf) -> Point:
+        """The maximum next to a configuration; a point on the way to it if that is not going to be ``worth`` it."""
         best, small = self._point(start), 0
         if not self._free:
             return best
@@ -164,6 +167,8 @@ class Ascent:
             trial = self._farther(best, trial, step, gained / expected)
             notify(trial)
             small = small + 1 if gained < _NOTHING else 0
+            if trial.log_posterior + _PROMISE * expected < worth:
+                return trial
             if small == _CREEPING or (self._may_stop and max(gained, expected) < self._tolerance):
                 return trial
             self._follow(best, trial, _GOOD * expected < gained < _NEARBY)
@@ -230,15 +235,24 @@ class Ascent:
 
 
 def maximise_by_axis(
-    likelihood: Likelihood, start: FusionConfig, free: Sequence[Parameter], notify: Notify, tolerance: float
+    likelihood: Likelihood,
+    start: FusionConfig,
+    free: Sequence[Parameter],
+    notify: Notify,
+    tolerance: float,
+    beside: Point | None = None,
 ) -> Point:
-    """Find the nearest maximum of each axis, several at a time; of all together where a parameter is shared."""
+    """Find the nearest maximum of each axis, several at a time; of all together where a parameter is shared.
+
+    What is not going to be as high as the point ``beside`` is not followed to its end.
+    """
+    worth = np.full(len(likelihood.axes), -np.inf) if beside is None else beside.axes
     if any(one.axis is None for one in free):
-        return maximise(likelihood, start, free, notify, tolerance=tolerance)
+        return maximise(likelihood, start, free, notify, tolerance=tolerance, worth=float(worth.sum()))
 
     def of(axis: str) -> FusionConfig:
-        mine = [one for one in free if one.axis == axis]
-        return maximise(likelihood.of_axis(axis), start, mine, tolerance=tolerance).config
+        mine, least = [one for one in free if one.axis == axis], float(worth[likelihood.axes.index(axis)])
+        return maximise(likelihood.of_axis(axis), start, mine, tolerance=tolerance, worth=least).config
 
     best, axes = start, list(likelihood.sensors)
     for axis, config in zip(axes, in_threads(of, axes), strict=True):

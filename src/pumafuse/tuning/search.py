@@ -380,8 +380,8 @@ def _past_ticks(likelihood: Likelihood, config: FusionConfig, free: FreeOf, noti
     whole = [axis for axis in likelihood.axes if _plant_is_free(free(config), axis)]
     peaks = [point(likelihood, config, free(config))]
     for ticks in (-1.0, 1.0) if whole else ():
-        beside = _lagging(config, whole, free(config), ticks=ticks)
-        peaks.append(maximise_by_axis(likelihood, beside, free(beside), notify, _ROUGHLY))
+        there = _lagging(config, whole, free(config), ticks=ticks)
+        peaks.append(maximise_by_axis(likelihood, there, free(there), notify, _ROUGHLY, beside=peaks[0]))
     return _best_by_axis(likelihood, peaks)
 
 
