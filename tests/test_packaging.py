@@ -46,7 +46,8 @@ def test_the_wheel_works_in_an_empty_environment(built: tuple[Path, Path], tmp_p
     assert len(accuracy) == 3
     assert accuracy == [line for line in there.splitlines() if line.split()[:1] == ["scan1"]]
     assert {"fused.png", "fused.rrd", "summary.json"} <= {path.name for path in (tmp_path / "demo").iterdir()}
-    assert "_PUMAFUSE_COMPLETE" in run(place / "pumafuse", "--show-completion", "bash")
+    in_a_shell = f"'{place / 'pumafuse'}' --show-completion; true"  # it looks for the shell that it was started by
+    assert "_PUMAFUSE_COMPLETE" in run("bash", "-c", in_a_shell)
 
 
 @pytest.mark.long
