@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import textwrap
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -234,7 +235,9 @@ def main() -> None:
     warnings.simplefilter("ignore", pf.PumafuseWarning)  # what is odd in the runs, and what fits cannot tell
     rows = [row for recording in recordings(given.servo) for row in measure(recording)]
     lines = [[row.run, row.axis, row.mode, *row.cells(METHODS)] for row in rows]
-    listed = "\n".join(f"- {verdict}" for verdict in verdicts(rows))
+    listed = "\n".join(
+        textwrap.fill(f"- {verdict}", 120, subsequent_indent="  ", break_on_hyphens=False) for verdict in verdicts(rows)
+    )
     compared = f"{table(['recording', 'axis', 'mode', *METHODS], lines, 3)}\n\n{listed}"
     print(compared, readme(rows), sep="\n\n")
     if given.write:

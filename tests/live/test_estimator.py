@@ -254,6 +254,29 @@ def test_commands_beyond_the_models_limits_are_said() -> None:
     assert f"700 mm that the arm model is valid for, at {27 * PERIOD:.3f} s" in said[1]
 
 
+@pytest.mark.parametrize(
+    ("interval", "said"),
+    [
+        (PERIOD, ""),
+        (0.02, f"every 20 ms, {0.02 / PERIOD:.3g} times the arm's update_period_ms = {PERIOD * 1e3:g}"),
+        (2 * PERIOD, "2 times the arm's update_period_ms"),
+        (1e3 * PERIOD, "are its stamps ms that are called s"),
+    ],
+)
+def test_commands_at_another_interval_are_said_once(interval: float, said: str) -> None:
+    """After the first hundred, which may come out of order, with both periods; nothing at the arm's own."""
+    notices: list[str] = []
+    live = pf.LiveEstimator(CONFIG, on_notice=notices.append)
+    for number in (1, 0, *range(2, 99)):
+        live.command(number * interval, radial=0.57)
+    assert not any("interval" in text or "commands come" in text for text in notices)
+    for number in range(99, 400):
+        live.command(number * interval, radial=0.57)
+    of_interval = [text for text in notices if "commands come" in text]
+    assert len(of_interval) == bool(said)
+    assert said in "".join(of_interval)
+
+
 def test_after_warming_up_nothing_is_left_to_compile() -> None:
     """In a new process: every kernel that Python calls is ready, also those of a flood and of a clock set anew."""
     code = """

@@ -19,6 +19,7 @@ from ..filter.window import FIRST_ROWS, MOST_ROWS, Incoming, Memory, Window
 from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS
 from ..fusion.setup import at_rest, columns_of, filter_model, filter_sensors
+from ..logs.clock import other_period
 from ..logs.frames import CARTESIAN, Cylindrical
 from ..model.arm import Validity
 from ..units import Kind
@@ -28,6 +29,7 @@ from .rate_limit import RateLimitedLog
 from .results import AxisNow, Health, LiveEstimate, UpdateResult, health_of, no_estimate, update_result
 
 _MOST_AXES = 62  # a kernel takes the axes of an event as bits
+_FIRST = 100  # commands whose interval is looked at
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
 
@@ -118,6 +120,7 @@ class LiveEstimator:
         self._answers: dict[bytes, UpdateResult] = {}
         self._aside: list[tuple[_Event, Outcome]] = []
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
+        self._first: list[int] | None = []  # stamps of the first commands, until they are enough
         self._clock = Clock(round(window * 1e9))
         self._start, self._before = dict(start or {}), None
         self._begin(None)
@@ -411,6 +414,8 @@ class LiveEstimator:
             self._commands[result.outcome] += 1
             self._doubtful += self._clock.doubtful and result.outcome is _FUSED
             self._watch_limits()
+            if self._first is not None and result.outcome is _FUSED:
+                self._watch_interval(self._first, stamp)
         elif window.contradicts >= 0:
             self._say_contradiction(stamp, sensor)
         elif sensor in self._contradicting and result.outcome is _FUSED:
@@ -433,6 +438,19 @@ class LiveEstimator:
         radius = latest["radial"][1] if isinstance(self.config.frame, Cylindrical) and "radial" in latest else None
         for passed in validity.excess(speed, radius):
             self._log.write(passed.split(" reach")[0], f"{passed}, at {stamp / 1e9:.3f} s")
+
+    def _watch_interval(self, first: list[int], stamp: int) -> None:
+        """Say after the first commands if they come at another interval than the arm's update period."""
+        first.append(stamp)
+        if len(first) < _FIRST:
+            return
+        self._first = None
+        try:
+            found = other_period("the stream", np.sort(np.array(first)), self.config.arm.update_period)
+        except RunError as error:  # in another unit
+            found = [f"{str(error).partition('? ')[0]}? Its t is in s, its t_ns in ns"]
+        for sentence in found:
+            self._log.write("interval of commands", sentence)
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""

@@ -198,7 +198,7 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
         RunError: The stamps of a source are in another unit than they are taken to be in.
     """
     command = _ascending(run.command.stamp)
-    found = _other_period(run.command.label, command, period) + _missing(run.command)
+    found = other_period(run.command.label, command, period) + _missing(run.command)
     for name in sensors:
         stamp = _ascending(run.sensors[name].stamp)
         if len(stamp):
@@ -213,7 +213,7 @@ def _ascending(stamp: TimeArray) -> TimeArray:
     return known if (np.diff(known) >= 0).all() else np.sort(known)
 
 
-def _other_period(label: str, stamp: TimeArray, period: float) -> list[str]:
+def other_period(label: str, stamp: TimeArray, period: float) -> list[str]:
     """A sentence if the interval of the commands is far from the update period.
 
     Raises:
