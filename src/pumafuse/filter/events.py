@@ -63,6 +63,10 @@ class Events(NamedTuple):
         spread = of(self.spread) if len(self.spread) else self.spread
         return Events(of(self.time), of(self.source), of(self.stamp), of(self.value), spread, of(self.known))
 
+    def where(self, mask: BoolArray) -> Events:
+        """The events that a mask (n,) selects; themselves, not copied, if it selects all."""
+        return self if mask.all() else self.rows(np.flatnonzero(mask))
+
     def repeated(self, times: int) -> Events:
         """The events with their axes so many times, one set after the other."""
         value, spread, known = (np.tile(part, times) for part in (self.value, self.spread, self.known))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -136,18 +137,21 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
 def sensor_problems(est: Estimates) -> list[str]:
     """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows, frozen."""
     found, given = list[str](), est.measurements
-    alone = np.count_nonzero(np.bincount(given.sensor)) < 2
+    order, begin = given.grouped
+    outcome, value, ends = given.outcome[order], given.value[order], begin.tolist()
+    count = np.diff(begin).reshape(len(given.sensors), len(given.axes))
+    alone = np.count_nonzero(count.any(axis=1)) < 2
     for number, name in enumerate(given.sensors):
-        mine = np.flatnonzero(given.sensor == number)
-        if not len(mine):
+        if not count[number].any():
             continue
-        outcome, time, axis, value = given.outcome[mine], given.time[mine], given.axis[mine], given.value[mine]
-        rejected = np.count_nonzero(outcome == int(Outcome.REJECTED)) / len(mine)
-        reacquired = len(np.unique(time[outcome == Outcome.REACQUIRED]))
+        groups = ends[number * len(given.axes) : (number + 1) * len(given.axes) + 1]
+        mine = slice(groups[0], groups[-1])
+        rejected = np.count_nonzero(outcome[mine] == int(Outcome.REJECTED)) / count[number].sum()
+        reacquired = len(np.unique(given.time[order[mine][outcome[mine] == Outcome.REACQUIRED]]))
         times = "once" if reacquired == 1 else f"{reacquired} times"
         width = _width_of_prior(est, name)
-        frozen = {each: _frozen(value[axis == column]) for column, each in enumerate(given.axes)}
-        of_axes = [given.axes[column] for column in np.flatnonzero(np.bincount(axis)).tolist()]
+        frozen = {each: _frozen(value[slice(*of)]) for each, of in zip(given.axes, pairwise(groups), strict=True)}
+        of_axes = [each for each, some in zip(given.axes, count[number].tolist(), strict=True) if some]
         kinds: dict[Kind, None] = {est.config.arm.axes[each].kind: None for each in of_axes}
         sd, bias_sd, offset_sd = (
             "/".join(of_kind(key, kind) for kind in kinds) for key in ("sd_mm", "bias_sd_mm", "offset_sd_mm")

@@ -121,12 +121,12 @@ class Measurements:
 
     def of(self, sensor: str, axis: str) -> Measurements:
         """The components of one sensor on one axis."""
-        order, begin = self._grouped
+        order, begin = self.grouped
         group = self.sensors.index(sensor) * len(self.axes) + self.axes.index(axis)
         return self.where(order[begin[group] : begin[group + 1]])
 
     @cached_property
-    def _grouped(self) -> tuple[IntArray, IntArray]:
+    def grouped(self) -> tuple[IntArray, IntArray]:
         """Components by sensor and axis, (m,), and where each of these groups begins."""
         group = self.sensor.astype(np.int64) * len(self.axes) + self.axis
         count = np.bincount(group, minlength=len(self.sensors) * len(self.axes))

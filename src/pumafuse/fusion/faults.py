@@ -143,7 +143,7 @@ def _given(segment: Segment, config: FusionConfig) -> _Given:
             continue
         known = {axis: rows.known[:, number] == int(Outcome.FUSED) for number, axis in enumerate(segment.axes)}
         found[name] = {
-            axis: (rows.stamp[mine], rows.value[:, number][mine])
+            axis: (rows.stamp, rows.value[:, number]) if mine.all() else (rows.stamp[mine], rows.value[mine, number])
             for number, (axis, mine) in enumerate(known.items())
             if mine.any()
         }

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import reduce
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -118,7 +119,7 @@ class Segment:
         rows, measured, parts, moves = self.command_rows, self.measurement_rows, list[Events](), list[IntArray]()
         for group in sorted(set(groups)):
             known = np.where(np.array(groups) == group, rows.known, np.uint8(ABSENT))
-            parts.append(rows._replace(known=known).rows(np.flatnonzero(_on_any_axis(known, Outcome.FUSED))))
+            parts.append(rows._replace(known=known).where(_on_any_axis(known, Outcome.FUSED)))
             moves.append(np.full(len(parts[-1].time), group))
         sensors = max(groups) + 1 + measured.source.astype(np.int64)
         found = joined([*parts, measured]), np.concatenate([*moves, sensors])
@@ -134,8 +135,9 @@ class Segment:
 
     def rows_by_sensor(self) -> dict[str, Events]:
         """The rows of each sensor that has any, by stamp; angles go on beyond a turn."""
-        rows = self.measurement_rows._replace(value=self.unwrapped())
-        found = {name: rows.rows(np.flatnonzero(rows.source == number)) for number, name in enumerate(self.sensors)}
+        rows = self.measurement_rows._replace(value=self.unwrapped())  # one sensor after the other
+        begin = np.searchsorted(rows.source, np.arange(len(self.sensors) + 1)).tolist()
+        found = {name: rows.rows(slice(*ends)) for name, ends in zip(self.sensors, pairwise(begin), strict=True)}
         return {name: part for name, part in found.items() if len(part.time)}
 
     def unwrapped(self) -> FloatArray:
@@ -239,7 +241,7 @@ def build(
     within = rows.stamp <= ends[1]
     outside = int(np.count_nonzero((used_rows & ~within)[_owned(rows.stamp, own)]))
     command_counts = _counted(command_counts | {"used": command_counts["used"] - outside, OUTSIDE: outside})
-    rows = rows.rows(np.flatnonzero(within))
+    rows = rows.where(within)
     notes += _unmatched([name for name in chosen if name not in run.sensors], strangers)
     commands = rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)]
     commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
@@ -401,7 +403,7 @@ def _on_ticks(run: Run, config: FusionConfig, rows: Events, notes: list[str]) ->
     if run.clock == "stamps":
         return rows
     label = run.command.label
-    rows = rows.rows(np.flatnonzero(_on_any_axis(rows.known, Outcome.FUSED)))
+    rows = rows.where(_on_any_axis(rows.known, Outcome.FUSED))
     distinct, place = np.unique(rows.stamp, return_inverse=True)
     grid, note = regular_grid(distinct, config.arm.update_period, label)
     notes.extend([] if note is None else [note])
@@ -428,7 +430,7 @@ def _measurement_rows(
     rows = _table(source, run.axes, order, number, latency)
     rows = _classified(rows, policy, origin, lag[order] > TOLERATED_STEP_BACK_NS)
     rows.known[~used[order]] = ABSENT
-    kept = rows.rows(np.flatnonzero(used[order]))
+    kept = rows.where(used[order])
     mine = source.stamp[_owned(_valid(source.stamp, latency), own)]
     counts = _measurement_counts(kept.rows(_owned(kept.time, own)), mine)
     note_rows(notes, label, lag > 0, "a stamp that steps back: sorted")
