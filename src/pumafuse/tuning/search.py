@@ -120,7 +120,7 @@ def search(
     best, disturbances = most_likely_models(likelihood, found, rough)
     best, arm = _arm(likelihood, best, own, notify, again=True)
     best = _without_needless(likelihood, best, own, notify)
-    if len(found) > 1 and not near:
+    if len(found) > 1:  # near, too: a part of a run may not have told one tick from the next
         best = _past_ticks(likelihood, best, own, notify)
     best, delays = _with_one_delay(likelihood, best, free, one_delay)
     orders: Reasons = {}
