@@ -19,7 +19,7 @@ from ..filter.window import FIRST_ROWS, MOST_ROWS, Incoming, Memory, Window
 from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS
 from ..fusion.setup import at_rest, columns_of, filter_model, filter_sensors
-from ..logs.clock import other_period
+from ..logs.clock import other_interval
 from ..logs.frames import CARTESIAN, Cylindrical
 from ..model.arm import Validity
 from ..units import Kind
@@ -445,12 +445,11 @@ class LiveEstimator:
         if len(first) < _FIRST:
             return
         self._first = None
-        try:
-            found = other_period("the stream", np.sort(np.array(first)), self.config.arm.update_period)
-        except RunError as error:  # in another unit
-            found = [f"{str(error).partition('? ')[0]}? Its t is in s, its t_ns in ns"]
-        for sentence in found:
-            self._log.write("interval of commands", sentence)
+        other = other_interval(np.sort(np.array(first)), self.config.arm.update_period)
+        if other is not None:
+            sentence, is_unit = other
+            where = " A stream has t in s, or t_ns in ns" if is_unit else ""
+            self._log.write("interval of commands", sentence + where)
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""

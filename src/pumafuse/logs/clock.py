@@ -23,6 +23,7 @@ _MOST_JUMPS = 100
 _FEW, _MANY = 30, 10_000  # stamps, below which nothing is said about their unit, and from which it is clear
 _SCATTERED, _JUMP = 5, 3.0  # periods of a short gap, and steps as large as a usual one that a long one hides
 _MANY_LOST, _OFF_TICK = 0.03, 0.25  # shares: of commands in motion, above which it is said; of a period
+_CORRECT = "Correct the unit of its time in run.toml"
 _EVEN = 0.1  # spread of intervals over the usual one, up to which commands are a steady stream
 _HOUR_NS = 3_600_000_000_000
 _LONG_NS = 87_660 * _HOUR_NS  # ten years: no log is as long
@@ -198,7 +199,13 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
         RunError: The stamps of a source are in another unit than they are taken to be in.
     """
     command = _ascending(run.command.stamp)
-    found = other_period(run.command.label, command, period) + _missing(run.command)
+    found, label = list[str](), run.command.label
+    if (other := other_interval(command, period)) is not None:
+        sentence, is_unit = other
+        if is_unit:
+            raise RunError(f"{label}: {sentence} {_CORRECT}, or update_period_ms in arm.toml")
+        found.append(f"{label}: {sentence}")
+    found += _missing(run.command)
     for name in sensors:
         stamp = _ascending(run.sensors[name].stamp)
         if len(stamp):
@@ -213,31 +220,31 @@ def _ascending(stamp: TimeArray) -> TimeArray:
     return known if (np.diff(known) >= 0).all() else np.sort(known)
 
 
-def other_period(label: str, stamp: TimeArray, period: float) -> list[str]:
-    """A sentence if the interval of the commands is far from the update period.
+def other_interval(stamp: TimeArray, period: float) -> tuple[str, bool] | None:
+    """Whether the interval of commands is far from the update period.
 
-    Raises:
-        RunError: They come steadily, and it is the update period in another unit.
+    Args:
+        stamp: Of the commands, ascending, int64 ns, (n,).
+        period: The arm's update period T [s].
+
+    Returns:
+        A sentence that ends in a question, and whether their stamps are in another unit; None where it is not far.
     """
     intervals = np.diff(stamp[:_MANY])
     intervals = intervals[intervals > 0]
     if len(intervals) < _FEW:
-        return []
+        return None
     early, usual, late = np.quantile(intervals, [0.25, 0.5, 0.75]) / 1e9
     units, even = mistaken(usual / period, TIMES), late - early <= _EVEN * usual
     if units and even:
-        raise RunError(
-            f"{label}: commands come every {usual:.4g} s, {usual / period:.4g} times the arm's update_period_ms ="
-            f" {period * 1e3:g}: {_taken(units)}, or update_period_ms in arm.toml"
-        )
+        times = f"{usual:.4g} s, {usual / period:.4g} times the arm's update_period_ms = {period * 1e3:g}"
+        return f"commands come every {times}: {_taken(units)}", True
     far = _OTHER_BEAT if even else _OTHER_PERIOD
     if 1.0 / far < usual / period < far:
-        return []
+        return None
     lost = "are most of them lost, or is it another one?" if usual > period else "is it another one?"
-    return [
-        f"{label}: commands come every {usual * 1e3:.4g} ms, {usual / period:.3g} times the arm's update_period_ms ="
-        f" {period * 1e3:g}: {lost}"
-    ]
+    times = f"{usual * 1e3:.4g} ms, {usual / period:.3g} times the arm's update_period_ms = {period * 1e3:g}"
+    return f"commands come every {times}: {lost}", False
 
 
 def _missing(command: Source) -> list[str]:
@@ -277,12 +284,13 @@ def _check_span(label: str, stamp: TimeArray, command: TimeArray) -> None:
     if min(len(stamp), len(command)) >= _FEW and (units := mistaken(span / max(commanded, 1e-9), TIMES)):
         raise RunError(
             f"{label}: measurements go on for {span:.4g} s, the commands for {commanded:.4g} s: {_taken(units)}"
+            f" {_CORRECT}"
         )
 
 
 def _taken(units: Sequence[tuple[str, str]]) -> str:
     words = " or ".join(f"{true} that are called {called}" for true, called in units)
-    return f"are its stamps {words}? Correct the unit of its time in run.toml"
+    return f"are its stamps {words}?"
 
 
 def _apart(stamp: TimeArray, first: int, last: int) -> list[str]:
