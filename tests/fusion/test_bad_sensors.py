@@ -108,6 +108,24 @@ def test_a_frozen_sensor_is_seen(scan: pf.Run, config: pf.FusionConfig) -> None:
         assert rmse(est, axis, after=41.0) == pytest.approx(rmse(good, axis, after=41.0), rel=0.01)
 
 
+def test_what_one_axis_does_is_said_of_that_axis(scan: pf.Run, config: pf.FusionConfig) -> None:
+    """The last axis alone freezes: the others do not. Half of its values are wild: a sixth of all components."""
+
+    def of_vertical(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Source], Source]:
+        return lambda source: Source(
+            source.stamp, {**source.values, "vertical": change(source.values["vertical"])}, source.label
+        )
+
+    _, frozen = fused(scan, config, of_vertical(lambda value: np.where(np.arange(len(value)) > 3000, value[0], value)))
+    assert [axis for axis in AXES if said(frozen, f" {axis} measurements in a row have the same value")] == ["vertical"]
+    sides = np.random.default_rng(0).choice([-0.4, 0.0, 0.0, 0.4], 6000)
+    alone = {name: msgspec.structs.replace(one, gate_rows=False) for name, one in config.sensors.items()}
+    by_axis = msgspec.structs.replace(config, sensors=alone)
+    _, wild = fused(scan, by_axis, of_vertical(lambda value: value + sides[: len(value)]))
+    (note,) = [note for note in wild.notes if "of its components were rejected" in note]
+    assert note.startswith(("tracker: 16%", "tracker: 17%"))
+
+
 def test_a_sensor_of_nothing_but_nan_is_left_out(
     scan: pf.Run, config: pf.FusionConfig, camera_alone: pf.Estimates
 ) -> None:
