@@ -221,7 +221,8 @@ def test_ends_beside_many_parameters_are_where_their_profile_has_dropped() -> No
     """Noise, delay and plant in 16 short runs, all others maximised anew at each profiled end, far more exactly.
 
     The roots of twice the drops are 1.96 on average, to 2 %. At most 4 % are less than 0.9 of it and 10 % more than
-    1.1: the likelihood has other maxima beside, and bumps along times. Profiles maximised to 0.002 give the same shares.
+    1.1: the likelihood has other maxima beside, and bumps along times. Profiles maximised to 0.002 give the
+    same shares.
     """
     roots: list[float] = []
     for seed in range(1, 9):
