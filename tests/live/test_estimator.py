@@ -277,6 +277,23 @@ def test_commands_at_another_interval_are_said_once(interval: float, said: str) 
     assert said in "".join(of_interval)
 
 
+@pytest.mark.parametrize(("lost", "said"), [(0, False), (10, True), (50, False)])
+def test_missing_commands_are_counted(lost: int, said: bool) -> None:
+    """One in ten lost in motion: said with its number after a thousand; none, or one in fifty: nothing."""
+    notices: list[str] = []
+    live = pf.LiveEstimator(CONFIG, on_notice=notices.append)
+    sent = [number for number in range(1200) if not lost or number % lost != 3]
+    for number in sent:
+        live.command(1000.0 + number * PERIOD, radial=0.57 + 0.01 * math.sin(0.01 * number))
+    last = sent[999]
+    gaps = sum(number % lost == 3 for number in range(last)) if said else 0
+    found = [text for text in notices if "missing" in text]
+    assert len(found) == said
+    if said:
+        assert f"until {1000.0 + last * PERIOD:.3f} s {gaps} of" in found[0]
+        assert f"one is due every {PERIOD * 1e3:g} ms), the longest gap is {2 * PERIOD:.3g} s" in found[0]
+
+
 def test_after_warming_up_nothing_is_left_to_compile() -> None:
     """In a new process: every kernel that Python calls is ready, also those of a flood and of a clock set anew."""
     code = """

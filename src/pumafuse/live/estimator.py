@@ -19,8 +19,9 @@ from ..filter.window import FIRST_ROWS, MOST_ROWS, Incoming, Memory, Window
 from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS
 from ..fusion.setup import at_rest, columns_of, filter_model, filter_sensors
-from ..logs.clock import other_interval
+from ..logs.clock import missing_commands, other_interval
 from ..logs.frames import CARTESIAN, Cylindrical
+from ..logs.run import Source
 from ..model.arm import Validity
 from ..units import Kind
 from .clock import Clock, Time, Verdict, nanoseconds
@@ -29,7 +30,7 @@ from .rate_limit import RateLimitedLog
 from .results import AxisNow, Health, LiveEstimate, UpdateResult, health_of, no_estimate, update_result
 
 _MOST_AXES = 62  # a kernel takes the axes of an event as bits
-_FIRST = 100  # commands whose interval is looked at
+_FIRST, _MANY = 100, 1000  # commands whose interval is looked at, and those that missing ones are counted among
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
 
@@ -120,7 +121,7 @@ class LiveEstimator:
         self._answers: dict[bytes, UpdateResult] = {}
         self._aside: list[tuple[_Event, Outcome]] = []
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
-        self._first: list[int] | None = []  # stamps of the first commands, until they are enough
+        self._knows_interval = False
         self._clock = Clock(round(window * 1e9))
         self._start, self._before = dict(start or {}), None
         self._begin(None)
@@ -243,6 +244,7 @@ class LiveEstimator:
         self._before = counters
         self._frame_start = FrameStart(self.config.frame, self.axes)
         self._window = empty_window(self.config, self.axes, self._frame_start.start(self._start), counters)
+        self._recent: list[_Event] = []  # commands that are still to be looked at
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it.
         # With each goes its outcome, and whether it never came into the window.
         self._early: list[tuple[_Event, Outcome, bool]] | None = [] if self._frame_start.waits else None
@@ -414,8 +416,9 @@ class LiveEstimator:
             self._commands[result.outcome] += 1
             self._doubtful += self._clock.doubtful and result.outcome is _FUSED
             self._watch_limits()
-            if self._first is not None and result.outcome is _FUSED:
-                self._watch_interval(self._first, stamp)
+            if result.outcome is _FUSED:
+                self._recent.append(_Event(stamp, None, values))
+                self._watch_commands()
         elif window.contradicts >= 0:
             self._say_contradiction(stamp, sensor)
         elif sensor in self._contradicting and result.outcome is _FUSED:
@@ -439,17 +442,25 @@ class LiveEstimator:
         for passed in validity.excess(speed, radius):
             self._log.write(passed.split(" reach")[0], f"{passed}, at {stamp / 1e9:.3f} s")
 
-    def _watch_interval(self, first: list[int], stamp: int) -> None:
-        """Say after the first commands if they come at another interval than the arm's update period."""
-        first.append(stamp)
-        if len(first) < _FIRST:
+    def _watch_commands(self) -> None:
+        """Say if commands come at another interval than the arm's update period, and if many of them are missing."""
+        recent = self._recent
+        if len(recent) == _FIRST and not self._knows_interval:
+            self._knows_interval = True
+            stamps = np.sort(np.array([one.stamp for one in recent]))
+            if (other := other_interval(stamps, self.config.arm.update_period)) is not None:
+                sentence, is_unit = other
+                where = " A stream has t in s, or t_ns in ns" if is_unit else ""
+                self._log.write("interval of commands", sentence + where)
+        if len(recent) < _MANY:
             return
-        self._first = None
-        other = other_interval(np.sort(np.array(first)), self.config.arm.update_period)
-        if other is not None:
-            sentence, is_unit = other
-            where = " A stream has t in s, or t_ns in ns" if is_unit else ""
-            self._log.write("interval of commands", sentence + where)
+        self._recent = []
+        recent.sort(key=lambda one: one.stamp)
+        table = {axis: np.array([_number(one.values.get(axis)) for one in recent]) for axis in recent[0].values}
+        steady = {axis: values for axis, values in table.items() if np.isfinite(values).all()}
+        source = Source(np.array([one.stamp for one in recent]), steady, "commands")
+        if steady and (missing := missing_commands(source)) is not None:
+            self._log.write("missing commands", f"until {recent[-1].stamp / 1e9:.3f} s {missing}; send every command")
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""

@@ -205,7 +205,8 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
         if is_unit:
             raise RunError(f"{label}: {sentence} {_CORRECT}, or update_period_ms in arm.toml")
         found.append(f"{label}: {sentence}")
-    found += _missing(run.command)
+    if (missing := missing_commands(run.command)) is not None:
+        found.append(f"{label}: {missing}; log every command")
     for name in sensors:
         stamp = _ascending(run.sensors[name].stamp)
         if len(stamp):
@@ -247,7 +248,7 @@ def other_interval(stamp: TimeArray, period: float) -> tuple[str, bool] | None:
     return f"commands come every {times}: {lost}", False
 
 
-def _missing(command: Source) -> list[str]:
+def missing_commands(command: Source) -> str | None:
     """A sentence if commands of a steady stream are missing where they move.
 
     Short gaps count in mid-motion, long ones if the command jumps: who sends a command only when it changes leaves the
@@ -257,11 +258,11 @@ def _missing(command: Source) -> list[str]:
     rows = rows[np.diff(command.stamp[rows], prepend=ALWAYS) > 0]
     intervals = np.diff(command.stamp[rows]) / 1e9
     if len(intervals) < _FEW or (intervals <= 0.0).any():
-        return []
+        return None
     usual = float(np.median(intervals))
     ticks = np.rint(intervals / usual)
     if np.mean(np.abs(intervals / usual - ticks) > _OFF_TICK) > _EVEN:
-        return []
+        return None
     steps = np.abs(np.diff([value[rows] for value in command.values.values()], axis=1))
     largest = np.nanmax(np.where(ticks == 1, steps, 0.0), axis=1, keepdims=True)
     jumps = np.any(steps > _JUMP * largest, axis=0)
@@ -270,12 +271,11 @@ def _missing(command: Source) -> list[str]:
     gaps = (ticks > 1) & np.where(ticks > _SCATTERED, jumps, on)
     missing, sent = int(np.sum(ticks[gaps] - 1)), int(np.count_nonzero(moving))
     if missing < _FEW or missing <= _MANY_LOST * (missing + sent):
-        return []
-    return [
-        f"{command.label}: {missing} of {missing + sent} commands are missing while the arm moves (one is due every"
-        f" {usual * 1e3:.4g} ms), the longest gap is {intervals[gaps].max():.3g} s: the model holds the one before; log"
-        " every command"
-    ]
+        return None
+    return (
+        f"{missing} of {missing + sent} commands are missing while the arm moves (one is due every"
+        f" {usual * 1e3:.4g} ms), the longest gap is {intervals[gaps].max():.3g} s: the model holds the one before"
+    )
 
 
 def _check_span(label: str, stamp: TimeArray, command: TimeArray) -> None:
