@@ -418,3 +418,23 @@ def test_every_other_command_alone_is_told() -> None:
     run, config = logged("scan1")
     half = replace(run, command=run.command.rows(np.arange(0, len(run.command.stamp), 2)))
     assert "2 times the arm's update_period_ms" in " ".join(clock_faults(half, config.arm.update_period, []))
+
+
+@pytest.mark.parametrize("every", [3, 5, 20])
+def test_a_log_without_most_commands_is_refused(every: int) -> None:
+    """Steady ones, that is: the model would hold each for periods in which the arm went on."""
+    rows = slice(None, None, every)
+    line = refusal(of_commands("scan1", lambda one: one.rows(np.arange(len(one.stamp))[rows])), "scan1")
+    assert "commands come every" in line and f"{every} times the arm's update_period_ms = 28" in line
+    assert line.endswith("Log every command, or correct update_period_ms in arm.toml")
+
+
+def test_commands_of_rounded_stamps_are_told_and_those_of_changes_alone_are_not_refused() -> None:
+    """With stamps of 0.1 s all rows are there; and who sends what changes sends a staircase every two seconds."""
+    run, config = logged("scan1")
+    rounded = replace(run, command=replace(run.command, stamp=run.command.stamp // 100_000_000 * 100_000_000))
+    assert "commands come every 100 ms" in " ".join(clock_faults(rounded, config.arm.update_period, []))
+    time = np.cumsum(np.random.default_rng(1).uniform(1e9, 3e9, 60)).astype(np.int64)
+    level = 0.5 + 0.01 * (np.arange(60) % 2)
+    steps = replace(run, command=Source(time, dict.fromkeys(run.axes, level), "commands"))
+    assert "are most of them lost" in " ".join(clock_faults(steps, config.arm.update_period, []))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from ..identification.trials import StepTrials
 from ..model.arm import ArmModel
 from ..units import SCREEN, si
 from ..views import report as reports
-from .tables import console, table
+from .tables import print_tables, table
 
 
 def run(
@@ -90,11 +89,10 @@ def _check_replaceable(path: Path, force: bool) -> None:
 
 
 def _show(found: Identification) -> None:
-    out = console(sys.stdout)
-    out.print(table(*reports.models(found)))
+    print_tables([table(*reports.models(found))])
     typer.echo("\n".join(reports.sentences(found)))
     if found.dependences:
-        out.print(table(*reports.dependences(found)))
-    out.print(table(*reports.scatter(found)))
+        print_tables([table(*reports.dependences(found))])
+    print_tables([table(*reports.scatter(found))])
     for one in found.performance:
         typer.echo(f"combined model by {one.factor}: {one.verdict}")

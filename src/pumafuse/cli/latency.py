@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from ..folders import write_file
 from ..logs.run import Run
 from ..tuning.latency import Latency, latency
 from ..views import report as reports
-from .tables import console, table
+from .tables import print_tables, table
 
 
 def run(
@@ -84,7 +83,7 @@ def _show(found: Latency) -> None:
     """Print the answers and a table on stdout."""
     for line in reports.answers(found.details):
         typer.echo(line)
-    console(sys.stdout).print(table(*reports.lags(found.details)))
+    print_tables([table(*reports.lags(found.details))])
     if any(one.shared_delay for one in found.details.axes.values()):
         typer.echo("* one dead time for several axes")
 

@@ -33,7 +33,7 @@ from ..live.stream import Stream
 from ..live.wire import Event
 from ..logs.run import Run
 from ..units import MS
-from .tables import Columns, cells, console, headings, table
+from .tables import Columns, cells, console, headings, print_tables, table
 
 if TYPE_CHECKING:
     from ..views.live import LiveView
@@ -120,7 +120,7 @@ def run(
     for sentence in _sentences(stream, summaries):
         notify(sentence)
     with contextlib.suppress(OSError):
-        errors.print(_sensor_table(live))
+        print_tables([_sensor_table(live)], sys.stderr)
 
 
 def _output(status: bool) -> Callable[[list[bytes]], None]:

@@ -10,6 +10,7 @@ from typing import Any, TextIO
 import msgspec
 import typer
 from rich import box
+from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -26,6 +27,7 @@ Columns = Mapping[str, tuple[str, str, float | None]]
 
 _GIVEN = {"used", "fused", "rejected", "reacquired", NOT_SELECTED}  # what is no surprise
 _WIDEST = 2000  # characters of a cell
+_SENTENCE = 30  # characters, from which a cell is broken into lines
 _FEW_RUNS = 20  # that get lines of their own
 _SCORE: Columns = {
     "RMSE, {unit}": ("rmse", ".3f", None),
@@ -54,26 +56,38 @@ def print_json(tree: Any) -> None:
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     """A table for the terminal, without columns in which no row has anything.
 
-    Columns of numbers are right-justified. They and cells of several lines are not wrapped.
+    Columns of numbers are right-justified. They, names and cells of several lines are not wrapped, and sentences get no
+    narrower than a few words: a digit that is cut off makes another number.
     """
     made = Table(box=box.SIMPLE_HEAD)
-    kept: list[Sequence[str]] = []
-    for heading, *cells in zip(headings, *rows, strict=True):
-        if not set(cells) <= {"", "–"}:
-            numbers = all(cell[:1] in "+-–…<0123456789" for cell in cells)
-            whole = numbers or any("\n" in cell for cell in cells)
-            made.add_column(escape(heading), justify="right" if numbers else "left", overflow="fold", no_wrap=whole)
-            kept.append([escape("\n".join(printable(line, _WIDEST) for line in cell.splitlines())) for cell in cells])
+    kept: list[list[str]] = []
+    for heading, *column in zip(headings, *rows, strict=True):
+        if set(column) <= {"", "–"}:
+            continue
+        cells = ["\n".join(printable(line, _WIDEST) for line in cell.splitlines()) for cell in column]
+        numbers = all(cell[:1] in "+-–…<0123456789" for cell in cells)
+        longest = max(cell_len(line) for cell in (heading, *cells) for line in cell.splitlines())
+        whole = numbers or any("\n" in cell for cell in cells) or longest <= _SENTENCE
+        made.add_column(
+            escape(heading),
+            justify="right" if numbers else "left",
+            overflow="ellipsis" if whole else "fold",
+            no_wrap=whole,
+            min_width=longest if whole else _SENTENCE,
+        )
+        kept.append([escape(cell) for cell in cells])
     for row in zip(*kept, strict=True):
         made.add_row(*row)
     return made
 
 
-def print_tables(tables: Iterable[Table]) -> None:
-    """Print the tables that have anything in them on standard output."""
+def print_tables(tables: Iterable[Table], file: TextIO | None = None) -> None:
+    """Print the tables that have anything in them on standard output, or another stream: whole, however wide it is."""
     for one in tables:
         if one.columns:
-            console(sys.stdout).print(one)
+            out = console(file or sys.stdout)
+            out.width = max(out.width, out.measure(one, options=out.options.update(width=_WIDEST)).minimum)
+            out.print(one, crop=False)
 
 
 def number(value: float | None, form: str = ".3f") -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -20,7 +19,7 @@ from ..tuning.summary import TuningSummary
 from ..tuning.tune import tune
 from ..units import SCREEN
 from ..views import formatting
-from .tables import console, interval, number, table
+from .tables import interval, number, print_tables, table
 
 SUMMARY = "tuning.json"
 PAGE = "report.html"
@@ -95,8 +94,7 @@ def run(
 
 def _show(summary: TuningSummary, period: float) -> None:
     """Print the summary on stdout; period [s]."""
-    out = console(sys.stdout)
-    out.print(_parameters(summary))
+    print_tables([_parameters(summary)])
     if summary.lags:
         typer.echo(formatting.lag(period))
     lines = [*formatting.chosen(summary.orders), *summary.not_identifiable]
@@ -113,9 +111,9 @@ def _show(summary: TuningSummary, period: float) -> None:
         [axis, str(one.components), number(one.before, ".1f"), number(one.after, ".1f")]
         for axis, one in summary.likelihood.items()
     ]
-    out.print(table(["fitted on", "measurements", "log-likelihood before", "after"], likelihood))
+    print_tables([table(["fitted on", "measurements", "log-likelihood before", "after"], likelihood)])
     if summary.validation:
-        out.print(_validation(summary))
+        print_tables([_validation(summary)])
     for check in summary.validation or ():
         typer.echo(f"{check.run}, {check.axis}: {check.verdict}")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from ..model.arm import ArmModel
 from ..units import si
 from ..views import formatting
 from ..views import report as reports
-from .tables import console, print_json, table
+from .tables import print_json, print_tables, table
 
 _FAILED = 3
 
@@ -51,8 +50,7 @@ def run(
     if json:
         print_json([toml.reported(one, one.kind) for one in verified])
     else:
-        for of_kind in reports.verifications(verified):
-            console(sys.stdout).print(table(*of_kind))
+        print_tables(table(*of_kind) for of_kind in reports.verifications(verified))
         typer.echo("\n".join([formatting.lag(model.update_period), *map(reports.verdict, verified)]))
         if report is not None:
             typer.echo(f"written to {report}")

@@ -449,8 +449,8 @@ class LiveEstimator:
             self._knows_interval = True
             stamps = np.sort(np.array([one.stamp for one in recent]))
             if (other := other_interval(stamps, self.config.arm.update_period)) is not None:
-                sentence, is_unit = other
-                where = " A stream has t in s, or t_ns in ns" if is_unit else ""
+                sentence, kind = other
+                where = " A stream has t in s, or t_ns in ns" if kind == "unit" else ""
                 self._log.write("interval of commands", sentence + where)
         if len(recent) < _MANY:
             return
@@ -487,7 +487,7 @@ class LiveEstimator:
         if self._contradicting.get(sensor) == other:
             return
         self._contradicting[sensor] = other
-        found = zip(self.axes, window.outcome.tolist(), window.innovation.tolist(), strict=True)
+        found = list(zip(self.axes, window.outcome.tolist(), window.innovation.tolist(), strict=True))
         screens = {axis: self.config.arm.screen_of(axis) for axis, _, _ in found}
         off = ", ".join(
             f"{axis} by {nu * screens[axis].scale:+.4g} {screens[axis].unit}"

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from .run import Run, Source, note_rows
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
 _OTHER_PERIOD, _OTHER_BEAT = 2.0, 1.25  # times the update period from which an interval is another one; a steady one
+_MOST_LOST = 2.5  # times the update period, from which more than half of the commands are missing
 _NEW_CLOCK = 3  # so many rows in a row with another time: the clock was set anew; fewer are stray
 _MOST_JUMPS = 100
 _FEW, _MANY = 30, 10_000  # stamps, below which nothing is said about their unit, and from which it is clear
@@ -201,9 +203,11 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
     command = _ascending(run.command.stamp)
     found, label = list[str](), run.command.label
     if (other := other_interval(command, period)) is not None:
-        sentence, is_unit = other
-        if is_unit:
+        sentence, kind = other
+        if kind == "unit":
             raise RunError(f"{label}: {sentence} {_CORRECT}, or update_period_ms in arm.toml")
+        if kind == "lost":
+            raise RunError(f"{label}: {sentence} Log every command, or correct update_period_ms in arm.toml")
         found.append(f"{label}: {sentence}")
     if (missing := missing_commands(run.command)) is not None:
         found.append(f"{label}: {missing}; log every command")
@@ -221,7 +225,7 @@ def _ascending(stamp: TimeArray) -> TimeArray:
     return known if (np.diff(known) >= 0).all() else np.sort(known)
 
 
-def other_interval(stamp: TimeArray, period: float) -> tuple[str, bool] | None:
+def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit", "lost", "other"]] | None:
     """Whether the interval of commands is far from the update period.
 
     Args:
@@ -229,23 +233,26 @@ def other_interval(stamp: TimeArray, period: float) -> tuple[str, bool] | None:
         period: The arm's update period T [s].
 
     Returns:
-        A sentence that ends in a question, and whether their stamps are in another unit; None where it is not far.
+        A sentence that ends in a question, and what it is: stamps in another ``unit``, a steady stream in which most
+        commands are ``lost``, or another interval (who sends only what changes leaves commands out on purpose); None
+        where it is not far.
     """
-    intervals = np.diff(stamp[:_MANY])
-    intervals = intervals[intervals > 0]
+    every = np.diff(stamp[:_MANY])  # rows that share a stamp are there, even if only the last one counts
+    intervals = every[every > 0]
     if len(intervals) < _FEW:
         return None
     early, usual, late = np.quantile(intervals, [0.25, 0.5, 0.75]) / 1e9
     units, even = mistaken(usual / period, TIMES), late - early <= _EVEN * usual
     if units and even:
         times = f"{usual:.4g} s, {usual / period:.4g} times the arm's update_period_ms = {period * 1e3:g}"
-        return f"commands come every {times}: {_taken(units)}", True
+        return f"commands come every {times}: {_taken(units)}", "unit"
     far = _OTHER_BEAT if even else _OTHER_PERIOD
     if 1.0 / far < usual / period < far:
         return None
     lost = "are most of them lost, or is it another one?" if usual > period else "is it another one?"
     times = f"{usual * 1e3:.4g} ms, {usual / period:.3g} times the arm's update_period_ms = {period * 1e3:g}"
-    return f"commands come every {times}: {lost}", False
+    is_lost = even and float(every.mean()) / 1e9 > _MOST_LOST * period
+    return f"commands come every {times}: {lost}", "lost" if is_lost else "other"
 
 
 def missing_commands(command: Source) -> str | None:
