@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import warnings
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,6 +46,12 @@ class PumafuseWarning(UserWarning):
 
     def __init__(self, text: str) -> None:
         super().__init__(printable(text, _LONGEST))
+
+
+def warn(sentences: Iterable[str]) -> None:
+    """Give each sentence as a warning of the caller."""
+    for sentence in sentences:
+        warnings.warn(sentence, PumafuseWarning, stacklevel=3)
 
 
 def printable(text: str, longest: int = 80) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from decimal import Decimal
@@ -16,6 +17,7 @@ from .errors import ConfigError, PumafuseError, suggestion
 from .units import AN, KINDS, Kind, as_length, ending, from_si, in_unit, of_kind, to_si
 
 _MOST_TEXT = 16 << 20  # characters; what is longer, a device perhaps, is no configuration
+_BOUND = re.compile(r"Expected `(?:float|int)` (>=|<=|>|<) (\S+)")
 S = TypeVar("S", bound=msgspec.Struct)
 
 MOST = 1e9  # in SI, of any number: what is larger is no size of an arm, and would overflow
@@ -246,4 +248,14 @@ def _problems(tree: Any, kind: Any, path: str, axis: Kind = "length") -> Iterato
         try:
             msgspec.convert(tree, cast(Any, kind))
         except msgspec.ValidationError as error:
-            yield f"{path}: {str(error).split(' - at ')[0]}"
+            yield f"{path}: {_in_words(str(error).split(' - at ')[0], path)}"
+
+
+def _in_words(problem: str, path: str) -> str:
+    """What msgspec says of a value, a bound [SI] in the unit of its key."""
+    bound = _BOUND.fullmatch(problem)
+    if bound is None:
+        return problem
+    unit = next((unit for name in reversed(path.split(".")) if (unit := ending(name))), "")
+    value = float(bound[2])
+    return f"must be {bound[1]} {float(in_unit(value, unit)) if unit else value:g}"

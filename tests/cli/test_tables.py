@@ -27,7 +27,8 @@ def test_no_number_and_no_name_is_cut(width: int, monkeypatch: pytest.MonkeyPatc
     """A digit that is cut off makes another number: rather the lines are longer than the screen."""
     monkeypatch.setenv("COLUMNS", str(width))
     screen = Terminal()
-    print_tables([table(HEADINGS, ROWS)], screen)
+    monkeypatch.setattr("sys.stdout", screen)
+    print_tables([table(HEADINGS, ROWS)])
     shown = screen.getvalue()
     for row in ROWS:
         for cell in row[:4]:
@@ -37,8 +38,9 @@ def test_no_number_and_no_name_is_cut(width: int, monkeypatch: pytest.MonkeyPatc
     assert all(line.strip() in shown for heading in HEADINGS for line in heading.splitlines())
 
 
-def test_a_log_file_gets_whole_tables_too() -> None:
+def test_a_log_file_gets_whole_tables_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """120 columns are taken where it is no terminal, more where they do not suffice."""
     file = StringIO()
-    print_tables([table([f"number {place}" for place in range(20)], [["12345.6789"] * 20])], file)
+    monkeypatch.setattr("sys.stderr", file)
+    print_tables([table([f"number {place}" for place in range(20)], [["12345.6789"] * 20])], "stderr")
     assert file.getvalue().count("12345.6789") == 20

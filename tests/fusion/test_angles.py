@@ -353,6 +353,10 @@ WRONG = {
         "process.b.disturbance_sd_mm.*disturbance_sd_deg",
     ),
     "start of lengths": (("offset_sd_deg", "offset_sd_mm"), "start.offset_sd_mm.*offset_sd_deg"),
+    "no sd": (("sd_deg = { a", "# sd_deg = { a"), "'sensors.eye.sd_deg' is missing; accepted: sd_deg, .*bias_sd_deg"),
+    "a sensor's key misspelled": (("sd_deg = { a", "sd_degs = { a"), "unknown key 'sensors.eye.sd_degs'; .*'sd_deg'"),
+    "start misspelled": (("offset_sd_deg", "offset"), "unknown key 'start.offset'; .*offset_sd_deg"),
+    "a start below 0": (("offset_sd_deg = ", "offset_sd_deg = -"), "start.offset_sd_deg: must be >= 0"),
 }
 
 
@@ -369,6 +373,31 @@ def test_a_unit_of_the_other_kind_is_refused_with_the_right_one(
     with pytest.raises(pf.ConfigError, match=message) as caught:
         pf.FusionConfig.load(tmp_path / "fusion.toml")
     assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(("unit", "right"), [("deg", "max_speed_deg_s"), ("mm", "max_speed_m_s")])
+def test_a_limit_of_the_other_kind_is_refused(folders: dict[str, Path], unit: str, right: str, tmp_path: Path) -> None:
+    """It would never be passed."""
+    text = (folders[unit] / "arm.toml").read_text()
+    assert f"\n{right} = " in text
+    (wrong,) = {"max_speed_deg_s", "max_speed_m_s"} - {right}
+    (tmp_path / "arm.toml").write_text(text.replace(right, wrong))
+    with pytest.raises(pf.ConfigError, match=rf"arm\.toml: validity\.{wrong}: no axis of the arm .*; give {right}$"):
+        pf.ArmModel.load(tmp_path / "arm.toml")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "least"), [("update_period_ms", "0.0005", ">= 0.001"), ("delay_ms", "2e7", "<= 1e+07")]
+)
+def test_a_bound_has_the_unit_of_its_key(
+    folders: dict[str, Path], key: str, value: str, least: str, tmp_path: Path
+) -> None:
+    """0.0005 ms is less than 0.001 ms, which is 1e-6 s."""
+    text = (folders["deg"] / "arm.toml").read_text()
+    (line,) = (line for line in text.splitlines() if line.startswith(key))
+    (tmp_path / "arm.toml").write_text(text.replace(line, f"{key} = {value}"))
+    with pytest.raises(pf.ConfigError, match=rf"{key}: must be {re.escape(least)}$"):
+        pf.ArmModel.load(tmp_path / "arm.toml")
 
 
 def test_columns_of_the_other_kind_are_refused(folders: dict[str, Path], tmp_path: Path) -> None:

@@ -183,10 +183,10 @@ REFUSED = {
     "key with a newline": ("42.5", '42.5\n"a\\nb" = 1', "axes.radial", ""),
     "axis named like a unit": ("axes.radial", "axes.rail_mm", "axis 'rail_mm'", "must not end in a unit"),
     "zero": ("42.5", "0.0", "axes.radial.time_constant_ms", "> 0"),
-    "a period of nothing": ("28.0", "1e-160", "update_period_ms", ">= 1e-06"),
+    "a period of nothing": ("28.0", "1e-160", "update_period_ms", ">= 0.001"),
     "a frequency of nothing": ("natural_frequency_rad_s = 53.9", "natural_frequency_rad_s = 1e-160",
                                "axes.tangential.natural_frequency_rad_s", ">= 1e-06"),
-    "a recovery of nothing": ("100.0", "1e-160", "axes.radial.gain_recovery_ms", ">= 1e-06"),
+    "a recovery of nothing": ("100.0", "1e-160", "axes.radial.gain_recovery_ms", ">= 0.001"),
     "negative": ("60.45", "-1.0", "delay_ms", ">= 0"),
     "not TOML": ("name = ", "name = = ", "not valid TOML", ""),
 }  # fmt: skip

@@ -8,6 +8,7 @@ import numpy as np
 import typer
 
 from ..arrays import FloatArray
+from ..errors import warn
 from ..model.arm import ArmModel
 from ..model.discrete import DiscreteModel, discretize
 from ..units import MS, Screen, in_unit, si
@@ -24,6 +25,7 @@ def run(source: str, axis: str | None, period_ms: float | None, json: bool) -> N
         PumafuseError: No such arm or axis.
     """
     arm = ArmModel.load(source)
+    warn(arm.doubts())
     period = arm.update_period if period_ms is None else si(period_ms, "_ms")
     # 1 m/√Hz and states in m give the same numbers as 1 mm/√Hz and states in mm, or as degrees.
     models = {

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import typer
 
-from ..errors import RunError, printable
+from ..errors import RunError, printable, warn
 from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Estimates, Mode
@@ -51,6 +51,7 @@ def run(
     """
     given = FusionConfig.load(config)
     given.sensor_names(sensors)  # before any run is read
+    warn(given.arm.doubts())
     whole = partial(fuse, config=given, sensors=sensors, rate=rate, mode=mode, engine=engine)
     long = partial(fuse_to, config=given, sensors=sensors, rate=rate, part=part, force=force)
     needs = {"--smooth": mode == "smoothed", "--as-live": mode == "as-live", "--engine filterpy": engine != "compiled"}

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import typer
 
-from ..errors import ConfigError, PumafuseWarning
+from ..errors import ConfigError, warn
 from ..folders import FolderError, write_file
 from ..identification.identify import Identification, identify
 from ..identification.trials import StepTrials
@@ -65,8 +64,7 @@ def run(
     campaign, name = StepTrials.read(folder), folder.resolve().name
     most = None if tolerance is None else si(tolerance, f"_{SCREEN[campaign.kind].unit}")
     found = identify(campaign, period=period, samples=samples, paper=paper, tolerance=most, name=name)
-    for note in found.notes:
-        warnings.warn(note, PumafuseWarning, stacklevel=1)
+    warn(found.notes)
     write_file(output, found.arm.to_toml(), replace=force)
     if report is not None:
         reports.write_identification(found, campaign, report, force)

@@ -93,6 +93,8 @@ def run(
         estimator = partial(LiveEstimator, known, window=window, stale_after=stale_after, start=start, on_notice=notify)
         estimator().warm_up()  # before anything is made or listens: meanwhile datagrams would be lost
         gc.freeze()  # what is here stays: looking through it again and again would take longer than an estimate may
+        for doubt in known.arm.doubts():
+            notify(doubt)
         recorder = Recorder(record, known, start, notify) if record else None
         live = estimator(event_log=recorder)
         if recorder is not None:
@@ -120,7 +122,7 @@ def run(
     for sentence in _sentences(stream, summaries):
         notify(sentence)
     with contextlib.suppress(OSError):
-        print_tables([_sensor_table(live)], sys.stderr)
+        print_tables([_sensor_table(live)], "stderr")
 
 
 def _output(status: bool) -> Callable[[list[bytes]], None]:

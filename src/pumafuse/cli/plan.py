@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import typer
 
-from ..errors import ConfigError, PumafuseWarning
+from ..errors import ConfigError, warn
 from ..identification import plan as plans
 from ..identification.plan import Design
 from ..logs import tables
@@ -69,8 +68,7 @@ def run(
         model,
         None if max_speed is None else si(max_speed, speed),
     )
-    for warning in planned.warnings:
-        warnings.warn(warning, PumafuseWarning, stacklevel=1)
+    warn(planned.warnings)
     plans.write(planned, output, force)
     typer.echo(
         f"{len(planned.trials)} step trials and {len(planned.noise)} white-noise sequences,"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from io import StringIO
-from typing import Any, TextIO
+from typing import Any, Literal, TextIO
 
 import msgspec
 import typer
@@ -81,11 +81,11 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     return made
 
 
-def print_tables(tables: Iterable[Table], file: TextIO | None = None) -> None:
-    """Print the tables that have anything in them on standard output, or another stream: whole, however wide it is."""
+def print_tables(tables: Iterable[Table], stream: Literal["stdout", "stderr"] = "stdout") -> None:
+    """Print the tables that have anything in them, whole, however narrow the screen is."""
     for one in tables:
         if one.columns:
-            out = console(file or sys.stdout)
+            out = console(getattr(sys, stream))
             out.width = max(out.width, out.measure(one, options=out.options.update(width=_WIDEST)).minimum)
             out.print(one, crop=False)
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import typer
 
 from .. import toml
-from ..errors import PumafuseWarning
+from ..errors import warn
 from ..identification.verify import verify
 from ..logs.run import Run
 from ..model.arm import ArmModel
@@ -39,14 +38,13 @@ def run(
     if report is not None:
         reports.check_writable(report, force)
     model = ArmModel.load(arm)
+    warn(model.doubts())
     levels = {axis: si(level, f"_{model.screen_of(axis).unit}") for axis, level in start.items()}
     found = [one for path in paths for one in verify(Run.read(path), model, sensors=sensors, start=levels)]
     if report is not None:
         reports.write_verification(found, model, report, force)
     verified = [verification for verification, _ in found]
-    for one in verified:
-        for note in one.notes:
-            warnings.warn(f"run '{one.run}': {note}", PumafuseWarning, stacklevel=1)
+    warn(f"run '{one.run}': {note}" for one in verified for note in one.notes)
     if json:
         print_json([toml.reported(one, one.kind) for one in verified])
     else:

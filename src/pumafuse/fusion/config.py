@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, cast
 import msgspec
 
 from .. import toml
-from ..errors import ConfigError, UnknownNameError, shortened
+from ..errors import ConfigError, UnknownNameError, shortened, suggestion
 from ..logs.frames import Frame
 from ..model.arm import ArmModel, arm_of
 from ..model.presets import PRESETS
@@ -269,6 +269,10 @@ def _config(tree: Mapping[str, Any], arm: ArmModel, where: str) -> FusionConfig:
     tree = with_names_of_lengths({**tree, "arm": arm}, arm, where)
     if isinstance(tree.get("process"), dict):
         tree["process"] = with_defaults(tree["process"], arm)
+    for name, table in cast(dict[str, Any], tree.get("sensors", {})).items():
+        if isinstance(table, dict) and "sd_mm" not in table:
+            sd = " or ".join(f"'sensors.{name}.{of_kind('sd_mm', of)}'" for of in arm.kinds)
+            raise ConfigError(f"{where}: {sd} is missing; accepted: {', '.join(_accepted(Sensor, arm, _PER_AXIS))}")
     return toml.struct(tree, FusionConfig, where)
 
 
@@ -405,7 +409,15 @@ def of_all_axes(
         if each:
             same = len(each) == len(arm.axes) and len(set(each.values())) == 1
             found[key] = next(iter(each.values())) if same else each
+    for key in found.keys() - types.keys():
+        raise ConfigError(f"{where}: unknown key '{path}.{key}'; {suggestion(key, _accepted(kind, arm, per_axis))}")
     return found
+
+
+def _accepted(kind: type[msgspec.Struct], arm: ArmModel, per_axis: Sequence[str]) -> list[str]:
+    """The keys of a table for all axes of an arm."""
+    keys = (field.encode_name for field in msgspec.structs.fields(kind))
+    return [name for key in keys for name in ([of_kind(key, of) for of in arm.kinds] if key in per_axis else [key])]
 
 
 def with_defaults(process: Mapping[str, Mapping[str, Any]], arm: ArmModel) -> dict[str, dict[str, Any]]:

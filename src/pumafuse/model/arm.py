@@ -14,7 +14,7 @@ from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError, suggestion
 from ..toml import Interval, Positive, Time
-from ..units import KINDS, MM, MS, SCREEN, Kind, Screen, refuse_name
+from ..units import AN, KINDS, MM, MS, SCREEN, Kind, Screen, refuse_name
 from .plants import PLANTS, Delay
 from .presets import PRESETS
 
@@ -143,6 +143,11 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def __post_init__(self) -> None:
         for name in self.axes:
             refuse_name("axis", name)
+        keys: dict[Kind, str] = {"length": "max_speed_m_s", "angle": "max_speed_deg_s"}
+        for kind in KINDS:
+            if self.validity.limit_of(kind) is not None and kind not in self.kinds:
+                right = keys[self.kinds[0]]
+                raise ConfigError(f"validity.{keys[kind]}: no axis of the arm is {AN[kind]}; give {right}")
 
     def __repr__(self) -> str:
         lags = ", ".join(f"{axis} {self.lag_of(axis) * MS:.4g} ms" for axis in self.axes)
@@ -210,6 +215,17 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         """Td [s] of one axis: its own, or the arm's."""
         own = self.axis(axis).delay
         return self.delay if own is None else own
+
+    def doubts(self) -> list[str]:
+        """A sentence if the gain of axes depends on the speed and does not recover."""
+        axes = [name for name, one in self.axes.items() if one.gain.slope and one.gain_recovery is None]
+        if not axes:
+            return []
+        of = f"axis {axes[0]}" if len(axes) == 1 else f"axes {', '.join(axes)}"
+        return [
+            f"{of}: a gain that depends on the speed without gain_recovery_ms: where a motion ends depends on how fast"
+            " it went, which no arm does for long; tune --fit gain finds a recovery"
+        ]
 
     def lag_of(self, axis: str, speed: float = 0.0) -> float:
         """Total lag [s] of one axis behind the held command at constant velocity: :meth:`AxisModel.lag`."""

@@ -507,7 +507,9 @@ def _axis_lag(
         centre, half = 0.5 * (low + high), 0.5 * margin * (high - low)
         if quantity in ("lag", "delay"):
             half = max(half, _FINEST)
-        low, high = min(centre - half, middle), max(centre + half, middle)
+        low, high = centre - half, centre + half
+        if not low < middle < high:  # other models say otherwise: both count, and no interval ends at its estimate
+            low, high = min(low, middle - half), max(high, middle + half)
         if quantity == "delay":
             low = max(low, 0.0)
         return (math.exp(low), math.exp(high)) if log else (low, high)
