@@ -18,12 +18,14 @@ help:
 	@echo "make lock       write requirements.lock anew (needs uv)"
 	@echo "make clean      remove .venv, ./demo and ./site"
 
+# pip compiles what it installs, but not what is edited in place; a setting may forbid Python to keep it, too.
 $(READY): requirements.lock pyproject.toml
 	@echo "Setting up .venv from requirements.lock ..."
 	@$(PYTHON) -c 'import sys; sys.exit("pumafuse needs Python 3.11 or newer: make PYTHON=python3.12 ...") if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	$(BIN)/python -m compileall -q src
 	@touch $@
 
 demo: $(READY)
@@ -54,6 +56,7 @@ notebooks: $(READY)
 	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
 	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check --requirement benchmarks/requirements-peers.txt
 	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	.venv-bench/bin/python -m compileall -q src
 	@touch $@
 
 bench: .venv-bench/.ready
