@@ -214,7 +214,6 @@ UNREADABLE: dict[str, tuple[str, bytes | None, str]] = {
     "folder": ("", None, "cannot be read"),
     "empty": ("log.csv", b"", "empty"),
     "header, no newline": ("log.csv", b"t_s,x_mm", "Empty CSV"),
-    "column twice": ("log.csv", b"t_s,x_mm,x_mm\n0,1,2\n", "two columns are named 'x_mm'"),
     "one endless line": ("log.csv", b"t_s,x_mm\n0," + b"1" * 3 * FIRST_BLOCK, "not a table"),
     "CSV called Parquet": ("log.parquet", b"t_s,x_mm\n0,1\n", "not a table"),
     "CSV called gzip": ("log.csv.gz", b"t_s,x_mm\n0,1\n", "cannot be read"),
@@ -238,6 +237,26 @@ def test_a_file_that_is_no_table_is_refused_in_one_line(
     assert text.startswith(f"{path}: ")
     assert reason in text
     assert capfd.readouterr() == ("", "")
+
+
+def test_two_columns_of_one_name_are_in_the_way_of_nobody_else(tmp_path: Path) -> None:
+    """It is said that none of them is used, and who asks for one is refused; the others are read."""
+    path = tmp_path / "log.csv"
+    path.write_text("t_s,x_mm,q,q,,\n0,1,2,3,4,5\n")
+    table = tables.read(path)
+    assert table.numbers("x_mm")[0].tolist() == [1e-3]
+    assert sorted(table.notes) == [f"log.csv: two columns are named '{name}': neither is used" for name in ("", "q")]
+    assert "two columns are named 'q'" in refusal(lambda: table.plain("q"))
+
+
+@pytest.mark.parametrize("rest", ["0", "0,000"])
+def test_decimal_commas_may_come_late(tmp_path: Path, rest: str) -> None:
+    """A log that rests for long shows them after thousands of rows."""
+    path = tmp_path / "log.csv"
+    path.write_text("t_ms;x_mm\n" + "".join(f"{k};0\n" for k in range(3000)) + f"3000;{rest}\n3001;0,030\n")
+    assert tables.read(path).numbers("x_mm")[0].tolist() == [0.0] * 3001 + [0.03 / 1e3]
+    path.write_text("t_ms;x_mm;note\n" + "".join(f"{k};0.5;\n" for k in range(3000)) + "3000;0.25;1,5\n")
+    assert tables.read(path).numbers("x_mm")[0].tolist() == [5e-4] * 3000 + [2.5e-4]
 
 
 @pytest.mark.parametrize("text", ["t_s;x_mm;y_mm\n0.5;1.25;\n1;2;3\n", "t_s;x_mm;y_mm\n0,5;1,25;\n1;2;3\n"])

@@ -122,7 +122,7 @@ def run(
     for sentence in _sentences(stream, summaries):
         notify(sentence)
     with contextlib.suppress(OSError):
-        print_tables([_sensor_table(live)], "stderr")
+        print_tables([_sensor_table(live, feeder.now)], "stderr")
 
 
 def _output(status: bool) -> Callable[[list[bytes]], None]:
@@ -167,6 +167,7 @@ class _Feeder:
     view: LiveView | None
     screen: Live | None
     sure: int | None = None
+    now: int | None = None
     moved: float = field(default_factory=time.monotonic)
     drawn: float = field(default_factory=time.monotonic)
 
@@ -176,15 +177,16 @@ class _Feeder:
         self.stream.take(items)
         sure = self.stream.live.sure
         if sure != self.sure:
-            self.sure, self.moved = sure, now
+            self.sure, self.now, self.moved = sure, None, now
         elif sure is not None and now - self.moved > QUIET and math.isfinite(self.speed):
-            self.stream.idle(sure + round((now - self.moved - QUIET) * self.speed * 1e9))
+            self.now = sure + round((now - self.moved - QUIET) * self.speed * 1e9)
+            self.stream.idle(self.now)
         if self.recorder is not None:
             self.recorder.tick(sure)
         if self.view is not None:
-            self.view.tick(self.stream.live.health)
+            self.view.tick(lambda: self.stream.live.health(self.now))
         if self.screen is not None and now - self.drawn >= _REDRAWN:
-            self.screen.update(status(self.stream, self.summaries), refresh=True)
+            self.screen.update(status(self.stream, self.summaries, self.now), refresh=True)
             self.drawn = now
 
 
@@ -209,15 +211,16 @@ def _caught_signals() -> Generator[list[int]]:
             signal.signal(number, handler)
 
 
-def status(stream: Stream, summaries: Sequence[Callable[[], str]] = ()) -> Group:
+def status(stream: Stream, summaries: Sequence[Callable[[], str]] = (), now: int | None = None) -> Group:
     """One screen: the position of each axis, and how each sensor does.
 
     Args:
         stream: The stream.
         summaries: Give a sentence each on the parts beside it; empty for nothing.
+        now: What the stream's time has come to [ns] while nothing came; None: that of the newest event.
     """
-    estimate = stream.live.estimate()
-    now = "no event yet" if stream.live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
+    estimate = stream.live.estimate(now)
+    time = "no event yet" if stream.live.newest is None else f"t = {estimate.time:.3f} s, {estimate.reason}"
     arm, tables = stream.live.config.arm, list[Table]()
     for kind in arm.kinds:
         rows = [
@@ -226,12 +229,12 @@ def status(stream: Stream, summaries: Sequence[Callable[[], str]] = ()) -> Group
             if arm.axes[name].kind == kind
         ]
         tables.append(table(["axis", *headings(_AXIS, kind), ""], rows))
-    return Group(Text(now), *tables, _sensor_table(stream.live), *map(Text, _sentences(stream, summaries)))
+    return Group(Text(time), *tables, _sensor_table(stream.live, now), *map(Text, _sentences(stream, summaries)))
 
 
-def _sensor_table(live: LiveEstimator) -> Table:
+def _sensor_table(live: LiveEstimator, now: int | None) -> Table:
     """Rate, lateness, dropouts and NIS of each sensor, and its components by outcome."""
-    sensors = live.health().sensors
+    sensors = live.health(now).sensors
     words = [one.word for one in Outcome if any(sensor.outcomes[one.word] for sensor in sensors.values())]
     rows = [
         [name, *cells(one, _SENSOR), "stale" if one.stale else "", *(str(one.outcomes[word]) for word in words)]

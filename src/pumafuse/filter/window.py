@@ -20,7 +20,7 @@ import numpy as np
 from ..arrays import ALWAYS, NEVER, CodeArray, FloatArray, IndexArray, IntArray, TimeArray
 from ..compiled import compiled, compiled_apart, kernel
 from .axis import PERIOD, START, STEP, Model, Sensors, State, U, copy_rows
-from .counters import Counters, count_duplicate, count_rows, forget_after
+from .counters import CAME, Counters, count_duplicate, count_rows, forget_after
 from .events import COMMAND, DUPLICATE, FUSED, Events, Results, classify, repeats_earlier
 from .forward import ALL_THERE, NO_TIMES, ONE, ZERO, Filter, Flat, Output, checkpoint_of, filter_events
 from .gate import FUSED_AT, NOBODY
@@ -459,6 +459,14 @@ class Window:
         self.command_at(0)
         self.forget(0)
         self.counters()
+
+    def count_late(self, sensor: int, stamp: int, newest: int) -> None:
+        """Count a measurement that has come too late for the window; ``newest`` [ns] is the latest stamp of all."""
+        count_rows(self._flat_counters, *self._counting, self._counted, self._counted, sensor, stamp, newest)
+
+    def uncount_late(self, sensor: int) -> None:
+        """Take one back that is fed again."""
+        self._counters.number[sensor, CAME] -= 1
 
     def counters(self) -> Counters:
         """What there was of each sensor until now, with what is still in the window."""

@@ -16,7 +16,7 @@ from ..arrays import FloatArray, TimeArray
 from ..discovery.matching import SMALL_SHIFT, Grid, Match, matches, without_spikes
 from ..discovery.tracking import FOLLOWS, GAIN, Tracking
 from ..errors import RunError
-from ..filter.outcome import Outcome
+from ..filter.outcome import ABSENT, Outcome
 from ..model.response import response
 from ..units import OF_KIND, Kind, mistaken
 from .config import FusionConfig
@@ -151,13 +151,18 @@ def _given(segment: Segment, config: FusionConfig) -> _Given:
 
 
 def _trackings(segment: Segment, config: FusionConfig, given: _Given) -> _Trackings:
-    """How each sensor tracks the commands until 1 s after the last command, without axes of which there is little."""
+    """How each sensor tracks the commands until 1 s after the last command, without axes of which there is little.
+
+    Where most of it lies outside of the commands it is the clock that is wrong: the rest would tell of anything.
+    """
     found: dict[str, dict[str, Tracking]] = {}
+    every = segment.rows_by_sensor()
     for name, axes in given.items():
         found[name] = {}
         for axis, (stamp, value) in axes.items():
             count = int(np.searchsorted(stamp, int(segment.commands[-1]) + _TAIL_NS, side="right"))
-            if count >= _FEW:
+            logged = np.count_nonzero(every[name].known[:, segment.axes.index(axis)] != ABSENT)
+            if count >= max(_FEW, logged / 2):
                 some = slice(None, count, 1 + count // _ENOUGH)
                 alike = without_spikes(value[some])
                 found[name][axis] = _tracking(segment, config, name, axis, stamp[some][alike], value[some][alike])
@@ -253,16 +258,17 @@ def _not_following(segment: Segment, config: FusionConfig, given: _Given, tracki
     found: list[Fault] = []
     for name, mine in trackings.items():
         if odd := [axis for axis, tracking in mine.items() if not tracking.follows]:
-            causes = _matches(segment, config, name, {axis: given[name][axis] for axis in mine})
-            found += _faults(config, name, mine, {axis: causes[axis] for axis in odd})
+            grid = _busiest(segment, config.arm.update_period)
+            causes = _matches(segment, config, name, {axis: given[name][axis] for axis in mine}, grid)
+            found += _faults(config, name, mine, {axis: causes[axis] for axis in odd}, grid.margin * grid.step)
     return _of_commands(found, trackings)
 
 
 def _matches(
-    segment: Segment, config: FusionConfig, name: str, given: Mapping[str, tuple[TimeArray, FloatArray]]
+    segment: Segment, config: FusionConfig, name: str, given: Mapping[str, tuple[TimeArray, FloatArray]], grid: Grid
 ) -> dict[str, Match]:
     """What explains the motion that a sensor measures on each axis, without single outliers."""
-    sensor, grid = config.sensors[name], _busiest(segment, config.arm.update_period)
+    sensor = config.sensors[name]
     led = {axis: _led(segment, config, axis, grid.time) for axis in segment.axes}
     measured: dict[str, FloatArray] = {}
     for axis, (stamp, value) in given.items():
@@ -287,9 +293,12 @@ def _busiest(segment: Segment, period: float) -> Grid:
 
 
 def _faults(
-    config: FusionConfig, name: str, trackings: Mapping[str, Tracking], causes: Mapping[str, Match]
+    config: FusionConfig, name: str, trackings: Mapping[str, Tracking], causes: Mapping[str, Match], searched: float
 ) -> list[Fault]:
-    """The faults of one sensor, from what explains its motion on the axes that it does not follow."""
+    """The faults of one sensor, from what explains its motion on the axes that it does not follow.
+
+    Shifts were ``searched`` up to so many seconds.
+    """
     found: list[Fault] = []
 
     def fault(axes: Sequence[str], cause: _Cause, size: float, words: str, refused: bool = False) -> None:
@@ -319,7 +328,7 @@ def _faults(
     faulty = {axis for one in found for axis in one.axes}
     odd = {axis: trackings[axis] for axis in causes if axis not in faulty and abs(causes[axis].correlation) < _LOST}
     if lost := {axis: one for axis, one in odd.items() if one.lacks_motion}:
-        fault(list(lost), "nothing", 1.0, _nothing(lost))
+        fault(list(lost), "nothing", 1.0, _nothing(lost, searched))
     return found
 
 
@@ -374,12 +383,12 @@ def _digits(number: float, count: int) -> str:
     return f"{float(f'{number:.{count}g}'):g}"
 
 
-def _nothing(trackings: Mapping[str, Tracking]) -> str:
+def _nothing(trackings: Mapping[str, Tracking], searched: float) -> str:
     rests = "rests and " if all(one.rests for one in trackings.values()) else ""
     axes = ", ".join(f"{axis} (correlation {one.correlation:+.2f})" for axis, one in trackings.items())
     return (
-        f"{rests}does not follow the commands of {axes}, nor those of other axes or of up to 30 s before or after: is"
-        " it that axis of this run, are both stamped by one clock, is arm.toml that of this arm?"
+        f"{rests}does not follow the commands of {axes}, nor those of other axes or of up to {searched:.2g} s before or"
+        " after: is it that axis of this run, are both stamped by one clock, is arm.toml that of this arm?"
     )
 
 

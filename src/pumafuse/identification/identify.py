@@ -18,7 +18,7 @@ from .combine import CombinedAxis, Common, Fitted, coefficients, combine, combin
 from .estimate import common
 from .fit import StepFit, fit_steps, flags
 from .paper import fit_as_published, onset
-from .trials import StepTrials, Trial, TrialsError, first_few
+from .trials import FEWEST_SAMPLES, StepTrials, Trial, TrialsError, first_few
 
 # m, the paper's; rad, of 0.1 degrees, which are a millimetre at 0.57 m from the joint
 TOLERANCE: dict[Kind, float] = {"length": 1e-3, "angle": units.si(0.1, "_deg")}
@@ -167,8 +167,13 @@ def identify(
         name: Of the arm.
 
     Raises:
-        TrialsError: The period is not known, or no axis has trials enough for a model.
+        TrialsError: The period is not known, ``samples`` or ``tolerance`` is none, or no axis has trials enough for a
+            model.
     """
+    if samples is not None and samples < FEWEST_SAMPLES:
+        raise TrialsError(f"samples: at least {FEWEST_SAMPLES} of a trial are needed, not {samples}")
+    if tolerance is not None and not 0.0 < tolerance < np.inf:
+        raise TrialsError(f"tolerance: must be positive and finite, not {tolerance}")
     period, kind = trials.period(period), trials.kind
     tolerance = TOLERANCE[kind] if tolerance is None else tolerance
     fitted = _fit_all(trials.trials, samples, paper)

@@ -85,8 +85,10 @@ class Design:
             refuse_name("axis", axis)
             if axis in _TAKEN or re.search(r"[^\w -]", axis):
                 raise ConfigError(f"plan: an axis cannot be called '{axis}'")
-        if not self.speeds:
-            raise ConfigError("plan: at least one speed")
+        if not self.speeds or not self.positions:
+            raise ConfigError("plan: at least one speed, and one position")
+        if self.seed < 0:
+            raise ConfigError(f"plan: seed must be >= 0, not {self.seed}")
         steps, sizes = [speed * self.period for speed in self.speeds], _SIZES[self.kind]
         for name, of_these in (("speeds", steps), ("amplitudes", self.amplitudes)):
             if any(not sizes.least <= size <= sizes.most for size in of_these):

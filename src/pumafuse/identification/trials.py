@@ -15,7 +15,7 @@ from ..errors import PumafuseError, RunError
 from ..logs import tables
 from ..units import KINDS, OF_KIND, SPEEDS, Kind, ending, seconds, si_of
 
-_FEWEST = 8  # samples from the step on: a second-order fit with delay, gain and zero has five unknowns
+FEWEST_SAMPLES = 8  # samples from the step on: a second-order fit with delay, gain and zero has five unknowns
 _AGREE = 0.03  # relative difference of step over speed between trials that is still one update period
 _PERIODS = (0.001, 0.2)  # s, range of an update period found from the trials
 _GIVEN = (1e-4, 10.0)  # s, range of an update period given by the user
@@ -173,8 +173,8 @@ def _unusable(times_listed: int, axis: str, step: float, time: FloatArray, posit
     if not _STEPS[0] <= abs(step) <= _STEPS[1]:
         return "its step is 0 or no number, or of no size an arm has"
     after = len(np.unique(time[time >= 0.0]))
-    if after < _FEWEST:
-        return f"{after} samples from the step on, at least {_FEWEST} are needed"
+    if after < FEWEST_SAMPLES:
+        return f"{after} samples from the step on, at least {FEWEST_SAMPLES} are needed"
     return "its position never changes" if np.ptp(position) == 0.0 else None
 
 

@@ -120,7 +120,8 @@ def verify(
     Raises:
         PumafuseError: The run has no such sensor, commands an axis that the arm has not, or nothing to compare with.
     """
-    chosen = _with_sources(run, None if sensors is None else tuple(sensors))
+    names = (sensors,) if isinstance(sensors, str) else sensors
+    chosen = _with_sources(run, None if names is None else tuple(names))
     config = FusionConfig(arm=arm, sensors={name: Sensor(sd=1e-3) for name in chosen.sensors})
     parts, jumps = segments(in_axes(chosen, None)[0])
     found: list[tuple[AxisVerification, Trace]] = []

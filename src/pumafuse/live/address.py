@@ -145,7 +145,7 @@ def _network_address(text: str, where: str) -> Address:
         host, port = parts.hostname or "", parts.port
     except ValueError:
         host, port = "", None
-    plain = port is not None and text == f"{kind}://{host_port(host, port)}"
+    plain = port is not None and text.lower() == f"{kind}://{host_port(host, port)}"
     if port is None or not plain or (kind == "tcp" and not (host and port)):
         raise ConfigError(f"{where}: expected {kind}://HOST:PORT, as in {kind}://{_LOOPBACK}:5005")
     return Address(kind, host=host, port=port)

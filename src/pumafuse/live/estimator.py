@@ -227,15 +227,20 @@ class LiveEstimator:
         right = self._clock.low <= stamp <= self._clock.high or (known and self._clock.ends_doubt(stamp, sensor))
         return stamp if right else self.sure
 
-    def health(self) -> Health:
-        """How each sensor does, and what became of everything so far."""
+    def health(self, at: Time | None = None) -> Health:
+        """How each sensor does, and what became of everything so far.
+
+        Args:
+            at: Until when a sensor that is silent has been so; None: until the newest stamp.
+        """
+        newest = None if self._clock.newest is None else max(self._clock.now, nanoseconds(at or 0))
         return health_of(
             self._window.counters(),
             self._refused,
             self._commands,
             self._strangers,
             self.segment,
-            None if self._clock.newest is None else self._clock.now,
+            newest,
             self._stale_ns,
         )
 
@@ -318,6 +323,8 @@ class LiveEstimator:
             self._aside.append((event._replace(values=dict(values)), outcome))
         if verdict is Verdict.AHEAD:
             return self._refuse(sensor, values, outcome, f"stamped {(stamp - newest) / 1e9:.0f} s ahead of all others")
+        if outcome == _TOO_LATE:
+            return self._refuse_late(stamp, sensor, values)
         return self._refuse(sensor, values, outcome, self._behind(stamp))
 
     def _behind(self, stamp: int) -> str:
@@ -396,7 +403,7 @@ class LiveEstimator:
             stranger = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
         oldest = self._oldest()
         if stamp < oldest:
-            return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
+            return self._refuse_late(stamp, sensor, values)
         if not given:
             missing = not stranger and len(values) > 0
             why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
@@ -408,7 +415,7 @@ class LiveEstimator:
         if self.config.frame is not None:
             window.spread[:] = 1.0
         if not taken:
-            return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
+            return self._refuse_late(stamp, sensor, values)
         codes = window.outcome.tobytes()
         result = self._answers.get(codes) if not stranger else None
         result = result or self._answer(codes, stranger)
@@ -514,6 +521,12 @@ class LiveEstimator:
             return result._replace(axes=axes, reason=f"{result.reason}; {self._no_axis(stranger)}")
         return self._answers.setdefault(codes, result)
 
+    def _refuse_late(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
+        """Count an event that is behind the window; how late it is shows which window it would take."""
+        if sensor is not None:
+            self._window.count_late(self._sensors[sensor], stamp, self._clock.now)
+        return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
+
     def _refuse(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str) -> UpdateResult:
         """Count an event that never comes into the window."""
         self._refusals += 1
@@ -526,6 +539,8 @@ class LiveEstimator:
             self._commands[outcome] += times
         elif sensor in self._refused:
             self._refused[sensor][outcome] += times * len(values)
+            if outcome == _TOO_LATE and times < 0:
+                self._window.uncount_late(self._sensors[sensor])
         else:
             self._strangers += times
 

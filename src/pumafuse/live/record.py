@@ -101,7 +101,7 @@ class Recorder:
             self._folders += 1
             self._folder = self._next_folder()
             self._start = {}
-            self._log.write("clock", f"record: another clock, so it goes on in {self._folder}")
+            self._notify(f"record: another clock, so it goes on in {self._folder}")
         self._clear()
 
     def append(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> None:
@@ -150,7 +150,8 @@ class Recorder:
 
     def summary(self) -> str:
         """What was recorded, in a sentence."""
-        return f"{self._first}: {self._state()}"
+        more = "" if self._folders == 1 else f" to {self._folder.name}, {self._folders} folders"
+        return f"{self._first}{more}: {self._state()}"
 
     def _report(self, now: float) -> None:
         """Report once a minute what is wrong with the disk, and once that it is well again."""

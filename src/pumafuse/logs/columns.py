@@ -160,8 +160,10 @@ class Table:
         """The column of a name or a field path, nothing converted. A column that has the whole path as its name wins.
 
         Raises:
-            RunError: There is none; says what there is.
+            RunError: There is none; says what there is. Or two have this name.
         """
+        if path not in self.columns and self.names.count(path) > 1:
+            raise RunError(f"{self.path}: two columns are named '{path}'")
         return find(self.columns, path, str(self.path))
 
     def _of_numbers(self, name: str, per_unit: int) -> tuple[TimeArray, str | None]:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -140,7 +140,7 @@ class Run:
         if self.clock not in get_args(Clock):
             raise UnknownNameError(where, "clock", str(self.clock), get_args(Clock))
         for axis, level in self.start.items():
-            if not np.isfinite(level):
+            if not np.isfinite(_number(level, np.nan)):
                 raise RunError(f"{where}: the start level of {axis} is not finite")
         if self.reference is not None:
             for axis in self.reference.values:
@@ -169,7 +169,7 @@ class Run:
         Raises:
             RunError: That is no interval after the first command.
         """
-        low, high = 0.0 if since is None else since, np.inf if until is None else until
+        low, high = (_number(one, end) for one, end in ((since, 0.0), (until, np.inf)))
         if not (0.0 <= low < high and low < np.inf):
             raise RunError(f"run '{self.name}': from {since} to {until} s is no interval after the first command")
         return replace(self, since=since, until=until if high < np.inf else None)
@@ -243,8 +243,10 @@ class Run:
         """
         notes = list[str]()
         commands = _from_arrays("command", time, command, notes)
-        streams = {sensor: _from_arrays(sensor, *arrays, notes) for sensor, arrays in (sensors or {}).items()}
-        scored = None if reference is None else replace(_from_arrays("reference", *reference, notes), sd=reference_sd)
+        streams = {name: _from_arrays(name, *_pair(name, arrays), notes) for name, arrays in (sensors or {}).items()}
+        scored = None
+        if reference is not None:
+            scored = replace(_from_arrays("reference", *_pair("reference", reference), notes), sd=reference_sd)
         return Run(name, commands, streams, scored, dict(start or {}), clock, frame, notes=tuple(notes))
 
 
@@ -302,6 +304,27 @@ def _changes(source: Source, axis: str) -> BoolArray:
     known = np.flatnonzero(np.isfinite(value) & (source.stamp != NO_STAMP))
     found[known[1:]] = (np.diff(source.stamp[known]) == 0) & (np.diff(value[known]) != 0)
     return found
+
+
+def _number(value: float | None, absent: float) -> float:
+    """A number that a user gave, NaN for what is none; ``absent`` for None."""
+    try:
+        return absent if value is None else float(value)
+    except (TypeError, ValueError):
+        return np.nan
+
+
+def _pair(label: str, arrays: Any) -> tuple[npt.ArrayLike, Mapping[str, npt.ArrayLike]]:
+    """Stamps and values of a source.
+
+    Raises:
+        RunError: It is no such pair.
+    """
+    if isinstance(arrays, tuple | list) and len(pair := tuple(cast(Sequence[Any], arrays))) == 2:
+        stamps, values = pair
+        if isinstance(values, Mapping):
+            return stamps, cast(Mapping[str, npt.ArrayLike], values)
+    raise RunError(f"{label}: give (stamps, {{axis: values}})")
 
 
 def _from_arrays(label: str, time: npt.ArrayLike, values: Mapping[str, npt.ArrayLike], notes: list[str]) -> Source:

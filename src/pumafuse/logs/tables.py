@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -30,8 +31,11 @@ _BATCH = 1 << 16  # rows of Parquet that are in memory before rows are chosen
 _READ_AHEAD = 1 << 20  # bytes of a column of Parquet
 _COMPRESSION = "zstd"
 _SOME = 8  # values in an error
-_HEAD = 4096  # bytes of rows that show how decimals are written
-_DECIMAL_COMMA = re.compile(rb"(?:^|[;\t\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[;\t\r\n]|$)")
+_HEAD = 4096  # bytes of rows that mostly show how decimals are written
+_DECIMAL_COMMA, _DECIMAL_POINT = (
+    re.compile(rb"(?:^|[;\t\n])[ \"]*[+-]?\d*%b\d+(?:[eE][+-]?\d+)?[ \"]*(?:[;\t\r\n]|$)" % re.escape(one))
+    for one in (b",", b".")
+)
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
 
 
@@ -75,7 +79,8 @@ def read(
             table, names = _only(path, whole, where), whole.column_names
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
-    return Table(path, _named(path, table), table.num_rows, tuple(notes), tuple(names))
+    notes += [f"{path.name}: two columns are named '{shortened(name)}': neither is used" for name in _repeated(names)]
+    return Table(path, _named(table), table.num_rows, tuple(notes), tuple(names))
 
 
 def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
@@ -88,7 +93,7 @@ def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
         names = tuple(file.schema.column(place).path for place in range(len(file.schema)))
         wanted = _wanted(path, file, fields, {})
         for part in _parts(file, wanted, None) if file.metadata.num_rows else [file.schema_arrow.empty_table()]:
-            yield Table(path, _named(path, part), part.num_rows, (), names)
+            yield Table(path, _named(part), part.num_rows, (), names)
 
 
 def row_count(path: Path) -> int:
@@ -164,7 +169,7 @@ def _recording(path: Path, topic: str, entity: str, fields: Sequence[str] | None
     table = _chosen(path, whole, _conditions(path, whole, where))
     if not table.num_rows:
         raise _no_row(path, [whole], where)
-    return replace(found, columns=_named(path, table), rows=table.num_rows)
+    return replace(found, columns=_named(table), rows=table.num_rows)
 
 
 def _text(path: Path) -> bytes:
@@ -220,7 +225,14 @@ def _dialect(text: bytes) -> tuple[str, str]:
     """What separates the cells of a CSV text, and the point of its decimals: ``1,5;2`` as well as ``1.5,2``."""
     head, _, rest = text.partition(b"\n")
     separator = max(",", ";", "\t", key=lambda one: head.count(one.encode()))  # of equals the first
-    return separator, "," if separator != "," and _DECIMAL_COMMA.search(rest[:_HEAD]) else "."
+    return separator, "," if separator != "," and _has_decimal_commas(rest) else "."
+
+
+def _has_decimal_commas(rows: bytes) -> bool:
+    """Whether cells such as ``1,5`` are numbers: there are some at once, or later and none such as ``1.5``."""
+    if _DECIMAL_COMMA.search(rows[:_HEAD]):
+        return True
+    return _DECIMAL_COMMA.search(rows) is not None and _DECIMAL_POINT.search(rows) is None
 
 
 def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
@@ -253,7 +265,7 @@ def _wanted(path: Path, file: papq.ParquetFile, fields: Sequence[str] | None, wh
     Raises:
         RunError: A field is absent: that is reported now, while all names are known.
     """
-    columns = _named(path, file.schema_arrow.empty_table())
+    columns = _named(file.schema_arrow.empty_table())
     for field in fields or ():
         find(columns, field, str(path))
     return None if fields is None else prefixes([*fields, *where])
@@ -283,7 +295,7 @@ def _conditions(path: Path, table: pa.Table, where: Where) -> dict[str, pa.Scala
     Raises:
         RunError: A column is absent, or of a type that cannot have such a value.
     """
-    columns = _named(path, table)
+    columns = _named(table)
     return {name: _like(path, name, find(columns, name, str(path)).type, value) for name, value in where.items()}
 
 
@@ -302,7 +314,7 @@ def _like(path: Path, name: str, kind: pa.DataType, value: bool | float | str) -
 
 def _chosen(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.Table:
     """The rows of a table that meet all conditions; what is null meets none."""
-    columns = _named(path, rows)
+    columns = _named(rows)
     met = [pc.equal(find(columns, name, str(path), part=True), value) for name, value in conditions.items()]
     return rows.filter(reduce(pc.and_, met)) if met else rows
 
@@ -321,7 +333,7 @@ def _no_row(path: Path, parts: Iterable[Any], where: Where) -> RunError:
     """What to say when no row is left: what the columns hold, their range or some of it."""
     held: dict[str, list[Any]] = {name: [] for name in where}
     for part in parts:
-        columns = _named(path, part)
+        columns = _named(part)
         for name, values in held.items():
             found = {*values, *pc.unique(find(columns, name, str(path), part=True).drop_null()).to_pylist()}
             known = sorted(found)
@@ -348,14 +360,12 @@ def _written(value: Any) -> str:
     )
 
 
-def _named(path: Path, table: pa.Table) -> dict[str, pa.ChunkedArray]:
-    """The columns of a table by name.
+def _named(table: pa.Table) -> dict[str, pa.ChunkedArray]:
+    """The columns of a table by name, without those that share one."""
+    repeated = _repeated(table.column_names)
+    return {name: table.column(name) for name in table.column_names if name not in repeated}
 
-    Raises:
-        RunError: Two have one name.
-    """
-    names: list[str] = table.column_names
-    if len(set(names)) < len(names):
-        repeated = next(name for name in names if names.count(name) > 1)
-        raise RunError(f"{path}: two columns are named '{repeated}'")
-    return dict(zip(names, table.columns, strict=True))
+
+def _repeated(names: Sequence[str]) -> set[str]:
+    """The names that more than one column has."""
+    return {name for name, count in Counter(names).items() if count > 1}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -141,13 +142,26 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     provenance: dict[str, Any] = {}
 
     def __post_init__(self) -> None:
-        for name in self.axes:
+        if not self.axes:
+            raise ConfigError("axes: an arm has one at least")
+        for name, axis in self.axes.items():
             refuse_name("axis", name)
+            self._check(name, axis)
         keys: dict[Kind, str] = {"length": "max_speed_m_s", "angle": "max_speed_deg_s"}
         for kind in KINDS:
             if self.validity.limit_of(kind) is not None and kind not in self.kinds:
                 right = keys[self.kinds[0]]
                 raise ConfigError(f"validity.{keys[kind]}: no axis of the arm is {AN[kind]}; give {right}")
+
+    def _check(self, name: str, axis: AxisModel) -> None:
+        """Refuse numbers that no file may have: an arm may be made in Python, too."""
+        plant = [one for one in msgspec.structs.astuple(axis.plant) if isinstance(one, float | int)]
+        positive = (self.update_period, 1.0 if axis.gain_recovery is None else axis.gain_recovery, *plant)
+        delays = self.delay, 0.0 if axis.delay is None else axis.delay
+        if not math.isfinite(sum(positive) + sum(delays) + axis.gain.slope + axis.gain.intercept):
+            raise ConfigError(f"axes.{name}: period, delay, plant and gain must be finite")
+        if min(positive) <= 0.0 or min(delays) < 0.0:
+            raise ConfigError(f"axes.{name}: period, plant and recovery must be > 0, the delay >= 0")
 
     def __repr__(self) -> str:
         lags = ", ".join(f"{axis} {self.lag_of(axis) * MS:.4g} ms" for axis in self.axes)

@@ -68,6 +68,8 @@ def simulate(scenario: Scenario, seed: int | None = None) -> Simulated:
         PumafuseError: The trajectory's file cannot be read, or it is too long.
     """
     seed = scenario.seed if seed is None else seed
+    if seed < 0:
+        raise ConfigError(f"seed: must be >= 0, not {seed}")
     period = scenario.arm.update_period
     commands = _commands(scenario, seed)
     axes, count = tuple(commands), len(next(iter(commands.values())))
