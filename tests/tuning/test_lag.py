@@ -88,10 +88,10 @@ def test_an_end_is_open_only_where_nothing_can_go_there() -> None:
 
 
 @pytest.mark.long
-def test_intervals_contain_the_lag_over_40_runs() -> None:
-    """Delay, plant and noise free, from a wrong arm: of 80 intervals at least 88 % hold (sd of a share: 2.4 %)."""
+def test_intervals_contain_the_lag_over_25_runs() -> None:
+    """Delay, plant and noise free, from a wrong arm: of 50 intervals at least 86 % hold (sd of a share: 3.1 %)."""
     inside: list[bool] = []
-    for seed in range(1, 41):
+    for seed in range(1, 26):
         sim = outage(seed)
         stage = fit_stage(sim.run, spoiled_arm(sim.config), ("noise", "delay", "plant"))
         around = lag_intervals(stage.likelihood, stage.best, stage.free)
@@ -99,5 +99,5 @@ def test_intervals_contain_the_lag_over_40_runs() -> None:
             low, high = one.lag_ms_ci95
             assert low is not None and high is not None and low < one.lag_ms < high
             inside.append(low <= 1e3 * sim.config.arm.lag_of(axis) <= high)
-    assert len(inside) == 80
-    assert np.mean(inside) >= 0.88
+    assert len(inside) == 50
+    assert np.mean(inside) >= 0.86
