@@ -72,6 +72,21 @@ def test_gaps_are_dropouts_and_silence_is_stale() -> None:
     assert health["tracker"].silent == pytest.approx(1.51)
     assert health["never"].silent is None
     assert health["never"].stale
+    assert live.health(15.0).sensors["tracker"].silent == pytest.approx(5.01)  # while nothing comes at all
+    assert live.health(1.0).sensors["tracker"].silent == pytest.approx(1.51)
+
+
+def test_what_comes_too_late_has_come_and_says_how_late() -> None:
+    """Three seconds behind a window of two: not one is fused, and the lateness says which window it takes."""
+    live = pf.LiveEstimator(CONFIG)
+    for step in range(400):
+        live.command(step * 0.028, radial=0.57)
+        if step > 150:
+            live.measurement(step * 0.028 - 3.0, "camera", radial=0.57)
+    health = live.health().sensors["camera"]
+    assert health.rows == health.outcomes["too_late"] == 249
+    assert health.lateness == pytest.approx(3.0) and health.lateness_max == pytest.approx(3.0)
+    assert health.silent == pytest.approx(3.0)
 
 
 def test_all_outcomes_are_counted() -> None:

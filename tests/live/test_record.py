@@ -177,6 +177,17 @@ def test_a_reset_clock_begins_another_record(tmp_path: Path, monkeypatch: pytest
     assert (tmp_path / "record.2" / "commands.csv").read_text() == "mine"
 
 
+def test_every_folder_of_a_record_is_said(tmp_path: Path) -> None:
+    """A clock that is reset three times: three lines, and the last folder in the summary."""
+    recorded = Recorded(tmp_path / "record")
+    for number in range(4):
+        recorded.go(60, begin=50_000 - 10_000 * number)
+    recorded.close()
+    said = [text for text in recorded.notices if "another clock" in text]
+    assert [text.rpartition("/")[2] for text in said] == ["record.2", "record.3", "record.4"]
+    assert recorded.recorder.summary().startswith(f"{tmp_path / 'record'} to record.4, 4 folders: ")
+
+
 def test_an_axis_without_a_number_is_none_of_the_run(recorded: Recorded) -> None:
     """Commands and measurements whose other axis is always null: a run of one axis, which fuses."""
     recorded.live.measurement(0, "tracker", radial=np.nan)
