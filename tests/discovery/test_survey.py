@@ -88,6 +88,7 @@ def check_fuses(log: Path, folder: Path, axes: tuple[str, ...] = ("x", "y", "z")
         ("timestamp", lambda t: [round(1e6 * (START + one)) for one in t], "us"),
         ("stamp", lambda t: [START * 10**9 + round(1e9 * one) for one in t], "ns"),
         ("Time [ms]", lambda t: [repr(float(1e3 * (START + one))) for one in t], "ms"),
+        ("uptime_s", lambda t: [repr(float(one)) for one in t], ""),
         ("date", lambda t: [str(np.datetime64(START * 10**9 + round(1e9 * one), "ns")) for one in t], ""),
     ],
 )
@@ -351,6 +352,10 @@ def test_doubts_are_said_with_their_numbers(tmp_path: Path) -> None:
     [
         ({}, "no log in it that can be read"),
         ({"a.csv": "x_mm,y_mm\n" + "1,2\n3,4\n" * 20}, "no columns of positions with a clock"),
+        (
+            {"a.csv": "t_s,command.x_mm\n" + "".join(f"{k},5\n" for k in range(40))},
+            "no columns of positions with a clock beside them, but command.x_mm (always 5); say in run.toml",
+        ),
         ({"a.csv": ""}, "the file is empty"),
         ({"a.parquet": "PAR1"}, "not a table that can be read"),
         ({"a.mcap": "no"}, "the recording is empty; the recording was cut off"),

@@ -230,8 +230,12 @@ def _numeric_paths(table: Table) -> Iterator[str]:
 
 
 def _clock(table: Table) -> Clock | None:
-    """The first column that runs like a clock; when it was recorded only where nothing else does."""
+    """The first column that runs like a clock; when it was recorded only where nothing else does.
+
+    Where none is called so, one in a unit of time may be: ``uptime_s``.
+    """
     columns = sorted(_stamp_columns(table), key=lambda name: name == LOG_TIME)
+    columns = columns or [name for name in table.columns if ending(leaf(name)) in TIMES]
     return next((clock for name in columns if (clock := _clock_of(table, name)) is not None), None)
 
 

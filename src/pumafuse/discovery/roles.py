@@ -20,6 +20,7 @@ from .names import Role
 _FOLLOWS = 0.5  # correlation of changes from which one signal is said to follow another
 _SAME = 0.8  # from which it is taken for the same axis under another name
 _MOST_PAIRS, _MOST_CANDIDATES = 400, 12  # that are compared, at 0.1 s a pair of axes
+_MOST_LISTED = 8  # columns in an error
 _NUMBERED = re.compile(r"joint\d+|position")
 
 
@@ -90,9 +91,17 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     Raises:
         RunError: There are no positions, or none that can be commands.
     """
+    parts = list(parts)
     streams = [stream for part in parts for stream in _streams(part)]
     if not streams:
-        raise RunError(f"{log}: no columns of positions with a clock beside them; say in run.toml where they are")
+        others = [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
+        clockless = [f"{part.label} (no clock)" for part in parts if part.signals and part.clock is None]
+        there = ", ".join(map(printable, [*clockless, *others][:_MOST_LISTED]))
+        raise RunError(
+            f"{log}: no columns of positions with a clock beside them"
+            + (f", but {there}" if there else "")
+            + "; say in run.toml where they are"
+        )
     streams = _uniquely_named(streams)
     command, why = _command(streams, log)
     left_out: list[tuple[Stream, str]] = []
