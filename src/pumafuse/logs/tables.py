@@ -79,7 +79,9 @@ def read(
             table, names = _only(path, whole, where), whole.column_names
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
-    notes += [f"{path.name}: two columns are named '{shortened(name)}': neither is used" for name in _repeated(names)]
+    notes += [
+        f"{path.name}: two columns are named '{shortened(name)}': neither is used" for name in sorted(_repeated(names))
+    ]
     return Table(path, _named(table), table.num_rows, tuple(notes), tuple(names))
 
 
