@@ -185,6 +185,14 @@ def test_clocks_far_apart_are_told_with_their_distance(seconds: float, words: st
     assert ("time zone" in note) == (abs(seconds) in (3600.0, 7200.0))
 
 
+@pytest.mark.parametrize("seconds", [45.0, -45.0, 56.0])
+def test_of_a_clock_that_leaves_little_within_the_commands_nothing_else_is_told(seconds: float) -> None:
+    """What is left of the run would follow anything, at any shift, with any zero; it contradicts the tracker."""
+    said = [note for note in notes(of_sensor("scan1", "vision", later(seconds)), "scan1") if "vision" in note]
+    assert any(note.startswith("vision: most measurements lie") for note in said)
+    assert not [note for note in said if note.startswith("sensor 'vision'") and "contradicts" not in note]
+
+
 @pytest.mark.parametrize("log", LOGS)
 @pytest.mark.parametrize(
     ("factor", "taken"), [(1e3, "ms that are called s"), (1e-3, "s that are called ms"), (1e6, "us")]
