@@ -25,6 +25,14 @@ def test_the_lines_of_the_design() -> None:
     assert math.isnan(DECODER.decode(b'{"t": 1, "sensor": "tracker", "radial": null}').values["radial"])
 
 
+def test_a_byte_order_mark_may_come_first() -> None:
+    """As PowerShell pipes text; many are nothing."""
+    line, mark = b'{"t": 1, "sensor": "tracker", "radial": 570}', "\ufeff".encode()
+    assert DECODER.decode(mark + line) == DECODER.decode(line)
+    with pytest.raises(BadLine, match="not JSON"):
+        DECODER.decode(mark * 20_000 + line)
+
+
 def test_values_under_unknown_names_are_passed_on() -> None:
     """A row with a further field is still a row; the field comes with it, so that it can be reported."""
     event = DECODER.decode(b'{"t": 1, "sensor": "tracker", "radial": 570, "quality": {"snr": [1, 2]}}')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
@@ -115,6 +116,9 @@ class LineDecoder:
         except msgspec.ValidationError as error:
             raise BadLine(str(error)) from None
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            rest = line.removeprefix(codecs.BOM_UTF8)  # with which PowerShell begins what it pipes
+            if rest != line and not rest.startswith(codecs.BOM_UTF8):
+                return self.decode(rest)
             raise BadLine(f"not JSON: {error}") from None
         t, t_ns, command, sensor, *values = msgspec.structs.astuple(found)
         if command is not None:
