@@ -216,3 +216,20 @@ def test_the_grid_goes_on_over_a_pause(pause: float, commands_first: bool) -> No
     both.end()
     found = [(one["t"], one["radial"]["position_mm"]) for one in both.estimates[: len(offline.time)]]
     assert found == list(zip(offline.time.tolist(), (offline.axes["radial"].position * 1e3).tolist(), strict=True))
+
+
+@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+def test_a_command_without_a_value_counts_as_in_a_table() -> None:
+    """``invalid``, as ``fuse`` calls it."""
+    stamp, level = np.arange(30) * 0.028, np.full(30, 0.57)
+    hollow = np.where(np.arange(30) == 9, np.nan, level)
+    run = pf.Run.from_arrays(stamp, {"radial": hollow}, {"tracker": (stamp, {"radial": level})})
+    live = pf.LiveEstimator(TRACKED)
+    for events in replayed(run, TRACKED, np.inf):
+        for event in events:
+            if event.sensor:
+                live.measurement(event.t, event.sensor, **event.values)
+            else:
+                live.command(event.t, **event.values)
+    counts, offline = live.health().commands, pf.fuse(run, TRACKED).command_counts
+    assert (counts["fused"], counts["invalid"]) == (offline["used"], offline["invalid"]) == (29, 1)

@@ -67,11 +67,12 @@ def _arrivals(run: Run, config: FusionConfig) -> tuple[TimeArray, list[Event]]:
 
 
 def _events(name: str, source: Source) -> Iterator[Event]:
-    """The rows of a sensor, or of commands (no name), which give only the axes that they have a value for."""
+    """The rows of a sensor, or of commands (no name), which give only the axes that they have a value for, if any."""
     columns: list[list[float]] = [value.tolist() for value in source.values.values()]
     for stamp, *row in zip(source.stamp.tolist(), *columns, strict=True):
-        values = {axis: value for axis, value in zip(source.values, row, strict=True) if name or value == value}
-        yield Event(math.nan if stamp == NO_STAMP else stamp, name, values)
+        every = dict(zip(source.values, row, strict=True))
+        values = {axis: value for axis, value in every.items() if name or value == value}
+        yield Event(math.nan if stamp == NO_STAMP else stamp, name, values or every)
 
 
 def _paced(arrival: TimeArray, events: list[Event], speed: float) -> Iterator[list[Event]]:
