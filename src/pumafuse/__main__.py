@@ -1,5 +1,17 @@
-"""`python -m pumafuse`, the same as `pumafuse`."""
+"""What `pumafuse` and `python -m pumafuse` run."""
 
-from .cli.main import main
+import sys
 
-main()
+
+def main() -> None:
+    """Run the command line; interrupted while it is still imported, it ends as it does later."""
+    try:
+        from .cli.main import main as run
+
+        run()
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

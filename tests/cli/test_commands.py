@@ -210,6 +210,21 @@ def test_a_gain_of_the_speed_that_never_recovers_is_warned_of(command: str, tmp_
     assert said == [False, True]
 
 
+def test_an_interrupt_while_the_command_line_is_imported_is_no_traceback() -> None:
+    """Ctrl-C within the first tenth of a second, as one who has mistyped presses it: exit code 130, no word."""
+    code = (
+        "import sys\n"
+        "class Interrupted:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'typer': raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Interrupted())\n"
+        "from pumafuse.__main__ import main\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
 def test_help_imports_nothing_heavy() -> None:
     """`--help` stays fast because parsing needs no numpy."""
     code = (

@@ -50,13 +50,15 @@ def test_a_folder_of_tables_goes_through_without_an_edit(tmp_path: Path) -> None
 
 
 @pytest.mark.long
-def test_the_shipped_scan_is_fused_to_a_tenth_of_a_millimetre(tmp_path: Path) -> None:
-    """Without its run.toml: three sensors, one of them mirrored."""
+@pytest.mark.parametrize("described", [True, False])
+def test_the_shipped_scan_is_fused_to_a_tenth_of_a_millimetre(described: bool, tmp_path: Path) -> None:
+    """With its run.toml and without: three sensors, one of them mirrored, a command that is a sum."""
     log = tmp_path / "scan"
     shutil.copytree(DATA / "scan1", log)
-    (log / "run.toml").unlink()
+    if not described:
+        (log / "run.toml").unlink()
     found = scores(carried_through(log, tmp_path, "noise,delay,plant"))
-    assert set(found) == {"x", "y", "z"}
+    assert set(found) == ({"tangential", "radial", "vertical"} if described else {"x", "y", "z"})
     assert max(found.values()) < 0.15, found  # mm; the camera's noise is 0.5, and it is 45 ms late at 60 mm/s
 
 

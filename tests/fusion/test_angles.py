@@ -356,6 +356,10 @@ WRONG = {
     "no sd": (("sd_deg = { a", "# sd_deg = { a"), "'sensors.eye.sd_deg' is missing; accepted: sd_deg, .*bias_sd_deg"),
     "a sensor's key misspelled": (("sd_deg = { a", "sd_degs = { a"), "unknown key 'sensors.eye.sd_degs'; .*'sd_deg'"),
     "start misspelled": (("offset_sd_deg", "offset"), "unknown key 'start.offset'; .*offset_sd_deg"),
+    "an sd beyond all": (
+        ("sd_deg = { a = ", "sd_deg = { a = 10000000000000"),
+        r"sensors.eye.sd_deg: must be <= 5.72958e\+10",
+    ),
     "a start below 0": (("offset_sd_deg = ", "offset_sd_deg = -"), "start.offset_sd_deg: must be >= 0"),
 }
 

@@ -84,7 +84,7 @@ def estimates_of(found: pf.Identification) -> dict[str, tuple[float, tuple[float
 @pytest.mark.long
 @pytest.mark.parametrize("order", [1, 2])
 def test_intervals_hold_over_300_campaigns(order: int) -> None:
-    """Each true value is in its 95 % interval in 91 to 98.5 % of 300 campaigns of 12 trials, together in 93.5 to 97 %.
+    """Each true value is in its 95 % interval in 92 to 98 % of 300 campaigns of 12 trials, together in 94 to 96.5 %.
 
     One standard deviation of a share of 95 % in 300 is 1.3 %. The bias of each is below 1 %. The right order is chosen
     in at least 90 %; with a first-order arm 1/ω² may be 0 in as many, and the curve is within 0.1 % of K in as many.
@@ -105,8 +105,8 @@ def test_intervals_hold_over_300_campaigns(order: int) -> None:
         off.append(float(np.abs(plant.step_response(TIMES) - Arm(order, 0.0).response(TIMES)).max()))
     assert right >= 270
     shares = {name: float(np.mean(hits)) for name, hits in inside.items()}
-    assert all(0.91 <= share <= 0.985 for share in shares.values()), shares
-    assert 0.935 <= np.mean(list(shares.values())) <= 0.97, shares
+    assert all(0.92 <= share <= 0.98 for share in shares.values()), shares
+    assert 0.94 <= np.mean(list(shares.values())) <= 0.965, shares
     for name, truth in truths_of(order).items():
         assert abs(np.mean(values[name]) / truth - 1.0) < 0.01, name
     if order == 1:

@@ -72,12 +72,12 @@ def test_of_two_sensors_the_less_accurate_gets_the_bias() -> None:
 
 @pytest.mark.long
 def test_hardly_any_false_bias_is_found_in_60_runs() -> None:
-    """A gain of 3 in log-likelihood for a prior 1 mm wide: at most 2 of 60 lines without a constant have one."""
+    """A gain of 3 in log-likelihood for a prior 1 mm wide: at most 1 of 60 lines without a constant have one."""
     false = 0
     for seed in range(60):
         run, config = recorded(0.0, seed, height=0.0)
         false += fit_stage(run, spoiled(config)).best.config.sensors["vision"].bias_sd > 0.0
-    assert false <= 2
+    assert false <= 1
 
 
 @pytest.mark.parametrize(("fixed", "off"), [("bias_sd_mm", 3e-4), ("sensors.vision", 0.6)])

@@ -292,26 +292,26 @@ def shares(
 
 
 @pytest.mark.long
-def test_coverage_of_noise_over_120_runs() -> None:
+def test_coverage_of_noise_over_200_runs() -> None:
     """A camera with outliers, fitted from noise that is wrong by factors of 2 to 3.
 
-    One standard deviation of a share of 95 % in 120 is 2 %: each number's is at least 89 %, and all together in 93 to
-    97.5 %: more for a noise that is 0.
+    One standard deviation of a share of 95 % in 200 is 1.5 %: each number's is in 90 to 99.5 %, and all together in
+    93.5 to 97.5 %: more for a noise that is 0.
     """
-    each, together = shares("panel-vision", range(1, 121), ("noise",), spoiled)
+    each, together = shares("panel-vision", range(1, 201), ("noise",), spoiled)
     assert len(each) == 10
-    assert all(share >= 0.89 for share in each.values()), each
-    assert 0.93 <= together <= 0.975, each
+    assert all(0.90 <= share <= 0.995 for share in each.values()), each
+    assert 0.935 <= together <= 0.975, each
 
 
 @pytest.mark.long
 def test_coverage_of_an_arm_over_25_runs() -> None:
     """Noise, delay and plant by a tracker with an outage and a camera, the arm too slow and too late to begin with.
 
-    One standard deviation of a share of 95 % in 25 is 4.4 %: each number's is at least 80 %, and all together in 91 to
+    One standard deviation of a share of 95 % in 25 is 4.4 %: each number's is at least 82 %, and all together in 92 to
     98 %. A plant of the wrong order counts as not contained.
     """
     each, together = shares("panel-tracker-outage", range(1, 26), ("noise", "delay", "plant"), spoiled_arm)
     assert {"axes.tangential.damping", "axes.vertical.time_constant_ms"} <= set(each)
-    assert all(share >= 0.80 for share in each.values()), each
-    assert 0.91 <= together <= 0.98, each
+    assert all(share >= 0.82 for share in each.values()), each
+    assert 0.92 <= together <= 0.98, each

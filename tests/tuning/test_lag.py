@@ -89,7 +89,7 @@ def test_an_end_is_open_only_where_nothing_can_go_there() -> None:
 
 @pytest.mark.long
 def test_intervals_contain_the_lag_over_25_runs() -> None:
-    """Delay, plant and noise free, from a wrong arm: of 50 intervals at least 86 % hold (sd of a share: 3.1 %)."""
+    """Delay, plant and noise free, from a wrong arm: of 50 intervals at least 88 % hold (sd of a share: 3.1 %)."""
     inside: list[bool] = []
     for seed in range(1, 26):
         sim = outage(seed)
@@ -100,4 +100,4 @@ def test_intervals_contain_the_lag_over_25_runs() -> None:
             assert low is not None and high is not None and low < one.lag_ms < high
             inside.append(low <= 1e3 * sim.config.arm.lag_of(axis) <= high)
     assert len(inside) == 50
-    assert np.mean(inside) >= 0.86
+    assert np.mean(inside) >= 0.88

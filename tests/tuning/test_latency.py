@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from pumafuse.tuning.latency import Latency
 from pumafuse.tuning.likelihood import Derivatives, Likelihood
 from pumafuse.tuning.posterior import AxisPosterior, axis_posterior
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
 Array = NDArray[np.float64]
 STEP, PERIOD, LENGTH = 2e-4, 0.02, 20.0  # s
 DELAY, TAU, GAIN, LATENCY = 0.083, 0.041, 0.93, 0.037
@@ -216,3 +219,17 @@ def test_a_worker_that_dies_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(module, "axis_posterior", partial(killed, os.getpid()))
     with pytest.raises(pf.TuneError, match="a worker process died"):
         pf.latency(replace(run, command=replace(run.command, values=both), sensors={"tracker": tracker}))
+
+
+@pytest.mark.long
+def test_no_interval_ends_at_its_estimate() -> None:
+    """Half a minute of a soft arm: models that are about as likely lag by milliseconds more than the chosen one."""
+    run = replace(pf.Run.read(EXAMPLES / "trunk-servo" / "0g"), until=30.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        axes = pf.latency(run).details.axes
+    assert len(axes) == 6
+    for name, one in axes.items():
+        low, high = one.lag_ci95
+        assert low < one.lag < high, name
+        assert one.lag - low > 1e-4 and high - one.lag > 1e-4, name  # s

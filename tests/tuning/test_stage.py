@@ -57,7 +57,7 @@ def test_a_wrong_latency_is_found(believed: float) -> None:
 
 @pytest.mark.long
 def test_intervals_of_latencies_over_40_runs() -> None:
-    """They contain the truth in 85 to 100 %: one standard deviation of a share of 95 % in 40 is 3.4 %.
+    """They contain the truth in 88 to 100 %: one standard deviation of a share of 95 % in 40 is 3.4 %.
 
     The mean is within 0.5 ms.
     """
@@ -66,7 +66,7 @@ def test_intervals_of_latencies_over_40_runs() -> None:
         found, interval = wrong_latency(seed, 0.009)
         inside.append(interval.ci95[0] < 0.045 < interval.ci95[1])
         off.append(found.best.config.sensors["vision"].latency - 0.045)
-    assert np.mean(inside) >= 0.85
+    assert np.mean(inside) >= 0.88
     assert abs(np.mean(off)) < 5e-4
 
 

@@ -232,6 +232,9 @@ class LiveEstimator:
 
         Args:
             at: Until when a sensor that is silent has been so; None: until the newest stamp.
+
+        Raises:
+            ValueError: ``at`` is no time.
         """
         newest = None if self._clock.newest is None else max(self._clock.now, nanoseconds(at or 0))
         return health_of(
