@@ -194,7 +194,7 @@ def test_discretize_prints_the_model_it_names() -> None:
 
 @pytest.mark.parametrize("command", ["discretize", "fuse"])
 def test_a_gain_of_the_speed_that_never_recovers_is_warned_of(command: str, tmp_path: Path) -> None:
-    """Where a motion ends would depend on how fast it went: one line with the axis, none where it recovers."""
+    """Where a motion ends would depend on how fast it went: said with the axis; not where it recovers or does not vary."""
     scan = SCAN.with_name("scan")
     arm = (scan / "arm.toml").read_text()
     (tmp_path / "fusion.toml").write_text((scan / "fusion.toml").read_text())
@@ -203,11 +203,12 @@ def test_a_gain_of_the_speed_that_never_recovers_is_warned_of(command: str, tmp_
         "fuse": ["fuse", scan, "-c", tmp_path / "fusion.toml", "-o", tmp_path / "out", "--force", "--to", "5"],
     }[command]
     said: list[bool] = []
-    for text in (arm, arm.replace("gain_recovery_ms", "# gain_recovery_ms", 1)):
+    never = arm.replace("gain_recovery_ms", "# gain_recovery_ms", 1)
+    for text in (arm, never, never.replace("slope_s_m = 0.0518", "slope_s_m = 0")):
         (tmp_path / "arm.toml").write_text(text)
         done = pumafuse(*arguments)
         said.append("axis x: a gain that depends on the speed without gain_recovery_ms" in done.stderr)
-    assert said == [False, True]
+    assert said == [False, True, False]
 
 
 def test_an_interrupt_while_the_command_line_is_imported_is_no_traceback() -> None:

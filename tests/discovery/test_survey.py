@@ -89,6 +89,7 @@ def check_fuses(log: Path, folder: Path, axes: tuple[str, ...] = ("x", "y", "z")
         ("stamp", lambda t: [START * 10**9 + round(1e9 * one) for one in t], "ns"),
         ("Time [ms]", lambda t: [repr(float(1e3 * (START + one))) for one in t], "ms"),
         ("uptime_s", lambda t: [repr(float(one)) for one in t], ""),
+        ("uptime_ms", lambda t: [repr(float(1e3 * one)) for one in t], ""),
         ("date", lambda t: [str(np.datetime64(START * 10**9 + round(1e9 * one), "ns")) for one in t], ""),
     ],
 )

@@ -193,6 +193,18 @@ def test_of_a_clock_that_leaves_little_within_the_commands_nothing_else_is_told(
     assert not [note for note in said if note.startswith("sensor 'vision'") and "contradicts" not in note]
 
 
+@pytest.mark.parametrize(("until", "searched"), [(20.0, 16), (None, 30)])
+def test_the_shifts_that_were_searched_are_told(until: float | None, searched: int) -> None:
+    """At most 30 s, and three quarters of the commands with the second after them."""
+    walk = np.cumsum(np.random.default_rng(5).normal(0.0, 2e-3, 1704))
+    run = of_sensor("scan1", "vision", lambda one: replace(one, values=dict.fromkeys(one.values, walk)))
+    if until is not None:
+        kept = np.flatnonzero(run.command.stamp <= run.command.stamp[0] + round(until * 1e9))
+        run = replace(run, command=run.command.rows(kept)).between(0.0, until)
+    (note,) = [note for note in notes(run, "scan1") if "does not follow the commands" in note]
+    assert f"nor those of other axes or of up to {searched} s before or after:" in note
+
+
 @pytest.mark.parametrize("log", LOGS)
 @pytest.mark.parametrize(
     ("factor", "taken"), [(1e3, "ms that are called s"), (1e-3, "s that are called ms"), (1e6, "us")]

@@ -76,6 +76,19 @@ def test_gaps_are_dropouts_and_silence_is_stale() -> None:
     assert live.health(1.0).sensors["tracker"].silent == pytest.approx(1.51)
 
 
+def test_what_was_behind_a_clock_that_was_set_anew_counts_once() -> None:
+    """Behind all at first, and fed again when three commands have shown the new clock."""
+    live = pf.LiveEstimator(CONFIG)
+    for begin, steps in ((100.0, 100), (0.0, 10)):
+        for step in range(steps):
+            live.command(begin + step * 0.028, radial=0.57)
+            live.measurement(begin + step * 0.028 + 0.01, "tracker", radial=0.57)
+    health = live.health()
+    assert health.segments == 2
+    assert health.sensors["tracker"].rows == 110
+    assert health.sensors["tracker"].outcomes["too_late"] == 0
+
+
 def test_what_comes_too_late_has_come_and_says_how_late() -> None:
     """Three seconds behind a window of two: not one is fused, and the lateness says which window it takes."""
     live = pf.LiveEstimator(CONFIG)

@@ -31,11 +31,7 @@ _BATCH = 1 << 16  # rows of Parquet that are in memory before rows are chosen
 _READ_AHEAD = 1 << 20  # bytes of a column of Parquet
 _COMPRESSION = "zstd"
 _SOME = 8  # values in an error
-_HEAD = 4096  # bytes of rows that mostly show how decimals are written
-_DECIMAL_COMMA, _DECIMAL_POINT = (
-    re.compile(rb"(?:^|[;\t\n])[ \"]*[+-]?\d*%b\d+(?:[eE][+-]?\d+)?[ \"]*(?:[;\t\r\n]|$)" % re.escape(one))
-    for one in (b",", b".")
-)
+_DECIMAL_COMMA = re.compile(rb"(?:^|[;\t\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[;\t\r\n]|$)")
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
 
 
@@ -227,14 +223,7 @@ def _dialect(text: bytes) -> tuple[str, str]:
     """What separates the cells of a CSV text, and the point of its decimals: ``1,5;2`` as well as ``1.5,2``."""
     head, _, rest = text.partition(b"\n")
     separator = max(",", ";", "\t", key=lambda one: head.count(one.encode()))  # of equals the first
-    return separator, "," if separator != "," and _has_decimal_commas(rest) else "."
-
-
-def _has_decimal_commas(rows: bytes) -> bool:
-    """Whether cells such as ``1,5`` are numbers: there are some at once, or later and none such as ``1.5``."""
-    if _DECIMAL_COMMA.search(rows[:_HEAD]):
-        return True
-    return _DECIMAL_COMMA.search(rows) is not None and _DECIMAL_POINT.search(rows) is None
+    return separator, "," if separator != "," and _DECIMAL_COMMA.search(rest) else "."
 
 
 def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
