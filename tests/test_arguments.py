@@ -32,13 +32,13 @@ def trials() -> pf.StepTrials:
 
 
 WRONG: dict[str, tuple[Callable[[], object], str]] = {
-    "no period": (lambda: arm(update_period=0.0), "arm: update_period_ms: must be >= 0.001"),
-    "negative delay": (lambda: arm(delay=-0.06), "arm: delay_ms: must be >= 0"),
-    "a delay that is none": (lambda: arm(delay=math.nan), "arm: delay_ms: must be"),
-    "a gain that is none": (lambda: arm(gain=pf.Gain(intercept=math.nan)), "axes.x.gain.intercept: must be"),
-    "negative time constant": (lambda: arm(plant=pf.FirstOrder(time_constant=-1.0)), "time_constant_ms: must be > 0"),
+    "no period": (lambda: arm(update_period=0.0), "axes.x: period, plant and recovery must be > 0"),
+    "negative delay": (lambda: arm(delay=-0.06), "the delay >= 0"),
+    "a delay that is none": (lambda: arm(delay=math.nan), "must be finite"),
+    "a gain that is none": (lambda: arm(gain=pf.Gain(intercept=math.nan)), "must be finite"),
+    "negative time constant": (lambda: arm(plant=pf.FirstOrder(time_constant=-1.0)), "must be > 0"),
     "negative damping": (lambda: arm(plant=pf.SecondOrder(natural_frequency=9.0, damping=-1.0)), "must be > 0"),
-    "no recovery": (lambda: arm(gain_recovery=0.0), "axes.x.gain_recovery_ms: must be >= 0.001"),
+    "no recovery": (lambda: arm(gain_recovery=0.0), "must be > 0"),
     "no axes": (lambda: pf.ArmModel(name="a", update_period=0.028, delay=0.06, axes={}), "an arm has one at least"),
     "values without stamps": (lambda: run(sensors={"cam": TIME}), "cam: give (stamps, {axis: values})"),
     "an array for axes": (lambda: run(sensors={"cam": (TIME, TIME)}), "cam: give (stamps, {axis: values})"),

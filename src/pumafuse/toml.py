@@ -21,7 +21,6 @@ _BOUND = re.compile(r"Expected `(?:float|int)` (>=|<=|>|<) (\S+)")
 S = TypeVar("S", bound=msgspec.Struct)
 
 MOST = 1e9  # in SI, of any number: what is larger is no size of an arm, and would overflow
-Finite = Annotated[float, msgspec.Meta(ge=-MOST, le=MOST)]
 Positive = Annotated[float, msgspec.Meta(gt=0, le=MOST)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0, le=MOST)]
 Time = Annotated[float, msgspec.Meta(ge=1e-6, le=MOST)]  # s, after which something is forgotten
@@ -136,20 +135,8 @@ def check(value: Any, kind: Any, where: str, path: str) -> None:
     Raises:
         ConfigError: It is not; names file and key.
     """
-    for problem in _problems(msgspec.to_builtins(value, enc_hook=float), kind, path):  # numpy's numbers are floats
+    for problem in _problems(value, kind, path):
         raise ConfigError(f"{where}: {problem}")
-
-
-def check_struct(part: msgspec.Struct, where: str, path: str, axis: Kind) -> None:
-    """Refuse a struct that was made in Python and is out of range. A search makes thousands: the words come after.
-
-    Raises:
-        ConfigError: It is not as a file would have it; names the key.
-    """
-    try:
-        msgspec.convert(builtins(part), type(part))
-    except msgspec.ValidationError:
-        struct(builtins(part, axis), type(part), where, path, axis)
 
 
 def text(tree: Mapping[str, Any]) -> str:

@@ -194,7 +194,7 @@ def test_discretize_prints_the_model_it_names() -> None:
 
 @pytest.mark.parametrize("command", ["discretize", "fuse"])
 def test_a_gain_of_the_speed_that_never_recovers_is_warned_of(command: str, tmp_path: Path) -> None:
-    """Where a motion ends would depend on how fast it went: said with the axis; not where it recovers or does not vary."""
+    """Where a motion ends would depend on how fast it went: said; not where it recovers, or has no slope."""
     scan = SCAN.with_name("scan")
     arm = (scan / "arm.toml").read_text()
     (tmp_path / "fusion.toml").write_text((scan / "fusion.toml").read_text())

@@ -165,7 +165,7 @@ class FusionConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     def __post_init__(self) -> None:
         _known_axes("process", self.process, self.arm)
         for path, part, kind in self._parts():
-            toml.check_struct(part, "configuration", path, kind)
+            _check(path, part, kind)
         for name, sensor in self.sensors.items():
             refuse_name("sensor", name)
             if not math.isfinite(sensor.scale + sensor.latency + sensor.gate + sensor.latency_sd):
@@ -274,6 +274,14 @@ def _config(tree: Mapping[str, Any], arm: ArmModel, where: str) -> FusionConfig:
             sd = " or ".join(f"'sensors.{name}.{of_kind('sd_mm', of)}'" for of in arm.kinds)
             raise ConfigError(f"{where}: {sd} is missing; accepted: {', '.join(_accepted(Sensor, arm, _PER_AXIS))}")
     return toml.struct(tree, FusionConfig, where)
+
+
+def _check(path: str, part: msgspec.Struct, kind: Kind) -> None:
+    """Refuse a table that was made in Python and is out of range. A search makes thousands: the words come after."""
+    try:
+        msgspec.convert(toml.builtins(part), type(part))
+    except msgspec.ValidationError:
+        toml.struct(toml.builtins(part, kind), type(part), "configuration", path, kind)
 
 
 def load_arm(tree: Mapping[str, Any], path: Path) -> ArmModel:

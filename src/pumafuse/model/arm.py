@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 from .. import toml
 from ..arrays import FloatArray
 from ..errors import ConfigError, UnknownNameError, suggestion
-from ..toml import Finite, Interval, Positive, Time
+from ..toml import Interval, Positive, Time
 from ..units import AN, KINDS, MM, MS, SCREEN, Kind, Screen, refuse_name
 from .plants import PLANTS, Delay
 from .presets import PRESETS
@@ -32,8 +33,8 @@ class Gain(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
         intercept_ci95: 95 % interval of b.
     """
 
-    slope: Finite = msgspec.field(name="slope_s_m", default=0.0)
-    intercept: Finite = 1.0
+    slope: float = msgspec.field(name="slope_s_m", default=0.0)
+    intercept: float = 1.0
     slope_ci95: Interval | None = msgspec.field(name="slope_s_m_ci95", default=None)
     intercept_ci95: Interval | None = None
 
@@ -143,16 +144,24 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     def __post_init__(self) -> None:
         if not self.axes:
             raise ConfigError("axes: an arm has one at least")
-        toml.check(self.update_period, Time, "arm", "update_period_ms")
-        toml.check(self.delay, Delay, "arm", "delay_ms")
         for name, axis in self.axes.items():
             refuse_name("axis", name)
-            toml.check_struct(axis, "arm", f"axes.{name}", axis.kind)
+            self._check(name, axis)
         keys: dict[Kind, str] = {"length": "max_speed_m_s", "angle": "max_speed_deg_s"}
         for kind in KINDS:
             if self.validity.limit_of(kind) is not None and kind not in self.kinds:
                 right = keys[self.kinds[0]]
                 raise ConfigError(f"validity.{keys[kind]}: no axis of the arm is {AN[kind]}; give {right}")
+
+    def _check(self, name: str, axis: AxisModel) -> None:
+        """Refuse numbers that no file may have: an arm may be made in Python, too."""
+        plant = [one for one in msgspec.structs.astuple(axis.plant) if isinstance(one, float | int)]
+        positive = (self.update_period, 1.0 if axis.gain_recovery is None else axis.gain_recovery, *plant)
+        delays = self.delay, 0.0 if axis.delay is None else axis.delay
+        if not math.isfinite(sum(positive) + sum(delays) + axis.gain.slope + axis.gain.intercept):
+            raise ConfigError(f"axes.{name}: period, delay, plant and gain must be finite")
+        if min(positive) <= 0.0 or min(delays) < 0.0:
+            raise ConfigError(f"axes.{name}: period, plant and recovery must be > 0, the delay >= 0")
 
     def __repr__(self) -> str:
         lags = ", ".join(f"{axis} {self.lag_of(axis) * MS:.4g} ms" for axis in self.axes)
