@@ -367,6 +367,15 @@ def test_where_chooses_rows(tmp_path: Path, where: str, rows: tuple[int, int], n
     same(run.command, STAMP[slice(*rows)], x=X[slice(*rows)])
 
 
+@pytest.mark.parametrize("kind", [pa.large_string(), pa.string_view(), pa.dictionary(pa.int32(), pa.string())])
+def test_where_compares_text_of_each_type(tmp_path: Path, kind: pa.DataType) -> None:
+    """Text has three types: pandas writes large strings and categories, polars views."""
+    columns = episodes()
+    columns["name"] = pa.array(columns["name"]).cast(kind)
+    run = read(tmp_path, f"{AXIS}\nwhere = {{ name = 'run3' }}", columns)
+    same(run.command, STAMP[150:200], x=X[150:200])
+
+
 def test_sources_of_one_file_have_rows_of_their_own(tmp_path: Path) -> None:
     """Two sources may read different runs of one table, and 1 is not true."""
     sensor = '[sensors.s]\nfile = "log.parquet"\ntime = "t_ns"\nx = "x_m"\nwhere = { even = true }'

@@ -229,7 +229,7 @@ def _dialect(text: bytes) -> tuple[str, str]:
 def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
     """The columns asked for and the rows, some at a time; and the names of all that the file has."""
     with _opened(path) as file:
-        empty, wanted = file.schema_arrow.empty_table(), _wanted(path, file, fields, where)
+        empty, wanted = _filterable(file.schema_arrow.empty_table()), _wanted(path, file, fields, where)
         conditions = _conditions(path, empty, where)
         groups = [
             place for place in range(file.num_row_groups) if _may_hold(file.metadata.row_group(place), conditions)
@@ -265,7 +265,15 @@ def _wanted(path: Path, file: papq.ParquetFile, fields: Sequence[str] | None, wh
 def _parts(file: papq.ParquetFile, columns: list[str] | None, groups: list[int] | None) -> Iterator[pa.Table]:
     """Some columns of a Parquet file, some rows at a time."""
     for batch in file.iter_batches(_BATCH, row_groups=groups, columns=columns, use_threads=False):
-        yield pa.Table.from_batches([batch])
+        yield _filterable(pa.Table.from_batches([batch]))
+
+
+def _filterable(table: pa.Table) -> pa.Table:
+    """A table with plain text for text in views, as polars writes it: pyarrow cannot filter these."""
+    for place, field in enumerate(table.schema):
+        if pa.types.is_string_view(field.type):
+            table = table.set_column(place, field.name, table.column(place).cast(pa.string()))
+    return table
 
 
 def _only(path: Path, whole: pa.Table, where: Where) -> pa.Table:
