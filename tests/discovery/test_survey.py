@@ -132,19 +132,58 @@ def test_one_table_with_everything_needs_no_names(tmp_path: Path) -> None:
     assert found.roles.command.why == "others follow it"
 
 
-def test_a_single_table_is_taken_apart_by_the_names_of_its_columns(tmp_path: Path) -> None:
-    """`command.x_mm`, and the columns of other loggers; empty cells are rows of others."""
+@pytest.mark.parametrize(
+    ("commanded", "measured"),
+    [
+        ("command.{}_mm", "camera.{}_mm"),
+        ("{}_goal_mm", "{}_actual_mm"),
+        ("{}_ref_mm", "{}_mm"),
+        ("{}_set_mm", "{}_act_mm"),
+        ("{}_soll_mm", "{}_ist_mm"),
+        ("first_{}_mm", "second_{}_mm"),
+        ("{}_out_mm", "{}_in_mm"),
+        ("{}d_mm", "{}_mm"),
+    ],
+)
+def test_a_single_table_is_taken_apart_by_the_names_of_its_columns(
+    commanded: str, measured: str, tmp_path: Path
+) -> None:
+    """By words of roles, or else by those that tell them apart and what runs ahead; empty cells are rows of others."""
     t, u, s, z = recorded()
     blank = [""] * len(t)
-    for number, (cmd, seen) in enumerate([("command.{}_mm", "camera.{}_mm"), ("{}_goal_mm", "{}_actual_mm")]):
-        order = np.argsort([*t, *s])
-        columns: dict[str, Any] = {"time_s": [*t, *s]}
-        for n, axis in enumerate("xyz"):
-            columns[cmd.format(axis)] = [*(1e3 * u[:, n]), *blank]
-            columns[seen.format(axis)] = [*blank, *(1e3 * z[:, n])]
-        log = tmp_path / f"log{number}.csv"
-        write(log, {key: [column[row] for row in order] for key, column in columns.items()})
-        check_fuses(log, tmp_path / f"out{number}")
+    order = np.argsort([*t, *s])
+    columns: dict[str, Any] = {"time_s": [*t, *s]}
+    for n, axis in enumerate("xyz"):
+        columns[commanded.format(axis)] = [*(1e3 * u[:, n]), *blank]
+        columns[measured.format(axis)] = [*blank, *(1e3 * z[:, n])]
+    log = tmp_path / "log.csv"
+    write(log, {key: [column[row] for row in order] for key, column in columns.items()})
+    check_fuses(log, tmp_path / "out")
+
+
+def test_joints_that_are_desired_are_commands(tmp_path: Path) -> None:
+    """As a Franka's log has it: ``q_d_0`` beside ``q_0``; what they are is not told by numbers and letters of axes."""
+    t, u, _, _ = recorded()
+    z = path(t - LAG) + np.random.default_rng(2).normal(0.0, 1e-4, u.shape)
+    columns = {f"q_{n}": z[:, n] for n in range(3)} | {f"q_d_{n}": u[:, n] for n in range(3)}
+    write(tmp_path / "log.csv", {"time": t, **columns})
+    found = survey(tmp_path / "log.csv").roles
+    assert found is not None
+    columns_of = [[one.column for (one,) in stream.axes.values()] for stream in (found.command, *found.sensors)]
+    assert columns_of == [["q_d_0", "q_d_1", "q_d_2"], ["q_0", "q_1", "q_2"]]
+
+
+@pytest.mark.parametrize("columns", ["x_m,y_m,z_m", "left_x_m,right_x_m,right_y_m", "pan_rad,tilt_rad"])
+def test_what_moves_at_once_is_no_command_and_its_sensor(columns: str, tmp_path: Path) -> None:
+    """Axes of one sensor, two sensors, two joints: no word tells commands from measurements, and nothing runs ahead."""
+    t, _, _, _ = recorded()
+    moves = path(t)[:, 0]
+    rng = np.random.default_rng(3)
+    turned = {"pan_rad": moves, "tilt_rad": np.roll(moves, 20)}
+    values = {name: turned.get(name, moves) + rng.normal(0.0, 1e-4, len(t)) for name in columns.split(",")}
+    write(tmp_path / "log.csv", {"time_s": t, **values})
+    with pytest.raises(pf.PumafuseError, match="which numbers are the commands"):
+        survey(tmp_path / "log.csv")
 
 
 def test_axes_of_other_names_are_known_by_how_they_move(tmp_path: Path) -> None:

@@ -18,13 +18,17 @@ def words_in(text: str) -> frozenset[str]:
 
 # Where words of several roles meet, as in command_state, the first role wins.
 _ROLES: dict[Role, frozenset[str]] = {
-    "reference": words_in("truth reference ground gt groundtruth"),
-    "command": words_in("command commands commanded cmd goal goals target targets desired setpoint action"),
+    "reference": words_in("truth reference ref ground gt groundtruth"),
+    "command": words_in(
+        "command commands commanded cmd goal goals target targets desired des demand demanded setpoint setpoints set sp"
+        " soll planned action"
+    ),
     "sensor": words_in(
-        "state states measured measurement measurements meas actual encoder encoders tracker camera vision sensor"
-        " feedback observed observation range laser mocap vicon optitrack recorded reported odom gps"
+        "state states measured measurement measurements meas actual act ist pv encoder encoders tracker camera vision"
+        " sensor feedback fb observed observation range laser mocap vicon optitrack recorded reported odom gps"
     ),
 }
+_OF_COLUMNS = words_in("set sp act pv fb")  # in the name of a topic or file these are something else
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _OF_PLACES = words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in that of a column
 _PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
@@ -68,7 +72,7 @@ def words(name: str) -> list[str]:
 
 def role_of(name: str) -> Role | None:
     """What the name of a topic or a file says its numbers are."""
-    return _role(words(name), _OF_PLACES)
+    return _role([word for word in words(name) if word not in _OF_COLUMNS], _OF_PLACES)
 
 
 def role_words(column: str) -> list[str]:

@@ -19,9 +19,12 @@ from .names import Role
 
 _FOLLOWS = 0.5  # correlation of changes from which one signal is said to follow another
 _SAME = 0.8  # from which it is taken for the same axis under another name
+_AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: two sensors move together
 _MOST_PAIRS, _MOST_CANDIDATES = 400, 12  # that are compared, at 0.1 s a pair of axes
+_MOST_APART = 40  # axes of a table that is taken apart by their names
 _MOST_LISTED = 8  # columns in an error
 _NUMBERED = re.compile(r"joint\d+|position")
+_AXIS_WORD = re.compile(r"[xyz]|\d+|")
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             + (f", but {there}" if there else "")
             + "; say in run.toml where they are"
         )
-    streams = _uniquely_named(streams)
+    streams = _uniquely_named(_apart(streams[0]) if len(streams) == 1 else streams)
     command, why = _command(streams, log)
     left_out: list[tuple[Stream, str]] = []
     kept: list[Stream] = []
@@ -179,6 +182,45 @@ def _axes(signals: Sequence[Signal]) -> dict[str, list[Signal]]:
     }
 
 
+def _apart(stream: Stream) -> list[Stream]:
+    """The only stream of a log, taken apart where a word tells axes of two apart, and one of these runs ahead.
+
+    ``a_x`` and ``b_x``, ``q_d_0`` and ``q_0``, ``xd`` and ``x``; but words like x, y, z and numbers are axes.
+    """
+    by_word: dict[str, dict[tuple[str, ...], str]] = {"": {}}
+    for axis in stream.axes if len(stream.axes) <= _MOST_APART else ():
+        whole = tuple(axis.split("_"))
+        if axis[-1:] == "d" and axis[:-1] in stream.axes:  # desired
+            whole = axis[:-1], "d"
+        by_word[""][whole] = axis
+        for place, word in enumerate(whole):
+            by_word.setdefault(word, {})[whole[:place] + whole[place + 1 :]] = axis
+
+    def of(word: str, rests: Iterable[tuple[str, ...]]) -> Stream:
+        axes = {names.axis_of("_".join(rest), []): stream.axes[by_word[word][rest]] for rest in rests}
+        return Stream(names.plain(word) or stream.name, None, "", stream.part, axes)
+
+    ways = list[list[Stream]]()
+    for word, mine in by_word.items():
+        shared = {
+            other: rests
+            for other, rest in by_word.items()
+            if (rests := sorted(mine.keys() & rest.keys())) and _tells_apart(word, other, rests, stream)
+        }
+        if shared:
+            every = sorted(set[tuple[str, ...]]().union(*shared.values()))
+            ways.append([of(word, every), *(of(other, rests) for other, rests in shared.items())])
+    best = max(ways, key=lambda way: _followers(way[0], way), default=[stream])
+    return best if _followers(best[0], best) else [stream]
+
+
+def _tells_apart(word: str, other: str, rests: Sequence[tuple[str, ...]], stream: Stream) -> bool:
+    """Whether two words in names of axes, of which the rests are the same, can be of commands and a sensor."""
+    if word == other or (_AXIS_WORD.fullmatch(word) and _AXIS_WORD.fullmatch(other)):
+        return False
+    return rests != [()] or (len(stream.axes) == 2 and not any(map(names.is_turning, (word, other))))
+
+
 def _uniquely_named(streams: Iterable[Stream]) -> list[Stream]:
     found: dict[str, Stream] = {}
     for stream in streams:
@@ -196,10 +238,7 @@ def _command(streams: Sequence[Stream], log: str) -> tuple[Stream, str]:
     if len(called) == 1:
         return called[0], called[0].why
     # A reference that runs ahead is a set point, as control engineers call it.
-    candidates = (
-        called or [one for one in streams if one.role is None] or [one for one in streams if one.role == "reference"]
-    )
-    candidates = candidates[:_MOST_CANDIDATES]
+    candidates = (called or [one for one in streams if one.role != "sensor"])[:_MOST_CANDIDATES]
     followers = {one.name: _followers(one, streams) for one in candidates}
     best = max(candidates, key=lambda one: followers[one.name], default=None)
     if best is None or (not called and not followers[best.name]):
@@ -216,9 +255,10 @@ def _followers(leader: Stream, streams: Sequence[Stream]) -> int:
     count = 0
     for other in streams:
         if other is not leader and other.role != "command":
-            for axis in _matched(leader, other)[0]:
-                found = _relation(leader, axis, other, axis)
-                count += found is not None and abs(found.correlation) >= _FOLLOWS and found.lag > 0.0
+            axes, _ = _matched(leader, other)
+            for axis in axes:
+                found = _relation(leader, axis, replace(other, axes=axes), axis)
+                count += found is not None and abs(found.correlation) >= _FOLLOWS and found.lag > _AT_ONCE
     return count
 
 
