@@ -139,7 +139,7 @@ def test_one_table_with_everything_needs_no_names(tmp_path: Path) -> None:
         ("{}_goal_mm", "{}_actual_mm"),
         ("{}_ref_mm", "{}_mm"),
         ("{}_set_mm", "{}_act_mm"),
-        ("{}_soll_mm", "{}_ist_mm"),
+        ("ASPos.{}", "AIPos.{}"),
         ("first_{}_mm", "second_{}_mm"),
         ("{}_out_mm", "{}_in_mm"),
         ("{}d_mm", "{}_mm"),
@@ -171,6 +171,17 @@ def test_joints_that_are_desired_are_commands(tmp_path: Path) -> None:
     assert found is not None
     columns_of = [[one.column for (one,) in stream.axes.values()] for stream in (found.command, *found.sensors)]
     assert columns_of == [["q_d_0", "q_d_1", "q_d_2"], ["q_0", "q_1", "q_2"]]
+
+
+def test_two_cameras_of_one_table_are_two_sensors(tmp_path: Path) -> None:
+    """Numbers tell devices apart, but axes of a goal."""
+    t, u, _, _ = recorded()
+    z = path(t - LAG) + np.random.default_rng(4).normal(0.0, 1e-4, u.shape)
+    columns = {f"camera{n}_{axis}_m": z[:, place] for n in (1, 2) for place, axis in enumerate("xy")}
+    write(tmp_path / "log.csv", {"time_s": t, **columns, "goal_x_m": u[:, 0], "goal_y_m": u[:, 1]})
+    found = survey(tmp_path / "log.csv").roles
+    assert found is not None
+    assert {one.name: [*one.axes] for one in found.sensors} == {"camera1": ["x", "y"], "camera2": ["x", "y"]}
 
 
 @pytest.mark.parametrize("columns", ["x_m,y_m,z_m", "left_x_m,right_x_m,right_y_m", "pan_rad,tilt_rad"])
@@ -351,6 +362,9 @@ def test_hostile_names_stay_names(name: str, tmp_path: Path) -> None:
         ("translation[1]", "y", ""),
         ("Tool Position X [mm]", "x", "mm"),
         ("goalPosition1 (rad)", "position1", "rad"),
+        ("RSol.X", "r_x", ""),
+        ("QTarget2_rad", "q_2", "rad"),
+        ("camera2_x_mm", "x", "mm"),
         ("m3", "m3", ""),
         ("range_mm", "position", "mm"),
         ("position[肩]", "position", ""),

@@ -16,16 +16,18 @@ def words_in(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
+_DEVICES = words_in("tracker camera vision sensor range laser mocap vicon optitrack gps")  # of which there may be two
 # Where words of several roles meet, as in command_state, the first role wins.
 _ROLES: dict[Role, frozenset[str]] = {
     "reference": words_in("truth reference ref ground gt groundtruth"),
     "command": words_in(
         "command commands commanded cmd goal goals target targets desired des demand demanded setpoint setpoints set sp"
-        " soll planned action"
+        " soll sol planned action"
     ),
-    "sensor": words_in(
-        "state states measured measurement measurements meas actual act ist pv encoder encoders tracker camera vision"
-        " sensor feedback fb observed observation range laser mocap vicon optitrack recorded reported odom gps"
+    "sensor": _DEVICES
+    | words_in(
+        "state states measured measurement measurements meas actual act ist pv encoder encoders feedback fb observed"
+        " observation recorded reported odom"
     ),
 }
 _OF_COLUMNS = words_in("set sp act pv fb")  # in the name of a topic or file these are something else
@@ -49,6 +51,7 @@ _NO_POSITIONS = words_in(
 _TIMES = words_in(
     "t time times stamp stamps timestamp timestamps sec secs seconds date datetime clock ts arrival arrived"
 )
+_DIGITS = "0123456789"
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
 _SLIDING = words_in("slide slider prismatic linear rail gantry")
 _UNITS = {
@@ -65,9 +68,18 @@ _TURNING = re.compile(
 
 
 def words(name: str) -> list[str]:
-    """The words of a name in lower case: ``goalPose_x`` → goal, pose, x."""
-    apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name)
-    return [word.lower() for word in re.split(r"[^A-Za-z0-9]+", apart) if word]
+    """The words of a name in lower case: ``goalPose_x`` is goal, pose, x; ``QTarget2`` is q, target, 2.
+
+    Numbers of devices stay with them: ``camera2`` is one word.
+    """
+    apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
+    found = [word.lower() for word in re.split(r"[^A-Za-z0-9]+", apart) if word]
+    numbered = [re.fullmatch(r"([a-z]+)(\d+)", word) for word in found]
+    return [
+        part
+        for word, match in zip(found, numbered, strict=True)
+        for part in (match.groups() if match and match[1] in _OF_ROLES - _DEVICES else (word,))
+    ]
 
 
 def role_of(name: str) -> Role | None:
@@ -77,7 +89,7 @@ def role_of(name: str) -> Role | None:
 
 def role_words(column: str) -> list[str]:
     """The words of a column's name that say whose it is."""
-    return [word for word in words(leaf(column)) if word in _OF_ROLES]
+    return [word for word in words(leaf(column)) if word.rstrip(_DIGITS) in _OF_ROLES]
 
 
 def column_role(column: str) -> Role | None:
@@ -138,7 +150,7 @@ def axis_of(column: str, labels: list[str]) -> str:
     if label:
         return plain(label[1]) or "position"
     unit = unit_of(column)
-    kept = [word for word in words(column) if word not in _SILENT]
+    kept = [word for word in words(column) if word not in _SILENT and word.rstrip(_DIGITS) not in _DEVICES]
     if unit and kept and _UNITS.get(kept[-1]) == unit:
         kept = kept[:-1]
     if kept and all(word.isdigit() for word in kept):
@@ -156,6 +168,6 @@ def plain(name: str) -> str:
 
 def _role(found: list[str], more: frozenset[str]) -> Role | None:
     for role, known in _ROLES.items():
-        if not known.isdisjoint(found):
+        if not known.isdisjoint(word.rstrip(_DIGITS) for word in found):
             return role
     return None if more.isdisjoint(found) else "sensor"
