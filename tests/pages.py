@@ -184,13 +184,16 @@ class Reader:
 
 
 def shows(printed_text: str, expected: str) -> bool:
-    """Whether lines in a row of what was printed are the expected ones, white space aside."""
-    lines = [" ".join(line.split()) for line in expected.strip("\n").splitlines()]
+    """Whether lines in a row of what was printed are the expected ones, white space and lengths of rules aside."""
+
+    def squeezed(text: str) -> list[str]:
+        return [re.sub("─+", "─", " ".join(line.split())) for line in text.splitlines()]
+
+    lines = squeezed(expected.strip("\n"))
     pattern = "\n".join(
         "(?:.*\n)*?.*" if line == "…" else "[^\n]*?".join(map(re.escape, line.split("…"))) for line in lines
     )
-    squeezed = "\n".join(" ".join(line.split()) for line in printed_text.splitlines())
-    return re.search(f"(?m)^{pattern}$", squeezed) is not None
+    return re.search(f"(?m)^{pattern}$", "\n".join(squeezed(printed_text))) is not None
 
 
 def _furnish(folder: Path) -> None:
