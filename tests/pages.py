@@ -184,16 +184,16 @@ class Reader:
 
 
 def shows(printed_text: str, expected: str) -> bool:
-    """Whether lines in a row of what was printed are the expected ones, white space and lengths of rules aside."""
+    """Whether lines in a row of what was printed are the expected ones, but for white space and lengths of rules."""
 
     def squeezed(text: str) -> list[str]:
-        return [re.sub("─+", "─", " ".join(line.split())) for line in text.splitlines()]
+        return [re.sub("─+", "─", " ".join(line.split())) + "\n" for line in text.splitlines() if line.strip()]
 
-    lines = squeezed(expected.strip("\n"))
-    pattern = "\n".join(
-        "(?:.*\n)*?.*" if line == "…" else "[^\n]*?".join(map(re.escape, line.split("…"))) for line in lines
-    )
-    return re.search(f"(?m)^{pattern}$", "\n".join(squeezed(printed_text))) is not None
+    def pattern(line: str) -> str:
+        return "(?:.*\n)*?" if line == "…\n" else "[^\n]*?".join(map(re.escape, line.split("…")))
+
+    wanted = "".join(map(pattern, squeezed(expected)))
+    return re.search(f"(?m)^{wanted}", "".join(squeezed(printed_text))) is not None
 
 
 def _furnish(folder: Path) -> None:
