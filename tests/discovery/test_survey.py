@@ -162,15 +162,17 @@ def test_a_single_table_is_taken_apart_by_the_names_of_its_columns(
 
 
 def test_joints_that_are_desired_are_commands(tmp_path: Path) -> None:
-    """As a Franka's log has it: ``q_d_0`` beside ``q_0``; what they are is not told by numbers and letters of axes."""
+    """As a Franka's log has it: ``q_d_0`` beside ``q_0``, both angles; velocities run ahead, too, but not as alike."""
     t, u, _, _ = recorded()
     z = path(t - LAG) + np.random.default_rng(2).normal(0.0, 1e-4, u.shape)
-    columns = {f"q_{n}": z[:, n] for n in range(3)} | {f"q_d_{n}": u[:, n] for n in range(3)}
+    columns = {f"dq_{n}": np.gradient(z[:, n], t) for n in range(3)}
+    columns |= {f"q_{n}": z[:, n] for n in range(3)} | {f"q_d_{n}": u[:, n] for n in range(3)}
     write(tmp_path / "log.csv", {"time": t, **columns})
     found = survey(tmp_path / "log.csv").roles
     assert found is not None
     columns_of = [[one.column for (one,) in stream.axes.values()] for stream in (found.command, *found.sensors)]
     assert columns_of == [["q_d_0", "q_d_1", "q_d_2"], ["q_0", "q_1", "q_2"]]
+    assert {found.command.kind(axis) for axis in found.command.axes} == {"angle"}
 
 
 def test_two_cameras_of_one_table_are_two_sensors(tmp_path: Path) -> None:

@@ -63,7 +63,7 @@ _UNITS = {
     "mrad": "mrad",
 }
 _TURNING = re.compile(
-    r"joint|shoulder|elbow|wrist|angle|theta|yaw|pitch|roll|motor|servo|pan|tilt|lift|flex|gripper|^[mjq]_?\d+$"
+    r"joint|shoulder|elbow|wrist|angle|theta|yaw|pitch|roll|motor|servo|pan|tilt|lift|flex|gripper|^[mjq](_?d)?_?\d+$"
 )
 
 

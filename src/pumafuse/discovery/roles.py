@@ -210,8 +210,8 @@ def _apart(stream: Stream) -> list[Stream]:
         if shared:
             every = sorted(set[tuple[str, ...]]().union(*shared.values()))
             ways.append([of(word, every), *(of(other, rests) for other, rests in shared.items())])
-    best = max(ways, key=lambda way: _followers(way[0], way), default=[stream])
-    return best if _followers(best[0], best) else [stream]
+    behind = [_followers(way[0], way) for way in ways]
+    return ways[int(np.argmax(behind))] if any(behind) else [stream]
 
 
 def _tells_apart(word: str, other: str, rests: Sequence[tuple[str, ...]], stream: Stream) -> bool:
@@ -250,15 +250,16 @@ def _command(streams: Sequence[Stream], log: str) -> tuple[Stream, str]:
     return best, best.why or "others follow it"
 
 
-def _followers(leader: Stream, streams: Sequence[Stream]) -> int:
-    """How many axes of others run behind a stream."""
-    count = 0
+def _followers(leader: Stream, streams: Sequence[Stream]) -> float:
+    """How many axes of others run behind a stream, each as far as its motion is the same."""
+    count = 0.0
     for other in streams:
         if other is not leader and other.role != "command":
             axes, _ = _matched(leader, other)
             for axis in axes:
                 found = _relation(leader, axis, replace(other, axes=axes), axis)
-                count += found is not None and abs(found.correlation) >= _FOLLOWS and found.lag > _AT_ONCE
+                if found is not None and abs(found.correlation) >= _FOLLOWS and found.lag > _AT_ONCE:
+                    count += abs(found.correlation)
     return count
 
 
