@@ -120,7 +120,9 @@ def test_names_of_a_log_do_not_reach_the_terminal_as_markup(tmp_path: Path) -> N
 
 def test_what_is_no_log_is_one_line(tmp_path: Path) -> None:
     """Nothing is written."""
-    (tmp_path / "a.txt").write_text("no log")
+    (tmp_path / "a.xlsx").write_text("no log")
     assert "no such file or folder" in refused("init", tmp_path / "none")
-    assert "accepted: CSV, Parquet, MCAP" in refused("init", tmp_path / "a.txt", "-o", tmp_path / "made")
-    assert names(tmp_path) == {"a.txt"}
+    assert "accepted: CSV, lines of JSON, Parquet, MCAP" in refused(
+        "init", tmp_path / "a.xlsx", "-o", tmp_path / "made"
+    )
+    assert names(tmp_path) == {"a.xlsx"}

@@ -165,7 +165,7 @@ def test_joints_that_are_desired_are_commands(tmp_path: Path) -> None:
     """As a Franka's log has it: ``q_d_0`` beside ``q_0``, both angles; velocities run ahead, too, but not as alike."""
     t, u, _, _ = recorded()
     z = path(t - LAG) + np.random.default_rng(2).normal(0.0, 1e-4, u.shape)
-    columns = {f"dq_{n}": np.gradient(z[:, n], t) for n in range(3)}
+    columns = {f"w_{n}": np.gradient(z[:, n], t) for n in range(3)}
     columns |= {f"q_{n}": z[:, n] for n in range(3)} | {f"q_d_{n}": u[:, n] for n in range(3)}
     write(tmp_path / "log.csv", {"time": t, **columns})
     found = survey(tmp_path / "log.csv").roles
@@ -173,6 +173,19 @@ def test_joints_that_are_desired_are_commands(tmp_path: Path) -> None:
     columns_of = [[one.column for (one,) in stream.axes.values()] for stream in (found.command, *found.sensors)]
     assert columns_of == [["q_d_0", "q_d_1", "q_d_2"], ["q_0", "q_1", "q_2"]]
     assert {found.command.kind(axis) for axis in found.command.axes} == {"angle"}
+
+
+def test_a_clock_of_its_own_is_said(tmp_path: Path) -> None:
+    """Motion capture counts from its own start: whatever its file is called, that is why nothing follows."""
+    t, u, s, z = recorded()
+    log = tmp_path / "log"
+    log.mkdir()
+    write(log / "commands.csv", {"time_s": t + START, "x_m": u[:, 0]})
+    write(log / "take1.csv", {"time_s": s, "x_m": z[:, 0]})
+    with pytest.raises(pf.PumafuseError, match=r"take1: its stamps \(0\.\d+ to .* are not of the commands' time"):
+        survey(log)
+    (log / "take1.csv").rename(log / "camera.csv")
+    assert any("camera: its stamps (0." in one for one in questions(survey(log)))
 
 
 def test_two_cameras_of_one_table_are_two_sensors(tmp_path: Path) -> None:
@@ -367,6 +380,7 @@ def test_hostile_names_stay_names(name: str, tmp_path: Path) -> None:
         ("RSol.X", "r_x", ""),
         ("QTarget2_rad", "q_2", "rad"),
         ("camera2_x_mm", "x", "mm"),
+        ("A1_Soll [°]", "a1", "deg"),
         ("m3", "m3", ""),
         ("range_mm", "position", "mm"),
         ("position[肩]", "position", ""),
@@ -378,10 +392,19 @@ def test_axes_and_units_by_name(column: str, axis: str, unit: str) -> None:
     assert (names.axis_of(column, []), names.unit_of(column)) == (axis, unit)
 
 
-@pytest.mark.parametrize("column", ["speed_m_s", "velocity[0]", "orientation.x", "frame", "quality", "twist.linear.x"])
+@pytest.mark.parametrize(
+    "column",
+    ["speed_m_s", "velocity[0]", "orientation.x", "frame", "quality", "twist.linear.x", "actual_qd_0", "current_1"],
+)
 def test_what_is_no_position_is_left_out(column: str) -> None:
     """By a word in the name, or by a unit of something else."""
     assert names.no_position(column)
+
+
+@pytest.mark.parametrize("column", ["q_d_0", "qd_0", "current_position.x", "current_x_mm"])
+def test_what_may_be_a_position_is_not(column: str) -> None:
+    """A desired joint, and where the tool is at present."""
+    assert not names.no_position(column)
 
 
 def test_doubts_are_said_with_their_numbers(tmp_path: Path) -> None:

@@ -180,8 +180,8 @@ def _folders(runs: Sequence[Path], output: Path) -> list[Path]:
     found, free = dict[str, None](), dict[str, Iterator[str]]()
     for path in map(Path.resolve, runs):
         named = path.parent if path.name == "run.toml" else path
-        name = (named.name if named.is_dir() else re.sub(r"(\.csv|\.parquet)?(\.gz)?$", "", named.name)) or "run"
-        names = free.setdefault(name, _numbered(name))
+        name = named.name if named.is_dir() else re.sub(r"(\.(csv|jsonl|ndjson|parquet))?(\.gz)?$", "", named.name)
+        names = free.setdefault(name, _numbered(name or "run"))
         found[next(one for one in names if one not in found)] = None
     return [output / name for name in found]
 

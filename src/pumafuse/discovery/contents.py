@@ -21,7 +21,8 @@ from ..logs.columns import LOG_TIME, Table, Topic, leaf, numeric_paths, prefixes
 from ..units import TIMES, ending, si_of
 from . import names
 
-_TABLES = (".csv", ".csv.gz", ".parquet")
+_TABLES = (".csv", ".csv.gz", ".tsv", *tables.JSON_LINES, ".parquet")
+_TEXTS = (".txt", ".dat")  # tables, too, if one is given; in a folder they may be anything
 _MOST_PARTS = 200  # files or topics
 _MOST_COLUMNS = 200  # of positions in one of them
 _FEWEST_ROWS = 10
@@ -139,8 +140,10 @@ def _files(log: Path) -> list[Path]:
     if not os.path.exists(log):  # noqa: PTH110 - Path.exists raises on a name that is too long
         raise RunError(f"{log}: no such file or folder")
     if not log.is_dir():
-        if not (log.name.endswith(_TABLES) or tables.is_recording(log)):
-            raise RunError(f"{log}: no log that can be read; accepted: CSV, Parquet, MCAP, bags of ROS, .rrd")
+        if not (log.name.endswith(_TABLES + _TEXTS) or tables.is_recording(log)):
+            raise RunError(
+                f"{log}: no log that can be read; accepted: CSV, lines of JSON, Parquet, MCAP, bags of ROS, .rrd"
+            )
         return [log]
     inside = sorted(path for path in log.rglob("*") if path.is_file())
     if (log / "metadata.yaml").is_file() or (inside and all(path.suffix in (".db3", ".mcap") for path in inside)):
@@ -149,7 +152,9 @@ def _files(log: Path) -> list[Path]:
         inside = [path for path in inside if log / "data" in path.parents][:1]
     found = [path for path in inside if path.name.endswith(_TABLES) or tables.is_recording(path)]
     if not found:
-        raise RunError(f"{log}: no log in it that can be read; accepted: CSV, Parquet, MCAP, bags of ROS, .rrd")
+        raise RunError(
+            f"{log}: no log in it that can be read; accepted: CSV, lines of JSON, Parquet, MCAP, bags of ROS, .rrd"
+        )
     return found
 
 

@@ -26,11 +26,11 @@ _ROLES: dict[Role, frozenset[str]] = {
     ),
     "sensor": _DEVICES
     | words_in(
-        "state states measured measurement measurements meas actual act ist pv encoder encoders feedback fb observed"
-        " observation recorded reported odom"
+        "state states measured measurement measurements meas actual act ist pv current encoder encoders feedback fb"
+        " observed observation recorded reported odom"
     ),
 }
-_OF_COLUMNS = words_in("set sp act pv fb")  # in the name of a topic or file these are something else
+_OF_COLUMNS = words_in("set sp act pv fb current")  # in the name of a topic or file these are something else
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _OF_PLACES = words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in that of a column
 _PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
@@ -43,13 +43,14 @@ _SILENT = (
     )
 )
 _NO_POSITIONS = words_in(
-    "velocity velocities vel speed acceleration accelerations acc jerk effort efforts torque force current voltage"
-    " temperature temp quality confidence covariance orientation rotation quaternion twist index id seq sequence count"
-    " status valid std sd sigma latency duration error header stamp nanosec layout frame done reward task episode tick"
-    " time timestamp"
+    "velocity velocities vel speed dq dot acceleration accelerations acc accelerometer ddq qdd jerk effort efforts"
+    " torque torques tau force forces momentum current currents voltage mode scaling bits temperature temperatures temp"
+    " quality confidence covariance orientation rotation quaternion twist index id seq sequence count status valid std"
+    " sd sigma latency duration error header stamp nanosec layout frame done reward task episode tick time timestamp"
 )
+_POSITIONS = words_in("position positions pos pose")  # current_position is one
 _TIMES = words_in(
-    "t time times stamp stamps timestamp timestamps sec secs seconds date datetime clock ts arrival arrived"
+    "t time times stamp stamps timestamp timestamps sec secs seconds date datetime clock ts arrival arrived zeit"
 )
 _DIGITS = "0123456789"
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
@@ -63,7 +64,7 @@ _UNITS = {
     "mrad": "mrad",
 }
 _TURNING = re.compile(
-    r"joint|shoulder|elbow|wrist|angle|theta|yaw|pitch|roll|motor|servo|pan|tilt|lift|flex|gripper|^[mjq](_?d)?_?\d+$"
+    r"joint|shoulder|elbow|wrist|angle|theta|yaw|pitch|roll|motor|servo|pan|tilt|lift|flex|gripper|^[amjq](_?d)?_?\d+$"
 )
 
 
@@ -109,9 +110,14 @@ def is_time(column: str) -> bool:
 
 def no_position(column: str) -> str | None:
     """What a column is by its name, if that is no position."""
-    kind, unit = kind_of(leaf(column)), ending(leaf(column))
-    found = next((word for word in words(leaf(column)) if word in _NO_POSITIONS), None)
-    return found or (f"in {unit.strip('_').replace('_', '/')}" if unit is not None and kind is None else None)
+    kind, unit, found = kind_of(leaf(column)), ending(leaf(column)), words(leaf(column))
+    if "qd" in found and role_words(column):  # as UR calls it: target_qd_0 beside target_q_0
+        return "velocity"
+    whats = [one for one in found if one in _NO_POSITIONS]
+    if whats == ["current"] and (kind or not _POSITIONS.isdisjoint(found)):
+        return None
+    of_unit = f"in {unit.strip('_').replace('_', '/')}" if unit is not None and kind is None else None
+    return next(iter(whats), of_unit)
 
 
 def unit_of(column: str) -> str:
@@ -119,6 +125,8 @@ def unit_of(column: str) -> str:
     unit = ending(leaf(column))
     if unit is not None and kind_of(leaf(column)) is not None:
         return unit[1:]
+    if "°" in column:
+        return "deg"
     *before, last = words(column) or [""]  # also that of `x [mm]`
     return _UNITS.get(last, "") if before else ""
 

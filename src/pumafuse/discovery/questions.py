@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ..arrays import NO_STAMP
 from ..errors import printable
 from ..units import MS
+from .roles import another_clock
 from .survey import Survey
 
 _FOLLOWS = 0.5  # correlation of changes
@@ -20,7 +20,8 @@ def questions(found: Survey) -> Iterator[str]:
     for name, source in run.sensors.items():
         mine = {axis: found.relations[name, axis] for axis in source.values if (name, axis) in found.relations}
         if not mine:
-            yield f"{name}: {_apart(found, name)}"
+            why = another_clock(source, run.command)
+            yield f"{name}: {why or 'too few measurements, or no motion, while there are commands'}"
         for axis, one in mine.items():
             if abs(one.correlation) < _FOLLOWS:
                 yield (
@@ -44,16 +45,3 @@ def questions(found: Survey) -> Iterator[str]:
             "how old is a measurement when it is stamped? Commands and measurements tell only the sum of the arm's lag"
             " and that age (fusion.toml, latency_ms)"
         )
-
-
-def _apart(found: Survey, name: str) -> str:
-    """Why a sensor cannot be compared with the commands."""
-    mine, theirs = (
-        source.stamp[source.stamp != NO_STAMP] / 1e9 for source in (found.run.sensors[name], found.run.command)
-    )
-    if len(mine) and len(theirs) and (mine.max() < theirs.min() or mine.min() > theirs.max()):
-        return (
-            f"its stamps ({mine.min():.3f} to {mine.max():.3f} s) are not of the commands' time"
-            f" ({theirs.min():.3f} to {theirs.max():.3f} s): name a clock that both have (run.toml, time)"
-        )
-    return "too few measurements, or no motion, while there are commands"

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..arrays import NO_STAMP
 from ..errors import RunError, printable
 from ..logs.run import Run, Source
 from ..units import AN, OF_KIND, Kind, kind_of
@@ -124,7 +125,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         if axes and matched.role:
             kept.append(matched)
         else:
-            left_out.append((stream, why_not))
+            left_out.append((stream, another_clock(stream.source, command.source) or why_not))
     command, *kept = _renamed([replace(command, role="command", why=why), *kept])
     sensors = [one for one in kept if one.role == "sensor"]
     references = [one for one in kept if one.role == "reference"]
@@ -145,6 +146,17 @@ def relations(run: Run) -> dict[tuple[str, str], Following]:
         if axis in run.command.values
         and (found := following((run.command.stamp, run.command.values[axis]), (source.stamp, value))) is not None
     }
+
+
+def another_clock(source: Source, command: Source) -> str:
+    """What to say of a source whose stamps are all before or all after those of the commands; empty for others."""
+    mine, theirs = (one.stamp[one.stamp != NO_STAMP] / 1e9 for one in (source, command))
+    if len(mine) and len(theirs) and (mine.max() < theirs.min() or mine.min() > theirs.max()):
+        return (
+            f"its stamps ({mine.min():.3f} to {mine.max():.3f} s) are not of the commands' time"
+            f" ({theirs.min():.3f} to {theirs.max():.3f} s): name a clock that both have (run.toml, time)"
+        )
+    return ""
 
 
 def _streams(part: Part) -> list[Stream]:

@@ -1,10 +1,11 @@
-"""Tables on disk, CSV or Parquet: which columns and rows of them are read.
+"""Tables on disk, text or Parquet: which columns and rows of them are read.
 
-A line that does not fit the header is left out, and noted in a sentence.
+A line of text that does not fit the header is left out, and noted in a sentence.
 """
 
 from __future__ import annotations
 
+import codecs
 import os
 import re
 from collections import Counter
@@ -13,11 +14,12 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pacsv
+import pyarrow.json as pajson
 import pyarrow.parquet as papq
 
 from ..errors import RunError, UnknownNameError, counted, shortened
@@ -31,7 +33,13 @@ _BATCH = 1 << 16  # rows of Parquet that are in memory before rows are chosen
 _READ_AHEAD = 1 << 20  # bytes of a column of Parquet
 _COMPRESSION = "zstd"
 _SOME = 8  # values in an error
-_DECIMAL_COMMA = re.compile(rb"(?:^|[;\t\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[;\t\r\n]|$)")
+_HEAD = 1 << 16  # bytes of a text, among which its header is
+_BESIDE = 3  # rows of numbers that make the line above them a header
+_COMMENT = re.compile(r"\s*(#|%|//)\s*")
+_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf", re.IGNORECASE)
+_UNIT = re.compile(r"[\[(]?(|-|[µunm]?s|[µum]?m|m?rad|deg|°|%|[km]?N|Nm|[mk]?[VA]|Hz|(mm|m|deg|rad|°)/s²?)[\])]?")
+JSON_LINES = (".jsonl", ".ndjson", ".jsonl.gz", ".ndjson.gz")
+_DECIMAL_COMMA = rb"(?:^|[%b\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[%b\r\n]|$)"  # between separators
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
 
 
@@ -44,7 +52,7 @@ def read(
     topic: str = "",
     entity: str = "",
 ) -> Table:
-    """Read a CSV or Parquet table, gzip allowed for CSV (``.csv.gz``), or a part of a recording.
+    """Read a table (CSV, lines of JSON, gzip allowed for both, or Parquet), or a part of a recording.
 
     Args:
         path: The file, or the folder of a bag.
@@ -71,7 +79,7 @@ def read(
         if path.suffix == ".parquet":
             (table, names), notes = _parquet(path, fields, where), list[str]()
         else:
-            whole, notes = _parsed(path, _text(path), growing)
+            whole, notes = _of_text(path, growing)
             table, names = _only(path, whole, where), whole.column_names
     if table.num_rows == 0:
         notes = [f"{path.name}: the table has no rows", *notes]
@@ -181,15 +189,33 @@ def _text(path: Path) -> bytes:
     return content
 
 
-def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]]:
-    """The table in a CSV text; lines with the wrong number of cells, and a torn last line, are left out and noted."""
-    notes: list[str] = []
+def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
+    """The table in a text; lines with the wrong number of cells, and a torn last line, are left out and noted."""
+    text, notes = _text(path), list[str]()
     if growing and b"\n" in text and not text.endswith((b"\n", b"\r")) and path.suffix not in _COMPRESSED:
         text = text[: text.rindex(b"\n") + 1]
         torn = "the last line has no end and may be torn: left out (if it is whole, end it with a line break)"
         notes = [f"{path.name}: {torn}"]
+    if path.name.endswith(JSON_LINES):
+        return pajson.read_json(pa.BufferReader(text), pajson.ReadOptions(use_threads=False)), notes
+    try:
+        table, more = _parsed(path, text)
+        _ = table.column_names  # only now it is seen whether they are UTF-8
+    except (UnicodeDecodeError, pa.ArrowInvalid) as error:
+        if b"\0" in text or not (isinstance(error, UnicodeDecodeError) or "UTF8" in str(error)):
+            raise
+        table, more = _parsed(path, text.decode("cp1252").encode())
+        more = [f"{path.name}: its text is not UTF-8: taken for Windows-1252", *more]
+    return table, [*more, *notes]
+
+
+def _parsed(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
+    """The table in a CSV text, and what was left out of it."""
+    layout = _layout(text)
+    if layout.separator == " ":
+        text = re.sub(rb"(?m)^[ \t]+|[ \t]+(?=\r?$)|(?<=[ \t])[ \t]+", b"", text)
     wrong: list[pacsv.InvalidRow] = []
-    separator, point = _dialect(text)
+    notes = [f"{path.name}: {counted(layout.above, 'line')} above the header left out"] if layout.above else []
 
     def leave_out(row: pacsv.InvalidRow) -> str:
         wrong.append(row)
@@ -198,9 +224,16 @@ def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]
     def parsed(**options: Any) -> pa.Table:
         return pacsv.read_csv(
             pa.BufferReader(text),
-            read_options=pacsv.ReadOptions(use_threads=False),
-            parse_options=pacsv.ParseOptions(delimiter=separator, **options),
-            convert_options=pacsv.ConvertOptions(null_values=BLANK, strings_can_be_null=True, decimal_point=point),
+            read_options=pacsv.ReadOptions(
+                use_threads=False,
+                skip_rows=layout.skipped,
+                column_names=layout.names,
+                skip_rows_after_names=int(layout.units),
+            ),
+            parse_options=pacsv.ParseOptions(delimiter=layout.separator, **options),
+            convert_options=pacsv.ConvertOptions(
+                null_values=BLANK, strings_can_be_null=True, decimal_point=layout.point
+            ),
         )
 
     try:
@@ -219,11 +252,71 @@ def _parsed(path: Path, text: bytes, growing: bool) -> tuple[pa.Table, list[str]
     return table, [note, *notes]
 
 
-def _dialect(text: bytes) -> tuple[str, str]:
-    """What separates the cells of a CSV text, and the point of its decimals: ``1,5;2`` as well as ``1.5,2``."""
-    head, _, rest = text.partition(b"\n")
-    separator = max(",", ";", "\t", key=lambda one: head.count(one.encode()))  # of equals the first
-    return separator, "," if separator != "," and _DECIMAL_COMMA.search(rest) else "."
+class _Layout(NamedTuple):
+    """How a CSV text is laid out.
+
+    Attributes:
+        separator: Between cells; a blank stands for any number of them.
+        point: Of decimals: ``1,5;2`` as well as ``1.5,2``.
+        skipped: Lines above the header, or with it where it is a comment.
+        names: Of the columns, where the header is a comment: ``# t x y``.
+        units: Whether a line with units is below the header.
+        above: How many of the lines above are no comments and not blank.
+    """
+
+    separator: str
+    point: str
+    skipped: int
+    names: list[str] | None
+    units: bool
+    above: int
+
+
+def _layout(text: bytes) -> _Layout:
+    """Find the header: the first line that is no comment, if the next few have as many cells.
+
+    Else it is the one right above rows of numbers: recorders write their settings on top (``Format Version,1.23,…``).
+    """
+    lines = re.split("\r\n|\r|\n", text[:_HEAD].removeprefix(codecs.BOM_UTF8).decode("utf-8", errors="replace"))
+    lines = lines if len(text) <= _HEAD else lines[:-1]
+    full = [n for n, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)] or [0]
+    header, names, units = full[0], None, False
+    separator = _separator(lines[header])
+    first, *below = (_cells(lines[n], separator) for n in full[: 1 + _BESIDE])
+    comment = _COMMENT.sub("", lines[header - 1], 1) if header > 0 else ""
+    if header > 0 and _begins(lines, header, _separator(comment)):
+        separator = _separator(comment)
+        names = _cells(comment, separator)
+        names = names if len(names) == len(_cells(lines[header], separator)) else None
+    elif '"' in lines[header] or all(len(row) == len(first) > 1 for row in below):
+        units = bool(below) and any(below[0]) and all(map(_UNIT.fullmatch, below[0]))
+    else:
+        header = next((n - 1 for n in full[1:] if _begins(lines, n, _separator(lines[n - 1]))), header)
+        separator = _separator(lines[header])
+    around = separator.encode()
+    point = "," if separator != "," and re.search(_DECIMAL_COMMA % (around, around), text) else "."
+    return _Layout(separator, point, header, names, units, sum(n < header for n in full))
+
+
+def _begins(lines: Sequence[str], place: int, separator: str) -> bool:
+    """Whether rows of numbers begin at a line, the same number of them in each of the next few."""
+    rows = [_cells(line, separator) for line in lines[place : place + _BESIDE]]
+    return len(rows) > 1 and all(
+        len(row) == len(rows[0]) > 1 and 2 * sum(_NUMBER.fullmatch(one) is not None for one in row) > len(row)
+        for row in rows
+    )
+
+
+def _separator(line: str) -> str:
+    """What separates the cells of a line: of equals the first; a blank only where there is nothing else."""
+    separator = max(",", ";", "\t", key=line.count)
+    return " " if separator not in line and " " in line.strip() else separator
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    """The cells of a line, without quotes."""
+    found = line.split() if separator == " " else line.split(separator)
+    return [one.strip().strip('"').strip() for one in found]
 
 
 def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
