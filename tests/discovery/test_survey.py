@@ -140,6 +140,7 @@ def test_one_table_with_everything_needs_no_names(tmp_path: Path) -> None:
         ("{}_ref_mm", "{}_mm"),
         ("{}_set_mm", "{}_act_mm"),
         ("ASPos.{}", "AIPos.{}"),
+        ("act_{}", "obs_{}"),
         ("first_{}_mm", "second_{}_mm"),
         ("{}_out_mm", "{}_in_mm"),
         ("{}d_mm", "{}_mm"),

@@ -26,11 +26,11 @@ _ROLES: dict[Role, frozenset[str]] = {
     ),
     "sensor": _DEVICES
     | words_in(
-        "state states measured measurement measurements meas actual act ist pv current encoder encoders feedback fb"
+        "state states measured measurement measurements meas actual ist pv current encoder encoders feedback fb"
         " observed observation recorded reported odom"
     ),
 }
-_OF_COLUMNS = words_in("set sp act pv fb current")  # in the name of a topic or file these are something else
+_OF_COLUMNS = words_in("set sp pv fb current")  # in the name of a topic or file these are something else
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _OF_PLACES = words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in that of a column
 _PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
