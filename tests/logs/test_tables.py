@@ -196,6 +196,10 @@ LAYOUTS: dict[str, tuple[str, str]] = {
         "Robot,UR5\nt_s;x_mm\n" + "".join(f"{t};{x}\n".replace(".", ",") for t, x in ROWS),
         "1 line above the header left out",
     ),
+    "settings and units": (
+        "Trajectories\n100\nt_s,x_mm\n[s],[mm]\n" + "".join(f"{t},{x}\n" for t, x in ROWS),
+        "2 lines above the header left out",
+    ),
     "units": ("t_s,x_mm\n[s],[mm]\n" + "".join(f"{t},{x}\n" for t, x in ROWS), ""),
     "decimal commas": ("t_s x_mm\n" + "".join(f"{t} {x}\n".replace(".", ",") for t, x in ROWS), ""),
 }
@@ -210,6 +214,36 @@ def test_one_table_however_laid_out(tmp_path: Path, layout: str) -> None:
     assert table.stamps("t_s")[0].tolist() == [round(t * 10**9) for t, _ in ROWS]
     np.testing.assert_allclose(table.numbers("x_mm")[0], [x / 1e3 for _, x in ROWS], rtol=1e-15)
     assert table.notes == ((f"log.csv: {note}",) if note else ())
+
+
+def test_a_header_of_several_lines_tells_columns_of_one_name_apart(tmp_path: Path) -> None:
+    """As OptiTrack's Motive exports rigid bodies."""
+    table = csv(
+        tmp_path,
+        "Format Version,1.23,Take Name,one,Capture Frame Rate,120.0\n\n"
+        ",,Rigid Body,Rigid Body,Rigid Body,Rigid Body\n,,tool,tool,tool,tool\n"
+        ",,Rotation,Rotation,Position,Position\nFrame,Time (Seconds),X,Y,X,Y\n"
+        "0,0.000000,0.1,0.2,0.3,0.4\n1,0.008333,0.1,0.2,0.3,0.5\n",
+    )
+    assert list(table.columns) == ["Frame", "Time (Seconds)", "Rotation X", "Rotation Y", "Position X", "Position Y"]
+    assert table.columns["Position Y"].to_pylist() == [0.4, 0.5]
+    assert table.notes == ("log.csv: 3 lines above the header left out",)
+
+
+@pytest.mark.parametrize("text", ["\ufeff", "\n", "\ufeff\n", "# only\n", '"', "#", " \n \n", "a\n\n\n1 2\n3 4"])
+def test_what_has_no_header_is_a_table_or_one_line(tmp_path: Path, text: str) -> None:
+    """Whatever its first lines are."""
+    try:
+        csv(tmp_path, text)
+    except RunError as error:
+        assert "\n" not in str(error)
+
+
+def test_a_header_may_be_longer_than_what_is_looked_at(tmp_path: Path) -> None:
+    """Ten thousand columns, separated by semicolons."""
+    names = [f"sensor{n}.position_mm" for n in range(10_000)]
+    text = f"{';'.join(names)}\n" + f"{';'.join(['0,5'] * len(names))}\n" * 3
+    assert list(csv(tmp_path, text).columns) == names
 
 
 def test_lines_are_counted_from_the_top_of_the_file(tmp_path: Path) -> None:

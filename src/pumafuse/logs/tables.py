@@ -258,8 +258,8 @@ class _Layout(NamedTuple):
     Attributes:
         separator: Between cells; a blank stands for any number of them.
         point: Of decimals: ``1,5;2`` as well as ``1.5,2``.
-        skipped: Lines above the header, or with it where it is a comment.
-        names: Of the columns, where the header is a comment: ``# t x y``.
+        skipped: Lines above the header; with it where ``names`` are given.
+        names: Of the columns, where the header is a comment (``# t x y``) or several lines (Position above X, Y, Z).
         units: Whether a line with units is below the header.
         above: How many of the lines above are no comments and not blank.
     """
@@ -273,29 +273,53 @@ class _Layout(NamedTuple):
 
 
 def _layout(text: bytes) -> _Layout:
-    """Find the header: the first line that is no comment, if the next few have as many cells.
-
-    Else it is the one right above rows of numbers: recorders write their settings on top (``Format Version,1.23,…``).
-    """
-    lines = re.split("\r\n|\r|\n", text[:_HEAD].removeprefix(codecs.BOM_UTF8).decode("utf-8", errors="replace"))
-    lines = lines if len(text) <= _HEAD else lines[:-1]
+    """How a text is laid out, by its first lines."""
+    head = text[: max(_HEAD, text.find(b"\n") + 1)].removeprefix(codecs.BOM_UTF8).decode("utf-8", errors="replace")
+    *lines, last = re.split("\r\n|\r|\n", head)
+    lines = [*lines, last] if not lines or (last and len(text) <= _HEAD) else lines
     full = [n for n, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)] or [0]
-    header, names, units = full[0], None, False
+    first = full[0]
+    comment = _COMMENT.sub("", lines[first - 1], 1) if first > 0 else ""
+    separator = _separator(comment)
+    names = _cells(comment, separator)
+    if len(names) == len(_cells(lines[first], separator)) and _begins(lines, first, separator):
+        return _Layout(separator, _point(text, separator), first, names, units=False, above=0)
+    header = _header(lines, full)
     separator = _separator(lines[header])
+    units = header > first and all(map(_UNIT.fullmatch, _cells(lines[header], separator)))
+    top, names = _told_apart(lines, header - units, separator)
+    skipped = header - units + (names is not None)
+    return _Layout(separator, _point(text, separator), skipped, names, units, sum(n < top for n in full))
+
+
+def _header(lines: Sequence[str], full: Sequence[int]) -> int:
+    """Where the header is: the first full line, if rows of as many cells begin below it.
+
+    Else it is what stands right above rows of numbers: recorders write their settings on top (``Format Version,1.23``).
+    """
+    header, separator = full[0], _separator(lines[full[0]])
+    if '"' in lines[header]:  # a name may go on in the next line
+        return header
     first, *below = (_cells(lines[n], separator) for n in full[: 1 + _BESIDE])
-    comment = _COMMENT.sub("", lines[header - 1], 1) if header > 0 else ""
-    if header > 0 and _begins(lines, header, _separator(comment)):
-        separator = _separator(comment)
-        names = _cells(comment, separator)
-        names = names if len(names) == len(_cells(lines[header], separator)) else None
-    elif '"' in lines[header] or all(len(row) == len(first) > 1 for row in below):
-        units = bool(below) and any(below[0]) and all(map(_UNIT.fullmatch, below[0]))
-    else:
-        header = next((n - 1 for n in full[1:] if _begins(lines, n, _separator(lines[n - 1]))), header)
-        separator = _separator(lines[header])
-    around = separator.encode()
-    point = "," if separator != "," and re.search(_DECIMAL_COMMA % (around, around), text) else "."
-    return _Layout(separator, point, header, names, units, sum(n < header for n in full))
+    begin = next((n for n in full[1:] if _begins(lines, n, _separator(lines[n - 1]))), header + 1)
+    between = [_cells(lines[n], separator) for n in full[1:] if n < begin]
+    even = all(len(row) == len(first) > 1 for row in below)
+    return begin - 1 if not even or (between and all(map(_is_text, between))) else header
+
+
+def _told_apart(lines: Sequence[str], header: int, separator: str) -> tuple[int, list[str] | None]:
+    """Names of which some are the same, with those in the lines above them: X, Y, Z of a Rotation and of a Position.
+
+    Returns:
+        The first line that names are from, and the names; None where the header has them all.
+    """
+    top, names = header, _cells(lines[header], separator)
+    while top > 0 and len(set(names)) < len(names):
+        above = _cells(lines[top - 1], separator)
+        if len(above) != len(names):
+            break
+        top, names = top - 1, [f"{one} {other}".strip() for one, other in zip(above, names, strict=True)]
+    return top, names if top < header else None
 
 
 def _begins(lines: Sequence[str], place: int, separator: str) -> bool:
@@ -305,6 +329,17 @@ def _begins(lines: Sequence[str], place: int, separator: str) -> bool:
         len(row) == len(rows[0]) > 1 and 2 * sum(_NUMBER.fullmatch(one) is not None for one in row) > len(row)
         for row in rows
     )
+
+
+def _is_text(row: Sequence[str]) -> bool:
+    """Whether a row is no row of data: it has words, and no cell that begins like a number or a date."""
+    return any(one not in BLANK for one in row) and not any(re.match(r"[+-]?[.,]?\d", one) for one in row)
+
+
+def _point(text: bytes, separator: str) -> str:
+    """What stands before decimals."""
+    around = separator.encode()
+    return "," if separator != "," and re.search(_DECIMAL_COMMA % (around, around), text) else "."
 
 
 def _separator(line: str) -> str:
