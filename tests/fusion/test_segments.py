@@ -230,6 +230,19 @@ def test_every_defect_is_noted_once() -> None:
         assert sum(note.startswith(sentence) for note in notes) == 1, (sentence, notes)
 
 
+def test_what_is_said_of_an_angle_has_its_unit() -> None:
+    """A sensor's sd, and what is too far to be a position."""
+    joints = {name: AxisModel(plant=FirstOrder(time_constant=0.04), kind="angle") for name in ("elbow", "wrist")}
+    arm = ArmModel(name="two joints", update_period=PERIOD, delay=0.0, axes=joints)
+    known = FusionConfig(arm=arm, sensors={"b": Sensor(sd={"elbow": 1e-3})})
+    rows = {"b": ([ORIGIN], {"elbow": [0.5], "wrist": [0.5]})}
+    notes = build(recorded(rows, axes=("elbow", "wrist")), known).notes
+    assert "b: sd_deg has no entry for wrist, which is not used: unknown" in notes
+    far = Run.from_arrays([ORIGIN, ORIGIN + TICK], {"elbow": [1e7, 1e7]})
+    with pytest.raises(RunError, match="no command for axis 'elbow' is a number below 1e6 m or rad"):
+        build(far, known)
+
+
 # ---- commands
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 
-FARTHEST = 1e6  # m; what is farther is a sentinel, no position
+FARTHEST = 1e6  # m or rad; what is farther is a sentinel, no position
 ABSENT = 255  # in an array of outcomes: the row gives no value for this axis
 
 

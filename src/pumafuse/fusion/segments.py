@@ -25,7 +25,7 @@ from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
 from ..logs.run import Run, Source, note_rows
-from ..units import AN
+from ..units import AN, of_kind
 from .config import FusionConfig
 from .setup import at_rest, columns_of, filter_model, filter_sensors
 
@@ -367,7 +367,7 @@ def _command_rows(run: Run, policy: _Policy, notes: list[str]) -> Events:
         hollow[order] = known == Outcome.INVALID
         note_rows(notes, label, hollow, f"no finite {axis} command: not used")
         if not (known == Outcome.FUSED).any():
-            raise RunError(f"{label}: no command for axis '{axis}' is a position within 1000 km")
+            raise RunError(f"{label}: no command for axis '{axis}' is a number below 1e6 m or rad")
     return rows
 
 
@@ -446,7 +446,8 @@ def _measurement_rows(
         note_rows(notes, label, _on_any_axis(known, kind), f"{reason}: {kind.word}")
     for column, axis in enumerate(run.axes):
         if axis in source.values and sensor.sd_of(axis) is None:
-            notes.append(f"{label}: sd_mm has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
+            sd = of_kind("sd_mm", config.arm.axes[axis].kind)
+            notes.append(f"{label}: {sd} has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
         hollow = (known[:, column] == Outcome.INVALID) & ~missing
         note_rows(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
     return kept, counts
