@@ -25,6 +25,7 @@ from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
 from ..logs.run import Run, Source, note_rows
+from ..model.arm import ArmModel
 from ..units import AN, of_kind
 from .config import FusionConfig
 from .setup import at_rest, columns_of, filter_model, filter_sensors
@@ -207,26 +208,8 @@ def build(
         PumafuseError: The run commands an axis that the arm has not, a chosen sensor is not configured, or the part of
             the run to use has no measurement.
     """
-    arm, label, notes = config.arm, run.command.label, list(run.notes)
-    for axis in run.axes:
-        if axis in CARTESIAN and axis not in arm.axes:
-            raise RunError(
-                f"{label}: commands are in x, y, z, the arm '{arm.name}' has {', '.join(arm.axes)}: write an arm.toml"
-                " with axes x, y, z, or give a [frame] in run.toml or fusion.toml"
-            )
-        if axis not in arm.axes:
-            raise UnknownNameError(f"{label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes)
-    for axis, kind in run.kinds.items():
-        if axis in arm.axes and kind != arm.axes[axis].kind:
-            raise RunError(
-                f"run '{run.name}': {axis} is {AN[kind]}, the arm '{arm.name}' says {AN[arm.axes[axis].kind]}; give"
-                f' [axes.{axis}] kind = "{kind}", or columns of the other unit'
-            )
-    for name, source in run.sensors.items():
-        if any(axis in CARTESIAN and axis not in run.axes for axis in source.values):
-            raise RunError(
-                f"sensor '{name}' is in x, y, z, the commands are not; give a [frame], and them in x, y, z too"
-            )
+    _check_axes(run, config.arm)
+    label, notes = run.command.label, list(run.notes)
     chosen = config.sensor_names(sensors)
     strangers = [name for name in run.sensors if name not in config.sensors] if sensors is None else []
     used = (*(name for name in chosen if name in run.sensors), *strangers)
@@ -326,6 +309,35 @@ def as_commanded(run: Run, config: FusionConfig) -> Source:
     rows = _on_ticks(run, config, _command_rows(run, _policy(config, run.axes, ()), []), [])
     value = np.where(rows.known == Outcome.FUSED, rows.value, np.nan)
     return Source(rows.stamp, dict(zip(run.axes, value.T, strict=True)), run.command.label)
+
+
+def _check_axes(run: Run, arm: ArmModel) -> None:
+    """Whether the arm has the axes of the run, of its kinds and in its frame.
+
+    Raises:
+        RunError: Axes are of another kind, or x, y, z on one side only.
+        UnknownNameError: The arm has no such axis.
+    """
+    label = run.command.label
+    for axis in run.axes:
+        if axis in CARTESIAN and axis not in arm.axes:
+            raise RunError(
+                f"{label}: commands are in x, y, z, the arm '{arm.name}' has {', '.join(arm.axes)}: write an arm.toml"
+                " with axes x, y, z, or give a [frame] in run.toml or fusion.toml"
+            )
+        if axis not in arm.axes:
+            raise UnknownNameError(f"{label}: the arm '{arm.name}' has no such axis", "axis", axis, arm.axes)
+    for axis, kind in run.kinds.items():
+        if axis in arm.axes and kind != arm.axes[axis].kind:
+            raise RunError(
+                f"run '{run.name}': {axis} is {AN[kind]}, the arm '{arm.name}' says {AN[arm.axes[axis].kind]}; give"
+                f' [axes.{axis}] kind = "{kind}", or columns of the other unit'
+            )
+    for name, source in run.sensors.items():
+        if any(axis in CARTESIAN and axis not in run.axes for axis in source.values):
+            raise RunError(
+                f"sensor '{name}' is in x, y, z, the commands are not; give a [frame], and them in x, y, z too"
+            )
 
 
 def _policy(config: FusionConfig, axes: Sequence[str], sensors: Sequence[str]) -> _Policy:

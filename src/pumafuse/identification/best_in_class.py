@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -137,42 +138,11 @@ def best_in_class(measured: Measured, command: Commands, model: AxisModel, delay
         delay: Its Td, also a start [s].
         start: Level before the first command [m or rad].
     """
-    from scipy.optimize import least_squares
-
-    z = measured.position - measured.position.mean()
     columns = _gain_columns(command, model)
-
-    def design(x: FloatArray) -> FloatArray:
-        """Simulated positions without their means, a gain column each, (n, g)."""
-        axes = [msgspec.structs.replace(axis, plant=_plant_at(x)) for axis in columns]
-        moved = [command.moved(axis, float(x[0]) ** 2, start, measured.time) for axis in axes]
-        found = np.stack([moved[0], *(column - moved[0] for column in moved[1:])], axis=1)
-        return found - found.mean(axis=0)
-
-    def linear(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Simulated position (n,), and the coefficients of the gain columns (g,), of the best gain."""
-        found = design(x)
-        share = np.asarray(np.linalg.lstsq(found, z, rcond=None)[0], dtype=np.float64)
-        return found @ share, share
-
-    def residual(x: FloatArray) -> FloatArray:
-        return z - linear(x)[0]
-
-    def cost(x: FloatArray) -> float:
-        return float(np.sum(residual(x) ** 2))
-
+    problem = _Problem(measured, command, columns, start, measured.position - measured.position.mean())
     own = model.plant.natural_frequency**-2 if isinstance(model.plant, SecondOrder) else 0.0  # p
-    ratios = _RATIOS if own else (0.0,)
-    lags = np.geomspace(0.2 * command.period, 10.0 * command.period, _LAGS).tolist()
-    shapes = [(q, ratio * q * q) for q in lags for ratio in ratios]
-    delays = np.linspace(0.0, _LATEST * command.period, _DELAYS).tolist()
-    cells = sorted((min((_coordinates(td, q, p) for q, p in shapes), key=cost) for td in delays), key=cost)
-    found = [
-        least_squares(residual, x, x_scale="jac", xtol=1e-10, ftol=1e-12, gtol=1e-12, max_nfev=300)
-        for x in [_coordinates(delay, model.plant.lag, own), *cells[:_STARTS]]
-    ]
-    best = min(found, key=lambda one: float(one.cost)).x
-    modelled, share = linear(best)
+    best = problem.solve([_coordinates(delay, model.plant.lag, own), *problem.starts(second_order=own > 0.0)])
+    modelled, share = problem.modelled(best)
     speed = np.array(command.speeds.mean())
 
     def axis_at(parameters: FloatArray) -> AxisModel:
@@ -189,9 +159,12 @@ def best_in_class(measured: Measured, command: Commands, model: AxisModel, delay
     at = np.concatenate((best, share))
     steps = _STEP * np.eye(len(at))
     slope = np.array([lag(at + step) - lag(at - step) for step in steps])
-    moves = [design(one[: len(best)]) @ one[len(best) :] for step in steps for one in (at + step, at - step)]
-    jacobian = np.stack(moves[::2], axis=1) - np.stack(moves[1::2], axis=1)
-    half = _half_width(jacobian, slope, z - modelled)
+
+    def positions(parameters: FloatArray) -> FloatArray:
+        return problem.columns_at(parameters[: len(best)]) @ parameters[len(best) :]
+
+    jacobian = np.stack([positions(at + step) - positions(at - step) for step in steps], axis=1)
+    half = _half_width(jacobian, slope, problem.z - modelled)
     axis = axis_at(at)
     return BestInClass(
         fit=measured.fit(modelled, command.amplitude),
@@ -201,6 +174,65 @@ def best_in_class(measured: Measured, command: Commands, model: AxisModel, delay
         gain=axis.gain.intercept,
         plant=axis.plant,
     )
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Least squares over delay and plant; the best gain at each is linear (Golub & Pereyra's variable projection).
+
+    Attributes:
+        measured: To be fitted.
+        command: Of the axis.
+        axes: With the gains whose responses span those of all gains.
+        start: Level before the first command [m or rad].
+        z: The measurements without their mean, (n,).
+    """
+
+    measured: Measured
+    command: Commands
+    axes: Sequence[AxisModel]
+    start: float
+    z: FloatArray
+
+    def columns_at(self, x: FloatArray) -> FloatArray:
+        """Simulated positions without their means, a gain column each, (n, g)."""
+        axes = [msgspec.structs.replace(axis, plant=_plant_at(x)) for axis in self.axes]
+        moved = [self.command.moved(axis, float(x[0]) ** 2, self.start, self.measured.time) for axis in axes]
+        found = np.stack([moved[0], *(column - moved[0] for column in moved[1:])], axis=1)
+        return found - found.mean(axis=0)
+
+    def modelled(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Simulated position (n,), and the coefficients of the gain columns (g,), of the best gain."""
+        found = self.columns_at(x)
+        share = np.asarray(np.linalg.lstsq(found, self.z, rcond=None)[0], dtype=np.float64)
+        return found @ share, share
+
+    def residual(self, x: FloatArray) -> FloatArray:
+        """What the best gain leaves over, (n,)."""
+        return self.z - self.modelled(x)[0]
+
+    def cost(self, x: FloatArray) -> float:
+        """Its sum of squares."""
+        return float(np.sum(self.residual(x) ** 2))
+
+    def starts(self, *, second_order: bool) -> list[FloatArray]:
+        """The best cells of a grid over delays and plants."""
+        period = self.command.period
+        lags = np.geomspace(0.2 * period, 10.0 * period, _LAGS).tolist()
+        shapes = [(q, ratio * q * q) for q in lags for ratio in (_RATIOS if second_order else (0.0,))]
+        delays = np.linspace(0.0, _LATEST * period, _DELAYS).tolist()
+        cells = [min((_coordinates(td, q, p) for q, p in shapes), key=self.cost) for td in delays]
+        return sorted(cells, key=self.cost)[:_STARTS]
+
+    def solve(self, starts: Iterable[FloatArray]) -> FloatArray:
+        """Delay and plant of least squares, from the best of several starts."""
+        from scipy.optimize import least_squares
+
+        found = [
+            least_squares(self.residual, x, x_scale="jac", xtol=1e-10, ftol=1e-12, gtol=1e-12, max_nfev=300)
+            for x in starts
+        ]
+        return min(found, key=lambda one: float(one.cost)).x
 
 
 def _half_width(jacobian: FloatArray, slope: FloatArray, residual: FloatArray) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -206,19 +207,11 @@ def identify(
     factors = anova.factors_of([one.trial for one in used], period, kind)
     performance = anova.performances(factors, np.array([rms[one.trial.name] for one in used]), tolerance, kind)
     fastest = max(one.trial.speed_at(period) for one in used)
-    provenance = {
-        "made_by": f"pumafuse identify {version('pumafuse')}",
-        "trials": {axis: one.trials for axis, one in axes.items()},
-        "left_out": left_out,
-        "order": {axis: one.choice.why for axis, one in axes.items()},
-        "delay": one_delay,
-        "delay_spread_ms": {axis: round(one.delay_spread * units.MS, 2) for axis, one in axes.items()},
-        "gain": {axis: one.gain_words for axis, one in axes.items()},
-        "validity": {one.factor: one.verdict for one in performance},
-        "samples": "all" if samples is None else samples,
-        "method": "delay and gain read off each trial (--paper)" if paper else "all parameters fitted",
-    }
-    arm = msgspec.structs.replace(arm, validity=anova.validity(performance, fastest, kind), provenance=provenance)
+    arm = msgspec.structs.replace(
+        arm,
+        validity=anova.validity(performance, fastest, kind),
+        provenance=_provenance(axes, left_out, one_delay, performance, samples, paper),
+    )
     return Identification(
         arm=_rounded(arm),
         method="published" if paper else "fitted",
@@ -277,6 +270,29 @@ def _arm(
         models = {axis: msgspec.structs.replace(one, delay=None, delay_ci95=None) for axis, one in models.items()}
         words = "one delay" + ("" if p is None else f": the axes do not differ (Welch's test, p = {p:.2g})")
     return ArmModel(name=name, update_period=period, delay=every.value, delay_ci95=every.ci95, axes=models), words
+
+
+def _provenance(
+    axes: Mapping[str, CombinedAxis],
+    left_out: Mapping[str, str],
+    one_delay: str,
+    performance: Sequence[anova.Performance],
+    samples: int | None,
+    paper: bool,
+) -> dict[str, Any]:
+    """What the arm's file says of where its numbers come from."""
+    return {
+        "made_by": f"pumafuse identify {version('pumafuse')}",
+        "trials": {axis: one.trials for axis, one in axes.items()},
+        "left_out": left_out,
+        "order": {axis: one.choice.why for axis, one in axes.items()},
+        "delay": one_delay,
+        "delay_spread_ms": {axis: round(one.delay_spread * units.MS, 2) for axis, one in axes.items()},
+        "gain": {axis: one.gain_words for axis, one in axes.items()},
+        "validity": {one.factor: one.verdict for one in performance},
+        "samples": "all" if samples is None else samples,
+        "method": "delay and gain read off each trial (--paper)" if paper else "all parameters fitted",
+    }
 
 
 def _rounded(arm: ArmModel) -> ArmModel:

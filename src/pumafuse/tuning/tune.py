@@ -110,18 +110,8 @@ def tune(
         PumafuseError: Nothing can be fitted to the runs, or they and the configuration do not fit together.
     """
     runs = [runs] if isinstance(runs, Run) else runs
-    if not runs:
-        raise TuneError("no run to fit on")
-    for number, run in enumerate(runs):
-        if any(_same(run, other) for other in runs[:number]):
-            raise TuneError(f"run '{run.name}' is given twice: its measurements would count twice")
     kinds, fixed = kinds_of(fit), list(fix)
-    check_fixed(config, fixed)
-    for word in share:
-        if word != "delay":
-            raise ConfigError(f"--share: unknown '{word}'; accepted: delay")
-        if "delay" not in kinds:
-            raise ConfigError("--share delay: delays are not fitted; add delay to --fit")
+    _check(runs, config, kinds, fixed, share)
     pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust, sd_prior, "delay" in share), progress)
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
     until = _fitted_until(runs[0]) if len(runs) == 1 and validate is None else None
@@ -181,6 +171,31 @@ def tune(
     for note in summary.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=2)
     return Tuning(tuned, config, summary, [one.profile for one in intervals.values()] if profiles else [])
+
+
+def _check(
+    runs: Sequence[Run],
+    config: FusionConfig,
+    kinds: Sequence[Fit],
+    fixed: Sequence[str],
+    share: Iterable[Literal["delay"]],
+) -> None:
+    """Whether it can be fitted as asked.
+
+    Raises:
+        PumafuseError: No run, one twice, or a name to fix or a word to share that means nothing.
+    """
+    if not runs:
+        raise TuneError("no run to fit on")
+    for number, run in enumerate(runs):
+        if any(_same(run, other) for other in runs[:number]):
+            raise TuneError(f"run '{run.name}' is given twice: its measurements would count twice")
+    check_fixed(config, fixed)
+    for word in share:
+        if word != "delay":
+            raise ConfigError(f"--share: unknown '{word}'; accepted: delay")
+        if "delay" not in kinds:
+            raise ConfigError("--share delay: delays are not fitted; add delay to --fit")
 
 
 def plans(
