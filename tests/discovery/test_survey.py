@@ -91,6 +91,12 @@ def check_fuses(log: Path, folder: Path, axes: tuple[str, ...] = ("x", "y", "z")
         ("uptime_s", lambda t: [repr(float(one)) for one in t], ""),
         ("uptime_ms", lambda t: [repr(float(1e3 * one)) for one in t], ""),
         ("date", lambda t: [str(np.datetime64(START * 10**9 + round(1e9 * one), "ns")) for one in t], ""),
+        ("asctime", lambda t: [f"2026-11-25 10:00:{one:06.3f}".replace(".", ",") for one in t], ""),
+        ("Zeit", lambda t: [f"25.11.2026 10:00:{one:06.3f}" for one in t], ""),
+        ("Time", lambda t: [f"{one:g} sec" for one in t], ""),
+        ("time", lambda t: [f"12:00:{one:06.3f}" for one in t], ""),
+        ("", lambda t: [f"0 days 00:00:{one:09.6f}" for one in t], ""),
+        ("", lambda t: [repr(float(one)) for one in t], "s"),
     ],
 )
 def test_clocks_are_known_by_name_by_date_and_by_interval(name: str, stamps: Any, unit: str, tmp_path: Path) -> None:
@@ -102,6 +108,56 @@ def test_clocks_are_known_by_name_by_date_and_by_interval(name: str, stamps: Any
     write(log / "camera.csv", {name: stamps(s), **{f"{axis}_m": z[:, n] for n, axis in enumerate("xyz")}})
     found = check_fuses(log, tmp_path / "out")
     assert {part.clock.unit for part in found.parts if part.clock} == {unit}
+
+
+def test_tables_without_a_header(tmp_path: Path) -> None:
+    """As ``ros2 topic echo --csv`` writes poses: seconds and nanoseconds apart, then a word."""
+    t, u, s, z = recorded()
+    log = tmp_path / "log"
+    log.mkdir()
+    for name, time, value in (("goal_pose", t, u), ("tracker", s, z)):
+        rows = zip(time, *value.T, strict=True)
+        lines = [f"{START + int(a)},{round(1e9 * (a % 1.0)):d},base,{x:.7f},{y:.7f},{z:.7f}\n" for a, x, y, z in rows]
+        (log / f"{name}.csv").write_text("".join(lines))
+    found = check_fuses(log, tmp_path / "out", ("column_4", "column_5", "column_6"))
+    assert {part.clock.nanoseconds for part in found.parts if part.clock} == {"column 2"}
+
+
+def test_joints_have_the_names_that_are_beside_them(tmp_path: Path) -> None:
+    """As ``rostopic echo -p`` writes joint states: angles, stamped by their header, not when they were written."""
+    t, u, s, z = recorded()
+    log = tmp_path / "log"
+    log.mkdir()
+    for file, time, value in (("joint_command", t, u), ("joint_states", s, z)):
+        stamp = [START * 10**9 + round(1e9 * one) for one in time]
+        write(
+            log / f"{file}.csv",
+            {
+                "%time": [one + 30_000_000 for one in stamp],
+                "field.header.stamp": stamp,
+                **{f"field.name{n}": [name] * len(time) for n, name in enumerate(("pan", "lift", "wrist"))},
+                **{f"field.position{n}": value[:, n] for n in range(3)},
+                **{f"field.velocity{n}": np.gradient(value[:, n], 0.02) for n in range(3)},
+            },
+        )
+    found = check_fuses(log, tmp_path / "out", ("pan", "lift", "wrist"))
+    assert {part.clock.column for part in found.parts if part.clock} == {"field.header.stamp"}
+    assert {one.unit for part in found.parts for one in part.signals} == {"rad"}
+
+
+@pytest.mark.parametrize(("yes", "no", "key"), [(1, 0, "1"), (True, False, "true")])
+def test_rows_that_a_sensor_calls_invalid_are_left_out(yes: Any, no: Any, key: str, tmp_path: Path) -> None:
+    """Where it was lost it writes 0, which is a position; ``where`` chooses the others, and that is said."""
+    t, u, s, z = recorded()
+    log, lost = tmp_path / "log", np.arange(1000) % 5 == 0
+    log.mkdir()
+    write(log / "commands.csv", {"t_s": t, **{f"{a}_m": u[:, n] for n, a in enumerate("xyz")}})
+    columns = {f"{a}_m": np.where(lost, 0.0, z[:, n]) for n, a in enumerate("xyz")}
+    write(log / "camera.csv", {"t_s": s, **columns, "is_valid": [no if one else yes for one in lost]})
+    found = check_fuses(log, tmp_path / "out")
+    assert f"where = {{ is_valid = {key} }}" in (tmp_path / "out/run.toml").read_text()
+    (camera,) = (part for part in found.parts if part.label == "camera.csv")
+    assert "200 of 1000 rows are not is_valid: left out" in camera.notes
 
 
 @pytest.mark.parametrize("unit", ["", "_m", "_mm", "_um"])

@@ -224,12 +224,68 @@ def test_a_struct_of_seconds_and_nanoseconds_is_a_stamp(names: tuple[str, str]) 
         ["2024-01-01T00:00:00Z", "1.5"],
         ["2024-01-01T00:00:00", "2024-01-01T00:00:00Z"],
         ["2024-01-01T00:00:00+01:00", "2024-01-01 00:00:00"],
+        ["2024-01-01T12:00:00", "12:00:00"],
+        ["12:00:00", "1.5"],
     ],
 )
 def test_stamps_written_in_two_ways_are_refused(cells: list[str]) -> None:
     """Dates and numbers, and dates with and without a zone, would be of two clocks; both rows are named."""
     text = one_line(RunError, lambda: one_column(cells).stamps("t"))
     assert "row 1" in text and "row 2" in text
+
+
+@pytest.mark.parametrize(
+    ("cell", "ns"),
+    [
+        ("12:34:56.789", 45_296_789_000_000),
+        ("0:00:01", GIGA),
+        ("0 days 00:00:01.500000", 1_500_000_000),  # pandas
+        ("1 day, 0:00:00.000001", 86_400 * GIGA + 1_000),  # Python
+        ("27:00:00,5", 97_200_500_000_000),
+        ("0.02 sec", 20_000_000),  # MATLAB
+        ("12 sec", 12 * GIGA),
+        ("1.2.1970 00:00:00.25", 31 * 86_400 * GIGA + 250_000_000),
+        ("31.12.1970 01:00:00", 364 * 86_400 * GIGA + 3_600 * GIGA),
+        ("1970/01/02 00:00:00,5", 86_400 * GIGA + 500_000_000),
+    ],
+)
+def test_times_as_programs_write_them(cell: str, ns: int) -> None:
+    """Times of day and since the start, and dates with the day first or the year first."""
+    table = one_column([cell, "", None])
+    assert table.stamps("t")[0].tolist() == [ns, NO_STAMP, NO_STAMP]
+    assert table.is_dated("t")
+
+
+def test_a_date_that_can_be_read_in_two_ways_is_refused() -> None:
+    """The fourth of March, or the third of April? It is said how to write it."""
+    text = one_line(RunError, lambda: one_column(["", "3/4/2026 10:00:00"]).stamps("t"))
+    assert "column 't', row 2: '3/4/2026 10:00:00' is no number and no ISO 8601 date (2026-" in text
+
+
+NINES = st.sampled_from([999.0, -9999.0, 99999.0, 32767.0, -32768.0, 2147483647.0])
+
+
+@properties
+@given(st.lists(st.floats(-50.0, 50.0), min_size=12, max_size=40, unique_by=abs), NINES, st.data())
+def test_a_number_that_stands_for_none_is_missing_and_noted(numbers: list[float], none: float, data: Any) -> None:
+    """Wherever it stands and however often; all others stay what they are."""
+    places = data.draw(st.lists(st.integers(0, len(numbers)), min_size=1, max_size=5))
+    cells: list[float] = list(numbers)
+    for place in places:
+        cells.insert(place, none)
+    found, note = one_column(cells).numbers("t", "_m")
+    assert found[~np.isnan(found)].tolist() == numbers
+    first = cells.index(none) + 1
+    many = "1 cell" if len(places) == 1 else f"{len(places)} cells"
+    assert f"{many} of column 't' with {none:.15g}, " in str(note) and f"first in row {first}: taken" in str(note)
+
+
+@pytest.mark.parametrize("numbers", [[0.0, 999.0, 0.0, 999.0], [float(n) for n in range(1000)], [9999.0] * 50])
+def test_a_number_of_nines_may_be_a_position(numbers: list[float]) -> None:
+    """A step to 999 mm, a path that leads there, an axis at rest there."""
+    found, note = one_column(numbers).numbers("t", "_mm")
+    np.testing.assert_array_equal(found, np.array(numbers) / 1e3)
+    assert note is None
 
 
 @pytest.mark.parametrize(

@@ -239,6 +239,22 @@ def test_what_has_no_header_is_a_table_or_one_line(tmp_path: Path, text: str) ->
         assert "\n" not in str(error)
 
 
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("0.00,1,2\n0.02,2,3\n0.04,3,4\n", ["column 1", "column 2", "column 3"]),  # numpy's savetxt
+        ("# run of Monday\n0.00 1\n0.02 2\n0.04 3\n", ["column 1", "column 2"]),
+        ("5,20000000,base,1.5,2\n5,40000000,base,1.6,3\n6,0,base,1.7,4\n", [f"column {n}" for n in range(1, 6)]),
+        (",x_mm\n0.00,1\n0.02,2\n0.04,3\n", ["column 1", "x_mm"]),  # pandas, with its index
+        (",0,1\n0,5,6\n1,6,7\n2,7,8\n", ["column 1", "0", "1"]),  # the same, of an array
+    ],
+)
+def test_columns_without_a_name_are_called_by_their_place(text: str, names: list[str], tmp_path: Path) -> None:
+    """The first row of a table without a header is no header."""
+    table = csv(tmp_path, text)
+    assert (list(table.columns), table.rows, table.notes) == (names, 3, ())
+
+
 def test_a_header_may_be_longer_than_what_is_looked_at(tmp_path: Path) -> None:
     """Ten thousand columns, separated by semicolons."""
     names = [f"sensor{n}.position_mm" for n in range(10_000)]
@@ -334,7 +350,8 @@ def test_two_columns_of_one_name_are_in_the_way_of_nobody_else(tmp_path: Path) -
     path.write_text("t_s,x_mm,q,q,,\n0,1,2,3,4,5\n")
     table = tables.read(path)
     assert table.numbers("x_mm")[0].tolist() == [1e-3]
-    assert sorted(table.notes) == [f"log.csv: two columns are named '{name}': neither is used" for name in ("", "q")]
+    assert table.notes == ("log.csv: two columns are named 'q': neither is used",)
+    assert list(table.columns) == ["t_s", "x_mm", "column 5", "column 6"]
     assert "two columns are named 'q'" in refusal(lambda: table.plain("q"))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ import pyarrow.parquet as papq
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, printable
 from ..logs import recordings, tables
-from ..logs.columns import LOG_TIME, Table, Topic, leaf, numeric_paths, prefixes
+from ..logs.columns import LOG_TIME, Table, Topic, leaf, numeric_paths, prefixes, without_sentinels
 from ..units import TIMES, ending, si_of
 from . import names
 
@@ -29,6 +30,8 @@ _FEWEST_ROWS = 10
 _GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows of a clock that are not before the row above
 _EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns that tell runs in one table apart
+_VALID = names.words_in("valid tracked visible detected")  # columns that say whether a row of a sensor means anything
+_NAMED = re.compile(r"(|.*\.)name(\d+)")
 _EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18, 4e18)}  # from 2001 to 2096
 _INTERVALS = {"s": 2.0, "ms": 2e3, "us": 2e6}  # rows of a robot's log are 2 ms to 2 s apart; shorter: a finer unit
 _METRES = ("Pose", "PoseStamped", "PoseWithCovarianceStamped", "Point", "PointStamped", "Odometry", "TransformStamped")
@@ -162,26 +165,40 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]]) -> Part:
     """A part with its clock and its columns, from its table."""
     clock = _clock(table)
     used = () if clock is None else (clock.column, clock.nanoseconds)
-    signals, left_out = list[Signal](), dict[str, str]()
+    signals, left_out, joints = list[Signal](), dict[str, str](), _joints(table)
     for path in _numeric_paths(table):
         if path in used or (clock is not None and path.startswith(f"{clock.column}.")):
             continue
-        if why := "another clock" if names.is_time(path) else names.no_position(path):
+        if names.is_time(path):
+            left_out[path] = "another clock" if clock else _no_clock(table, path)
+        elif why := names.no_position(path):
             left_out[path] = why
         elif len(signals) == _MOST_COLUMNS:
             left_out[path] = f"more than {_MOST_COLUMNS} columns"
-        elif isinstance(found := _signal(table, path, place.type, labels.get(leaf(path), [])), Signal):
-            signals.append(found)
+        elif isinstance(
+            found := _signal(table, path, _RADIANS[0] if path in joints else place.type, labels.get(leaf(path), [])),
+            Signal,
+        ):
+            signals.append(replace(found, axis=joints.get(path, found.axis)))
         elif found:
             left_out[path] = found
     notes = (*place.notes, *table.notes)
     return replace(place, rows=table.rows, clock=clock, signals=_with_units(signals), left_out=left_out, notes=notes)
 
 
+def _joints(table: Table) -> dict[str, str]:
+    """What joints are called, by the column of their position, where columns beside say it: ``rostopic echo -p``."""
+    found = dict[str, str]()
+    for name, column in table.columns.items():
+        if (match := _NAMED.fullmatch(name)) and pa.types.is_string(column.type) and column.null_count < len(column):
+            found[f"{match[1]}position{match[2]}"] = names.plain(column.drop_null()[0].as_py())
+    return found
+
+
 def _signal(table: Table, path: str, type_: str, labels: list[str]) -> Signal | str:
     """A column as positions, or why it is none; empty for text."""
     try:
-        values, _ = table.plain(path)
+        values, _ = without_sentinels(table.plain(path)[0])
     except RunError as error:
         return printable(str(error).removeprefix(f"{table.path}: "))
     known = values[np.isfinite(values)]
@@ -235,12 +252,16 @@ def _numeric_paths(table: Table) -> Iterator[str]:
 
 
 def _clock(table: Table) -> Clock | None:
-    """The first column that runs like a clock; when it was recorded only where nothing else does.
+    """The first column that runs like a clock, of a header before others; when it was recorded only for want of any.
 
-    Where none is called so, one in a unit of time may be: ``uptime_s``.
+    Where none is called so, one in a unit of time may be, ``uptime_s``, one of dates, such as the index of pandas, or
+    the first, if it has no name and rises.
     """
-    columns = sorted(_stamp_columns(table), key=lambda name: name == LOG_TIME)
+    columns = sorted(_stamp_columns(table), key=lambda name: (name == LOG_TIME, "header" not in names.words(name)))
     columns = columns or [name for name in table.columns if ending(leaf(name)) in TIMES]
+    columns = columns or [name for name, one in table.columns.items() if _is_dated(table, name, one)]
+    if not columns and tables.FIRST in table.columns:
+        return _nameless_clock(table)
     return next((clock for name in columns if (clock := _clock_of(table, name)) is not None), None)
 
 
@@ -266,9 +287,8 @@ def _clock_of(table: Table, name: str) -> Clock | None:
     """The stamps of a column; None if they do not run like those of a clock."""
     try:
         kind = table.column(name).type
-        if pa.types.is_nested(kind) or pa.types.is_temporal(kind) or table.zoned(name) is not None:
-            basis = "a date" if not pa.types.is_nested(kind) else "seconds and nanoseconds"
-            clock = Clock(name, "", "", basis, table.stamps(name)[0])
+        if pa.types.is_nested(kind) or pa.types.is_temporal(kind) or table.is_dated(name):
+            clock = Clock(name, "", "", _basis(table, name, kind), table.stamps(name)[0])
         elif pa.types.is_integer(kind) and (beside := table.nanoseconds_beside(name)):
             clock = Clock(name, beside, "", "seconds and nanoseconds", table.stamps(name, beside)[0])
         elif (unit := ending(leaf(name))) in TIMES:
@@ -280,6 +300,47 @@ def _clock_of(table: Table, name: str) -> Clock | None:
         return None
     steps = np.diff(clock.stamp[clock.stamp != NO_STAMP])
     return clock if len(steps) and steps.any() and (steps >= 0).mean() >= _IN_ORDER else None
+
+
+def _nameless_clock(table: Table) -> Clock | None:
+    """The first column, which has no name, if its numbers rise, but do not count rows.
+
+    Where they are of whole seconds and the second column may be the nanoseconds, both: ``ros2 topic echo --csv``.
+    """
+    first, *others = table.columns
+    try:
+        numbers = table.plain(first)[0]
+        rest = table.plain(others[0])[0] if others else np.full(len(numbers), np.nan)
+    except RunError:
+        return None
+    if ((numbers % 1.0 == 0.0) & (rest % 1.0 == 0.0) & (rest >= 0.0) & (rest < 1e9)).all() and rest.max() > 1e6:
+        return Clock(first, others[0], "", "seconds and nanoseconds", table.stamps(first, others[0])[0])
+    steps = np.diff(numbers)
+    rises = len(steps) and (steps > 0.0).mean() >= _IN_ORDER and (steps != 1.0).any()
+    return _clock_of(table, first) if rises else None
+
+
+def _basis(table: Table, name: str, kind: pa.DataType) -> str:
+    """How it is known what stamps without a unit are."""
+    if pa.types.is_nested(kind):
+        return "seconds and nanoseconds"
+    return "a time without a date" if pa.types.is_duration(kind) or table.zoned(name) is None else "a date"
+
+
+def _is_dated(table: Table, name: str, column: pa.ChunkedArray) -> bool:
+    try:
+        return pa.types.is_string(column.type) and table.is_dated(name)
+    except RunError:  # dates mixed with numbers
+        return False
+
+
+def _no_clock(table: Table, name: str) -> str:
+    """Why a column that is called as stamps are is no clock."""
+    try:
+        table.stamps(name, unit="_s")
+    except RunError as error:
+        return str(error).removeprefix(f"{table.path}: column '{name}', ")
+    return "does not run like a clock"
 
 
 def _time_unit(values: FloatArray) -> tuple[str, str]:
@@ -299,18 +360,30 @@ def _time_unit(values: FloatArray) -> tuple[str, str]:
 
 
 def _tabled(path: Path) -> Part:
-    """A table; of several runs in it the first."""
-    if path.suffix == ".parquet":
-        fields = _fields(path)
-        some = [name for name in _EPISODES if name in fields]
-        where = _first_run(tables.read(path, fields=some)) if some else {}
-        table = tables.read(path, fields=fields, where=where)
-    else:
-        table = tables.read(path, growing=True)
-        where = _first_run(table)
-        table = tables.read(path, growing=True, where=where) if where else table
+    """A table; of several runs in it the first, of a sensor's rows those that it calls valid."""
+    fields = _fields(path) if path.suffix == ".parquet" else None
+    some = [name for name in _EPISODES if name in fields] if fields else None
+    where = {} if some == [] else _first_run(tables.read(path, fields=some, growing=True))
     notes = [f"has several runs: only {key} = {value!r} is used" for key, value in where.items()]
+    table = tables.read(path, fields=fields, where=where, growing=True)
+    if valid := _validity(table) if names.role_of(path.name.split(".")[0]) in ("sensor", "reference") else {}:
+        where, rows = {**where, **valid}, table.rows
+        table = tables.read(path, fields=fields, where=where, growing=True)
+        notes += [f"{rows - table.rows} of {rows} rows are not {key}: left out" for key in valid]
     return _part(table, Part(path, where=where, notes=tuple(notes)), _labels(path))
+
+
+def _validity(table: Table) -> dict[str, Any]:
+    """Which rows are valid, where a column of 0 and 1, or of false and true, says it."""
+    for name, column in table.columns.items():
+        if _VALID.isdisjoint(names.words(name)) or not (
+            pa.types.is_boolean(column.type) or pa.types.is_integer(column.type)
+        ):
+            continue
+        values = pc.unique(column.drop_null()).sort().to_pylist()
+        if values == [0, 1]:
+            return {name: values[1]}
+    return {}
 
 
 def _fields(path: Path) -> list[str]:

@@ -113,6 +113,7 @@ def no_position(column: str) -> str | None:
     kind, unit, found = kind_of(leaf(column)), ending(leaf(column)), words(leaf(column))
     if "qd" in found and role_words(column):  # as UR calls it: target_qd_0 beside target_q_0
         return "velocity"
+    found = [one.rstrip(_DIGITS) for one in found]
     whats = [one for one in found if one in _NO_POSITIONS]
     if whats == ["current"] and (kind or not _POSITIONS.isdisjoint(found)):
         return None

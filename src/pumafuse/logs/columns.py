@@ -35,11 +35,31 @@ _WHOLE = r"^[+-]?\d{1,19}$"
 _NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
 _DATE = r"^\d{4}-\d\d-\d\d[T ]\d\d(:\d\d){1,2}([.,]\d{1,9})?([Zz]|[+-]\d\d(:?\d\d)?)?$"  # ISO 8601
 _ZONE = r"\d([Zz]|[+-]\d\d(:?\d\d)?)$"  # behind a time
+# Other ways to write a time that cannot be read in two ways, and what stands for them here. With points the day comes
+# first everywhere; with slashes that depends on the country, but where the year is first. MATLAB writes 1.5 sec.
+_REWRITTEN = (
+    (r"^(\d\d?)\.(\d)\.", r"\1.0\2."),
+    (r"^(\d)\.(\d\d)\.", r"0\1.\2."),
+    (r"^(\d\d)\.(\d\d)\.(\d{4})[ T]", r"\3-\2-\1 "),
+    (r"^(\d{4})/(\d\d)/(\d\d)[ T]", r"\1-\2-\3 "),
+    (r"^(\d{1,9}(?:\.\d{1,9})?) SEC$", r"0:00:\1"),
+)
+# A time of day, or since the start: 12:34:56.789; of pandas 0 days 00:00:01.5.
+_ELAPSED = (
+    r"^(?:(?P<days>\d{1,4}) DAYS?,? )?(?P<hours>\d{1,4}):(?P<minutes>\d\d):(?P<seconds>\d{1,9})"
+    r"(?:[.,](?P<fraction>\d{1,9}))?$"
+)
 BLANK = ("", "NaN", "nan", "-nan", "NA", "N/A", "n/a", "#N/A", "NULL", "null", "None")
 _NUMBERS = (pa.types.is_floating, pa.types.is_integer, pa.types.is_decimal, pa.types.is_null)
 _NEITHER_NUMBERS_NOR_TEXT = (pa.types.is_boolean, pa.types.is_temporal, pa.types.is_nested, pa.types.is_union)
 _LISTS = (pa.types.is_list, pa.types.is_large_list, pa.types.is_fixed_size_list)
 _TEXTS = (pa.types.is_string, pa.types.is_large_string)
+# Numbers that stand for "none": nines, and the ends of whole numbers of 16 and 32 bits.
+_SENTINELS = {
+    *(10.0**digits - 1.0 for digits in range(3, 10)),
+    *(2.0**bits - one for bits in (15, 16, 31, 32) for one in (0, 1)),
+}
+_FAR, _OTHERS = 10.0, 10  # times all other numbers of a column; different ones at least: steps may go to 999
 _LONGEST_LIST = 64  # elements of a list that are listed one by one
 _MOST_BYTES = 1 << 30  # of a table
 
@@ -63,7 +83,7 @@ class Table:
     names: tuple[str, ...] = ()
 
     def numbers(self, name: str, unit: str = "") -> tuple[FloatArray, str | None]:
-        """A column of positions [m or rad], NaN where a cell is empty or no number, and a note on cells that were text.
+        """A column of positions [m or rad], NaN where a cell has none, and a note on cells of text and sentinels.
 
         Args:
             name: The column, or a field path.
@@ -75,7 +95,16 @@ class Table:
         """
         self._plain_column(name)
         unit = unit or self._ending(name, (*units.LENGTHS, *units.ANGLES), "mm")
-        values, note = self.plain(name)
+        given, note = self.plain(name)
+        values, none = without_sentinels(given)
+        if none is not None:
+            gone = np.isnan(values) & ~np.isnan(given)
+            cells = counted(int(gone.sum()), "cell")
+            what = (
+                f"{self.path.name}: {cells} of column '{shortened(name)}' with {none:.15g}, ten times as far as all"
+                f" others, first in row {gone.argmax() + 1}: taken as missing"
+            )
+            note = what if note is None else f"{note}; {what}"
         return units.si_of(values, unit), note
 
     def plain(self, name: str) -> tuple[FloatArray, str | None]:
@@ -103,10 +132,11 @@ class Table:
         """Stamps in int64 ns, ``NO_STAMP`` where a cell is empty or no time, and a note on cells that were text.
 
         Whole numbers, also beside cells of text, decimals, dates and Arrow's timestamps are exact, and so are seconds
-        and nanoseconds apart. A date without a time zone is in UTC.
+        and nanoseconds apart. A date without a time zone is in UTC; a time without a date is since its midnight.
 
         Args:
-            name: A column, or a field path: numbers, timestamps, ISO 8601 text, or structs of seconds and nanoseconds.
+            name: A column, or a field path: numbers, timestamps, dates or times as text, or structs of seconds and
+                nanoseconds.
             nanoseconds: A column beside it: then both are whole numbers, and ``name`` is of seconds.
             unit: The ending of the unit of numbers (``_ms``); empty: what the name ends in.
 
@@ -127,9 +157,14 @@ class Table:
         dates = self._dates(name, column)
         if dates is not None:
             return self._within_reach(name, self._of_clock(name, dates[0])), dates[1]
-        self._plain_column(name)
+        self._refuse_words(name, self._plain_column(name))
         exponent = 9 - 3 * units.TIMES.index(unit or self._ending(name, units.TIMES, "s"))
         return self._of_numbers(name, 10**exponent)
+
+    def is_dated(self, name: str) -> bool:
+        """Whether a column of text has dates, or times of day."""
+        column = self.column(name)
+        return _is_any(column.type, _TEXTS) and self._dates(name, column) is not None
 
     def zoned(self, name: str) -> bool | None:
         """Whether a column of dates says its time zone; None for a column of anything else."""
@@ -138,8 +173,8 @@ class Table:
             return column.type.tz is not None
         if not _is_any(column.type, _TEXTS):
             return None
-        found = column.filter(pc.match_substring_regex(pc.utf8_trim_whitespace(column), _DATE))
-        return pc.any(pc.match_substring_regex(found, _ZONE)).as_py()
+        text = _rewritten(column)
+        return pc.any(pc.match_substring_regex(text.filter(pc.match_substring_regex(text, _DATE)), _ZONE)).as_py()
 
     def nanoseconds_beside(self, name: str) -> str | None:
         """A column beside one of seconds that by its name has their nanoseconds; None without one."""
@@ -214,30 +249,48 @@ class Table:
         return _filled(self._cast(name, column, kind).cast(pa.int64()), NO_STAMP)
 
     def _dates(self, name: str, column: pa.ChunkedArray) -> tuple[pa.ChunkedArray, str | None] | None:
-        """A column of ISO 8601 text as timestamps, and a note on other text; None for a column without dates.
+        """A column of dates or times as text, as Arrow's, and a note on other text; None for a column without any.
 
         Raises:
-            RunError: It has numbers, too, or dates with and without a time zone.
+            RunError: It has numbers, too, or dates with and without a time zone, or both dates and times.
         """
         if not _is_any(column.type, _TEXTS):
             return None
-        text = pc.utf8_upper(pc.utf8_trim_whitespace(column))
-        dated = pc.match_substring_regex(text, _DATE)
-        if not pc.any(dated).as_py():
+        text = _rewritten(column)
+        dated, elapsed = pc.match_substring_regex(text, _DATE), pc.match_substring_regex(text, _ELAPSED)
+        good = pc.or_(dated, elapsed)
+        if not pc.any(good).as_py():
             return None
         zoned = pc.and_(dated, pc.match_substring_regex(text, _ZONE))
         kinds = {
             "a date with a time zone": zoned,
             "a date without one": pc.and_(dated, pc.invert(zoned)),
+            "a time without a date": elapsed,
             "a number": pc.match_substring_regex(text, _NUMBER),
         }
         rows = {kind: pc.index(mask, value=True).as_py() + 1 for kind, mask in kinds.items() if pc.any(mask).as_py()}
         if len(rows) > 1:
             found = ", ".join(f"{kind} in row {row}" for kind, row in rows.items())
             raise RunError(f"{self.path}: column '{shortened(name)}' mixes stamps: {found}; write all in one way")
+        note = self._words(name, column, good, "a date" if "a time without a date" not in rows else "a time")
+        if "a time without a date" in rows:
+            return _durations(text), note
         text = pc.replace_substring(pc.if_else(dated, text, pa.scalar(None, text.type)), ",", ".")
         kind = pa.timestamp("ns", "UTC" if "a date with a time zone" in rows else None)
-        return self._cast(name, text, kind), self._words(name, column, dated, "a date")
+        return self._cast(name, text, kind), note
+
+    def _refuse_words(self, name: str, column: pa.ChunkedArray) -> None:
+        """Refuse a column of text without any number: perhaps it has dates that could be read in two ways."""
+        if not _is_any(column.type, _TEXTS):
+            return
+        text = pc.utf8_trim_whitespace(column)
+        word = pc.and_(pc.is_valid(text), pc.invert(pc.is_in(text, value_set=pa.array(BLANK, text.type))))
+        if pc.any(word).as_py() and not pc.any(pc.match_substring_regex(text, _NUMBER)).as_py():
+            row = pc.index(word, value=True).as_py()
+            raise RunError(
+                f"{self.path}: column '{shortened(name)}', row {row + 1}: {text[row].as_py()[:40]!r} is no number and"
+                " no ISO 8601 date (2026-11-25T10:00:00.125)"
+            )
 
     def _within_reach(self, name: str, stamp: TimeArray) -> TimeArray:
         self._refuse_beyond(name, (stamp != NO_STAMP) & ((stamp >= int(REACH_NS)) | (stamp <= -int(REACH_NS))))
@@ -323,6 +376,44 @@ class Topic:
 def leaf(path: str) -> str:
     """A field path without the choice of an element at its end: the name that may carry a unit."""
     return re.sub(r"(\[[^\]]*\])+$", "", path)
+
+
+def without_sentinels(values: FloatArray) -> tuple[FloatArray, float | None]:
+    """Numbers with NaN for one that stands for "none" (−9999, 32767), and that one; None without any.
+
+    It is told by its digits, and must be ten times as far as all others, of which there must be some.
+    """
+    size = np.abs(values, where=np.isfinite(values), out=np.zeros(len(values)))
+    top = float(size.max(initial=0.0))
+    if top not in _SENTINELS:
+        return values, None
+    others = np.unique(size[size < top])
+    if len(others) < _OTHERS or top <= _FAR * others[-1]:
+        return values, None
+    return np.where(size < top, values, np.nan), float(values[size.argmax()])
+
+
+def _rewritten(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """A column of text with its dates as ISO 8601 writes them, in capital letters."""
+    text = pc.utf8_upper(pc.utf8_trim_whitespace(column))
+    for written, meant in _REWRITTEN:
+        text = pc.replace_substring_regex(text, written, meant)
+    return text
+
+
+def _durations(text: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Times without a date as durations [ns]; null where a cell has none."""
+    found = pc.extract_regex(text, _ELAPSED)
+
+    def number(part: str) -> pa.ChunkedArray:
+        digits = pc.struct_field(found, part)
+        digits = pc.utf8_rpad(digits, 9, "0") if part == "fraction" else digits
+        return pc.if_else(pc.equal(digits, ""), "0", digits).cast(pa.int64())
+
+    total = number("days")
+    for factor, part in ((24, "hours"), (60, "minutes"), (60, "seconds"), (_GIGA, "fraction")):
+        total = pc.add(pc.multiply(total, factor), number(part))
+    return total.cast(pa.duration("ns"))
 
 
 def prefixes(paths: Sequence[str]) -> list[str]:

@@ -38,6 +38,7 @@ _BESIDE = 3  # rows of numbers that make the line above them a header
 _COMMENT = re.compile(r"\s*(#|%|//)\s*")
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf", re.IGNORECASE)
 _UNIT = re.compile(r"[\[(]?(|-|[µunm]?s|[µum]?m|m?rad|deg|°|%|[km]?N|Nm|[mk]?[VA]|Hz|(mm|m|deg|rad|°)/s²?)[\])]?")
+FIRST = "column 1"  # what the first column is called, if it has no name
 JSON_LINES = (".jsonl", ".ndjson", ".jsonl.gz", ".ndjson.gz")
 _DECIMAL_COMMA = rb"(?:^|[%b\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[%b\r\n]|$)"  # between separators
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
@@ -206,7 +207,7 @@ def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
             raise
         table, more = _parsed(path, text.decode("cp1252").encode())
         more = [f"{path.name}: its text is not UTF-8: taken for Windows-1252", *more]
-    return table, [*more, *notes]
+    return table.rename_columns([name or _column(n) for n, name in enumerate(table.column_names)]), [*more, *notes]
 
 
 def _parsed(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
@@ -259,7 +260,8 @@ class _Layout(NamedTuple):
         separator: Between cells; a blank stands for any number of them.
         point: Of decimals: ``1,5;2`` as well as ``1.5,2``.
         skipped: Lines above the header; with it where ``names`` are given.
-        names: Of the columns, where the header is a comment (``# t x y``) or several lines (Position above X, Y, Z).
+        names: Of the columns, where the header is a comment (``# t x y``) or several lines (Position above X, Y, Z), or
+            there is none.
         units: Whether a line with units is below the header.
         above: How many of the lines above are no comments and not blank.
     """
@@ -284,6 +286,9 @@ def _layout(text: bytes) -> _Layout:
     names = _cells(comment, separator)
     if len(names) == len(_cells(lines[first], separator)) and _begins(lines, first, separator):
         return _Layout(separator, _point(text, separator), first, names, units=False, above=0)
+    separator = _separator(lines[first])
+    if _begins(lines, first, separator) and not _counts(row := _cells(lines[first], separator)):
+        return _Layout(separator, _point(text, separator), first, list(map(_column, range(len(row)))), False, 0)
     header = _header(lines, full)
     separator = _separator(lines[header])
     units = header > first and all(map(_UNIT.fullmatch, _cells(lines[header], separator)))
@@ -329,6 +334,16 @@ def _begins(lines: Sequence[str], place: int, separator: str) -> bool:
         len(row) == len(rows[0]) > 1 and 2 * sum(_NUMBER.fullmatch(one) is not None for one in row) > len(row)
         for row in rows
     )
+
+
+def _counts(row: Sequence[str]) -> bool:
+    """Whether a row numbers the columns from 0, as the header of pandas for columns without names."""
+    return [one for one in row if one] == list(map(str, range(sum(map(bool, row)))))
+
+
+def _column(place: int) -> str:
+    """What a column without a name is called."""
+    return FIRST.replace("1", str(place + 1))
 
 
 def _is_text(row: Sequence[str]) -> bool:
