@@ -200,6 +200,10 @@ def test_one_table_with_everything_needs_no_names(tmp_path: Path) -> None:
         ("first_{}_mm", "second_{}_mm"),
         ("{}_out_mm", "{}_in_mm"),
         ("{}d_mm", "{}_mm"),
+        ("ctrl_{}_mm", "qpos_{}_mm"),
+        ("input_{}_mm", "{}_estimate_mm"),
+        ("goal_position_{}_mm", "present_position_{}_mm"),
+        ("{}_cmd_mm", "{}_fbk_mm"),
     ],
 )
 def test_a_single_table_is_taken_apart_by_the_names_of_its_columns(
@@ -216,6 +220,35 @@ def test_a_single_table_is_taken_apart_by_the_names_of_its_columns(
     log = tmp_path / "log.csv"
     write(log, {key: [column[row] for row in order] for key, column in columns.items()})
     check_fuses(log, tmp_path / "out")
+
+
+def test_the_state_of_a_controller_names_its_joints(tmp_path: Path) -> None:
+    """As ros2_control writes it: what the controller sends on is no sensor, but the commands again."""
+    t, u, _, _ = recorded()
+    noise = np.random.default_rng(1).normal(scale=5e-4, size=u.shape)
+    told, seen = path(t), path(t - LAG) + noise
+    rows = [
+        {
+            "header": {"stamp": {"sec": START + int(at), "nanosec": round(1e9 * (at % 1.0))}},
+            "joint_names": ["pan", "slider", "wrist"],
+            **{name: {"positions": list(one), "velocities": [1.0, at, 2.0]} for name, one in sources},
+        }
+        for at, *sources in (
+            (at, ("reference", a), ("feedback", b), ("error", a - b), ("output", a))
+            for at, a, b in zip(t.tolist(), told, seen, strict=True)
+        )
+    ]
+    log = tmp_path / "state.jsonl"
+    log.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    found = check_fuses(log, tmp_path / "out", ("pan", "slider", "wrist"))
+    assert found.roles is not None
+    assert [one.name for one in found.roles.sensors] == ["feedback"]
+    assert [why for _, why in found.roles.left_out] == ["the same numbers as the commands, at the same time"]
+    assert {one.axis: one.unit for part in found.parts for one in part.signals} == {
+        "pan": "rad",
+        "slider": "m",
+        "wrist": "rad",
+    }
 
 
 def test_joints_that_are_desired_are_commands(tmp_path: Path) -> None:
@@ -451,14 +484,17 @@ def test_axes_and_units_by_name(column: str, axis: str, unit: str) -> None:
 
 @pytest.mark.parametrize(
     "column",
-    ["speed_m_s", "velocity[0]", "orientation.x", "frame", "quality", "twist.linear.x", "actual_qd_0", "current_1"],
+    [
+        *("speed_m_s", "velocity[0]", "orientation.x", "frame", "quality", "twist.linear.x", "actual_qd_0"),
+        *("current_1", "qvel_0", "field.velocity0", "vx", "setpoint.vz", "ay"),
+    ],
 )
 def test_what_is_no_position_is_left_out(column: str) -> None:
     """By a word in the name, or by a unit of something else."""
     assert names.no_position(column)
 
 
-@pytest.mark.parametrize("column", ["q_d_0", "qd_0", "current_position.x", "current_x_mm"])
+@pytest.mark.parametrize("column", ["q_d_0", "qd_0", "current_position.x", "current_x_mm", "ax1", "v_x"])
 def test_what_may_be_a_position_is_not(column: str) -> None:
     """A desired joint, and where the tool is at present."""
     assert not names.no_position(column)

@@ -31,11 +31,11 @@ _GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows of a clock that are not before the row above
 _EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns that tell runs in one table apart
 _VALID = names.words_in("valid tracked visible detected")  # columns that say whether a row of a sensor means anything
-_NAMED = re.compile(r"(|.*\.)name(\d+)")
+_OF_JOINT, _NAMED = re.compile(r"positions\[(\d+)\]$"), re.compile(r"(|.*\.)name(\d+)")
 _EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18, 4e18)}  # from 2001 to 2096
 _INTERVALS = {"s": 2.0, "ms": 2e3, "us": 2e6}  # rows of a robot's log are 2 ms to 2 s apart; shorter: a finer unit
 _METRES = ("Pose", "PoseStamped", "PoseWithCovarianceStamped", "Point", "PointStamped", "Odometry", "TransformStamped")
-_RADIANS = ("JointState", "JointTrajectory")
+_RADIANS = ("JointState", "JointTrajectory", "JointTrajectoryControllerState")
 _OTHER_TYPES = names.words_in(
     "Image CompressedImage CameraInfo PointCloud2 LaserScan Imu TFMessage Log DiagnosticArray Clock Twist TwistStamped"
     " Wrench WrenchStamped ParameterEvent Joy OccupancyGrid MarkerArray"
@@ -176,10 +176,9 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]]) -> Part:
         elif len(signals) == _MOST_COLUMNS:
             left_out[path] = f"more than {_MOST_COLUMNS} columns"
         elif isinstance(
-            found := _signal(table, path, _RADIANS[0] if path in joints else place.type, labels.get(leaf(path), [])),
-            Signal,
+            found := _signal(table, path, place.type, labels.get(leaf(path), []), joints.get(path)), Signal
         ):
-            signals.append(replace(found, axis=joints.get(path, found.axis)))
+            signals.append(found)
         elif found:
             left_out[path] = found
     notes = (*place.notes, *table.notes)
@@ -187,15 +186,23 @@ def _part(table: Table, place: Part, labels: Mapping[str, list[str]]) -> Part:
 
 
 def _joints(table: Table) -> dict[str, str]:
-    """What joints are called, by the column of their position, where columns beside say it: ``rostopic echo -p``."""
-    found = dict[str, str]()
+    """What joints are called, by the column of their position, where columns beside say it.
+
+    These are ``joint_names`` of a trajectory or its controller, and ``name0`` as ``rostopic echo -p`` writes it.
+    """
+    names_of = _joint_names(table)
+    found = {
+        path: names.plain(names_of[int(match[1])])
+        for path in _numeric_paths(table)
+        if (match := _OF_JOINT.search(path)) and int(match[1]) < len(names_of)
+    }
     for name, column in table.columns.items():
         if (match := _NAMED.fullmatch(name)) and pa.types.is_string(column.type) and column.null_count < len(column):
             found[f"{match[1]}position{match[2]}"] = names.plain(column.drop_null()[0].as_py())
     return found
 
 
-def _signal(table: Table, path: str, type_: str, labels: list[str]) -> Signal | str:
+def _signal(table: Table, path: str, type_: str, labels: list[str], joint: str | None) -> Signal | str:
     """A column as positions, or why it is none; empty for text."""
     try:
         values, _ = without_sentinels(table.plain(path)[0])
@@ -206,12 +213,12 @@ def _signal(table: Table, path: str, type_: str, labels: list[str]) -> Signal | 
         return "hardly any number" if len(known) else ""
     if known.min() == known.max() and not names.is_part(path):
         return f"always {known[0]:g}"
-    kind = type_.rpartition("/")[2]
-    sliding = kind in _RADIANS and names.is_sliding(path)
+    kind = _RADIANS[0] if joint else type_.rpartition("/")[2]
+    sliding = kind in _RADIANS and names.is_sliding(joint or path)
     of_type = "m" if kind in _METRES or sliding else "rad" if kind in _RADIANS else ""
     unit = names.unit_of(path)
     basis = "name" if unit else "type" if of_type and not sliding else "range"
-    return Signal(path, names.axis_of(path, labels), unit or of_type, basis, values)
+    return Signal(path, joint or names.axis_of(path, labels), unit or of_type, basis, values)
 
 
 def _with_units(signals: list[Signal]) -> tuple[Signal, ...]:
@@ -457,7 +464,7 @@ def _of_topic(place: Part, topic: Topic) -> Part:
         table = recordings.read(place.file, topic.name, fields)
     except RunError as error:
         return replace(place, notes=(str(error).removeprefix(f"{place.file}: "),))
-    return _part(table, place, {"points[0].positions": _joint_names(table)})
+    return _part(table, place, {})
 
 
 def _joint_names(table: Table) -> list[str]:

@@ -22,15 +22,16 @@ _ROLES: dict[Role, frozenset[str]] = {
     "reference": words_in("truth reference ref ground gt groundtruth"),
     "command": words_in(
         "command commands commanded cmd goal goals target targets desired des demand demanded setpoint setpoints set sp"
-        " soll sol planned action"
+        " soll sol planned action control ctrl input inputs"
     ),
     "sensor": _DEVICES
     | words_in(
-        "state states measured measurement measurements meas actual ist pv current encoder encoders feedback fb"
-        " observed observation recorded reported odom"
+        "state states measured measurement measurements meas msr actual present real ist pv current encoder encoders"
+        " feedback fbk fb observed observation estimate estimated recorded reported odom"
     ),
 }
-_OF_COLUMNS = words_in("set sp pv fb current")  # in the name of a topic or file these are something else
+# In the name of a topic or file these are something else.
+_OF_COLUMNS = words_in("set sp pv fb current present real control ctrl input inputs")
 _OF_ROLES = _ROLES["reference"] | _ROLES["command"] | _ROLES["sensor"]
 _OF_PLACES = words_in("pose poses")  # of a sensor in the name of a topic or file, of nobody in that of a column
 _PARTS = words_in("nominal correction corrections")  # a command may be the sum of such
@@ -39,15 +40,17 @@ _SILENT = (
     | _PARTS
     | words_in(
         "pose poses position positions pos point points data translation transform value values scalar scalars joint"
-        " controller robot arm tool tcp ee flange coordinates axis"
+        " jnt dof qpos controller robot arm tool tcp ee flange coordinates axis"
     )
 )
 _NO_POSITIONS = words_in(
-    "velocity velocities vel speed dq dot acceleration accelerations acc accelerometer ddq qdd jerk effort efforts"
-    " torque torques tau force forces momentum current currents voltage mode scaling bits temperature temperatures temp"
-    " quality confidence covariance orientation rotation quaternion twist index id seq sequence count status valid std"
-    " sd sigma latency duration error header stamp nanosec layout frame done reward task episode tick time timestamp"
+    "velocity velocities vel speed dq qvel dot acceleration accelerations acc accelerometer ddq qdd qacc jerk effort"
+    " efforts torque torques tau force forces momentum current currents voltage mode scaling bits temperature"
+    " temperatures temp quality confidence covariance orientation rotation quaternion twist index id seq sequence"
+    " count status valid std sd sigma latency duration error header stamp nanosec layout frame done reward task"
+    " episode tick time timestamp"
 )
+_RATES = words_in("vx vy vz ax ay az")  # but ax1 is an axis
 _POSITIONS = words_in("position positions pos pose")  # current_position is one
 _TIMES = words_in(
     "t time times stamp stamps timestamp timestamps sec secs seconds date datetime clock ts arrival arrived zeit"
@@ -64,7 +67,8 @@ _UNITS = {
     "mrad": "mrad",
 }
 _TURNING = re.compile(
-    r"joint|shoulder|elbow|wrist|angle|theta|yaw|pitch|roll|motor|servo|pan|tilt|lift|flex|gripper|^[amjq](_?d)?_?\d+$"
+    r"joint|jnt|dof|shoulder|elbow|wrist|angle|theta|yaw|pitch|roll|motor|servo|pan|tilt|lift|flex|gripper"
+    r"|^[amjq](_?d)?_?\d+$"
 )
 
 
@@ -113,6 +117,8 @@ def no_position(column: str) -> str | None:
     kind, unit, found = kind_of(leaf(column)), ending(leaf(column)), words(leaf(column))
     if "qd" in found and role_words(column):  # as UR calls it: target_qd_0 beside target_q_0
         return "velocity"
+    if not _RATES.isdisjoint(found):
+        return "a rate"
     found = [one.rstrip(_DIGITS) for one in found]
     whats = [one for one in found if one in _NO_POSITIONS]
     if whats == ["current"] and (kind or not _POSITIONS.isdisjoint(found)):

@@ -21,6 +21,7 @@ from .names import Role
 _FOLLOWS = 0.5  # correlation of changes from which one signal is said to follow another
 _SAME = 0.8  # from which it is taken for the same axis under another name
 _AT_ONCE = 0.002  # s, by which a signal must be late to say that it follows: two sensors move together
+_COPY = 0.9  # share of numbers that are the same, from which they are copies
 _MOST_PAIRS, _MOST_CANDIDATES = 400, 12  # that are compared, at 0.1 s a pair of axes
 _MOST_APART = 40  # axes of a table that is taken apart by their names
 _MOST_LISTED = 8  # columns in an error
@@ -117,6 +118,9 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
             left_out.append((stream, "other commands: a run has one source of them; exchange the two to use these"))
             continue
         axes, why_not = _matched(command, stream)
+        if axes and _copies(command, replace(stream, axes=axes)):
+            left_out.append((stream, "the same numbers as the commands, at the same time"))
+            continue
         matched = replace(stream, axes={axis: axes[axis] for axis in command.axes if axis in axes})
         if stream.role is None and axes:
             late = _follows(command, matched)
@@ -282,6 +286,17 @@ def _follows(command: Stream, stream: Stream) -> str:
         if found is not None and abs(found.correlation) >= _FOLLOWS:
             return f"{found.lag * 1e3:.0f} ms late"
     return ""
+
+
+def _copies(command: Stream, stream: Stream) -> bool:
+    """Whether a stream says again what is commanded just then."""
+    told, source = command.source, stream.source
+    order = np.argsort(told.stamp, kind="stable")
+    place = np.searchsorted(told.stamp[order], source.stamp, side="right") - 1
+    return all(
+        float(np.mean(np.isclose(value, told.values[axis][order][place], rtol=1e-9, atol=0.0))) > _COPY
+        for axis, value in source.values.items()
+    )
 
 
 def _relation(leader: Stream, axis: str, follower: Stream, other: str) -> Following | None:
