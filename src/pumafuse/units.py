@@ -19,7 +19,7 @@ from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
 
-from .arrays import NO_STAMP, FloatArray, TimeArray
+from .arrays import NO_STAMP, FloatArray, IntArray, TimeArray
 from .errors import ConfigError
 
 Kind: TypeAlias = Literal["length", "angle"]
@@ -46,6 +46,8 @@ class Screen:
 MM = 1e3  # mm in a metre
 MS = 1e3  # ms in a second
 DEG = 180.0 / math.pi  # degrees in a radian
+TURN = 2.0 * math.pi
+_JUMP, _STEP, _ALIKE = 0.75 * TURN, 0.25 * TURN, 3.0  # rad; times the steps beside it, as which a jump goes on
 SCREEN: dict[Kind, Screen] = {
     "length": Screen("mm", MM, "m/s", 1.0),
     "angle": Screen("deg", DEG, "deg/s", DEG),
@@ -188,6 +190,29 @@ def in_unit(value: float, unit: str) -> float | Decimal:
         decimal = next(one for one in rounded if si(one, unit) == value)
     plain = float(decimal)
     return plain if Decimal(repr(plain)) == decimal else decimal  # the 17th digit would be lost in a float
+
+
+def unwrapped(angle: FloatArray, turn: float = TURN) -> FloatArray:
+    """Angles that go on, from those that begin anew after each turn [all in rad]; NaN stays."""
+    found, known = angle.copy(), np.isfinite(angle)
+    found[known] = np.unwrap(angle[known], period=turn)
+    return found
+
+
+def wraps(angle: FloatArray) -> IntArray:
+    """Rows in which an angle [rad] begins a turn anew: it jumps by nearly one, but else goes on as around.
+
+    A step of nearly a turn from rest, and steps at random, are none.
+    """
+    rows = np.flatnonzero(np.isfinite(angle))
+    if len(rows) < 4 or np.ptp(angle[rows]) > TURN * (1.0 + 1e-6):
+        return rows[:0]
+    step = np.diff(angle[rows])
+    jumps = np.flatnonzero(np.abs(step) > _JUMP)
+    rest = np.pad(np.abs(step - TURN * np.round(step / TURN)), 2, mode="edge")
+    beside = np.max([rest[jumps + place] for place in (0, 1, 3, 4)], axis=0)
+    true = (beside < _STEP) & (rest[jumps + 2] <= _ALIKE * beside + 1.0 / DEG)
+    return rows[jumps + 1] if len(jumps) and true.mean() > 0.9 else rows[:0]
 
 
 def seconds(stamp: TimeArray, origin: int = 0) -> FloatArray:

@@ -69,6 +69,17 @@ def test_outliers_are_counted_and_jerks_are_not() -> None:
         assert found.outliers == pytest.approx(share, abs=0.004)
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_is_not_alike_at_any_lag_is_compared_all_the_same(seed: int) -> None:
+    """An angle within a turn beside one that goes on: its changes may correlate with the other's negatively only."""
+    t, s = np.arange(0.0, 40.0, 0.02), np.arange(0.5, 40.0, 0.04)
+    yaw = 0.9 * t + 0.5 * np.sin(0.6 * np.pi * t)
+    z = np.interp(s - 0.12, t, yaw) + np.random.default_rng(seed).normal(0.0, 0.005, len(s))
+    found = following((stamped(t), yaw), (stamped(s), (z + np.pi) % (2.0 * np.pi) - np.pi))
+    assert found is not None
+    assert abs(found.correlation) < 0.5
+
+
 def test_what_cannot_be_compared_has_no_relation() -> None:
     """Other times, too few rows, or no motion: nothing, and no warning of numpy."""
     t = np.arange(0.0, 20.0, 0.02)

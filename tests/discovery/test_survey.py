@@ -110,6 +110,33 @@ def test_clocks_are_known_by_name_by_date_and_by_interval(name: str, stamps: Any
     assert {part.clock.unit for part in found.parts if part.clock} == {unit}
 
 
+@pytest.mark.parametrize(("unit", "scale"), [("_deg", 180.0 / np.pi), ("_rad", 1.0), ("", 1.0)])
+@pytest.mark.parametrize("all_within", [False, True])
+def test_angles_that_begin_anew_after_a_turn(unit: str, scale: float, all_within: bool, tmp_path: Path) -> None:
+    """A table that turns four times, seen within a turn: it follows, and both files say that it goes on."""
+    t, _, s, _ = recorded()
+
+    def yaw(time: FloatArray) -> FloatArray:
+        return 1.2 * np.maximum(time, 0.0) + 0.5 * np.sin(1.9 * np.maximum(time, 0.0))
+
+    def within(angle: FloatArray) -> FloatArray:
+        return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+    log = tmp_path / "log"
+    log.mkdir()
+    noisy = yaw(s - LAG) + np.random.default_rng(1).normal(scale=1e-3, size=len(s))
+    write(log / "commands.csv", {"t_s": t, f"yaw{unit}": scale * (within(yaw(t)) if all_within else yaw(t))})
+    write(log / "gyro_sensor.csv", {"t_s": s, f"yaw{unit}": scale * within(noisy)})
+    found = survey(log)
+    run, config = written(found, tmp_path / "out")
+    assert config.sensors["gyro_sensor"].turn == pytest.approx(2.0 * np.pi)
+    assert np.ptp(run.sensors["gyro_sensor"].values["yaw"]) > 20.0
+    assert config.start.offset_sd_of("yaw") < 0.1
+    est = pf.fuse(run, config)
+    assert (est.measurements.outcome == pf.Outcome.FUSED).all()
+    assert np.std(est["yaw"].position[50:] - yaw(est.time - est.time[0] - LAG)[50:]) < 2e-3
+
+
 def test_tables_without_a_header(tmp_path: Path) -> None:
     """As ``ros2 topic echo --csv`` writes poses: seconds and nanoseconds apart, then a word."""
     t, u, s, z = recorded()

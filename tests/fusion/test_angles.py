@@ -11,6 +11,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pacsv
 import pyarrow.parquet as papq
 import pytest
 
@@ -19,7 +21,7 @@ from executable import pumafuse
 from pumafuse.cli.tables import outcome_table
 from pumafuse.fusion import results
 from pumafuse.live.stream import Stream
-from pumafuse.units import of_kind
+from pumafuse.units import of_kind, unwrapped, wraps
 
 DEG = math.pi / 180.0
 T = 0.02
@@ -282,6 +284,102 @@ def test_a_sensor_within_a_turn_is_as_good_as_one_that_counts_them(tmp_path: Pat
         assert its.rms == pytest.approx(mine.rms, rel=1e-6)
     shown = within.measured_positions("camera", "yaw").value
     np.testing.assert_allclose(shown, whole.measured_positions("camera", "yaw").value, atol=1e-9)
+
+
+def within(yaw: np.ndarray) -> np.ndarray:
+    """Angles from -180 to 180."""
+    return (yaw + 180.0) % 360.0 - 180.0
+
+
+@pytest.mark.parametrize("rate", [-200.0, -60.0, 45.0, 600.0])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_angles_that_begin_anew_are_known(rate: float, noise: float) -> None:
+    """Slowly and fast, also where noise goes to and fro across the turn: every row in which a turn is counted."""
+    time = np.arange(500) * T
+    whole = 100.0 + rate * time + 25.0 * np.sin(3.0 * time) + noise * np.random.default_rng(5).normal(size=500)
+    rows = wraps(within(whole) * DEG)
+    counted = np.flatnonzero(np.diff(np.floor((whole + 180.0) / 360.0))) + 1
+    assert rows.tolist() == counted.tolist() and len(rows) > 0
+    np.testing.assert_allclose(np.diff(unwrapped(within(whole) * DEG)), np.diff(whole) * DEG, atol=1e-9)
+    assert len(wraps(whole * DEG)) == 0
+
+
+@pytest.mark.parametrize(
+    "angle",
+    [
+        np.repeat([0.0, 300.0, 0.0, 300.0], 50),
+        np.repeat([-179.0, 179.0], 50) * np.repeat([1.0, 0.5], 50),
+        np.random.default_rng(2).uniform(-180.0, 180.0, 300),
+        np.repeat(np.random.default_rng(3).uniform(-180.0, 180.0, 60), 5),
+        np.full(50, np.nan),
+        np.arange(3.0),
+    ],
+)
+def test_steps_are_no_turns(angle: np.ndarray) -> None:
+    """A servo that is commanded from end to end, or at random."""
+    assert len(wraps(angle * DEG)) == 0
+
+
+def turned(folder: Path, how: str, command: str = "", sensor: str = "") -> pf.Run:
+    """A table that turns by 90 deg/s, commanded, measured 100 ms late from 2 s on and scored within a turn or not."""
+    folder.mkdir()
+    time = np.arange(500) * T
+    yaw, noise = 170.0 + 90.0 * time, np.random.default_rng(4).normal(0.0, 0.1, 500)
+    shown = within if how == "within" else np.asarray
+    tables = {"commands": yaw, "eye": np.maximum(yaw - 9.0, 170.0) + noise, "truth": np.maximum(yaw - 9.0, 170.0)}
+    for name, values in tables.items():
+        first = 100 if name == "eye" else 0
+        pacsv.write_csv(pa.table({"t_s": time[first:], "yaw_deg": shown(values)[first:]}), folder / f"{name}.csv")
+    of = {"command": ("commands", command), "sensors.eye": ("eye", sensor), "reference": ("truth", sensor)}
+    (folder / "run.toml").write_text(
+        "".join(
+            f'[{key}]\nfile = "{name}.csv"\ntime = "t_s"\nyaw = {{ column = "yaw_deg"{more} }}\n'
+            for key, (name, more) in of.items()
+        )
+    )
+    return pf.Run.read(folder)
+
+
+def turning(folder: Path, more: str = "") -> pf.FusionConfig:
+    """A table that turns and a sensor of it."""
+    (folder / "arm.toml").write_text(MIXED.replace('[axes.x]\nplant = "first-order"\ntime_constant_ms = 50.0\n', ""))
+    (folder / "fusion.toml").write_text(
+        f'arm = "arm.toml"\n[process]\ninput_noise_deg_rtHz = 0.3\n[sensors.eye]\nsd_deg = 0.1\n{more}'
+    )
+    return pf.FusionConfig.load(folder / "fusion.toml")
+
+
+@pytest.mark.parametrize("turn", [", turn_deg = 360", ', unit = "deg", turn_deg = 360.0'])
+def test_columns_within_a_turn_go_on_beside_the_commands(turn: str, tmp_path: Path) -> None:
+    """Wherever a source begins, with ``turn_deg`` it gives what one gives that counts its turns."""
+    whole, made = turned(tmp_path / "whole", "whole"), turned(tmp_path / "made", "within", turn, turn)
+    for one, other in zip(
+        (whole.command, *whole.sensors.values(), whole.reference),
+        (made.command, *made.sensors.values(), made.reference),
+        strict=True,
+    ):
+        assert one is not None and other is not None
+        np.testing.assert_allclose(other.values["yaw"], one.values["yaw"], atol=1e-9)
+    config = turning(tmp_path)
+    first, second = (pf.fuse(run, config) for run in (whole, made))
+    np.testing.assert_allclose(first["yaw"].position, second["yaw"].position, atol=1e-9)
+    assert np.ptp(first["yaw"].position) > 600.0 * DEG
+
+
+def test_columns_within_a_turn_are_said(tmp_path: Path) -> None:
+    """Without ``turn_deg`` the model goes back by a turn: commands and sensor are named, with how often."""
+    notes = quiet(turned(tmp_path / "run", "within"), turning(tmp_path)).notes
+    assert any(note.startswith("the commands begin anew on yaw after each turn, 3 times: ") for note in notes), notes
+    assert (
+        "sensor 'eye' begins anew on yaw after each turn, 2 times: turn_deg = 360 in its table makes it go on" in notes
+    )
+    notes = quiet(turned(tmp_path / "other", "within"), turning(tmp_path, "turn_deg = 360\n")).notes
+    assert not any("sensor 'eye' begins anew" in note for note in notes)
+    turned(tmp_path / "mm", "whole")
+    lengths = (tmp_path / "mm" / "run.toml").read_text().replace('"yaw_deg"', '"yaw_deg", unit = "mm", turn_deg = 360')
+    (tmp_path / "mm" / "run.toml").write_text(lengths)
+    with pytest.raises(pf.ConfigError, match=r"run\.toml: command\.yaw\.turn_deg: the column is no angle"):
+        pf.Run.read(tmp_path / "mm")
 
 
 def test_two_rejected_measurements_on_both_sides_of_the_turn_agree(tmp_path: Path) -> None:

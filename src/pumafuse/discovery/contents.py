@@ -19,7 +19,7 @@ from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, printable
 from ..logs import recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, numeric_paths, prefixes, without_sentinels
-from ..units import TIMES, ending, si_of
+from ..units import TIMES, ending, kind_of, si_of, unwrapped, wraps
 from . import names
 
 _TABLES = (".csv", ".csv.gz", ".tsv", *tables.JSON_LINES, ".parquet")
@@ -69,8 +69,9 @@ class Signal:
         column: Its name or field path.
         axis: What it seems to be called.
         unit: ``mm``, ``rad``, …
-        basis: How the unit is known: ``name``, ``type``, or ``range``, which is a guess.
+        basis: How the unit is known: ``name``, ``type``, ``turn``, or ``range``, which is a guess.
         plain: Its numbers in that unit, (rows,).
+        turns: Whether it is an angle that begins anew after each turn.
     """
 
     column: str
@@ -78,11 +79,13 @@ class Signal:
     unit: str
     basis: str
     plain: FloatArray
+    turns: bool = False
 
     @property
     def value(self) -> FloatArray:
-        """Its numbers in m or rad, (rows,)."""
-        return si_of(self.plain, f"_{self.unit}")
+        """Its numbers in m or rad, (rows,); angles go on beyond a turn."""
+        value = si_of(self.plain, f"_{self.unit}")
+        return unwrapped(value) if self.turns else value
 
 
 @dataclass(frozen=True)
@@ -237,6 +240,8 @@ def _with_units(signals: list[Signal]) -> tuple[Signal, ...]:
             else:
                 unit = "mm" if largest > 10.0 else "m"
             one = replace(one, unit=unit)
+        if kind_of(f"_{one.unit}") == "angle" and len(wraps(one.value)):
+            one = replace(one, turns=True, basis="turn" if one.basis == "range" else one.basis)
         found.append(one)
     return tuple(found)
 

@@ -13,12 +13,13 @@ import tomli_w
 from ..errors import printable
 from ..logs.columns import leaf
 from ..units import MS, SCREEN, ending
+from .contents import Signal
 from .guesses import ArmGuess, SensorGuess, guess
 from .roles import Stream
 from .survey import Survey
 
 FILES = ("run.toml", "arm.toml", "fusion.toml")
-BASES = {"name": "by name", "type": "by type of message", "range": "guessed by range"}
+BASES = {"name": "by name", "type": "by type of message", "turn": "by its turn", "range": "guessed by range"}
 _COMMENT = 48  # column at which comments begin
 
 
@@ -72,13 +73,17 @@ def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
     time = {"column": clock.column, "unit": clock.unit} if clock.unit else time
     lines.append(_line(_pair("time", time), clock.basis))
     for axis, signals in stream.axes.items():
-        columns: list[Any] = [
-            one.column if _says_unit(one.column, one.unit) else {"column": one.column, "unit": one.unit}
-            for one in signals
-        ]
+        columns: list[Any] = [_column(one) for one in signals]
         how = "DECIDE: unit " if signals[0].basis == "range" else "unit "
         lines.append(_line(_pair(axis, columns[0] if len(columns) == 1 else columns), how + BASES[signals[0].basis]))
     return lines
+
+
+def _column(one: Signal) -> Any:
+    """A column, with what its name does not say."""
+    more = {} if _says_unit(one.column, one.unit) else {"unit": one.unit}
+    more |= {"turn_deg": 360} if one.turns else {}
+    return {"column": one.column, **more} if more else one.column
 
 
 def _rebased(found: Survey, folder: Path) -> str:
@@ -143,6 +148,8 @@ def _fusion_toml(arm: ArmGuess, sensors: Mapping[str, SensorGuess]) -> str:
             lines.append(_line(_pair("scale", -1.0), "it moves against the commands, as a distance may"))
         if one.bias:
             lines += _by_kind("bias_sd", one.bias, arm, "its zero is another than the commands'")
+        if one.turns:
+            lines.append(_line(_pair("turn_deg", 360), "it measures within a turn"))
         if one.gate:
             lines.append(_line(_pair("gate", one.gate), "it has outliers"))
     return "\n".join([*lines, ""])

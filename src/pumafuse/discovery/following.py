@@ -114,7 +114,7 @@ def _at_span(
     found = np.array([correlation(lag, every) for lag in coarse])
     if not np.abs(found).any():
         return None
-    sign = -1.0 if -found.min() > found.max() + _MIRRORED else 1.0
+    sign = -1.0 if found.max() <= 0.0 or -found.min() > found.max() + _MIRRORED else 1.0
     found = np.pad(sign * found, 1, constant_values=-1.0)
     peaks = (found[1:-1] >= np.maximum(found[:-2], found[2:])) & (found[1:-1] >= _NEARLY * found.max())
     best = min(coarse[peaks], key=abs)

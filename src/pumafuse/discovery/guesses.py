@@ -61,7 +61,10 @@ class ArmGuess:
 
 @dataclass(frozen=True)
 class SensorGuess:
-    """A sensor: noise and biases by axis [m or rad], latency [s] and where it is from, scale, gate (0: none needed)."""
+    """A sensor: noise and biases by axis [m or rad], latency [s] and where it is from, scale, gate (0: none needed).
+
+    ``turns``: whether it measures angles within a turn.
+    """
 
     sd: Mapping[str, float]
     bias: Mapping[str, float]
@@ -69,6 +72,7 @@ class SensorGuess:
     latency_words: str
     scale: float
     gate: float
+    turns: bool
 
 
 def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
@@ -152,7 +156,8 @@ def _sensor(
         words = "so much later than the reference, whose stamps are taken to be right"
     elif first and name != first:
         words = f"so much later than {first}; add how old a measurement of that one is"
-    return SensorGuess(sd, bias, latency, words, scale, _GATE if outliers > _OUTLIERS else 0.0)
+    turns = found.roles is not None and any(one.turns for one in found.roles.sensors if one.name == name)
+    return SensorGuess(sd, bias, latency, words, scale, _GATE if outliers > _OUTLIERS else 0.0, turns)
 
 
 def _bias(found: Survey, axis: str, one: Following, scale: float, others: Mapping[str, Following]) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from ..arrays import NO_STAMP
 from ..errors import RunError, printable
 from ..logs.run import Run, Source
-from ..units import AN, OF_KIND, Kind, kind_of
+from ..units import AN, OF_KIND, TURN, Kind, kind_of
 from . import names
 from .contents import Part, Signal
 from .following import Following, following
@@ -56,6 +56,11 @@ class Stream:
         return source.rows(source.has_value)
 
     @property
+    def turns(self) -> dict[str, float]:
+        """After what axes begin anew [rad], for those that do."""
+        return {axis: TURN for axis, signals in self.axes.items() if any(one.turns for one in signals)}
+
+    @property
     def guessed(self) -> bool:
         """Whether its units are a guess by their range."""
         return any(one.basis == "range" for signals in self.axes.values() for one in signals)
@@ -84,10 +89,12 @@ class Roles:
     @property
     def run(self) -> Run:
         """The run as it would be read."""
-        sensors = {one.name: one.source for one in self.sensors}
+        command = self.command.source
+        sensors = {one.name: one.source.beside(command, one.turns) for one in self.sensors}
         kinds: dict[str, Kind] = {axis: self.command.kind(axis) for axis in self.command.axes}
-        reference = None if self.reference is None else self.reference.source
-        return Run("log", self.command.source, sensors, reference, kinds=kinds)
+        scored = self.reference
+        reference = None if scored is None else scored.source.beside(command, scored.turns)
+        return Run("log", command, sensors, reference, kinds=kinds)
 
 
 def roles_of(parts: Iterable[Part], log: str) -> Roles:

@@ -18,7 +18,7 @@ from ..discovery.tracking import FOLLOWS, GAIN, Tracking
 from ..errors import RunError
 from ..filter.outcome import ABSENT, Outcome
 from ..model.response import response
-from ..units import OF_KIND, Kind, mistaken
+from ..units import OF_KIND, Kind, mistaken, wraps
 from .config import FusionConfig
 from .segments import Segment
 from .setup import turn_of
@@ -87,7 +87,7 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
                 " of its own, at its own stamp; log each once"
             )
     quiet = {name: mine for name, mine in trackings.items() if name not in named}
-    return [*found, *_moving_alone(config, quiet), *_off(config, quiet)]
+    return [*_within_a_turn(segment, config, given), *found, *_moving_alone(config, quiet), *_off(config, quiet)]
 
 
 def not_following(segment: Segment, config: FusionConfig) -> list[Fault]:
@@ -133,6 +133,22 @@ def latency_questions(config: FusionConfig, names: Iterable[str]) -> list[str]:
 
 _Given: TypeAlias = Mapping[str, Mapping[str, tuple[TimeArray, FloatArray]]]  # stamps and values, by sensor and axis
 _Trackings: TypeAlias = Mapping[str, Mapping[str, Tracking]]
+
+
+def _within_a_turn(segment: Segment, config: FusionConfig, given: _Given) -> Iterable[str]:
+    """A sentence on each angle of the commands or of a sensor that begins anew after each turn."""
+    for axis in segment.axes:
+        if config.arm.axes[axis].kind == "length":
+            continue
+        said = f"on {axis} after each turn"
+        if times := len(wraps(segment.given(axis)[1])):
+            yield (
+                f"the commands begin anew {said}, {times} times: the model goes back by a turn then; turn_deg = 360"
+                " beside their column in run.toml makes them go on"
+            )
+        for name, axes in given.items():
+            if axis in axes and (times := len(wraps(axes[axis][1]))):
+                yield f"sensor '{name}' begins anew {said}, {times} times: turn_deg = 360 in its table makes it go on"
 
 
 def _given(segment: Segment, config: FusionConfig) -> _Given:

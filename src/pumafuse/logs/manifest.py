@@ -19,10 +19,17 @@ _MOST = 2**63  # more than a whole number of a column can be
 
 
 class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A column or field path, and its unit (``mm``) where its name does not end in it."""
+    """A column or field path, and its unit (``mm``) where its name does not end in it.
+
+    Attributes:
+        column: Its name or field path.
+        unit: Without the bar.
+        turn: After which an angle begins anew [rad]: it is made to go on; 0: never.
+    """
 
     column: str
     unit: str = ""
+    turn: NotNegative = msgspec.field(name="turn_deg", default=0.0)
 
     @property
     def ending(self) -> str:
@@ -74,6 +81,12 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     def fields(self) -> list[str]:
         """All its columns and field paths."""
         return [*self.time.columns, *(column.column for columns in self.axes.values() for column in columns)]
+
+    @property
+    def turns(self) -> dict[str, float]:
+        """After what an axis begins anew [rad], for those that do."""
+        turns = {axis: max(column.turn for column in columns) for axis, columns in self.axes.items()}
+        return {axis: turn for axis, turn in turns.items() if turn}
 
     @property
     def label(self) -> str:
@@ -191,6 +204,8 @@ def _columns(given: Any, where: str, path: str) -> list[Any]:
     for one in columns:
         toml.check(one, Column, where, path)
         _check_unit(one, (*LENGTHS, *ANGLES), where, path)
+        if one.get("turn_deg") and msgspec.convert(one, Column).kind != "angle":
+            raise ConfigError(f"{where}: {path}.turn_deg: the column is no angle")
     return columns
 
 

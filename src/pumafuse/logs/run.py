@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ..arrays import ALWAYS, NEVER, NO_STAMP, REACH_NS, BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError, counted
 from ..model.arm import CANONICAL_AXES
-from ..units import AN, Kind, ending, nanoseconds
+from ..units import AN, Kind, ending, nanoseconds, unwrapped
 from . import manifest, tables
 from .frames import CARTESIAN, Frame
 
@@ -77,6 +77,24 @@ class Source:
     def has_value(self) -> BoolArray:
         """Rows that have a value for any axis, (rows,)."""
         return np.any(~np.isnan(list(self.values.values())), axis=0)
+
+    def beside(self, command: Source, turns: Mapping[str, float]) -> Source:
+        """The source with angles that go on moved by whole turns to where they are commanded.
+
+        Args:
+            command: The commands.
+            turns: What a turn is, by axis [rad].
+        """
+        values = dict(self.values)
+        for axis in turns.keys() & values.keys() & command.values.keys():
+            turn = turns[axis]
+            told, mine = (np.isfinite(one.values[axis]) & (one.stamp != NO_STAMP) for one in (command, self))
+            if not (told.any() and mine.any()):
+                continue
+            order = np.argsort(command.stamp[told], kind="stable")
+            there = np.interp(self.stamp[mine], command.stamp[told][order], command.values[axis][told][order])
+            values[axis] = values[axis] - turn * np.round(np.median(values[axis][mine] - there) / turn)
+        return replace(self, values=values)
 
     def rows(self, chosen: BoolArray | IntArray | slice) -> Source:
         """The chosen rows, in the order chosen."""
@@ -415,8 +433,9 @@ def of_tables(
         empty[table] = empty[table] & ~mine if table in empty else ~mine
     for name, mine in has_value.items():  # where only others of its table have any, a row is theirs
         sources[name] = sources[name].rows(mine | empty[entries[name].rows])
-    command, reference = sources["command"], sources.get("reference")
-    sensors = {name: sources[f"sensor {name}"] for name in listed.sensors}
+    command = sources["command"]
+    sources = {name: one.beside(command, entries[name].turns) for name, one in sources.items()}
+    reference, sensors = sources.get("reference"), {name: sources[f"sensor {name}"] for name in listed.sensors}
     if reference is not None and scored is not None:
         of_kind = {"length": scored.sd, "angle": scored.angular_sd}
         sds = {axis: of_kind[units[axis]] for axis in reference.values}
@@ -497,7 +516,11 @@ def _source(
                 raise RunError(
                     f"{table.path}: column '{column.column}' is {AN[kind]}, but {axis} is {AN[units[axis]]} elsewhere"
                 )
-        values[axis] = np.sum([numbers for numbers, _ in parts], axis=0)
+        going_on = [
+            unwrapped(numbers, column.turn) if column.turn else numbers
+            for column, (numbers, _) in zip(columns, parts, strict=True)
+        ]
+        values[axis] = np.sum(going_on, axis=0)
         found.extend(note for _, note in parts)
     notes.extend(note for note in found if note is not None and note not in notes)
     source = Source(stamp, values, label)

@@ -124,6 +124,8 @@ def needs_whole(path: Path, config: FusionConfig) -> str | None:
     listed = None if path.suffix == ".parquet" else manifest.load(_manifest(path))
     if listed is not None and listed.command.clock == "regular":
         return "clock = 'regular'"
+    if listed is not None and any(entry.turns for entry in listed.entries.values()):
+        return "turn_deg"
     frame = config.frame if listed is None or listed.frame is None else listed.frame
     named = {axis for entry in listed.entries.values() for axis in entry.axes} if listed else set(CARTESIAN)
     return "a cylindrical [frame]" if isinstance(frame, Cylindrical) and not named.isdisjoint(CARTESIAN) else None

@@ -62,6 +62,7 @@ from .posterior import (
 
 REFERENCE = "reference"  # the name of a run's reference among its sensors
 _MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/comparison.md
+_HIGHEST = 700.0  # logarithm of what a number can be
 _FINEST = 2e-5  # s: no stamp of a log is better, whatever the likelihood says where measurements pass commands
 _ROUGHLY = 0.1  # tolerance in log-likelihood
 _GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
@@ -512,7 +513,7 @@ def _axis_lag(
             low, high = min(low, middle - half), max(high, middle + half)
         if quantity == "delay":
             low = max(low, 0.0)
-        return (math.exp(low), math.exp(high)) if log else (low, high)
+        return (math.exp(low), math.exp(high) if high < _HIGHEST else math.inf) if log else (low, high)
 
     lag = best.config.arm.lag_of(axis)
     found = AxisLag(
