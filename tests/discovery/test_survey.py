@@ -137,6 +137,31 @@ def test_angles_that_begin_anew_after_a_turn(unit: str, scale: float, all_within
     assert np.std(est["yaw"].position[50:] - yaw(est.time - est.time[0] - LAG)[50:]) < 2e-3
 
 
+@pytest.mark.parametrize("file", ["poses.csv", "poses.txt", "groundtruth.txt"])
+def test_a_trajectory_of_tum_is_a_sensor(file: str, tmp_path: Path) -> None:
+    """With its header in a comment, or without; other texts beside it are none.
+
+    z moves as x does: names decide. What is called the truth is a sensor where there is no other.
+    """
+    t, u, s, z = recorded()
+    alike = [0, 1, 0]
+    log = tmp_path / "log"
+    log.mkdir()
+    write(log / "commands.csv", {"t_s": START + t, **{f"{a}_m": u[:, n] for n, a in zip(alike, "xyz", strict=True)}})
+    rows = zip(s, *z[:, alike].T, strict=True)
+    text = "".join(
+        f"{START + at:.4f} {x:.7f} {y:.7f} {z:.7f} 0 0 {np.sin(at):.4f} {np.cos(at):.4f}\n" for at, x, y, z in rows
+    )
+    (log / file).write_text(f"# tracker\n# timestamp tx ty tz qx qy qz qw\n{text}")
+    (log / "README.txt").write_text("A table that was moved\nby hand, 1 m at a time.\n")
+    (log / "notes.dat").write_bytes(b"\x00\x01\x02")
+    found = survey(log)
+    assert found.roles is not None
+    (sensor,) = found.roles.sensors
+    assert {axis: one[0].column for axis, one in sensor.axes.items()} == {"x": "tx", "y": "ty", "z": "tz"}
+    assert {part.label for part in found.parts} == {"commands.csv", file}
+
+
 def test_tables_without_a_header(tmp_path: Path) -> None:
     """As ``ros2 topic echo --csv`` writes poses: seconds and nanoseconds apart, then a word."""
     t, u, s, z = recorded()
@@ -513,7 +538,7 @@ def test_axes_and_units_by_name(column: str, axis: str, unit: str) -> None:
     "column",
     [
         *("speed_m_s", "velocity[0]", "orientation.x", "frame", "quality", "twist.linear.x", "actual_qd_0"),
-        *("current_1", "qvel_0", "field.velocity0", "vx", "setpoint.vz", "ay"),
+        *("current_1", "qx", "qvel_0", "field.velocity0", "vx", "setpoint.vz", "ay"),
     ],
 )
 def test_what_is_no_position_is_left_out(column: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -23,7 +24,7 @@ from ..units import TIMES, ending, kind_of, si_of, unwrapped, wraps
 from . import names
 
 _TABLES = (".csv", ".csv.gz", ".tsv", *tables.JSON_LINES, ".parquet")
-_TEXTS = (".txt", ".dat")  # tables, too, if one is given; in a folder they may be anything
+_TEXTS = (".txt", ".dat")  # tables, too; in a folder they may be anything
 _MOST_PARTS = 200  # files or topics
 _MOST_COLUMNS = 200  # of positions in one of them
 _FEWEST_ROWS = 10
@@ -135,7 +136,10 @@ def parts_of(log: Path) -> list[Part]:
     """
     found: list[Part] = []
     for path in _files(log):
-        found += _recorded(path) if tables.is_recording(path) else [_tabled(path)]
+        if path.suffix in _TEXTS and path != log:
+            found += _perhaps(path)
+        else:
+            found += _recorded(path) if tables.is_recording(path) else [_tabled(path)]
         if len(found) > _MOST_PARTS:
             raise RunError(f"{log}: more than {_MOST_PARTS} tables or topics; give the log of one run")
     return found
@@ -156,7 +160,7 @@ def _files(log: Path) -> list[Path]:
         return [log]  # a bag
     if (log / "meta" / "info.json").is_file():  # LeRobot: many files of many episodes
         inside = [path for path in inside if log / "data" in path.parents][:1]
-    found = [path for path in inside if path.name.endswith(_TABLES) or tables.is_recording(path)]
+    found = [path for path in inside if path.name.endswith(_TABLES + _TEXTS) or tables.is_recording(path)]
     if not found:
         raise RunError(
             f"{log}: no log in it that can be read; accepted: CSV, lines of JSON, Parquet, MCAP, bags of ROS, .rrd"
@@ -383,6 +387,14 @@ def _tabled(path: Path) -> Part:
         table = tables.read(path, fields=fields, where=where, growing=True)
         notes += [f"{rows - table.rows} of {rows} rows are not {key}: left out" for key in valid]
     return _part(table, Part(path, where=where, notes=tuple(notes)), _labels(path))
+
+
+def _perhaps(path: Path) -> Iterator[Part]:
+    """A text in a folder, which may be anything, if it is a table of positions with a clock."""
+    with suppress(RunError):
+        part = _tabled(path)
+        if part.clock and part.signals:
+            yield part
 
 
 def _validity(table: Table) -> dict[str, Any]:

@@ -50,7 +50,9 @@ _NO_POSITIONS = words_in(
     " count status valid std sd sigma latency duration error header stamp nanosec layout frame done reward task"
     " episode tick time timestamp"
 )
-_RATES = words_in("vx vy vz ax ay az")  # but ax1 is an axis
+# Words that are something else only without a number: ax1 is an axis.
+_WHOLE = {**dict.fromkeys(words_in("vx vy vz ax ay az"), "a rate"), **dict.fromkeys(words_in("qx qy qz qw"), "turning")}
+_TRANSLATIONS = {"tx": "x", "ty": "y", "tz": "z"}
 _POSITIONS = words_in("position positions pos pose")  # current_position is one
 _TIMES = words_in(
     "t time times stamp stamps timestamp timestamps sec secs seconds date datetime clock ts arrival arrived zeit"
@@ -117,8 +119,8 @@ def no_position(column: str) -> str | None:
     kind, unit, found = kind_of(leaf(column)), ending(leaf(column)), words(leaf(column))
     if "qd" in found and role_words(column):  # as UR calls it: target_qd_0 beside target_q_0
         return "velocity"
-    if not _RATES.isdisjoint(found):
-        return "a rate"
+    if whole := next((_WHOLE[one] for one in found if one in _WHOLE), None):
+        return whole
     found = [one.rstrip(_DIGITS) for one in found]
     whats = [one for one in found if one in _NO_POSITIONS]
     if whats == ["current"] and (kind or not _POSITIONS.isdisjoint(found)):
@@ -168,6 +170,7 @@ def axis_of(column: str, labels: list[str]) -> str:
     kept = [word for word in words(column) if word not in _SILENT and word.rstrip(_DIGITS) not in _DEVICES]
     if unit and kept and _UNITS.get(kept[-1]) == unit:
         kept = kept[:-1]
+    kept = [_TRANSLATIONS.get(word, word) for word in kept]
     if kept and all(word.isdigit() for word in kept):
         kept = ["joint", *kept]
     return plain("_".join(kept)) or "position"

@@ -141,6 +141,9 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     sensors = [one for one in kept if one.role == "sensor"]
     references = [one for one in kept if one.role == "reference"]
     left_out += [(one, "a second reference") for one in references[1:]]
+    if not sensors:
+        sensors = [replace(one, role="sensor", why=f"{one.why}, but nothing else measures") for one in references[:1]]
+        references = []
     reports = [one for one in sensors if "reported" in one.name.split("_") and len(sensors) > 1]
     left_out += [(one, "what the controller itself reports: no measurement of where the tool is") for one in reports]
     sensors = [one for one in sensors if one not in reports]
@@ -328,6 +331,9 @@ def _matched(command: Stream, stream: Stream) -> tuple[dict[str, Sequence[Signal
             if (one := _relation(command, axis, stream, own)) is not None
         }
         axis = max(found, key=found.__getitem__, default="")
+        named = own.rpartition("_")[2]  # p_RS_R_x is x, if that moves alike
+        if found.get(named, 0.0) >= _SAME:
+            axis = named
         if axis and found[axis] >= _SAME:
             fits[axis] = signals
         elif axis:
