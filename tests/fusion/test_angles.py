@@ -369,12 +369,14 @@ def test_columns_within_a_turn_go_on_beside_the_commands(turn: str, tmp_path: Pa
 def test_columns_within_a_turn_are_said(tmp_path: Path) -> None:
     """Without ``turn_deg`` the model goes back by a turn: commands and sensor are named, with how often."""
     notes = quiet(turned(tmp_path / "run", "within"), turning(tmp_path)).notes
-    assert any(note.startswith("the commands begin anew on yaw after each turn, 3 times: ") for note in notes), notes
-    assert (
-        "sensor 'eye' begins anew on yaw after each turn, 2 times: turn_deg = 360 in its table makes it go on" in notes
+    assert any(
+        note.startswith("the commands: an angle that begins anew on yaw after each turn, 3 times: ") for note in notes
+    ), notes
+    assert any(
+        note.startswith("sensor 'eye': an angle that begins anew on yaw after each turn, 2 times: ") for note in notes
     )
     notes = quiet(turned(tmp_path / "other", "within"), turning(tmp_path, "turn_deg = 360\n")).notes
-    assert not any("sensor 'eye' begins anew" in note for note in notes)
+    assert not any("sensor 'eye': an angle" in note for note in notes)
     turned(tmp_path / "mm", "whole")
     lengths = (tmp_path / "mm" / "run.toml").read_text().replace('"yaw_deg"', '"yaw_deg", unit = "mm", turn_deg = 360')
     (tmp_path / "mm" / "run.toml").write_text(lengths)

@@ -87,7 +87,7 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
                 " of its own, at its own stamp; log each once"
             )
     quiet = {name: mine for name, mine in trackings.items() if name not in named}
-    return [*_within_a_turn(segment, config, given), *found, *_moving_alone(config, quiet), *_off(config, quiet)]
+    return [*within_a_turn(segment, config), *found, *_moving_alone(config, quiet), *_off(config, quiet)]
 
 
 def not_following(segment: Segment, config: FusionConfig) -> list[Fault]:
@@ -135,20 +135,24 @@ _Given: TypeAlias = Mapping[str, Mapping[str, tuple[TimeArray, FloatArray]]]  # 
 _Trackings: TypeAlias = Mapping[str, Mapping[str, Tracking]]
 
 
-def _within_a_turn(segment: Segment, config: FusionConfig, given: _Given) -> Iterable[str]:
+def within_a_turn(segment: Segment, config: FusionConfig) -> list[str]:
     """A sentence on each angle of the commands or of a sensor that begins anew after each turn."""
+    found, given = list[str](), _given(segment, config)
     for axis in segment.axes:
         if config.arm.axes[axis].kind == "length":
             continue
-        said = f"on {axis} after each turn"
         if times := len(wraps(segment.given(axis)[1])):
-            yield (
-                f"the commands begin anew {said}, {times} times: the model goes back by a turn then; turn_deg = 360"
-                " beside their column in run.toml makes them go on"
+            found.append(
+                f"the commands: an angle that begins anew on {axis} after each turn, {times} times: the model goes back"
+                " by a turn then; turn_deg = 360 beside their column in run.toml makes them go on"
             )
         for name, axes in given.items():
             if axis in axes and (times := len(wraps(axes[axis][1]))):
-                yield f"sensor '{name}' begins anew {said}, {times} times: turn_deg = 360 in its table makes it go on"
+                found.append(
+                    f"sensor '{name}': an angle that begins anew on {axis} after each turn, {times} times: turn_deg ="
+                    " 360 in its table makes it go on"
+                )
+    return found
 
 
 def _given(segment: Segment, config: FusionConfig) -> _Given:

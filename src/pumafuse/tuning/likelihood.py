@@ -28,7 +28,7 @@ from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
 from ..fusion.engine import innovations, innovations_of_each
-from ..fusion.faults import Fault, not_following, starts_in_motion
+from ..fusion.faults import Fault, not_following, starts_in_motion, within_a_turn
 from ..fusion.segments import Segment, added, build
 from ..logs.axes import in_axes
 from ..logs.clock import clock_faults, segments
@@ -234,7 +234,8 @@ class Likelihood:
             asked = [one for one in chosen if one in part.sensors]
             clocks = clock_faults(part, config.arm.update_period, asked)
             built.append(build(part, config, chosen))
-            notes = (*clocks, *built[-1].notes, *starts_in_motion(built[-1], config))
+            faults = (*within_a_turn(built[-1], config), *starts_in_motion(built[-1], config))
+            notes = (*clocks, *built[-1].notes, *faults)
             self.notes += [f"run '{name}': {note}" for note in notes]
             counted.setdefault(name, []).append(built[-1])
         self.commands = {name: added(one.command_counts for one in parts) for name, parts in counted.items()}
