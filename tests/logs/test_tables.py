@@ -247,6 +247,8 @@ def test_what_has_no_header_is_a_table_or_one_line(tmp_path: Path, text: str) ->
         ("5,20000000,base,1.5,2\n5,40000000,base,1.6,3\n6,0,base,1.7,4\n", [f"column {n}" for n in range(1, 6)]),
         (",x_mm\n0.00,1\n0.02,2\n0.04,3\n", ["column 1", "x_mm"]),  # pandas, with its index
         (",0,1\n0,5,6\n1,6,7\n2,7,8\n", ["column 1", "0", "1"]),  # the same, of an array
+        ("0,1\n5,6\n6,7\n7,8\n", ["0", "1"]),  # without it
+        ("t,1,2,3\n0.0,1,2,3\n0.1,2,3,4\n0.2,3,4,5\n", ["t", "1", "2", "3"]),  # joints by their numbers
     ],
 )
 def test_columns_without_a_name_are_called_by_their_place(text: str, names: list[str], tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -327,10 +328,11 @@ def _nameless_clock(table: Table) -> Clock | None:
     try:
         numbers = table.plain(first)[0]
         rest = table.plain(others[0])[0] if others else np.full(len(numbers), np.nan)
+        whole = (numbers % 1.0 == 0.0) & (rest % 1.0 == 0.0) & (rest >= 0.0) & (rest < 1e9)
+        if whole.all() and rest.max(initial=0.0) > 1e6:
+            return Clock(first, others[0], "", "seconds and nanoseconds", table.stamps(first, others[0])[0])
     except RunError:
         return None
-    if ((numbers % 1.0 == 0.0) & (rest % 1.0 == 0.0) & (rest >= 0.0) & (rest < 1e9)).all() and rest.max() > 1e6:
-        return Clock(first, others[0], "", "seconds and nanoseconds", table.stamps(first, others[0])[0])
     steps = np.diff(numbers)
     rises = len(steps) and (steps > 0.0).mean() >= _IN_ORDER and (steps != 1.0).any()
     return _clock_of(table, first) if rises else None
@@ -378,13 +380,19 @@ def _time_unit(values: FloatArray) -> tuple[str, str]:
 def _tabled(path: Path) -> Part:
     """A table; of several runs in it the first, of a sensor's rows those that it calls valid."""
     fields = _fields(path) if path.suffix == ".parquet" else None
-    some = [name for name in _EPISODES if name in fields] if fields else None
-    where = {} if some == [] else _first_run(tables.read(path, fields=some, growing=True))
+    read = partial(tables.read, path, growing=True)
+    if fields is None:
+        table = read()
+        where = _first_run(table)
+        table = read(where=where) if where else table
+    else:
+        some = [name for name in _EPISODES if name in fields]
+        where = _first_run(read(fields=some)) if some else {}
+        table = read(fields=fields, where=where)
     notes = [f"has several runs: only {key} = {value!r} is used" for key, value in where.items()]
-    table = tables.read(path, fields=fields, where=where, growing=True)
     if valid := _validity(table) if names.role_of(path.name.split(".")[0]) in ("sensor", "reference") else {}:
         where, rows = {**where, **valid}, table.rows
-        table = tables.read(path, fields=fields, where=where, growing=True)
+        table = read(fields=fields, where=where)
         notes += [f"{rows - table.rows} of {rows} rows are not {key}: left out" for key in valid]
     return _part(table, Part(path, where=where, notes=tuple(notes)), _labels(path))
 

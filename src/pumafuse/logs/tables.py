@@ -287,8 +287,9 @@ def _layout(text: bytes) -> _Layout:
     if len(names) == len(_cells(lines[first], separator)) and _begins(lines, first, separator):
         return _Layout(separator, _point(text, separator), first, names, units=False, above=0)
     separator = _separator(lines[first])
-    if _begins(lines, first, separator) and not _counts(row := _cells(lines[first], separator)):
-        return _Layout(separator, _point(text, separator), first, list(map(_column, range(len(row)))), False, 0)
+    if _is_headless(lines, first, separator):
+        names = list(map(_column, range(len(_cells(lines[first], separator)))))
+        return _Layout(separator, _point(text, separator), first, names, units=False, above=0)
     header = _header(lines, full)
     separator = _separator(lines[header])
     units = header > first and all(map(_UNIT.fullmatch, _cells(lines[header], separator)))
@@ -336,9 +337,18 @@ def _begins(lines: Sequence[str], place: int, separator: str) -> bool:
     )
 
 
-def _counts(row: Sequence[str]) -> bool:
-    """Whether a row numbers the columns from 0, as the header of pandas for columns without names."""
-    return [one for one in row if one] == list(map(str, range(sum(map(bool, row)))))
+def _is_headless(lines: Sequence[str], first: int, separator: str) -> bool:
+    """Whether rows begin with the first line: it has a number wherever the next one has, and does not count columns.
+
+    That does the header of pandas for an array: 0,1,2.
+    """
+    if not _begins(lines, first, separator):
+        return False
+    row, below = (_cells(lines[first + n], separator) for n in (0, 1))
+    alike = all(
+        map(_NUMBER.fullmatch, (one for one, other in zip(row, below, strict=True) if _NUMBER.fullmatch(other)))
+    )
+    return alike and row != list(map(str, range(len(row))))
 
 
 def _column(place: int) -> str:
