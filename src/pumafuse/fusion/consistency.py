@@ -87,7 +87,8 @@ def log_density(innovation: FloatArray, innovation_sd: FloatArray, outcome: Code
         outcome: Fused, rejected or re-acquired, (m,).
         gate: Of each component's sensor, (m,).
     """
-    square = np.where(outcome == Outcome.REJECTED, gate**2, (innovation / innovation_sd) ** 2)
+    rejected = int(Outcome.REJECTED)  # numpy asks an enumeration for attributes; a Ctrl-C that comes then is lost
+    square = np.where(outcome == rejected, gate**2, (innovation / innovation_sd) ** 2)
     return -0.5 * (np.log(2.0 * np.pi * (innovation_sd * MM) ** 2) + square)
 
 

@@ -361,7 +361,7 @@ class Likelihood:
             return None
         segment, rows = part.segment, part.segment.measurement_rows
         found = innovations(segment, config)
-        weight = ((found.outcome != Outcome.REJECTED) / found.innovation_sd)[:, 0]
+        weight = ((found.outcome != int(Outcome.REJECTED)) / found.innovation_sd)[:, 0]
         delay, certain = config.arm.delay_of(axis), _certain(config)
 
         def predicted(shift: float) -> FloatArray:
@@ -468,7 +468,7 @@ class Likelihood:
             (nu_up, S_up), (nu_down, S_down) = next(moved), (nu, S) if log else next(moved)
             width = _LOG_STEP if log else 2.0 * _STEP
             d_nu[place], d_s[place] = (nu_up - nu_down) / width, (S_up - S_down) / width
-        return _Linear(part.whole, mine, outcome != Outcome.REJECTED, nu, S, d_nu, d_s)
+        return _Linear(part.whole, mine, outcome != int(Outcome.REJECTED), nu, S, d_nu, d_s)
 
 
 def _certain(config: FusionConfig) -> FusionConfig:
