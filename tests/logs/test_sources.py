@@ -17,8 +17,9 @@ import pyarrow.csv as pacsv
 import pyarrow.parquet as papq
 import pytest
 
+from pumafuse import ArmModel, AxisModel, FirstOrder, FusionConfig, Sensor, fuse
 from pumafuse.arrays import NO_STAMP
-from pumafuse.errors import PumafuseError
+from pumafuse.errors import PumafuseError, PumafuseWarning
 from pumafuse.logs.run import Run, Source
 from refusals import one_line
 
@@ -376,6 +377,66 @@ def test_where_compares_text_of_each_type(tmp_path: Path, kind: pa.DataType) -> 
     same(run.command, STAMP[150:200], x=X[150:200])
 
 
+@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
+def test_rows_that_come_at_a_rate_need_no_stamps(tmp_path: Path, name: str) -> None:
+    """Without a column each row is the next; a column of frames says which are missing, and where both clocks begin."""
+    columns = {"x_m": nullable(X), "frame": np.arange(ROWS) + 7 + 2 * (np.arange(ROWS) > 99)}
+    run = read(tmp_path, 'time = { rate_hz = 400 }\nx = "x_m"', columns, name)
+    same(run.command, 2_500_000 * np.arange(ROWS), x=X)
+    run = read(tmp_path, 'time = { column = "frame", rate_hz = 400 }\nx = "x_m"', columns, name)
+    same(run.command, 2_500_000 * columns["frame"], x=X)
+
+
+@pytest.mark.parametrize("name", ["log.parquet", "log.csv"])
+def test_axes_in_rows_of_their_own_are_put_beside_each_other(tmp_path: Path, name: str) -> None:
+    """Rows of one stamp are one row; an axis without one there is absent, and nothing is said of it."""
+    stamp, elbow = np.repeat(STAMP[:200], 2), np.tile([True, False], 200)
+    keep = np.delete(np.arange(400), [20, 41])  # no elbow of row 10, no wrist of row 20
+    columns = pa.table(
+        {"t_ns": stamp, "joint": np.where(elbow, "elbow", "wrist"), "goal": ANGLE[:400], "state": X[:400]}
+    ).take(keep)
+
+    def axes(column: str) -> str:
+        return "\n".join(
+            f'{axis} = {{ column = "{column}", unit = "rad", where = {{ joint = "{axis}" }} }}'
+            for axis in ("elbow", "wrist")
+        )
+
+    sensor = f'[sensors.s]\nfile = "{name}"\ntime = "t_ns"\n{axes("state")}'
+    run = read(tmp_path, f'time = "t_ns"\n{axes("goal")}\n{sensor}', columns, name)
+    absent = np.arange(200)
+    wanted = {
+        "elbow": np.where(absent == 10, np.nan, ANGLE[:400:2]),
+        "wrist": np.where(absent == 20, np.nan, ANGLE[1:400:2]),
+    }
+    same(run.command, STAMP[:200], **wanted)
+    assert np.isnan(run.sensors["s"].values["elbow"][10]) and not run.notes
+    plants = {axis: AxisModel(kind="angle", plant=FirstOrder(time_constant=0.02)) for axis in wanted}
+    arm = ArmModel(name="arm", update_period=0.01, delay=0.0, axes=plants)
+    with pytest.warns(PumafuseWarning) as said:
+        est = fuse(run, FusionConfig(arm=arm, sensors={"s": Sensor(sd=0.1, gate=0.0)}))
+    assert all("does not follow the commands" in str(one.message) for one in said)
+    assert est.measurements.counts() == {"fused": 398 - 1}  # X has one NaN
+
+
+def test_commands_between_which_a_controller_interpolates(tmp_path: Path) -> None:
+    """They lie on the line, in steps that fit; a pause is none, and where a value is missing none is made up."""
+    time = np.concatenate([np.arange(50) * 0.1, 20.0 + np.arange(50) * 0.1])
+    value = np.sin(time)
+    value[70] = np.nan
+    columns = {"t_s": time, "x_m": value}
+    run = read(tmp_path, 'time = "t_s"\nx = "x_m"\ninterpolation_ms = 20', columns)
+    stamp, x = run.command.stamp / 1e9, run.command.values["x"]
+    assert len(stamp) == 2 * (49 * 5 + 1)
+    np.testing.assert_allclose(np.diff(stamp)[[0, 1, 244, 245, 246]], [0.02, 0.02, 0.02, 20.0 - 4.9, 0.02], atol=1e-9)
+    known = np.isfinite(x)
+    np.testing.assert_allclose(x[known], np.interp(stamp[known], time, np.sin(time)), atol=2e-3)
+    assert (~known).sum() == 9 and np.isin(value[np.isfinite(value)], x).all()
+    for step in (100, 0.05):
+        text = refusal(partial(read, tmp_path, f'time = "t_s"\nx = "x_m"\ninterpolation_ms = {step}', columns))
+        assert f"interpolation_ms = {step} is not between a thousandth of the interval of the commands, 100 ms" in text
+
+
 def test_sources_of_one_file_have_rows_of_their_own(tmp_path: Path) -> None:
     """Two sources may read different runs of one table, and 1 is not true."""
     sensor = '[sensors.s]\nfile = "log.parquet"\ntime = "t_ns"\nx = "x_m"\nwhere = { even = true }'
@@ -559,6 +620,20 @@ REFUSALS: dict[str, tuple[str, tuple[str, ...]]] = {
     "empty column": ('time = "t_ns"\nx = { column = "" }', ("command.x", "column")),
     "empty list": ('time = "t_ns"\nx = []', ("command.x", "column")),
     "list of numbers": ('time = "t_ns"\nx = [1, 2]', ("command.x", "column")),
+    "a rate of 0": ('time = { rate_hz = 0 }\nx = "x_m"', ("command.time", "{ rate_hz = 100 }")),
+    "a negative rate": ('time = { rate_hz = -5 }\nx = "x_m"', ("command.time", "rate_hz", ">= 0")),
+    "a rate and a unit": ('time = { column = "t", rate_hz = 5, unit = "s" }\nx = "x_m"', ("command.time", "column")),
+    "a rate of centuries": ('time = { rate_hz = 1e-8 }\nx = "x_m"', ("log.parquet", "beyond the year 2110")),
+    "frames that are words": ('time = { column = "yes", rate_hz = 5 }\nx = "x_m"', ("'yes'", "bool", "not numbers")),
+    "rows of nobody": (
+        'time = "t_ns"\nx = { column = "x_m", where = { plain = 1000 } }',
+        ("no row has plain = 1000", "0 to 499"),
+    ),
+    "rows by a column that is not there": (
+        'time = "t_ns"\nx = { column = "x_m", where = { joint = "elbow" } }',
+        ("unknown column 'joint'",),
+    ),
+    "rows by nothing": ('time = "t_ns"\nx = { column = "x_m", where = {} }', ("command.x.where", "expected")),
     "empty time": ('time = ""\nx = "x_m"', ("command.time", "column")),
     "one time in a list": ('time = ["t_ns"]\nx = "x_m"', ("command.time", "['sec', 'nanosec']")),
     "three times": ('time = ["a", "b", "c"]\nx = "x_m"', ("command.time", "['sec', 'nanosec']")),

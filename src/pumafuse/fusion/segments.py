@@ -480,7 +480,8 @@ def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int |
     spread = np.ones(shape if source.spread else (0, len(axes)))
     for axis, column in source.values.items():
         at = axes.index(axis)
-        value[:, at], known[:, at] = column[order], Outcome.FUSED
+        value[:, at] = column[order]
+        known[:, at] = np.where(np.isnan(value[:, at]), ABSENT, Outcome.FUSED) if source.apart else Outcome.FUSED
         if axis in source.spread:
             spread[:, at] = source.spread[axis][order]
     return Events(_valid(stamp, latency), np.full(len(order), number, dtype=np.int16), stamp, value, spread, known)

@@ -202,7 +202,8 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
     """
     command = _ascending(run.command.stamp)
     found, label = list[str](), run.command.label
-    if (other := other_interval(command, period)) is not None:
+    one = run.command.rows(np.isfinite(run.command.values[run.axes[0]])) if run.command.apart else run.command
+    if (other := other_interval(_ascending(one.stamp), period)) is not None:
         sentence, kind = other
         if kind == "unit":
             raise RunError(f"{label}: {sentence} {_CORRECT}, or update_period_ms in arm.toml")

@@ -32,7 +32,7 @@ _SPLIT_STAMPS = (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("secon
 _NANOSECONDS = re.compile("nano|nsec", re.IGNORECASE)
 _GIGA = 10**9
 _WHOLE = r"^[+-]?\d{1,19}$"
-_NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
+NUMBER = r"^[+-]?(\d+\.?\d*([eE][+-]?\d+)?|\.\d+([eE][+-]?\d+)?|[iI]nf|inf)$"
 _DATE = r"^\d{4}-\d\d-\d\d[T ]\d\d(:\d\d){1,2}([.,]\d{1,9})?([Zz]|[+-]\d\d(:?\d\d)?)?$"  # ISO 8601
 _ZONE = r"\d([Zz]|[+-]\d\d(:?\d\d)?)$"  # behind a time
 # Other ways to write a time that cannot be read in two ways, and what stands for them here. With points the day comes
@@ -161,6 +161,22 @@ class Table:
         exponent = 9 - 3 * units.TIMES.index(unit or self._ending(name, units.TIMES, "s"))
         return self._of_numbers(name, 10**exponent)
 
+    def frames(self, rate: float, name: str = "") -> tuple[TimeArray, str | None]:
+        """Stamps of rows that come at a rate [Hz], in int64 ns since frame 0, and a note on cells that were text.
+
+        Args:
+            rate: How often there is a frame [Hz].
+            name: A column that counts frames; without one each row is the next.
+
+        Raises:
+            RunError: The column is absent or holds something else than numbers, or a stamp is beyond reach.
+        """
+        number, note = self.plain(name) if name else (np.arange(self.rows, dtype=np.float64), None)
+        time = number / rate
+        if (np.abs(time) >= REACH_NS / 1e9).any():
+            raise RunError(f"{self.path}: at {rate:g} Hz a row is stamped beyond the year 2110")
+        return units.nanoseconds(time), note
+
     def is_dated(self, name: str) -> bool:
         """Whether a column of text has dates, or times of day."""
         column = self.column(name)
@@ -266,7 +282,7 @@ class Table:
             "a date with a time zone": zoned,
             "a date without one": pc.and_(dated, pc.invert(zoned)),
             "a time without a date": elapsed,
-            "a number": pc.match_substring_regex(text, _NUMBER),
+            "a number": pc.match_substring_regex(text, NUMBER),
         }
         rows = {kind: pc.index(mask, value=True).as_py() + 1 for kind, mask in kinds.items() if pc.any(mask).as_py()}
         if len(rows) > 1:
@@ -285,7 +301,7 @@ class Table:
             return
         text = pc.utf8_trim_whitespace(column)
         word = pc.and_(pc.is_valid(text), pc.invert(pc.is_in(text, value_set=pa.array(BLANK, text.type))))
-        if pc.any(word).as_py() and not pc.any(pc.match_substring_regex(text, _NUMBER)).as_py():
+        if pc.any(word).as_py() and not pc.any(pc.match_substring_regex(text, NUMBER)).as_py():
             row = pc.index(word, value=True).as_py()
             raise RunError(
                 f"{self.path}: column '{shortened(name)}', row {row + 1}: {text[row].as_py()[:40]!r} is no number and"
@@ -334,7 +350,7 @@ class Table:
             return column, None
         column = self._cast(name, column, pa.string())
         trimmed = pc.utf8_trim_whitespace(column)
-        numeric = pc.match_substring_regex(trimmed, _NUMBER)
+        numeric = pc.match_substring_regex(trimmed, NUMBER)
         note = self._words(name, column, numeric, "a number")
         return pc.if_else(numeric, trimmed, pa.scalar(None, pa.string())), note
 

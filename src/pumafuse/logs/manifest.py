@@ -9,10 +9,11 @@ from typing import Any, Literal, cast
 import msgspec
 
 from .. import toml
+from ..arrays import TimeArray
 from ..errors import ConfigError, PumafuseError, UnknownNameError
 from ..toml import NotNegative
 from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of, refuse_name
-from .columns import leaf
+from .columns import Table, leaf
 from .frames import Frame
 
 _MOST = 2**63  # more than a whole number of a column can be
@@ -25,11 +26,13 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         column: Its name or field path.
         unit: Without the bar.
         turn: After which an angle begins anew [rad]: it is made to go on; 0: never.
+        where: In which of the rows it is the axis: those in which each of these columns has this value.
     """
 
     column: str
     unit: str = ""
     turn: NotNegative = msgspec.field(name="turn_deg", default=0.0)
+    where: dict[str, bool | int | float | str] = {}
 
     @property
     def ending(self) -> str:
@@ -42,15 +45,36 @@ class Column(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return kind_of(self.ending or leaf(self.column))
 
 
-class Time(Column, frozen=True, forbid_unknown_fields=True):
-    """A column of stamps; with ``nanoseconds`` it is of whole seconds, and these are beside it."""
+class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the stamps of rows are.
 
+    Attributes:
+        column: Of stamps; with a rate, of numbers of frames, and empty where each row is the next frame.
+        unit: Without the bar.
+        nanoseconds: A column beside it, which is then of whole seconds.
+        rate: At which frames come [Hz], for a table without stamps; 0: there are some.
+    """
+
+    column: str = ""
+    unit: str = ""
     nanoseconds: str = ""
+    rate: NotNegative = msgspec.field(name="rate_hz", default=0.0)
+
+    @property
+    def ending(self) -> str:
+        """Its unit as the ending of a name, empty where only its name says it."""
+        return f"_{self.unit}" if self.unit else ""
 
     @property
     def columns(self) -> list[str]:
         """All columns that it takes."""
-        return [self.column, self.nanoseconds] if self.nanoseconds else [self.column]
+        return [column for column in (self.column, self.nanoseconds) if column]
+
+    def stamps(self, table: Table) -> tuple[TimeArray, str | None]:
+        """Stamps of the rows of a table, see :meth:`Table.stamps`, or by its frames, see :meth:`Table.frames`."""
+        if self.rate:
+            return table.frames(self.rate, self.column)
+        return table.stamps(self.column, self.nanoseconds, self.ending)
 
 
 class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
@@ -80,7 +104,13 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def fields(self) -> list[str]:
         """All its columns and field paths."""
-        return [*self.time.columns, *(column.column for columns in self.axes.values() for column in columns)]
+        axes = [column for columns in self.axes.values() for column in columns]
+        return [*self.time.columns, *(column.column for column in axes), *(name for one in axes for name in one.where)]
+
+    @property
+    def has_own_rows(self) -> bool:
+        """Whether its axes are in rows of their own, which its columns choose."""
+        return any(column.where for columns in self.axes.values() for column in columns)
 
     @property
     def turns(self) -> dict[str, float]:
@@ -95,11 +125,19 @@ class SourceEntry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CommandEntry(SourceEntry, frozen=True, kw_only=True):
-    """The commands, with the start level by axis [m or rad], the kinds that its keys say, and how to use the stamps."""
+    """The commands.
+
+    Attributes:
+        start: The start level by axis [m or rad].
+        kinds: The kinds of axes that its keys say.
+        clock: Whether the stamps are used as they are.
+        interpolation: In which steps the controller goes on from one command to the next [s]; 0: it holds each.
+    """
 
     start: dict[str, float] = {}
     kinds: dict[str, Kind] = {}
     clock: Literal["stamps", "regular"] = "stamps"
+    interpolation: NotNegative = msgspec.field(name="interpolation_ms", default=0.0)
 
 
 class ReferenceEntry(SourceEntry, frozen=True, kw_only=True):
@@ -202,6 +240,8 @@ def _columns(given: Any, where: str, path: str) -> list[Any]:
             f" {axis} = {{ column = 'pose.position.x', unit = 'm' }}"
         )
     for one in columns:
+        if "where" in one:
+            one["where"] = _where(one["where"], where, f"{path}.where")
         toml.check(one, Column, where, path)
         _check_unit(one, (*LENGTHS, *ANGLES), where, path)
         if one.get("turn_deg") and msgspec.convert(one, Column).kind != "angle":
@@ -219,10 +259,13 @@ def _time(given: Any, where: str, path: str) -> dict[str, Any]:
         case {"column": str() as column, **more} if column and more.keys() <= {"unit"}:
             _check_unit(more, TIMES, where, path)
             return {"column": column, **more}
+        case {"rate_hz": float() | int() as rate, **more} if rate and more.keys() <= {"column"}:
+            return {"rate_hz": rate, **more}
         case _:
             raise ConfigError(
                 f"{where}: {path}: expected a column ('t_s', 'header.stamp'), a column with its unit"
-                " ({ column = 't', unit = 's' }), or columns of whole seconds and of nanoseconds (['sec', 'nanosec'])"
+                " ({ column = 't', unit = 's' }), columns of whole seconds and of nanoseconds (['sec', 'nanosec']), or"
+                " how often rows come ({ rate_hz = 100 }; by a column of frames, { column = 'frame', rate_hz = 100 })"
             )
 
 

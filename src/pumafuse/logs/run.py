@@ -30,6 +30,7 @@ Clock = Literal["stamps", "regular"]
 
 _LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
 _FEW_ROWS = 10  # too few to judge a clock by
+_MOST_STEPS, _PAUSE = 1000, 5.0  # between two commands; times the median interval, which is no path
 
 
 class NoCommandError(RunError):
@@ -46,6 +47,7 @@ class Source:
         label: What a person calls it: the file, or the column group of a single table.
         spread: For an axis computed by a frame, the factor on the noise of each row, (rows,).
         sd: Standard deviation of the noise of a reference [m or rad], for all axes or for each.
+        apart: Whether axes may have rows of their own: NaN is then not invalid, but another axis's row.
     """
 
     stamp: TimeArray
@@ -53,6 +55,7 @@ class Source:
     label: str
     spread: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
     sd: float | Mapping[str, float] = 0.0
+    apart: bool = False
 
     def sd_of(self, axis: str) -> float:
         """Standard deviation of the noise of a reference on one axis [m or rad]."""
@@ -95,6 +98,53 @@ class Source:
             there = np.interp(self.stamp[mine], command.stamp[told][order], command.values[axis][told][order])
             values[axis] = values[axis] - turn * np.round(np.median(values[axis][mine] - there) / turn)
         return replace(self, values=values)
+
+    def pivoted(self) -> Source:
+        """The source with axes that have rows of their own beside each other, where these have one stamp."""
+        known = {axis: np.isfinite(value) for axis, value in self.values.items()}
+        group = np.cumsum(np.diff(self.stamp, prepend=self.stamp[:1]) != 0)
+        first = np.searchsorted(group, group)
+        place = np.zeros(len(group), dtype=np.int64)  # of an axis with several values of one stamp
+        for mask in known.values():
+            count = np.cumsum(mask)
+            place = np.maximum(place, np.where(mask, count - (count - mask)[first], 0))
+        _, row, together = np.unique(np.stack([group, place]), axis=1, return_index=True, return_inverse=True)
+        values = {axis: np.full(len(row), np.nan) for axis in self.values}
+        for axis, mask in known.items():
+            values[axis][together[mask]] = self.values[axis][mask]
+        found = replace(self, stamp=self.stamp[row], values=values, apart=True)
+        return found.rows(found.has_value)
+
+    def interpolated(self, step: float) -> Source:
+        """The source with values between its rows, on the line from each to the next, for a controller that does so.
+
+        A pause, longer than five times the median interval, stays one.
+
+        Args:
+            step: From one value to the next, about [s].
+
+        Raises:
+            RunError: That is not between a thousandth of the median interval and the interval.
+        """
+        gap = np.diff(self.stamp.astype(np.float64))  # far and negative where a row has no stamp
+        interval = float(np.median(gap[gap > 0.0])) if (gap > 0.0).any() else np.nan
+        if not interval / _MOST_STEPS <= step * 1e9 < interval:
+            raise RunError(
+                f"{self.label}: interpolation_ms = {step * 1e3:g} is not between a thousandth of the interval of the"
+                f" commands, {interval / 1e6:.4g} ms, and that"
+            )
+        goes_on = (gap > 0.0) & (gap <= _PAUSE * interval)
+        parts = np.where(goes_on, np.maximum(np.rint(np.where(goes_on, gap, 0.0) / (step * 1e9)), 1.0), 1.0)
+        parts = np.append(parts, 1.0).astype(np.int64)
+        row = np.repeat(np.arange(len(parts)), parts)
+        share = (np.arange(len(row)) - (np.cumsum(parts) - parts)[row]) / parts[row]
+
+        def between(value: FloatArray) -> FloatArray:
+            change = np.append(np.diff(value), 0.0)[row]
+            return value[row] + np.where(share > 0.0, share * change, 0.0)
+
+        stamp = self.stamp[row] + np.rint(share * np.append(gap, 0.0)[row]).astype(np.int64)
+        return replace(self, stamp=stamp, values={axis: between(value) for axis, value in self.values.items()})
 
     def rows(self, chosen: BoolArray | IntArray | slice) -> Source:
         """The chosen rows, in the order chosen."""
@@ -276,15 +326,36 @@ def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: s
         notes.append(f"{label}: {len(found)} {plural} {what} (first: row {found[0] + 1}{first})")
 
 
+def standing_clock(source: Source) -> str:
+    """What is wrong with a clock that stands still while values go on, in words; empty of any other.
+
+    Real logs have rows with the stamp of the row before: clocks tick every 1 ms, 10 ms, or 15.6 ms (Windows), a sensor
+    is asked several times. Too coarse is a clock that ticks every 0.1 s or more, where most values of an axis change
+    within a tick, and not by far less than from one tick to the next, as a measurement that is repeated at a standstill
+    does. Measured on scan1 and trunk-servo, their commands or measurements stamped by such clocks: ticks up to 15.6 ms
+    raise the RMSE by a quarter at most, 50 ms double it, 0.1 s raise it up to 4 times, 1 s up to 10 times. As recorded,
+    no row of theirs, nor of any other run at hand, has the stamp of the row before.
+    """
+    axis, changes = _most_changes(source)
+    most = changes.sum()
+    if not most:
+        return ""
+    known = np.isfinite(source.values[axis]) & (source.stamp != NO_STAMP)
+    step, tick = np.abs(np.diff(source.values[axis][known])), np.diff(source.stamp[known])
+    ticks = int((tick != 0).sum()) + 1
+    period = np.median(tick[tick > 0]) / 1e9 if (tick > 0).any() else np.inf
+    going_on = 2.0 * step[tick == 0].mean() >= (step[tick != 0].mean() if ticks > 1 else 0.0)
+    if most <= ticks or most < _FEW_ROWS or period < _LONGEST_TICK or not going_on:
+        return ""
+    every = f", one every {period:.3g} s" if np.isfinite(period) else ""
+    return (
+        f"{counted(ticks, 'distinct stamp')}{every}, in {len(step) + 1} rows with {axis}, which goes on while the clock"
+        " stands still"
+    )
+
+
 def _note_standing_clock(notes: list[str], source: Source, advice: str) -> None:
     """Append a note on rows with the stamp of the row before and another value; refuse a clock that stands still.
-
-    Real logs have such rows: clocks tick every 1 ms, 10 ms, or 15.6 ms (Windows), a sensor is asked several times.
-    Refused is a clock that ticks every 0.1 s or more, where most values of an axis change within a tick, and not by
-    far less than from one tick to the next, as a measurement that is repeated at a standstill does. Measured on scan1
-    and trunk-servo, their commands or measurements stamped by such clocks: ticks up to 15.6 ms raise the RMSE by a
-    quarter at most, 50 ms double it, 0.1 s raise it up to 4 times, 1 s up to 10 times. As recorded, no row of theirs,
-    nor of any other run at hand, has the stamp of the row before.
 
     Args:
         notes: Gets the note.
@@ -294,26 +365,20 @@ def _note_standing_clock(notes: list[str], source: Source, advice: str) -> None:
     Raises:
         RunError: The clock stands still.
     """
+    if stands := standing_clock(source):
+        raise RunError(f"{source.label}: {stands}; {advice}")
+    axis, changes = _most_changes(source)
+    what = f"the stamp of the row before and another {axis} (of commands, the last of a stamp counts)"
+    note_rows(notes, source.label, changes, what)
+
+
+def _most_changes(source: Source) -> tuple[str, BoolArray]:
+    """The axis with the most rows that have the stamp of the row before and another value, and these rows, (rows,)."""
     if not (np.diff(source.stamp) == 0).any():
-        return
+        return "", np.zeros(len(source.stamp), dtype=np.bool_)
     changes = {axis: _changes(source, axis) for axis in source.values}
     axis = max(changes, key=lambda axis: changes[axis].sum())
-    most = changes[axis].sum()
-    if not most:
-        return
-    known = np.isfinite(source.values[axis]) & (source.stamp != NO_STAMP)
-    step, tick = np.abs(np.diff(source.values[axis][known])), np.diff(source.stamp[known])
-    ticks = int((tick != 0).sum()) + 1
-    period = np.median(tick[tick > 0]) / 1e9 if (tick > 0).any() else np.inf
-    going_on = 2.0 * step[tick == 0].mean() >= (step[tick != 0].mean() if ticks > 1 else 0.0)
-    if most > ticks and most >= _FEW_ROWS and period >= _LONGEST_TICK and going_on:
-        stands = f", one every {period:.3g} s" if np.isfinite(period) else ""
-        raise RunError(
-            f"{source.label}: {counted(ticks, 'distinct stamp')}{stands}, in {len(step) + 1} rows with {axis}, which"
-            f" goes on while the clock stands still; {advice}"
-        )
-    what = f"the stamp of the row before and another {axis} (of commands, the last of a stamp counts)"
-    note_rows(notes, source.label, changes[axis], what)
+    return axis, changes[axis]
 
 
 def _changes(source: Source, axis: str) -> BoolArray:
@@ -419,20 +484,24 @@ def of_tables(
         if entry.rows not in read:
             read[entry.rows] = read_table(entry)
             notes.extend(note for note in read[entry.rows].notes if note not in notes)
-        known = read[entry.rows].zoned(entry.time.column)
+        known = None if entry.time.rate else read[entry.rows].zoned(entry.time.column)
         if known is not None:
             (zoned if known else naive).append(name)
-        return _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units)
+        found = _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units)
+        return found.pivoted() if entry.has_own_rows else found
 
     sources = {name: source(name) for name in entries}
-    tables_of = Counter(entry.rows for entry in entries.values())
-    has_value = {name: sources[name].has_value for name, entry in entries.items() if tables_of[entry.rows] > 1}
+    together = {name: entry for name, entry in entries.items() if not entry.has_own_rows}
+    tables_of = Counter(entry.rows for entry in together.values())
+    has_value = {name: sources[name].has_value for name, entry in together.items() if tables_of[entry.rows] > 1}
     empty: dict[tuple[str, ...], BoolArray] = {}  # rows of a table in which none of its sources has a value
     for name, mine in has_value.items():
         table = entries[name].rows
         empty[table] = empty[table] & ~mine if table in empty else ~mine
     for name, mine in has_value.items():  # where only others of its table have any, a row is theirs
         sources[name] = sources[name].rows(mine | empty[entries[name].rows])
+    if listed.command.interpolation:
+        sources["command"] = sources["command"].interpolated(listed.command.interpolation)
     command = sources["command"]
     sources = {name: one.beside(command, entries[name].turns) for name, one in sources.items()}
     reference, sensors = sources.get("reference"), {name: sources[f"sensor {name}"] for name in listed.sensors}
@@ -506,7 +575,7 @@ def _source(
     units: dict[str, Kind],
 ) -> Source:
     """A source from its columns, those of an axis added up; new notes and new kinds of axes are put in."""
-    stamp, note = table.stamps(time.column, time.nanoseconds, time.ending)
+    stamp, note = time.stamps(table)
     values, found = dict[str, FloatArray](), [note]
     for axis, columns in axes.items():
         parts = [table.numbers(column.column, column.ending) for column in columns]
@@ -516,11 +585,7 @@ def _source(
                 raise RunError(
                     f"{table.path}: column '{column.column}' is {AN[kind]}, but {axis} is {AN[units[axis]]} elsewhere"
                 )
-        going_on = [
-            unwrapped(numbers, column.turn) if column.turn else numbers
-            for column, (numbers, _) in zip(columns, parts, strict=True)
-        ]
-        values[axis] = np.sum(going_on, axis=0)
+        values[axis] = np.sum([_own(table, one, numbers) for one, (numbers, _) in zip(columns, parts, strict=True)], 0)
         found.extend(note for _, note in parts)
     notes.extend(note for note in found if note is not None and note not in notes)
     source = Source(stamp, values, label)
@@ -528,3 +593,9 @@ def _source(
     advice = f"write time = ['{time.column}', '{beside}']" if beside else "name a finer column of time"
     _note_standing_clock(notes, source, advice)
     return source
+
+
+def _own(table: tables.Table, column: manifest.Column, numbers: FloatArray) -> FloatArray:
+    """The numbers of a column, NaN in rows that are another axis's; an angle that begins anew goes on."""
+    own = np.where(tables.meets(table, column.where), numbers, np.nan) if column.where else numbers
+    return unwrapped(own, column.turn) if column.turn else own

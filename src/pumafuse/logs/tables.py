@@ -16,14 +16,16 @@ from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 import pyarrow.json as pajson
 import pyarrow.parquet as papq
 
+from ..arrays import BoolArray
 from ..errors import RunError, UnknownNameError, counted, shortened
-from .columns import BLANK, Table, find, longest, prefixes
+from .columns import BLANK, NUMBER, Table, find, longest, prefixes
 
 Where: TypeAlias = Mapping[str, bool | int | float | str]  # rows in which each of these columns has this value
 
@@ -42,6 +44,11 @@ FIRST = "column 1"  # what the first column is called, if it has no name
 JSON_LINES = (".jsonl", ".ndjson", ".jsonl.gz", ".ndjson.gz")
 _DECIMAL_COMMA = rb"(?:^|[%b\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[%b\r\n]|$)"  # between separators
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
+# A list in one cell, as Python and numpy print it: [0.5, -1.2], [0.5 -1.2], array('d', [0.5]), ['elbow', 'wrist'].
+_BARE_LIST = re.compile(rb"(?<=[,;\t]) *(\[\s*[-+.\d][^\[\]\"]*[\s,][^\[\]\"]*\])")
+_LIST = r"^(array\()?('\w', *)?[\[(]\s*(['\"]|[-+.\d])"
+_BETWEEN = r"\s*[,;]\s*|\s+"
+_AROUND_LIST = r"^(array\()?('\w', *)?[\[(]+\s*|\s*[\])]+(, *dtype=\w+\))?$"
 
 
 def read(
@@ -88,6 +95,20 @@ def read(
         f"{path.name}: two columns are named '{shortened(name)}': neither is used" for name in sorted(_repeated(names))
     ]
     return Table(path, _named(table), table.num_rows, tuple(notes), tuple(names))
+
+
+def meets(table: Table, where: Where) -> BoolArray:
+    """Rows in which each of some columns has a value, (rows,).
+
+    Raises:
+        RunError: There is none, or a column is absent or never has such a value.
+    """
+    whole = pa.table(dict(table.columns))
+    met = _met(table.path, whole, _conditions(table.path, whole, where))
+    found = np.from_dlpack(pc.fill_null(met, False).cast(pa.uint8()).combine_chunks()) > 0
+    if not found.any():
+        raise _no_row(table.path, [whole], where)
+    return found
 
 
 def in_parts(path: Path, fields: Sequence[str] | None) -> Iterator[Table]:
@@ -207,11 +228,30 @@ def _of_text(path: Path, growing: bool) -> tuple[pa.Table, list[str]]:
             raise
         table, more = _parsed(path, text.decode("cp1252").encode())
         more = [f"{path.name}: its text is not UTF-8: taken for Windows-1252", *more]
-    return table.rename_columns([name or _column(n) for n, name in enumerate(table.column_names)]), [*more, *notes]
+    names = [name or _column(n) for n, name in enumerate(table.column_names)]
+    return pa.table([_listed(one) for one in table.columns], names), [*more, *notes]
+
+
+def _listed(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """A column of text that are lists as lists of numbers, or of words; any other as it is."""
+    if not pa.types.is_string(column.type):
+        return column
+    first = next(iter(pc.utf8_trim_whitespace(column.drop_null()[:1]).to_pylist()), "")
+    if not (match := re.match(_LIST, first)):
+        return column
+    inside = pc.replace_substring_regex(pc.utf8_trim_whitespace(column), _AROUND_LIST, "")
+    lists = pc.split_pattern_regex(pc.replace_substring_regex(inside, "['\"]", ""), _BETWEEN).combine_chunks()
+    elements = lists.flatten()
+    if match[3] not in ("'", '"'):
+        numeric = pc.match_substring_regex(elements, NUMBER)
+        elements = pc.if_else(numeric, elements, None).cast(pa.float64())
+    return pa.chunked_array([pa.ListArray.from_arrays(lists.offsets, elements, mask=lists.is_null())])
 
 
 def _parsed(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
     """The table in a CSV text, and what was left out of it."""
+    if (match := _BARE_LIST.search(text, 0, _HEAD)) and b'"' not in text[: match.start()]:
+        text = _BARE_LIST.sub(rb'"\1"', text)
     layout = _layout(text)
     if layout.separator == " ":
         text = re.sub(rb"(?m)^[ \t]+|[ \t]+(?=\r?$)|(?<=[ \t])[ \t]+", b"", text)
@@ -231,7 +271,7 @@ def _parsed(path: Path, text: bytes) -> tuple[pa.Table, list[str]]:
                 column_names=layout.names,
                 skip_rows_after_names=int(layout.units),
             ),
-            parse_options=pacsv.ParseOptions(delimiter=layout.separator, **options),
+            parse_options=pacsv.ParseOptions(delimiter=layout.separator, newlines_in_values=layout.broken, **options),
             convert_options=pacsv.ConvertOptions(
                 null_values=BLANK, strings_can_be_null=True, decimal_point=layout.point
             ),
@@ -264,6 +304,7 @@ class _Layout(NamedTuple):
             there is none.
         units: Whether a line with units is below the header.
         above: How many of the lines above are no comments and not blank.
+        broken: Whether cells in quotes go on in the next line.
     """
 
     separator: str
@@ -272,30 +313,42 @@ class _Layout(NamedTuple):
     names: list[str] | None
     units: bool
     above: int
+    broken: bool
 
 
 def _layout(text: bytes) -> _Layout:
     """How a text is laid out, by its first lines."""
     head = text[: max(_HEAD, text.find(b"\n") + 1)].removeprefix(codecs.BOM_UTF8).decode("utf-8", errors="replace")
     *lines, last = re.split("\r\n|\r|\n", head)
-    lines = [*lines, last] if not lines or (last and len(text) <= _HEAD) else lines
+    lines, broken = _whole_lines([*lines, last] if not lines or (last and len(text) <= _HEAD) else lines)
     full = [n for n, line in enumerate(lines) if line.strip() and not _COMMENT.match(line)] or [0]
     first = full[0]
     comment = _COMMENT.sub("", lines[first - 1], 1) if first > 0 else ""
     separator = _separator(comment)
     names = _cells(comment, separator)
     if len(names) == len(_cells(lines[first], separator)) and _begins(lines, first, separator):
-        return _Layout(separator, _point(text, separator), first, names, units=False, above=0)
+        return _Layout(separator, _point(text, separator), first, names, units=False, above=0, broken=broken)
     separator = _separator(lines[first])
     if _is_headless(lines, first, separator):
         names = list(map(_column, range(len(_cells(lines[first], separator)))))
-        return _Layout(separator, _point(text, separator), first, names, units=False, above=0)
+        return _Layout(separator, _point(text, separator), first, names, units=False, above=0, broken=broken)
     header = _header(lines, full)
     separator = _separator(lines[header])
     units = header > first and all(map(_UNIT.fullmatch, _cells(lines[header], separator)))
     top, names = _told_apart(lines, header - units, separator)
     skipped = header - units + (names is not None)
-    return _Layout(separator, _point(text, separator), skipped, names, units, sum(n < top for n in full))
+    return _Layout(separator, _point(text, separator), skipped, names, units, sum(n < top for n in full), broken)
+
+
+def _whole_lines(lines: Sequence[str]) -> tuple[list[str], bool]:
+    """Lines of a text, those together in which a cell in quotes goes on; and whether there are such."""
+    found = list[str]()
+    for line in lines:
+        if found and found[-1].count('"') % 2:
+            found[-1] += f"\n{line}"
+        else:
+            found.append(line)
+    return found, len(found) < len(lines)
 
 
 def _header(lines: Sequence[str], full: Sequence[int]) -> int:
@@ -369,14 +422,16 @@ def _point(text: bytes, separator: str) -> str:
 
 def _separator(line: str) -> str:
     """What separates the cells of a line: of equals the first; a blank only where there is nothing else."""
+    line = re.sub('"[^"]*"', "", line)
     separator = max(",", ";", "\t", key=line.count)
     return " " if separator not in line and " " in line.strip() else separator
 
 
 def _cells(line: str, separator: str) -> list[str]:
     """The cells of a line, without quotes."""
-    found = line.split() if separator == " " else line.split(separator)
-    return [one.strip().strip('"').strip() for one in found]
+    inside = re.sub('"[^"]*"', lambda quoted: quoted[0].replace(separator, "\0"), line)
+    found = line.split() if separator == " " else inside.split(separator)
+    return [one.strip().strip('"').strip().replace("\0", separator) for one in found]
 
 
 def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
@@ -466,9 +521,14 @@ def _like(path: Path, name: str, kind: pa.DataType, value: bool | float | str) -
 
 def _chosen(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.Table:
     """The rows of a table that meet all conditions; what is null meets none."""
+    return rows.filter(_met(path, rows, conditions)) if conditions else rows
+
+
+def _met(path: Path, rows: pa.Table, conditions: Mapping[str, pa.Scalar]) -> pa.ChunkedArray:
+    """Which rows of a table meet all conditions."""
     columns = _named(rows)
     met = [pc.equal(find(columns, name, str(path), part=True), value) for name, value in conditions.items()]
-    return rows.filter(reduce(pc.and_, met)) if met else rows
+    return reduce(pc.and_, met)
 
 
 def _may_hold(group: Any, conditions: Mapping[str, pa.Scalar]) -> bool:

@@ -110,7 +110,8 @@ def rows_of(path: Path) -> int:
     entries = list(manifest.load(listed).entries.values())
     clocks = {(entry.rows, repr(entry.time)) for entry in entries}
     files = {entry.rows: listed.parent / entry.file for entry in entries}
-    if len(clocks) > len(files) or any(entry.where or entry.topic or entry.entity for entry in entries):
+    chosen = any(entry.where or entry.has_own_rows or entry.topic or entry.entity for entry in entries)
+    if len(clocks) > len(files) or chosen:
         return 0
     counts = [tables.row_count(file) for file in files.values()]
     return sum(counts) if all(counts) else 0
@@ -119,13 +120,18 @@ def rows_of(path: Path) -> int:
 def needs_whole(path: Path, config: FusionConfig) -> str | None:
     """What a run has that needs all of it in memory; None without anything.
 
-    A grid of ticks is fitted to all commands, and whole turns about a base are counted from the first row on.
+    A grid of ticks is fitted to all commands; whole turns about a base, and rows at a rate, are counted from the first
+    row on.
     """
     listed = None if path.suffix == ".parquet" else manifest.load(_manifest(path))
     if listed is not None and listed.command.clock == "regular":
         return "clock = 'regular'"
+    if listed is not None and listed.command.interpolation:
+        return "interpolation_ms"
     if listed is not None and any(entry.turns for entry in listed.entries.values()):
         return "turn_deg"
+    if listed is not None and any(entry.time.rate for entry in listed.entries.values()):
+        return "rate_hz"
     frame = config.frame if listed is None or listed.frame is None else listed.frame
     named = {axis for entry in listed.entries.values() for axis in entry.axes} if listed else set(CARTESIAN)
     return "a cylindrical [frame]" if isinstance(frame, Cylindrical) and not named.isdisjoint(CARTESIAN) else None
@@ -164,7 +170,7 @@ class _Rows:
         if part is None:
             self.ended, self.frontier = True, NEVER
             return 0
-        stamp, _ = part.stamps(self._time.column, self._time.nanoseconds, self._time.ending)
+        stamp, _ = self._time.stamps(part)
         self._held.append(pa.table(dict(part.columns)))
         self._stamp = np.concatenate([self._stamp, stamp])
         self._read += part.rows
