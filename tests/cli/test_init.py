@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 from pathlib import Path
 
@@ -116,6 +117,23 @@ def test_names_of_a_log_do_not_reach_the_terminal_as_markup(tmp_path: Path) -> N
     done = pumafuse("init", log, "-o", tmp_path / "made")
     assert "\x1b" not in done.stdout
     assert "[red]quality?[31m" in done.stdout.replace("\n", "")
+
+
+def test_a_table_without_stamps_is_read_at_a_rate(tmp_path: Path) -> None:
+    """As a milling machine writes it: set and actual positions, and how often rows come is known."""
+    lines = ["X_ActualPosition,X_ActualVelocity,X_SetPosition,Process"]
+    for row in range(400):
+        now, before = (round(50.0 * math.sin(0.2 * (0.1 * row - late)), 3) for late in (0.0, 0.03))
+        lines.append(f"{before},{now},{now},{'Prep' if row < 200 else 'Layer 1'}")
+    (tmp_path / "mill.csv").write_text("\n".join([*lines, ""]))
+    assert "if rows come at a constant rate, give it as --rate HZ" in refused("init", tmp_path / "mill.csv")
+    done = pumafuse("init", tmp_path / "mill.csv", "-o", tmp_path / "made", "--rate", "10")
+    assert "rows (at 10 Hz, as given)" in done.stdout
+    text = (tmp_path / "made" / "run.toml").read_text()
+    assert "time = { rate_hz = 10.0 }" in text and "interpolation_ms = 10.0" in text
+    pumafuse("fuse", tmp_path / "made", "-c", tmp_path / "made" / "fusion.toml", "-o", tmp_path / "fused")
+    for rate in ("0", "-1", "nan"):
+        pumafuse("init", tmp_path / "mill.csv", "--rate", rate, "--force", code=2)
 
 
 def test_what_is_no_log_is_one_line(tmp_path: Path) -> None:

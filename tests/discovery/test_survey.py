@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import tomllib
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pyarrow.parquet as papq
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 
 import bag_files
 import pumafuse as pf
@@ -52,6 +54,12 @@ def recorded(count: int = 1000, seed: int = 0) -> tuple[FloatArray, FloatArray, 
     return t, path(t), t + 0.004, path(t + 0.004 - LAG) + noise
 
 
+def recorded_at_once() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The same with commands and measurements in the same rows: times, commands, measurements."""
+    t, u, s, z = recorded()
+    return t, u, path(t - LAG) + z - path(s - LAG)
+
+
 def written(found: Survey, folder: Path) -> tuple[pf.Run, pf.FusionConfig]:
     """The three files, as the loaders take them."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -60,9 +68,9 @@ def written(found: Survey, folder: Path) -> tuple[pf.Run, pf.FusionConfig]:
     return pf.Run.read(folder), pf.FusionConfig.load(folder / "fusion.toml")
 
 
-def check_fuses(log: Path, folder: Path, axes: tuple[str, ...] = ("x", "y", "z")) -> Survey:
+def check_fuses(log: Path, folder: Path, axes: tuple[str, ...] = ("x", "y", "z"), rate: float = 0.0) -> Survey:
     """A log of :func:`recorded` fuses as it is, and well."""
-    found = survey(log)
+    found = survey(log, rate)
     run, config = written(found, folder)
     assert run.axes == axes == tuple(config.arm.axes)
     assert tuple(run.sensors) == tuple(config.sensors)
@@ -173,6 +181,125 @@ def test_tables_without_a_header(tmp_path: Path) -> None:
         (log / f"{name}.csv").write_text("".join(lines))
     found = check_fuses(log, tmp_path / "out", ("column_4", "column_5", "column_6"))
     assert {part.clock.nanoseconds for part in found.parts if part.clock} == {"column 2"}
+
+
+@pytest.mark.parametrize("stamps", ["none", "frames", "seconds"])
+def test_tables_without_stamps_need_a_rate(stamps: str, tmp_path: Path) -> None:
+    """Without any column of time, with a number of frames, of which some are lost, and with stamps of whole seconds."""
+    t, u, z = recorded_at_once()
+    kept = np.ones(len(t), dtype=np.bool_)
+    kept[300:302] = stamps != "frames"
+    clock = {"none": {}, "frames": {"Frame": np.arange(len(t))[kept]}, "seconds": {"pc_ts": START + t.astype(np.int64)}}
+    log = tmp_path / "log"
+    log.mkdir()
+    for name, value in (("goal", u), ("camera", z)):
+        columns = {f"{axis}_m": value[kept, number] for number, axis in enumerate("xyz")}
+        write(log / f"{name}.csv", {**clock[stamps], **columns})
+    said = one_line(RunError, lambda: survey(log))
+    assert "if rows come at a constant rate, give it as --rate HZ, else say in run.toml" in said
+    stands = "pc_ts is no clock: 20 distinct stamps, one every 1 s, in 1000 rows"
+    assert (stands in said) == (stamps == "seconds")
+    check_fuses(log, tmp_path / "out", rate=50.0)
+    time = tomllib.loads((tmp_path / "out" / "run.toml").read_text())["command"]["time"]
+    assert time == ({"column": "Frame", "rate_hz": 50} if stamps == "frames" else {"rate_hz": 50})
+
+
+LISTS: dict[str, Callable[[FloatArray], str]] = {
+    "python": lambda row: f'"[{row[0]:.7f}, {row[1]:.7f}, {row[2]:.7f}]"',
+    "tuple": lambda row: f'"({row[0]:.7f}, {row[1]:.7f}, {row[2]:.7f})"',
+    "array": lambda row: f"\"array('d', [{row[0]:.7f}, {row[1]:.7f}, {row[2]:.7f}])\"",
+    "numpy": lambda row: f'"array([{row[0]:.7f}, {row[1]:.7f}, {row[2]:.7f}], dtype=float32)"',
+    "numpy over lines": lambda row: f'"[{row[0]:.7e} {row[1]:.7e}\n {row[2]:.7e}]"',
+    "without quotes": lambda row: f"[{row[0]:.7f}, {row[1]:.7f}, {row[2]:.7f}]",
+    "numpy without quotes": lambda row: f"[{row[0]:.7f} {row[1]:.7f} {row[2]:.7f}]",
+}
+
+
+@pytest.mark.parametrize("form", LISTS)
+def test_cells_that_hold_lists_as_text(form: str, tmp_path: Path) -> None:
+    """As Python, pandas and numpy write them, also over several lines; names beside them are those of the elements."""
+    t, u, s, z = recorded()
+    log = tmp_path / "log"
+    log.mkdir()
+    for name, time, value in (("cmd", t, u), ("joint_states", s, z)):
+        names_of = "\"['x', 'y', 'z']\""
+        lines = [f"{at:.6f},{names_of},{LISTS[form](row)}\n" for at, row in zip(time, value, strict=True)]
+        if "without" in form:
+            lines = [line.replace(f"{names_of},", "") for line in lines]
+        header = "time,position\n" if "without" in form else "time,name,position\n"
+        (log / f"{name}.csv").write_text("".join([header, *lines]))
+    found = survey(log)
+    assert found.roles is not None and all(part.rows == len(t) for part in found.parts)
+    axes = {"joint0", "joint1", "joint2"} if "without" in form else {"x", "y", "z"}
+    assert set(found.roles.command.axes) == axes
+    for number, value in enumerate(found.roles.command.source.values.values()):
+        np.testing.assert_allclose(value, u[:, number], atol=1e-7)
+
+
+def long_rows(kind: str) -> list[list[str]]:
+    """The log of :func:`recorded` with axes, or sources, in rows of their own, in the order of time."""
+    t, u, z = recorded_at_once()
+    rows: list[tuple[float, list[str]]] = []
+    for number, axis in enumerate("xyz"):
+        apart = 3e-4 * number if kind == "stamps of their own" else 0.0
+        for at, goal, state in zip(t + apart, u[:, number], z[:, number], strict=True):
+            if kind == "tags":
+                rows += [(at, [f"root.{axis}.{what}", f"{x:.7f}"]) for what, x in (("SetPos", goal), ("ActPos", state))]
+            else:
+                rows.append((at, [str(11 + number) if kind == "numbers" else axis, f"{goal:.7f}", f"{state:.7f}"]))
+    if kind == "sources":
+        rows = [(at, ["goal", *map("{:.7f}".format, row)]) for at, row in zip(t, u, strict=True)]
+        rows += [(at + 1e-6, ["camera", *map("{:.7f}".format, row)]) for at, row in zip(t, z, strict=True)]
+    return [[f"{at:.6f}", *cells] for at, cells in sorted(rows, key=lambda row: row[0])]
+
+
+@pytest.mark.parametrize(
+    ("kind", "header", "axes"),
+    [
+        ("names", "time_s,joint,desired_position_m,actual_position_m", "xyz"),
+        ("stamps of their own", "time_s,joint,desired_position_m,actual_position_m", "xyz"),
+        ("numbers", "time_s,id,goal_position_m,present_position_m", ["joint_11", "joint_12", "joint_13"]),
+        ("tags", "time_s,tag,value_m", ["root_x", "root_y", "root_z"]),
+        ("sources", "time_s,source,x_m,y_m,z_m", "xyz"),
+    ],
+)
+def test_axes_and_sources_in_rows_of_their_own(kind: str, header: str, axes: Sequence[str], tmp_path: Path) -> None:
+    """As loggers of joints, historians and databases of time series write them: a column says whose a row is."""
+    lines = [header, *(",".join(row) for row in long_rows(kind))]
+    (tmp_path / "log.csv").write_text("\n".join([*lines, ""]))
+    check_fuses(tmp_path / "log.csv", tmp_path / "out", tuple(axes))
+
+
+def test_commands_that_are_samples_of_a_path(tmp_path: Path) -> None:
+    """An arm that follows the path between commands 30 ms late: it is far better fused if that is known, and is said.
+
+    One that is late by more than half an interval may as well hold each command.
+    """
+    t = 0.1 * np.arange(400)
+    s = np.arange(0.05, 39.0, 0.1)
+    noise = np.random.default_rng(3).normal(scale=2e-4, size=(len(s), 3))
+    error = {}
+    for late in (0.03, 0.08):
+        for name, at, value in (("goal", t, path(t)), ("camera", s, path(s - late) + noise)):
+            columns = {f"{axis}_m": value[:, number] for number, axis in enumerate("xyz")}
+            write(tmp_path / f"{name}.csv", {"time_s": at, **columns})
+        found = survey(tmp_path)
+        if late == 0.08:
+            assert not found.interpolation
+            continue
+        assert found.interpolation == 0.01
+        assert "(interpolation_ms in run.toml)" in "\n".join(questions(found))
+        run, config = written(found, tmp_path / "out")
+        assert config.arm.update_period == pytest.approx(0.01)
+        text = (tmp_path / "out" / "run.toml").read_text()
+        (tmp_path / "out" / "run.toml").write_text(text.replace("interpolation_ms", "# interpolation_ms"))
+        held = pf.Run.read(tmp_path / "out")
+        for what, one in (("path", run), ("held", held)):
+            arm = structs.replace(config.arm, update_period=0.01 if what == "path" else 0.1)
+            est = pf.fuse(one, structs.replace(config, arm=arm), rate=50)
+            inside = est.time > 2.0
+            error[what] = np.sqrt(np.mean((est["x"].position - path(est.time - late)[:, 0])[inside] ** 2))
+        assert error["path"] < 0.3 * error["held"], error
 
 
 def test_joints_have_the_names_that_are_beside_them(tmp_path: Path) -> None:
@@ -505,6 +632,14 @@ def test_hostile_names_stay_names(name: str, tmp_path: Path) -> None:
     ]
     assert columns == [name, "x_m"]
     pf.fuse(run, config)
+
+
+@pytest.mark.parametrize(
+    ("axis", "turns"), [("q", True), ("q_0", True), ("a1", True), ("elbow", True), ("x", False), ("a", False)]
+)
+def test_joints_are_known_by_their_names(axis: str, turns: bool) -> None:
+    """The generalized coordinate q alone, as logs of one joint have it, is one, too."""
+    assert names.is_turning(axis) is turns
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from ..discovery.contents import Part, rate_of
+from ..discovery.contents import Part, Signal, rate_of
 from ..discovery.drafts import BASES, FILES, drafts
 from ..discovery.questions import questions
 from ..discovery.roles import Stream
@@ -23,18 +23,19 @@ from .tables import print_tables, table
 _FEW = 4  # columns that are named
 
 
-def run(log: Path, output: Path | None, force: bool) -> None:
+def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     """Look at a log, print what it holds, and write three files to begin with.
 
     Args:
         log: The log.
         output: Where they go; None: a new folder named after the log.
+        rate: How often rows come in tables without stamps [Hz]; 0: not known.
         force: Replace them.
 
     Raises:
         PumafuseError: The log cannot be read, has no commands or no sensor, or the files are in the way.
     """
-    found = survey(log)
+    found = survey(log, rate)
     folder = Path(f"{found.name}-fusion") if output is None else output
     there = [name for name in FILES if (folder / name).exists()]
     if there and not force:
@@ -70,7 +71,7 @@ def _tables(found: Survey) -> Iterator[Table]:
 
 def _part_row(part: Part) -> list[str]:
     interval, gaps = ("", "") if part.clock is None else _rate(part.clock.stamp)
-    clock = "none found" if part.clock is None else f"{part.clock.column} ({part.clock.basis})"
+    clock = "none found" if part.clock is None else f"{part.clock.column or 'rows'} ({part.clock.basis})"
     named = [f"{name}: {why}" for name, why in part.left_out.items()]
     more = [f"{len(named) - _FEW} more"] if len(named) > _FEW else []
     unused = "; ".join([*part.notes, *named[:_FEW], *more])
@@ -98,10 +99,15 @@ def _axis_rows(what: str, stream: Stream) -> Iterator[list[str]]:
     because = stream.why
     for axis, signals in stream.axes.items():
         low, high = (f(signals[0].plain[np.isfinite(signals[0].plain)]) for f in (np.min, np.max))
-        columns = " + ".join(one.column for one in signals)
+        columns = " + ".join(_where(one) for one in signals)
         unit = f"{signals[0].unit}, {BASES[signals[0].basis]}"
         yield [what, axis, columns, unit, f"{low:.4g} … {high:.4g}", because]
         what = because = ""
+
+
+def _where(one: Signal) -> str:
+    """A column, and in which of the rows it is the axis."""
+    return ", ".join([one.column, *(f"{name} = {key}" for name, key in one.where.items())])
 
 
 def _relations_table(found: Survey) -> Table:

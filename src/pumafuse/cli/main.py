@@ -64,12 +64,15 @@ def init(
     output: Annotated[
         Path | None, Option("--output", "-o", metavar="DIR", help="Where the files go; default: LOG-fusion.")
     ] = None,
+    rate: Annotated[float | None, Option(metavar="HZ", help="How often rows come, for tables without stamps.")] = None,
     force: Force = False,
 ) -> None:
     """Look at a log, list what is in it, and write run.toml, arm.toml and fusion.toml to begin with."""
     from . import init as command
 
-    command.run(log, output, force)
+    if rate is not None and not 0.0 < rate < 1e9:
+        raise BadParameter("--rate is a number of rows a second, above 0")
+    command.run(log, output, rate or 0.0, force)
 
 
 @app.command()

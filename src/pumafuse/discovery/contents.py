@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,6 +23,7 @@ from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, printable
 from ..logs import recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, numeric_paths, prefixes, without_sentinels
+from ..logs.run import Source, standing_clock
 from ..units import TIMES, ending, kind_of, si_of, unwrapped, wraps
 from . import names
 
@@ -31,6 +34,7 @@ _MOST_COLUMNS = 200  # of positions in one of them
 _FEWEST_ROWS = 10
 _GAP = 5.0  # times the typical interval
 _IN_ORDER = 0.95  # share of rows of a clock that are not before the row above
+_MOST_KEYS, _IN_TURNS = 40, 0.3  # axes and sources in rows of their own; share of rows that are another's than before
 _EPISODES = ("episode_index", "episode", "run_id", "run", "trial")  # columns that tell runs in one table apart
 _VALID = names.words_in("valid tracked visible detected")  # columns that say whether a row of a sensor means anything
 _OF_JOINT, _NAMED = re.compile(r"positions\[(\d+)\]$"), re.compile(r"(|.*\.)name(\d+)")
@@ -49,11 +53,12 @@ class Clock:
     """The stamps of a part.
 
     Attributes:
-        column: A column or field path.
+        column: A column or field path; with a rate, of numbers of frames, and empty where each row is the next.
         nanoseconds: A column beside it, where it is of whole seconds; else empty.
         unit: Of numbers whose name does not say it (``ms``), else empty.
         basis: How the unit is known, in words.
         stamp: Int64 ns, (rows,).
+        rate: At which frames come, as the user says [Hz]; 0: these are stamps.
     """
 
     column: str
@@ -61,6 +66,7 @@ class Clock:
     unit: str
     basis: str
     stamp: TimeArray
+    rate: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -74,6 +80,7 @@ class Signal:
         basis: How the unit is known: ``name``, ``type``, ``turn``, or ``range``, which is a guess.
         plain: Its numbers in that unit, (rows,).
         turns: Whether it is an angle that begins anew after each turn.
+        where: In which of the rows it is this axis, where others are in rows of their own.
     """
 
     column: str
@@ -82,6 +89,12 @@ class Signal:
     basis: str
     plain: FloatArray
     turns: bool = False
+    where: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+    @property
+    def name(self) -> str:
+        """What it is called: by its column, and by what says which rows are its own."""
+        return _called(self.column, self.where)
 
     @property
     def value(self) -> FloatArray:
@@ -129,8 +142,12 @@ class Part:
         return self.topic or self.entity or self.file.name.split(".")[0]
 
 
-def parts_of(log: Path) -> list[Part]:
+def parts_of(log: Path, rate: float = 0.0) -> list[Part]:
     """What a log has: a table, a recording, or a folder of them.
+
+    Args:
+        log: The file or folder.
+        rate: How often rows, or frames, come in tables without stamps [Hz]; 0: not known.
 
     Raises:
         RunError: There is nothing that can be read.
@@ -138,9 +155,9 @@ def parts_of(log: Path) -> list[Part]:
     found: list[Part] = []
     for path in _files(log):
         if path.suffix in _TEXTS and path != log:
-            found += _perhaps(path)
+            found += _perhaps(path, rate)
         else:
-            found += _recorded(path) if tables.is_recording(path) else [_tabled(path)]
+            found += _recorded(path) if tables.is_recording(path) else [_tabled(path, rate)]
         if len(found) > _MOST_PARTS:
             raise RunError(f"{log}: more than {_MOST_PARTS} tables or topics; give the log of one run")
     return found
@@ -169,28 +186,35 @@ def _files(log: Path) -> list[Path]:
     return found
 
 
-def _part(table: Table, place: Part, labels: Mapping[str, list[str]]) -> Part:
+def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: float = 0.0) -> Part:
     """A part with its clock and its columns, from its table."""
     clock = _clock(table)
     used = () if clock is None else (clock.column, clock.nanoseconds)
     signals, left_out, joints = list[Signal](), dict[str, str](), _joints(table)
-    for path in _numeric_paths(table):
-        if path in used or (clock is not None and path.startswith(f"{clock.column}.")):
+    for path, where in product(_numeric_paths(table), _axes_in_rows(table)):
+        name = _called(path, where)
+        if path in used or path in where or (clock is not None and path.startswith(f"{clock.column}.")):
             continue
         if names.is_time(path):
             left_out[path] = "another clock" if clock else _no_clock(table, path)
-        elif why := names.no_position(path):
-            left_out[path] = why
+        elif why := names.no_position(name):
+            left_out[name] = why
         elif len(signals) == _MOST_COLUMNS:
-            left_out[path] = f"more than {_MOST_COLUMNS} columns"
+            left_out[name] = f"more than {_MOST_COLUMNS} columns"
         elif isinstance(
-            found := _signal(table, path, place.type, labels.get(leaf(path), []), joints.get(path)), Signal
+            found := _signal(table, path, where, place.type, labels.get(leaf(path), []), joints.get(path)), Signal
         ):
             signals.append(found)
         elif found:
-            left_out[path] = found
-    notes = (*place.notes, *table.notes)
-    return replace(place, rows=table.rows, clock=clock, signals=_with_units(signals), left_out=left_out, notes=notes)
+            left_out[name] = found
+    notes = [*place.notes, *table.notes]
+    if clock is not None and (stands := _stands_still(clock, signals, table)):
+        notes, clock = [f"{clock.column} is no clock: {stands}", *notes], None
+    if clock is None and rate:
+        clock = _counted(table, rate)
+    return replace(
+        place, rows=table.rows, clock=clock, signals=_with_units(signals), left_out=left_out, notes=tuple(notes)
+    )
 
 
 def _joints(table: Table) -> dict[str, str]:
@@ -210,10 +234,37 @@ def _joints(table: Table) -> dict[str, str]:
     return found
 
 
-def _signal(table: Table, path: str, type_: str, labels: list[str], joint: str | None) -> Signal | str:
+def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
+    """Which rows are whose, where a column tells axes or sources of a table apart; else all, once.
+
+    Such a column changes from row to row. Of numbers it has to be called so: ``id``.
+    """
+    for name, column in table.columns.items():
+        numbered = pa.types.is_integer(column.type) and names.tells_apart(name)
+        if not numbered and not (pa.types.is_string(column.type) and not table.is_dated(name)):
+            continue
+        counts = pc.value_counts(column.drop_null())
+        keys = {one["values"].as_py(): one["counts"].as_py() for one in counts} if len(counts) <= _MOST_KEYS else {}
+        if len(keys) < 2 or min(keys.values()) < _FEWEST_ROWS:
+            continue
+        if pc.mean(pc.not_equal(column[1:], column[:-1])).as_py() > _IN_TURNS:
+            return [{name: key} for key in keys]
+    return [{}]
+
+
+def _called(column: str, where: Mapping[str, Any]) -> str:
+    """A column by its name, and by what says which rows are its own: ``elbow_position``, ``joint_11_position``."""
+    keys = (key if isinstance(key, str) else f"joint_{key}" for key in where.values())
+    return "_".join([*keys, column])
+
+
+def _signal(
+    table: Table, path: str, where: Mapping[str, Any], type_: str, labels: list[str], joint: str | None
+) -> Signal | str:
     """A column as positions, or why it is none; empty for text."""
     try:
         values, _ = without_sentinels(table.plain(path)[0])
+        values = np.where(tables.meets(table, where), values, np.nan) if where else values
     except RunError as error:
         return printable(str(error).removeprefix(f"{table.path}: "))
     known = values[np.isfinite(values)]
@@ -226,7 +277,8 @@ def _signal(table: Table, path: str, type_: str, labels: list[str], joint: str |
     of_type = "m" if kind in _METRES or sliding else "rad" if kind in _RADIANS else ""
     unit = names.unit_of(path)
     basis = "name" if unit else "type" if of_type and not sliding else "range"
-    return Signal(path, joint or names.axis_of(path, labels), unit or of_type, basis, values)
+    axis = joint or names.axis_of(_called(path, where), labels)
+    return Signal(path, axis, unit or of_type, basis, values, where=where)
 
 
 def _with_units(signals: list[Signal]) -> tuple[Signal, ...]:
@@ -338,6 +390,29 @@ def _nameless_clock(table: Table) -> Clock | None:
     return _clock_of(table, first) if rises else None
 
 
+def _stands_still(clock: Clock, signals: Sequence[Signal], table: Table) -> str:
+    """What is wrong with a clock that is too coarse for the rows, in words; empty of any other."""
+    if not signals:
+        return ""
+    return standing_clock(Source(clock.stamp, {one.name: one.plain for one in signals}, table.path.name))
+
+
+def _counted(table: Table, rate: float) -> Clock:
+    """Frames that come at a rate, by a column that counts them, or else each row."""
+    for name in table.columns:
+        if names.is_counter(name):
+            with suppress(RunError):
+                steps = np.diff(table.plain(name)[0])
+                if (steps >= 1.0).all() and (steps % 1.0 == 0.0).all() and (steps == 1.0).mean() > 0.5:
+                    return Clock(name, "", "", f"at {rate:g} Hz, as given", table.frames(rate, name)[0], rate)
+    return Clock("", "", "", f"at {rate:g} Hz, as given", table.frames(rate)[0], rate)
+
+
+def without_clock(part: Part) -> str:
+    """Why a part that has positions has no clock."""
+    return next((note for note in part.notes if " is no clock: " in note), "no clock")
+
+
 def _basis(table: Table, name: str, kind: pa.DataType) -> str:
     """How it is known what stamps without a unit are."""
     if pa.types.is_nested(kind):
@@ -377,7 +452,7 @@ def _time_unit(values: FloatArray) -> tuple[str, str]:
 # Tables.
 
 
-def _tabled(path: Path) -> Part:
+def _tabled(path: Path, rate: float) -> Part:
     """A table; of several runs in it the first, of a sensor's rows those that it calls valid."""
     fields = _fields(path) if path.suffix == ".parquet" else None
     read = partial(tables.read, path, growing=True)
@@ -394,14 +469,14 @@ def _tabled(path: Path) -> Part:
         where, rows = {**where, **valid}, table.rows
         table = read(fields=fields, where=where)
         notes += [f"{rows - table.rows} of {rows} rows are not {key}: left out" for key in valid]
-    return _part(table, Part(path, where=where, notes=tuple(notes)), _labels(path))
+    return _part(table, Part(path, where=where, notes=tuple(notes)), _labels(path), rate)
 
 
-def _perhaps(path: Path) -> Iterator[Part]:
-    """A text in a folder, which may be anything, if it is a table of positions with a clock."""
+def _perhaps(path: Path, rate: float) -> Iterator[Part]:
+    """A text in a folder, which may be anything, if it is a table of positions with a clock of its own."""
     with suppress(RunError):
-        part = _tabled(path)
-        if part.clock and part.signals:
+        part = _tabled(path, rate)
+        if part.clock and not part.clock.rate and part.signals:
             yield part
 
 
@@ -497,6 +572,12 @@ def _joint_names(table: Table) -> list[str]:
     column = table.columns.get("joint_names")
     listed: Any = None if column is None or not len(column) else column[0].as_py()
     return [str(name) for name in cast(list[Any], listed)] if isinstance(listed, list) else []
+
+
+def period_of(command: Source) -> float:
+    """Median time between the commands of an axis [s], of several axes in the middle; NaN of fewer than two."""
+    periods = [rate_of(command.stamp[np.isfinite(value)])[0] for value in command.values.values()]
+    return float(np.nanmedian(periods)) if np.isfinite(periods).any() else math.nan
 
 
 def rate_of(stamp: TimeArray) -> tuple[float, FloatArray]:

@@ -48,6 +48,9 @@ def _run_toml(found: Survey, folder: Path) -> str:
         f"name = {_value(found.name)}",
     ]
     lines += _source(["command"], roles.command, folder)
+    if found.interpolation:
+        why = "DECIDE: what measures follows the path between commands; without this line each is held"
+        lines.append(_line(_pair("interpolation_ms", found.interpolation * MS), why))
     for one in roles.sensors:
         lines += _source(["sensors", one.name], one, folder)
     if roles.reference is not None:
@@ -69,8 +72,9 @@ def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
     lines = ["", _line(_header(table), printable(stream.why, 200)), _line(_pair("file", _from(folder, part.file)))]
     keys = {"topic": part.topic, "entity": part.entity, "where": dict(part.where)}
     lines += [_line(_pair(key, value)) for key, value in keys.items() if value]
-    time: Any = [clock.column, clock.nanoseconds] if clock.nanoseconds else clock.column
-    time = {"column": clock.column, "unit": clock.unit} if clock.unit else time
+    more = {"column": clock.column, "unit": clock.unit, "rate_hz": clock.rate}
+    time: Any = {key: value for key, value in more.items() if value} if clock.unit or clock.rate else clock.column
+    time = [clock.column, clock.nanoseconds] if clock.nanoseconds else time
     lines.append(_line(_pair("time", time), clock.basis))
     for axis, signals in stream.axes.items():
         columns: list[Any] = [_column(one) for one in signals]
@@ -83,6 +87,7 @@ def _column(one: Signal) -> Any:
     """A column, with what its name does not say."""
     more = {} if _says_unit(one.column, one.unit) else {"unit": one.unit}
     more |= {"turn_deg": 360} if one.turns else {}
+    more |= {"where": dict(one.where)} if one.where else {}
     return {"column": one.column, **more} if more else one.column
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import RunError
 from ..units import Kind
-from .contents import rate_of
+from .contents import period_of
 from .following import Following
 from .survey import Survey
 
@@ -82,7 +82,7 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
         RunError: There are fewer than two commands.
     """
     run = found.run
-    period = rate_of(run.command.stamp)[0]
+    period = period_of(run.command)
     if math.isnan(period):
         raise RunError(f"{found.log}: fewer than two commands with stamps of their own")
     relations = {key: one for key, one in found.relations.items() if abs(one.correlation) >= _FOLLOWS}

@@ -45,10 +45,10 @@ _SILENT = (
 )
 _NO_POSITIONS = words_in(
     "velocity velocities vel speed dq qvel dot acceleration accelerations acc accelerometer ddq qdd qacc jerk effort"
-    " efforts torque torques tau force forces momentum current currents voltage mode scaling bits temperature"
-    " temperatures temp quality confidence covariance orientation rotation quaternion twist index id seq sequence"
-    " count status valid std sd sigma latency duration error header stamp nanosec layout frame done reward task"
-    " episode tick time timestamp"
+    " efforts torque torques tau force forces momentum current currents voltage power pressure mode scaling bits"
+    " temperature temperatures temp quality confidence covariance orientation rotation quaternion twist index id seq"
+    " sequence count status valid std sd sigma latency duration error header stamp nanosec layout frame done reward"
+    " task episode tick time timestamp"
 )
 # Words that are something else only without a number: ax1 is an axis.
 _WHOLE = {**dict.fromkeys(words_in("vx vy vz ax ay az"), "a rate"), **dict.fromkeys(words_in("qx qy qz qw"), "turning")}
@@ -57,6 +57,8 @@ _POSITIONS = words_in("position positions pos pose")  # current_position is one
 _TIMES = words_in(
     "t time times stamp stamps timestamp timestamps sec secs seconds date datetime clock ts arrival arrived zeit"
 )
+_COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
+_WHOSE = words_in("id joint motor servo axis actuator device node channel marker body")
 _DIGITS = "0123456789"
 _KEYS = words_in("file topic entity where time clock start")  # of a source in run.toml, beside its axes
 _SLIDING = words_in("slide slider prismatic linear rail gantry")
@@ -70,7 +72,7 @@ _UNITS = {
 }
 _TURNING = re.compile(
     r"joint|jnt|dof|shoulder|elbow|wrist|angle|theta|yaw|pitch|roll|motor|servo|pan|tilt|lift|flex|gripper"
-    r"|^[amjq](_?d)?_?\d+$"
+    r"|^([amj](_?d)?_?\d+|q(_?d)?_?\d*)$"
 )
 
 
@@ -112,6 +114,16 @@ def is_part(column: str) -> bool:
 def is_time(column: str) -> bool:
     """Whether a column is called as stamps are."""
     return not _TIMES.isdisjoint(words(column))
+
+
+def is_counter(column: str) -> bool:
+    """Whether a column is called as numbers of frames are."""
+    return not _COUNTERS.isdisjoint(words(leaf(column)))
+
+
+def tells_apart(column: str) -> bool:
+    """Whether a column of numbers is called as those are that say whose a row is."""
+    return not _WHOSE.isdisjoint(words(leaf(column)))
 
 
 def no_position(column: str) -> str | None:

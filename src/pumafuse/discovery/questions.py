@@ -33,6 +33,11 @@ def questions(found: Survey) -> Iterator[str]:
             elif one.lag < 0.0:
                 yield f"{name} runs {-one.lag * MS:.0f} ms ahead of the commands on {axis}: is its clock another one?"
             lags.append(one.lag)
+    if found.interpolation:
+        yield (
+            "are the commands samples of a path that the controller interpolates, or is a clock off? What measures"
+            " follows that path sooner than an arm can that holds each command (interpolation_ms in run.toml)"
+        )
     if found.roles is not None:
         roles = found.roles
         streams = [roles.command, *roles.sensors, *([] if roles.reference is None else [roles.reference])]

@@ -14,7 +14,7 @@ from ..errors import RunError, printable
 from ..logs.run import Run, Source
 from ..units import AN, OF_KIND, TURN, Kind, kind_of
 from . import names
-from .contents import Part, Signal
+from .contents import Part, Signal, without_clock
 from .following import Following, following
 from .names import Role
 
@@ -53,7 +53,8 @@ class Stream:
         assert self.part.clock is not None
         values = {axis: np.sum([one.value for one in signals], axis=0) for axis, signals in self.axes.items()}
         source = Source(self.part.clock.stamp, values, self.part.label)
-        return source.rows(source.has_value)
+        has_own_rows = any(one.where for signals in self.axes.values() for one in signals)
+        return source.pivoted() if has_own_rows else source.rows(source.has_value)
 
     @property
     def turns(self) -> dict[str, float]:
@@ -107,12 +108,13 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
     streams = [stream for part in parts for stream in _streams(part)]
     if not streams:
         others = [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
-        clockless = [f"{part.label} (no clock)" for part in parts if part.signals and part.clock is None]
+        clockless = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
         there = ", ".join(map(printable, [*clockless, *others][:_MOST_LISTED]))
+        at_a_rate = " if rows come at a constant rate, give it as --rate HZ, else" if clockless else ""
         raise RunError(
             f"{log}: no columns of positions with a clock beside them"
             + (f", but {there}" if there else "")
-            + "; say in run.toml where they are"
+            + f";{at_a_rate} say in run.toml where they are"
         )
     streams = _uniquely_named(_apart(streams[0]) if len(streams) == 1 else streams)
     command, why = _command(streams, log)
@@ -179,10 +181,10 @@ def _streams(part: Part) -> list[Stream]:
         return []
     groups: dict[str, list[Signal]] = {}
     for signal in part.signals:
-        groups.setdefault("_".join(dict.fromkeys(names.role_words(signal.column))), []).append(signal)
+        groups.setdefault("_".join(dict.fromkeys(names.role_words(signal.name))), []).append(signal)
     found = list[Stream]()
     for key, signals in groups.items():
-        own = (names.column_role(signals[0].column), f"its columns are called '{key.replace('_', ' ')}'")
+        own = (names.column_role(signals[0].name), f"its columns are called '{key.replace('_', ' ')}'")
         file = (names.role_of(part.stem), f"it is called '{printable(part.stem)}'")
         clock = (names.column_role(part.clock.column), f"its clock is called '{printable(part.clock.column)}'")
         by_type = ("command" if part.type.endswith("JointTrajectory") else None, f"its messages are {part.type}")
@@ -199,7 +201,7 @@ def _axes(signals: Sequence[Signal]) -> dict[str, list[Signal]]:
     found: dict[str, list[Signal]] = {}
     for signal in signals:
         axis, number = signal.axis, 1
-        while axis in found and not (names.is_part(signal.column) and names.is_part(found[axis][0].column)):
+        while axis in found and not (names.is_part(signal.name) and names.is_part(found[axis][0].name)):
             number += 1
             axis = f"{signal.axis}_{number}"
         found.setdefault(axis, []).append(signal)

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ..errors import RunError
 from ..logs.axes import in_axes
 from ..logs.run import Run
-from .contents import Part, parts_of
+from .contents import Part, parts_of, period_of, without_clock
 from .following import Following
 from .roles import Roles, relations, roles_of
+
+_SURELY = 0.9  # correlation of changes from which a lag is known well
+SOONER = 2e-3  # s: lags are known to 1 ms
+_STEPS, _FINEST = 10, 1e-3  # of an update period; s
 
 
 @dataclass(frozen=True)
@@ -29,6 +36,7 @@ class Survey:
         parts: Its tables or topics; none where it has a ``run.toml``.
         roles: Who is who; None where a ``run.toml`` says it.
         manifest: What that ``run.toml`` holds.
+        interpolation: In which steps the run's commands go on between those of the log [s]; 0: they are the log's.
     """
 
     log: Path
@@ -37,6 +45,7 @@ class Survey:
     parts: Sequence[Part] = ()
     roles: Roles | None = None
     manifest: Mapping[str, Any] | None = None
+    interpolation: float = 0.0
 
     @property
     def name(self) -> str:
@@ -46,8 +55,12 @@ class Survey:
         return re.sub(r"(\.(csv|parquet|mcap|bag|db3|rrd))?(\.gz)?$", "", log.name) or "log"
 
 
-def survey(log: Path) -> Survey:
+def survey(log: Path, rate: float = 0.0) -> Survey:
     """Look at a log of any kind that can be read.
+
+    Args:
+        log: The file or folder.
+        rate: How often rows, or frames, come in tables without stamps [Hz]; 0: not known.
 
     Raises:
         PumafuseError: Nothing can be read, or nothing in it can be commands.
@@ -56,12 +69,39 @@ def survey(log: Path) -> Survey:
     if os.path.isfile(described):  # noqa: PTH113 - Path.is_file raises on a name that is too long
         run, _ = in_axes(Run.read(described), None)
         return Survey(log, run, relations(run), manifest=tomllib.loads(described.read_text(encoding="utf-8")))
-    parts = parts_of(log)
+    parts = parts_of(log, rate)
     roles = roles_of(parts, str(log))
     if not roles.sensors:
-        raise RunError(f"{log}: commands, but nothing that measures where they lead: {_reasons(roles)}")
-    return Survey(log, roles.run, relations(roles.run), parts, roles)
+        raise RunError(f"{log}: commands, but nothing that measures where they lead: {_reasons(roles, parts)}")
+    found = Survey(log, roles.run, relations(roles.run), parts, roles)
+    if step := interpolation(found):
+        command = found.run.command.interpolated(step)
+        found = replace(found, run=replace(found.run, command=command), interpolation=step)
+    return found
 
 
-def _reasons(roles: Roles) -> str:
-    return "; ".join(f"{stream.name}: {why}" for stream, why in roles.left_out) or "nothing else is in the log"
+def interpolation(found: Survey) -> float:
+    """In which steps the arm seems to go on between its commands [s]; 0 where it may as well hold each.
+
+    Behind the path through the commanded points, an arm that holds each is late by half an update period and more. One
+    that follows this path sooner knows what is between: the log has samples of what a controller interpolates.
+    """
+    period = period_of(found.run.command)
+    margin = max(SOONER, 0.1 * period)
+    goes_on = -margin <= soonest(found) < 0.5 * period - margin
+    return max(float(f"{period / _STEPS:.1g}"), _FINEST) if goes_on else 0.0
+
+
+def soonest(found: Survey) -> float:
+    """The least lag of any source behind the path through the commanded points, where it is known well [s]."""
+    lags = dict[str, list[float]]()
+    for (name, _), one in found.relations.items():
+        if abs(one.correlation) >= _SURELY:
+            lags.setdefault(name, []).append(one.lag)
+    return min((float(np.median(mine)) for mine in lags.values()), default=math.inf)
+
+
+def _reasons(roles: Roles, parts: Sequence[Part]) -> str:
+    reasons = [f"{stream.name}: {why}" for stream, why in roles.left_out]
+    reasons += [f"{part.label}: {without_clock(part)}" for part in parts if part.signals and part.clock is None]
+    return "; ".join(reasons) or "nothing else is in the log"
