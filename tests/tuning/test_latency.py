@@ -170,6 +170,19 @@ def test_the_held_command_is_half_a_period_late_itself() -> None:
     assert axis.lag == pytest.approx(0.1 - 0.5 * PERIOD, abs=1e-3)
 
 
+@pytest.mark.parametrize(("ahead", "said"), [(0.012, "12 ms ahead of the commands"), (-0.003, "interpolation_ms = 2 ")])
+def test_an_arm_that_is_sooner_than_one_can_be_is_reported(ahead: float, said: str) -> None:
+    """Where it follows the path before its points are logged, or between them; no dead time is below 0 all the same."""
+    time, command = path("smooth")
+    rng, stamp = np.random.default_rng(5), np.arange(0.3, LENGTH - 0.3, 0.02)
+    position = np.interp(stamp + ahead, time, command) + rng.normal(0.0, 1e-4, len(stamp))
+    run = pf.Run.from_arrays(time, {"x": command}, {"tracker": (stamp, {"x": position})})
+    with pytest.warns(pf.PumafuseWarning, match=said):
+        late = pf.latency(run)
+    one = late.details.axes["x"]
+    assert 0.0 <= one.delay_ci95[0] <= one.delay <= one.delay_ci95[1]
+
+
 def test_a_mirrored_sensor_is_followed() -> None:
     """A distance that falls while the axis moves on: the same lag."""
     found = pf.latency(recorded("steps", scale=-1.0))

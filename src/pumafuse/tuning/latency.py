@@ -22,7 +22,7 @@ from .. import toml
 from ..arrays import FloatArray
 from ..discovery.guesses import ArmGuess, AxisGuess, SensorGuess, guess
 from ..discovery.roles import relations
-from ..discovery.survey import Survey
+from ..discovery.survey import SOONER, Survey, interpolation, soonest
 from ..errors import PumafuseWarning, UnknownNameError
 from ..fusion.config import FusionConfig, Process, Sensor, Start
 from ..fusion.score import Z95
@@ -63,6 +63,11 @@ from .posterior import (
 REFERENCE = "reference"  # the name of a run's reference among its sensors
 _MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/comparison.md
 _HIGHEST = 700.0  # logarithm of what a number can be
+_SAMPLED = (
+    "{}: what measures follows the path between commands sooner than an arm can that holds each; if they are samples of"
+    " a path that the controller interpolates, write interpolation_ms = {:g} below [command] in run.toml"
+)
+_AHEAD_OF = "{}: what measures is {:.0f} ms ahead of the commands, and the lag is wrong: are both stamped by one clock?"
 _FINEST = 2e-5  # s: no stamp of a log is better, whatever the likelihood says where measurements pass commands
 _ROUGHLY = 0.1  # tolerance in log-likelihood
 _GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
@@ -247,7 +252,8 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     if not every:
         raise TuneError("no run to look at")
     with _workers(len({axis for run in every for axis in run.command.values})) as workers:
-        config = first_guess(every)
+        surveys = [Survey(Path(run.name), run, relations(run)) for run in sorted(every, key=_motion, reverse=True)]
+        config = first_guess(surveys)
         trusted = _trusted(config, every, sensor)
         likelihood = Likelihood(every, _known(config, trusted), [trusted])
         moving = excited_axes(likelihood, likelihood.config)
@@ -259,6 +265,8 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     lags, clock = _with_courses(likelihood, config, lags)
     still = [axis for axis in config.arm.axes if axis not in moving]
     notes = [*likelihood.notes, *(f"{axis}: does not move, or {trusted} does not measure it" for axis in still)]
+    notes += [_SAMPLED.format(one.run.name, step * MS) for one in surveys if (step := interpolation(one))]
+    notes += [_AHEAD_OF.format(one.run.name, -lag * MS) for one in surveys if (lag := soonest(one)) < -SOONER]
     summary = LatencySummary(
         pumafuse=version("pumafuse"),
         runs=[run.name for run in every],
@@ -286,15 +294,15 @@ def _with_reference(run: Run) -> Run:
     return replace(run, sensors={REFERENCE: run.reference, **run.sensors}, reference=None)
 
 
-def first_guess(runs: Sequence[Run]) -> FusionConfig:
+def first_guess(surveys: Sequence[Survey]) -> FusionConfig:
     """A configuration by correlation: lags, noise and latencies of the runs, those with the most motion first.
 
     Raises:
         RunError: There are fewer than two commands.
     """
     arms, axes, sensors = list[ArmGuess](), dict[str, AxisGuess](), dict[str, SensorGuess]()
-    for run in sorted(runs, key=_motion, reverse=True):
-        arm, found = guess(Survey(Path(run.name), run, relations(run)))
+    for survey in surveys:
+        arm, found = guess(survey)
         arms.append(arm)
         axes = {**arm.axes, **axes}
         for name, one in found.items():
@@ -381,7 +389,8 @@ def _known(config: FusionConfig, trusted: str) -> FusionConfig:
     for name, one in config.sensors.items():
         config = changed(config, ("sensors", name, "latency"), one.latency - late)
     for axis in config.arm.axes:
-        config = changed(config, ("arm", "axes", axis, "delay"), config.arm.delay_of(axis) + late)
+        delay = max(config.arm.delay_of(axis) + late, 0.0)  # where it seems to be ahead
+        config = changed(config, ("arm", "axes", axis, "delay"), delay)
     return config
 
 

@@ -296,7 +296,7 @@ def past_bumps(likelihood: Likelihood, best: Point, free: Sequence[Parameter], n
         if one.fit not in ("delay", "latency"):
             continue
         at = one.at(best.config)
-        near = [point(likelihood, one.move(best.config, at + shift), free) for shift in _BUMPS]
+        near = [point(likelihood, one.move(best.config, one.coordinate(at + shift)), free) for shift in _BUMPS]
         beside = max(near, key=lambda found: found.log_posterior)
         if beside.log_posterior > best.log_posterior + _TOLERANCE:
             best = maximise(likelihood, beside.config, free, notify)
