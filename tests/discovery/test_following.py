@@ -39,7 +39,7 @@ def test_lag_gain_and_level_are_found(lag: float, gain: float, level: float, rat
     assert found is not None
     assert found.lag == pytest.approx(lag, abs=0.006 if rate > 5.0 else 0.015)  # 190 measurements
     assert found.slope == pytest.approx(gain, rel=0.02)
-    assert abs(found.correlation) > 0.95
+    assert abs(found.correlation) > (0.95 if rate > 5.0 else 0.9)  # each outlier is in two of 190 changes
     if rate > 5.0:
         assert 2e-4 < found.scatter < 5e-4
     expected = np.median(z - np.sign(gain) * path(s - lag))
