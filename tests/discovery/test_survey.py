@@ -270,6 +270,15 @@ def test_axes_and_sources_in_rows_of_their_own(kind: str, header: str, axes: Seq
     check_fuses(tmp_path / "log.csv", tmp_path / "out", tuple(axes))
 
 
+def test_a_status_that_changes_all_the_time_tells_nothing_apart(tmp_path: Path) -> None:
+    """It is of the row, not of an axis."""
+    t, u, z = recorded_at_once()
+    words = np.where(np.random.default_rng(1).random(len(t)) < 0.5, "good", "poor")
+    columns = {f"{what}.{a}_m": one[:, n] for what, one in (("goal", u), ("camera", z)) for n, a in enumerate("xyz")}
+    write(tmp_path / "log.csv", {"time_s": t, "status": words, **columns})
+    check_fuses(tmp_path / "log.csv", tmp_path / "out")
+
+
 def test_commands_that_are_samples_of_a_path(tmp_path: Path) -> None:
     """An arm that follows the path between commands 30 ms late: it is far better fused if that is known, and is said.
 

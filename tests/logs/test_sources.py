@@ -437,6 +437,19 @@ def test_commands_between_which_a_controller_interpolates(tmp_path: Path) -> Non
         assert f"interpolation_ms = {step} is not between a thousandth of the interval of the commands, 100 ms" in text
 
 
+def test_axes_with_stamps_of_their_own_are_interpolated_each(tmp_path: Path) -> None:
+    """Each has the values that it has alone, whatever lies between its rows."""
+    time, joint = np.arange(200) * 0.05 + 1e-3 * (np.arange(200) % 2), np.tile(["elbow", "wrist"], 100)
+    columns = {"t_s": time, "joint": joint, "goal": np.sin(time)}
+    axis = '{0} = {{ column = "goal", unit = "rad", where = {{ joint = "{0}" }} }}'.format
+    both = read(tmp_path, f'time = "t_s"\ninterpolation_ms = 10\n{axis("elbow")}\n{axis("wrist")}', columns).command
+    for one in ("elbow", "wrist"):
+        alone = read(tmp_path, f'time = "t_s"\ninterpolation_ms = 10\n{axis(one)}', columns).command
+        assert len(alone.stamp) == 991
+        known = np.isfinite(both.values[one])
+        same(alone, both.stamp[known], **{one: both.values[one][known]})
+
+
 def test_sources_of_one_file_have_rows_of_their_own(tmp_path: Path) -> None:
     """Two sources may read different runs of one table, and 1 is not true."""
     sensor = '[sensors.s]\nfile = "log.parquet"\ntime = "t_ns"\nx = "x_m"\nwhere = { even = true }'

@@ -237,11 +237,11 @@ def _joints(table: Table) -> dict[str, str]:
 def _axes_in_rows(table: Table) -> list[dict[str, Any]]:
     """Which rows are whose, where a column tells axes or sources of a table apart; else all, once.
 
-    Such a column changes from row to row. Of numbers it has to be called so: ``id``.
+    Such a column changes from row to row. Of numbers it has to be called so: ``id``. A ``status`` is none.
     """
     for name, column in table.columns.items():
-        numbered = pa.types.is_integer(column.type) and names.tells_apart(name)
-        if not numbered and not (pa.types.is_string(column.type) and not table.is_dated(name)):
+        whose, words = names.tells_apart(name), pa.types.is_string(column.type) and not table.is_dated(name)
+        if not (whose and pa.types.is_integer(column.type)) and not (words and (whose or not names.no_position(name))):
             continue
         counts = pc.value_counts(column.drop_null())
         keys = {one["values"].as_py(): one["counts"].as_py() for one in counts} if len(counts) <= _MOST_KEYS else {}

@@ -108,17 +108,23 @@ class Source:
         for mask in known.values():
             count = np.cumsum(mask)
             place = np.maximum(place, np.where(mask, count - (count - mask)[first], 0))
-        _, row, together = np.unique(np.stack([group, place]), axis=1, return_index=True, return_inverse=True)
+        key = group * (place.max(initial=0) + 1) + place
+        _, row, together = np.unique(key, return_index=True, return_inverse=True)
         values = {axis: np.full(len(row), np.nan) for axis in self.values}
         for axis, mask in known.items():
             values[axis][together[mask]] = self.values[axis][mask]
         found = replace(self, stamp=self.stamp[row], values=values, apart=True)
         return found.rows(found.has_value)
 
+    def _of(self, axis: str) -> Source:
+        """The rows of one axis alone."""
+        own = self.rows(np.isfinite(self.values[axis]))
+        return replace(own, values={axis: own.values[axis]}, apart=False)
+
     def interpolated(self, step: float) -> Source:
         """The source with values between its rows, on the line from each to the next, for a controller that does so.
 
-        A pause, longer than five times the median interval, stays one.
+        A pause, longer than five times the median interval, stays one. Axes with rows of their own are apart here, too.
 
         Args:
             step: From one value to the next, about [s].
@@ -126,6 +132,8 @@ class Source:
         Raises:
             RunError: That is not between a thousandth of the median interval and the interval.
         """
+        if self.apart:
+            return _side_by_side([self._of(axis).interpolated(step) for axis in self.values])
         gap = np.diff(self.stamp.astype(np.float64))  # far and negative where a row has no stamp
         interval = float(np.median(gap[gap > 0.0])) if (gap > 0.0).any() else np.nan
         if not interval / _MOST_STEPS <= step * 1e9 < interval:
@@ -324,6 +332,18 @@ def note_rows(notes: list[str], label: str, rows: BoolArray, what: str, first: s
     if len(found):
         plural = "row has" if len(found) == 1 else "rows have"
         notes.append(f"{label}: {len(found)} {plural} {what} (first: row {found[0] + 1}{first})")
+
+
+def _side_by_side(sources: Sequence[Source]) -> Source:
+    """Sources of an axis each as one, in the order of their stamps; values of one stamp are in one row."""
+    stamp = np.concatenate([one.stamp for one in sources])
+    ends = np.cumsum([0, *(len(one.stamp) for one in sources)])
+    values = {axis: np.full(len(stamp), np.nan) for one in sources for axis in one.values}
+    for one, begin in zip(sources, ends, strict=False):
+        for axis, value in one.values.items():
+            values[axis][begin : begin + len(value)] = value
+    order = np.argsort(stamp, kind="stable")
+    return replace(sources[0], stamp=stamp, values=values).rows(order).pivoted()
 
 
 def standing_clock(source: Source) -> str:
