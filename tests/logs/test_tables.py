@@ -257,6 +257,31 @@ def test_columns_without_a_name_are_called_by_their_place(text: str, names: list
     assert (list(table.columns), table.rows, table.notes) == (names, 3, ())
 
 
+@pytest.mark.parametrize(
+    ("cells", "state"),
+    [
+        (['"[0.5, -1e-2]"', '"[2, nan]"', ""], [[0.5, -0.01], [2.0, None], None]),
+        (['"[0.5 -1e-2\n]"', '"[ 2.  nan]"', '"[]"'], [[0.5, -0.01], [2.0, None], [None]]),
+        (["\"array('d', [0.5, -1e-2])\"", "\"array('d', [2])\"", ""], [[0.5, -0.01], [2.0], None]),
+        (["[0.5, -1e-2]", "[2, 3]", ""], [[0.5, -0.01], [2.0, 3.0], None]),
+        (["\"('elbow', 'wrist')\"", "\"['a b' 'c']\"", ""], [["elbow", "wrist"], ["a b", "c"], None]),
+        (['"(1) approach, slowly"', '"[2] grasp"', ""], ["(1) approach, slowly", "[2] grasp", None]),
+    ],
+)
+def test_a_cell_may_hold_a_list(tmp_path: Path, cells: list[str], state: list[object]) -> None:
+    """As Python and numpy print it; what is no list stays text."""
+    table = csv(tmp_path, "".join(f"{n},{cell},7\n" for n, cell in enumerate(cells)).join(["t_s,state,b\n", ""]))
+    assert table.columns["state"].to_pylist() == state
+    assert table.plain("b")[0].tolist() == [7.0, 7.0, 7.0] and not table.notes
+
+
+def test_a_mark_of_inches_opens_no_cell(tmp_path: Path) -> None:
+    """Of a quote that does not begin a cell nothing goes on in the next line."""
+    table = csv(tmp_path, 't_s,Length ("),x_mm\n0,1,2\n1,3",4\n2,5,6\n')
+    assert table.names == ("t_s", 'Length (")', "x_mm")
+    assert table.plain("x_mm")[0].tolist() == [2.0, 4.0, 6.0]
+
+
 def test_a_header_may_be_longer_than_what_is_looked_at(tmp_path: Path) -> None:
     """Ten thousand columns, separated by semicolons."""
     names = [f"sensor{n}.position_mm" for n in range(10_000)]

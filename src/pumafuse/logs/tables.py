@@ -46,8 +46,10 @@ _DECIMAL_COMMA = rb"(?:^|[%b\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[%b\
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
 # A list in one cell, as Python and numpy print it: [0.5, -1.2], [0.5 -1.2], array('d', [0.5]), ['elbow', 'wrist'].
 _BARE_LIST = re.compile(rb"(?<=[,;\t]) *(\[\s*[-+.\d][^\[\]\"]*[\s,][^\[\]\"]*\])")
-_LIST = r"^(array\()?('\w', *)?[\[(]\s*(['\"]|[-+.\d])"
+_LIST = r"^(array\()?('\w', *)?[\[(]\s*(['\"]|[-+.\d])[^\0]*[\])]$"
+_OPEN = re.compile(r'(?:^|[,;\t ])"[^"]*$')  # a cell that begins with a quote and has no other
 _BETWEEN = r"\s*[,;]\s*|\s+"
+_BETWEEN_WORDS = r"['\"]\s*,?\s*['\"]"
 _AROUND_LIST = r"^(array\()?('\w', *)?[\[(]+\s*|\s*[\])]+(, *dtype=\w+\))?$"
 
 
@@ -240,9 +242,12 @@ def _listed(column: pa.ChunkedArray) -> pa.ChunkedArray:
     if not (match := re.match(_LIST, first)):
         return column
     inside = pc.replace_substring_regex(pc.utf8_trim_whitespace(column), _AROUND_LIST, "")
-    lists = pc.split_pattern_regex(pc.replace_substring_regex(inside, "['\"]", ""), _BETWEEN).combine_chunks()
+    words = match[3] in ("'", '"')
+    lists = pc.split_pattern_regex(inside, _BETWEEN_WORDS if words else _BETWEEN).combine_chunks()
     elements = lists.flatten()
-    if match[3] not in ("'", '"'):
+    if words:
+        elements = pc.replace_substring_regex(elements, "['\"]", "")
+    else:
         numeric = pc.match_substring_regex(elements, NUMBER)
         elements = pc.if_else(numeric, elements, None).cast(pa.float64())
     return pa.chunked_array([pa.ListArray.from_arrays(lists.offsets, elements, mask=lists.is_null())])
@@ -344,7 +349,7 @@ def _whole_lines(lines: Sequence[str]) -> tuple[list[str], bool]:
     """Lines of a text, those together in which a cell in quotes goes on; and whether there are such."""
     found = list[str]()
     for line in lines:
-        if found and found[-1].count('"') % 2:
+        if found and found[-1].count('"') % 2 and _OPEN.search(found[-1]):
             found[-1] += f"\n{line}"
         else:
             found.append(line)
