@@ -216,6 +216,26 @@ def test_one_table_however_laid_out(tmp_path: Path, layout: str) -> None:
     assert table.notes == ((f"log.csv: {note}",) if note else ())
 
 
+def test_settings_above_may_look_like_a_table_themselves(tmp_path: Path) -> None:
+    """As LabVIEW writes them: keys and values, then a line for each channel, then its header."""
+    settings = "LabVIEW Measurement\t\nWriter_Version\t2\nReader_Version\t2\nTime\t10:00:00.1\n***End_of_Header***\t\n"
+    channels = "Channels\t2\t\t\nSamples\t9\t9\t\nX0\t0.0E+0\t0.0E+0\t\n***End_of_Header***\t\t\t\n"
+    rows = "".join(f"{0.02 * n:.6f}\t{n}.5\t-{n}.5\t\n" for n in range(40))
+    table = csv(tmp_path, f"{settings}\n{channels}X_Value\tSetPos\tActPos\tComment\n{rows}", "log.lvm")
+    assert table.names == ("X_Value", "SetPos", "ActPos", "Comment") and table.rows == 40
+    assert table.notes == ("log.lvm: 9 lines above the header left out",)
+
+
+def test_settings_above_rows_without_a_header(tmp_path: Path) -> None:
+    """As Qualisys writes markers: the last setting is no header of three columns."""
+    settings = "NO_OF_FRAMES\t40\nFREQUENCY\t100\nDATA_INCLUDED\t3D\nMARKER_NAMES\ttool\n"
+    rows = "".join(f"{n}.125\t-{n}.5\t7.0\n" for n in range(40))
+    table = csv(tmp_path, settings + rows, "mocap.tsv")
+    assert table.names == ("column 1", "column 2", "column 3") and table.rows == 40
+    assert table.plain("column 2")[0].tolist() == [-(n + 0.5) for n in range(40)]
+    assert table.notes == ("mocap.tsv: 4 lines above the header left out",)
+
+
 def test_a_header_of_several_lines_tells_columns_of_one_name_apart(tmp_path: Path) -> None:
     """As OptiTrack's Motive exports rigid bodies."""
     table = csv(

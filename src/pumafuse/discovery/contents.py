@@ -28,7 +28,7 @@ from ..units import TIMES, ending, kind_of, si_of, unwrapped, wraps
 from . import names
 
 _TABLES = (".csv", ".csv.gz", ".tsv", *tables.JSON_LINES, ".parquet")
-_TEXTS = (".txt", ".dat")  # tables, too; in a folder they may be anything
+_TEXTS = (".txt", ".dat", ".lvm")  # tables, too; in a folder they may be anything
 _MOST_PARTS = 200  # files or topics
 _MOST_COLUMNS = 200  # of positions in one of them
 _FEWEST_ROWS = 10
@@ -324,12 +324,12 @@ def _clock(table: Table) -> Clock | None:
     """The first column that runs like a clock, of a header before others; when it was recorded only for want of any.
 
     Where none is called so, one in a unit of time may be, ``uptime_s``, one of dates, such as the index of pandas, or
-    the first, if it has no name and rises.
+    the first, if it rises and has no name, or LabVIEW's.
     """
     columns = sorted(_stamp_columns(table), key=lambda name: (name == LOG_TIME, "header" not in names.words(name)))
     columns = columns or [name for name in table.columns if ending(leaf(name)) in TIMES]
     columns = columns or [name for name, one in table.columns.items() if _is_dated(table, name, one)]
-    if not columns and tables.FIRST in table.columns:
+    if not columns and next(iter(table.columns), "") in (tables.FIRST, "X_Value"):
         return _nameless_clock(table)
     return next((clock for name in columns if (clock := _clock_of(table, name)) is not None), None)
 
@@ -372,7 +372,7 @@ def _clock_of(table: Table, name: str) -> Clock | None:
 
 
 def _nameless_clock(table: Table) -> Clock | None:
-    """The first column, which has no name, if its numbers rise, but do not count rows.
+    """The first column, which is called after no clock, if its numbers rise, but do not count rows.
 
     Where they are of whole seconds and the second column may be the nanoseconds, both: ``ros2 topic echo --csv``.
     """

@@ -334,10 +334,13 @@ def _layout(text: bytes) -> _Layout:
     if len(names) == len(_cells(lines[first], separator)) and _begins(lines, first, separator):
         return _Layout(separator, _point(text, separator), first, names, units=False, above=0, broken=broken)
     separator = _separator(lines[first])
-    if _is_headless(lines, first, separator):
-        names = list(map(_column, range(len(_cells(lines[first], separator)))))
-        return _Layout(separator, _point(text, separator), first, names, units=False, above=0, broken=broken)
-    header = _header(lines, full)
+    header = -1 if _is_headless(lines, first, separator) else _header(lines, full)
+    rows = next((n for n in full if n > header), header)
+    if header < 0 or (first < header < rows and _is_other(lines, header, rows)):
+        separator = _separator(lines[rows])
+        names = list(map(_column, range(len(_cells(lines[rows], separator)))))
+        above = sum(n < rows for n in full)
+        return _Layout(separator, _point(text, separator), rows, names, units=False, above=above, broken=broken)
     separator = _separator(lines[header])
     units = header > first and all(map(_UNIT.fullmatch, _cells(lines[header], separator)))
     top, names = _told_apart(lines, header - units, separator)
@@ -357,7 +360,7 @@ def _whole_lines(lines: Sequence[str]) -> tuple[list[str], bool]:
 
 
 def _header(lines: Sequence[str], full: Sequence[int]) -> int:
-    """Where the header is: the first full line, if rows of as many cells begin below it.
+    """Where the header is: the first full line, if rows of as many cells, as most lines have, begin below it.
 
     Else it is what stands right above rows of numbers: recorders write their settings on top (``Format Version,1.23``).
     """
@@ -367,7 +370,8 @@ def _header(lines: Sequence[str], full: Sequence[int]) -> int:
     first, *below = (_cells(lines[n], separator) for n in full[: 1 + _BESIDE])
     begin = next((n for n in full[1:] if _begins(lines, n, _separator(lines[n - 1]))), header + 1)
     between = [_cells(lines[n], separator) for n in full[1:] if n < begin]
-    even = all(len(row) == len(first) > 1 for row in below)
+    most = Counter(len(_cells(lines[n], separator)) for n in full).most_common(1)[0][0]
+    even = all(len(row) == len(first) == most > 1 for row in below)
     return begin - 1 if not even or (between and all(map(_is_text, between))) else header
 
 
@@ -407,6 +411,14 @@ def _is_headless(lines: Sequence[str], first: int, separator: str) -> bool:
         map(_NUMBER.fullmatch, (one for one, other in zip(row, below, strict=True) if _NUMBER.fullmatch(other)))
     )
     return alike and row != list(map(str, range(len(row))))
+
+
+def _is_other(lines: Sequence[str], header: int, rows: int) -> bool:
+    """Whether what stands above rows of numbers is no header of theirs, as it has another number of cells."""
+    separator = _separator(lines[rows])
+    return _begins(lines, rows, separator) and len(_cells(lines[header], separator)) != len(
+        _cells(lines[rows], separator)
+    )
 
 
 def _column(place: int) -> str:
