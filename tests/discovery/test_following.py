@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pumafuse.arrays import FloatArray, TimeArray
-from pumafuse.discovery.following import following
+from pumafuse.discovery.following import following, resolution
 
 
 def path(t: FloatArray) -> FloatArray:
@@ -44,6 +44,16 @@ def test_lag_gain_and_level_are_found(lag: float, gain: float, level: float, rat
         assert 2e-4 < found.scatter < 5e-4
     expected = np.median(z - np.sign(gain) * path(s - lag))
     assert found.offset == pytest.approx(float(expected), abs=2e-3)
+
+
+def test_values_come_in_steps_or_do_not() -> None:
+    """An encoder's do, whatever text they were in; noise does not, and of a few levels nothing can be told."""
+    motion = path(np.arange(0.0, 40.0, 0.01))
+    counts = np.rint(motion / 1e-4)
+    assert resolution(1e-4 * counts) == pytest.approx(1e-4 / np.sqrt(12.0), rel=1e-6)
+    assert resolution(np.array([float(f"{one:.4f}") for one in motion])) == pytest.approx(1e-4 / np.sqrt(12.0))
+    assert resolution(motion + np.random.default_rng(1).normal(scale=1e-4, size=len(motion))) == 0.0
+    assert resolution(np.repeat([0.0, 0.1, 0.2], 100)) == 0.0
 
 
 def test_of_a_periodic_motion_the_shortest_lag_counts() -> None:

@@ -183,6 +183,24 @@ def test_an_arm_that_is_sooner_than_one_can_be_is_reported(ahead: float, said: s
     assert 0.0 <= one.delay_ci95[0] <= one.delay <= one.delay_ci95[1]
 
 
+@pytest.mark.parametrize("step", [1e-4, 5e-4])
+def test_an_encoder_that_rests_most_of_the_time_is_not_taken_for_exact(step: float) -> None:
+    """At rest all its values are one: its noise is that of its steps, and the arm is found in the motions between."""
+    time, stamp = np.arange(0.0, LENGTH, PERIOD), np.arange(0.3, LENGTH - 0.3, 0.02) + 0.003
+    begins, far = (3.0, 9.0, 15.0), (0.05, 0.03, -0.04)
+    moves = [1.0 - np.cos(2.0 * np.pi * np.clip((time - begin) / 1.5, 0.0, 1.0)) for begin in begins]
+    command = 0.5 * np.array(far) @ np.array(moves)
+    position = step * np.rint(moved(time, command, stamp) / step)
+    run = pf.Run.from_arrays(time, {"x": command}, {"encoder": (stamp, {"x": position})})
+    found = pf.latency(run)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)  # of an sd at its bound
+        tuned = pf.tune(run, found.config, fit=["noise", "delay", "plant"])
+    for config in (found.config, tuned.config):
+        assert config.arm.lag_of("x") == pytest.approx(DELAY + TAU, abs=2e-3)
+        assert config.sensors["encoder"].sd_of("x") == pytest.approx(step / math.sqrt(12.0), rel=0.5)
+
+
 def test_a_mirrored_sensor_is_followed() -> None:
     """A distance that falls while the axis moves on: the same lag."""
     found = pf.latency(recorded("steps", scale=-1.0))

@@ -17,6 +17,7 @@ _COARSE, _FINE = 0.01, 0.001  # s, steps of a lag
 _SPANS = (0.1, 0.5, 2.0, math.inf)
 _MOST, _FEW = 3000, 500  # changes, and for a first look
 _FEWEST = 20
+_WHOLE = 0.01  # from a whole number, of steps
 _OUTLYING, _AGREEING = 8.0, 2.0  # sds
 _NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
 _MIRRORED = 0.1  # a negative correlation must be stronger by this than any positive one
@@ -138,6 +139,15 @@ def _resolution(value: FloatArray) -> float:
     """Noise of the steps in which values come."""
     steps = np.diff(np.unique(value))
     return float(steps.min()) / math.sqrt(12.0) if len(steps) else 0.0
+
+
+def resolution(value: FloatArray) -> float:
+    """Noise of the steps in which values come, if they do: all are whole multiples of the smallest; else 0."""
+    steps = np.diff(np.unique(value))
+    if len(steps) < _FEWEST:
+        return 0.0
+    multiples = steps / steps.min()
+    return _resolution(value) if (np.abs(multiples - np.rint(multiples)) < _WHOLE).all() else 0.0
 
 
 def _outliers(value: FloatArray) -> float:

@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 
 from ..arrays import BoolArray, CodeArray, FloatArray, IntArray
-from ..discovery.following import scatter
+from ..discovery.following import resolution, scatter
 from ..filter.events import Results
 from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
@@ -286,6 +286,16 @@ class Likelihood:
                 if len(rows.time) > 3:
                     found.setdefault((name, self.axes[part.axis]), []).append(scatter(rows.value[:, 0]))
         return {key: float(np.median(sds)) for key, sds in found.items() if min(sds) > 0.0}
+
+    @cached_property
+    def resolution(self) -> dict[tuple[str, str], float]:
+        """Noise of the steps in which values of a sensor on an axis come, if they do [m or rad], by both names."""
+        found: dict[tuple[str, str], list[FloatArray]] = {}
+        for part in self._parts:
+            for name, rows in part.segment.rows_by_sensor().items():
+                found.setdefault((name, self.axes[part.axis]), []).append(rows.value[:, 0])
+        every = {key: resolution(np.concatenate(values)) for key, values in found.items()}
+        return {key: noise for key, noise in every.items() if noise > 0.0}
 
     @cached_property
     def share_after_end(self) -> dict[str, float]:

@@ -205,6 +205,7 @@ def parameters(
     fit: Sequence[Fit],
     fixed: Iterable[str] = (),
     sd_prior: bool = True,
+    resolution: Mapping[tuple[str, str], float] | None = None,
 ) -> list[Parameter]:
     """The parameters to fit, those of each axis together.
 
@@ -215,6 +216,7 @@ def parameters(
         fit: Which kinds.
         fixed: Parts of names: a parameter whose name has all the parts of one, in their order, is left out.
         sd_prior: Whether a sensor's noise is believed to be the configured one within a factor of 1.5.
+        resolution: The least noise of a sensor on an axis [m or rad]: at rest all its values may be one.
     """
     used = {name for names in sensors.values() for name in names}
     every = [
@@ -226,7 +228,14 @@ def parameters(
     ]
     free = [one for one in every if not is_fixed(one.key, fixed)]
     free = [one for one in free if _belongs(one, config, sensors)]
+    free = [_above(one, (resolution or {}).get((one.sensor or "", one.axis or ""), 0.0)) for one in free]
     return free if sd_prior else [replace(one, prior=None) if one.fit == "noise" else one for one in free]
+
+
+def _above(one: Parameter, least: float) -> Parameter:
+    """The parameter; if it is a sensor's noise, not below a least one."""
+    is_noise = one.fit == "noise" and one.sensor is not None and least > one.bounds[0]
+    return replace(one, bounds=(least, one.bounds[1])) if is_noise else one
 
 
 def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:

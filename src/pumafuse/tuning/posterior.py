@@ -269,7 +269,8 @@ class _AxisSearch:
         return self._free[key]
 
     def _listed(self, config: FusionConfig, model: Model, fits: Sequence[Fit]) -> list[Parameter]:
-        every = parameters(config, self.start, {self.axis: self.likelihood.sensors[self.axis]}, fits)
+        measured, least = {self.axis: self.likelihood.sensors[self.axis]}, self.likelihood.resolution
+        every = parameters(config, self.start, measured, fits, resolution=least)
         found: list[Parameter] = []
         for one in every:
             field = one.path[-1]

@@ -108,7 +108,7 @@ def run_stage(
 
     def free(at: FusionConfig) -> list[Parameter]:
         names = [*plan.fixed, *(one.fixed for one in fixed)]
-        every = parameters(at, config, likelihood.sensors, plan.fit, names, plan.sd_prior)
+        every = parameters(at, config, likelihood.sensors, plan.fit, names, plan.sd_prior, likelihood.resolution)
         return [one for one in every if _may_vary(one, at, plan, excited)]
 
     start, notes = likelihood.config, list[str]()
