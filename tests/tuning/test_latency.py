@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
@@ -195,10 +196,13 @@ def test_an_encoder_that_rests_most_of_the_time_is_not_taken_for_exact(step: flo
     found = pf.latency(run)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", pf.PumafuseWarning)  # of an sd at its bound
-        tuned = pf.tune(run, found.config, fit=["noise", "delay", "plant"])
+        rough = structs.replace(found.config, sensors={"encoder": pf.Sensor(sd={"x": step}, gate=0.0)})
+        tuned = pf.tune(run, rough, fit=["noise", "delay", "plant"])
     for config in (found.config, tuned.config):
         assert config.arm.lag_of("x") == pytest.approx(DELAY + TAU, abs=2e-3)
         assert config.sensors["encoder"].sd_of("x") == pytest.approx(step / math.sqrt(12.0), rel=0.5)
+    (noise,) = [one for one in tuned.details.parameters if one.key == "sensors.encoder.sd_mm.x"]
+    assert noise.notes == "that of the steps in which its values come"
 
 
 def test_a_mirrored_sensor_is_followed() -> None:

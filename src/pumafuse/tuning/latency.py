@@ -577,7 +577,8 @@ def _sensors(
     others = [name for name in others if any(name in names for names in measured.values())]
 
     def free(at: FusionConfig) -> list[Parameter]:
-        every = parameters(at, config, measured, ["noise", "latency"], sd_prior=False)
+        least = likelihood.resolution
+        every = parameters(at, config, measured, ["noise", "latency"], sd_prior=False, resolution=least)
         return [one for one in every if one.sensor in others]
 
     for name in others:

@@ -97,6 +97,11 @@ class Parameter:
         return "bias_drift_sd" in self.path or (self.path[0] == "process" and self.path[-1] != "disturbance_time")
 
     @property
+    def is_noise(self) -> bool:
+        """Whether it is the noise of a sensor."""
+        return self.fit == "noise" and self.sensor is not None
+
+    @property
     def range(self) -> tuple[float, float]:
         """The bounds as coordinates."""
         return self.coordinate(self.bounds[0]), self.coordinate(self.bounds[1])
@@ -234,8 +239,7 @@ def parameters(
 
 def _above(one: Parameter, least: float) -> Parameter:
     """The parameter; if it is a sensor's noise, not below a least one."""
-    is_noise = one.fit == "noise" and one.sensor is not None and least > one.bounds[0]
-    return replace(one, bounds=(least, one.bounds[1])) if is_noise else one
+    return replace(one, bounds=(least, one.bounds[1])) if one.is_noise and least > one.bounds[0] else one
 
 
 def _belongs(one: Parameter, config: FusionConfig, axes: Iterable[str]) -> bool:

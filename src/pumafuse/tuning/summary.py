@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from .. import toml
-from ..fusion.config import FusionConfig
+from ..fusion.config import SD_BOUNDS, FusionConfig
 from ..fusion.score import Z95
 from ..logs.run import Run
 from ..units import MS, Kind
@@ -220,6 +220,8 @@ def _notes(one: Parameter, interval: ConfidenceInterval) -> str:
     bounds = {name: f"{bound / one.unit:g}" for name, bound in zip(("lower", "upper"), one.bounds, strict=True)}
     if interval.at == "lower" and one.vanishes:
         return "not significant"
+    if interval.at == "lower" and one.is_noise and one.bounds[0] > SD_BOUNDS[0]:
+        return "that of the steps in which its values come"
     if interval.at is not None:
         return f"at its {interval.at} bound ({bounds[interval.at]}): the model does not fit"
     if all(interval.open):
