@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..arrays import NO_STAMP, BoolArray, FloatArray, TimeArray
 
 _EARLIEST, _LATEST = -1.0, 2.0  # s, of a lag
 _BEYOND = 1e9  # m or rad, where no robot goes
@@ -19,6 +19,7 @@ _MOST, _FEW = 3000, 500  # changes, and for a first look
 _FEWEST = 20
 _WHOLE = 0.01  # from a whole number, of steps
 _OUTLYING, _AGREEING = 8.0, 2.0  # sds
+_MOST_OUTLYING = 0.05  # of the changes: each outlier is in two, and of few measurements some are more than a clip takes
 _NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
 _MIRRORED = 0.1  # a negative correlation must be stronger by this than any positive one
 
@@ -79,6 +80,14 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
     )
 
 
+def _without_few(rest: FloatArray, motion: FloatArray) -> BoolArray:
+    """Which changes are no outliers by what is left of them, (n,); all, where these are many, or are the motion."""
+    kept = np.abs(rest - np.median(rest)) <= _OUTLYING * _robust_sd(rest)
+    few = np.count_nonzero(~kept) <= _MOST_OUTLYING * len(rest)
+    is_motion = float(motion[kept] @ motion[kept]) < (1.0 - 2.0 * _MOST_OUTLYING) * float(motion @ motion)
+    return kept if few and not is_motion else np.ones(len(rest), dtype=np.bool_)
+
+
 def _known(stamp: TimeArray, value: FloatArray, origin: int) -> tuple[FloatArray, FloatArray]:
     """Seconds and values of the rows that have both, in order, without what no robot reaches."""
     there = (stamp != NO_STAMP) & (np.abs(value) < _BEYOND)
@@ -122,7 +131,10 @@ def _at_span(
     fine = np.arange(best - 1.5 * _COARSE, best + 1.5 * _COARSE, _FINE)
     lag = float(fine[int(np.argmax([sign * correlation(one) for one in fine]))])
     other = moves(lag)
-    return lag, correlation(lag), float(other @ change) / float(other @ other)
+    kept = _without_few(change - float(other @ change) / float(other @ other) * other, other)
+    other, mine = other[kept], change[kept]
+    power = float(other @ other)
+    return lag, float(other @ mine) / math.sqrt(power * float(mine @ mine)), float(other @ mine) / power
 
 
 def scatter(value: FloatArray) -> float:
