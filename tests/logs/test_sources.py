@@ -432,6 +432,9 @@ def test_commands_between_which_a_controller_interpolates(tmp_path: Path) -> Non
     known = np.isfinite(x)
     np.testing.assert_allclose(x[known], np.interp(stamp[known], time, np.sin(time)), atol=2e-3)
     assert (~known).sum() == 9 and np.isin(value[np.isfinite(value)], x).all()
+    many = {"t_s": np.arange(40_000) * 0.1, "x_m": np.zeros(40_000)}
+    text = refusal(partial(read, tmp_path, 'time = "t_s"\nx = "x_m"\ninterpolation_ms = 0.1', many))
+    assert "makes 40 million commands, more than 30 million" in text
     for step in (100, 0.05):
         text = refusal(partial(read, tmp_path, f'time = "t_s"\nx = "x_m"\ninterpolation_ms = {step}', columns))
         assert f"interpolation_ms = {step} is not between a thousandth of the interval of the commands, 100 ms" in text

@@ -295,6 +295,27 @@ def test_a_cell_may_hold_a_list(tmp_path: Path, cells: list[str], state: list[ob
     assert table.plain("b")[0].tolist() == [7.0, 7.0, 7.0] and not table.notes
 
 
+def test_lists_over_lines_may_fill_a_large_file(tmp_path: Path) -> None:
+    """Beyond the blocks in which pyarrow reads; a quote that nothing closes is said."""
+    rows = "".join(f'{n},"[{n}.5 -1.0\n  {n}.25]"\n' for n in range(100_000))
+    table = csv(tmp_path, f"t_s,state\n{rows}")
+    assert table.rows == 100_000
+    assert table.columns["state"][99_999].as_py() == [99_999.5, -1.0, 99_999.25]
+    lost = "".join(f"{n},{n},z\n" for n in range(200_000))
+    assert "is a quote not closed?" in refusal(lambda: csv(tmp_path, f't_s,x_m,who\n0,1,"abc\n{lost}'))
+
+
+@pytest.mark.parametrize("text", ["0,[" + "1," * 30_000, '0,"' + "\n" * 60_000 + '"', ',"[' * 20_000])
+def test_a_text_of_brackets_and_quotes_is_a_table_or_one_line(tmp_path: Path, text: str) -> None:
+    """What looks like a list, or a cell that goes on, need not be one."""
+    try:
+        table = csv(tmp_path, f"t_s,q\n{text}\n1,[2,3]\n")
+    except PumafuseError as error:
+        assert "\n" not in str(error)
+    else:
+        assert table.names == ("t_s", "q")
+
+
 def test_a_mark_of_inches_opens_no_cell(tmp_path: Path) -> None:
     """Of a quote that does not begin a cell nothing goes on in the next line."""
     table = csv(tmp_path, 't_s,Length ("),x_mm\n0,1,2\n1,3",4\n2,5,6\n')

@@ -30,6 +30,7 @@ Clock = Literal["stamps", "regular"]
 
 _LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
 _FEW_ROWS = 10  # too few to judge a clock by
+_MOST_ROWS = 30_000_000  # of interpolated commands, all of which are in memory
 _MOST_STEPS, _PAUSE = 1000, 5.0  # between two commands; times the median interval, which is no path
 
 
@@ -144,6 +145,11 @@ class Source:
         goes_on = (gap > 0.0) & (gap <= _PAUSE * interval)
         parts = np.where(goes_on, np.maximum(np.rint(np.where(goes_on, gap, 0.0) / (step * 1e9)), 1.0), 1.0)
         parts = np.append(parts, 1.0).astype(np.int64)
+        if parts.sum() > _MOST_ROWS:
+            raise RunError(
+                f"{self.label}: interpolation_ms = {step * 1e3:g} makes {parts.sum() / 1e6:.0f} million commands, more"
+                f" than {_MOST_ROWS / 1e6:.0f} million: a longer step, or a shorter run"
+            )
         row = np.repeat(np.arange(len(parts)), parts)
         share = (np.arange(len(row)) - (np.cumsum(parts) - parts)[row]) / parts[row]
 

@@ -45,7 +45,7 @@ JSON_LINES = (".jsonl", ".ndjson", ".jsonl.gz", ".ndjson.gz")
 _DECIMAL_COMMA = rb"(?:^|[%b\n])[ \"]*[+-]?\d*,\d+(?:[eE][+-]?\d+)?[ \"]*(?:[%b\r\n]|$)"  # between separators
 _MOST_TEXT = 2 << 30  # bytes of CSV, all of which are in memory
 # A list in one cell, as Python and numpy print it: [0.5, -1.2], [0.5 -1.2], array('d', [0.5]), ['elbow', 'wrist'].
-_BARE_LIST = re.compile(rb"(?<=[,;\t]) *(\[\s*[-+.\d][^\[\]\"]*[\s,][^\[\]\"]*\])")
+_BARE_LIST = re.compile(rb"(?<=[,;\t]) *(\[\s*[-+.\d][^\[\]\"]*\])")
 _LIST = r"^(array\()?('\w', *)?[\[(]\s*(['\"]|[-+.\d])[^\0]*[\])]$"
 _OPEN = re.compile(r'(?:^|[,;\t ])"[^"]*$')  # a cell that begins with a quote and has no other
 _BETWEEN = r"\s*[,;]\s*|\s+"
@@ -171,6 +171,7 @@ def _one_line(path: Path) -> Generator[None]:
         raise RunError(f"{path}: not a table that can be read: its text is not UTF-8") from None
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
         reason = str(error).splitlines()[0].removeprefix("CSV parse error: ")
+        reason = "a row of more than 1 MB: is a quote not closed?" if "straddling" in reason else reason
         raise RunError(f"{path}: not a table that can be read: {reason}") from None
     except FileNotFoundError:
         raise RunError(f"{path}: no such file") from None
@@ -350,13 +351,16 @@ def _layout(text: bytes) -> _Layout:
 
 def _whole_lines(lines: Sequence[str]) -> tuple[list[str], bool]:
     """Lines of a text, those together in which a cell in quotes goes on; and whether there are such."""
-    found = list[str]()
+    found, is_open = list[list[str]](), False
     for line in lines:
-        if found and found[-1].count('"') % 2 and _OPEN.search(found[-1]):
-            found[-1] += f"\n{line}"
+        odd = line.count('"') % 2 == 1
+        if is_open:
+            found[-1].append(line)
+            is_open = not odd
         else:
-            found.append(line)
-    return found, len(found) < len(lines)
+            found.append([line])
+            is_open = odd and _OPEN.search(line) is not None
+    return ["\n".join(parts) for parts in found], len(found) < len(lines)
 
 
 def _header(lines: Sequence[str], full: Sequence[int]) -> int:
