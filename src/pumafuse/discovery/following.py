@@ -30,7 +30,7 @@ class Following:
 
     Attributes:
         lag: How late it is behind the path through the other's points [s].
-        correlation: Of their changes at that lag.
+        correlation: Of their changes at that lag, outliers apart.
         slope: By how much it moves when the other moves by 1.
         offset: How far its level is from slope ± 1 times the other's [m or rad].
         scatter: Its noise, roughly, [m or rad].
@@ -131,10 +131,10 @@ def _at_span(
     fine = np.arange(best - 1.5 * _COARSE, best + 1.5 * _COARSE, _FINE)
     lag = float(fine[int(np.argmax([sign * correlation(one) for one in fine]))])
     other = moves(lag)
-    kept = _without_few(change - float(other @ change) / float(other @ other) * other, other)
-    other, mine = other[kept], change[kept]
-    power = float(other @ other)
-    return lag, float(other @ mine) / math.sqrt(power * float(mine @ mine)), float(other @ mine) / power
+    slope = float(other @ change) / float(other @ other)
+    kept = _without_few(change - slope * other, other)
+    other, change = other[kept], change[kept]
+    return lag, float(other @ change) / math.sqrt(float(other @ other) * float(change @ change)), slope
 
 
 def scatter(value: FloatArray) -> float:
