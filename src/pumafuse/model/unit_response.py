@@ -12,20 +12,38 @@ _TOGETHER = 0.3  # (T₁ − T₂)/(T₁ + T₂) of two poles below which their 
 def unit_response(time: FloatArray | float, q: FloatArray | float, p: FloatArray | float) -> FloatArray:
     """Unit step response c(t) of 1/(p s² + q s + 1), 0 before t = 0; all three broadcast, p ≥ 0 and q > 0.
 
-    Equations 4, 6 and 9, joined at ζ = 1, where 6 and 9 divide by √|ζ² − 1| and lose all digits. Time constants T₁ ≥ T₂
-    of an over-damped plant are q/2 ± √(q²/4 − p).
+    Equations 4, 6 and 9, joined at ζ = 1, where 6 and 9 divide by √|ζ² − 1| and lose all digits.
     """
-    t, half = np.maximum(time, 0.0), 0.5 * np.asarray(q)
+    half, p = 0.5 * np.asarray(q), np.asarray(p)
     square = half * half - p
     root = np.sqrt(np.abs(square))
+    over_damped, apart = square >= 0.0, root > _TOGETHER * half
+    found = np.zeros(np.broadcast_shapes(np.shape(time), square.shape))
+    forms = (over_damped & apart, _apart), (over_damped & ~apart, _together), (~over_damped, _swinging)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # where T₂ or the swing is next to nothing
+        for plants, form in forms:
+            if plants.any():
+                chosen = np.broadcast_to(plants & (np.asarray(time) > 0.0), found.shape)
+                found[chosen] = form(*(np.broadcast_to(one, found.shape)[chosen] for one in (time, half, root, p)))
+    return found
+
+
+def _apart(t: FloatArray, half: FloatArray, root: FloatArray, p: FloatArray) -> FloatArray:
+    """Over-damped: time constants T₁ > T₂ are q/2 ± √(q²/4 − p); T₂ may be 0."""
     slow = half + root
     fast = p / slow
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        apart = 1.0 - (slow * np.exp(-t / slow) - np.where(fast > 0.0, fast * np.exp(-t / fast), 0.0)) / (2.0 * root)
-        decay, turn = half * t / p, root * t / p
-        swinging = 1.0 - np.exp(-decay) * (np.cos(turn) + decay * np.sinc(turn / np.pi))
-        # e^(−decay) cosh(turn) would overflow: the slow pole is taken out of both terms
-        sinhc = np.where(turn > 0.0, -np.expm1(-2.0 * turn) / (2.0 * turn), 1.0)
-        together = 1.0 - np.exp(-t / slow) * (0.5 * (1.0 + np.exp(-2.0 * turn)) + decay * sinhc)
-    over_damped = np.where(root > _TOGETHER * half, apart, together)
-    return np.where(t > 0.0, np.where(square >= 0.0, over_damped, swinging), 0.0)
+    sooner = np.where(fast > 0.0, fast * np.exp(-t / fast), 0.0)
+    return 1.0 - (slow * np.exp(-t / slow) - sooner) / (2.0 * root)
+
+
+def _together(t: FloatArray, half: FloatArray, root: FloatArray, p: FloatArray) -> FloatArray:
+    """About ζ = 1: e^(−decay) cosh(turn) would overflow, so that the slow pole is taken out of both terms."""
+    turn = root * t / p
+    sinhc = np.where(turn > 0.0, -np.expm1(-2.0 * turn) / (2.0 * turn), 1.0)
+    return 1.0 - np.exp(-t / (half + root)) * (0.5 * (1.0 + np.exp(-2.0 * turn)) + half * t / p * sinhc)
+
+
+def _swinging(t: FloatArray, half: FloatArray, root: FloatArray, p: FloatArray) -> FloatArray:
+    """Under-damped: e^(−decay) and a swing."""
+    decay, turn = half * t / p, root * t / p
+    return 1.0 - np.exp(-decay) * (np.cos(turn) + decay * np.sinc(turn / np.pi))
