@@ -18,8 +18,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
     Who starts the tests in the background, or with nohup, may have made them and all that they start deaf to signals.
     numba does not notice that a kernel which another file calls has changed: what it keeps on disk is removed if it is
-    older than any of its sources. Workers would each compile all of them anew, so that is done before.
+    older than any of its sources. Workers would each compile all of them anew, so that is done before. Each worker has
+    a core to itself: threads of several would wait for one another.
     """
+    if hasattr(config, "workerinput"):
+        os.environ.setdefault("LOKY_MAX_CPU_COUNT", "1")
     for number in (signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_IGN:
             signal.signal(number, signal.default_int_handler)
