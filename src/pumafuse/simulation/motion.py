@@ -183,7 +183,8 @@ def _events(acting: TimeArray, instants: TimeArray, fastest: float) -> TimeArray
         lag = f"a lag or time constant of {1e3 / fastest:.3g} ms"
         raise ConfigError(f"{lag} is too short to follow over {end / 1e9:.0f} s: at least {least:.2g} ms")
     finer = np.arange(0, end if longest < instants[1] else 0, longest, dtype=np.int64)
-    return np.unique(np.concatenate((acting[acting <= end], instants, finer)))
+    time = np.sort(np.concatenate((acting[acting <= end], instants, finer)), kind="stable")  # merges what ascends
+    return time[np.diff(time, prepend=-1) > 0]
 
 
 def _backlash(position: FloatArray, width: float) -> FloatArray:
