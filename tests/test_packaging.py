@@ -11,12 +11,22 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
+EVERY_KERNEL = """
+import pumafuse as pf
+from importlib.resources import files
+data = files("pumafuse") / "data" / "scan"
+run, config = pf.Run.read(data), pf.FusionConfig.load(data / "fusion.toml")
+for mode in ("filtered", "as-live", "smoothed"):
+    pf.summarise(pf.fuse(run, config, mode=mode))
+pf.LiveEstimator(config).warm_up()
+"""
 
 
-def run(*words: object) -> str:
+def run(*words: object) -> tuple[str, str]:
+    """What a command writes to its output and to its errors."""
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stderr
-    return done.stdout
+    return done.stdout, done.stderr
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +41,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_the_wheel_works_in_an_empty_environment(built: tuple[Path, Path], tmp_path: Path) -> None:
     """Installed with nothing but what it asks for, at the locked versions: version, demo and completion work.
 
-    The demo's accuracy is, digit by digit, that of this checkout.
+    The demo's accuracy is, digit by digit, that of this checkout. It compiles, and says so, for all that comes after.
     """
     versions = tmp_path / "constraints.txt"
     locked = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
@@ -39,15 +49,20 @@ def test_the_wheel_works_in_an_empty_environment(built: tuple[Path, Path], tmp_p
     venv.create(tmp_path / "empty", with_pip=True)
     place = tmp_path / "empty" / "bin"
     run(place / "python", "-m", "pip", "install", "--quiet", "--constraint", versions, built[0])
-    assert run(place / "pumafuse", "--version") == f"pumafuse {version('pumafuse')}\n"
-    here = run(sys.executable, "-m", "pumafuse", "demo", "--output", tmp_path / "here")
-    there = run(place / "pumafuse", "demo", "--output", tmp_path / "demo")
+    assert run(place / "pumafuse", "--version")[0] == f"pumafuse {version('pumafuse')}\n"
+    here, _ = run(sys.executable, "-m", "pumafuse", "demo", "--output", tmp_path / "here")
+    there, said = run(place / "pumafuse", "demo", "--output", tmp_path / "demo")
     accuracy = [line for line in here.splitlines() if line.split()[:1] == ["scan1"]]
     assert len(accuracy) == 3
     assert accuracy == [line for line in there.splitlines() if line.split()[:1] == ["scan1"]]
     assert {"fused.png", "fused.rrd", "summary.json"} <= {path.name for path in (tmp_path / "demo").iterdir()}
+    assert said.splitlines()[0] == "compiling the filter for this machine, once (some 15 s) ..."
+    assert run(place / "python", "-c", EVERY_KERNEL) == ("", "")
+    source = (path.read_text(encoding="utf-8") for path in (ROOT / "src").rglob("*.py"))
+    kernels = sum(text.count("\n@kernel\n") for text in source)
+    assert len(list((tmp_path / "empty").glob("lib/*/site-packages/pumafuse/**/*.nbi"))) == kernels > 10
     in_a_shell = f"'{place / 'pumafuse'}' --show-completion; true"  # it looks for the shell that it was started by
-    assert "_PUMAFUSE_COMPLETE" in run("bash", "-c", in_a_shell)
+    assert "_PUMAFUSE_COMPLETE" in run("bash", "-c", in_a_shell)[0]
 
 
 @pytest.mark.long
