@@ -51,14 +51,56 @@ def test_a_folder_of_tables_goes_through_without_an_edit(tmp_path: Path) -> None
 
 
 @pytest.mark.long
-def test_the_shipped_scan_is_fused_to_a_tenth_of_a_millimetre(tmp_path: Path) -> None:
-    """Without its run.toml: three sensors, one of them mirrored, a command that is a sum."""
+def test_one_command_fuses_the_shipped_scan_to_a_tenth_of_a_millimetre(tmp_path: Path) -> None:
+    """Without its run.toml: three sensors, one of them mirrored, a command that is a sum. Its error bars hold."""
     log = tmp_path / "scan"
     shutil.copytree(DATA / "scan1", log)
     (log / "run.toml").unlink()
-    found = scores(carried_through(log, tmp_path, "noise,delay,plant"))
+    pumafuse("fuse", log, "-o", tmp_path / "fused")
+    found = scores(tmp_path / "fused")
     assert set(found) == {"x", "y", "z"}
     assert max(found.values()) < 0.15, found  # mm; the camera's noise is 0.5, and it is 45 ms late at 60 mm/s
+    summary = json.loads((tmp_path / "fused" / "summary.json").read_text())
+    for axis in summary["axes"].values():
+        assert axis["score"]["coverage"] > 0.9
+
+
+def test_one_command_looks_fits_and_fuses(tmp_path: Path) -> None:
+    """Tables that nothing describes: what it found, fitted and fused is said; its folder is a run for every command."""
+    log = tmp_path / "log"
+    log.mkdir()
+    for name in ("robot.csv", "camera.csv"):
+        shutil.copy(EXAMPLES / "my-run" / name, log)
+    out = pumafuse("fuse", log, "-o", tmp_path / "fused", "--figures").stdout
+    lines = [line.split() for line in out.splitlines()]
+    assert ["camera.csv", "913", "29.74"] in [line[:3] for line in lines]
+    (lag,) = [line for line in lines if line[:4] == ["lag", "of", "x,", "ms"]]
+    assert 130.0 < float(lag[5]) < 145.0
+    assert {"run.toml", "arm.toml", "fusion.toml", "summary.json", "fused.png"} < names(tmp_path / "fused")
+    summary = json.loads((tmp_path / "fused" / "summary.json").read_text())
+    assert summary["run"] == "log"
+    assert all(part["sensors"]["camera"]["verdict"].endswith(": consistent") for part in summary["axes"].values())
+    again = tmp_path / "again"
+    pumafuse("fuse", tmp_path / "fused", "-c", tmp_path / "fused" / "fusion.toml", "-o", again)
+    assert (again / "estimates.parquet").read_bytes() == (tmp_path / "fused" / "estimates.parquet").read_bytes()
+
+
+def test_a_result_with_a_run_toml_stays_unless_it_is_made_anew(tmp_path: Path) -> None:
+    """Else the run would be lost to who fuses it into its own folder; nothing is fitted before that is clear."""
+    mine, config = tmp_path / "mine", EXAMPLES / "my-run" / "fusion.toml"
+    pumafuse("fuse", EXAMPLES / "my-run", "-c", config, "-o", mine)
+    (mine / "run.toml").write_text("[command]")
+    assert "holds 'run.toml', which is not ours" in refused(
+        "fuse", EXAMPLES / "my-run", "-c", config, "-o", mine, "--force"
+    )
+    assert "mine: exists; --force replaces it" in refused("fuse", EXAMPLES / "my-run", "-o", mine)
+
+
+@pytest.mark.parametrize("more", [[EXAMPLES / "trunk-servo" / "0g"], ["--resume"]])
+def test_one_command_is_for_one_log(more: list[object], tmp_path: Path) -> None:
+    """Several runs need one configuration."""
+    done = pumafuse("fuse", EXAMPLES / "my-run", *more, "-o", tmp_path / "out", code=2)
+    assert "--config: is needed for several runs, and to --resume" in " ".join(done.stderr.split())
 
 
 def first_guess(log: Path, place: Path) -> Path:
@@ -132,7 +174,7 @@ def test_a_table_without_stamps_is_read_at_a_rate(tmp_path: Path) -> None:
         now, before = (round(50.0 * math.sin(0.2 * (0.1 * row - late)), 3) for late in (0.0, 0.03))
         lines.append(f"{before},{now},{now},{'Prep' if row < 200 else 'Layer 1'}")
     (tmp_path / "mill.csv").write_text("\n".join([*lines, ""]))
-    assert "if rows come at a constant rate, give it as --rate HZ" in refused("init", tmp_path / "mill.csv")
+    assert "if rows come at a constant rate, give it to init as --rate HZ" in refused("init", tmp_path / "mill.csv")
     done = pumafuse("init", tmp_path / "mill.csv", "-o", tmp_path / "made", "--rate", "10")
     assert "rows (at 10 Hz, as given)" in done.stdout
     text = (tmp_path / "made" / "run.toml").read_text()

@@ -196,7 +196,7 @@ def test_tables_without_stamps_need_a_rate(stamps: str, tmp_path: Path) -> None:
         columns = {f"{axis}_m": value[kept, number] for number, axis in enumerate("xyz")}
         write(log / f"{name}.csv", {**clock[stamps], **columns})
     said = one_line(RunError, lambda: survey(log))
-    assert "if rows come at a constant rate, give it as --rate HZ, else say in run.toml" in said
+    assert "if rows come at a constant rate, give it to init as --rate HZ, else say in run.toml" in said
     stands = "pc_ts is no clock: 20 distinct stamps, one every 1 s, in 1000 rows"
     assert (stands in said) == (stamps == "seconds")
     check_fuses(log, tmp_path / "out", rate=50.0)

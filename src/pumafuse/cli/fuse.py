@@ -66,7 +66,7 @@ def run(
         if summary is None:
             with progress_bar(str(runs[0])) as progress:
                 summary = job(runs[0], output, progress)
-        _show(summary)
+        show(summary)
         typer.echo(f"{where} {output}")
         return
     places = dict(zip(map(str, runs), _folders(runs, output), strict=True))
@@ -140,29 +140,30 @@ def _fuse(
     recorded = Run.read(path).between(*part)
     est = whole(recorded, progress=progress)
     results.check_fused(est.counts, est.config)
-
-    def extras(new: Path) -> None:
-        if rrd:
-            from ..views.rerun import recording_of
-
-            (new / "fused.rrd").write_bytes(recording_of(est, recorded))
-        if figures:
-            from ..views.figures import error_figure, fused_figure, path_figure, validation_figure
-
-            drawn = {
-                "fused": fused_figure(est),
-                "validation": validation_figure(est),
-                "path": path_figure(est, recorded),
-                "error": None if est.reference is None else error_figure(est),
-            }
-            for name, figure in drawn.items():
-                if figure is not None:
-                    figure.savefig(new / f"{name}.png", dpi=130)
-
-    return results.write(est, folder, force, extras)
+    return results.write(est, folder, force, lambda new: draw(new, est, recorded, rrd, figures))
 
 
-def _show(summary: Summary) -> None:
+def draw(folder: Path, est: Estimates, recorded: Run, rrd: bool, figures: bool) -> None:
+    """Write ``fused.rrd`` and figures, if wanted."""
+    if rrd:
+        from ..views.rerun import recording_of
+
+        (folder / "fused.rrd").write_bytes(recording_of(est, recorded))
+    if figures:
+        from ..views.figures import error_figure, fused_figure, path_figure, validation_figure
+
+        drawn = {
+            "fused": fused_figure(est),
+            "validation": validation_figure(est),
+            "path": path_figure(est, recorded),
+            "error": None if est.reference is None else error_figure(est),
+        }
+        for name, figure in drawn.items():
+            if figure is not None:
+                figure.savefig(folder / f"{name}.png", dpi=130)
+
+
+def show(summary: Summary) -> None:
     """Print the tables of one fusion."""
     part = "" if summary.from_s is None else f" from {summary.from_s:g} s on"
     made = f"{summary.estimates} estimates over {summary.duration_s:.1f} s{part}, {summary.mode}"

@@ -40,18 +40,22 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     there = [name for name in FILES if (folder / name).exists()]
     if there and not force:
         raise ConfigError(f"{folder}: has {there[0]} already; --force replaces it, or choose another folder")
-    texts = drafts(found, folder)
-    print_tables(_tables(found))
-    for name, text in texts.items():
+    for name, text in drafts(found, folder).items():
         write_file(folder / name, text, replace=force)
-    for number, question in enumerate(questions(found), 1):
-        typer.echo(f"{number}. {question}" if number > 1 else f"To decide:\n1. {question}")
+    show(found)
     place = shlex.quote(str(folder))
     typer.echo(f"written to {folder}: {', '.join(FILES)}; what to decide is in their comments, too\nnext:")
     tuned, fused = f"{place}/tuned", f"{place}/fused"
     typer.echo(f"  pumafuse latency {place}")
     typer.echo(f"  pumafuse tune {place} -c {place}/fusion.toml -o {tuned} --fit noise,delay,plant")
     typer.echo(f"  pumafuse fuse {place} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
+
+
+def show(found: Survey) -> None:
+    """Print what was found, and what the user has to decide."""
+    print_tables(_tables(found))
+    for number, question in enumerate(questions(found), 1):
+        typer.echo(f"{number}. {question}" if number > 1 else f"To decide:\n1. {question}")
 
 
 def _tables(found: Survey) -> Iterator[Table]:

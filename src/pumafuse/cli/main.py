@@ -77,9 +77,14 @@ def init(
 
 @app.command()
 def fuse(
-    runs: Runs,
-    config: Config,
+    runs: Annotated[
+        list[Path], Argument(metavar="RUN...", help="Folders with run.toml, or single tables; without -c one log.")
+    ],
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the result folder goes.")],
+    config: Annotated[
+        Path | None,
+        Option("--config", "-c", metavar="FUSION.TOML", help="Arm, noise and sensors; default: found in the log."),
+    ] = None,
     sensors: Annotated[str | None, Option(metavar="A,B", help="Which sensors to use; default: all configured.")] = None,
     rate: Rate = None,
     smooth: Annotated[bool, Option("--smooth", help="Use later measurements too; gives no velocity.")] = False,
@@ -96,10 +101,9 @@ def fuse(
 ) -> None:
     """Fuse recorded runs: estimates, the outcome of each measurement, and a summary.
 
-    Several runs get a folder each inside DIR.
+    Several runs get a folder each inside DIR. Without -c a log of any kind is looked at as by `init`, and arm and noise
+    are fitted to it as by `tune`.
     """
-    from . import fuse as command
-
     if smooth and as_live:
         raise BadParameter("choose one of --smooth and --as-live")
     if resume and force:
@@ -110,6 +114,15 @@ def fuse(
     _check_interval(since, until)
     mode = "smoothed" if smooth else "as-live" if as_live else "filtered"
     part = since, until
+    if config is None:
+        from . import from_log
+
+        if len(runs) > 1 or resume:
+            raise BadParameter("is needed for several runs, and to --resume", param_hint="--config")
+        from_log.run(runs[0], output, _names(sensors), rate, mode, rrd, figures, engine, force, part)
+        return
+    from . import fuse as command
+
     command.run(runs, config, output, _names(sensors), rate, mode, rrd, figures, engine, force, part, resume)
 
 

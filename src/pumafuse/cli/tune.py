@@ -24,6 +24,7 @@ from .tables import interval, number, print_tables, table
 SUMMARY = "tuning.json"
 PAGE = "report.html"
 OURS = frozenset({SUMMARY, PAGE, "fusion.toml", "arm.toml"})
+_HEADINGS = ["parameter", "before", "fitted", "95 % interval"]
 _PAIRS = 3  # of correlated parameters that are shown
 _WORSE, _INTERRUPTED = 3, 130
 
@@ -92,6 +93,12 @@ def run(
         raise typer.Exit(_WORSE)
 
 
+def show_lags(summary: TuningSummary, period: float) -> None:
+    """Print the lags alone; period [s]."""
+    print_tables([table(_HEADINGS, _lags(summary))])
+    typer.echo(formatting.lag(period))
+
+
 def _show(summary: TuningSummary, period: float) -> None:
     """Print the summary on stdout; period [s]."""
     print_tables([_parameters(summary)])
@@ -121,16 +128,19 @@ def _show(summary: TuningSummary, period: float) -> None:
 def _parameters(summary: TuningSummary) -> Table:
     """The lags and the parameters with their intervals."""
     rows = [
-        [f"lag of {axis}, ms", f"{one.before_ms:.4g}", f"{one.lag_ms:.4g}", _limits(one.lag_ms_ci95), ""]
-        for axis, one in summary.lags.items()
-    ]
-    rows += [
         [one.key, number(one.before, ".4g"), number(one.value, ".4g"), _limits(one.ci95), one.notes]
         for one in summary.parameters
     ]
-    made = table(["parameter", "before", "fitted", "95 % interval", ""], rows)
+    made = table([*_HEADINGS, ""], [*([*row, ""] for row in _lags(summary)), *rows])
     made.columns[0].no_wrap = True
     return made
+
+
+def _lags(summary: TuningSummary) -> list[list[str]]:
+    return [
+        [f"lag of {axis}, ms", f"{one.before_ms:.4g}", f"{one.lag_ms:.4g}", _limits(one.lag_ms_ci95)]
+        for axis, one in summary.lags.items()
+    ]
 
 
 def _limits(ci95: tuple[float | None, float | None]) -> str:

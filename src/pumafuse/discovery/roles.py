@@ -110,7 +110,7 @@ def roles_of(parts: Iterable[Part], log: str) -> Roles:
         others = [f"{column} ({why})" for part in parts for column, why in part.left_out.items()]
         clockless = [f"{part.label} ({without_clock(part)})" for part in parts if part.signals and part.clock is None]
         there = ", ".join(map(printable, [*clockless, *others][:_MOST_LISTED]))
-        at_a_rate = " if rows come at a constant rate, give it as --rate HZ, else" if clockless else ""
+        at_a_rate = " if rows come at a constant rate, give it to init as --rate HZ, else" if clockless else ""
         raise RunError(
             f"{log}: no columns of positions with a clock beside them"
             + (f", but {there}" if there else "")

@@ -40,6 +40,7 @@ _FILES = {ESTIMATES, MEASUREMENTS, REFERENCE, SUMMARY, "fusion.toml", "arm.toml"
     "validation.png",
     "path.png",
 }  # a folder with anything else in it is never replaced
+_RUN = "run.toml"
 _REFERENCE_PREFIX = "reference."
 
 
@@ -81,13 +82,19 @@ class Result:
         return {axis: value for axis, value in found.items() if value is not None}
 
 
-def check_writable(folder: Path, force: bool) -> None:
+def check_writable(folder: Path, force: bool, with_run: bool = False) -> None:
     """Refuse a folder that :func:`write` must not replace, before any work is done.
+
+    Args:
+        folder: The folder.
+        force: Replace an earlier result.
+        with_run: Whether one with a ``run.toml``, which is then written anew, is such a result.
 
     Raises:
         FolderError: The folder exists and is not to be replaced, or holds something else than results.
     """
-    folders.check_writable(folder, force, [SUMMARY], _FILES.__contains__)
+    ours = _FILES | {_RUN} if with_run else _FILES
+    folders.check_writable(folder, force, [SUMMARY], ours.__contains__)
 
 
 @dataclass(frozen=True)
@@ -159,7 +166,13 @@ def check_fused(counts: Mapping[str, Mapping[str, int]], config: FusionConfig) -
     raise RunError(f"nothing was fused, nothing is written: {why}")
 
 
-def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], None] | None = None) -> Summary:
+def write(
+    est: Estimates,
+    folder: Path,
+    force: bool,
+    extras: Callable[[Path], None] | None = None,
+    run_toml: str | None = None,
+) -> Summary:
     """Write a result folder: complete, or not at all.
 
     Args:
@@ -167,11 +180,12 @@ def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], No
         folder: Where to; its parents are made.
         force: Replace an earlier result.
         extras: Writes more files into the folder before it takes its place.
+        run_toml: The text of the ``run.toml`` that says where the log is, for a folder that is a run, too.
 
     Raises:
         FolderError: See :func:`check_writable`, or the disk refuses.
     """
-    check_writable(folder, force)
+    check_writable(folder, force, run_toml is not None)
     summary = summarise(est)
     with folders.replacing(folder) as new:
         tables.write(estimates_table(est), new / ESTIMATES)
@@ -180,6 +194,8 @@ def write(est: Estimates, folder: Path, force: bool, extras: Callable[[Path], No
             tables.write(reference_table(est.reference, est.config.arm), new / REFERENCE)
         est.config.save(new)
         (new / SUMMARY).write_bytes(encode(summary))
+        if run_toml is not None:
+            (new / _RUN).write_text(run_toml, encoding="utf-8")
         if extras is not None:
             extras(new)
     return summary

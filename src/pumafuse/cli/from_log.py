@@ -1,0 +1,70 @@
+"""`pumafuse fuse` of a log of which nothing is known."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import typer
+from rich.console import Console
+
+from ..discovery.drafts import drafts
+from ..discovery.survey import survey
+from ..fusion import results
+from ..fusion.config import FusionConfig
+from ..fusion.estimates import Mode
+from ..fusion.offline import Engine, fuse
+from ..logs.run import Run
+from ..model.arm import ArmModel
+from ..tuning.parameters import Fit
+from ..tuning.tune import tune
+from . import init
+from . import tune as tuned
+from .fuse import draw, show
+
+_FITTED: Sequence[Fit] = ("noise", "delay", "plant", "gain")
+
+
+def run(
+    log: Path,
+    output: Path,
+    sensors: Sequence[str] | None,
+    rate: float | None,
+    mode: Mode,
+    rrd: bool,
+    figures: bool,
+    engine: Engine,
+    force: bool,
+    part: tuple[float | None, float | None],
+) -> None:
+    """Fuse a log of which nothing is known into a result folder: what ``init``, ``tune`` and ``fuse`` do, at once.
+
+    The folder also has the ``run.toml`` that was found, so that every other command takes it for a run.
+
+    Raises:
+        PumafuseError: The log cannot be read, has no commands or no sensor, or nothing can be fitted to it.
+    """
+    results.check_writable(output, force, with_run=True)
+    found = survey(log)
+    texts = drafts(found, output)
+    begun = FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
+    begun.sensor_names(sensors)  # before anything is fitted
+    run = replace(found.run, name=found.name) if found.manifest is None else Run.read(log)
+    recorded = run.between(*part)
+    init.show(found)
+    with Console(stderr=True).status("fitting") as status:
+
+        def progress(what: str, log_likelihood: float) -> None:
+            status.update(f"{what}: log-likelihood {log_likelihood:.1f} (Ctrl-C keeps the best so far)")
+
+        fitted = tune(recorded, begun, fit=_FITTED, progress=progress)
+    est = fuse(recorded, fitted.config, sensors=sensors, rate=rate, mode=mode, engine=engine)
+    results.check_fused(est.counts, est.config)
+    extras = partial(draw, est=est, recorded=recorded, rrd=rrd, figures=figures)
+    summary = results.write(est, output, force, extras, texts["run.toml"])
+    tuned.show_lags(fitted.details, fitted.config.arm.update_period)
+    show(summary)
+    typer.echo(f"written to {output}\nnext: pumafuse fuse ANOTHER_LOG -c {shlex.quote(str(output))}/fusion.toml -o DIR")
