@@ -38,3 +38,9 @@ def pytest_configure(config: pytest.Config) -> None:
             half.wait() for half in [subprocess.Popen([*first_use, part], env=alone) for part in ("forward", "rest")]
         ):
             raise pytest.UsageError("the kernels cannot be compiled")
+
+
+@pytest.fixture
+def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Threads and worker processes, where a worker of the tests has none."""
+    monkeypatch.setenv("LOKY_MAX_CPU_COUNT", "2")

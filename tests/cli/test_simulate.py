@@ -202,6 +202,7 @@ def test_sweeping_up_takes_nothing_of_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("two_cores")
 def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
     """As when memory runs out: the command says so and ends; what was half written is swept, what is whole is kept."""
     script, out = tmp_path / "dies.py", tmp_path / "out"

@@ -245,6 +245,7 @@ def killed(parent: int, *given: Any) -> AxisPosterior:
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("two_cores")
 def test_a_worker_that_dies_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """The axes are looked at in processes of their own; one that is killed is an error, not a traceback."""
     run = recorded()

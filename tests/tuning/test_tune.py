@@ -52,6 +52,15 @@ def total(run: pf.Run, config: pf.FusionConfig) -> float:
 # ---- the result -----------------------------------------------------------------------------------------------------
 
 
+def test_threads_change_no_digit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On one core the axes are fitted one after the other, on two at once: the same numbers and intervals."""
+    sim, texts = with_outliers(1), list[str]()
+    for cores in ("1", "2"):
+        monkeypatch.setenv("LOKY_MAX_CPU_COUNT", cores)
+        texts.append(quietly(lambda: pf.tune(sim.run, spoiled(sim.config))).to_json())
+    assert texts[0] == texts[1]
+
+
 def test_numbers_and_intervals_are_there_as_statisticians_have_them() -> None:
     """By key, as in the files: each number inside its interval, an end that is open infinite; a table in plain text."""
     found = tuned()
