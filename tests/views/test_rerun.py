@@ -97,6 +97,13 @@ def test_everything_is_in_mm_on_one_clock(fused: tuple[pf.Estimates, pf.Run], re
         np.testing.assert_allclose(series(recorded, f"/{name}", "variances")[1], (sd * 1e3) ** 2)
 
 
+def test_the_layout_is_followed_in_a_browser_too(recorded: Path) -> None:
+    """A native viewer takes a layout that is but the default; a browser then makes its own, a panel for each line."""
+    viewer = Path(sys.executable).parent / "rerun"
+    done = subprocess.run([viewer, "rrd", "print", "-vvv", recorded], capture_output=True, text=True, check=True)
+    assert "make_active: true, make_default: true" in done.stdout
+
+
 def test_outcomes_are_states_and_silence_is_one(tmp_path: Path) -> None:
     """A camera at 50 Hz, its 30th frame wild, quiet for 2 s: fused, rejected, fused, silent, fused, silent."""
     stamp = np.concatenate([0.5 + 0.02 * np.arange(50), 3.5 + 0.02 * np.arange(50)])

@@ -75,7 +75,7 @@ def recording_of(est: Estimates, run: Run) -> bytes:
         return _layer(est, run, run.recording)
     with rr.RecordingStream("pumafuse") as stream:
         memory = stream.memory_recording()
-        stream.send_blueprint(_blueprint(est), make_active=False, make_default=True)
+        stream.send_blueprint(_blueprint(est), make_active=True)  # a browser follows no other
         _send_named(est, run, stream)
         return memory.drain_as_bytes()
 
