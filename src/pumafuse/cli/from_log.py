@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.estimates import Mode
 from ..fusion.offline import Engine, fuse
-from ..logs.run import Run
+from ..logs.run import described
 from ..model.arm import ArmModel
 from ..tuning.parameters import Fit
 from ..tuning.tune import tune
@@ -49,11 +48,10 @@ def run(
     """
     results.check_writable(output, force, with_run=True)
     found = survey(log)
-    texts = drafts(found, output)
+    texts, here = drafts(found, output), Path()
     begun = FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
     begun.sensor_names(sensors)  # before anything is fitted
-    run = replace(found.run, name=found.name) if found.manifest is None else Run.read(log)
-    recorded = run.between(*part)
+    recorded = described(drafts(found, here)["run.toml"], here).between(*part)
     init.show(found)
     with Console(stderr=True).status("fitting") as status:
 

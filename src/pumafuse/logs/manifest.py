@@ -177,7 +177,19 @@ def load(path: Path) -> Manifest:
     Raises:
         ConfigError: The file is no manifest; names the key and the accepted ones.
     """
-    tree, where = toml.read(path), str(path)
+    return _manifest(toml.read(path), str(path))
+
+
+def parse(text: str) -> Manifest:
+    """The same of the text of a ``run.toml``.
+
+    Raises:
+        ConfigError: It is no manifest; names the key and the accepted ones.
+    """
+    return _manifest(toml.parsed(text, "run.toml"), "run.toml")
+
+
+def _manifest(tree: dict[str, Any], where: str) -> Manifest:
     for key, kind in (("command", CommandEntry), ("reference", ReferenceEntry)):
         if key in tree:
             tree[key] = _source(tree[key], kind, where, key)

@@ -292,7 +292,9 @@ class Run:
         path = Path(path)
         if os.path.isdir(path):  # noqa: PTH112 - Path.is_dir raises on a name that is too long
             path = path / "run.toml"
-        return _read_manifest(path) if path.suffix == ".toml" else of_table(tables.read(path, growing=True))
+        if path.suffix == ".toml":
+            return _read(manifest.load(path), path.parent)
+        return of_table(tables.read(path, growing=True))
 
     @staticmethod
     def from_arrays(
@@ -476,16 +478,24 @@ def _stamps(time: npt.NDArray[Any]) -> TimeArray:
     return nanoseconds(rough) if kind == "f" else time.astype("M8[ns]").astype(np.int64)
 
 
-def _read_manifest(path: Path) -> Run:
-    listed = manifest.load(path)
+def described(text: str, folder: Path) -> Run:
+    """The run that the text of a ``run.toml`` in a folder describes.
+
+    Raises:
+        PumafuseError: Not a recorded run; says what, where, and what is accepted.
+    """
+    return _read(manifest.parse(text), folder)
+
+
+def _read(listed: manifest.Manifest, folder: Path) -> Run:
     fields = listed.fields
 
     def read(entry: manifest.SourceEntry) -> tables.Table:
-        file, chosen = path.parent / entry.file, {"topic": entry.topic, "entity": entry.entity}
+        file, chosen = folder / entry.file, {"topic": entry.topic, "entity": entry.entity}
         return tables.read(file, growing=True, fields=fields[entry.rows], where=entry.where, **chosen)
 
-    run = of_tables(listed, path.parent, read)
-    return replace(run, recording=_recording(path.parent, listed.entries.values()))
+    run = of_tables(listed, folder, read)
+    return replace(run, recording=_recording(folder, listed.entries.values()))
 
 
 def of_tables(
