@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 
 import typer
-from rich.console import Console
 
 from ..discovery.drafts import drafts
 from ..discovery.survey import survey
@@ -21,8 +20,8 @@ from ..model.arm import ArmModel
 from ..tuning.parameters import Fit
 from ..tuning.tune import tune
 from . import init
-from . import tune as tuned
 from .fuse import draw, show
+from .tune import fitting, show_lags
 
 _FITTED: Sequence[Fit] = ("noise", "delay", "plant", "gain")
 
@@ -53,16 +52,12 @@ def run(
     begun.sensor_names(sensors)  # before anything is fitted
     recorded = described(drafts(found, here)["run.toml"], here).between(*part)
     init.show(found)
-    with Console(stderr=True).status("fitting") as status:
-
-        def progress(what: str, log_likelihood: float) -> None:
-            status.update(f"{what}: log-likelihood {log_likelihood:.1f} (Ctrl-C keeps the best so far)")
-
+    with fitting() as progress:
         fitted = tune(recorded, begun, fit=_FITTED, progress=progress)
     est = fuse(recorded, fitted.config, sensors=sensors, rate=rate, mode=mode, engine=engine)
     results.check_fused(est.counts, est.config)
     extras = partial(draw, est=est, recorded=recorded, rrd=rrd, figures=figures)
     summary = results.write(est, output, force, extras, texts["run.toml"])
-    tuned.show_lags(fitted.details, fitted.config.arm.update_period)
+    show_lags(fitted.details, fitted.config.arm.update_period)
     show(summary)
     typer.echo(f"written to {output}\nnext: pumafuse fuse ANOTHER_LOG -c {shlex.quote(str(output))}/fusion.toml -o DIR")

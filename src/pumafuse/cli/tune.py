@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +17,7 @@ from ..fusion.config import FusionConfig
 from ..logs.run import Run
 from ..tuning.parameters import kinds_of
 from ..tuning.summary import TuningSummary
-from ..tuning.tune import tune
+from ..tuning.tune import Progress, tune
 from ..units import SCREEN
 from ..views import formatting
 from .tables import interval, number, print_tables, table
@@ -58,11 +59,7 @@ def run(
     given = FusionConfig.load(config)
     runs = [Run.read(path).between(*part) for path in paths]
     other = None if validate is None else Run.read(validate)
-    with Console(stderr=True).status("preparing") as status:
-
-        def progress(what: str, log_likelihood: float) -> None:
-            status.update(f"{what}: log-likelihood {log_likelihood:.1f} (Ctrl-C keeps the best so far)")
-
+    with fitting() as progress:
         found = tune(
             runs,
             given,
@@ -91,6 +88,15 @@ def run(
         raise typer.Exit(_INTERRUPTED)
     if found.details.worse:
         raise typer.Exit(_WORSE)
+
+
+@contextmanager
+def fitting() -> Generator[Progress]:
+    """A line on stderr that says how far the fit is, where that is a terminal, and the function that changes it."""
+    with Console(stderr=True).status("preparing") as status:
+        yield lambda what, log_likelihood: status.update(
+            f"{what}: log-likelihood {log_likelihood:.1f} (Ctrl-C keeps the best so far)"
+        )
 
 
 def show_lags(summary: TuningSummary, period: float) -> None:
