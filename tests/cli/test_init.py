@@ -5,11 +5,17 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 import pytest
+import typer
 
+import pumafuse as pf
 from executable import DATA, names, pumafuse, refused
+from pumafuse.cli import from_log
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -94,6 +100,28 @@ def test_a_result_with_a_run_toml_stays_unless_it_is_made_anew(tmp_path: Path) -
         "fuse", EXAMPLES / "my-run", "-c", config, "-o", mine, "--force"
     )
     assert "mine: exists; --force replaces it" in refused("fuse", EXAMPLES / "my-run", "-o", mine)
+
+
+def test_one_command_fuses_with_the_best_until_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `tune` keeps it; the exit code says so."""
+
+    @contextmanager
+    def impatient() -> Generator[Callable[[str, float], None]]:
+        calls = count()
+
+        def progress(_what: str, _log_likelihood: float) -> None:
+            if next(calls) == 5:
+                raise KeyboardInterrupt
+
+        yield progress
+
+    monkeypatch.setattr(from_log, "fitting", impatient)
+    with pytest.raises(typer.Exit) as ended, pytest.warns(pf.PumafuseWarning, match="interrupted: these are the best"):
+        from_log.run(
+            EXAMPLES / "my-run", tmp_path, None, None, "filtered", False, False, "compiled", False, (None, None)
+        )
+    assert ended.value.exit_code == 130
+    assert {"run.toml", "summary.json"} < names(tmp_path)
 
 
 @pytest.mark.parametrize("more", [[EXAMPLES / "trunk-servo" / "0g"], ["--resume"]])

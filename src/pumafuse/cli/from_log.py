@@ -21,7 +21,7 @@ from ..tuning.parameters import Fit
 from ..tuning.tune import tune
 from . import init
 from .fuse import draw, show
-from .tune import fitting, show_lags
+from .tune import INTERRUPTED, fitting, show_lags
 
 _FITTED: Sequence[Fit] = ("noise", "delay", "plant", "gain")
 
@@ -44,6 +44,7 @@ def run(
 
     Raises:
         PumafuseError: The log cannot be read, has no commands or no sensor, or nothing can be fitted to it.
+        Exit: With 130 after Ctrl-C while it was fitted; the best until then is fused.
     """
     results.check_writable(output, force, with_run=True)
     found = survey(log)
@@ -61,3 +62,5 @@ def run(
     show_lags(fitted.details, fitted.config.arm.update_period)
     show(summary)
     typer.echo(f"written to {output}\nnext: pumafuse fuse ANOTHER_LOG -c {shlex.quote(str(output))}/fusion.toml -o DIR")
+    if fitted.details.interrupted:
+        raise typer.Exit(INTERRUPTED)

@@ -27,7 +27,7 @@ PAGE = "report.html"
 OURS = frozenset({SUMMARY, PAGE, "fusion.toml", "arm.toml"})
 _HEADINGS = ["parameter", "before", "fitted", "95 % interval"]
 _PAIRS = 3  # of correlated parameters that are shown
-_WORSE, _INTERRUPTED = 3, 130
+_WORSE, INTERRUPTED = 3, 130
 
 
 def run(
@@ -85,7 +85,7 @@ def run(
         _show(found.details, found.config.arm.update_period)
         typer.echo(f"written to {output}\nnext: pumafuse fuse RUN -c {output / 'fusion.toml'} -o DIR")
     if found.details.interrupted:
-        raise typer.Exit(_INTERRUPTED)
+        raise typer.Exit(INTERRUPTED)
     if found.details.worse:
         raise typer.Exit(_WORSE)
 
