@@ -7,9 +7,12 @@ import math
 import shutil
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 import typer
 
@@ -102,6 +105,13 @@ def test_a_result_with_a_run_toml_stays_unless_it_is_made_anew(tmp_path: Path) -
     assert "mine: exists; --force replaces it" in refused("fuse", EXAMPLES / "my-run", "-o", mine)
 
 
+def exit_code_here(folder: Path) -> int:
+    """How `fuse` of the example ends in this process, where not by itself."""
+    with pytest.raises(typer.Exit) as ended:
+        from_log.run(EXAMPLES / "my-run", folder, None, None, "filtered", False, False, "compiled", False, (None, None))
+    return ended.value.exit_code
+
+
 def test_one_command_fuses_with_the_best_until_ctrl_c(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As `tune` keeps it; the exit code says so."""
 
@@ -116,11 +126,20 @@ def test_one_command_fuses_with_the_best_until_ctrl_c(tmp_path: Path, monkeypatc
         yield progress
 
     monkeypatch.setattr(from_log, "fitting", impatient)
-    with pytest.raises(typer.Exit) as ended, pytest.warns(pf.PumafuseWarning, match="interrupted: these are the best"):
-        from_log.run(
-            EXAMPLES / "my-run", tmp_path, None, None, "filtered", False, False, "compiled", False, (None, None)
-        )
-    assert ended.value.exit_code == 130
+    with pytest.warns(pf.PumafuseWarning, match="interrupted: these are the best"):
+        assert exit_code_here(tmp_path) == 130
+    assert {"run.toml", "summary.json"} < names(tmp_path)
+
+
+def test_one_command_says_that_the_fit_is_worse_as_tune_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Than the first guess, on the last third of the log: exit code 3, and the result is there."""
+
+    def worse(*given: Any, **how: Any) -> pf.Tuning:
+        found = pf.tune(*given, **how)
+        return replace(found, details=msgspec.structs.replace(found.details, worse=True))
+
+    monkeypatch.setattr(from_log, "tune", worse)
+    assert exit_code_here(tmp_path) == 3
     assert {"run.toml", "summary.json"} < names(tmp_path)
 
 

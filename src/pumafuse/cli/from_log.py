@@ -21,7 +21,7 @@ from ..tuning.parameters import Fit
 from ..tuning.tune import tune
 from . import init
 from .fuse import draw, show
-from .tune import INTERRUPTED, fitting, show_lags
+from .tune import end, fitting, show_lags
 
 _FITTED: Sequence[Fit] = ("noise", "delay", "plant", "gain")
 
@@ -44,7 +44,8 @@ def run(
 
     Raises:
         PumafuseError: The log cannot be read, has no commands or no sensor, or nothing can be fitted to it.
-        Exit: With 130 after Ctrl-C while it was fitted; the best until then is fused.
+        Exit: With 130 after Ctrl-C while it was fitted, when the best until then is fused; with 3 where what was fitted
+            is worse than the first guess on the last third of the log.
     """
     results.check_writable(output, force, with_run=True)
     found = survey(log)
@@ -62,5 +63,4 @@ def run(
     show_lags(fitted.details, fitted.config.arm.update_period)
     show(summary)
     typer.echo(f"written to {output}\nnext: pumafuse fuse ANOTHER_LOG -c {shlex.quote(str(output))}/fusion.toml -o DIR")
-    if fitted.details.interrupted:
-        raise typer.Exit(INTERRUPTED)
+    end(fitted.details)

@@ -27,7 +27,7 @@ PAGE = "report.html"
 OURS = frozenset({SUMMARY, PAGE, "fusion.toml", "arm.toml"})
 _HEADINGS = ["parameter", "before", "fitted", "95 % interval"]
 _PAIRS = 3  # of correlated parameters that are shown
-_WORSE, INTERRUPTED = 3, 130
+_WORSE, _INTERRUPTED = 3, 130
 
 
 def run(
@@ -84,9 +84,18 @@ def run(
     else:
         _show(found.details, found.config.arm.update_period)
         typer.echo(f"written to {output}\nnext: pumafuse fuse RUN -c {output / 'fusion.toml'} -o DIR")
-    if found.details.interrupted:
-        raise typer.Exit(INTERRUPTED)
-    if found.details.worse:
+    end(found.details)
+
+
+def end(summary: TuningSummary) -> None:
+    """Leave with the exit code of a tuning that was interrupted, or is worse on what it was validated on.
+
+    Raises:
+        Exit: With 130 or 3.
+    """
+    if summary.interrupted:
+        raise typer.Exit(_INTERRUPTED)
+    if summary.worse:
         raise typer.Exit(_WORSE)
 
 
