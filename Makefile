@@ -4,6 +4,8 @@ BIN := .venv/bin
 READY := .venv/.ready
 # Matrices are small: threads of a BLAS would only wait for each other.
 export OPENBLAS_NUM_THREADS := 1
+# Python compiles what is imported, once; pip would compile all that it installs, which takes as long as the rest.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help demo test test-long lint docs notebooks bench lock clean
 
@@ -18,14 +20,12 @@ help:
 	@echo "make lock       write requirements.lock anew (needs uv)"
 	@echo "make clean      remove .venv, ./demo and ./site"
 
-# pip compiles what it installs, but not what is edited in place; a setting may forbid Python to keep it, too.
 $(READY): requirements.lock pyproject.toml
 	@echo "Setting up .venv from requirements.lock ..."
 	@$(PYTHON) -c 'import sys; sys.exit("pumafuse needs Python 3.11 or newer: make PYTHON=python3.12 ...") if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
-	$(BIN)/python -m compileall -q src
 	@touch $@
 
 demo: $(READY)
@@ -41,7 +41,7 @@ test-long: $(READY)
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright --threads 2
+	$(BIN)/pyright
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir site
@@ -53,10 +53,9 @@ notebooks: $(READY)
 # Peers live apart: what they need may be older or newer than what pumafuse is locked to.
 .venv-bench/.ready: requirements.lock pyproject.toml benchmarks/requirements-peers.txt
 	$(PYTHON) -m venv .venv-bench
-	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
-	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check --requirement benchmarks/requirements-peers.txt
+	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check --no-compile --requirement requirements.lock
+	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check --no-compile --requirement benchmarks/requirements-peers.txt
 	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
-	.venv-bench/bin/python -m compileall -q src
 	@touch $@
 
 bench: .venv-bench/.ready

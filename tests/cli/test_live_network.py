@@ -143,9 +143,10 @@ def test_a_million_broken_datagrams() -> None:
             measurement = {"t": t, "sensor": "tracker", "radial": radial, "vertical": -90.0}
             command = {"t": t, "command": {"radial": 560.0, "vertical": -90.0}}
             good = [json.dumps(body).encode() for body in (measurement, command)]
-            for _ in range(100):
-                datagram = broken(rng, rng.choice(good), rng.choice(good))
+            datagrams = [broken(rng, rng.choice(good), rng.choice(good)) for _ in range(100)]
+            for datagram in datagrams:
                 ours.sendto(datagram, place)
+            for datagram in datagrams:
                 events = [line for line in datagram.split(b"\n") if is_json(line)]
                 shadow.take(events)
                 garbage += not events

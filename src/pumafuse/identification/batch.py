@@ -153,6 +153,27 @@ class Batch:
         score = np.einsum("kij,ij->ik", slopes[1:], at.residual) - coupling * gradient[:, None]
         return Equations(gradient / own, coupling, information, score, delay_sd)
 
+    def stepped(self, at: Point, order: Order, damping: FloatArray, low: FloatArray, high: FloatArray) -> Point:
+        """After a Gauss-Newton step of each group of rows, between ``low`` and ``high``, (3,).
+
+        Args:
+            at: Before it.
+            order: Of the plant.
+            damping: Of each group, (R / size,).
+            low: Least delay, q and p.
+            high: Most.
+        """
+        size = len(at.shape) // len(damping)
+        slopes, _ = self.slopes(at, order)
+        own = self.equations(at, slopes, np.repeat(damping, size))
+        information, score = _grouped(own.information, size), _grouped(own.score, size)
+        plant = _damped_step(at.shape[::size, 1:], information, score, damping)
+        plant = np.clip(np.repeat(plant, size, axis=0), low[1:], high[1:])
+        plant[:, 0] = np.maximum(plant[:, 0], 0.2 * at.shape[:, 1])
+        moved = (plant - at.shape[:, 1:])[:, :order]
+        delay = at.shape[:, 0] + own.shift - np.einsum("ij,ij->i", own.coupling, moved)
+        return self.point(np.column_stack((np.clip(delay, low[0], high[0]), plant)))
+
     def fit(self, start: FloatArray, order: Order, size: int = 1) -> Point:
         """The nearest minimum from ``start`` (R, 3): of each row by itself, or of one plant for each ``size`` rows.
 
@@ -164,21 +185,11 @@ class Batch:
         found = self.point(np.clip(start, low, high))
         rows, damping = np.arange(len(start)), np.full(len(start) // size, 1e-3)
 
-        def grouped(values: FloatArray) -> FloatArray:
-            return values.reshape(-1, size, *values.shape[1:]).sum(axis=1)
-
         for _ in range(_ITERATIONS):
             here, at = self.take(rows), Point(*(whole[rows] for whole in found))
-            slopes, _ = here.slopes(at, order)
-            own = here.equations(at, slopes, np.repeat(damping, size))
-            plant = _damped_step(at.shape[::size, 1:], grouped(own.information), grouped(own.score), damping)
-            plant = np.clip(np.repeat(plant, size, axis=0), low[1:], high[1:])
-            plant[:, 0] = np.maximum(plant[:, 0], 0.2 * at.shape[:, 1])
-            moved = (plant - at.shape[:, 1:])[:, :order]
-            delay = at.shape[:, 0] + own.shift - np.einsum("ij,ij->i", own.coupling, moved)
-            new = here.point(np.column_stack((np.clip(delay, low[0], high[0]), plant)))
-            cost = grouped(at.cost)
-            decrease = cost - grouped(new.cost)
+            new = here.stepped(at, order, damping, low, high)
+            cost = _grouped(at.cost, size)
+            decrease = cost - _grouped(new.cost, size)
             better = decrease >= 0.0
             damping = np.where(better, np.maximum(0.2 * damping, 1e-12), 8.0 * damping)
             going = np.where(better, decrease > _CONVERGED * cost, damping < _MOST_DAMPING)
@@ -189,6 +200,11 @@ class Batch:
             if not len(rows):
                 break
         return found
+
+
+def _grouped(values: FloatArray, size: int) -> FloatArray:
+    """Sums over each ``size`` rows, (R / size, ...)."""
+    return values.reshape(-1, size, *values.shape[1:]).sum(axis=1)
 
 
 def _power(unit: FloatArray) -> FloatArray:
