@@ -106,22 +106,23 @@ def _at_span(
     begin, end = s[some], s[some + rows]
 
     def changes(at_begin: FloatArray, at_end: FloatArray) -> FloatArray:
-        return at_end - (at_begin if rows else at_end.mean())
+        return at_end - (at_begin if rows else at_end.mean(axis=-1, keepdims=True))
 
     change = changes(z[some], z[some + rows])
     low, high = np.quantile(change, [0.01, 0.99])  # outliers
     change = np.clip(change, low, high)
 
-    def moves(lag: float, every: int = 1) -> FloatArray:
-        return changes(np.interp(begin[::every] - lag, t, u), np.interp(end[::every] - lag, t, u))
+    def moves(lags: FloatArray, every: int = 1) -> FloatArray:
+        later = lags[:, None]
+        return changes(np.interp(begin[::every] - later, t, u), np.interp(end[::every] - later, t, u))
 
-    def correlation(lag: float, every: int = 1) -> float:
-        other, mine = moves(lag, every), change[::every]
-        norm = math.sqrt(float(other @ other) * float(mine @ mine))
-        return float(other @ mine) / norm if norm > 0.0 else 0.0
+    def correlations(lags: FloatArray, every: int = 1) -> FloatArray:
+        others, mine = moves(lags, every), change[::every]
+        norm = np.sqrt(np.einsum("ij,ij->i", others, others) * float(mine @ mine))
+        return (others @ mine) / np.where(norm > 0.0, norm, np.inf)
 
     coarse, every = np.arange(_EARLIEST, _LATEST, _COARSE), max(1, len(change) // _FEW)
-    found = np.array([correlation(lag, every) for lag in coarse])
+    found = correlations(coarse, every)
     if not np.abs(found).any():
         return None
     sign = -1.0 if found.max() <= 0.0 or -found.min() > found.max() + _MIRRORED else 1.0
@@ -129,8 +130,8 @@ def _at_span(
     peaks = (found[1:-1] >= np.maximum(found[:-2], found[2:])) & (found[1:-1] >= _NEARLY * found.max())
     best = min(coarse[peaks], key=abs)
     fine = np.arange(best - 1.5 * _COARSE, best + 1.5 * _COARSE, _FINE)
-    lag = float(fine[int(np.argmax([sign * correlation(one) for one in fine]))])
-    other = moves(lag)
+    lag = float(fine[np.argmax(sign * correlations(fine))])
+    other = moves(np.array([lag]))[0]
     slope = float(other @ change) / float(other @ other)
     kept = _without_few(change - slope * other, other)
     other, change = other[kept], change[kept]
