@@ -18,13 +18,14 @@ def unit_response(time: FloatArray | float, q: FloatArray | float, p: FloatArray
     square = half * half - p
     root = np.sqrt(np.abs(square))
     over_damped, apart = square >= 0.0, root > _TOGETHER * half
-    found = np.zeros(np.broadcast_shapes(np.shape(time), square.shape))
     forms = (over_damped & apart, _apart), (over_damped & ~apart, _together), (~over_damped, _swinging)
+    needed = [(plants, form) for plants, form in forms if plants.any()]
+    time, half, root, p, *masks = np.broadcast_arrays(time, half, root, p, *(plants for plants, _ in needed))
+    found, begun = np.zeros(time.shape), time > 0.0
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # where T₂ or the swing is next to nothing
-        for plants, form in forms:
-            if plants.any():
-                chosen = np.broadcast_to(plants & (np.asarray(time) > 0.0), found.shape)
-                found[chosen] = form(*(np.broadcast_to(one, found.shape)[chosen] for one in (time, half, root, p)))
+        for plants, (_, form) in zip(masks, needed, strict=True):
+            chosen = plants & begun
+            found[chosen] = form(time[chosen], half[chosen], root[chosen], p[chosen])
     return found
 
 
