@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, TypeAlias
@@ -88,6 +89,7 @@ class _View(NamedTuple):
         free: The free parameters that are not at a bound. The prior of a shared one is the information of other axes.
         linear: The innovations around the maximum, to first order in these.
         covariance: Of their coordinates, (k, k).
+        top: The log-posterior of the maximum.
     """
 
     likelihood: Likelihood
@@ -95,6 +97,7 @@ class _View(NamedTuple):
     free: Sequence[Parameter]
     linear: Linearised
     covariance: FloatArray
+    top: float
 
 
 def confidence_intervals(
@@ -168,7 +171,8 @@ def _of_shared(information: FloatArray, own: int) -> FloatArray:
 def _view(likelihood: Likelihood, outcomes: Sequence[CodeArray], best: Point, free: Sequence[Parameter]) -> _View:
     there = point(likelihood, best.config, free, outcomes)
     linear = likelihood.linearised(best.config, free, there.outcomes)
-    return _View(likelihood, outcomes, free, linear, covariance(with_priors(linear, there, free).information, free))
+    cov = covariance(with_priors(linear, there, free).information, free)
+    return _View(likelihood, outcomes, free, linear, cov, there.log_posterior)
 
 
 class _End(NamedTuple):
@@ -224,7 +228,7 @@ class _Side:
         self._vanishing = self._bound is not None and one.vanishes
         self._range = np.array([other.range for other in self._others]).reshape(-1, 2).T
         self._known = {0.0: _Known(0.0, coordinates(best.config, self._others), near)}  # by distance
-        self._top = point(view.likelihood, best.config, self._every, view.outcomes).log_posterior
+        self._top = view.top + (0.0 if self._bound is None else one.log_prior(best.config))
         self.limit = self._distance(one.bounds[0 if sign < 0.0 else 1])
 
     def value(self, distance: float) -> float:
@@ -239,16 +243,16 @@ class _Side:
 
         end = min(Z95, self.limit)
         if self._bound is not None:
-            end = self.limit
-            for _ in range(_HALVINGS):
-                if _root(self._drop(end)) < Z95:
-                    break
-                end *= 0.5
+            places = [0.5**n * self.limit for n in range(_HALVINGS + 1)]
+            end = places[bisect_left(places, True, hi=_HALVINGS, key=lambda place: _root(self._drop(place)) < Z95)]
         elif self.limit > Z95 and abs(self._drop(Z95) / (0.5 * Z95**2) - 1.0) < _SKEWED:
             return Z95, False
         inner = 0.0
         while self._missing(end) < 0.0 and end < self.limit:
-            inner, end = end, min(_FARTHER * end, self.limit)
+            if inner == 0.0 and self._may_be_none(end):
+                return self.limit, True
+            aimed = (1.0 + 0.5 * _CLOSE) * Z95 / self.root(end)  # a little beyond, by a parabola
+            inner, end = end, min(min(_FARTHER, aimed) * end, self.limit)
         if self._missing(end) > 0.0:
             end = float(brentq(self._missing, inner, end, rtol=_CLOSE))
         return end, True
@@ -265,6 +269,16 @@ class _Side:
                 found = min(found, beside, key=lambda one: one.drop)
             self._known[distance] = found
         return _root(self._known[distance].drop)
+
+    def _may_be_none(self, distance: float) -> bool:
+        """Whether a noise that has not dropped at a distance may be 0: on the way there its profile hardly changes."""
+        if not self._one.vanishes or self._unit > 0.0:
+            return False
+        _, others, near = self._known[distance]
+        found = self._maximum(self.limit, others, near)
+        if may_be := _root(found.drop) < Z95:
+            self._known[self.limit] = found
+        return may_be
 
     def curve(self, end: float, profiled: bool) -> list[tuple[float, float]]:
         """Points of the profile to one and a half times the end: values [SI] and what the likelihood drops by."""
