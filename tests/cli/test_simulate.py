@@ -204,7 +204,10 @@ def test_sweeping_up_takes_nothing_of_others(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.usefixtures("two_cores")
 def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
-    """As when memory runs out: the command says so and ends; what was half written is swept, what is whole is kept."""
+    """As when memory runs out: the command says so and ends; what was half written is swept, what is whole is kept.
+
+    Of what processes shared joblib may have to clean up something, of which it would warn.
+    """
     script, out = tmp_path / "dies.py", tmp_path / "out"
     script.write_text(
         "import os, signal, time\nfrom pathlib import Path\n"
@@ -213,7 +216,9 @@ def test_a_worker_that_dies_is_one_line(tmp_path: Path) -> None:
         "def whole():\n    with folders.replacing(out / 'a') as new:\n        (new / 'x').write_text('')\n"
         "def die():\n    while not (out / 'a').exists():\n        time.sleep(0.01)\n"
         "    with folders.replacing(out / 'b'):\n        os.kill(os.getpid(), signal.SIGKILL)\n"
-        "def app():\n    many.run_jobs('x', {'a': whole, 'b': die}, [out / 'a', out / 'b'])\n"
+        "def app():\n    from joblib.externals.loky.backend import resource_tracker\n"
+        "    resource_tracker.register('/loky-left', 'semlock')\n"
+        "    many.run_jobs('x', {'a': whole, 'b': die}, [out / 'a', out / 'b'])\n"
         "if __name__ == '__main__':\n    main.app = app\n    main.main()\n"
     )
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False)

@@ -378,6 +378,9 @@ def main() -> None:
     # What is imported stays: looking through it time and again, and once more at the end, is a quarter of `fuse`.
     gc.set_threshold(10_000, 1_000)
     atexit.register(gc.freeze)
+    # After a worker was killed, joblib's process that cleans up what workers share may warn of what it finds.
+    quiet = "ignore::UserWarning:joblib.externals.loky.backend.resource_tracker"
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), quiet)))
     for stop in ("SIGTERM", "SIGHUP"):
         number = getattr(signal, stop, None)  # Windows has no SIGHUP; nohup ignores it
         if number is not None and signal.getsignal(number) == signal.SIG_DFL:

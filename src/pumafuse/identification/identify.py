@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from importlib.metadata import version
 from typing import Any
 
@@ -238,7 +239,10 @@ def _fit_all(trials: Sequence[Trial], samples: int | None, paper: bool) -> list[
     cut = [trial.cut(samples) for trial in trials]
     batches = [cut[first : first + _BATCH] for first in range(0, len(cut), _BATCH)]
     parallel = Parallel(n_jobs=-1 if len(batches) > 1 else 1, return_as="generator")
-    fits = [pair for batch in parallel(delayed(fit_steps)(batch) for batch in batches) for pair in batch]
+    try:
+        fits = [pair for batch in parallel(delayed(fit_steps)(batch) for batch in batches) for pair in batch]
+    except BrokenProcessPool:
+        raise TrialsError("a worker process died (out of memory?) while trials were fitted") from None
     if paper:
         fits = [
             (fit_as_published(one, first), fit_as_published(one, second))
