@@ -299,14 +299,18 @@ class _AxisSearch:
         best = maximise(self.likelihood, config, self.everything(config, model), tolerance=_ROUGHLY)
         return past_bumps(self.likelihood, best, self.everything(best.config, model))
 
-    def maximum(self, model: Model, starts: Iterable[FusionConfig], climbed: int = 2) -> Point:
-        """The best of the maxima of the arm next to the best starts, the noise as it is."""
+    def maximum(self, model: Model, starts: Iterable[FusionConfig], climbed: int = 2, worth: float = -np.inf) -> Point:
+        """The best of the maxima of the arm next to the best starts, the noise as it is.
+
+        What is not going to be ``worth`` it, or as high as the best until then, is not followed to its end.
+        """
         tried = [point(self.likelihood, start, self.free(start, model, _ARM)) for start in starts]
         tried.sort(key=lambda one: -one.log_posterior)
-        peaks = [
-            maximise(self.likelihood, one.config, self.free(one.config, model, _ARM), tolerance=_COARSELY)
-            for one in tried[:climbed]
-        ]
+        peaks: list[Point] = []
+        for one in tried[:climbed]:
+            free = self.free(one.config, model, _ARM)
+            peaks.append(maximise(self.likelihood, one.config, free, tolerance=_COARSELY, worth=worth))
+            worth = max(worth, peaks[-1].log_posterior)
         return max(peaks, key=lambda one: one.log_posterior)
 
     def with_white_noise(self, config: FusionConfig) -> FusionConfig:
@@ -396,9 +400,11 @@ class _AxisSearch:
         highest = max(one[0] for one in found)
         for evidence, model, peak in list(found):
             for start in self._ticks_away(peak.config) if evidence > highest - _FORLORN else ():
-                beside = self.maximum(model, [start])
+                worth = peak.log_posterior - _NEARLY
+                beside = self.maximum(model, [start], worth=worth)
                 known = [self.delay_of(one) for _, other, one in found if other == model]
-                if min(abs(self.delay_of(beside) - delay) for delay in known) > _SAME:
+                apart = min(abs(self.delay_of(beside) - delay) for delay in known)
+                if apart > _SAME and beside.log_posterior > worth:
                     found.append(self._weighed(model, self.polished(model, beside.config)))
         return sorted(found, key=lambda one: -one[0])
 
@@ -409,14 +415,15 @@ class _AxisSearch:
             own = self.with_noise_of(best[model].config, noise)
             found[model] = self.maximum(model, [own, *self.starts(model, top)], climbed=1)
             if len(found) == 1:  # the best until now: with commands a period apart a wrong period fits well, too
-                again = self.maximum(model, self._ticks_away(found[model].config))
+                ticks_away = self._ticks_away(found[model].config)
+                again = self.maximum(model, ticks_away, worth=found[model].log_posterior)
                 if again.log_posterior > found[model].log_posterior:
                     found[model], top = again, again.config
         other = self._best(found)
         for model, peak in found.items():
             if peak.log_posterior < other.log_posterior - _WORSE:
                 starts = list(self.starts(model, other.config))
-                again = self.maximum(model, starts, climbed=1)
+                again = self.maximum(model, starts, climbed=1, worth=peak.log_posterior)
                 found[model] = max(peak, again, key=lambda one: one.log_posterior)
         return found
 
