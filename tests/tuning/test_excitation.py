@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 import pumafuse as pf
 from pumafuse.logs.run import Source
 from pumafuse.tuning.identifiability import excited_axes
+from pumafuse.tuning.parameters import Fit
 from pumafuse.tuning.stage import Plan, likelihood_of
 from tuning_runs import fit_stage, later, outage, quietly, replaced, scenario, spoiled
 
@@ -73,6 +74,18 @@ def test_too_few_measurements() -> None:
     few = replace(run, sensors={"vision": camera.rows(slice(0, 29))})
     assert refused([few], validate=run) == "tangential: only 29 measurements; a fit needs at least 30"
     assert len(fit_stage([few, few], outage(1).config).free) > 0
+
+
+def test_few_measurements_for_many_numbers_are_told() -> None:
+    """Fewer than 30 for each number that is fitted: with more of the same sensor, or fewer numbers, nothing is said."""
+    run, tracker = outage(1).run, outage(1).run.sensors["tracker"]
+
+    def told(rows: int, fit: Sequence[Fit]) -> list[str]:
+        part = replace(run, sensors={"tracker": tracker.rows(slice(0, rows))})
+        return [one for one in fit_stage([part], outage(1).config, fit).notes if "numbers to fit" in one]
+
+    assert told(60, ["noise"])[0].startswith("tangential: 60 measurements for 5 numbers to fit: with fewer than 30")
+    assert told(400, ["noise"]) == told(60, ["delay"]) == []
 
 
 def test_no_motion() -> None:

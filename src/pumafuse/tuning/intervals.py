@@ -105,7 +105,7 @@ def confidence_intervals(
 ) -> dict[str, ConfidenceInterval]:
     """Compute the 95 % interval of each free parameter, by its key.
 
-    ``drawn``: with profiles to draw, too, which takes half as long again.
+    ``drawn``: with profiles to draw, too, which takes nearly twice as long.
 
     From the curvature: 1.96 sd of the coordinate each way. Where the likelihood at an end, the other parameters moved
     along, has not dropped by what that predicts (1.92), the end is where its profile has (Cox & Hinkley, Theoretical

@@ -12,7 +12,14 @@ from ..fusion.config import FusionConfig, Sensor
 from ..fusion.score import Z95
 from ..logs.run import Run
 from ..units import SCREEN, Kind, as_length, of_kind
-from .identifiability import NotIdentifiable, excited_axes, not_identifiable, not_identifiable_noise, shared_times
+from .identifiability import (
+    NotIdentifiable,
+    excited_axes,
+    few_measurements,
+    not_identifiable,
+    not_identifiable_noise,
+    shared_times,
+)
 from .likelihood import Likelihood
 from .maximise import Notify, Point, ignore, maximise_with_gates
 from .parameters import (
@@ -141,6 +148,7 @@ def run_stage(
         for name, sensor in config.sensors.items()
         if 0.0 < sensor.gate < _NARROWEST and name in used
     ]
+    notes += few_measurements(likelihood, free(best.config))
     return Stage(likelihood, best, free(best.config), fixed, orders, notes)
 
 

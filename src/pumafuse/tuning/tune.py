@@ -97,7 +97,7 @@ def tune(
         share: ``delay``: all axes share one whatever the measurements say. Else those share one to which an own one is
             not worth its number (Bayesian information criterion).
         profiles: Whether to compute the likelihood along each parameter, too, to draw it and to look for a second
-            maximum: that takes about a quarter longer.
+            maximum: that takes about a tenth longer.
         progress: Called with what is being done and the best log-likelihood so far.
 
     Returns:
