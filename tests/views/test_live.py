@@ -279,7 +279,6 @@ def test_a_viewer_that_stalls_is_left_alone_until_it_goes_on(recorder: tuple[sub
         resident.append(drawer.memory_info().rss)
     assert resident[-1] - resident[len(resident) // 2] < 20e6  # by then all the frames wait that ever will
     server.send_signal(signal.SIGCONT)
-    driven.go(5)
+    later = 0.028 * driven.step
+    until(lambda: driven.go() or (len(found := series(path, "/radial/command")[0]) and found.max() > later - 1e-6))
     driven.view.close()
-    last = 0.028 * (driven.step - 1)
-    until(lambda: len(found := series(path, "/radial/command")[0]) and found.max() > last - 1e-6)
