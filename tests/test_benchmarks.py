@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import shutil
+from collections import defaultdict
 from pathlib import Path
 from types import ModuleType
 
@@ -13,6 +14,8 @@ from scipy.integrate import solve_ivp
 
 import pumafuse as pf
 from pages import ROOT
+from pumafuse.tuning.likelihood import Likelihood
+from pumafuse.tuning.posterior import AxisPosterior, axis_posterior
 from pumafuse.units import DEG
 
 SHARED = ROOT.parent / "shared" / "data" / "trunk-servo"
@@ -130,6 +133,27 @@ def test_intervals_of_lags_hold_on_arms_of_all_kinds(lag: ModuleType) -> None:
     ours, rival = np.sqrt(np.mean(errors**2, axis=0))
     assert ours < rival / 3.0
     assert sum(bool(named) for _, _, named in found) <= 1  # nothing drifts or wanders here
+
+
+@pytest.mark.long
+def test_delays_a_period_away_are_looked_at(lag: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In one run a model has two maxima a period of 8 ms apart, in another the first one found is a period off."""
+    posteriors, latency = list[AxisPosterior](), importlib.import_module("pumafuse.tuning.latency")
+
+    def kept(likelihood: Likelihood, start: pf.FusionConfig, axis: str) -> AxisPosterior:
+        posteriors.append(axis_posterior(likelihood, start, axis))
+        return posteriors[-1]
+
+    monkeypatch.setattr(latency, "axis_posterior", kept)
+    lag.examined((323, 2, 0.0))
+    tops = defaultdict[tuple[int, str], list[float]](list)
+    for number, posterior in enumerate(posteriors):
+        for one in posterior.branches:
+            tops[number, str(one.model)].append(one.delays[np.argmax(one.log_density)] / 0.008)
+    assert any(0.6 < max(each) - min(each) < 1.4 for each in tops.values()), tops
+    found, _, _ = lag.examined((306, 2, 0.0))
+    assert len(found) == 8
+    assert all(one.low <= one.truth <= one.high for one in found), found
 
 
 @pytest.mark.long

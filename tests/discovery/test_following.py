@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pumafuse.arrays import FloatArray, TimeArray
-from pumafuse.discovery.following import following, resolution
+from pumafuse.discovery.following import _at_span, following, resolution
 
 
 def path(t: FloatArray) -> FloatArray:
@@ -103,6 +103,15 @@ def test_what_is_not_alike_at_any_lag_is_compared_all_the_same(seed: int) -> Non
     found = following((stamped(t), yaw), (stamped(s), (z + np.pi) % (2.0 * np.pi) - np.pi))
     assert found is not None
     assert abs(found.correlation) < 0.5
+
+
+def test_changes_from_the_mean_tell_the_lag_of_a_path_with_a_trend() -> None:
+    """At 0.1 m/s on average each lag has a mean of its own, and that of all would add 0.1 s to the lag."""
+    t, s = np.arange(0.0, 40.0, 0.02), np.arange(3.0, 37.0, 0.05)
+    trend = path(t) + 0.1 * t
+    found = _at_span(t, trend, s, np.interp(s - 0.25, t, trend), np.inf)
+    assert found is not None
+    assert found[0] == pytest.approx(0.25, abs=0.01)
 
 
 def test_what_cannot_be_compared_has_no_relation() -> None:

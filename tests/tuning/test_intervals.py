@@ -12,7 +12,7 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.stats import multivariate_normal
 
 import pumafuse as pf
-from pumafuse.tuning.intervals import ConfidenceInterval, Profile, confidence_intervals
+from pumafuse.tuning.intervals import ConfidenceInterval, Profile, _Side, _views, confidence_intervals
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import maximise, maximise_with_gates, point
 from pumafuse.tuning.parameters import Fit, moved, rounded, with_own_delays
@@ -265,6 +265,17 @@ def test_an_interval_contains_the_result() -> None:
             assert found.open[0] or found.ci95[0] < value, one.key
             assert found.open[1] or value < found.ci95[1], one.key
             assert found.open[0] or value > one.bounds[0], one.key
+
+
+def test_a_profile_begins_at_its_maximum_also_beside_a_bound_and_a_prior() -> None:
+    """A camera's noise put at its least, far from what it is configured as: nothing has dropped there yet."""
+    found = fit_stage(outage(1).run, outage(1).config)
+    one = next(one for one in found.free if one.sensor == "vision" and one.prior is not None)
+    least = one.put(found.best.config, one.bounds[0])
+    assert one.at_bound(least) == "lower" and one.log_prior(least) < -10.0
+    best = point(found.likelihood, least, found.free)
+    view = _views(found.likelihood, best, found.free)[one.axis]
+    assert _Side(view, best, one, 1.0)._drop(0.0) == pytest.approx(0.0, abs=1e-6)
 
 
 # ---- coverage -------------------------------------------------------------------------------------------------------
