@@ -1,8 +1,10 @@
-"""The message of a refusal."""
+"""The message of a refusal, and a worker process that dies."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -16,3 +18,10 @@ def one_line(kind: type[PumafuseError], call: Callable[[], object]) -> str:
     text = str(caught.value)
     assert len(text.splitlines()) == 1, text
     return text
+
+
+def killed_beside(parent: int, work: Callable[..., Any], *given: Any) -> Any:
+    """What a system that runs out of memory does to every process but the ``parent``, which does the work."""
+    if os.getpid() != parent:
+        os._exit(9)
+    return work(*given)

@@ -10,7 +10,6 @@ from collections import defaultdict
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from scipy.stats import t as student_t
 import pumafuse as pf
 from pumafuse.identification.fit import fit_steps
 from pumafuse.identification.trials import Trial
+from refusals import killed_beside
 
 TIMES = np.arange(60) * 0.00563  # s
 PERIOD = 0.028  # s
@@ -237,19 +237,14 @@ def test_the_paper_reads_a_gain_low_when_the_window_ends_early() -> None:
     assert float(fitted.at(np.array(0.29))) / true == pytest.approx(1.0, abs=0.03)
 
 
-def killed(parent: int, *given: Any) -> Any:
-    """What a system that runs out of memory does to a process, but to this one."""
-    if os.getpid() != parent:
-        os._exit(9)
-    return fit_steps(*given)
-
-
 @pytest.mark.long
 @pytest.mark.usefixtures("two_cores")
 def test_a_worker_that_dies_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """More than a hundred trials are fitted in processes of their own; one that is killed is no traceback."""
     trials = [trial for seed in range(9) for trial in Arm(1, noise=0.03e-3).campaign(seed)]
     assert len(trials) > 100
-    monkeypatch.setattr(import_module("pumafuse.identification.identify"), "fit_steps", partial(killed, os.getpid()))
+    monkeypatch.setattr(
+        import_module("pumafuse.identification.identify"), "fit_steps", partial(killed_beside, os.getpid(), fit_steps)
+    )
     with pytest.raises(pf.PumafuseError, match="a worker process died"):
         identified(trials)

@@ -8,7 +8,6 @@ import warnings
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +19,8 @@ import pumafuse as pf
 from pumafuse.tuning import latency as module
 from pumafuse.tuning.latency import Latency
 from pumafuse.tuning.likelihood import Derivatives, Likelihood
-from pumafuse.tuning.posterior import AxisPosterior, axis_posterior
+from pumafuse.tuning.posterior import axis_posterior
+from refusals import killed_beside
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 Array = NDArray[np.float64]
@@ -237,13 +237,6 @@ def test_what_tells_nothing_is_refused() -> None:
         pf.latency(replace(run, sensors={"tracker": early}))
 
 
-def killed(parent: int, *given: Any) -> AxisPosterior:
-    """What a system that runs out of memory does to a process, but to this one."""
-    if os.getpid() != parent:
-        os._exit(9)
-    return axis_posterior(*given)
-
-
 @pytest.mark.long
 @pytest.mark.usefixtures("two_cores")
 def test_a_worker_that_dies_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,7 +245,7 @@ def test_a_worker_that_dies_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch)
     both = dict.fromkeys(("x", "y"), run.command.values["x"])
     seen = dict.fromkeys(both, run.sensors["tracker"].values["x"])
     tracker = replace(run.sensors["tracker"], values=seen)
-    monkeypatch.setattr(module, "axis_posterior", partial(killed, os.getpid()))
+    monkeypatch.setattr(module, "axis_posterior", partial(killed_beside, os.getpid(), axis_posterior))
     with pytest.raises(pf.TuneError, match="a worker process died"):
         pf.latency(replace(run, command=replace(run.command, values=both), sensors={"tracker": tracker}))
 
