@@ -34,9 +34,10 @@ demo: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest -m "not long" -n 2
 
-# Tests of one group (those that listen on a port that a page names) go to one worker.
+# Tests of one group (those that listen on a port that a page names) go to one worker. Some wait more than they compute,
+# so there is a worker more than cores.
 test-long: $(READY)
-	$(BIN)/python -m pytest -m long -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -m long -n 3 --dist loadgroup
 
 lint: $(READY)
 	$(BIN)/ruff check .
