@@ -34,8 +34,8 @@ demo: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest -m "not long" -n 2
 
-# Tests of one group (those that listen on a port that a page names) go to one worker. Some wait more than they compute,
-# so there is a worker more than cores.
+# Tests of one group go to one worker: they listen on a port that a page names, or compile the same. Some wait more than
+# they compute, so there is a worker more than cores.
 test-long: $(READY)
 	$(BIN)/python -m pytest -m long -n 3 --dist loadgroup
 

@@ -45,6 +45,7 @@ def covariance(order: int, density: float, time: float, prior: np.ndarray, s: np
 
 
 @pytest.mark.long
+@pytest.mark.xdist_group("ungated")  # or each worker compiles the rivals
 @pytest.mark.parametrize("order", [1, 2, 3])
 @pytest.mark.parametrize(("late", "smooth"), [(0.0, False), (0.07, False), (0.0, True)])
 def test_estimates_are_those_of_a_gaussian_process(ungated: ModuleType, order: int, late: float, smooth: bool) -> None:
