@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parent.parent
 EVERY_KERNEL = """
@@ -35,7 +36,8 @@ def what_it_asks_for(name: str) -> set[str]:
     found, left = set[str](), [name]
     while left:
         asked = map(Requirement, requires(left.pop()) or ())
-        new = {one.name for one in asked if one.marker is None or one.marker.evaluate({"extra": ""})} - found
+        needed = (one.name for one in asked if one.marker is None or one.marker.evaluate({"extra": ""}))
+        new = set(map(canonicalize_name, needed)) - found
         found |= new
         left += new
     return found
