@@ -2,6 +2,11 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+PIP := -m pip install --quiet --disable-pip-version-check --no-deps
+LOCKED := $(PIP) --no-compile --requirement
+# The library is made in build, and compiled anew only where its sources have changed.
+INPLACE := $(PIP) --no-build-isolation --editable .
+CORE := core/backend.py CMakeLists.txt $(wildcard core/*.?pp core/include/*.h)
 # Matrices are small: threads of a BLAS would only wait for each other.
 export OPENBLAS_NUM_THREADS := 1
 # Python compiles what is imported, once; pip would compile all that it installs, which takes as long as the rest.
@@ -16,16 +21,20 @@ help:
 	@echo "make lint       ruff and pyright"
 	@echo "make docs       the documentation as a site (into ./site)"
 	@echo "make notebooks  run the notebooks anew, in place"
-	@echo "make bench      pumafuse against its peers and version 0.1 (into .venv-bench and docs; 25 minutes)"
+	@echo "make bench      pumafuse against its peers and version 0.2 (into .venv-bench and docs; 25 minutes)"
 	@echo "make lock       write requirements.lock anew (needs uv)"
-	@echo "make clean      remove .venv, ./demo and ./site"
+	@echo "make clean      remove .venv, ./build, ./demo and ./site"
 
-$(READY): requirements.lock pyproject.toml
+.venv/.locked: requirements.lock core/zig.lock
 	@echo "Setting up .venv from requirements.lock ..."
 	@$(PYTHON) -c 'import sys; sys.exit("pumafuse needs Python 3.11 or newer: make PYTHON=python3.12 ...") if sys.version_info < (3, 11) else None'
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-compile --requirement requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	$(BIN)/python $(LOCKED) requirements.lock
+	@$(BIN)/python core/backend.py || $(BIN)/python $(LOCKED) core/zig.lock
+	@touch $@
+
+$(READY): .venv/.locked pyproject.toml $(CORE)
+	$(BIN)/python $(INPLACE)
 	@touch $@
 
 demo: $(READY)
@@ -34,8 +43,7 @@ demo: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest -m "not long" -n 2
 
-# Tests of one group go to one worker: they listen on a port that a page names, or compile the same. Some wait more than
-# they compute, so there is a worker more than cores.
+# Tests of one group go to one worker: they listen on a port that a page names. Some wait more than they compute, so there is a worker more than cores.
 test-long: $(READY)
 	$(BIN)/python -m pytest -m long -n 3 --dist loadgroup
 
@@ -52,19 +60,22 @@ notebooks: $(READY)
 	$(BIN)/python notebooks/run.py
 
 # Peers live apart: what they need may be older or newer than what pumafuse is locked to.
-.venv-bench/.ready: requirements.lock pyproject.toml benchmarks/requirements-peers.txt
+.venv-bench/.ready: requirements.lock pyproject.toml benchmarks/requirements-peers.txt $(CORE)
 	$(PYTHON) -m venv .venv-bench
-	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-compile --requirement requirements.lock
+	.venv-bench/bin/python $(LOCKED) requirements.lock
 	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check --no-compile --requirement benchmarks/requirements-peers.txt
-	.venv-bench/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@.venv-bench/bin/python core/backend.py || .venv-bench/bin/python $(LOCKED) core/zig.lock
+	.venv-bench/bin/python $(INPLACE)
 	@touch $@
 
 bench: .venv-bench/.ready
 	.venv-bench/bin/python benchmarks/run.py --write
 
 # Universal: one lock for every platform and Python. No index address goes into it.
+LOCK := uv pip compile --universal --generate-hashes --no-emit-index-url --no-header --quiet
 lock:
-	uv pip compile pyproject.toml --extra bags --group dev --universal --generate-hashes --no-emit-index-url --no-header --quiet --output-file requirements.lock
+	$(LOCK) pyproject.toml --extra bags --group dev --output-file requirements.lock
+	echo ziglang | $(LOCK) - --output-file core/zig.lock
 
 clean:
-	rm -rf .venv .venv-bench demo site
+	rm -rf .venv .venv-bench build demo site src/pumafuse/filter/_core.*

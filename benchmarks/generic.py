@@ -124,7 +124,7 @@ def measure(case: Case) -> Iterator[Row]:
         for axis, found in numbers.items():
             here = measured[axis]
             generic = {
-                kind: [error(est, axis, since, here.follow(order, one)[0]) for one in found[kind]]
+                kind: [error(est, axis, since, here.position(order, one)) for one in found[kind]]
                 for kind, order in ORDERS.items()
             }
             row: Row = {"set": name, "axis": axis}

@@ -3,40 +3,35 @@
 What is constant is a random walk, exactly integrated between the irregular instants at which measurements are valid. Of
 the sensors and of the start they know what pumafuse knows; their gate and their likelihood are pumafuse's, too, but for
 this: a re-acquisition makes not the position alone uncertain but all of the motion, as it was before the first
-measurement.
+measurement. Filters with different noise run side by side.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import differential_evolution, minimize
+from scipy.optimize import differential_evolution
 
 import pumafuse as pf
-from pumafuse.filter.gate import RECENT_NS
 from pumafuse.fusion.score import interpolated
 from pumafuse.fusion.segments import build
 
 Array = npt.NDArray[np.float64]
 Whole = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+Cost = Callable[[Array], Array]  # of c candidates with d logarithms each, (d, c) to (c,)
 
 GATE = 5.0  # standard deviations
-RECENT = RECENT_NS / 1e9
+RECENT = 0.5  # s, as in core/gate.hpp
 REST = (0.01, 0.1)  # m/s and m/s²: how well they know that the arm begins at rest; wider priors cost them up to 0.5 %
 ORDERS = {"velocity": 2, "acceleration": 3}  # what is constant, and how many states the motion takes
 
-# Where a search begins: all of a grid are tried, the best are followed downhill.
-DENSITIES = np.log(10.0) * np.arange(-5.0, 4.01, 0.5)  # logarithms of the random walk's
-SDS = np.log([0.3, 1.0, 3.0])  # and of the sensors' sds over the configured ones
-STARTS = 4
-REACH = 50.0  # the oracle's sds are at most so many times smaller or greater than the configured ones
+DENSITIES = (1e-5, 1e4)  # of the random walk: where a search looks
+REACH = 50.0  # and by how much sds are smaller or greater than the configured ones
 
 
 class Known(NamedTuple):
@@ -69,108 +64,130 @@ class Measured(NamedTuple):
     value: Array
 
 
-@numba.njit(cache=True, error_model="numpy")
-def follow(order: int, numbers: Array, known: Known, measured: Measured, times: Array, position: Array) -> float:
-    """Filter all measurements; write the position at each of ``times`` [m] and return the log-likelihood, m in mm.
+class Filters:
+    """Filters side by side, each with noise of its own; they are the last index of all arrays.
 
-    ``numbers`` are logarithms: of the density of the random walk, then of each sensor's sd [m]. The state is the
-    position with its derivatives, ``order`` in all, and the biases. A rejected measurement counts as if it were at the
-    gate.
+    The state is the position with its derivatives, ``order`` in all, and the biases.
     """
-    size, density, sds = order + len(known.bias_sd), math.exp(2.0 * numbers[0]), np.exp(numbers[1:])
-    x, P, H, K = np.zeros(size), np.zeros((size, size)), np.zeros(size), np.zeros(size)
-    rejected, reacquired, fused = np.zeros((len(sds), 3)), np.zeros(len(sds)), np.full(len(sds), -np.inf)
-    x[0], P[0, 0] = known.start, known.start_sd**2
-    for i in range(1, order):
-        P[i, i] = REST[i - 1] ** 2
-    for i in range(order, size):
-        P[i, i] = known.bias_sd[i - order] ** 2
-    now, total, n = 0.0, 0.0, 0
-    for k in range(len(measured.time)):
-        while n < len(times) and times[n] < measured.time[k]:
-            position[n] = ahead(x, order, times[n] - now)
-            n += 1
-        move(x, P, order, density, measured.time[k] - now)
-        now, s = measured.time[k], measured.sensor[k]
-        H[:] = 0.0
-        H[0] = known.scale[s]
-        if known.bias[s] >= 0:
-            H[order + known.bias[s]] = 1.0
-        R = sds[s] ** 2 + (known.scale[s] * x[1] * known.latency_sd[s]) ** 2
-        nu, S = measured.value[k], R + spread(P, H, K)
-        for i in range(size):
-            nu -= H[i] * x[i]
-        beyond, believed, again = abs(nu) > GATE * math.sqrt(S), False, False
-        if beyond:
-            nu_then, R_then, then = rejected[s]  # R is 0 where there is none
-            dt = now - then
-            again = R_then > 0.0 and dt < known.period
-            motion = dt**2 * P[1, 1] + (density * dt**3 / 3.0 if order == 2 else density * dt**5 / 20.0)
-            if order == 3:
-                motion += dt**3 * P[1, 2] + 0.25 * dt**4 * P[2, 2]
-            spread_between = R_then + R + known.scale[s] ** 2 * motion
-            believed = R_then > 0.0 and not again and abs(nu - nu_then) <= GATE * math.sqrt(spread_between)
-            for other in range(len(sds)):
-                if other != s and now - fused[other] <= RECENT and reacquired[other] <= reacquired[s]:
-                    believed = False
-        if believed:
-            P[0, 0] += (nu / known.scale[s]) ** 2
-            for i in range(1, order):  # without commands the motion is as much in doubt as the position
-                P[i, i] += REST[i - 1] ** 2
-            reacquired[s] += 1
-            S = R + spread(P, H, K)
-        elif beyond and not again:
-            rejected[s] = nu, R, now
-        taken = believed or not beyond
-        if taken:
-            rejected[s, 1], fused[s] = 0.0, now
-        total -= 0.5 * (math.log(2.0e6 * math.pi * S) + (nu * nu / S if taken else GATE**2))
-        for i in range(size if taken else 0):
-            x[i] += K[i] / S * nu
-            for j in range(size):
-                P[i, j] -= K[i] * K[j] / S
-    for rest in range(n, len(times)):
-        position[rest] = ahead(x, order, times[rest] - now)
-    return total
+
+    def __init__(self, order: int, numbers: Array, known: Known) -> None:
+        """Before the first command; ``numbers`` as in :func:`follow`."""
+        self.order, self.known, self.density, self.R = order, known, np.exp(2.0 * numbers[0]), np.exp(2.0 * numbers[1:])
+        prior = np.array([known.start_sd, *REST[: order - 1], *known.bias_sd])
+        size, shape = len(prior), self.R.shape
+        self.x, self.P = np.zeros((size, shape[1])), np.zeros((size, size, shape[1]))
+        self.x[0], self.P[np.diag_indices(size)] = known.start, prior[:, None] ** 2
+        self.H = np.zeros((len(known.scale), size))
+        self.H[:, 0], biased = known.scale, known.bias >= 0
+        self.H[biased, order + known.bias[biased]] = 1.0
+        # Of each sensor: the last rejected measurement, whose R is 0 where there is none; what was fused, re-acquired.
+        self.nu, self.r, self.then, self.reacquired = (np.zeros(shape) for _ in range(4))
+        self.fused = np.full(shape, -np.inf)
+
+    def predict(self, F: Array, Q: Array) -> None:
+        """x⁺ = F x, P⁺ = F P Fᵀ + Q; ``Q`` is of the motion, for a density of 1."""
+        self.x, FP = F @ self.x, (F @ self.P.reshape(len(F), -1)).reshape(self.P.shape)
+        self.P = F @ FP
+        self.P[: self.order, : self.order] += Q[..., None] * self.density
+
+    def measure(self, s: int, now: float, z: float) -> tuple[Array, Array]:
+        """A measurement of sensor ``s``: S, and ν²/S, which for a rejected one is that at the gate."""
+        scale, H, R = self.known.scale[s], self.H[s], self.R[s]
+        if self.known.latency_sd[s]:
+            R = R + (scale * self.x[1] * self.known.latency_sd[s]) ** 2
+        nu, (PH, S) = z - H @ self.x, self.along(H, R)
+        beyond = nu * nu > GATE**2 * S
+        if beyond.any():
+            believed = self.doubt(s, now, nu, R, beyond)
+            self.P[0, 0] += believed * (nu / scale) ** 2
+            for i in range(1, self.order):  # without commands the motion is as much in doubt as the position
+                self.P[i, i] += believed * REST[i - 1] ** 2
+            PH, S = self.along(H, R)
+            taken = believed | ~beyond
+            K, distance = taken * PH / S, np.where(taken, nu * nu / S, GATE**2)
+            self.r[s, taken], self.fused[s, taken] = 0.0, now
+        else:
+            K, distance = PH / S, nu * nu / S
+            self.r[s], self.fused[s] = 0.0, now
+        self.x += K * nu
+        self.P -= K * PH[:, None]
+        return S, distance
+
+    def along(self, H: Array, R: Array) -> tuple[Array, Array]:
+        """P Hᵀ and S = H P Hᵀ + R."""
+        PH = (H @ self.P.reshape(len(H), -1)).reshape(self.x.shape)
+        return PH, H @ PH + R
+
+    def doubt(self, s: int, now: float, nu: Array, R: Array, beyond: Mask) -> Mask:
+        """Which re-acquire by a measurement beyond the gate; the others keep it in mind."""
+        before, dt, P = beyond & (self.r[s] > 0.0), now - self.then[s], self.P
+        again = before & (dt < self.known.period)
+        motion = dt**2 * P[1, 1] + self.density * (dt**3 / 3.0 if self.order == 2 else dt**5 / 20.0)
+        if self.order == 3:
+            motion += dt**3 * P[1, 2] + 0.25 * dt**4 * P[2, 2]
+        between = self.r[s] + R + self.known.scale[s] ** 2 * motion
+        believed = before & ~again & ((nu - self.nu[s]) ** 2 <= GATE**2 * between)
+        for other in range(len(self.R)):
+            if other != s:
+                believed &= (now - self.fused[other] > RECENT) | (self.reacquired[other] > self.reacquired[s])
+        rejected = beyond & ~believed & ~again
+        self.nu[s, rejected], self.r[s, rejected], self.then[s, rejected] = nu[rejected], R[rejected], now
+        self.reacquired[s] += believed
+        return believed
 
 
-@numba.njit(cache=True)
-def move(x: Array, P: Array, order: int, density: float, dt: float) -> None:
-    """To ``dt`` [s] later: x⁺ = F x, P⁺ = F P Fᵀ + Q."""
+def follow(order: int, numbers: Array, known: Known, measured: Measured, times: Array) -> tuple[Array, Array]:
+    """Filter all measurements with c filters.
+
+    Args:
+        order: How many states the motion takes.
+        numbers: Logarithms: of the density of the random walk, then of each sensor's sd [m], (1 + sensors, c).
+        known: Of the axis.
+        measured: The measurements.
+        times: Of the positions [s], ascending, (n,).
+
+    Returns:
+        Positions [m], (n, c), and log-likelihoods, m in mm, (c,). A rejected measurement counts as if it were at the
+        gate.
+    """
+    filters, rows = Filters(order, numbers, known), len(measured.time)
+    F, Q = np.tile(np.eye(len(filters.x)), (rows, 1, 1)), np.zeros((rows, order, order))
+    F[:, :order, :order], Q[:] = integrated(order, np.diff(measured.time, prepend=0.0))
+    motion, S = np.empty((rows + 1, *filters.x[:order].shape)), np.empty((rows, numbers.shape[1]))
+    motion[0], distance = filters.x[:order], np.empty_like(S)
+    columns = (column.tolist() for column in (measured.sensor, measured.time, measured.value))
+    for k, (s, now, z) in enumerate(zip(*columns, strict=True)):
+        filters.predict(F[k], Q[k])
+        S[k], distance[k] = filters.measure(s, now, z)
+        motion[k + 1] = filters.x[:order]
+    last = np.searchsorted(measured.time, times, side="right")
+    ahead, _ = integrated(order, times - np.append(0.0, measured.time)[last])
+    position = np.sum(ahead[:, 0, :, None] * motion[last], axis=1)
+    return position, -0.5 * np.sum(np.log(2.0e6 * np.pi * S) + distance, axis=0)
+
+
+def integrated(order: int, dt: Array) -> tuple[Array, Array]:
+    """F and Q over each ``dt`` [s] of white noise of density 1 that is integrated so often, (..., order, order)."""
     factorial = (1.0, 1.0, 2.0)
-    for i in range(order):  # from the top: what is below is still of before
-        for j in range(i + 1, order):
-            f = dt ** (j - i) / factorial[j - i]
-            x[i] += f * x[j]
-            for column in range(len(x)):
-                P[i, column] += f * P[j, column]
-    for i in range(order):
-        for j in range(i + 1, order):
-            f = dt ** (j - i) / factorial[j - i]
-            for row in range(len(x)):
-                P[row, i] += f * P[row, j]
+    F, Q = np.zeros((*dt.shape, order, order)), np.zeros((*dt.shape, order, order))
     for i in range(order):
         for j in range(order):
             a, b = order - 1 - i, order - 1 - j
-            P[i, j] += density * dt ** (a + b + 1) / (factorial[a] * factorial[b] * (a + b + 1))
+            Q[..., i, j] = dt ** (a + b + 1) / (factorial[a] * factorial[b] * (a + b + 1))
+            if j >= i:
+                F[..., i, j] = dt ** (j - i) / factorial[j - i]
+    return F, Q
 
 
-@numba.njit(cache=True)
-def ahead(x: Array, order: int, dt: float) -> float:
-    """The position ``dt`` [s] later [m]."""
-    return x[0] + dt * x[1] + (0.5 * dt * dt * x[2] if order == 3 else 0.0)
+def searched(cost: Cost, ranges: Sequence[tuple[float, float]], begin: Array | None = None) -> Array:
+    """The logarithms of numbers, each in its range, that have the least cost, (d,).
 
-
-@numba.njit(cache=True)
-def spread(P: Array, H: Array, K: Array) -> float:
-    """H P Hᵀ, and P Hᵀ into ``K``."""
-    total = 0.0
-    for i in range(len(H)):
-        K[i] = 0.0
-        for j in range(len(H)):
-            K[i] += P[i, j] * H[j]
-        total += H[i] * K[i]
-    return total
+    By evolution: gates make many valleys, and candidates of one generation are filtered side by side. ``begin`` is
+    among the first.
+    """
+    many = {"popsize": 15, "vectorized": True, "updating": "deferred"}
+    end = {"tol": 1e-9, "maxiter": 60, "polish": False}
+    return differential_evolution(cost, np.log(ranges), x0=begin, rng=1, **many, **end).x
 
 
 @dataclass(frozen=True)
@@ -193,10 +210,9 @@ class Axis:
     measured: Measured
     sds: Array
 
-    def follow(self, order: int, numbers: Array) -> tuple[Array, float]:
-        """Positions [m] and the log-likelihood."""
-        position = np.empty(len(self.times))
-        return position, follow(order, numbers, self.known, self.measured, self.times, position)
+    def position(self, order: int, numbers: Array) -> Array:
+        """Positions [m] by one filter."""
+        return follow(order, numbers[:, None], self.known, self.measured, self.times)[0][:, 0]
 
     def held(self) -> list[Array]:
         """Each sensor's last measurement as a position [m], the start before the first; a bias is the first one's."""
@@ -210,35 +226,20 @@ class Axis:
 
     def likeliest(self, order: int) -> Array:
         """The numbers of maximum likelihood: what ``pumafuse tune`` is to a generic filter."""
-
-        def cost(numbers: Array) -> float:
-            return -self.follow(order, numbers)[1]
-
-        return self._search(cost)
+        return self._searched(lambda numbers: -follow(order, numbers, self.known, self.measured, self.times[:0])[1])
 
     def closest(self, order: int, likeliest: Array) -> Array:
-        """The numbers of the least error, which only the truth can tell; gates make many valleys, so by evolution."""
+        """The numbers of the least error, which only the truth can tell."""
         scored = np.isfinite(self.truth)
+        times, truth = self.times[scored], self.truth[scored, None]
 
-        def rmse_mm(numbers: Array) -> float:
-            return 1e3 * float(np.sqrt(np.mean((self.follow(order, numbers)[0] - self.truth)[scored] ** 2)))
+        def rmse(numbers: Array) -> Array:
+            return np.sqrt(np.mean((follow(order, numbers, self.known, self.measured, times)[0] - truth) ** 2, axis=0))
 
-        bounds = [(DENSITIES[0], DENSITIES[-1]), *((math.log(sd / REACH), math.log(sd * REACH)) for sd in self.sds)]
-        evolved = differential_evolution(rmse_mm, bounds, popsize=12, maxiter=60, polish=False, rng=1).x
-        return self._search(rmse_mm, likeliest, evolved)
+        return self._searched(rmse, likeliest)
 
-    def _search(self, cost: Callable[[Array], float], *also: Array) -> Array:
-        grid = [np.concatenate(([q], np.log(self.sds) + sd)) for q, sd in product(DENSITIES, SDS)]
-        return min((descend(cost, start) for start in (*also, *sorted(grid, key=cost)[:STARTS])), key=cost)
-
-
-def descend(cost: Callable[[Array], float], start: Array) -> Array:
-    """Downhill by simplexes, the second one around what the first has found."""
-    for size in (0.7, 0.2):
-        simplex = np.vstack((start, start + size * np.eye(len(start))))
-        options = {"initial_simplex": simplex, "adaptive": True, "xatol": 1e-3, "fatol": 1e-7, "maxfev": 600}
-        start = minimize(cost, start, method="Nelder-Mead", options=options).x
-    return start
+    def _searched(self, cost: Cost, begin: Array | None = None) -> Array:
+        return searched(cost, [DENSITIES, *((sd / REACH, sd * REACH) for sd in self.sds)], begin)
 
 
 def axes_of(run: pf.Run, config: pf.FusionConfig) -> dict[str, Axis]:

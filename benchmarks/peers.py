@@ -1,4 +1,4 @@
-"""The scan through other programs: loops in C++ on the table of events, and general filters with matrices per event.
+"""The scan through other programs: general filters with matrices for each event, and pumafuse's own filter alone.
 
     python benchmarks/peers.py NAME REPEATS    prints the rows of one of PEERS as JSON; run.py calls it
 
@@ -8,28 +8,23 @@ made once (tables, matrices, a compiled program) is made before the clock starts
 
 from __future__ import annotations
 
-import ctypes
 import json
-import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 import project
 from project import Row
 
 import pumafuse as pf
-from pumafuse.filter.axis import OFFSET, ORDER, POSITION, RATE, START, STATES
+from pumafuse.filter.core import transition
 from pumafuse.filter.events import COMMAND, Events
-from pumafuse.fusion.engine import Filtered, arranged, biased_sensors, filter_segment, innovations
+from pumafuse.fusion.engine import Filtered, filter_segment, innovations, model_of
+from pumafuse.fusion.estimates import Mode
 from pumafuse.fusion.segments import Segment, build
-from pumafuse.model import closed
 
 Array = npt.NDArray[np.float64]
 Answer = Mapping[str, Array]  # outputs (axes, estimates), innovations (events, axes), or the log_likelihood
@@ -37,9 +32,8 @@ TOLERANCE = 1e-9  # of a standard deviation
 FUSED = pf.Outcome.FUSED
 FILTERED = ("position", "position_sd", "velocity", "velocity_sd", "offset", "offset_sd")
 FIELDS = {"filter": FILTERED, "as live": FILTERED, "smooth": ("position", "position_sd", "offset", "offset_sd")}
-MODES: dict[str, pf.Mode] = {"filter": "filtered", "as live": "as-live", "smooth": "smoothed"}
-SOURCE = Path(__file__).with_name("loop.cpp")
-LIBRARY = SOURCE.parent / ".build" / "loop.so"
+MODES: dict[str, Mode] = {"filter": "filtered", "as live": "as-live", "smooth": "smoothed"}
+POSITION, RATE, OFFSET, BIASES = range(4)  # of a state: what a plant of first order has not is left out in the end
 MICRO = 1e6  # dynamax adds 1e-9 to the diagonal of what it inverts: too much in m², nothing in µm²
 
 
@@ -91,120 +85,7 @@ def ours(job: str) -> Callable[[Problem], Callable[[], Any]]:
     return lambda problem: lambda: problem.answer(job)
 
 
-# C++
-
-
-SIZES = ("axes", "rows", "estimates", "origin")
-ARRAYS = (
-    *("axis", "scale", "sd", "biased"),
-    *("time", "source", "stamp", "value", "outcome", "times"),
-    *("innovation", "innovation_sd", "outputs"),
-)
-
-
-class Loop(ctypes.Structure):
-    """The arguments of loop.cpp."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in SIZES),
-        *((name, ctypes.c_void_p) for name in ARRAYS),
-    )
-
-
-@cache
-def library() -> ctypes.CDLL:
-    """The loops, built anew when their source is younger."""
-    if not LIBRARY.exists() or LIBRARY.stat().st_mtime < SOURCE.stat().st_mtime:
-        LIBRARY.parent.mkdir(exist_ok=True)
-        command = ["g++", "-std=c++20", "-O3", "-march=native", "-shared", "-fPIC", SOURCE, "-o", LIBRARY]
-        subprocess.run(command, check=True)
-    return ctypes.CDLL(str(LIBRARY))
-
-
-def cpp(job: str, estimates: bool = True) -> Callable[[Problem], Callable[[], Answer]]:
-    """What the gates decided is given: it calculates every innovation and fuses what pumafuse fused."""
-
-    def adapter(problem: Problem) -> Callable[[], Answer]:
-        segment, events = problem.segment, problem.events
-        command = (events.source == COMMAND)[:, None]
-        outcome = np.where(command, events.known, problem.filtered.results.outcome).astype(np.uint8)
-        times = problem.times if estimates else problem.times[:0]
-        table = (*constants(problem), events.time, events.source, events.stamp, events.value, outcome, times)
-        order, places = arrivals(problem) if job == "as live" else ((), 0)
-        loop = getattr(library(), job.replace(" ", "_"))
-
-        def run() -> Answer:
-            innovation, innovation_sd = np.full((2, *events.value.shape), np.nan)
-            outputs = np.empty((len(FIELDS[job]), len(segment.axes), len(times)))
-            arrays = map(pointer, (*table, innovation, innovation_sd, outputs))
-            sizes = len(segment.axes), len(events.time), len(times), segment.origin
-            loop(ctypes.byref(Loop(*sizes, *arrays)), *map(pointer, order), ctypes.c_int64(places))
-            found = {"innovation": innovation, "innovation_sd": innovation_sd}
-            return found | dict(zip(FIELDS[job], outputs, strict=True)) if estimates else found
-
-        return run
-
-    return adapter
-
-
-def constants(problem: Problem) -> tuple[npt.NDArray[Any], ...]:
-    """Axes, and of sensors scale, sd and whether they have a bias, as loop.cpp takes them."""
-    config, segment = problem.config, problem.segment
-    biases, packed = biased_sensors(segment, config), list[list[float]]()
-    for axis, biased in zip(segment.axes, biases, strict=True):
-        model, process = config.arm.axes[axis], config.process[axis]
-        plant, gain = model.plant, model.gain
-        first = isinstance(plant, pf.FirstOrder)
-        shape = (
-            [1.0, 1.0 / plant.time_constant, 0.0, 0.0] if first else [2.0, 0.0, plant.natural_frequency, plant.damping]
-        )
-        decay = 0.0 if model.gain_recovery is None else 1.0 / model.gain_recovery
-        noise = [process.input_noise, process.drift, process.maneuver_noise, process.maneuver_drift]
-        prior = [segment.start[axis], config.start.offset_sd_of(axis), 3.0 + len(biased)]
-        prior.append(config.sensors[biased[0]].bias_sd_of(axis) if biased else 0.0)
-        packed.append([*shape, gain.slope, gain.intercept, decay, config.arm.update_period, *noise, *prior])
-    sensors = [config.sensors[name] for name in segment.sensors]
-    sd = np.array([[sensor.sd_of(axis) for axis in segment.axes] for sensor in sensors], dtype=np.float64)
-    biased = np.array([[int(name in biased) for biased in biases] for name in segment.sensors])
-    return np.array(packed), np.array([sensor.scale for sensor in sensors]), sd, biased
-
-
-def arrivals(problem: Problem) -> tuple[tuple[npt.NDArray[np.int64], ...], int]:
-    """When each event arrives [ns] and the rows in that order; how many checkpoints that takes."""
-    events, times = problem.events, np.append(problem.times, np.iinfo(np.int64).max)
-    arrival = np.where(events.source == COMMAND, events.stamp, np.maximum(events.stamp, events.time))
-    seen = np.searchsorted(times, arrival)  # at which estimate
-    back = np.searchsorted(events.time, times[seen], side="right") - np.arange(len(arrival))
-    return (arrival, np.argsort(arrival, kind="stable")), int(back.max()) + 1
-
-
-def cpp_likelihood(problem: Problem) -> Callable[[], Answer]:
-    """Without estimates, and the sum."""
-    run = cpp("filter", estimates=False)(problem)
-    fused = (problem.filtered.results.outcome == FUSED) & (problem.events.source != COMMAND)[:, None]
-
-    def likelihood() -> Answer:
-        found = run()
-        nu, S = found["innovation"][fused], found["innovation_sd"][fused] ** 2
-        return {"log_likelihood": np.array(-0.5 * np.sum(np.log(2.0 * np.pi * S) + nu**2 / S))}
-
-    return likelihood
-
-
-def pointer(array: npt.NDArray[Any]) -> ctypes.c_void_p:
-    """Its place in memory."""
-    assert array.flags.c_contiguous
-    return ctypes.c_void_p(array.ctypes.data)
-
-
 # General filters: x[k] = F[k] x[k-1] + B[k] v[k] + w, z[k] = H[k] x[k] + e
-
-
-@numba.njit(cache=True)
-def interval(order: int, plant: Array, axis: int, decay: float, dt: float) -> tuple[tuple[float, ...], ...]:
-    """What an axis does in an interval [s], to be called from Python: Φ and Q, and what a gain error does."""
-    f = closed.transition(order, plant, axis, dt)
-    return f, closed.decaying_response(order, plant, axis, decay, dt, f[0], f[1], f[3])
 
 
 class Steps(NamedTuple):
@@ -244,46 +125,45 @@ class Steps(NamedTuple):
 
 def steps_of(problem: Problem) -> list[Steps]:
     """Every axis as matrices, by the transitions of pumafuse: only the filters are compared."""
-    biases = biased_sensors(problem.segment, problem.config)
-    model, sensors, state = arranged(problem.segment, problem.config, biases)
-    found: list[Steps] = []
-    for axis in range(len(problem.segment.axes)):
-        events, outcome = problem.events, problem.filtered.results.outcome[:, axis]
-        command = (events.source == COMMAND) & (events.known[:, axis] == FUSED)
+    events, model, found = problem.events, model_of(problem.segment, problem.config), list[Steps]()
+    for number, axis in enumerate(model.axis):
+        outcome, view = problem.filtered.results.outcome[:, number], model.view[:, number]
+        command = (events.source == COMMAND) & (events.known[:, number] == FUSED)
         rows = np.flatnonzero(command | ((events.source != COMMAND) & (outcome == FUSED)))
         time = np.concatenate((events.time[rows], problem.times))
         row = np.concatenate((rows, np.full(len(problem.times), -1)))
         order = np.argsort(time, kind="stable")  # at one instant the estimate is the last
         row, dt = row[order], np.diff(time[order], prepend=problem.segment.origin) / 1e9
-        start, m, size = state.drive[axis, START], len(row), int(model.kind[axis, STATES])
+        biased = np.flatnonzero(view["bias_sd"] > 0.0)
+        prior = np.array([0.0, 0.0, axis["offset_sd"], *view["bias_sd"][biased]]) ** 2
+        start, m, size = axis["start"], len(row), len(prior)
         F, Q, B = np.zeros((m, size, size)), np.zeros((m, size, size)), np.zeros((m, size, 2))
         v, H, R, z = np.zeros((m, 2)), np.zeros((m, size)), np.ones(m), np.full(m, np.nan)
         F[:] = np.eye(size)
-        order_of_plant, plant = model.kind[axis, ORDER], model.constants
-        slope, intercept, decay, period = model.gain[axis]
-        u, step, e, noise, drift = 0.0, 0.0, 0.0, model.process[axis, 0] ** 2, model.process[axis, 1] ** 2
+        u, step, e, noise, drift = 0.0, 0.0, 0.0, axis["input_noise"] ** 2, axis["drift"] ** 2
         for k in range(m):
-            (f11, f12, f21, f22, q11, q12, q22), (a, b, left) = interval(order_of_plant, plant, axis, decay, dt[k])
+            f11, f12, f21, f22, q11, q12, q22, a, b, left = transition(model.axis[number : number + 1], dt[k]).tolist()
             F[k, :2, :2] = [[f11, f12], [f21, f22]]
             B[k, :2], v[k], e = [[1.0 - f11, a], [-f21, b]], [u, e], e * left
             Q[k, :2, :2], Q[k, OFFSET, OFFSET] = [[noise * q11, noise * q12], [noise * q12, noise * q22]], drift * dt[k]
             if row[k] < 0:
                 continue
-            value, sensor = events.value[row[k], axis] - start, events.source[row[k]]
+            value, sensor = events.value[row[k], number] - start, events.source[row[k]]
             if sensor != COMMAND:
-                z[k] = value + start * (1.0 - sensors.scale[sensor])
-                H[k, [POSITION, OFFSET]], R[k] = sensors.scale[sensor], sensors.sd[sensor, axis] ** 2
-                bias = sensors.bias[sensor, axis]
-                H[k, bias[bias >= 0]] = 1.0
+                scale = model.sensor["scale"][sensor]
+                z[k] = value + start * (1.0 - scale)
+                H[k, [POSITION, OFFSET]], R[k] = scale, view["sd"][sensor] ** 2
+                H[k, BIASES + np.flatnonzero(biased == sensor)] = 1.0
                 continue
-            maneuver = abs(value - u - step) / period
+            maneuver = abs(value - u - step) / axis["period"]
             u, step = value, value - u
-            e += (slope * abs(step) / period + intercept - 1.0) * step
-            noise, drift = (model.process[axis, :2] ** 2 + (model.process[axis, 2:] * maneuver) ** 2).tolist()
-        used = [i for i in range(size) if i != RATE or order_of_plant == 2]
+            e += (axis["slope"] * abs(step) / axis["period"] + axis["intercept"] - 1.0) * step
+            noise = axis["input_noise"] ** 2 + (axis["maneuver_noise"] * maneuver) ** 2
+            drift = axis["drift"] ** 2 + (axis["maneuver_drift"] * maneuver) ** 2
+        used = [i for i in range(size) if i != RATE or axis["time_constant"] == 0.0]
         position = np.zeros(size)
         position[[POSITION, OFFSET]] = 1.0
-        F, Q, P0 = F[:, used][:, :, used], Q[:, used][:, :, used], state.P[axis][np.ix_(used, used)]
+        F, Q, P0 = F[:, used][:, :, used], Q[:, used][:, :, used], np.diag(prior[used])
         found.append(Steps(F, B[:, used], v, Q, H[:, used], R, z, P0, float(start), position[used], row < 0))
     return found
 
@@ -438,21 +318,16 @@ class Peer(NamedTuple):
 
 MATRICES = "position and sd alone, of what was fused; on one scan"
 READY = "a table of rows in, arrays of numbers out: neither classifies rows nor lists outcomes"
-GIVEN = "the same in and out; what gates decided is given"
 PEERS: dict[str, Peer] = {
-    "C++ loop": Peer("filter", cpp("filter"), project.ROWS, GIVEN),
     "pumafuse, table ready": Peer("filter", ours("filter"), project.ROWS, READY),
     "statsmodels": Peer("filter", statsmodels("filter"), 0, MATRICES),
     "dynamax": Peer("filter", dynamax("filter"), 0, MATRICES),
     "fast-kalman": Peer("filter", fast_kalman, 0, MATRICES),
     "filterpy": Peer("filter", filterpy, 0, MATRICES),
-    "C++ loop, as live": Peer("as live", cpp("as live"), project.ROWS, GIVEN),
     "pumafuse, as live, table ready": Peer("as live", ours("as live"), project.ROWS, READY),
-    "C++ loop, smoother": Peer("smooth", cpp("smooth"), project.ROWS, GIVEN),
     "pumafuse, smoother, table ready": Peer("smooth", ours("smooth"), project.ROWS, READY),
     "statsmodels, smoother": Peer("smooth", statsmodels("smooth"), 0, MATRICES),
     "dynamax, smoother": Peer("smooth", dynamax("smooth"), 0, MATRICES),
-    "C++ loop, likelihood": Peer("likelihood", cpp_likelihood, project.ROWS, "what gates decided is given"),
     "statsmodels, likelihood": Peer("likelihood", statsmodels("likelihood"), 0, "of what was fused; on one scan"),
     "dynamax, likelihood": Peer("likelihood", dynamax("likelihood"), 0, "of what was fused; on one scan"),
 }

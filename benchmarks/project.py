@@ -2,12 +2,11 @@
 
     python benchmarks/project.py NAME REPEATS    prints the rows of one of CASES as JSON; run.py calls it
 
-It measures the pumafuse that Python finds, of version 0.1, too: `run.py --against` puts another on PYTHONPATH.
+It measures the pumafuse that Python finds: `run.py --against` puts another on PYTHONPATH, of version 0.2 or later.
 """
 
 from __future__ import annotations
 
-import inspect
 import json
 import os
 import resource
@@ -27,19 +26,22 @@ import numpy as np
 from page import REPOSITORY
 
 import pumafuse as pf
+from pumafuse.fusion.engine import innovations
+from pumafuse.fusion.estimates import Mode
+from pumafuse.fusion.segments import build
 
 Row = dict[str, Any]
 
 DATA = Path(str(files("pumafuse") / "data"))
 SCAN, CONFIG = DATA / "scan1", DATA / "fusion.toml"
 TRUNK = REPOSITORY / "examples" / "trunk-servo"
-OLD = "mode" not in inspect.signature(pf.fuse).parameters  # version 0.1
 START = {"tangential": 0.0, "radial": 0.56, "vertical": -0.1}  # m
 ROWS = 1_000_000
 LENGTH = 60_200_000_000  # ns, from one repetition of the scan to the next
 MS = 1_000_000  # ns
 JITTER = 0.2e-3  # s, so that no repetition has the intervals of another
 FIT = "noise,delay,plant"
+KEPT = ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR")  # where processes keep something: the last one is of version 0.2
 PUMAFUSE = (sys.executable, "-c", "from pumafuse.cli.main import main; main()")
 
 
@@ -84,13 +86,10 @@ def row(job: str, name: str, unit: str, values: list[float], note: str = "", **m
 # In one process
 
 
-def fuse(job: str, mode: str, repeats: int) -> list[Row]:
+def fuse(job: str, mode: Mode, repeats: int) -> list[Row]:
     """One million rows of three axes."""
     run, config = repeated(ROWS), pf.FusionConfig.load(CONFIG)
-    options = (
-        {"filtered": {}, "as-live": {"as_live": True}, "smoothed": {"smooth": True}}[mode] if OLD else {"mode": mode}
-    )
-    seconds = timed(lambda: pf.fuse(run, config, **options), repeats)
+    seconds = timed(lambda: pf.fuse(run, config, mode=mode), repeats)
     name = "pumafuse.fuse" if mode == "filtered" else f"pumafuse.fuse, {mode}"
     return [
         row(job, name, "ns", [1e9 * s / values_of(run) for s in seconds], "everything, from the run to its estimates")
@@ -99,12 +98,6 @@ def fuse(job: str, mode: str, repeats: int) -> list[Row]:
 
 def likelihood(repeats: int) -> list[Row]:
     """What one step of a search by likelihood takes."""
-    from pumafuse.fusion.engine import innovations
-
-    if OLD:
-        from pumafuse.fusion.timeline import build
-    else:
-        from pumafuse.fusion.segments import build
     run, config = repeated(ROWS), pf.FusionConfig.load(CONFIG)
     segment = build(run, config)
     seconds = timed(lambda: innovations(segment, config), repeats)
@@ -124,7 +117,7 @@ def live(repeats: int) -> list[Row]:
     for _ in range(repeats):
         estimator = pf.LiveEstimator(pf.FusionConfig.load(CONFIG))
         filters = textbook_filters()
-        add = getattr(estimator, "measurement", None) or estimator.reading  # version 0.1
+        add = estimator.measurement
         calls: list[tuple[str, Callable[[], object]]] = []
         for n, (x, y, z) in enumerate(values):
             place = {"tangential": x, "radial": y, "vertical": z}
@@ -204,9 +197,9 @@ class Spent(NamedTuple):
         return Spent(self.cpu - other.cpu, self.wall - other.wall)
 
 
-def seconds_of(command: list[str], stdin: str = "", compiled: str | None = None) -> Spent:
-    """What a process takes, with those that it starts; what it compiles goes to the folder ``compiled``."""
-    environment = os.environ | ({} if compiled is None else {"NUMBA_CACHE_DIR": compiled})
+def seconds_of(command: list[str], stdin: str = "", home: str | None = None) -> Spent:
+    """What a process takes, with those that it starts; what it keeps for the next one goes to the folder ``home``."""
+    environment = os.environ | ({} if home is None else dict.fromkeys(KEPT, home))
     with tempfile.TemporaryFile("w+") as file:
         file.write(stdin)
         file.seek(0)
@@ -223,9 +216,9 @@ def fuse_command(folder: str) -> list[str]:
     return [*PUMAFUSE, "fuse", str(SCAN), "--config", str(CONFIG), "--output", f"{folder}/result", "--force"]
 
 
-def tune_command(folder: str, run: Path, config: Path, fit: str, *options: str) -> list[str]:
+def tune_command(folder: str, run: Path, config: Path, *options: str) -> list[str]:
     """``pumafuse tune``."""
-    return [*PUMAFUSE, "tune", str(run), "-c", str(config), "-o", f"{folder}/tuned", "--force", "--fit", fit, *options]
+    return [*PUMAFUSE, "tune", str(run), "-c", str(config), "-o", f"{folder}/tuned", "--force", "--fit", FIT, *options]
 
 
 def live_command(*options: str) -> list[str]:
@@ -263,7 +256,7 @@ def processes(repeats: int) -> list[Row]:
         commands = {
             "pumafuse fuse": fuse_command(folder),
             "pumafuse --help": [*PUMAFUSE, "--help"],
-            "import numpy, pyarrow, numba": [sys.executable, "-c", "import numpy, pyarrow, numba"],
+            "import numpy, pyarrow": [sys.executable, "-c", "import numpy, pyarrow"],
             "import pumafuse": [sys.executable, "-c", "import pumafuse"],
             "python": [sys.executable, "-c", "pass"],
         }
@@ -273,38 +266,31 @@ def processes(repeats: int) -> list[Row]:
                 found[name].append(seconds_of(command))
     cpu = {name: [spent.cpu for spent in seconds[1:]] for name, seconds in found.items()}
     wall = {name: [spent.wall for spent in seconds[1:]] for name, seconds in found.items()}
-    whole, needed = "pumafuse fuse", "import numpy, pyarrow, numba"
+    whole, needed = "pumafuse fuse", "import numpy, pyarrow"
     for kind in (cpu, wall):
         kind["pumafuse fuse, more than these imports"] = [min(kind[whole]) - min(kind[needed])]
     return [row("process", name, "s", cpu[name], wall=wall[name]) for name in cpu]
 
 
 def tune(_repeats: int) -> list[Row]:
-    """The shipped scan; a minute of a servo, which version 0.1 cannot read."""
+    """The shipped scan; a minute of a servo."""
     with tempfile.TemporaryDirectory() as folder:
-        commands = {"the scan": tune_command(folder, SCAN, CONFIG, FIT)}
-        if not OLD:
-            minute = tune_command(folder, TRUNK / "0g", TRUNK / "fusion.toml", FIT, "--to", "60")
-            commands["a minute of examples/trunk-servo/0g"] = minute
+        minute = tune_command(folder, TRUNK / "0g", TRUNK / "fusion.toml", "--to", "60")
+        commands = {"the scan": tune_command(folder, SCAN, CONFIG), "a minute of examples/trunk-servo/0g": minute}
         found = {name: seconds_of(command) for name, command in commands.items()}
     return [row("tune", name, "s", [spent.cpu], wall=[spent.wall]) for name, spent in found.items()]
 
 
-def first_use(_repeats: int) -> list[Row]:
-    """What compiling takes: processes on a machine that has nothing compiled, less the same once more."""
-    with tempfile.TemporaryDirectory() as folder:
-        fuse, live = (fuse_command(folder), ""), (live_command(), lines(100))
-        tune = tune_command(folder, SCAN, CONFIG, "noise"), ""
-
-        def first(command: tuple[list[str], str], compiled: str) -> float:
-            cold, warm = (seconds_of(*command, f"{folder}/{compiled}") for _ in range(2))
-            return (cold - warm).wall
-
-        found = {"pumafuse fuse": first(fuse, "one"), "pumafuse live stdin": first(live, "other")}
-        found["fuse, tune and live, one after the other"] = (
-            found["pumafuse fuse"] + first(tune, "one") + first(live, "one")
-        )
-    return [row("compile", name, "s", [seconds]) for name, seconds in found.items()]
+def first_use(repeats: int) -> list[Row]:
+    """Processes of somebody who has never used pumafuse, and the same once more."""
+    found: dict[str, list[float]] = defaultdict(list)
+    for _ in range(min(repeats, 2)):
+        for name in ("fuse", "live stdin"):
+            with tempfile.TemporaryDirectory() as home:
+                command = (fuse_command(home), "") if name == "fuse" else (live_command(), lines(100))
+                for use in ("first", "next"):
+                    found[f"pumafuse {name}, {use} use"].append(seconds_of(*command, home).wall)
+    return [row("first use", name, "s", seconds) for name, seconds in found.items()]
 
 
 CASES: dict[str, Callable[[int], list[Row]]] = {

@@ -1,10 +1,10 @@
-"""Times pumafuse on real jobs, beside loops in C++, other filters, and another checkout of itself.
+"""Times pumafuse on real jobs, beside other filters and another checkout of itself.
 
     python benchmarks/run.py [--only TEXT] [--against WHICH] [--repeats N] [--rounds N] [--json FILE] [--write]
 
 Everything runs in a process of its own: what one leaves behind (a grown heap, compiled code) then cannot flatter or
 hurt another. With --against, the two checkouts take turns. Minima of all calls of all rounds are compared: on a
-machine that does other work, too, they say most. ``--write`` measures everything beside version 0.1 and puts the
+machine that does other work, too, they say most. ``--write`` measures everything beside version 0.2 and puts the
 tables into the pages.
 """
 
@@ -32,9 +32,7 @@ from page import COMPARISON, LIVE, REPOSITORY, put, table
 from project import Row
 
 HERE = Path(__file__).parent
-# Version 0.1 was not tagged: this is its last commit; the next one gives its modules and words new names, with which
-# the core was then rebuilt as 0.2.
-VERSION_0_1 = "19fb045"
+VERSION_0_2 = "a513260"  # its last commit; the next one moves the filter from numba to C++
 CASES = [*((HERE / "peers.py", name) for name in peers.PEERS), *((HERE / "project.py", name) for name in project.CASES)]
 ONCE = ("tune", "first use", "memory")  # what takes long is measured in one round
 PACKAGES = ("numpy", "scipy", "numba", "filterpy", "statsmodels", "dynamax", "jax", "fast-kalman")
@@ -47,25 +45,28 @@ TITLES = {
     "live": "Live, three axes, µs a call or row",
     "process": "Whole processes on the scan, s",
     "tune": "`pumafuse tune --fit noise,delay,plant`, s",
-    "compile": "First use on a machine, s of wall time more than the next time",
+    "first use": "First use on a machine, and the next, s of wall time",
     "memory": "Memory at the peak, GB",
 }
-BESIDE = "C++"  # what the ratios of a job are to
 DIGITS = {"ns": 0, "µs": 1, "s": 2, "GB": 2}
 
 
 def checkout(which: str) -> Path:
-    """Another checkout of pumafuse: a folder, or a commit, whose sources are laid down in one that git ignores."""
+    """Another checkout of pumafuse: a folder, or a commit, which is laid down, and built, in one that git ignores."""
     if Path(which).is_dir():
         return Path(which).resolve()
     folder = HERE / ".build" / which
     if not folder.exists():
-        command = ["git", "-C", str(REPOSITORY), "archive", "--format=tar", which, "src"]
+        command = ["git", "-C", str(REPOSITORY), "archive", "--format=tar", which]
         done = subprocess.run(command, capture_output=True, check=False)
         if done.returncode:
             sys.exit(f"no folder and no commit {which}: {done.stderr.decode().strip()}")
         with tarfile.open(fileobj=io.BytesIO(done.stdout)) as archive:
             archive.extractall(folder, filter="data")
+    if (folder / "CMakeLists.txt").exists():  # version 0.2 has no library to build
+        build = str(folder / "build")
+        for step in (["-S", str(folder), "-B", build, "-DPUMAFUSE_INPLACE=ON"], ["--build", build]):
+            subprocess.run([sys.executable, "-m", "cmake", *step], check=True, stdout=subprocess.DEVNULL)
     return folder
 
 
@@ -96,16 +97,11 @@ def measured(script: Path, name: str, given: argparse.Namespace) -> list[Row]:
     return list(rows.values())
 
 
-def bases(rows: list[Row]) -> dict[str, float]:
-    """Of each job that has a loop in C++, its minimum."""
-    return {row["job"]: min(row["values"]) for row in rows if row["name"].startswith(BESIDE) and row["values"]}
+HEAD = ("", "min", "median", "wall", "99 %", "0.2", "over 0.2", "error", "note")
 
 
-HEAD = ("", "min", "median", f"over {BESIDE}", "wall", "99 %", "0.1", "over 0.1", "error", "note")
-
-
-def cells(row: Row, base: float | None) -> list[str]:
-    """A row as text, as in HEAD; ``base`` is what its ratio is to."""
+def cells(row: Row) -> list[str]:
+    """A row as text, as in HEAD."""
     values, against, digits = row["values"], row["against"], DIGITS[row["unit"]]
 
     def number(found: list[float], kind: Callable[[list[float]], float] = min) -> str:
@@ -117,7 +113,6 @@ def cells(row: Row, base: float | None) -> list[str]:
         row["name"],
         number(values),
         number(values, statistics.median),
-        f"{min(values) / base:.2f}" if base else "",
         number(row["wall"]),
         number(row["high"]),
         number(against),
@@ -132,8 +127,7 @@ def machine() -> str:
     info = Path("/proc/cpuinfo")
     names = [line for line in info.read_text().splitlines() if line.startswith("model name")] if info.exists() else []
     cpu = names[0].split(":", 1)[1].strip() if names else platform.processor() or platform.machine()
-    compiler = subprocess.run(["g++", "-dumpfullversion"], capture_output=True, text=True, check=False).stdout.strip()
-    found = [f"Python {platform.python_version()}", f"g++ {compiler} (`-O3 -march=native`)"]
+    found = [f"Python {platform.python_version()}"]
     for package in PACKAGES:
         try:
             found.append(f"{package} {importlib.metadata.version(package)}")
@@ -144,13 +138,13 @@ def machine() -> str:
 
 
 def tables(rows: list[Row], jobs: Iterable[str]) -> str:
-    """The tables of some jobs; beside a loop in C++ the fastest comes first."""
-    base, found = bases(rows), list[str]()
+    """The tables of some jobs; where there are peers the fastest comes first."""
+    compared, found = {peer.job for peer in peers.PEERS.values()}, list[str]()
     for job in jobs:
         mine = [row for row in rows if row["job"] == job]
-        if job in base:
+        if job in compared:
             mine.sort(key=lambda row: min(row["values"]))
-        lines = [cells(row, base.get(job)) for row in mine]
+        lines = [cells(row) for row in mine]
         used = [any(line[column] for line in lines) and HEAD[column] != "median" for column in range(len(HEAD))]
         head = ["", mine[0]["unit"], *HEAD[2:-1], ""]
         text = [list(compress(line, used)) for line in (head, *lines)]
@@ -166,12 +160,12 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="calls in each process")
     parser.add_argument("--rounds", type=int, default=2, help="processes of each case; what takes long has one")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all numbers there")
-    parser.add_argument("--write", action="store_true", help="all, beside version 0.1, into the pages")
+    parser.add_argument("--write", action="store_true", help="all, beside version 0.2, into the pages")
     given = parser.parse_args()
     if given.write and (given.only or given.against):
-        parser.error("--write measures everything, beside version 0.1")
+        parser.error("--write measures everything, beside version 0.2")
     if given.write:
-        given.against = VERSION_0_1
+        given.against = VERSION_0_2
     if given.against is not None:
         given.against = checkout(given.against)
     print(f"{machine()}\n{'':<48}" + "".join(f"{name:>12}" for name in HEAD[1:-1]), flush=True)
@@ -180,9 +174,8 @@ def main() -> None:
         if given.only in name:
             found = measured(script, name, given)
             rows += found
-            base = bases(rows)
             for row in found:
-                label, *numbers, note = cells(row, base.get(row["job"]))
+                label, *numbers, note = cells(row)
                 print(f"{label:<48}" + "".join(f"{n:>12}" for n in numbers) + f"  {note}", flush=True)
     if given.json:
         given.json.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")

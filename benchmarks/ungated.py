@@ -3,64 +3,62 @@
 - Constant velocity and constant acceleration: white noise on the acceleration or on the jerk.
 - LSQ+OU: delay, first-order lag, static gain and offset by least squares; an Ornstein-Uhlenbeck process is left.
 
-Their noise and the sensor's are of maximum likelihood, in a Kalman filter and a Rauch-Tung-Striebel smoother.
+Their noise and the sensor's are of maximum likelihood, in a Kalman filter and a Rauch-Tung-Striebel smoother. All takes
+one candidate, or several side by side, which are then the last index of numbers and the first of matrices.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import product
 
-import numba
 import numpy as np
-from kinematic import Array, descend
+from kinematic import Array, integrated, searched
+
+Number = float | Array  # of one candidate, or of each, (c,)
 
 SMALLEST_SD = 1e-3  # of a sensor [mm]; nothing else keeps it from 0
-STARTS = 3  # of a grid, those that are followed downhill
 SETTLED = 1.0  # s after the first command: before, least squares would need to know how the axis came there
 
 
-@numba.njit(cache=True)
-def transition(order: int, density: float, time: float, dt: float) -> tuple[Array, Array]:
+def matrices(number: Number) -> Array:
+    """Numbers as matrices of one row and column."""
+    return np.asarray(number)[..., None, None]
+
+
+def transition(order: int, density: Number, time: Number, dt: Number) -> tuple[Array, Array]:
     """F and Q over ``dt`` [s]: an Ornstein-Uhlenbeck process for order 1, else white noise integrated so often."""
-    F, Q = np.eye(order), np.zeros((order, order))
     if order == 1:
-        F[0, 0] = math.exp(-dt / time)
-        Q[0, 0] = -0.5 * density**2 * time * math.expm1(-2.0 * dt / time)
-        return F, Q
-    factorial = (1.0, 1.0, 2.0)
-    for i in range(order):
-        for j in range(order):
-            if j > i:
-                F[i, j] = dt ** (j - i) / factorial[j - i]
-            a, b = order - 1 - i, order - 1 - j
-            Q[i, j] = density**2 * dt ** (a + b + 1) / (factorial[a] * factorial[b] * (a + b + 1))
-    return F, Q
+        Q = -0.5 * density**2 * time * np.expm1(-2.0 * dt / time)
+        return matrices(np.exp(-dt / time)), matrices(Q)
+    F, Q = integrated(order, np.asarray(dt))
+    return F, matrices(density) ** 2 * Q
 
 
-@numba.njit(cache=True)
-def run(
-    order: int, density: float, time: float, sd: float, x: Array, P: Array, when: Array, value: Array, smooth: bool
-) -> tuple[float, Array, Array]:
-    """Log-likelihood, states (n, order) and covariances at ``when``; where ``value`` is NaN nothing is measured."""
-    n, total = len(when), 0.0
-    states, covariances = np.empty((n, order)), np.empty((n, order, order))
-    predicted, spreads, steps = states.copy(), covariances.copy(), covariances.copy()
+def run(F: Array, Q: Array, R: Array, x: Array, P: Array, value: Array, smooth: bool) -> tuple[Array, Array, Array]:
+    """Log-likelihoods, states (n, ..., order, 1) and covariances; where ``value`` is NaN nothing is measured.
+
+    ``F`` and ``Q`` lead to each of n instants from the one before.
+    """
+    n, total = len(value), np.zeros_like(R)
+    covariances = np.empty(np.broadcast_shapes(F.shape, Q.shape))
+    states = np.empty((*covariances.shape[:-1], 1))
+    predicted, spreads = states.copy(), covariances.copy()
     for k in range(n):
-        F, Q = transition(order, density, time, when[k] - when[max(k - 1, 0)])
-        x, P = F @ x, F @ P @ F.T + Q
-        steps[k], predicted[k], spreads[k] = F, x, P
+        x, P = F[k] @ x, F[k] @ P @ F[k].mT + Q[k]
+        predicted[k], spreads[k] = x, P
         if not math.isnan(value[k]):
-            nu, S, K = value[k] - x[0], P[0, 0] + sd**2, P[:, 0] / (P[0, 0] + sd**2)
-            total -= 0.5 * (math.log(2.0 * math.pi * S) + nu * nu / S)
-            x, P = x + K * nu, P - np.outer(K, K) * S
+            nu, S = value[k] - x[..., :1, :], P[..., :1, :1] + R
+            K = P[..., :, :1] / S
+            total -= 0.5 * (np.log(2.0 * math.pi * S) + nu * nu / S)
+            x, P = x + K * nu, P - K * S * K.mT
         states[k], covariances[k] = x, P
-    for k in range(n - 2 if smooth else -1, -1, -1):
-        C = np.linalg.solve(spreads[k + 1], steps[k + 1] @ covariances[k]).T
-        states[k] += C @ (states[k + 1] - predicted[k + 1])
-        covariances[k] += C @ (covariances[k + 1] - spreads[k + 1]) @ C.T
-    return total, states, covariances
+    if smooth:
+        C = np.linalg.solve(spreads[1:], F[1:] @ covariances[:-1]).mT
+        for k in range(n - 2, -1, -1):
+            states[k] += C[k] @ (states[k + 1] - predicted[k + 1])
+            covariances[k] += C[k] @ (covariances[k + 1] - spreads[k + 1]) @ C[k].mT
+    return total[..., 0, 0], states, covariances
 
 
 @dataclass(frozen=True)
@@ -75,20 +73,22 @@ class Process:
     """
 
     order: int
-    density: float
-    sd: float
-    time: float = 1.0
+    density: Number
+    sd: Number
+    time: Number = 1.0
 
-    def _run(self, when: Array, value: Array, smooth: bool) -> tuple[float, Array, Array]:
+    def _run(self, when: Array, value: Array, smooth: bool) -> tuple[Array, Array, Array]:
         measured = value[np.isfinite(value)]
         if self.order == 1:
-            x, P = np.zeros(1), np.array([[0.5 * self.density**2 * self.time]])
+            x, P = np.zeros((1, 1)), matrices(0.5 * self.density**2 * self.time)
         else:  # as good as unknown: a motion as wide as that of the run, in a tenth of a second
-            x, P = np.zeros(self.order), np.diag(np.var(measured) * 100.0 ** np.arange(self.order))
+            x, P = np.zeros((self.order, 1)), np.diag(np.var(measured) * 100.0 ** np.arange(self.order))
             x[0] = measured[0]
-        return run(self.order, self.density, self.time, self.sd, x, P, when, value, smooth)
+        dt = np.diff(when, prepend=when[0]).reshape(-1, *[1] * np.ndim(self.density))
+        F, Q = transition(self.order, self.density, self.time, dt)
+        return run(F, Q, matrices(self.sd) ** 2, x, P, value, smooth)
 
-    def likelihood(self, time: Array, value: Array) -> float:
+    def likelihood(self, time: Array, value: Array) -> Array:
         """The log-likelihood of measurements [mm] valid at ``time`` [s]."""
         return self._run(time, value, False)[0]
 
@@ -99,35 +99,29 @@ class Process:
         asked = np.argsort(order)[len(time) :]
         _, x, P = self._run(when[order], np.append(value, np.full(len(at), np.nan))[order], smooth)
         F, Q = transition(self.order, self.density, self.time, late)
-        return [x[asked] @ F[0], np.sqrt(np.einsum("i,kij,j->k", F[0], P[asked], F[0]) + Q[0, 0])]
+        return [(F[:1] @ x[asked])[:, 0, 0], np.sqrt((F[:1] @ P[asked] @ F[:1].T)[:, 0, 0] + Q[0, 0])]
 
 
 def likeliest(order: int, time: Array, value: Array) -> Process:
     """The process of maximum likelihood."""
-    wide = float(np.std(value))
 
     def process(numbers: Array) -> Process:
-        density, sd, forgets = np.exp(np.clip(numbers, -20.0, 20.0)).tolist()
-        return Process(order, density, max(sd, SMALLEST_SD), min(max(forgets, 0.01), 100.0))
+        return Process(order, *np.exp(numbers))
 
-    def cost(numbers: Array) -> float:
-        return -process(numbers).likelihood(time, value)
-
-    densities, sds = wide * 10.0 ** np.arange(-1.0, 4.0, 0.5), wide * np.array([0.003, 0.03, 0.3])
-    grid = np.log(list(product(densities, sds, [0.1, 1.0] if order == 1 else [1.0])))
-    return process(min((descend(cost, start) for start in sorted(grid, key=cost)[:STARTS]), key=cost))
+    wide = float(np.std(value))
+    ranges = [(0.1 * wide, 1e4 * wide), (SMALLEST_SD, wide), *([(0.01, 100.0)] if order == 1 else [])]
+    return process(searched(lambda numbers: -process(numbers).likelihood(time, value), ranges))
 
 
-@numba.njit(cache=True)
-def lagged(time_constant: float, time: Array, command: Array, at: Array) -> Array:
-    """A first-order response to held commands at ``at``, ascending, from rest at the first of them."""
-    found, x, n = np.empty(len(at)), command[0], 0
-    for k in range(len(at)):
-        while n + 1 < len(time) and time[n + 1] <= at[k]:
-            x = command[n] + (x - command[n]) * math.exp((time[n] - time[n + 1]) / time_constant)
-            n += 1
-        found[k] = command[n] + (x - command[n]) * math.exp(-max(at[k] - time[n], 0.0) / time_constant)
-    return found
+def lagged(time_constant: Array, time: Array, command: Array, at: Array) -> Array:
+    """First-order responses to held commands at ``at``, (n, c), from rest at the first of them."""
+    left = np.exp(-np.diff(time)[:, None] / time_constant)
+    x = np.full((len(time), len(time_constant)), command[0])
+    for n in range(len(time) - 1):
+        x[n + 1] = command[n] + (x[n] - command[n]) * left[n]
+    n = np.maximum(np.searchsorted(time, at, side="right") - 1, 0)
+    left = np.exp(-np.maximum(at - time[n], 0.0) / time_constant)
+    return command[n] + (x[n, np.arange(len(time_constant))] - command[n]) * left
 
 
 @dataclass(frozen=True)
@@ -141,23 +135,24 @@ class Response:
 
     def at(self, time: Array, command: Array, at: Array) -> Array:
         """The position [mm] at ``at`` [s]."""
-        return self.offset + self.gain * lagged(self.time_constant, time, command, at - self.delay)
+        moved = lagged(np.array([self.time_constant]), time, command, at[:, None] - self.delay)
+        return self.offset + self.gain * moved[:, 0]
 
 
 def least_squares(time: Array, command: Array, when: Array, value: Array) -> Response:
     """The response that leaves the smallest squares of measurements [mm] valid at ``when`` [s]."""
 
-    def solved(numbers: Array) -> tuple[float, Response]:
-        delay, time_constant = 0.05 * max(numbers[0], 0.0), math.exp(min(max(numbers[1], -7.0), 7.0))
-        columns = np.stack((lagged(time_constant, time, command, when - delay), np.ones(len(when))), axis=1)
-        gain, offset = np.linalg.lstsq(columns, value)[0].tolist()
-        return float(np.sum((value - columns @ [gain, offset]) ** 2)), Response(delay, time_constant, gain, offset)
+    def fitted(numbers: Array) -> tuple[Array, ...]:
+        delay, time_constant = np.exp(numbers)
+        moved = lagged(time_constant, time, command, when[:, None] - delay)
+        mean, level = np.mean(moved, axis=0), np.mean(value)
+        off = value[:, None] - level
+        gain = np.sum((moved - mean) * off, axis=0) / np.sum((moved - mean) ** 2, axis=0)
+        rest = np.sum((off - gain * (moved - mean)) ** 2, axis=0)
+        return rest, delay, time_constant, gain, level - gain * mean
 
-    def cost(numbers: Array) -> float:
-        return solved(numbers)[0]
-
-    grid = [np.array(start) for start in product(np.arange(7.0), np.log([0.02, 0.1, 0.3]))]
-    return solved(min((descend(cost, start) for start in sorted(grid, key=cost)[:STARTS]), key=cost))[1]
+    best = searched(lambda numbers: fitted(numbers)[0], [(1e-3, 0.5), (1e-3, 1.0)])
+    return Response(*(float(one[0]) for one in fitted(best[:, None])[1:]))
 
 
 @dataclass(frozen=True)

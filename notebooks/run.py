@@ -8,8 +8,6 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
-ANNOUNCED = "compiling the filter for this machine"  # said in a first run on a machine
-
 
 def main() -> None:
     """Each in a kernel of its own, in an empty folder."""
@@ -26,9 +24,6 @@ def main() -> None:
                 coalesce_streams=True,
             ).execute()
         notebook.metadata.language_info = language
-        for cell in notebook.cells:
-            if cell.cell_type == "code":
-                cell.outputs = [one for one in cell.outputs if not one.get("text", "").startswith(ANNOUNCED)]
         nbformat.write(notebook, path)
 
 

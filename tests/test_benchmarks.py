@@ -1,9 +1,8 @@
-"""What pumafuse is compared with: rivals without a gate on real recordings, lags by correlation, loops in C++."""
+"""What pumafuse is compared with: filters without commands, lags by correlation, general filters."""
 
 from __future__ import annotations
 
 import importlib
-import shutil
 from collections import defaultdict
 from pathlib import Path
 from types import ModuleType
@@ -11,6 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.stats import multivariate_normal
 
 import pumafuse as pf
 from pages import ROOT
@@ -25,6 +25,12 @@ SHARED = ROOT.parent / "shared" / "data" / "trunk-servo"
 def ungated(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     return importlib.import_module("ungated")
+
+
+@pytest.fixture
+def kinematic(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return importlib.import_module("kinematic")
 
 
 @pytest.fixture
@@ -44,8 +50,6 @@ def covariance(order: int, density: float, time: float, prior: np.ndarray, s: np
     return density**2 * noise[order] + sum(variance * power for variance, power in zip(prior, powers, strict=True))
 
 
-@pytest.mark.long
-@pytest.mark.xdist_group("ungated")  # or each worker compiles the rivals
 @pytest.mark.parametrize("order", [1, 2, 3])
 @pytest.mark.parametrize(("late", "smooth"), [(0.0, False), (0.07, False), (0.0, True)])
 def test_estimates_are_those_of_a_gaussian_process(ungated: ModuleType, order: int, late: float, smooth: bool) -> None:
@@ -65,6 +69,36 @@ def test_estimates_are_those_of_a_gaussian_process(ungated: ModuleType, order: i
         weights = np.linalg.solve(K + 0.09 * np.eye(seen.sum()), cross.T)[:, 0]
         assert mean[k] == pytest.approx(level + weights @ (value[seen] - level), abs=1e-6)
         assert sd[k] ** 2 == pytest.approx(own[0, 0] - cross[0] @ weights, rel=1e-5)
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_filters_with_a_gate_are_a_gaussian_process_without_outliers(kinematic: ModuleType, order: int) -> None:
+    """Of two that run side by side: positions and likelihoods of regressions on all but the outlier, at once.
+
+    The outlier counts as if it were at the gate.
+    """
+    rng = np.random.default_rng(3)
+    time, at = np.sort(rng.uniform(0.0, 3.0, 30)), np.sort(rng.uniform(0.2, 3.0, 15))
+    value = 0.5 + 0.002 * np.sin(2.0 * time) + rng.normal(0.0, 3e-4, len(time))
+    value[20] += 1.0
+    known = kinematic.Known(np.ones(1), np.zeros(1), np.array([-1]), np.zeros(0), 0.5, 0.002, 0.03)
+    densities, sds = np.array([0.01, 0.03]), np.array([3e-4, 5e-4])
+    measured = kinematic.Measured(time, np.zeros(len(time), dtype=np.int64), value)
+    position, likelihood = kinematic.follow(order, np.log([densities, sds]), known, measured, at)
+    fused, prior = np.arange(len(time)) != 20, np.array([0.002, 0.01, 0.1])[:order] ** 2
+    for k, (density, sd) in enumerate(zip(densities, sds, strict=True)):
+        K, cross, now = (
+            covariance(order, density, 1.0, prior, a, b) for a, b in ((time, time), (at, time), (time[20:21], time))
+        )
+        K += sd**2 * np.eye(len(time))
+        for n, instant in enumerate(at):
+            seen = fused & (time <= instant)
+            weights = np.linalg.solve(K[np.ix_(seen, seen)], value[seen] - 0.5)
+            assert position[n, k] == pytest.approx(0.5 + cross[n, seen] @ weights, abs=1e-9)
+        before = np.arange(20)
+        S = K[20, 20] - now[0, before] @ np.linalg.solve(K[np.ix_(before, before)], now[0, before])
+        rest = multivariate_normal.logpdf(1e3 * (value - 0.5)[fused], cov=1e6 * K[np.ix_(fused, fused)])
+        assert likelihood[k] == pytest.approx(rest - 0.5 * (np.log(2e6 * np.pi * S) + 25.0), abs=1e-6)
 
 
 def test_least_squares_find_what_the_commands_lead_to(ungated: ModuleType) -> None:
@@ -165,18 +199,17 @@ def test_a_drift_of_20_ms_is_named(lag: ModuleType) -> None:
         assert any("drifts" in one for one in named), seed
 
 
-# ---- loops in C++, and where tables go ------------------------------------------------------------------------------
+# ---- general filters, and where tables go ---------------------------------------------------------------------------
 
 
 @pytest.mark.long
-@pytest.mark.skipif(shutil.which("g++") is None, reason="there is no g++")
-def test_a_loop_in_cpp_gives_the_numbers_of_pumafuse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the shipped scan, filtered, as live and smoothed, to 1e-9 of a standard deviation."""
+@pytest.mark.parametrize("job", ["filter", "smooth", "likelihood"])
+def test_a_general_filter_gives_the_numbers_of_pumafuse(monkeypatch: pytest.MonkeyPatch, job: str) -> None:
+    """statsmodels, with matrices for each event of the shipped scan, to 1e-9 of a standard deviation."""
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     peers = importlib.import_module("peers")
     scan = peers.Problem.of(0)
-    for job in peers.FIELDS:
-        assert peers.error(peers.cpp(job)(scan)(), scan.answer(job)) < 1e-9, job
+    assert peers.error(peers.statsmodels(job)(scan)(), scan.answer(job)) < 1e-9
 
 
 def test_tables_go_between_the_marks_of_who_makes_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

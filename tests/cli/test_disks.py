@@ -1,8 +1,7 @@
-"""Full disks, damaged caches, two at once, names that no disk takes: one line, and nothing half written."""
+"""Full disks, two at once, names that no disk takes: one line, and nothing half written."""
 
 from __future__ import annotations
 
-import os
 import resource
 import signal
 import subprocess
@@ -52,26 +51,6 @@ def test_a_closed_standard_output_is_no_fault(tmp_path: Path) -> None:
     done = subprocess.run(f"{line} >&-", shell=True, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "out" / "summary.json").exists()
-
-
-@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
-def test_a_damaged_kernel_is_compiled_anew(ending: str, tmp_path: Path) -> None:
-    """It is said, the result is right, and the next start finds it whole."""
-    (tmp_path / "some.py").write_text(
-        "from pumafuse.compiled import kernel\n@kernel\ndef double(x):\n    return 2.0 * x\nprint(double(21.0))\n"
-    )
-
-    def shown() -> subprocess.CompletedProcess[str]:
-        words = [sys.executable, "-c", "import some"]
-        return subprocess.run(words, capture_output=True, text=True, timeout=60, check=False, cwd=tmp_path)
-
-    assert shown().stdout == "42.0\n"
-    for kept in tmp_path.rglob(f"*{ending}"):
-        os.truncate(kept, kept.stat().st_size // 2)
-    again = shown()
-    assert again.stdout == "42.0\n"
-    assert "a compiled kernel is damaged" in again.stderr
-    assert (shown().stdout, shown().stderr) == ("42.0\n", "")
 
 
 def test_two_that_write_one_folder_at_once(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -10,12 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
-from pumafuse.arrays import CodeArray, FloatArray, TimeArray
-from pumafuse.filter.axis import Model, Sensors, State
+from pumafuse.arrays import FloatArray, TimeArray
+from pumafuse.filter.core import Filter
 from pumafuse.filter.events import COMMAND, Events, Results, joined
-from pumafuse.filter.forward import ALL_THERE, Filter, Output, filter_events, no_history
 from pumafuse.filter.outcome import Outcome
-from pumafuse.fusion.engine import arranged, biased_sensors
+from pumafuse.fusion.engine import model_of
 from pumafuse.fusion.segments import Segment, build
 
 MS = 1_000_000  # ns
@@ -54,57 +52,53 @@ def segment_of(seed: int) -> Segment:
     return build(pf.Run.from_arrays(stamp, command, streams), CONFIG)
 
 
-@dataclass
-class Pass:
-    """A state, and what becomes of events and estimates."""
-
-    model: Model
-    sensors: Sensors
-    state: State
-    results: list[Results]
-    outputs: list[FloatArray]
-
-    @staticmethod
-    def over(segment: Segment, places: int = 0) -> Pass:
-        return Pass(*arranged(segment, CONFIG, biased_sensors(segment, CONFIG), places), [], [])
-
-    def run(self, events: Events, times: TimeArray, outcome: CodeArray | None = None) -> None:
-        results, outputs = (
-            Results.room(len(events.time), len(AXES)),
-            np.zeros((len(Output), len(AXES), len(times))),
-        )
-        if outcome is not None:
-            results.outcome[:] = outcome
-        count, history = len(events.time), no_history(len(AXES), self.state.x.shape[1])
-        arrays = Filter(self.model, self.sensors, events, self.state, results, history).flat()
-        filter_events(arrays, outcome is not None, 0, count, count, *ALL_THERE, 0, times, outputs)
-        self.results.append(results)
-        self.outputs.append(outputs)
-
-    def compare(self, other: Pass) -> None:
-        """Every outcome, innovation and estimate, and the state at the end, to the bit."""
-        for mine, theirs in zip(zip(*self.results, strict=True), zip(*other.results, strict=True), strict=True):
-            np.testing.assert_array_equal(np.concatenate(mine), np.concatenate(theirs))
-        np.testing.assert_array_equal(np.concatenate(self.outputs, axis=2), np.concatenate(other.outputs, axis=2))
-        for mine, theirs in zip(self.state[:-1], other.state[:-1], strict=True):
-            np.testing.assert_array_equal(mine[: len(AXES)], theirs[: len(AXES)])
-
-
 GRID = 20 * MS * np.arange(160)
+LAST = GRID[-1:]
+NONE = GRID[:0]
+slips = settings(derandomize=True, deadline=None, max_examples=20)
 
 
-@settings(derandomize=True, deadline=None, max_examples=20)
-@given(st.integers(0, 1000), st.lists(st.integers(0, 3100), max_size=4))
-def test_ordered_pieces_are_one_pass(seed: int, cuts: list[int]) -> None:
-    """A pass takes a state in and gives one out; what the gate remembers is part of it."""
+class Pass:
+    """A filter, and what becomes of events and estimates in all that it runs over."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.core = Filter(model_of(segment, CONFIG), segment.origin)
+        self.results, self.outputs = list[Results](), list[FloatArray]()
+
+    def run(self, events: Events, times: TimeArray, span: tuple[int, int] | None = None) -> Pass:
+        results = Results.room(*events.known.shape)
+        self.outputs.append(self.core.run(events, results, times, span))
+        self.results.append(results.rows(np.arange(*span)) if span else results)
+        return self
+
+    def check(self, whole: Pass) -> None:
+        """Every outcome, innovation and estimate, and the biases at the end, are those of another to the bit."""
+        for mine, theirs in zip(zip(*self.results, strict=True), zip(*whole.results, strict=True), strict=True):
+            np.testing.assert_array_equal(np.concatenate(mine), np.concatenate(theirs))
+        np.testing.assert_array_equal(np.concatenate(self.outputs, axis=2), np.concatenate(whole.outputs, axis=2))
+        assert [self.core.bias(1, axis) for axis in range(2)] == [whole.core.bias(1, axis) for axis in range(2)]
+
+
+@slips
+@given(st.integers(0, 1000), st.lists(st.integers(0, 3100), max_size=4), st.booleans())
+def test_ordered_pieces_are_one_pass(seed: int, cuts: list[int], in_place: bool) -> None:
+    """What a filter remembers, the gate included, goes on from call to call, in one table or in one for each.
+
+    Where the table is one, an estimate also knows the commands that come after the piece.
+    """
     segment = segment_of(seed)
     events, _ = segment.events(CONFIG)
-    whole, pieces = Pass.over(segment), Pass.over(segment)
-    whole.run(events, np.empty(0, dtype=np.int64))
-    edges = [0, *np.searchsorted(events.time, np.sort(cuts) * MS).tolist(), len(events.time)]
-    for begin, end in pairwise(edges):
-        pieces.run(events.rows(slice(begin, end)), np.empty(0, dtype=np.int64))
-    pieces.compare(whole)
+    pieces, times = Pass(segment), GRID if in_place else LAST
+    ends = [*np.sort(cuts).tolist(), 10**6]
+    for begin, end in pairwise([-1, *ends]):
+        rows = tuple(np.searchsorted(events.time, (begin * MS, end * MS), side="right").tolist())
+        asked = times[(times > begin * MS) & (times <= end * MS)]
+        if in_place:
+            pieces.run(events, asked, rows)
+        else:
+            pieces.run(events.rows(slice(*rows)), asked)
+    whole = Pass(segment).run(events, times)
+    pieces.check(whole)
     assert {Outcome.REJECTED, Outcome.REACQUIRED} <= set(np.unique(whole.results[0].outcome))
 
 
@@ -112,35 +106,25 @@ def test_estimates_leave_no_trace() -> None:
     """Asked for or not, events become the same; and the instants before and after do not matter to an estimate."""
     segment = segment_of(1)
     events, _ = segment.events(CONFIG)
-    without, dense, sparse = (Pass.over(segment) for _ in range(3))
-    without.run(events, np.empty(0, dtype=np.int64))
-    dense.run(events, GRID)
-    sparse.run(events, GRID[::7].copy())
-    np.testing.assert_array_equal(dense.results[0].outcome, without.results[0].outcome)
-    np.testing.assert_array_equal(dense.state.x[:2], without.state.x[:2])
+    without, dense, sparse = (Pass(segment).run(events, times) for times in (NONE, GRID, GRID[::7].copy()))
     np.testing.assert_array_equal(dense.outputs[0][:, :, ::7], sparse.outputs[0])
+    for one in (without, dense, sparse):
+        one.outputs = [one.core.run(events.rows(slice(0)), Results.room(0, 2), LAST)]
+        one.check(without)
 
 
-@settings(derandomize=True, deadline=None, max_examples=20)
+@slips
 @given(st.integers(0, 1000))
 def test_late_events_end_as_events_in_time(seed: int) -> None:
-    """However late each event comes, an estimate after the last of them is that of the whole pass."""
+    """However late each measurement comes, an estimate after the last of them is that of the whole pass."""
     segment = segment_of(seed)
     events, _ = segment.events(CONFIG)
-    rng, count = np.random.default_rng(seed), len(events.time)
-    arrival = events.time + rng.integers(0, 1500 * MS, count)
-    arrival[events.source == COMMAND] = events.stamp[events.source == COMMAND]
-    times = np.append(GRID, arrival.max())
-    live, whole = Pass.over(segment, count + 1), Pass.over(segment)
-    results, outputs = Results.room(count, 2), np.zeros((len(Output), 2, len(times)))
-    arrived, history = np.zeros(count, dtype=np.bool_), no_history(len(AXES), live.state.x.shape[1])
-    queue = np.argsort(arrival, kind="stable")
-    arrays = Filter(live.model, live.sensors, events, live.state, results, history).flat()
-    filter_events(arrays, False, 0, count, count, arrival, queue, arrived, count + 1, times, outputs)
+    arrival = events.stamp + np.random.default_rng(seed).integers(0, 1500 * MS, len(events.time))
+    late = events._replace(stamp=np.where(events.source == COMMAND, events.stamp, arrival))
+    times, live, results = np.append(GRID, arrival.max()), Pass(segment), Results.room(*events.known.shape)
+    live.outputs.append(live.core.run_as_live(late, results, times)[:, :, -1:])
     live.results.append(results)
-    live.outputs.append(outputs[:, :, -1:])
-    whole.run(events, times[-1:])
-    live.compare(whole)
+    live.check(Pass(segment).run(late, times[-1:]))
 
 
 def test_tables_are_joined_with_the_spread_that_one_of_them_has() -> None:

@@ -14,11 +14,11 @@ import pytest
 
 import pumafuse as pf
 from pumafuse.arrays import FloatArray
+from pumafuse.filter.response import response
 from pumafuse.fusion.faults import not_following, sensor_faults
 from pumafuse.fusion.segments import build
 from pumafuse.logs.clock import clock_faults
 from pumafuse.logs.run import Source
-from pumafuse.model.response import response
 from tuning_runs import LONG, SCENARIOS, scenario
 
 REPOSITORY = Path(__file__).parents[2]

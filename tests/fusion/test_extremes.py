@@ -1,6 +1,6 @@
 """Numbers at the edge of what a configuration may say: estimates stay numbers, error bars are never less than nothing.
 
-Every run goes through all three modes of the compiled engine, twice, with another run in between.
+Every run goes through all three modes of the core, twice, with another run in between, and through its derivatives.
 """
 
 from __future__ import annotations
@@ -15,8 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
+from fusion.test_innovations import beside, numbers
 from pumafuse.filter.outcome import Outcome
+from pumafuse.fusion.engine import innovations, linearised
 from pumafuse.fusion.estimates import Estimates
+from pumafuse.fusion.segments import build
 from pumafuse.logs.run import Run
 from pumafuse.model.plants import Plant
 
@@ -144,7 +147,17 @@ def check(edge: Edge, rate: float | None = None) -> dict[str, Estimates]:
         again = parts(fused(edge, mode, rate))
         for name, one in parts(estimates).items():
             assert one.tobytes() == again[name].tobytes(), (mode, name)
+    check_derivatives(*edge.made())
     return found
+
+
+def check_derivatives(run: Run, config: pf.FusionConfig) -> None:
+    """By every number of the configuration: finite."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pf.PumafuseWarning)
+        segment = build(run, config)
+    outcome, each = innovations(segment, config).outcome, [beside(config, path) for path in numbers(config, "radial")]
+    assert all(np.isfinite(one).all() for one in linearised(segment, config, outcome, each)[1:])
 
 
 # ---- each extreme beside every plant --------------------------------------------------------------------------------

@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import warnings
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
+import pytest
 from hypothesis import given, settings
 
-from fusion.test_oracle import LAG, MS, UNDER, Case, Seen, cases, every, sensor
+from fusion.test_oracle import CRITICAL, LAG, MS, NOISE, OVER, PAPER, UNDER, Case, Seen, cases, every, sensor
 from fusion_oracle import AxisOracle
+from pumafuse.arrays import FloatArray
 from pumafuse.errors import PumafuseWarning
 from pumafuse.filter.events import Results
 from pumafuse.filter.outcome import ABSENT, Outcome
 from pumafuse.fusion.config import FusionConfig, Process
-from pumafuse.fusion.engine import innovations, innovations_of_each
+from pumafuse.fusion.engine import innovations, linearised
 from pumafuse.fusion.estimates import Estimates
 from pumafuse.fusion.offline import fuse
 from pumafuse.fusion.segments import Segment, build
 from pumafuse.logs.run import Run
-from pumafuse.model.arm import AxisModel, Gain
-from pumafuse.model.plants import FirstOrder
+from pumafuse.model.arm import AxisModel
+from pumafuse.model.plants import Plant, SecondOrder
+from pumafuse.tuning.parameters import changed as with_number
 
-KINDS: tuple[Literal["matern", "ou"], ...] = ("matern", "ou")
 changed = msgspec.structs.replace
 GATE = 1.2  # which rejects a good part of measurements that scatter by 1 mm
 
@@ -69,7 +71,7 @@ def test_innovations_of_any_run_are_those_of_its_fusion(case: Case) -> None:
 
 def contradicting() -> tuple[Run, FusionConfig]:
     """A camera of two axes that jumps by 50 mm after a second, when the tracker has ended: it is rejected, then not."""
-    camera = Seen(sensor(0.4e-3, latency=0.03), every(30, 60))
+    camera = Seen(sensor(0.4e-3, latency=0.03), every(30, 60, 7 * MS))
     tracker = Seen(sensor(0.3e-3, latency=0.004), every(11, 10, 3 * MS))
     axes = {"radial": AxisModel(plant=LAG), "vertical": AxisModel(plant=UNDER)}
     run, config = Case(axes, times=np.arange(75) * 28 * MS, seen={"camera": camera, "tracker": tracker}).made()
@@ -110,34 +112,111 @@ def test_given_outcomes_are_repeated_whatever_the_gates_would_say() -> None:
         np.testing.assert_allclose(repeated.innovation_sd[fused, column], sd, rtol=1e-8)
 
 
-def test_side_by_side_each_configuration_gives_what_it_gives_alone() -> None:
-    """To the bit: with other noise, another plant, gain, latency, delay, scale, disturbance, and with a bias."""
-    run, config = contradicting()
-    segment, arm = build(run, config), config.arm
-    outcome = innovations(segment, config).outcome
-    smooth, rough = (Process(disturbance_sd=2e-3, disturbance_time=0.2, disturbance_kind=kind) for kind in KINDS)
-    radial = msgspec.structs.replace(arm.axes["radial"], plant=FirstOrder(time_constant=0.05))
-    gains = {axis: msgspec.structs.replace(one, gain=Gain(intercept=0.9)) for axis, one in arm.axes.items()}
-    camera = config.sensors["camera"]
+# ---- derivatives ----------------------------------------------------------------------------------------------------
 
-    def seen(**changes: float) -> FusionConfig:
-        return changed(config, sensors={**config.sensors, "camera": msgspec.structs.replace(camera, **changes)})
+NEARLY = SecondOrder(natural_frequency=45.0, damping=1.0 - 1e-6)
+ARMS: dict[str, tuple[Plant, float, Literal["matern", "ou"]]] = {  # plant, recovery of the gain, disturbance
+    "lag": (LAG, 0.08, "matern"),
+    "lag as slow as the recovery": (LAG, LAG.time_constant, "ou"),
+    "under-damped": (UNDER, 0.08, "ou"),
+    "critical": (CRITICAL, 0.08, "matern"),
+    "recovery at a double pole": (CRITICAL, 1.0 / 45.0, "ou"),
+    "a hair above": (SecondOrder(natural_frequency=45.0, damping=1.0 + 1e-9), 1.0 / 45.0, "matern"),
+    "a hair below": (NEARLY, 0.08, "matern"),
+    "over-damped": (OVER, 0.08, "ou"),
+    "recovery at the slow pole of two": (OVER, 0.07348, "matern"),
+}
+PARTS = {
+    "panel": Seen(sensor(3e-4, scale=-1.3, latency=0.004, bias_sd=2e-3), every(31, 7, 41 * MS)),
+    "vision": Seen(
+        sensor(4e-4, latency=0.09, latency_sd=0.002, bias_drift_sd=1e-3, bias_time=0.3), every(23, 6, 67 * MS)
+    ),
+}
 
-    others = [
-        config,
-        louder(config),
-        changed(config, process={**config.process, "radial": smooth}),
-        changed(config, process={**config.process, "vertical": rough}),
-        changed(config, arm=changed(arm, axes={**arm.axes, "radial": radial})),
-        changed(config, arm=changed(arm, axes=gains)),
-        changed(config, arm=changed(arm, delay=arm.delay + 2e-5)),
-        seen(latency=camera.latency + 2e-5),
-        seen(scale=1.1),
-        seen(latency_sd=3e-3),
-        seen(bias_sd=1e-3),
-        seen(bias_drift_sd=1e-3, bias_time=3.0),
+
+def numbers(config: FusionConfig, axis: str) -> list[tuple[str, ...]]:
+    """Where each number of an axis and of all sensors is."""
+    noise = ("input_noise", "drift", "maneuver_noise", "maneuver_drift", "disturbance_sd", "disturbance_time")
+    arm = ("delay", "gain.slope", "gain.intercept", "gain_recovery")
+    plant = ("plant.time_constant", "plant.natural_frequency", "plant.damping")
+    kinds = ("sd", "latency", "latency_sd", "scale", "bias_sd", "bias_drift_sd")
+    paths = [
+        ("start", "offset_sd"),
+        *(("process", axis, name) for name in noise),
+        *(("arm", "axes", axis, *name.split(".")) for name in (*arm, *plant)),
+        *(("sensors", name, kind) for name in config.sensors for kind in kinds),
     ]
-    for other, found in zip(others, innovations_of_each(segment, others, outcome), strict=True):
-        alone = innovations(segment, other, outcome)
-        for part in ("outcome", "innovation", "innovation_sd"):
-            np.testing.assert_array_equal(getattr(found, part), getattr(alone, part))
+    drifts = [("sensors", name, "bias_time") for name, one in config.sensors.items() if one.bias_drift_sd]
+    return [path for path in paths if number(config, path)] + drifts
+
+
+def number(config: FusionConfig, path: tuple[str, ...]) -> float:
+    node: Any = config
+    for name in path:
+        node = node[name] if isinstance(node, dict) else getattr(node, name, 0.0)
+    return node
+
+
+def beside(config: FusionConfig, path: tuple[str, ...]) -> tuple[FusionConfig, FusionConfig, float]:
+    """The configuration a little below and above a number: instants by whole µs."""
+    at = number(config, path)
+    step = 2e-6 if path[-1] in ("delay", "latency") else 1e-4 * abs(at)
+    return with_number(config, path, at - step), with_number(config, path, at + step), 2.0 * step
+
+
+def alike(found: FloatArray, wanted: FloatArray, path: tuple[str, ...]) -> None:
+    """To a millionth of the largest."""
+    assert np.abs(wanted).max() > 0.0, path
+    assert np.abs(found - wanted).max() < 1e-6 * np.abs(wanted).max(), path
+
+
+@pytest.mark.parametrize(("plant", "recovery", "kind"), ARMS.values(), ids=ARMS)
+def test_derivatives_are_those_of_the_joint_gaussian(
+    plant: Plant, recovery: float, kind: Literal["matern", "ou"]
+) -> None:
+    """Of ν and S by every number of arm, noise and sensors at once: central differences of the dense oracle."""
+    noise = changed(NOISE, disturbance_sd=2e-3, disturbance_time=0.2, disturbance_kind=kind)
+    arm = {"radial": AxisModel(plant=plant, gain=PAPER, gain_recovery=recovery, delay=0.0412)}
+    run, config = Case(arm, times=np.arange(8) * 28 * MS, process=noise, seen=PARTS).made()
+    segment, paths = build(run, config), numbers(config, "radial")
+    order = np.argsort(segment.events(config)[1])
+    outcome = np.zeros_like(segment.measurement_rows.known)
+    _, d_nu, d_s = linearised(segment, config, outcome, [beside(config, path) for path in paths])
+    assert len(paths) > 20
+    for path, by_nu, by_s in zip(paths, d_nu[:, order, 0], d_s[:, order, 0], strict=True):
+        low, high, width = beside(config, path)
+        (nu, sd), (nu_up, sd_up) = (AxisOracle(run, one, "radial").innovations() for one in (low, high))
+        alike(by_nu, (nu_up - nu) / width, path)
+        alike(by_s, (sd_up**2 - sd**2) / width, path)
+
+
+def test_derivatives_are_those_of_innovations_whose_outcomes_stay() -> None:
+    """By the numbers of two axes, where some measurements are rejected and others re-acquire; eight go in one pass.
+
+    A parameter alone has the same bits as among others, and without any the innovations are the same.
+    """
+    run, config = contradicting()
+    segment, outcome = build(run, config), check(run, config).outcome
+    noise = changed(NOISE, disturbance_sd=2e-3, disturbance_time=0.2)
+    axes = {axis: changed(one, gain=PAPER, gain_recovery=0.08, delay=0.05) for axis, one in config.arm.axes.items()}
+    sensors = {
+        "camera": changed(config.sensors["camera"], latency_sd=2e-3, bias_sd=1e-3),
+        "tracker": changed(config.sensors["tracker"], bias_drift_sd=1e-3, bias_time=0.3),
+    }
+    config = changed(config, arm=changed(config.arm, axes=axes), process=dict.fromkeys(axes, noise), sensors=sensors)
+    paths = list(dict.fromkeys(path for axis in axes for path in numbers(config, axis)))
+    found, d_nu, d_s = linearised(segment, config, outcome, [beside(config, path) for path in paths])
+    for path, by_nu, by_s in zip(paths, d_nu, d_s, strict=True):
+        low, high, width = beside(config, path)
+        down, up = (innovations(segment, one, outcome) for one in (low, high))
+        alike(by_nu, (up.innovation - down.innovation) / width, path)
+        alike(by_s, (up.innovation_sd**2 - down.innovation_sd**2) / width, path)
+        _, alone_nu, alone_s = linearised(segment, config, outcome, [beside(config, path)])
+        np.testing.assert_array_equal(alone_nu[0], by_nu)
+        np.testing.assert_array_equal(alone_s[0], by_s)
+    plain, *none = linearised(segment, config, outcome, [])
+    assert [len(one) for one in none] == [0, 0]
+    for one in (found, innovations(segment, config, outcome)):
+        np.testing.assert_array_equal(one.innovation, plain.innovation)
+        np.testing.assert_array_equal(one.innovation_sd, plain.innovation_sd)
+        np.testing.assert_array_equal(one.outcome, outcome)

@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 import pumafuse as pf
 from pumafuse.arrays import FloatArray
-from pumafuse.model.response import response
+from pumafuse.filter.response import response
 
 MS = 1_000_000  # ns
 SECONDS = 25

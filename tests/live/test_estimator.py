@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 
 import msgspec
 import numpy as np
@@ -309,28 +307,6 @@ def test_missing_commands_are_counted(lost: int, said: bool) -> None:
     if said:
         assert f"until {1000.0 + last * PERIOD:.3f} s {gaps} of" in found[0]
         assert f"one is due every {PERIOD * 1e3:g} ms), the longest gap is {2 * PERIOD:.3g} s" in found[0]
-
-
-def test_after_warming_up_nothing_is_left_to_compile() -> None:
-    """In a new process: every kernel that Python calls is ready, also those of a flood and of a clock set anew."""
-    code = """
-import pumafuse as pf
-from pumafuse.filter import forward, window
-arm, sensors = pf.ArmModel.load("puma560-internal"), {"tracker": pf.Sensor(sd=1e-4)}
-live = pf.LiveEstimator(pf.FusionConfig(arm=arm, sensors=sensors))
-live.warm_up()
-called = [getattr(window, name) for name in ("put_measurement", "put_command", "last_commands")]
-called.append(forward.filter_events)
-assert all(len(one.signatures) == 1 for one in called)
-for row in range(70_000):
-    live.measurement(row, "tracker", radial=0.5) if row else live.command(0, radial=0.5)
-live.estimate(69_000)
-for stamp in (10**12, 2 * 10**12, 10**10, 10**10 + 1, 10**10 + 2):
-    live.command(stamp, radial=0.5)
-assert live.newest is not None
-assert all(len(one.signatures) == 1 for one in called)
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=100)
 
 
 def test_a_first_command_that_is_no_position_is_invalid() -> None:

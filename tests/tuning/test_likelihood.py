@@ -220,7 +220,7 @@ def far_from_the_maximum(order: int) -> tuple[Likelihood, Point, pf.FusionConfig
 def test_the_score_is_the_derivative_of_the_log_likelihood(order: int) -> None:
     """For every kind of parameter, by central differences with fixed outcomes, with and without priors.
 
-    To a thousandth of it and a hundredth of a standard deviation; some measurements are rejected.
+    To 1e-5 of it and of a standard deviation; some measurements are rejected.
     """
     likelihood, at, config = far_from_the_maximum(order)
     free = free_of(likelihood, config, ALL)
@@ -236,11 +236,11 @@ def test_the_score_is_the_derivative_of_the_log_likelihood(order: int) -> None:
             point(likelihood, moved(config, [one], [here + sign * step]), free, at.outcomes) for sign in (1, -1)
         )
         sd = 1.0 / np.sqrt(found.information[number, number])
-        within = 0.01 / sd
+        within = 1e-5 / sd
         wanted = (up.log_likelihood - down.log_likelihood) / (2.0 * step)
-        assert bare.score[number] == pytest.approx(wanted, rel=1e-3, abs=within), one.key
+        assert bare.score[number] == pytest.approx(wanted, rel=1e-5, abs=within), one.key
         with_prior = (up.log_posterior - down.log_posterior) / (2.0 * step)
-        assert found.score[number] == pytest.approx(with_prior, rel=1e-3, abs=within), one.key
+        assert found.score[number] == pytest.approx(with_prior, rel=1e-5, abs=within), one.key
         more = 0.0 if one.prior is None else one.prior[1] ** -2
         assert found.information[number, number] - bare.information[number, number] == pytest.approx(more, rel=1e-6)
         steep += abs(wanted) * sd > 1.0
@@ -278,7 +278,7 @@ WITH_NOISE = Case(
 def test_scores_and_information_are_those_of_the_joint_gaussian() -> None:
     """For every kind of parameter, with measurements drawn from the oracle's mean m and covariance K.
 
-    The score of each draw is r′K⁻¹∂m + ½ (r′K⁻¹∂K K⁻¹r − tr K⁻¹∂K), to a thousandth of a standard deviation. The
+    The score of each draw is r′K⁻¹∂m + ½ (r′K⁻¹∂K K⁻¹r − tr K⁻¹∂K), to 5e-5 standard deviations. The
     information is random but for its mean ∂m′K⁻¹∂m + ½ tr K⁻¹∂K K⁻¹∂K: that of 100 draws is within 4 standard errors.
     """
     run, config = WITH_NOISE.made()
@@ -313,7 +313,7 @@ def test_scores_and_information_are_those_of_the_joint_gaussian() -> None:
             d_m @ r + 0.5 * (r @ covariance @ d_K @ r - np.trace(d_K))
             for d_m, d_K in zip(d_mean, d_covariance, strict=True)
         ]
-        np.testing.assert_allclose(there.score / sd, score / sd, atol=2e-3, rtol=2e-3)
+        np.testing.assert_allclose(there.score / sd, score / sd, atol=5e-5, rtol=0.0)
         found.append(there.information / np.outer(sd, sd))
     scatter = np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
     off = np.abs(np.mean(found, axis=0) - wanted / np.outer(sd, sd))

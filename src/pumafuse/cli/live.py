@@ -91,7 +91,6 @@ def run(
         signals = stack.enter_context(_caught_signals())
         sender = stack.enter_context(contextlib.closing(UdpSender(out))) if out else None
         estimator = partial(LiveEstimator, known, window=window, stale_after=stale_after, start=start, on_notice=notify)
-        estimator().warm_up()  # before anything is made or listens: meanwhile datagrams would be lost
         gc.freeze()  # what is here stays: looking through it again and again would take longer than an estimate may
         for doubt in known.arm.doubts():
             notify(doubt)

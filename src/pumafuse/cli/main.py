@@ -358,6 +358,21 @@ def live(
 
 
 @app.command()
+def export(
+    config: Config,
+    output: Annotated[Path, Option("--output", "-o", metavar="FILTER.H", help="Where the header goes.")],
+    force: Force = False,
+) -> None:
+    """Write a configuration as a C header, for a controller with the filter in it (pumafuse.h).
+
+    The names in it begin with the file's: filter_model, FILTER_AXES.
+    """
+    from . import export as command
+
+    command.run(config, output, force)
+
+
+@app.command()
 def demo(
     output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Where the result goes.")] = Path("demo"),
     force: Force = False,

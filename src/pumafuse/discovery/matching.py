@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
@@ -165,7 +164,12 @@ def without_spikes(value: FloatArray) -> BoolArray:
 
     A motion is none, however fast: where it goes on, each value is that median itself.
     """
-    around = np.median(sliding_window_view(np.pad(value, 2, mode="reflect"), 5), axis=1)
+    if len(value) < 3:
+        return np.ones(len(value), dtype=np.bool_)
+    padded = np.concatenate((value[2:0:-1], value, value[-2:-4:-1]))  # reflected
+    a, b, c, d, e = (padded[k : k + len(value)] for k in range(5))
+    low, high = np.maximum(np.minimum(a, b), np.minimum(c, d)), np.minimum(np.maximum(a, b), np.maximum(c, d))
+    around = np.maximum(np.minimum(low, high), np.minimum(e, np.maximum(low, high)))  # the median of five
     far = np.abs(value - around)
     spikes = far > _SPIKE * float(np.median(far))
     return ~spikes if np.count_nonzero(spikes) < _MOST_SPIKES * len(value) else np.ones(len(value), dtype=np.bool_)

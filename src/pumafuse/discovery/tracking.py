@@ -115,14 +115,17 @@ class Tracking:
         """
         _, measured, led, before = self._near
         columns = [one for one in (led, led - before) if float(np.std(one)) > self.noise]
-        known = np.stack([np.ones(len(led)), *columns], axis=1)
-        found, *_ = np.linalg.lstsq(known, measured - led)
-        left = measured - led - known @ found
+        known, off = np.array([np.ones(len(led)), *columns]), measured - led
+        gram = known @ known.T
+        found = np.linalg.lstsq(gram, known @ off)[0]
+        if not self.excludes(float(found[0])):
+            return 0.0
+        left = off - found @ known
         wanders = float(np.std([piece.mean() for piece in np.array_split(left, _PIECES)]))
         # at a distance from the start that hardly changes, the constant is as uncertain as the slope
-        chance = wanders * math.sqrt(len(left) * float(np.linalg.inv(known.T @ known)[0, 0]))
+        chance = wanders * math.sqrt(len(left) * float(np.linalg.inv(gram)[0, 0]))
         error = max(chance, _MODEL * float(np.ptp(led)))
-        return float(found[0]) if abs(found[0]) > _FAR * error and self.excludes(float(found[0])) else 0.0
+        return float(found[0]) if abs(found[0]) > _FAR * error else 0.0
 
     def excludes(self, zero: float) -> bool:
         """Whether the priors do not expect such a difference of the zeros [m or rad]."""

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from ..arrays import NO_STAMP, CodeArray, TimeArray
-from ..filter.axis import Model, Sensors, State
-from ..filter.events import COMMAND, Events, Results
-from ..filter.forward import ALL_THERE, NO_ESTIMATES, Filter, History, Output, filter_events, no_history
+from ..arrays import NO_STAMP, CodeArray, FloatArray, TimeArray
+from ..filter.core import Filter, Model, linearise
+from ..filter.events import Events, Results
 from ..filter.outcome import Outcome
-from ..filter.smoother import smooth
 from .config import FusionConfig
 from .estimates import AxisEstimate, Bias, Mode
 from .segments import Segment
-from .setup import Column, at_rest, columns_of, filter_model, filter_sensors
+from .setup import filter_model
 
 Engine = Literal["compiled", "filterpy"]
+_NO_TIMES = np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -58,49 +57,27 @@ def filter_segment(
         progress: Called now and then by the filterpy engine with the share done, 0 to 1.
     """
     events, _ = segment.events(config)
-    biases, axes, count = biased_sensors(segment, config), len(segment.axes), len(events.time)
-    arrival, queue, places = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), 0
-    if mode == "as-live":
-        arrival = np.where(events.source == COMMAND, events.stamp, np.maximum(events.stamp, events.time))
-        queue = np.argsort(arrival, kind="stable")
-        places = _most_taken_back(events.time, arrival, times) + 1
-    model, sensors, state = arranged(segment, config, biases, places)
-    width, arrived = state.x.shape[1], np.zeros(len(queue), dtype=np.bool_)
-    history = _history(events, state, len(times)) if mode == "smoothed" else no_history(axes, width)
-    results = Results.room(count, axes)
-    results.outcome[:] = events.known
-    outputs = np.zeros((len(Output), axes, len(times)))
+    model, results = model_of(segment, config), _undecided(events)
     if engine == "filterpy":
-        from ..filter import filterpy_engine
+        from ..filter import reference
 
-        plants = [config.arm.axes[axis] for axis in segment.axes]
-        filterpy_engine.filter_events(plants, model, sensors, events, state, times, results, outputs, progress)
-    else:
-        arrays = Filter(model, sensors, events, state, results, history).flat()
-        filter_events(arrays, False, 0, count, count, arrival, queue, arrived, places, times, outputs)
-    if mode == "smoothed":
-        room = np.empty((2, width)), np.empty((2, width, width)), np.empty((1, 4, width)), np.empty((width + 1, width))
-        smooth(model, sensors, events, results, history, segment.origin, times, room, outputs)
-    estimates = {
-        axis: AxisEstimate(segment.start[axis] + outputs[0, number], *outputs[1:, number])
-        for number, axis in enumerate(segment.axes)
-    }
-    return Filtered(estimates, events, results, _known_biases(segment, sensors, state))
+        plants = [config.arm.axes[axis].plant for axis in segment.axes]
+        found = reference.Filter(plants, model, segment.origin, events)
+        outputs = found.run(results, times, progress)
+        return _filtered(segment, outputs, events, results, found.bias)
+    core = Filter(model, segment.origin)
+    run = {"filtered": core.run, "as-live": core.run_as_live, "smoothed": core.smooth}[mode]
+    return _filtered(segment, run(events, results, times), events, results, core.bias)
 
 
 def filter_piece(
-    segment: Segment,
-    carried: tuple[Model, Sensors, State],
-    config: FusionConfig,
-    times: TimeArray,
-    own: tuple[int, int],
+    segment: Segment, core: Filter, config: FusionConfig, times: TimeArray, own: tuple[int, int]
 ) -> Filtered:
     """Filter a piece of a segment as the whole of it would be.
 
     Args:
         segment: Its events and those around them.
-        carried: The filter's arrays (:func:`arranged`); the state is that of the pieces before, and after this one in
-            the end.
+        core: The filter, after the pieces before; after this one in the end.
         config: Arm, noise and sensors.
         times: Of the estimates, int64 ns, ascending.
         own: After which time, and until which, events are the piece's own [int ns].
@@ -108,22 +85,12 @@ def filter_piece(
     Returns:
         The estimates and what became of its own events; those without a stamp come first.
     """
-    (model, sensors, state), (events, _) = carried, segment.events(config)
+    events, _ = segment.events(config)
     begin, end = np.searchsorted(events.time, own, side="right").tolist()
-    count, axes = len(events.time), len(segment.axes)
-    results = Results.room(count, axes)
-    results.outcome[:] = events.known
-    # Where no estimate is asked for the filter rounds otherwise: so one is, of which no use is made.
-    asked = times if len(times) else events.time[begin:end][-1:]
-    outputs = np.zeros((len(Output), axes, len(asked)))
-    arrays = Filter(model, sensors, events, state, results, no_history(axes, state.x.shape[1])).flat()
-    filter_events(arrays, False, begin, end, count, *ALL_THERE, 0, asked, outputs)
-    estimates = {
-        axis: AxisEstimate(segment.start[axis] + outputs[0, number, : len(times)], *outputs[1:, number, : len(times)])
-        for number, axis in enumerate(segment.axes)
-    }
+    results = _undecided(events)
+    outputs = core.run(events, results, times, (begin, end))
     mine = np.r_[: np.searchsorted(events.time, NO_STAMP, side="right"), begin:end]
-    return Filtered(estimates, events.rows(mine), results.rows(mine), _known_biases(segment, sensors, state))
+    return _filtered(segment, outputs, events.rows(mine), results.rows(mine), core.bias)
 
 
 def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | None = None) -> Results:
@@ -135,56 +102,54 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
         outcome: What became of each measurement in an earlier fusion, (m, A), to be repeated whatever the gates would
             say; None: they say.
     """
-    columns = columns_of(config, segment.axes, biased_sensors(segment, config))
-    return _innovations(segment, config, columns, outcome)
-
-
-def innovations_of_each(segment: Segment, configs: Sequence[FusionConfig], outcome: CodeArray) -> list[Results]:
-    """The same of several configurations, while the outcomes are repeated.
-
-    Those of one time and scale go through the filter side by side: its rows are read once, and what several of them do
-    in an interval is computed once.
-    """
-    alike: dict[Hashable, list[int]] = {}
-    for number, config in enumerate(configs):
-        sensors = [config.sensors[name] for name in segment.sensors if name in config.sensors]
-        shared = tuple((one.scale, one.latency_sd) for one in sensors)
-        alike.setdefault((segment.times(config), shared), []).append(number)
-    found: dict[int, Results] = {}
-    for numbers in alike.values():
-        columns: list[Column] = []
-        for number in numbers:
-            columns += columns_of(configs[number], segment.axes, biased_sensors(segment, configs[number]))
-        together = _innovations(segment, configs[numbers[0]], columns, outcome)
-        found |= zip(numbers, together.split(len(numbers)), strict=True)
-    return [found[number] for number in range(len(configs))]
-
-
-def _innovations(
-    segment: Segment, config: FusionConfig, columns: Sequence[Column], outcome: CodeArray | None
-) -> Results:
-    """Innovations by ``measurement_rows``; columns are the axes, once or more often, at the times of ``config``."""
     events, place = segment.events(config)
-    count, times = len(events.time), len(columns) // len(segment.axes)
-    if times > 1:
-        events = events.repeated(times)
-    model, sensors = filter_model(columns), filter_sensors(columns, segment.sensors)
-    state = at_rest(columns, len(segment.sensors), segment.origin, segment.start)
-    results = Results.room(count, len(columns))
+    results = _undecided(events)
     if outcome is not None:
-        results.outcome[place] = np.tile(outcome, times)
-    arrays = Filter(model, sensors, events, state, results, no_history(len(columns), state.x.shape[1])).flat()
-    filter_events(arrays, outcome is not None, 0, count, count, *ALL_THERE, 0, *NO_ESTIMATES)
+        results.outcome[place] = outcome
+    core = Filter(model_of(segment, config), segment.origin)
+    core.run(events, results, _NO_TIMES, given=outcome is not None)
     return results.rows(place)
 
 
-def arranged(
-    segment: Segment, config: FusionConfig, biases: list[list[str]], places: int = 0
-) -> tuple[Model, Sensors, State]:
-    """The filter's arrays for a segment, and the state at rest."""
-    columns = columns_of(config, segment.axes, biases)
-    state = at_rest(columns, len(segment.sensors), segment.origin, segment.start, places)
-    return filter_model(columns), filter_sensors(columns, segment.sensors), state
+def linearised(
+    segment: Segment,
+    config: FusionConfig,
+    outcome: CodeArray,
+    beside: Sequence[tuple[FusionConfig, FusionConfig, float]],
+) -> tuple[Results, FloatArray, FloatArray]:
+    """The same, with derivatives by k parameters; by ``measurement_rows``.
+
+    Args:
+        segment: The events.
+        config: Arm, noise and sensors.
+        outcome: What became of each measurement, (m, A), to be repeated.
+        beside: For each parameter the configuration a little below and above, and how far these are apart.
+
+    Returns:
+        Innovations; derivatives of ν and of S, (k, m, A) each.
+    """
+    events, place = segment.events(config)
+    results = _undecided(events)
+    results.outcome[place] = outcome
+    model = model_of(segment, config)
+    tangents = [_slope(model_of(segment, low), model_of(segment, high), width) for low, high, width in beside]
+    d_nu, d_s = linearise(model, tangents, segment.origin, events, results)
+    return results.rows(place), d_nu[:, place], d_s[:, place]
+
+
+def _slope(low: Model, high: Model, width: float) -> Model:
+    """How every number changes from one model to another, ``width`` of a parameter apart."""
+
+    def of(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        change = (b.view(np.float64) - a.view(np.float64)) / width
+        return np.nan_to_num(change).view(a.dtype)  # NaN where there is none: no level, no sd
+
+    return Model(*map(of, low, high))
+
+
+def model_of(segment: Segment, config: FusionConfig) -> Model:
+    """What the filter knows of a segment's axes and sensors, with the biases of those that measure."""
+    return filter_model(config, segment.axes, segment.sensors, segment.start, biased_sensors(segment, config))
 
 
 def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
@@ -202,39 +167,27 @@ def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
     ]
 
 
-def _history(events: Events, state: State, estimates: int) -> History:
-    """Room for what happens to each axis: an interval for each command, an interval and an update for a measurement."""
-    axes, width = events.known.shape[1], state.x.shape[1]
-    measured, decided = events.source != COMMAND, [column == Outcome.FUSED for column in events.known.T]
-    room = [np.count_nonzero(fused) + np.count_nonzero(fused & measured) for fused in decided]
-    size = sum(room)
-    return History(
-        np.concatenate(([0], np.cumsum(room))),
-        np.zeros(axes, dtype=np.int64),
-        np.empty(size, dtype=np.int64),
-        np.empty(size, dtype=np.int64),
-        np.empty(size),
-        np.empty(size),
-        np.empty((size, width)),
-        np.empty((axes, estimates, width)),
-        np.empty((axes, estimates, width, width)),
-    )
+def _undecided(events: Events) -> Results:
+    """Room for what becomes of events: until a filter decides what was known of them."""
+    results = Results.room(*events.known.shape)
+    results.outcome[:] = events.known
+    return results
 
 
-def _most_taken_back(time: TimeArray, arrival: TimeArray, times: TimeArray) -> int:
-    """How many events the filter may be past one that arrives late."""
-    estimate = np.searchsorted(times, arrival)  # the first estimate that knows of each event
-    until = np.append(np.searchsorted(time, times, side="right"), len(time))[estimate]
-    before = np.append(0, np.searchsorted(time, times, side="right"))[estimate]  # how far the filter was until then
-    return int(np.maximum(np.maximum(until, before) - np.arange(len(time)), 0).max(initial=0)) + 1
-
-
-def _known_biases(segment: Segment, sensors: Sensors, state: State) -> dict[str, dict[str, Bias]]:
-    """The constant biases at the end."""
-    found: dict[str, dict[str, Bias]] = {}
+def _filtered(
+    segment: Segment,
+    outputs: FloatArray,
+    events: Events,
+    results: Results,
+    bias: Callable[[int, int], tuple[float, float] | None],
+) -> Filtered:
+    axes = {
+        axis: AxisEstimate(segment.start[axis] + outputs[0, number], *outputs[1:, number])
+        for number, axis in enumerate(segment.axes)
+    }
+    biases: dict[str, dict[str, Bias]] = {}
     for number, axis in enumerate(segment.axes):
-        for name, place in zip(segment.sensors, sensors.bias[:, number, 1].tolist(), strict=True):
-            if place >= 0:
-                sd = float(np.sqrt(max(state.P[number, place, place], 0.0)))
-                found.setdefault(name, {})[axis] = Bias(float(state.x[number, place]), sd)
-    return found
+        for place, name in enumerate(segment.sensors):
+            if (known := bias(place, number)) is not None:
+                biases.setdefault(name, {})[axis] = Bias(*known)
+    return Filtered(axes, events, results, biases)

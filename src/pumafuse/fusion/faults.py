@@ -17,7 +17,7 @@ from ..discovery.matching import SMALL_SHIFT, Grid, Match, matches, without_spik
 from ..discovery.tracking import FOLLOWS, GAIN, Tracking
 from ..errors import RunError
 from ..filter.outcome import ABSENT, Outcome
-from ..model.response import response
+from ..filter.response import response
 from ..units import OF_KIND, Kind, mistaken, wraps
 from .config import FusionConfig
 from .segments import Segment
@@ -175,29 +175,46 @@ def _trackings(segment: Segment, config: FusionConfig, given: _Given) -> _Tracki
 
     Where most of it lies outside of the commands it is the clock that is wrong: the rest would tell of anything.
     """
-    found: dict[str, dict[str, Tracking]] = {}
-    every = segment.rows_by_sensor()
-    for name, axes in given.items():
-        found[name] = {}
-        for axis, (stamp, value) in axes.items():
-            count = int(np.searchsorted(stamp, int(segment.commands[-1]) + _TAIL_NS, side="right"))
-            logged = np.count_nonzero(every[name].known[:, segment.axes.index(axis)] != ABSENT)
-            if count >= max(_FEW, logged / 2):
-                some = slice(None, count, 1 + count // _ENOUGH)
-                alike = without_spikes(value[some])
-                found[name][axis] = _tracking(segment, config, name, axis, stamp[some][alike], value[some][alike])
+    found: dict[str, dict[str, Tracking]] = {name: {} for name in given}
+    every, until = segment.rows_by_sensor(), int(segment.commands[-1]) + _TAIL_NS
+    for number, axis in enumerate(segment.axes):
+        some: dict[str, tuple[TimeArray, FloatArray]] = {}
+        for name, (stamp, value) in ((name, axes[axis]) for name, axes in given.items() if axis in axes):
+            count = int(np.searchsorted(stamp, until, side="right"))
+            if count >= max(_FEW, np.count_nonzero(every[name].known[:, number] != ABSENT) / 2):
+                chosen = slice(None, count, 1 + count // _ENOUGH)
+                alike = without_spikes(value[chosen])
+                valid = stamp[chosen][alike] - round(config.sensors[name].latency * 1e9)
+                some[name] = valid, value[chosen][alike]
+        for name, led in _led_at(segment, config, axis, {name: valid for name, (valid, _) in some.items()}).items():
+            found[name][axis] = _tracking(segment, config, name, axis, *some[name], *led)
     return found
 
 
+def _led_at(
+    segment: Segment, config: FusionConfig, axis: str, valid: Mapping[str, TimeArray]
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Where the commands lead an axis at the instants of several sensors, and where they had led shortly before."""
+    if not valid:
+        return {}
+    every = np.concatenate([part for one in valid.values() for part in (one, one - round(SMALL_SHIFT * 1e9))])
+    order, position = np.argsort(every), np.empty(len(every))
+    position[order] = _led(segment, config, axis, every[order])
+    parts = iter(np.split(position, np.cumsum([len(one) for one in valid.values() for _ in range(2)])[:-1]))
+    return {name: (next(parts), next(parts)) for name in valid}
+
+
 def _tracking(
-    segment: Segment, config: FusionConfig, name: str, axis: str, stamp: TimeArray, value: FloatArray
+    segment: Segment,
+    config: FusionConfig,
+    name: str,
+    axis: str,
+    valid: TimeArray,
+    value: FloatArray,
+    led: FloatArray,
+    before: FloatArray,
 ) -> Tracking:
     sensor, process = config.sensors[name], config.process[axis]
-    valid = stamp - round(sensor.latency * 1e9)
-    both = np.concatenate([valid, valid - round(SMALL_SHIFT * 1e9)])
-    order, position = np.argsort(both), np.empty(len(both))
-    position[order] = _led(segment, config, axis, both[order])
-    led, before = position[: len(valid)], position[len(valid) :]
     of_sensor = math.hypot(sensor.sd_of(axis) or 0.0, sensor.bias_drift_sd_of(axis)) / abs(sensor.scale)
     noise = math.hypot(of_sensor, process.disturbance_sd)
     zero_sd = math.hypot(noise, sensor.bias_sd_of(axis) / abs(sensor.scale), config.start.offset_sd_of(axis))

@@ -62,7 +62,7 @@ def fuse(
         rate: Estimates on an even grid [Hz] from the first command on; one for each command for None.
         mode: What an estimate knows: ``filtered``, all measurements that are valid by then; ``as-live``, only those
             that had arrived by then, as a live user would have had; ``smoothed``, every measurement of the run.
-        engine: ``compiled``, or ``filterpy``, the reference: the same meaning, hundreds of times slower.
+        engine: ``compiled``, or ``filterpy``, the reference: the same meaning, a thousand times slower.
         progress: Called now and then by the reference engine with the share done, 0 to 1.
 
     Returns:

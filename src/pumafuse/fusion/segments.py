@@ -12,14 +12,13 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import reduce
 from itertools import pairwise
-from typing import TypeAlias
 
 import numpy as np
 
 from ..arrays import ALWAYS, NEVER, NO_STAMP, BoolArray, CodeArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError, UnknownNameError
-from ..filter.axis import Model, Sensors, State
-from ..filter.events import COMMAND, Events, classify_all, joined
+from ..filter.core import Model, classify
+from ..filter.events import COMMAND, Events, joined
 from ..filter.outcome import ABSENT, Outcome
 from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind
 from ..logs.frames import CARTESIAN
@@ -28,7 +27,7 @@ from ..logs.run import Run, Source, note_rows
 from ..model.arm import ArmModel
 from ..units import AN, of_kind
 from .config import FusionConfig
-from .setup import at_rest, columns_of, filter_model, filter_sensors
+from .setup import filter_model
 
 _MOST_ESTIMATES = 10_000_000
 _KEPT = 3  # orders of the events: those of a search's point, and a little earlier and later
@@ -42,7 +41,6 @@ _REASONS = {
     Outcome.BEFORE_START: "a time before the first command",
     Outcome.TOO_LATE: "a stamp more than 1 s behind an earlier one",
 }
-_Policy: TypeAlias = tuple[Model, Sensors, State]  # what decides on values before the filter does
 WHOLE = ALWAYS, NEVER
 
 
@@ -249,7 +247,7 @@ def build(
         command_rows=rows,
         measurement_rows=measured,
         notes=tuple(notes),
-        turn=policy[1].turn,
+        turn=np.ascontiguousarray(policy.view["turn"]),
         command_counts=command_counts,
         counts=counts,
         ends=ends,
@@ -340,10 +338,9 @@ def _check_axes(run: Run, arm: ArmModel) -> None:
             )
 
 
-def _policy(config: FusionConfig, axes: Sequence[str], sensors: Sequence[str]) -> _Policy:
-    columns = columns_of(config, axes, [()] * len(axes))
-    state = at_rest(columns, 0, 0, dict.fromkeys(axes, 0.0))
-    return filter_model(columns), filter_sensors(columns, sensors), state
+def _policy(config: FusionConfig, axes: Sequence[str], sensors: Sequence[str]) -> Model:
+    """What decides on values before the filter does; every axis has begun."""
+    return filter_model(config, axes, sensors, dict.fromkeys(axes, 0.0))
 
 
 def _unmatched(silent: Sequence[str], strangers: Sequence[str]) -> list[str]:
@@ -356,7 +353,7 @@ def _unmatched(silent: Sequence[str], strangers: Sequence[str]) -> list[str]:
     return found
 
 
-def _command_rows(run: Run, policy: _Policy, notes: list[str]) -> Events:
+def _command_rows(run: Run, policy: Model, notes: list[str]) -> Events:
     """The stamped command rows of a segment in order, with time = stamp, each value classified.
 
     Args:
@@ -427,7 +424,7 @@ def _measurement_rows(
     config: FusionConfig,
     number: int,
     names: Sequence[str],
-    policy: _Policy,
+    policy: Model,
     origin: int,
     own: tuple[int, int],
     notes: list[str],
@@ -487,12 +484,9 @@ def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int |
     return Events(_valid(stamp, latency), np.full(len(order), number, dtype=np.int16), stamp, value, spread, known)
 
 
-def _classified(rows: Events, policy: _Policy, origin: int, too_late: BoolArray) -> Events:
+def _classified(rows: Events, policy: Model, origin: int, too_late: BoolArray) -> Events:
     """Rows of one source with every value classified."""
-    model, sensors, state = policy
-    known = np.empty_like(rows.known)
-    classify_all(model, sensors, rows, state, origin, too_late, known)
-    return rows._replace(known=known)
+    return rows._replace(known=classify(policy, rows, origin, too_late))
 
 
 def _best(known: CodeArray) -> CodeArray:

@@ -12,9 +12,6 @@ first of each segment, before which the others know nothing. All but the command
 - the filter, by its innovations. It may know other sensors.
 """
 
-# pyright: reportArgumentType=false
-# (an element of an array is a plain number in a kernel: numba compiles it, numpy's types do not know)
-
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -25,14 +22,13 @@ import numpy as np
 
 from .. import toml
 from ..arrays import FloatArray
-from ..compiled import kernel
+from ..filter.core import constant_velocity
 from ..filter.outcome import Outcome
-from ..model.response import response
+from ..filter.response import response
 from .estimates import Estimates, Measurements
 from .setup import turn_of
 
 _DENSITIES = np.logspace(-8.0, 2.0, 11)  # of the acceleration, over R and the cube of the median interval
-_UNKNOWN = 1e6  # variance of the rate at the start, over R and the square of the median interval
 
 
 class PredictionError(toml.Reported, frozen=True, kw_only=True):
@@ -123,44 +119,9 @@ def _by_constant_velocity(parts: Sequence[Measurements]) -> FloatArray:
     unit = float(np.median(intervals[intervals > 0.0])) if (intervals > 0.0).any() else 1.0
     square, found, end = np.zeros(len(_DENSITIES)), np.empty(len(intervals)), 0
     for part in parts:
-        constant_velocity(part.time / unit, part.value, _DENSITIES, np.empty((5, len(square))), square, found[:0])
+        constant_velocity(part.time / unit, part.value, _DENSITIES, square)
     best = _DENSITIES[[np.argmin(square)]]
     for part in parts:
         begin, end = end, end + len(part.value) - 1
-        constant_velocity(part.time / unit, part.value, best, np.empty((5, 1)), np.zeros(1), found[begin:end])
+        constant_velocity(part.time / unit, part.value, best, np.zeros(1), found[begin:end])
     return found
-
-
-@kernel
-def constant_velocity(
-    time: FloatArray, value: FloatArray, density: FloatArray, room: FloatArray, square: FloatArray, found: FloatArray
-) -> None:
-    """Constant-velocity filters with R = 1.
-
-    Args:
-        time: Of the measurements, ascending, (n,).
-        value: Of the measurements, (n,).
-        density: Of each filter's noise, white on the acceleration, (g,).
-        room: For the filters' states, (5, g).
-        square: The sum of the squares of each one's innovations is added, (g,).
-        found: Gets the last one's innovations, without the first, (n - 1,); (0,): they are not kept.
-    """
-    position, rate, p11, p12, p22 = room[0], room[1], room[2], room[3], room[4]
-    position[:], rate[:], p11[:], p12[:], p22[:] = value[0], 0.0, 1.0, 0.0, _UNKNOWN
-    last = 0.0
-    for n in range(1, len(value)):
-        dt = time[n] - time[n - 1]
-        for g in range(len(density)):
-            noise = density[g] * dt
-            a = p11[g] + dt * (2.0 * p12[g] + dt * (p22[g] + noise / 3.0))
-            b = p12[g] + dt * (p22[g] + 0.5 * noise)
-            gain, gain_of_rate = a / (a + 1.0), b / (a + 1.0)
-            predicted = position[g] + rate[g] * dt
-            nu = value[n] - predicted
-            square[g] += nu * nu
-            position[g] = predicted + gain * nu
-            rate[g] += gain_of_rate * nu
-            p11[g], p12[g], p22[g] = gain, gain_of_rate, p22[g] + noise - gain_of_rate * b
-            last = nu
-        if len(found):
-            found[n - 1] = last

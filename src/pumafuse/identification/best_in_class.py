@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 
 from ..arrays import FloatArray, TimeArray
+from ..filter.response import response
 from ..model.arm import AxisModel, Gain, commanded_speed
 from ..model.plants import PLANTS, SecondOrder
-from ..model.response import response
 from ..toml import Interval
 from .estimate import t_quantile
 from .fit import plant_of

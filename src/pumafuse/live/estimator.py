@@ -11,14 +11,11 @@ import numpy as np
 
 from ..arrays import NEVER, FloatArray
 from ..errors import ConfigError, RunError, suggestion
-from ..filter.counters import Counters
-from ..filter.events import Events, Results
-from ..filter.forward import Filter, no_history
 from ..filter.outcome import ABSENT, FARTHEST, Outcome
-from ..filter.window import FIRST_ROWS, MOST_ROWS, Incoming, Memory, Window
+from ..filter.window import MOST_ROWS, Counters, Window
 from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS
-from ..fusion.setup import at_rest, columns_of, filter_model, filter_sensors
+from ..fusion.setup import live_model
 from ..logs.clock import missing_commands, other_interval
 from ..logs.frames import CARTESIAN, Cylindrical
 from ..logs.run import Source
@@ -29,7 +26,7 @@ from .frame_start import FrameStart
 from .rate_limit import RateLimitedLog
 from .results import AxisNow, Health, LiveEstimate, UpdateResult, health_of, no_estimate, update_result
 
-_MOST_AXES = 62  # a kernel takes the axes of an event as bits
+_MOST_AXES = 62  # the core takes the axes of an event as bits
 _FIRST, _MANY = 100, 1000  # commands whose interval is looked at, and those that missing ones are counted among
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
@@ -113,6 +110,7 @@ class LiveEstimator:
         self._sensors = {name: number for number, name in enumerate(config.sensors)}
         self._bits = {name: number for number, name in enumerate(self.axes)}
         self._stale_ns = round(stale_after * 1e9)
+        self._no_spread = [1.0] * len(self.axes)
         self._log, self._event_log = RateLimitedLog(on_notice), event_log
         self._refused: dict[str, dict[Outcome, int]] = {name: dict.fromkeys(Outcome, 0) for name in config.sensors}
         self._strangers = self._refusals = 0
@@ -125,17 +123,6 @@ class LiveEstimator:
         self._clock = Clock(round(window * 1e9))
         self._start, self._before = dict(start or {}), None
         self._begin(None)
-
-    def warm_up(self) -> None:
-        """Load now what else takes a second when it is first needed; on a new machine compile it, some 15 s."""
-        other = LiveEstimator(self.config)
-        place = dict.fromkeys((*self.axes, *(CARTESIAN if self.config.frame is not None else ())), 1.0)
-        other.command(0, **place)
-        for sensor in self.config.sensors:
-            other.measurement(0, sensor, **place)
-        other.estimate()
-        other.health()
-        other._window.warm_up()
 
     def command(self, t: Time, /, **axes: float) -> UpdateResult:
         """Add a command: the arm is to go to a position [m] on each of ``axes``.
@@ -164,6 +151,10 @@ class LiveEstimator:
                 the future: predicted with the last command held. None: at the newest stamp (but not at one that a
                 sensor alone has run ahead to).
         """
+        return self._estimate(at, NEVER)
+
+    def _estimate(self, at: Time | None, after: int) -> LiveEstimate:
+        """The same by nothing that is stamped after ``after`` [ns]."""
         newest = self._clock.newest
         now = 0 if newest is None else self._clock.now
         try:
@@ -181,7 +172,7 @@ class LiveEstimator:
             return no_estimate(stamp, _INVALID, "more than an hour ahead")
         axes: dict[str, AxisNow] = {}
         stale: list[str] = []
-        for axis, found in zip(self.axes, self._window.estimate(stamp), strict=True):
+        for axis, found in zip(self.axes, self._window.estimate(stamp, after), strict=True):
             if found is not None:
                 outputs, fused = found
                 axes[axis] = AxisNow(*outputs)
@@ -210,8 +201,7 @@ class LiveEstimator:
 
     def estimate_as_live(self, stamp: int) -> LiveEstimate:
         """The estimate for an instant [ns] in the window by nothing that is stamped later, as if that had not come."""
-        with self._window.hidden(stamp):
-            return self.estimate(stamp)
+        return self._estimate(stamp, stamp)
 
     def until(self, t: Time, sensor: str | None = None) -> int | None:
         """Up to which instant [ns] a clock may go on before an event stamped ``t`` comes in; None before the first one.
@@ -251,7 +241,7 @@ class LiveEstimator:
         """An empty window, with what was counted before."""
         self._before = counters
         self._frame_start = FrameStart(self.config.frame, self.axes)
-        self._window = empty_window(self.config, self.axes, self._frame_start.start(self._start), counters)
+        self._window = Window(live_model(self.config, self._frame_start.start(self._start)), counters)
         self._recent: list[_Event] = []  # commands that are still to be looked at
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it.
         # With each goes its outcome, and whether it never came into the window.
@@ -259,7 +249,7 @@ class LiveEstimator:
 
     def _oldest(self) -> int:
         """No event stamped before is taken [ns]."""
-        return max(self._clock.sure - self._clock.window, self._window.floor)
+        return max(self._clock.sure - self._clock.window, self._window.port.floor)
 
     def _take(self, t: Time, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
         """Put an event where its stamp says, if that can be."""
@@ -416,10 +406,10 @@ class LiveEstimator:
         else:
             taken = window.add_measurement(stamp, self._sensors[sensor], given, self._clock.sure, oldest)
         if self.config.frame is not None:
-            window.spread[:] = 1.0
+            window.spread[:] = self._no_spread
         if not taken:
             return self._refuse_late(stamp, sensor, values)
-        codes = window.outcome.tobytes()
+        codes = bytes(window.outcome)
         result = self._answers.get(codes) if not stranger else None
         result = result or self._answer(codes, stranger)
         if sensor is None:
@@ -429,7 +419,7 @@ class LiveEstimator:
             if result.outcome is _FUSED:
                 self._recent.append(_Event(stamp, None, values))
                 self._watch_commands()
-        elif window.contradicts >= 0:
+        elif window.port.contradicts >= 0:
             self._say_contradiction(stamp, sensor)
         elif sensor in self._contradicting and result.outcome is _FUSED:
             del self._contradicting[sensor]
@@ -440,7 +430,7 @@ class LiveEstimator:
         validity = self.config.arm.validity
         if validity == Validity():
             return
-        latest = {axis: found for axis in self.axes if (found := self._window.command_at(self._bits[axis])) is not None}
+        latest = {axis: found for axis, found in zip(self.axes, self._window.commands(), strict=True) if found}
         if not latest:
             return
         stamp = max(stamp for stamp, _, _ in latest.values())
@@ -487,17 +477,17 @@ class LiveEstimator:
 
     def _commanded(self, axis: str, stamp: int) -> FloatArray:
         """The position [m] commanded on an axis at ``stamp`` [ns], as far as is known, (1,)."""
-        found = self._window.command_at(self._bits[axis], stamp) if axis in self._bits else None
+        found = self._window.commands(stamp)[self._bits[axis]] if axis in self._bits else None
         return np.array([0.0 if found is None else found[1]])
 
     def _say_contradiction(self, stamp: int, sensor: str) -> None:
         """Say which other sensor one contradicts, by how much, and since when."""
         window = self._window
-        other = tuple(self._sensors)[window.contradicts]
+        other = tuple(self._sensors)[window.port.contradicts]
         if self._contradicting.get(sensor) == other:
             return
         self._contradicting[sensor] = other
-        found = list(zip(self.axes, window.outcome.tolist(), window.innovation.tolist(), strict=True))
+        found = list(zip(self.axes, window.outcome, window.innovation, strict=True))
         screens = {axis: self.config.arm.screen_of(axis) for axis, _, _ in found}
         off = ", ".join(
             f"{axis} by {nu * screens[axis].scale:+.4g} {screens[axis].unit}"
@@ -546,49 +536,6 @@ class LiveEstimator:
                 self._window.uncount_late(self._sensors[sensor])
         else:
             self._strangers += times
-
-
-def empty_window(
-    config: FusionConfig, axes: tuple[str, ...], start: Mapping[str, float], counters: Counters | None
-) -> Window:
-    """A window with nothing in it.
-
-    Args:
-        config: Arm, noise and sensors.
-        axes: Every axis in its order.
-        start: The level u₀ [m] of axes that do not rest at their first command before it.
-        counters: What was counted before.
-    """
-    names, count = tuple(config.sensors), len(axes)
-    biases = [
-        [name for name, sensor in config.sensors.items() if sensor.is_biased(axis) and sensor.sd_of(axis) is not None]
-        for axis in axes
-    ]
-    columns = columns_of(config, axes, biases)
-    state = at_rest(columns, len(names), NEVER, start, FIRST_ROWS + 1)
-    for part in state.by_row:
-        part[-count:] = part[:count]  # at rest
-    counted = Counters.none(len(names))
-    if counters is not None:
-        counted.number[:], counted.usual[:] = counters.number, counters.usual
-    level = [start.get(axis, np.nan) for axis in axes]
-    delay = [round(config.arm.delay_of(axis) * 1e9) for axis in axes]
-    arrays = Filter(
-        model=filter_model(columns),
-        sensors=filter_sensors(columns, names),
-        events=Events.empty(count, FIRST_ROWS)._replace(spread=np.ones((FIRST_ROWS, count))),
-        state=state,
-        results=Results.room(FIRST_ROWS, count),
-        history=no_history(count, state.x.shape[1]),
-    )
-    incoming = Incoming(
-        span=np.array([0, 0, 0, 0, NEVER]),
-        times=np.array([[NEVER, one] for one in delay]),
-        values=np.array([[0.0, 1.0, one] for one in level]),
-        outcome=np.zeros(count, dtype=np.uint8),
-        latency=np.array([round(sensor.latency * 1e9) for sensor in config.sensors.values()], dtype=np.int64),
-    )
-    return Window(Memory(arrays, incoming), counted)
 
 
 def _number(value: object) -> float:

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from ..arrays import ALWAYS
 from ..errors import UnknownNameError
-from ..filter.counters import CAME, DROPOUTS, LATENESS, MOST_LATE, NIS, ROWS, SCALARS, SECONDS, Counters
 from ..filter.outcome import Outcome
+from ..filter.window import CAME, DROPOUTS, LATENESS, MOST_LATE, NIS, ROWS, SCALARS, SECONDS, Counters
 
 COMPARED = frozenset({Outcome.FUSED, Outcome.REACQUIRED, Outcome.REJECTED})  # with its prediction
 _REASONS: Mapping[Outcome, str] = {  # the best first

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Literal, TypeAlias
 
 import msgspec
@@ -18,6 +19,8 @@ from ..model.arm import CANONICAL_AXES, ArmModel
 
 CARTESIAN = ("x", "y", "z")
 Direction = Literal["counterclockwise", "clockwise"]
+_TURN = 2.0 * math.pi
+_QUIET = np.errstate(over="ignore", invalid="ignore")  # a sensor without a target may report infinity, or 1.8e308
 
 
 class _Kind(msgspec.Struct, frozen=True, kw_only=True, tag_field="kind", forbid_unknown_fields=True):
@@ -79,6 +82,12 @@ class Placed:
     def _sign(self) -> float:
         return 1.0 if self.frame.positive == "counterclockwise" else -1.0
 
+    @property
+    def _lever(self) -> float:
+        """Tangential position [m] of an angle of 1 rad."""
+        return self._sign * self.radius
+
+    @_QUIET
     def to_axes(
         self, x: FloatArray, y: FloatArray, near: FloatArray | None = None, last: float = 0.0
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -101,21 +110,28 @@ class Placed:
             finite = np.isfinite(x) & np.isfinite(y)
             x, y = np.where(finite, x, np.nan), np.where(finite, y, np.nan)
             return self._sign * (y * cos - x * sin), x * cos + y * sin, np.ones(len(x))
-        from ..model.cylindrical import to_cylinder
+        dx, dy = x - self.frame.base[0], y - self.frame.base[1]
+        r = np.hypot(dx, dy)
+        known = np.isfinite(x + y) & (r > 0.0)  # some sensors that lost their target report the base's axis
+        r, turn = np.where(known, (r, np.arctan2(dy, dx) - self.angle), np.nan)
+        spread = np.where(known, self.radius / r, 1.0)
+        lever = self._lever
+        if near is not None:
+            return lever * (turn + _TURN * np.rint((near / lever - turn) / _TURN)), r, spread
 
-        out = np.empty(len(x)), np.empty(len(x)), np.empty(len(x))
-        nearby = np.empty(0) if near is None else near
-        to_cylinder(x, y, *self.frame.base, self.radius, self.angle, self._sign, nearby, last, *out)
-        return out
+        def follow(before: float, turn: float) -> float:  # from the position before, which is all that a stream keeps
+            return lever * (turn + _TURN * round((before / lever - turn) / _TURN))
 
+        tangential = np.full(len(x), np.nan)
+        tangential[known] = list(accumulate(turn[known].tolist(), follow, initial=last))[1:]
+        return tangential, r, spread
+
+    @_QUIET
     def to_log(self, tangential: FloatArray, radial: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The log's x and y [m] of axis positions [m]; the inverse of :meth:`to_axes`."""
         if isinstance(self.frame, Rotated):
             across = self._sign * tangential
             cos, sin = math.cos(self.angle), math.sin(self.angle)
             return radial * cos - across * sin, radial * sin + across * cos
-        from ..model.cylindrical import from_cylinder
-
-        x, y = np.empty(len(tangential)), np.empty(len(tangential))
-        from_cylinder(tangential, radial, *self.frame.base, self.radius, self.angle, self._sign, x, y)
-        return x, y
+        theta = self.angle + tangential / self._lever
+        return self.frame.base[0] + radial * np.cos(theta), self.frame.base[1] + radial * np.sin(theta)

@@ -1,8 +1,5 @@
 """Fit of a controller's even ticks of T to stamps that jitter."""
 
-# pyright: reportArgumentType=false, reportAssignmentType=false
-# (an element of an array is a plain number in a kernel: numba compiles it, numpy's types do not know)
-
 from __future__ import annotations
 
 import math
@@ -10,8 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from ..arrays import BoolArray, CodeArray, FloatArray, IntArray, TimeArray
-from ..compiled import kernel
+from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..errors import RunError
 
 _MOST_LATE = 9  # a stamp's ticks are sought from this many before it ...
@@ -133,51 +129,57 @@ def _longest(flag: BoolArray) -> int:
 
 
 def assigned_ticks(place: FloatArray) -> IntArray | None:
-    """Ascending ticks of least total cost for stamps in periods, (n,); None if there are too few ticks."""
+    """Ascending ticks of least total cost for stamps in periods, (n,); None if there are too few ticks.
+
+    Each stamp costs least on its nearest tick. Where these ticks do not ascend, the stamps about there form a group,
+    which takes the cheapest ascending ticks of its own. It is widened until its ticks ascend among those around it:
+    then each part costs the least it can, and so does the whole.
+    """
     ticks = np.rint(place).astype(np.int64)
-    if np.all(np.diff(ticks) > 0):
-        return ticks
-    first = np.floor(place).astype(np.int64) - _MOST_LATE
-    workspace = np.empty(_CHOICES), np.empty((len(place), _CHOICES), dtype=np.uint8)
-    return ticks if _cheapest_ticks(place, first, *workspace, ticks) else None
+    tied = np.zeros(len(place), dtype=np.bool_)  # stamps in the group of the one before
+    reach = 1
+    while len(clash := np.flatnonzero(np.diff(ticks) <= 0) + 1):
+        tied[np.clip(clash[:, None] + np.arange(-reach, reach + 1), 1, len(place) - 1)] = True
+        group = np.cumsum(~tied)
+        rows = np.isin(group, group[clash])
+        found = _cheapest_ticks(place[rows], tied[rows])
+        if found is None:
+            return None
+        ticks[rows] = found
+        reach *= 2  # where no tick is free for a thousand stamps, few rounds find the next one
+    return ticks
 
 
-@kernel
-def _cheapest_ticks(place: FloatArray, first: IntArray, best: FloatArray, choice: CodeArray, ticks: IntArray) -> bool:
-    """Fill in the strictly ascending ticks of least total cost; False if there are too few ticks about the stamps.
+def _cheapest_ticks(place: FloatArray, tied: BoolArray) -> IntArray | None:
+    """Ticks that ascend within each group at the least total cost, (n,); None if there are too few about the stamps.
 
     A stamp's cost is the square of its distance from the tick in periods; beyond 0.7 late it hardly grows.
 
     Args:
         place: Each stamp in periods; ticks are whole numbers, (n,).
-        first: The first of the _CHOICES ticks open to each stamp, (n,).
-        best: Workspace: the least cost so far if the last stamp has no later tick than this, (_CHOICES,).
-        choice: Workspace: the tick of this cost, counted from the first, (n, _CHOICES).
-        ticks: The ticks found, (n,).
+        tied: Stamps in the group of the one before, (n,).
     """
-    for n in range(len(place)):
-        ahead = first[n] - first[n - 1] - 1 if n else 0  # choice j comes after choice j + ahead of the row before
-        for one in range(_CHOICES):
-            j = one if ahead >= 0 else _CHOICES - 1 - one  # overwrite no cost that is still needed
-            off = place[n] - (first[n] + j)
-            cost = _LATE_COST + _LATER_COST * (off - _LATE) if off > _LATE else off * off
-            if n:
-                cost += best[min(j + ahead, _CHOICES - 1)] if j + ahead >= 0 else math.inf
-            best[j] = cost
-        choice[n, 0] = 0
-        for j in range(1, _CHOICES):
-            choice[n, j] = j
-            if best[j - 1] < best[j]:
-                best[j] = best[j - 1]
-                choice[n, j] = choice[n, j - 1]
-        if best[_CHOICES - 1] == math.inf:
-            return False
-    upto = _CHOICES - 1
+    first = np.floor(place).astype(np.int64) - _MOST_LATE
+    choices = np.arange(_CHOICES)
+    off = place[:, None] - (first[:, None] + choices)
+    total = np.where(off > _LATE, _LATE_COST + _LATER_COST * (off - _LATE), off * off)
+    # Least cost so far if the last stamp's tick is one of its first 0, 1, 2, ...; at the end 0, the cost of no stamp.
+    least = np.concatenate(([math.inf], np.zeros(_CHOICES + 1)))
+    # For each tick of a stamp: how many of those open to the stamp before come before it.
+    before = np.clip(choices + np.diff(first, prepend=0)[:, None], 0, _CHOICES)
+    before[~tied] = _CHOICES + 1
+    for row, index in zip(total, before, strict=True):
+        row += least[index]
+        np.minimum.accumulate(row, out=least[1:-1])
+    if np.isinf(total.min(axis=1)).any():
+        return None
+    lowest = total == np.minimum.accumulate(total, axis=1)
+    choice = np.maximum.accumulate(np.where(lowest, choices, 0), axis=1)  # the cheapest one up to each
+    ticks, upto = np.empty_like(first), _CHOICES
     for n in range(len(place) - 1, -1, -1):
-        ticks[n] = first[n] + choice[n, upto]
-        if n:
-            upto = min(ticks[n] - 1 - first[n - 1], _CHOICES - 1)
-    return True
+        chosen = choice[n, min(upto, _CHOICES) - 1]
+        ticks[n], upto = first[n] + chosen, before[n, chosen]
+    return ticks
 
 
 def _places(since: FloatArray, tick: float) -> FloatArray:

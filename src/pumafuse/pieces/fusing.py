@@ -19,15 +19,16 @@ import numpy as np
 from .. import folders
 from ..arrays import ALWAYS, NEVER
 from ..errors import PumafuseWarning, RunError
-from ..filter.axis import Model, Sensors, State
+from ..filter.core import Filter
 from ..fusion import results
 from ..fusion.config import FusionConfig
 from ..fusion.consistency import sensor_problems
-from ..fusion.engine import arranged, filter_piece
+from ..fusion.engine import filter_piece
 from ..fusion.estimates import Estimates
 from ..fusion.faults import latency_questions, sensor_faults, starts_in_motion
 from ..fusion.offline import Part, estimates_of, found_by
 from ..fusion.segments import Segment, build, no_estimates, output_times
+from ..fusion.setup import filter_model
 from ..fusion.summary import Summary, encode
 from ..logs import tables
 from ..logs.axes import in_axes
@@ -44,7 +45,7 @@ class _Begun(NamedTuple):
     """What the pieces of a run share: its first segment, and the filter with its state."""
 
     segment: Segment
-    carried: tuple[Model, Sensors, State]
+    core: Filter
 
 
 def fuse_to(
@@ -149,7 +150,8 @@ def _begin(run: Run, config: FusionConfig, chosen: Sequence[str] | None) -> _Beg
         ]
         for axis in segment.axes
     ]
-    return _Begun(segment, arranged(segment, config, biases))
+    model = filter_model(config, segment.axes, segment.sensors, segment.start, biases)
+    return _Begun(segment, Filter(model, segment.origin))
 
 
 def _piece(
@@ -170,7 +172,7 @@ def _piece(
         )
     segment = build(in_place, config, chosen, begun.segment, own)
     times = output_times(segment, config, rate, own)
-    filtered = filter_piece(segment, begun.carried, config, times, own)
+    filtered = filter_piece(segment, begun.core, config, times, own)
     first = own[0] == ALWAYS
     if not first:  # for those who ask where the commands lead: the arm rests at what was commanded before
         segment = replace(segment, start={axis: float(segment.given(axis)[1][0]) for axis in segment.axes})

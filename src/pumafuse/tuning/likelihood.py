@@ -27,7 +27,7 @@ from ..filter.events import Results
 from ..filter.outcome import ABSENT, Outcome
 from ..fusion.config import FusionConfig, Process, Start
 from ..fusion.consistency import log_density
-from ..fusion.engine import innovations, innovations_of_each
+from ..fusion.engine import innovations, linearised
 from ..fusion.faults import Fault, not_following, starts_in_motion, within_a_turn
 from ..fusion.segments import Segment, added, build
 from ..logs.axes import in_axes
@@ -465,20 +465,13 @@ class Likelihood:
     ) -> _Linear:
         outcome = outcomes[part.whole][part.rows, part.column]
         mine = [number for number, one in enumerate(parameters) if one.axis in (None, self.axes[part.axis])]
-        beside = [config]  # for each parameter a little up, then, but where it is a logarithm, as little down
+        beside = list[tuple[FusionConfig, FusionConfig, float]]()
         for one in (parameters[number] for number in mine):
-            at = one.at(config)
-            beside += [one.move(config, at + step) for step in ([_LOG_STEP] if one.log else [_STEP, -_STEP])]
-        every = innovations_of_each(part.segment, beside, outcome[:, None])
-        moved = iter([(found.innovation[:, 0], found.innovation_sd[:, 0] ** 2) for found in every])
-        nu, S = next(moved)
-        d_nu, d_s = np.empty((len(mine), len(nu))), np.empty((len(mine), len(nu)))
-        for place, number in enumerate(mine):
-            log = parameters[number].log
-            (nu_up, S_up), (nu_down, S_down) = next(moved), (nu, S) if log else next(moved)
-            width = _LOG_STEP if log else 2.0 * _STEP
-            d_nu[place], d_s[place] = (nu_up - nu_down) / width, (S_up - S_down) / width
-        return _Linear(part.whole, mine, outcome != int(Outcome.REJECTED), nu, S, d_nu, d_s)
+            at, step = one.at(config), _LOG_STEP if one.log else _STEP
+            beside.append((one.move(config, at - step), one.move(config, at + step), 2.0 * step))
+        found, d_nu, d_s = linearised(part.segment, config, outcome[:, None], beside)
+        nu, S = found.innovation[:, 0], found.innovation_sd[:, 0] ** 2
+        return _Linear(part.whole, mine, outcome != int(Outcome.REJECTED), nu, S, d_nu[:, :, 0], d_s[:, :, 0])
 
 
 def _certain(config: FusionConfig) -> FusionConfig:

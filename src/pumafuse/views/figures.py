@@ -14,13 +14,13 @@ from matplotlib.ticker import MaxNLocator
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..filter.outcome import Outcome
+from ..filter.response import response
 from ..fusion.consistency import LAGS, Consistency, consistency
 from ..fusion.estimates import Estimates, Measurements
 from ..fusion.results import Result
 from ..fusion.score import Z95, ReferenceTrack, interpolated, score
 from ..logs.frames import CARTESIAN, in_space
 from ..logs.run import Run
-from ..model.response import response
 from ..tuning.latency import Latency
 from ..units import MS, SCREEN, seconds
 from . import colours

@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 import pumafuse as pf
 from pumafuse import AxisModel, FirstOrder, Gain, SecondOrder
 from pumafuse.arrays import FloatArray, TimeArray
+from pumafuse.filter.response import response
 from pumafuse.model.plants import PLANTS
-from pumafuse.model.response import response
 
 EPOCH = 1_790_000_000_000_000_000  # ns: stamps of a logger in 2026, too large for a float to hold
 PERIOD, DELAY, START = 0.028, 0.06, 0.5

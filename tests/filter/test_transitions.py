@@ -1,4 +1,4 @@
-"""Closed-form transitions against integrals of exponentials worked out with 160 digits."""
+"""Transitions in closed form against integrals of exponentials worked out with 160 digits."""
 
 from __future__ import annotations
 
@@ -13,15 +13,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mpmath import mpf
 
-from kernels import callable_kernel
-from pumafuse.arrays import FloatArray
-from pumafuse.model import closed
-from pumafuse.model.arm import Gain
+from pumafuse.filter import core
+from pumafuse.filter.response import record_of
+from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import PLANTS, FirstOrder, SecondOrder
-
-transition = callable_kernel(closed.transition)
-decaying_response = callable_kernel(closed.decaying_response)
-gain_error = callable_kernel(closed.gain_error)
 
 DIGITS = 160  # close poles over a nanosecond cancel a hundred of them
 TINY = mpf(1e-290)  # below it numbers are subnormal somewhere on the way
@@ -64,12 +59,19 @@ def wanted(omega: float, zeta: float, t: float) -> Step:
         return Step(Phi, Q)
 
 
-def found(omega: float, zeta: float, t: float) -> Step:
-    """What the package says, brought to the same states."""
-    plant = closed.constants(SecondOrder(natural_frequency=omega, damping=zeta))
-    values = transition(2, np.stack([np.full_like(plant, np.nan), plant]), 1, t)
+def step_of(plant: PLANTS, t: float, decay: float = 0.0) -> list[float]:
+    """Φ and Q over an interval; position, rate and rest of an input of 1 m that decays."""
+    recovery = 1.0 / decay if decay else None
+    axis = record_of(AxisModel(plant=plant, gain_recovery=recovery), 0.028, 0.0, 0.0)
+    values = core.transition(axis, t).tolist()
     assert all(map(math.isfinite, values))
-    f11, f12, f21, f22, q11, q12, q22 = map(mpf, values)
+    return values
+
+
+def found(omega: float, zeta: float, t: float) -> Step:
+    """What the core says, brought to the same states."""
+    values = step_of(SecondOrder(natural_frequency=omega, damping=zeta), t)
+    f11, f12, f21, f22, q11, q12, q22 = map(mpf, values[:7])
     with mpmath.workdps(DIGITS):
         w = mpf(omega)
         Q = mpmath.matrix([[q11, q12 / w], [q12 / w, q22 / w**2]])
@@ -175,7 +177,7 @@ def test_process_noise_is_a_covariance(made: tuple[float, float, float]) -> None
         assert Q[0, 1] ** 2 <= Q[0, 0] * Q[1, 1] * (1 + 4e-16)
 
 
-@pytest.mark.parametrize("turn", [closed._TINY, closed._SHORT])
+@pytest.mark.parametrize("turn", [0.1, 0.5])
 @pytest.mark.parametrize("zeta", DAMPINGS)
 def test_nothing_jumps_where_one_form_takes_over_from_another(zeta: float, turn: float) -> None:
     """On either side of the intervals where series end, and are lengthened, a transition is the same to 1e-13."""
@@ -189,31 +191,19 @@ def test_nothing_jumps_where_one_form_takes_over_from_another(zeta: float, turn:
 def test_nothing_happens_in_no_time() -> None:
     """Over an interval of 0 every plant stands still, exactly."""
     for plant in [FirstOrder(time_constant=0.04), *(SecondOrder(natural_frequency=53.9, damping=z) for z in DAMPINGS)]:
-        order, known = closed_form(plant)
-        still = transition(order, known, 0, 0.0)
-        assert still == (1.0, 0.0, 0.0, float(order == 2), 0.0, 0.0, 0.0)
-        assert decaying_response(order, known, 0, 10.0, 0.0, still[0], still[1], still[3]) == (0.0, 0.0, 1.0)
+        rate = float(isinstance(plant, SecondOrder))  # which a lag has not
+        assert step_of(plant, 0.0, 10.0) == [1.0, 0.0, 0.0, rate, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 
 
 # ---- first order ----------------------------------------------------------------------------------------------------
-
-
-def closed_form(plant: PLANTS) -> tuple[int, FloatArray]:
-    """Order and constants of a plant, as an array of one axis."""
-    return 1 if isinstance(plant, FirstOrder) else 2, closed.constants(plant)[None]
-
-
-def lag(tau: float, t: float) -> tuple[float, float]:
-    phi, *others, q, cross, rate = transition(*closed_form(FirstOrder(time_constant=tau)), 0, t)
-    assert (*others, cross, rate) == (0.0, 0.0, 0.0, 0.0, 0.0)
-    return phi, q
 
 
 @settings(derandomize=True, deadline=None, max_examples=1000)
 @given(powers(-6.0, 3.0), powers(-9.0, 5.0))
 def test_any_lag_is_that_of_the_plant(tau: float, t: float) -> None:
     """Φ = e^(−t/τ) to an ulp of 1, Q = (1 − e^(−2t/τ)) / 2τ to 2e-15 of itself."""
-    phi, q = lag(tau, t)
+    phi, *others, q, cross, rate = step_of(FirstOrder(time_constant=tau), t)[:7]
+    assert (*others, cross, rate) == (0.0, 0.0, 0.0, 0.0, 0.0)
     with mpmath.workdps(DIGITS):
         turned = mpf(t) / mpf(tau)
         assert abs(mpf(phi) - mpmath.exp(-turned)) < 3e-16
@@ -237,13 +227,10 @@ def wanted_decaying(plant: PLANTS, decay: float, t: float) -> tuple[mpf, mpf, mp
 
 
 def check_decaying(plant: PLANTS, decay: float, t: float, tolerance: float = 1e-13) -> None:
-    order, known = closed_form(plant)
-    f11, f12, _, f22, *_ = transition(order, known, 0, t)
-    position, rate, left = decaying_response(order, known, 0, decay, t, f11, f12, f22)
+    position, rate, left = step_of(plant, t, decay)[7:]
     omega = plant.natural_frequency if isinstance(plant, SecondOrder) else 1.0
     blur = blurred(omega, plant.damping, t) if isinstance(plant, SecondOrder) else 1.0
     for got, right in zip((position, rate / omega, left), wanted_decaying(plant, decay, t), strict=True):
-        assert math.isfinite(got)
         assert abs(mpf(got) - right) <= tolerance * blur
 
 
@@ -295,21 +282,27 @@ def test_a_recovery_on_or_beside_a_pole(zeta: float | None) -> None:
 @pytest.mark.parametrize("plant", [FirstOrder(time_constant=0.04), SecondOrder(natural_frequency=53.9, damping=0.8)])
 def test_an_input_that_stays_is_a_step_and_one_that_is_gone_at_once_is_nothing(plant: PLANTS) -> None:
     """Decay 0 gives the step response; a decay of a nanosecond leaves its impulse; over a day nothing overflows."""
-    order, known = closed_form(plant)
     for t in (1e-3, 0.03, 0.5, 86400.0):
-        f11, f12, _, f22, *_ = transition(order, known, 0, t)
-        position, _, left = decaying_response(order, known, 0, 0.0, t, f11, f12, f22)
+        position, _, left = step_of(plant, t)[7:]
         assert left == 1.0
         assert position == pytest.approx(float(plant.step_response(t)), abs=1e-14)
         for decay in (1e-12, 1e9, 1e15):
             check_decaying(plant, decay, t)
 
 
-def test_a_gain_error_is_what_the_gain_adds_to_a_step() -> None:
-    """(K − 1) · step with K = a · speed + b; both ways alike; none where K is 1."""
-    gain, period = Gain(slope=0.2, intercept=0.9), 0.028
-    for step in (0.004, -0.004, 0.1):
-        expected = (float(gain.at(np.array(abs(step) / period))) - 1.0) * step
-        assert gain_error(step, gain.slope, gain.intercept, period) == pytest.approx(expected, rel=1e-15)
-    assert gain_error(0.0, 0.2, 0.9, period) == 0.0
-    assert gain_error(0.3, 0.0, 1.0, period) == 0.0
+# ---- a smooth disturbance -------------------------------------------------------------------------------------------
+
+
+@settings(derandomize=True, deadline=None, max_examples=500)
+@given(powers(-4.0, 5.0), powers(-9.0, 5.0))
+@example(0.5, 1.0 - 1e-15)  # where a series ends
+@example(0.5, 1.0 + 1e-15)
+def test_any_disturbance_is_that_of_its_covariance(rate: float, t: float) -> None:
+    """Φ and Q for d and its rate over λ, from k(s) = (1 + λ|s|) e^(−λ|s|): P(t) P(0)⁻¹ and P(0) − Φ P(0) Φᵀ."""
+    f11, f12, f21, f22, q11, q12, q22 = map(mpf, core.disturbance(rate, t).tolist())
+    with mpmath.workdps(DIGITS):
+        rate, a = mpf(rate), mpf(rate) * mpf(t)
+        Phi = mpmath.exp(-a) * mpmath.matrix([[1 + a, a], [-a, 1 - a]])  # k, k' and k'' at t; at 0 they are 1, 0, -1
+        right = Step(Phi, mpmath.eye(2) - Phi * Phi.T)
+        Q = mpmath.matrix([[q11, q12 / rate], [q12 / rate, q22 / rate**2]])
+        check(Step(mpmath.matrix([[f11, f12 * rate], [f21 / rate, f22]]), Q), right, 2e-15, 1e-13)

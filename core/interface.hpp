@@ -1,0 +1,76 @@
+// What the C interface is made of: numbers with derivatives, sizes known to the compiler, errors as text.
+#pragma once
+#include <new>
+#include <stdexcept>
+#include <string>
+
+#include "likelihood.hpp"
+
+namespace pumafuse {
+
+inline thread_local std::string error;  // of the last call of this thread that failed
+
+template <int N>
+struct Size {};
+
+// Structs of numbers with derivatives, by as many tangents of the same type as there are.
+template <template <class> class Of, class Real, class In>
+std::vector<Of<Real>> lifted(const In* in, Time count, const std::vector<const In*>& tangents) {
+    constexpr std::size_t fields = sizeof(In) / sizeof(double);
+    std::vector<Of<Real>> found(count);
+    Real* to = reinterpret_cast<Real*>(found.data());
+    for (std::size_t i = 0; i < count * fields; ++i) {
+        to[i] = reinterpret_cast<const double*>(in)[i];
+        if constexpr (std::is_same_v<Real, Dual>)
+            for (std::size_t k = 0; k < tangents.size(); ++k)
+                to[i].d[k] = reinterpret_cast<const double*>(tangents[k])[i];
+    }
+    return found;
+}
+
+template <class Real>
+Model<Real> model_of(const pf_model& model, const pf_model* tangents = nullptr, Time lanes = 0) {
+    std::vector<const pf_axis*> axes;
+    std::vector<const pf_sensor*> sensors;
+    std::vector<const pf_view*> views;
+    for (const pf_model* one = tangents; one < tangents + lanes; ++one)
+        axes.push_back(one->axis), sensors.push_back(one->sensor), views.push_back(one->view);
+    return {lifted<Axis, Real>(model.axis, model.axes, axes), lifted<Sensor, Real>(model.sensor, model.sensors, sensors),
+            lifted<View, Real>(model.view, model.sensors * model.axes, views)};
+}
+
+// Calls `make` with the compiled size for the states of the axis that has the most: the next larger one serves, and what is
+// left over stays 0. With lengths known the algebra takes half the time.
+inline auto sized(const pf_model& model, auto make) {
+    int most = 0;
+    for (Time a = 0; a < model.axes; ++a) {
+        const pf_axis& axis = model.axis[a];
+        int states = FIRST_BIAS + (axis.disturbance_sd == 0.0 ? 0 : axis.smoothness > 1.0 ? 2 : 1);
+        for (Time s = 0; s < model.sensors; ++s) {
+            const pf_view& view = model.view[s * model.axes + a];
+            states += (view.bias_sd > 0.0) + (view.bias_drift_sd > 0.0);
+        }
+        most = std::max(most, states);
+    }
+    if (most <= 4) return make(Size<4>{});
+    if (most <= 6) return make(Size<6>{});
+    if (most <= 9) return make(Size<9>{});
+    if (most <= 16) return make(Size<16>{});
+    if (most <= 64) return make(Size<64>{});
+    throw std::length_error("an axis has " + std::to_string(most) +
+                            " states, of which 64 are the most: too many sensors have biases");
+}
+
+// 0; -1 and an error text if the work cannot be done.
+inline int attempt(auto work) {
+    try {
+        return work(), 0;
+    } catch (const std::bad_alloc&) {
+        error = "not enough memory";
+    } catch (const std::exception& exception) {
+        error = exception.what();
+    }
+    return -1;
+}
+
+}  // namespace pumafuse

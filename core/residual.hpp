@@ -1,0 +1,211 @@
+// The residual xi: what nobody commanded. Zero mean, linear, Gaussian: one Kalman filter.
+//
+// Its states, in this order: the plant's position and rate (0 for a plant of first order), driven by white noise on the
+// input; the offset; the disturbance d and, where that is smooth, its rate; of each sensor that has them a bias that
+// drifts and a constant one. The position is r + x[PLANT] + x[OFFSET] + x[DISTURBANCE].
+#pragma once
+#include "plant.hpp"
+
+namespace pumafuse {
+
+enum { PLANT, RATE, OFFSET, DISTURBANCE, FIRST_BIAS = DISTURBANCE };  // of x; the last if there is no disturbance
+enum class Smoothness { none, rough, smooth };                        // no state, d alone, d and its rate
+
+// M <- F M F^T where F moves the states i and i + 1.
+template <int N, class Real>
+void move_pair(Matrix<N, Real>& M, int i, Real f11, Real f12, Real f21, Real f22) {
+    const int k = i + 1;
+    const Real a = M[i][i], b = M[i][k], c = M[k][k], d = f11 * a + f12 * b, e = f11 * b + f12 * c;
+    M[i][i] = d * f11 + e * f12;
+    M[i][k] = M[k][i] = d * f21 + e * f22;
+    M[k][k] = (f21 * a + f22 * b) * f21 + (f21 * b + f22 * c) * f22;
+    for (int j = 0; j < N; ++j) {
+        if (j == i || j == k) continue;
+        const Real p = M[i][j], v = M[k][j];
+        M[i][j] = M[j][i] = f11 * p + f12 * v;
+        M[k][j] = M[j][k] = f21 * p + f22 * v;
+    }
+}
+
+// M H^T and S = H M H^T + R. S cannot be known to be smaller than what rounding leaves of what it is made of.
+template <int N, class Real>
+struct Along {
+    Vector<N, Real> MH{};
+    Real S = 0.0;
+
+    Along() = default;
+
+    Along(const Matrix<N, Real>& M, const Vector<N, Real>& H, Real R) : S(R) {
+        constexpr double ROUNDING = 1e-15;
+        Real own = 0.0;
+        for (int j = 0; j < N; ++j)
+            for (int i = 0; i < N; ++i) MH[i] = MH[i] + M[j][i] * H[j];
+        for (int i = 0; i < N; ++i) own = own + H[i] * H[i] * M[i][i], S = S + H[i] * MH[i];
+        if (value_of(S) < value_of(R)) S = R;
+        if (value_of(S) < ROUNDING * value_of(own)) S = ROUNDING * own;
+    }
+};
+
+// K = M H^T / S, and M <- (I - K H) M (I - K H)^T + K R K^T. Returns K.
+//
+// The smoother uses it for its dual, too. A state that H does not see and that shares nothing with the others changes no
+// bit of theirs. A quotient is exactly 1 where a prior is all there is to S; a product with 1/S would leave a variance
+// below 0.
+template <int N, class Real>
+Vector<N, Real> joseph(Matrix<N, Real>& M, const Vector<N, Real>& H, const Along<N, Real>& along, Real R) {
+    Vector<N, Real> K, WH{};
+    for (int i = 0; i < N; ++i) K[i] = along.MH[i] / along.S;
+    for (int i = 0; i < N; ++i)  // W = (I - K H) M, and W H^T
+        for (int j = 0; j < N; ++j) M[i][j] = M[i][j] - K[i] * along.MH[j], WH[i] = WH[i] + M[i][j] * H[j];
+    for (int i = 0; i < N; ++i)  // W - W H^T K^T + K R K^T; the last apart, or a wide prior would round it away
+        for (int j = 0; j <= i; ++j) {
+            const Real left = M[i][j] - WH[i] * K[j] + M[j][i] - WH[j] * K[i];
+            M[i][j] = M[j][i] = 0.5 * left + K[i] * R * K[j];
+        }
+    for (int i = 0; i < N; ++i)  // rounding beside a prior 1e16 times as wide: known, as far as doubles go
+        if (value_of(M[i][i]) < 0.0)
+            for (int j = 0; j < N; ++j) M[i][j] = M[j][i] = 0.0;
+    return K;
+}
+
+// What is known of the residual of one axis.
+template <int N, class Real>
+struct Noise {
+    Real input_noise, drift, maneuver_noise, maneuver_drift;  // as pf_axis has them
+    bool maneuvers;                                           // whether they count
+    Smoothness smoothness = Smoothness::none;
+    Real lambda = 0.0;              // 1/s, of the disturbance
+    int biases = FIRST_BIAS;        // the first bias
+    int size = FIRST_BIAS;          // how many states there are
+    Vector<N, Real> reverting{};    // how fast each state reverts to 0 [1/s]; 0: it stays
+    Vector<N, Real> variance{};     // of each at the start, and of what reverts for ever [m^2]
+
+    Noise() = default;
+
+    explicit Noise(const Axis<Real>& axis)
+        : input_noise(axis.input_noise), drift(axis.drift), maneuver_noise(axis.maneuver_noise),
+          maneuver_drift(axis.maneuver_drift),
+          maneuvers(value_of(maneuver_noise) != 0.0 || value_of(maneuver_drift) != 0.0) {
+        variance[OFFSET] = square(axis.offset_sd);
+        if (value_of(axis.disturbance_sd) == 0.0) return;
+        smoothness = value_of(axis.smoothness) > 1.0 ? Smoothness::smooth : Smoothness::rough;
+        lambda = (smoothness == Smoothness::smooth ? std::sqrt(3.0) : 1.0) / axis.disturbance_time;
+        add(lambda, square(axis.disturbance_sd));
+        if (smoothness == Smoothness::smooth) add(lambda, square(lambda * axis.disturbance_sd));
+        biases = size;
+    }
+
+    bool smooth() const { return DISTURBANCE + 1 < N && smoothness == Smoothness::smooth; }
+
+    // One more state; returns which.
+    int add(Real rate, Real at_first) {
+        reverting[size] = rate, variance[size] = at_first;
+        return size++;
+    }
+};
+
+template <int N, class Real>
+struct Residual {
+    Instant<Real> time;
+    Real q = 0.0, drift = 0.0;  // densities squared in force: input noise [m^2 s] and the offset's drift [m^2/s]
+    Vector<N, Real> x{};
+    Matrix<N, Real> P{};
+
+    Residual() = default;
+
+    Residual(const Noise<N, Real>& noise, const Instant<Real>& origin) : time(origin) {
+        apply_maneuver(noise, 0.0);
+        for (int i = 0; i < N; ++i) P[i][i] = noise.variance[i];
+    }
+
+    void apply_maneuver(const Noise<N, Real>& noise, double maneuver) {
+        q = square(noise.input_noise) + square(noise.maneuver_noise * maneuver);
+        drift = square(noise.drift) + square(noise.maneuver_drift * maneuver);
+    }
+
+    // x <- F x and P <- F P F^T + Q; f is of the plant over the interval.
+    void predict(const Noise<N, Real>& noise, const Transition<Real>& f, const Instant<Real>& to) {
+        using std::exp, std::expm1;
+        const Real dt = seconds(time, to);
+        const Real p = x[PLANT], v = x[RATE];
+        x[PLANT] = f.f11 * p + f.f12 * v, x[RATE] = f.f21 * p + f.f22 * v;
+        move_pair<N, Real>(P, PLANT, f.f11, f.f12, f.f21, f.f22);
+        add_pair(PLANT, q * f.q11, q * f.q12, q * f.q22);
+        P[OFFSET][OFFSET] = P[OFFSET][OFFSET] + drift * dt;
+        int i = DISTURBANCE;
+        if (noise.smooth()) {
+            const Transition<Real> d = smooth_disturbance(noise.lambda, dt);
+            const Real variance = noise.variance[DISTURBANCE], was = x[i], rate = x[i + 1];
+            x[i] = d.f11 * was + d.f12 * rate, x[i + 1] = d.f21 * was + d.f22 * rate;
+            move_pair<N, Real>(P, i, d.f11, d.f12, d.f21, d.f22);
+            add_pair(i, variance * d.q11, variance * d.q12, variance * d.q22);
+            i += 2;
+        }
+        for (; i < noise.size; ++i) {
+            if (value_of(noise.reverting[i]) == 0.0) continue;
+            const Real left = exp(-noise.reverting[i] * dt);
+            x[i] = x[i] * left;
+            for (int j = 0; j < N; ++j) P[i][j] = P[i][j] * left, P[j][i] = P[j][i] * left;
+            P[i][i] = P[i][i] - noise.variance[i] * expm1(-2.0 * noise.reverting[i] * dt);
+        }
+        time = to;
+    }
+
+    void predict(const Plant<Real>& plant, const Noise<N, Real>& noise, const Instant<Real>& to) {
+        const Real dt = seconds(time, to);
+        if (!is_zero(dt)) predict(noise, plant.over(dt), to);
+    }
+
+    Real along(const Vector<N, Real>& h) const {  // h x
+        Real sum = 0.0;
+        for (int i = 0; i < N; ++i) sum = sum + h[i] * x[i];
+        return sum;
+    }
+
+    // x <- x + K nu and P <- (I - K H) P (I - K H)^T + K R K^T. Returns K.
+    Vector<N, Real> update(const Vector<N, Real>& H, const Along<N, Real>& along, Real nu, Real R) {
+        const Vector<N, Real> K = joseph<N, Real>(P, H, along, R);
+        for (int i = 0; i < N; ++i) x[i] = x[i] + K[i] * nu;
+        return K;
+    }
+
+    void add_pair(int i, Real q11, Real q12, Real q22) {
+        P[i][i] = P[i][i] + q11, P[i + 1][i + 1] = P[i + 1][i + 1] + q22;
+        P[i][i + 1] = P[i + 1][i] = P[i][i + 1] + q12;
+    }
+};
+
+// h, which makes the position of the states.
+template <int N, class Real>
+Vector<N, Real> position_of(const Noise<N, Real>& noise) {
+    Vector<N, Real> h{};
+    h[PLANT] = h[OFFSET] = 1.0;
+    if (noise.smoothness != Smoothness::none) h[DISTURBANCE] = 1.0;
+    return h;
+}
+
+// h (Phi - I): what the states make of a motion over dt [s].
+template <int N, class Real>
+Vector<N, Real> motion_of(const Plant<Real>& plant, const Noise<N, Real>& noise, Real dt) {
+    using std::expm1;
+    const Transition<Real> f = plant.over(dt);
+    Vector<N, Real> h{};
+    h[PLANT] = f.f11 - 1.0, h[RATE] = f.f12;
+    if (noise.smoothness == Smoothness::rough) h[DISTURBANCE] = expm1(-noise.lambda * dt);
+    if (noise.smooth()) {
+        const Transition<Real> d = smooth_disturbance(noise.lambda, dt);
+        h[DISTURBANCE] = d.f11 - 1.0, h[DISTURBANCE + 1] = d.f12;
+    }
+    return h;
+}
+
+// The states that make the position: where these alone count, biases do not.
+template <int N, class Real>
+Real variance_along(const Matrix<N, Real>& P, const Vector<N, Real>& h) {
+    Real variance = 0.0;
+    for (int i = 0; i < N; ++i)
+        for (int j = 0; j < N; ++j) variance = variance + h[i] * P[i][j] * h[j];
+    return value_of(variance) > 0.0 ? variance : Real(0.0);
+}
+
+}  // namespace pumafuse

@@ -1,0 +1,59 @@
+// The response r: what the commands do to an axis. Known, without noise. Another plant is another response.
+#pragma once
+#include "plant.hpp"
+
+namespace pumafuse {
+
+// Gain and plant of an axis. The gain error e is what K(speed) adds to each step; it decays with the recovery.
+template <class Real>
+struct Arm {
+    Plant<Real> plant;
+    Real slope, intercept, decay;  // s/m, 1, 1/s
+    double period;                 // s
+
+    Arm() = default;
+    explicit Arm(const Axis<Real>& axis)
+        : plant(axis), slope(axis.slope), intercept(axis.intercept), decay(axis.recovery), period(value_of(axis.period)) {
+        if (value_of(decay) > 0.0) decay = 1.0 / decay;
+    }
+
+    Real gain_error(double step) const { return (slope * (std::fabs(step) / period) + intercept - 1.0) * step; }
+};
+
+template <class Real>
+struct Response {
+    Instant<Real> time;
+    double start = 0.0;          // u0 [m] as logged; all else is relative to it. NaN: not known
+    double u = 0.0, step = 0.0;  // the command in force and the step that it was [m]
+    Real error = 0.0;            // the gain error e now [m]
+    Real x = 0.0, rate = 0.0;    // m, m/s
+
+    // x <- u + Phi (x - u) + Gamma_e e
+    void predict(const Arm<Real>& arm, const Transition<Real>& f, const Instant<Real>& to) {
+        const Real dt = seconds(time, to), gap = x - u, before = rate;
+        x = u + (f.f11 * gap + f.f12 * before), rate = f.f21 * gap + f.f22 * before;
+        if (!is_zero(error)) {
+            const Decay<Real> by = arm.plant.decaying(f, arm.decay, dt);
+            x = x + by.position * error, rate = rate + by.rate * error, error = error * by.left;
+        }
+        time = to;
+    }
+
+    void predict(const Arm<Real>& arm, const Instant<Real>& to) {
+        const Real dt = seconds(time, to);
+        if (!is_zero(dt)) predict(arm, arm.plant.over(dt), to);
+    }
+
+    // From now on u is `command` [m] as logged. Returns the maneuver |u_n - 2 u_(n-1) + u_(n-2)| / T [m/s].
+    double command(const Arm<Real>& arm, double command) {
+        const double next = command - start, now = next - u, maneuver = std::fabs(now - step) / arm.period;
+        error = error + arm.gain_error(now);
+        u = next, step = now;
+        return maneuver;
+    }
+
+    // Where it would be if nothing were held back: C (A x + B (u + e)) of a plant of first order.
+    Real speed(const Arm<Real>& arm) const { return arm.plant.order == 1 ? arm.plant.rate * (u + error - x) : rate; }
+};
+
+}  // namespace pumafuse

@@ -1,0 +1,183 @@
+// The smoother: what all later measurements say of the residual, carried backward as information. The response is known,
+// so that nothing later changes it.
+//
+// In the deviation delta from the filter's mean the later measurements' likelihood is exp(-½ delta' M delta + eta' delta).
+// From the last event backward, M = 0 and eta = 0 at first:
+//     over an interval   eta <- F' (I + M Q)^-1 eta,          M <- F' (I + M Q)^-1 M F
+//     over an update     eta <- eta + M K nu + H' nu / R,     M <- M + H' H / R
+// and with the filter's covariance P the smoothed state is x + P_s eta with P_s = (I + P M)^-1 P. No covariance is
+// inverted (the predicted one is singular: some states are known), and P_s is not a difference, as P - P Lambda P would be
+// in the Bryson-Frazier form: with a wide prior that loses the error bars altogether. Each product with an inverse is a
+// row of updates of rank one: noise enters M as measurements enter P.
+// (Fraser & Potter, "The optimum linear smoother as a combination of two optimum linear filters", IEEE Trans. AC 14(4),
+// 1969.)
+#pragma once
+#include "filter.hpp"
+
+namespace pumafuse {
+
+template <int N>
+struct Later {
+    Vector<N, double> eta{};
+    Matrix<N, double> M{};
+
+    void over_interval(const Arm<double>& arm, const Noise<N, double>& noise, double dt, double q, double drift) {
+        const Transition<double> f = arm.plant.over(dt);
+        over_pair(PLANT, f, q);
+        through_noise(OFFSET, std::sqrt(drift * dt));
+        int i = DISTURBANCE;
+        if (noise.smooth()) {
+            over_pair(i, smooth_disturbance(noise.lambda, dt), noise.variance[i]);
+            i += 2;
+        }
+        for (; i < noise.size; ++i) {
+            if (noise.reverting[i] == 0.0) continue;
+            const double fading = -noise.reverting[i] * dt, left = std::exp(fading);
+            through_noise(i, std::sqrt(-noise.variance[i] * std::expm1(2.0 * fading)));
+            eta[i] *= left;
+            for (int j = 0; j < N; ++j) M[i][j] *= left, M[j][i] *= left;
+        }
+    }
+
+    void over_update(const Vector<N, double>& H, const Entry<N>& update) {
+        for (int i = 0; i < N; ++i) {
+            for (int j = 0; j < N; ++j) eta[i] += M[i][j] * update.K[j] * update.nu;
+            eta[i] += H[i] * update.nu / update.R;
+        }
+        for (int i = 0; i < N; ++i)
+            for (int j = 0; j < N; ++j) M[i][j] += H[i] * H[j] / update.R;
+        through_noise(OFFSET, std::sqrt(update.widened));  // what re-acquiring added
+    }
+
+    // x <- x + P_s eta and P <- P_s: M = L L' and eta = L y, a column of L after the other is a measurement with unit
+    // noise. P_s eta itself would lose a wide prior.
+    void smooth(Residual<N, double>& xi) const {
+        auto [L, y] = root();
+        for (int k = 0; k < N; ++k) {
+            const Vector<N, double> K = xi.update(L[k], Along<N, double>(xi.P, L[k], 1.0), y[k], 1.0);
+            for (int m = k + 1; m < N; ++m)
+                for (int i = 0; i < N; ++i) y[m] -= L[m][i] * K[i] * y[k];
+        }
+    }
+
+  private:
+    // Through the noise of the states i and i + 1, as two independent parts, and back over their transition.
+    void over_pair(int i, const Transition<double>& f, double variance) {
+        const double first = std::sqrt(variance * f.q11), both = first > 0.0 ? variance * f.q12 / first : 0.0;
+        through_noise(i, first, both);
+        through_noise(i + 1, std::sqrt(std::max(variance * f.q22 - both * both, 0.0)));
+        const double p = eta[i], v = eta[i + 1];
+        eta[i] = f.f11 * p + f.f21 * v, eta[i + 1] = f.f12 * p + f.f22 * v;
+        move_pair<N, double>(M, i, f.f11, f.f21, f.f12, f.f22);
+    }
+
+    // Unit noise that enters state i by `first` and the next one by `second`, G: M <- M - M G G' M / S, S = 1 + G' M G.
+    void through_noise(int i, double first, double second = 0.0) {
+        if (first == 0.0 && second == 0.0) return;
+        Vector<N, double> MG;
+        for (int j = 0; j < N; ++j) MG[j] = first * M[j][i] + (second != 0.0 ? second * M[j][i + 1] : 0.0);
+        const double S = 1.0 + first * MG[i] + (second != 0.0 ? second * MG[i + 1] : 0.0);
+        const double seen = first * eta[i] + (second != 0.0 ? second * eta[i + 1] : 0.0);
+        for (int j = 0; j < N; ++j) {
+            const double K = MG[j] / S;
+            eta[j] -= K * seen;
+            for (int l = 0; l <= j; ++l) M[j][l] = M[l][j] = M[j][l] - K * MG[l];
+        }
+    }
+
+    struct Root {
+        Matrix<N, double> L{};  // its rows are the columns
+        Vector<N, double> y{};
+    };
+
+    // The state with the largest share of its own information left comes first: M says nothing of some states, or of
+    // their differences, and in another order a pivot of rounding would be divided by.
+    Root root() const {
+        constexpr double NOTHING = 1e-15;  // of a pivot, below which it is rounding
+        auto [L, y] = Root{};
+        Vector<N, double> left;
+        for (int i = 0; i < N; ++i) left[i] = M[i][i];
+        for (int k = 0; k < N; ++k) {
+            int pivot = -1;
+            double most = NOTHING;
+            for (int i = 0; i < N; ++i)
+                if (left[i] > most * M[i][i]) pivot = i, most = left[i] / M[i][i];
+            if (pivot < 0) break;
+            L[k][pivot] = std::sqrt(left[pivot]), left[pivot] = 0.0, y[k] = eta[pivot];
+            for (int m = 0; m < k; ++m) y[k] -= y[m] * L[m][pivot];
+            y[k] /= L[k][pivot];
+            for (int i = 0; i < N; ++i) {
+                if (!(left[i] > 0.0)) continue;
+                L[k][i] = M[i][pivot];
+                for (int m = 0; m < k; ++m) L[k][i] -= L[m][i] * L[m][pivot];
+                L[k][i] /= L[k][pivot], left[i] -= L[k][i] * L[k][i];
+            }
+        }
+        return {L, y};
+    }
+};
+
+// The filter's own estimate of an axis at an instant.
+template <int N>
+struct Filtered {
+    double r;
+    Residual<N, double> residual;
+};
+
+// How many entries the history of an axis may have.
+inline std::size_t updates(const Table& rows, Time axis, bool maneuvers) {
+    std::size_t count = 0;
+    for (Time row = 0; row < rows.events.count; ++row)
+        count += rows[row].known[axis] == PF_FUSED && (maneuvers || !rows[row].is_command());
+    return count;
+}
+
+// All events, and at each of n times what all measurements say: forward, keeping what happened and the states at the
+// estimates, then backward, axis by axis.
+template <int N>
+void run_smoothed(const Filter<N>& filter, State<N, double>& state, const Table& rows, Time n, const Time* times,
+                  double* outputs) {
+    const Time A = filter.size(), count = rows.events.count;
+    typename Filter<N>::History history(A);
+    for (Time a = 0; a < A; ++a) history[a].reserve(updates(rows, a, filter.axes[a].noise.maneuvers));
+    std::vector<Filtered<N>> at;
+    at.reserve(A * n);
+    const Time origin = A ? state.axes[0].response.time.ns : 0;
+    Time row = 0;
+    for (Time k = 0; k <= n; ++k) {
+        for (; row < count && (k == n || rows.events.time[row] <= times[k]); ++row)
+            filter.step(state, rows[row], rows.fate(row), false, &history);
+        for (Time a = 0; a < A && k < n; ++a) {
+            const AxisState<N, double> now = filter.at(state.axes[a], a, times[k]);
+            at.push_back({now.response.x, now.residual});
+        }
+    }
+    for (Time a = 0; a < A; ++a) {
+        const auto& axis = filter.axes[a];
+        Later<N> later;
+        Time k = n - 1;
+        const auto smoothed = [&] {
+            double found[PF_OUTPUTS];
+            Filter<N>::describe(axis, at[k * A + a].r, at[k * A + a].residual, found);
+            for (int i = 0; i < PF_OUTPUTS; ++i) outputs[(i * A + a) * n + k] = found[i];
+        };
+        for (; k >= 0 && (history[a].empty() || times[k] >= history[a].back().time); --k) smoothed();  // nothing is later
+        for (auto entry = history[a].rbegin(); entry != history[a].rend(); ++entry) {
+            if (entry->sensor != NOBODY) later.over_update(filter.H[entry->sensor * A + a], *entry);
+            const Time before = entry + 1 != history[a].rend() ? entry[1].time : origin;
+            Time here = entry->time;
+            const auto back_to = [&](Time there) {
+                if (here > there) later.over_interval(axis.arm, axis.noise, double(here - there) / 1e9, entry->q, entry->drift);
+                here = there;
+            };
+            for (; k >= 0 && times[k] >= before; --k) {
+                back_to(times[k]);
+                later.smooth(at[k * A + a].residual);
+                smoothed();
+            }
+            back_to(before);
+        }
+    }
+}
+
+}  // namespace pumafuse

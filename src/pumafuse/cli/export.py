@@ -1,0 +1,51 @@
+"""`pumafuse export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from ..errors import ConfigError, warn
+from ..folders import FolderError, write_file
+from ..fusion.config import FusionConfig
+from ..live.estimator import LiveEstimator
+from ..live.export import MARK, header, identifier
+
+
+def run(config: Path, output: Path, force: bool) -> None:
+    """Write a configuration as a C header.
+
+    Args:
+        config: The ``fusion.toml``.
+        output: The header; what it is called is what the names in it begin with.
+        force: Replace an earlier one.
+
+    Raises:
+        PumafuseError: The configuration is wrong or cannot be followed live, or the file is in the way.
+    """
+    if output.exists():
+        _check_replaceable(output, force)
+    name = identifier(output.stem)
+    if name.lower() in ("pf", "pumafuse"):
+        raise ConfigError(f"{output}: its names would be those of pumafuse.h; choose another")
+    known = FusionConfig.load(config)
+    if not known.sensors:
+        raise ConfigError(f"{config}: has no sensor: without one there is nothing to fuse")
+    LiveEstimator(known)  # refuses what it cannot follow
+    warn(known.arm.doubts())
+    write_file(output, header(known, name, str(config)), replace=force)
+    axes = ", ".join(known.arm.axes)
+    typer.echo(f"{name}_model, of {axes} measured by {', '.join(known.sensors)}, written to {output}")
+    if known.frame is not None:
+        typer.echo(f"it is in the arm's axes: turning x, y, z into {axes}, as [frame] says, is left to the controller")
+
+
+def _check_replaceable(path: Path, force: bool) -> None:
+    """Refuse to replace what is no header of ours, also with --force: its name may be a slip."""
+    if not path.is_file() or not path.read_bytes().startswith(MARK.encode()):
+        raise FolderError(
+            f"{path}: exists and is no header of pumafuse export, which is not ours to replace; choose another"
+        )
+    if not force:
+        raise FolderError(f"{path}: exists; --force replaces it")

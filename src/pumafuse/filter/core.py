@@ -1,0 +1,285 @@
+"""The filter's core, a library in C++: its interface is ``core/include/pumafuse.h``, its algebra ``core/``.
+
+Arrays go in and come out; they are the caller's. The interpreter is free while the core runs.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from collections.abc import Sequence
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import BoolArray, CodeArray, FloatArray, TimeArray
+from ..errors import PumafuseError
+from .events import Events, Results
+
+VERSION = 3  # of the interface
+LIBRARY = Path(__file__).with_name("_core" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
+Record = npt.NDArray[np.void]  # an array of structs
+
+
+def _numbers(*names: str) -> np.dtype[np.void]:
+    return np.dtype([(name, np.float64) for name in names])
+
+
+AXIS = _numbers(
+    *("period", "delay", "time_constant", "natural_frequency", "damping", "slope", "intercept", "recovery"),
+    *("input_noise", "drift", "maneuver_noise", "maneuver_drift"),
+    *("disturbance_sd", "disturbance_time", "smoothness", "offset_sd", "start"),
+)
+SENSOR = _numbers("scale", "latency", "latency_sd", "gate", "gate_rows")
+VIEW = _numbers("sd", "bias_sd", "bias_drift_sd", "bias_time", "turn")
+
+
+class Output(IntEnum):
+    """What an estimate says of an axis, relative to its start level; first index of outputs, (8, A, n)."""
+
+    POSITION = 0  # p [m]
+    POSITION_SD = 1
+    VELOCITY = 2  # mean over the coming update period [m/s]
+    VELOCITY_SD = 3
+    OFFSET = 4  # o [m]
+    OFFSET_SD = 5
+    DISTURBANCE = 6  # d [m]; 0 where the model has none
+    DISTURBANCE_SD = 7
+
+
+class Model(NamedTuple):
+    """What the filter knows of A axes and S sensors: records of ``pf_axis``, ``pf_sensor`` and ``pf_view``.
+
+    Attributes:
+        axis: (A,).
+        sensor: (S,).
+        view: What each sensor sees of each axis, (S, A).
+    """
+
+    axis: Record
+    sensor: Record
+    view: Record
+
+
+def struct(counts: Sequence[str], arrays: Sequence[str]) -> type[ctypes.Structure]:
+    """A struct of the interface: some counts, then some arrays."""
+    integers, pointers = ([(name, kind) for name in names] for names, kind in ((counts, _INT64), (arrays, _POINTER)))
+    return type("Struct", (ctypes.Structure,), {"_fields_": [*integers, *pointers]})
+
+
+_INT64, _POINTER = ctypes.c_int64, ctypes.c_void_p
+_Model = struct(["axes", "sensors"], Model._fields)
+_Events = struct(["count"], Events._fields)
+_Results = struct([], Results._fields)
+_KINDS = {"p": _POINTER, "n": _INT64, "d": ctypes.c_double, "i": ctypes.c_int, "u": ctypes.c_uint64}
+_FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double, int, uint64; v: nothing
+    "transition": "vpdp",
+    "response": "vpnppnpp",
+    "classify": "vppnpp",
+    "constant_velocity": "vnppnppp",
+    "filter_new": "ppn",
+    "filter_free": "vp",
+    "filter_run": "vppnnipnpp",
+    "filter_run_as_live": "ipppnpp",
+    "filter_smooth": "ipppnpp",
+    "filter_bias": "ipnnp",
+    "linearise": "ippnnpppp",
+    "live_new": "ppnnp",
+    "live_free": "vp",
+    "live_port": "pp",
+    "live_measurement": "ipnnunn",
+    "live_command": "ipnun",
+    "live_estimate": "vpnnpp",
+    "live_commands": "vpnppp",
+    "live_forget": "ipn",
+    "live_count_late": "vpnnnn",
+    "live_counters": "ipp",
+}
+
+
+def _loaded() -> ctypes.CDLL:
+    """The library.
+
+    Raises:
+        PumafuseError: It is not there, does not load, or is of another version.
+    """
+    again = "install pumafuse again (in a checkout: make .venv/.ready)"
+    try:
+        library = ctypes.CDLL(str(LIBRARY))
+        if (version := library.pf_version()) != VERSION:
+            raise PumafuseError(f"{LIBRARY}: the filter's core has interface {version}, this is for {VERSION}: {again}")
+        library.pf_error.restype = ctypes.c_char_p
+        for name, (result, *arguments) in _FUNCTIONS.items():
+            function = getattr(library, f"pf_{name}")
+            function.restype, function.argtypes = _KINDS.get(result), [_KINDS[one] for one in arguments]
+    except (OSError, AttributeError) as error:
+        raise PumafuseError(f"{LIBRARY}: the filter's core does not load ({error}): {again}") from None
+    return library
+
+
+library = _loaded()
+
+
+def at(array: np.ndarray) -> int:
+    """Where an array begins in memory; it must lie there as a whole."""
+    assert array.flags.c_contiguous
+    return array.ctypes.data
+
+
+def checked(result: Any) -> Any:
+    """What a call returned.
+
+    Raises:
+        PumafuseError: The call failed.
+    """
+    if result is None or result < 0:
+        raise PumafuseError(f"the filter stops: {library.pf_error().decode()}")
+    return result
+
+
+def struct_of(model: Model) -> ctypes.Structure:
+    """A model as the core takes it, whose arrays must live as long."""
+    return _Model(len(model.axis), len(model.sensor), *map(at, model))
+
+
+def _tables(events: Events, results: Results) -> tuple[Any, Any]:
+    return ctypes.byref(_events_of(events)), ctypes.byref(_Results(*map(at, results)))
+
+
+def _events_of(events: Events) -> ctypes.Structure:
+    pointers = [at(part) for part in events]
+    pointers[Events._fields.index("spread")] *= len(events.spread) > 0
+    return _Events(len(events.time), *pointers)
+
+
+class Filter:
+    """A filter over recorded events, whose state goes on from one call to the next."""
+
+    def __init__(self, model: Model, origin: int) -> None:
+        """At rest at the instant ``origin`` [ns].
+
+        Raises:
+            PumafuseError: An axis has more states than the core is made for.
+        """
+        self._axes = len(model.axis)
+        self._core: int | None = None
+        self._core = checked(library.pf_filter_new(ctypes.byref(struct_of(model)), origin))
+
+    def __del__(self) -> None:
+        if self._core is not None:
+            library.pf_filter_free(self._core)
+
+    def run(
+        self,
+        events: Events,
+        results: Results,
+        times: TimeArray,
+        span: tuple[int, int] | None = None,
+        given: bool = False,
+    ) -> FloatArray:
+        """Events in their order, and an estimate at each of ``times`` by the events until then.
+
+        Args:
+            events: All of them.
+            results: Gets what became of each measurement; has, where ``given``, the outcomes to repeat.
+            times: Of the estimates, int64 ns, ascending, (n,).
+            span: The first event that is run, and the one after the last; an estimate knows commands behind it, too.
+            given: Whether outcomes are repeated, whatever a gate would say.
+
+        Returns:
+            Outputs by :class:`Output`, axis and time, (8, A, n).
+        """
+        outputs, (table, fates) = np.zeros((len(Output), self._axes, len(times))), _tables(events, results)
+        begin, end = span or (0, len(events.time))
+        library.pf_filter_run(self._core, table, begin, end, given, fates, len(times), at(times), at(outputs))
+        return outputs
+
+    def run_as_live(self, events: Events, results: Results, times: TimeArray) -> FloatArray:
+        """The same, each estimate by those events that had arrived by then."""
+        return self._whole(library.pf_filter_run_as_live, events, results, times)
+
+    def smooth(self, events: Events, results: Results, times: TimeArray) -> FloatArray:
+        """The same, each estimate by all measurements."""
+        return self._whole(library.pf_filter_smooth, events, results, times)
+
+    def _whole(self, call: Any, events: Events, results: Results, times: TimeArray) -> FloatArray:
+        outputs = np.zeros((len(Output), self._axes, len(times)))
+        checked(call(self._core, *_tables(events, results), len(times), at(times), at(outputs)))
+        return outputs
+
+    def bias(self, sensor: int, axis: int) -> tuple[float, float] | None:
+        """Mean and sd [m] of the constant bias of a sensor on an axis; None where none is in the state."""
+        found = np.empty(2)
+        return (
+            (float(found[0]), float(found[1])) if library.pf_filter_bias(self._core, sensor, axis, at(found)) else None
+        )
+
+
+def linearise(
+    model: Model, tangents: Sequence[Model], origin: int, events: Events, results: Results
+) -> tuple[FloatArray, FloatArray]:
+    """Innovations while the outcomes in ``results`` are repeated, and how they change with k parameters.
+
+    Args:
+        model: Axes and sensors.
+        tangents: The derivatives of all its numbers by each parameter.
+        origin: The first command, int ns.
+        events: In their order.
+        results: Has the outcomes, gets innovations and their sd.
+
+    Returns:
+        Derivatives of ν and of S, (k, n, A) each.
+    """
+    d_nu, d_s = np.zeros((2, len(tangents), *events.known.shape))
+    models = struct_of(model), (_Model * len(tangents))(*map(struct_of, tangents))
+    tables = *_tables(events, results), at(d_nu), at(d_s)
+    checked(library.pf_linearise(*map(ctypes.byref, models), len(tangents), origin, *tables))
+    return d_nu, d_s
+
+
+def classify(model: Model, events: Events, origin: int, too_late: BoolArray) -> CodeArray:
+    """What each value of a table is before the filter sees it, (n, A).
+
+    Args:
+        model: Axes and sensors.
+        events: In their order.
+        origin: The first command, int ns.
+        too_late: Rows far behind earlier ones, (n,).
+    """
+    known = np.empty_like(events.known)
+    structs = ctypes.byref(struct_of(model)), ctypes.byref(_events_of(events))
+    library.pf_classify(*structs, origin, at(too_late), at(known))
+    return known
+
+
+def transition(axis: Record, dt: float) -> FloatArray:
+    """Φ11, Φ12, Φ21, Φ22, Q11, Q12, Q22 of an axis (1,) over ``dt`` [s]; its gain error's part."""
+    found = np.empty(17)
+    library.pf_transition(at(axis), dt, at(found))
+    return found[:10]
+
+
+def disturbance(rate: float, dt: float) -> FloatArray:
+    """Φ and Q of a smooth disturbance of variance 1 over ``dt`` [s]; ``rate`` is √3 / time [1/s]."""
+    axis, found = np.zeros(1, AXIS), np.empty(17)
+    axis["time_constant"], axis["disturbance_time"] = 1.0, np.sqrt(3.0) / rate
+    library.pf_transition(at(axis), dt, at(found))
+    return found[10:]
+
+
+def respond(axis: Record, acts: TimeArray, command: FloatArray, time: TimeArray) -> FloatArray:
+    """Where an axis (1,) goes without noise, relative to its start level [m], by commands that act at ``acts`` [ns]."""
+    position = np.empty(len(time))
+    library.pf_response(at(axis), len(acts), at(acts), at(command), len(time), at(time), at(position))
+    return position
+
+
+def constant_velocity(
+    time: FloatArray, value: FloatArray, density: FloatArray, square: FloatArray, innovation: FloatArray | None = None
+) -> None:
+    """Constant-velocity filters with R = 1 on measurements (n,): see ``pf_constant_velocity``."""
+    kept = None if innovation is None else at(innovation)
+    library.pf_constant_velocity(len(time), at(time), at(value), len(density), at(density), at(square), kept)

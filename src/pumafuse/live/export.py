@@ -1,0 +1,109 @@
+"""A configuration as a C header: the numbers that a program in C gives to the filter's core, ``pumafuse.h``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from importlib.metadata import version
+
+from ..filter.core import VERSION, Record
+from ..fusion.config import FusionConfig
+from ..fusion.setup import live_model
+
+MARK = "/* Made by pumafuse"  # what every header begins with
+_HEADER = """\
+{mark} {version} from {source}: make it anew rather than change it.
+ *
+ * Arm and sensors as `pumafuse live` has them, to the bit, in SI{frame}. pumafuse.h says what each number is.
+ */
+#ifndef {upper}_MODEL_H
+#define {upper}_MODEL_H
+
+#include <math.h>
+
+#include "pumafuse.h"
+
+#if PF_VERSION != {interface}
+#error "this is for interface {interface} of pumafuse.h: make it anew with the pumafuse that this one is of"
+#endif
+
+enum {{ {axes}, {upper}_AXES }};
+enum {{ {sensors}, {upper}_SENSORS }};
+
+static const pf_axis {name}_axis[{upper}_AXES] = {{
+{axis}}};
+
+static const pf_sensor {name}_sensor[{upper}_SENSORS] = {{
+{sensor}}};
+
+static const pf_view {name}_view[] = {{
+{view}}};
+
+static const pf_model {name}_model = {{{upper}_AXES, {upper}_SENSORS, {name}_axis, {name}_sensor, {name}_view}};
+
+#endif
+"""
+
+
+def header(config: FusionConfig, name: str, source: str) -> str:
+    """The text of a header with the numbers that :class:`.LiveEstimator` gives to the filter.
+
+    Args:
+        config: Arm, noise and sensors, of which there is one at least.
+        name: What each name in it begins with: letters, digits and underscores, no digit first.
+        source: Where the configuration is from.
+    """
+    axes, sensors, upper = tuple(config.arm.axes), tuple(config.sensors), name.upper()
+    axis, sensor, view = live_model(config)
+    return _HEADER.format(
+        mark=MARK,
+        version=version("pumafuse"),
+        source=_comment(source),
+        frame="" if config.frame is None else ", in the axes of the arm: its [frame] is not in here",
+        upper=upper,
+        name=name,
+        interface=VERSION,
+        axes=", ".join(_identifiers(f"{upper}_AXIS", axes)),
+        sensors=", ".join(_identifiers(f"{upper}_SENSOR", sensors)),
+        axis=_structs(axis, axes),
+        sensor=_structs(sensor, sensors),
+        view=_structs(view.ravel(), (f"{one} on {axis}" for one in sensors for axis in axes)),
+    )
+
+
+def identifier(text: str) -> str:
+    """A text as a name in C, with underscores for what no name in C may have."""
+    return re.sub(r"\W|^(?=\d)", "_", text, flags=re.ASCII)
+
+
+def _identifiers(prefix: str, names: Iterable[str]) -> list[str]:
+    """A constant of its own for each name."""
+    found: list[str] = []
+    for name in names:
+        one = identifier(f"{prefix}_{name}").upper()
+        while one in found:
+            one += "_"
+        found.append(one)
+    return found
+
+
+def _structs(records: Record, names: Iterable[str]) -> str:
+    """Initialisers of an array of structs, a line for each number."""
+    found = ""
+    for record, name in zip(records, names, strict=True):
+        fields = zip(record.dtype.names or (), record.tolist(), strict=True)
+        numbers = "".join(f"        .{field} = {_exact(number)}\n" for field, number in fields)
+        found += f"    {{ /* {_comment(name)} */\n{numbers}    }},\n"
+    return found
+
+
+def _exact(number: float) -> str:
+    """A double to the last bit: a compiler may round decimals as it likes, but no hexadecimal ones."""
+    if number != number:
+        return "NAN,"
+    return f"{number:.1f}," if number.is_integer() and abs(number) < 2**53 else f"{number.hex()}, /* {number!r} */"
+
+
+def _comment(text: str) -> str:
+    """A text that may stand in a comment."""
+    return text.replace("*/", "* /").replace("/*", "/ *")

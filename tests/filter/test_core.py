@@ -1,0 +1,265 @@
+"""The core against a textbook Kalman filter on whole matrices; and what must not change a bit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from pumafuse.arrays import FloatArray
+from pumafuse.errors import PumafuseError
+from pumafuse.filter.core import Filter, Model, Output, linearise
+from pumafuse.filter.events import COMMAND, Events, Results
+from pumafuse.filter.outcome import ABSENT, Outcome
+from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
+from pumafuse.fusion.setup import filter_model
+from pumafuse.model.arm import ArmModel, AxisModel, Gain
+from pumafuse.model.plants import PLANTS, FirstOrder, SecondOrder
+
+MS = 1_000_000  # ns
+T, START = 0.028, 0.5
+MANEUVER = Process(input_noise=0.2e-3, drift=0.5e-3, maneuver_noise=0.4e-3, maneuver_drift=5e-3)
+SMOOTH = Process(input_noise=0.2e-3, drift=0.5e-3, disturbance_sd=2e-3, disturbance_time=0.2)
+ROUGH = Process(maneuver_noise=0.4e-3, disturbance_sd=1e-3, disturbance_time=0.05, disturbance_kind="ou")
+SENSORS = {
+    "plain": Sensor(sd=1e-4, scale=-2.0, gate=0.0),
+    "biased": Sensor(sd=3e-4, bias_sd=5e-3, latency_sd=0.004, gate=0.0),
+    "drifting": Sensor(sd=3e-4, bias_sd=1e-3, bias_drift_sd=2e-3, bias_time=0.3, gate=0.0),
+}
+
+
+def of(plant: PLANTS, recovery: float | None = 0.15) -> AxisModel:
+    return AxisModel(plant=plant, gain=Gain(slope=0.08, intercept=0.93), gain_recovery=recovery)
+
+
+LAG = of(FirstOrder(time_constant=0.04))
+TURNING = of(SecondOrder(natural_frequency=45.0, damping=0.4))
+SLOW = of(SecondOrder(natural_frequency=30.0, damping=1.6))
+CRITICAL = of(SecondOrder(natural_frequency=45.0, damping=1.0))
+AXES = {
+    "lag": (LAG, MANEUVER),
+    "lag, disturbed": (LAG, SMOOTH),
+    "turning": (TURNING, MANEUVER),
+    "turning, rough": (TURNING, ROUGH),
+    "slow, disturbed": (SLOW, SMOOTH),
+    "critical": (CRITICAL, MANEUVER),
+    "critical, for good": (of(CRITICAL.plant, recovery=None), SMOOTH),
+}
+every_axis = pytest.mark.parametrize("axis", AXES)
+
+
+def config_of(
+    axes: Sequence[str], sensors: dict[str, Sensor] = SENSORS, process: Process | None = None, offset_sd: float = 5e-3
+) -> FusionConfig:
+    arm = ArmModel(name="an arm", update_period=T, delay=0.0, axes={axis: AXES[axis][0] for axis in axes})
+    each = {axis: process or AXES[axis][1] for axis in axes}
+    return FusionConfig(arm=arm, start=Start(offset_sd=offset_sd), process=each, sensors=sensors)
+
+
+def model_of(config: FusionConfig) -> Model:
+    """Every sensor measures every axis, with its bias."""
+    axes, names = tuple(config.arm.axes), list(config.sensors)
+    return filter_model(config, axes, names, dict.fromkeys(axes, START), [names] * len(axes))
+
+
+def any_events(config: FusionConfig, count: int = 80, seed: int = 1) -> Events:
+    """Commands, and measurements of all sensors, after gaps from a nanosecond to 0.3 s; each row is of all axes."""
+    rng, axes = np.random.default_rng(seed), len(config.arm.axes)
+    events = Events.empty(axes, count)
+    events.time[:] = events.stamp[:] = np.cumsum(rng.choice([1, MS, 10 * MS, 28 * MS, 300 * MS], count))
+    events.source[:] = rng.integers(COMMAND, len(config.sensors), count)
+    scale = np.array([*(sensor.scale for sensor in config.sensors.values()), 1.0])[events.source]  # -1: the last
+    events.value[:] = scale[:, None] * (START + rng.normal(0.0, 5e-3, (count, 1)))  # the same of every axis
+    events.known[:] = Outcome.FUSED
+    return events._replace(spread=rng.uniform(0.5, 2.0, (count, 1)).repeat(axes, axis=1))
+
+
+def run(config: FusionConfig, events: Events) -> tuple[FloatArray, Results, Filter]:
+    """Outputs at each event, by what was known until then."""
+    results, core = Results.room(*events.known.shape), Filter(model_of(config), 0)
+    return core.run(events, results, events.time), results, core
+
+
+# ---- the textbook ---------------------------------------------------------------------------------------------------
+
+
+class Textbook:
+    """One axis: position, rate, the input u, the gain error e, the offset, what is disturbed, biases: known or not."""
+
+    def __init__(self, config: FusionConfig, axis: str) -> None:
+        self.config, self.axis, self.process = config, config.arm.axes[axis], config.process[axis]
+        plant, process, recovery = self.axis.plant, self.process, self.axis.gain_recovery
+        smooth = process.disturbance_kind == "matern"
+        disturbed = (2 if smooth else 1) if process.disturbance_sd else 0
+        size = 5 + disturbed + sum((one.bias_sd > 0) + (one.bias_drift_sd > 0) for one in config.sensors.values())
+        self.x, self.h, self.noise = np.zeros((3, size))
+        self.P, self.A = np.zeros((2, size, size))
+        self.step = self.maneuver = 0.0
+        if isinstance(plant, FirstOrder):
+            self.A[0, [0, 2, 3]] = np.array([-1.0, 1.0, 1.0]) / plant.time_constant
+        else:
+            w = plant.natural_frequency
+            self.A[0, 1], self.A[1, :4] = 1.0, [-w * w, -2.0 * plant.damping * w, w * w, w * w]
+        self.B = self.A[:, 2].copy()
+        self.A[3, 3] = -1.0 / recovery if recovery else 0.0
+        self.P[4, 4] = config.start.offset_sd**2
+        self.h[[0, 4]] = 1.0
+        moving = [0]  # what the speed is made of
+        if disturbed:
+            self.h[5], self.P[5, 5] = 1.0, process.disturbance_sd**2
+            rate = (np.sqrt(3.0) if smooth else 1.0) / process.disturbance_time
+            if smooth:
+                moving.append(5)
+                self.A[5, 6], self.A[6, 5:7] = 1.0, [-(rate**2), -2.0 * rate]
+                self.P[6, 6], self.noise[6] = rate**2 * self.P[5, 5], 4.0 * rate**3 * self.P[5, 5]
+            else:
+                self.A[5, 5], self.noise[5] = -rate, 2.0 * rate * self.P[5, 5]
+        self.speed = self.A[moving].sum(axis=0)
+        self.H, at = list[FloatArray](), 5 + disturbed
+        for sensor in config.sensors.values():
+            self.H.append(sensor.scale * self.h)
+            if sensor.bias_drift_sd:
+                self.H[-1][at], self.P[at, at], self.A[at, at] = 1.0, sensor.bias_drift_sd**2, -1.0 / sensor.bias_time
+                self.noise[at], at = 2.0 * self.P[at, at] / sensor.bias_time, at + 1
+            if sensor.bias_sd:
+                self.H[-1][at], self.P[at, at], at = 1.0, sensor.bias_sd**2, at + 1
+
+    def over(self, dt: float) -> tuple[FloatArray, FloatArray]:
+        """Φ and Q: Van Loan's exponential of a short part, doubled."""
+        noise, process, size = np.diag(self.noise), self.process, len(self.x)
+        noise += (process.input_noise**2 + (process.maneuver_noise * self.maneuver) ** 2) * np.outer(self.B, self.B)
+        noise[4, 4] += process.drift**2 + (process.maneuver_drift * self.maneuver) ** 2
+        doublings = max(math.ceil(math.log2(np.abs(self.A).max() * dt)), 0)
+        power = expm(np.block([[-self.A, noise], [np.zeros_like(noise), self.A.T]]) * dt / 2.0**doublings)
+        F = power[size:, size:].T
+        Q = F @ power[:size, size:]
+        for _ in range(doublings):
+            F, Q = F @ F, F @ Q @ F.T + Q
+        return F, Q
+
+    def predict(self, dt: float) -> None:
+        F, Q = self.over(dt)
+        self.x, self.P = F @ self.x, F @ self.P @ F.T + Q
+
+    def command(self, value: float) -> None:
+        step, gain = value - START - self.x[2], self.axis.gain
+        self.maneuver, self.step = abs(step - self.step) / T, step
+        self.x[2] += step
+        self.x[3] += (gain.slope * abs(step) / T + gain.intercept - 1.0) * step
+
+    def measure(self, number: int, value: float, spread: float) -> tuple[float, float]:
+        """ν and √S."""
+        sensor, H = list(self.config.sensors.values())[number], self.H[number]
+        R = (spread * sensor.sd) ** 2 + (sensor.scale * (self.speed @ self.x) * sensor.latency_sd) ** 2
+        nu, S = value - sensor.scale * START - H @ self.x, H @ self.P @ H + R
+        K = self.P @ H / S
+        left = np.eye(len(self.x)) - np.outer(K, H)
+        self.x, self.P = self.x + K * nu, left @ self.P @ left.T + R * np.outer(K, K)
+        return nu, np.sqrt(S)
+
+    def outputs(self) -> list[float]:
+        F, Q = self.over(T)
+        ahead = self.h @ (F - np.eye(len(F)))
+        disturbed = self.process.disturbance_sd > 0.0
+        return [
+            self.h @ self.x, np.sqrt(self.h @ self.P @ self.h),
+            ahead @ self.x / T, np.sqrt(ahead @ self.P @ ahead + self.h @ Q @ self.h) / T,
+            self.x[4], np.sqrt(self.P[4, 4]),
+            disturbed * self.x[5], disturbed * np.sqrt(self.P[5, 5]),
+        ]  # fmt: skip
+
+
+@every_axis
+def test_predictions_and_updates_are_the_textbook_s(axis: str) -> None:
+    """ν, √S, every output after every event, and the biases: means to 1e-9 of their sd, error bars to 1e-9.
+
+    So Φ and Q are those of the exponential, with an input that is held and a gain error that decays; a command adds
+    (K − 1)·step to it and sets the noise by |u_n − 2u_(n−1) + u_(n−2)| / T; R grows with spread and with the speed
+    times the latency's spread; and an update is the Joseph form's.
+    """
+    config = config_of([axis])
+    events = any_events(config)
+    outputs, results, core = run(config, events)
+    book, time = Textbook(config, axis), 0
+    for row, (then, source) in enumerate(zip(events.time.tolist(), events.source.tolist(), strict=True)):
+        book.predict((then - time) / 1e9)
+        value, time = float(events.value[row, 0]), then
+        if source == COMMAND:
+            book.command(value)
+        else:
+            nu, sd = book.measure(source, value, float(events.spread[row, 0]))
+            assert results.innovation[row, 0] == pytest.approx(nu, abs=1e-9 * sd)
+            assert results.innovation_sd[row, 0] == pytest.approx(sd, rel=1e-9)
+        wanted = np.array(book.outputs()).reshape(-1, 2)
+        np.testing.assert_allclose(outputs[1::2, 0, row], wanted[:, 1], rtol=1e-9, atol=1e-30)
+        assert (np.abs(outputs[::2, 0, row] - wanted[:, 0]) <= 1e-9 * wanted[:, 1] + 1e-15).all()
+    for sensor, place in (("biased", -3), ("drifting", -1)):
+        bias = core.bias(list(SENSORS).index(sensor), 0)
+        assert bias == pytest.approx((book.x[place], np.sqrt(book.P[place, place])), rel=1e-8, abs=1e-12)
+    assert core.bias(0, 0) is None
+
+
+# ---- to the bit -----------------------------------------------------------------------------------------------------
+
+
+def test_what_a_measurement_does_not_see_keeps_its_bits() -> None:
+    """A bias that nobody has measured, an offset that is known, an axis that is not in the row."""
+    config = config_of(["turning", "lag"])
+    events = any_events(config)
+    events.known[:, 0][events.source == 2] = ABSENT
+    outputs, results, core = run(config, events)
+    assert core.bias(2, 0) == (0.0, SENSORS["drifting"].bias_sd)
+    assert core.bias(2, 1) != (0.0, SENSORS["drifting"].bias_sd)
+    seen = events.known[:, 0] == Outcome.FUSED
+    alone, others, _ = run(config_of(["turning"]), events.columns([0]).rows(np.flatnonzero(seen)))
+    np.testing.assert_array_equal(outputs[:, 0, seen], alone[:, 0])
+    np.testing.assert_array_equal(others.innovation[:, 0], results.innovation[seen, 0])
+    known = config_of(["turning"], process=Process(input_noise=1e-3, drift=0.0), offset_sd=0.0)
+    outputs, _, _ = run(known, events.columns([0]))
+    assert not outputs[[Output.OFFSET, Output.OFFSET_SD]].any()
+
+
+@pytest.mark.parametrize("beside", [1, 3, 6, 13, 30, 58])
+@every_axis
+def test_an_axis_beside_one_with_more_states_gives_the_same_bits(axis: str, beside: int) -> None:
+    """Whatever size the core takes for the two: outputs, innovations and their derivatives."""
+    plain = config_of([axis], {"plain": SENSORS["plain"]})
+    many = {"plain": SENSORS["plain"]} | {f"s{n}": Sensor(sd=1e-3, bias_sd=1e-3, gate=0.0) for n in range(beside)}
+    both = config_of([axis, "turning, rough" if axis != "turning, rough" else "lag"], many)
+    wide, model = any_events(both, 60 + 6 * beside), model_of(both)
+    model.view["bias_sd"][:, 0] = 0.0
+    wide.known[wide.source > 0, 0] = ABSENT
+    mine = np.flatnonzero(wide.source <= 0)
+    events, found = wide.rows(mine).columns([0]), Results.room(*wide.known.shape)
+    alone, results, _ = run(plain, events)
+    np.testing.assert_array_equal(Filter(model, 0).run(wide, found, wide.time)[:, 0, mine], alone[:, 0])
+    np.testing.assert_array_equal(found.innovation[mine, 0], results.innovation[:, 0])
+    np.testing.assert_array_equal(found.innovation_sd[mine, 0], results.innovation_sd[:, 0])
+    of_both = linearise(model, tangents(model), 0, wide, found)
+    of_one = linearise(model_of(plain), tangents(model_of(plain)), 0, events, results)
+    for one, other in zip(of_both, of_one, strict=True):
+        np.testing.assert_array_equal(one[:, mine, 0], other[:, :, 0])
+    assert all(one.any() for one in of_one[0])
+
+
+def tangents(model: Model) -> list[Model]:
+    """By the noise and the delay of the first axis, and by how well the first sensor sees it."""
+    found = [Model(*map(np.zeros_like, model)) for _ in range(3)]
+    found[0].axis["input_noise"][0] = found[1].axis["delay"][0] = found[2].view["sd"][0, 0] = 1.0
+    return found
+
+
+def test_more_states_than_the_core_is_made_for_are_refused() -> None:
+    """64 are filtered, one more is one line that says which limit it is."""
+    biased = {f"s{number}": Sensor(sd=1e-3, bias_sd=1e-3) for number in range(62)}
+    most, more = (config_of(["lag"], dict(list(biased.items())[:count])) for count in (61, 62))
+    outputs, _, core = run(most, any_events(most))
+    assert np.isfinite(outputs).all()
+    assert core.bias(60, 0) is not None
+    with pytest.raises(PumafuseError, match=r"^the filter stops: an axis has 65 states, of which 64 are the most"):
+        Filter(model_of(more), 0)
+    with pytest.raises(PumafuseError, match="65 states"):
+        linearise(model_of(more), [], 0, any_events(more), Results.room(80, 1))

@@ -1,0 +1,68 @@
+"""A library that is not there, or not the right one: one line that says what to do."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import pumafuse
+from executable import FUSION, SCAN
+from pumafuse.filter.core import LIBRARY, VERSION
+
+PACKAGE = Path(pumafuse.__file__).parent
+AGAIN = "install pumafuse again (in a checkout: make .venv/.ready)"
+
+
+@pytest.fixture
+def library(tmp_path: Path) -> Path:
+    """That of a copy of the package, which is not there yet."""
+    shutil.copytree(PACKAGE, tmp_path / "pumafuse", ignore=shutil.ignore_patterns("__pycache__", LIBRARY.name))
+    return tmp_path / "pumafuse" / "filter" / LIBRARY.name
+
+
+def said(library: Path, *words: object, code: int = 1) -> str:
+    """The only line that a command of the copy says."""
+    copy = os.environ | {"PYTHONPATH": str(library.parents[2])}
+    line = [sys.executable, "-m", "pumafuse", *map(str, words)]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=60, check=False, env=copy, cwd=library.parent)
+    assert done.returncode == code
+    (found,) = (done.stdout + done.stderr).splitlines()
+    return found
+
+
+FUSE = ("fuse", SCAN, "-c", FUSION, "-o", "out")
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no library"])
+def test_one_that_does_not_load(library: Path, content: bytes | None) -> None:
+    """None, an empty file, or anything else; what needs no filter works."""
+    if content is not None:
+        library.write_bytes(content)
+    line = said(library, *FUSE)
+    assert line.startswith(f"pumafuse: {library}: the filter's core does not load (")
+    assert line.endswith(f"): {AGAIN}")
+    assert said(library, "--version", code=0)
+    assert not (library.parent / "out").exists()
+
+
+def test_one_of_another_version(library: Path) -> None:
+    """A package that has been changed around it says which interface it found, and which it is for."""
+    shutil.copy(LIBRARY, library)
+    core = library.with_name("core.py")
+    text = core.read_text(encoding="utf-8")
+    core.write_text(text.replace(f"\nVERSION = {VERSION} ", f"\nVERSION = {VERSION + 1} "), encoding="utf-8")
+    wanted = f"the filter's core has interface {VERSION}, this is for {VERSION + 1}: {AGAIN}"
+    assert said(library, *FUSE) == f"pumafuse: {library}: {wanted}"
+
+
+def test_a_library_that_is_another_one(library: Path) -> None:
+    """It loads, but has no such functions."""
+    import _ctypes
+
+    shutil.copy(_ctypes.__file__, library)
+    assert said(library, *FUSE).endswith(AGAIN)

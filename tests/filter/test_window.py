@@ -1,0 +1,92 @@
+"""The core's window without what stands before it in a live estimator: of any size, fed with anything."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pumafuse as pf
+from pumafuse.arrays import ALWAYS
+from pumafuse.filter import window
+from pumafuse.filter.outcome import ABSENT, Outcome
+from pumafuse.filter.window import CAME, Window
+from pumafuse.fusion.setup import filter_model
+
+MS = 1_000_000  # ns
+T = 28 * MS
+PLANTS = (pf.FirstOrder(time_constant=0.05), pf.SecondOrder(natural_frequency=50.0, damping=0.8))
+SENSORS = {
+    "tracker": pf.Sensor(sd=1e-4, latency=0.008, gate=3.0),
+    "vision": pf.Sensor(sd=5e-4, latency=0.1, latency_sd=0.002, gate=2.0, gate_rows=False, bias_sd=1e-3),
+    "ahead": pf.Sensor(sd=3e-4, latency=-0.05, scale=-1.0, bias_drift_sd=1e-3),
+}
+WRONG = (np.nan, np.inf, -np.inf, 1e300, -3.4e38, 1e6)
+
+
+def empty(delays: tuple[float, ...]) -> Window:
+    axes = {f"axis {n}": pf.AxisModel(plant=PLANTS[n % 2], delay=delay) for n, delay in enumerate(delays)}
+    arm = pf.ArmModel(name="any", update_period=0.028, delay=0.06, axes=axes)
+    process = dict.fromkeys(axes, pf.Process(maneuver_noise=1e-3, maneuver_drift=1e-2))
+    config = pf.FusionConfig(arm=arm, sensors=SENSORS, process=process)
+    return Window(filter_model(config, tuple(axes), tuple(SENSORS), None, [["vision", "ahead"]] * len(axes)))
+
+
+@settings(derandomize=True, deadline=None, max_examples=150)
+@given(
+    st.integers(0, 2**32),
+    st.lists(st.sampled_from([0.0, 0.06, 0.5]), min_size=1, max_size=3),
+    st.sampled_from([(1, 1), (3, 3), (2, 8), (4, 100), (4096, 4096)]),
+)
+def test_a_window_of_any_size_takes_anything(seed: int, delays: list[float], rooms: tuple[int, int]) -> None:
+    """Rows early and late, values that are none, clocks set back: every row is counted, every estimate is a number."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(window, "FIRST_ROWS", rooms[0])
+        patch.setattr(window, "MOST_ROWS", rooms[1])
+        live = empty(tuple(delays))
+    rng, axes = np.random.default_rng(seed), len(delays)
+    now, came, values = int(rng.integers(-(10**18), 10**18)), np.zeros((2, 3), dtype=np.int64), 0
+    assert live.estimate(now) == [None] * axes
+    for _ in range(200):
+        now += int(rng.choice([0, 1, MS, T, 300 * MS]))
+        oldest = max(now - 1000 * MS, live.port.floor)
+        stamp = max(int(now - rng.choice([0, 0, 1, 5 * MS, 900 * MS])), oldest)
+        sensor, bits = int(rng.integers(-1, 3)), int(rng.integers(1, 2**axes))
+        for axis in range(axes):
+            level = -0.5 if sensor == 2 else 0.5
+            live.value[axis] = rng.choice(WRONG) if rng.random() < 0.05 else level + rng.normal(0.0, 3e-3)
+        if sensor < 0:
+            taken = live.add_command(stamp, bits, oldest)
+        elif taken := live.add_measurement(stamp, sensor, bits, now, oldest):
+            came[:, sensor] += 1, bits.bit_count()
+        for axis, code in enumerate(live.outcome):
+            assert not taken or (code == ABSENT) != bool(bits >> axis & 1)
+        assert 0 <= live.port.held <= live.port.room <= max(rooms[1], 4) * 2
+        for time in (stamp, now, now + 300 * MS):
+            for found in live.estimate(time, *([stamp] if rng.random() < 0.5 else [])):
+                if found is not None:
+                    assert np.isfinite(found[0]).all()
+                    assert min(found[0][1::2]) >= 0.0
+        if rng.random() < 0.01:
+            now = max(now - 200 * MS, live.port.floor)
+            live.forget(now)
+        values = live.counters().number
+    assert values[:, CAME].tolist() == came[0].tolist()
+    assert values[:, : len(Outcome)].sum(axis=1).tolist() == came[1].tolist()
+
+
+def test_commands_of_the_past_are_known_as_long_as_they_matter() -> None:
+    """Stamp, value and step of the last one stamped until any instant; of those that left the window, of the latest."""
+    live, levels = empty((0.06,)), 0.5 + np.cumsum(np.random.default_rng(1).normal(0.0, 1e-3, 100))
+    for number, level in enumerate(levels.tolist()):
+        live.value[0] = level
+        assert live.add_command(number * T, 1, (number - 20) * T)
+    first = 100 - live.port.held
+    assert 0 < first < 85
+    steps = np.diff(levels, prepend=levels[0])
+    for number in range(first, 100):
+        for until in (number * T, (number + 1) * T - 1):
+            (found,) = live.commands(until)
+            assert found == (number * T, levels[number], pytest.approx(steps[number], rel=1e-12))
+    assert live.commands(first * T - 1) == [(ALWAYS, pytest.approx(levels[first - 1]), pytest.approx(steps[first - 1]))]
