@@ -114,14 +114,13 @@ class Filter {
             const Time next = follow(now, a, rows, pending, end, time, stamped);
             double found[PF_OUTPUTS];
             describe(axis, now.response.x, now.residual, found);
-            const double before = found[PF_POSITION];
             const double known = variance_along<N, Real>(now.residual.P, axis.motion);
             now.residual.P = {};  // what comes is noise alone
             follow(now, a, rows, next, end, time + axis.ahead, stamped);
-            double later[PF_OUTPUTS];
-            describe(axis, now.response.x, now.residual, later);
-            found[PF_VELOCITY] = (later[PF_POSITION] - before) / axis.arm.period;
-            found[PF_VELOCITY_SD] = std::sqrt(known + square(later[PF_POSITION_SD])) / axis.arm.period;
+            const double later = now.response.x + now.residual.along(axis.position);
+            const double noise = variance_along<N, Real>(now.residual.P, axis.position);
+            found[PF_VELOCITY] = (later - found[PF_POSITION]) / axis.arm.period;
+            found[PF_VELOCITY_SD] = std::sqrt(known + noise) / axis.arm.period;
             for (int k = 0; k < PF_OUTPUTS; ++k) outputs[(k * size() + a) * count + n] = found[k];
         }
     }

@@ -30,7 +30,7 @@ def sanitized(library: Path) -> dict[str, str]:
         clang = "clang" in Path(compiler).name
         for sanitizers in SANITIZERS:
             words = [compiler, *FLAGS, f"-fsanitize={sanitizers}", *(["-shared-libasan"] if clang else [])]
-            words += ["-shared", "-fPIC", f"-I{CORE / 'include'}", str(CORE / "pumafuse.cpp"), "-o", str(library)]
+            words += ["-shared", "-fPIC", f"-I{CORE / 'include'}", *map(str, CORE.glob("*.cpp")), "-o", str(library)]
             made = subprocess.run(words, capture_output=True, text=True, check=False)
             if made.returncode:
                 why = made.stderr.strip().splitlines()[-1]
