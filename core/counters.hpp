@@ -1,6 +1,7 @@
 // How each sensor of a stream does: how many rows came and how late, what is missing, the NIS of the last minute.
 #pragma once
-#include <vector>
+#include <algorithm>
+#include <utility>
 
 #include "events.hpp"
 
@@ -8,9 +9,9 @@ namespace pumafuse {
 
 struct Counters {
     Time sensors;
-    std::vector<std::int64_t> number;       // (S, PF_COUNTS)
-    std::vector<Time> last, left, second;   // (S,), (S,), (S, PF_SECONDS)
-    std::vector<double> usual, minute;      // (S,), (S, PF_SECONDS, PF_KINDS)
+    std::vector<std::int64_t> number;      // (S, PF_COUNTS)
+    std::vector<Time> last, left, second;  // (S,), (S,), (S, PF_SECONDS)
+    std::vector<double> usual, minute;     // (S,), (S, PF_SECONDS, PF_KINDS)
 
     explicit Counters(Time sensors)
         : sensors(sensors), number(sensors * PF_COUNTS), last(sensors, PF_ALWAYS), left(sensors, PF_ALWAYS),
@@ -22,7 +23,7 @@ struct Counters {
     void came(int sensor, Time stamp, Time newest) {
         ++count(sensor, PF_CAME);
         last[sensor] = std::max(last[sensor], stamp);
-        if (double* minute = second_of(sensor, stamp)) {
+        if (double* minute = minute_at(sensor, stamp)) {
             const double lateness = double(std::max(newest - stamp, Time(0))) / 1e9;
             minute[ROWS] += 1.0, minute[LATENESS] += lateness, minute[LATEST] = std::max(minute[LATEST], lateness);
         }
@@ -32,14 +33,12 @@ struct Counters {
     void leaves(const Event& event, const Fate& fate, Time axes) {
         if (event.is_command()) return;
         look_at_interval(event.source, event.stamp);
-        double* minute = second_of(event.source, event.stamp);
+        double* minute = minute_at(event.source, event.stamp);
         for (Time a = 0; a < axes; ++a) {
             const Code outcome = fate.outcome[a];
-            if (outcome == PF_ABSENT) continue;
-            ++count(event.source, outcome);
+            if (outcome != PF_ABSENT) ++count(event.source, outcome);
             if (!minute || (outcome != PF_FUSED && outcome != PF_REACQUIRED)) continue;
-            const double r = fate.innovation[a] / fate.innovation_sd[a];
-            minute[NIS] += r * r, minute[VALUES] += 1.0;
+            minute[NIS] += square(fate.innovation[a] / fate.innovation_sd[a]), minute[VALUES] += 1.0;
         }
     }
 
@@ -57,20 +56,19 @@ struct Counters {
 
     void forget(Time after) {
         for (Time& one : last) one = one > after ? PF_ALWAYS : one;
-        for (Time& one : second) one = one > floor_second(after) ? PF_ALWAYS : one;
+        for (Time& one : second) one = one > whole_second(after) ? PF_ALWAYS : one;
     }
 
   private:
     enum { ROWS, LATENESS, LATEST, NIS, VALUES };
     static constexpr std::int64_t FEW = 20, MANY = 100;  // intervals before a usual one is known, and of which it is a mean
-    static constexpr double GAP = 1.5;      // usual intervals without a row: one is missing
-    static constexpr double SLOWER = 1.1;   // by dropouts in a row the usual interval grows until a slower sensor has one
+    static constexpr double GAP = 1.5;     // usual intervals without a row: one is missing
+    static constexpr double SLOWER = 1.1;  // by dropouts in a row the usual interval grows until a slower sensor has one
 
-    static Time floor_second(Time stamp) { return stamp / 1'000'000'000 - (stamp % 1'000'000'000 < 0); }
+    static Time whole_second(Time stamp) { return stamp / 1'000'000'000 - (stamp % 1'000'000'000 < 0); }
 
     void look_at_interval(int sensor, Time stamp) {
-        const Time before = left[sensor];
-        left[sensor] = stamp;
+        const Time before = std::exchange(left[sensor], stamp);
         if (before == PF_ALWAYS) return;
         const double interval = double(stamp - before) / 1e9;
         if (++count(sensor, PF_INTERVALS) > FEW && interval > GAP * usual[sensor]) {
@@ -83,13 +81,12 @@ struct Counters {
     }
 
     // Where the second of a stamp is counted; none if it is over a minute old.
-    double* second_of(int sensor, Time stamp) {
-        const Time now = floor_second(stamp), slot = ((now % PF_SECONDS) + PF_SECONDS) % PF_SECONDS;
+    double* minute_at(int sensor, Time stamp) {
+        const Time now = whole_second(stamp), slot = ((now % PF_SECONDS) + PF_SECONDS) % PF_SECONDS;
         Time& there = second[sensor * PF_SECONDS + slot];
         double* found = &minute[(sensor * PF_SECONDS + slot) * PF_KINDS];
-        if (now < there) return nullptr;
         if (now > there) there = now, std::fill_n(found, PF_KINDS, 0.0);
-        return found;
+        return now < there ? nullptr : found;
     }
 };
 

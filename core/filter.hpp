@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <limits>
 #include <numeric>
-#include <vector>
 
 #include "events.hpp"
 #include "gate.hpp"
@@ -11,13 +10,6 @@
 #include "response.hpp"
 
 namespace pumafuse {
-
-template <class Real>
-struct Model {  // pf_model, with derivatives
-    std::vector<Axis<Real>> axes;
-    std::vector<Sensor<Real>> sensors;
-    std::vector<View<Real>> views;  // (S, A)
-};
 
 // What changes of one axis.
 template <int N, class Real>
@@ -34,6 +26,22 @@ struct State {
     std::vector<Gate> gates;  // (A, S)
 };
 
+// What is known of one axis.
+template <int N, class Real>
+struct Known {
+    Arm<Real> arm;
+    Noise<N, Real> noise;
+    Time ahead;              // T [ns]
+    Vector<N, Real> motion;  // over the period ahead
+    Real delayed;            // what the delay's derivatives make of an instant
+    double start;
+
+    explicit Known(const Axis<Real>& axis)
+        : arm(axis), noise(axis), ahead(std::llrint(arm.period * 1e9)),
+          motion(noise.motion(arm.plant, double(ahead) / 1e9)), delayed(axis.delay - value_of(axis.delay)),
+          start(value_of(axis.start)) {}
+};
+
 // What the smoother needs to know of an update by `sensor`, or of a change of noise, which is of none.
 template <int N>
 struct Entry {
@@ -44,8 +52,8 @@ struct Entry {
     Vector<N, double> K{};
 };
 
-// One outcome to store; with derivatives likelihood.hpp stores more.
-inline void store(const Fate& fate, int axis, double nu, double S) {
+// An innovation and its S; with derivatives likelihood.hpp stores more.
+inline void store(const Fate& fate, Time axis, double nu, double S) {
     fate.innovation[axis] = nu, fate.innovation_sd[axis] = std::sqrt(S);
 }
 
@@ -53,24 +61,24 @@ template <int N, class Real = double>
 class Filter {
   public:
     using History = std::vector<std::vector<Entry<N>>>;  // of each axis, by time
+    std::vector<Known<N, Real>> axes;
+    std::vector<Sensor<Real>> sensors;
+    std::vector<View<Real>> views;   // (S, A)
+    std::vector<Vector<N, Real>> H;  // of each sensor on each axis, (S, A)
+    std::vector<int> bias;           // which state is the constant bias of each, -1 for none, (S, A)
 
-    explicit Filter(const Model<Real>& model) : sensors(model.sensors), views(model.views) {
-        for (const Axis<Real>& axis : model.axes) axes.emplace_back(axis);
-        const Time A = size();
-        innovations.resize(A);
-        bias.assign(views.size(), -1);
-        for (Time s = 0; s < Time(sensors.size()); ++s)
-            for (Time a = 0; a < A; ++a) {
-                const View<Real>& view = views[s * A + a];
-                OneAxis& axis = axes[a];
-                Vector<N, Real> h{};
-                for (int i = 0; i < N; ++i) h[i] = sensors[s].scale * axis.position[i];
-                if (value_of(view.bias_drift_sd) > 0.0)
-                    h[axis.noise.add(1.0 / view.bias_time, square(view.bias_drift_sd))] = 1.0;
-                if (value_of(view.bias_sd) > 0.0)
-                    h[bias[s * A + a] = axis.noise.add(0.0, square(view.bias_sd))] = 1.0;
-                H.push_back(h);
-            }
+    explicit Filter(const Model<Real>& model)
+        : axes(model.axes.begin(), model.axes.end()), sensors(model.sensors), views(model.views),
+          bias(model.views.size(), -1), innovations(axes.size()) {
+        for (Time at = 0; at < Time(views.size()); ++at) {
+            const View<Real>& view = views[at];
+            Noise<N, Real>& noise = axes[at % size()].noise;
+            Vector<N, Real> h{};
+            for (int i = 0; i < N; ++i) h[i] = sensors[at / size()].scale * noise.position[i];
+            if (value_of(view.bias_drift_sd) > 0.0) h[noise.add(1.0 / view.bias_time, square(view.bias_drift_sd))] = 1.0;
+            if (value_of(view.bias_sd) > 0.0) h[bias[at] = noise.add(0.0, square(view.bias_sd))] = 1.0;
+            H.push_back(h);
+        }
     }
 
     Time size() const { return Time(axes.size()); }
@@ -93,14 +101,11 @@ class Filter {
     void step(State<N, Real>& state, const Event& event, const Fate& fate, bool given = false,
               History* history = nullptr) const {
         *fate.contradicts = NOBODY;
-        if (event.is_command()) {
-            for (Time a = 0; a < size(); ++a)
-                if (event.commands(a)) command(state.axes[a], a, event, history);
-            return;
+        const Time together = !event.is_command() && value_of(sensors[event.source].gate_rows) != 0.0 ? size() : 1;
+        for (Time a = 0; a < size(); a += together) {
+            if (!event.is_command()) measurement(state, event, a, a + together, fate, given, history);
+            else if (event.commands(a)) command(state.axes[a], a, event, history);
         }
-        const Time together = value_of(sensors[event.source].gate_rows) != 0.0 ? size() : 1;
-        for (Time first = 0; first < size(); first += together)
-            measurement(state, event, first, first + together, fate, given, history);
     }
 
     // Every axis at an instant, as estimate n of `count`; of rows from `pending` on, which are not in the state yet, the
@@ -109,61 +114,46 @@ class Filter {
     void estimate(const State<N, Real>& state, const Rows& rows, Time pending, Time end, Time time, Time stamped,
                   double* outputs, Time count = 1, Time n = 0) const {
         for (Time a = 0; a < size(); ++a) {
-            const OneAxis& axis = axes[a];
+            const Known<N, Real>& axis = axes[a];
             AxisState<N, Real> now = state.axes[a];
             const Time next = follow(now, a, rows, pending, end, time, stamped);
             double found[PF_OUTPUTS];
             describe(axis, now.response.x, now.residual, found);
-            const double known = variance_along<N, Real>(now.residual.P, axis.motion);
+            const double known = now.residual.variance(axis.motion);
             now.residual.P = {};  // what comes is noise alone
             follow(now, a, rows, next, end, time + axis.ahead, stamped);
-            const double later = now.response.x + now.residual.along(axis.position);
-            const double noise = variance_along<N, Real>(now.residual.P, axis.position);
+            const double later = now.response.x + now.residual.along(axis.noise.position);
             found[PF_VELOCITY] = (later - found[PF_POSITION]) / axis.arm.period;
-            found[PF_VELOCITY_SD] = std::sqrt(known + noise) / axis.arm.period;
+            found[PF_VELOCITY_SD] = std::sqrt(known + now.residual.variance(axis.noise.position)) / axis.arm.period;
             for (int k = 0; k < PF_OUTPUTS; ++k) outputs[(k * size() + a) * count + n] = found[k];
         }
     }
 
-    // One axis at an instant, if no command acts until then.
-    AxisState<N, Real> at(AxisState<N, Real> state, Time a, Time time) const {
-        advance(state, axes[a], {time, 0.0});
-        return state;
-    }
-
     // Position, offset and disturbance of an axis whose response is at r; no velocity.
-    struct OneAxis;
-    static void describe(const OneAxis& axis, double r, const Residual<N, double>& xi, double (&found)[PF_OUTPUTS]) {
+    static void describe(const Known<N, Real>& axis, double r, const Residual<N, double>& xi, double (&found)[PF_OUTPUTS]) {
         const auto sd = [&](int i) { return std::sqrt(std::max(xi.P[i][i], 0.0)); };
         const bool disturbed = axis.noise.smoothness != Smoothness::none;
-        found[PF_POSITION] = r + xi.along(axis.position);
-        found[PF_POSITION_SD] = std::sqrt(variance_along<N, double>(xi.P, axis.position));
+        found[PF_POSITION] = r + xi.along(axis.noise.position);
+        found[PF_POSITION_SD] = std::sqrt(xi.variance(axis.noise.position));
+        found[PF_VELOCITY] = found[PF_VELOCITY_SD] = std::numeric_limits<double>::quiet_NaN();
         found[PF_OFFSET] = xi.x[OFFSET], found[PF_OFFSET_SD] = sd(OFFSET);
         found[PF_DISTURBANCE] = disturbed ? xi.x[DISTURBANCE] : 0.0;
         found[PF_DISTURBANCE_SD] = disturbed ? sd(DISTURBANCE) : 0.0;
-        found[PF_VELOCITY] = found[PF_VELOCITY_SD] = std::numeric_limits<double>::quiet_NaN();
     }
 
-    struct OneAxis {
-        Arm<Real> arm;
-        Noise<N, Real> noise;
-        Vector<N, Real> position, motion;  // h, and h (Phi - I) over the period ahead
-        Time ahead;                        // T [ns]
-        Real delayed;                      // what the delay's derivatives make of an instant
-        double start;
-
-        explicit OneAxis(const Axis<Real>& axis)
-            : arm(axis), noise(axis), position(position_of(noise)), ahead(std::llrint(arm.period * 1e9)),
-              delayed(axis.delay - value_of(axis.delay)), start(value_of(axis.start)) {
-            motion = motion_of<N, Real>(arm.plant, noise, double(ahead) / 1e9);
+    // Response and residual to an instant; where they are at the same one, which is where no command lies between, by one
+    // transition.
+    void advance(AxisState<N, Real>& state, Time a, const Instant<Real>& to) const {
+        const auto& [arm, noise, ahead, motion, delayed, start] = axes[a];
+        Response<Real>& r = state.response;
+        Residual<N, Real>& xi = state.residual;
+        if (r.time.ns != xi.time.ns || !is_zero(r.time.shift - xi.time.shift)) {
+            r.predict(arm, to), xi.predict(arm.plant, noise, to);
+        } else if (const Real dt = seconds(xi.time, to); !is_zero(dt)) {
+            const Transition<Real> f = arm.plant.over(dt);
+            r.predict(arm, f, to), xi.predict(noise, f, to);
         }
-    };
-
-    std::vector<OneAxis> axes;
-    std::vector<Sensor<Real>> sensors;
-    std::vector<View<Real>> views;      // (S, A)
-    std::vector<Vector<N, Real>> H;     // of each sensor on each axis, (S, A)
-    std::vector<int> bias;              // which state is the constant bias of each, -1 for none, (S, A)
+    }
 
   private:
     struct Innovation {
@@ -174,31 +164,28 @@ class Filter {
     mutable std::vector<Innovation> innovations;
 
     void command(AxisState<N, Real>& state, Time a, const Event& event, History* history) const {
-        const OneAxis& axis = axes[a];
+        const Known<N, Real>& axis = axes[a];
         const Instant<Real> acts{event.time, axis.delayed};
+        Residual<N, Real>& xi = state.residual;
         if (!axis.noise.maneuvers) {  // then commands change nothing of the residual
             state.response.predict(axis.arm, acts);
             state.response.command(axis.arm, event.value[a]);
-            return;
+        } else {
+            if (history) (*history)[a].push_back({.time = event.time, .q = value_of(xi.q), .drift = value_of(xi.drift)});
+            advance(state, a, acts);
+            xi.apply_maneuver(axis.noise, state.response.command(axis.arm, event.value[a]));
         }
-        Residual<N, Real>& xi = state.residual;
-        if (history) (*history)[a].push_back({.time = event.time, .q = value_of(xi.q), .drift = value_of(xi.drift)});
-        advance(state, axis, acts);
-        xi.apply_maneuver(axis.noise, state.response.command(axis.arm, event.value[a]));
     }
 
-    // Both to an instant; where they are at the same one, which is where no command lies between, by one transition.
-    void advance(AxisState<N, Real>& state, const OneAxis& axis, const Instant<Real>& to) const {
-        Response<Real>& r = state.response;
-        Residual<N, Real>& xi = state.residual;
-        if (r.time.ns == xi.time.ns && is_zero(r.time.shift - xi.time.shift)) {
-            const Real dt = seconds(xi.time, to);
-            if (is_zero(dt)) return;
-            const Transition<Real> f = axis.arm.plant.over(dt);
-            r.predict(axis.arm, f, to), xi.predict(axis.noise, f, to);
-        } else {
-            r.predict(axis.arm, to), xi.predict(axis.arm.plant, axis.noise, to);
+    // Predict to `until` by the commands from row `next` on that act by then and are stamped by `stamped`; the row after.
+    template <class Rows>
+    Time follow(AxisState<N, Real>& state, Time a, const Rows& rows, Time next, Time end, Time until, Time stamped) const {
+        for (; next < end && rows[next].time <= until; ++next) {
+            const Event event = rows[next];
+            if (event.commands(a) && event.stamp <= stamped) command(state, a, event, nullptr);
         }
+        advance(state, a, {until, 0.0});
+        return next;
     }
 
     // R = (spread sd)^2 + (scale speed latency_sd)^2 [m^2] here and now.
@@ -206,43 +193,36 @@ class Filter {
         const Sensor<Real>& sensor = sensors[event.source];
         const Real sd = views[event.source * size() + a].sd * (event.spread ? event.spread[a] : 1.0);
         if (value_of(sensor.latency_sd) == 0.0) return square(sd);
-        const OneAxis& axis = axes[a];
-        const Vector<N, Real>& x = state.residual.x;
-        Real speed = state.response.speed(axis.arm);  // C (A x + B (u + e)) of the whole state
-        speed = speed + (axis.arm.plant.order == 1 ? -axis.arm.plant.rate * x[PLANT] : x[RATE]);
-        if (axis.noise.smooth()) speed = speed + x[DISTURBANCE + 1];
+        const auto& [arm, noise, ahead, motion, delayed, start] = axes[a];
+        const Vector<N, Real>& x = state.residual.x;  // the speed is C (A x + B (u + e)) of response and residual
+        Real speed = state.response.speed(arm) + (arm.plant.order == 1 ? -arm.plant.rate * x[PLANT] : x[RATE]);
+        if (noise.smooth()) speed = speed + x[DISTURBANCE + 1];
         return square(sd) + square(sensor.scale * speed * sensor.latency_sd);
     }
 
     Gates gates_of(State<N, Real>& state, Time a) const {
-        const int count = int(sensors.size());
-        return {state.gates.data() + a * count, count, state.axes[a].unsettled};
+        return {state.gates.data() + a * sensors.size(), int(sensors.size()), state.axes[a].unsettled};
     }
 
     // Axes first to end of one row, which pass the gate together or not at all.
     void measurement(State<N, Real>& state, const Event& event, Time first, Time end, const Fate& fate, bool given,
                      History* history) const {
-        const int s = event.source;
-        const Sensor<Real>& sensor = sensors[s];
+        const Sensor<Real>& sensor = sensors[event.source];
         const double gate = value_of(sensor.gate);
-        const Instant<Real> valid{event.time, value_of(sensor.latency) - sensor.latency};
+        const auto far = [&](Time a) { return std::fabs(fate.innovation[a]) > gate * fate.innovation_sd[a]; };
         bool beyond = false;
         for (Time a = first; a < end; ++a) {
             if (!given) fate.outcome[a] = event.known[a];
             if (event.known[a] != PF_FUSED) continue;
-            advance(state.axes[a], axes[a], valid);
+            advance(state.axes[a], a, {event.time, value_of(sensor.latency) - sensor.latency});
             const Innovation& found = innovations[a] = innovation(state.axes[a], event, a);
             store(fate, a, found.nu, found.along.S);
-            beyond |= gate > 0.0 && std::fabs(fate.innovation[a]) > gate * fate.innovation_sd[a];
+            beyond |= gate > 0.0 && far(a);
         }
-        const bool decided = beyond && !given;
-        const bool reacquires = decided && this->reacquires(state, event, first, end, fate);
+        const bool reacquires = beyond && !given && this->reacquires(state, event, first, end, fate);
         for (Time a = first; a < end; ++a) {
             if (event.known[a] != PF_FUSED) continue;
-            if (decided) {
-                const bool far = std::fabs(fate.innovation[a]) > gate * fate.innovation_sd[a];
-                fate.outcome[a] = !reacquires ? PF_REJECTED : far ? PF_REACQUIRED : PF_FUSED;
-            }
+            if (beyond && !given) fate.outcome[a] = !reacquires ? PF_REJECTED : far(a) ? PF_REACQUIRED : PF_FUSED;
             if (fate.outcome[a] != PF_REJECTED) update(state, event, a, fate, history);
         }
     }
@@ -250,29 +230,27 @@ class Filter {
     // nu = z - H x and S = H P H^T + R here and now; an angle that is measured within a turn is the nearest of all turns.
     Innovation innovation(const AxisState<N, Real>& state, const Event& event, Time a) const {
         const Time at = event.source * size() + a;
-        const Response<Real>& r = state.response;
         const Real R = noise_of(state, event, a), scale = sensors[event.source].scale;
-        const Real nu = event.value[a] - scale * r.start - scale * r.x - state.residual.along(H[at]);
-        return {nearest(nu, value_of(views[at].turn)), R, Along<N, Real>(state.residual.P, H[at], R)};
+        const Real expected = scale * state.response.start + scale * state.response.x + state.residual.along(H[at]);
+        return {nearest(event.value[a] - expected, value_of(views[at].turn)), R, {state.residual.P, H[at], R}};
     }
 
     void update(State<N, Real>& state, const Event& event, Time a, const Fate& fate, History* history) const {
-        AxisState<N, Real>& axis = state.axes[a];
+        Residual<N, Real>& xi = state.axes[a].residual;
         auto [nu, R, along] = innovations[a];
-        Real widened = 0.0;
         const Vector<N, Real>& h = H[event.source * size() + a];
+        Real widened = 0.0;
         if (fate.outcome[a] == PF_REACQUIRED) {  // the offset may have moved by nu
             widened = square(nu / sensors[event.source].scale);
-            axis.residual.P[OFFSET][OFFSET] = axis.residual.P[OFFSET][OFFSET] + widened;
+            xi.P[OFFSET][OFFSET] = xi.P[OFFSET][OFFSET] + widened;
             gates_of(state, a).reacquire(event.source, event.time);
-            along = Along<N, Real>(axis.residual.P, h, R);
+            along = {xi.P, h, R};
             store(fate, a, nu, along.S);
         }
-        const Vector<N, Real> K = axis.residual.update(h, along, nu, R);
+        const Vector<N, Real> K = xi.update(h, along, nu, R);
         gates_of(state, a).fuse(event.source, event.time);
         if constexpr (std::is_same_v<Real, double>)
-            if (history)
-                (*history)[a].push_back({event.time, axis.residual.q, axis.residual.drift, event.source, nu, R, widened, K});
+            if (history) (*history)[a].push_back({event.time, xi.q, xi.drift, event.source, nu, R, widened, K});
     }
 
     // Whether a row beyond its gate re-acquires; if not, it is remembered, and whom it contradicts noted.
@@ -289,43 +267,29 @@ class Filter {
         if (all_agree && other == NOBODY) return true;
         if (all_agree) *fate.contradicts = std::int16_t(other);
         for (Time a = first; a < end; ++a)
-            if (event.known[a] == PF_FUSED) {
-                const double R = value_of(noise_of(state.axes[a], event, a));
-                gates_of(state, a).reject(event.source, fate.innovation[a], R, event.time, again);
-            }
+            if (event.known[a] == PF_FUSED)
+                gates_of(state, a).reject(event.source, fate.innovation[a], value_of(innovations[a].R), event.time, again);
         return false;
     }
 
     // Whether a rejected measurement agrees with the one before:
     // |nu2 - nu1| <= gate sqrt(R1 + R2 + the variance of the motion between), both predicted by what did not follow them.
     Agreement agreement(State<N, Real>& state, const Event& event, Time a, double nu) const {
-        const OneAxis& axis = axes[a];
+        const Known<N, Real>& axis = axes[a];
         const Sensor<Real>& sensor = sensors[event.source];
         const Gate& before = gates_of(state, a).sensor[event.source];
+        const Residual<N, Real>& xi = state.axes[a].residual;
+        const Time between = event.time - before.rejected_at;
         if (before.in_a_row == 0) return Agreement::no;
-        const double between = double(event.time - before.rejected_at), dt = between / 1e9;
-        if (between < axis.arm.period * 1e9) return Agreement::too_soon;
-        const AxisState<N, Real>& now = state.axes[a];
+        if (double(between) < axis.arm.period * 1e9) return Agreement::too_soon;
         Residual<N, Real> moved;  // from what is known, by noise alone
-        moved.q = now.residual.q, moved.drift = now.residual.drift;
-        moved.predict(axis.arm.plant, axis.noise, {event.time - before.rejected_at, 0.0});
-        const Real motion = variance_along<N, Real>(now.residual.P, motion_of<N, Real>(axis.arm.plant, axis.noise, dt)) +
-                            variance_along<N, Real>(moved.P, axis.position);
-        const double variance =
-            before.R + value_of(noise_of(now, event, a)) + value_of(square(sensor.scale) * motion);
+        moved.q = xi.q, moved.drift = xi.drift;
+        moved.predict(axis.arm.plant, axis.noise, {between, 0.0});
+        const Real motion =
+            xi.variance(axis.noise.motion(axis.arm.plant, double(between) / 1e9)) + moved.variance(axis.noise.position);
+        const double variance = value_of(before.R + innovations[a].R + square(sensor.scale) * motion);
         const double apart = nearest(nu - before.nu, value_of(views[event.source * size() + a].turn));
         return std::fabs(apart) <= value_of(sensor.gate) * std::sqrt(variance) ? Agreement::yes : Agreement::no;
-    }
-
-    // Predict to `until` by the commands from row `next` on that act by then and are stamped by `stamped`; the row after.
-    template <class Rows>
-    Time follow(AxisState<N, Real>& state, Time a, const Rows& rows, Time next, Time end, Time until, Time stamped) const {
-        for (; next < end && rows[next].time <= until; ++next) {
-            const Event event = rows[next];
-            if (event.commands(a) && event.stamp <= stamped) command(state, a, event, nullptr);
-        }
-        advance(state, axes[a], {until, 0.0});
-        return next;
     }
 };
 
@@ -348,27 +312,25 @@ void run_as_live(const Filter<N>& filter, State<N, double>& state, const Table& 
                  double* outputs) {
     const pf_events& events = rows.events;
     const Time count = events.count;
-    std::vector<Time> arrival(count), queue(count);
+    std::vector<Time> arrival(count), queue(count), valid(n + 1, count);  // valid: how many rows are by each estimate
     for (Time row = 0; row < count; ++row)
         arrival[row] = rows[row].is_command() ? events.stamp[row] : std::max(events.stamp[row], events.time[row]);
     std::iota(queue.begin(), queue.end(), Time(0));
     std::stable_sort(queue.begin(), queue.end(), [&](Time a, Time b) { return arrival[a] < arrival[b]; });
-    const auto rows_until = [&](Time k) {  // how many rows are valid by estimate k
-        return k < 0 ? Time(0) : k < n ? std::upper_bound(events.time, events.time + count, times[k]) - events.time : count;
-    };
     Time places = 1;  // more than rows may have to be taken back
-    for (Time k = 0, due = 0; k <= n; ++k)
-        for (Time there = rows_until(k); due < count && (k == n || arrival[queue[due]] <= times[k]); ++due)
-            places = std::max(places, there - queue[due] + 1);
+    for (Time k = 0, due = 0; k <= n; ++k) {
+        if (k < n) valid[k] = std::upper_bound(events.time, events.time + count, times[k]) - events.time;
+        for (; due < count && (k == n || arrival[queue[due]] <= times[k]); ++due)
+            places = std::max(places, valid[k] - queue[due] + 1);
+    }
     std::vector<State<N, double>> checkpoints(places, state);
     std::vector<char> arrived(count, 0);
-    Time due = 0, done = 0;
-    for (Time k = 0; k <= n; ++k) {
+    for (Time k = 0, due = 0, done = 0; k <= n; ++k) {
         Time row = done;
         for (; due < count && (k == n || arrival[queue[due]] <= times[k]); ++due)
             arrived[queue[due]] = 1, row = std::min(row, queue[due]);
         if (row < done) state = checkpoints[row % places];
-        for (done = std::max(done, rows_until(k)); row < done; ++row) {
+        for (done = std::max(done, valid[k]); row < done; ++row) {
             checkpoints[row % places] = state;
             if (arrived[row]) filter.step(state, rows[row], rows.fate(row));
         }

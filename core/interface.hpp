@@ -45,7 +45,7 @@ inline auto sized(const pf_model& model, auto make) {
     int most = 0;
     for (Time a = 0; a < model.axes; ++a) {
         const pf_axis& axis = model.axis[a];
-        int states = FIRST_BIAS + (axis.disturbance_sd == 0.0 ? 0 : axis.smoothness > 1.0 ? 2 : 1);
+        int states = DISTURBANCE + (axis.disturbance_sd == 0.0 ? 0 : axis.smoothness > 1.0 ? 2 : 1);
         for (Time s = 0; s < model.sensors; ++s) {
             const pf_view& view = model.view[s * model.axes + a];
             states += (view.bias_sd > 0.0) + (view.bias_drift_sd > 0.0);

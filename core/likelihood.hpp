@@ -63,7 +63,38 @@ inline Dual sin(const Dual& a) { return a.chain(std::sin(a.value), std::cos(a.va
 inline Dual cos(const Dual& a) { return a.chain(std::cos(a.value), -std::sin(a.value)); }
 inline Dual sqrt(const Dual& a) { return a.chain(std::sqrt(a.value), 0.5 / std::sqrt(a.value)); }
 
-inline void store(const Fate& fate, int axis, const Dual& nu, const Dual& S) {
+// At its best K the covariance does not change with K: d(P+) = (I - K H) dP (I - K H)' + K dR K' - K dH P+ - (K dH P+)'.
+template <int N>
+Vector<N, Dual> joseph_tangent(auto& M, const auto& H, const Along<N, Dual>& along, const Dual& R) {
+    Vector<N, Dual> K;
+    Vector<N, double> h;
+    Matrix<N, double> P;
+    for (int i = 0; i < N; ++i) {
+        K[i] = along.MH[i] / along.S, h[i] = H[i].value;
+        for (int j = 0; j < N; ++j) P[i][j] = M[i][j].value;
+    }
+    joseph<N, double>(P, h, {P, h, R.value}, R.value);
+    std::array<std::array<double, LANES>, N> across{};  // H dP + dH P+
+    std::array<double, LANES> along_h = R.d;            // H dP H' + dR
+    for (int j = 0; j < N; ++j) {
+        for (int i = 0; i < N; ++i)
+            for (int k = 0; k < LANES; ++k) across[j][k] += h[i] * M[i][j].d[k];
+        for (int k = 0; k < LANES; ++k) along_h[k] += h[j] * across[j][k];
+        for (int i = 0; i < N; ++i)
+            for (int k = 0; k < LANES; ++k) across[j][k] += H[i].d[k] * P[i][j];
+    }
+    for (int i = 0; i < N; ++i)
+        for (int j = 0; j <= i; ++j) {
+            const double a = K[i].value, b = K[j].value, ab = a * b;
+            Dual& there = M[i][j];
+            there.value = P[i][j];
+            for (int k = 0; k < LANES; ++k) there.d[k] += ab * along_h[k] - a * across[j][k] - b * across[i][k];
+            M[j][i] = there;
+        }
+    return K;
+}
+
+inline void store(const Fate& fate, Time axis, const Dual& nu, const Dual& S) {
     store(fate, axis, nu.value, S.value);
     for (int i = 0; i < fate.lanes; ++i)
         fate.d_innovation[i * fate.stride + axis] = nu.d[i], fate.d_variance[i * fate.stride + axis] = S.d[i];

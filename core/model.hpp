@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstdint>
 #include <tuple>
+#include <vector>
 
 #include "pumafuse.h"
 
@@ -21,17 +22,17 @@ struct Axis {  // the fields of pf_axis
 };
 
 template <class Real>
-struct Sensor {  // of pf_sensor
-    Real scale, latency, latency_sd, gate, gate_rows;
-};
+struct Sensor { Real scale, latency, latency_sd, gate, gate_rows; };  // of pf_sensor
 
 template <class Real>
-struct View {  // of pf_view
-    Real sd, bias_sd, bias_drift_sd, bias_time, turn;
-};
+struct View { Real sd, bias_sd, bias_drift_sd, bias_time, turn; };  // of pf_view
 
-static_assert(sizeof(Axis<double>) == sizeof(pf_axis) && sizeof(Sensor<double>) == sizeof(pf_sensor) &&
-              sizeof(View<double>) == sizeof(pf_view));
+template <class Real>
+struct Model {
+    std::vector<Axis<Real>> axes;
+    std::vector<Sensor<Real>> sensors;
+    std::vector<View<Real>> views;  // (S, A)
+};
 
 template <int N, class Real>
 using Vector = std::array<Real, N>;
@@ -40,9 +41,7 @@ using Matrix = std::array<std::array<Real, N>, N>;
 
 inline double value_of(double a) { return a; }
 inline bool is_zero(double a) { return a == 0.0; }
-
-template <class Real>
-Real square(Real a) { return a * a; }
+auto square(auto a) { return a * a; }
 
 // An instant: its derivatives, if it has any, are those of the delay or the latency that it comes from.
 template <class Real>

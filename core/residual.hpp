@@ -8,7 +8,7 @@
 
 namespace pumafuse {
 
-enum { PLANT, RATE, OFFSET, DISTURBANCE, FIRST_BIAS = DISTURBANCE };  // of x; the last if there is no disturbance
+enum { PLANT, RATE, OFFSET, DISTURBANCE };                            // of x; where there is no disturbance, biases follow
 enum class Smoothness { none, rough, smooth };                        // no state, d alone, d and its rate
 
 // M <- F M F^T where F moves the states i and i + 1.
@@ -72,13 +72,13 @@ Vector<N, Real> joseph(Matrix<N, Real>& M, const Vector<N, Real>& H, const Along
 template <int N, class Real>
 struct Noise {
     Real input_noise, drift, maneuver_noise, maneuver_drift;  // as pf_axis has them
-    bool maneuvers;                                           // whether they count
+    bool maneuvers;                                           // whether commands change these
     Smoothness smoothness = Smoothness::none;
-    Real lambda = 0.0;              // 1/s, of the disturbance
-    int biases = FIRST_BIAS;        // the first bias
-    int size = FIRST_BIAS;          // how many states there are
-    Vector<N, Real> reverting{};    // how fast each state reverts to 0 [1/s]; 0: it stays
-    Vector<N, Real> variance{};     // of each at the start, and of what reverts for ever [m^2]
+    Real lambda = 0.0;            // 1/s, of the disturbance
+    int size = DISTURBANCE;       // how many states there are
+    Vector<N, Real> reverting{};  // how fast each reverts to 0 [1/s]; 0: it stays
+    Vector<N, Real> variance{};   // of each at the start, and of what reverts for ever [m^2]
+    Vector<N, Real> position{};   // h, which makes the position of the states
 
     Noise() = default;
 
@@ -86,13 +86,12 @@ struct Noise {
         : input_noise(axis.input_noise), drift(axis.drift), maneuver_noise(axis.maneuver_noise),
           maneuver_drift(axis.maneuver_drift),
           maneuvers(value_of(maneuver_noise) != 0.0 || value_of(maneuver_drift) != 0.0) {
-        variance[OFFSET] = square(axis.offset_sd);
+        variance[OFFSET] = square(axis.offset_sd), position[PLANT] = position[OFFSET] = 1.0;
         if (value_of(axis.disturbance_sd) == 0.0) return;
         smoothness = value_of(axis.smoothness) > 1.0 ? Smoothness::smooth : Smoothness::rough;
         lambda = (smoothness == Smoothness::smooth ? std::sqrt(3.0) : 1.0) / axis.disturbance_time;
-        add(lambda, square(axis.disturbance_sd));
+        position[add(lambda, square(axis.disturbance_sd))] = 1.0;
         if (smoothness == Smoothness::smooth) add(lambda, square(lambda * axis.disturbance_sd));
-        biases = size;
     }
 
     bool smooth() const { return DISTURBANCE + 1 < N && smoothness == Smoothness::smooth; }
@@ -101,6 +100,17 @@ struct Noise {
     int add(Real rate, Real at_first) {
         reverting[size] = rate, variance[size] = at_first;
         return size++;
+    }
+
+    // h (Phi - I): what the states make of a motion over dt [s].
+    Vector<N, Real> motion(const Plant<Real>& plant, Real dt) const {
+        using std::expm1;
+        const Transition<Real> f = plant.over(dt), d = smooth_disturbance(lambda, dt);
+        Vector<N, Real> h{};
+        h[PLANT] = f.f11 - 1.0, h[RATE] = f.f12;
+        if (smoothness == Smoothness::rough) h[DISTURBANCE] = expm1(-lambda * dt);
+        if (smooth()) h[DISTURBANCE] = d.f11 - 1.0, h[DISTURBANCE + 1] = d.f12;
+        return h;
     }
 };
 
@@ -127,20 +137,10 @@ struct Residual {
     void predict(const Noise<N, Real>& noise, const Transition<Real>& f, const Instant<Real>& to) {
         using std::exp, std::expm1;
         const Real dt = seconds(time, to);
-        const Real p = x[PLANT], v = x[RATE];
-        x[PLANT] = f.f11 * p + f.f12 * v, x[RATE] = f.f21 * p + f.f22 * v;
-        move_pair<N, Real>(P, PLANT, f.f11, f.f12, f.f21, f.f22);
-        add_pair(PLANT, q * f.q11, q * f.q12, q * f.q22);
+        predict_pair(PLANT, f, q);
         P[OFFSET][OFFSET] = P[OFFSET][OFFSET] + drift * dt;
         int i = DISTURBANCE;
-        if (noise.smooth()) {
-            const Transition<Real> d = smooth_disturbance(noise.lambda, dt);
-            const Real variance = noise.variance[DISTURBANCE], was = x[i], rate = x[i + 1];
-            x[i] = d.f11 * was + d.f12 * rate, x[i + 1] = d.f21 * was + d.f22 * rate;
-            move_pair<N, Real>(P, i, d.f11, d.f12, d.f21, d.f22);
-            add_pair(i, variance * d.q11, variance * d.q12, variance * d.q22);
-            i += 2;
-        }
+        if (noise.smooth()) predict_pair(i, smooth_disturbance(noise.lambda, dt), noise.variance[i]), i += 2;
         for (; i < noise.size; ++i) {
             if (value_of(noise.reverting[i]) == 0.0) continue;
             const Real left = exp(-noise.reverting[i] * dt);
@@ -162,50 +162,30 @@ struct Residual {
         return sum;
     }
 
+    Real variance(const Vector<N, Real>& h) const {  // h P h^T
+        Real sum = 0.0;
+        for (int i = 0; i < N; ++i)
+            for (int j = 0; j < N; ++j) sum = sum + h[i] * P[i][j] * h[j];
+        return value_of(sum) > 0.0 ? sum : Real(0.0);
+    }
+
     // x <- x + K nu and P <- (I - K H) P (I - K H)^T + K R K^T. Returns K.
     Vector<N, Real> update(const Vector<N, Real>& H, const Along<N, Real>& along, Real nu, Real R) {
-        const Vector<N, Real> K = joseph<N, Real>(P, H, along, R);
+        Vector<N, Real> K;
+        if constexpr (std::is_same_v<Real, double>) K = joseph<N, double>(P, H, along, R);
+        else K = joseph_tangent(P, H, along, R);  // likelihood.hpp
         for (int i = 0; i < N; ++i) x[i] = x[i] + K[i] * nu;
         return K;
     }
 
-    void add_pair(int i, Real q11, Real q12, Real q22) {
-        P[i][i] = P[i][i] + q11, P[i + 1][i + 1] = P[i + 1][i + 1] + q22;
-        P[i][i + 1] = P[i + 1][i] = P[i][i + 1] + q12;
+  private:
+    void predict_pair(int i, const Transition<Real>& f, Real density) {
+        const Real a = x[i], b = x[i + 1];
+        x[i] = f.f11 * a + f.f12 * b, x[i + 1] = f.f21 * a + f.f22 * b;
+        move_pair<N, Real>(P, i, f.f11, f.f12, f.f21, f.f22);
+        P[i][i] = P[i][i] + density * f.q11, P[i + 1][i + 1] = P[i + 1][i + 1] + density * f.q22;
+        P[i][i + 1] = P[i + 1][i] = P[i][i + 1] + density * f.q12;
     }
 };
-
-// h, which makes the position of the states.
-template <int N, class Real>
-Vector<N, Real> position_of(const Noise<N, Real>& noise) {
-    Vector<N, Real> h{};
-    h[PLANT] = h[OFFSET] = 1.0;
-    if (noise.smoothness != Smoothness::none) h[DISTURBANCE] = 1.0;
-    return h;
-}
-
-// h (Phi - I): what the states make of a motion over dt [s].
-template <int N, class Real>
-Vector<N, Real> motion_of(const Plant<Real>& plant, const Noise<N, Real>& noise, Real dt) {
-    using std::expm1;
-    const Transition<Real> f = plant.over(dt);
-    Vector<N, Real> h{};
-    h[PLANT] = f.f11 - 1.0, h[RATE] = f.f12;
-    if (noise.smoothness == Smoothness::rough) h[DISTURBANCE] = expm1(-noise.lambda * dt);
-    if (noise.smooth()) {
-        const Transition<Real> d = smooth_disturbance(noise.lambda, dt);
-        h[DISTURBANCE] = d.f11 - 1.0, h[DISTURBANCE + 1] = d.f12;
-    }
-    return h;
-}
-
-// The states that make the position: where these alone count, biases do not.
-template <int N, class Real>
-Real variance_along(const Matrix<N, Real>& P, const Vector<N, Real>& h) {
-    Real variance = 0.0;
-    for (int i = 0; i < N; ++i)
-        for (int j = 0; j < N; ++j) variance = variance + h[i] * P[i][j] * h[j];
-    return value_of(variance) > 0.0 ? variance : Real(0.0);
-}
 
 }  // namespace pumafuse

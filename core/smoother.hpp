@@ -22,14 +22,10 @@ struct Later {
     Matrix<N, double> M{};
 
     void over_interval(const Arm<double>& arm, const Noise<N, double>& noise, double dt, double q, double drift) {
-        const Transition<double> f = arm.plant.over(dt);
-        over_pair(PLANT, f, q);
+        over_pair(PLANT, arm.plant.over(dt), q);
         through_noise(OFFSET, std::sqrt(drift * dt));
         int i = DISTURBANCE;
-        if (noise.smooth()) {
-            over_pair(i, smooth_disturbance(noise.lambda, dt), noise.variance[i]);
-            i += 2;
-        }
+        if (noise.smooth()) over_pair(i, smooth_disturbance(noise.lambda, dt), noise.variance[i]), i += 2;
         for (; i < noise.size; ++i) {
             if (noise.reverting[i] == 0.0) continue;
             const double fading = -noise.reverting[i] * dt, left = std::exp(fading);
@@ -54,7 +50,7 @@ struct Later {
     void smooth(Residual<N, double>& xi) const {
         auto [L, y] = root();
         for (int k = 0; k < N; ++k) {
-            const Vector<N, double> K = xi.update(L[k], Along<N, double>(xi.P, L[k], 1.0), y[k], 1.0);
+            const Vector<N, double> K = xi.update(L[k], {xi.P, L[k], 1.0}, y[k], 1.0);
             for (int m = k + 1; m < N; ++m)
                 for (int i = 0; i < N; ++i) y[m] -= L[m][i] * K[i] * y[k];
         }
@@ -62,10 +58,10 @@ struct Later {
 
   private:
     // Through the noise of the states i and i + 1, as two independent parts, and back over their transition.
-    void over_pair(int i, const Transition<double>& f, double variance) {
-        const double first = std::sqrt(variance * f.q11), both = first > 0.0 ? variance * f.q12 / first : 0.0;
+    void over_pair(int i, const Transition<double>& f, double density) {
+        const double first = std::sqrt(density * f.q11), both = first > 0.0 ? density * f.q12 / first : 0.0;
         through_noise(i, first, both);
-        through_noise(i + 1, std::sqrt(std::max(variance * f.q22 - both * both, 0.0)));
+        through_noise(i + 1, std::sqrt(std::max(density * f.q22 - both * both, 0.0)));
         const double p = eta[i], v = eta[i + 1];
         eta[i] = f.f11 * p + f.f21 * v, eta[i + 1] = f.f12 * p + f.f22 * v;
         move_pair<N, double>(M, i, f.f11, f.f21, f.f12, f.f22);
@@ -74,10 +70,10 @@ struct Later {
     // Unit noise that enters state i by `first` and the next one by `second`, G: M <- M - M G G' M / S, S = 1 + G' M G.
     void through_noise(int i, double first, double second = 0.0) {
         if (first == 0.0 && second == 0.0) return;
+        const int next = second != 0.0 ? i + 1 : i;
         Vector<N, double> MG;
-        for (int j = 0; j < N; ++j) MG[j] = first * M[j][i] + (second != 0.0 ? second * M[j][i + 1] : 0.0);
-        const double S = 1.0 + first * MG[i] + (second != 0.0 ? second * MG[i + 1] : 0.0);
-        const double seen = first * eta[i] + (second != 0.0 ? second * eta[i + 1] : 0.0);
+        for (int j = 0; j < N; ++j) MG[j] = first * M[j][i] + second * M[j][next];
+        const double S = 1.0 + first * MG[i] + second * MG[next], seen = first * eta[i] + second * eta[next];
         for (int j = 0; j < N; ++j) {
             const double K = MG[j] / S;
             eta[j] -= K * seen;
@@ -124,57 +120,47 @@ struct Filtered {
     Residual<N, double> residual;
 };
 
-// How many entries the history of an axis may have.
-inline std::size_t updates(const Table& rows, Time axis, bool maneuvers) {
-    std::size_t count = 0;
-    for (Time row = 0; row < rows.events.count; ++row)
-        count += rows[row].known[axis] == PF_FUSED && (maneuvers || !rows[row].is_command());
-    return count;
-}
-
 // All events, and at each of n times what all measurements say: forward, keeping what happened and the states at the
 // estimates, then backward, axis by axis.
 template <int N>
 void run_smoothed(const Filter<N>& filter, State<N, double>& state, const Table& rows, Time n, const Time* times,
                   double* outputs) {
-    const Time A = filter.size(), count = rows.events.count;
+    const Time A = filter.size(), count = rows.events.count, origin = state.axes.front().response.time.ns;
     typename Filter<N>::History history(A);
-    for (Time a = 0; a < A; ++a) history[a].reserve(updates(rows, a, filter.axes[a].noise.maneuvers));
     std::vector<Filtered<N>> at;
+    for (auto& entries : history) entries.reserve(count);
     at.reserve(A * n);
-    const Time origin = A ? state.axes[0].response.time.ns : 0;
     Time row = 0;
     for (Time k = 0; k <= n; ++k) {
         for (; row < count && (k == n || rows.events.time[row] <= times[k]); ++row)
             filter.step(state, rows[row], rows.fate(row), false, &history);
         for (Time a = 0; a < A && k < n; ++a) {
-            const AxisState<N, double> now = filter.at(state.axes[a], a, times[k]);
+            AxisState<N, double> now = state.axes[a];
+            filter.advance(now, a, {times[k], 0.0});
             at.push_back({now.response.x, now.residual});
         }
     }
     for (Time a = 0; a < A; ++a) {
-        const auto& axis = filter.axes[a];
+        const Known<N, double>& axis = filter.axes[a];
         Later<N> later;
         Time k = n - 1;
-        const auto smoothed = [&] {
+        const auto smoothed = [&] {  // estimate k, and on to the one before
             double found[PF_OUTPUTS];
+            later.smooth(at[k * A + a].residual);
             Filter<N>::describe(axis, at[k * A + a].r, at[k * A + a].residual, found);
             for (int i = 0; i < PF_OUTPUTS; ++i) outputs[(i * A + a) * n + k] = found[i];
+            --k;
         };
-        for (; k >= 0 && (history[a].empty() || times[k] >= history[a].back().time); --k) smoothed();  // nothing is later
+        while (k >= 0 && (history[a].empty() || times[k] >= history[a].back().time)) smoothed();  // nothing is later
         for (auto entry = history[a].rbegin(); entry != history[a].rend(); ++entry) {
             if (entry->sensor != NOBODY) later.over_update(filter.H[entry->sensor * A + a], *entry);
-            const Time before = entry + 1 != history[a].rend() ? entry[1].time : origin;
             Time here = entry->time;
             const auto back_to = [&](Time there) {
                 if (here > there) later.over_interval(axis.arm, axis.noise, double(here - there) / 1e9, entry->q, entry->drift);
                 here = there;
             };
-            for (; k >= 0 && times[k] >= before; --k) {
-                back_to(times[k]);
-                later.smooth(at[k * A + a].residual);
-                smoothed();
-            }
+            const Time before = entry + 1 != history[a].rend() ? entry[1].time : origin;
+            for (; k >= 0 && times[k] >= before; smoothed()) back_to(times[k]);
             back_to(before);
         }
     }

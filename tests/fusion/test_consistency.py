@@ -15,9 +15,13 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy import stats
+from scipy.special import chdtrc, chdtri
 
 import pumafuse as pf
+from pumafuse.fusion import chi_square
 from pumafuse.fusion.consistency import (
     LAGS,
     Consistency,
@@ -271,3 +275,12 @@ def test_ten_equal_values_in_white_noise_are_frozen(equal: int, found: int) -> N
         values = np.random.default_rng(1).standard_normal(300)
         values[first : first + equal] = values[first]
         assert _frozen(values) == found
+
+
+@settings(derandomize=True, deadline=None)
+@given(st.integers(1, 10_000_000), st.floats(1e-6, 1.0 - 1e-6), st.floats(0.0, 30.0))
+def test_chi_square_is_scipys(degrees: int, share: float, times: float) -> None:
+    """Quantiles to 1e-10, and the tail to 1e-7 of itself wherever a double holds it."""
+    assert chi_square.quantile(degrees, share) == pytest.approx(chdtri(degrees, share), rel=1e-10)
+    for x in (degrees * times, chdtri(degrees, share)):
+        assert chi_square.tail(degrees, x) == pytest.approx(chdtrc(degrees, x), rel=1e-7, abs=1e-290)

@@ -16,6 +16,7 @@ import numpy as np
 from ..arrays import CodeArray, FloatArray
 from ..filter.outcome import Outcome
 from ..units import MM, Kind, of_kind
+from . import chi_square
 from .config import FusionConfig, Sensor
 from .estimates import Estimates, Measurements
 from .score import Z95
@@ -94,9 +95,7 @@ def log_density(innovation: FloatArray, innovation_sd: FloatArray, outcome: Code
 
 def chi_square_band(count: int) -> tuple[float, float]:
     """Where the mean of ``count`` squares of standard normal variables lies in 95 % of cases."""
-    from scipy.special import chdtri
-
-    return float(chdtri(count, 0.975)) / count, float(chdtri(count, 0.025)) / count
+    return chi_square.quantile(count, 0.975) / count, chi_square.quantile(count, 0.025) / count
 
 
 def ljung_box(values: FloatArray, lags: int = LAGS) -> tuple[FloatArray, float]:
@@ -115,11 +114,9 @@ def ljung_box(values: FloatArray, lags: int = LAGS) -> tuple[FloatArray, float]:
 
 def whiteness_of(correlation: FloatArray, count: int) -> float:
     """Ljung-Box p-value that autocorrelations at lags 1, 2, … of ``count`` values are all zero."""
-    from scipy.special import chdtrc
-
     lags = len(correlation)
     statistic = count * (count + 2) * float(np.sum(correlation**2 / (count - np.arange(1, lags + 1))))
-    return float(chdtrc(lags, statistic))
+    return chi_square.tail(lags, statistic)
 
 
 def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
