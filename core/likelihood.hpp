@@ -4,7 +4,7 @@
 
 namespace pumafuse {
 
-inline constexpr int LANES = 8;  // derivatives that one pass carries
+inline constexpr int LANES = 10;  // derivatives that one pass carries: as many as an axis mostly has
 
 // A number with its derivatives.
 struct Dual {

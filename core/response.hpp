@@ -30,10 +30,11 @@ struct Response {
 
     // x <- u + Phi (x - u) + Gamma_e e
     void predict(const Arm<Real>& arm, const Transition<Real>& f, const Instant<Real>& to) {
-        const Real dt = seconds(time, to), gap = x - u, before = rate;
-        x = u + (f.f11 * gap + f.f12 * before), rate = f.f21 * gap + f.f22 * before;
-        if (!is_zero(error)) {
-            const Decay<Real> by = arm.plant.decaying(f, arm.decay, dt);
+        const bool stays = is_zero(arm.decay);  // then e is a part of the input
+        const Real target = stays ? u + error : Real(u), gap = x - target, before = rate;
+        x = target + (f.f11 * gap + f.f12 * before), rate = f.f21 * gap + f.f22 * before;
+        if (!stays && !is_zero(error)) {
+            const Decay<Real> by = arm.plant.decaying(f, arm.decay, seconds(time, to));
             x = x + by.position * error, rate = rate + by.rate * error, error = error * by.left;
         }
         time = to;

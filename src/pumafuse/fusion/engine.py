@@ -56,7 +56,7 @@ def filter_segment(
         engine: Which filter; ``filterpy`` only filters.
         progress: Called now and then by the filterpy engine with the share done, 0 to 1.
     """
-    events, _ = segment.events(config)
+    events = segment.events_once(config)
     model, results = model_of(segment, config), _undecided(events)
     if engine == "filterpy":
         from ..filter import reference
@@ -85,7 +85,7 @@ def filter_piece(
     Returns:
         The estimates and what became of its own events; those without a stamp come first.
     """
-    events, _ = segment.events(config)
+    events = segment.events_once(config)
     begin, end = np.searchsorted(events.time, own, side="right").tolist()
     results = _undecided(events)
     outputs = core.run(events, results, times, (begin, end))

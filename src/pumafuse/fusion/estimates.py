@@ -100,7 +100,7 @@ class Measurements:
     stamp: FloatArray
     sensor: IndexArray
     axis: IndexArray
-    segment: IntArray
+    segment: IndexArray
     value: FloatArray
     innovation: FloatArray
     innovation_sd: FloatArray
@@ -156,7 +156,7 @@ class Estimates:
         reference: The run's reference, where it has one.
         origin: Stamp of the first command, int ns.
         segment: 0, and one more after each time the log's clock was set back.
-        segments: Commands and measurements of each segment as the filter was given them.
+        segments: The commands of each segment as the filter was given them.
         mode: Which measurements an estimate uses: all that are valid by then (``filtered``), only those that had
             arrived (``as-live``), or all of the run (``smoothed``).
         engine: Which engine computed it.

@@ -86,20 +86,24 @@ def fuse(
     chosen = None if sensors is None else config.sensor_names(sensors)
     in_place, placed = in_axes(run, config.frame)
     logged, jumps = segments(in_place)
-    parts, faults = list[Part](), list[str]()
+    parts, faults, moving = list[Part](), list[str](), list[str]()
     for number, part in enumerate(logged):
         asked = [name for name in config.sensor_names(chosen) if name in part.sensors]
         faults += clock_faults(part, config.arm.update_period, asked)
         segment = build(part, config, chosen)
         faults += sensor_faults(segment, config)
+        moving += starts_in_motion(segment, config)
         times = output_times(segment, config, rate)
         share = None if progress is None else _share(progress, number, len(logged))
-        parts.append(Part(part, segment, times, filter_segment(segment, config, times, mode, engine, share)))
+        filtered = filter_segment(segment, config, times, mode, engine, share)
+        segment = segment.without_measurements()  # the filter's table has them
+        parts.append(Part(part, segment, times, filtered))
+    del filtered
     est = estimates_of(run, in_place, placed, config, parts, mode, engine)
-    notes = [*faults, *found_by(est, parts)]
-    notes += [note for part in parts for note in starts_in_motion(part.segment, config)]
+    notes = [*faults, *found_by(est, parts), *moving]
     notes += latency_questions(config, parts[0].segment.sensors)
     notes += [*jumps, *_uncovered(est), *config.arm.validity.excess(est.speed, est.radius)]
+    parts.clear()  # their tables are as large as what est has of them
     est = replace(est, notes=(*notes, *sensor_problems(est)), rate=rate, selected=chosen)
     for note in est.notes:
         warnings.warn(f"run '{run.name}': {note}", PumafuseWarning, stacklevel=2)
@@ -289,11 +293,11 @@ def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measu
     """Every component of every measurement in the order of the filter."""
     first, columns = cut[0], list[tuple[npt.NDArray[Any], ...]]()
     for number, (events, results) in enumerate((part.events, part.results) for part in filtered):
-        given = np.flatnonzero((events.source != COMMAND)[:, None] & (events.known != ABSENT))
-        row = given // len(first.axes)
-        axis = (given - row * len(first.axes)).astype(np.int16)
-        time, stamp = (seconds(part, first.origin)[row] for part in (events.time, events.stamp))
-        of_filter = (part.take(given) for part in (results.innovation, results.innovation_sd, results.outcome))
-        segment = np.full(len(given), number)
-        columns.append((time, stamp, events.source[row], axis, segment, events.value.take(given), *of_filter))
+        given = (events.source != COMMAND)[:, None] & (events.known != ABSENT)
+        count = reduce(np.add, given.view(np.uint8).T)  # of each row; of a long run no table of places is made
+        time, stamp = (np.repeat(seconds(part, first.origin), count) for part in (events.time, events.stamp))
+        axis = np.broadcast_to(np.arange(len(first.axes), dtype=np.int16), given.shape)[given]
+        segment = np.full(len(time), number, dtype=np.int16)
+        values = (events.value, results.innovation, results.innovation_sd, results.outcome)
+        columns.append((time, stamp, np.repeat(events.source, count), axis, segment, *(part[given] for part in values)))
     return Measurements(*map(_joined, zip(*columns, strict=True)), sensors=first.sensors, axes=first.axes)

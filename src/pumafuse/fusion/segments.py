@@ -88,22 +88,33 @@ class Segment:
         Returns:
             The events; and where among them each of ``measurement_rows`` is.
         """
-        times = self.times(config)  # a search asks for many configurations of the same times
-        found = self._latest.get(times)
+        times = (*self._delay(config), *self._latency(config).tolist())
+        found = self._latest.get(times)  # a search asks for many configurations of the same times
         if found is None:
-            delay, latency = times[: len(self.axes)], np.array(times[len(self.axes) :], dtype=np.int64)
-            found = self._latest[times] = self._ordered(delay, latency)
+            groups = self._groups(config)
+            if groups not in self._tables:
+                self._tables.clear()  # threads share it
+                self._tables[groups] = self._joined(groups)
+            found = self._latest[times] = self._ordered(config, *self._tables[groups])
             for oldest in list(self._latest)[:-_KEPT]:
                 self._latest.pop(oldest, None)  # threads share it
         return found
 
-    def times(self, config: FusionConfig) -> tuple[int, ...]:
-        """All that the order of the events depends on: the delay of each axis, the latency of each sensor, int ns."""
-        return (*(round(config.arm.delay_of(axis) * 1e9) for axis in self.axes), *self._latency(config).tolist())
+    def events_once(self, config: FusionConfig) -> Events:
+        """The events in their order where nobody will ask again: nothing of them is kept here."""
+        return self._ordered(config, *self._joined(self._groups(config)))[0]
 
-    def _ordered(self, delay: Sequence[int], latency: IntArray) -> tuple[Events, IntArray]:
-        distinct = sorted(set(delay))
-        unordered, moves = self._joined(tuple(distinct.index(one) for one in delay))
+    def _delay(self, config: FusionConfig) -> list[int]:
+        """Of each axis, int ns."""
+        return [round(config.arm.delay_of(axis) * 1e9) for axis in self.axes]
+
+    def _groups(self, config: FusionConfig) -> tuple[int, ...]:
+        """Which of the distinct delays each axis has."""
+        distinct = sorted(set(self._delay(config)))
+        return tuple(distinct.index(one) for one in self._delay(config))
+
+    def _ordered(self, config: FusionConfig, unordered: Events, moves: IntArray) -> tuple[Events, IntArray]:
+        distinct, latency = sorted(set(self._delay(config))), self._latency(config)
         missing, shift = unordered.stamp == NO_STAMP, np.concatenate([distinct, -latency])
         time = np.where(missing, NO_STAMP, unordered.stamp + shift[moves])
         order = np.argsort(time, kind="stable")  # each source is in its order: commands, then the sensors'
@@ -113,18 +124,13 @@ class Segment:
 
     def _joined(self, groups: tuple[int, ...]) -> tuple[Events, IntArray]:
         """Commands, one event for each group of axes that share a delay, then measurements; which time moves each."""
-        if (found := self._tables.get(groups)) is not None:
-            return found
         rows, measured, parts, moves = self.command_rows, self.measurement_rows, list[Events](), list[IntArray]()
         for group in sorted(set(groups)):
             known = np.where(np.array(groups) == group, rows.known, np.uint8(ABSENT))
             parts.append(rows._replace(known=known).where(_on_any_axis(known, Outcome.FUSED)))
             moves.append(np.full(len(parts[-1].time), group))
         sensors = max(groups) + 1 + measured.source.astype(np.int64)
-        found = joined([*parts, measured]), np.concatenate([*moves, sensors])
-        self._tables.clear()  # threads share it
-        self._tables[groups] = found
-        return found
+        return joined([*parts, measured]), np.concatenate([*moves, sensors])
 
     def given(self, axis: str) -> tuple[TimeArray, FloatArray]:
         """Stamps [int64 ns] and values [m] of the commands of one axis, (n,)."""
@@ -161,6 +167,10 @@ class Segment:
             measurement_rows=self.measurement_rows.rows(rows).columns(column),
             turn=self.turn[:, column],
         )
+
+    def without_measurements(self) -> Segment:
+        """The segment with its commands alone: of a long run its measurements take as much memory as their results."""
+        return replace(self, measurement_rows=Events.empty(len(self.axes)))
 
     def highest_speed(self, axis: str, period: float) -> float:
         """Highest commanded speed on an axis [m/s or rad/s]."""
