@@ -61,9 +61,9 @@ struct Counters {
 
   private:
     enum { ROWS, LATENESS, LATEST, NIS, VALUES };
-    static constexpr std::int64_t FEW = 20, MANY = 100;  // intervals before a usual one is known, and of which it is a mean
+    static constexpr std::int64_t FEW = 20, MANY = 100;  // intervals before a usual one is known, and that it is of
     static constexpr double GAP = 1.5;     // usual intervals without a row: one is missing
-    static constexpr double SLOWER = 1.1;  // by dropouts in a row the usual interval grows until a slower sensor has one
+    static constexpr double SLOWER = 1.1;  // by dropouts in a row the usual interval grows, if a sensor is slower now
 
     static Time whole_second(Time stamp) { return stamp / 1'000'000'000 - (stamp % 1'000'000'000 < 0); }
 
@@ -73,7 +73,7 @@ struct Counters {
         const double interval = double(stamp - before) / 1e9;
         if (++count(sensor, PF_INTERVALS) > FEW && interval > GAP * usual[sensor]) {
             ++count(sensor, PF_DROPOUTS);
-            if (++count(sensor, PF_IN_A_ROW) > 1) usual[sensor] *= SLOWER;  // not a row that is missing: it is slower now
+            if (++count(sensor, PF_IN_A_ROW) > 1) usual[sensor] *= SLOWER;
             return;
         }
         count(sensor, PF_IN_A_ROW) = 0;

@@ -47,7 +47,8 @@ struct Table {
 
     Fate fate(Time row) const {
         const Time at = row * axes;
-        return {results->innovation + at, results->innovation_sd + at, results->outcome + at, results->contradicts + row};
+        const auto& [innovation, innovation_sd, outcome, contradicts] = *results;
+        return {innovation + at, innovation_sd + at, outcome + at, contradicts + row};
     }
 };
 

@@ -75,7 +75,8 @@ class Filter {
             Noise<N, Real>& noise = axes[at % size()].noise;
             Vector<N, Real> h{};
             for (int i = 0; i < N; ++i) h[i] = sensors[at / size()].scale * noise.position[i];
-            if (value_of(view.bias_drift_sd) > 0.0) h[noise.add(1.0 / view.bias_time, square(view.bias_drift_sd))] = 1.0;
+            const bool drifts = value_of(view.bias_drift_sd) > 0.0;
+            if (drifts) h[noise.add(1.0 / view.bias_time, square(view.bias_drift_sd))] = 1.0;
             if (value_of(view.bias_sd) > 0.0) h[bias[at] = noise.add(0.0, square(view.bias_sd))] = 1.0;
             H.push_back(h);
         }
@@ -108,8 +109,8 @@ class Filter {
         }
     }
 
-    // Every axis at an instant, as estimate n of `count`; of rows from `pending` on, which are not in the state yet, the
-    // commands count that act by then and are stamped by `stamped`.
+    // Every axis at an instant, as estimate n of `count`; of rows from `pending` on, which are not in the state yet,
+    // the commands count that act by then and are stamped by `stamped`.
     template <class Rows>
     void estimate(const State<N, Real>& state, const Rows& rows, Time pending, Time end, Time time, Time stamped,
                   double* outputs, Time count = 1, Time n = 0) const {
@@ -130,7 +131,8 @@ class Filter {
     }
 
     // Position, offset and disturbance of an axis whose response is at r; no velocity.
-    static void describe(const Known<N, Real>& axis, double r, const Residual<N, double>& xi, double (&found)[PF_OUTPUTS]) {
+    static void describe(const Known<N, Real>& axis, double r, const Residual<N, double>& xi,
+                         double (&found)[PF_OUTPUTS]) {
         const auto sd = [&](int i) { return std::sqrt(std::max(xi.P[i][i], 0.0)); };
         const bool disturbed = axis.noise.smoothness != Smoothness::none;
         found[PF_POSITION] = r + xi.along(axis.noise.position);
@@ -141,8 +143,8 @@ class Filter {
         found[PF_DISTURBANCE_SD] = disturbed ? sd(DISTURBANCE) : 0.0;
     }
 
-    // Response and residual to an instant; where they are at the same one, which is where no command lies between, by one
-    // transition.
+    // Response and residual to an instant; where they are at the same one, which is where no command lies between, by
+    // one transition.
     void advance(AxisState<N, Real>& state, Time a, const Instant<Real>& to) const {
         const auto& [arm, noise, ahead, motion, delayed, start] = axes[a];
         Response<Real>& r = state.response;
@@ -171,15 +173,17 @@ class Filter {
             state.response.predict(axis.arm, acts);
             state.response.command(axis.arm, event.value[a]);
         } else {
-            if (history) (*history)[a].push_back({.time = event.time, .q = value_of(xi.q), .drift = value_of(xi.drift)});
+            if (history) (*history)[a].push_back({event.time, value_of(xi.q), value_of(xi.drift)});
             advance(state, a, acts);
             xi.apply_maneuver(axis.noise, state.response.command(axis.arm, event.value[a]));
         }
     }
 
-    // Predict to `until` by the commands from row `next` on that act by then and are stamped by `stamped`; the row after.
+    // Predict to `until` by the commands from row `next` on that act by then and are stamped by `stamped`; the row
+    // after.
     template <class Rows>
-    Time follow(AxisState<N, Real>& state, Time a, const Rows& rows, Time next, Time end, Time until, Time stamped) const {
+    Time follow(AxisState<N, Real>& state, Time a, const Rows& rows, Time next, Time end, Time until,
+                Time stamped) const {
         for (; next < end && rows[next].time <= until; ++next) {
             const Event event = rows[next];
             if (event.commands(a) && event.stamp <= stamped) command(state, a, event, nullptr);
@@ -227,7 +231,8 @@ class Filter {
         }
     }
 
-    // nu = z - H x and S = H P H^T + R here and now; an angle that is measured within a turn is the nearest of all turns.
+    // nu = z - H x and S = H P H^T + R here and now; an angle that is measured within a turn is the nearest of all
+    // turns.
     Innovation innovation(const AxisState<N, Real>& state, const Event& event, Time a) const {
         const Time at = event.source * size() + a;
         const Real R = noise_of(state, event, a), scale = sensors[event.source].scale;
@@ -266,14 +271,15 @@ class Filter {
         }
         if (all_agree && other == NOBODY) return true;
         if (all_agree) *fate.contradicts = std::int16_t(other);
-        for (Time a = first; a < end; ++a)
-            if (event.known[a] == PF_FUSED)
-                gates_of(state, a).reject(event.source, fate.innovation[a], value_of(innovations[a].R), event.time, again);
+        for (Time a = first; a < end; ++a) {
+            if (event.known[a] != PF_FUSED) continue;
+            gates_of(state, a).reject(event.source, fate.innovation[a], value_of(innovations[a].R), event.time, again);
+        }
         return false;
     }
 
-    // Whether a rejected measurement agrees with the one before:
-    // |nu2 - nu1| <= gate sqrt(R1 + R2 + the variance of the motion between), both predicted by what did not follow them.
+    // Whether a rejected measurement agrees with the one before: |nu2 - nu1| <= gate sqrt(R1 + R2 + the variance of the
+    // motion between), both predicted by what did not follow them.
     Agreement agreement(State<N, Real>& state, const Event& event, Time a, double nu) const {
         const Known<N, Real>& axis = axes[a];
         const Sensor<Real>& sensor = sensors[event.source];

@@ -1,10 +1,11 @@
 // Which measurements are believed: the gate, and what lifts it.
 //
-// A measurement with |nu| > gate sqrt(S) is rejected. Outliers are independent, a wrong model persists: when two rejected
-// measurements of one sensor, at least T apart and none fused between, agree with each other, the second is believed and
-// nu^2 is added to the offset's variance (it re-acquires). But not where another sensor was fused on the same axis
-// within the last 0.5 s and has not re-acquired more often: then one of the two is wrong, it cannot be known which, and
-// what was believed goes on to be. Re-acquisitions are forgotten when all sensors of the axis agreed for 5 s.
+// A measurement with |nu| > gate sqrt(S) is rejected. Outliers are independent, a wrong model persists: when two
+// rejected measurements of one sensor, at least T apart and none fused between, agree with each other, the second is
+// believed and nu^2 is added to the offset's variance (it re-acquires). But not where another sensor was fused on the
+// same axis within the last 0.5 s and has not re-acquired more often: then one of the two is wrong, it cannot be known
+// which, and what was believed goes on to be. Re-acquisitions are forgotten when all sensors of the axis agreed for 5
+// s.
 #pragma once
 #include <cmath>
 
@@ -13,7 +14,7 @@
 namespace pumafuse {
 
 inline constexpr Time RECENT = 500'000'000;     // ns; a sensor fused within this time stands for what is believed
-inline constexpr Time SETTLED = 5'000'000'000;  // ns; all sensors in agreement for so long: what was before is forgotten
+inline constexpr Time SETTLED = 5'000'000'000;  // ns; all sensors in agreement for so long: all is forgotten
 inline constexpr int NOBODY = -1;
 enum class Agreement { no, yes, too_soon };
 

@@ -35,12 +35,13 @@ Model<Real> model_of(const pf_model& model, const pf_model* tangents = nullptr, 
     std::vector<const pf_view*> views;
     for (const pf_model* one = tangents; one < tangents + lanes; ++one)
         axes.push_back(one->axis), sensors.push_back(one->sensor), views.push_back(one->view);
-    return {lifted<Axis, Real>(model.axis, model.axes, axes), lifted<Sensor, Real>(model.sensor, model.sensors, sensors),
+    return {lifted<Axis, Real>(model.axis, model.axes, axes),
+            lifted<Sensor, Real>(model.sensor, model.sensors, sensors),
             lifted<View, Real>(model.view, model.sensors * model.axes, views)};
 }
 
-// Calls `make` with the compiled size for the states of the axis that has the most: the next larger one serves, and what is
-// left over stays 0. With lengths known the algebra takes half the time.
+// Calls `make` with the compiled size for the states of the axis that has the most: the next larger one serves, and
+// what is left over stays 0. With lengths known the algebra takes half the time.
 inline auto sized(const pf_model& model, auto make) {
     int most = 0;
     for (Time a = 0; a < model.axes; ++a) {

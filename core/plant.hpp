@@ -114,7 +114,7 @@ class Plant {
     static constexpr double TINY = 0.1;         // rad; up to which few terms are enough
     static constexpr double SHORT = 0.5;        // rad; fastest pole times interval up to which the series are used
     static constexpr double CLOSE = 0.05;       // of what it would be with the signs alike: below, sums cancel
-    static constexpr double APART = 0.5;        // half the poles' difference over sigma, below which exponentials cancel
+    static constexpr double APART = 0.5;        // half the poles' distance over sigma, below which exponentials cancel
 
     Real apart = 0.0;                 // (zeta^2 - 1) omega^2: below 0 the poles are a pair
     double fastest = 0.0;             // rad/s
@@ -125,9 +125,11 @@ class Plant {
         const Real u = fastest * t, v = u * u;
         Free evens{}, odds{};
         for (int k = (value_of(u) <= TINY ? FEW : TERMS) - 2; k >= 0; k -= 2)
-            for (int i = 0; i < 3; ++i) evens[i] = evens[i] * v + series[k][i], odds[i] = odds[i] * v + series[k + 1][i];
+            for (int i = 0; i < 3; ++i)
+                evens[i] = evens[i] * v + series[k][i], odds[i] = odds[i] * v + series[k + 1][i];
         const double r = fastest;
-        return {(evens[0] + u * odds[0]) * u / r, evens[1] + u * odds[1], (evens[2] + u * odds[2]) * u * v / (r * r * r)};
+        const Real energy = (evens[2] + u * odds[2]) * u * v / (r * r * r);
+        return {(evens[0] + u * odds[0]) * u / r, evens[1] + u * odds[1], energy};
     }
 
     Free by_exponentials(Real t) const {
@@ -172,7 +174,8 @@ class Plant {
         using std::exp;
         const double most = std::max(fastest, value_of(decay)), turned = most * value_of(t);
         const int doublings = turned > SHORT ? int(std::ceil(std::log2(turned / SHORT))) : 0;
-        const Real u = most * t / std::ldexp(1.0, doublings), s = sigma / most, w = square(omega / most), b = decay / most;
+        const Real s = sigma / most, w = square(omega / most), b = decay / most;
+        const Real u = most * t / std::ldexp(1.0, doublings);
         Real g_k = 0.0, g_next = 1.0, h_k = 0.0, power = 1.0, g = 0.0, g_rate = 0.0, h = 0.0;  // g_k, h_k: of u^k
         for (int k = 0; k < TERMS + 2; ++k) {
             g = g + g_k * power, h = h + h_k * power, g_rate = g_rate + double(k + 1) * g_next * power;

@@ -40,7 +40,8 @@ const char* pf_error(void) { return error.c_str(); }
 
 void pf_transition(const pf_axis* axis, double dt, double step[17]) {
     const Arm<double> arm(lifted<Axis, double>(axis, 1, {})[0]);
-    const Transition<double> f = arm.plant.over(dt), d = smooth_disturbance(std::sqrt(3.0) / axis->disturbance_time, dt);
+    const Transition<double> f = arm.plant.over(dt);
+    const Transition<double> d = smooth_disturbance(std::sqrt(3.0) / axis->disturbance_time, dt);
     const Decay<double> e = arm.plant.decaying(f, arm.decay, dt);
     const double found[] = {f.f11, f.f12, f.f21, f.f22, f.q11, f.q12, f.q22, e.position, e.rate, e.left,
                             d.f11, d.f12, d.f21, d.f22, d.q11, d.q12, d.q22};

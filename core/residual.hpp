@@ -8,8 +8,8 @@
 
 namespace pumafuse {
 
-enum { PLANT, RATE, OFFSET, DISTURBANCE };                            // of x; where there is no disturbance, biases follow
-enum class Smoothness { none, rough, smooth };                        // no state, d alone, d and its rate
+enum { PLANT, RATE, OFFSET, DISTURBANCE };      // of x; where there is no disturbance, biases follow
+enum class Smoothness { none, rough, smooth };  // no state, d alone, d and its rate
 
 // M <- F M F^T where F moves the states i and i + 1.
 template <int N, class Real>
@@ -48,9 +48,9 @@ struct Along {
 
 // K = M H^T / S, and M <- (I - K H) M (I - K H)^T + K R K^T. Returns K.
 //
-// The smoother uses it for its dual, too. A state that H does not see and that shares nothing with the others changes no
-// bit of theirs. A quotient is exactly 1 where a prior is all there is to S; a product with 1/S would leave a variance
-// below 0.
+// The smoother uses it for its dual, too. A state that H does not see and that shares nothing with the others changes
+// no bit of theirs. A quotient is exactly 1 where a prior is all there is to S; a product with 1/S would leave a
+// variance below 0.
 template <int N, class Real>
 Vector<N, Real> joseph(Matrix<N, Real>& M, const Vector<N, Real>& H, const Along<N, Real>& along, Real R) {
     Vector<N, Real> K, WH{};

@@ -13,7 +13,8 @@ struct Arm {
 
     Arm() = default;
     explicit Arm(const Axis<Real>& axis)
-        : plant(axis), slope(axis.slope), intercept(axis.intercept), decay(axis.recovery), period(value_of(axis.period)) {
+        : plant(axis), slope(axis.slope), intercept(axis.intercept), decay(axis.recovery),
+          period(value_of(axis.period)) {
         if (value_of(decay) > 0.0) decay = 1.0 / decay;
     }
 

@@ -1,16 +1,15 @@
-// The smoother: what all later measurements say of the residual, carried backward as information. The response is known,
-// so that nothing later changes it.
+// The smoother: what all later measurements say of the residual, carried backward as information. The response is
+// known, so that nothing later changes it.
 //
-// In the deviation delta from the filter's mean the later measurements' likelihood is exp(-½ delta' M delta + eta' delta).
-// From the last event backward, M = 0 and eta = 0 at first:
+// In the deviation delta from the filter's mean the later measurements' likelihood is exp(-½ delta' M delta + eta'
+// delta). From the last event backward, M = 0 and eta = 0 at first:
 //     over an interval   eta <- F' (I + M Q)^-1 eta,          M <- F' (I + M Q)^-1 M F
 //     over an update     eta <- eta + M K nu + H' nu / R,     M <- M + H' H / R
 // and with the filter's covariance P the smoothed state is x + P_s eta with P_s = (I + P M)^-1 P. No covariance is
-// inverted (the predicted one is singular: some states are known), and P_s is not a difference, as P - P Lambda P would be
-// in the Bryson-Frazier form: with a wide prior that loses the error bars altogether. Each product with an inverse is a
-// row of updates of rank one: noise enters M as measurements enter P.
-// (Fraser & Potter, "The optimum linear smoother as a combination of two optimum linear filters", IEEE Trans. AC 14(4),
-// 1969.)
+// inverted (the predicted one is singular: some states are known), and P_s is not a difference, as P - P Lambda P would
+// be in the Bryson-Frazier form: with a wide prior that loses the error bars altogether. Each product with an inverse
+// is a row of updates of rank one: noise enters M as measurements enter P. (Fraser & Potter, "The optimum linear
+// smoother as a combination of two optimum linear filters", IEEE Trans. AC 14(4), 1969.)
 #pragma once
 #include "filter.hpp"
 
@@ -156,8 +155,8 @@ void run_smoothed(const Filter<N>& filter, State<N, double>& state, const Table&
             if (entry->sensor != NOBODY) later.over_update(filter.H[entry->sensor * A + a], *entry);
             Time here = entry->time;
             const auto back_to = [&](Time there) {
-                if (here > there) later.over_interval(axis.arm, axis.noise, double(here - there) / 1e9, entry->q, entry->drift);
-                here = there;
+                const double dt = double(std::exchange(here, there) - there) / 1e9;
+                if (dt > 0.0) later.over_interval(axis.arm, axis.noise, dt, entry->q, entry->drift);
             };
             const Time before = entry + 1 != history[a].rend() ? entry[1].time : origin;
             for (; k >= 0 && times[k] >= before; smoothed()) back_to(times[k]);

@@ -62,7 +62,8 @@ class Window {
     Window(const pf_model& given, const Model<double>& model, Time first_room, Time most, const Counters& carried)
         : axis(given.axis, given.axis + given.axes), sensor(given.sensor, given.sensor + given.sensors),
           view(given.view, given.view + given.axes * given.sensors), filter(model), state(filter.at_rest(0)),
-          aside(state), rows(rounded(std::max(first_room, given.axes)), given.axes), checkpoints(rows.room, state), most(most),
+          aside(state), rows(rounded(std::max(first_room, given.axes)), given.axes), checkpoints(rows.room, state),
+          most(most),
           first(given.axes, PF_NEVER), value(given.axes), spread(given.axes, 1.0), found(3 * given.axes),
           outcome(2 * given.axes), counters(carried) {
         Time period = 0;
@@ -138,7 +139,7 @@ class Window {
         end = done = target = begin;
         if (port.origin > after) port.origin = PF_NEVER;
         for (Time a = 0; a < size(); ++a)
-            if (first[a] > after && first[a] < PF_NEVER) first[a] = PF_NEVER, rest(a, axis[a].start);  // it only just began
+            if (first[a] > after && first[a] < PF_NEVER) first[a] = PF_NEVER, rest(a, axis[a].start);  // just begun
         const std::vector<Time> begun = first;
         for (Time& one : first) one = one < PF_NEVER ? PF_ALWAYS : one;  // what left the window since then stays
         for (Time row = begin; row < stop; ++row) {
@@ -220,8 +221,8 @@ class Window {
         for (; left < begin; ++left) counters.leaves(rows[left], rows.fate(left), size());
     }
 
-    // Let go of events that nothing can change any more, and make room for `wanted` rows more: in more memory, or at the
-    // limit by giving up the oldest eighth. False if an event of that stamp is then too late.
+    // Let go of events that nothing can change any more, and make room for `wanted` rows more: in more memory, or at
+    // the limit by giving up the oldest eighth. False if an event of that stamp is then too late.
     bool has_room(Time wanted, Time stamp, Time oldest) {
         const Time horizon = oldest - behind;
         while (begin < done && rows[begin].time < horizon) ++begin;
@@ -316,8 +317,8 @@ class Window {
         }
     }
 
-    // Put the axes of the port that are bits of `given` in their place: by time, then source, then stamp; of those alike
-    // the new one is the last. Returns the row.
+    // Put the axes of the port that are bits of `given` in their place: by time, then source, then stamp; of those
+    // alike the new one is the last. Returns the row.
     Time insert(Time time, int source, Time stamp, std::uint64_t given) {
         Time at = end;
         for (; at > begin; --at) {

@@ -2,13 +2,11 @@
  *
  * All numbers are SI: m, m/s and s; of an axis that is an angle rad and rad/s. Instants are int64 nanoseconds of any
  * one clock. Matrices are flat, the last index runs fastest: "(S, A)" is S rows of A numbers.
- *
  * Ownership: what a caller gives is read, and what it gets is written, during the call alone; nothing of it is kept or
  * freed. Who makes a pf_filter or a pf_live frees it.
  * Errors: a call that may fail returns NULL or a number below 0; pf_error() then has one line on why.
  * Threads: a pf_filter or a pf_live belongs to one thread at a time; different ones do not know of each other.
- * Not checked: that counts, the numbers of sensors and axes, and the order of events are as said here.
- */
+ * Not checked: that counts, the numbers of sensors and axes, and the order of events are as said here. */
 #ifndef PUMAFUSE_H
 #define PUMAFUSE_H
 
@@ -24,64 +22,56 @@
 extern "C" {
 #endif
 
-#define PF_VERSION 3 /* of this interface: a program and its library must agree */
-#define PF_NO_STAMP INT64_MIN /* the time of a row without a readable stamp */
+#define PF_VERSION 3              /* of this interface: a program and its library must agree */
+#define PF_NO_STAMP INT64_MIN     /* the time of a row without a readable stamp */
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
-#define PF_NEVER INT64_MAX /* after all instants */
-#define PF_COMMAND (-1) /* the source of a command */
+#define PF_NEVER INT64_MAX        /* after all instants */
+#define PF_COMMAND (-1)           /* the source of a command */
 
-/* What became of a value. */
+/* What became of a value; PF_ABSENT: the row gives none for this axis. */
 enum {
     PF_FUSED, PF_REJECTED, PF_REACQUIRED, PF_DUPLICATE, PF_BEFORE_START, PF_TOO_LATE, PF_INVALID, PF_UNKNOWN,
-    PF_ABSENT = 255 /* the row gives no value for this axis */
+    PF_ABSENT = 255
 };
 
 /* What an estimate says of an axis, relative to its start level: first index of outputs (PF_OUTPUTS, A, n). */
 enum {
-    PF_POSITION, PF_POSITION_SD, /* p [m] */
-    PF_VELOCITY, PF_VELOCITY_SD, /* mean over the coming period [m/s]; NaN where smoothed */
-    PF_OFFSET, PF_OFFSET_SD, /* o [m] */
+    PF_POSITION, PF_POSITION_SD,       /* p [m] */
+    PF_VELOCITY, PF_VELOCITY_SD,       /* mean over the coming period [m/s]; NaN where smoothed */
+    PF_OFFSET, PF_OFFSET_SD,           /* o [m] */
     PF_DISTURBANCE, PF_DISTURBANCE_SD, /* d [m]; 0 where the axis has none */
     PF_OUTPUTS
 };
 
 /* How an axis answers its commands, and what it does that nobody commanded. */
 typedef struct {
-    double period;            /* T [s]: from a command to the next */
-    double delay;             /* Td [s]: from a command's stamp to where it acts */
-    double time_constant;     /* tau [s] of a first-order plant; 0: it is of second order */
-    double natural_frequency; /* omega [rad/s] */
-    double damping;           /* zeta */
-    double slope;             /* a [s/m] and */
-    double intercept;         /* b of the gain K = a * speed + b */
-    double recovery;          /* Tr [s], of the gain error; 0: it stays */
-    double input_noise;       /* density of the white noise on the plant's input [m/sqrt(Hz)] */
-    double drift;             /* density of the offset's random walk [m/sqrt(s)] */
-    double maneuver_noise;    /* what each m/s of maneuver adds to the one [m/sqrt(Hz)] */
-    double maneuver_drift;    /* and to the other [m/sqrt(s)] */
-    double disturbance_sd;    /* [m]; 0: there is none */
-    double disturbance_time;  /* [s] */
-    double smoothness;        /* of the disturbance: 1.5 (Matern) or 0.5 (Ornstein-Uhlenbeck) */
-    double offset_sd;         /* prior of the offset [m] */
-    double start;             /* u0 [m]: where the axis rests before its first command; NaN: not known */
+    double period, delay;                  /* T and Td [s]: from a command to the next, and to where it acts */
+    double time_constant;                  /* tau [s] of a first-order plant; 0: it is of second order */
+    double natural_frequency, damping;     /* omega [rad/s] and zeta */
+    double slope, intercept;               /* a [s/m] and b of the gain K = a * speed + b */
+    double recovery;                       /* Tr [s], of the gain error; 0: it stays */
+    double input_noise, drift;             /* densities: white noise on the input [m/sqrt(Hz)]; offset [m/sqrt(s)] */
+    double maneuver_noise, maneuver_drift; /* what each m/s of maneuver adds to them, likewise */
+    double disturbance_sd, disturbance_time; /* [m], 0: there is none; [s] */
+    double smoothness;                     /* of the disturbance: 1.5 (Matern) or 0.5 (Ornstein-Uhlenbeck) */
+    double offset_sd;                      /* prior of the offset [m] */
+    double start;                          /* u0 [m]: where it rests before its first command; NaN: not known */
 } pf_axis;
 
 /* A sensor: z = scale * p(stamp - latency) + biases + noise. */
 typedef struct {
     double scale;
-    double latency;    /* [s] */
-    double latency_sd; /* how far the latency wanders [s] */
-    double gate;       /* [standard deviations]; 0: none */
-    double gate_rows;  /* 1: one axis beyond the gate rejects its row; 0: itself alone */
+    double latency, latency_sd; /* [s]; the sd is how far it wanders */
+    double gate;                /* [standard deviations]; 0: none */
+    double gate_rows;           /* 1: one axis beyond the gate rejects its row; 0: itself alone */
 } pf_sensor;
 
 /* What a sensor sees of an axis. */
 typedef struct {
-    double sd;            /* noise [m]; NaN: the sensor is not used there */
-    double bias_sd;       /* prior of a constant bias [m]; 0: none is in the state */
-    double bias_drift_sd; /* of a bias that drifts [m]; 0: none is in the state */
-    double bias_time;     /* how long such a drift lasts [s] */
-    double turn;          /* angle after which it measures the same again [rad]; 0: never */
+    double sd;                       /* noise [m]; NaN: the sensor is not used there */
+    double bias_sd, bias_drift_sd;   /* of a constant bias, and of one that drifts [m]; 0: none is in the state */
+    double bias_time;                /* how long such a drift lasts [s] */
+    double turn;                     /* angle after which it measures the same again [rad]; 0: never */
 } pf_view;
 
 typedef struct {
@@ -104,24 +94,22 @@ typedef struct {
 
 /* What became of n events; the caller's arrays. Values that the filter does not decide on are not written. */
 typedef struct {
-    double *innovation;    /* nu [m], (n, A) */
-    double *innovation_sd; /* sqrt(S) [m], (n, A) */
-    uint8_t *outcome;      /* (n, A) */
-    int16_t *contradicts;  /* the sensor that a rejected row contradicts time after time, -1: none, (n,) */
+    double *innovation, *innovation_sd; /* nu and sqrt(S) [m], (n, A) */
+    uint8_t *outcome;                   /* (n, A) */
+    int16_t *contradicts; /* the sensor that a rejected row contradicts time after time, -1: none, (n,) */
 } pf_results;
 
 PF_API int pf_version(void);
 PF_API const char *pf_error(void); /* of the last call of this thread that failed */
 
 /* What an axis does over dt [s]. step: Phi11, Phi12, Phi21, Phi22, Q11, Q12, Q22 of its plant for unit noise on the
- * input; what an input that decays from 1 m by exp(-dt/Tr) makes of position and rate, and what is left of it; Phi and Q
- * of a smooth disturbance of variance 1. */
+ * input; what an input that decays from 1 m by exp(-dt/Tr) makes of position and rate, and what is left of it; Phi and
+ * Q of a smooth disturbance of variance 1. */
 PF_API void pf_transition(const pf_axis *axis, double dt, double step[17]);
 /* Where an axis goes without noise, relative to its start level [m], at n instants, ascending; commands [m] act at
  * their instants, ascending. */
 PF_API void pf_response(const pf_axis *axis, int64_t commands, const int64_t *acts, const double *command, int64_t n,
                         const int64_t *time, double *position);
-
 /* What each value is before the filter sees it, into known (n, A); too_late (n,): rows far behind earlier ones. */
 PF_API void pf_classify(const pf_model *model, const pf_events *events, int64_t origin, const uint8_t *too_late,
                         uint8_t *known);
@@ -136,10 +124,9 @@ PF_API void pf_filter_free(pf_filter *filter); /* NULL: nothing */
 PF_API void pf_filter_run(pf_filter *filter, const pf_events *events, int64_t begin, int64_t end, int given,
                           const pf_results *results, int64_t n, const int64_t *time, double *outputs);
 /* The same of all events, each estimate by those that had arrived by its instant: commands at their stamp, measurements
- * at the later of stamp and validity. Returns 0; -1 without memory. */
+ * at the later of stamp and validity. And: each by all measurements. Return 0; -1 without memory. */
 PF_API int pf_filter_run_as_live(pf_filter *filter, const pf_events *events, const pf_results *results, int64_t n,
                                  const int64_t *time, double *outputs);
-/* The same of all events, each estimate by all measurements. Returns 0; -1 without memory. */
 PF_API int pf_filter_smooth(pf_filter *filter, const pf_events *events, const pf_results *results, int64_t n,
                             const int64_t *time, double *outputs);
 /* Mean and sd [m] of the constant bias of a sensor on an axis; returns 1, or 0 where none is in the state. */
@@ -151,9 +138,9 @@ PF_API int pf_filter_bias(const pf_filter *filter, int64_t sensor, int64_t axis,
 PF_API int pf_linearise(const pf_model *model, const pf_model *tangents, int64_t k, int64_t origin,
                         const pf_events *events, const pf_results *results, double *d_innovation, double *d_variance);
 
-/* Constant-velocity filters with R = 1 on n measurements at times [any unit], ascending, g densities of the noise on
- * their acceleration: adds the squares of the innovations to square (g,), the last filter's go to innovation (n - 1,),
- * unless that is NULL. The simplest rival. */
+/* The simplest rival: constant-velocity filters with R = 1 on n measurements at times [any unit], ascending, g
+ * densities of the noise on their acceleration. Adds the squares of the innovations to square (g,); those of the last
+ * filter go to innovation (n - 1,), unless that is NULL. */
 PF_API void pf_constant_velocity(int64_t n, const double *time, const double *value, int64_t g, const double *density,
                                  double *square, double *innovation);
 
@@ -163,43 +150,41 @@ typedef struct pf_live pf_live;
 
 /* What goes in and comes out of a pf_live, in its memory; A <= 62. */
 typedef struct {
-    double *value;       /* of the event that comes in [m], (A,) */
-    double *spread;      /* by what the noise of each is scaled, 1 unless a caller says otherwise, (A,) */
-    uint8_t *outcome;    /* what became of each, PF_ABSENT for an axis that the event does not give, (A,) */
-    double *innovation;  /* nu of each value of a measurement [m], (A,) */
-    int64_t contradicts; /* the sensor that the last measurement contradicts time after time; -1: none */
-    int64_t origin;      /* stamp of the first command; PF_NEVER before it */
-    int64_t floor;       /* what is stamped before is taken no more: the stream was too dense; PF_ALWAYS at first */
-    int64_t room, held;  /* events that there is room for, and those that are there */
+    double *value, *spread; /* of the event that comes in [m], and by what its noise is scaled, else 1, (A,) */
+    uint8_t *outcome;       /* what became of each, PF_ABSENT for an axis that the event does not give, (A,) */
+    double *innovation;     /* nu of each value of a measurement [m], (A,) */
+    int64_t contradicts;    /* the sensor that the last measurement contradicts time after time; -1: none */
+    int64_t origin;         /* stamp of the first command; PF_NEVER before it */
+    int64_t floor;          /* what is stamped before is taken no more: the stream was too dense; PF_ALWAYS at first */
+    int64_t room, held;     /* events that there is room for, and those that are there */
 } pf_port;
 
-/* What was counted of each sensor. */
-enum { PF_CAME = 8, PF_DROPOUTS, PF_INTERVALS, PF_IN_A_ROW, PF_COUNTS }; /* of number, after the outcomes */
-enum { PF_SECONDS = 60, PF_KINDS = 5 }; /* rows, sum and most of lateness [s], sum of NIS, fused values */
+/* What was counted of each sensor: number has outcomes of values that left the window, then rows that came, ...; minute
+ * has for each second rows, sum and most of lateness [s], sum of NIS, fused values. */
+enum { PF_CAME = 8, PF_DROPOUTS, PF_INTERVALS, PF_IN_A_ROW, PF_COUNTS, PF_SECONDS = 60, PF_KINDS = 5 };
 typedef struct {
-    int64_t *number;  /* values that left the window by outcome, rows that came, ..., (S, PF_COUNTS) */
-    int64_t *last;    /* latest stamp, PF_ALWAYS without one, (S,) */
-    int64_t *left;    /* stamp of the latest row that left the window, (S,) */
-    double *usual;    /* usual interval [s], (S,) */
-    int64_t *second;  /* which second each entry of minute is, (S, PF_SECONDS) */
-    double *minute;   /* (S, PF_SECONDS, PF_KINDS) */
+    int64_t *number;      /* (S, PF_COUNTS) */
+    int64_t *last, *left; /* latest stamp, and that of the latest row that left the window; else PF_ALWAYS, (S,) */
+    double *usual;        /* usual interval [s], (S,) */
+    int64_t *second;      /* which second each entry of minute is, (S, PF_SECONDS) */
+    double *minute;       /* (S, PF_SECONDS, PF_KINDS) */
 } pf_counters;
 
-/* Empty. room: events that it has memory for at first, most: at the most; with both alike pf_live_measurement, _command,
- * _estimate, _commands and _count_late allocate nothing later.
- * carried: number and usual of what was counted before, or NULL. Returns NULL on failure. */
+/* Empty. room: events that it has memory for at first, most: at the most; with both alike pf_live_measurement,
+ * _command, _estimate, _commands and _count_late allocate nothing later. carried: number and usual of what was counted
+ * before, or NULL. Returns NULL on failure. */
 PF_API pf_live *pf_live_new(const pf_model *model, int64_t room, int64_t most, const pf_counters *carried);
 PF_API void pf_live_free(pf_live *live); /* NULL: nothing */
 PF_API pf_port *pf_live_port(pf_live *live); /* the same all its life */
 /* Take in the measurement, or the command, in the port, of the axes that are bits of `given`. No event that is stamped
- * before `oldest` will come any more; `newest` is the latest stamp of all. Returns 1; 0 if to make room the window let go
- * of its time; -1 without memory. */
+ * before `oldest` will come any more; `newest` is the latest stamp of all. Returns 1; 0 if to make room the window let
+ * go of its time; -1 without memory. */
 PF_API int pf_live_measurement(pf_live *live, int64_t stamp, int64_t sensor, uint64_t given, int64_t newest,
                                int64_t oldest);
 PF_API int pf_live_command(pf_live *live, int64_t stamp, uint64_t given, int64_t oldest);
 /* Every axis at an instant by all measurements valid until then, of events that are stamped until `after` (PF_NEVER: by
- * all); nothing changes. outputs (PF_OUTPUTS, A): positions as logged, NaN for an axis of which no level is known; fused
- * (A,): when the last measurement was valid that it knows of. */
+ * all); nothing changes. outputs (PF_OUTPUTS, A): positions as logged, NaN for an axis of which no level is known;
+ * fused (A,): when the last measurement was valid that it knows of. */
 PF_API void pf_live_estimate(pf_live *live, int64_t time, int64_t after, double *outputs, int64_t *fused);
 /* Of each axis the last command stamped until `until`: its stamp (PF_ALWAYS where it has left the window, PF_NEVER for
  * none), value and step [m], (A,). */
