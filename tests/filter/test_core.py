@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 
@@ -16,6 +17,7 @@ from pumafuse.filter.events import COMMAND, Events, Results
 from pumafuse.filter.outcome import ABSENT, Outcome
 from pumafuse.fusion.config import FusionConfig, Process, Sensor, Start
 from pumafuse.fusion.setup import filter_model
+from pumafuse.live.estimator import LiveEstimator
 from pumafuse.model.arm import ArmModel, AxisModel, Gain
 from pumafuse.model.plants import PLANTS, FirstOrder, SecondOrder
 
@@ -263,3 +265,14 @@ def test_more_states_than_the_core_is_made_for_are_refused() -> None:
         Filter(model_of(more), 0)
     with pytest.raises(PumafuseError, match="65 states"):
         linearise(model_of(more), [], 0, any_events(more), Results.room(80, 1))
+
+
+def test_what_the_core_has_made_is_no_copys() -> None:
+    """It would be freed twice."""
+    arm = ArmModel(
+        name="an arm", update_period=0.028, delay=0.0, axes={"x": AxisModel(plant=FirstOrder(time_constant=0.04))}
+    )
+    live = LiveEstimator(FusionConfig(arm=arm))
+    for one in (live, live._window):  # pyright: ignore[reportPrivateUsage]
+        with pytest.raises(TypeError, match="cannot be copied"):
+            copy.deepcopy(one)

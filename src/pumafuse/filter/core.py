@@ -155,8 +155,26 @@ def _events_of(events: Events) -> ctypes.Structure:
     return _Events(len(events.time), *pointers)
 
 
-class Filter:
+class Handle:
+    """What the core has made; freed with this. It is no copy's."""
+
+    _free: Any
+
+    def __init__(self, core: int | None) -> None:
+        self._core: int | None = checked(core)
+
+    def __del__(self) -> None:
+        if (core := getattr(self, "_core", None)) is not None:
+            self._free(core)
+
+    def __reduce__(self) -> Any:
+        raise TypeError("a filter cannot be copied or pickled")
+
+
+class Filter(Handle):
     """A filter over recorded events, whose state goes on from one call to the next."""
+
+    _free = library.pf_filter_free
 
     def __init__(self, model: Model, origin: int) -> None:
         """At rest at the instant ``origin`` [ns].
@@ -164,13 +182,8 @@ class Filter:
         Raises:
             PumafuseError: An axis has more states than the core is made for.
         """
+        super().__init__(library.pf_filter_new(ctypes.byref(struct_of(model)), origin))
         self._axes = len(model.axis)
-        self._core: int | None = None
-        self._core = checked(library.pf_filter_new(ctypes.byref(struct_of(model)), origin))
-
-    def __del__(self) -> None:
-        if self._core is not None:
-            library.pf_filter_free(self._core)
 
     def run(
         self,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import NEVER, FloatArray, IntArray, TimeArray
-from .core import Model, Output, at, checked, library, struct, struct_of
+from .core import Handle, Model, Output, at, checked, library, struct, struct_of
 
 MOST_ROWS = 65_536  # events; what is more shortens the window
 FIRST_ROWS = 4096  # at first
@@ -57,7 +57,7 @@ class _Port(ctypes.Structure):
     floor: int
 
 
-class Window:
+class Window(Handle):
     """Takes events in any order; a new one is put where its time says, and the filter runs on from there.
 
     An event comes in through ``value`` and ``spread``, then :meth:`add_measurement` or :meth:`add_command`, which say
@@ -75,14 +75,14 @@ class Window:
 
     value: ctypes.Array[ctypes.c_double]
     spread: ctypes.Array[ctypes.c_double]
+    _free = library.pf_live_free
 
     def __init__(self, model: Model, carried: Counters | None = None) -> None:
         """Empty; ``carried`` is what was counted before."""
-        self._core: int | None = None
-        self._axes, self._sensors = len(model.axis), len(model.sensor)
         before = None if carried is None else ctypes.byref(_Counters(*map(at, carried)))
-        self._core = core = checked(library.pf_live_new(ctypes.byref(struct_of(model)), FIRST_ROWS, MOST_ROWS, before))
-        self.port = port = _Port.from_address(library.pf_live_port(core))
+        super().__init__(library.pf_live_new(ctypes.byref(struct_of(model)), FIRST_ROWS, MOST_ROWS, before))
+        self._axes, self._sensors = len(model.axis), len(model.sensor)
+        self.port = port = _Port.from_address(library.pf_live_port(self._core))
         numbers = ctypes.c_double * self._axes
         self.value, self.spread = (
             numbers.from_address(ctypes.addressof(one.contents)) for one in (port.value, port.spread)
@@ -92,10 +92,6 @@ class Window:
         self._outputs, self._fused = np.zeros((len(Output), self._axes)), np.zeros(self._axes, dtype=np.int64)
         self._found = at(self._outputs), at(self._fused)
         self._commands = (ctypes.c_int64 * self._axes)(), numbers(), numbers()
-
-    def __del__(self) -> None:
-        if self._core is not None:
-            library.pf_live_free(self._core)
 
     @property
     def origin(self) -> int | None:

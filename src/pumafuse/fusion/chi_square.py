@@ -1,4 +1,4 @@
-"""The chi-square distribution: of its two functions that are needed here scipy takes a quarter of a second to import."""
+"""The chi-square distribution: scipy, which has it, takes a quarter of a second to import."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def tail(degrees: int, x: float) -> float:
 
 @lru_cache(maxsize=1024)
 def quantile(degrees: int, share: float) -> float:
-    """x with P(χ² > x) = ``share``: Newton's steps for ln x, from Wilson and Hilferty's approximation."""
+    """The x with P(χ² > x) = ``share``: Newton's steps for ln x, from Wilson and Hilferty's approximation."""
     a, width = 0.5 * degrees, math.sqrt(2.0 / (9.0 * degrees))
     cube = 1.0 - width**2 + width * NormalDist().inv_cdf(1.0 - share)
     smallest = 2.0 * math.exp((math.log1p(-share) + math.lgamma(a + 1.0)) / a)  # P ≈ y^a / Γ(a + 1) near 0

@@ -87,18 +87,19 @@ def fuse(
     in_place, placed = in_axes(run, config.frame)
     logged, jumps = segments(in_place)
     parts, faults, moving = list[Part](), list[str](), list[str]()
-    for number, part in enumerate(logged):
+
+    def filtered(number: int, part: Run) -> Part:
         asked = [name for name in config.sensor_names(chosen) if name in part.sensors]
-        faults += clock_faults(part, config.arm.update_period, asked)
+        faults.extend(clock_faults(part, config.arm.update_period, asked))
         segment = build(part, config, chosen)
-        faults += sensor_faults(segment, config)
-        moving += starts_in_motion(segment, config)
+        faults.extend(sensor_faults(segment, config))
+        moving.extend(starts_in_motion(segment, config))
         times = output_times(segment, config, rate)
         share = None if progress is None else _share(progress, number, len(logged))
-        filtered = filter_segment(segment, config, times, mode, engine, share)
-        segment = segment.without_measurements()  # the filter's table has them
-        parts.append(Part(part, segment, times, filtered))
-    del filtered
+        found = filter_segment(segment, config, times, mode, engine, share)
+        return Part(part, segment.without_measurements(), times, found)  # found has them
+
+    parts += [filtered(number, part) for number, part in enumerate(logged)]
     est = estimates_of(run, in_place, placed, config, parts, mode, engine)
     notes = [*faults, *found_by(est, parts), *moving]
     notes += latency_questions(config, parts[0].segment.sensors)

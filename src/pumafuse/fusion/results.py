@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from .. import folders
-from ..arrays import FloatArray, IntArray
+from ..arrays import FloatArray, IndexArray, IntArray
 from ..errors import RunError
 from ..filter.outcome import Outcome
 from ..folders import FolderError
@@ -386,7 +386,7 @@ def _time_and_segment(table: Table) -> tuple[FloatArray, IntArray]:
     return time, segment.astype(np.int64)
 
 
-def _segment_column(segment: IntArray) -> dict[str, pa.Array]:
+def _segment_column(segment: IntArray | IndexArray) -> dict[str, pa.Array]:
     """A column only where the log's clock was set back: most runs are one segment."""
     return {"segment": _column_of(segment)} if segment.any() else {}
 

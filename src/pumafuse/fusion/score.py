@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray
+from ..arrays import NO_STAMP, BoolArray, FloatArray, IndexArray, IntArray, TimeArray
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
 from ..logs.run import Source
 from ..units import seconds
@@ -146,7 +146,7 @@ def score_velocity(
     return _score(velocity - (after - before) / period, sd**2 + (noise + more) / period**2)
 
 
-def interpolated(time: FloatArray, segment: IntArray, reference: ReferenceTrack, axis: str) -> FloatArray:
+def interpolated(time: FloatArray, segment: IntArray | IndexArray, reference: ReferenceTrack, axis: str) -> FloatArray:
     """The reference [m] at ``time``, linear between its rows; NaN outside it and in gaps, (n,).
 
     A gap is an interval longer than twice the reference's median interval and longer than 50 ms.
