@@ -501,7 +501,7 @@ def _times_each(values: FloatArray) -> int:
     Not at rest, where a long row of equal values is one row of many, and not where coarse steps repeat by themselves.
     """
     changes = np.flatnonzero(np.diff(values))
-    if len(changes) < _FEW:
+    if len(changes) < _FEW or 1.5 * len(changes) > len(values):  # half of them, or more, come once
         return 1
     times = int(np.median(np.diff(changes)))
     if times > 1:
