@@ -294,11 +294,12 @@ def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measu
     """Every component of every measurement in the order of the filter."""
     first, columns = cut[0], list[tuple[npt.NDArray[Any], ...]]()
     for number, (events, results) in enumerate((part.events, part.results) for part in filtered):
-        given = (events.source != COMMAND)[:, None] & (events.known != ABSENT)
-        count = reduce(np.add, given.view(np.uint8).T)  # of each row; of a long run no table of places is made
-        time, stamp = (np.repeat(seconds(part, first.origin), count) for part in (events.time, events.stamp))
-        axis = np.broadcast_to(np.arange(len(first.axes), dtype=np.int16), given.shape)[given]
-        segment = np.full(len(time), number, dtype=np.int16)
+        given = np.flatnonzero((events.source != COMMAND)[:, None] & (events.known != ABSENT))
+        row = given // len(first.axes)
+        time, stamp = (seconds(part, first.origin)[row] for part in (events.time, events.stamp))
+        sensor, axis = events.source[row], (given - row * len(first.axes)).astype(np.int16)
+        del row  # of a long run each array counts
+        segment = np.full(len(given), number, dtype=np.int16)
         values = (events.value, results.innovation, results.innovation_sd, results.outcome)
-        columns.append((time, stamp, np.repeat(events.source, count), axis, segment, *(part[given] for part in values)))
+        columns.append((time, stamp, sensor, axis, segment, *(part.take(given) for part in values)))
     return Measurements(*map(_joined, zip(*columns, strict=True)), sensors=first.sensors, axes=first.axes)
