@@ -162,7 +162,7 @@ class Filter {
         Real nu, R;
         Along<N, Real> along;
     };
-    // Of the row at hand: its axes pass the gate together, and computing each twice would take a fifth more.
+    // Of the row at hand, whose axes pass the gate together: each is computed once.
     mutable std::vector<Innovation> innovations;
 
     void command(AxisState<N, Real>& state, Time a, const Event& event, History* history) const {

@@ -41,7 +41,7 @@ Model<Real> model_of(const pf_model& model, const pf_model* tangents = nullptr, 
 }
 
 // Calls `make` with the compiled size for the states of the axis that has the most: the next larger one serves, and
-// what is left over stays 0. With lengths known the algebra takes half the time.
+// what is left over stays 0.
 inline auto sized(const pf_model& model, auto make) {
     int most = 0;
     for (Time a = 0; a < model.axes; ++a) {

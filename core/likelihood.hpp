@@ -63,8 +63,8 @@ inline Dual sin(const Dual& a) { return a.chain(std::sin(a.value), std::cos(a.va
 inline Dual cos(const Dual& a) { return a.chain(std::cos(a.value), -std::sin(a.value)); }
 inline Dual sqrt(const Dual& a) { return a.chain(std::sqrt(a.value), 0.5 / std::sqrt(a.value)); }
 
-// At its best K the covariance does not change with K: d(P+) = (I - K H) dP (I - K H)' + K dR K' - K dH P+ - (K dH
-// P+)'.
+// At its best K the covariance does not change with K:
+//     d(P+) = (I - K H) dP (I - K H)' + K dR K' - K dH P+ - (K dH P+)'
 template <int N>
 Vector<N, Dual> joseph_tangent(auto& M, const auto& H, const Along<N, Dual>& along, const Dual& R) {
     Vector<N, Dual> K;
