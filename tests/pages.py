@@ -197,10 +197,10 @@ def shows(printed_text: str, expected: str) -> bool:
 
 
 def _furnish(folder: Path) -> None:
-    """What a clone has, but for the sources; ``.venv`` is the environment that runs the tests."""
-    for name in ("Makefile", "README.md", "pyproject.toml", "requirements.lock"):
+    """What a clone has, but for the package; ``.venv`` is the environment that runs the tests."""
+    for name in ("Makefile", "CMakeLists.txt", "README.md", "pyproject.toml", "requirements.lock"):
         shutil.copy2(ROOT / name, folder)
-    for name in ("examples", "scenarios", "notebooks", "benchmarks", "src/pumafuse/data"):
+    for name in ("core", "examples", "scenarios", "notebooks", "benchmarks", "src/pumafuse/data"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", ".*"))
     (folder / ".venv").symlink_to(sys.prefix)
 
