@@ -76,7 +76,7 @@ class Tracking:
     def follows(self) -> bool:
         """Whether there is nothing to ask: it moves about as far as commanded, about then, or is off by its noise."""
         measured, led, before = self._moved
-        if float(np.std(measured - led)) <= _NOISY * self.noise or not led.any():
+        if _spread(measured - led) <= _NOISY * self.noise or not led.any():
             return True
         if self.correlation < FOLLOWS:
             return False
@@ -91,7 +91,7 @@ class Tracking:
         """Whether less than half of the commanded motion is there, by three standard errors."""
         measured, led, _ = self._moved
         slope, error = slope_of_pieces(measured, led)
-        return slope + 3.0 * error < 0.5 and float(np.std(led)) > self.noise
+        return slope + 3.0 * error < 0.5 and _spread(led) > self.noise
 
     @cached_property
     def own_motion(self) -> float:
@@ -114,7 +114,9 @@ class Tracking:
         does not count. Where the zero wanders, its scatter is its error.
         """
         _, measured, led, before = self._near
-        columns = [one for one in (led, led - before) if float(np.std(one)) > self.noise]
+        _, moved, moved_before = self._moved
+        motions = (led, moved), (led - before, moved - moved_before)
+        columns = [one for one, about_zero in motions if _spread(about_zero) > self.noise]
         known, off = np.array([np.ones(len(led)), *columns]), measured - led
         gram = known @ known.T
         found = np.linalg.lstsq(gram, known @ off)[0]
@@ -130,3 +132,8 @@ class Tracking:
     def excludes(self, zero: float) -> bool:
         """Whether the priors do not expect such a difference of the zeros [m or rad]."""
         return abs(zero) > _UNLIKELY * self.zero_sd
+
+
+def _spread(about_zero: FloatArray) -> float:
+    """Standard deviation of values whose mean is 0."""
+    return math.sqrt(float(about_zero @ about_zero) / len(about_zero))

@@ -109,14 +109,15 @@ def without_strays(run: Run) -> Run:
         apart = stray_offsets(source.stamp)
         if source is not run.command:
             apart = np.maximum(apart, 0)
+        if not apart.any():
+            return source
         for side, rows in (("ahead of", apart > 0), ("behind", apart < 0)):
             if rows.any():
                 what = f"a stray stamp, more than 1 s {side} the rows around: taken for none"
                 note_rows(notes, label, rows, what, f", by {abs(apart[rows][0]) / 1e9:.3f} s")
         return replace(source, stamp=np.where(apart == 0, source.stamp, NO_STAMP))
 
-    kept = run.each(mended)
-    return run if len(notes) == len(run.notes) else replace(kept, notes=tuple(notes), without_strays=True)
+    return replace(run.each(mended), notes=tuple(notes), without_strays=True)
 
 
 def segments(run: Run) -> tuple[list[Run], list[str]]:
@@ -242,7 +243,8 @@ def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit"
     intervals = every[every > 0]
     if len(intervals) < _FEW:
         return None
-    early, usual, late = np.quantile(intervals, [0.25, 0.5, 0.75]) / 1e9
+    quarters = len(intervals) * np.arange(1, 4) // 4  # numpy's quantile takes ten times as long
+    early, usual, late = np.partition(intervals, quarters)[quarters] / 1e9
     units, even = mistaken(usual / period, TIMES), late - early <= _EVEN * usual
     if units and even:
         times = f"{usual:.4g} s, {usual / period:.4g} times the arm's update_period_ms = {period * 1e3:g}"
