@@ -47,10 +47,10 @@ struct Later {
     // x <- x + P_s eta and P <- P_s: M = L L' and eta = L y, a column of L after the other is a measurement with unit
     // noise. P_s eta itself would lose a wide prior.
     void smooth(Residual<N, double>& xi) const {
-        auto [L, y] = root();
-        for (int k = 0; k < N; ++k) {
+        auto [L, y, rank] = root();
+        for (int k = 0; k < rank; ++k) {
             const Vector<N, double> K = xi.update(L[k], {xi.P, L[k], 1.0}, y[k], 1.0);
-            for (int m = k + 1; m < N; ++m)
+            for (int m = k + 1; m < rank; ++m)
                 for (int i = 0; i < N; ++i) y[m] -= L[m][i] * K[i] * y[k];
         }
     }
@@ -83,16 +83,18 @@ struct Later {
     struct Root {
         Matrix<N, double> L{};  // its rows are the columns
         Vector<N, double> y{};
+        int rank = 0;
     };
 
     // The state with the largest share of its own information left comes first: M says nothing of some states, or of
     // their differences, and in another order a pivot of rounding would be divided by.
     Root root() const {
         constexpr double NOTHING = 1e-15;  // of a pivot, below which it is rounding
-        auto [L, y] = Root{};
+        Root found;
+        auto& [L, y, rank] = found;
         Vector<N, double> left;
         for (int i = 0; i < N; ++i) left[i] = M[i][i];
-        for (int k = 0; k < N; ++k) {
+        for (int& k = rank; k < N; ++k) {
             int pivot = -1;
             double most = NOTHING;
             for (int i = 0; i < N; ++i)
@@ -108,7 +110,7 @@ struct Later {
                 L[k][i] /= L[k][pivot], left[i] -= L[k][i] * L[k][i];
             }
         }
-        return {L, y};
+        return found;
     }
 };
 

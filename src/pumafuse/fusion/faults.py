@@ -198,7 +198,7 @@ def _led_at(
     if not valid:
         return {}
     every = np.concatenate([part for one in valid.values() for part in (one, one - round(SMALL_SHIFT * 1e9))])
-    order, position = np.argsort(every), np.empty(len(every))
+    order, position = np.argsort(every, kind="stable"), np.empty(len(every))  # which merges what is in order
     position[order] = _led(segment, config, axis, every[order])
     parts = iter(np.split(position, np.cumsum([len(one) for one in valid.values() for _ in range(2)])[:-1]))
     return {name: (next(parts), next(parts)) for name in valid}

@@ -274,7 +274,7 @@ def missing_commands(command: Source) -> str | None:
     if np.mean(np.abs(intervals / usual - ticks) > _OFF_TICK) > _EVEN:
         return None
     steps = np.abs(np.diff([value[rows] for value in command.values.values()], axis=1))
-    largest = np.nanmax(np.where(ticks == 1, steps, 0.0), axis=1, keepdims=True)
+    largest = np.fmax.reduce(np.where(ticks == 1, steps, 0.0), axis=1, keepdims=True)
     jumps = np.any(steps > _JUMP * largest, axis=0)
     moving = np.pad(np.any(steps > 0.0, axis=0), 1)
     moving, on = moving[1:-1], moving[:-2] & moving[1:-1] & moving[2:]
