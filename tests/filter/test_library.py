@@ -12,6 +12,7 @@ import pytest
 
 import pumafuse
 from executable import FUSION, SCAN
+from pumafuse.filter import core
 from pumafuse.filter.core import LIBRARY, VERSION
 
 PACKAGE = Path(pumafuse.__file__).parent
@@ -66,3 +67,10 @@ def test_a_library_that_is_another_one(library: Path) -> None:
 
     shutil.copy(_ctypes.__file__, library)
     assert said(library, *FUSE).endswith(AGAIN)
+
+
+def test_the_interpreter_is_free_over_a_recording_and_kept_over_a_live_event() -> None:
+    """A call of microseconds that lets go of it waits for milliseconds until a busy thread gives it back."""
+    keeps = 4  # FUNCFLAG_PYTHONAPI of CPython's ctypes.h
+    kept = {name: bool(getattr(core.library, f"pf_{name}")._flags_ & keeps) for name in core._FUNCTIONS}
+    assert kept == {name: name.startswith("live_") for name in kept}

@@ -1,6 +1,7 @@
 """The filter's core, a library in C++: its interface is ``core/include/pumafuse.h``, its algebra ``core/``.
 
-Arrays go in and come out; they are the caller's. The interpreter is free while the core runs.
+Arrays go in and come out; they are the caller's. The interpreter is free while the core runs over a recording. Over a
+live event it is not: beside a busy thread it would come back after milliseconds, for a call of microseconds.
 """
 
 from __future__ import annotations
@@ -108,13 +109,14 @@ def _loaded() -> ctypes.CDLL:
     """
     again = "install pumafuse again (in a checkout: make .venv/.ready)"
     try:
-        library = ctypes.CDLL(str(LIBRARY))
+        library, held = ctypes.CDLL(str(LIBRARY)), ctypes.PyDLL(str(LIBRARY))
         if (version := library.pf_version()) != VERSION:
             raise PumafuseError(f"{LIBRARY}: the filter's core has interface {version}, this is for {VERSION}: {again}")
         library.pf_error.restype = ctypes.c_char_p
         for name, (result, *arguments) in _FUNCTIONS.items():
-            function = getattr(library, f"pf_{name}")
+            function = getattr(held if name.startswith("live_") else library, f"pf_{name}")
             function.restype, function.argtypes = _KINDS.get(result), [_KINDS[one] for one in arguments]
+            setattr(library, f"pf_{name}", function)
     except (OSError, AttributeError) as error:
         raise PumafuseError(f"{LIBRARY}: the filter's core does not load ({error}): {again}") from None
     return library
