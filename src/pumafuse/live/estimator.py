@@ -63,7 +63,8 @@ class LiveEstimator:
     in, the estimates are those of ``fuse``, bit for bit. Time is that of the stamps. One that is farther behind than
     the window is too late; a clock of the commands that was set anew restarts the filter.
 
-    Positions are in m, in the stream's own coordinates; times are float seconds or int nanoseconds.
+    Positions are in m, in the stream's own coordinates; times are float seconds or int nanoseconds. Where several
+    threads feed one estimator, they take turns by a lock of theirs.
 
     Attributes:
         config: As given.
