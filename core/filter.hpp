@@ -150,10 +150,10 @@ class Filter {
         Response<Real>& r = state.response;
         Residual<N, Real>& xi = state.residual;
         if (r.time.ns != xi.time.ns || !is_zero(r.time.shift - xi.time.shift)) {
-            r.predict(arm, to), xi.predict(arm.plant, noise, to);
+            r.predict(arm.plant, to), xi.predict(arm.plant, noise, to);
         } else if (const Real dt = seconds(xi.time, to); !is_zero(dt)) {
             const Transition<Real> f = arm.plant.over(dt);
-            r.predict(arm, f, to), xi.predict(noise, f, to);
+            r.predict(f, to), xi.predict(noise, f, to);
         }
     }
 
@@ -170,7 +170,7 @@ class Filter {
         const Instant<Real> acts{event.time, axis.delayed};
         Residual<N, Real>& xi = state.residual;
         if (!axis.noise.maneuvers) {  // then commands change nothing of the residual
-            state.response.predict(axis.arm, acts);
+            state.response.predict(axis.arm.plant, acts);
             state.response.command(axis.arm, event.value[a]);
         } else {
             if (history) (*history)[a].push_back({event.time, value_of(xi.q), value_of(xi.drift)});

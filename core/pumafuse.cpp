@@ -41,10 +41,10 @@ const char* pf_error(void) { return error.c_str(); }
 void pf_transition(const pf_axis* axis, double dt, double step[17]) {
     const Arm<double> arm(lifted<Axis, double>(axis, 1, {})[0]);
     const Transition<double> f = arm.plant.over(dt);
-    const Transition<double> d = smooth_disturbance(std::sqrt(3.0) / axis->disturbance_time, dt);
-    const Decay<double> e = arm.plant.decaying(f, arm.decay, dt);
-    const double found[] = {f.f11, f.f12, f.f21, f.f22, f.q11, f.q12, f.q22, e.position, e.rate, e.left,
-                            d.f11, d.f12, d.f21, d.f22, d.q11, d.q12, d.q22};
+    const double lambda = std::sqrt(3.0) / axis->disturbance_time, density = 4.0 / lambda;
+    const Transition<double> d = Plant<double>(lambda, 1.0, 0.0).over(dt);
+    const double found[] = {f.f11, f.f12, f.f21, f.f22, f.q11, f.q12, f.q22, f.e1, f.e2, f.left, d.f11, d.f12, d.f21,
+                            d.f22, density * d.q11, density * d.q12, density * d.q22};
     std::copy_n(found, 17, step);
 }
 
@@ -56,10 +56,10 @@ void pf_response(const pf_axis* axis, int64_t commands, const int64_t* acts, con
     if (commands > 0 && n > 0) response.time.ns = std::min(acts[0], time[0]);
     for (int64_t k = 0, c = 0; k < n; ++k) {
         for (; c < commands && acts[c] <= time[k]; ++c) {
-            response.predict(arm, {acts[c], 0.0});
+            response.predict(arm.plant, {acts[c], 0.0});
             response.command(arm, command[c]);
         }
-        response.predict(arm, {time[k], 0.0});
+        response.predict(arm.plant, {time[k], 0.0});
         position[k] = response.x;
     }
 }

@@ -74,7 +74,8 @@ struct Noise {
     Real input_noise, drift, maneuver_noise, maneuver_drift;  // as pf_axis has them
     bool maneuvers;                                           // whether commands change these
     Smoothness smoothness = Smoothness::none;
-    Real lambda = 0.0;            // 1/s, of the disturbance
+    Plant<Real> disturbance;      // a smooth one is a plant with a double pole, driven by white noise
+    Real density = 0.0;           // of that noise
     int size = DISTURBANCE;       // how many states there are
     Vector<N, Real> reverting{};  // how fast each reverts to 0 [1/s]; 0: it stays
     Vector<N, Real> variance{};   // of each at the start, and of what reverts for ever [m^2]
@@ -89,9 +90,11 @@ struct Noise {
         variance[OFFSET] = square(axis.offset_sd), position[PLANT] = position[OFFSET] = 1.0;
         if (value_of(axis.disturbance_sd) == 0.0) return;
         smoothness = value_of(axis.smoothness) > 1.0 ? Smoothness::smooth : Smoothness::rough;
-        lambda = (smoothness == Smoothness::smooth ? std::sqrt(3.0) : 1.0) / axis.disturbance_time;
+        const Real lambda = (smoothness == Smoothness::smooth ? std::sqrt(3.0) : 1.0) / axis.disturbance_time;
         position[add(lambda, square(axis.disturbance_sd))] = 1.0;
-        if (smoothness == Smoothness::smooth) add(lambda, square(lambda * axis.disturbance_sd));
+        if (smoothness == Smoothness::rough) return;
+        add(lambda, square(lambda * axis.disturbance_sd));
+        disturbance = {lambda, 1.0, 0.0}, density = 4.0 * square(axis.disturbance_sd) / lambda;
     }
 
     bool smooth() const { return DISTURBANCE + 1 < N && smoothness == Smoothness::smooth; }
@@ -105,11 +108,13 @@ struct Noise {
     // h (Phi - I): what the states make of a motion over dt [s].
     Vector<N, Real> motion(const Plant<Real>& plant, Real dt) const {
         using std::expm1;
-        const Transition<Real> f = plant.over(dt), d = smooth_disturbance(lambda, dt);
+        const Transition<Real> f = plant.over(dt);
         Vector<N, Real> h{};
         h[PLANT] = f.f11 - 1.0, h[RATE] = f.f12;
-        if (smoothness == Smoothness::rough) h[DISTURBANCE] = expm1(-lambda * dt);
-        if (smooth()) h[DISTURBANCE] = d.f11 - 1.0, h[DISTURBANCE + 1] = d.f12;
+        if (smoothness == Smoothness::rough) h[DISTURBANCE] = expm1(-reverting[DISTURBANCE] * dt);
+        if (!smooth()) return h;
+        const Transition<Real> d = disturbance.over(dt);
+        h[DISTURBANCE] = d.f11 - 1.0, h[DISTURBANCE + 1] = d.f12;
         return h;
     }
 };
@@ -140,7 +145,7 @@ struct Residual {
         predict_pair(PLANT, f, q);
         P[OFFSET][OFFSET] = P[OFFSET][OFFSET] + drift * dt;
         int i = DISTURBANCE;
-        if (noise.smooth()) predict_pair(i, smooth_disturbance(noise.lambda, dt), noise.variance[i]), i += 2;
+        if (noise.smooth()) predict_pair(i, noise.disturbance.over(dt), noise.density), i += 2;
         for (; i < noise.size; ++i) {
             if (value_of(noise.reverting[i]) == 0.0) continue;
             const Real left = exp(-noise.reverting[i] * dt);

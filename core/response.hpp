@@ -8,15 +8,11 @@ namespace pumafuse {
 template <class Real>
 struct Arm {
     Plant<Real> plant;
-    Real slope, intercept, decay;  // s/m, 1, 1/s
-    double period;                 // s
+    Real slope, intercept;  // s/m, 1
+    double period;          // s
 
-    Arm() = default;
     explicit Arm(const Axis<Real>& axis)
-        : plant(axis), slope(axis.slope), intercept(axis.intercept), decay(axis.recovery),
-          period(value_of(axis.period)) {
-        if (value_of(decay) > 0.0) decay = 1.0 / decay;
-    }
+        : plant(axis), slope(axis.slope), intercept(axis.intercept), period(value_of(axis.period)) {}
 
     Real gain_error(double step) const { return (slope * (std::fabs(step) / period) + intercept - 1.0) * step; }
 };
@@ -29,21 +25,16 @@ struct Response {
     Real error = 0.0;            // the gain error e now [m]
     Real x = 0.0, rate = 0.0;    // m, m/s
 
-    // x <- u + Phi (x - u) + Gamma_e e
-    void predict(const Arm<Real>& arm, const Transition<Real>& f, const Instant<Real>& to) {
-        const bool stays = is_zero(arm.decay);  // then e is a part of the input
-        const Real target = stays ? u + error : Real(u), gap = x - target, before = rate;
-        x = target + (f.f11 * gap + f.f12 * before), rate = f.f21 * gap + f.f22 * before;
-        if (!stays && !is_zero(error)) {
-            const Decay<Real> by = arm.plant.decaying(f, arm.decay, seconds(time, to));
-            x = x + by.position * error, rate = rate + by.rate * error, error = error * by.left;
-        }
-        time = to;
+    // x <- u + Phi (x - u) + Gamma_e e; f is of the plant over the interval.
+    void predict(const Transition<Real>& f, const Instant<Real>& to) {
+        const Real gap = x - u, before = rate;
+        x = u + (f.f11 * gap + f.f12 * before) + f.e1 * error, rate = f.f21 * gap + f.f22 * before + f.e2 * error;
+        error = error * f.left, time = to;
     }
 
-    void predict(const Arm<Real>& arm, const Instant<Real>& to) {
+    void predict(const Plant<Real>& plant, const Instant<Real>& to) {
         const Real dt = seconds(time, to);
-        if (!is_zero(dt)) predict(arm, arm.plant.over(dt), to);
+        if (!is_zero(dt)) predict(plant.over(dt), to);
     }
 
     // From now on u is `command` [m] as logged. Returns the maneuver |u_n - 2 u_(n-1) + u_(n-2)| / T [m/s].

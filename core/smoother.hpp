@@ -24,7 +24,7 @@ struct Later {
         over_pair(PLANT, arm.plant.over(dt), q);
         through_noise(OFFSET, std::sqrt(drift * dt));
         int i = DISTURBANCE;
-        if (noise.smooth()) over_pair(i, smooth_disturbance(noise.lambda, dt), noise.variance[i]), i += 2;
+        if (noise.smooth()) over_pair(i, noise.disturbance.over(dt), noise.density), i += 2;
         for (; i < noise.size; ++i) {
             if (noise.reverting[i] == 0.0) continue;
             const double fading = -noise.reverting[i] * dt, left = std::exp(fading);
