@@ -1,4 +1,4 @@
-"""Array types, and the special stamps."""
+"""Array types, the special stamps, and a median."""
 
 from __future__ import annotations
 
@@ -18,3 +18,10 @@ TimeArray: TypeAlias = npt.NDArray[np.int64]  # absolute stamps, int64 ns
 NO_STAMP = -(2**63)  # in a TimeArray: a row without a readable stamp (numpy's NaT)
 NEVER, ALWAYS = 2**63 - 1, 1 - 2**63  # in a TimeArray: after all stamps, before all stamps
 REACH_NS = 4.6e18  # |stamp| whose differences int64 ns can hold: the years 1824 to 2115
+
+
+def median(values: FloatArray) -> float:
+    """The median; numpy's takes twice as long, and imports masked arrays (0.02 s)."""
+    middle = len(values) // 2
+    ordered = np.partition(values, [middle - 1, middle])
+    return float(ordered[middle] if len(values) % 2 else (ordered[middle - 1] + ordered[middle]) / 2)

@@ -44,7 +44,7 @@ _SCORE: Columns = {
 def console(file: TextIO) -> Console:
     """A stream for people: 120 columns wide where it is no terminal; nowhere if it is closed, which makes it None."""
     there = file or StringIO()
-    return Console(file=there, highlight=False, width=None if there.isatty() else 120)
+    return Console(file=there, highlight=False, emoji=False, width=None if there.isatty() else 120)
 
 
 def print_json(tree: Any) -> None:

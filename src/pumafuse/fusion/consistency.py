@@ -145,7 +145,7 @@ def sensor_problems(est: Estimates) -> list[str]:
         groups = ends[number * len(given.axes) : (number + 1) * len(given.axes) + 1]
         mine = slice(groups[0], groups[-1])
         rejected = np.count_nonzero(outcome[mine] == int(Outcome.REJECTED)) / count[number].sum()
-        reacquired = len(np.unique(given.time[order[mine][outcome[mine] == Outcome.REACQUIRED]]))
+        reacquired = len(set(given.time[order[mine][outcome[mine] == int(Outcome.REACQUIRED)]].tolist()))
         times = "once" if reacquired == 1 else f"{reacquired} times"
         width = _width_of_prior(est, name)
         frozen = {each: _frozen(value[slice(*of)]) for each, of in zip(given.axes, pairwise(groups), strict=True)}

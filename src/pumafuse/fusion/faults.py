@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, TimeArray
+from ..arrays import FloatArray, TimeArray, median
 from ..discovery.matching import SMALL_SHIFT, Grid, Match, matches, without_spikes
 from ..discovery.tracking import FOLLOWS, GAIN, Tracking
 from ..errors import RunError
@@ -220,7 +220,7 @@ def _tracking(
     zero_sd = math.hypot(noise, sensor.bias_sd_of(axis) / abs(sensor.scale), config.start.offset_sd_of(axis))
     measured, turn = value / sensor.scale - segment.start[axis], turn_of(config, name, axis) / abs(sensor.scale)
     if turn:
-        measured -= turn * np.round(np.median(measured - led) / turn)
+        measured -= turn * round(median(measured - led) / turn)
     return Tracking((valid - valid[0]) / 1e9, measured, led, before, noise, zero_sd, process.drift)
 
 
@@ -503,9 +503,9 @@ def _times_each(values: FloatArray) -> int:
     changes = np.flatnonzero(np.diff(values))
     if len(changes) < _FEW or 1.5 * len(changes) > len(values):  # half of them, or more, come once
         return 1
-    times = int(np.median(np.diff(changes)))
+    times = int(median(np.diff(changes)))
     if times > 1:
         steps = np.abs(np.diff(values)[changes])
-        if np.median(steps) < _COARSE * steps.min():
+        if median(steps) < _COARSE * steps.min():
             return 1
     return times

@@ -251,7 +251,7 @@ def _contradictions(segment: Segment, config: FusionConfig, filtered: Filtered, 
     events, results, found = filtered.events, filtered.results, list[str]()
     rows = np.flatnonzero(results.contradicts >= 0)
     pairs = events.source[rows].astype(np.int64) * len(segment.sensors) + results.contradicts[rows]
-    for pair in np.unique(pairs).tolist():
+    for pair in sorted(set(pairs.tolist())):
         sensor, other = divmod(pair, len(segment.sensors))
         mine = rows[pairs == pair]
         first, count = mine[0], len(mine)

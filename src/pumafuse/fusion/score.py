@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import NO_STAMP, BoolArray, FloatArray, IndexArray, IntArray, TimeArray
+from ..arrays import NO_STAMP, BoolArray, FloatArray, IndexArray, IntArray, TimeArray, median
 from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
 from ..logs.run import Source
 from ..units import seconds
@@ -152,7 +152,7 @@ def interpolated(time: FloatArray, segment: IntArray | IndexArray, reference: Re
     A gap is an interval longer than twice the reference's median interval and longer than 50 ms.
     """
     found = np.full(len(time), np.nan)
-    for number in np.unique(segment):
+    for number in set(segment.tolist()):
         here = segment == number
         rows = (reference.segment == number) & np.isfinite(reference.position[axis])
         found[here] = _between(time[here], reference.time[rows], reference.position[axis][rows])
@@ -189,7 +189,7 @@ def _between(time: FloatArray, known: FloatArray, value: FloatArray) -> FloatArr
     if not len(known):
         return np.full(len(time), np.nan)
     known, first = np.unique(known, return_index=True)
-    longest = max(2.0 * float(np.median(np.diff(known))) if len(known) > 1 else 0.0, _SHORTEST_GAP)
+    longest = max(2.0 * median(np.diff(known)) if len(known) > 1 else 0.0, _SHORTEST_GAP)
     after = np.searchsorted(known, time, side="right")
     right, left = np.minimum(after, len(known) - 1), np.maximum(after - 1, 0)
     inside = (time >= known[0]) & (time <= known[-1])

@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from .. import toml
-from ..arrays import FloatArray
+from ..arrays import FloatArray, median
 from ..filter.core import constant_velocity
 from ..filter.outcome import Outcome
 from ..filter.response import response
@@ -93,7 +93,7 @@ def _turn(est: Estimates, measured: Measurements) -> float:
 
 
 def _summed_up(error: FloatArray) -> PredictionError:
-    return PredictionError(rms=float(np.sqrt(error @ error / len(error))), median=float(np.median(np.abs(error))))
+    return PredictionError(rms=float(np.sqrt(error @ error / len(error))), median=median(np.abs(error)))
 
 
 def _by_command(est: Estimates, measured: Measurements) -> FloatArray:
@@ -116,7 +116,7 @@ def _by_command(est: Estimates, measured: Measurements) -> FloatArray:
 def _by_constant_velocity(parts: Sequence[Measurements]) -> FloatArray:
     """Innovations [m or rad] of the best constant-velocity filter on each segment, without the first of each, (n,)."""
     intervals = np.concatenate([np.diff(part.time) for part in parts])
-    unit = float(np.median(intervals[intervals > 0.0])) if (intervals > 0.0).any() else 1.0
+    unit = median(intervals[intervals > 0.0]) if (intervals > 0.0).any() else 1.0
     square, found, end = np.zeros(len(_DENSITIES)), np.empty(len(intervals)), 0
     for part in parts:
         constant_velocity(part.time / unit, part.value, _DENSITIES, square)

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import ALWAYS, NO_STAMP, IntArray, TimeArray
+from ..arrays import ALWAYS, NO_STAMP, IntArray, TimeArray, median
 from ..errors import RunError
 from ..units import TIMES, mistaken
 from .run import Run, Source, note_rows
@@ -269,7 +269,7 @@ def missing_commands(command: Source) -> str | None:
     intervals = np.diff(command.stamp[rows]) / 1e9
     if len(intervals) < _FEW or (intervals <= 0.0).any():
         return None
-    usual = float(np.median(intervals))
+    usual = median(intervals)
     ticks = np.rint(intervals / usual)
     if np.mean(np.abs(intervals / usual - ticks) > _OFF_TICK) > _EVEN:
         return None

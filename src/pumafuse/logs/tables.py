@@ -374,7 +374,7 @@ def _header(lines: Sequence[str], full: Sequence[int]) -> int:
     first, *below = (_cells(lines[n], separator) for n in full[: 1 + _BESIDE])
     begin = next((n for n in full[1:] if _begins(lines, n, _separator(lines[n - 1]))), header + 1)
     between = [_cells(lines[n], separator) for n in full[1:] if n < begin]
-    most = Counter(len(_cells(lines[n], separator)) for n in full).most_common(1)[0][0]
+    most = Counter(len(_split(lines[n], separator)) for n in full).most_common(1)[0][0]
     even = all(len(row) == len(first) == most > 1 for row in below)
     return begin - 1 if not even or (between and all(map(_is_text, between))) else header
 
@@ -450,9 +450,14 @@ def _separator(line: str) -> str:
 
 def _cells(line: str, separator: str) -> list[str]:
     """The cells of a line, without quotes."""
-    inside = re.sub('"[^"]*"', lambda quoted: quoted[0].replace(separator, "\0"), line)
-    found = line.split() if separator == " " else inside.split(separator)
-    return [one.strip().strip('"').strip().replace("\0", separator) for one in found]
+    return [one.strip().strip('"').strip().replace("\0", separator) for one in _split(line, separator)]
+
+
+def _split(line: str, separator: str) -> list[str]:
+    """The cells of a line as written, a separator that is in quotes being a zero."""
+    if separator == " ":
+        return line.split()
+    return re.sub('"[^"]*"', lambda quoted: quoted[0].replace(separator, "\0"), line).split(separator)
 
 
 def _parquet(path: Path, fields: Sequence[str] | None, where: Where) -> tuple[pa.Table, list[str]]:
