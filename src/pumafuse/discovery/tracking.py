@@ -52,6 +52,8 @@ class Tracking:
         distance = self.measured - self.led
         distance = np.abs(distance - middle(distance))
         near = distance <= max(10.0 * middle(distance), float(np.ptp(self.led))) + 1e-12
+        if near.all():
+            return self.time, self.measured, self.led, self.before
         return self.time[near], self.measured[near], self.led[near], self.before[near]
 
     @cached_property

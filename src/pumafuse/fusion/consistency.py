@@ -136,7 +136,7 @@ def sensor_problems(est: Estimates) -> list[str]:
     """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows, frozen."""
     found, given = list[str](), est.measurements
     order, begin = given.grouped
-    outcome, value, ends = given.outcome[order], given.value[order], begin.tolist()
+    outcome, value, ends = given.outcome.take(order), given.value.take(order), begin.tolist()
     count = np.diff(begin).reshape(len(given.sensors), len(given.axes))
     alone = np.count_nonzero(count.any(axis=1)) < 2
     for number, name in enumerate(given.sensors):
@@ -199,7 +199,7 @@ def _frozen(values: FloatArray) -> int:
     times in n measurements.
     """
     values = values[np.isfinite(values)]
-    changes = np.diff(values) != 0.0
+    changes = values[1:] != values[:-1]
     if len(values) - 1 - np.count_nonzero(changes) < _FROZEN - 1:
         return 0
     edges = np.flatnonzero(np.concatenate(([True], changes, [True])))

@@ -161,7 +161,7 @@ def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:
             for number, name in enumerate(segment.sensors)
             if name in config.sensors
             and config.sensors[name].is_biased(axis)
-            and (known[rows.source == number] == Outcome.FUSED).any()
+            and (known[rows.source == number] == int(Outcome.FUSED)).any()
         ]
         for axis, known in zip(segment.axes, rows.known.T, strict=True)
     ]

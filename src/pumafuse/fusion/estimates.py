@@ -128,9 +128,11 @@ class Measurements:
     @cached_property
     def grouped(self) -> tuple[IntArray, IntArray]:
         """Components by sensor and axis, (m,), and where each of these groups begins."""
-        group = self.sensor.astype(np.int64) * len(self.axes) + self.axis
-        count = np.bincount(group, minlength=len(self.sensors) * len(self.axes))
-        return np.argsort(group.astype(np.min_scalar_type(len(count))), kind="stable"), np.append(0, np.cumsum(count))
+        count = len(self.sensors) * len(self.axes)
+        small = np.min_scalar_type(count)  # which is sorted ten times as fast
+        group = self.sensor.astype(small) * len(self.axes) + self.axis.astype(small)
+        order = np.argsort(group, kind="stable")
+        return order, np.searchsorted(group.take(order), np.arange(count + 1, dtype=small))
 
     def where(self, chosen: BoolArray | IntArray) -> Measurements:
         """The components that a mask (m,) or their places select."""

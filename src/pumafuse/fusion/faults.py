@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -137,10 +138,9 @@ _Trackings: TypeAlias = Mapping[str, Mapping[str, Tracking]]
 
 def within_a_turn(segment: Segment, config: FusionConfig) -> list[str]:
     """A sentence on each angle of the commands or of a sensor that begins anew after each turn."""
-    found, given = list[str](), _given(segment, config)
-    for axis in segment.axes:
-        if config.arm.axes[axis].kind == "length":
-            continue
+    found, angles = list[str](), [axis for axis in segment.axes if config.arm.axes[axis].kind == "angle"]
+    given: _Given = _given(segment, config) if angles else {}
+    for axis in angles:
         if times := len(wraps(segment.given(axis)[1])):
             found.append(
                 f"the commands: an angle that begins anew on {axis} after each turn, {times} times: the model goes back"
@@ -200,7 +200,8 @@ def _led_at(
     every = np.concatenate([part for one in valid.values() for part in (one, one - round(SMALL_SHIFT * 1e9))])
     order, position = np.argsort(every, kind="stable"), np.empty(len(every))  # which merges what is in order
     position[order] = _led(segment, config, axis, every[order])
-    parts = iter(np.split(position, np.cumsum([len(one) for one in valid.values() for _ in range(2)])[:-1]))
+    ends = pairwise(np.cumsum([0, *(len(one) for one in valid.values() for _ in range(2))]).tolist())
+    parts = (position[begin:end] for begin, end in ends)
     return {name: (next(parts), next(parts)) for name in valid}
 
 
@@ -500,7 +501,7 @@ def _times_each(values: FloatArray) -> int:
 
     Not at rest, where a long row of equal values is one row of many, and not where coarse steps repeat by themselves.
     """
-    changes = np.flatnonzero(np.diff(values))
+    changes = np.flatnonzero(values[1:] != values[:-1])
     if len(changes) < _FEW or 1.5 * len(changes) > len(values):  # half of them, or more, come once
         return 1
     times = int(median(np.diff(changes)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import NO_STAMP, BoolArray, FloatArray, IndexArray, IntArray, TimeArray, median
-from ..logs.clock import TOLERATED_STEP_BACK_NS, behind
+from ..logs.clock import TOLERATED_STEP_BACK_NS, behind, in_order
 from ..logs.run import Source
 from ..units import seconds
 
@@ -56,9 +56,8 @@ def late_rows(stamp: TimeArray) -> BoolArray:
 
 def reference_track(parts: Sequence[Source], origin: int) -> ReferenceTrack:
     """The reference of a run's segments in order, in seconds since ``origin`` (int ns), without late rows."""
-    late = [(part.stamp == NO_STAMP) | late_rows(part.stamp) for part in parts]
-    orders = [np.argsort(part.stamp, kind="stable") for part in parts]
-    used = [part.rows(order[~not_used[order]]) for part, order, not_used in zip(parts, orders, late, strict=True)]
+    known = [part.rows((part.stamp != NO_STAMP) & ~late_rows(part.stamp)) for part in parts]
+    used = [part.rows(in_order(part.stamp)) for part in known]
     noise = [
         {axis: part.sd_of(axis) * part.spread.get(axis, np.ones(len(part.stamp))) for axis in part.values}
         for part in used

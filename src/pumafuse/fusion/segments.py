@@ -20,7 +20,7 @@ from ..errors import RunError, UnknownNameError
 from ..filter.core import Model, classify
 from ..filter.events import COMMAND, Events, joined
 from ..filter.outcome import ABSENT, Outcome
-from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind
+from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind, in_order
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
 from ..logs.run import Run, Source, note_rows
@@ -29,6 +29,7 @@ from ..units import AN, of_kind
 from .config import FusionConfig
 from .setup import filter_model
 
+_FUSED = int(Outcome.FUSED)  # numpy asks an enumeration for attributes, as long as it compares a whole column
 _MOST_ESTIMATES = 10_000_000
 _KEPT = 3  # orders of the events: those of a search's point, and a little earlier and later
 
@@ -95,7 +96,10 @@ class Segment:
             if groups not in self._tables:
                 self._tables.clear()  # threads share it
                 self._tables[groups] = self._joined(groups)
-            found = self._latest[times] = self._ordered(config, *self._tables[groups])
+            events, order = self._ordered(config, *self._tables[groups])
+            place = np.empty(len(order), dtype=np.int64)
+            place[order] = np.arange(len(order))
+            found = self._latest[times] = events, place[len(order) - len(self.measurement_rows.time) :]
             for oldest in list(self._latest)[:-_KEPT]:
                 self._latest.pop(oldest, None)  # threads share it
         return found
@@ -114,20 +118,19 @@ class Segment:
         return tuple(distinct.index(one) for one in self._delay(config))
 
     def _ordered(self, config: FusionConfig, unordered: Events, moves: IntArray) -> tuple[Events, IntArray]:
+        """Events in their order, and that."""
         distinct, latency = sorted(set(self._delay(config))), self._latency(config)
         missing, shift = unordered.stamp == NO_STAMP, np.concatenate([distinct, -latency])
         time = np.where(missing, NO_STAMP, unordered.stamp + shift[moves])
         order = np.argsort(time, kind="stable")  # each source is in its order: commands, then the sensors'
-        place = np.empty(len(order), dtype=np.int64)
-        place[order] = np.arange(len(order))
-        return unordered._replace(time=time).rows(order), place[len(order) - len(self.measurement_rows.time) :]
+        return unordered._replace(time=time).rows(order), order
 
     def _joined(self, groups: tuple[int, ...]) -> tuple[Events, IntArray]:
         """Commands, one event for each group of axes that share a delay, then measurements; which time moves each."""
         rows, measured, parts, moves = self.command_rows, self.measurement_rows, list[Events](), list[IntArray]()
         for group in sorted(set(groups)):
             known = np.where(np.array(groups) == group, rows.known, np.uint8(ABSENT))
-            parts.append(rows._replace(known=known).where(_on_any_axis(known, Outcome.FUSED)))
+            parts.append(rows._replace(known=known).where(on_any_axis(known, Outcome.FUSED)))
             moves.append(np.full(len(parts[-1].time), group))
         sensors = max(groups) + 1 + measured.source.astype(np.int64)
         return joined([*parts, measured]), np.concatenate([*moves, sensors])
@@ -135,8 +138,8 @@ class Segment:
     def given(self, axis: str) -> tuple[TimeArray, FloatArray]:
         """Stamps [int64 ns] and values [m] of the commands of one axis, (n,)."""
         number, rows = self.axes.index(axis), self.command_rows
-        chosen = rows.known[:, number] == Outcome.FUSED
-        return rows.stamp[chosen], rows.value[chosen, number]
+        chosen = np.flatnonzero(rows.known[:, number] == _FUSED)
+        return rows.stamp.take(chosen), rows.value[:, number].take(chosen)
 
     def rows_by_sensor(self) -> dict[str, Events]:
         """The rows of each sensor that has any, by stamp; angles go on beyond a turn."""
@@ -159,7 +162,7 @@ class Segment:
     def of_axis(self, axis: str, rows: IntArray) -> Segment:
         """The segment with one axis alone, and some of its measurements' ``rows``."""
         column = [self.axes.index(axis)]
-        commands = np.flatnonzero(self.command_rows.known[:, column[0]] == Outcome.FUSED)
+        commands = np.flatnonzero(self.command_rows.known[:, column[0]] == _FUSED)
         return replace(
             self,
             axes=(axis,),
@@ -182,7 +185,7 @@ class Segment:
         Measurements an hour after the last command are on another clock.
         """
         rows = self._measured(self._latency(config))
-        valid = rows.time[_on_any_axis(rows.known, Outcome.FUSED)]
+        valid = rows.time[on_any_axis(rows.known, Outcome.FUSED)]
         return int(valid[valid <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
 
     def _latency(self, config: FusionConfig) -> IntArray:
@@ -226,27 +229,27 @@ def build(
     unstamped = len(run.command.stamp) - len(rows.stamp)
     command_counts = _command_counts(rows.rows(_owned(rows.stamp, own)), unstamped)
     rows = _on_ticks(run, config, rows, notes)
-    used_rows = _on_any_axis(rows.known, Outcome.FUSED)
+    used_rows = on_any_axis(rows.known, Outcome.FUSED)
     origin = begun.origin if begun else int(rows.stamp[used_rows][0])
     ends = run.ends(origin)
     within = rows.stamp <= ends[1]
     outside = int(np.count_nonzero((used_rows & ~within)[_owned(rows.stamp, own)]))
-    command_counts = _counted(command_counts | {"used": command_counts["used"] - outside, OUTSIDE: outside})
+    command_counts = counted(command_counts | {"used": command_counts["used"] - outside, OUTSIDE: outside})
     rows = rows.where(within)
     notes += _unmatched([name for name in chosen if name not in run.sensors], strangers)
-    commands = rows.stamp[_on_any_axis(rows.known, Outcome.FUSED)]
+    commands = rows.stamp[on_any_axis(rows.known, Outcome.FUSED)]
     commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
-    late = [axis for axis, known in zip(run.axes, rows.known.T, strict=True) if Outcome.FUSED not in known]
+    late = [axis for axis, known in zip(run.axes, rows.known.T, strict=True) if _FUSED not in known]
     if late and not begun:
         raise RunError(f"{label}: no command for axis '{late[0]}' {run.interval} after the first command")
-    given = {axis: (rows.known[:, number] == Outcome.FUSED).argmax() for number, axis in enumerate(run.axes)}
+    given = {axis: (rows.known[:, number] == _FUSED).argmax() for number, axis in enumerate(run.axes)}
     first = {axis: float(rows.value[row, number]) for number, (axis, row) in enumerate(given.items())}
     parts = [_measurement_rows(run, config, number, used, policy, origin, own, notes) for number in range(len(used))]
     measured = joined([Events.empty(len(run.axes)), *(part for part, _ in parts)])
     stamps = {name: source.stamp[_owned(source.stamp, own)] for name, source in run.sensors.items()}
     counts = {name: {NOT_SELECTED: len(stamp)} for name, stamp in stamps.items()}
     counts |= {name: found for name, (_, found) in zip(used, parts, strict=True)}
-    if run.interval and own == WHOLE and not (measured.known == Outcome.FUSED).any():
+    if run.interval and own == WHOLE and not (measured.known == _FUSED).any():
         raise RunError(f"run '{run.name}': no measurement to use is stamped {run.interval} after the first command")
     return Segment(
         axes=run.axes,
@@ -315,7 +318,7 @@ def as_commanded(run: Run, config: FusionConfig) -> Source:
     if run.clock == "stamps":
         return run.command
     rows = _on_ticks(run, config, _command_rows(run, _policy(config, run.axes, ()), []), [])
-    value = np.where(rows.known == Outcome.FUSED, rows.value, np.nan)
+    value = np.where(rows.known == _FUSED, rows.value, np.nan)
     return Source(rows.stamp, dict(zip(run.axes, value.T, strict=True)), run.command.label)
 
 
@@ -378,27 +381,27 @@ def _command_rows(run: Run, policy: Model, notes: list[str]) -> Events:
     missing, label = source.stamp == NO_STAMP, source.label
     note_rows(notes, label, missing, "no stamp: not used")
     note_rows(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
-    order = np.argsort(source.stamp, kind="stable")[np.count_nonzero(missing) :]
-    rows = _classified(_table(source, run.axes, order, COMMAND), policy, 0, np.zeros(len(order), np.bool_))
+    order = in_order(source.stamp, int(np.count_nonzero(missing)))
+    rows = _classified(_table(source, run.axes, order, COMMAND), policy, 0, np.zeros_like(missing[order]))
     note_rows(notes, label, source.repeated() & ~missing, "the stamp and values of an earlier row: duplicate")
     for number, axis in enumerate(run.axes):
         known, hollow = rows.known[:, number], np.zeros(len(missing), dtype=np.bool_)
-        hollow[order] = known == Outcome.INVALID
+        hollow[order] = known == int(Outcome.INVALID)
         note_rows(notes, label, hollow, f"no finite {axis} command: not used")
-        if not (known == Outcome.FUSED).any():
+        if not (known == _FUSED).any():
             raise RunError(f"{label}: no command for axis '{axis}' is a number below 1e6 m or rad")
     return rows
 
 
 def _command_counts(rows: Events, unstamped: int) -> dict[str, int]:
     """How many rows of the commands are what, those without a stamp too; of a stamp the last one counts."""
-    best = _best(rows.known)
-    again, hidden = best == Outcome.DUPLICATE, np.diff(rows.stamp, append=NEVER) == 0
+    best = best_of(rows.known)
+    again, hidden = best == int(Outcome.DUPLICATE), np.diff(rows.stamp, append=NEVER) == 0
     return {
-        "used": int(np.count_nonzero(best == Outcome.FUSED)),
+        "used": int(np.count_nonzero(best == _FUSED)),
         Outcome.DUPLICATE.word: int(np.count_nonzero(again & hidden)),
         REPETITION: int(np.count_nonzero(again & ~hidden)),
-        Outcome.INVALID.word: int(np.count_nonzero(best == Outcome.INVALID)),
+        Outcome.INVALID.word: int(np.count_nonzero(best == int(Outcome.INVALID))),
         NO_STAMP_WORD: unstamped,
     }
 
@@ -408,7 +411,7 @@ def added(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
     return dict(sum(map(Counter[str], counts), Counter[str]()))
 
 
-def _counted(counts: Mapping[str, int]) -> dict[str, int]:
+def counted(counts: Mapping[str, int]) -> dict[str, int]:
     """The counts that are not 0."""
     return {word: count for word, count in counts.items() if count}
 
@@ -422,7 +425,7 @@ def _on_ticks(run: Run, config: FusionConfig, rows: Events, notes: list[str]) ->
     if run.clock == "stamps":
         return rows
     label = run.command.label
-    rows = rows.where(_on_any_axis(rows.known, Outcome.FUSED))
+    rows = rows.where(on_any_axis(rows.known, Outcome.FUSED))
     distinct, place = np.unique(rows.stamp, return_inverse=True)
     grid, note = regular_grid(distinct, config.arm.update_period, label)
     notes.extend([] if note is None else [note])
@@ -444,7 +447,7 @@ def _measurement_rows(
     source, sensor = run.sensors[name], config.sensors.get(name)
     label, used = source.label_for(name), run.within(source.stamp, origin)
     lag, missing = np.where(used, behind(source.stamp), 0), used & (source.stamp == NO_STAMP)
-    order = np.argsort(source.stamp, kind="stable")
+    order = in_order(source.stamp)
     latency = 0 if sensor is None else round(sensor.latency * 1e9)
     rows = _table(source, run.axes, order, number, latency)
     rows = _classified(rows, policy, origin, lag[order] > TOLERATED_STEP_BACK_NS)
@@ -457,17 +460,17 @@ def _measurement_rows(
         note_rows(notes, label, used, "no sensor of this name in the configuration: unknown")
         return kept, counts
     note_rows(notes, label, missing, f"no stamp: {Outcome.INVALID.word}")
-    if ((rows.known == int(Outcome.FUSED)) | (rows.known == ABSENT)).all():
+    if ((rows.known == _FUSED) | (rows.known == ABSENT)).all():
         return kept, counts
     known = np.empty_like(rows.known)
     known[order] = rows.known
     for kind, reason in _REASONS.items():
-        note_rows(notes, label, _on_any_axis(known, kind), f"{reason}: {kind.word}")
+        note_rows(notes, label, on_any_axis(known, kind), f"{reason}: {kind.word}")
     for column, axis in enumerate(run.axes):
         if axis in source.values and sensor.sd_of(axis) is None:
             sd = of_kind("sd_mm", config.arm.axes[axis].kind)
             notes.append(f"{label}: {sd} has no entry for {axis}, which is not used: {Outcome.UNKNOWN.word}")
-        hollow = (known[:, column] == Outcome.INVALID) & ~missing
+        hollow = (known[:, column] == int(Outcome.INVALID)) & ~missing
         note_rows(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
     return kept, counts
 
@@ -475,24 +478,25 @@ def _measurement_rows(
 def _measurement_counts(kept: Events, stamp: TimeArray) -> dict[str, int]:
     """How many rows of a sensor are what, those of every ``stamp``, of which ``kept`` are in the part to use."""
     unstamped = int(np.count_nonzero(stamp == NO_STAMP))
-    best = _best(kept.known)[kept.stamp != NO_STAMP]
+    best = best_of(kept.known)[kept.stamp != NO_STAMP]
     number = np.bincount(best, minlength=len(Outcome)).tolist()
     of_outcomes = {outcome.word: number[outcome] for outcome in Outcome}
-    return _counted({**of_outcomes, NO_STAMP_WORD: unstamped, OUTSIDE: len(stamp) - unstamped - len(best)})
+    return counted({**of_outcomes, NO_STAMP_WORD: unstamped, OUTSIDE: len(stamp) - unstamped - len(best)})
 
 
-def _table(source: Source, axes: tuple[str, ...], order: IntArray, number: int | np.int64, latency: int = 0) -> Events:
+def _table(source: Source, axes: tuple[str, ...], order: IntArray | slice, number: int, latency: int = 0) -> Events:
     """Rows of a source in an order, everything that it gives for the filter to decide on."""
-    stamp, shape = source.stamp[order], (len(order), len(axes))
+    stamp = source.stamp[order].copy()
+    shape = len(stamp), len(axes)
     value, known = np.full(shape, np.nan), np.full(shape, ABSENT, dtype=np.uint8)
     spread = np.ones(shape if source.spread else (0, len(axes)))
     for axis, column in source.values.items():
         at = axes.index(axis)
         value[:, at] = column[order]
-        known[:, at] = np.where(np.isnan(value[:, at]), ABSENT, Outcome.FUSED) if source.apart else Outcome.FUSED
+        known[:, at] = np.where(np.isnan(value[:, at]), ABSENT, _FUSED) if source.apart else _FUSED
         if axis in source.spread:
             spread[:, at] = source.spread[axis][order]
-    return Events(_valid(stamp, latency), np.full(len(order), number, dtype=np.int16), stamp, value, spread, known)
+    return Events(_valid(stamp, latency), np.full(len(stamp), number, dtype=np.int16), stamp, value, spread, known)
 
 
 def _classified(rows: Events, policy: Model, origin: int, too_late: BoolArray) -> Events:
@@ -500,12 +504,12 @@ def _classified(rows: Events, policy: Model, origin: int, too_late: BoolArray) -
     return rows._replace(known=classify(policy, rows, origin, too_late))
 
 
-def _best(known: CodeArray) -> CodeArray:
+def best_of(known: CodeArray) -> CodeArray:
     """Of each row the outcome of the value that got farthest, (n,)."""
     return reduce(np.minimum, known.T)
 
 
-def _on_any_axis(known: CodeArray, kind: Outcome) -> BoolArray:
+def on_any_axis(known: CodeArray, kind: Outcome) -> BoolArray:
     """Rows of which a value is of a kind, (n,); ``any(axis=1)`` takes twenty times as long for few axes."""
     return reduce(np.logical_or, (known == int(kind)).T)
 

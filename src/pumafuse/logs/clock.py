@@ -35,7 +35,18 @@ _TAIL_NS = 1_000_000_000  # that belong to the motion after the last command
 
 def behind(stamp: TimeArray) -> TimeArray:
     """Lag of each row behind the latest stamp before it [ns], 0 for a row in order or without a stamp, (rows,)."""
+    if _ascends(stamp):
+        return np.zeros(len(stamp), dtype=np.int64)
     return np.where(stamp == NO_STAMP, 0, np.maximum.accumulate(stamp) - stamp)
+
+
+def in_order(stamp: TimeArray, first: int = 0) -> IntArray | slice:
+    """The rows by stamp, those without one first, from the ``first`` on; most logs are in order."""
+    return slice(first, None) if _ascends(stamp) else np.argsort(stamp, kind="stable")[first:]
+
+
+def _ascends(stamp: TimeArray) -> bool:
+    return bool((stamp[1:] >= stamp[:-1]).all())
 
 
 def stray_offsets(stamp: TimeArray) -> IntArray:
@@ -106,6 +117,8 @@ def without_strays(run: Run) -> Run:
     notes = list(run.notes)
 
     def mended(label: str, source: Source) -> Source:
+        if _ascends(source.stamp):
+            return source
         apart = stray_offsets(source.stamp)
         if source is not run.command:
             apart = np.maximum(apart, 0)
@@ -201,10 +214,10 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
     Raises:
         RunError: The stamps of a source are in another unit than they are taken to be in.
     """
-    command = _ascending(run.command.stamp)
-    found, label = list[str](), run.command.label
-    one = run.command.rows(np.isfinite(run.command.values[run.axes[0]])) if run.command.apart else run.command
-    if (other := other_interval(_ascending(one.stamp), period)) is not None:
+    found, label, stamp = list[str](), run.command.label, run.command.stamp
+    command = _ascending(stamp)
+    first = _ascending(stamp[np.isfinite(run.command.values[run.axes[0]])]) if run.command.apart else command
+    if (other := other_interval(first, period)) is not None:
         sentence, kind = other
         if kind == "unit":
             raise RunError(f"{label}: {sentence} {_CORRECT}, or update_period_ms in arm.toml")
@@ -224,7 +237,7 @@ def clock_faults(run: Run, period: float, sensors: Iterable[str]) -> list[str]:
 def _ascending(stamp: TimeArray) -> TimeArray:
     """The stamps that there are, in order."""
     known = stamp[stamp != NO_STAMP]
-    return known if (np.diff(known) >= 0).all() else np.sort(known)
+    return known[in_order(known)]
 
 
 def other_interval(stamp: TimeArray, period: float) -> tuple[str, Literal["unit", "lost", "other"]] | None:
@@ -271,7 +284,7 @@ def missing_commands(command: Source) -> str | None:
         return None
     usual = median(intervals)
     ticks = np.rint(intervals / usual)
-    if np.mean(np.abs(intervals / usual - ticks) > _OFF_TICK) > _EVEN:
+    if np.sum(ticks[ticks > 1.0] - 1.0) < _FEW or np.mean(np.abs(intervals / usual - ticks) > _OFF_TICK) > _EVEN:
         return None
     steps = np.abs(np.diff([value[rows] for value in command.values.values()], axis=1))
     largest = np.fmax.reduce(np.where(ticks == 1, steps, 0.0), axis=1, keepdims=True)

@@ -161,7 +161,9 @@ class Source:
         return replace(self, stamp=stamp, values={axis: between(value) for axis, value in self.values.items()})
 
     def rows(self, chosen: BoolArray | IntArray | slice) -> Source:
-        """The chosen rows, in the order chosen."""
+        """The chosen rows, in the order chosen; not copied if they are all or a slice."""
+        if isinstance(chosen, np.ndarray) and chosen.dtype == np.bool_ and chosen.all():
+            return self
         values = {axis: value[chosen] for axis, value in self.values.items()}
         spread = {axis: value[chosen] for axis, value in self.spread.items()}
         return replace(self, stamp=self.stamp[chosen], values=values, spread=spread)
