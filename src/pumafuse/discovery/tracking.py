@@ -52,9 +52,8 @@ class Tracking:
         distance = self.measured - self.led
         distance = np.abs(distance - middle(distance))
         near = distance <= max(10.0 * middle(distance), float(np.ptp(self.led))) + 1e-12
-        if near.all():
-            return self.time, self.measured, self.led, self.before
-        return self.time[near], self.measured[near], self.led[near], self.before[near]
+        kept = slice(None) if near.all() else near
+        return self.time[kept], self.measured[kept], self.led[kept], self.before[kept]
 
     @cached_property
     def _moved(self) -> tuple[FloatArray, FloatArray, FloatArray]:

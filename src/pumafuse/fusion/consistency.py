@@ -57,7 +57,7 @@ class Consistency:
     nis_band: tuple[float, float]
     correlation: FloatArray
     whiteness: float
-    verdict: str
+    verdict: str = ""
 
     @property
     def correlation_band(self) -> float:
@@ -127,9 +127,10 @@ def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
     if not count:
         return None
     whiteness = ljung_box(fused.innovation / fused.innovation_sd)
-    found = Consistency(count, float(np.mean(fused.nis)), chi_square_band(count), *whiteness, verdict="")
+    found = Consistency(count, float(np.mean(fused.nis)), chi_square_band(count), *whiteness)
     rejected = 1.0 - count / np.count_nonzero(measurements.outcome <= Outcome.REACQUIRED)
-    return with_verdict(found, est.config, sensor, axis, rejected, lambda: follows_velocity(est, axis, fused))
+    verdict = verdict_of(found, est.config, sensor, axis, rejected, lambda: follows_velocity(est, axis, fused))
+    return replace(found, verdict=verdict)
 
 
 def sensor_problems(est: Estimates) -> list[str]:
@@ -208,10 +209,10 @@ def _frozen(values: FloatArray) -> int:
     return longest if longest >= _FROZEN and len(values) * elsewhere ** (longest - 1) < _NEVER else 0
 
 
-def with_verdict(
+def verdict_of(
     found: Consistency, config: FusionConfig, sensor: str, axis: str, rejected: float, follow: Callable[[], bool]
-) -> Consistency:
-    """The numbers of one sensor's components on one axis with their verdict.
+) -> str:
+    """The verdict on the numbers of one sensor's components on one axis.
 
     Args:
         found: The numbers.
@@ -221,12 +222,6 @@ def with_verdict(
         rejected: Share of rejected components.
         follow: Whether the innovations follow the velocity, asked where it makes a difference.
     """
-    return replace(found, verdict=_verdict(found, config, sensor, axis, rejected, follow))
-
-
-def _verdict(
-    found: Consistency, config: FusionConfig, sensor: str, axis: str, rejected: float, follow: Callable[[], bool]
-) -> str:
     if found.count < _FEW:
         return f"too few measurements ({found.count}) to tell"
     (low, high), sd = found.nis_band, of_kind("sd_mm", config.arm.axes[axis].kind)

@@ -55,16 +55,7 @@ class AxisEstimate:
     disturbance: FloatArray
     disturbance_sd: FloatArray
 
-    FIELDS = (
-        "position",
-        "position_sd",
-        "velocity",
-        "velocity_sd",
-        "offset",
-        "offset_sd",
-        "disturbance",
-        "disturbance_sd",
-    )
+    FIELDS = tuple(name + sd for name in ("position", "velocity", "offset", "disturbance") for sd in ("", "_sd"))
 
     def __repr__(self) -> str:
         return f"AxisEstimate({len(self.position):,} of position, velocity, offset, disturbance and their sd)"

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -114,8 +113,7 @@ def starts_in_motion(segment: Segment, config: FusionConfig) -> list[str]:
     return [
         f"the run begins in motion ({speeds[most] * screen.scale:.3g} {screen.unit}/s on {most}), the model at rest:"
         f" estimates are wrong by up to {off[most] * screen.scale:.2g} {screen.unit} at first; record from rest, or use"
-        f" --from"
-        f" {max(_settled(config, axis) for axis in speeds):.2g} or later"
+        f" --from {max(_settled(config, axis) for axis in speeds):.2g} or later"
     ]
 
 
@@ -200,8 +198,7 @@ def _led_at(
     every = np.concatenate([part for one in valid.values() for part in (one, one - round(SMALL_SHIFT * 1e9))])
     order, position = np.argsort(every, kind="stable"), np.empty(len(every))  # which merges what is in order
     position[order] = _led(segment, config, axis, every[order])
-    ends = pairwise(np.cumsum([0, *(len(one) for one in valid.values() for _ in range(2))]).tolist())
-    parts = (position[begin:end] for begin, end in ends)
+    parts = iter(np.split(position, np.cumsum([len(one) for one in valid.values() for _ in range(2)])[:-1]))
     return {name: (next(parts), next(parts)) for name in valid}
 
 
@@ -349,9 +346,8 @@ def _faults(
         best = max(late, key=lambda axis: clear[axis].correlation)
         fault(list(trackings), "clock", clear[best].shift, _late(config, name, best, trackings[best], clear[best]))
     if exchanged := [axis for axis, one in clear.items() if one.axis != axis]:
-        both = list(
-            dict.fromkeys([*exchanged, *(clear[axis].axis for axis in exchanged if clear[axis].axis in trackings)])
-        )
+        others = [clear[axis].axis for axis in exchanged if clear[axis].axis in trackings]
+        both = list(dict.fromkeys([*exchanged, *others]))
         fault(both, "columns", 1.0, _exchanged({axis: (trackings[axis], clear[axis]) for axis in exchanged}))
     own = {axis: one for axis, one in clear.items() if one.axis == axis}
     if turned := [axis for axis, one in own.items() if one.slope < 0.0]:
@@ -504,9 +500,5 @@ def _times_each(values: FloatArray) -> int:
     changes = np.flatnonzero(values[1:] != values[:-1])
     if len(changes) < _FEW or 1.5 * len(changes) > len(values):  # half of them, or more, come once
         return 1
-    times = int(median(np.diff(changes)))
-    if times > 1:
-        steps = np.abs(np.diff(values)[changes])
-        if median(steps) < _COARSE * steps.min():
-            return 1
-    return times
+    steps = np.abs(np.diff(values)[changes])
+    return 1 if median(steps) < _COARSE * steps.min() else int(median(np.diff(changes)))

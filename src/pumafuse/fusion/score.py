@@ -58,14 +58,13 @@ def reference_track(parts: Sequence[Source], origin: int) -> ReferenceTrack:
     """The reference of a run's segments in order, in seconds since ``origin`` (int ns), without late rows."""
     known = [part.rows((part.stamp != NO_STAMP) & ~late_rows(part.stamp)) for part in parts]
     used = [part.rows(in_order(part.stamp)) for part in known]
-    noise = [
-        {axis: part.sd_of(axis) * part.spread.get(axis, np.ones(len(part.stamp))) for axis in part.values}
-        for part in used
-    ]
     return ReferenceTrack(
         seconds(np.concatenate([part.stamp for part in used]), origin),
         {axis: np.concatenate([part.values[axis] for part in used]) for axis in used[0].values},
-        {axis: np.concatenate([sd[axis] for sd in noise]) for axis in noise[0]},
+        {
+            axis: np.concatenate([part.sd_of(axis) * part.spread.get(axis, np.ones(len(part.stamp))) for part in used])
+            for axis in used[0].values
+        },
         np.repeat(np.arange(len(used)), [len(part.stamp) for part in used]),
     )
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import reduce
 from itertools import pairwise
+from typing import TypeAlias
 
 import numpy as np
 
@@ -43,6 +44,7 @@ _REASONS = {
     Outcome.TOO_LATE: "a stamp more than 1 s behind an earlier one",
 }
 WHOLE = ALWAYS, NEVER
+_Kept: TypeAlias = dict[tuple[int, ...], tuple[Events, IntArray]]  # by delays and latencies, or groups of delays
 
 
 @dataclass(frozen=True)
@@ -76,12 +78,8 @@ class Segment:
     command_counts: Mapping[str, int]
     counts: Mapping[str, Mapping[str, int]]
     ends: tuple[int, int] = (ALWAYS, NEVER)
-    _latest: dict[tuple[int, ...], tuple[Events, IntArray]] = field(
-        default_factory=dict[tuple[int, ...], tuple[Events, IntArray]], init=False, repr=False, compare=False
-    )
-    _tables: dict[tuple[int, ...], tuple[Events, IntArray]] = field(
-        default_factory=dict[tuple[int, ...], tuple[Events, IntArray]], init=False, repr=False, compare=False
-    )
+    _latest: _Kept = field(default_factory=_Kept, init=False, repr=False, compare=False)
+    _tables: _Kept = field(default_factory=_Kept, init=False, repr=False, compare=False)
 
     def events(self, config: FusionConfig) -> tuple[Events, IntArray]:
         """The events in their total order, by the delays and latencies of ``config``.
@@ -184,18 +182,14 @@ class Segment:
 
         Measurements an hour after the last command are on another clock.
         """
-        rows = self._measured(self._latency(config))
-        valid = rows.time[on_any_axis(rows.known, Outcome.FUSED)]
+        rows = self.measurement_rows
+        valid = _valid(rows.stamp, self._latency(config)[rows.source])[on_any_axis(rows.known, Outcome.FUSED)]
         return int(valid[valid <= self.commands[-1] + LONGEST_TAIL_NS].max(initial=self.commands[-1]))
 
     def _latency(self, config: FusionConfig) -> IntArray:
         """Of each sensor, int ns."""
         latency = [config.sensors[name].latency if name in config.sensors else 0.0 for name in self.sensors]
         return np.rint(np.array(latency) * 1e9).astype(np.int64)
-
-    def _measured(self, latency: IntArray) -> Events:
-        rows = self.measurement_rows
-        return rows._replace(time=_valid(rows.stamp, latency[rows.source]))
 
 
 def build(
@@ -235,9 +229,8 @@ def build(
     within = rows.stamp <= ends[1]
     outside = int(np.count_nonzero((used_rows & ~within)[_owned(rows.stamp, own)]))
     command_counts = counted(command_counts | {"used": command_counts["used"] - outside, OUTSIDE: outside})
-    rows = rows.where(within)
+    commands, rows = rows.stamp[used_rows & within], rows.where(within)
     notes += _unmatched([name for name in chosen if name not in run.sensors], strangers)
-    commands = rows.stamp[on_any_axis(rows.known, Outcome.FUSED)]
     commands = commands[np.diff(commands, prepend=commands[0] - 1) > 0]
     late = [axis for axis, known in zip(run.axes, rows.known.T, strict=True) if _FUSED not in known]
     if late and not begun:
@@ -246,8 +239,7 @@ def build(
     first = {axis: float(rows.value[row, number]) for number, (axis, row) in enumerate(given.items())}
     parts = [_measurement_rows(run, config, number, used, policy, origin, own, notes) for number in range(len(used))]
     measured = joined([Events.empty(len(run.axes)), *(part for part, _ in parts)])
-    stamps = {name: source.stamp[_owned(source.stamp, own)] for name, source in run.sensors.items()}
-    counts = {name: {NOT_SELECTED: len(stamp)} for name, stamp in stamps.items()}
+    counts = {name: {NOT_SELECTED: len(one.stamp[_owned(one.stamp, own)])} for name, one in run.sensors.items()}
     counts |= {name: found for name, (_, found) in zip(used, parts, strict=True)}
     if run.interval and own == WHOLE and not (measured.known == _FUSED).any():
         raise RunError(f"run '{run.name}': no measurement to use is stamped {run.interval} after the first command")

@@ -14,15 +14,7 @@ from ..units import SCREEN, Screen, seconds
 from . import tables
 from .run import Run, Source
 
-_KEYS = (
-    "file",
-    "topic",
-    "entity",
-    "where",
-    "time",
-    "start",
-    "clock",
-)  # keys of a source in run.toml; every other key is an axis
+_KEYS = ("file", "topic", "entity", "where", "time", "start", "clock")  # of a source in run.toml; others are axes
 _TAKEN = ("commands", "truth", "trials", "samples", "path")
 
 

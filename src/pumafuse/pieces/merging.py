@@ -17,7 +17,7 @@ import numpy as np
 
 from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
-from ..fusion.consistency import Consistency, chi_square_band, follows_velocity, whiteness_of, with_verdict
+from ..fusion.consistency import Consistency, chi_square_band, follows_velocity, verdict_of, whiteness_of
 from ..fusion.estimates import Estimates
 from ..fusion.offline import UNCOVERED
 from ..fusion.segments import added
@@ -175,10 +175,10 @@ def _consistency(
         power += own + aside
     correlation = products / power if power > 0.0 else products
     white = whiteness_of(correlation, count) if lags else 1.0
-    found = Consistency(count, nis, chi_square_band(count), correlation, white, verdict="")
+    found = Consistency(count, nis, chi_square_band(count), correlation, white)
     decided = sum(part.outcomes.get(one.word, 0) for part in parts for one in Outcome if one <= Outcome.REACQUIRED)
     follow = 2 * sum(n for one, n in zip(innovations, fused, strict=True) if one.follow) > count
-    return with_verdict(found, config, name, axis, 1.0 - count / decided, lambda: follow)
+    return replace(found, verdict=verdict_of(found, config, name, axis, 1.0 - count / decided, lambda: follow))
 
 
 def _skill(parts: Sequence[Skill]) -> Skill | None:
