@@ -89,7 +89,7 @@ bool repeats_earlier(const Rows& rows, Time row, Time begin, int axes) {
 
 // What decides on a value: of the model, and of where the axes stand.
 struct Policy {
-    const pf_model& model;
+    const Model<double>& model;
     Time origin;  // the first command
 
     // `whole` is what the row is for all axes: a duplicate, too late, or PF_FUSED; `level` the start level of the axis.
@@ -100,9 +100,9 @@ struct Policy {
         const bool possible = std::fabs(event.value[axis]) < FARTHEST;  // neither NaN nor a sentinel such as 3.4e38
         if (event.is_command()) {
             if (!possible) return PF_INVALID;
-            return repeats(rows, row, axis, model.axis[axis].period, begin, end) ? PF_DUPLICATE : PF_FUSED;
+            return repeats(rows, row, axis, model.axes[axis].period, begin, end) ? PF_DUPLICATE : PF_FUSED;
         }
-        if (std::isnan(model.view[event.source * model.axes + axis].sd)) return PF_UNKNOWN;
+        if (std::isnan(model.views[event.source * model.axes.size() + axis].sd)) return PF_UNKNOWN;
         if (event.time == PF_NO_STAMP) return PF_INVALID;
         if (whole != PF_FUSED) return whole;
         if (event.time < origin || std::isnan(level)) return PF_BEFORE_START;

@@ -11,19 +11,18 @@
 
 namespace pumafuse {
 
-// What changes of one axis.
+// Where one axis is.
 template <int N, class Real>
 struct AxisState {
     Response<Real> response;
     Residual<N, Real> residual;
-    Time unsettled = PF_ALWAYS;
 };
 
 // What changes: a copy of it is a checkpoint.
 template <int N, class Real>
 struct State {
     std::vector<AxisState<N, Real>> axes;
-    std::vector<Gate> gates;  // (A, S)
+    std::vector<Gates> gates;
 };
 
 // What is known of one axis.
@@ -94,7 +93,7 @@ class Filter {
     State<N, Real> at_rest(Time origin) const {
         State<N, Real> state;
         for (Time a = 0; a < size(); ++a) state.axes.push_back(at_rest(a, axes[a].start, origin));
-        state.gates.resize(size() * sensors.size());
+        state.gates.assign(size(), {std::vector<Gate>(sensors.size())});
         return state;
     }
 
@@ -143,18 +142,10 @@ class Filter {
         found[PF_DISTURBANCE_SD] = disturbed ? sd(DISTURBANCE) : 0.0;
     }
 
-    // Response and residual to an instant; where they are at the same one, which is where no command lies between, by
-    // one transition.
+    // Response and residual to an instant.
     void advance(AxisState<N, Real>& state, Time a, const Instant<Real>& to) const {
-        const auto& [arm, noise, ahead, motion, delayed, start] = axes[a];
-        Response<Real>& r = state.response;
-        Residual<N, Real>& xi = state.residual;
-        if (r.time.ns != xi.time.ns || !is_zero(r.time.shift - xi.time.shift)) {
-            r.predict(arm.plant, to), xi.predict(arm.plant, noise, to);
-        } else if (const Real dt = seconds(xi.time, to); !is_zero(dt)) {
-            const Transition<Real> f = arm.plant.over(dt);
-            r.predict(f, to), xi.predict(noise, f, to);
-        }
+        state.response.predict(axes[a].arm.plant, to);
+        state.residual.predict(axes[a].arm.plant, axes[a].noise, to);
     }
 
   private:
@@ -169,14 +160,12 @@ class Filter {
         const Known<N, Real>& axis = axes[a];
         const Instant<Real> acts{event.time, axis.delayed};
         Residual<N, Real>& xi = state.residual;
-        if (!axis.noise.maneuvers) {  // then commands change nothing of the residual
-            state.response.predict(axis.arm.plant, acts);
-            state.response.command(axis.arm, event.value[a]);
-        } else {
-            if (history) (*history)[a].push_back({event.time, value_of(xi.q), value_of(xi.drift)});
-            advance(state, a, acts);
-            xi.apply_maneuver(axis.noise, state.response.command(axis.arm, event.value[a]));
-        }
+        state.response.predict(axis.arm.plant, acts);
+        const double maneuver = state.response.command(axis.arm, event.value[a]);
+        if (!axis.noise.maneuvers) return;  // then commands change nothing of the residual
+        if (history) (*history)[a].push_back({event.time, value_of(xi.q), value_of(xi.drift)});
+        xi.enter(axis.arm.plant, acts);
+        xi.set_noise(axis.noise, maneuver);
     }
 
     // Predict to `until` by the commands from row `next` on that act by then and are stamped by `stamped`; the row
@@ -202,10 +191,6 @@ class Filter {
         Real speed = state.response.speed(arm) + (arm.plant.order == 1 ? -arm.plant.rate * x[PLANT] : x[RATE]);
         if (noise.smooth()) speed = speed + x[DISTURBANCE + 1];
         return square(sd) + square(sensor.scale * speed * sensor.latency_sd);
-    }
-
-    Gates gates_of(State<N, Real>& state, Time a) const {
-        return {state.gates.data() + a * sensors.size(), int(sensors.size()), state.axes[a].unsettled};
     }
 
     // Axes first to end of one row, which pass the gate together or not at all.
@@ -248,12 +233,12 @@ class Filter {
         if (fate.outcome[a] == PF_REACQUIRED) {  // the offset may have moved by nu
             widened = square(nu / sensors[event.source].scale);
             xi.P[OFFSET][OFFSET] = xi.P[OFFSET][OFFSET] + widened;
-            gates_of(state, a).reacquire(event.source, event.time);
+            state.gates[a].reacquire(event.source, event.time);
             along = {xi.P, h, R};
             store(fate, a, nu, along.S);
         }
         const Vector<N, Real> K = xi.update(h, along, nu, R);
-        gates_of(state, a).fuse(event.source, event.time);
+        state.gates[a].fuse(event.source, event.time);
         if constexpr (std::is_same_v<Real, double>)
             if (history) (*history)[a].push_back({event.time, xi.q, xi.drift, event.source, nu, R, widened, K});
     }
@@ -267,13 +252,13 @@ class Filter {
             if (event.known[a] != PF_FUSED || !(std::fabs(fate.innovation[a]) > gate * fate.innovation_sd[a])) continue;
             const Agreement found = agreement(state, event, a, fate.innovation[a]);
             all_agree &= found == Agreement::yes, again |= found == Agreement::too_soon;
-            other = std::max(other, gates_of(state, a).contradicted(event.source, event.time));
+            other = std::max(other, state.gates[a].contradicted(event.source, event.time));
         }
         if (all_agree && other == NOBODY) return true;
         if (all_agree) *fate.contradicts = std::int16_t(other);
         for (Time a = first; a < end; ++a) {
             if (event.known[a] != PF_FUSED) continue;
-            gates_of(state, a).reject(event.source, fate.innovation[a], value_of(innovations[a].R), event.time, again);
+            state.gates[a].reject(event.source, fate.innovation[a], value_of(innovations[a].R), event.time, again);
         }
         return false;
     }
@@ -283,7 +268,7 @@ class Filter {
     Agreement agreement(State<N, Real>& state, const Event& event, Time a, double nu) const {
         const Known<N, Real>& axis = axes[a];
         const Sensor<Real>& sensor = sensors[event.source];
-        const Gate& before = gates_of(state, a).sensor[event.source];
+        const Gate& before = state.gates[a].sensor[event.source];
         const Residual<N, Real>& xi = state.axes[a].residual;
         const Time between = event.time - before.rejected_at;
         if (before.in_a_row == 0) return Agreement::no;

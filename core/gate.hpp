@@ -32,13 +32,12 @@ struct Gate {
 
 // All sensors of one axis.
 struct Gates {
-    Gate* sensor;  // (S,)
-    int sensors;
-    Time& unsettled;  // when sensors last disagreed while re-acquisitions were counted; PF_ALWAYS for never
+    std::vector<Gate> sensor;     // (S,)
+    Time unsettled = PF_ALWAYS;   // when sensors last disagreed while re-acquisitions were counted; else never
 
     // The sensor that stands for what is believed and contradicts `mine`; NOBODY for none.
     int contradicted(int mine, Time time) const {
-        for (int other = 0; other < sensors; ++other) {
+        for (int other = 0; other < int(sensor.size()); ++other) {
             const Gate& gate = sensor[other];
             const bool recently = gate.fused_at > PF_ALWAYS && time - gate.fused_at <= RECENT;
             if (other != mine && recently && gate.reacquired <= sensor[mine].reacquired) return other;
@@ -59,10 +58,10 @@ struct Gates {
     void fuse(int mine, Time time) {
         sensor[mine].in_a_row = 0, sensor[mine].fused_at = time;
         if (unsettled == PF_ALWAYS || time - unsettled < SETTLED) return;
-        for (int other = 0; other < sensors; ++other)
-            if (sensor[other].fused_at > PF_ALWAYS && time - sensor[other].fused_at > SETTLED) return;
+        for (const Gate& other : sensor)
+            if (other.fused_at > PF_ALWAYS && time - other.fused_at > SETTLED) return;
         unsettled = PF_ALWAYS;
-        for (int other = 0; other < sensors; ++other) sensor[other].reacquired = 0;
+        for (Gate& other : sensor) other.reacquired = 0;
     }
 };
 

@@ -44,22 +44,12 @@ Model<Real> model_of(const pf_model& model, const pf_model* tangents = nullptr, 
 // what is left over stays 0.
 inline auto sized(const pf_model& model, auto make) {
     int most = 0;
-    for (Time a = 0; a < model.axes; ++a) {
-        const pf_axis& axis = model.axis[a];
-        int states = DISTURBANCE + (axis.disturbance_sd == 0.0 ? 0 : axis.smoothness > 1.0 ? 2 : 1);
-        for (Time s = 0; s < model.sensors; ++s) {
-            const pf_view& view = model.view[s * model.axes + a];
-            states += (view.bias_sd > 0.0) + (view.bias_drift_sd > 0.0);
-        }
-        most = std::max(most, states);
-    }
+    for (const auto& axis : Filter<64>(model_of<double>(model)).axes) most = std::max(most, axis.noise.size);
     if (most <= 4) return make(Size<4>{});
     if (most <= 6) return make(Size<6>{});
     if (most <= 9) return make(Size<9>{});
     if (most <= 16) return make(Size<16>{});
-    if (most <= 64) return make(Size<64>{});
-    throw std::length_error("an axis has " + std::to_string(most) +
-                            " states, of which 64 are the most: too many sensors have biases");
+    return make(Size<64>{});
 }
 
 // 0; -1 and an error text if the work cannot be done.

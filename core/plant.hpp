@@ -14,9 +14,11 @@
 
 namespace pumafuse {
 
-// Phi and Q; what an input of 1 m that decays makes of position and rate, and what is left of it.
 template <class Real>
-struct Transition { Real f11, f12, f21, f22, q11, q12, q22, e1, e2, left; };
+struct Transition { Real f11{}, f12{}, f21{}, f22{}, q11{}, q12{}, q22{}; };  // Phi and Q
+
+template <class Real>
+struct Decay { Real position, rate, left; };  // what an input makes that decays from 1 m, and what is left of it
 
 // ∫ exp(-a s) exp(-b (t - s)) ds = (exp(-b t) - exp(-a t)) / (a - b), also where a and b meet.
 template <class Real>
@@ -39,14 +41,18 @@ class Plant {
     Real decay = 0.0;               // of the input [1/s]; 0: it stays
 
     Plant() = default;
-    Plant(Real rate, Real decay) : rate(rate), decay(decay) {}
+    Plant(Real rate, Real decay) : rate(rate), decay(decay) {
+        close = std::fabs(value_of(rate - decay)) < CLOSE * value_of(rate + decay);
+        if (!close) share = rate / (rate - decay);
+    }
 
     Plant(Real omega, Real zeta, Real decay) : order(2), omega(omega), sigma(zeta * omega), decay(decay) {
         apart = (zeta - 1.0) * (zeta + 1.0) * omega * omega;
         fastest = value_of(apart) > 0.0 ? value_of(sigma) + std::sqrt(value_of(apart)) : value_of(omega);
         far_apart = std::fabs(value_of(apart)) > square(APART * value_of(sigma));
-        product = decay * decay - 2.0 * sigma * decay + omega * omega;
+        const Real product = decay * decay - 2.0 * sigma * decay + omega * omega;  // of the decay's distances from them
         close = std::fabs(value_of(product)) < CLOSE * value_of(decay * decay + 2.0 * sigma * decay + omega * omega);
+        if (!close) share = 1.0 / product;
         s = sigma / fastest, w = square(omega / fastest), b = decay / fastest;
         std::array<Real, TERMS + 3> g{}, y{}, h{};  // y = g^2: y"' = -6 s y" - (8 s^2 + 4 w) y' - 8 s w y
         g[1] = y[2] = 1.0;
@@ -66,20 +72,21 @@ class Plant {
         else *this = {axis.natural_frequency, axis.damping, decay};
     }
 
-    // A plant of first order has a rate, too, that is always 0: the algebra is the same for both orders.
-    Transition<Real> over(Real t) const {
-        using std::exp, std::expm1;
-        const bool stays = value_of(decay) == 0.0;
-        const Real left = stays ? Real(1.0) : exp(-decay * t);
-        if (order == 1) {
-            const Real lost = expm1(-rate * t), e1 = stays ? -lost : rate * divided_difference(rate, decay, t);
-            return {1.0 + lost, 0.0, 0.0, 0.0, -0.5 * rate * lost * (2.0 + lost), 0.0, 0.0, e1, 0.0, left};
-        }
-        auto [g, g_rate, energy, h] = far_apart && fastest * value_of(t) > SHORT ? by_exponentials(t) : by_doubling(t);
-        if (!close) h = (left - g_rate - (2.0 * sigma - decay) * g) / product;
-        const Real w2 = omega * omega, x = w2 * g, q11 = w2 * w2 * energy, q12 = 0.5 * x * x;
-        const Real q22 = w2 * q11 + 2.0 * sigma * q12 + x * w2 * g_rate;
-        return {g_rate + 2.0 * sigma * g, g, -x, g_rate, q11, q12, q22, w2 * h, w2 * (g - decay * h), left};
+    // A plant of first order has a rate, too, that is always 0: the algebra is the same for both orders. The last
+    // interval is remembered: response and residual share it, and commands come at one interval.
+    const Transition<Real>& over(Real t) const {
+        if (!is_zero(t - last)) last = t, remembered = computed(t);
+        return remembered;
+    }
+
+    // Of an input that decays by `decay`; f is the plant's transition over t.
+    Decay<Real> decaying(const Transition<Real>& f, Real t) const {
+        using std::exp;
+        if (value_of(decay) == 0.0) return {1.0 - f.f11, -f.f21, 1.0};
+        const Real left = exp(-decay * t);
+        if (order == 1) return {close ? rate * divided_difference(rate, decay, t) : share * (left - f.f11), 0.0, left};
+        const Real h = close ? free(t)[3] : share * (left - f.f22 - (2.0 * sigma - decay) * f.f12);
+        return {omega * omega * h, omega * omega * (f.f12 - decay * h), left};
     }
 
   private:
@@ -93,10 +100,27 @@ class Plant {
 
     bool far_apart = false, close = false;
     Real apart = 0.0;                  // (zeta^2 - 1) omega^2: below 0 the poles are a pair
-    Real product = 0.0;                // of the decay's distances from the plant's poles
+    Real share = 0.0;                  // what a decay that is not close to the poles has of their response
     double fastest = 0.0;              // rad/s
     Real s = 0.0, w = 0.0, b = 0.0;    // sigma, omega^2 and decay in the time u = fastest t
+    mutable Real last = -1.0;          // s
+    mutable Transition<Real> remembered{};
     std::array<Free, TERMS> series{};  // coefficients of g / u, g', ∫ g^2 / u^3 and h / u^2
+
+    Transition<Real> computed(Real t) const {
+        using std::expm1;
+        if (order == 1) {
+            const Real lost = expm1(-rate * t);
+            return {1.0 + lost, 0.0, 0.0, 0.0, -0.5 * rate * lost * (2.0 + lost), 0.0, 0.0};
+        }
+        const auto [g, g_rate, energy, h] = free(t);
+        const Real w2 = omega * omega, x = w2 * g, q11 = w2 * w2 * energy, q12 = 0.5 * x * x;
+        return {g_rate + 2.0 * sigma * g, g, -x, g_rate, q11, q12, w2 * q11 + 2.0 * sigma * q12 + x * w2 * g_rate};
+    }
+
+    Free free(Real t) const {
+        return far_apart && fastest * value_of(t) > SHORT ? by_exponentials(t) : by_doubling(t);
+    }
 
     Free by_doubling(Real t) const {
         using std::exp;
@@ -105,7 +129,7 @@ class Plant {
         const Real u = fastest * t / std::ldexp(1.0, doublings), v = u * u;
         Free evens{}, odds{};  // apart, so that sums wait for half as many others
         for (int k = (value_of(u) <= TINY ? FEW : TERMS) - 2; k >= 0; k -= 2)
-            for (int i = 0; i < 3 + close; ++i)
+            for (int i = 0; i < 4; ++i)
                 evens[i] = evens[i] * v + series[k][i], odds[i] = odds[i] * v + series[k + 1][i];
         Real g = (evens[0] + u * odds[0]) * u, g_rate = evens[1] + u * odds[1];
         Real energy = (evens[2] + u * odds[2]) * u * v, h = (evens[3] + u * odds[3]) * v;

@@ -1,38 +1,44 @@
 // The C interface (pumafuse.h): from flat arrays to filters whose number of states is known to the compiler.
-#include <memory>
-#include <variant>
-
 #include "interface.hpp"
 #include "smoother.hpp"
 #include "window.hpp"
 
 using namespace pumafuse;
 
-namespace {
-
-// A type for each size that is compiled.
-template <template <int> class Of>
-using Sized = std::variant<Of<4>, Of<6>, Of<9>, Of<16>, Of<64>>;
-
-template <int N>
-struct Recorded {
-    Filter<N> filter;
-    State<N, double> state;
-};
-
-template <int N>
-using Stream = std::unique_ptr<Window<N>>;
-
-}  // namespace
-
 struct pf_filter {
     Time axes;
-    Sized<Recorded> core;
+
+    explicit pf_filter(Time axes) : axes(axes) {}
+    virtual ~pf_filter() = default;
+    virtual void run(int mode, const Table& rows, Time begin, Time end, Time n, const Time* time, double* outputs) = 0;
+    virtual bool bias(Time sensor, Time axis, double found[2]) const = 0;
 };
 
-struct pf_live {
-    Sized<Stream> core;
+namespace {
+
+template <int N>
+struct Recorded final : pf_filter {
+    Filter<N> filter;
+    State<N, double> state;
+
+    Recorded(const pf_model& model, Time origin)
+        : pf_filter(model.axes), filter(model_of<double>(model)), state(filter.at_rest(origin)) {}
+
+    void run(int mode, const Table& rows, Time begin, Time end, Time n, const Time* time, double* outputs) override {
+        if (mode == PF_AS_LIVE) run_as_live(filter, state, rows, n, time, outputs);
+        else if (mode == PF_SMOOTHED) run_smoothed(filter, state, rows, n, time, outputs);
+        else pumafuse::run(filter, state, rows, begin, end, mode == PF_REPEATED, n, time, outputs);
+    }
+
+    bool bias(Time sensor, Time axis, double found[2]) const override {
+        const int i = filter.bias[sensor * axes + axis];
+        const Residual<N, double>& xi = state.axes[axis].residual;
+        if (i >= 0) found[0] = xi.x[i], found[1] = std::sqrt(std::max(xi.P[i][i], 0.0));
+        return i >= 0;
+    }
 };
+
+}  // namespace
 
 int pf_version(void) { return PF_VERSION; }
 
@@ -40,10 +46,11 @@ const char* pf_error(void) { return error.c_str(); }
 
 void pf_transition(const pf_axis* axis, double dt, double step[17]) {
     const Arm<double> arm(lifted<Axis, double>(axis, 1, {})[0]);
-    const Transition<double> f = arm.plant.over(dt);
+    const Transition<double>& f = arm.plant.over(dt);
+    const Decay<double> e = arm.plant.decaying(f, dt);
     const double lambda = std::sqrt(3.0) / axis->disturbance_time, density = 4.0 / lambda;
     const Transition<double> d = Plant<double>(lambda, 1.0, 0.0).over(dt);
-    const double found[] = {f.f11, f.f12, f.f21, f.f22, f.q11, f.q12, f.q22, f.e1, f.e2, f.left, d.f11, d.f12, d.f21,
+    const double found[] = {f.f11, f.f12, f.f21, f.f22, f.q11, f.q12, f.q22, e.position, e.rate, e.left, d.f11, d.f12, d.f21,
                             d.f22, density * d.q11, density * d.q12, density * d.q22};
     std::copy_n(found, 17, step);
 }
@@ -67,56 +74,32 @@ void pf_response(const pf_axis* axis, int64_t commands, const int64_t* acts, con
 void pf_classify(const pf_model* model, const pf_events* events, int64_t origin, const uint8_t* too_late,
                  uint8_t* known) {
     const Table rows{*events, nullptr, model->axes};
+    const Policy policy{model_of<double>(*model), origin};
     for (Time row = 0; row < events->count; ++row) {
         const bool again = events->source[row] != PF_COMMAND && repeats_earlier(rows, row, 0, int(model->axes));
         const Code whole = again ? PF_DUPLICATE : too_late[row] ? PF_TOO_LATE : PF_FUSED;
         for (int a = 0; a < model->axes; ++a)
             known[row * model->axes + a] =
-                Policy{*model, origin}.classify(rows, row, a, 0, events->count, whole, model->axis[a].start);
+                policy.classify(rows, row, a, 0, events->count, whole, model->axis[a].start);
     }
 }
 
 pf_filter* pf_filter_new(const pf_model* model, int64_t origin) {
     pf_filter* made = nullptr;
-    attempt([&] {
-        sized(*model, [&]<int N>(Size<N>) {
-            Filter<N> filter(model_of<double>(*model));
-            made = new pf_filter{model->axes, Recorded<N>{filter, filter.at_rest(origin)}};
-        });
-    });
+    attempt([&] { sized(*model, [&]<int N>(Size<N>) { made = new Recorded<N>(*model, origin); }); });
     return made;
 }
 
 void pf_filter_free(pf_filter* filter) { delete filter; }
 
-void pf_filter_run(pf_filter* filter, const pf_events* events, int64_t begin, int64_t end, int given,
-                   const pf_results* results, int64_t n, const int64_t* time, double* outputs) {
+int pf_filter_run(pf_filter* filter, int mode, const pf_events* events, int64_t begin, int64_t end,
+                  const pf_results* results, int64_t n, const int64_t* time, double* outputs) {
     const Table rows{*events, results, filter->axes};
-    std::visit([&](auto& core) { run(core.filter, core.state, rows, begin, end, given, n, time, outputs); },
-               filter->core);
-}
-
-int pf_filter_run_as_live(pf_filter* filter, const pf_events* events, const pf_results* results, int64_t n,
-                          const int64_t* time, double* outputs) {
-    const Table rows{*events, results, filter->axes};
-    const auto work = [&](auto& core) { run_as_live(core.filter, core.state, rows, n, time, outputs); };
-    return attempt([&] { std::visit(work, filter->core); });
-}
-
-int pf_filter_smooth(pf_filter* filter, const pf_events* events, const pf_results* results, int64_t n,
-                     const int64_t* time, double* outputs) {
-    const Table rows{*events, results, filter->axes};
-    const auto work = [&](auto& core) { run_smoothed(core.filter, core.state, rows, n, time, outputs); };
-    return attempt([&] { std::visit(work, filter->core); });
+    return attempt([&] { filter->run(mode, rows, begin, end, n, time, outputs); });
 }
 
 int pf_filter_bias(const pf_filter* filter, int64_t sensor, int64_t axis, double bias[2]) {
-    return std::visit([&](const auto& core) {
-        const int i = core.filter.bias[sensor * filter->axes + axis];
-        const auto& xi = core.state.axes[axis].residual;
-        if (i >= 0) bias[0] = xi.x[i], bias[1] = std::sqrt(std::max(xi.P[i][i], 0.0));
-        return int(i >= 0);
-    }, filter->core);
+    return filter->bias(sensor, axis, bias);
 }
 
 void pf_constant_velocity(int64_t n, const double* time, const double* value, int64_t g, const double* density,
@@ -136,53 +119,31 @@ void pf_constant_velocity(int64_t n, const double* time, const double* value, in
     }
 }
 
-pf_live* pf_live_new(const pf_model* model, int64_t room, int64_t most, const pf_counters* carried) {
+pf_live* pf_live_new(const pf_model* model, int64_t room, int64_t most) {
     pf_live* made = nullptr;
     attempt([&] {
         if (model->axes > 62) throw std::length_error("a stream is followed on at most 62 axes");
-        Counters counters(model->sensors);
-        if (carried) counters.carry(*carried);
-        sized(*model, [&]<int N>(Size<N>) {
-            made = new pf_live{std::make_unique<Window<N>>(*model, model_of<double>(*model), room, most, counters)};
-        });
+        sized(*model, [&]<int N>(Size<N>) { made = new Window<N>(model_of<double>(*model), room, most); });
     });
     return made;
 }
 
 void pf_live_free(pf_live* live) { delete live; }
 
-pf_port* pf_live_port(pf_live* live) {
-    return std::visit([](auto& window) { return &window->port; }, live->core);
-}
+pf_port* pf_live_port(pf_live* live) { return &live->port; }
 
-int pf_live_measurement(pf_live* live, int64_t stamp, int64_t sensor, uint64_t given, int64_t newest, int64_t oldest) {
+int pf_live_add(pf_live* live, int64_t stamp, int64_t source, uint64_t given, int64_t oldest) {
     int taken = 0;
-    const auto work = [&](auto& one) { taken = one->measurement(stamp, int(sensor), given, newest, oldest); };
-    return attempt([&] { std::visit(work, live->core); }) < 0 ? -1 : taken;
-}
-
-int pf_live_command(pf_live* live, int64_t stamp, uint64_t given, int64_t oldest) {
-    int taken = 0;
-    const auto work = [&](auto& window) { taken = window->command(stamp, given, oldest); };
-    return attempt([&] { std::visit(work, live->core); }) < 0 ? -1 : taken;
+    return attempt([&] { taken = live->add(stamp, int(source), given, oldest); }) < 0 ? -1 : taken;
 }
 
 void pf_live_estimate(pf_live* live, int64_t time, int64_t after, double* outputs, int64_t* fused) {
-    std::visit([&](auto& window) { window->estimate(time, after, outputs, fused); }, live->core);
+    live->estimate(time, after, outputs, fused);
 }
 
-void pf_live_commands(const pf_live* live, int64_t until, int64_t* stamp, double* value, double* step) {
-    std::visit([&](const auto& window) { window->commands(until, stamp, value, step); }, live->core);
+void pf_live_read(const pf_live* live, int64_t begin, int64_t end, int64_t* stamp, int16_t* source,
+                  const pf_results* results) {
+    live->read(begin, end, stamp, source, *results);
 }
 
-int pf_live_forget(pf_live* live, int64_t after) {
-    return attempt([&] { std::visit([&](auto& window) { window->forget(after); }, live->core); });
-}
-
-void pf_live_count_late(pf_live* live, int64_t sensor, int64_t stamp, int64_t newest, int64_t times) {
-    std::visit([&](auto& window) { window->count_late(int(sensor), stamp, newest, times); }, live->core);
-}
-
-int pf_live_counters(const pf_live* live, const pf_counters* found) {
-    return attempt([&] { std::visit([&](const auto& window) { window->counted().give(*found); }, live->core); });
-}
+void pf_live_forget(pf_live* live, int64_t after) { live->forget(after); }

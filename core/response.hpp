@@ -25,16 +25,16 @@ struct Response {
     Real error = 0.0;            // the gain error e now [m]
     Real x = 0.0, rate = 0.0;    // m, m/s
 
-    // x <- u + Phi (x - u) + Gamma_e e; f is of the plant over the interval.
-    void predict(const Transition<Real>& f, const Instant<Real>& to) {
-        const Real gap = x - u, before = rate;
-        x = u + (f.f11 * gap + f.f12 * before) + f.e1 * error, rate = f.f21 * gap + f.f22 * before + f.e2 * error;
-        error = error * f.left, time = to;
-    }
-
+    // x <- u + Phi (x - u) + Gamma_e e
     void predict(const Plant<Real>& plant, const Instant<Real>& to) {
         const Real dt = seconds(time, to);
-        if (!is_zero(dt)) predict(plant.over(dt), to);
+        if (is_zero(dt)) return;
+        const Transition<Real>& f = plant.over(dt);
+        const Decay<Real> e = plant.decaying(f, dt);
+        const Real gap = x - u, before = rate;
+        x = u + (f.f11 * gap + f.f12 * before) + e.position * error;
+        rate = f.f21 * gap + f.f22 * before + e.rate * error, error = error * e.left;
+        time = to;
     }
 
     // From now on u is `command` [m] as logged. Returns the maneuver |u_n - 2 u_(n-1) + u_(n-2)| / T [m/s].

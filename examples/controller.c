@@ -75,10 +75,7 @@ static void take(const struct event *event)
     if (oldest < port->floor) oldest = port->floor; /* there was no room for what is older */
 
     int taken = 0;
-    if (event->stamp >= oldest)
-        taken = event->source == PF_COMMAND
-                    ? pf_live_command(live, event->stamp, given, oldest)
-                    : pf_live_measurement(live, event->stamp, event->source, given, newest, oldest);
+    if (event->stamp >= oldest) taken = pf_live_add(live, event->stamp, event->source, given, oldest);
     for (int a = 0; a < FILTER_AXES; a++)
         if (event->source != PF_COMMAND && given >> a & 1) outcomes[taken == 1 ? port->outcome[a] : PF_TOO_LATE]++;
 }
@@ -93,7 +90,7 @@ int main(void)
         fprintf(stderr, "the library is of interface %d, this program of %d\n", pf_version(), PF_VERSION);
         return 1;
     }
-    live = pf_live_new(&filter_model, ROOM, ROOM, NULL); /* room at first, and at the most: all memory is taken here */
+    live = pf_live_new(&filter_model, ROOM, ROOM); /* room at first, and at the most: all memory is taken here */
     if (live == NULL) {
         fprintf(stderr, "no filter: %s\n", pf_error());
         return 1;

@@ -22,7 +22,7 @@
 extern "C" {
 #endif
 
-#define PF_VERSION 3              /* of this interface: a program and its library must agree */
+#define PF_VERSION 4              /* of this interface: a program and its library must agree */
 #define PF_NO_STAMP INT64_MIN     /* the time of a row without a readable stamp */
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
 #define PF_NEVER INT64_MAX        /* after all instants */
@@ -118,17 +118,14 @@ PF_API void pf_classify(const pf_model *model, const pf_events *events, int64_t 
 typedef struct pf_filter pf_filter;
 PF_API pf_filter *pf_filter_new(const pf_model *model, int64_t origin);
 PF_API void pf_filter_free(pf_filter *filter); /* NULL: nothing */
-/* Events begin to end, and an estimate at each of n times, ascending, by the events until then; the commands in later
- * rows that are stamped by then are known, too. outputs (PF_OUTPUTS, A, n). given: outcomes are repeated, whatever a
- * gate would say. */
-PF_API void pf_filter_run(pf_filter *filter, const pf_events *events, int64_t begin, int64_t end, int given,
-                          const pf_results *results, int64_t n, const int64_t *time, double *outputs);
-/* The same of all events, each estimate by those that had arrived by its instant: commands at their stamp, measurements
- * at the later of stamp and validity. And: each by all measurements. Return 0; -1 without memory. */
-PF_API int pf_filter_run_as_live(pf_filter *filter, const pf_events *events, const pf_results *results, int64_t n,
-                                 const int64_t *time, double *outputs);
-PF_API int pf_filter_smooth(pf_filter *filter, const pf_events *events, const pf_results *results, int64_t n,
-                            const int64_t *time, double *outputs);
+/* How estimates are asked for: by the events until then; likewise, where outcomes are repeated, whatever a gate would
+ * say; by the events that had arrived by then (commands at their stamp, measurements at the later of stamp and
+ * validity); by all measurements. */
+enum { PF_FILTERED, PF_REPEATED, PF_AS_LIVE, PF_SMOOTHED };
+/* Events begin to end, all of them for the last two, and an estimate at each of n times, ascending; the commands in
+ * later rows that are stamped by then are known, too. outputs (PF_OUTPUTS, A, n). Returns 0; -1 without memory. */
+PF_API int pf_filter_run(pf_filter *filter, int mode, const pf_events *events, int64_t begin, int64_t end,
+                         const pf_results *results, int64_t n, const int64_t *time, double *outputs);
 /* Mean and sd [m] of the constant bias of a sensor on an axis; returns 1, or 0 where none is in the state. */
 PF_API int pf_filter_bias(const pf_filter *filter, int64_t sensor, int64_t axis, double bias[2]);
 
@@ -152,49 +149,33 @@ typedef struct pf_live pf_live;
 typedef struct {
     double *value, *spread; /* of the event that comes in [m], and by what its noise is scaled, else 1, (A,) */
     uint8_t *outcome;       /* what became of each, PF_ABSENT for an axis that the event does not give, (A,) */
-    double *innovation;     /* nu of each value of a measurement [m], (A,) */
+    double *innovation, *innovation_sd; /* of each value of a measurement [m], (A,) */
     int64_t contradicts;    /* the sensor that the last measurement contradicts time after time; -1: none */
     int64_t origin;         /* stamp of the first command; PF_NEVER before it */
     int64_t floor;          /* what is stamped before is taken no more: the stream was too dense; PF_ALWAYS at first */
-    int64_t room, held;     /* events that there is room for, and those that are there */
+    int64_t room;           /* rows that there is room for; one for an event, of a command for each delay of its axes */
+    int64_t begin, end;     /* the rows of the window, counted from the first that ever came */
 } pf_port;
 
-/* What was counted of each sensor: number has outcomes of values that left the window, then rows that came, ...; minute
- * has for each second rows, sum and most of lateness [s], sum of NIS, fused values. */
-enum { PF_CAME = 8, PF_DROPOUTS, PF_INTERVALS, PF_IN_A_ROW, PF_COUNTS, PF_SECONDS = 60, PF_KINDS = 5 };
-typedef struct {
-    int64_t *number;      /* (S, PF_COUNTS) */
-    int64_t *last, *left; /* latest stamp, and that of the latest row that left the window; else PF_ALWAYS, (S,) */
-    double *usual;        /* usual interval [s], (S,) */
-    int64_t *second;      /* which second each entry of minute is, (S, PF_SECONDS) */
-    double *minute;       /* (S, PF_SECONDS, PF_KINDS) */
-} pf_counters;
-
-/* Empty. room: events that it has memory for at first, most: at the most; with both alike pf_live_measurement,
- * _command, _estimate, _commands and _count_late allocate nothing later. carried: number and usual of what was counted
- * before, or NULL. Returns NULL on failure. */
-PF_API pf_live *pf_live_new(const pf_model *model, int64_t room, int64_t most, const pf_counters *carried);
+/* Empty. room: events that it has memory for at first, most: at the most; with both alike nothing allocates later.
+ * Returns NULL on failure. */
+PF_API pf_live *pf_live_new(const pf_model *model, int64_t room, int64_t most);
 PF_API void pf_live_free(pf_live *live); /* NULL: nothing */
 PF_API pf_port *pf_live_port(pf_live *live); /* the same all its life */
-/* Take in the measurement, or the command, in the port, of the axes that are bits of `given`. No event that is stamped
- * before `oldest` will come any more; `newest` is the latest stamp of all. Returns 1; 0 if to make room the window let
- * go of its time; -1 without memory. */
-PF_API int pf_live_measurement(pf_live *live, int64_t stamp, int64_t sensor, uint64_t given, int64_t newest,
-                               int64_t oldest);
-PF_API int pf_live_command(pf_live *live, int64_t stamp, uint64_t given, int64_t oldest);
+/* Take in the event in the port, of a sensor or PF_COMMAND, of the axes that are bits of `given`. No event that is
+ * stamped before `oldest` will come any more. Returns 1; 0 if to make room the window let go of its time; -1 without
+ * memory. */
+PF_API int pf_live_add(pf_live *live, int64_t stamp, int64_t source, uint64_t given, int64_t oldest);
 /* Every axis at an instant by all measurements valid until then, of events that are stamped until `after` (PF_NEVER: by
  * all); nothing changes. outputs (PF_OUTPUTS, A): positions as logged, NaN for an axis of which no level is known;
  * fused (A,): when the last measurement was valid that it knows of. */
 PF_API void pf_live_estimate(pf_live *live, int64_t time, int64_t after, double *outputs, int64_t *fused);
-/* Of each axis the last command stamped until `until`: its stamp (PF_ALWAYS where it has left the window, PF_NEVER for
- * none), value and step [m], (A,). */
-PF_API void pf_live_commands(const pf_live *live, int64_t until, int64_t *stamp, double *value, double *step);
-/* Take back all that is stamped after an instant: it was of another clock. Returns 0; -1 without memory. */
-PF_API int pf_live_forget(pf_live *live, int64_t after);
-/* Count a measurement that came too late for the window; times -1: take one back that is fed again. */
-PF_API void pf_live_count_late(pf_live *live, int64_t sensor, int64_t stamp, int64_t newest, int64_t times);
-/* What there was of each sensor until now, with what is still in the window. Returns 0; -1 without memory. */
-PF_API int pf_live_counters(const pf_live *live, const pf_counters *found);
+/* What became of rows begin to end: their stamp, source (n,), and results (n, A), which mean nothing for a command.
+ * Those before port->begin do not change any more. They are there to be read until room / 16 more have come. */
+PF_API void pf_live_read(const pf_live *live, int64_t begin, int64_t end, int64_t *stamp, int16_t *source,
+                         const pf_results *results);
+/* Take back all that is stamped after an instant: it was of another clock. */
+PF_API void pf_live_forget(pf_live *live, int64_t after);
 
 #ifdef __cplusplus
 }

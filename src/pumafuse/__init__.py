@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from .identification.trials import StepTrials, Trial, TrialsError
     from .identification.verify import AxisVerification, BestInClass, ModelFit, Trace, verify
     from .live.estimator import EventLog, LiveEstimator
-    from .live.results import AxisNow, Health, LiveEstimate, SensorHealth, UpdateResult
+    from .live.health import Health, SensorHealth
+    from .live.results import AxisNow, LiveEstimate, UpdateResult
     from .logs.frames import Cylindrical, Rotated
     from .logs.run import Run, Source
     from .model.arm import ArmModel, AxisModel, Gain, Validity
@@ -56,7 +57,8 @@ _NAMES = {
     "identification.trials": ["StepTrials", "Trial", "TrialsError"],
     "identification.verify": ["AxisVerification", "BestInClass", "ModelFit", "Trace", "verify"],
     "live.estimator": ["EventLog", "LiveEstimator"],
-    "live.results": ["AxisNow", "Health", "LiveEstimate", "SensorHealth", "UpdateResult"],
+    "live.health": ["Health", "SensorHealth"],
+    "live.results": ["AxisNow", "LiveEstimate", "UpdateResult"],
     "logs.frames": ["Cylindrical", "Rotated"],
     "logs.run": ["Run", "Source"],
     "model.arm": ["ArmModel", "AxisModel", "Gain", "Validity"],

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import pumafuse as pf
-from pumafuse.arrays import ALWAYS
 from pumafuse.filter import window
+from pumafuse.filter.events import COMMAND
 from pumafuse.filter.outcome import ABSENT, Outcome
-from pumafuse.filter.window import CAME, Window
+from pumafuse.filter.window import Window
 from pumafuse.fusion.setup import filter_model
 
 MS = 1_000_000  # ns
@@ -40,13 +40,22 @@ def empty(delays: tuple[float, ...]) -> Window:
     st.sampled_from([(1, 1), (3, 3), (2, 8), (4, 100), (4096, 4096)]),
 )
 def test_a_window_of_any_size_takes_anything(seed: int, delays: list[float], rooms: tuple[int, int]) -> None:
-    """Rows early and late, values that are none, clocks set back: every row is counted, every estimate is a number."""
+    """Rows early and late, values that are none, clocks set back: every row can be read, every estimate is a number."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(window, "FIRST_ROWS", rooms[0])
         patch.setattr(window, "MOST_ROWS", rooms[1])
         live = empty(tuple(delays))
     rng, axes = np.random.default_rng(seed), len(delays)
-    now, came, values = int(rng.integers(-(10**18), 10**18)), np.zeros((2, 3), dtype=np.int64), 0
+    now, given, unread = int(rng.integers(-(10**18), 10**18)), np.zeros(3, dtype=np.int64), 0
+    read = np.zeros(3, dtype=np.int64)  # values that were found in rows, by sensor
+
+    def count(begin: int, end: int) -> None:
+        stamp, source, results = live.read(begin, end)
+        measured = source >= 0
+        assert (stamp <= now).all()
+        assert (results.outcome[measured] != Outcome.DUPLICATE).all()
+        np.add.at(read, source[measured], np.count_nonzero(results.outcome[measured] != ABSENT, axis=1))
+
     assert live.estimate(now) == [None] * axes
     for _ in range(200):
         now += int(rng.choice([0, 1, MS, T, 300 * MS]))
@@ -56,37 +65,35 @@ def test_a_window_of_any_size_takes_anything(seed: int, delays: list[float], roo
         for axis in range(axes):
             level = -0.5 if sensor == 2 else 0.5
             live.value[axis] = rng.choice(WRONG) if rng.random() < 0.05 else level + rng.normal(0.0, 3e-3)
-        if sensor < 0:
-            taken = live.add_command(stamp, bits, oldest)
-        elif taken := live.add_measurement(stamp, sensor, bits, now, oldest):
-            came[:, sensor] += 1, bits.bit_count()
+        rows = live.port.end
+        taken = live.add(stamp, sensor, bits, oldest)
+        assert taken or live.port.end == rows
+        if taken and sensor != COMMAND:
+            given[sensor] += bits.bit_count() * (live.port.end - rows)
         for axis, code in enumerate(live.outcome):
             assert not taken or (code == ABSENT) != bool(bits >> axis & 1)
-        assert 0 <= live.port.held <= live.port.room <= max(rooms[1], 4) * 2
+        assert 0 <= live.port.end - live.port.begin <= live.port.room <= max(rooms[1], 32 * axes) * 2
+        if live.port.begin - unread > live.port.room // 32:
+            count(unread, live.port.begin)
+            unread = live.port.begin
         for time in (stamp, now, now + 300 * MS):
             for found in live.estimate(time, *([stamp] if rng.random() < 0.5 else [])):
                 if found is not None:
                     assert np.isfinite(found[0]).all()
                     assert min(found[0][1::2]) >= 0.0
         if rng.random() < 0.01:
-            now = max(now - 200 * MS, live.port.floor)
+            count(unread, live.port.end)
+            kept = live.port.end
+            unread, now = live.port.begin, max(now - 200 * MS, live.port.floor)
             live.forget(now)
-        values = live.counters().number
-    assert values[:, CAME].tolist() == came[0].tolist()
-    assert values[:, : len(Outcome)].sum(axis=1).tolist() == came[1].tolist()
+            assert live.port.begin == unread <= live.port.end <= kept
+            read -= counted_in(live)
+    count(unread, live.port.end)
+    assert read.tolist() == given.tolist()
 
 
-def test_commands_of_the_past_are_known_as_long_as_they_matter() -> None:
-    """Stamp, value and step of the last one stamped until any instant; of those that left the window, of the latest."""
-    live, levels = empty((0.06,)), 0.5 + np.cumsum(np.random.default_rng(1).normal(0.0, 1e-3, 100))
-    for number, level in enumerate(levels.tolist()):
-        live.value[0] = level
-        assert live.add_command(number * T, 1, (number - 20) * T)
-    first = 100 - live.port.held
-    assert 0 < first < 85
-    steps = np.diff(levels, prepend=levels[0])
-    for number in range(first, 100):
-        for until in (number * T, (number + 1) * T - 1):
-            (found,) = live.commands(until)
-            assert found == (number * T, levels[number], pytest.approx(steps[number], rel=1e-12))
-    assert live.commands(first * T - 1) == [(ALWAYS, pytest.approx(levels[first - 1]), pytest.approx(steps[first - 1]))]
+def counted_in(live: Window) -> np.ndarray:
+    """The values that are in a window, by sensor."""
+    _, source, results = live.read(live.port.begin, live.port.end)
+    values = np.count_nonzero(results.outcome != ABSENT, axis=1)
+    return np.array([values[source == sensor].sum() for sensor in range(len(SENSORS))])

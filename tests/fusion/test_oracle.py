@@ -379,11 +379,11 @@ def test_a_million_steps_leave_the_covariance_as_it_was() -> None:
     assert len(events.time) > 1_000_000
     last, results, sds = events.time[-1000:], Results.room(*events.known.shape), list[float]()
     for begin in range(0, len(events.time) - 5000, 5000):
-        outputs = core.run(events, results, events.time[begin : begin + 1], (begin, begin + 5000))
+        outputs = core.run(events, results, events.time[begin : begin + 1], span=(begin, begin + 5000))
         assert (outputs[1:6:2] >= 0.0).all()
         sds.append(core.bias(0, 0)[1])
     assert (np.diff(sds) < 0.0).all()
-    outputs = core.run(events, results, last, (begin + 5000, len(events.time)))
+    outputs = core.run(events, results, last, span=(begin + 5000, len(events.time)))
     model.view["bias_sd"] = 0.0
     begun = Filter(model, int(events.time[-5000]))
     wanted = begun.run(events.rows(slice(-5000, None)), Results.room(5000, 1), last)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from importlib.resources import files
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
 
 import pumafuse as pf
-from streams import delayed, events_of, feed
+from streams import any_stream, delayed, events_of, feed
 
 CONFIG = pf.FusionConfig(
     arm=pf.ArmModel.load("puma560-internal"),
@@ -100,6 +102,85 @@ def test_what_comes_too_late_has_come_and_says_how_late() -> None:
     assert health.rows == health.outcomes["too_late"] == 249
     assert health.lateness == pytest.approx(3.0) and health.lateness_max == pytest.approx(3.0)
     assert health.silent == pytest.approx(3.0)
+
+
+@pytest.mark.filterwarnings("ignore::pumafuse.PumafuseWarning")
+@settings(derandomize=True, deadline=None, max_examples=100)
+@given(any_stream())
+def test_what_counts_is_what_became_of_a_row_in_the_end(drawn: tuple[pf.FusionConfig, pf.Run, int]) -> None:
+    """Whatever comes late, commands too: NIS and outcomes are those of the innovations of the whole run."""
+    config, run, seed = drawn
+    offline, live = pf.fuse(run, config), pf.LiveEstimator(config, window=20.0, start=run.start)
+    events = events_of(run)
+    tied = {(event.stamp, event.sensor) for event in events}
+    for event in delayed(events, 1.9, seed) if len(tied) == len(events) else events:
+        feed(live, event)
+    found, health = offline.measurements, live.health()
+    taken = (found.outcome == pf.Outcome.FUSED) | (found.outcome == pf.Outcome.REACQUIRED)
+    for number, name in enumerate(found.sensors):
+        ours = taken & (found.sensor == number)
+        if name in health.sensors and ours.any():
+            nis = float(np.mean((found.innovation[ours] / found.innovation_sd[ours]) ** 2))
+            assert health.sensors[name].nis == pytest.approx(nis, rel=1e-9)
+            assert health.sensors[name].outcomes["fused"] == np.sum(found.outcome[ours] == pf.Outcome.FUSED)
+
+
+def test_what_leaves_at_once_is_counted_all_the_same() -> None:
+    """A thousand rows a second, and pauses after which the whole window is of the past: not one row is missing."""
+    live, rng = pf.LiveEstimator(CONFIG), np.random.default_rng(5)
+    for begin in (0.0, 10.0, 20.0):
+        for row in range(3000):
+            t = begin + row * 1e-3
+            if row % 28 == 0:
+                live.command(t, radial=0.57)
+            live.measurement(t, "camera", radial=0.57 + rng.normal(0.0, 5e-4))
+    for row in range(100):  # all that came before has left, and nobody has asked since
+        live.measurement(40.0 + row * 1e-3, "camera", radial=0.57)
+    camera = live.health().sensors["camera"]
+    assert camera.rows == camera.outcomes["fused"] == 9100
+    assert camera.dropouts == 3
+    assert camera.nis == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 9000.0))
+
+
+def test_what_is_kept_is_no_more_than_the_window_needs() -> None:
+    """After ten minutes of rows, and after one that is sent again and again while no time goes by."""
+    live, events = pf.LiveEstimator(CONFIG), events_of(stream(600.0))
+    for event in [*events, *[events[-2]] * 1000]:
+        feed(live, event)
+    health = live.health()
+    assert health.sensors["tracker"].outcomes["duplicate"] + health.commands["duplicate"] == 1000
+    assert sum(len(given) for given in live._commands._given) < 80  # two seconds
+    assert len(live._counts._came) < 128
+
+
+def test_what_is_taken_back_is_invalid_and_nothing_else_remains_of_it() -> None:
+    """A sensor runs half a minute ahead for ten rows: they came, and all else is as without them."""
+    live, clean = pf.LiveEstimator(CONFIG), pf.LiveEstimator(CONFIG)
+    for step in range(300):
+        for one in (live, clean):
+            one.command(step * 0.01, radial=0.57)
+            one.measurement(step * 0.01, "camera", radial=0.57 + 1e-5 * (step % 7))
+        if step == 200:
+            for row in range(10):
+                told = live.measurement(32.0 + row * 0.01, "camera", radial=0.57)
+                assert told.outcome is pf.Outcome.FUSED
+            assert live.health().sensors["camera"].outcomes["fused"] == 211
+    found, expected = (one.health().sensors["camera"] for one in (live, clean))
+    outcomes = expected.outcomes | {"invalid": 10}
+    assert found == replace(expected, rows=310, outcomes=outcomes)
+
+
+def test_a_restart_keeps_what_was_counted() -> None:
+    """After the commands' clock was reset: rows, outcomes and dropouts go on, and the usual interval is still known."""
+    live = pf.LiveEstimator(CONFIG)
+    for begin in (100.0, 0.0):
+        for row in range(400):
+            live.command(begin + row * 0.01, radial=0.57)
+            if row >= 10 and row not in (100, 200):
+                live.measurement(begin + row * 0.01, "tracker", radial=0.57)
+    tracker = live.health().sensors["tracker"]
+    assert live.segment == 1
+    assert (tracker.rows, tracker.outcomes["fused"], tracker.dropouts) == (776, 776, 4)
 
 
 def test_all_outcomes_are_counted() -> None:

@@ -49,7 +49,8 @@ def test_the_first_room_serves_for_ever() -> None:
     live = pf.LiveEstimator(config)
     assert differences(live, events_of(run), pf.fuse(run, config), 0.1) == []
     assert live._window.port.room == window.FIRST_ROWS
-    assert live._window.port.held < 2.2 * 236.0
+    port = live._window.port
+    assert port.end - port.begin < 2.2 * 236.0
 
 
 def flood(live: pf.LiveEstimator, values: FloatArray) -> None:
@@ -103,7 +104,7 @@ def test_a_frozen_stamp_ends_in_a_shorter_window(monkeypatch: pytest.MonkeyPatch
     live = pf.LiveEstimator(config_of())
     live.command(0, radial=0.5)
     told = [live.measurement(100 * MS, "slow", radial=0.5 + 1e-9 * row) for row in range(5000)]
-    assert told[4000].outcome is pf.Outcome.FUSED
+    assert told[3800].outcome is pf.Outcome.FUSED  # one place in sixteen is for rows that have left
     assert told[-1].outcome is pf.Outcome.TOO_LATE
     assert "the window holds no more" in told[-1].reason
     assert live.command(100 * MS + 10 * MS + T + 1, radial=0.5).outcome is pf.Outcome.FUSED  # after latency and T

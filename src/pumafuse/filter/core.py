@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,7 @@ from ..arrays import BoolArray, CodeArray, FloatArray, TimeArray
 from ..errors import PumafuseError
 from .events import Events, Results
 
-VERSION = 3  # of the interface
+VERSION = 4  # of the interface
 LIBRARY = Path(__file__).with_name("_core" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
 Record = npt.NDArray[np.void]  # an array of structs
 
@@ -75,6 +75,7 @@ _INT64, _POINTER = ctypes.c_int64, ctypes.c_void_p
 _Model = struct(["axes", "sensors"], Model._fields)
 _Events = struct(["count"], Events._fields)
 _Results = struct([], Results._fields)
+_MODES = "filtered", "repeated", "as-live", "smoothed"
 _KINDS = {"p": _POINTER, "n": _INT64, "d": ctypes.c_double, "i": ctypes.c_int, "u": ctypes.c_uint64}
 _FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double, int, uint64; v: nothing
     "transition": "vpdp",
@@ -83,21 +84,16 @@ _FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double
     "constant_velocity": "vnppnppp",
     "filter_new": "ppn",
     "filter_free": "vp",
-    "filter_run": "vppnnipnpp",
-    "filter_run_as_live": "ipppnpp",
-    "filter_smooth": "ipppnpp",
+    "filter_run": "ipipnnpnpp",
     "filter_bias": "ipnnp",
     "linearise": "ippnnpppp",
-    "live_new": "ppnnp",
+    "live_new": "ppnn",
     "live_free": "vp",
     "live_port": "pp",
-    "live_measurement": "ipnnunn",
-    "live_command": "ipnun",
+    "live_add": "ipnnun",
     "live_estimate": "vpnnpp",
-    "live_commands": "vpnppp",
-    "live_forget": "ipn",
-    "live_count_late": "vpnnnn",
-    "live_counters": "ipp",
+    "live_read": "vpnnppp",
+    "live_forget": "vpn",
 }
 
 
@@ -147,8 +143,13 @@ def struct_of(model: Model) -> ctypes.Structure:
     return _Model(len(model.axis), len(model.sensor), *map(at, model))
 
 
+def fates(results: Results) -> Any:
+    """Results as the core fills them, whose arrays must live as long."""
+    return ctypes.byref(_Results(*map(at, results)))
+
+
 def _tables(events: Events, results: Results) -> tuple[Any, Any]:
-    return ctypes.byref(_events_of(events)), ctypes.byref(_Results(*map(at, results)))
+    return ctypes.byref(_events_of(events)), fates(results)
 
 
 def _events_of(events: Events) -> ctypes.Structure:
@@ -192,45 +193,31 @@ class Filter(Handle):
         events: Events,
         results: Results,
         times: TimeArray,
+        mode: Literal["filtered", "repeated", "as-live", "smoothed"] = "filtered",
         span: tuple[int, int] | None = None,
-        given: bool = False,
     ) -> FloatArray:
-        """Events in their order, and an estimate at each of ``times`` by the events until then.
+        """Events in their order, and an estimate at each of ``times``.
 
         Args:
             events: All of them.
-            results: Gets what became of each measurement; has, where ``given``, the outcomes to repeat.
+            results: Gets what became of each measurement; has the outcomes that are to be ``repeated``.
             times: Of the estimates, int64 ns, ascending, (n,).
+            mode: What an estimate knows: the events until then (``repeated``: whatever a gate would say), those that
+                had arrived by then, or all of them.
             span: The first event that is run, and the one after the last; an estimate knows commands behind it, too.
-            given: Whether outcomes are repeated, whatever a gate would say.
 
         Returns:
             Outputs by :class:`Output`, axis and time, (8, A, n).
         """
-        outputs, (table, fates) = np.zeros((len(Output), self._axes, len(times))), _tables(events, results)
-        begin, end = span or (0, len(events.time))
-        library.pf_filter_run(self._core, table, begin, end, given, fates, len(times), at(times), at(outputs))
-        return outputs
-
-    def run_as_live(self, events: Events, results: Results, times: TimeArray) -> FloatArray:
-        """The same, each estimate by those events that had arrived by then."""
-        return self._whole(library.pf_filter_run_as_live, events, results, times)
-
-    def smooth(self, events: Events, results: Results, times: TimeArray) -> FloatArray:
-        """The same, each estimate by all measurements."""
-        return self._whole(library.pf_filter_smooth, events, results, times)
-
-    def _whole(self, call: Any, events: Events, results: Results, times: TimeArray) -> FloatArray:
-        outputs = np.zeros((len(Output), self._axes, len(times)))
-        checked(call(self._core, *_tables(events, results), len(times), at(times), at(outputs)))
+        outputs, (table, found) = np.zeros((len(Output), self._axes, len(times))), _tables(events, results)
+        ends, asked = span or (0, len(events.time)), (len(times), at(times), at(outputs))
+        checked(library.pf_filter_run(self._core, _MODES.index(mode), table, *ends, found, *asked))
         return outputs
 
     def bias(self, sensor: int, axis: int) -> tuple[float, float] | None:
         """Mean and sd [m] of the constant bias of a sensor on an axis; None where none is in the state."""
-        found = np.empty(2)
-        return (
-            (float(found[0]), float(found[1])) if library.pf_filter_bias(self._core, sensor, axis, at(found)) else None
-        )
+        found = (ctypes.c_double * 2)()
+        return (found[0], found[1]) if library.pf_filter_bias(self._core, sensor, axis, found) else None
 
 
 def linearise(
@@ -271,25 +258,10 @@ def classify(model: Model, events: Events, origin: int, too_late: BoolArray) -> 
 
 
 def transition(axis: Record, dt: float) -> FloatArray:
-    """Φ11, Φ12, Φ21, Φ22, Q11, Q12, Q22 of an axis (1,) over ``dt`` [s]; its gain error's part."""
+    """What an axis (1,) does over ``dt`` [s]: see ``pf_transition``, (17,)."""
     found = np.empty(17)
     library.pf_transition(at(axis), dt, at(found))
-    return found[:10]
-
-
-def disturbance(rate: float, dt: float) -> FloatArray:
-    """Φ and Q of a smooth disturbance of variance 1 over ``dt`` [s]; ``rate`` is √3 / time [1/s]."""
-    axis, found = np.zeros(1, AXIS), np.empty(17)
-    axis["time_constant"], axis["disturbance_time"] = 1.0, np.sqrt(3.0) / rate
-    library.pf_transition(at(axis), dt, at(found))
-    return found[10:]
-
-
-def respond(axis: Record, acts: TimeArray, command: FloatArray, time: TimeArray) -> FloatArray:
-    """Where an axis (1,) goes without noise, relative to its start level [m], by commands that act at ``acts`` [ns]."""
-    position = np.empty(len(time))
-    library.pf_response(at(axis), len(acts), at(acts), at(command), len(time), at(time), at(position))
-    return position
+    return found
 
 
 def constant_velocity(

@@ -7,7 +7,7 @@ import numpy as np
 from ..arrays import FloatArray, TimeArray
 from ..model.arm import AxisModel
 from ..model.plants import FirstOrder
-from .core import AXIS, Record, respond
+from .core import AXIS, Record, at, library
 
 
 def record_of(axis: AxisModel, period: float, delay: float, start: float) -> Record:
@@ -46,6 +46,8 @@ def response(
     Returns:
         The position [m] relative to ``start``, (n,).
     """
-    acts = given + round(delay * 1e9)
+    acts, position = given + round(delay * 1e9), np.empty(len(time))
     command, time = np.ascontiguousarray(command, dtype=np.float64), np.ascontiguousarray(time)
-    return respond(record_of(axis, period, delay, start), acts, command, time)
+    record = record_of(axis, period, delay, start)
+    library.pf_response(at(record), len(acts), at(acts), at(command), len(time), at(time), at(position))
+    return position

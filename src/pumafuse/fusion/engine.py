@@ -66,8 +66,7 @@ def filter_segment(
         outputs = found.run(results, times, progress)
         return _filtered(segment, outputs, events, results, found.bias)
     core = Filter(model, segment.origin)
-    run = {"filtered": core.run, "as-live": core.run_as_live, "smoothed": core.smooth}[mode]
-    return _filtered(segment, run(events, results, times), events, results, core.bias)
+    return _filtered(segment, core.run(events, results, times, mode), events, results, core.bias)
 
 
 def filter_piece(
@@ -88,7 +87,7 @@ def filter_piece(
     events = segment.events_once(config)
     begin, end = np.searchsorted(events.time, own, side="right").tolist()
     results = _undecided(events)
-    outputs = core.run(events, results, times, (begin, end))
+    outputs = core.run(events, results, times, span=(begin, end))
     mine = np.r_[: np.searchsorted(events.time, NO_STAMP, side="right"), begin:end]
     return _filtered(segment, outputs, events.rows(mine), results.rows(mine), core.bias)
 
@@ -107,7 +106,7 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
     if outcome is not None:
         results.outcome[place] = outcome
     core = Filter(model_of(segment, config), segment.origin)
-    core.run(events, results, _NO_TIMES, given=outcome is not None)
+    core.run(events, results, _NO_TIMES, "filtered" if outcome is None else "repeated")
     return results.rows(place)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -9,26 +10,25 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ..arrays import NEVER, FloatArray
+from ..arrays import NEVER, IntArray
 from ..errors import ConfigError, RunError, suggestion
+from ..filter.events import COMMAND
 from ..filter.outcome import ABSENT, FARTHEST, Outcome
-from ..filter.window import MOST_ROWS, Counters, Window
+from ..filter.window import MOST_ROWS, Window
 from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS
 from ..fusion.setup import live_model
-from ..logs.clock import missing_commands, other_interval
-from ..logs.frames import CARTESIAN, Cylindrical
-from ..logs.run import Source
-from ..model.arm import Validity
-from ..units import Kind
+from ..logs.frames import CARTESIAN
 from .clock import Clock, Time, Verdict, nanoseconds
+from .commands import Commands, CommandWatch, number
 from .frame_start import FrameStart
+from .health import Counts, Health, by_word
 from .rate_limit import RateLimitedLog
-from .results import AxisNow, Health, LiveEstimate, UpdateResult, health_of, no_estimate, update_result
+from .results import AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
-_FIRST, _MANY = 100, 1000  # commands whose interval is looked at, and those that missing ones are counted among
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
+_ABSENT = bytes((ABSENT,))
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
 
 
@@ -100,10 +100,10 @@ class LiveEstimator:
         if len(config.arm.axes) > _MOST_AXES:
             raise ConfigError(f"arm '{config.arm.name}': a stream is followed on at most {_MOST_AXES} axes")
         for name, value in {"window": window, "stale_after": stale_after}.items():
-            if not 0.0 < _number(value) <= LONGEST_TAIL_NS / 1e9:
+            if not 0.0 < number(value) <= LONGEST_TAIL_NS / 1e9:
                 raise ConfigError(f"{name}: must be more than 0 s and at most an hour, not {value!r:.40}")
         for name, value in (start or {}).items():
-            if not abs(_number(value)) < FARTHEST:
+            if not abs(number(value)) < FARTHEST:
                 raise ConfigError(f"start: the level of {name} must be a finite position in m, not {value!r:.40}")
         self.config = config
         self.segment = 0
@@ -113,17 +113,16 @@ class LiveEstimator:
         self._stale_ns = round(stale_after * 1e9)
         self._no_spread = [1.0] * len(self.axes)
         self._log, self._event_log = RateLimitedLog(on_notice), event_log
-        self._refused: dict[str, dict[Outcome, int]] = {name: dict.fromkeys(Outcome, 0) for name in config.sensors}
-        self._strangers = self._refusals = 0
+        self._refused: IntArray = np.zeros((len(self._sensors) + 1, len(Outcome)), dtype=np.int64)
+        self._strangers = 0
         self._doubtful = 0  # commands that may have to be taken back
-        self._commands = dict.fromkeys(Outcome, 0)
         self._answers: dict[bytes, UpdateResult] = {}
         self._aside: list[tuple[_Event, Outcome]] = []
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
-        self._knows_interval = False
         self._clock = Clock(round(window * 1e9))
-        self._start, self._before = dict(start or {}), None
-        self._begin(None)
+        self._watch = CommandWatch(config.arm, config.frame, self._log)
+        self._start = dict(start or {})
+        self._begin(Counts(len(self._sensors)))
 
     def command(self, t: Time, /, **axes: float) -> UpdateResult:
         """Add a command: the arm is to go to a position [m] on each of ``axes``.
@@ -228,25 +227,25 @@ class LiveEstimator:
             ValueError: ``at`` is no time.
         """
         newest = None if self._clock.newest is None else max(self._clock.now, nanoseconds(at or 0))
-        return health_of(
-            self._window.counters(),
-            self._refused,
-            self._commands,
-            self._strangers,
-            self.segment,
-            newest,
-            self._stale_ns,
-        )
+        counts = self._counts.counted(self._window)
+        sensors = {
+            name: counts.health(sensor, self._refused[sensor], newest, self._stale_ns)
+            for name, sensor in self._sensors.items()
+        }
+        commands = by_word(counts.outcomes[COMMAND] + self._refused[COMMAND])
+        return Health(newest, self.segment + 1, commands, sensors, self._strangers)
 
-    def _begin(self, counters: Counters | None) -> None:
-        """An empty window, with what was counted before."""
-        self._before = counters
+    def _begin(self, counts: Counts) -> None:
+        """An empty window; ``counts`` go on."""
         self._frame_start = FrameStart(self.config.frame, self.axes)
-        self._window = Window(live_model(self.config, self._frame_start.start(self._start)), counters)
-        self._recent: list[_Event] = []  # commands that are still to be looked at
-        # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it.
-        # With each goes its outcome, and whether it never came into the window.
-        self._early: list[tuple[_Event, Outcome, bool]] | None = [] if self._frame_start.waits else None
+        model = live_model(self.config, self._frame_start.start(self._start))
+        self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
+        self._watch.restart()
+        counts.restart()
+        # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
+        # what came is fed again then, and counted anew.
+        self._early: list[_Event] | None = [] if self._frame_start.waits else None
+        self._counts, self._before = counts, copy.deepcopy(counts)
 
     def _oldest(self) -> int:
         """No event stamped before is taken [ns]."""
@@ -257,14 +256,16 @@ class LiveEstimator:
         try:
             stamp = nanoseconds(t)
         except ValueError as error:
-            return self._refuse(sensor, values, _INVALID, str(error))
+            return self._refuse(sensor, values, _INVALID, str(error), self._refused)
         if sensor is not None and sensor not in self._sensors:
-            return self._refuse(sensor, values, _UNKNOWN, f"unknown sensor; {suggestion(sensor, self._sensors)}")
+            self._strangers += 1
+            why = f"unknown sensor; {suggestion(sensor, self._sensors)}"
+            return refused(values, _UNKNOWN, why)
         clock = self._clock
         if not clock.low <= stamp <= clock.high:
-            refused = self._judged(_Event(stamp, sensor, values))
-            if refused is not None:
-                return refused
+            told = self._judged(_Event(stamp, sensor, values))
+            if told is not None:
+                return told
         elif clock.newest is not None and stamp > clock.newest:
             clock.settle(stamp)
         if sensor is None and self._aside:
@@ -282,19 +283,16 @@ class LiveEstimator:
         newest, command = clock.newest, sensor is None
         if newest is None or (self._window.origin is None and (command or stamp > newest)):
             if newest is not None and command:
-                self._begin(self._window.counters())  # the commands' clock counts: what came before is of another
+                self._begin(
+                    self._counts.counted(self._window)
+                )  # the commands' clock counts: what came before is of another
                 if self._event_log is not None:
                     self._event_log.begin_segment()
             clock.start(stamp)
             return None
         verdict = clock.judge(stamp, sensor)
         while verdict is Verdict.CONTRADICTED:
-            self._window.forget(clock.bound)
-            if self._event_log is not None:
-                self._event_log.discard(clock.bound)
-            self._commands[_FUSED] -= self._doubtful
-            self._commands[_INVALID] += self._doubtful
-            self._doubtful = 0
+            self._forget(clock.bound)
             who = "a command" if clock.ahead_of is None else f"sensor '{clock.ahead_of}'"
             ahead = (newest - stamp) / 1e9
             self._log.write(
@@ -316,30 +314,35 @@ class LiveEstimator:
         if clock.other and len(self._aside) < _MOST_ASIDE:
             self._aside.append((event._replace(values=dict(values)), outcome))
         if verdict is Verdict.AHEAD:
-            return self._refuse(sensor, values, outcome, f"stamped {(stamp - newest) / 1e9:.0f} s ahead of all others")
-        if outcome == _TOO_LATE:
-            return self._refuse_late(stamp, sensor, values)
-        return self._refuse(sensor, values, outcome, self._behind(stamp))
+            why = f"stamped {(stamp - newest) / 1e9:.0f} s ahead of all others"
+            return self._refuse(sensor, values, outcome, why, self._refused)
+        return self._refuse_late(stamp, sensor, values, self._refused)
 
-    def _behind(self, stamp: int) -> str:
-        """Why a stamp is too late."""
-        if stamp >= self._clock.sure - self._clock.window:
-            return f"more than {MOST_ROWS} events came since: the window holds no more"
-        late = (self._clock.sure - stamp) / 1e9
-        return f"stamped {late:.3f} s behind the newest; the window is {self._clock.window / 1e9:g} s"
+    def _forget(self, after: int) -> None:
+        """Take back all that is stamped after ``after`` [ns]."""
+        self._counts.forget(self._window, after)
+        self._window.forget(after)
+        self._commands.forget(after)
+        if self._event_log is not None:
+            self._event_log.discard(after)
+        self._counts.outcomes[COMMAND, _FUSED] -= self._doubtful
+        self._counts.outcomes[COMMAND, _INVALID] += self._doubtful
+        self._doubtful = 0
 
     def _start_anew(self, event: _Event, newest: int) -> UpdateResult:
         """A new segment from the events that have shown the commands' clock to be another."""
         aside, self._aside = self._aside, []
         first = next(other.stamp for other, _ in aside if other.sensor is None)
         for (_, sensor, values), outcome in aside:
-            self._count(sensor, values, outcome, -1)
+            self._count(sensor, values, outcome, self._refused, -1)
+            if sensor is not None and outcome == _TOO_LATE:
+                self._counts.rows[self._sensors[sensor]] -= 1
         self.segment += 1
         way = "back" if first < newest else "ahead"
         moved = f"{way} by {abs(newest - first) / 1e9:.3f} s"
         self._log.write("clock", f"the commands' clock was set {moved}: new segment, filter restarted")
         self._start = {}
-        self._begin(self._window.counters())
+        self._begin(self._counts.counted(self._window))
         if self._event_log is not None:
             self._event_log.begin_segment()
         self._clock.start(first)
@@ -354,121 +357,84 @@ class LiveEstimator:
         if origin is not None and self._clock.sure - origin > self._clock.window:
             self._early = None
             return self._feed(*event)
-        x, y = (_number(event.values.get(name)) for name in ("x", "y"))
+        x, y = (number(event.values.get(name)) for name in ("x", "y"))
         if event.sensor is None and math.isfinite(x + y) and (since is None or event.stamp < since):
             frame_start = FrameStart(self.config.frame, self.axes)
             try:
                 frame_start.place(event.stamp, x, y)
             except RunError as error:
-                return self._refuse(None, event.values, _INVALID, str(error))
-            events = [one for one, _, _ in self._early if one.stamp >= oldest]
-            for (_, sensor, values), outcome, refused in self._early:
-                if sensor is None or refused:
-                    self._count(sensor, values, outcome, -1)
+                return self._refuse(None, event.values, _INVALID, str(error), self._refused)
+            early = [one for one in self._early if one.stamp >= oldest]
             self._begin(self._before)
-            self._frame_start = frame_start
-            for one in events:
-                self._feed_early(one)
-        return self._feed_early(event)
-
-    def _feed_early(self, event: _Event) -> UpdateResult:
-        """Feed an event, and keep it for when the frame's place changes."""
-        assert self._early is not None
-        before = self._refusals
-        result = self._feed(*event)
+            self._early, self._frame_start = early, frame_start
+            for one in early:
+                self._feed(*one)
         if len(self._early) >= _MOST_ASIDE:
             del self._early[: _MOST_ASIDE // 2]
-        self._early.append((event, result.outcome, self._refusals > before))
-        return result
+        self._early.append(event)
+        return self._feed(*event)
 
     def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
         """Give an event that is in time to the window."""
-        window, given, stranger = self._window, 0, ""
+        window, counts, given, stranger = self._window, self._counts, 0, ""
         new = window.value
         for name, value in values.items():
             axis = self._bits.get(name)
             if axis is None:
                 stranger = name
                 continue
-            new[axis] = value if type(value) is float else _number(value)
+            new[axis] = value if type(value) is float else number(value)
             given |= 1 << axis
         if stranger and self.config.frame is not None:
             given |= self._turned(stamp, sensor, values)
             stranger = next((name for name in values if name not in self._bits and name not in CARTESIAN), "")
         oldest = self._oldest()
         if stamp < oldest:
-            return self._refuse_late(stamp, sensor, values)
+            return self._refuse_late(stamp, sensor, values, counts.outcomes)
         if not given:
             missing = not stranger and len(values) > 0
             why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
-            return self._refuse(sensor, values, Outcome.BEFORE_START if missing else _UNKNOWN, why)
-        if sensor is None:
-            taken = window.add_command(stamp, given, oldest)
-        else:
-            taken = window.add_measurement(stamp, self._sensors[sensor], given, self._clock.sure, oldest)
+            outcome = Outcome.BEFORE_START if missing else _UNKNOWN
+            return self._refuse(sensor, values, outcome, why, counts.outcomes)
+        rows = window.port.end
+        source = COMMAND if sensor is None else self._sensors[sensor]
+        taken = window.add(stamp, source, given, oldest)
         if self.config.frame is not None:
             window.spread[:] = self._no_spread
         if not taken:
-            return self._refuse_late(stamp, sensor, values)
+            return self._refuse_late(stamp, sensor, values, counts.outcomes)
         codes = bytes(window.outcome)
         result = self._answers.get(codes) if not stranger else None
         result = result or self._answer(codes, stranger)
+        counts.read(window)
         if sensor is None:
-            self._commands[result.outcome] += 1
-            self._doubtful += self._clock.doubtful and result.outcome is _FUSED
-            self._watch_limits()
-            if result.outcome is _FUSED:
-                self._recent.append(_Event(stamp, None, values))
-                self._watch_commands()
-        elif window.port.contradicts >= 0:
+            self._take_command(stamp, values, codes, result.outcome, oldest)
+            return result
+        counts.came(source, stamp, self._clock.sure)
+        if window.port.end == rows:  # it repeats another
+            for code in codes.replace(_ABSENT, b""):
+                counts.outcomes[source, code] += 1
+        if window.port.contradicts >= 0:
             self._say_contradiction(stamp, sensor)
         elif sensor in self._contradicting and result.outcome is _FUSED:
             del self._contradicting[sensor]
         return result
 
-    def _watch_limits(self) -> None:
-        """Say when a command leaves what the arm model is valid for."""
-        validity = self.config.arm.validity
-        if validity == Validity():
-            return
-        latest = {axis: found for axis, found in zip(self.axes, self._window.commands(), strict=True) if found}
-        if not latest:
-            return
-        stamp = max(stamp for stamp, _, _ in latest.values())
-        speed: dict[Kind, float] = {}
-        for axis, (_, _, step) in latest.items():
-            kind = self.config.arm.axes[axis].kind
-            speed[kind] = max(speed.get(kind, 0.0), abs(step) / self.config.arm.update_period)
-        radius = latest["radial"][1] if isinstance(self.config.frame, Cylindrical) and "radial" in latest else None
-        for passed in validity.excess(speed, radius):
-            self._log.write(passed.split(" reach")[0], f"{passed}, at {stamp / 1e9:.3f} s")
-
-    def _watch_commands(self) -> None:
-        """Say if commands come at another interval than the arm's update period, and if many of them are missing."""
-        recent = self._recent
-        if len(recent) == _FIRST and not self._knows_interval:
-            self._knows_interval = True
-            stamps = np.sort(np.array([one.stamp for one in recent]))
-            if (other := other_interval(stamps, self.config.arm.update_period)) is not None:
-                sentence, kind = other
-                where = " A stream has t in s, or t_ns in ns" if kind == "unit" else ""
-                self._log.write("interval of commands", sentence + where)
-        if len(recent) < _MANY:
-            return
-        self._recent = []
-        recent.sort(key=lambda one: one.stamp)
-        table = {axis: np.array([_number(one.values.get(axis)) for one in recent]) for axis in recent[0].values}
-        steady = {axis: values for axis, values in table.items() if np.isfinite(values).all()}
-        source = Source(np.array([one.stamp for one in recent]), steady, "commands")
-        if steady and (missing := missing_commands(source)) is not None:
-            self._log.write("missing commands", f"until {recent[-1].stamp / 1e9:.3f} s {missing}; send every command")
+    def _take_command(self, stamp: int, values: Mapping[str, Any], codes: bytes, outcome: Outcome, oldest: int) -> None:
+        """Keep and watch a command that is in the window."""
+        self._counts.outcomes[COMMAND, outcome] += 1
+        self._commands.add(stamp, codes, self._window.value[:], oldest)
+        self._watch.limits(self._commands)
+        if outcome is _FUSED:
+            self._doubtful += self._clock.doubtful
+            self._watch.intervals(stamp, values)
 
     def _turned(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> int:
         """Put an event's x, y and z into the window's ``value`` and ``spread`` as axes; which ones, as bits."""
         window, given = self._window, 0
         placed = self._frame_start.in_axes(
-            {name: _number(values[name]) for name in CARTESIAN if name in values},
-            None if sensor is None else self._commanded("tangential", stamp),
+            {name: number(values[name]) for name in CARTESIAN if name in values},
+            None if sensor is None else np.array([self._tangential(stamp)]),
         )
         for name, component in placed.items():
             axis = self._bits[name]
@@ -476,10 +442,10 @@ class LiveEstimator:
             given |= 1 << axis
         return given
 
-    def _commanded(self, axis: str, stamp: int) -> FloatArray:
-        """The position [m] commanded on an axis at ``stamp`` [ns], as far as is known, (1,)."""
-        found = self._window.commands(stamp)[self._bits[axis]] if axis in self._bits else None
-        return np.array([0.0 if found is None else found[1]])
+    def _tangential(self, stamp: int) -> float:
+        """Where the tangential axis is commanded to be at ``stamp`` [ns], as far as is known [m]."""
+        found = self._commands.at(self._bits["tangential"], stamp) if "tangential" in self._bits else None
+        return 0.0 if found is None else found
 
     def _say_contradiction(self, stamp: int, sensor: str) -> None:
         """Say which other sensor one contradicts, by how much, and since when."""
@@ -515,35 +481,28 @@ class LiveEstimator:
             return result._replace(axes=axes, reason=f"{result.reason}; {self._no_axis(stranger)}")
         return self._answers.setdefault(codes, result)
 
-    def _refuse_late(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
+    def _refuse_late(
+        self, stamp: int, sensor: str | None, values: Mapping[str, Any], outcomes: IntArray
+    ) -> UpdateResult:
         """Count an event that is behind the window; how late it is shows which window it would take."""
         if sensor is not None:
-            self._window.count_late(self._sensors[sensor], stamp, self._clock.now)
-        return self._refuse(sensor, values, _TOO_LATE, self._behind(stamp))
+            self._counts.came(self._sensors[sensor], stamp, self._clock.now)
+        late, window = self._clock.sure - stamp, self._clock.window
+        why = f"stamped {late / 1e9:.3f} s behind the newest; the window is {window / 1e9:g} s"
+        if late <= window:
+            why = f"more than {MOST_ROWS} events came since: the window holds no more"
+        return self._refuse(sensor, values, _TOO_LATE, why, outcomes)
 
-    def _refuse(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str) -> UpdateResult:
-        """Count an event that never comes into the window."""
-        self._refusals += 1
-        self._count(sensor, values, outcome, 1)
-        return UpdateResult(outcome, MappingProxyType(dict.fromkeys(values, outcome)), reason)
+    def _refuse(
+        self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, reason: str, outcomes: IntArray
+    ) -> UpdateResult:
+        """Count an event that never comes into the window, among ``outcomes``."""
+        self._count(sensor, values, outcome, outcomes, 1)
+        return refused(values, outcome, reason)
 
-    def _count(self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, times: int) -> None:
-        """Count an event's outcome, a measurement's for each of its components; ``times`` −1 takes it back."""
-        if sensor is None:
-            self._commands[outcome] += times
-        elif sensor in self._refused:
-            self._refused[sensor][outcome] += times * len(values)
-            if outcome == _TOO_LATE and times < 0:
-                self._window.uncount_late(self._sensors[sensor])
-        else:
-            self._strangers += times
-
-
-def _number(value: object) -> float:
-    """A number as it is; NaN for what is none."""
-    if isinstance(value, str | bytes | bool):
-        return math.nan
-    try:
-        return float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError, OverflowError):
-        return math.nan
+    def _count(
+        self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, outcomes: IntArray, times: int
+    ) -> None:
+        """Count what is refused, a measurement for each of its components; ``times`` −1 takes it back."""
+        source, components = (COMMAND, 1) if sensor is None else (self._sensors[sensor], len(values))
+        outcomes[source, outcome] += times * components

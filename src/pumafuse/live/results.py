@@ -1,16 +1,14 @@
-"""Results of a live estimator: what became of an event, the estimate at an instant, the health of each sensor."""
+"""Results of a live estimator: what became of an event, the estimate at an instant."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
 
-from ..arrays import ALWAYS
 from ..errors import UnknownNameError
 from ..filter.outcome import Outcome
-from ..filter.window import CAME, DROPOUTS, LATENESS, MOST_LATE, NIS, ROWS, SCALARS, SECONDS, Counters
 
 COMPARED = frozenset({Outcome.FUSED, Outcome.REACQUIRED, Outcome.REJECTED})  # with its prediction
 _REASONS: Mapping[Outcome, str] = {  # the best first
@@ -46,6 +44,11 @@ def update_result(outcomes: Mapping[str, Outcome]) -> UpdateResult:
     best = min(outcomes.values(), key=_ORDER.index)
     reasons = "; ".join(dict.fromkeys(_REASONS[outcome] for outcome in outcomes.values()))
     return UpdateResult(best, MappingProxyType(dict(outcomes)), reasons)
+
+
+def refused(values: Iterable[str], outcome: Outcome, reason: str) -> UpdateResult:
+    """The result of an event that never came to the filter, whatever it gives."""
+    return UpdateResult(outcome, MappingProxyType(dict.fromkeys(values, outcome)), reason)
 
 
 class AxisNow(NamedTuple):
@@ -112,99 +115,3 @@ class LiveEstimate:
 def no_estimate(stamp: int, outcome: Outcome, reason: str) -> LiveEstimate:
     """An estimate without axes at ``stamp`` [ns], and the reason for that."""
     return LiveEstimate(stamp, {}, None, (), outcome, reason)
-
-
-@dataclass(frozen=True)
-class SensorHealth:
-    """Rate, lateness, dropouts, NIS and outcomes of one sensor.
-
-    Attributes:
-        rows: How many have come.
-        rate: Rows a second over the last minute of stream time [Hz].
-        lateness: How far its stamps were behind the newest one of all when they came, mean of the last minute [s].
-        lateness_max: The highest of that minute [s].
-        silent: For how long nothing has come, in stream time [s]; None if nothing ever did.
-        stale: Whether that is longer than the limit.
-        dropouts: Intervals longer than one and a half times the usual one, once late rows are in.
-        nis: Mean ν²/S of the last minute; 1 where the noise is as configured; None without a fused component.
-        outcomes: Number of its components by the outcome's word.
-    """
-
-    rows: int
-    rate: float
-    lateness: float
-    lateness_max: float
-    silent: float | None
-    stale: bool
-    dropouts: int
-    nis: float | None
-    outcomes: Mapping[str, int]
-
-    @property
-    def reacquired(self) -> int:
-        """Number of components that were fused although they failed the gate."""
-        return self.outcomes[Outcome.REACQUIRED.word]
-
-
-@dataclass(frozen=True)
-class Health:
-    """Counters of a whole stream.
-
-    Attributes:
-        newest: The newest stamp (but not one that a sensor alone has run ahead to), int ns; None before any event.
-        segments: How often the filter has started: 1, and once more each time the commands' clock was reset.
-        commands: Number of commands by the outcome's word.
-        sensors: In the order of the configuration.
-        unknown: Rows of sensors that the configuration does not know.
-    """
-
-    newest: int | None
-    segments: int
-    commands: Mapping[str, int]
-    sensors: Mapping[str, SensorHealth]
-    unknown: int
-
-
-def health_of(
-    counters: Counters,
-    refused: Mapping[str, Mapping[Outcome, int]],
-    commands: Mapping[Outcome, int],
-    unknown: int,
-    segment: int,
-    newest: int | None,
-    stale_ns: int,
-) -> Health:
-    """Health from the window's counters, and from what was refused before it came into the window.
-
-    Args:
-        counters: Of each sensor in the window.
-        refused: Number of refused components, by sensor and outcome.
-        commands: Number of commands by outcome.
-        unknown: Rows of unknown sensors.
-        segment: How often the commands' clock was reset.
-        newest: The newest stamp, int ns; None before any event.
-        stale_ns: After how long a silent sensor is stale [ns].
-    """
-    sensors: dict[str, SensorHealth] = {}
-    second = 0 if newest is None else newest // 1_000_000_000
-    for number, (name, more) in enumerate(refused.items()):
-        last = int(counters.last[number])
-        silent = None if newest is None or last == ALWAYS else max((newest - last) / 1e9, 0.0)
-        age = second - counters.second[number]
-        recent = (age >= 0) & (age < SECONDS)
-        minute = counters.minute[number][recent]
-        rows, components = float(minute[:, ROWS].sum()), float(minute[:, SCALARS].sum())
-        span = float(age[recent].max(initial=0)) + (0.0 if newest is None else newest / 1e9 - second)
-        sensors[name] = SensorHealth(
-            rows=int(counters.number[number, CAME]),
-            rate=rows / max(span, 1.0),
-            lateness=float(minute[:, LATENESS].sum()) / max(rows, 1.0),
-            lateness_max=float(minute[:, MOST_LATE].max(initial=0.0)),
-            silent=silent,
-            stale=silent is None or silent > stale_ns / 1e9,
-            dropouts=int(counters.number[number, DROPOUTS]),
-            nis=float(minute[:, NIS].sum()) / components if components else None,
-            outcomes={outcome.word: int(counters.number[number, outcome]) + more[outcome] for outcome in Outcome},
-        )
-    by_word = {outcome.word: count for outcome, count in commands.items()}
-    return Health(newest, segment + 1, by_word, sensors, unknown)

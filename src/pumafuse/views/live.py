@@ -33,7 +33,8 @@ from ..units import Kind
 
 if TYPE_CHECKING:
     from ..fusion.config import FusionConfig
-    from ..live.results import Health, LiveEstimate, UpdateResult
+    from ..live.health import Health
+    from ..live.results import LiveEstimate, UpdateResult
     from ..live.wire import Event
 
 # Everything since the frame before, as rows that begin with their time [s]; the first word of a name says what follows:

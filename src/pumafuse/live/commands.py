@@ -1,0 +1,137 @@
+"""The commands of a stream: which one is in force at an instant, and what is odd about them."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..arrays import FloatArray
+from ..filter.outcome import Outcome
+from ..logs.clock import missing_commands, other_interval
+from ..logs.frames import Cylindrical, Frame
+from ..logs.run import Source
+from ..model.arm import ArmModel, Validity
+from ..units import Kind
+from .rate_limit import RateLimitedLog
+
+_FIRST, _MANY = 100, 1000  # commands whose interval is looked at, and those that missing ones are counted among
+_FUSED = int(Outcome.FUSED)
+
+
+class Commands:
+    """What was commanded on each axis, as far back as a window needs it."""
+
+    def __init__(self, start: Sequence[float]) -> None:
+        """No command yet; ``start`` is the level [m] of each axis before its first one, NaN: that of the first one."""
+        self._start = start
+        self._given: list[list[tuple[int, float]]] = [[] for _ in start]  # stamps and values, by stamp
+
+    def add(self, stamp: int, codes: bytes, values: Sequence[float], oldest: int) -> None:
+        """Add the values [m] of a command that were fused, in the place of what the axis had at that stamp [ns].
+
+        Args:
+            stamp: Int ns.
+            codes: What became of each value.
+            values: [m].
+            oldest: Nobody will ask for what was before [ns].
+        """
+        for given, code, value in zip(self._given, codes, values, strict=True):
+            if code != _FUSED:
+                continue
+            if not given or stamp > given[-1][0]:
+                given.append((stamp, value))
+            else:
+                place = bisect_left(given, (stamp,))
+                given[place : bisect_left(given, (stamp + 1,))] = [(stamp, value)]
+            if len(given) > 2 and given[2][0] <= oldest:  # one was in force then, and one is for its step
+                del given[0]
+
+    def at(self, axis: int, stamp: int) -> float | None:
+        """What is commanded on an axis at ``stamp`` [ns], in m; None before any command."""
+        given = self._given[axis]
+        place = bisect_left(given, (stamp + 1,))
+        return given[place - 1][1] if place else self._before(axis) if given else None
+
+    def latest(self) -> list[tuple[int, float, float] | None]:
+        """Of each axis stamp [ns], value and step [m] of its latest command; None before any."""
+        return [self._latest(axis, given) if given else None for axis, given in enumerate(self._given)]
+
+    def forget(self, after: int) -> None:
+        """Take back those that are stamped after ``after`` [ns]."""
+        for given in self._given:
+            del given[bisect_left(given, (after + 1,)) :]
+
+    def _latest(self, axis: int, given: list[tuple[int, float]]) -> tuple[int, float, float]:
+        stamp, value = given[-1]
+        return stamp, value, value - (given[-2][1] if len(given) > 1 else self._before(axis))
+
+    def _before(self, axis: int) -> float:
+        """Where an axis rests before its first command [m]."""
+        start = self._start[axis]
+        return self._given[axis][0][1] if math.isnan(start) else start
+
+
+class CommandWatch:
+    """Says when commands leave what the arm model is valid for, come at another interval, or are missing."""
+
+    def __init__(self, arm: ArmModel, frame: Frame | None, log: RateLimitedLog) -> None:
+        """Watch the commands of an arm; ``log`` gets the sentences."""
+        self._arm, self._log = arm, log
+        self._cylindrical = isinstance(frame, Cylindrical)
+        self._knows_interval = False
+        self._recent: list[tuple[int, Mapping[str, Any]]] = []
+
+    def restart(self) -> None:
+        """Begin anew by another clock."""
+        self._recent = []
+
+    def limits(self, commands: Commands) -> None:
+        """Say when the latest commands leave what the arm model is valid for."""
+        arm = self._arm
+        if arm.validity == Validity():
+            return
+        latest = {axis: found for axis, found in zip(arm.axes, commands.latest(), strict=True) if found is not None}
+        speed: dict[Kind, float] = {}
+        for axis, (_, _, step) in latest.items():
+            kind = arm.axes[axis].kind
+            speed[kind] = max(speed.get(kind, 0.0), abs(step) / arm.update_period)
+        radius = latest["radial"][1] if self._cylindrical and "radial" in latest else None
+        for passed in arm.validity.excess(speed, radius):
+            stamp = max(stamp for stamp, _, _ in latest.values())
+            self._log.write(passed.split(" reach")[0], f"{passed}, at {stamp / 1e9:.3f} s")
+
+    def intervals(self, stamp: int, values: Mapping[str, Any]) -> None:
+        """Take a fused command; say if they come at another interval than the update period, or many are missing."""
+        recent = self._recent
+        recent.append((stamp, values))
+        if len(recent) == _FIRST and not self._knows_interval:
+            self._knows_interval = True
+            stamps = np.sort(np.array([stamp for stamp, _ in recent]))
+            if (other := other_interval(stamps, self._arm.update_period)) is not None:
+                sentence, kind = other
+                where = " A stream has t in s, or t_ns in ns" if kind == "unit" else ""
+                self._log.write("interval of commands", sentence + where)
+        if len(recent) >= _MANY:
+            self._recent = []
+            self._look_for_missing(sorted(recent, key=lambda one: one[0]))
+
+    def _look_for_missing(self, recent: list[tuple[int, Mapping[str, Any]]]) -> None:
+        stamps = np.array([stamp for stamp, _ in recent])
+        table = {axis: np.array([number(values.get(axis)) for _, values in recent]) for axis in recent[0][1]}
+        steady: dict[str, FloatArray] = {axis: column for axis, column in table.items() if np.isfinite(column).all()}
+        if steady and (missing := missing_commands(Source(stamps, steady, "commands"))) is not None:
+            self._log.write("missing commands", f"until {recent[-1][0] / 1e9:.3f} s {missing}; send every command")
+
+
+def number(value: object) -> float:
+    """A number as it is; NaN for what is none."""
+    if isinstance(value, str | bytes | bool):
+        return math.nan
+    try:
+        return float(value)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
