@@ -142,7 +142,8 @@ def steps_of(problem: Problem) -> list[Steps]:
         F[:] = np.eye(size)
         u, step, e, noise, drift = 0.0, 0.0, 0.0, axis["input_noise"] ** 2, axis["drift"] ** 2
         for k in range(m):
-            f11, f12, f21, f22, q11, q12, q22, a, b, left = transition(model.axis[number : number + 1], dt[k]).tolist()
+            over = transition(model.axis[number : number + 1], dt[k])
+            f11, f12, f21, f22, q11, q12, q22, a, b, left = over[:10].tolist()
             F[k, :2, :2] = [[f11, f12], [f21, f22]]
             B[k, :2], v[k], e = [[1.0 - f11, a], [-f21, b]], [u, e], e * left
             Q[k, :2, :2], Q[k, OFFSET, OFFSET] = [[noise * q11, noise * q12], [noise * q12, noise * q22]], drift * dt[k]

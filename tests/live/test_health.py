@@ -192,13 +192,14 @@ def test_all_outcomes_are_counted() -> None:
     live.measurement(1.0, "tracker", radial=0.57)
     live.measurement(float("nan"), "tracker", radial=0.57)
     live.measurement(4.0, "lidar", radial=0.57)
+    live.measurement(float("nan"), "lidar", radial=0.57)
     health = live.health()
     tracker = health.sensors["tracker"]
     assert tracker.reacquired == 1
     assert tracker.outcomes["rejected"] == 3  # rows of 10 ms in a period of 28 ms
     assert tracker.outcomes["too_late"] == 1
     assert tracker.outcomes["invalid"] == 1
-    assert health.unknown == 1
+    assert health.unknown == 2
     assert health.commands["fused"] + health.commands["duplicate"] == 400
     assert health.segments == 1
 

@@ -258,9 +258,8 @@ class LiveEstimator:
         except ValueError as error:
             return self._refuse(sensor, values, _INVALID, str(error), self._refused)
         if sensor is not None and sensor not in self._sensors:
-            self._strangers += 1
             why = f"unknown sensor; {suggestion(sensor, self._sensors)}"
-            return refused(values, _UNKNOWN, why)
+            return self._refuse(sensor, values, _UNKNOWN, why, self._refused)
         clock = self._clock
         if not clock.low <= stamp <= clock.high:
             told = self._judged(_Event(stamp, sensor, values))
@@ -283,9 +282,8 @@ class LiveEstimator:
         newest, command = clock.newest, sensor is None
         if newest is None or (self._window.origin is None and (command or stamp > newest)):
             if newest is not None and command:
-                self._begin(
-                    self._counts.counted(self._window)
-                )  # the commands' clock counts: what came before is of another
+                # The commands' clock counts: what came before is of another.
+                self._begin(self._counts.counted(self._window))
                 if self._event_log is not None:
                     self._event_log.begin_segment()
             clock.start(stamp)
@@ -504,5 +502,9 @@ class LiveEstimator:
         self, sensor: str | None, values: Mapping[str, Any], outcome: Outcome, outcomes: IntArray, times: int
     ) -> None:
         """Count what is refused, a measurement for each of its components; ``times`` −1 takes it back."""
-        source, components = (COMMAND, 1) if sensor is None else (self._sensors[sensor], len(values))
-        outcomes[source, outcome] += times * components
+        if sensor is None:
+            outcomes[COMMAND, outcome] += times
+        elif sensor in self._sensors:
+            outcomes[self._sensors[sensor], outcome] += times * len(values)
+        else:
+            self._strangers += times
