@@ -47,6 +47,7 @@ from .parameters import (
     with_own_delays,
     with_shared_delay,
 )
+from .plain import PlainArm, doubt, refuted, with_plain_arm
 from .posterior import (
     INTERCEPTS,
     AxisPosterior,
@@ -261,6 +262,9 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
         posteriors = _posteriors(parts, likelihood.config, workers)
     fits = {axis: _Fit(parts[axis], one) for axis, one in posteriors.items()}
     config, lags = _arm(likelihood, fits, trusted)
+    for axis, (arm, off) in refuted(likelihood, config, lags).items():
+        lags[axis] = _plain_lag(arm, trusted, doubt(config, axis, arm, off))
+        config = with_plain_arm(config, axis, arm)
     best, sensors = _sensors(every, config, trusted, moving)
     lags, clock = _with_courses(likelihood, config, lags)
     still = [axis for axis in config.arm.axes if axis not in moving]
@@ -547,6 +551,24 @@ def _axis_lag(
         }
     found = msgspec.structs.replace(found, **values)
     return msgspec.structs.replace(found, notes=_notes(found))
+
+
+def _plain_lag(arm: PlainArm, trusted: str, note: str) -> AxisLag:
+    """The lag of an axis whose arm is that of least squares, which does not know its parts."""
+    low, high = arm.lag_ci95
+    return AxisLag(
+        sensor=trusted,
+        lag=arm.lag,
+        lag_ci95=(low, high),
+        delay=arm.delay,
+        delay_ci95=(0.0, high),
+        shared_delay=False,
+        plant="first-order",
+        time_constant=arm.time_constant,
+        time_constant_ci95=(0.0, high),
+        gain=arm.gain,
+        notes=[note],
+    )
 
 
 def _scattered(likelihood: Likelihood, best: Point, axis: str) -> float:

@@ -21,7 +21,7 @@ from typing import NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
-from ..arrays import BoolArray, CodeArray, FloatArray, IntArray
+from ..arrays import BoolArray, CodeArray, FloatArray, IntArray, TimeArray
 from ..discovery.following import resolution, scatter
 from ..filter.events import Results
 from ..filter.outcome import ABSENT, Outcome
@@ -172,6 +172,26 @@ class Linearised:
         return Derivatives(scores.sum(axis=(0, 2)), information, np.einsum("nip,njp->ij", scores, scores))
 
 
+class Motion(NamedTuple):
+    """What was commanded on an axis, and what a sensor measured of it.
+
+    Attributes:
+        sensor: Its name.
+        given: When each command was given, int64 ns, (k,).
+        command: u [m], (k,).
+        start: The level [m] at which the axis rests before its first command.
+        time: When each measurement is valid, int64 ns, (m,).
+        value: Where the axis was then by the sensor, whose scale is taken out [m], (m,).
+    """
+
+    sensor: str
+    given: TimeArray
+    command: FloatArray
+    start: float
+    time: TimeArray
+    value: FloatArray
+
+
 @dataclass(frozen=True)
 class _Part:
     """One axis of one segment.
@@ -260,6 +280,16 @@ class Likelihood:
         self.sensors: Mapping[str, Sequence[str]] = {
             axis: [name for name in chosen if name in measured[axis]] for axis in self.axes if axis in measured
         }
+
+    def motions(self, axis: str, config: FusionConfig) -> list[Motion]:
+        """What was commanded on an axis and measured of it, in each recording and by each sensor."""
+        found: list[Motion] = []
+        for segment in (part.segment for part in self._of(axis)):
+            for name, rows in segment.rows_by_sensor().items():
+                sensor = config.sensors[name]
+                time, value = rows.stamp - round(sensor.latency * 1e9), rows.value[:, 0] / sensor.scale
+                found.append(Motion(name, *segment.given(axis), segment.start[axis], time, value))
+        return found
 
     def of_axis(self, axis: str) -> Likelihood:
         """The likelihood of the measurements of one axis; ``axes`` stay as they are."""

@@ -19,6 +19,7 @@ from ..units import MS, Kind
 from .identifiability import Correlation
 from .intervals import ConfidenceInterval, Distances, lag_slopes
 from .parameters import Parameter
+from .plain import LONGEST, PlainArm
 from .validation import Check, fused
 
 _FROM_PRIOR = 0.8  # of the prior's interval, from which the measurements say hardly anything
@@ -148,7 +149,7 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
 def fitted_lags(
     free: Sequence[Parameter], before: FusionConfig, after: FusionConfig, around: Mapping[str, Distances]
 ) -> dict[str, FittedLag]:
-    """The lag of each axis that the free parameters change.
+    """The lag of each axis that the free parameters change; none that is longer than any that is looked for.
 
     Args:
         free: The parameters that were fitted.
@@ -159,9 +160,25 @@ def fitted_lags(
     found: dict[str, FittedLag] = {}
     for axis in lag_slopes(free, after):
         lag, (below, above) = after.arm.lag_of(axis), around.get(axis, (np.inf, np.inf))
+        if lag > LONGEST:
+            continue
         ends = [None if np.isinf(end) else end * MS for end in (lag - below, lag + above)]
         found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag * MS, lag_ms_ci95=(ends[0], ends[1]))
     return found
+
+
+def plain_lags(
+    arms: Mapping[str, tuple[PlainArm, float]], before: FusionConfig, after: FusionConfig
+) -> dict[str, FittedLag]:
+    """The lags of the axes whose arm is that of least squares."""
+    return {
+        axis: FittedLag(
+            before_ms=before.arm.lag_of(axis) * MS,
+            lag_ms=after.arm.lag_of(axis) * MS,
+            lag_ms_ci95=(arm.lag_ci95[0] * MS, arm.lag_ci95[1] * MS),
+        )
+        for axis, (arm, _) in arms.items()
+    }
 
 
 def open_interval(ci95: tuple[float | None, float | None]) -> tuple[float, float]:

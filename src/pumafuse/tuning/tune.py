@@ -16,12 +16,23 @@ from ..fusion.faults import latency_questions
 from ..logs.clock import segments
 from ..logs.run import Run
 from .identifiability import TuneError, correlations, excited_axes
-from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
+from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals, lag_slopes
 from .likelihood import Likelihood, LogLikelihood
 from .maximise import Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
+from .plain import LONGEST, PlainArm, doubt, refuted, with_plain_arm
 from .stage import Plan, Stage, likelihood_of, run_stage
-from .summary import AxisLikelihood, TuningSummary, encode, fitted, fitted_lags, found_biases, open_interval, text
+from .summary import (
+    AxisLikelihood,
+    TuningSummary,
+    encode,
+    fitted,
+    fitted_lags,
+    found_biases,
+    open_interval,
+    plain_lags,
+    text,
+)
 from .validation import Check, check
 
 _FITTED_ON = 2.0 / 3.0  # of a single run; the rest is for validation
@@ -114,19 +125,23 @@ def tune(
     _check(runs, config, kinds, fixed, share)
     pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust, sd_prior, "delay" in share), progress)
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
+    plain: dict[str, tuple[PlainArm, float]] = {}
+    doubts: list[str] = []
     until = _fitted_until(runs[0]) if len(runs) == 1 and validate is None else None
     intervals: dict[str, ConfidenceInterval] = {}
     around: dict[str, Distances] = {}
     validation: list[Check] | None = None
     interrupted = False
     try:
-        pipeline.fit(until)
-        if until is not None:
-            validation = check(runs[0], config, pipeline.result(), since=until)
-            pipeline.fit(None)
-        pipeline.keep_the_better()
-        if validate is not None:
-            validation = check(validate, config, pipeline.result())
+        validation = _fitted_and_validated(pipeline, config, until, validate)
+        plain = pipeline.refuted() if "noise" in kinds else {}
+        if plain:
+            doubts = [doubt(pipeline.result(), axis, *arm) for axis, arm in plain.items()]
+            held, start = [*fixed, *(f"axes.{axis}" for axis in plain)], config
+            for axis, (arm, _) in plain.items():
+                start = with_plain_arm(start, axis, arm)
+            pipeline = Pipeline(runs, start, plans(start, kinds, held, trust, sd_prior, "delay" in share), progress)
+            validation = _fitted_and_validated(pipeline, config, until, validate)
         for stage in pipeline.stages:
             progress("computing intervals", stage.best.log_likelihood)
             around |= lag_intervals(stage.likelihood, stage.best, stage.free)
@@ -139,7 +154,8 @@ def tune(
     if not stages:  # the configuration as given, or interrupted before a stage was complete
         free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed, sd_prior)
     tuned = _with_provenance(pipeline.result(), free, intervals, names)
-    notes = list(pipeline.notes)
+    slow = [axis for axis in lag_slopes(free, tuned) if tuned.arm.lag_of(axis) > LONGEST]
+    notes = [*doubts, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in slow)]
     if interrupted:
         notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
     known = validate is not None and any(_same(validate, run) for run in runs)
@@ -158,7 +174,7 @@ def tune(
         sd_prior=sd_prior,
         interrupted=interrupted,
         likelihood=_likelihoods(pipeline.whole, config, tuned),
-        lags=fitted_lags(free, config, tuned, around),
+        lags=fitted_lags(free, config, tuned, around) | plain_lags(plain, config, tuned),
         parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in free],
         biases=[one for run in runs for one in found_biases(run, tuned)],
         correlations=[one for stage in stages for one in correlations(stage.likelihood, stage.best, stage.free)],
@@ -171,6 +187,19 @@ def tune(
     for note in summary.notes:
         warnings.warn(note, PumafuseWarning, stacklevel=2)
     return Tuning(tuned, config, summary, [one.profile for one in intervals.values()] if profiles else [])
+
+
+def _fitted_and_validated(
+    pipeline: Pipeline, before: FusionConfig, until: float | None, validate: Run | None
+) -> list[Check] | None:
+    """Fit, and compare with the configuration ``before``: on what comes after ``until`` [s], or on another run."""
+    pipeline.fit(until)
+    validation = None
+    if until is not None:
+        validation = check(pipeline.runs[0], before, pipeline.result(), since=until)
+        pipeline.fit(None)
+    pipeline.keep_the_better()
+    return validation if validate is None else check(validate, before, pipeline.result())
 
 
 def _check(
@@ -263,6 +292,13 @@ class Pipeline:
             raise TuneError("; ".join([*why, "everything that could be fitted is fixed: nothing to fit"]))
         self.best, self.stages = config, stages
         self.notes = [note for stage in stages for note in (*stage.likelihood.notes, *stage.notes)]
+
+    def refuted(self) -> dict[str, tuple[PlainArm, float]]:
+        """The arms that were fitted and predict worse than the delayed command: see :func:`.plain.refuted`."""
+        if not self.stages:
+            return {}
+        config, free = self.result(), [one for stage in self.stages for one in stage.free]
+        return refuted(self.stages[0].likelihood, config, lag_slopes(free, config))
 
     def keep_the_better(self) -> None:
         """Go back to the configuration as given if it is more likely: with gates the search may pass worse points."""

@@ -1,0 +1,100 @@
+"""Least squares finds an arm of which nothing is known, and refutes one that the likelihood has mistaken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+import pumafuse as pf
+from executable import pumafuse
+from pumafuse.filter.response import response
+from pumafuse.model.arm import AxisModel, Gain
+from pumafuse.model.plants import FirstOrder
+from pumafuse.tuning.likelihood import Likelihood, Motion
+from pumafuse.tuning.plain import Recorded, refuted, with_plain_arm
+from tuning_runs import quietly, replaced, scenario
+
+DEAD_BAND = Path(__file__).parent / "data" / "dead-band.csv"
+T = 0.02
+NOISE = 1e-4  # m
+
+
+def motion(delay: float, time_constant: float, gain: float, seed: int = 0, commands: int = 1500) -> Motion:
+    """Steps and ramps, and a sensor of 50 Hz that is off by 7 mm."""
+    rng = np.random.default_rng(seed)
+    speed = np.repeat(rng.normal(0.0, 0.1, commands // 25 + 1), 25)[:commands]
+    command = 0.5 + np.cumsum(speed * T) + np.cumsum((rng.random(commands) < 0.02) * rng.normal(0.0, 0.02, commands))
+    given = np.arange(commands) * round(T * 1e9)
+    time = np.sort(rng.integers(0, given[-1], commands))
+    axis = AxisModel(plant=FirstOrder(time_constant=time_constant), gain=Gain(intercept=gain))
+    path = response(axis, T, delay, given, command, 0.5, time)
+    return Motion("camera", given, command, 0.5, time, 0.507 + path + rng.normal(0.0, NOISE, commands))
+
+
+@settings(derandomize=True, deadline=None, max_examples=15, phases=[Phase.explicit, Phase.generate])
+@given(st.floats(0.0, 0.5), st.floats(0.002, 0.5), st.floats(0.7, 1.3), st.integers(0, 1000))
+def test_any_arm_is_found(delay: float, time_constant: float, gain: float, seed: int) -> None:
+    """Lag to 3 ms and a hundredth, gain to a hundredth, and no more than its noise is left: from no guess at all."""
+    found = Recorded([motion(delay, time_constant, gain, seed)], T).plain_arm()
+    assert found is not None
+    lag = delay + time_constant
+    assert found.lag == pytest.approx(lag, abs=3e-3, rel=0.01)
+    assert found.lag_ci95[0] - 3e-3 - 0.01 * lag <= lag <= found.lag_ci95[1] + 3e-3 + 0.01 * lag
+    assert found.gain == pytest.approx(gain, rel=0.01)
+    assert found.rms < 2.5 * NOISE
+
+
+def test_outliers_and_the_length_of_a_recording_do_not_matter() -> None:
+    """A hundredth of wild measurements; forty thousand commands, most of which are rest: the same arm."""
+    one = motion(0.08, 0.06, 1.0)
+    value = one.value.copy()
+    value[::100] += 0.3
+    wild = Recorded([one._replace(value=value)], T).plain_arm()
+    rest, step = 40_000, round(T * 1e9)
+    given = np.append(np.arange(rest) * step, rest * step + one.given)
+    long = one._replace(given=given, command=np.append(np.full(rest, 0.5), one.command), time=rest * step + one.time)
+    late = Recorded([long], T).plain_arm()
+    assert wild is not None
+    assert late is not None
+    assert wild.lag == pytest.approx(0.14, abs=2e-3)
+    assert late.lag == pytest.approx(0.14, abs=2e-3)
+
+
+def test_nothing_is_said_of_an_axis_at_rest_or_hardly_measured() -> None:
+    one = motion(0.05, 0.05, 1.0)
+    assert Recorded([one._replace(command=np.full(len(one.command), 0.5))], T).plain_arm() is None
+    assert Recorded([one._replace(time=one.time[:5], value=one.value[:5])], T).plain_arm() is None
+    assert Recorded([], T).plain_arm() is None
+
+
+def test_a_right_arm_is_not_refuted_and_a_wrong_one_is() -> None:
+    """Of a simulated arm: its own numbers stand; twice its dead time is farther off than the delayed command."""
+    simulated = pf.simulate(scenario("panel-vision", 0.3, 0.02), 2)
+    config = simulated.config
+    likelihood = quietly(lambda: Likelihood([simulated.run], config))
+    assert refuted(likelihood, config, likelihood.axes) == {}
+    slow = replaced(config, arm=replaced(config.arm, delay=3.0 * config.arm.delay))
+    found = refuted(likelihood, slow, likelihood.axes)
+    assert "tangential" in found  # the vertical axis hardly moves
+    for axis, (arm, off) in found.items():
+        mended = with_plain_arm(slow, axis, arm)
+        assert arm.lag == pytest.approx(config.arm.lag_of(axis), abs=0.02)
+        assert off > arm.delayed_off
+        assert axis not in refuted(likelihood, mended, [axis])
+
+
+def test_one_command_says_no_wrong_lag_of_an_arm_with_a_dead_band(tmp_path: Path) -> None:
+    """An encoder of a joint that is 140 ms late and has a dead band of 1°: its increments fit a lag of 283 ms best.
+
+    That arm alone is 15° off; the command 171 ms later is 0.6°.
+    """
+    done = pumafuse("fuse", DEAD_BAND, "-o", tmp_path / "run")
+    assert "the likelihood has fitted something else" in done.stderr
+    config = pf.FusionConfig.load(tmp_path / "run" / "fusion.toml")
+    assert 0.14 < config.arm.lag_of("j") < 0.19
+    told = quietly(lambda: pf.latency(pf.Run.read(tmp_path / "run")))
+    assert told.details.axes["j"].lag == pytest.approx(config.arm.lag_of("j"), abs=0.05)
