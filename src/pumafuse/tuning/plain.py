@@ -21,7 +21,7 @@ from ..units import MS
 from .likelihood import Likelihood, Motion
 from .parameters import changed, rounded
 
-_STEP, _LATEST = 0.01, 0.6  # s, of dead times; the longest, or five update periods
+_LATEST, _DELAYS = 0.6, 61  # s, or five update periods: the longest dead time; how many are looked at
 _LAGS = np.geomspace(1e-3, 2.0, 14)  # s, of a first-order plant
 LONGEST = 2.6  # s, of a lag that is told: of both together
 _COMMANDS = 10_000  # of a recording that are looked at, where it moves most
@@ -105,7 +105,7 @@ class Recorded:
         """The arm that leaves the least squares, without outliers; None where nothing moves or is measured."""
         if sum(map(len, self._counts)) < 2 * _FEWEST:
             return None
-        delays = np.arange(0.0, max(_LATEST, 5.0 * self._period) + 0.5 * _STEP, _STEP)
+        delays = np.linspace(0.0, max(_LATEST, 5.0 * self._period), _DELAYS)
         self._leave_out_far_from(min(self._squares(delays, _LAGS)))
         cells = self._squares(delays, _LAGS)
         delayed = min((one for one in cells if one.time_constant == _LAGS[0]), key=lambda one: one.unit)
@@ -234,7 +234,7 @@ def doubt(config: FusionConfig, axis: str, arm: PlainArm, off: float) -> str:
     """The sentence on an axis whose arm is ``off`` [m], farther than the delayed command: see :func:`refuted`."""
     screen = config.arm.screen_of(axis)
     return (
-        f"{axis}: the likelihood has fitted something else than how the axis follows its commands: its arm, a lag of"
+        "the likelihood has fitted something else than how the axis follows its commands: its arm, a lag of"
         f" {config.arm.lag_of(axis) * MS:.4g} ms, is {off * screen.scale:.3g} {screen.unit} off, the commands"
         f" {arm.delayed * MS:.0f} ms later are {arm.delayed_off * screen.scale:.3g}. The arm is that of least squares"
         " instead. The cause may be play, a limit of the speed, a sensor that repeats old values, or too little motion"

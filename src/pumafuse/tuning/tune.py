@@ -136,7 +136,7 @@ def tune(
         validation = _fitted_and_validated(pipeline, config, until, validate)
         plain = pipeline.refuted() if "noise" in kinds else {}
         if plain:
-            doubts = [doubt(pipeline.result(), axis, *arm) for axis, arm in plain.items()]
+            doubts = [f"{axis}: {doubt(pipeline.result(), axis, *arm)}" for axis, arm in plain.items()]
             held, start = [*fixed, *(f"axes.{axis}" for axis in plain)], config
             for axis, (arm, _) in plain.items():
                 start = with_plain_arm(start, axis, arm)
