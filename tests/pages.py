@@ -198,7 +198,7 @@ def shows(printed_text: str, expected: str) -> bool:
 
 def _furnish(folder: Path) -> None:
     """What a clone has, but for the package; ``.venv`` is the environment that runs the tests."""
-    for name in ("Makefile", "CMakeLists.txt", "README.md", "pyproject.toml", "requirements.lock"):
+    for name in ("Makefile", "CMakeLists.txt", "README.md", "pyproject.toml", "LICENSE", "requirements.lock"):
         shutil.copy2(ROOT / name, folder)
     for name in ("core", "examples", "scenarios", "notebooks", "benchmarks", "src/pumafuse/data"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", ".*"))

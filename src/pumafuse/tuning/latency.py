@@ -47,7 +47,7 @@ from .parameters import (
     with_own_delays,
     with_shared_delay,
 )
-from .plain import PlainArm, doubt, refuted, with_plain_arm
+from .plain import Doubt, doubts, with_plain_arm
 from .posterior import (
     INTERCEPTS,
     AxisPosterior,
@@ -262,9 +262,10 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
         posteriors = _posteriors(parts, likelihood.config, workers)
     fits = {axis: _Fit(parts[axis], one) for axis, one in posteriors.items()}
     config, lags = _arm(likelihood, fits, trusted)
-    for axis, (arm, off) in refuted(likelihood, config, lags).items():
-        lags[axis] = _plain_lag(arm, trusted, doubt(config, axis, arm, off))
-        config = with_plain_arm(config, axis, arm)
+    for axis, one in doubts(likelihood, config, lags).items():
+        lags[axis] = _doubted(lags[axis], one, one.sentence(config, axis))
+        if one.refutes:
+            config = with_plain_arm(config, axis, one.arm)
     best, sensors = _sensors(every, config, trusted, moving)
     lags, clock = _with_courses(likelihood, config, lags)
     still = [axis for axis in config.arm.axes if axis not in moving]
@@ -553,11 +554,14 @@ def _axis_lag(
     return msgspec.structs.replace(found, notes=_notes(found))
 
 
-def _plain_lag(arm: PlainArm, trusted: str, note: str) -> AxisLag:
-    """The lag of an axis whose arm is that of least squares, which does not know its parts."""
-    low, high = arm.lag_ci95
-    return AxisLag(
-        sensor=trusted,
+def _doubted(lag: AxisLag, doubt: Doubt, sentence: str) -> AxisLag:
+    """The lag of an axis with an interval that covers what least squares says, or that of least squares instead."""
+    arm, (low, high) = doubt.arm, doubt.arm.lag_ci95
+    if not doubt.refutes:
+        both = min(low, lag.lag_ci95[0]), max(high, lag.lag_ci95[1])
+        return msgspec.structs.replace(lag, lag_ci95=both, notes=[sentence, *lag.notes])
+    return AxisLag(  # which does not know its parts
+        sensor=lag.sensor,
         lag=arm.lag,
         lag_ci95=(low, high),
         delay=arm.delay,
@@ -567,7 +571,7 @@ def _plain_lag(arm: PlainArm, trusted: str, note: str) -> AxisLag:
         time_constant=arm.time_constant,
         time_constant_ci95=(0.0, high),
         gain=arm.gain,
-        notes=[note],
+        notes=[sentence],
     )
 
 

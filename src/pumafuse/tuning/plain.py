@@ -34,7 +34,7 @@ _FEWEST = 4.0  # independent measurements, at least: however alike their errors 
 _CHANCE = 3.84  # of χ² with one degree of freedom, 95 %
 _ROUNDING = 1e-12  # of all squares: what is left of them where nothing is
 _MOST = 0.8  # of the measurements: how far these are off is not decided by single commands that were never sent
-_WORSE = 1.25  # times as far off as the delayed command: such an arm is refuted
+_DOUBTED, _REFUTED = 1.25, 4.0  # times as far off as the delayed command: such an arm is doubted, or replaced
 
 
 class PlainArm(NamedTuple):
@@ -203,19 +203,43 @@ def _thinned(motion: Motion) -> Motion:
     return motion._replace(time=np.ascontiguousarray(motion.time[some]), value=motion.value[some])
 
 
-def refuted(likelihood: Likelihood, config: FusionConfig, axes: Iterable[str]) -> dict[str, tuple[PlainArm, float]]:
-    """The arms of a configuration that predict worse than the commands do when they are delayed.
+class Doubt(NamedTuple):
+    """That an axis's arm predicts worse than the commands do when they are delayed.
+
+    Attributes:
+        arm: That of least squares.
+        off: How far the axis's own is off [m]; four fifths of the measurements are nearer.
+    """
+
+    arm: PlainArm
+    off: float
+
+    @property
+    def refutes(self) -> bool:
+        """Whether it is so much worse that the arm of least squares is to take its place."""
+        return self.off > _REFUTED * self.arm.delayed_off
+
+    def sentence(self, config: FusionConfig, axis: str) -> str:
+        """What to know of it, under the configuration that is doubted."""
+        screen = config.arm.screen_of(axis)
+        then = "The arm is that of least squares instead" if self.refutes else "The interval of its lag covers both"
+        return (
+            "the likelihood has fitted something else than how the axis follows its commands: its arm, a lag of"
+            f" {config.arm.lag_of(axis) * MS:.4g} ms, is {self.off * screen.scale:.3g} {screen.unit} off, the commands"
+            f" {self.arm.delayed * MS:.0f} ms later are {self.arm.delayed_off * screen.scale:.3g}. {then}. The cause"
+            " may be play, a limit of the speed, a sensor that repeats old values, or too little motion"
+        )
+
+
+def doubts(likelihood: Likelihood, config: FusionConfig, axes: Iterable[str]) -> dict[str, Doubt]:
+    """The arms of a configuration that predict worse than the delayed command, by axis.
 
     Args:
-        likelihood: The measurements.
+        likelihood: The measurements; of an axis those of the sensor count that an arm explains best.
         config: The configuration.
         axes: The axes to look at.
-
-    Returns:
-        By axis the arm that is left by least squares, and how far the one of the configuration is off [m]; both by the
-        sensor that an arm explains best.
     """
-    found: dict[str, tuple[PlainArm, float]] = {}
+    found: dict[str, Doubt] = {}
     for axis in axes:
         motions, arms = likelihood.motions(axis, config), list[tuple[float, PlainArm, Recorded]]()
         for name in dict.fromkeys(one.sensor for one in motions):
@@ -225,20 +249,9 @@ def refuted(likelihood: Likelihood, config: FusionConfig, axes: Iterable[str]) -
         if arms:
             _, arm, recorded = min(arms, key=lambda one: one[0])
             off = recorded.off(config.arm.axes[axis], config.arm.delay_of(axis))
-            if off > _WORSE * arm.delayed_off:
-                found[axis] = arm, off
+            if off > _DOUBTED * arm.delayed_off:
+                found[axis] = Doubt(arm, off)
     return found
-
-
-def doubt(config: FusionConfig, axis: str, arm: PlainArm, off: float) -> str:
-    """The sentence on an axis whose arm is ``off`` [m], farther than the delayed command: see :func:`refuted`."""
-    screen = config.arm.screen_of(axis)
-    return (
-        "the likelihood has fitted something else than how the axis follows its commands: its arm, a lag of"
-        f" {config.arm.lag_of(axis) * MS:.4g} ms, is {off * screen.scale:.3g} {screen.unit} off, the commands"
-        f" {arm.delayed * MS:.0f} ms later are {arm.delayed_off * screen.scale:.3g}. The arm is that of least squares"
-        " instead. The cause may be play, a limit of the speed, a sensor that repeats old values, or too little motion"
-    )
 
 
 def with_plain_arm(config: FusionConfig, axis: str, arm: PlainArm) -> FusionConfig:

@@ -19,7 +19,7 @@ from ..units import MS, Kind
 from .identifiability import Correlation
 from .intervals import ConfidenceInterval, Distances, lag_slopes
 from .parameters import Parameter
-from .plain import LONGEST, PlainArm
+from .plain import LONGEST, Doubt
 from .validation import Check, fused
 
 _FROM_PRIOR = 0.8  # of the prior's interval, from which the measurements say hardly anything
@@ -167,18 +167,21 @@ def fitted_lags(
     return found
 
 
-def plain_lags(
-    arms: Mapping[str, tuple[PlainArm, float]], before: FusionConfig, after: FusionConfig
+def with_doubts(
+    lags: Mapping[str, FittedLag], doubts: Mapping[str, Doubt], before: FusionConfig, after: FusionConfig
 ) -> dict[str, FittedLag]:
-    """The lags of the axes whose arm is that of least squares."""
-    return {
-        axis: FittedLag(
-            before_ms=before.arm.lag_of(axis) * MS,
-            lag_ms=after.arm.lag_of(axis) * MS,
-            lag_ms_ci95=(arm.lag_ci95[0] * MS, arm.lag_ci95[1] * MS),
-        )
-        for axis, (arm, _) in arms.items()
-    }
+    """The lags with intervals that cover what least squares says of a doubted arm, and those of replaced arms."""
+    found = dict(lags)
+    for axis, (arm, _) in doubts.items():
+        low, high = (end * MS for end in arm.lag_ci95)
+        if (one := found.get(axis)) is None:
+            lag = after.arm.lag_of(axis) * MS
+            found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag, lag_ms_ci95=(low, high))
+        else:
+            below, above = one.lag_ms_ci95
+            ends = None if below is None else min(below, low), None if above is None else max(above, high)
+            found[axis] = msgspec.structs.replace(one, lag_ms_ci95=ends)
+    return found
 
 
 def open_interval(ci95: tuple[float | None, float | None]) -> tuple[float, float]:

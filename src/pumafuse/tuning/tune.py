@@ -20,7 +20,7 @@ from .intervals import ConfidenceInterval, Distances, Profile, confidence_interv
 from .likelihood import Likelihood, LogLikelihood
 from .maximise import Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
-from .plain import LONGEST, PlainArm, doubt, refuted, with_plain_arm
+from .plain import LONGEST, Doubt, doubts, with_plain_arm
 from .stage import Plan, Stage, likelihood_of, run_stage
 from .summary import (
     AxisLikelihood,
@@ -30,8 +30,8 @@ from .summary import (
     fitted_lags,
     found_biases,
     open_interval,
-    plain_lags,
     text,
+    with_doubts,
 )
 from .validation import Check, check
 
@@ -125,8 +125,8 @@ def tune(
     _check(runs, config, kinds, fixed, share)
     pipeline = Pipeline(runs, config, plans(config, kinds, fixed, trust, sd_prior, "delay" in share), progress)
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
-    plain: dict[str, tuple[PlainArm, float]] = {}
-    doubts: list[str] = []
+    found: dict[str, Doubt] = {}
+    doubted: list[str] = []
     until = _fitted_until(runs[0]) if len(runs) == 1 and validate is None else None
     intervals: dict[str, ConfidenceInterval] = {}
     around: dict[str, Distances] = {}
@@ -134,12 +134,12 @@ def tune(
     interrupted = False
     try:
         validation = _fitted_and_validated(pipeline, config, until, validate)
-        plain = pipeline.refuted() if "noise" in kinds else {}
-        if plain:
-            doubts = [f"{axis}: {doubt(pipeline.result(), axis, *arm)}" for axis, arm in plain.items()]
-            held, start = [*fixed, *(f"axes.{axis}" for axis in plain)], config
-            for axis, (arm, _) in plain.items():
-                start = with_plain_arm(start, axis, arm)
+        found = pipeline.doubts() if "noise" in kinds else {}
+        doubted = [f"{axis}: {one.sentence(pipeline.result(), axis)}" for axis, one in found.items()]
+        if refuted := [axis for axis, one in found.items() if one.refutes]:
+            held, start = [*fixed, *(f"axes.{axis}" for axis in refuted)], config
+            for axis in refuted:
+                start = with_plain_arm(start, axis, found[axis].arm)
             pipeline = Pipeline(runs, start, plans(start, kinds, held, trust, sd_prior, "delay" in share), progress)
             validation = _fitted_and_validated(pipeline, config, until, validate)
         for stage in pipeline.stages:
@@ -155,7 +155,7 @@ def tune(
         free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed, sd_prior)
     tuned = _with_provenance(pipeline.result(), free, intervals, names)
     slow = [axis for axis in lag_slopes(free, tuned) if tuned.arm.lag_of(axis) > LONGEST]
-    notes = [*doubts, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in slow)]
+    notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in slow)]
     if interrupted:
         notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
     known = validate is not None and any(_same(validate, run) for run in runs)
@@ -174,7 +174,7 @@ def tune(
         sd_prior=sd_prior,
         interrupted=interrupted,
         likelihood=_likelihoods(pipeline.whole, config, tuned),
-        lags=fitted_lags(free, config, tuned, around) | plain_lags(plain, config, tuned),
+        lags=with_doubts(fitted_lags(free, config, tuned, around), found, config, tuned),
         parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in free],
         biases=[one for run in runs for one in found_biases(run, tuned)],
         correlations=[one for stage in stages for one in correlations(stage.likelihood, stage.best, stage.free)],
@@ -293,12 +293,12 @@ class Pipeline:
         self.best, self.stages = config, stages
         self.notes = [note for stage in stages for note in (*stage.likelihood.notes, *stage.notes)]
 
-    def refuted(self) -> dict[str, tuple[PlainArm, float]]:
-        """The arms that were fitted and predict worse than the delayed command: see :func:`.plain.refuted`."""
+    def doubts(self) -> dict[str, Doubt]:
+        """Of the arms that were fitted: see :func:`.plain.doubts`."""
         if not self.stages:
             return {}
         config, free = self.result(), [one for stage in self.stages for one in stage.free]
-        return refuted(self.stages[0].likelihood, config, lag_slopes(free, config))
+        return doubts(self.stages[0].likelihood, config, lag_slopes(free, config))
 
     def keep_the_better(self) -> None:
         """Go back to the configuration as given if it is more likely: with gates the search may pass worse points."""
