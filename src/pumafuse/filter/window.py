@@ -11,7 +11,8 @@ from ..arrays import NEVER, IndexArray, TimeArray
 from .core import Handle, Model, Output, at, checked, fates, library, struct_of
 from .events import Results
 
-MOST_ROWS = 65_536  # events; what is more shortens the window
+MOST_ROWS = 65_536  # places for events
+MOST_EVENTS = MOST_ROWS * 15 // 16  # what is more shortens the window: the rest is for what has left and may be read
 FIRST_ROWS = 4096  # at first
 
 

@@ -14,7 +14,7 @@ from ..arrays import NEVER, IntArray
 from ..errors import ConfigError, RunError, suggestion
 from ..filter.events import COMMAND
 from ..filter.outcome import ABSENT, FARTHEST, Outcome
-from ..filter.window import MOST_ROWS, Window
+from ..filter.window import MOST_EVENTS, Window
 from ..fusion.config import FusionConfig
 from ..fusion.segments import LONGEST_TAIL_NS
 from ..fusion.setup import live_model
@@ -488,7 +488,7 @@ class LiveEstimator:
         late, window = self._clock.sure - stamp, self._clock.window
         why = f"stamped {late / 1e9:.3f} s behind the newest; the window is {window / 1e9:g} s"
         if late <= window:
-            why = f"more than {MOST_ROWS} events came since: the window holds no more"
+            why = f"more than {MOST_EVENTS} events came since: the window holds no more"
         return self._refuse(sensor, values, _TOO_LATE, why, outcomes)
 
     def _refuse(
