@@ -24,7 +24,7 @@ from .parameters import changed, rounded
 _LATEST, _DELAYS = 0.6, 61  # s, or five update periods: the longest dead time; how many are looked at
 _LAGS = np.geomspace(1e-3, 2.0, 14)  # s, of a first-order plant
 LONGEST = 2.6  # s, of a lag that is told: of both together
-_COMMANDS = 10_000  # of a recording that are looked at, where it moves most
+_COMMANDS = 6000  # of a recording that are looked at, where it moves most
 _ROWS = 2000  # measurements of a recording that are looked at, evenly over all of it
 _STARTS = 3  # cells from which the least squares are looked for
 _AROUND = np.linspace(-1.5, 1.5, 7)  # logarithm of τ about the best one,
@@ -95,6 +95,7 @@ class Recorded:
         self._period = period
         self._motions = [_thinned(_liveliest(one)) for one in motions]
         self._counts = [np.ones(len(one.time), dtype=np.bool_) for one in self._motions]
+        self._known: dict[tuple[float, float], list[FloatArray]] = {}  # responses of cells, which are looked at twice
 
     def off(self, axis: AxisModel, delay: float) -> float:
         """How far an arm without noise is off [m]: four fifths of the measurements are nearer."""
@@ -138,7 +139,9 @@ class Recorded:
         y, found = self._measured(), list[_Cell]()
         for delay in delays.tolist():
             for lag in lags.tolist():
-                r = self._response(_first_order(lag), delay)
+                if (delay, lag) not in self._known:
+                    self._known[delay, lag] = self._responses(_first_order(lag), delay)
+                r = self._centred(self._known[delay, lag])
                 power, along = float(r @ r), max(float(r @ y), 0.0)
                 gain = along / power if power > 0.0 else 0.0
                 left = max(float(y @ y) - gain * along, 0.0)
@@ -173,9 +176,12 @@ class Recorded:
         return self._centred([one.value for one in self._motions])
 
     def _response(self, axis: AxisModel, delay: float) -> FloatArray:
-        return self._centred(
-            [response(axis, self._period, delay, one.given, one.command, one.start, one.time) for one in self._motions]
-        )
+        return self._centred(self._responses(axis, delay))
+
+    def _responses(self, axis: AxisModel, delay: float) -> list[FloatArray]:
+        return [
+            response(axis, self._period, delay, one.given, one.command, one.start, one.time) for one in self._motions
+        ]
 
     def _centred(self, parts: Sequence[FloatArray]) -> FloatArray:
         """What counts of each recording without its mean, one after the other."""
