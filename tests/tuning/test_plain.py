@@ -15,7 +15,8 @@ from pumafuse.filter.response import response
 from pumafuse.model.arm import AxisModel, Gain
 from pumafuse.model.plants import FirstOrder
 from pumafuse.tuning.likelihood import Likelihood, Motion
-from pumafuse.tuning.plain import Recorded, doubts, with_plain_arm
+from pumafuse.tuning.plain import Doubt, PlainArm, Recorded, doubts, with_plain_arm
+from pumafuse.tuning.summary import FittedLag, with_doubts
 from tuning_runs import quietly, replaced, scenario
 
 DEAD_BAND = Path(__file__).parent / "data" / "dead-band.csv"
@@ -95,3 +96,29 @@ def test_one_command_says_no_wrong_lag_of_an_arm_with_a_dead_band(tmp_path: Path
     assert 0.14 < config.arm.lag_of("j") < 0.19
     told = quietly(lambda: pf.latency(pf.Run.read(tmp_path / "run")))
     assert told.details.axes["j"].lag == pytest.approx(config.arm.lag_of("j"), abs=0.05)
+
+
+def test_the_interval_of_a_doubted_lag_covers_both_and_one_that_is_replaced_is_that_of_least_squares() -> None:
+    """80 (78 to 82) ms by the likelihood and 50 to 60 ms by least squares are 50 to 82; an open end stays open."""
+    config = pf.simulate(scenario("panel-vision", 0.1, 0.02), 2).config
+    arm = PlainArm(0.03, 0.025, 1.0, lag_ci95=(0.05, 0.06), rms=1e-3, delayed=0.055, delayed_off=1e-3)
+    doubted = {axis: Doubt(arm, off=2e-3) for axis in config.arm.axes}
+    first, *others = config.arm.axes
+    lags = {first: FittedLag(before_ms=70.0, lag_ms=80.0, lag_ms_ci95=(78.0, 82.0))}
+    found = with_doubts(lags, doubted, config, config)
+    assert found[first] == FittedLag(before_ms=70.0, lag_ms=80.0, lag_ms_ci95=(50.0, 82.0))
+    assert found[others[0]].lag_ms_ci95 == (50.0, 60.0)
+    lags = {first: FittedLag(before_ms=70.0, lag_ms=80.0, lag_ms_ci95=(None, 82.0))}
+    assert with_doubts(lags, doubted, config, config)[first].lag_ms_ci95 == (None, 82.0)
+    assert [Doubt(arm, off).refutes for off in (3.9e-3, 4.1e-3)] == [False, True]
+
+
+def test_no_lag_is_told_of_a_sensor_that_measures_something_else(tmp_path: Path) -> None:
+    """Noise of 10° beside commands of ±20°: a note instead of a number."""
+    k, rng = np.arange(400), np.random.default_rng(1)
+    rows = zip(k * 0.033, 20.0 * np.sin(k / 30.0), rng.normal(0.0, 10.0, 400), strict=True)
+    log = tmp_path / "noise.csv"
+    log.write_text("time_s,action.j_deg,state.j_deg\n" + "".join(f"{t:.3f},{u:.4f},{z:.4f}\n" for t, u, z in rows))
+    done = pumafuse("fuse", log, "-o", tmp_path / "run")
+    assert "j: no lag up to 2.6 s explains its motion" in done.stderr
+    assert "lag of j" not in done.stdout
