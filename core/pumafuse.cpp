@@ -1,5 +1,6 @@
 // The C interface (pumafuse.h): from flat arrays to filters whose number of states is known to the compiler.
 #include "interface.hpp"
+#include "search.hpp"
 #include "smoother.hpp"
 #include "window.hpp"
 
@@ -55,20 +56,25 @@ void pf_transition(const pf_axis* axis, double dt, double step[17]) {
     std::copy_n(found, 17, step);
 }
 
-void pf_response(const pf_axis* axis, int64_t commands, const int64_t* acts, const double* command, int64_t n,
+void pf_response(const pf_axis* axis, int64_t commands, const int64_t* given, const double* command, int64_t n,
                  const int64_t* time, double* position) {
     const Arm<double> arm(lifted<Axis, double>(axis, 1, {})[0]);
-    Response<double> response;
-    response.start = axis->start;
-    if (commands > 0 && n > 0) response.time.ns = std::min(acts[0], time[0]);
-    for (int64_t k = 0, c = 0; k < n; ++k) {
-        for (; c < commands && acts[c] <= time[k]; ++c) {
-            response.predict(arm.plant, {acts[c], 0.0});
-            response.command(arm, command[c]);
-        }
-        response.predict(arm.plant, {time[k], 0.0});
-        position[k] = response.x;
-    }
+    respond(arm, axis->start, std::llround(axis->delay * 1e9), commands, given, command, n, time, position);
+}
+
+void pf_whiten(const pf_noise* noise, int64_t n, const int64_t* time, const double* variance, int64_t c,
+               const double* columns, double* whitened, double* log_determinant) {
+    const Whitening whitening(*noise, n, time, variance);
+    for (int64_t j = 0; j < c; ++j) whitening(columns + j * n, whitened + j * n);
+    *log_determinant = whitening.log_determinant;
+}
+
+void pf_weigh(const pf_noise* noise, int64_t n, const int64_t* time, const double* variance, int64_t c,
+              const double* whitened, int64_t commands, const int64_t* given, const double* command, int64_t count,
+              const pf_axis* axis, double* products) {
+    const Whitening whitening(*noise, n, time, variance);
+    for (int64_t i = 0; i < count; ++i)
+        weigh(axis[i], whitening, commands, given, command, n, time, c, whitened, products + i * 2 * (2 + c));
 }
 
 void pf_classify(const pf_model* model, const pf_events* events, int64_t origin, const uint8_t* too_late,

@@ -22,7 +22,7 @@
 extern "C" {
 #endif
 
-#define PF_VERSION 4              /* of this interface: a program and its library must agree */
+#define PF_VERSION 5              /* of this interface: a program and its library must agree */
 #define PF_NO_STAMP INT64_MIN     /* the time of a row without a readable stamp */
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
 #define PF_NEVER INT64_MAX        /* after all instants */
@@ -106,10 +106,27 @@ PF_API const char *pf_error(void); /* of the last call of this thread that faile
  * input; what an input that decays from 1 m by exp(-dt/Tr) makes of position and rate, and what is left of it; Phi and
  * Q of a smooth disturbance of variance 1. */
 PF_API void pf_transition(const pf_axis *axis, double dt, double step[17]);
-/* Where an axis goes without noise, relative to its start level [m], at n instants, ascending; commands [m] act at
- * their instants, ascending. */
-PF_API void pf_response(const pf_axis *axis, int64_t commands, const int64_t *acts, const double *command, int64_t n,
+/* Where an axis goes without noise, relative to its start level [m], at n instants, ascending; commands [m] are given
+ * at their instants, ascending. */
+PF_API void pf_response(const pf_axis *axis, int64_t commands, const int64_t *given, const double *command, int64_t n,
                         const int64_t *time, double *position);
+
+/* What an arm leaves of what is measured, beside white noise. */
+typedef struct {
+    double walk, offset_sd;                  /* of a random walk: density [m/sqrt(s)], and where it begins [m] */
+    double disturbance_sd, disturbance_time; /* [m], 0: there is none; [s] */
+    double smoothness;                       /* of the disturbance, as in pf_axis */
+} pf_noise;
+
+/* c columns (c, n) of what was measured at n instants, ascending, with white noise of `variance` (n,) [m^2], infinite
+ * where none was: their innovations over standard deviations, and the sum of log S. */
+PF_API void pf_whiten(const pf_noise *noise, int64_t n, const int64_t *time, const double *variance, int64_t c,
+                      const double *columns, double *whitened, double *log_determinant);
+/* How `count` arms fit c columns that are whitened: the response to a gain of 1 and what 1 of gain adds to it, both
+ * whitened, times these two and times the columns. products (count, 2, 2 + c). */
+PF_API void pf_weigh(const pf_noise *noise, int64_t n, const int64_t *time, const double *variance, int64_t c,
+                     const double *whitened, int64_t commands, const int64_t *given, const double *command,
+                     int64_t count, const pf_axis *axis, double *products);
 /* What each value is before the filter sees it, into known (n, A); too_late (n,): rows far behind earlier ones. */
 PF_API void pf_classify(const pf_model *model, const pf_events *events, int64_t origin, const uint8_t *too_late,
                         uint8_t *known);

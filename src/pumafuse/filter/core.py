@@ -20,7 +20,7 @@ from ..arrays import BoolArray, CodeArray, FloatArray, TimeArray
 from ..errors import PumafuseError
 from .events import Events, Results
 
-VERSION = 4  # of the interface
+VERSION = 5  # of the interface
 LIBRARY = Path(__file__).with_name("_core" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
 Record = npt.NDArray[np.void]  # an array of structs
 
@@ -80,6 +80,8 @@ _KINDS = {"p": _POINTER, "n": _INT64, "d": ctypes.c_double, "i": ctypes.c_int, "
 _FUNCTIONS = {  # what each returns, then what it takes: pointers, int64, double, int, uint64; v: nothing
     "transition": "vpdp",
     "response": "vpnppnpp",
+    "whiten": "vpnppnppp",
+    "weigh": "vpnppnpnppnpp",
     "classify": "vppnpp",
     "constant_velocity": "vnppnppp",
     "filter_new": "ppn",

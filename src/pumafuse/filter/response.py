@@ -46,8 +46,8 @@ def response(
     Returns:
         The position [m] relative to ``start``, (n,).
     """
-    acts, position = given + round(delay * 1e9), np.empty(len(time))
+    position = np.empty(len(time))
     command, time = np.ascontiguousarray(command, dtype=np.float64), np.ascontiguousarray(time)
     record = record_of(axis, period, delay, start)
-    library.pf_response(at(record), len(acts), at(acts), at(command), len(time), at(time), at(position))
+    library.pf_response(at(record), len(given), at(given), at(command), len(time), at(time), at(position))
     return position

@@ -1,0 +1,341 @@
+"""The one search for an arm: from any motion, from no guess.
+
+A grid over dead time and lag finds where the likelihood has its maxima: at first by plain least squares, then under the
+noise that the best arm leaves. Each model is fitted from there, and followed along the dead time to both sides, with
+Laplace's approximation for its other numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import FloatArray
+from .arms import LOGARITHMIC, Arm, Coordinates, Fit, Limits, Measured, Rest, rests
+from .posterior import SHORTEST, AxisPosterior, Branch, Entry, GainKind, Model, Quantity
+
+LONGEST_DELAY, _DELAYS = 0.6, 61  # s, or five update periods: the longest dead time; how many are looked at
+_LAGS = np.geomspace(1e-3, 2.0, 14)  # s, of a plant
+BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": (0.02, 0.5), "gain": (0.7, 1.3)}  # recovery [s]
+# A gain is 1 within a tenth. What is sold as an axis neither rings for ever nor has two lags far apart.
+PRIORS = {"gain": (1.0, 0.1), "damping": (0.0, 0.7)}
+_LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each as likely
+_STARTS = 3  # maxima of the grid from which an arm is fitted
+_NEAR = 20.0  # log-likelihood behind the best, up to which a maximum of the grid is looked at
+_OUTLIER = 8.0  # times the median distance from the best arm: what is farther does not count
+_SHARE, _PART = 0.98, 0.5  # of the measurements
+_EARLIER, _DAMPED = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no dead time, ζ
+_ERRORS, _RECOVERING = (-0.12, -0.05, 0.05), (0.05, 0.12, 0.3)  # starts: gains less 1, recoveries [s]
+_WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
+_SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
+_QUICKEST = 2.0  # update periods, of a disturbance
+_DOUBT = 20.0  # log-likelihood that a recovery at a bound must gain: mostly another model says the same
+_FORLORN = 8.0  # log-likelihood behind the best, from which a model or a dead time counts for nothing
+_SAME = 2e-4  # s, between dead times of maxima that are one
+_STEP = 0.7  # standard deviations, between dead times
+_LONGEST_STEP = 0.03  # s
+_MOST = 12  # steps away from a maximum
+_SLOPE = 1e-5  # of a coordinate, by which quantities are varied
+
+
+class Freedom(NamedTuple):
+    """What of an arm is to be found; the rest stays as given.
+
+    Attributes:
+        given: The arm as it is known.
+        delay: Whether its dead time is free.
+        plant: Whether its plant is, of either order.
+        gains: The kinds of gain to try.
+    """
+
+    given: Arm
+    delay: bool = True
+    plant: bool = True
+    gains: Sequence[GainKind] = ("given", "static", "recovering")
+
+    @property
+    def models(self) -> list[Model]:
+        """The models to try, the simplest first."""
+        orders = (1, 2) if self.plant else (2 if self.given.damping else 1,)
+        return sorted((Model(*one) for one in product(orders, self.gains)), key=lambda model: model.size)
+
+    def names(self, model: Model) -> list[str]:
+        """The coordinates of a model that are free, the dead time first."""
+        found = ["delay"] if self.delay else []
+        if self.plant:
+            found += ["lag"] if model.order == 1 else ["lag", "damping"]
+        return found + {"given": [], "static": ["gain"], "recovering": ["gain", "recovery"]}[model.gain]
+
+    def shaped(self, arm: Arm, gain: GainKind) -> Arm:
+        """An arm with the kind of gain; one as it is given keeps what is known of it."""
+        if gain == "given":
+            return arm._replace(gain=self.given.gain, recovery=self.given.recovery, slope=self.given.slope)
+        return arm._replace(recovery=0.0, slope=0.0) if gain == "static" else arm._replace(slope=self.given.slope)
+
+
+def axis_posterior(
+    measured: Measured,
+    freedom: Freedom,
+    noise: Rest,
+    least: Sequence[float],
+    prior: float | None = None,
+) -> AxisPosterior:
+    """The posterior of an axis's arm.
+
+    Args:
+        measured: The measurements of the axis.
+        freedom: What is to be found.
+        noise: What an arm is believed to leave.
+        least: The least noise of each sensor [m].
+        prior: The sd of the logarithm of the sensors' noise about that in ``noise``; None: it is not believed.
+    """
+    search = ArmSearch(measured, freedom)
+    peaks = search.peaks(noise, least, prior)
+    best = peaks[0][0]
+    branches: list[Branch] = []
+    for evidence, model, peak in peaks:
+        if evidence > best - _FORLORN and not _walked(branches, model, peak.arm.delay):
+            highest = max((float(one.log_density.max()) for one in branches), default=-np.inf)
+            branches.append(search.walk(model, peak, highest - _FORLORN))
+    return AxisPosterior(branches, search.rest)
+
+
+def _walked(branches: Sequence[Branch], model: Model, delay: float) -> bool:
+    return any(one.model == model and one.delays[0] <= delay <= one.delays[-1] for one in branches)
+
+
+class ArmSearch:
+    """Maxima of each model of an axis, and the walk from one along the dead time.
+
+    Attributes:
+        rest: What the best arm leaves; white noise of 1 m at first: least squares.
+    """
+
+    def __init__(self, measured: Measured, freedom: Freedom) -> None:
+        longest = max(LONGEST_DELAY, 5.0 * measured.period)
+        self._measured, self._freedom, self._longest = measured, freedom, longest
+        self._limits = Limits({"delay": (0.0, longest), **BOUNDS}, PRIORS)
+        self.rest = Rest(np.ones(len(measured.sources)))
+
+    def peaks(self, noise: Rest, least: Sequence[float], prior: float | None) -> list[tuple[float, Model, Fit]]:
+        """The maxima of every model with their evidence, the best first.
+
+        By least squares at first: noise that is fitted to a poor arm explains what a better one would. Then with the
+        noise that the best arm leaves; and an update period of dead time away.
+        """
+        models, period = self._freedom.models, self._measured.period
+        plain = self._on_grid(1)[0]
+        self._measured = self._measured.where(self._near(plain))
+        plain = self._on_grid(1)[0]
+        self.rest = self._likely_rest(plain, noise, least, prior)
+        found = self._fitted(models, self._on_grid(_STARTS))
+        self.rest = self._likely_rest(self._best(found).arm, self.rest, least, None)
+        found = self._fitted(models, [self._best(found).arm], found)
+        every = [(self._evidence(model, fit), model, fit) for model, fit in found.items()]
+        highest = max(one[0] for one in every)
+        for evidence, model, fit in list(every) if self._freedom.delay else ():
+            for ticks in (-1.0, 1.0) if evidence > highest - _FORLORN else ():
+                beside = self._fit(model, self._delayed(fit.arm, fit.arm.delay + ticks * period))
+                known = [one.arm.delay for _, other, one in every if other == model]
+                if min(abs(beside.arm.delay - one) for one in known) > _SAME:
+                    every.append((self._evidence(model, beside), model, beside))
+        return sorted(every, key=lambda one: -one[0])
+
+    def _on_grid(self, count: int) -> list[Arm]:
+        """The arms of highest likelihood on a grid of first-order plants, no two of them neighbours."""
+        given, free = self._freedom.given, self._freedom
+        delays = np.linspace(0.0, self._longest, _DELAYS) if free.delay else np.array([given.delay])
+        lags = _LAGS if free.plant else np.array([given.lag])
+        damping = 0.0 if free.plant else given.damping
+        arms = [given._replace(delay=d, lag=l, damping=damping) for d, l in product(delays.tolist(), lags.tolist())]
+        varied = tuple(free.gains) != ("given",)
+        if varied:
+            arms = [self._freedom.shaped(arm, "static") for arm in arms]
+        log, gain = self._measured.weighed(arms, self.rest, self._limits if varied else None)
+        table = log.reshape(len(delays), len(lags))
+        around = np.pad(table, 1, constant_values=-np.inf)
+        highest = np.max([np.roll(around, shift, (0, 1)) for shift in product((-1, 0, 1), repeat=2)], axis=0)[1:-1, 1:-1]
+        summits = [int(one) for one in np.flatnonzero(table >= highest) if log[one] > log.max() - _NEAR]
+        summits.sort(key=lambda one: -log[one])
+        return [arms[one]._replace(gain=float(gain[one])) for one in summits[:count]]
+
+    def _near(self, arm: Arm) -> list[FloatArray]:
+        """Weights of 0 for measurements that are outliers beside an arm."""
+        left = self._measured.residuals(arm)
+        apart = [np.abs(one - np.median(one)) if len(one) else one for one in left]
+        limit = _OUTLIER * max(float(np.median(np.concatenate(apart))), 1e-9)
+        return [np.where(one <= limit, part.weight, 0.0) for one, part in zip(apart, self._measured.recordings, strict=True)]
+
+    def _likely_rest(self, arm: Arm, start: Rest, least: Sequence[float], prior: float | None) -> Rest:
+        """The most likely of what an arm leaves, after the penalty for its numbers."""
+        found = list(rests(self._measured, arm, start, _QUICKEST * self._measured.period, least, prior))
+        dearer = math.log(max(self._measured.count, 2))  # of two numbers more (BIC)
+        prices = [_WANDERS, dearer + _SMOOTHER, dearer]
+        return max(zip(found, prices, strict=True), key=lambda one: one[0][1] - one[1])[0][0]
+
+    def _fitted(
+        self, models: Sequence[Model], starts: Sequence[Arm], known: Mapping[Model, Fit] | None = None
+    ) -> dict[Model, Fit]:
+        """Each model fitted from the best of the starts, from the simpler models, and from where it was."""
+        found = dict[Model, Fit]()
+        for model in models:
+            if not found:
+                tries = [self._fit(model, arm) for arm in self._likeliest(model, starts, len(starts))]
+            else:
+                best = self._best(found).arm
+                tries = [self._fit(model, arm) for arm in self._likeliest(model, [best], 1 if known else 2)]
+            if known:
+                tries.append(self._fit(model, known[model].arm))
+            found[model] = max(tries, key=lambda one: one.log_posterior)
+        return found
+
+    def _likeliest(self, model: Model, arms: Iterable[Arm], count: int) -> list[Arm]:
+        """The likeliest arms of a model that are as late as others."""
+        tried = [shaped for arm in arms for shaped in self._shapes(model, arm)]
+        if len(tried) <= count:
+            return tried
+        log, _ = self._measured.weighed(tried, self.rest)
+        return [tried[place] for place in np.argsort(-log)[:count].tolist()]
+
+    def _shapes(self, model: Model, arm: Arm) -> Iterator[Arm]:
+        """Arms of a model that are as late as another one."""
+        order = 2 if arm.damping else 1
+        kind = "recovering" if arm.recovery else "static"
+        gains = [arm]
+        if model.gain != "recovering" or kind == "recovering":
+            gains = [self._freedom.shaped(arm, model.gain)]
+        else:
+            changes = product(_ERRORS, _RECOVERING)
+            gains = [arm._replace(gain=1.0 + error, recovery=recovery) for error, recovery in changes]
+        for one in gains:
+            one = self._as_late(one, arm.total)
+            if model.order == order:
+                yield one
+            elif model.order == 1:
+                yield one._replace(damping=0.0)
+            else:
+                for earlier, damping in product(_EARLIER, _DAMPED) if len(gains) == 1 else ((0.3, 1.0),):
+                    yield self._delayed(one, one.delay - earlier * one.delay)._replace(damping=damping)
+
+    def _as_late(self, arm: Arm, total: float) -> Arm:
+        """An arm whose plant makes up for what its gain changed of the lag."""
+        low, high = self._limits.bounds["lag"]
+        if not self._freedom.plant:
+            return arm
+        return arm._replace(lag=min(max(arm.lag + total - arm.total, 0.1 * arm.lag, low), high))
+
+    def _delayed(self, arm: Arm, delay: float) -> Arm:
+        """An arm with another dead time, and so much less or more lag of the plant, where these are free."""
+        if not self._freedom.delay:
+            return arm
+        delay = min(max(delay, 0.0), self._longest)
+        later = arm._replace(delay=delay)
+        return self._as_late(later, arm.total)
+
+    def _fit(self, model: Model, start: Arm) -> Fit:
+        return self._measured.fitted(start, self._freedom.names(model), self.rest, self._limits)
+
+    def _best(self, found: Mapping[Model, Fit]) -> Fit:
+        return max(found.values(), key=lambda one: one.log_posterior)
+
+    def _evidence(self, model: Model, fit: Fit) -> float:
+        """The log-density of a maximum with the penalty for the model's numbers, roughly."""
+        names = self._freedom.names(model)
+        low, high = self._limits.range(names)
+        at = np.array([fit.arm.coordinate(name) for name in names])
+        bound = (at <= low + 1e-6) | (at >= high - 1e-6)
+        doubt = _DOUBT if any(one for one, name in zip(bound, names, strict=True) if name == "recovery") else 0.0
+        return self._laplace(fit, names, ~bound) - doubt
+
+    def _laplace(self, fit: Fit, names: Coordinates, inside: FloatArray) -> float:
+        """The log-density with the free numbers integrated out, each with its prior's constant."""
+        log = fit.log_posterior
+        free = [name for name, one in zip(names, inside, strict=True) if one]
+        for name in free:
+            if name in PRIORS:
+                log -= math.log(PRIORS[name][1] * math.sqrt(2.0 * math.pi))
+            elif name == "lag":
+                log -= _LOG_RANGE
+            elif name == "delay":
+                log -= math.log(self._longest)
+            else:
+                log -= math.log(math.log(BOUNDS[name][1] / BOUNDS[name][0]))
+        if free:
+            information = fit.information[np.ix_(inside, inside)]
+            size = np.sqrt(np.maximum(np.diag(information), 1e-9))
+            _, determinant = np.linalg.slogdet(information / np.outer(size, size) + 1e-9 * np.eye(len(free)))
+            log -= 0.5 * (float(determinant) + 2.0 * float(np.log(size).sum()) - len(free) * math.log(2.0 * math.pi))
+        return log
+
+    # ---- the walk ---------------------------------------------------------------------------------------------------
+
+    def walk(self, model: Model, peak: Fit, least: float) -> Branch:
+        """The entries of a model about a maximum, until they count for nothing or less than ``least``."""
+        names = self._freedom.names(model)
+        if not self._freedom.delay:
+            return Branch(model, [self._entry(peak, names)])
+        cov = _covariance(peak.information)
+        sd, slope = math.sqrt(cov[0, 0]), cov[1:, 0] / cov[0, 0]
+        step = min(max(_STEP * sd, SHORTEST), _LONGEST_STEP)
+        middle = self._at(peak.arm, names[1:])
+        sides = [
+            list(self._side(peak, names[1:], sign * step, slope, max(least, middle.log_density - _FORLORN)))
+            for sign in (-1.0, 1.0)
+        ]
+        return Branch(model, [*reversed(sides[0]), middle, *sides[1]])
+
+    def _side(self, peak: Fit, names: Coordinates, step: float, slope: FloatArray, least: float) -> Iterator[Entry]:
+        low, high = self._limits.range(names)
+        before, move = peak.arm, step * slope
+        for _ in range(_MOST):
+            delay = before.delay + step
+            if not -abs(step) < delay <= self._longest:
+                return
+            at = np.array([before.coordinate(name) for name in names])
+            there = before.moved(names, np.clip(at + move, low, high).tolist())._replace(delay=max(delay, 0.0))
+            entry = self._at(there, names)
+            yield entry
+            least = max(least, entry.log_density - _FORLORN)
+            if entry.log_density < least or delay <= 0.0:
+                return
+            before = entry.arm
+            move = np.array([before.coordinate(name) for name in names]) - at
+
+    def _at(self, arm: Arm, names: Coordinates) -> Entry:
+        """The entry of the best arm with the same dead time."""
+        return self._entry(self._measured.fitted(arm, names, self.rest, self._limits), names)
+
+    def _entry(self, fit: Fit, names: Coordinates) -> Entry:
+        low, high = self._limits.range(names)
+        at = np.array([fit.arm.coordinate(name) for name in names])
+        inside = (at > low + 1e-6) & (at < high - 1e-6)
+        free = [name for name, one in zip(names, inside, strict=True) if one]
+        cov = _covariance(fit.information[np.ix_(inside, inside)])
+        means = _quantities(fit.arm)
+        moved = [_quantities(fit.arm.moved([name], [fit.arm.coordinate(name) + _SLOPE])) for name in free]
+        sds: dict[Quantity, float] = {}
+        for quantity, mean in means.items():
+            slope = np.array([(one[quantity] - mean) / _SLOPE for one in moved])
+            sds[quantity] = math.sqrt(max(float(slope @ cov @ slope), 0.0)) if free else 0.0
+        return Entry(fit.arm.delay, fit.arm, self._laplace(fit, names, inside), means, sds)
+
+
+def _covariance(information: FloatArray) -> FloatArray:
+    """The covariance of coordinates; without information it is enormous."""
+    size = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
+    values, vectors = np.linalg.eigh(information * np.outer(size, size))
+    return (vectors / np.maximum(values, 1e-12)) @ vectors.T * np.outer(size, size)
+
+
+def _quantities(arm: Arm) -> dict[Quantity, float]:
+    """What is said of an arm; of what can only be positive the logarithm."""
+    found: dict[Quantity, float] = {"lag": arm.total, "delay": arm.delay, "gain": arm.gain}
+    if arm.damping:
+        found |= {"natural_frequency": math.log(2.0 * arm.damping / arm.lag), "damping": math.log(arm.damping)}
+    else:
+        found["time_constant"] = math.log(arm.lag)
+    return found | ({"gain_recovery": math.log(arm.recovery)} if arm.recovery else {})

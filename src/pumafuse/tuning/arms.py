@@ -1,0 +1,401 @@
+"""Arms against a recorded motion: how well each explains it, under the noise that the best of them leaves.
+
+The response r of an arm is computed exactly at each measurement. Gain and constant biases are linear and projected out.
+What is left is a random walk, a disturbance and white noise; a filter for these makes it independent ("whitens" it), so
+that sums of squares are likelihoods. The heavy part is in the core (``core/search.hpp``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ..arrays import FloatArray, IntArray, TimeArray
+from ..filter.core import Record, at, library
+from ..filter.response import record_of
+from ..model.arm import AxisModel, Gain
+from ..model.plants import FirstOrder, SecondOrder
+
+_NOISE = np.dtype([(name, np.float64) for name in ("walk", "offset_sd", "disturbance_sd", "disturbance_time", "smoothness")])
+_FAR = 30.0  # times all that is measured: where an offset may begin
+_WALKS, _SDS = (1e-8, 10.0), (1e-8, 10.0)  # m/√s, m: bounds
+_TIME, _TIMES = 0.3, (1e-3, 1e3)  # s, of a disturbance: start, bounds
+_CLOSE = 0.02  # log-likelihood: what is less is no progress
+_STEPS = 12  # of Gauss and Newton, at most
+_SHIFT, _LOG_SHIFT = 1e-4, 1e-3  # s, 1: by which responses are varied; delays are coarser than a nanosecond's rounding
+_REACH = np.array([0.03, 0.7])  # longest step of a delay [s], of a logarithm
+_DAMPINGS = (0.0, 1e-2, 1.0, 1e2)  # of a step that fails, one after the other
+_LOG_2PI = math.log(2.0 * math.pi)
+
+Coordinates: TypeAlias = Sequence[str]  # among the fields below
+LOGARITHMIC = ("lag", "damping", "recovery")
+
+
+class Recording(NamedTuple):
+    """What was commanded on an axis, and what was measured of it, in one piece.
+
+    Attributes:
+        given: When each command was given, int64 ns, (k,).
+        command: u [m], (k,).
+        start: The level [m] at which the axis rests before its first command.
+        time: When each measurement is valid, int64 ns, ascending, (m,).
+        value: Where the axis was then, relative to ``start``; the sensor's scale is taken out [m], (m,).
+        source: The number of its sensor, (m,).
+        weight: 1, or 0 where a measurement does not count, (m,).
+    """
+
+    given: TimeArray
+    command: FloatArray
+    start: float
+    time: TimeArray
+    value: FloatArray
+    source: IntArray
+    weight: FloatArray
+
+    def of(self, rows: Any) -> Recording:
+        """With some of the measurements."""
+        time, value, source, weight = (part[rows] for part in self[3:])
+        return self._replace(time=np.ascontiguousarray(time), value=value, source=source, weight=weight)
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What an arm leaves of the measurements.
+
+    Attributes:
+        sd: White noise of each sensor [m], (s,).
+        walk: Density of a random walk [m/√s].
+        disturbance_sd: [m]; 0: there is none.
+        disturbance_time: [s].
+        smoothness: 1.5 (Matérn) or 0.5 (Ornstein-Uhlenbeck).
+    """
+
+    sd: FloatArray
+    walk: float = 0.0
+    disturbance_sd: float = 0.0
+    disturbance_time: float = _TIME
+    smoothness: float = 0.5
+
+
+class Arm(NamedTuple):
+    """An arm of an axis: what is varied of it.
+
+    Attributes:
+        delay: Dead time [s].
+        lag: Of the plant, behind an input of constant velocity: τ or 2 ζ / ω [s].
+        damping: ζ; 0: the plant is of first order.
+        recovery: Time constant with which the gain recovers [s]; 0: it stays.
+        gain: K of slow motion.
+        slope: What it gains with speed [s/m].
+    """
+
+    delay: float
+    lag: float
+    damping: float = 0.0
+    recovery: float = 0.0
+    gain: float = 1.0
+    slope: float = 0.0
+
+    @property
+    def total(self) -> float:
+        """Lag behind the held command at constant velocity [s]."""
+        return self.delay + self.lag + (1.0 - self.gain) * self.recovery
+
+    @property
+    def model(self) -> AxisModel:
+        """Plant and gain."""
+        plant: FirstOrder | SecondOrder = FirstOrder(time_constant=self.lag)
+        if self.damping:
+            plant = SecondOrder(natural_frequency=2.0 * self.damping / self.lag, damping=self.damping)
+        gain = Gain(slope=self.slope, intercept=self.gain)
+        return AxisModel(plant=plant, gain=gain, gain_recovery=self.recovery or None)
+
+    @classmethod
+    def of(cls, axis: AxisModel, delay: float) -> Arm:
+        """That of an axis's model and its dead time [s]."""
+        damping = axis.plant.damping if isinstance(axis.plant, SecondOrder) else 0.0
+        gain = axis.gain
+        return cls(delay, axis.plant.lag, damping, axis.gain_recovery or 0.0, gain.intercept, gain.slope)
+
+    def coordinate(self, name: str) -> float:
+        """One of its numbers; of what can only be positive the logarithm."""
+        value: float = getattr(self, name)
+        return math.log(value) if name in LOGARITHMIC else value
+
+    def moved(self, names: Coordinates, coordinates: Sequence[float]) -> Arm:
+        """With other coordinates."""
+        values = zip(names, coordinates, strict=True)
+        return self._replace(**{name: math.exp(one) if name in LOGARITHMIC else one for name, one in values})
+
+
+class Limits(NamedTuple):
+    """Where the numbers of an arm may lie, and what is believed of them: mean and sd of a coordinate."""
+
+    bounds: dict[str, tuple[float, float]]
+    priors: dict[str, tuple[float, float]]
+
+    def range(self, names: Coordinates) -> FloatArray:
+        """Lower and upper bounds of coordinates, (2, k)."""
+        logs = [[math.log(end) if name in LOGARITHMIC else end for end in self.bounds[name]] for name in names]
+        return np.array(logs, dtype=np.float64).reshape(-1, 2).T
+
+    def log_prior(self, arm: Arm, names: Coordinates) -> float:
+        """Logarithm of the prior density, but for a constant."""
+        return -0.5 * sum(
+            ((arm.coordinate(name) - self.priors[name][0]) / self.priors[name][1]) ** 2
+            for name in names
+            if name in self.priors
+        )
+
+
+class Fit(NamedTuple):
+    """An arm that was fitted.
+
+    Attributes:
+        arm: The arm.
+        log_posterior: With the biases at their best.
+        information: Of the coordinates that were varied, the biases being at their best, (k, k).
+    """
+
+    arm: Arm
+    log_posterior: float
+    information: FloatArray
+
+
+class Measured:
+    """All recordings of an axis, as a function of the arm and the rest."""
+
+    def __init__(self, recordings: Sequence[Recording], period: float) -> None:
+        """Of an axis whose update period is ``period`` [s]."""
+        self.recordings, self.period = recordings, period
+        self.count = int(sum(one.weight.sum() for one in recordings))
+        self.sources = sorted({int(one) for part in recordings for one in np.unique(part.source)})
+        reach = max((float(np.ptp(one.value)) for one in recordings if len(one.value)), default=0.0)
+        self._offset = _FAR * max(reach, 1e-6)
+
+    def where(self, weights: Sequence[FloatArray]) -> Measured:
+        """With other weights of the measurements."""
+        parts = [one._replace(weight=weight) for one, weight in zip(self.recordings, weights, strict=True)]
+        return Measured(parts, self.period)
+
+    def responses(self, arm: Arm) -> list[FloatArray]:
+        """The response of each recording [m], relative to its start."""
+        return [self._response(one, arm) for one in self.recordings]
+
+    def residuals(self, arm: Arm) -> list[FloatArray]:
+        """What an arm leaves of each recording [m]."""
+        return [one.value - moved for one, moved in zip(self.recordings, self.responses(arm), strict=True)]
+
+    def whitened(self, rest: Rest, columns: Sequence[FloatArray]) -> tuple[FloatArray, float]:
+        """Columns (c, m) of each recording, one recording after the other, whitened; and the sum of log S."""
+        found, log_determinant = list[FloatArray](), 0.0
+        for one, some in zip(self.recordings, columns, strict=True):
+            white, log = self._white(one, rest, some)
+            found.append(white)
+            log_determinant += log
+        return np.concatenate(found, axis=1), log_determinant
+
+    def weighed(self, arms: Sequence[Arm], rest: Rest, limits: Limits | None = None) -> tuple[FloatArray, FloatArray]:
+        """The log-likelihood of each arm with its best gain, and that gain; for ``limits`` of None the gain is given.
+
+        Returns:
+            Both, (n,).
+        """
+        records = np.concatenate([record_of(arm.model, self.period, arm.delay, 0.0) for arm in arms])
+        c = len(self.sources)  # the measurements, and for each sensor but the first whether it is that
+        products, own, log_determinant = np.zeros((len(arms), 2, 2 + c)), np.zeros((c, c)), 0.0
+        for one in self.recordings:
+            white, log = self._white(one, rest, self._columns(one))
+            own, log_determinant = own + white @ white.T, log_determinant + log
+            found, variance = np.empty_like(products), self._variance(one, rest)
+            records["start"] = one.start
+            library.pf_weigh(
+                at(self._noise(rest)), len(one.time), at(one.time), at(variance), c, at(white), len(one.given),
+                at(one.given), at(one.command), len(arms), at(records), at(found),
+            )  # fmt: skip
+            products += found
+        plain, more = products[:, 0], products[:, 1]
+        left = np.zeros((len(arms), 1 + c, 1 + c))  # products of what the plain response leaves, gain, and biases
+        left[:, 0, 0] = own[0, 0] - 2.0 * plain[:, 2] + plain[:, 0]
+        left[:, 0, 1] = left[:, 1, 0] = more[:, 2] - plain[:, 1]
+        left[:, 1, 1] = more[:, 1]
+        left[:, 2:, 2:] = own[1:, 1:]
+        left[:, 0, 2:] = left[:, 2:, 0] = own[0, 1:] - plain[:, 3:]
+        left[:, 1, 2:] = left[:, 2:, 1] = more[:, 3:]
+        free = [*range(1, 1 + c)]
+        if limits is None:
+            given = np.array([arm.gain for arm in arms]) - 1.0
+            left[:, 0, 0] += given * (given * left[:, 1, 1] - 2.0 * left[:, 0, 1])
+            left[:, 0, 2:] -= given[:, None] * left[:, 1, 2:]
+            left[:, 2:, 0] = left[:, 0, 2:]
+            free = free[1:]
+        else:
+            mean, sd = limits.priors.get("gain", (1.0, math.inf))
+            left[:, 1, 1] += 1.0 / sd**2
+            left[:, 0, 1] += (mean - 1.0) / sd**2
+            left[:, 1, 0] = left[:, 0, 1]
+        inner = left[:, free][:, :, free] + 1e-12 * np.eye(len(free)) * np.maximum(left[:, free, free], 1e-300)[:, None]
+        best = np.linalg.solve(inner, left[:, free, 0][:, :, None])[:, :, 0] if free else np.zeros((len(arms), 0))
+        squares = left[:, 0, 0] - np.einsum("ni,ni->n", best, left[:, free, 0])
+        gain = 1.0 + best[:, 0] if limits is not None else np.array([arm.gain for arm in arms])
+        return -0.5 * (np.maximum(squares, 0.0) + log_determinant + self.count * _LOG_2PI), gain
+
+    def fitted(self, start: Arm, names: Coordinates, rest: Rest, limits: Limits) -> Fit:
+        """The arm of the highest posterior near another one, by Gauss and Newton."""
+        low, high = limits.range(names)
+        reach = np.where([name in LOGARITHMIC for name in names], _REACH[1], _REACH[0])
+        arm = start.moved(names, np.clip([start.coordinate(name) for name in names], low, high).tolist())
+        best = self._linear(arm, names, rest, limits)
+        for _ in range(_STEPS if names else 0):
+            here = np.array([best.arm.coordinate(name) for name in names])
+            for damping in _DAMPINGS:
+                step = _step(best, np.maximum(low - here, -reach), np.minimum(high - here, reach), damping)
+                trial = self._linear(best.arm.moved(names, (here + step).tolist()), names, rest, limits)
+                if trial.log_posterior > best.log_posterior:
+                    break
+            else:
+                break
+            gained = trial.log_posterior - best.log_posterior
+            best = trial
+            if gained < _CLOSE:
+                break
+        return Fit(best.arm, best.log_posterior, best.information)
+
+    def _linear(self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits) -> _Linear:
+        """Posterior, score and information at an arm."""
+        moved = [self._derivatives(one, arm, names) for one in self.recordings]
+        columns = [
+            np.vstack([one.value - rows[0], rows[1:], self._columns(one)[1:]])
+            for one, rows in zip(self.recordings, moved, strict=True)
+        ]
+        white, log_determinant = self.whitened(rest, columns)
+        k = len(names)
+        left, slopes, others = white[0], white[1 : 1 + k], white[1 + k :]
+        if len(others):
+            basis = np.linalg.qr(others.T)[0]
+            left, slopes = left - basis @ (left @ basis), slopes - (slopes @ basis) @ basis.T
+        information, score = slopes @ slopes.T, slopes @ left
+        for place, name in enumerate(names):
+            if name in limits.priors:
+                mean, sd = limits.priors[name]
+                information[place, place] += 1.0 / sd**2
+                score[place] -= (arm.coordinate(name) - mean) / sd**2
+        log = -0.5 * (float(left @ left) + log_determinant + self.count * _LOG_2PI)
+        return _Linear(arm, log + limits.log_prior(arm, names), score, information)
+
+    def _derivatives(self, one: Recording, arm: Arm, names: Coordinates) -> FloatArray:
+        """The response, and how it changes with each coordinate, (1 + k, m)."""
+        here, rows = self._response(one, arm), list[FloatArray]()
+        for name in names:
+            step = _LOG_SHIFT if name in LOGARITHMIC else _SHIFT
+            if name == "gain":
+                step = 1.0  # it is linear
+            there = arm.moved([name], [arm.coordinate(name) + step])
+            rows.append((self._response(one, there) - here) / step)
+        return np.array([here, *rows])
+
+    def _columns(self, one: Recording) -> FloatArray:
+        """The measurements, and for each sensor but the first which are its, (s, m)."""
+        return np.array([one.value, *((one.source == other).astype(np.float64) for other in self.sources[1:])])
+
+    def _response(self, one: Recording, arm: Arm) -> FloatArray:
+        record, position = record_of(arm.model, self.period, arm.delay, one.start), np.empty(len(one.time))
+        library.pf_response(
+            at(record), len(one.given), at(one.given), at(one.command), len(one.time), at(one.time), at(position)
+        )
+        return position
+
+    def _variance(self, one: Recording, rest: Rest) -> FloatArray:
+        places = np.searchsorted(self.sources, one.source)
+        return np.where(one.weight > 0.0, np.square(rest.sd)[places], np.inf)
+
+    def _noise(self, rest: Rest) -> Record:
+        found = np.zeros(1, _NOISE)
+        found[0] = rest.walk, self._offset, rest.disturbance_sd, rest.disturbance_time, rest.smoothness
+        return found
+
+    def _white(self, one: Recording, rest: Rest, columns: FloatArray) -> tuple[FloatArray, float]:
+        noise, variance, white, log = self._noise(rest), self._variance(one, rest), np.empty_like(columns), np.empty(1)
+        library.pf_whiten(
+            at(noise), len(one.time), at(one.time), at(variance), len(columns), at(columns), at(white), at(log)
+        )
+        return white, float(log[0])
+
+
+class _Linear(NamedTuple):
+    """An arm with its log-posterior, and score and information of the coordinates."""
+
+    arm: Arm
+    log_posterior: float
+    score: FloatArray
+    information: FloatArray
+
+
+def _step(at_: _Linear, low: FloatArray, high: FloatArray, damping: float) -> FloatArray:
+    """A step of Gauss and Newton between bounds: what is beyond one goes there, the others follow."""
+    size = np.sqrt(np.maximum(np.diag(at_.information), 1e-12))
+    matrix = at_.information / np.outer(size, size) + (1e-9 + damping) * np.eye(len(size))
+    step, free = np.zeros(len(size)), np.ones(len(size), dtype=np.bool_)
+    for _ in range(len(size)):
+        wanted = at_.score / size - matrix @ (size * np.where(free, 0.0, step))
+        step[free] = np.linalg.solve(matrix[np.ix_(free, free)], wanted[free]) / size[free]
+        beyond = free & ((step < low) | (step > high))
+        step = np.clip(step, low, high)
+        if not beyond.any() or not (free & ~beyond).any():
+            break
+        free &= ~beyond
+    return step
+
+
+# ---- the rest -------------------------------------------------------------------------------------------------------
+
+
+def rests(
+    measured: Measured, arm: Arm, start: Rest, quickest: float, least: Sequence[float], prior: float | None = None
+) -> Iterator[tuple[Rest, float]]:
+    """The most likely rest that an arm leaves, without a disturbance and with one of each kind.
+
+    Args:
+        measured: The measurements.
+        arm: The arm.
+        start: Where to begin; its noise of the sensors is the mean of their prior, if they have one.
+        quickest: The shortest time of a disturbance that is believed [s].
+        least: The least noise of each sensor [m].
+        prior: The sd of the logarithm of the sensors' noise; None: the measurements alone decide.
+
+    Yields:
+        Each with its log-posterior.
+    """
+    from scipy.optimize import minimize
+
+    left = [one[None] for one in measured.residuals(arm)]
+    spread = max(float(np.std(np.concatenate([one[0] for one in left]))), 1e-7)
+    means = np.log(np.maximum(start.sd, least))
+    s = len(means)
+
+    def rest_of(x: FloatArray, smoothness: float | None) -> Rest:
+        sd, walk, *disturbance = np.split(np.exp(x), [s, s + 1]) if smoothness is None else np.split(np.exp(x), [s, s + 1, s + 2])
+        found = Rest(sd, float(walk[0]))
+        if smoothness is None:
+            return found
+        return replace(found, disturbance_sd=float(disturbance[0][0]), disturbance_time=float(disturbance[1][0]), smoothness=smoothness)
+
+    for smoothness in (None, 1.5, 0.5):
+        begin = [*means, math.log(max(start.walk, 0.1 * spread))]
+        bounds = [(math.log(max(one, _SDS[0])), math.log(_SDS[1])) for one in least] + [tuple(np.log(_WALKS))]
+        if smoothness is not None:
+            begin = [*means, math.log(0.01 * spread), math.log(0.7 * spread), math.log(_TIME)]
+            bounds += [tuple(np.log(_SDS)), (math.log(quickest), math.log(_TIMES[1]))]
+
+        def cost(x: FloatArray, smoothness: float | None = smoothness) -> float:
+            white, log_determinant = measured.whitened(rest_of(x, smoothness), left)
+            found = 0.5 * (float(np.vdot(white, white)) + log_determinant + measured.count * _LOG_2PI)
+            return found + (0.5 * float(np.sum(((x[:s] - means) / prior) ** 2)) if prior else 0.0)
+
+        solve: Any = minimize
+        found = solve(cost, np.array(begin), method="L-BFGS-B", bounds=bounds, options={"ftol": 5e-6, "eps": 1e-4})
+        yield rest_of(found.x, smoothness), -float(found.fun)
