@@ -10,24 +10,25 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ..arrays import FloatArray
-from .arms import LOGARITHMIC, Arm, Coordinates, Fit, Limits, Measured, Rest, rests
+from ..fusion.config import FusionConfig, Process
+from .arms import Arm, Coordinates, Fit, Limits, Measured, Rest, rests
+from .parameters import changed, rounded
+from .plain import LAGS, LATEST, delays, plain_arm
 from .posterior import SHORTEST, AxisPosterior, Branch, Entry, GainKind, Model, Quantity
 
-LONGEST_DELAY, _DELAYS = 0.6, 61  # s, or five update periods: the longest dead time; how many are looked at
-_LAGS = np.geomspace(1e-3, 2.0, 14)  # s, of a plant
 BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": (0.02, 0.5), "gain": (0.7, 1.3)}  # recovery [s]
 # A gain is 1 within a tenth. What is sold as an axis neither rings for ever nor has two lags far apart.
 PRIORS = {"gain": (1.0, 0.1), "damping": (0.0, 0.7)}
 _LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each as likely
 _STARTS = 3  # maxima of the grid from which an arm is fitted
 _NEAR = 20.0  # log-likelihood behind the best, up to which a maximum of the grid is looked at
-_OUTLIER = 8.0  # times the median distance from the best arm: what is farther does not count
-_SHARE, _PART = 0.98, 0.5  # of the measurements
+_GATED = 2  # times: outliers widen the noise by which they are told
+_GATE = 6.0  # standard deviations, from which a measurement does not count
 _EARLIER, _DAMPED = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no dead time, ζ
 _ERRORS, _RECOVERING = (-0.12, -0.05, 0.05), (0.05, 0.12, 0.3)  # starts: gains less 1, recoveries [s]
 _WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten, as most real arms come back
@@ -77,61 +78,83 @@ class Freedom(NamedTuple):
         return arm._replace(recovery=0.0, slope=0.0) if gain == "static" else arm._replace(slope=self.given.slope)
 
 
-def axis_posterior(
-    measured: Measured,
-    freedom: Freedom,
-    noise: Rest,
-    least: Sequence[float],
-    prior: float | None = None,
-) -> AxisPosterior:
-    """The posterior of an axis's arm.
-
-    Args:
-        measured: The measurements of the axis.
-        freedom: What is to be found.
-        noise: What an arm is believed to leave.
-        least: The least noise of each sensor [m].
-        prior: The sd of the logarithm of the sensors' noise about that in ``noise``; None: it is not believed.
-    """
-    search = ArmSearch(measured, freedom)
-    peaks = search.peaks(noise, least, prior)
-    best = peaks[0][0]
-    branches: list[Branch] = []
-    for evidence, model, peak in peaks:
-        if evidence > best - _FORLORN and not _walked(branches, model, peak.arm.delay):
-            highest = max((float(one.log_density.max()) for one in branches), default=-np.inf)
-            branches.append(search.walk(model, peak, highest - _FORLORN))
-    return AxisPosterior(branches, search.rest)
-
-
-def _walked(branches: Sequence[Branch], model: Model, delay: float) -> bool:
-    return any(one.model == model and one.delays[0] <= delay <= one.delays[-1] for one in branches)
-
-
 class ArmSearch:
-    """Maxima of each model of an axis, and the walk from one along the dead time.
+    """The arms of an axis: maxima of each model, and the walk from one along the dead time.
 
     Attributes:
-        rest: What the best arm leaves; white noise of 1 m at first: least squares.
+        plain: The arm of least squares; None where nothing moves.
+        rest: What the best arm leaves.
+        posterior: All models that count, along their dead times.
     """
 
-    def __init__(self, measured: Measured, freedom: Freedom) -> None:
-        longest = max(LONGEST_DELAY, 5.0 * measured.period)
-        self._measured, self._freedom, self._longest = measured, freedom, longest
-        self._limits = Limits({"delay": (0.0, longest), **BOUNDS}, PRIORS)
-        self.rest = Rest(np.ones(len(measured.sources)))
+    def __init__(
+        self,
+        measured: Measured,
+        freedom: Freedom,
+        noise: Rest,
+        least: Sequence[float],
+        prior: float | None = None,
+    ) -> None:
+        """Search.
 
-    def peaks(self, noise: Rest, least: Sequence[float], prior: float | None) -> list[tuple[float, Model, Fit]]:
+        Args:
+            measured: The measurements of the axis.
+            freedom: What is to be found.
+            noise: What an arm is believed to leave.
+            least: The least noise of each sensor [m].
+            prior: The sd of the logarithm of the sensors' noise about that in ``noise``; None: it is not believed.
+        """
+        self._measured, self._freedom = measured, freedom
+        self._longest = max(LATEST, 5.0 * measured.period)
+        self._limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
+        self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sources)))  # at first: least squares
+        peaks, branches = self._peaks(noise, least, prior), list[Branch]()
+        for evidence, model, peak in peaks:
+            walked = (one for one in branches if one.model == model)
+            if evidence > peaks[0][0] - _FORLORN and not any(
+                one.delays[0] <= peak.arm.delay <= one.delays[-1] for one in walked
+            ):
+                highest = max((float(one.log_density.max()) for one in branches), default=-np.inf)
+                branches.append(self._walk(model, peak, highest - _FORLORN))
+        self.posterior = AxisPosterior(branches)
+
+    def arm(self, model: Model, delay: float | None = None) -> Arm:
+        """The most likely arm of a model; the one with this dead time [s]."""
+        entries = [one for branch in self.posterior.branches if branch.model == model for one in branch.entries]
+        if delay is None:
+            return max(entries, key=lambda one: one.log_density).arm
+        near = min(entries, key=lambda one: abs(one.delay - delay)).arm._replace(delay=delay)
+        names = [name for name in self._freedom.names(model) if name != "delay"]
+        return self._measured.fitted(near, names, self.rest, self._limits).arm
+
+    def lag_scatter(self, model: Model, arm: Arm) -> float:
+        """How much more the lag scatters over pieces of the runs than the information says, 1 or more (White, 1982)."""
+        names = self._freedom.names(model)
+        low, high = self._limits.range(names)
+        at = np.array([arm.coordinate(name) for name in names])
+        free = [name for name, one in zip(names, (at > low + 1e-6) & (at < high - 1e-6), strict=True) if one]
+        slope = np.array(
+            [(arm.moved([name], [arm.coordinate(name) + _SLOPE]).total - arm.total) / _SLOPE for name in free]
+        )
+        if not slope.any():
+            return 1.0
+        information, scatter = self._measured.scattered(arm, free, self.rest, self._limits)
+        cov = _covariance(information)
+        return max(1.0, math.sqrt(float(slope @ cov @ scatter @ cov @ slope) / float(slope @ cov @ slope)))
+
+    # ---- maxima -----------------------------------------------------------------------------------------------------
+
+    def _peaks(self, noise: Rest, least: Sequence[float], prior: float | None) -> list[tuple[float, Model, Fit]]:
         """The maxima of every model with their evidence, the best first.
 
         By least squares at first: noise that is fitted to a poor arm explains what a better one would. Then with the
         noise that the best arm leaves; and an update period of dead time away.
         """
         models, period = self._freedom.models, self._measured.period
-        plain = self._on_grid(1)[0]
-        self._measured = self._measured.where(self._near(plain))
-        plain = self._on_grid(1)[0]
-        self.rest = self._likely_rest(plain, noise, least, prior)
+        begin = self._on_grid(1)[0]
+        for _ in range(_GATED):
+            self.rest = self._likely_rest(begin, noise, least, prior)
+            self._measured = self._measured.gated(begin, self.rest, _GATE)
         found = self._fitted(models, self._on_grid(_STARTS))
         self.rest = self._likely_rest(self._best(found).arm, self.rest, least, None)
         found = self._fitted(models, [self._best(found).arm], found)
@@ -148,27 +171,22 @@ class ArmSearch:
     def _on_grid(self, count: int) -> list[Arm]:
         """The arms of highest likelihood on a grid of first-order plants, no two of them neighbours."""
         given, free = self._freedom.given, self._freedom
-        delays = np.linspace(0.0, self._longest, _DELAYS) if free.delay else np.array([given.delay])
-        lags = _LAGS if free.plant else np.array([given.lag])
+        late = delays(self._measured) if free.delay else np.array([given.delay])
+        lags = LAGS if free.plant else np.array([given.lag])
         damping = 0.0 if free.plant else given.damping
-        arms = [given._replace(delay=d, lag=l, damping=damping) for d, l in product(delays.tolist(), lags.tolist())]
+        arms = [given._replace(delay=d, lag=lag, damping=damping) for d, lag in product(late.tolist(), lags.tolist())]
         varied = tuple(free.gains) != ("given",)
         if varied:
             arms = [self._freedom.shaped(arm, "static") for arm in arms]
         log, gain = self._measured.weighed(arms, self.rest, self._limits if varied else None)
-        table = log.reshape(len(delays), len(lags))
+        table = log.reshape(len(late), len(lags))
         around = np.pad(table, 1, constant_values=-np.inf)
-        highest = np.max([np.roll(around, shift, (0, 1)) for shift in product((-1, 0, 1), repeat=2)], axis=0)[1:-1, 1:-1]
+        highest = np.max([np.roll(around, shift, (0, 1)) for shift in product((-1, 0, 1), repeat=2)], axis=0)[
+            1:-1, 1:-1
+        ]
         summits = [int(one) for one in np.flatnonzero(table >= highest) if log[one] > log.max() - _NEAR]
         summits.sort(key=lambda one: -log[one])
         return [arms[one]._replace(gain=float(gain[one])) for one in summits[:count]]
-
-    def _near(self, arm: Arm) -> list[FloatArray]:
-        """Weights of 0 for measurements that are outliers beside an arm."""
-        left = self._measured.residuals(arm)
-        apart = [np.abs(one - np.median(one)) if len(one) else one for one in left]
-        limit = _OUTLIER * max(float(np.median(np.concatenate(apart))), 1e-9)
-        return [np.where(one <= limit, part.weight, 0.0) for one, part in zip(apart, self._measured.recordings, strict=True)]
 
     def _likely_rest(self, arm: Arm, start: Rest, least: Sequence[float], prior: float | None) -> Rest:
         """The most likely of what an arm leaves, after the penalty for its numbers."""
@@ -198,8 +216,9 @@ class ArmSearch:
         tried = [shaped for arm in arms for shaped in self._shapes(model, arm)]
         if len(tried) <= count:
             return tried
-        log, _ = self._measured.weighed(tried, self.rest)
-        return [tried[place] for place in np.argsort(-log)[:count].tolist()]
+        varied = "gain" in self._freedom.names(model)
+        log, gain = self._measured.weighed(tried, self.rest, self._limits if varied else None)
+        return [tried[place]._replace(gain=float(gain[place])) for place in np.argsort(-log)[:count].tolist()]
 
     def _shapes(self, model: Model, arm: Arm) -> Iterator[Arm]:
         """Arms of a model that are as late as another one."""
@@ -273,7 +292,7 @@ class ArmSearch:
 
     # ---- the walk ---------------------------------------------------------------------------------------------------
 
-    def walk(self, model: Model, peak: Fit, least: float) -> Branch:
+    def _walk(self, model: Model, peak: Fit, least: float) -> Branch:
         """The entries of a model about a maximum, until they count for nothing or less than ``least``."""
         names = self._freedom.names(model)
         if not self._freedom.delay:
@@ -322,6 +341,21 @@ class ArmSearch:
             slope = np.array([(one[quantity] - mean) / _SLOPE for one in moved])
             sds[quantity] = math.sqrt(max(float(slope @ cov @ slope), 0.0)) if free else 0.0
         return Entry(fit.arm.delay, fit.arm, self._laplace(fit, names, inside), means, sds)
+
+
+def with_rest(config: FusionConfig, axis: str, rest: Rest, sensors: Sequence[str]) -> FusionConfig:
+    """The configuration with what an arm leaves of an axis as its noise."""
+    kind: Literal["matern", "ou"] = "matern" if rest.smoothness > 1.0 else "ou"
+    process = Process(
+        input_noise=0.0,
+        drift=rounded(rest.walk),
+        disturbance_sd=rounded(rest.disturbance_sd),
+        disturbance_time=rounded(rest.disturbance_time),
+        disturbance_kind=kind,
+    )
+    for name, sd in zip(sensors, rest.sd.tolist(), strict=True):
+        config = changed(config, ("sensors", name, "sd", axis), rounded(sd))
+    return changed(config, ("process", axis), process)
 
 
 def _covariance(information: FloatArray) -> FloatArray:

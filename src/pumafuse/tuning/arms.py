@@ -20,15 +20,19 @@ from ..filter.response import record_of
 from ..model.arm import AxisModel, Gain
 from ..model.plants import FirstOrder, SecondOrder
 
-_NOISE = np.dtype([(name, np.float64) for name in ("walk", "offset_sd", "disturbance_sd", "disturbance_time", "smoothness")])
+_NOISE = np.dtype(
+    [(name, np.float64) for name in ("walk", "offset_sd", "disturbance_sd", "disturbance_time", "smoothness")]
+)
 _FAR = 30.0  # times all that is measured: where an offset may begin
 _WALKS, _SDS = (1e-8, 10.0), (1e-8, 10.0)  # m/√s, m: bounds
 _TIME, _TIMES = 0.3, (1e-3, 1e3)  # s, of a disturbance: start, bounds
-_CLOSE = 0.02  # log-likelihood: what is less is no progress
+_PIECES = 20  # of all recordings, that a model which is right has independent scores in
+_SETTLED = 2.6  # s, after which an arm has forgotten earlier commands
+_CLOSE = 5e-3  # log-likelihood: what is expected to gain less is no step
 _STEPS = 12  # of Gauss and Newton, at most
 _SHIFT, _LOG_SHIFT = 1e-4, 1e-3  # s, 1: by which responses are varied; delays are coarser than a nanosecond's rounding
-_REACH = np.array([0.03, 0.7])  # longest step of a delay [s], of a logarithm
-_DAMPINGS = (0.0, 1e-2, 1.0, 1e2)  # of a step that fails, one after the other
+_REACH = {"delay": 0.03, "lag": 0.7, "damping": 0.7, "recovery": 0.7, "gain": 1.0}  # longest step of each coordinate
+_DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the other
 _LOG_2PI = math.log(2.0 * math.pi)
 
 Coordinates: TypeAlias = Sequence[str]  # among the fields below
@@ -177,10 +181,42 @@ class Measured:
         reach = max((float(np.ptp(one.value)) for one in recordings if len(one.value)), default=0.0)
         self._offset = _FAR * max(reach, 1e-6)
 
-    def where(self, weights: Sequence[FloatArray]) -> Measured:
-        """With other weights of the measurements."""
-        parts = [one._replace(weight=weight) for one, weight in zip(self.recordings, weights, strict=True)]
+    def left(self, arm: Arm) -> FloatArray:
+        """What an arm leaves of the measurements that count, of each recording about its mean [m]."""
+        parts = [
+            one[part.weight > 0.0]
+            for one, part in zip(self.residuals(arm), self.recordings, strict=True)
+            if part.weight.any()
+        ]
+        return np.concatenate([one - one.mean() for one in parts] or [np.zeros(0)])
+
+    @property
+    def power(self) -> float:
+        """The sum of squares of all that is measured [m²], of each recording about its mean."""
+        return sum(float(np.var(one.value) * len(one.value)) for one in self.recordings if len(one.value))
+
+    def without_far_from(self, arm: Arm, times: float) -> Measured:
+        """Without measurements so many times as far off an arm as half of them are."""
+        apart = [np.abs(one - np.median(one)) if len(one) else one for one in self.residuals(arm)]
+        limit = times * max(float(np.median(np.concatenate(apart))), 1e-9)
+        parts = [
+            one._replace(weight=np.where(far <= limit, one.weight, 0.0))
+            for one, far in zip(self.recordings, apart, strict=True)
+        ]
         return Measured(parts, self.period)
+
+    def gated(self, arm: Arm, rest: Rest, gate: float) -> Measured:
+        """Without measurements whose innovation beside an arm is beyond so many standard deviations."""
+        left, parts = self.residuals(arm), list[Recording]()
+        for one, mine in zip(self.recordings, left, strict=True):
+            white, _ = self._white(one, rest, mine[None])
+            parts.append(one._replace(weight=np.where(np.abs(white[0]) <= gate, one.weight, 0.0)))
+        return Measured(parts, self.period)
+
+    def excerpt(self, commands: int, rows: int) -> Measured:
+        """The part of each recording with the most motion, and some of its measurements, evenly."""
+        parts = [_liveliest(one, commands) for one in self.recordings]
+        return Measured([one.of(slice(None, None, len(one.time) // rows + 1)) for one in parts], self.period)
 
     def responses(self, arm: Arm) -> list[FloatArray]:
         """The response of each recording [m], relative to its start."""
@@ -247,37 +283,36 @@ class Measured:
     def fitted(self, start: Arm, names: Coordinates, rest: Rest, limits: Limits) -> Fit:
         """The arm of the highest posterior near another one, by Gauss and Newton."""
         low, high = limits.range(names)
-        reach = np.where([name in LOGARITHMIC for name in names], _REACH[1], _REACH[0])
+        reach = np.array([_REACH[name] for name in names])
         arm = start.moved(names, np.clip([start.coordinate(name) for name in names], low, high).tolist())
         best = self._linear(arm, names, rest, limits)
         for _ in range(_STEPS if names else 0):
             here = np.array([best.arm.coordinate(name) for name in names])
             for damping in _DAMPINGS:
                 step = _step(best, np.maximum(low - here, -reach), np.minimum(high - here, reach), damping)
-                trial = self._linear(best.arm.moved(names, (here + step).tolist()), names, rest, limits)
-                if trial.log_posterior > best.log_posterior:
+                expected = float(best.score @ step) - 0.5 * float(step @ best.information @ step)
+                trial = best.arm.moved(names, (here + step).tolist())
+                if expected < _CLOSE or self._linear(trial, [], rest, limits, names).log_posterior > best.log_posterior:
                     break
             else:
                 break
-            gained = trial.log_posterior - best.log_posterior
-            best = trial
-            if gained < _CLOSE:
+            if expected < _CLOSE:
                 break
+            best = self._linear(trial, names, rest, limits)
         return Fit(best.arm, best.log_posterior, best.information)
 
-    def _linear(self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits) -> _Linear:
-        """Posterior, score and information at an arm."""
-        moved = [self._derivatives(one, arm, names) for one in self.recordings]
-        columns = [
-            np.vstack([one.value - rows[0], rows[1:], self._columns(one)[1:]])
-            for one, rows in zip(self.recordings, moved, strict=True)
-        ]
-        white, log_determinant = self.whitened(rest, columns)
-        k = len(names)
-        left, slopes, others = white[0], white[1 : 1 + k], white[1 + k :]
-        if len(others):
-            basis = np.linalg.qr(others.T)[0]
-            left, slopes = left - basis @ (left @ basis), slopes - (slopes @ basis) @ basis.T
+    def scattered(self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits) -> tuple[FloatArray, FloatArray]:
+        """The information of coordinates, and what it is by the scatter of the score over pieces of the recordings."""
+        left, slopes, _ = self._sloped(arm, names, rest)
+        begins = np.unique(np.arange(_PIECES) * len(left) // _PIECES)
+        scores = np.add.reduceat(slopes * left, begins, axis=1)
+        return self._linear(arm, names, rest, limits).information, scores @ scores.T
+
+    def _linear(
+        self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits, believed: Coordinates | None = None
+    ) -> _Linear:
+        """Posterior, score and information at an arm; with the priors of other coordinates where ``believed`` is."""
+        left, slopes, log_determinant = self._sloped(arm, names, rest)
         information, score = slopes @ slopes.T, slopes @ left
         for place, name in enumerate(names):
             if name in limits.priors:
@@ -285,7 +320,21 @@ class Measured:
                 information[place, place] += 1.0 / sd**2
                 score[place] -= (arm.coordinate(name) - mean) / sd**2
         log = -0.5 * (float(left @ left) + log_determinant + self.count * _LOG_2PI)
-        return _Linear(arm, log + limits.log_prior(arm, names), score, information)
+        return _Linear(arm, log + limits.log_prior(arm, believed or names), score, information)
+
+    def _sloped(self, arm: Arm, names: Coordinates, rest: Rest) -> tuple[FloatArray, FloatArray, float]:
+        """What an arm leaves and how it changes with each coordinate, whitened, without biases; the sum of log S."""
+        moved = [self._derivatives(one, arm, names) for one in self.recordings]
+        columns = [
+            np.vstack([one.value - rows[0], rows[1:], self._columns(one)[1:]])
+            for one, rows in zip(self.recordings, moved, strict=True)
+        ]
+        white, log_determinant = self.whitened(rest, columns)
+        left, slopes, others = np.split(white, [1, 1 + len(names)])
+        if len(others):
+            basis = np.linalg.qr(others.T)[0]
+            left, slopes = left - (left @ basis) @ basis.T, slopes - (slopes @ basis) @ basis.T
+        return left[0], slopes, log_determinant
 
     def _derivatives(self, one: Recording, arm: Arm, names: Coordinates) -> FloatArray:
         """The response, and how it changes with each coordinate, (1 + k, m)."""
@@ -324,6 +373,20 @@ class Measured:
             at(noise), len(one.time), at(one.time), at(variance), len(columns), at(columns), at(white), at(log)
         )
         return white, float(log[0])
+
+
+def _liveliest(one: Recording, most: int) -> Recording:
+    """The part with the most motion, without what the commands before it still do."""
+    if len(one.given) <= most:
+        return one
+    ends = np.append(np.arange(0, len(one.given) - most, most // 2), len(one.given) - most)
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(one.command))))
+    first = int(max(ends, key=lambda end: way[end + most - 1] - way[end]))
+    given, command = one.given[first : first + most], one.command[first : first + most]
+    since = given[0] + round(_SETTLED * 1e9) * (first > 0)
+    part = one.of((one.time >= since) & (one.time <= given[-1]))
+    start = float(command[0])
+    return part._replace(given=given, command=command, start=start, value=part.value + one.start - start)
 
 
 class _Linear(NamedTuple):
@@ -378,11 +441,18 @@ def rests(
     s = len(means)
 
     def rest_of(x: FloatArray, smoothness: float | None) -> Rest:
-        sd, walk, *disturbance = np.split(np.exp(x), [s, s + 1]) if smoothness is None else np.split(np.exp(x), [s, s + 1, s + 2])
+        sd, walk, *disturbance = (
+            np.split(np.exp(x), [s, s + 1]) if smoothness is None else np.split(np.exp(x), [s, s + 1, s + 2])
+        )
         found = Rest(sd, float(walk[0]))
         if smoothness is None:
             return found
-        return replace(found, disturbance_sd=float(disturbance[0][0]), disturbance_time=float(disturbance[1][0]), smoothness=smoothness)
+        return replace(
+            found,
+            disturbance_sd=float(disturbance[0][0]),
+            disturbance_time=float(disturbance[1][0]),
+            smoothness=smoothness,
+        )
 
     for smoothness in (None, 1.5, 0.5):
         begin = [*means, math.log(max(start.walk, 0.1 * spread))]
@@ -397,5 +467,5 @@ def rests(
             return found + (0.5 * float(np.sum(((x[:s] - means) / prior) ** 2)) if prior else 0.0)
 
         solve: Any = minimize
-        found = solve(cost, np.array(begin), method="L-BFGS-B", bounds=bounds, options={"ftol": 5e-6, "eps": 1e-4})
+        found = solve(cost, np.array(begin), method="SLSQP", bounds=bounds, options={"ftol": 1e-3, "eps": 1e-4})
         yield rest_of(found.x, smoothness), -float(found.fun)

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections import deque
-from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,10 +27,11 @@ from ..model.arm import ArmModel, AxisModel
 from ..model.plants import FirstOrder
 from ..toml import Interval
 from ..units import MS
+from .arm_search import BOUNDS, ArmSearch, Freedom, with_rest
+from .arms import Arm, Rest
 from .identifiability import TuneError, covariance, excited_axes
-from .intervals import lag_slopes
-from .likelihood import Derivatives, Likelihood
-from .maximise import Point, derivatives, maximise, past_bumps, point
+from .likelihood import Derivatives, Likelihood, in_threads
+from .maximise import derivatives, maximise, past_bumps, point
 from .parameters import (
     LATENCIES,
     Parameter,
@@ -43,23 +39,11 @@ from .parameters import (
     moved,
     parameters,
     rounded,
-    with_axis_of,
     with_own_delays,
     with_shared_delay,
 )
-from .plain import Doubt, doubts, with_plain_arm
-from .posterior import (
-    INTERCEPTS,
-    AxisPosterior,
-    Mixture,
-    Model,
-    Quantity,
-    axis_posterior,
-    chosen_model,
-    fitted_with,
-    shared_delay,
-    sharing,
-)
+from .plain import Doubt, doubts, with_arm, with_plain_arm
+from .posterior import Mixture, Model, Quantity, chosen_model, shared_delay, sharing
 
 REFERENCE = "reference"  # the name of a run's reference among its sensors
 _MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/comparison.md
@@ -225,13 +209,6 @@ class Latency:
         return msgspec.json.format(msgspec.json.Encoder(decimal_format="number").encode(tree), indent=2).decode() + "\n"
 
 
-class _Fit(NamedTuple):
-    """One axis: its likelihood and its posterior."""
-
-    likelihood: Likelihood
-    posterior: AxisPosterior
-
-
 def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     """Tell how late each axis is behind its commands, and each sensor behind another, from recorded motion alone.
 
@@ -252,20 +229,18 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     every = [_with_reference(run) for run in ([runs] if isinstance(runs, Run) else runs)]
     if not every:
         raise TuneError("no run to look at")
-    with _workers(len({axis for run in every for axis in run.command.values})) as workers:
-        surveys = [Survey(Path(run.name), run, relations(run)) for run in sorted(every, key=_motion, reverse=True)]
-        config = first_guess(surveys)
-        trusted = _trusted(config, every, sensor)
-        likelihood = Likelihood(every, _known(config, trusted), [trusted])
-        moving = excited_axes(likelihood, likelihood.config)
-        parts = {axis: likelihood.of_axis(axis) for axis in moving}
-        posteriors = _posteriors(parts, likelihood.config, workers)
-    fits = {axis: _Fit(parts[axis], one) for axis, one in posteriors.items()}
-    config, lags = _arm(likelihood, fits, trusted)
-    for axis, one in doubts(likelihood, config, lags).items():
+    surveys = [Survey(Path(run.name), run, relations(run)) for run in sorted(every, key=_motion, reverse=True)]
+    config = first_guess(surveys)
+    trusted = _trusted(config, every, sensor)
+    likelihood = Likelihood(every, _with_right_stamps(config, trusted), [trusted])
+    moving = excited_axes(likelihood, likelihood.config)
+    found = dict(zip(moving, in_threads(lambda axis: _search(likelihood, axis), moving), strict=True))
+    _check_clock(found, trusted)
+    config, lags = _arm(likelihood.config, found, trusted)
+    for axis, one in doubts({axis: search.plain for axis, search in found.items()}, config).items():
         lags[axis] = _doubted(lags[axis], one, one.sentence(config, axis))
         if one.refutes:
-            config = with_plain_arm(config, axis, one.arm)
+            config = with_plain_arm(config, axis, one.plain.arm)
     best, sensors = _sensors(every, config, trusted, moving)
     lags, clock = _with_courses(likelihood, config, lags)
     still = [axis for axis in config.arm.axes if axis not in moving]
@@ -380,103 +355,51 @@ def _trusted(config: FusionConfig, runs: Sequence[Run], asked: str | None) -> st
     return min(config.sensors, key=rank)
 
 
-def _known(config: FusionConfig, trusted: str) -> FusionConfig:
-    """The configuration with the trusted sensor's stamps right, and the others' latencies as much shorter.
-
-    Raises:
-        TuneError: It moves before its commands.
-    """
+def _with_right_stamps(config: FusionConfig, trusted: str) -> FusionConfig:
+    """The configuration with the trusted sensor's stamps right, and the others' latencies as much shorter."""
     late = config.sensors[trusted].latency
-    if late < -_AHEAD:
-        raise TuneError(
-            f"sensor '{trusted}' moves {-late * MS:.0f} ms before its commands: are both stamped by one clock?"
-        )
     for name, one in config.sensors.items():
         config = changed(config, ("sensors", name, "latency"), one.latency - late)
-    for axis in config.arm.axes:
-        delay = max(config.arm.delay_of(axis) + late, 0.0)  # where it seems to be ahead
-        config = changed(config, ("arm", "axes", axis, "delay"), delay)
     return config
 
 
 # ---- axes -----------------------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def _workers(axes: int) -> Generator[Sequence[Executor]]:
-    """Processes beside this one, a core each, that begin at once with what takes longest: importing this package."""
-    from joblib import cpu_count
-    from joblib.externals.loky import ProcessPoolExecutor
-
-    workers = [ProcessPoolExecutor(1) for _ in range(min(cpu_count(), axes) - 1)]
-    try:
-        for worker in workers:
-            worker.submit(import_module, __name__)
-        yield workers
-    except BrokenProcessPool:
-        raise TuneError("a worker process died (out of memory?): a shorter part, with --from and --to?") from None
-    finally:
-        for worker in workers:
-            worker.shutdown(kill_workers=True)
+def _search(likelihood: Likelihood, axis: str) -> ArmSearch:
+    """The arm of one axis."""
+    config, names = likelihood.config, likelihood.sensors[axis]
+    sd = np.array([config.sensors[name].sd_of(axis) for name in names], dtype=np.float64)
+    least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
+    return ArmSearch(likelihood.measured(axis, config), Freedom(Arm(0.0, 0.1)), Rest(sd), least)
 
 
-def _posteriors(
-    parts: Mapping[str, Likelihood], config: FusionConfig, workers: Sequence[Executor]
-) -> dict[str, AxisPosterior]:
-    """The posterior of each axis, by this process and the workers, each taking the next axis when it is ready."""
-    waiting, found = deque(parts), dict[str, AxisPosterior]()
+def _check_clock(found: Mapping[str, ArmSearch], trusted: str) -> None:
+    """Refuse a sensor that is ahead of the commands.
 
-    def take(run: Callable[[Likelihood, FusionConfig, str], AxisPosterior]) -> None:
-        with suppress(IndexError):
-            while True:
-                axis = waiting.popleft()
-                found[axis] = run(parts[axis], config, axis)
-
-    def feed(worker: Executor) -> None:
-        take(lambda mine, config, axis: worker.submit(axis_posterior, mine, config, axis).result())
-
-    threads = ThreadPoolExecutor(max(len(workers), 1))
-    try:
-        fed = [threads.submit(feed, worker) for worker in workers]
-        take(axis_posterior)
-        for one in fed:
-            one.result()
-    finally:
-        waiting.clear()
-        threads.shutdown(wait=False)
-    return {axis: found[axis] for axis in parts}
+    Raises:
+        TuneError: It moves before its commands.
+    """
+    ahead = [one.plain.ahead for one in found.values() if one.plain is not None]
+    if ahead and (late := float(np.median(ahead))) > _AHEAD:
+        raise TuneError(
+            f"sensor '{trusted}' moves {late * MS:.0f} ms before its commands: are both stamped by one clock?"
+        )
 
 
-def _arm(likelihood: Likelihood, fits: Mapping[str, _Fit], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:
-    """The arm of all axes, and the lag of each with its intervals."""
-    posteriors = {axis: one.posterior for axis, one in fits.items()}
+def _arm(config: FusionConfig, found: Mapping[str, ArmSearch], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:
+    """The arm of all axes with what it leaves, and the lag of each with its intervals."""
+    posteriors, lags = {axis: one.posterior for axis, one in found.items()}, dict[str, AxisLag]()
     shares = sharing(posteriors)
     delay = shared_delay([posteriors[axis] for axis in shares]) if shares else None
-    config, lags = likelihood.config, dict[str, AxisLag]()
-    for axis, fit in fits.items():
-        others = [posteriors[one] for one in shares if one != axis] if axis in shares else []
-
-        def elsewhere(delays: FloatArray, others: Sequence[AxisPosterior] = others) -> FloatArray:
-            return np.sum([one.log_density(delays) for one in others], axis=0) if others else np.zeros(len(delays))
-
-        mixture = fit.posterior.mixture(elsewhere)
+    for axis, search in found.items():
+        mixture = search.posterior.mixture([posteriors[one] for one in shares if axis in shares and one != axis])
         model = chosen_model(mixture)
-        best = fitted_with(fit.likelihood, likelihood.config, fit.posterior, model, delay if axis in shares else None)
-        free = parameters(
-            best.config, best.config, {axis: likelihood.sensors[axis]}, ["noise", "delay", "plant", "gain"]
-        )
-        config = with_axis_of(config, _rounded(best.config, [one for one in free if one.axis == axis]), axis)
-        lags[axis] = _axis_lag(fit.likelihood, best, mixture, model, axis, trusted, axis in shares)
-    if delay is not None:
-        config = with_shared_delay(config, shares, rounded(delay))
-    return config, lags
-
-
-def _rounded(config: FusionConfig, free: Sequence[Parameter]) -> FusionConfig:
-    """The configuration with numbers that can be read: more digits would only look exact."""
-    for one in free:
-        config = one.put(config, rounded(one.get(config)))
-    return config
+        arm = search.arm(model, delay if axis in shares else None)
+        arm = Arm(*(rounded(number) for number in arm))
+        config = with_rest(with_arm(config, axis, arm), axis, search.rest, [trusted])
+        lags[axis] = _axis_lag(search, arm, mixture, model, trusted, axis in shares)
+    return with_shared_delay(config, shares, rounded(delay)) if delay is not None else config, lags
 
 
 def _notes(one: AxisLag) -> list[str]:
@@ -495,7 +418,7 @@ def _notes(one: AxisLag) -> list[str]:
         )
     if one.gain_ci95 is not None and one.gain_ci95[1] - one.gain_ci95[0] > _WIDE_GAIN:
         found.append("the motion is too poor for the gain; record motion over more of the range")
-    if one.gain in INTERCEPTS:
+    if one.gain in BOUNDS["gain"]:
         found.append(
             f"the gain lies at the end of what is believed, {one.gain:g}: the arm is of a higher order than these"
             " models; the lag holds, the gain and its recovery mean little"
@@ -503,11 +426,7 @@ def _notes(one: AxisLag) -> list[str]:
     return found
 
 
-def _axis_lag(
-    likelihood: Likelihood, best: Point, mixture: Mixture, model: Model, axis: str, trusted: str, shared: bool
-) -> AxisLag:
-    arm, delay = best.config.arm.axes[axis], best.config.arm.delay_of(axis)
-
+def _axis_lag(search: ArmSearch, arm: Arm, mixture: Mixture, model: Model, trusted: str, shared: bool) -> AxisLag:
     def interval(quantity: Quantity, value: float, margin: float = _MARGIN) -> Interval:
         """Of the models like the chosen one; of a logarithm in the number itself."""
         log = quantity not in ("lag", "delay", "gain")
@@ -529,62 +448,47 @@ def _axis_lag(
             low = max(low, 0.0)
         return (math.exp(low), math.exp(high) if high < _HIGHEST else math.inf) if log else (low, high)
 
-    lag = best.config.arm.lag_of(axis)
+    plant = arm.model.plant
     found = AxisLag(
         sensor=trusted,
-        lag=lag,
-        lag_ci95=interval("lag", lag, _scattered(likelihood, best, axis)),
-        delay=delay,
-        delay_ci95=interval("delay", delay),
+        lag=arm.total,
+        lag_ci95=interval("lag", arm.total, search.lag_scatter(model, arm)),
+        delay=arm.delay,
+        delay_ci95=interval("delay", arm.delay),
         shared_delay=shared,
         plant="first-order" if model.order == 1 else "second-order",
-        gain=arm.gain.intercept,
-        gain_ci95=None if model.gain == "none" else interval("gain", arm.gain.intercept),
+        gain=arm.gain,
+        gain_ci95=None if model.gain == "given" else interval("gain", arm.gain),
     )
     values: dict[str, Any] = {}
     for name in ("time_constant", "natural_frequency", "damping"):
-        if (value := getattr(arm.plant, name, None)) is not None:
+        if (value := getattr(plant, name, None)) is not None:
             values |= {name: value, f"{name}_ci95": interval(name, value)}
-    if arm.gain_recovery is not None:
-        values |= {
-            "gain_recovery": arm.gain_recovery,
-            "gain_recovery_ci95": interval("gain_recovery", arm.gain_recovery),
-        }
+    if arm.recovery:
+        values |= {"gain_recovery": arm.recovery, "gain_recovery_ci95": interval("gain_recovery", arm.recovery)}
     found = msgspec.structs.replace(found, **values)
     return msgspec.structs.replace(found, notes=_notes(found))
 
 
 def _doubted(lag: AxisLag, doubt: Doubt, sentence: str) -> AxisLag:
     """The lag of an axis with an interval that covers what least squares says, or that of least squares instead."""
-    arm, (low, high) = doubt.arm, doubt.arm.lag_ci95
+    arm, (low, high) = doubt.plain.arm, doubt.plain.lag_ci95
     if not doubt.refutes:
         both = min(low, lag.lag_ci95[0]), max(high, lag.lag_ci95[1])
         return msgspec.structs.replace(lag, lag_ci95=both, notes=[sentence, *lag.notes])
     return AxisLag(  # which does not know its parts
         sensor=lag.sensor,
-        lag=arm.lag,
+        lag=arm.total,
         lag_ci95=(low, high),
         delay=arm.delay,
         delay_ci95=(0.0, high),
         shared_delay=False,
         plant="first-order",
-        time_constant=arm.time_constant,
+        time_constant=arm.lag,
         time_constant_ci95=(0.0, high),
         gain=arm.gain,
         notes=[sentence],
     )
-
-
-def _scattered(likelihood: Likelihood, best: Point, axis: str) -> float:
-    """How much more the lag scatters over pieces of the runs than the information says, at least 1 (White, 1982)."""
-    every = parameters(best.config, best.config, {axis: likelihood.sensors[axis]}, ["delay", "plant", "gain"])
-    free = [one for one in every if one.axis == axis and one.at_bound(best.config) is None]
-    slope = lag_slopes(free, best.config).get(axis)
-    if slope is None:
-        return 1.0
-    _, information, scatter = derivatives(likelihood, best, free)
-    cov = covariance(information, free)
-    return max(1.0, math.sqrt(float(slope @ cov @ scatter @ cov @ slope) / float(slope @ cov @ slope)))
 
 
 # ---- sensors --------------------------------------------------------------------------------------------------------

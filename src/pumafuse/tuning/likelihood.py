@@ -33,6 +33,7 @@ from ..fusion.segments import Segment, added, build
 from ..logs.axes import in_axes
 from ..logs.clock import clock_faults, segments
 from ..logs.run import Run
+from .arms import Measured, Recording
 from .parameters import Parameter, changed
 
 _LOG_STEP = 1e-4  # of a logarithm, one-sided: the truncation error is half of it, the rounding error 1e-11
@@ -172,26 +173,6 @@ class Linearised:
         return Derivatives(scores.sum(axis=(0, 2)), information, np.einsum("nip,njp->ij", scores, scores))
 
 
-class Motion(NamedTuple):
-    """What was commanded on an axis, and what a sensor measured of it.
-
-    Attributes:
-        sensor: Its name.
-        given: When each command was given, int64 ns, (k,).
-        command: u [m], (k,).
-        start: The level [m] at which the axis rests before its first command.
-        time: When each measurement is valid, int64 ns, (m,).
-        value: Where the axis was then by the sensor, whose scale is taken out [m], (m,).
-    """
-
-    sensor: str
-    given: TimeArray
-    command: FloatArray
-    start: float
-    time: TimeArray
-    value: FloatArray
-
-
 @dataclass(frozen=True)
 class _Part:
     """One axis of one segment.
@@ -281,15 +262,21 @@ class Likelihood:
             axis: [name for name in chosen if name in measured[axis]] for axis in self.axes if axis in measured
         }
 
-    def motions(self, axis: str, config: FusionConfig) -> list[Motion]:
-        """What was commanded on an axis and measured of it, in each recording and by each sensor."""
-        found: list[Motion] = []
+    def measured(self, axis: str, config: FusionConfig, sensors: Sequence[str] | None = None) -> Measured:
+        """What was commanded on an axis and measured of it, by all sensors or some, in their order."""
+        names, found = list(self.sensors[axis] if sensors is None else sensors), list[Recording]()
         for segment in (part.segment for part in self._of(axis)):
+            start, parts = segment.start[axis], list[tuple[TimeArray, FloatArray, IntArray]]()
             for name, rows in segment.rows_by_sensor().items():
-                sensor = config.sensors[name]
-                time, value = rows.stamp - round(sensor.latency * 1e9), rows.value[:, 0] / sensor.scale
-                found.append(Motion(name, *segment.given(axis), segment.start[axis], time, value))
-        return found
+                if name in names:
+                    sensor = config.sensors[name]
+                    time, value = rows.stamp - round(sensor.latency * 1e9), rows.value[:, 0] / sensor.scale - start
+                    parts.append((time, value, np.full(len(time), names.index(name))))
+            if parts:
+                time, value, source = (np.concatenate(column) for column in zip(*parts, strict=True))
+                every = Recording(*segment.given(axis), start, time, value, source, np.ones(len(time)))
+                found.append(every.of(np.argsort(time, kind="stable")))
+        return Measured(found, config.arm.update_period)
 
     def of_axis(self, axis: str) -> Likelihood:
         """The likelihood of the measurements of one axis; ``axes`` stay as they are."""

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from ..arrays import FloatArray
-from .arms import Arm, Rest
+from .arms import Arm
 
 Quantity: TypeAlias = Literal[
     "lag", "delay", "gain", "gain_recovery", "time_constant", "natural_frequency", "damping"
@@ -133,11 +133,9 @@ class AxisPosterior:
 
     Attributes:
         branches: Of all models that count.
-        rest: What the best arm leaves.
     """
 
     branches: Sequence[Branch]
-    rest: Rest
 
     def log_density(self, delays: FloatArray) -> FloatArray:
         """The log-density of the delay, all models together, (m,)."""
@@ -147,11 +145,11 @@ class AxisPosterior:
             found = np.logaddexp(found, np.max(each, axis=0))
         return found
 
-    def mixture(self, others: Callable[[FloatArray], FloatArray]) -> Mixture:
-        """The mixture, with the log-density of the delay by other axes."""
+    def mixture(self, others: Iterable[AxisPosterior] = ()) -> Mixture:
+        """The mixture, with the log-density of the dead time by other axes that share it."""
         parts = [self._points(branch) for branch in self.branches]
         delay = np.concatenate([part.delay for part in parts])
-        logs = np.concatenate([part.weight for part in parts]) + others(delay)
+        logs = np.concatenate([part.weight for part in parts]) + sum(one.log_density(delay) for one in others)
         weight = np.exp(logs - logs.max())
         return Mixture(
             weight / weight.sum(),
@@ -242,12 +240,3 @@ def chosen_model(mixture: Mixture) -> Model:
     shares = [float(mixture.weight[mixture.model == number].sum()) for number in range(len(MODELS))]
     likely = [model for model, share in zip(MODELS, shares, strict=True) if share >= _AS_LIKELY * max(shares)]
     return min(likely, key=lambda model: model.size)
-
-
-def best_entry(posterior: AxisPosterior, model: Model, delay: float | None = None) -> Entry:
-    """The most likely entry of a model, or of those with a dead time about ``delay`` [s]."""
-    entries = [one for branch in posterior.branches if branch.model == model for one in branch.entries]
-    if delay is not None:
-        nearest = min(abs(one.delay - delay) for one in entries)
-        entries = [one for one in entries if abs(one.delay - delay) <= nearest + SHORTEST]
-    return max(entries, key=lambda one: one.log_density)
