@@ -23,10 +23,16 @@ from .posterior import SHORTEST, AxisPosterior, Branch, Entry, GainKind, Model, 
 
 BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": (0.02, 0.5), "gain": (0.7, 1.3)}  # recovery [s]
 # A gain is 1 within a tenth. What is sold as an axis neither rings for ever nor has two lags far apart.
-PRIORS = {"gain": (1.0, 0.1), "damping": (0.0, 0.7)}
+# 95 % of what is believed of a recovery lies within its bounds.
+PRIORS = {
+    "gain": (1.0, 0.1),
+    "damping": (0.0, 0.7),
+    "recovery": (math.log(0.1), math.log(0.5 / 0.02) / (2.0 * 1.96)),
+}
 _LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each as likely
 _STARTS = 3  # maxima of the grid from which an arm is fitted
 _NEAR = 20.0  # log-likelihood behind the best, up to which a maximum of the grid is looked at
+_SHARE, _SMALLEST = 0.98, 1e-7  # of the measurements that least squares are of; the rest may be outliers; m
 _GATED = 2  # times: outliers widen the noise by which they are told
 _GATE = 6.0  # standard deviations, from which a measurement does not count
 _EARLIER, _DAMPED = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no dead time, ζ
@@ -151,12 +157,16 @@ class ArmSearch:
         noise that the best arm leaves; and an update period of dead time away.
         """
         models, period = self._freedom.models, self._measured.period
-        begin = self._on_grid(1)[0]
-        for _ in range(_GATED):
-            self.rest = self._likely_rest(begin, noise, least, prior)
-            self._measured = self._measured.gated(begin, self.rest, _GATE)
+        self.rest = self._white(self._on_grid(1)[0])
         found = self._fitted(models, self._on_grid(_STARTS))
-        self.rest = self._likely_rest(self._best(found).arm, self.rest, least, None)
+        self.rest = self._white(self._best(found).arm)
+        found = self._fitted(models, [self._best(found).arm], found)
+        self.rest = noise
+        for _ in range(_GATED):
+            self.rest = self._likely_rest(self._best(found).arm, self.rest, least, prior)
+            self._measured = self._measured.gated(self._best(found).arm, self.rest, _GATE)
+        found = self._fitted(models, [self._best(found).arm, *self._on_grid(_STARTS)], found)
+        self.rest = self._likely_rest(self._best(found).arm, self.rest, least, prior)
         found = self._fitted(models, [self._best(found).arm], found)
         every = [(self._evidence(model, fit), model, fit) for model, fit in found.items()]
         highest = max(one[0] for one in every)
@@ -188,6 +198,13 @@ class ArmSearch:
         summits.sort(key=lambda one: -log[one])
         return [arms[one]._replace(gain=float(gain[one])) for one in summits[:count]]
 
+    def _white(self, arm: Arm) -> Rest:
+        """All that an arm leaves as noise of the sensors: for least squares."""
+        left = np.sort(np.abs(self._measured.left(arm)))
+        left = left[: math.ceil(_SHARE * len(left))]
+        sd = max(float(np.sqrt(np.mean(left**2))), _SMALLEST) if len(left) else 1.0
+        return Rest(np.full(len(self._measured.sources), sd))
+
     def _likely_rest(self, arm: Arm, start: Rest, least: Sequence[float], prior: float | None) -> Rest:
         """The most likely of what an arm leaves, after the penalty for its numbers."""
         found = list(rests(self._measured, arm, start, _QUICKEST * self._measured.period, least, prior))
@@ -201,14 +218,15 @@ class ArmSearch:
         """Each model fitted from the best of the starts, from the simpler models, and from where it was."""
         found = dict[Model, Fit]()
         for model in models:
-            if not found:
-                tries = [self._fit(model, arm) for arm in self._likeliest(model, starts, len(starts))]
-            else:
-                best = self._best(found).arm
-                tries = [self._fit(model, arm) for arm in self._likeliest(model, [best], 1 if known else 2)]
+            arms = starts if not found else [self._best(found).arm]
+            tries = [self._fit(model, arm) for arm in self._likeliest(model, arms, max(len(starts), 2))]
             if known:
                 tries.append(self._fit(model, known[model].arm))
             found[model] = max(tries, key=lambda one: one.log_posterior)
+        best = max(found, key=lambda model: found[model].log_posterior)
+        for ticks in (-1.0, 1.0):  # with commands a period apart a wrong period fits well, too
+            there = self._delayed(found[best].arm, found[best].arm.delay + ticks * self._measured.period)
+            found[best] = max(found[best], self._fit(best, there), key=lambda one: one.log_posterior)
         return found
 
     def _likeliest(self, model: Model, arms: Iterable[Arm], count: int) -> list[Arm]:
@@ -279,10 +297,8 @@ class ArmSearch:
                 log -= math.log(PRIORS[name][1] * math.sqrt(2.0 * math.pi))
             elif name == "lag":
                 log -= _LOG_RANGE
-            elif name == "delay":
-                log -= math.log(self._longest)
             else:
-                log -= math.log(math.log(BOUNDS[name][1] / BOUNDS[name][0]))
+                log -= math.log(self._longest)
         if free:
             information = fit.information[np.ix_(inside, inside)]
             size = np.sqrt(np.maximum(np.diag(information), 1e-9))

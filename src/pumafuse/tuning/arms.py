@@ -19,6 +19,7 @@ from ..filter.core import Record, at, library
 from ..filter.response import record_of
 from ..model.arm import AxisModel, Gain
 from ..model.plants import FirstOrder, SecondOrder
+from .steps import bounded_step
 
 _NOISE = np.dtype(
     [(name, np.float64) for name in ("walk", "offset_sd", "disturbance_sd", "disturbance_time", "smoothness")]
@@ -289,16 +290,16 @@ class Measured:
         for _ in range(_STEPS if names else 0):
             here = np.array([best.arm.coordinate(name) for name in names])
             for damping in _DAMPINGS:
-                step = _step(best, np.maximum(low - here, -reach), np.minimum(high - here, reach), damping)
-                expected = float(best.score @ step) - 0.5 * float(step @ best.information @ step)
+                ends = np.maximum(low - here, -reach), np.minimum(high - here, reach)
+                step = bounded_step(best.score, best.information, *ends, np.full(len(names), damping))
+                if float(best.score @ step) - 0.5 * float(step @ best.information @ step) < _CLOSE:
+                    return Fit(best.arm, best.log_posterior, best.information)
                 trial = best.arm.moved(names, (here + step).tolist())
-                if expected < _CLOSE or self._linear(trial, [], rest, limits, names).log_posterior > best.log_posterior:
+                if self._linear(trial, [], rest, limits, names).log_posterior > best.log_posterior:
+                    best = self._linear(trial, names, rest, limits)
                     break
             else:
                 break
-            if expected < _CLOSE:
-                break
-            best = self._linear(trial, names, rest, limits)
         return Fit(best.arm, best.log_posterior, best.information)
 
     def scattered(self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits) -> tuple[FloatArray, FloatArray]:
@@ -396,22 +397,6 @@ class _Linear(NamedTuple):
     log_posterior: float
     score: FloatArray
     information: FloatArray
-
-
-def _step(at_: _Linear, low: FloatArray, high: FloatArray, damping: float) -> FloatArray:
-    """A step of Gauss and Newton between bounds: what is beyond one goes there, the others follow."""
-    size = np.sqrt(np.maximum(np.diag(at_.information), 1e-12))
-    matrix = at_.information / np.outer(size, size) + (1e-9 + damping) * np.eye(len(size))
-    step, free = np.zeros(len(size)), np.ones(len(size), dtype=np.bool_)
-    for _ in range(len(size)):
-        wanted = at_.score / size - matrix @ (size * np.where(free, 0.0, step))
-        step[free] = np.linalg.solve(matrix[np.ix_(free, free)], wanted[free]) / size[free]
-        beyond = free & ((step < low) | (step > high))
-        step = np.clip(step, low, high)
-        if not beyond.any() or not (free & ~beyond).any():
-            break
-        free &= ~beyond
-    return step
 
 
 # ---- the rest -------------------------------------------------------------------------------------------------------

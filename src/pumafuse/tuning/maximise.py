@@ -18,11 +18,11 @@ from ..filter.events import Results
 from ..fusion.config import FusionConfig
 from .likelihood import Derivatives, Likelihood, Linearised, in_threads
 from .parameters import Parameter, coordinates, moved, with_axis_of
+from .steps import bounded_step
 
 _ITERATIONS = 60
 _TOLERANCE = 2e-3  # expected gain in log-likelihood that is not worth another step
 _FIRST_DAMPING = 1e-4
-_ROUNDING = 1e-10  # of a matrix with a diagonal of 1, below which its eigenvalues mean nothing
 _LAST_DAMPING = 1e8  # at which the search gives up
 _DOUBLES = (2.0, 4.0, 8.0)
 _NOTHING, _CREEPING = 2e-4, 3  # log-likelihood; steps in a row that gain less: at a cusp, the score promises too much
@@ -30,7 +30,6 @@ _POOR = 0.1  # of the expected gain, from which a step was too long
 _GOOD = 0.5  # of the expected gain, from which derivatives are carried along to the next step, if that was
 _NEARBY = 2.0  # at most in log-likelihood: farther away they change too much
 _MORE = 1.1  # of the expected gain, from which a longer step is tried
-_ACTIVE_SETS = 8  # that are tried; they may go round in circles
 _PROMISE = 5.0  # times the gain expected of the last step, beyond which no further steps are hoped to lead
 _GATE_ROUNDS = 12  # times that the gates decide again
 _BUMPS = tuple(sign * shift for shift in (2e-4, 5e-4, 1e-3, 2e-3) for sign in (-1.0, 1.0))  # s
@@ -192,7 +191,7 @@ class Ascent:
             assert self.linear is not None
             found = with_priors(self.linear, best, self._free)
             low, high = np.maximum(self._low - at, -self._reach), np.minimum(self._high - at, self._reach)
-            step = _step(found, low, high, self._damping)
+            step = bounded_step(found.score, found.information, low, high, self._damping)
             expected = float(found.score @ step) - 0.5 * float(step @ found.information @ step)
             if not self._may_stop and expected < self._tolerance:
                 self._renew(best)
@@ -301,43 +300,3 @@ def past_bumps(likelihood: Likelihood, best: Point, free: Sequence[Parameter], n
         if beside.log_posterior > best.log_posterior + _TOLERANCE:
             best = maximise(likelihood, beside.config, free, notify)
     return best
-
-
-def _step(found: Derivatives, low: FloatArray, high: FloatArray, damping: FloatArray) -> FloatArray:
-    """The δ between ``low`` and ``high`` that minimises ½ δᵀ(I + λ diag I)δ − gᵀδ, (k,).
-
-    The matrix is scaled to a diagonal of 1 + λ. A parameter without any information does not move.
-    """
-    diagonal = np.diag(found.information)
-    known = diagonal > 0.0
-    step, size = np.zeros(len(diagonal)), 1.0 / np.sqrt(diagonal[known])
-    matrix = found.information[np.ix_(known, known)] * np.outer(size, size) + np.diag(damping[known] + _ROUNDING)
-    lowest, highest = low[known] / size, high[known] / size
-    inner = _between(matrix, size * found.score[known], lowest, highest)
-    if inner is None:
-        from scipy.optimize import lsq_linear  # takes a while to import, and is seldom needed
-
-        root = np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
-        aim = np.asarray(np.linalg.solve(root, size * found.score[known]), dtype=np.float64)
-        inner = lsq_linear(root.T, aim, (lowest, highest), method="bvls").x
-    step[known] = size * inner
-    return step
-
-
-def _between(matrix: FloatArray, score: FloatArray, lowest: FloatArray, highest: FloatArray) -> FloatArray | None:
-    """The δ between bounds that minimises ½ δᵀMδ − gᵀδ; None where this does not find it.
-
-    What is beyond a bound is fixed there, and set free again where the score points inside, until nothing changes
-    (Hintermüller, Ito & Kunisch, "The primal-dual active set strategy as a semismooth Newton method", SIAM Journal on
-    Optimization 13, 2002).
-    """
-    at_low = at_high = np.zeros(len(score), dtype=np.bool_)
-    for _ in range(_ACTIVE_SETS):
-        free = ~(at_low | at_high)
-        delta = np.where(at_low, lowest, np.where(at_high, highest, 0.0))
-        delta[free] = np.linalg.solve(matrix[np.ix_(free, free)], (score - matrix @ delta)[free])
-        beyond = delta + np.where(free, 0.0, score - matrix @ delta)  # by what remains of the score
-        before, at_low, at_high = (at_low, at_high), beyond < lowest, beyond > highest
-        if np.array_equal(before, (at_low, at_high)):
-            return delta
-    return None
