@@ -8,17 +8,15 @@ Laplace's approximation for its other numbers.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import product
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..arrays import FloatArray
-from ..fusion.config import FusionConfig, Process
-from .arms import Arm, Coordinates, Fit, Limits, Measured, Rest, rests
-from .parameters import changed, rounded
-from .plain import LAGS, LATEST, delays, plain_arm
+from .arms import Arm, Coordinates, Fit, Limits, Measured, Rest, longest_delay, rests
+from .plain import LAGS, delays, plain_arm
 from .posterior import SHORTEST, AxisPosterior, Branch, Entry, GainKind, Model, Quantity
 
 BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": (0.02, 0.5), "gain": (0.7, 1.3)}  # recovery [s]
@@ -54,28 +52,26 @@ class Freedom(NamedTuple):
 
     Attributes:
         given: The arm as it is known.
-        delay: Whether its dead time is free.
-        plant: Whether its plant is, of either order.
+        free: The coordinates that may vary.
+        orders: The orders of the plant to try.
         gains: The kinds of gain to try.
     """
 
     given: Arm
-    delay: bool = True
-    plant: bool = True
+    free: Collection[str] = ("delay", "lag", "damping", "recovery", "gain")
+    orders: Sequence[int] = (1, 2)
     gains: Sequence[GainKind] = ("given", "static", "recovering")
 
     @property
     def models(self) -> list[Model]:
         """The models to try, the simplest first."""
-        orders = (1, 2) if self.plant else (2 if self.given.damping else 1,)
-        return sorted((Model(*one) for one in product(orders, self.gains)), key=lambda model: model.size)
+        return sorted((Model(*one) for one in product(self.orders, self.gains)), key=lambda model: model.size)
 
     def names(self, model: Model) -> list[str]:
         """The coordinates of a model that are free, the dead time first."""
-        found = ["delay"] if self.delay else []
-        if self.plant:
-            found += ["lag"] if model.order == 1 else ["lag", "damping"]
-        return found + {"given": [], "static": ["gain"], "recovering": ["gain", "recovery"]}[model.gain]
+        found = ["delay", "lag"] if model.order == 1 else ["delay", "lag", "damping"]
+        found += {"given": [], "static": ["gain"], "recovering": ["gain", "recovery"]}[model.gain]
+        return [name for name in found if name in self.free]
 
     def shaped(self, arm: Arm, gain: GainKind) -> Arm:
         """An arm with the kind of gain; one as it is given keeps what is known of it."""
@@ -88,8 +84,10 @@ class ArmSearch:
     """The arms of an axis: maxima of each model, and the walk from one along the dead time.
 
     Attributes:
+        sensors: By which it is known.
         plain: The arm of least squares; None where nothing moves.
         rest: What the best arm leaves.
+        rests: Likewise, without a disturbance, with a smooth one and with a rough one.
         posterior: All models that count, along their dead times.
     """
 
@@ -100,6 +98,7 @@ class ArmSearch:
         noise: Rest,
         least: Sequence[float],
         prior: float | None = None,
+        near: ArmSearch | None = None,
     ) -> None:
         """Search.
 
@@ -109,11 +108,13 @@ class ArmSearch:
             noise: What an arm is believed to leave.
             least: The least noise of each sensor [m].
             prior: The sd of the logarithm of the sensors' noise about that in ``noise``; None: it is not believed.
+            near: What was found on a part of the measurements, to begin from.
         """
-        self._measured, self._freedom = measured, freedom
-        self._longest = max(LATEST, 5.0 * measured.period)
+        self._measured, self._freedom, self.sensors = measured, freedom, measured.sensors
+        self._longest = longest_delay(measured.period)
         self._limits = Limits({"delay": (0.0, self._longest), **BOUNDS}, PRIORS)
-        self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sources)))  # at first: least squares
+        self.plain, self.rest = plain_arm(measured), Rest(np.ones(len(measured.sensors)))  # at first: least squares
+        self._fits = self._by_least_squares() if near is None else near._fits
         peaks, branches = self._peaks(noise, least, prior), list[Branch]()
         for evidence, model, peak in peaks:
             walked = (one for one in branches if one.model == model)
@@ -123,6 +124,11 @@ class ArmSearch:
                 highest = max((float(one.log_density.max()) for one in branches), default=-np.inf)
                 branches.append(self._walk(model, peak, highest - _FORLORN))
         self.posterior = AxisPosterior(branches)
+
+    @property
+    def spread(self) -> float:
+        """How far the measurements are from the best arm, as a standard deviation [m]."""
+        return float(self._white(self._best(self._fits).arm).sd[0])
 
     def arm(self, model: Model, delay: float | None = None) -> Arm:
         """The most likely arm of a model; the one with this dead time [s]."""
@@ -150,29 +156,27 @@ class ArmSearch:
 
     # ---- maxima -----------------------------------------------------------------------------------------------------
 
-    def _peaks(self, noise: Rest, least: Sequence[float], prior: float | None) -> list[tuple[float, Model, Fit]]:
-        """The maxima of every model with their evidence, the best first.
-
-        By least squares at first: noise that is fitted to a poor arm explains what a better one would. Then with the
-        noise that the best arm leaves; and an update period of dead time away.
-        """
-        models, period = self._freedom.models, self._measured.period
+    def _by_least_squares(self) -> dict[Model, Fit]:
+        """Each model, from the grid: noise that is fitted to a poor arm explains what a better one would."""
         self.rest = self._white(self._on_grid(1)[0])
-        found = self._fitted(models, self._on_grid(_STARTS))
+        found = self._fitted(self._on_grid(_STARTS))
         self.rest = self._white(self._best(found).arm)
-        found = self._fitted(models, [self._best(found).arm], found)
+        return self._fitted([self._best(found).arm], found)
+
+    def _peaks(self, noise: Rest, least: Sequence[float], prior: float | None) -> list[tuple[float, Model, Fit]]:
+        """The maxima of every model with their evidence, the best first; those an update period away, too."""
         self.rest = noise
         for _ in range(_GATED):
-            self.rest = self._likely_rest(self._best(found).arm, self.rest, least, prior)
-            self._measured = self._measured.gated(self._best(found).arm, self.rest, _GATE)
-        found = self._fitted(models, [self._best(found).arm, *self._on_grid(_STARTS)], found)
-        self.rest = self._likely_rest(self._best(found).arm, self.rest, least, prior)
-        found = self._fitted(models, [self._best(found).arm], found)
-        every = [(self._evidence(model, fit), model, fit) for model, fit in found.items()]
+            self.rest = self._likely_rest(self._best(self._fits).arm, self.rest, least, prior)
+            self._measured = self._measured.gated(self._best(self._fits).arm, self.rest, _GATE)
+        self._fits = self._fitted([self._best(self._fits).arm, *self._on_grid(_STARTS)], self._fits)
+        self.rest = self._likely_rest(self._best(self._fits).arm, self.rest, least, prior)
+        self._fits = self._fitted([self._best(self._fits).arm], self._fits)
+        every = [(self._evidence(model, fit), model, fit) for model, fit in self._fits.items()]
         highest = max(one[0] for one in every)
-        for evidence, model, fit in list(every) if self._freedom.delay else ():
+        for evidence, model, fit in list(every) if "delay" in self._freedom.free else ():
             for ticks in (-1.0, 1.0) if evidence > highest - _FORLORN else ():
-                beside = self._fit(model, self._delayed(fit.arm, fit.arm.delay + ticks * period))
+                beside = self._fit(model, self._delayed(fit.arm, fit.arm.delay + ticks * self._measured.period))
                 known = [one.arm.delay for _, other, one in every if other == model]
                 if min(abs(beside.arm.delay - one) for one in known) > _SAME:
                     every.append((self._evidence(model, beside), model, beside))
@@ -181,13 +185,13 @@ class ArmSearch:
     def _on_grid(self, count: int) -> list[Arm]:
         """The arms of highest likelihood on a grid of first-order plants, no two of them neighbours."""
         given, free = self._freedom.given, self._freedom
-        late = delays(self._measured) if free.delay else np.array([given.delay])
-        lags = LAGS if free.plant else np.array([given.lag])
-        damping = 0.0 if free.plant else given.damping
+        late = delays(self._measured) if "delay" in free.free else np.array([given.delay])
+        lags = LAGS if "lag" in free.free else np.array([given.lag])
+        damping = 0.0 if 1 in free.orders else given.damping
         arms = [given._replace(delay=d, lag=lag, damping=damping) for d, lag in product(late.tolist(), lags.tolist())]
-        varied = tuple(free.gains) != ("given",)
+        varied = "gain" in free.free
         if varied:
-            arms = [self._freedom.shaped(arm, "static") for arm in arms]
+            arms = [free.shaped(arm, "static") for arm in arms]
         log, gain = self._measured.weighed(arms, self.rest, self._limits if varied else None)
         table = log.reshape(len(late), len(lags))
         around = np.pad(table, 1, constant_values=-np.inf)
@@ -203,28 +207,29 @@ class ArmSearch:
         left = np.sort(np.abs(self._measured.left(arm)))
         left = left[: math.ceil(_SHARE * len(left))]
         sd = max(float(np.sqrt(np.mean(left**2))), _SMALLEST) if len(left) else 1.0
-        return Rest(np.full(len(self._measured.sources), sd))
+        return Rest(np.full(len(self._measured.sensors), sd))
 
     def _likely_rest(self, arm: Arm, start: Rest, least: Sequence[float], prior: float | None) -> Rest:
         """The most likely of what an arm leaves, after the penalty for its numbers."""
         found = list(rests(self._measured, arm, start, _QUICKEST * self._measured.period, least, prior))
+        self.rests = [rest for rest, _ in found]
         dearer = math.log(max(self._measured.count, 2))  # of two numbers more (BIC)
         prices = [_WANDERS, dearer + _SMOOTHER, dearer]
         return max(zip(found, prices, strict=True), key=lambda one: one[0][1] - one[1])[0][0]
 
-    def _fitted(
-        self, models: Sequence[Model], starts: Sequence[Arm], known: Mapping[Model, Fit] | None = None
-    ) -> dict[Model, Fit]:
+    def _fitted(self, starts: Sequence[Arm], known: Mapping[Model, Fit] | None = None) -> dict[Model, Fit]:
         """Each model fitted from the best of the starts, from the simpler models, and from where it was."""
         found = dict[Model, Fit]()
-        for model in models:
+        for model in self._freedom.models:
             arms = starts if not found else [self._best(found).arm]
             tries = [self._fit(model, arm) for arm in self._likeliest(model, arms, max(len(starts), 2))]
             if known:
                 tries.append(self._fit(model, known[model].arm))
             found[model] = max(tries, key=lambda one: one.log_posterior)
         best = max(found, key=lambda model: found[model].log_posterior)
-        for ticks in (-1.0, 1.0):  # with commands a period apart a wrong period fits well, too
+        for ticks in (
+            (-1.0, 1.0) if "delay" in self._freedom.free else ()
+        ):  # with commands a period apart a wrong period fits well, too
             there = self._delayed(found[best].arm, found[best].arm.delay + ticks * self._measured.period)
             found[best] = max(found[best], self._fit(best, there), key=lambda one: one.log_posterior)
         return found
@@ -261,13 +266,13 @@ class ArmSearch:
     def _as_late(self, arm: Arm, total: float) -> Arm:
         """An arm whose plant makes up for what its gain changed of the lag."""
         low, high = self._limits.bounds["lag"]
-        if not self._freedom.plant:
+        if "lag" not in self._freedom.free:
             return arm
         return arm._replace(lag=min(max(arm.lag + total - arm.total, 0.1 * arm.lag, low), high))
 
     def _delayed(self, arm: Arm, delay: float) -> Arm:
         """An arm with another dead time, and so much less or more lag of the plant, where these are free."""
-        if not self._freedom.delay:
+        if "delay" not in self._freedom.free:
             return arm
         delay = min(max(delay, 0.0), self._longest)
         later = arm._replace(delay=delay)
@@ -311,7 +316,7 @@ class ArmSearch:
     def _walk(self, model: Model, peak: Fit, least: float) -> Branch:
         """The entries of a model about a maximum, until they count for nothing or less than ``least``."""
         names = self._freedom.names(model)
-        if not self._freedom.delay:
+        if "delay" not in self._freedom.free:
             return Branch(model, [self._entry(peak, names)])
         cov = _covariance(peak.information)
         sd, slope = math.sqrt(cov[0, 0]), cov[1:, 0] / cov[0, 0]
@@ -357,21 +362,6 @@ class ArmSearch:
             slope = np.array([(one[quantity] - mean) / _SLOPE for one in moved])
             sds[quantity] = math.sqrt(max(float(slope @ cov @ slope), 0.0)) if free else 0.0
         return Entry(fit.arm.delay, fit.arm, self._laplace(fit, names, inside), means, sds)
-
-
-def with_rest(config: FusionConfig, axis: str, rest: Rest, sensors: Sequence[str]) -> FusionConfig:
-    """The configuration with what an arm leaves of an axis as its noise."""
-    kind: Literal["matern", "ou"] = "matern" if rest.smoothness > 1.0 else "ou"
-    process = Process(
-        input_noise=0.0,
-        drift=rounded(rest.walk),
-        disturbance_sd=rounded(rest.disturbance_sd),
-        disturbance_time=rounded(rest.disturbance_time),
-        disturbance_kind=kind,
-    )
-    for name, sd in zip(sensors, rest.sd.tolist(), strict=True):
-        config = changed(config, ("sensors", name, "sd", axis), rounded(sd))
-    return changed(config, ("process", axis), process)
 
 
 def _covariance(information: FloatArray) -> FloatArray:

@@ -24,6 +24,7 @@ from .steps import bounded_step
 _NOISE = np.dtype(
     [(name, np.float64) for name in ("walk", "offset_sd", "disturbance_sd", "disturbance_time", "smoothness")]
 )
+_LATEST, _PERIODS = 0.6, 5.0  # s, or update periods: the longest dead time
 _FAR = 30.0  # times all that is measured: where an offset may begin
 _WALKS, _SDS = (1e-8, 10.0), (1e-8, 10.0)  # m/√s, m: bounds
 _TIME, _TIMES = 0.3, (1e-3, 1e3)  # s, of a disturbance: start, bounds
@@ -84,6 +85,11 @@ class Rest:
     disturbance_sd: float = 0.0
     disturbance_time: float = _TIME
     smoothness: float = 0.5
+
+
+def longest_delay(period: float) -> float:
+    """The longest dead time [s] that is looked for of an arm with this update period [s]."""
+    return max(_LATEST, _PERIODS * period)
 
 
 class Arm(NamedTuple):
@@ -174,13 +180,15 @@ class Fit(NamedTuple):
 class Measured:
     """All recordings of an axis, as a function of the arm and the rest."""
 
-    def __init__(self, recordings: Sequence[Recording], period: float) -> None:
-        """Of an axis whose update period is ``period`` [s]."""
-        self.recordings, self.period = recordings, period
+    def __init__(self, recordings: Sequence[Recording], period: float, sensors: Sequence[str]) -> None:
+        """By these ``sensors``, of an axis whose update period is ``period`` [s]."""
+        self.recordings, self.period, self.sensors = recordings, period, sensors
         self.count = int(sum(one.weight.sum() for one in recordings))
-        self.sources = sorted({int(one) for part in recordings for one in np.unique(part.source)})
         reach = max((float(np.ptp(one.value)) for one in recordings if len(one.value)), default=0.0)
         self._offset = _FAR * max(reach, 1e-6)
+
+    def _with(self, recordings: Sequence[Recording]) -> Measured:
+        return Measured(recordings, self.period, self.sensors)
 
     def left(self, arm: Arm) -> FloatArray:
         """What an arm leaves of the measurements that count, of each recording about its mean [m]."""
@@ -204,7 +212,7 @@ class Measured:
             one._replace(weight=np.where(far <= limit, one.weight, 0.0))
             for one, far in zip(self.recordings, apart, strict=True)
         ]
-        return Measured(parts, self.period)
+        return self._with(parts)
 
     def gated(self, arm: Arm, rest: Rest, gate: float) -> Measured:
         """Without measurements whose innovation beside an arm is beyond so many standard deviations."""
@@ -212,12 +220,12 @@ class Measured:
         for one, mine in zip(self.recordings, left, strict=True):
             white, _ = self._white(one, rest, mine[None])
             parts.append(one._replace(weight=np.where(np.abs(white[0]) <= gate, one.weight, 0.0)))
-        return Measured(parts, self.period)
+        return self._with(parts)
 
     def excerpt(self, commands: int, rows: int) -> Measured:
         """The part of each recording with the most motion, and some of its measurements, evenly."""
         parts = [_liveliest(one, commands) for one in self.recordings]
-        return Measured([one.of(slice(None, None, len(one.time) // rows + 1)) for one in parts], self.period)
+        return self._with([one.of(slice(None, None, len(one.time) // rows + 1)) for one in parts])
 
     def responses(self, arm: Arm) -> list[FloatArray]:
         """The response of each recording [m], relative to its start."""
@@ -243,7 +251,7 @@ class Measured:
             Both, (n,).
         """
         records = np.concatenate([record_of(arm.model, self.period, arm.delay, 0.0) for arm in arms])
-        c = len(self.sources)  # the measurements, and for each sensor but the first whether it is that
+        c = len(self.sensors)  # the measurements, and for each sensor but the first whether it is that
         products, own, log_determinant = np.zeros((len(arms), 2, 2 + c)), np.zeros((c, c)), 0.0
         for one in self.recordings:
             white, log = self._white(one, rest, self._columns(one))
@@ -350,7 +358,9 @@ class Measured:
 
     def _columns(self, one: Recording) -> FloatArray:
         """The measurements, and for each sensor but the first which are its, (s, m)."""
-        return np.array([one.value, *((one.source == other).astype(np.float64) for other in self.sources[1:])])
+        return np.array(
+            [one.value, *((one.source == other).astype(np.float64) for other in range(1, len(self.sensors)))]
+        )
 
     def _response(self, one: Recording, arm: Arm) -> FloatArray:
         record, position = record_of(arm.model, self.period, arm.delay, one.start), np.empty(len(one.time))
@@ -360,8 +370,7 @@ class Measured:
         return position
 
     def _variance(self, one: Recording, rest: Rest) -> FloatArray:
-        places = np.searchsorted(self.sources, one.source)
-        return np.where(one.weight > 0.0, np.square(rest.sd)[places], np.inf)
+        return np.where(one.weight > 0.0, np.square(rest.sd)[one.source], np.inf)
 
     def _noise(self, rest: Rest) -> Record:
         found = np.zeros(1, _NOISE)

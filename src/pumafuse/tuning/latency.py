@@ -27,7 +27,7 @@ from ..model.arm import ArmModel, AxisModel
 from ..model.plants import FirstOrder
 from ..toml import Interval
 from ..units import MS
-from .arm_search import BOUNDS, ArmSearch, Freedom, with_rest
+from .arm_search import BOUNDS, ArmSearch, Freedom
 from .arms import Arm, Rest
 from .identifiability import TuneError, covariance, excited_axes
 from .likelihood import Derivatives, Likelihood, in_threads
@@ -39,10 +39,12 @@ from .parameters import (
     moved,
     parameters,
     rounded,
+    with_arm,
     with_own_delays,
+    with_rest,
     with_shared_delay,
 )
-from .plain import Doubt, doubts, with_arm, with_plain_arm
+from .plain import Doubt, doubts, with_plain_arm
 from .posterior import Mixture, Model, Quantity, chosen_model, shared_delay, sharing
 
 REFERENCE = "reference"  # the name of a run's reference among its sensors

@@ -13,9 +13,10 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import ConfigError, suggestion
-from ..fusion.config import SD_BOUNDS, FusionConfig, Sensor
+from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor
 from ..model.plants import FirstOrder, SecondOrder
 from ..units import ending, of_kind, si
+from .arms import Arm, Rest, longest_delay
 
 Fit = Literal["noise", "delay", "plant", "gain", "latency", "scale", "bias"]
 FITS: tuple[Fit, ...] = get_args(Fit)
@@ -25,7 +26,6 @@ T = TypeVar("T")
 
 _replace = msgspec.structs.replace
 LATENCIES = (-0.1, 0.3)  # s; bounds of a latency, relative to the configured one
-DELAYS = (-0.1, 0.2)  # s; likewise of a delay, which is never below 0
 _RECOVERY = (0.020, 0.500)  # s; 95 % of the prior lie within
 _RECOVERY_PRIOR = (0.5 * math.log(_RECOVERY[0] * _RECOVERY[1]), math.log(_RECOVERY[1] / _RECOVERY[0]) / (2.0 * 1.96))
 _SD_PRIOR = (0.0, math.log(1.5))  # about the configured number
@@ -168,10 +168,13 @@ class Parameter:
             around = self.prior and one.fit == "noise"
             return replace(one, prior=(one.at(known), self.prior[1])) if around and self.prior else one
         middle, (low, high) = one.get(known), self.bounds
+        if self.fit == "delay":
+            return replace(one, bounds=(0.0, max(longest_delay(known.arm.update_period), middle)))
         if self.fit == "scale":  # shares of it: a scale of 0 is none
             low, high, one = low * abs(middle), high * abs(middle), replace(one, scale=self.scale * abs(middle))
-        bounds = (max(middle + low, 0.0) if self.fit == "delay" else middle + low, middle + high)
-        return replace(one, bounds=bounds, prior=self.prior and (middle + self.prior[0], self.prior[1]))
+        return replace(
+            one, bounds=(middle + low, middle + high), prior=self.prior and (middle + self.prior[0], self.prior[1])
+        )
 
 
 def _line(fit: Fit, key: str, path: str, low: float, high: float, **more: Any) -> Parameter:
@@ -188,8 +191,8 @@ _TABLE = (
     _line("noise", "process.{axis}.disturbance_sd_mm", "process.{axis}.disturbance_sd", 1e-7, 10.0),
     _line("noise", "process.{axis}.disturbance_time_ms", "process.{axis}.disturbance_time", 1e-3, 1e3),
     _line("noise", "sensors.{sensor}.sd_mm.{axis}", "sensors.{sensor}.sd.{axis}", *SD_BOUNDS, prior=_SD_PRIOR),
-    _line("delay", "axes.{axis}.delay_ms", "arm.axes.{axis}.delay", *DELAYS, log=False, scale=_TICK),
-    _line("delay", "delay_ms", "arm.delay", *DELAYS, log=False, scale=_TICK),
+    _line("delay", "axes.{axis}.delay_ms", "arm.axes.{axis}.delay", 0.0, 0.0, log=False, scale=_TICK),
+    _line("delay", "delay_ms", "arm.delay", 0.0, 0.0, log=False, scale=_TICK),
     _line("plant", "axes.{axis}.time_constant_ms", "arm.axes.{axis}.plant.time_constant", 1e-4, 10.0),
     _line("plant", "axes.{axis}.natural_frequency_rad_s", "arm.axes.{axis}.plant.natural_frequency", 0.5, 5e3),
     _line("plant", "axes.{axis}.damping", "arm.axes.{axis}.plant.damping", 0.05, 20.0),
@@ -396,6 +399,28 @@ def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> Fusion
         if isinstance(sensor.sd, dict) and axis in sensor.sd:
             config = changed(config, ("sensors", name, "sd", axis), sensor.sd[axis])
     return changed(config, ("process", axis), other.process[axis])
+
+
+def with_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
+    """The configuration with another arm of an axis, and a delay of its own."""
+    model = arm.model
+    for name in ("plant", "gain", "gain_recovery"):
+        config = changed(config, ("arm", "axes", axis, name), getattr(model, name))
+    return changed(config, ("arm", "axes", axis, "delay"), arm.delay)
+
+
+def with_rest(config: FusionConfig, axis: str, rest: Rest, sensors: Sequence[str]) -> FusionConfig:
+    """The configuration with what an arm leaves of an axis as its noise and that of these sensors."""
+    process = Process(
+        input_noise=0.0,
+        drift=rounded(rest.walk),
+        disturbance_sd=rounded(rest.disturbance_sd),
+        disturbance_time=rounded(rest.disturbance_time),
+        disturbance_kind="matern" if rest.smoothness > 1.0 else "ou",
+    )
+    for name, sd in zip(sensors, rest.sd.tolist(), strict=True):
+        config = changed(config, ("sensors", name, "sd", axis), rounded(sd))
+    return changed(config, ("process", axis), process)
 
 
 def with_gates(config: FusionConfig, given: FusionConfig, wider: float | None = None) -> FusionConfig:

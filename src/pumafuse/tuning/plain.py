@@ -15,10 +15,10 @@ import numpy as np
 from ..arrays import FloatArray
 from ..fusion.config import FusionConfig
 from ..units import MS
-from .arms import Arm, Limits, Measured, Rest
-from .parameters import changed, rounded
+from .arms import Arm, Limits, Measured, Rest, longest_delay
+from .parameters import rounded, with_arm
 
-LATEST, _DELAYS = 0.6, 61  # s, or five update periods: the longest dead time; how many are looked at
+_DELAYS = 61  # dead times that are looked at
 LAGS = np.geomspace(1e-3, 2.0, 14)  # s, of a first-order plant
 LONGEST = 2.6  # s, of a lag that is told: of both together
 _COMMANDS, _ROWS = 6000, 2000  # of a recording that are looked at: where it moves most, and evenly of that
@@ -59,7 +59,7 @@ class PlainArm(NamedTuple):
 
 def delays(measured: Measured) -> FloatArray:
     """The dead times that are looked at [s]."""
-    return np.linspace(0.0, max(LATEST, 5.0 * measured.period), _DELAYS)
+    return np.linspace(0.0, longest_delay(measured.period), _DELAYS)
 
 
 def off(measured: Measured, arm: Arm) -> float:
@@ -73,7 +73,7 @@ def plain_arm(measured: Measured) -> PlainArm | None:
     measured = measured.excerpt(_COMMANDS, _ROWS)
     if measured.count < 2 * _FEWEST:
         return None
-    rest = Rest(np.ones(len(measured.sources)))
+    rest = Rest(np.ones(len(measured.sensors)))
     late = delays(measured).tolist()
     arms = [Arm(delay, lag) for delay in late for lag in LAGS.tolist()]
     best = _fitted(measured, arms, rest, 1)[0]
@@ -158,11 +158,3 @@ def doubts(plain: Mapping[str, PlainArm | None], config: FusionConfig) -> dict[s
 def with_plain_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
     """The configuration with an axis's arm by least squares: of first order, with a gain that stays."""
     return with_arm(config, axis, Arm(*(rounded(one) for one in arm)))
-
-
-def with_arm(config: FusionConfig, axis: str, arm: Arm) -> FusionConfig:
-    """The configuration with another arm of an axis."""
-    model = arm.model
-    for name in ("plant", "gain", "gain_recovery"):
-        config = changed(config, ("arm", "axes", axis, name), getattr(model, name))
-    return changed(config, ("arm", "axes", axis, "delay"), arm.delay)

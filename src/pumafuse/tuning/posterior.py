@@ -26,6 +26,7 @@ QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 GainKind: TypeAlias = Literal["given", "static", "recovering"]
 
 SHORTEST = 2e-5  # s, between two dead times that differ
+_NEVER = 1e-300  # a probability
 _GRID = 2000  # points of a distribution, at most
 _REFINED = 8  # points between two dead times, along which everything is interpolated
 _AS_LIKELY = 0.2  # of the most likely model's probability: the simplest of such models is taken
@@ -111,6 +112,12 @@ class Mixture(NamedTuple):
     delay: FloatArray
     mean: Mapping[Quantity, FloatArray]
     sd: Mapping[Quantity, FloatArray]
+
+    def log_odds(self, chosen: Callable[[Model], bool]) -> float:
+        """The logarithm of how much likelier the models that are chosen are than the others."""
+        models = np.array([chosen(one) for one in MODELS])[self.model.astype(np.int64)]
+        mine, others = (float(self.weight[some].sum()) for some in (models, ~models))
+        return math.log(max(mine, _NEVER)) - math.log(max(others, _NEVER))
 
     def quantiles(self, quantity: Quantity, chosen: Callable[[Model], bool], share: float = 0.95) -> tuple[float, ...]:
         """The ends of the middle ``share`` of a quantity under the models that are chosen."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -12,6 +12,7 @@ from ..fusion.config import FusionConfig, Sensor
 from ..fusion.score import Z95
 from ..logs.run import Run
 from ..units import SCREEN, Kind, as_length, of_kind
+from .arm_search import ArmSearch
 from .identifiability import (
     NotIdentifiable,
     excited_axes,
@@ -79,6 +80,7 @@ class Stage:
         not_identifiable: What the measurements do not determine, so that one parameter of each was fixed.
         orders: The reasons for the order of each axis's plant, for its gain and for its disturbance, where chosen.
         notes: Everything else noticed.
+        arms: The arms that were looked for, by axis.
     """
 
     likelihood: Likelihood
@@ -87,6 +89,7 @@ class Stage:
     not_identifiable: Sequence[NotIdentifiable]
     orders: dict[str, str]
     notes: Sequence[str]
+    arms: Mapping[str, ArmSearch]
 
 
 def run_stage(
@@ -95,7 +98,7 @@ def run_stage(
     plan: Plan,
     until: float | None = None,
     notify: Notify = ignore,
-    near: FusionConfig | None = None,
+    near: Stage | None = None,
 ) -> Stage:
     """Fit the parameters of a plan; where a combination is not identifiable, fix one of it and go on.
 
@@ -120,7 +123,8 @@ def run_stage(
 
     start, notes = likelihood.config, list[str]()
     if near is not None:
-        start = with_gates(near if "bias" in plan.fit else _with_biases_of(near, config), start)
+        begun = near.best.config
+        start = with_gates(begun if "bias" in plan.fit else _with_biases_of(begun, config), start)
     own = with_own_delays(start, excited)
     if any(one.fit == "delay" for one in free(own)):
         start = own
@@ -130,7 +134,7 @@ def run_stage(
         start, notes = with_large_biases(likelihood, start, plan.fixed)
     if "latency" in plan.fit:
         fixed += shared_times(likelihood.sensors, excited, free(start), start)
-    best, orders = search(likelihood, start, free, notify, plan.one_delay, near=near is not None)
+    best, orders, arms = search(likelihood, start, free, notify, plan.one_delay, near.arms if near else None)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
         if more:
@@ -149,7 +153,7 @@ def run_stage(
         if 0.0 < sensor.gate < _NARROWEST and name in used
     ]
     notes += few_measurements(likelihood, free(best.config))
-    return Stage(likelihood, best, free(best.config), fixed, orders, notes)
+    return Stage(likelihood, best, free(best.config), fixed, orders, notes, arms)
 
 
 def likelihood_of(runs: Sequence[Run], config: FusionConfig, plan: Plan, until: float | None = None) -> Likelihood:

@@ -139,7 +139,7 @@ def tune(
         if refuted := [axis for axis, one in found.items() if one.refutes]:
             held, start = [*fixed, *(f"axes.{axis}" for axis in refuted)], config
             for axis in refuted:
-                start = with_plain_arm(start, axis, found[axis].arm)
+                start = with_plain_arm(start, axis, found[axis].plain.arm)
             pipeline = Pipeline(runs, start, plans(start, kinds, held, trust, sd_prior, "delay" in share), progress)
             validation = _fitted_and_validated(pipeline, config, until, validate)
         for stage in pipeline.stages:
@@ -277,7 +277,7 @@ class Pipeline:
             TuneError: No stage has any free parameter.
         """
         config, stages, again = self.config, list[Stage](), bool(self.stages)
-        near = self.stages[0].best.config if again else None
+        near = self.stages[0] if again else None
 
         def notify(found: Point) -> None:
             if not again:
@@ -295,10 +295,8 @@ class Pipeline:
 
     def doubts(self) -> dict[str, Doubt]:
         """Of the arms that were fitted: see :func:`.plain.doubts`."""
-        if not self.stages:
-            return {}
-        config, free = self.result(), [one for stage in self.stages for one in stage.free]
-        return doubts(self.stages[0].likelihood, config, lag_slopes(free, config))
+        arms = {axis: one for stage in self.stages for axis, one in stage.arms.items()}
+        return doubts({axis: one.plain for axis, one in arms.items()}, self.result())
 
     def keep_the_better(self) -> None:
         """Go back to the configuration as given if it is more likely: with gates the search may pass worse points."""
