@@ -132,11 +132,11 @@ def test_a_noise_that_is_none_costs_nothing() -> None:
 
 
 def test_a_disturbance_that_is_too_quick_is_never_worth_it() -> None:
-    """Forgotten within less than two update periods: no likelihood makes up for it. One of two periods may be."""
+    """Forgotten within two update periods or less: no likelihood makes up for it. One that lasts longer may be."""
     least = quickest(moving()[0])
     assert least == 2.0 * PERIOD
-    assert score_of(disturbance_sd=1e-3, disturbance_time=0.99 * least) == -np.inf
-    assert np.isfinite(score_of(disturbance_sd=1e-3, disturbance_time=least))
+    assert score_of(disturbance_sd=1e-3, disturbance_time=least) == -np.inf
+    assert np.isfinite(score_of(disturbance_sd=1e-3, disturbance_time=1.01 * least))
 
 
 def test_noise_that_is_correlated_for_ten_milliseconds_is_no_disturbance() -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from ..arrays import FloatArray
 from .arms import Arm, Coordinates, Fit, Limits, Measured, Rest, longest_delay, rests
 from .plain import LAGS, delays, plain_arm
-from .posterior import SHORTEST, AxisPosterior, Branch, Entry, GainKind, Model, Quantity
+from .posterior import GAINS, SHORTEST, AxisPosterior, Branch, Entry, GainKind, Model, Quantity
 
 BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": (0.02, 0.5), "gain": (0.7, 1.3)}  # recovery [s]
 # A gain is 1 within a tenth. What is sold as an axis neither rings for ever nor has two lags far apart.
@@ -60,7 +60,7 @@ class Freedom(NamedTuple):
     given: Arm
     free: Collection[str] = ("delay", "lag", "damping", "recovery", "gain")
     orders: Sequence[int] = (1, 2)
-    gains: Sequence[GainKind] = ("given", "static", "recovering")
+    gains: Sequence[GainKind] = GAINS
 
     @property
     def models(self) -> list[Model]:

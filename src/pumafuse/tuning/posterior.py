@@ -24,6 +24,7 @@ Quantity: TypeAlias = Literal[
 ]  # s, but for the gain, ω [rad/s] and ζ
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 GainKind: TypeAlias = Literal["given", "static", "recovering"]
+GAINS: tuple[GainKind, ...] = get_args(GainKind)
 
 SHORTEST = 2e-5  # s, between two dead times that differ
 _NEVER = 1e-300  # a probability
@@ -42,10 +43,10 @@ class Model(NamedTuple):
     @property
     def size(self) -> int:
         """How many numbers it has beside the delay."""
-        return self.order + ("given", "static", "recovering").index(self.gain)
+        return self.order + GAINS.index(self.gain)
 
 
-MODELS = tuple(Model(*one) for one in product((1, 2), ("given", "static", "recovering")))
+MODELS = tuple(Model(*one) for one in product((1, 2), GAINS))
 
 
 @dataclass(frozen=True)
@@ -199,6 +200,29 @@ def sharing(posteriors: Mapping[str, AxisPosterior]) -> list[str]:
     """
     if len(posteriors) < 2:
         return []
+    gain = _gain_of_sharing(posteriors)
+    shares: list[str] = list(posteriors)
+    while len(shares) > 1:
+        fewer: list[list[str]] = [[axis for axis in shares if axis != one] for one in shares]
+        best = max(fewer, key=gain)
+        if gain(shares) >= gain(best):
+            return shares
+        shares = best
+    return []
+
+
+def own_worth(posteriors: Mapping[str, AxisPosterior], shares: Sequence[str]) -> dict[str, float]:
+    """By how much each axis's measurements are likelier with a delay of its own than with the shared one."""
+    if not shares:
+        return {}
+    gain = _gain_of_sharing(posteriors)
+    return {
+        axis: gain(one for one in shares if one != axis) - gain(dict.fromkeys([*shares, axis])) for axis in posteriors
+    }
+
+
+def _gain_of_sharing(posteriors: Mapping[str, AxisPosterior]) -> Callable[[Iterable[str]], float]:
+    """How much likelier one delay for some axes is than one each."""
     grid = _grid(posteriors.values())
     width = np.gradient(grid)
     logs = {axis: one.log_density(grid) for axis, one in posteriors.items()}
@@ -209,19 +233,14 @@ def sharing(posteriors: Mapping[str, AxisPosterior]) -> list[str]:
 
     alone = {axis: evidence(log) for axis, log in logs.items()}
 
-    def gain(axes: Sequence[str]) -> float:
-        """How much likelier one delay for these axes is than one each."""
-        price = (len(axes) - 1) * math.log(_OWN_WIDTH)
-        return evidence(np.sum([logs[axis] for axis in axes], axis=0)) - sum(alone[axis] for axis in axes) + price
+    def gain(axes: Iterable[str]) -> float:
+        mine = list(axes)
+        if len(mine) < 2:
+            return 0.0
+        price = (len(mine) - 1) * math.log(_OWN_WIDTH)
+        return evidence(np.sum([logs[axis] for axis in mine], axis=0)) - sum(alone[axis] for axis in mine) + price
 
-    shares: list[str] = list(posteriors)
-    while len(shares) > 1:
-        fewer: list[list[str]] = [[axis for axis in shares if axis != one] for one in shares]
-        best = max(fewer, key=lambda axes: gain(axes) if len(axes) > 1 else 0.0)
-        if gain(shares) >= (gain(best) if len(best) > 1 else 0.0):
-            return shares
-        shares = best
-    return []
+    return gain
 
 
 def shared_delay(posteriors: Sequence[AxisPosterior]) -> float:

@@ -16,6 +16,7 @@ import numpy as np
 from ..arrays import FloatArray
 from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
+from ..model.plants import SecondOrder
 from .arm_search import ArmSearch, Freedom
 from .arms import Arm, Rest
 from .identifiability import covariance
@@ -31,7 +32,7 @@ from .parameters import (
     with_rest,
     with_shared_delay,
 )
-from .posterior import GainKind, Mixture, Model, chosen_model, shared_delay, sharing
+from .posterior import GAINS, GainKind, Mixture, Model, chosen_model, own_worth, shared_delay, sharing
 
 _ROUGHLY = 0.1  # tolerance in log-likelihood where maxima are only compared
 _STEP = 0.010  # s, between latencies that are tried: their maxima are as wide
@@ -101,19 +102,25 @@ def search(
 
 def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom | None:
     """What of an axis's arm the free parameters leave open; None: nothing."""
-    both = with_arm(config, axis, Arm(0.0, 0.1, 1.0, 0.1))  # of second order, with a gain that recovers
-    fields = {one.path[-1] for at in (config, both) for one in free(at) if one.axis == axis}
-    fields |= {"delay"} & {one.path[-1] for one in free(config) if one.axis is None}
-    names = {_NAMES[field] for field in fields if field in _NAMES}
-    given = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
-    whole = {"natural_frequency", "damping"} <= fields
-    order = 2 if given.damping else 1
+    other = with_arm(config, axis, Arm(0.0, 0.1, 0.0 if _is_second(config, axis) else 1.0, 0.1))
+    here, there = ({one.path[-1] for one in free(at) if one.axis == axis} for at in (config, other))
+    if any(one.fit == "delay" for one in free(config) if one.axis in (None, axis)):
+        here.add("delay")
+    plants = {"natural_frequency", "damping"}, {"time_constant"}
+    whole = any(plant <= here for plant in plants) and any(plant <= there for plant in plants)
     gains: list[GainKind] = ["given"]
-    if "gain" in names:
-        gains = ["static", "recovering"] if "recovery" in names else ["recovering" if given.recovery else "static"]
-    if not whole:
-        names -= {"damping"} if order == 1 else set()
+    given = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
+    if "intercept" in here and "gain_recovery" in there:
+        here, gains, given = here | {"gain_recovery"}, [*GAINS], given._replace(gain=1.0, recovery=0.0, slope=0.0)
+    elif "intercept" in here:
+        gains = ["recovering" if given.recovery else "static"]
+    names = {_NAMES[field] for field in here | (plants[0] if whole else set()) if field in _NAMES}
+    order = 2 if given.damping else 1
     return Freedom(given, names, (1, 2) if whole else (order,), gains) if names else None
+
+
+def _is_second(config: FusionConfig, axis: str) -> bool:
+    return isinstance(config.arm.axes[axis].plant, SecondOrder)
 
 
 def _arm_search(
@@ -151,14 +158,16 @@ def _with_arms(
     delayed = {axis: one.posterior for axis, one in searched.items() if "delay" in freedoms[axis].free}
     shares = list(delayed) if one_delay else sharing(delayed)
     delay = shared_delay([delayed[axis] for axis in shares]) if shares else None
+    worth = {} if one_delay else own_worth(delayed, shares)
     for axis, search in searched.items():
-        mine, model = axis in shares, Model(1, "given")
+        mine = axis in shares
         mixture = search.posterior.mixture([delayed[one] for one in shares if mine and one != axis])
         model = chosen_model(mixture)
         config = with_arm(config, axis, search.arm(model, delay if mine else None))
         reasons[axis] += _why(freedoms[axis], mixture, model)
         if len(delayed) > 1 and axis in delayed:
-            reasons[axis].append(f"delay: {'shared' if mine else 'its own'}")
+            gain = f" (own {worth[axis]:+.1f})" if axis in worth else ""
+            reasons[axis].append(f"delay: {'shared' if mine else 'its own'}{gain}")
     return config if delay is None else with_shared_delay(config, shares, delay)
 
 
