@@ -27,7 +27,7 @@ PRIORS = {
     "damping": (0.0, 0.7),
     "recovery": (math.log(0.1), math.log(0.5 / 0.02) / (2.0 * 1.96)),
 }
-_LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each as likely
+_LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each share of which is as likely
 _STARTS = 3  # maxima of the grid from which an arm is fitted
 _NEAR = 20.0  # log-likelihood behind the best, up to which a maximum of the grid is looked at
 _SHARE, _SMALLEST = 0.98, 1e-7  # of the measurements that least squares are of; the rest may be outliers; m
@@ -297,15 +297,15 @@ class ArmSearch:
         """The log-density with the free numbers integrated out, each with its prior's constant."""
         log = fit.log_posterior
         free = [name for name, one in zip(names, inside, strict=True) if one]
-        for name in free:
+        information = fit.information[np.ix_(inside, inside)]
+        for place, name in enumerate(free):
             if name in PRIORS:
                 log -= math.log(PRIORS[name][1] * math.sqrt(2.0 * math.pi))
-            elif name == "lag":
-                log -= _LOG_RANGE
-            else:
-                log -= math.log(self._longest)
+            else:  # uniform: where the likelihood is flat, it ends at its bounds all the same
+                width = _LOG_RANGE if name == "lag" else self._longest
+                log -= math.log(width)
+                information[place, place] += 12.0 / width**2
         if free:
-            information = fit.information[np.ix_(inside, inside)]
             size = np.sqrt(np.maximum(np.diag(information), 1e-9))
             _, determinant = np.linalg.slogdet(information / np.outer(size, size) + 1e-9 * np.eye(len(free)))
             log -= 0.5 * (float(determinant) + 2.0 * float(np.log(size).sum()) - len(free) * math.log(2.0 * math.pi))

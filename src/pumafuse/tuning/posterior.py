@@ -27,10 +27,11 @@ GainKind: TypeAlias = Literal["given", "static", "recovering"]
 GAINS: tuple[GainKind, ...] = get_args(GainKind)
 
 SHORTEST = 2e-5  # s, between two dead times that differ
-_NEVER = 1e-300  # a probability
+_NEVER = 1e-9  # a probability that is as good as none
 _GRID = 2000  # points of a distribution, at most
 _REFINED = 8  # points between two dead times, along which everything is interpolated
 _AS_LIKELY = 0.2  # of the most likely model's probability: the simplest of such models is taken
+_SHARED = 2.3  # log-odds that an axis has the delay of the others: ten to one, since it is mostly the controller's
 _OWN_WIDTH = 0.05  # s: how far apart the dead times of axes that do not share one are a priori
 
 
@@ -237,7 +238,7 @@ def _gain_of_sharing(posteriors: Mapping[str, AxisPosterior]) -> Callable[[Itera
         mine = list(axes)
         if len(mine) < 2:
             return 0.0
-        price = (len(mine) - 1) * math.log(_OWN_WIDTH)
+        price = (len(mine) - 1) * (math.log(_OWN_WIDTH) + _SHARED)
         return evidence(np.sum([logs[axis] for axis in mine], axis=0)) - sum(alone[axis] for axis in mine) + price
 
     return gain

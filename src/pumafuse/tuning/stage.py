@@ -185,7 +185,10 @@ def _identified(
     fixed: list[NotIdentifiable],
     notify: Notify,
 ) -> Point:
-    """The best point with one parameter fixed of each combination that is not identifiable; appends to ``fixed``."""
+    """The best point with one parameter fixed of each combination that is not identifiable; appends to ``fixed``.
+
+    It is fixed as configured, unless the measurements know better than that: then as it was found.
+    """
 
     def as_configured(one: Parameter) -> FusionConfig:
         return changed(best.config, one.path, one.given(known))
@@ -193,9 +196,10 @@ def _identified(
     while len(fixed) < _MOST_FIXED and (found := not_identifiable(likelihood, best, free(best.config))) is not None:
         (one,) = (one for one in free(best.config) if one.key == found.fixed)
         other_order = one.fit == "plant" and one.given(known) is None  # while no recovery can be set back to none
-        start = best.config if other_order else as_configured(one)
+        starts = [best.config] if other_order else [as_configured(one), best.config]
         fixed.append(found)
-        best = maximise_with_gates(likelihood, start, free(best.config), notify)
+        peaks = (maximise_with_gates(likelihood, start, free(start), notify) for start in starts)
+        best = next((one for one in peaks if one.log_posterior > best.log_posterior - 0.5 * Z95**2), best)
     for one in not_identifiable_noise(likelihood, best, free(best.config)):
         start = as_configured(one)
         without = maximise_with_gates(likelihood, start, [other for other in free(start) if other.key != one.key])
