@@ -16,7 +16,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from .arms import Arm, Coordinates, Fit, Limits, Measured, Rest, longest_delay, rests
-from .plain import LAGS, delays, plain_arm
+from .plain import COMMANDS, LAGS, ROWS, delays, plain_arm
 from .posterior import GAINS, SHORTEST, AxisPosterior, Branch, Entry, GainKind, Model, Quantity
 
 BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": (0.02, 0.5), "gain": (0.7, 1.3)}  # recovery [s]
@@ -29,6 +29,7 @@ PRIORS = {
 }
 _LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each share of which is as likely
 _STARTS = 3  # maxima of the grid from which an arm is fitted
+_NEARLY = 40.0  # log-likelihood that a better noise may gain
 _NEAR = 20.0  # log-likelihood behind the best, up to which a maximum of the grid is looked at
 _SHARE, _SMALLEST = 0.98, 1e-7  # of the measurements that least squares are of; the rest may be outliers; m
 _GATED = 2  # times: outliers widen the noise by which they are told
@@ -158,10 +159,19 @@ class ArmSearch:
 
     def _by_least_squares(self) -> dict[Model, Fit]:
         """Each model, from the grid: noise that is fitted to a poor arm explains what a better one would."""
+        whole, self._measured = self._measured, self._measured.excerpt(COMMANDS, ROWS)
         self.rest = self._white(self._on_grid(1)[0])
         found = self._fitted(self._on_grid(_STARTS))
         self.rest = self._white(self._best(found).arm)
-        return self._fitted([self._best(found).arm], found)
+        found = self._fitted([self._best(found).arm], found)
+        self._measured = whole
+        return found
+
+    def _likely(self, found: Mapping[Model, Fit]) -> dict[Model, Fit]:
+        """Those models that a better noise could still bring near the best."""
+        evidence = {model: self._evidence(model, fit) for model, fit in found.items()}
+        least = max(evidence.values()) - _NEARLY
+        return {model: fit for model, fit in found.items() if evidence[model] > least}
 
     def _peaks(self, noise: Rest, least: Sequence[float], prior: float | None) -> list[tuple[float, Model, Fit]]:
         """The maxima of every model with their evidence, the best first; those an update period away, too."""
@@ -169,9 +179,9 @@ class ArmSearch:
         for _ in range(_GATED):
             self.rest = self._likely_rest(self._best(self._fits).arm, self.rest, least, prior)
             self._measured = self._measured.gated(self._best(self._fits).arm, self.rest, _GATE)
-        self._fits = self._fitted([self._best(self._fits).arm, *self._on_grid(_STARTS)], self._fits)
+        self._fits = self._likely(self._fitted([self._best(self._fits).arm, *self._on_grid(1)], self._fits))
         self.rest = self._likely_rest(self._best(self._fits).arm, self.rest, least, prior)
-        self._fits = self._fitted([self._best(self._fits).arm], self._fits)
+        self._fits = self._likely(self._fitted([self._best(self._fits).arm], self._fits))
         every = [(self._evidence(model, fit), model, fit) for model, fit in self._fits.items()]
         highest = max(one[0] for one in every)
         for evidence, model, fit in list(every) if "delay" in self._freedom.free else ():
@@ -220,7 +230,7 @@ class ArmSearch:
     def _fitted(self, starts: Sequence[Arm], known: Mapping[Model, Fit] | None = None) -> dict[Model, Fit]:
         """Each model fitted from the best of the starts, from the simpler models, and from where it was."""
         found = dict[Model, Fit]()
-        for model in self._freedom.models:
+        for model in known or self._freedom.models:
             arms = starts if not found else [self._best(found).arm]
             tries = [self._fit(model, arm) for arm in self._likeliest(model, arms, max(len(starts), 2))]
             if known:

@@ -24,6 +24,7 @@ from .steps import bounded_step
 _NOISE = np.dtype(
     [(name, np.float64) for name in ("walk", "offset_sd", "disturbance_sd", "disturbance_time", "smoothness")]
 )
+_WRONG = 0.01  # how likely a guess is just wrong
 _LATEST, _PERIODS = 0.6, 5.0  # s, or update periods: the longest dead time
 _FAR = 30.0  # times all that is measured: where an offset may begin
 _WALKS, _SDS = (1e-8, 10.0), (1e-8, 10.0)  # m/√s, m: bounds
@@ -408,6 +409,11 @@ class _Linear(NamedTuple):
     information: FloatArray
 
 
+def log_belief(x: float) -> float:
+    """What is believed of a number that is so many standard deviations from a guess, which may be just wrong."""
+    return math.log(math.exp(-0.5 * x * x) + _WRONG)
+
+
 # ---- the rest -------------------------------------------------------------------------------------------------------
 
 
@@ -458,7 +464,7 @@ def rests(
         def cost(x: FloatArray, smoothness: float | None = smoothness) -> float:
             white, log_determinant = measured.whitened(rest_of(x, smoothness), left)
             found = 0.5 * (float(np.vdot(white, white)) + log_determinant + measured.count * _LOG_2PI)
-            return found + (0.5 * float(np.sum(((x[:s] - means) / prior) ** 2)) if prior else 0.0)
+            return found - (sum(map(log_belief, ((x[:s] - means) / prior).tolist())) if prior else 0.0)
 
         solve: Any = minimize
         found = solve(cost, np.array(begin), method="SLSQP", bounds=bounds, options={"ftol": 1e-3, "eps": 1e-4})

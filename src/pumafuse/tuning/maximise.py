@@ -94,10 +94,9 @@ def with_priors(linear: Linearised, at: Point, free: Sequence[Parameter]) -> Der
     found = linear.derivatives()
     score, information = found.score.copy(), found.information.copy()
     for number, one in enumerate(free):
-        if one.prior is not None:
-            mean, sd = one.prior
-            score[number] -= (one.at(at.config) - mean) / sd**2
-            information[number, number] += 1.0 / sd**2
+        more, known = one.prior_score(at.config)
+        score[number] += more
+        information[number, number] += known
     return Derivatives(score, information, found.scatter)
 
 

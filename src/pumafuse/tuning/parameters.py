@@ -16,7 +16,7 @@ from ..errors import ConfigError, suggestion
 from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor
 from ..model.plants import FirstOrder, SecondOrder
 from ..units import ending, of_kind, si
-from .arms import Arm, Rest, longest_delay
+from .arms import Arm, Rest, log_belief, longest_delay
 
 Fit = Literal["noise", "delay", "plant", "gain", "latency", "scale", "bias"]
 FITS: tuple[Fit, ...] = get_args(Fit)
@@ -153,8 +153,27 @@ class Parameter:
         return "lower" if at <= low + margin else "upper" if at >= high - margin else None
 
     def log_prior(self, config: FusionConfig) -> float:
-        """Logarithm of the prior density, but for a constant."""
-        return 0.0 if self.prior is None else -0.5 * ((self.at(config) - self.prior[0]) / self.prior[1]) ** 2
+        """Logarithm of the prior density, but for a constant.
+
+        A sensor's noise is believed to be wrong by any factor in one case of a hundred: then the measurements alone
+        decide.
+        """
+        if self.prior is None:
+            return 0.0
+        x = self._from_prior(config)
+        return log_belief(x) if self.is_noise else -0.5 * x * x
+
+    def prior_score(self, config: FusionConfig) -> tuple[float, float]:
+        """How the prior's logarithm changes with the coordinate, and the prior's information of it."""
+        if self.prior is None:
+            return 0.0, 0.0
+        x, sd = self._from_prior(config), self.prior[1]
+        weight = math.exp(-0.5 * x * x - log_belief(x)) if self.is_noise else 1.0
+        return -weight * x / sd, weight / sd**2
+
+    def _from_prior(self, config: FusionConfig) -> float:
+        mean, sd = cast("tuple[float, float]", self.prior)
+        return (self.at(config) - mean) / sd
 
     def of(self, known: FusionConfig, axis: str | None, sensor: str | None) -> Parameter:
         """This line of the table for an axis and a sensor; bounds about the number in ``known`` if not log."""

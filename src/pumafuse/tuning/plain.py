@@ -21,7 +21,7 @@ from .parameters import rounded, with_arm
 _DELAYS = 61  # dead times that are looked at
 LAGS = np.geomspace(1e-3, 2.0, 14)  # s, of a first-order plant
 LONGEST = 2.6  # s, of a lag that is told: of both together
-_COMMANDS, _ROWS = 6000, 2000  # of a recording that are looked at: where it moves most, and evenly of that
+COMMANDS, ROWS = 6000, 2000  # of a recording that are looked at: where it moves most, and evenly of that
 _STARTS = 3  # cells from which the least squares are looked for
 _AROUND = np.linspace(-1.5, 1.5, 7)  # logarithm of τ about the best one,
 _BESIDE = np.linspace(-0.03, 0.03, 13)  # s, and lags about its lag: which of them are allowed
@@ -70,7 +70,7 @@ def off(measured: Measured, arm: Arm) -> float:
 
 def plain_arm(measured: Measured) -> PlainArm | None:
     """The arm that leaves the least squares, without outliers; None where nothing moves or is measured."""
-    measured = measured.excerpt(_COMMANDS, _ROWS)
+    measured = measured.excerpt(COMMANDS, ROWS)
     if measured.count < 2 * _FEWEST:
         return None
     rest = Rest(np.ones(len(measured.sensors)))

@@ -7,14 +7,13 @@ is worth its numbers is taken.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TypeAlias
 
 import msgspec
 import numpy as np
 
 from ..arrays import FloatArray
-from ..filter.outcome import Outcome
 from ..fusion.config import FusionConfig
 from ..model.plants import SecondOrder
 from .arm_search import ArmSearch, Freedom
@@ -72,7 +71,8 @@ def search(
         free: The parameters to vary, which depend on the order of the plants.
         notify: Called with each better point.
         one_delay: Whether all axes whose delay is free share one whatever the measurements say.
-        near: The arms that were found on a part of the measurements, to begin from.
+        near: The arms that were found on a part of the measurements, to begin from; the configuration has the noise
+            that was found there.
 
     Returns:
         The best point; for each axis the reasons for the order of its plant, its gain, its disturbance and whether it
@@ -90,9 +90,11 @@ def search(
     for one in free(config):
         if one.fit == "latency":
             config = _nearest_latency(likelihood, config, one, free)
-    found = [_maximum(likelihood, model, free, notify) for model in _noise_models(likelihood, config, arms, free)]
-    best = _likeliest(likelihood, found, free, reasons)
-    best = _without_needless(likelihood, best, free, notify)
+    if near is None:
+        found = [_maximum(likelihood, model, free, notify) for model in _noise_models(likelihood, config, arms, free)]
+        best = _without_needless(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
+    else:
+        best = _maximum(likelihood, config, free, notify).config
     best = maximise_with_gates(likelihood, with_gates(best, config), free(best), notify)
     return best, {axis: "; ".join(why) for axis, why in reasons.items() if why}, searched
 
@@ -256,22 +258,19 @@ def _maximum(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify:
     is looked for from both sides, where any are rejected.
     """
 
-    def below(times: float) -> Point:
-        at = config
+    def below(at: FusionConfig, times: float, axes: Collection[str]) -> Point:
         for gates in (times, 1.0) if gated else (1.0,):
             at = with_gates(at, config, gates)
             if shared := [one for one in free(at) if one.axis is None]:
                 at = maximise(likelihood, at, shared, notify, tolerance=_ROUGHLY).config
-            found = maximise_by_axis(
-                likelihood, at, [one for one in free(at) if one.axis is not None], notify, _ROUGHLY
-            )
+            found = maximise_by_axis(likelihood, at, [one for one in free(at) if one.axis in axes], notify, _ROUGHLY)
             at = found.config
-        return found
+        return point(likelihood, at, [one for one in free(at) if one.axis is not None])
 
     gated = any(sensor.gate > 0.0 for sensor in config.sensors.values())
-    found = below(_NARROWER)
-    if any((one == int(Outcome.REJECTED)).any() for one in found.outcomes):
-        peaks = [found, below(_WIDER)]
+    found = below(config, _NARROWER, likelihood.sensors.keys())
+    if rejecting := likelihood.rejecting(found.results):
+        peaks = [found, below(config, _WIDER, rejecting)]
         best = _best_by_axis(likelihood, peaks, [peak.axes for peak in peaks])
         found = point(likelihood, best, [one for one in free(best) if one.axis is not None])
     return found
