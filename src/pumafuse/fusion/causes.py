@@ -43,6 +43,7 @@ _CLOSE = 5.0  # log-likelihood within which another cause may be the right one: 
 _NEAR = 0.95  # share of the best gain above which another cause may be the right one: no model is exact
 _LAGS = 4  # at which innovations that are left are looked at
 _COLOURED = 20.0  # Box-Pierce over its expectation, of 4 lags: 1 of 10,000 white ones
+_REST = 0.5  # of what is too much of NIS, which a shape may leave
 _LONGEST = 3  # causes named
 _ROWS = 4 * _MOST  # components and commands
 _COMMANDS = 3  # for each component, beyond which none is given to the filter unless it needs them
@@ -119,12 +120,16 @@ class Weight(NamedTuple):
         gain: Log-likelihood that another noise gains.
         score: Of a shape: by its size, at 0.
         information: Of a shape.
+        number: Of innovations, beside a shape.
+        squares: Sum of their ν²/S, likewise.
         colour: Of another noise: Box-Pierce statistic of what it leaves, over its expectation for white innovations.
     """
 
     gain: float = 0.0
     score: float = 0.0
     information: float = 0.0
+    number: float = 0.0
+    squares: float = 0.0
     colour: float = 0.0
 
 
@@ -201,17 +206,29 @@ def _least_of_correlated(evidence: Evidence, first: Suspect) -> float:
 
 def _weighed(evidence: Evidence) -> Iterator[Suspect]:
     factors: dict[tuple[Cause, str], list[tuple[float, float]]] = {}
-    for (cause, sensor, which), (gain, score, information, _) in evidence.items():
+    for (cause, sensor, which), weight in evidence.items():
         if cause in (Cause.NOISE, Cause.PROCESS):
-            factors.setdefault((cause, sensor), [(1.0, 0.0)]).append((which, gain))
-        elif information > 0.0:
-            size = score / information
+            factors.setdefault((cause, sensor), [(1.0, 0.0)]).append((which, weight.gain))
+        elif weight.information > 0.0:
+            size = weight.score / weight.information
             if _is_possible(cause, which, size):
-                yield Suspect(cause, sensor, size * _unit(cause, which), 0.5 * score * size)
+                yield Suspect(cause, sensor, size * _unit(cause, which), _gain_of_shape(weight))
         else:
-            yield Suspect(cause, sensor, 0.0, gain - _HANDICAPS.get(cause, 0.0))
+            yield Suspect(cause, sensor, 0.0, weight.gain - _HANDICAPS.get(cause, 0.0))
     for (cause, sensor), tried in factors.items():
         yield Suspect(cause, sensor, *_highest(sorted(tried)))
+
+
+def _gain_of_shape(weight: Weight) -> float:
+    """Log-likelihood that the best size gains.
+
+    No shape is exact. One that explains most of what is too much may leave a rest that is still larger than expected:
+    then the variance of all innovations is that of the rest.
+    """
+    explained = weight.score**2 / weight.information
+    before, rest = weight.squares / weight.number, (weight.squares - explained) / weight.number
+    widened = 0.5 * weight.number * (rest - 1.0 - math.log(rest)) if 1.0 < rest < 1.0 + _REST * (before - 1.0) else 0.0
+    return 0.5 * explained + widened
 
 
 def _is_possible(cause: Cause, which: float, size: float) -> bool:
@@ -319,7 +336,8 @@ def _of_part(part: _Part) -> Evidence:
         found[tried] = Weight(gain=float(gains[column]), colour=colour)
     for column, (tried, move) in enumerate(moves.items(), 1 + len(other)):
         x = (normalised[:, column] - normalised[:, 0]) / move
-        found[tried] = Weight(score=float(x @ normalised[:, 0]), information=float(x @ x))
+        score, squares = float(x @ normalised[:, 0]), float(normalised[:, 0] @ normalised[:, 0])
+        found[tried] = Weight(score=score, information=float(x @ x), number=len(x), squares=squares)
     for number in part.sensors:
         for share, times in _TAILS:
             gain = _heavy_tailed(normalised[sensor == number, 0], share, times)

@@ -320,8 +320,8 @@ def _cause(one: Suspect, found: Consistency) -> str:
         case Cause.LATENCY:
             return f"latency_ms{mine} is {size * MS:.3g} ms too {small}"
         case Cause.LAG | Cause.PLANT:
-            whose = "latency_ms or the arm's lag" if one.sensor else "the arm's lag"
-            return f"{whose} (delay_ms, plant) is {size * MS:.3g} ms too {small}"
+            whose, keys = ("the", "latency_ms, ") if one.sensor else ("the arm's", "")
+            return f"{whose} lag is {size * MS:.3g} ms too {small} ({keys}delay_ms or plant)"
         case Cause.DYNAMICS:
             return "the error follows the acceleration: delay_ms against the plant, or a sensor that smooths its values"
         case Cause.SCALE:
