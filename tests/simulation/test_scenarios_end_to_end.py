@@ -127,7 +127,7 @@ def test_an_arm_that_is_not_as_modelled(tmp_path: Path) -> None:
     worked.check("tangential", (0.064, 0.087), (0.76, 0.89))
     worked.check("radial", (0.046, 0.069), (0.88, 0.944))
     verdict = worked.sensor("tangential", "tracker")["verdict"]
-    assert "process noise too small" in verdict or "latency_ms" in verdict
+    assert "the lag is 1" in verdict and "ms too small" in verdict  # 5.6 ms of delay, the poles, a slower recovery
     assert worked.sensor("tangential", "tracker")["nis_mean"] > 1.18
 
 

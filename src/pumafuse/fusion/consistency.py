@@ -7,17 +7,21 @@ components are left out.
 
 from __future__ import annotations
 
+import enum
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
 from ..arrays import CodeArray, FloatArray
 from ..filter.outcome import Outcome
-from ..units import MM, Kind, of_kind
+from ..units import MM, MS, SCREEN, Kind, of_kind
 from . import chi_square
-from .config import FusionConfig, Sensor
+from .causes import Cause, Evidence, Suspect, evidence_of, suspects
+from .config import Sensor
 from .estimates import Estimates, Measurements
 from .score import Z95
 
@@ -26,17 +30,22 @@ _FEW = 30  # fewer components get no verdict
 _FROZEN = 10  # equal values in a row of a sensor with noise
 _WIDEST = 1e6  # largest ratio of prior to noise at which double precision keeps the error bars
 _NEVER = 1e-6  # expected number below which chance is no explanation
+_COLOURED = 0.01  # p-value below which innovations are not white
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
 _MANY_REJECTED = 0.1  # share of rejected components beyond which the others are a selection
 _TOO_SMALL = "rejected: {sd}, latency_ms or the process noise too small"
-_CAUSES = {  # by whether the NIS is above its band, and the sign of a notable correlation
-    (True, 1): ", innovations positively correlated: the process noise too small, or latency_ms wrong",
-    (True, 0): ": {sd} or the process noise too small",
-    (True, -1): ", innovations negatively correlated: {sd} too small",
-    (False, 1): ": {sd} or the process noise too large",
-    (False, 0): ": {sd} or the process noise too large",
-    (False, -1): ", innovations negatively correlated: the process noise too large",
-}
+
+
+class Finding(enum.Enum):
+    """What the numbers of a sensor on an axis say."""
+
+    FEW = "few"  # too few to tell
+    REJECTED = "rejected"  # many were: the others were selected to fit
+    CONSISTENT = "consistent"
+    AT_BOUND = "at bound"  # consistent, but no measurement determined the noise
+    NOT_WHITE = "not white"  # as large as expected, but correlated
+    TOO_LARGE = "too large"  # innovations, for their predicted sd
+    TOO_SMALL = "too small"
 
 
 @dataclass(frozen=True)
@@ -49,7 +58,11 @@ class Consistency:
         nis_band: Where that mean lies in 95 % of cases for a right filter.
         correlation: Autocorrelation of the normalised innovations at lags 1 to 20, (lags,).
         whiteness: Ljung-Box p-value over those lags; small: the innovations are not white.
-        verdict: In words, with the likely cause and the key to change.
+        rejected: Share of components that a gate rejected, beside them.
+        sensor: The sensor.
+        kind: Of the axis.
+        at_bound: Whether the sensor's sd is at a bound of what can be fitted.
+        evidence: Of causes, looked for where it makes a difference.
     """
 
     count: int
@@ -57,7 +70,41 @@ class Consistency:
     nis_band: tuple[float, float]
     correlation: FloatArray
     whiteness: float
-    verdict: str = ""
+    rejected: float = 0.0
+    sensor: str = ""
+    kind: Kind = "length"
+    at_bound: bool = False
+    evidence: Callable[[], Evidence] = dict
+
+    @cached_property
+    def finding(self) -> Finding:
+        """What the numbers say."""
+        low, high = self.nis_band
+        if self.count < _FEW:
+            return Finding.FEW
+        if self.rejected > _MANY_REJECTED:
+            return Finding.REJECTED
+        if not low <= self.nis <= high:
+            return Finding.TOO_LARGE if self.nis > high else Finding.TOO_SMALL
+        if self.whiteness < _COLOURED and abs(self.correlation[self.strongest_lag - 1]) > _NOTABLE:
+            return Finding.NOT_WHITE
+        return Finding.AT_BOUND if self.at_bound else Finding.CONSISTENT
+
+    @cached_property
+    def causes(self) -> tuple[Suspect, ...]:
+        """What explains that the innovations are not as expected, best first; none where nothing stands out."""
+        asked = self.finding in (Finding.NOT_WHITE, Finding.TOO_LARGE, Finding.TOO_SMALL)
+        return suspects(self.evidence()) if asked else ()
+
+    @property
+    def strongest_lag(self) -> int:
+        """At which lag the autocorrelation is farthest from 0."""
+        return int(np.argmax(np.abs(self.correlation))) + 1
+
+    @property
+    def verdict(self) -> str:
+        """In words, with the likely causes and the keys to change."""
+        return sentence(self)
 
     @property
     def correlation_band(self) -> float:
@@ -119,18 +166,34 @@ def whiteness_of(correlation: FloatArray, count: int) -> float:
     return chi_square.tail(lags, statistic)
 
 
-def consistency(est: Estimates, sensor: str, axis: str) -> Consistency | None:
-    """NIS, whiteness and verdict of one sensor's components on one axis; None where none were fused."""
+def consistency(
+    est: Estimates, sensor: str, axis: str, evidence: Callable[[], Evidence] | None = None
+) -> Consistency | None:
+    """NIS, whiteness and verdict of one sensor's components on one axis; None where none were fused.
+
+    Args:
+        est: The estimates.
+        sensor: The sensor.
+        axis: The axis.
+        evidence: Of causes on this axis, where several sensors share it.
+    """
     measurements = est.measurements.of(sensor, axis)
     fused = measurements.where(measurements.outcome == Outcome.FUSED)
     count = len(fused.value)
     if not count:
         return None
-    whiteness = ljung_box(fused.innovation / fused.innovation_sd)
-    found = Consistency(count, float(np.mean(fused.nis)), chi_square_band(count), *whiteness)
-    rejected = 1.0 - count / np.count_nonzero(measurements.outcome <= Outcome.REACQUIRED)
-    verdict = verdict_of(found, est.config, sensor, axis, rejected, lambda: follows_velocity(est, axis, fused))
-    return replace(found, verdict=verdict)
+    known = est.config.sensors[sensor]
+    return Consistency(
+        count,
+        float(np.mean(fused.nis)),
+        chi_square_band(count),
+        *ljung_box(fused.innovation / fused.innovation_sd),
+        rejected=1.0 - count / np.count_nonzero(measurements.outcome <= Outcome.REACQUIRED),
+        sensor=sensor,
+        kind=est.config.arm.axes[axis].kind,
+        at_bound=known.is_at_bound(axis),
+        evidence=evidence or (lambda: evidence_of(est, axis)),
+    )
 
 
 def sensor_problems(est: Estimates) -> list[str]:
@@ -209,59 +272,79 @@ def _frozen(values: FloatArray) -> int:
     return longest if longest >= _FROZEN and len(values) * elsewhere ** (longest - 1) < _NEVER else 0
 
 
-def verdict_of(
-    found: Consistency, config: FusionConfig, sensor: str, axis: str, rejected: float, follow: Callable[[], bool]
-) -> str:
-    """The verdict on the numbers of one sensor's components on one axis.
+# ---- in words -------------------------------------------------------------------------------------------------------
 
-    Args:
-        found: The numbers.
-        config: As used.
-        sensor: The sensor.
-        axis: The axis.
-        rejected: Share of rejected components.
-        follow: Whether the innovations follow the velocity, asked where it makes a difference.
-    """
-    if found.count < _FEW:
+
+def sentence(found: Consistency) -> str:
+    """The verdict on a sensor's components on an axis, in words."""
+    if found.finding is Finding.FEW:
         return f"too few measurements ({found.count}) to tell"
-    (low, high), sd = found.nis_band, of_kind("sd_mm", config.arm.axes[axis].kind)
+    low, high = found.nis_band
     digits = next(n for n in range(2, 17) if _beside([found.nis, low, high]) == _beside([found.nis, low, high], n))
     nis = f"NIS {found.nis:.{digits}f}, expected {low:.{digits}f} to {high:.{digits}f}"
-    if rejected > _MANY_REJECTED:  # the others were selected to fit
-        return f"{nis}, but {rejected:.0%} were {_TOO_SMALL.format(sd=sd)}"
-    correlation, coloured = found.correlation, found.whiteness < 0.01
-    if low <= found.nis <= high:
-        strongest = int(np.argmax(np.abs(correlation)))
-        if coloured and abs(correlation[strongest]) > _NOTABLE:
-            return f"{nis}: consistent in size, but not white (lag {strongest + 1}: {correlation[strongest]:+.2f})"
-        if config.sensors[sensor].is_at_bound(axis):
+    sd, lag = of_kind("sd_mm", found.kind), found.strongest_lag if len(found.correlation) else 0
+    causes = ", or ".join(_cause(one, found) for one in found.causes)
+    match found.finding:
+        case Finding.REJECTED:
+            return f"{nis}, but {found.rejected:.0%} were {_TOO_SMALL.format(sd=sd)}"
+        case Finding.NOT_WHITE:
+            white = f"consistent in size, but not white (lag {lag}: {found.correlation[lag - 1]:+.2f})"
+            return f"{nis}: {white}" + (f": {causes}" if causes else "")
+        case Finding.AT_BOUND:
             return f"{nis}, but {sd} is at a bound of what can be fitted: error bars need not hold; configure it"
-        return f"{nis}: consistent"
-    sign = int(np.sign(correlation[0])) if coloured and abs(correlation[0]) > _NOTABLE else 0
-    if found.nis > high and sign and follow():
-        return f"{nis}, innovations follow the velocity: latency_ms is wrong"
-    return nis + _CAUSES[found.nis > high, sign].format(sd=sd)
+        case Finding.CONSISTENT:
+            return f"{nis}: consistent"
+        case _:
+            return f"{nis}: {causes or 'no one cause stands out'}"
+
+
+def _cause(one: Suspect, found: Consistency) -> str:
+    """A cause as a clause."""
+    sd, drift, bias = (of_kind(key, found.kind) for key in ("sd_mm", "bias_drift_sd_mm", "bias_sd_mm"))
+    maneuvers = of_kind("maneuver_drift_mm_rts_per_m_s", found.kind)
+    mine = f" of {one.sensor}" if one.sensor not in ("", found.sensor) else ""
+    size, small, screen = abs(one.size), "small" if one.size > 0.0 else "large", SCREEN[found.kind]
+    match one.cause:
+        case Cause.NOISE:
+            return f"{sd}{mine} is {_factor(one.size)}"
+        case Cause.PROCESS:
+            return f"the process noise is {_factor(one.size)}"
+        case Cause.MANEUVERS:
+            return f"the arm strays more where its speed changes ({maneuvers})"
+        case Cause.CORRELATED:
+            return f"the noise{mine} is correlated, as of filtered or repeated values ({drift}, bias_time_s)"
+        case Cause.OUTLIERS:
+            return (
+                f"a few innovations{mine} are far larger than the others: outliers of the sensor, or jerks of the arm"
+            )
+        case Cause.LATENCY:
+            return f"latency_ms{mine} is {size * MS:.3g} ms too {small}"
+        case Cause.LAG | Cause.PLANT:
+            whose, keys = ("the", "latency_ms, ") if one.sensor else ("the arm's", "")
+            return f"{whose} lag is {size * MS:.3g} ms too {small} ({keys}delay_ms or plant)"
+        case Cause.DYNAMICS:
+            return "the error follows the acceleration: delay_ms against the plant, or a sensor that smooths its values"
+        case Cause.SCALE:
+            return f"scale{mine} is {size:.2g} of itself too {small}"
+        case Cause.POSITION:
+            share = f" by {one.size:+.1%} of it" if size else ""
+            scale = "scale, " if one.sensor else ""
+            return f"the error follows the position{share}: {scale}gain or a sag"
+        case Cause.BIAS:
+            return f"{one.sensor} is off by a constant of {size * screen.scale:.2g} {screen.unit} ({bias})"
+        case Cause.PLAY:
+            return f"the error turns with the direction: a play of about {size * screen.scale:.2g} {screen.unit}"
+        case Cause.LIMIT:
+            return "the arm falls behind where it is fastest: a limit of its speed"
+
+
+def _factor(size: float) -> str:
+    """By what a noise is to be multiplied."""
+    small, times = ("small", size) if size > 1.0 else ("large", 1.0 / size if size else math.inf)
+    return f"too {small}" + ("" if math.isinf(times) else f" by a factor of {times:.2g}")
 
 
 def _beside(numbers: list[float], digits: int = 16) -> tuple[bool, bool]:
     """Whether a number, as printed, is below a band and whether it is above."""
     value, low, high = (round(number, digits) for number in numbers)
     return value < low, value > high
-
-
-def follows_velocity(est: Estimates, axis: str, fused: Measurements) -> bool:
-    """Whether innovations correlate with the velocity, as those of a measurement with the wrong valid time do.
-
-    The sign of the correlation does not show which way the latency is wrong: the offset absorbs most of the error, and
-    what is left of an accurate sensor's follows the acceleration.
-    """
-    if not len(est.time):
-        return False
-    inside = (fused.time >= est.time[0]) & (fused.time <= est.time[-1])
-    innovation, velocity = fused.innovation[inside], est[axis].velocity
-    if np.isnan(velocity).any():  # smoothed estimates have none
-        step = np.diff(est.time, append=np.nan)
-        velocity = np.divide(np.diff(est[axis].position, append=0.0), step, out=np.zeros(len(step)), where=step > 0.0)
-    velocity = np.interp(fused.time[inside], est.time, velocity)
-    power = float(velocity @ velocity) * float(innovation @ innovation)
-    return power > 0.0 and abs(float(innovation @ velocity)) > 0.3 * float(np.sqrt(power))

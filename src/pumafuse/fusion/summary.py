@@ -6,6 +6,8 @@ Names of keys are those for lengths; the file has those of each axis's kind: ``r
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import cache
 from importlib.metadata import version
 from typing import Any
 
@@ -16,6 +18,7 @@ from .. import toml
 from ..arrays import FloatArray, IntArray
 from ..filter.outcome import Outcome
 from ..units import Kind, to_si
+from .causes import Evidence, evidence_of
 from .consistency import Consistency, chi_square_band, consistency, log_likelihood
 from .estimates import AxisEstimate, Bias, Estimates
 from .score import ReferenceTrack, score, score_velocity
@@ -268,8 +271,11 @@ def axis_summary(est: Estimates, axis: str) -> AxisSummary:
     found = None
     if est.reference is not None:
         found = score_axis(est.time, est.segment, est[axis], est.reference, axis, est.config.arm.update_period)
+    evidence = cache(lambda: evidence_of(est, axis))
     return AxisSummary(
-        sensors={name: _sensor_summary(est, name, axis) for name in mine.sensors if len(mine.of(name, axis).value)},
+        sensors={
+            name: _sensor_summary(est, name, axis, evidence) for name in mine.sensors if len(mine.of(name, axis).value)
+        },
         log_likelihood=log_likelihood(mine, est.config.sensors),
         score=found,
         nees_band=chi_square_band(fused) if fused else None,
@@ -277,8 +283,8 @@ def axis_summary(est: Estimates, axis: str) -> AxisSummary:
     )
 
 
-def _sensor_summary(est: Estimates, sensor: str, axis: str) -> SensorSummary:
-    measurements, found = est.measurements.of(sensor, axis), consistency(est, sensor, axis)
+def _sensor_summary(est: Estimates, sensor: str, axis: str, evidence: Callable[[], Evidence]) -> SensorSummary:
+    measurements, found = est.measurements.of(sensor, axis), consistency(est, sensor, axis, evidence)
     if found is None:
         return SensorSummary(outcomes=measurements.counts(), skill=skill(est, measurements))
     fused = measurements.where(measurements.outcome == Outcome.FUSED)

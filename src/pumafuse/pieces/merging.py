@@ -16,8 +16,9 @@ import msgspec
 import numpy as np
 
 from ..filter.outcome import Outcome
+from ..fusion.causes import Evidence, evidence_of, together
 from ..fusion.config import FusionConfig
-from ..fusion.consistency import Consistency, chi_square_band, follows_velocity, verdict_of, whiteness_of
+from ..fusion.consistency import Consistency, chi_square_band, whiteness_of
 from ..fusion.estimates import Estimates
 from ..fusion.offline import UNCOVERED
 from ..fusion.segments import added
@@ -29,10 +30,10 @@ _NUMBER = re.compile(r"\d[\d.,]*(e[+-]?\d+)?")
 
 
 class Innovations(NamedTuple):
-    """Of a sensor on an axis: the mean of ν/√S, and whether the innovations follow the velocity."""
+    """Of a sensor on an axis: the mean of ν/√S; and what the axis tells of causes."""
 
     mean: float
-    follow: bool
+    evidence: Evidence
 
 
 class Digest(NamedTuple):
@@ -57,12 +58,13 @@ def digest(est: Estimates) -> Digest:
     """What has to be kept of a piece for the summary of the run."""
     found = dict[tuple[str, str], Innovations]()
     for axis in est.axes:
+        evidence = evidence_of(est, axis)
         for name in est.measurements.sensors:
             mine = est.measurements.of(name, axis)
             fused = mine.where(mine.outcome == Outcome.FUSED)
             if len(fused.time):
                 mean = float(np.mean(fused.innovation / fused.innovation_sd))
-                found[axis, name] = Innovations(mean, follows_velocity(est, axis, fused))
+                found[axis, name] = Innovations(mean, evidence)
     none = est.measurements.where(np.zeros(len(est.measurements.time), dtype=np.bool_))
     small = replace(est, time=est.time[:: max(len(est.time) - 1, 1)].copy(), axes={}, cartesian=None, measurements=none)
     small = replace(small, reference=None, segment=np.zeros(2, dtype=np.int64), segments=())
@@ -146,7 +148,7 @@ def _sensor(digests: Sequence[Digest], axis: str, name: str) -> SensorSummary:
     fused = [_fused(part) for part in parts]
     if not sum(fused):
         return SensorSummary(outcomes=outcomes, skill=skill)
-    innovations = [one.innovations.get((axis, name), Innovations(0.0, False)) for one in having]
+    innovations = [one.innovations.get((axis, name), Innovations(0.0, {})) for one in having]
     found = _consistency(parts, innovations, digests[0].est.config, name, axis)
     squares = [
         _mean([None if rms is None else rms**2 for rms in each], fused) or 0.0
@@ -175,10 +177,19 @@ def _consistency(
         power += own + aside
     correlation = products / power if power > 0.0 else products
     white = whiteness_of(correlation, count) if lags else 1.0
-    found = Consistency(count, nis, chi_square_band(count), correlation, white)
     decided = sum(part.outcomes.get(one.word, 0) for part in parts for one in Outcome if one <= Outcome.REACQUIRED)
-    follow = 2 * sum(n for one, n in zip(innovations, fused, strict=True) if one.follow) > count
-    return replace(found, verdict=verdict_of(found, config, name, axis, 1.0 - count / decided, lambda: follow))
+    return Consistency(
+        count,
+        nis,
+        chi_square_band(count),
+        correlation,
+        white,
+        rejected=1.0 - count / decided,
+        sensor=name,
+        kind=config.arm.axes[axis].kind,
+        at_bound=config.sensors[name].is_at_bound(axis),
+        evidence=lambda: together(one.evidence for one in innovations),
+    )
 
 
 def _skill(parts: Sequence[Skill]) -> Skill | None:
