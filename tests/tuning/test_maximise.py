@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 import pumafuse as pf
 from pumafuse.tuning.likelihood import Derivatives, Likelihood
-from pumafuse.tuning.maximise import Point, _step, derivatives, ignore, maximise, maximise_by_axis, point
+from pumafuse.tuning.maximise import Point, derivatives, ignore, maximise, maximise_by_axis, point
 from pumafuse.tuning.parameters import Fit, Parameter, moved
+from pumafuse.tuning.steps import bounded_step
 from tuning_runs import (
     free_of,
     outage,
@@ -122,7 +123,7 @@ def test_a_step_is_the_best_there_is_in_its_box(
 ) -> None:
     """Karush, Kuhn and Tucker: inside, the slope of ½ δᵀ(I + λ diag I)δ − gᵀδ is 0, at an edge it points outward."""
     found, low, high, damping = problem
-    step = _step(found, low, high, damping)
+    step = bounded_step(found.score, found.information, low, high, damping)
     size = 1.0 / np.sqrt(np.diag(found.information))
     tiny = 1e-9 * (high - low)
     assert ((step >= low - tiny) & (step <= high + tiny)).all()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-import pumafuse as pf
+from pumafuse.tuning.arms import Arm
 from pumafuse.tuning.posterior import (
     MODELS,
     QUANTITIES,
@@ -22,26 +22,23 @@ from pumafuse.tuning.posterior import (
     sharing,
 )
 
-FIRST, SECOND = Model(1, "none"), Model(2, "static")
+FIRST, SECOND = Model(1, "given"), Model(2, "static")
 
 
 def branch(delay: float, sd: float, height: float = 0.0, model: Model = FIRST, lag_sd: float = 1e-3) -> Branch:
     """A Gaussian density of the delay, with a lag of 0.1 s that does not depend on it."""
     at = delay + sd * np.linspace(-5.0, 5.0, 41)
     log = height + norm.logpdf(at, delay, sd)
-    config = pf.FusionConfig(arm=pf.ArmModel.load("puma560-internal"))
     pairs = zip(at.tolist(), log.tolist(), strict=True)
-    entries = [Entry(t, config, one, {"lag": 0.1, "delay": t}, {"lag": lag_sd, "delay": 0.0}) for t, one in pairs]
+    entries = [
+        Entry(t, Arm(t, 0.1 - t), one, {"lag": 0.1, "delay": t}, {"lag": lag_sd, "delay": 0.0}) for t, one in pairs
+    ]
     return Branch(model, entries)
-
-
-def alone(delays: np.ndarray) -> np.ndarray:
-    return np.zeros(len(delays))
 
 
 def test_quantiles_of_one_maximum_are_those_of_its_density() -> None:
     """A normal density of the delay: 1.96 standard deviations each way, and the lag's own."""
-    found = AxisPosterior("x", [branch(0.08, 2e-3)]).mixture(alone)
+    found = AxisPosterior([branch(0.08, 2e-3)]).mixture()
     assert found.quantiles("delay", lambda _: True) == pytest.approx((0.08 - 1.96 * 2e-3, 0.08 + 1.96 * 2e-3), abs=3e-5)
     assert found.quantiles("lag", lambda _: True) == pytest.approx((0.1 - 1.96e-3, 0.1 + 1.96e-3), abs=1e-5)
     assert found.weight.sum() == pytest.approx(1.0)
@@ -49,22 +46,22 @@ def test_quantiles_of_one_maximum_are_those_of_its_density() -> None:
 
 def test_quantiles_over_models_are_those_of_the_mixture() -> None:
     """Two models with odds of 3 to 1: the ends solve 0.75 Φ₁ + 0.25 Φ₂ = 2.5 % and 97.5 %."""
-    posterior = AxisPosterior("x", [branch(0.08, 2e-3, math.log(3.0)), branch(0.09, 4e-3, 0.0, SECOND)])
-    ends = posterior.mixture(alone).quantiles("delay", lambda _: True)
+    posterior = AxisPosterior([branch(0.08, 2e-3, math.log(3.0)), branch(0.09, 4e-3, 0.0, SECOND)])
+    ends = posterior.mixture().quantiles("delay", lambda _: True)
     below = [0.75 * norm.cdf(end, 0.08, 2e-3) + 0.25 * norm.cdf(end, 0.09, 4e-3) for end in ends]
     assert below == pytest.approx([0.025, 0.975], abs=2e-3)
 
 
 def test_maxima_of_one_model_that_meet_do_not_count_twice() -> None:
     """The same maximum found from two starts is one."""
-    once, twice = (AxisPosterior("x", [branch(0.08, 2e-3)] * times) for times in (1, 2))
+    once, twice = (AxisPosterior([branch(0.08, 2e-3)] * times) for times in (1, 2))
     delays = np.linspace(0.07, 0.09, 50)
     assert twice.log_density(delays) == pytest.approx(once.log_density(delays))
 
 
 def test_axes_that_agree_share_a_delay_and_others_do_not() -> None:
     """Delays 1 ms apart, known to 2 ms, are one; one that is 20 ms away is another; at most one is told apart."""
-    near = {name: AxisPosterior(name, [branch(at, 2e-3)]) for name, at in (("a", 0.080), ("b", 0.081), ("c", 0.1))}
+    near = {name: AxisPosterior([branch(at, 2e-3)]) for name, at in (("a", 0.080), ("b", 0.081), ("c", 0.1))}
     assert sharing(near) == ["a", "b"]
     assert sharing({name: near[name] for name in "ac"}) == []
     assert sharing({"a": near["a"]}) == []
@@ -72,9 +69,9 @@ def test_axes_that_agree_share_a_delay_and_others_do_not() -> None:
 
 def test_a_shared_delay_weighs_the_axes_by_what_they_know() -> None:
     """The product of two normal densities: the mean weighted by 1/sd²."""
-    posteriors = [AxisPosterior("a", [branch(0.080, 1e-3)]), AxisPosterior("b", [branch(0.083, 2e-3)])]
+    posteriors = [AxisPosterior([branch(0.080, 1e-3)]), AxisPosterior([branch(0.083, 2e-3)])]
     assert shared_delay(posteriors) == pytest.approx((0.080 / 1.0 + 0.083 / 4.0) / 1.25, abs=2e-5)
-    together = posteriors[1].mixture(posteriors[0].log_density).quantiles("delay", lambda _: True)
+    together = posteriors[1].mixture([posteriors[0]]).quantiles("delay", lambda _: True)
     assert together[1] - together[0] == pytest.approx(2.0 * 1.96 * 1e-3 / math.sqrt(1.25), rel=0.02)
 
 

@@ -31,7 +31,6 @@ _LOG_RANGE = math.log(2e3)  # of a plant's lag, 1 ms to 2 s, each share of which
 _STARTS = 3  # maxima of the grid from which an arm is fitted
 _NEARLY = 40.0  # log-likelihood that a better noise may gain
 _NEAR = 20.0  # log-likelihood behind the best, up to which a maximum of the grid is looked at
-_SHARE, _SMALLEST = 0.98, 1e-7  # of the measurements that least squares are of; the rest may be outliers; m
 _GATED = 2  # times: outliers widen the noise by which they are told
 _GATE = 6.0  # standard deviations, from which a measurement does not count
 _EARLIER, _DAMPED = (0.0, 0.3, 0.6), (0.6, 1.0, 1.6)  # starts: shares of the lag that are no dead time, ζ
@@ -129,7 +128,7 @@ class ArmSearch:
     @property
     def spread(self) -> float:
         """How far the measurements are from the best arm, as a standard deviation [m]."""
-        return float(self._white(self._best(self._fits).arm).sd[0])
+        return float(self._measured.white(self._best(self._fits).arm).sd[0])
 
     def arm(self, model: Model, delay: float | None = None) -> Arm:
         """The most likely arm of a model; the one with this dead time [s]."""
@@ -160,9 +159,9 @@ class ArmSearch:
     def _by_least_squares(self) -> dict[Model, Fit]:
         """Each model, from the grid: noise that is fitted to a poor arm explains what a better one would."""
         whole, self._measured = self._measured, self._measured.excerpt(COMMANDS, ROWS)
-        self.rest = self._white(self._on_grid(1)[0])
+        self.rest = self._measured.white(self._on_grid(1)[0])
         found = self._fitted(self._on_grid(_STARTS))
-        self.rest = self._white(self._best(found).arm)
+        self.rest = self._measured.white(self._best(found).arm)
         found = self._fitted([self._best(found).arm], found)
         self._measured = whole
         return found
@@ -211,13 +210,6 @@ class ArmSearch:
         summits = [int(one) for one in np.flatnonzero(table >= highest) if log[one] > log.max() - _NEAR]
         summits.sort(key=lambda one: -log[one])
         return [arms[one]._replace(gain=float(gain[one])) for one in summits[:count]]
-
-    def _white(self, arm: Arm) -> Rest:
-        """All that an arm leaves as noise of the sensors: for least squares."""
-        left = np.sort(np.abs(self._measured.left(arm)))
-        left = left[: math.ceil(_SHARE * len(left))]
-        sd = max(float(np.sqrt(np.mean(left**2))), _SMALLEST) if len(left) else 1.0
-        return Rest(np.full(len(self._measured.sensors), sd))
 
     def _likely_rest(self, arm: Arm, start: Rest, least: Sequence[float], prior: float | None) -> Rest:
         """The most likely of what an arm leaves, after the penalty for its numbers."""

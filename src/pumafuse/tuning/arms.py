@@ -30,6 +30,9 @@ _FAR = 30.0  # times all that is measured: where an offset may begin
 _WALKS, _SDS = (1e-8, 10.0), (1e-8, 10.0)  # m/√s, m: bounds
 _TIME, _TIMES = 0.3, (1e-3, 1e3)  # s, of a disturbance: start, bounds
 _PIECES = 20  # of all recordings, that a model which is right has independent scores in
+_SHARE, _SMALLEST = 0.98, 1e-7  # of the measurements that least squares are of; the rest may be outliers; m
+_FEW = 3  # outliers in a row
+_HARMLESS = 0.02  # of the range that is measured
 _SETTLED = 2.6  # s, after which an arm has forgotten earlier commands
 _CLOSE = 5e-3  # log-likelihood: what is expected to gain less is no step
 _STEPS = 12  # of Gauss and Newton, at most
@@ -185,8 +188,8 @@ class Measured:
         """By these ``sensors``, of an axis whose update period is ``period`` [s]."""
         self.recordings, self.period, self.sensors = recordings, period, sensors
         self.count = int(sum(one.weight.sum() for one in recordings))
-        reach = max((float(np.ptp(one.value)) for one in recordings if len(one.value)), default=0.0)
-        self._offset = _FAR * max(reach, 1e-6)
+        self.range = max((float(np.ptp(one.value)) for one in recordings if len(one.value)), default=0.0)
+        self._offset = _FAR * max(self.range, 1e-6)
 
     def _with(self, recordings: Sequence[Recording]) -> Measured:
         return Measured(recordings, self.period, self.sensors)
@@ -206,21 +209,37 @@ class Measured:
         return sum(float(np.var(one.value) * len(one.value)) for one in self.recordings if len(one.value))
 
     def without_far_from(self, arm: Arm, times: float) -> Measured:
-        """Without measurements so many times as far off an arm as half of them are."""
+        """Without measurements so many times as far off an arm as half of them are.
+
+        What is nearer than a small part of the motion does no harm: half of them may be of an axis at rest.
+        """
         apart = [np.abs(one - np.median(one)) if len(one) else one for one in self.residuals(arm)]
-        limit = times * max(float(np.median(np.concatenate(apart))), 1e-9)
+        limit = max(times * float(np.median(np.concatenate(apart))), _HARMLESS * self.range)
         parts = [
             one._replace(weight=np.where(far <= limit, one.weight, 0.0))
             for one, far in zip(self.recordings, apart, strict=True)
         ]
         return self._with(parts)
 
+    def white(self, arm: Arm) -> Rest:
+        """All that an arm leaves as noise of the sensors: for least squares."""
+        left = np.sort(np.abs(self.left(arm)))
+        left = left[: math.ceil(_SHARE * len(left))]
+        sd = max(float(np.sqrt(np.mean(left**2))), _SMALLEST) if len(left) else 1.0
+        return Rest(np.full(len(self.sensors), sd))
+
     def gated(self, arm: Arm, rest: Rest, gate: float) -> Measured:
-        """Without measurements whose innovation beside an arm is beyond so many standard deviations."""
+        """Without measurements whose innovation beside an arm is beyond so many standard deviations.
+
+        More than a few of them in a row are no outliers: it is the arm that moves otherwise.
+        """
         left, parts = self.residuals(arm), list[Recording]()
         for one, mine in zip(self.recordings, left, strict=True):
             white, _ = self._white(one, rest, mine[None])
-            parts.append(one._replace(weight=np.where(np.abs(white[0]) <= gate, one.weight, 0.0)))
+            far = np.abs(white[0]) > gate
+            begins = np.flatnonzero(np.append(True, far[1:] != far[:-1]))
+            in_a_row = np.repeat(np.diff(begins, append=len(far)), np.diff(begins, append=len(far)))
+            parts.append(one._replace(weight=np.where(far & (in_a_row <= _FEW), 0.0, one.weight)))
         return self._with(parts)
 
     def excerpt(self, commands: int, rows: int) -> Measured:
@@ -284,7 +303,7 @@ class Measured:
             left[:, 1, 1] += 1.0 / sd**2
             left[:, 0, 1] += (mean - 1.0) / sd**2
             left[:, 1, 0] = left[:, 0, 1]
-        inner = left[:, free][:, :, free] + 1e-12 * np.eye(len(free)) * np.maximum(left[:, free, free], 1e-300)[:, None]
+        inner = left[:, free][:, :, free] + 1e-12 * np.eye(len(free)) * np.maximum(left[:, free, free], 1e-30)[:, None]
         best = np.linalg.solve(inner, left[:, free, 0][:, :, None])[:, :, 0] if free else np.zeros((len(arms), 0))
         squares = left[:, 0, 0] - np.einsum("ni,ni->n", best, left[:, free, 0])
         gain = 1.0 + best[:, 0] if limits is not None else np.array([arm.gain for arm in arms])

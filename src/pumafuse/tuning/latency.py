@@ -59,7 +59,6 @@ _FINEST = 2e-5  # s: no stamp of a log is better, whatever the likelihood says w
 _ROUGHLY = 0.1  # tolerance in log-likelihood
 _GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
 _GATE = 8.0  # standard deviations, of a sensor that has outliers: what jerks is none
-_AHEAD = 0.02  # s, by which a sensor may seem to be ahead of the commands where it is noisy
 _BESIDE = 3e-4  # s, beside a latency where its interval is taken
 _WIDE, _WIDE_LAG, _WIDE_GAIN = 0.3, 0.02, 0.1  # of the lag, s, of 1: intervals from which a number is not known
 _PARTS = 10  # of a run, the lag of each of which is reported
@@ -237,8 +236,8 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     likelihood = Likelihood(every, _with_right_stamps(config, trusted), [trusted])
     moving = excited_axes(likelihood, likelihood.config)
     found = dict(zip(moving, in_threads(lambda axis: _search(likelihood, axis), moving), strict=True))
-    _check_clock(found, trusted)
-    config, lags = _arm(likelihood.config, found, trusted)
+    lost = [axis for axis, search in found.items() if search.plain is None]
+    config, lags = _arm(likelihood.config, {axis: found[axis] for axis in moving if axis not in lost}, trusted)
     for axis, one in doubts({axis: search.plain for axis, search in found.items()}, config).items():
         lags[axis] = _doubted(lags[axis], one, one.sentence(config, axis))
         if one.refutes:
@@ -247,6 +246,7 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
     lags, clock = _with_courses(likelihood, config, lags)
     still = [axis for axis in config.arm.axes if axis not in moving]
     notes = [*likelihood.notes, *(f"{axis}: does not move, or {trusted} does not measure it" for axis in still)]
+    notes += [f"{axis}: {trusted} does not follow its commands: no lag is told" for axis in lost]
     notes += [_SAMPLED.format(one.run.name, step * MS) for one in surveys if (step := interpolation(one))]
     notes += [_AHEAD_OF.format(one.run.name, -lag * MS) for one in surveys if (lag := soonest(one)) < -SOONER]
     summary = LatencySummary(
@@ -374,19 +374,6 @@ def _search(likelihood: Likelihood, axis: str) -> ArmSearch:
     sd = np.array([config.sensors[name].sd_of(axis) for name in names], dtype=np.float64)
     least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
     return ArmSearch(likelihood.measured(axis, config), Freedom(Arm(0.0, 0.1)), Rest(sd), least)
-
-
-def _check_clock(found: Mapping[str, ArmSearch], trusted: str) -> None:
-    """Refuse a sensor that is ahead of the commands.
-
-    Raises:
-        TuneError: It moves before its commands.
-    """
-    ahead = [one.plain.ahead for one in found.values() if one.plain is not None]
-    if ahead and (late := float(np.median(ahead))) > _AHEAD:
-        raise TuneError(
-            f"sensor '{trusted}' moves {late * MS:.0f} ms before its commands: are both stamped by one clock?"
-        )
 
 
 def _arm(config: FusionConfig, found: Mapping[str, ArmSearch], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:

@@ -27,12 +27,11 @@ _AROUND = np.linspace(-1.5, 1.5, 7)  # logarithm of τ about the best one,
 _BESIDE = np.linspace(-0.03, 0.03, 13)  # s, and lags about its lag: which of them are allowed
 _OUTLIER = 8.0  # times the median distance from the best arm: what is farther does not count
 _FEWEST = 4.0  # independent measurements, at least: however alike their errors are
+_FOLLOWS = 40.0  # of χ² that an arm must explain: of some hundred arms with noise beside them none does by chance
 _CHANCE = 3.84  # of χ² with one degree of freedom, 95 %
 _ROUNDING = 1e-12  # of all squares: what is left of them where nothing is
 _MOST = 0.8  # of the measurements: how far these are off is not decided by single commands that were never sent
 _DOUBTED, _REFUTED = 1.25, 4.0  # times as far off as the delayed command: such an arm is doubted, or replaced
-_EARLY = np.linspace(-2.0, -0.02, 100)  # s: delays of a sensor that is ahead of the commands
-_AHEAD = 0.8  # times as far off as with any delay from 0 on: such a sensor is
 _ANY = Limits({"delay": (0.0, 10.0), "lag": (0.1 * LAGS[0], 2.0 * LAGS[-1]), "gain": (-np.inf, np.inf)}, {})
 
 
@@ -45,7 +44,6 @@ class PlainArm(NamedTuple):
             of their own.
         delayed: By how much the command alone is to be delayed to leave the least [s].
         delayed_off: How far that is off [m]; four fifths of the measurements are nearer.
-        ahead: By how much what is measured is ahead of the commands [s]; 0: it is not.
         measured: What was looked at, without outliers.
     """
 
@@ -53,7 +51,6 @@ class PlainArm(NamedTuple):
     lag_ci95: tuple[float, float]
     delayed: float
     delayed_off: float
-    ahead: float
     measured: Measured
 
 
@@ -69,16 +66,15 @@ def off(measured: Measured, arm: Arm) -> float:
 
 
 def plain_arm(measured: Measured) -> PlainArm | None:
-    """The arm that leaves the least squares, without outliers; None where nothing moves or is measured."""
+    """The arm that leaves the least squares, without outliers; None where nothing follows the commands."""
     measured = measured.excerpt(COMMANDS, ROWS)
-    if measured.count < 2 * _FEWEST:
+    if measured.count < 2 * _FEWEST or not any(np.ptp(one.command) > 0.0 for one in measured.recordings):
         return None
-    rest = Rest(np.ones(len(measured.sensors)))
-    late = delays(measured).tolist()
+    late, rest = delays(measured).tolist(), measured.white(Arm(0.0, LAGS[0]))
     arms = [Arm(delay, lag) for delay in late for lag in LAGS.tolist()]
-    best = _fitted(measured, arms, rest, 1)[0]
-    measured = measured.without_far_from(best, _OUTLIER)
+    measured = measured.without_far_from(_fitted(measured, arms, rest, 1)[0], _OUTLIER)
     found = _fitted(measured, arms, rest, _STARTS)
+    rest = measured.white(found[0])
     begun = [measured.fitted(arm, ["delay", "lag", "gain"], rest, _ANY).arm for arm in found]
     for one in begun:  # along the ridge on which dead time and plant make up for each other
         for lag in (one.lag * np.exp(_AROUND)).tolist():
@@ -89,24 +85,18 @@ def plain_arm(measured: Measured) -> PlainArm | None:
     arm = arms[place]._replace(gain=float(gains[place]))
     if arm.gain <= 0.0 or measured.count < 2 * _FEWEST:
         return None
-    left = measured.left(arm)
+    left, sd = measured.left(arm), float(rest.sd[0])
     power = float(left @ left)
     alike = min(max(float(left[1:] @ left[:-1]) / max(power, 1e-300), 0.0), 1.0)
     independent = max(measured.count * (1.0 - alike) / (1.0 + alike), _FEWEST)
-    most = 0.5 * (power * _CHANCE / independent + _ROUNDING * measured.power)
+    if measured.power - power < _FOLLOWS * power / independent:
+        return None
+    most = 0.5 * (power * _CHANCE / independent + _ROUNDING * measured.power) / sd**2
     allowed = [one.delay + one.lag for one, behind in zip(arms, log[place] - log, strict=True) if behind <= most]
-    delayed, early = _likeliest(measured, late, rest), _likeliest(measured, _EARLY.tolist(), rest)
-    delayed_off, ahead = off(measured, delayed), 0.0
-    if off(measured, early) < _AHEAD * delayed_off:
-        ahead = -early.total
-    ends = [*allowed, delayed.total]
-    return PlainArm(arm, (min(ends), max(ends)), delayed.total, delayed_off, ahead, measured)
-
-
-def _likeliest(measured: Measured, late: list[float], rest: Rest) -> Arm:
-    """The commands alone with the delay that leaves the least squares."""
     commands = [Arm(delay, LAGS[0]) for delay in late]
-    return commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
+    delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
+    ends = [*allowed, delayed.total]
+    return PlainArm(arm, (min(ends), max(ends)), delayed.total, off(measured, delayed), measured)
 
 
 def _fitted(measured: Measured, arms: list[Arm], rest: Rest, count: int) -> list[Arm]:

@@ -6,7 +6,7 @@ Fitted parameters are in the units of their keys; what else belongs to an axis i
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -19,7 +19,7 @@ from ..units import MS, Kind
 from .identifiability import Correlation
 from .intervals import ConfidenceInterval, Distances, lag_slopes
 from .parameters import Parameter
-from .plain import LONGEST, Doubt
+from .plain import Doubt
 from .validation import Check, fused
 
 _FROM_PRIOR = 0.8  # of the prior's interval, from which the measurements say hardly anything
@@ -147,20 +147,25 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def fitted_lags(
-    free: Sequence[Parameter], before: FusionConfig, after: FusionConfig, around: Mapping[str, Distances]
+    free: Sequence[Parameter],
+    before: FusionConfig,
+    after: FusionConfig,
+    around: Mapping[str, Distances],
+    lost: Collection[str],
 ) -> dict[str, FittedLag]:
-    """The lag of each axis that the free parameters change; none that is longer than any that is looked for.
+    """The lag of each axis that the free parameters change.
 
     Args:
         free: The parameters that were fitted.
         before: The configuration as given.
         after: The tuned one.
         around: From :func:`lag_intervals`; an axis that is not in it gets no interval.
+        lost: Axes of which no lag is told.
     """
     found: dict[str, FittedLag] = {}
     for axis in lag_slopes(free, after):
         lag, (below, above) = after.arm.lag_of(axis), around.get(axis, (np.inf, np.inf))
-        if lag > LONGEST:
+        if axis in lost:
             continue
         ends = [None if np.isinf(end) else end * MS for end in (lag - below, lag + above)]
         found[axis] = FittedLag(before_ms=before.arm.lag_of(axis) * MS, lag_ms=lag * MS, lag_ms_ci95=(ends[0], ends[1]))

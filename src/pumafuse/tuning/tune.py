@@ -154,8 +154,9 @@ def tune(
     if not stages:  # the configuration as given, or interrupted before a stage was complete
         free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed, sd_prior)
     tuned = _with_provenance(pipeline.result(), free, intervals, names)
-    slow = [axis for axis in lag_slopes(free, tuned) if tuned.arm.lag_of(axis) > LONGEST]
-    notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in slow)]
+    arms = {axis: one for stage in stages for axis, one in stage.arms.items()}
+    lost = [axis for axis, one in arms.items() if one.plain is None or tuned.arm.lag_of(axis) > LONGEST]
+    notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
     if interrupted:
         notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
     known = validate is not None and any(_same(validate, run) for run in runs)
@@ -174,7 +175,7 @@ def tune(
         sd_prior=sd_prior,
         interrupted=interrupted,
         likelihood=_likelihoods(pipeline.whole, config, tuned),
-        lags=with_doubts(fitted_lags(free, config, tuned, around), found, config, tuned),
+        lags=with_doubts(fitted_lags(free, config, tuned, around, lost), found, config, tuned),
         parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in free],
         biases=[one for run in runs for one in found_biases(run, tuned)],
         correlations=[one for stage in stages for one in correlations(stage.likelihood, stage.best, stage.free)],

@@ -1,0 +1,124 @@
+"""Arms against a recorded motion: likelihoods are those of the dense joint Gaussian, fits are maxima."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from pumafuse.filter.response import response
+from pumafuse.tuning.arms import Arm, Limits, Measured, Recording, Rest, rests
+
+T = 0.02
+OFFSET = 30.0  # times the range of what is measured: where an offset may begin
+FREE = Limits({"delay": (0.0, 1.0), "lag": (1e-3, 2.0), "damping": (0.2, 8.0), "gain": (0.5, 1.5)}, {})
+NAMES = ["delay", "lag", "damping", "gain"]
+
+
+def recording(seed: int, count: int = 60, sensors: int = 1) -> Recording:
+    rng = np.random.default_rng(seed)
+    given = np.arange(100) * round(T * 1e9)
+    command = 0.3 + np.cumsum(rng.normal(0.0, 0.01, 100))
+    time = np.sort(rng.integers(0, given[-1], count))
+    value = rng.normal(0.0, 0.02, count).cumsum()
+    return Recording(given, command, 0.3, time, value, rng.integers(0, sensors, count), np.ones(count))
+
+
+def covariance(one: Recording, rest: Rest, offset_sd: float) -> np.ndarray:
+    """Of all that is measured: an offset that walks from its beginning, a disturbance and white noise."""
+    t = (one.time - one.time[0]) / 1e9
+    apart = np.abs(t[:, None] - t)
+    smooth = np.sqrt(3.0) * apart / rest.disturbance_time
+    alike = (1.0 + smooth) * np.exp(-smooth) if rest.smoothness > 1.0 else np.exp(-apart / rest.disturbance_time)
+    walk = offset_sd**2 + rest.walk**2 * np.minimum(t[:, None], t)
+    return walk + rest.disturbance_sd**2 * alike + np.diag(rest.sd[one.source] ** 2)
+
+
+RESTS = [
+    Rest(np.array([0.01]), 0.0),
+    Rest(np.array([0.01]), 0.02),
+    Rest(np.array([0.003]), 0.01, 0.03, 0.1, 1.5),
+    Rest(np.array([0.003]), 0.0, 0.03, 0.05, 0.5),
+]
+ARMS = [
+    Arm(0.05, 0.08, gain=0.9),
+    Arm(0.0, 0.03, damping=0.7),
+    Arm(0.11, 0.2, damping=1.3, recovery=0.2, gain=1.2),
+    Arm(0.02, 0.05, recovery=0.1, gain=0.8, slope=0.05),
+]
+
+
+@pytest.mark.parametrize("rest", RESTS)
+@pytest.mark.parametrize("arm", ARMS)
+def test_the_likelihood_of_an_arm_is_the_joint_gaussians(arm: Arm, rest: Rest) -> None:
+    """Of what the arm leaves, in two recordings."""
+    parts = [recording(1), recording(2, 40)]
+    measured, expected = Measured(parts, T, ["a"]), 0.0
+    reach = max(np.ptp(one.value) for one in parts)
+    for one in parts:
+        moved = response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
+        cov = covariance(one, rest, OFFSET * reach)
+        expected += multivariate_normal.logpdf(one.value - moved, cov=cov)
+    assert measured.weighed([arm], rest)[0][0] == pytest.approx(expected, rel=1e-7)
+    assert measured.fitted(arm, [], rest, FREE).log_posterior == pytest.approx(expected, rel=1e-7)
+
+
+def test_the_best_gain_is_that_of_generalised_least_squares() -> None:
+    """And the likelihood is that with this gain, beside a second sensor that is off by any constant."""
+    one, rest, arm = recording(3, 80, sensors=2), Rest(np.array([0.01, 0.02]), 0.02), Arm(0.05, 0.08)
+    measured = Measured([one], T, ["a", "b"])
+    log, gain = measured.weighed([arm], rest, Limits({}, {}))
+    r = response(arm.model, T, arm.delay, one.given, one.command, one.start, one.time)
+    X = np.column_stack([r, one.source == 1])
+    inverse = np.linalg.inv(covariance(one, rest, OFFSET * np.ptp(one.value)))
+    best = np.linalg.solve(X.T @ inverse @ X, X.T @ inverse @ one.value)
+    assert gain[0] == pytest.approx(best[0], rel=1e-6)
+    again, _ = measured.weighed([arm._replace(gain=float(gain[0]))], rest)
+    assert log[0] == pytest.approx(again[0], rel=1e-9)
+
+
+def test_a_measurement_that_does_not_count_is_as_if_it_were_not_there() -> None:
+    one, rest = recording(4), RESTS[2]
+    weight = (np.arange(60) % 7 > 0).astype(np.float64)
+    without = Measured([one.of(weight > 0.0)], T, ["a"])
+    wild = one._replace(weight=weight, value=np.where(weight > 0.0, one.value, 1e3))
+    masked = Measured([wild], T, ["a"])
+    masked._offset = without._offset  # the range is that of what counts
+    assert masked.weighed(ARMS, rest)[0] == pytest.approx(without.weighed(ARMS, rest)[0], rel=1e-9)
+
+
+def test_a_fit_is_a_maximum_and_its_information_the_curvature() -> None:
+    """A simulated second-order arm: no neighbour is likelier, and the likelihood falls as the information says."""
+    one, rest, true = recording(5, 400), Rest(np.array([1e-3])), Arm(0.05, 0.1, damping=0.8, gain=0.95)
+    moved = response(true.model, T, true.delay, one.given, one.command, one.start, one.time)
+    value = moved + np.random.default_rng(5).normal(0.0, 1e-3, 400)
+    measured = Measured([one._replace(value=value)], T, ["a"])
+    found = measured.fitted(Arm(0.06, 0.08, damping=1.0), NAMES, rest, FREE)
+    assert found.arm == pytest.approx(true, abs=0.03)
+    sd = np.sqrt(np.diag(np.linalg.inv(found.information)))
+    for place, name in enumerate(NAMES):
+        at, lower = found.arm.coordinate(name), []
+        for sign in (-1.0, 1.0):
+            beside = found.arm.moved([name], [at + sign * sd[place]])
+            lower.append(found.log_posterior - measured.fitted(beside, [], rest, FREE).log_posterior)
+        expected = 0.5 * found.information[place, place] * sd[place] ** 2
+        assert np.mean(lower) == pytest.approx(expected, rel=0.05), name
+
+
+@pytest.mark.parametrize(("number", "kind"), [(0, "walk"), (1, "smooth"), (2, "rough")])
+def test_what_an_arm_leaves_is_found(number: int, kind: str) -> None:
+    """A walk, a smooth and a rough disturbance with white noise: of the last two the right one is likelier."""
+    true = {"walk": Rest(np.array([2e-3]), 5e-3), "smooth": Rest(np.array([2e-3]), 1e-6, 0.02, 0.3, 1.5)}
+    rest = true.get(kind, Rest(np.array([2e-3]), 1e-6, 0.02, 0.3, 0.5))
+    one = recording(6, 1500)._replace(time=np.arange(1500) * 20_000_000)
+    value = np.random.default_rng(7).multivariate_normal(np.zeros(1500), covariance(one, rest, 1e-3))
+    still = one._replace(value=value, command=np.full(100, 0.3))
+    found = list(rests(Measured([still], T, ["a"]), Arm(0.0, 0.1), Rest(np.array([1e-3])), 0.04, [1e-6]))
+    if number:
+        assert found[number][1] > found[3 - number][1]
+    likely = found[number][0]
+    assert likely.sd[0] == pytest.approx(2e-3, rel=0.15 if number < 2 else 0.4)  # a rough one is nearly as white
+    if kind == "walk":
+        assert likely.walk == pytest.approx(5e-3, rel=0.2)
+    else:
+        assert (likely.disturbance_sd, likely.disturbance_time) == pytest.approx((0.02, 0.3), rel=0.35)
