@@ -45,9 +45,7 @@ struct Known {
           start(value_of(axis.start)), sd{value_of(axis.lag_sd), value_of(axis.gain_sd)} {}
 
     // What lag and gain add to the variance of what changes so with them.
-    double variance(const ByDoubt<>& by) const {
-        return square(by[LAG] * sd[LAG]) + square(by[GAIN] * sd[GAIN]);
-    }
+    double variance(const ByDoubt<>& by) const { return square(by[LAG] * sd[LAG]) + square(by[GAIN] * sd[GAIN]); }
 
     // Of a state.
     double sd_of(const Residual<N, Real>& xi, int i) const {
@@ -211,7 +209,8 @@ class Filter {
         const Sensor<Real>& sensor = sensors[event.source];
         const Real sd = views[event.source * size() + a].sd * (event.spread ? event.spread[a] : 1.0);
         if (value_of(sensor.latency_sd) == 0.0) return square(sd);
-        const auto& [arm, noise, ahead, motion, delayed, start, sd_of_arm] = axes[a];
+        const Arm<Real>& arm = axes[a].arm;
+        const Noise<N, Real>& noise = axes[a].noise;
         const Vector<N, Real>& x = state.residual.x;  // the speed is C (A x + B (u + e)) of response and residual
         Real speed = state.response.speed(arm) + (arm.plant.order == 1 ? -arm.plant.rate * x[PLANT] : x[RATE]);
         if (noise.smooth()) speed = speed + x[DISTURBANCE + 1];
