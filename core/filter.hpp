@@ -25,6 +25,9 @@ struct State {
     std::vector<Gates> gates;
 };
 
+// A standard deviation. It is never 0, whatever a model without noise says: no arm, sensor or log resolves less.
+inline double bar(double variance) { return std::max(std::sqrt(variance), PF_FINEST); }
+
 // What is known of one axis.
 template <int N, class Real>
 struct Known {
@@ -34,11 +37,25 @@ struct Known {
     Vector<N, Real> motion;  // over the period ahead
     Real delayed;            // what the delay's derivatives make of an instant
     double start;
+    ByDoubt<> sd;            // of the lag [s] and of the gain
 
     explicit Known(const Axis<Real>& axis)
         : arm(axis), noise(axis), ahead(std::llrint(arm.period * 1e9)),
           motion(noise.motion(arm.plant, double(ahead) / 1e9)), delayed(axis.delay - value_of(axis.delay)),
-          start(value_of(axis.start)) {}
+          start(value_of(axis.start)), sd{value_of(axis.lag_sd), value_of(axis.gain_sd)} {}
+
+    // What lag and gain add to the variance of what changes so with them.
+    double variance(const ByDoubt<>& by) const { return square(by[LAG] * sd[LAG]) + square(by[GAIN] * sd[GAIN]); }
+
+    // Of a state.
+    double sd_of(const Residual<N, Real>& xi, int i) const {
+        return bar(std::max(value_of(xi.P[i][i]), 0.0) + variance({xi.by[LAG][i], xi.by[GAIN][i]}));
+    }
+
+    // How the response changes with lag and gain, where these are doubted.
+    ByDoubt<> doubt(const Response<Real>& response) const {
+        return noise.doubted ? response.by_doubt(arm) : ByDoubt<>{};
+    }
 };
 
 // What the smoother needs to know of an update by `sensor`, or of a change of noise, which is of none.
@@ -48,6 +65,7 @@ struct Entry {
     double q, drift;  // in force until then
     int sensor = NOBODY;
     double nu = 0.0, R = 0.0, widened = 0.0;
+    ByDoubt<> d_nu{};
     Vector<N, double> K{};
 };
 
@@ -118,28 +136,32 @@ class Filter {
             AxisState<N, Real> now = state.axes[a];
             const Time next = follow(now, a, rows, pending, end, time, stamped);
             double found[PF_OUTPUTS];
-            describe(axis, now.response.x, now.residual, found);
+            const ByDoubt<> left = describe(axis, now.response.x, axis.doubt(now.response), now.residual, found);
             const double known = now.residual.variance(axis.motion);
             now.residual.P = {};  // what comes is noise alone
             follow(now, a, rows, next, end, time + axis.ahead, stamped);
             const double later = now.response.x + now.residual.along(axis.noise.position);
             found[PF_VELOCITY] = (later - found[PF_POSITION]) / axis.arm.period;
-            found[PF_VELOCITY_SD] = std::sqrt(known + now.residual.variance(axis.noise.position)) / axis.arm.period;
+            const ByDoubt<> then = now.residual.left(axis.doubt(now.response), 1.0, axis.noise.position);
+            const double doubted = axis.variance({then[LAG] - left[LAG], then[GAIN] - left[GAIN]});
+            found[PF_VELOCITY_SD] = bar(known + now.residual.variance(axis.noise.position) + doubted) / axis.arm.period;
             for (int k = 0; k < PF_OUTPUTS; ++k) outputs[(k * size() + a) * count + n] = found[k];
         }
     }
 
-    // Position, offset and disturbance of an axis whose response is at r; no velocity.
-    static void describe(const Known<N, Real>& axis, double r, const Residual<N, double>& xi,
-                         double (&found)[PF_OUTPUTS]) {
-        const auto sd = [&](int i) { return std::sqrt(std::max(xi.P[i][i], 0.0)); };
+    // Position, offset and disturbance of an axis whose response is at r; no velocity. Returns how what is not known of
+    // the position changes with lag and gain, as the response does by `doubt`.
+    static ByDoubt<> describe(const Known<N, Real>& axis, double r, const ByDoubt<>& doubt,
+                              const Residual<N, double>& xi, double (&found)[PF_OUTPUTS]) {
+        const ByDoubt<> left = xi.left(doubt, 1.0, axis.noise.position);
         const bool disturbed = axis.noise.smoothness != Smoothness::none;
         found[PF_POSITION] = r + xi.along(axis.noise.position);
-        found[PF_POSITION_SD] = std::sqrt(xi.variance(axis.noise.position));
+        found[PF_POSITION_SD] = bar(xi.variance(axis.noise.position) + axis.variance(left));
         found[PF_VELOCITY] = found[PF_VELOCITY_SD] = std::numeric_limits<double>::quiet_NaN();
-        found[PF_OFFSET] = xi.x[OFFSET], found[PF_OFFSET_SD] = sd(OFFSET);
+        found[PF_OFFSET] = xi.x[OFFSET], found[PF_OFFSET_SD] = axis.sd_of(xi, OFFSET);
         found[PF_DISTURBANCE] = disturbed ? xi.x[DISTURBANCE] : 0.0;
-        found[PF_DISTURBANCE_SD] = disturbed ? sd(DISTURBANCE) : 0.0;
+        found[PF_DISTURBANCE_SD] = disturbed ? axis.sd_of(xi, DISTURBANCE) : 0.0;
+        return left;
     }
 
     // Response and residual to an instant.
@@ -151,6 +173,7 @@ class Filter {
   private:
     struct Innovation {
         Real nu, R;
+        ByDoubt<> d_nu;
         Along<N, Real> along;
     };
     // Of the row at hand, whose axes pass the gate together: each is computed once.
@@ -186,7 +209,8 @@ class Filter {
         const Sensor<Real>& sensor = sensors[event.source];
         const Real sd = views[event.source * size() + a].sd * (event.spread ? event.spread[a] : 1.0);
         if (value_of(sensor.latency_sd) == 0.0) return square(sd);
-        const auto& [arm, noise, ahead, motion, delayed, start] = axes[a];
+        const Arm<Real>& arm = axes[a].arm;
+        const Noise<N, Real>& noise = axes[a].noise;
         const Vector<N, Real>& x = state.residual.x;  // the speed is C (A x + B (u + e)) of response and residual
         Real speed = state.response.speed(arm) + (arm.plant.order == 1 ? -arm.plant.rate * x[PLANT] : x[RATE]);
         if (noise.smooth()) speed = speed + x[DISTURBANCE + 1];
@@ -220,14 +244,17 @@ class Filter {
     // turns.
     Innovation innovation(const AxisState<N, Real>& state, const Event& event, Time a) const {
         const Time at = event.source * size() + a;
+        const Residual<N, Real>& xi = state.residual;
         const Real R = noise_of(state, event, a), scale = sensors[event.source].scale;
-        const Real expected = scale * state.response.start + scale * state.response.x + state.residual.along(H[at]);
-        return {nearest(event.value[a] - expected, value_of(views[at].turn)), R, {state.residual.P, H[at], R}};
+        const Real expected = scale * state.response.start + scale * state.response.x + xi.along(H[at]);
+        return {nearest(event.value[a] - expected, value_of(views[at].turn)), R,
+                xi.left(axes[a].doubt(state.response), value_of(scale), H[at]),
+                {xi.P, H[at], R}};
     }
 
     void update(State<N, Real>& state, const Event& event, Time a, const Fate& fate, History* history) const {
         Residual<N, Real>& xi = state.axes[a].residual;
-        auto [nu, R, along] = innovations[a];
+        auto [nu, R, d_nu, along] = innovations[a];
         const Vector<N, Real>& h = H[event.source * size() + a];
         Real widened = 0.0;
         if (fate.outcome[a] == PF_REACQUIRED) {  // the offset may have moved by nu
@@ -237,10 +264,10 @@ class Filter {
             along = {xi.P, h, R};
             store(fate, a, nu, along.S);
         }
-        const Vector<N, Real> K = xi.update(h, along, nu, R);
+        const Vector<N, Real> K = xi.update(h, along, nu, d_nu, R);
         state.gates[a].fuse(event.source, event.time);
         if constexpr (std::is_same_v<Real, double>)
-            if (history) (*history)[a].push_back({event.time, xi.q, xi.drift, event.source, nu, R, widened, K});
+            if (history) (*history)[a].push_back({event.time, xi.q, xi.drift, event.source, nu, R, widened, d_nu, K});
     }
 
     // Whether a row beyond its gate re-acquires; if not, it is remembered, and whom it contradicts noted.

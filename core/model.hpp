@@ -18,7 +18,7 @@ template <class Real>
 struct Axis {  // the fields of pf_axis
     Real period, delay, time_constant, natural_frequency, damping, slope, intercept, recovery;
     Real input_noise, drift, maneuver_noise, maneuver_drift, disturbance_sd, disturbance_time, smoothness;
-    Real offset_sd, start;
+    Real offset_sd, lag_sd, gain_sd, start;
 };
 
 template <class Real>

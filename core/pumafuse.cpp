@@ -34,7 +34,7 @@ struct Recorded final : pf_filter {
     bool bias(Time sensor, Time axis, double found[2]) const override {
         const int i = filter.bias[sensor * axes + axis];
         const Residual<N, double>& xi = state.axes[axis].residual;
-        if (i >= 0) found[0] = xi.x[i], found[1] = std::sqrt(std::max(xi.P[i][i], 0.0));
+        if (i >= 0) found[0] = xi.x[i], found[1] = filter.axes[axis].sd_of(xi, i);
         return i >= 0;
     }
 };

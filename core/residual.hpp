@@ -6,7 +6,7 @@
 #pragma once
 #include <stdexcept>
 
-#include "plant.hpp"
+#include "response.hpp"
 
 namespace pumafuse {
 
@@ -75,6 +75,7 @@ template <int N, class Real>
 struct Noise {
     Real input_noise, drift, maneuver_noise, maneuver_drift;  // as pf_axis has them
     bool maneuvers;                                           // whether commands change these
+    bool doubted;                                             // whether lag or gain of the response are
     Smoothness smoothness = Smoothness::none;
     Plant<Real> disturbance;      // a smooth one is a plant with a double pole, driven by white noise
     Real density = 0.0;           // of that noise
@@ -88,7 +89,8 @@ struct Noise {
     explicit Noise(const Axis<Real>& axis)
         : input_noise(axis.input_noise), drift(axis.drift), maneuver_noise(axis.maneuver_noise),
           maneuver_drift(axis.maneuver_drift),
-          maneuvers(value_of(maneuver_noise) != 0.0 || value_of(maneuver_drift) != 0.0) {
+          maneuvers(value_of(maneuver_noise) != 0.0 || value_of(maneuver_drift) != 0.0),
+          doubted(value_of(axis.lag_sd) != 0.0 || value_of(axis.gain_sd) != 0.0) {
         variance[OFFSET] = square(axis.offset_sd), position[PLANT] = position[OFFSET] = 1.0;
         if (value_of(axis.disturbance_sd) == 0.0) return;
         smoothness = value_of(axis.smoothness) > 1.0 ? Smoothness::smooth : Smoothness::rough;
@@ -127,6 +129,8 @@ struct Residual {
     Instant<Real> time;  // of x and P
     Vector<N, Real> x{};
     Matrix<N, Real> P{};
+    ByDoubt<Vector<N, double>> by{};  // how x changes with lag and gain of the response, by way of measurements
+    bool doubted = false;             // whether these are; a likelihood never asks
     Real q = 0.0, drift = 0.0;  // densities squared in force: input noise [m^2 s] and the offset's drift [m^2/s]
     Instant<Real> until;        // commands that change these have been taken into account until then:
     Transition<Real> since;     // Phi and Q of the plant from `time` on, Q with the noise that there was
@@ -135,7 +139,7 @@ struct Residual {
     Residual() = default;
 
     Residual(const Noise<N, Real>& noise, const Instant<Real>& origin) : time(origin), until(origin) {
-        set_noise(noise, 0.0);
+        doubted = noise.doubted, set_noise(noise, 0.0);
         for (int i = 0; i < N; ++i) P[i][i] = noise.variance[i];
     }
 
@@ -198,6 +202,16 @@ struct Residual {
         return sum;
     }
 
+    // How a position or a measurement changes, less what h x makes of it: of the response it sees `scale` times.
+    ByDoubt<> left(const ByDoubt<>& by_response, double scale, const Vector<N, Real>& h) const {
+        ByDoubt<> found{};
+        for (int k = 0; doubted && k < DOUBTS; ++k) {
+            found[k] = scale * by_response[k];
+            for (int i = 0; i < N; ++i) found[k] -= value_of(h[i]) * by[k][i];
+        }
+        return found;
+    }
+
     Real variance(const Vector<N, Real>& h) const {  // h P h^T
         Real sum = 0.0;
         for (int i = 0; i < N; ++i)
@@ -205,25 +219,40 @@ struct Residual {
         return value_of(sum) > 0.0 ? sum : Real(0.0);
     }
 
-    // x <- x + K nu and P <- (I - K H) P (I - K H)^T + K R K^T. Returns K.
-    Vector<N, Real> update(const Vector<N, Real>& H, const Along<N, Real>& along, Real nu, Real R) {
+    // x <- x + K nu and P <- (I - K H) P (I - K H)^T + K R K^T, and `by` likewise. Returns K.
+    Vector<N, Real> update(const Vector<N, Real>& H, const Along<N, Real>& along, Real nu, const ByDoubt<>& d_nu,
+                           Real R) {
         Vector<N, Real> K;
         if constexpr (std::is_same_v<Real, double>) K = joseph<N, double>(P, H, along, R);
         else K = joseph_tangent(P, H, along, R);  // likelihood.hpp
         for (int i = 0; i < N; ++i) x[i] = x[i] + K[i] * nu;
+        each_doubt([&](auto& one, int k) {
+            for (int i = 0; i < N; ++i) one[i] += K[i] * d_nu[k];
+        });
         return K;
     }
 
   private:
+    void each_doubt(auto work) {
+        if constexpr (std::is_same_v<Real, double>)
+            for (int k = 0; doubted && k < DOUBTS; ++k) work(by[k], k);
+    }
+
     void fade(int i, Real left) {
         x[i] = x[i] * left;
+        each_doubt([&](auto& one, int) { one[i] *= left; });
         for (int j = 0; j < N; ++j) P[i][j] = P[i][j] * left, P[j][i] = P[j][i] * left;
     }
 
     void move(int i, const Transition<Real>& f) {
+        move(x, i, f);
+        each_doubt([&](auto& one, int) { move(one, i, f); });
+        move_pair<N, Real>(P, i, f.f11, f.f12, f.f21, f.f22);
+    }
+
+    static void move(Vector<N, Real>& x, int i, const Transition<Real>& f) {
         const Real a = x[i], b = x[i + 1];
         x[i] = f.f11 * a + f.f12 * b, x[i + 1] = f.f21 * a + f.f22 * b;
-        move_pair<N, Real>(P, i, f.f11, f.f12, f.f21, f.f22);
     }
 
     void add(int i, Real q11, Real q12, Real q22) {

@@ -17,6 +17,11 @@ struct Arm {
     Real gain_error(double step) const { return (slope * (std::fabs(step) / period) + intercept - 1.0) * step; }
 };
 
+enum { LAG, GAIN, DOUBTS };  // what of a response may be doubted
+
+template <class Of = double>
+using ByDoubt = std::array<Of, DOUBTS>;  // how something changes with the lag [1/s] and with the gain, of 1
+
 template <class Real>
 struct Response {
     Instant<Real> time;
@@ -47,6 +52,9 @@ struct Response {
 
     // Where it would be if nothing were held back: C (A x + B (u + e)) of a plant of first order.
     Real speed(const Arm<Real>& arm) const { return arm.plant.order == 1 ? arm.plant.rate * (u + error - x) : rate; }
+
+    // How x changes with the lag, which sets it back, and with the gain, which it is proportional to.
+    ByDoubt<> by_doubt(const Arm<Real>& arm) const { return {-value_of(speed(arm)), value_of(x)}; }
 };
 
 }  // namespace pumafuse

@@ -15,9 +15,10 @@
 
 namespace pumafuse {
 
-template <int N>
+// How eta changes with the lag and the gain, where these are doubted, moves as eta does: columns of their own.
+template <int N, int COLUMNS>
 struct Later {
-    Vector<N, double> eta{};
+    std::array<Vector<N, double>, COLUMNS> eta{};
     Matrix<N, double> M{};
 
     void over_interval(const Arm<double>& arm, const Noise<N, double>& noise, double dt, double q, double drift) {
@@ -29,16 +30,18 @@ struct Later {
             if (noise.reverting[i] == 0.0) continue;
             const double fading = -noise.reverting[i] * dt, left = std::exp(fading);
             through_noise(i, std::sqrt(-noise.variance[i] * std::expm1(2.0 * fading)));
-            eta[i] *= left;
+            for (int c = 0; c < COLUMNS; ++c) eta[c][i] *= left;
             for (int j = 0; j < N; ++j) M[i][j] *= left, M[j][i] *= left;
         }
     }
 
     void over_update(const Vector<N, double>& H, const Entry<N>& update) {
-        for (int i = 0; i < N; ++i) {
-            for (int j = 0; j < N; ++j) eta[i] += M[i][j] * update.K[j] * update.nu;
-            eta[i] += H[i] * update.nu / update.R;
-        }
+        const double nu[] = {update.nu, update.d_nu[LAG], update.d_nu[GAIN]};
+        for (int c = 0; c < COLUMNS; ++c)
+            for (int i = 0; i < N; ++i) {
+                for (int j = 0; j < N; ++j) eta[c][i] += M[i][j] * update.K[j] * nu[c];
+                eta[c][i] += H[i] * nu[c] / update.R;
+            }
         for (int i = 0; i < N; ++i)
             for (int j = 0; j < N; ++j) M[i][j] += H[i] * H[j] / update.R;
         through_noise(OFFSET, std::sqrt(update.widened));  // what re-acquiring added
@@ -49,9 +52,12 @@ struct Later {
     void smooth(Residual<N, double>& xi) const {
         auto [L, y, rank] = root();
         for (int k = 0; k < rank; ++k) {
-            const Vector<N, double> K = xi.update(L[k], {xi.P, L[k], 1.0}, y[k], 1.0);
+            ByDoubt<> d_nu{};
+            if constexpr (COLUMNS > 1) std::copy_n(y[k].begin() + 1, DOUBTS, d_nu.begin());
+            const Vector<N, double> K = xi.update(L[k], {xi.P, L[k], 1.0}, y[k][0], d_nu, 1.0);
             for (int m = k + 1; m < rank; ++m)
-                for (int i = 0; i < N; ++i) y[m] -= L[m][i] * K[i] * y[k];
+                for (int i = 0; i < N; ++i)
+                    for (int c = 0; c < COLUMNS; ++c) y[m][c] -= L[m][i] * K[i] * y[k][c];
         }
     }
 
@@ -61,8 +67,10 @@ struct Later {
         const double first = std::sqrt(density * f.q11), both = first > 0.0 ? density * f.q12 / first : 0.0;
         through_noise(i, first, both);
         through_noise(i + 1, std::sqrt(std::max(density * f.q22 - both * both, 0.0)));
-        const double p = eta[i], v = eta[i + 1];
-        eta[i] = f.f11 * p + f.f21 * v, eta[i + 1] = f.f12 * p + f.f22 * v;
+        for (int c = 0; c < COLUMNS; ++c) {
+            const double p = eta[c][i], v = eta[c][i + 1];
+            eta[c][i] = f.f11 * p + f.f21 * v, eta[c][i + 1] = f.f12 * p + f.f22 * v;
+        }
         move_pair<N, double>(M, i, f.f11, f.f21, f.f12, f.f22);
     }
 
@@ -72,17 +80,19 @@ struct Later {
         const int next = second != 0.0 ? i + 1 : i;
         Vector<N, double> MG;
         for (int j = 0; j < N; ++j) MG[j] = first * M[j][i] + second * M[j][next];
-        const double S = 1.0 + first * MG[i] + second * MG[next], seen = first * eta[i] + second * eta[next];
+        const double S = 1.0 + first * MG[i] + second * MG[next];
+        std::array<double, COLUMNS> seen{};
+        for (int c = 0; c < COLUMNS; ++c) seen[c] = first * eta[c][i] + second * eta[c][next];
         for (int j = 0; j < N; ++j) {
             const double K = MG[j] / S;
-            eta[j] -= K * seen;
+            for (int c = 0; c < COLUMNS; ++c) eta[c][j] -= K * seen[c];
             for (int l = 0; l <= j; ++l) M[j][l] = M[l][j] = M[j][l] - K * MG[l];
         }
     }
 
     struct Root {
         Matrix<N, double> L{};  // its rows are the columns
-        Vector<N, double> y{};
+        std::array<std::array<double, COLUMNS>, N> y{};
         int rank = 0;
     };
 
@@ -100,9 +110,12 @@ struct Later {
             for (int i = 0; i < N; ++i)
                 if (left[i] > most * M[i][i]) pivot = i, most = left[i] / M[i][i];
             if (pivot < 0) break;
-            L[k][pivot] = std::sqrt(left[pivot]), left[pivot] = 0.0, y[k] = eta[pivot];
-            for (int m = 0; m < k; ++m) y[k] -= y[m] * L[m][pivot];
-            y[k] /= L[k][pivot];
+            L[k][pivot] = std::sqrt(left[pivot]), left[pivot] = 0.0;
+            for (int c = 0; c < COLUMNS; ++c) {
+                y[k][c] = eta[c][pivot];
+                for (int m = 0; m < k; ++m) y[k][c] -= y[m][c] * L[m][pivot];
+                y[k][c] /= L[k][pivot];
+            }
             for (int i = 0; i < N; ++i) {
                 if (!(left[i] > 0.0)) continue;
                 L[k][i] = M[i][pivot];
@@ -118,8 +131,39 @@ struct Later {
 template <int N>
 struct Filtered {
     double r;
+    ByDoubt<> doubt;  // of r
     Residual<N, double> residual;
 };
+
+// One axis backward, from its filtered states at the estimates.
+template <int COLUMNS, int N>
+void smooth_axis(const Filter<N>& filter, Time a, const std::vector<Entry<N>>& history,
+                 std::vector<Filtered<N>>& at, Time origin, Time n, const Time* times, double* outputs) {
+    const Time A = filter.size();
+    const Known<N, double>& axis = filter.axes[a];
+    Later<N, COLUMNS> later;
+    Time k = n - 1;
+    const auto smoothed = [&] {  // estimate k, and on to the one before
+        double found[PF_OUTPUTS];
+        auto& [r, doubt, residual] = at[k * A + a];
+        later.smooth(residual);
+        Filter<N>::describe(axis, r, doubt, residual, found);
+        for (int i = 0; i < PF_OUTPUTS; ++i) outputs[(i * A + a) * n + k] = found[i];
+        --k;
+    };
+    while (k >= 0 && (history.empty() || times[k] >= history.back().time)) smoothed();  // nothing is later
+    for (auto entry = history.rbegin(); entry != history.rend(); ++entry) {
+        if (entry->sensor != NOBODY) later.over_update(filter.H[entry->sensor * A + a], *entry);
+        Time here = entry->time;
+        const auto back_to = [&](Time there) {
+            const double dt = double(std::exchange(here, there) - there) / 1e9;
+            if (dt > 0.0) later.over_interval(axis.arm, axis.noise, dt, entry->q, entry->drift);
+        };
+        const Time before = entry + 1 != history.rend() ? entry[1].time : origin;
+        for (; k >= 0 && times[k] >= before; smoothed()) back_to(times[k]);
+        back_to(before);
+    }
+}
 
 // All events, and at each of n times what all measurements say: forward, keeping what happened and the states at the
 // estimates, then backward, axis by axis.
@@ -138,32 +182,12 @@ void run_smoothed(const Filter<N>& filter, State<N, double>& state, const Table&
         for (Time a = 0; a < A && k < n; ++a) {
             AxisState<N, double> now = state.axes[a];
             filter.advance(now, a, {times[k], 0.0});
-            at.push_back({now.response.x, now.residual});
+            at.push_back({now.response.x, filter.axes[a].doubt(now.response), now.residual});
         }
     }
     for (Time a = 0; a < A; ++a) {
-        const Known<N, double>& axis = filter.axes[a];
-        Later<N> later;
-        Time k = n - 1;
-        const auto smoothed = [&] {  // estimate k, and on to the one before
-            double found[PF_OUTPUTS];
-            later.smooth(at[k * A + a].residual);
-            Filter<N>::describe(axis, at[k * A + a].r, at[k * A + a].residual, found);
-            for (int i = 0; i < PF_OUTPUTS; ++i) outputs[(i * A + a) * n + k] = found[i];
-            --k;
-        };
-        while (k >= 0 && (history[a].empty() || times[k] >= history[a].back().time)) smoothed();  // nothing is later
-        for (auto entry = history[a].rbegin(); entry != history[a].rend(); ++entry) {
-            if (entry->sensor != NOBODY) later.over_update(filter.H[entry->sensor * A + a], *entry);
-            Time here = entry->time;
-            const auto back_to = [&](Time there) {
-                const double dt = double(std::exchange(here, there) - there) / 1e9;
-                if (dt > 0.0) later.over_interval(axis.arm, axis.noise, dt, entry->q, entry->drift);
-            };
-            const Time before = entry + 1 != history[a].rend() ? entry[1].time : origin;
-            for (; k >= 0 && times[k] >= before; smoothed()) back_to(times[k]);
-            back_to(before);
-        }
+        const auto smooth = filter.axes[a].noise.doubted ? smooth_axis<1 + DOUBTS, N> : smooth_axis<1, N>;
+        smooth(filter, a, history[a], at, origin, n, times, outputs);
     }
 }
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal, localcontext
+from statistics import NormalDist
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from pumafuse.model.arm import AxisModel
 from pumafuse.model.plants import FirstOrder
 
 DIGITS = 50
+Z95 = NormalDist().inv_cdf(0.975)
 FIELDS = ("position", "velocity", "offset", "disturbance")
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)  # 1e-18 of an integral over 1/fastest pole
@@ -340,11 +342,29 @@ class AxisOracle:
             C[np.arange(n) >= np.tile(count, len(FIELDS))[:, None]] = Decimal(0)
             mean = joint.mean[n:] + C.dot(w) if n else joint.mean[n:]
             variance = joint.variance[n:] - (C * C).sum(axis=1) if n else joint.variance[n:]
+            for doubt in self._doubts(rows):  # the weights of measurements are as if there were none
+                left = doubt[n:] - (C.dot(_substituted(doubt[None, :n], L)[0]) if n else 0)
+                variance = variance + left * left
             position, *others = mean.reshape(len(FIELDS), -1)
             sd = [_root(part) for part in variance.reshape(len(FIELDS), -1)]
             position = position + Decimal(self.start)
         means = [part.astype(float) for part in (position, *others)]
+        has = self.process.disturbance_sd > 0.0
+        for part, finest in zip(sd, (1e-9, 1e-9 / self.period, 1e-9, 1e-9 * has), strict=True):
+            np.maximum(part, finest, out=part)  # no bar is 0, but of a disturbance that there is not
         return Belief(*(part for pair in zip(means, sd, strict=True) for part in pair))
+
+    def _doubts(self, rows: Rows) -> list[np.ndarray]:
+        """How far positions and velocities in rows are off where lag or gain is one standard deviation off, (rows,)."""
+        axis, c = self.config.arm.axes[self.axis], self.response
+        instant, place = np.unique(rows.time, return_inverse=True)
+        now, later = (
+            self._superposed(c.impulse, c.gain_error_rate, instant, ahead)[place] for ahead in (0, self.ahead)
+        )
+        speed = rows.position * now + rows.velocity * (later - now) / self.period
+        gain = axis.gain.intercept if axis.gain_recovery is None else np.inf
+        sds = [np.diff(ci95 or (0.0, 0.0)).item() / (2.0 * Z95) for ci95 in (axis.lag_ci95, axis.gain.intercept_ci95)]
+        return [_decimal(sds[0] * speed), _decimal(sds[1] / gain * self._mean(rows))]
 
     def _condition(self, order: Sequence[Measurement], rows: Rows) -> tuple[np.ndarray, np.ndarray, _Joint]:
         """Cholesky factor of the measurements' covariance, and these whitened; the first of ``rows`` are theirs."""

@@ -129,9 +129,14 @@ def axes_of(draw: st.DrawFn) -> pf.ArmModel:
                 ]
             )
         )
-        gain = pf.Gain(slope=draw(st.sampled_from([0.0, 0.05])), intercept=draw(st.sampled_from([1.0, 0.97])))
-        recovery = draw(st.sampled_from([None, 0.01, 0.1, 3.0]))
-        return pf.AxisModel(plant=plant, gain=gain, gain_recovery=recovery, delay=draw(st.sampled_from([None, 0.0])))
+        gain = pf.Gain(
+            slope=draw(st.sampled_from([0.0, 0.05])),
+            intercept=draw(st.sampled_from([1.0, 0.97])),
+            intercept_ci95=draw(st.sampled_from([None, (0.95, 1.0)])),
+        )
+        recovery, lag = draw(st.sampled_from([None, 0.01, 0.1, 3.0])), draw(st.sampled_from([None, (0.08, 0.12)]))
+        delay = draw(st.sampled_from([None, 0.0]))
+        return pf.AxisModel(plant=plant, gain=gain, gain_recovery=recovery, delay=delay, lag_ci95=lag)
 
     return pf.ArmModel(name="any", update_period=0.028, delay=0.06, axes={"radial": one(), "vertical": one()})
 

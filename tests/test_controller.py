@@ -36,11 +36,13 @@ natural_frequency_rad_s = 41.7
 damping = 1.3
 gain = { slope_s_rad = 0.07, intercept = 0.9 }
 gain_recovery_ms = 90.0
+lag_ms_ci95 = [95.0, 105.0]
 [axes."1_ arm"]
 kind = "angle"
 plant = "first-order"
 time_constant_ms = 33.3
 delay_ms = 12.3
+gain = { intercept = 0.9, intercept_ci95 = [0.88, 0.93] }
 """
 CONFIG = """
 arm = "arm.toml"
@@ -209,7 +211,7 @@ def test_the_header_has_the_numbers_that_live_has(tmp_path: Path) -> None:
     model = window.call_args.args[0]
     done = subprocess.run([compiled(tmp_path, source)], capture_output=True, check=True)
     expected = np.concatenate([part.ravel().view(np.float64) for part in model])
-    assert len(expected) == 2 * 17 + 2 * 5 + 4 * 5
+    assert len(expected) == 2 * 19 + 2 * 5 + 4 * 5
     np.testing.assert_array_equal(np.frombuffer(done.stdout), expected)
     assert np.count_nonzero(np.isnan(expected)) == 3
     assert done.stderr == b"1 1"

@@ -27,6 +27,7 @@ extern "C" {
 #define PF_ALWAYS (INT64_MIN + 1) /* before all instants */
 #define PF_NEVER INT64_MAX        /* after all instants */
 #define PF_COMMAND (-1)           /* the source of a command */
+#define PF_FINEST 1e-9            /* [m or rad]: no position is known better, of a velocity over a period */
 
 /* What became of a value; PF_ABSENT: the row gives none for this axis. */
 enum {
@@ -55,6 +56,7 @@ typedef struct {
     double disturbance_sd, disturbance_time; /* [m], 0: there is none; [s] */
     double smoothness;                     /* of the disturbance: 1.5 (Matern) or 0.5 (Ornstein-Uhlenbeck) */
     double offset_sd;                      /* prior of the offset [m] */
+    double lag_sd, gain_sd;                /* how well the response is known: its lag [s], its size, of 1 */
     double start;                          /* u0 [m]: where it rests before its first command; NaN: not known */
 } pf_axis;
 

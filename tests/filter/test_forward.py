@@ -22,6 +22,7 @@ AXES = {
         plant=pf.SecondOrder(natural_frequency=45.0, damping=0.5),
         gain=pf.Gain(slope=0.08, intercept=0.93),
         gain_recovery=0.1,
+        lag_ci95=(0.07, 0.09),
     ),
     "vertical": pf.AxisModel(plant=pf.FirstOrder(time_constant=0.04), delay=0.01),
 }

@@ -28,7 +28,7 @@ from pumafuse.model.plants import Plant
 MS = 1_000_000  # ns
 FIELDS = ("position", "velocity", "offset", "disturbance")
 DATA = Path(pf.__file__).parent / "data"
-PAPER = pf.Gain(slope=0.0818, intercept=0.933)
+PAPER = pf.Gain(slope=0.0818, intercept=0.933, intercept_ci95=(0.9, 0.95))
 
 
 def both(run: Run, config: pf.FusionConfig, rate: float | None = None) -> tuple[Filtered, Filtered]:
@@ -144,6 +144,7 @@ def logs(draw: st.DrawFn) -> tuple[Run, pf.FusionConfig, float | None]:
             gain=some(draw, pf.Gain(slope=0.0, intercept=1.0), pf.Gain(slope=0.0, intercept=0.8), PAPER),
             gain_recovery=some(draw, None, 0.1, 0.004, 3.0),
             delay=some(draw, None, 0.0, 0.033),
+            lag_ci95=some(draw, None, (0.08, 0.12)),
         )
         for axis in axes
     }

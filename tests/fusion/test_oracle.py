@@ -239,6 +239,49 @@ def test_estimates_are_conditional_means(case: Case, mode: str) -> None:
     check(case, mode)
 
 
+LATE = replace_(PAPER, intercept_ci95=(0.833, 1.033))
+DOUBTED = {
+    "first order": Case(one(LAG, lag_ci95=(0.0929, 0.1129))),
+    "second order, its gain too, disturbed": Case(
+        one(UNDER, gain=LATE, lag_ci95=(0.03, 0.17)), process=replace_(NOISE, disturbance_sd=2e-3, disturbance_time=0.2)
+    ),
+    "gain": Case(one(OVER, gain=LATE), times=IRREGULAR, seen={"panel": PANEL, "tracker": TRACKER}, rate=70.0),
+    "a gain that recovers is a lag": Case(one(UNDER, gain=LATE, gain_recovery=0.1, lag_ci95=(0.06, 0.16))),
+    "nothing else": Case(one(UNDER, lag_ci95=(0.05, 0.15)), process=Process(input_noise=0.0, drift=0.0)),
+    "rough, late": Case(
+        one(LAG, gain=LATE, lag_ci95=(0.09, 0.12)),
+        process=Process(maneuver_noise=1e-3, drift=0.0, disturbance_sd=1e-3, disturbance_kind="ou"),
+        seen={"vision": VISION, "ahead": AHEAD},
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*sensors.ahead.latency_ms:pumafuse.PumafuseWarning")
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("case", DOUBTED.values(), ids=DOUBTED.keys())
+def test_error_bars_count_how_well_the_arm_is_known(case: Case, mode: str) -> None:
+    """Estimates weigh measurements as if lag and gain were right, and bars are those of their error where they are not.
+
+    With weights W the error of W z as an estimate of a position is Gaussian, of which the lag's standard deviation
+    times (the speed there - W times the speeds at the measurements) is an independent part.
+    """
+    check(case, mode)
+    run, config = case.made()
+    known = {axis: replace_(model, lag_ci95=None, gain=Gain(slope=model.gain.slope, intercept=model.gain.intercept))
+             for axis, model in config.arm.axes.items()}  # fmt: skip
+    with warned(run, config):
+        doubted = fuse(run, config, **MODES[mode])
+        certain = fuse(run, replace_(config, arm=replace_(config.arm, axes=known)), **MODES[mode])
+    assert np.array_equal(doubted["radial"].position, certain["radial"].position)
+    assert np.array_equal(doubted.measurements.innovation_sd, certain.measurements.innovation_sd)
+
+
+@pytest.mark.filterwarnings("ignore:.*sensors.ahead.latency_ms:pumafuse.PumafuseWarning")
+@pytest.mark.parametrize("case", DOUBTED.values(), ids=DOUBTED.keys())
+def test_the_reference_counts_it_too(case: Case) -> None:
+    check(case, engine="filterpy")
+
+
 DISTURBED = replace_(NOISE, disturbance_sd=2e-3, disturbance_time=0.05)
 WANDERING = {"first order": Case(delay=0.0), "second order": Case(one(UNDER)), "disturbed": Case(process=DISTURBED)}
 

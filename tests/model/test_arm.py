@@ -45,7 +45,8 @@ not_tiny = st.floats(1e-6, 1e9)
 interval = st.none() | st.tuples(finite, finite)
 word = st.text(max_size=8)
 
-gains = st.builds(Gain, slope=finite, intercept=finite, slope_ci95=interval, intercept_ci95=interval)
+ascending = st.none() | st.tuples(finite, finite).map(lambda ends: (min(ends), max(ends)))
+gains = st.builds(Gain, slope=finite, intercept=finite, slope_ci95=interval, intercept_ci95=ascending)
 first_order = st.builds(FirstOrder, time_constant=positive, time_constant_ci95=interval)
 second_order = st.builds(
     SecondOrder,
@@ -61,6 +62,7 @@ axis_models = st.builds(
     gain_recovery=st.none() | not_tiny,
     delay=st.none() | st.floats(0.0, 1e4),
     delay_ci95=interval,
+    lag_ci95=ascending,
 )
 provenance = st.fixed_dictionaries(
     {},
@@ -168,6 +170,8 @@ REFUSED = {
     "text for a number": ("28.0", '"28"', "update_period_ms", "float"),
     "number for a table": ("{ slope_s_m = 0.0818, intercept = 0.933 }", "0.9", "axes.radial.gain", "object"),
     "number for an axis": ("[axes.tangential]", "[axes]\nvertical = 3\n[axes.tangential]", "axes.vertical", "table"),
+    "interval backwards": ("42.5", "42.5\nlag_ms_ci95 = [110.0, 95.0]", "axes.radial.lag_ms_ci95", "lower end first"),
+    "interval of a gain": ("0.933 }", "0.933, intercept_ci95 = [1, 0] }", "axes.radial.gain.intercept_ci95", "lower"),
     "interval of one": ("60.45", "60.45\ndelay_ms_ci95 = [60.0]", "delay_ms_ci95", "length 2"),
     "missing key": ("update_period_ms = 28.0", "", "'update_period_ms' is missing", ""),
     "missing key of a plant": ("damping = 0.864", "", "'axes.tangential.damping' is missing", ""),

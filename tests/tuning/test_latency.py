@@ -114,6 +114,7 @@ def test_the_arm_is_ready_for_use(found: Latency) -> None:
     plant = arm.axes["x"].plant
     assert isinstance(plant, pf.FirstOrder)
     assert plant.time_constant_ci95 == found.details.axes["x"].time_constant_ci95
+    assert arm.axes["x"].lag_ci95 == found.details.axes["x"].lag_ci95
     est = pf.fuse(found.runs[0], found.config)
     assert np.isfinite(est["x"].position).all()
 

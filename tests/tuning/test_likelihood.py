@@ -173,6 +173,22 @@ def with_axis(config: pf.FusionConfig, axis: str, **changes: object) -> pf.Fusio
     return replaced(config, arm=replaced(arm, axes={**arm.axes, axis: replaced(arm.axes[axis], **changes)}))
 
 
+def test_how_well_the_arm_is_known_is_no_part_of_it() -> None:
+    """Intervals of lag and gain change neither the likelihood nor its derivatives, but what a fusion says."""
+    sim = two_sensors()
+    gain = pf.Gain(intercept=0.98, intercept_ci95=(0.5, 1.5))
+    doubted = with_axis(sim.config, "vertical", gain=gain, gain_recovery=None, lag_ci95=(0.0, 0.4))
+    certain = with_axis(sim.config, "vertical", gain=pf.Gain(intercept=0.98), gain_recovery=None)
+    likelihood = Likelihood([sim.run], certain)
+    free = free_of(likelihood, certain, ALL)
+    one, other = (likelihood.evaluate(config) for config in (certain, doubted))
+    np.testing.assert_array_equal(one.axes, other.axes)
+    scores = [likelihood.derivatives(config, free, one.outcomes).score for config in (certain, doubted)]
+    np.testing.assert_array_equal(*scores)
+    narrow, wide = (pf.fuse(sim.run, config)["vertical"].position_sd for config in (certain, doubted))
+    assert (wide >= narrow).all() and (wide > narrow).any()
+
+
 def test_another_configuration_is_as_if_built_with_it() -> None:
     """Delays, gains, plants and latencies moved afterwards, past each other: as anew, row by row.
 

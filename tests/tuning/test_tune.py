@@ -129,6 +129,7 @@ def test_what_is_saved_loads_and_is_as_likely(tmp_path: Path) -> None:
         one, place = (numbers[key], arm) if shared else (numbers[f"axes.tangential.{key}"], table)
         assert place[key] == pytest.approx(one.value, rel=1e-9)
         assert place[f"{key}_ci95"] == pytest.approx(one.ci95, rel=1e-5)
+    assert table["lag_ms_ci95"] == pytest.approx(found.details.lags["tangential"].lag_ms_ci95, rel=1e-5)
     known = outage(1).config.arm.provenance
     assert {key: arm["provenance"][key] for key in known} == known and arm["provenance"]["tuned_on"] == [run.name]
 

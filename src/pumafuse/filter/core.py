@@ -21,6 +21,7 @@ from ..errors import PumafuseError
 from .events import Events, Results
 
 VERSION = 5  # of the interface
+FINEST = 1e-9  # PF_FINEST
 LIBRARY = Path(__file__).with_name("_core" + {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so"))
 Record = npt.NDArray[np.void]  # an array of structs
 
@@ -32,7 +33,7 @@ def _numbers(*names: str) -> np.dtype[np.void]:
 AXIS = _numbers(
     *("period", "delay", "time_constant", "natural_frequency", "damping", "slope", "intercept", "recovery"),
     *("input_noise", "drift", "maneuver_noise", "maneuver_drift"),
-    *("disturbance_sd", "disturbance_time", "smoothness", "offset_sd", "start"),
+    *("disturbance_sd", "disturbance_time", "smoothness", "offset_sd", "lag_sd", "gain_sd", "start"),
 )
 SENSOR = _numbers("scale", "latency", "latency_sd", "gate", "gate_rows")
 VIEW = _numbers("sd", "bias_sd", "bias_drift_sd", "bias_time", "turn")

@@ -27,7 +27,7 @@ from filterpy.kalman import KalmanFilter
 
 from ..arrays import FloatArray, TimeArray
 from ..model.plants import Plant
-from .core import Model, Output, Record
+from .core import FINEST, Model, Output, Record
 from .events import COMMAND, Events, Results
 from .outcome import Outcome
 
@@ -93,6 +93,9 @@ class Axis:
         self.H = sensors["scale"][:, np.newaxis] * self.h + self.unit[drifting] + self.unit[constant]
         self.kf = KalmanFilter(dim_x=size, dim_z=1)
         self.kf.x, self.kf.P, self.kf.Q = np.zeros(size), np.diag(sd**2), np.zeros((size, size))
+        self.path = np.zeros(size)  # the state by commands alone
+        self.doubts = np.array((axis["lag_sd"], axis["gain_sd"]))  # of its lag [s], and of its size
+        self.by = np.zeros((2, size))  # how these have changed the state, by way of measurements
 
     def set_noise(self, maneuver: float) -> None:
         """The noise on offset and input from now on."""
@@ -113,13 +116,18 @@ class Axis:
         if time > self.time:
             F, Q = self.over(time - self.time)
             self.kf.predict(F=F, Q=Q)
-            self.time = time
+            self.path, self.by, self.time = F @ self.path, self.by @ F.T, time
 
     def give(self, time: int, command: float, acts: int) -> None:
         """A command [m], which acts at ``acts`` [ns], goes to the end of the register."""
         self.predict(time)
         self.in_flight = [*self.in_flight, acts]
-        self.kf.predict(u=command - self.axis["start"], B=self.unit[self.u + len(self.in_flight)])
+        self.enter(self.unit, command - float(self.axis["start"]), self.unit[self.u + len(self.in_flight)])
+
+    def enter(self, F: FloatArray, u: float, B: FloatArray) -> None:
+        """A command enters what is known of the state, and what is known by commands alone."""
+        self.kf.predict(F=F, u=u, B=B)
+        self.path = F @ self.path + B * u
 
     def act(self, time: int) -> None:
         """The first command in flight acts: the gain error jumps, and the register moves on."""
@@ -127,7 +135,7 @@ class Axis:
         self.in_flight = self.in_flight[1:]
         step = float(self.kf.x[self.u + 1] - self.kf.x[self.u])
         gain = self.axis["slope"] * abs(step) / self.period + self.axis["intercept"]
-        self.kf.predict(F=self.shift, u=(gain - 1.0) * step, B=self.unit[self.e])
+        self.enter(self.shift, float(gain - 1.0) * step, self.unit[self.e])
         self.set_noise(maneuver=abs(step - self.step) / self.period)
         self.step = step
 
@@ -143,9 +151,15 @@ class Axis:
         if reacquires:
             self.kf.P[OFFSET, OFFSET] += (found.nu / self.sensors[s]["scale"]) ** 2
         self.kf.update(self.H[s] @ self.kf.x + found.nu, R=found.R, H=self.H[s : s + 1])
+        missed = self.sensors[s]["scale"] * self.moved_by() - self.by @ self.H[s]  # how ν changes
+        self.by = self.by + np.outer(missed, self.kf.K)
         self.kf.P = 0.5 * (self.kf.P + self.kf.P.T)  # or rounding leads away from symmetry, over a million steps
         self.gate.fuse(s, found.time, reacquires)
         return math.sqrt(self.kf.S[0, 0])
+
+    def moved_by(self) -> FloatArray:
+        """How the position by commands alone changes with its lag [m/s] and with its size [m], (2,)."""
+        return np.array((-self.speed @ self.path, self.h @ self.path))
 
     def agrees(self, s: int, now: Innovation) -> bool | None:
         """Whether a rejected measurement agrees with the one before; None where that is less than T ago."""
@@ -167,6 +181,7 @@ class Axis:
         """What is known at ``time`` [ns], by ``Output``; the velocity is the mean over the coming period."""
         self.predict(time)
         h, T, x, P, until = self.h, self.period, self.kf.x, self.kf.P, time + round(self.period * 1e9)
+        left = self.moved_by() - self.by @ h  # how what is not known of the position changes
         later = copy(self)
         later.kf = copy(self.kf)
         later.kf.P = np.zeros_like(P)  # which becomes what noise adds until then
@@ -176,7 +191,12 @@ class Axis:
         moves = self.variance_of_motion(self.over(until - time)[0], later.kf.P)
         mean = np.array((h @ x, h @ (later.kf.x - x) / T, x[OFFSET], x[DISTURBANCE]))
         variance = np.array((h @ P @ h, moves / T**2, P[OFFSET, OFFSET], P[DISTURBANCE, DISTURBANCE]))
-        return np.stack((mean, np.sqrt(np.maximum(variance, 0.0))), axis=1).ravel()
+        moves_by = (later.moved_by() - later.by @ h - left) / T
+        doubts = np.stack((left, moves_by, self.by[:, OFFSET], self.by[:, DISTURBANCE]))
+        variance += doubts**2 @ self.doubts**2
+        sd = np.maximum(np.sqrt(np.maximum(variance, 0.0)), FINEST / np.array((1.0, T, 1.0, 1.0)))
+        sd[3] *= self.axis["disturbance_sd"] > 0.0  # else there is none
+        return np.stack((mean, sd), axis=1).ravel()
 
 
 class Gate:
@@ -279,4 +299,5 @@ class Filter:
     def bias(self, sensor: int, axis: int) -> tuple[float, float] | None:
         """Mean and sd [m] of the constant bias of a sensor on an axis; None where none is in the state."""
         one, i = self.axes[axis], FIRST_BIAS + len(self.sensors) + sensor
-        return (float(one.kf.x[i]), math.sqrt(max(one.kf.P[i, i], 0.0))) if one.views[sensor]["bias_sd"] else None
+        variance = max(one.kf.P[i, i], 0.0) + float(one.by[:, i] ** 2 @ one.doubts**2)
+        return (float(one.kf.x[i]), max(math.sqrt(variance), FINEST)) if one.views[sensor]["bias_sd"] else None

@@ -105,7 +105,7 @@ def innovations(segment: Segment, config: FusionConfig, outcome: CodeArray | Non
     results = _undecided(events)
     if outcome is not None:
         results.outcome[place] = outcome
-    core = Filter(model_of(segment, config), segment.origin)
+    core = Filter(_certain_model(segment, config), segment.origin)
     core.run(events, results, _NO_TIMES, "filtered" if outcome is None else "repeated")
     return results.rows(place)
 
@@ -130,9 +130,9 @@ def linearised(
     events, place = segment.events(config)
     results = _undecided(events)
     results.outcome[place] = outcome
-    model = model_of(segment, config)
-    tangents = [_slope(model_of(segment, low), model_of(segment, high), width) for low, high, width in beside]
-    d_nu, d_s = linearise(model, tangents, segment.origin, events, results)
+    model = _certain_model(segment, config)
+    ends = [(_certain_model(segment, low), _certain_model(segment, high), width) for low, high, width in beside]
+    d_nu, d_s = linearise(model, [_slope(*each) for each in ends], segment.origin, events, results)
     return results.rows(place), d_nu[:, place], d_s[:, place]
 
 
@@ -149,6 +149,13 @@ def _slope(low: Model, high: Model, width: float) -> Model:
 def model_of(segment: Segment, config: FusionConfig) -> Model:
     """What the filter knows of a segment's axes and sensors, with the biases of those that measure."""
     return filter_model(config, segment.axes, segment.sensors, segment.start, biased_sensors(segment, config))
+
+
+def _certain_model(segment: Segment, config: FusionConfig) -> Model:
+    """The same without error bars of lag and gain, which depend on the numbers that are fitted and change no ν."""
+    model = model_of(segment, config)
+    model.axis["lag_sd"] = model.axis["gain_sd"] = 0.0
+    return model
 
 
 def biased_sensors(segment: Segment, config: FusionConfig) -> list[list[str]]:

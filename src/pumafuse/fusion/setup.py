@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from ..filter.core import AXIS, SENSOR, VIEW, Model
 from ..filter.response import record_of
+from ..model.arm import AxisModel
+from ..toml import Interval
 from .config import FusionConfig
+from .score import Z95
 
 _SMOOTHNESS = {"matern": 1.5, "ou": 0.5}
 
@@ -42,6 +46,7 @@ def filter_model(
         record["disturbance_sd"], record["disturbance_time"] = process.disturbance_sd, process.disturbance_time
         record["smoothness"] = _SMOOTHNESS[process.disturbance_kind]
         record["offset_sd"] = config.start.offset_sd_of(name)
+        record["lag_sd"], record["gain_sd"] = _sd_of(one.lag_ci95, arm.lag_of(name)), _gain_sd_of(one)
     for row, name in enumerate(names):
         known = config.sensors.get(name)
         if known is None:
@@ -53,6 +58,20 @@ def filter_model(
             biases = (known.bias_sd_of(one), known.bias_drift_sd_of(one)) if inside else (0.0, 0.0)
             view[row, number] = np.nan if sd is None else sd, *biases, known.bias_time, turn_of(config, name, one)
     return Model(axis, sensor, view)
+
+
+def _sd_of(ci95: Interval | None, value: float) -> float:
+    """The standard deviation that a 95 % interval stands for; an end that is open is as far as 0."""
+    ends = (value, value) if ci95 is None else ci95
+    return sum(abs(end - value) if math.isfinite(end) else abs(value) for end in ends) / (2.0 * Z95)
+
+
+def _gain_sd_of(axis: AxisModel) -> float:
+    """That of the gain, of 1: a share of the distance. A gain that recovers makes no distance, but a lag."""
+    intercept = axis.gain.intercept
+    if axis.gain_recovery is not None or intercept == 0.0:
+        return 0.0
+    return _sd_of(axis.gain.intercept_ci95, intercept) / abs(intercept)
 
 
 def live_model(config: FusionConfig, start: Mapping[str, float] | None = None) -> Model:

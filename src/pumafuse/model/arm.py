@@ -54,6 +54,8 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         gain_recovery_ci95: Its 95 % interval [s], if it was fitted.
         delay: Dead time [s] of this axis if it differs from the arm's.
         delay_ci95: Its 95 % interval [s], if it was fitted.
+        lag_ci95: The 95 % interval of :meth:`lag` at slow motion [s], if it was fitted: delay and plant make up for
+            each other, so that their sum is known better than either.
     """
 
     kind: Kind = "length"
@@ -63,6 +65,7 @@ class AxisModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     gain_recovery_ci95: Interval | None = msgspec.field(name="gain_recovery_ms_ci95", default=None)
     delay: Delay | None = msgspec.field(name="delay_ms", default=None)
     delay_ci95: Interval | None = msgspec.field(name="delay_ms_ci95", default=None)
+    lag_ci95: Interval | None = msgspec.field(name="lag_ms_ci95", default=None)
 
     def lag(self, delay: float, speed: float = 0.0) -> float:
         """Total lag [s] behind the held command at constant velocity: Td + τ, or Td + 2ζ/ω, plus (1 − K)·recovery.
@@ -162,6 +165,9 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
             raise ConfigError(f"axes.{name}: period, delay, plant and gain must be finite")
         if min(positive) <= 0.0 or min(delays) < 0.0:
             raise ConfigError(f"axes.{name}: period, plant and recovery must be > 0, the delay >= 0")
+        for key, ci95 in {"lag_ms_ci95": axis.lag_ci95, "gain.intercept_ci95": axis.gain.intercept_ci95}.items():
+            if ci95 is not None and not ci95[0] <= ci95[1]:
+                raise ConfigError(f"axes.{name}.{key}: an interval has its lower end first, then its upper end")
 
     def __repr__(self) -> str:
         lags = ", ".join(f"{axis} {self.lag_of(axis) * MS:.4g} ms" for axis in self.axes)

@@ -199,6 +199,7 @@ class Latency:
                     arm = changed(arm, ("axes", axis, "plant", f"{name}_ci95"), getattr(one, f"{name}_ci95"))
             arm = changed(arm, ("axes", axis, "gain", "intercept_ci95"), one.gain_ci95)
             arm = changed(arm, ("axes", axis, "gain_recovery_ci95"), one.gain_recovery_ci95)
+            arm = changed(arm, ("axes", axis, "lag_ci95"), one.lag_ci95)
             own = arm.axes[axis].delay is not None
             arm = changed(arm, ("axes", axis, "delay_ci95") if own else ("delay_ci95",), one.delay_ci95)
         provenance = {"identified_on": self.details.runs, "sensor": self.details.sensor}

@@ -15,8 +15,9 @@ from ..fusion.config import FusionConfig
 from ..fusion.faults import latency_questions
 from ..logs.clock import segments
 from ..logs.run import Run
+from ..units import MS
 from .identifiability import TuneError, correlations, excited_axes
-from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals, lag_slopes
+from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
 from .likelihood import Likelihood, LogLikelihood
 from .maximise import Point
 from .parameters import Fit, Parameter, changed, check_fixed, kinds_of, parameters, rounded, with_gates
@@ -24,6 +25,7 @@ from .plain import LONGEST, Doubt, doubts, with_plain_arm
 from .stage import Plan, Stage, likelihood_of, run_stage
 from .summary import (
     AxisLikelihood,
+    FittedLag,
     TuningSummary,
     encode,
     fitted,
@@ -153,9 +155,10 @@ def tune(
     free = [one for stage in stages for one in stage.free]
     if not stages:  # the configuration as given, or interrupted before a stage was complete
         free = parameters(pipeline.best, config, pipeline.whole.sensors, kinds, fixed, sd_prior)
-    tuned = _with_provenance(pipeline.result(), free, intervals, names)
-    arms = {axis: one for stage in stages for axis, one in stage.arms.items()}
-    lost = [axis for axis, one in arms.items() if one.plain is None or tuned.arm.lag_of(axis) > LONGEST]
+    result, arms = pipeline.result(), {axis: one for stage in stages for axis, one in stage.arms.items()}
+    lost = [axis for axis, one in arms.items() if one.plain is None or result.arm.lag_of(axis) > LONGEST]
+    lags = with_doubts(fitted_lags(free, config, result, around, lost), found, config, result)
+    tuned = _with_provenance(result, free, intervals, {} if interrupted else lags, names)
     notes = [*doubted, *pipeline.notes, *(f"{axis}: no lag up to {LONGEST:g} s explains its motion" for axis in lost)]
     if interrupted:
         notes.append("interrupted: these are the best numbers until then, and not all of them have an interval")
@@ -175,7 +178,7 @@ def tune(
         sd_prior=sd_prior,
         interrupted=interrupted,
         likelihood=_likelihoods(pipeline.whole, config, tuned),
-        lags=with_doubts(fitted_lags(free, config, tuned, around, lost), found, config, tuned),
+        lags=lags,
         parameters=[fitted(one, config, tuned, intervals.get(one.key)) for one in free],
         biases=[one for run in runs for one in found_biases(run, tuned)],
         correlations=[one for stage in stages for one in correlations(stage.likelihood, stage.best, stage.free)],
@@ -351,9 +354,13 @@ def _likelihoods(likelihood: Likelihood, before: FusionConfig, after: FusionConf
 
 
 def _with_provenance(
-    config: FusionConfig, free: Sequence[Parameter], intervals: Mapping[str, ConfidenceInterval], runs: list[str]
+    config: FusionConfig,
+    free: Sequence[Parameter],
+    intervals: Mapping[str, ConfidenceInterval],
+    lags: Mapping[str, FittedLag],
+    runs: list[str],
 ) -> FusionConfig:
-    """The configuration with the intervals of the arm's parameters, and the runs they were fitted on."""
+    """The configuration with the intervals of the arm's parameters and lags, and the runs they were fitted on."""
     arm = [one for one in free if one.path[0] == "arm" and one.key in intervals]
     for one in arm:
         found = intervals[one.key]
@@ -362,6 +369,9 @@ def _with_provenance(
             for sign, is_open, end in zip((-1, 1), found.open, found.ci95, strict=True)
         )
         config = changed(config, (*one.path[:-1], f"{one.path[-1]}_ci95"), (low, high))
+    for axis, one in lags.items():
+        low, high = (rounded(end / MS) for end in open_interval(one.lag_ms_ci95))
+        config = changed(config, ("arm", "axes", axis, "lag_ci95"), (low, high))
     earlier = _tuned_on(config)  # what is not fitted now is from there
     return changed(config, ("arm", "provenance", "tuned_on"), [*(one for one in earlier if one not in runs), *runs])
 
