@@ -44,6 +44,7 @@ _SURELY = 4.0  # sds from which a jitter is named
 _SMALLEST_JITTER = 1e-3  # s
 _OF_BOTH = 2.0  # times that of the other sensor, at the least: what both see is the path's
 _SAME_BUNCH, _BUNCHED = 0.2, 0.2  # of the mean interval; share of the intervals
+_RANDOM = 0.5  # mean intervals; those of stamps at random scatter by 0.86
 
 
 @dataclass(frozen=True)
@@ -525,8 +526,12 @@ def _intervals(source: Source) -> tuple[int, FloatArray]:
 
 
 def _arrivals(source: Source) -> tuple[float, bool]:
-    """How far a jitter of its stamps may go [s]: as far as their intervals scatter, outliers apart; and bunches."""
+    """How large a jitter of its stamps may be [s], and whether rows arrive in bunches.
+
+    As their intervals scatter, outliers apart; anything, where these come near those of stamps at random.
+    """
     apart, interval = _intervals(source)
     low, high = np.quantile(interval, [0.1, 0.9])
     bunched = apart < (1.0 - _BUNCHED) * len(interval)
-    return math.inf if bunched else float(high - low) / 2.563, bunched
+    irregular = float(high - low) / 2.563
+    return math.inf if bunched or irregular > _RANDOM * interval.mean() else irregular, bunched
