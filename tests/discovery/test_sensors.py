@@ -159,6 +159,7 @@ def test_sensors_without_common_motion_have_no_latency() -> None:
     for other in (
         replace(camera, values={"y": camera.values["x"]}),
         camera.rows(slice(0, 30)),
+        camera.rows(slice(0, 0)),
         replace(camera, values={"x": np.random.default_rng(1).normal(size=len(camera.stamp))}),
         replace(camera, values={"x": np.full(len(camera.stamp), np.nan)}),
     ):

@@ -177,7 +177,8 @@ def _of_run(run: Run, first: str, second: str) -> Alignment | None:
 def _count(source: Source) -> int:
     """How many values it has, those of a bunch as one."""
     apart, _ = _intervals(source)
-    return sum(int(np.isfinite(value).sum()) for value in source.values.values()) * (apart + 1) // len(source.stamp)
+    values = sum(int(np.isfinite(value).sum()) for value in source.values.values())
+    return values * (apart + 1) // max(len(source.stamp), 1)
 
 
 def _axis(run: Run, name: str, one: Source, two: Source) -> _Axis | None:
