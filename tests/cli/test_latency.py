@@ -41,7 +41,7 @@ def told(trunk: Path) -> tuple[str, Path]:
 
 
 def test_it_says_how_late_the_arm_and_the_camera_are(told: tuple[str, Path]) -> None:
-    """The README of the recording: m1 is 202 to 209 ms late, the camera 45; both lie in their intervals, or beside."""
+    """The README of the recording: m1 is 202 to 209 ms late, the camera 45; both lie in their intervals."""
     text, _ = told
     numbers = r"([\d.]+) \(([\d.]+) to ([\d.]+)\) ms l"
     lag, camera = (
@@ -52,7 +52,7 @@ def test_it_says_how_late_the_arm_and_the_camera_are(told: tuple[str, Path]) -> 
     assert lag[1] < 209.0
     assert lag[2] > 202.0
     assert lag[2] - lag[1] < 20.0
-    assert camera[1] - 0.5 < 45.0 < camera[2] + 0.5  # m1 alone: 43.3 (41.8 to 44.9); all six axes: 44.7 (44.1 to 45.3)
+    assert camera[1] < 45.0 < camera[2]
     assert camera[2] - camera[1] < 6.0
     assert "The stamps of reference are taken to be right" in text
 

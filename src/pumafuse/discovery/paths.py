@@ -137,6 +137,11 @@ def residue(s: FloatArray, rest: FloatArray, freedom: float) -> Residue:
     return best
 
 
+def interpolated(s: FloatArray, rest: FloatArray) -> Residue:
+    """The residue that goes through all rows: what a sensor of little noise sees of a motion that nobody commanded."""
+    return Residue(lambda at: np.interp(at, s, rest), float(s[0]), float(s[-1]))
+
+
 @dataclass(frozen=True)
 class Path:
     """The path of an axis by one sensor.

@@ -18,7 +18,7 @@ import numpy as np
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..logs.run import Run, Source
 from .following import following, isolated, known
-from .paths import Path, Residue, Shrunk, clipped_rms, path, residue, robust_sd, shrunk
+from .paths import Path, Residue, Shrunk, clipped_rms, interpolated, path, residue, robust_sd, shrunk
 
 REFERENCE = "reference"  # the name of a run's reference among its sensors
 _FOLLOWS = 0.5  # correlation of changes below which two sensors do not see one motion
@@ -30,6 +30,7 @@ _PAUSE = 5.0  # mean intervals, over which a path by a sensor does not go on
 _ROUNDS, _FITTED, _CLOSE = 20, 3, 1e-5  # at the most; in which the noise is fitted anew; s
 _FARTHEST = 0.03  # s, by which a round moves the latency
 _ASIDE = 1e-3  # s, beside an instant, for speeds
+_BETTER = 0.98  # of what a smooth path leaves of the second sensor: one through all rows of the first must leave less
 _BEYOND = 3.0  # sds from which a row counts less (Huber)
 _PIECES = 20  # of the motion
 _FINEST = 6e-5  # s: between two commands the path is known no better, see benchmarks/lag.py, and no stamp of a log is
@@ -300,11 +301,14 @@ def _linear(axis: _Axis, noise: _Noise, latency: float, fitted: bool) -> _Linear
     columns[n1:, k + 2], columns[n1:, k + 3], columns[:, k + 4] = position(at) / noise.sd2, -speed[n1:], rest
     columns *= np.sqrt(np.minimum(1.0, _BEYOND / np.maximum(np.abs(rest), 1e-300)))[:, None]  # Huber's weights
     used = found.freedom * n1 / (n1 + n2)
-    left = residue(axis.s, rest1 + noise.left(axis.s), used) if fitted else noise.left
-    sd1 = clipped_rms(rest1) * math.sqrt(n1 / max(n1 - 1.0 - used - noise.left.freedom, 1.0))
     sd2 = clipped_rms(rest2) * math.sqrt(n2 / max(n2 - 2.0 - found.freedom + used, 1.0))
-    floor = 1e-9 * float(np.ptp(axis.z2))
-    noise = replace(noise, sd1=max(sd1, floor), sd2=max(sd2, floor), left=left, penalty=found.penalty)
+    noise = replace(noise, sd2=max(sd2, floor := 1e-9 * float(np.ptp(axis.z2))), penalty=found.penalty)
+    if fitted:
+        whole1, whole2 = rest1 + noise.left(axis.s), rest2 + noise.scale * noise.left(at)
+        smooth, through = residue(axis.s, whole1, used), interpolated(axis.s, whole1)
+        sd1 = clipped_rms(whole1 - smooth(axis.s)) * math.sqrt(n1 / max(n1 - 1.0 - used - smooth.freedom, 1.0))
+        off = [clipped_rms(whole2 - noise.scale * one(at)) for one in (smooth, through)]
+        noise = replace(noise, sd1=max(sd1, floor), left=through if off[1] < _BETTER * off[0] else smooth)
     return _Linear(axis, time, columns, rest, speed, found, noise)
 
 
