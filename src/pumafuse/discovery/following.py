@@ -18,7 +18,8 @@ _SPANS = (0.1, 0.5, 2.0, math.inf)
 _MOST, _FEW = 3000, 500  # changes, and for a first look
 _FEWEST = 20
 _WHOLE = 0.01  # from a whole number, of steps
-_OUTLYING, _AGREEING = 8.0, 2.0  # sds
+_OUTLYING = 8.0  # sds
+_APART = 5.0  # times as far off as its neighbours are: at the start or the turn of a motion it is three times
 _MOST_OUTLYING = 0.05  # of the changes: each outlier is in two, and of few measurements some are more than a clip takes
 _NEARLY = 0.98  # of the highest correlation: of several such lags, as a periodic motion has, the shortest counts
 _MIRRORED = 0.1  # a negative correlation must be stronger by this than any positive one
@@ -34,6 +35,7 @@ class Following:
         slope: By how much it moves when the other moves by 1.
         offset: How far its level is from slope ± 1 times the other's [m or rad].
         scatter: Its noise, roughly, [m or rad].
+        resolution: That of the steps in which its values come.
         misfit: Standard deviation of what the other, delayed and scaled, leaves of it, outliers apart [m or rad].
         outliers: The share of its values that jump away from their neighbours.
     """
@@ -43,6 +45,7 @@ class Following:
     slope: float
     offset: float
     scatter: float
+    resolution: float
     misfit: float
     outliers: float
 
@@ -55,7 +58,7 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
         follower: Likewise, (m,).
     """
     origin = int(leader[0][leader[0] != NO_STAMP].min(initial=2**62))
-    (t, u), (s, z) = _known(*leader, origin), _known(*follower, origin)
+    (t, u), (s, z) = known(*leader, origin), known(*follower, origin)
     inside = (s > t[0] if len(t) else s > np.inf) & (s < t[-1] if len(t) else False)
     s, z = s[inside], z[inside]
     if len(t) < _FEWEST or len(s) < _FEWEST:
@@ -75,8 +78,9 @@ def following(leader: tuple[TimeArray, FloatArray], follower: tuple[TimeArray, F
         slope=slope,
         offset=float(np.median(z - math.copysign(1.0, slope) * np.interp(s - lag, t, u))),
         scatter=max(min(scatter(z), scatter(rest(best))), _resolution(z)),
+        resolution=_resolution(z),
         misfit=_robust_sd(rest(best)),
-        outliers=_outliers(rest(best)),
+        outliers=float(isolated(z).mean()),
     )
 
 
@@ -88,8 +92,8 @@ def _without_few(rest: FloatArray, motion: FloatArray) -> BoolArray:
     return kept if few and not is_motion else np.ones(len(rest), dtype=np.bool_)
 
 
-def _known(stamp: TimeArray, value: FloatArray, origin: int) -> tuple[FloatArray, FloatArray]:
-    """Seconds and values of the rows that have both, in order, without what no robot reaches."""
+def known(stamp: TimeArray, value: FloatArray, origin: int) -> tuple[FloatArray, FloatArray]:
+    """Seconds after an origin [ns] and values of the rows that have both, in order, without what no robot reaches."""
     there = (stamp != NO_STAMP) & (np.abs(value) < _BEYOND)
     time, order = np.unique((stamp[there] - origin) / 1e9, return_index=True)
     return time, value[there][order]
@@ -163,11 +167,20 @@ def resolution(value: FloatArray) -> float:
     return _resolution(value) if (np.abs(multiples - np.rint(multiples)) < _WHOLE).all() else 0.0
 
 
-def _outliers(value: FloatArray) -> float:
-    """The share that jumps away from both neighbours, which agree."""
-    away = np.abs(value[1:-1] - 0.5 * (value[:-2] + value[2:]))
-    sd = max(1.4826 * float(np.median(away)), _resolution(value))
-    return float(((away > _OUTLYING * sd) & (np.abs(value[2:] - value[:-2]) < _AGREEING * sd)).mean())
+def isolated(value: FloatArray) -> BoolArray:
+    """Which values leave their neighbours, two on each side that lie on a line, and are back at once, (n,).
+
+    By the sensor alone: what an arm does that nobody commanded is none, nor is a turn of its motion.
+    """
+    found = np.zeros(len(value), dtype=np.bool_)
+    if len(value) < _FEWEST:
+        return found
+    neighbours, place = np.stack([value[:-4], value[1:-3], value[3:-1], value[4:]]), np.array([-2.0, -1.0, 1.0, 2.0])
+    middle = neighbours.mean(axis=0)
+    off = np.abs(neighbours - middle - place[:, None] * (place @ neighbours / 10.0)).max(axis=0)
+    least = np.maximum(_OUTLYING * max(scatter(value), _resolution(value)), _APART * off)
+    found[2:-2] = np.abs(value[2:-2] - middle) > least
+    return found
 
 
 def _robust_sd(rest: FloatArray) -> float:

@@ -8,17 +8,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..arrays import FloatArray
 from ..errors import RunError
+from ..logs.run import Run
 from ..units import Kind
 from .contents import period_of
-from .following import Following
+from .following import Following, isolated
+from .sensors import REFERENCE, aligned, noise
 from .survey import Survey
 
 _FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
 _DELAY_SHARE = 0.6  # of the lag; the PUMA's is 0.6, a servo's on a bus rather 0.75
+_AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
 _UNKNOWN_LAG = 0.1  # s, where nothing follows
 _UNKNOWN_SD, _SMALLEST_SD = 1e-3, 1e-6  # m or rad
-_OUTLIERS = 3e-3  # share from which a gate pays
+_OUTLIERS, _FEWEST_OUTLIERS = 3e-3, 3  # share and number from which a gate pays: one or two may be anything
 _GATE = 5.0
 _DIFFERENT = 5.0  # sds
 
@@ -86,39 +90,43 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
     if math.isnan(period):
         raise RunError(f"{found.log}: fewer than two commands with stamps of their own")
     relations = {key: one for key, one in found.relations.items() if abs(one.correlation) >= _FOLLOWS}
-    first, latencies = _latencies(relations)
+    first, latencies, noises = _against_each_other(found.run, relations)
     leads = {
         axis: {name: relations[name, axis] for name in run.sensors if (name, axis) in relations} for axis in run.axes
     }
     # Behind the path through the commanded points a held command is late by half a period itself.
     lags = {
-        axis: float(np.median([one.lag - latencies[name] for name, one in mine.items()])) - 0.5 * period
+        axis: float(np.median([one.lag - latencies.get(name, 0.0) for name, one in mine.items()])) - 0.5 * period
         for axis, mine in leads.items()
         if mine
     }
     shortest = max(min(lags.values(), default=_UNKNOWN_LAG), 0.0)
     delay = _DELAY_SHARE * shortest
     axes = {axis: _axis(found, axis, leads[axis], lags.get(axis, _UNKNOWN_LAG), delay) for axis in run.axes}
-    sensors = {name: _sensor(found, name, latencies.get(name, 0.0), first, leads) for name in run.sensors}
+    sensors = {name: _sensor(found, name, latencies, first, leads, noises.get(name, {})) for name in run.sensors}
     return ArmGuess(period, delay, axes), sensors
 
 
-def _latencies(relations: Mapping[tuple[str, str], Following]) -> tuple[str, dict[str, float]]:
-    """The source that is earliest, the reference if there is one, and how much later each sensor is [s].
+def _against_each_other(
+    run: Run, relations: Mapping[tuple[str, str], Following]
+) -> tuple[str, dict[str, float], dict[str, Mapping[str, float]]]:
+    """The source that is earliest, the reference if there is one; how much later each is [s]; noise by axis [m or rad].
 
-    Medians over the axes that both have.
+    Without sensors that have no motion in common with the one that has the most rows.
     """
-    lags: dict[str, dict[str, float]] = {}
-    for (name, axis), one in relations.items():
-        lags.setdefault(name, {})[axis] = one.lag
-    middle = {name: float(np.median(list(mine.values()))) for name, mine in lags.items()}
-    first = "reference" if "reference" in lags else min(middle, key=middle.__getitem__, default="")
-    ahead = min(middle.get(first, 0.0), 0.0)  # by another clock
-    late: dict[str, float] = {}
-    for name, mine in lags.items():
-        both = [mine[axis] - lags[first][axis] for axis in mine if axis in lags[first]]
-        late[name] = ahead + (max(float(np.median(both)), 0.0) if both else 0.0)
-    return first, late
+    lags: dict[str, list[float]] = {}
+    for (name, _), one in relations.items():
+        lags.setdefault(name, []).append(one.lag)
+    if not lags:
+        return "", {}, {}
+    base = REFERENCE if REFERENCE in lags else max(lags, key=lambda name: len(run.sensors[name].stamp))
+    pairs = {name: aligned([run], base, name) for name in lags if name != base}
+    later = {base: 0.0, **{name: one.latency for name, one in pairs.items() if one is not None}}
+    first = base if base == REFERENCE else min(later, key=later.__getitem__)
+    ahead = float(np.median(lags[first]))
+    ahead = ahead if ahead < -_AHEAD else 0.0
+    latencies = {name: ahead + max(late - later[first], 0.0) for name, late in later.items()}
+    return first, latencies, {name: one.sd for name, one in pairs.items() if one is not None}
 
 
 def _axis(found: Survey, axis: str, followers: Mapping[str, Following], lag: float, delay: float) -> AxisGuess:
@@ -142,22 +150,44 @@ def _axis(found: Survey, axis: str, followers: Mapping[str, Following], lag: flo
 
 
 def _sensor(
-    found: Survey, name: str, latency: float, first: str, leads: Mapping[str, Mapping[str, Following]]
+    found: Survey,
+    name: str,
+    latencies: Mapping[str, float],
+    first: str,
+    leads: Mapping[str, Mapping[str, Following]],
+    noises: Mapping[str, float],
 ) -> SensorGuess:
     relations = {axis: found.relations.get((name, axis)) for axis in found.run.sensors[name].values}
     known = {axis: one for axis, one in relations.items() if one is not None}
     mirrored = [one.slope < 0.0 for one in known.values() if abs(one.correlation) >= _FOLLOWS]
     scale = -1.0 if sum(mirrored) > len(mirrored) / 2 else 1.0
     bias = {axis: size for axis, one in known.items() if (size := _bias(found, axis, one, scale, leads[axis]))}
-    sd = {axis: max(known[axis].scatter, _SMALLEST_SD) if axis in known else _UNKNOWN_SD for axis in relations}
-    outliers = max((one.outliers for one in known.values()), default=0.0)
+    sd = dict.fromkeys(relations, _UNKNOWN_SD)
+    sd |= {axis: _noise(found, name, axis, one, noises.get(axis, math.inf)) for axis, one in known.items()}
     words = "DECIDE: how old a measurement is when it is stamped"
-    if first == "reference":
+    if first == REFERENCE and name in latencies:
         words = "so much later than the reference, whose stamps are taken to be right"
-    elif first and name != first:
+    elif first and name != first and name in latencies:
         words = f"so much later than {first}; add how old a measurement of that one is"
     turns = found.roles is not None and any(one.turns for one in found.roles.sensors if one.name == name)
-    return SensorGuess(sd, bias, latency, words, scale, _GATE if outliers > _OUTLIERS else 0.0, turns)
+    gate = _GATE if any(map(_has_outliers, found.run.sensors[name].values.values())) else 0.0
+    return SensorGuess(sd, bias, latencies.get(name, 0.0), words, scale, gate, turns)
+
+
+def _noise(found: Survey, name: str, axis: str, one: Following, beside: float) -> float:
+    """The least of three estimates [m or rad]: how far a slow sensor moves from row to row is none of its noise.
+
+    By its differences, beside the path that it tells itself, and beside that of another sensor.
+    """
+    alone = noise(found.run.command, found.run.sensors[name], axis, one.lag)
+    return max(min(one.scatter, alone, beside), one.resolution, _SMALLEST_SD)
+
+
+def _has_outliers(value: FloatArray) -> bool:
+    """Whether a gate pays: values that leave their neighbours and are back at once are more than a few."""
+    value = value[np.isfinite(value)]
+    count = int(isolated(value).sum())
+    return count >= _FEWEST_OUTLIERS and count > _OUTLIERS * len(value)
 
 
 def _bias(found: Survey, axis: str, one: Following, scale: float, others: Mapping[str, Following]) -> float:

@@ -17,10 +17,10 @@ from .. import toml
 from ..arrays import FloatArray
 from ..discovery.guesses import ArmGuess, AxisGuess, SensorGuess, guess
 from ..discovery.roles import relations
+from ..discovery.sensors import REFERENCE, Alignment, aligned
 from ..discovery.survey import SOONER, Survey, interpolation, soonest
 from ..errors import PumafuseWarning, UnknownNameError
-from ..fusion.config import FusionConfig, Process, Sensor, Start
-from ..fusion.score import Z95
+from ..fusion.config import SD_BOUNDS, FusionConfig, Process, Sensor, Start
 from ..logs.axes import in_axes
 from ..logs.run import Run
 from ..model.arm import ArmModel, AxisModel
@@ -29,14 +29,11 @@ from ..toml import Interval
 from ..units import MS
 from .arm_search import BOUNDS, ArmSearch, Freedom
 from .arms import Arm, Rest
-from .identifiability import TuneError, covariance, excited_axes
-from .likelihood import Derivatives, Likelihood, in_threads
-from .maximise import derivatives, maximise, past_bumps, point
+from .identifiability import TuneError, excited_axes
+from .likelihood import Likelihood, in_threads
 from .parameters import (
-    LATENCIES,
     Parameter,
     changed,
-    moved,
     parameters,
     rounded,
     with_arm,
@@ -47,7 +44,6 @@ from .parameters import (
 from .plain import Doubt, doubts, with_plain_arm
 from .posterior import Mixture, Model, Quantity, chosen_model, shared_delay, sharing
 
-REFERENCE = "reference"  # the name of a run's reference among its sensors
 _MARGIN = 1.25  # by which intervals of all but the lag are widened: found by simulation, see docs/comparison.md
 _HIGHEST = 700.0  # logarithm of what a number can be
 _SAMPLED = (
@@ -55,11 +51,11 @@ _SAMPLED = (
     " a path that the controller interpolates, write interpolation_ms = {:g} below [command] in run.toml"
 )
 _AHEAD_OF = "{}: what measures is {:.0f} ms ahead of the commands, and the lag is wrong: are both stamped by one clock?"
+_STEPS = "the latency of {} steps from {:.0f} to {:.0f} ms {:.1f} s after the first command: use parts, --from and --to"
+_APART = "{}: sees no motion that {} sees: its latency is not known"
 _FINEST = 2e-5  # s: no stamp of a log is better, whatever the likelihood says where measurements pass commands
 _ROUGHLY = 0.1  # tolerance in log-likelihood
-_GRID = np.linspace(-0.1, 0.1, 21)  # s, about a guessed latency
 _GATE = 8.0  # standard deviations, of a sensor that has outliers: what jerks is none
-_BESIDE = 3e-4  # s, beside a latency where its interval is taken
 _WIDE, _WIDE_LAG, _WIDE_GAIN = 0.3, 0.02, 0.1  # of the lag, s, of 1: intervals from which a number is not known
 _PARTS = 10  # of a run, the lag of each of which is reported
 _DRIFTS = 3.5  # standard deviations from which a drift is named
@@ -130,16 +126,32 @@ class PartLag(msgspec.Struct, frozen=True, kw_only=True):
     sd: float = msgspec.field(name="sd_ms")
 
 
+class LatencyStep(msgspec.Struct, frozen=True, kw_only=True):
+    """A latency that steps: when [s after the first command], from what and to what [s]."""
+
+    time: float = msgspec.field(name="time_s")
+    before: float = msgspec.field(name="before_ms")
+    after: float = msgspec.field(name="after_ms")
+
+
 class SensorLag(msgspec.Struct, frozen=True, kw_only=True):
     """How much older a sensor's measurements are when stamped than those of the sensor whose stamps are right.
 
     Attributes:
-        latency: The latency [s].
-        latency_ci95: Its 95 % interval.
+        latency: The latency [s]; where it steps, that of the longest part.
+        latency_ci95: Its 95 % interval; where it steps, of all parts.
+        latency_sd: Its standard deviation from row to row [s]; 0: none is seen.
+        scale: How far it moves where that sensor moves by 1; ± 1 unless it surely differs.
+        scale_ci95: The interval of what was fitted; null where axes do not agree.
+        steps: Where the latency steps.
     """
 
     latency: float = msgspec.field(name="latency_ms")
     latency_ci95: Interval = msgspec.field(name="latency_ms_ci95")
+    latency_sd: float = msgspec.field(name="latency_sd_ms", default=0.0)
+    scale: float = 1.0
+    scale_ci95: Interval | None = None
+    steps: list[LatencyStep] = []
 
 
 class LatencySummary(msgspec.Struct, frozen=True, kw_only=True):
@@ -243,10 +255,10 @@ def latency(runs: Sequence[Run] | Run, *, sensor: str | None = None) -> Latency:
         lags[axis] = _doubted(lags[axis], one, one.sentence(config, axis))
         if one.refutes:
             config = with_plain_arm(config, axis, one.plain.arm)
-    best, sensors = _sensors(every, config, trusted, moving)
+    best, sensors, said = _sensors(every, config, trusted)
     lags, clock = _with_courses(likelihood, config, lags)
     still = [axis for axis in config.arm.axes if axis not in moving]
-    notes = [*likelihood.notes, *(f"{axis}: does not move, or {trusted} does not measure it" for axis in still)]
+    notes = [*likelihood.notes, *said, *(f"{axis}: does not move, or {trusted} does not measure it" for axis in still)]
     notes += [f"{axis}: {trusted} does not follow its commands: no lag is told" for axis in lost]
     notes += [_SAMPLED.format(one.run.name, step * MS) for one in surveys if (step := interpolation(one))]
     notes += [_AHEAD_OF.format(one.run.name, -lag * MS) for one in surveys if (lag := soonest(one)) < -SOONER]
@@ -485,56 +497,65 @@ def _doubted(lag: AxisLag, doubt: Doubt, sentence: str) -> AxisLag:
 
 
 def _sensors(
-    runs: Sequence[Run], config: FusionConfig, trusted: str, moving: Sequence[str]
-) -> tuple[FusionConfig, dict[str, SensorLag]]:
-    """The configuration with the noise and latency of the other sensors, and those latencies with intervals."""
-    others = [name for name in config.sensors if name != trusted]
-    if not others:
-        return config, {}
-    latest = LATENCIES[1] + max(one.latency for one in config.sensors.values())
-    likelihood = Likelihood(runs, config, latest=max(latest, 0.0))
-    measured = {axis: names for axis, names in likelihood.sensors.items() if axis in moving}
-    others = [name for name in others if any(name in names for names in measured.values())]
+    runs: Sequence[Run], config: FusionConfig, trusted: str
+) -> tuple[FusionConfig, dict[str, SensorLag], list[str]]:
+    """The configuration with noise, latency and scale of the other sensors; these with intervals; what is to be said.
 
-    def free(at: FusionConfig) -> list[Parameter]:
-        least = likelihood.resolution
-        every = parameters(at, config, measured, ["noise", "latency"], sd_prior=False, resolution=least)
-        return [one for one in every if one.sensor in others]
-
-    for name in others:
-        config = _nearest_latency(likelihood, config, name)
-    best = maximise(likelihood, config, free(config))
-    best = past_bumps(likelihood, best, free(config))
-    own = with_own_delays(best.config, moving)
-    arm = [
-        one
-        for one in parameters(own, own, measured, ["delay", "plant", "gain"])
-        if one.axis in moving and one.at_bound(own) is None
-    ]
-    late = [one for one in free(own) if one.fit == "latency"]
-    every = [*arm, *late]
-
-    def beside(shift: float) -> Derivatives:
-        """Where the stamps of two sensors coincide, the likelihood has a cusp that says nothing of its width."""
-        there = moved(own, late, [one.at(own) + shift for one in late])
-        return derivatives(likelihood, point(likelihood, there, every), every)
-
-    both = [beside(sign * _BESIDE) for sign in (-1.0, 1.0)]
-    cov = covariance(0.5 * (both[0].information + both[1].information), every)
-    scatter = 0.5 * (both[0].scatter + both[1].scatter)
-    sd = np.sqrt(np.maximum(np.diag(cov), np.diag(cov @ scatter @ cov)))
-    found: dict[str, SensorLag] = {}
-    for one, half in zip(late, (Z95 * sd[len(arm) :]).tolist(), strict=True):
-        value = one.get(best.config)
-        found[str(one.sensor)] = SensorLag(latency=value, latency_ci95=(value - half, value + half))
-    return best.config, found
+    No arm is needed for it.
+    """
+    found, notes = dict[str, SensorLag](), list[str]()
+    for name, sensor in config.sensors.items():
+        one = None if name == trusted else aligned(runs, trusted, name)
+        if one is None:
+            notes += [] if name == trusted else [_APART.format(name, trusted)]
+            continue
+        found[name] = _sensor_lag(one)
+        notes += _sensor_notes(name, one, trusted)
+        sd = sensor.sd if isinstance(sensor.sd, dict) else {}
+        better = msgspec.structs.replace(
+            sensor,
+            sd={**sd, **{axis: max(rounded(value), SD_BOUNDS[0]) for axis, value in one.sd.items()}},
+            latency=rounded(one.latency),
+            latency_sd=rounded(one.latency_sd),
+            scale=rounded(one.scale) * config.sensors[trusted].scale,
+        )
+        config = changed(config, ("sensors", name), better)
+    return config, found, notes
 
 
-def _nearest_latency(likelihood: Likelihood, config: FusionConfig, name: str) -> FusionConfig:
-    """The configuration with the most likely latency of a sensor on a grid about the guessed one."""
-    middle = config.sensors[name].latency
-    tried = [changed(config, ("sensors", name, "latency"), middle + shift) for shift in _GRID.tolist()]
-    return max(tried, key=lambda one: likelihood.evaluate(one).total)
+def _sensor_lag(one: Alignment) -> SensorLag:
+    return SensorLag(
+        latency=one.latency,
+        latency_ci95=one.latency_ci95,
+        latency_sd=one.latency_sd,
+        scale=one.scale,
+        scale_ci95=one.scale_ci95,
+        steps=[LatencyStep(time=step.time, before=step.before, after=step.after) for step in one.steps],
+    )
+
+
+def _sensor_notes(name: str, one: Alignment, trusted: str) -> list[str]:
+    """What one latency does not say: steps, a drift, jitter, a scale."""
+    notes: list[str] = []
+    rises = {step.after > step.before for step in one.steps}
+    if len(one.steps) > 1 and len(rises) == 1:
+        first, last = one.steps[0], one.steps[-1]
+        notes.append(
+            f"the latency of {name} drifts from {first.before * MS:.0f} to {last.after * MS:.0f} ms: its clock runs"
+            f" {'slower' if last.after < first.before else 'faster'} than that of {trusted}"
+        )
+    else:
+        notes += [_STEPS.format(name, step.before * MS, step.after * MS, step.time) for step in one.steps]
+    if one.latency_sd:
+        bunched = "; its rows arrive in bunches" if one.bunched else ""
+        notes.append(
+            f"the latency of {name} scatters by {one.latency_sd * MS:.1f} ms from row to row{bunched}: write"
+            f" latency_sd_ms = {one.latency_sd * MS:.2g}, or stamp rows when they are measured"
+        )
+    if abs(one.scale) != 1.0 and one.scale_ci95 is not None:
+        low, high = one.scale_ci95
+        notes.append(f"{name} moves {one.scale:.4g} ({low:.4g} to {high:.4g}) times as far as {trusted}: its scale")
+    return notes
 
 
 # ---- the lag over the run -------------------------------------------------------------------------------------------

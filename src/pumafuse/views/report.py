@@ -16,7 +16,7 @@ from ..identification.trials import StepTrials
 from ..identification.verify import AxisVerification, Trace
 from ..model.arm import ArmModel
 from ..model.plants import PLANTS, FirstOrder
-from ..tuning.latency import AxisLag, Latency, LatencySummary
+from ..tuning.latency import AxisLag, Latency, LatencySummary, SensorLag
 from ..tuning.parameters import rounded
 from ..units import KINDS, MS, SCREEN, Kind, Screen
 from . import formatting, step_figures
@@ -247,10 +247,16 @@ def _gain_of(one: AxisLag) -> str:
 def settings(found: Latency) -> str:
     """The lines for ``fusion.toml`` and ``arm.toml``."""
     lines = [
-        toml.text({"sensors": {name: {"latency_ms": rounded(one.latency)}}})
+        toml.text({"sensors": {name: {key: rounded(value) for key, value in _fitted_keys(one).items()}}})
         for name, one in found.details.sensors.items()
     ]
     return "\n".join([*lines, found.config.arm.to_toml()])
+
+
+def _fitted_keys(one: SensorLag) -> dict[str, float]:
+    """What differs from a sensor's defaults."""
+    more = {"latency_sd_ms": one.latency_sd} if one.latency_sd else {}
+    return {"latency_ms": one.latency, **more, **({"scale": one.scale} if one.scale != 1.0 else {})}
 
 
 def elsewhere(found: LatencySummary) -> list[str]:

@@ -1,0 +1,542 @@
+"""Sensor against sensor: how much later one tells the same motion than another, with what scale, and whether it steps.
+
+Both see one path: p = responses to the commands (of any linear arm: none has to be known) + what these leave, which the
+sensor with more rows tells. Least squares of both sensors' rows on it have the latency, and a scale and biases for each
+axis, as unknowns. What the intervals count is how much the latency depends on any twentieth of the motion (jackknife):
+errors that last, and those of the path itself, are in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from ..arrays import NO_STAMP, FloatArray, TimeArray
+from ..logs.run import Run, Source
+from .following import following, isolated, known
+from .paths import Path, Residue, Shrunk, clipped_rms, interpolated, path, residue, robust_sd, shrunk
+
+REFERENCE = "reference"  # the name of a run's reference among its sensors
+_FOLLOWS = 0.5  # correlation of changes below which two sensors do not see one motion
+_FEWEST = 40  # rows of a sensor from which its latency is looked for
+_MOST = 10_000  # rows of a sensor that are used: more only take longer
+_CLEANED = 2  # times outliers are left out: some are beside others
+_STILL = 20  # rows of one value, of which none is used
+_PAUSE = 5.0  # mean intervals, over which a path by a sensor does not go on
+_ROUNDS, _FITTED, _CLOSE = 20, 3, 1e-5  # at the most; in which the noise is fitted anew; s
+_FARTHEST = 0.03  # s, by which a round moves the latency
+_ASIDE = 1e-3  # s, beside an instant, for speeds
+_BETTER = 0.98  # of what a smooth path leaves of the second sensor: one through all rows of the first must leave less
+_BEYOND = 3.0  # sds from which a row counts less (Huber)
+_PIECES = 20  # of the motion
+_FINEST = 6e-5  # s: between two commands the path is known no better, see benchmarks/lag.py, and no stamp of a log is
+_REACH, _STEP = 0.3, 0.005  # s: how far a latency steps at the most, and the grid on which steps are looked for
+_TABLE, _DENSE = 50_000, 2e-3  # instants at which a path is computed for these, at the most; s between them
+_FAR = 25.0  # squared sds, beyond which a row says no more about a step
+_GAIN = 50.0  # by how many squared sds a step must explain the rows better to be looked at
+_FURTHER = 3.0  # half intervals of both parts together, by which latencies before and after a step must differ
+_SMALLEST_STEP = 2e-3  # s
+_SCALES = 0.01  # from 1, of a scale that is named
+_SURELY = 4.0  # sds from which a jitter is named
+_SMALLEST_JITTER = 1e-3  # s
+_OF_BOTH = 2.0  # times that of the other sensor, at the least: what both see is the path's
+_SAME_BUNCH, _BUNCHED = 0.2, 0.2  # of the mean interval; share of the intervals
+_RANDOM = 0.5  # mean intervals; those of stamps at random scatter by 0.86
+
+
+@dataclass(frozen=True)
+class Step:
+    """A latency that steps: when [s after the first command], from what and to what [s], with half intervals [s]."""
+
+    time: float
+    before: float
+    after: float
+    halves: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How much later a sensor tells the same motion than another.
+
+    Attributes:
+        latency: By how much [s]; where it steps, that of the longest part.
+        latency_ci95: Its 95 % interval; where it steps, of all parts.
+        scale: How far it moves where the other moves by 1; ± 1 where that may be, or axes do not agree.
+        scale_ci95: The interval of the factor that was fitted; None where axes do not agree.
+        sd: Its noise on each axis at rest [m or rad].
+        latency_sd: Standard deviation of the latency from row to row [s]; 0: not seen to.
+        bunched: Whether its rows arrive in bunches.
+        steps: Where the latency steps.
+    """
+
+    latency: float
+    latency_ci95: tuple[float, float]
+    scale: float
+    scale_ci95: tuple[float, float] | None
+    sd: dict[str, float]
+    latency_sd: float
+    bunched: bool
+    steps: Sequence[Step] = ()
+
+    @property
+    def half(self) -> float:
+        """Half of the interval [s]."""
+        return 0.5 * (self.latency_ci95[1] - self.latency_ci95[0])
+
+
+def aligned(runs: Sequence[Run], first: str, second: str) -> Alignment | None:
+    """How much later the second sensor is than the first; None where they see no common motion.
+
+    Args:
+        runs: Recorded runs.
+        first: Name of a sensor, or ``reference``.
+        second: Likewise.
+    """
+    found = [one for run in runs if (one := _of_run(run, first, second)) is not None]
+    if len(found) < 2:
+        return found[0] if found else None
+    weight = np.array([one.half**-2 for one in found])
+    latency = np.array([one.latency for one in found])
+    mean = float(weight @ latency / weight.sum())
+    # Runs that differ by more than their intervals widen that of their mean (Birge, 1932).
+    birge = math.sqrt(max(1.0, float(weight @ (latency - mean) ** 2) * 1.96**2 / (len(found) - 1)))
+    half = birge / math.sqrt(float(weight.sum()))
+    best = found[int(np.argmax(weight))]
+    sd = {axis: value for one in reversed(found) for axis, value in one.sd.items()}
+    steps = [step for one in found for step in one.steps]
+    return replace(best, latency=mean, latency_ci95=(mean - half, mean + half), sd=sd, steps=steps)
+
+
+def noise(command: Source, source: Source, axis: str, lag: float) -> float:
+    """Noise of a sensor beside the path of its axis [m or rad]; infinite where it has too few rows for one.
+
+    Args:
+        command: The commands.
+        source: The sensor.
+        axis: The axis.
+        lag: How late it follows, roughly [s].
+    """
+    origin = int(command.stamp[command.stamp != NO_STAMP].min(initial=2**62))
+    s, z = _thinned(*known(*_clean(source.stamp, source.values[axis]), origin))
+    told = known(command.stamp, command.values[axis], origin)
+    return path(told, lag, s, z).sd if len(s) >= _FEWEST else math.inf
+
+
+# ---- rows -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """What two sensors tell of an axis; the denser one is the first [s, m or rad], and the path is by it."""
+
+    name: str
+    path: Path
+    s: FloatArray
+    z1: FloatArray
+    x: FloatArray
+    z2: FloatArray
+    lag: float
+    slope: float
+
+    def between(self, begin: float, end: float) -> _Axis:
+        """Its rows between two stamps of the second sensor [s]."""
+        late = self.lag
+        one, two = (begin - late <= self.s) & (self.s < end - late), (begin <= self.x) & (self.x < end)
+        return replace(self, s=self.s[one], z1=self.z1[one], x=self.x[two], z2=self.z2[two])
+
+
+def _source(run: Run, name: str) -> Source | None:
+    """The rows of a sensor, or of the reference, in the part of the run that is used."""
+    source = run.reference if name == REFERENCE and run.reference is not None else run.sensors.get(name)
+    there = run.command.stamp[run.command.stamp != NO_STAMP]
+    return None if source is None or not len(there) else source.rows(run.within(source.stamp, int(there.min())))
+
+
+def _of_run(run: Run, first: str, second: str) -> Alignment | None:
+    one, two = _source(run, first), _source(run, second)
+    if one is None or two is None:
+        return None
+    swapped = _count(two) > _count(one)
+    if swapped:
+        one, two = two, one
+    axes = [axis for name in one.values if (axis := _axis(run, name, one, two)) is not None]
+    if not axes:
+        return None
+    latency = float(np.median([axis.lag for axis in axes]))
+    axes = [replace(axis, lag=latency) for axis in axes]
+    found = _parts(axes, latency)
+    if found is None:
+        return None
+    fits, steps = found
+    return _alignment(fits, steps, swapped, one if swapped else two)
+
+
+def _count(source: Source) -> int:
+    """How many values it has, those of a bunch as one."""
+    apart, _ = _intervals(source)
+    values = sum(int(np.isfinite(value).sum()) for value in source.values.values())
+    return values * (apart + 1) // max(len(source.stamp), 1)
+
+
+def _axis(run: Run, name: str, one: Source, two: Source) -> _Axis | None:
+    """An axis that the commands move and both sensors see to move alike; outliers are left out."""
+    if name not in two.values or name not in run.command.values:
+        return None
+    told = run.command.stamp, run.command.values[name]
+    rows = [_clean(source.stamp, source.values[name]) for source in (one, two)]
+    between, behind = following(*rows), following(told, rows[0])
+    if between is None or behind is None or abs(between.correlation) < _FOLLOWS:
+        return None
+    origin = int(run.command.stamp[run.command.stamp != NO_STAMP].min())
+    (s, z1), (x, z2) = (_thinned(*known(*one, origin)) for one in rows)
+    if len(s) < _FEWEST:
+        return None
+    after = np.searchsorted(s, x - between.lag)
+    inside = (after > 0) & (after < len(s))
+    after = np.clip(after, 1, len(s) - 1)
+    inside &= s[after] - s[after - 1] < _PAUSE * float(np.diff(s).mean())
+    if inside.sum() < _FEWEST:
+        return None
+    by_first = path(known(*told, origin), behind.lag, s, z1)
+    return _Axis(name, by_first, s, z1, x[inside], z2[inside], between.lag, between.slope)
+
+
+def _clean(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, FloatArray]:
+    """Rows without outliers and without what stays the same for long: at rest it tells nothing, in motion it froze."""
+    there = np.isfinite(value) & (stamp != NO_STAMP)
+    stamp, value = stamp[there], value[there]
+    run = np.cumsum(np.diff(value, prepend=value[:1]) != 0.0)
+    moves = np.bincount(run, minlength=1)[run] <= _STILL if len(run) else there[:0]
+    stamp, value = stamp[moves], value[moves]
+    for _ in range(_CLEANED):
+        kept = ~isolated(value)
+        stamp, value = stamp[kept], value[kept]
+    return stamp, value
+
+
+def _thinned(time: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
+    every = -(-len(time) // _MOST)
+    return time[::every], value[::every]
+
+
+# ---- least squares --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """What is believed of an axis while the latency is sought.
+
+    Attributes:
+        scale: How far the second sensor moves where the first moves by 1.
+        sd1: Noise of the first [m or rad].
+        sd2: That of the second.
+        left: What the commands leave of the path.
+        penalty: The ridge of the responses; None: not known yet.
+    """
+
+    scale: float
+    sd1: float
+    sd2: float
+    left: Residue
+    penalty: float | None = None
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """An axis about a latency.
+
+    Attributes:
+        axis: Its rows.
+        time: When each row was valid, those of the first sensor before those of the second [s], (n,).
+        columns: Responses, levels of both, position, less the speed, and what is left, weighted, (n, k + 5).
+        rest: What is left of each row [sd], (n,).
+        speed: Of what it tells [sd/s], (n,).
+        shrunk: The coefficients of the responses.
+        noise: What to believe next.
+    """
+
+    axis: _Axis
+    time: FloatArray
+    columns: FloatArray
+    rest: FloatArray
+    speed: FloatArray
+    shrunk: Shrunk
+    noise: _Noise
+
+    def late(self, swapped: bool) -> tuple[FloatArray, FloatArray]:
+        """What is left of the rows of the second sensor [sd], of the first if they are swapped, and speeds [sd/s]."""
+        rows = slice(len(self.axis.s)) if swapped else slice(len(self.axis.s), None)
+        return self.rest[rows], self.speed[rows]
+
+
+def _linear(axis: _Axis, noise: _Noise, latency: float, fitted: bool) -> _Linear:
+    """An axis about a latency; ``fitted``: the noise is fitted anew."""
+    n1, n2 = len(axis.s), len(axis.x)
+    at = axis.x - latency
+    X1, X2 = axis.path.basis(axis.s), axis.path.basis(at)
+    y1, y2 = axis.z1 - noise.left(axis.s), axis.z2 - noise.scale * noise.left(at)
+    X = np.vstack([(X1 - X1.mean(0)) / noise.sd1, noise.scale * (X2 - X2.mean(0)) / noise.sd2])
+    z = np.concatenate([(y1 - y1.mean()) / noise.sd1, (y2 - y2.mean()) / noise.sd2])
+    found = shrunk(X, z, None if fitted else noise.penalty)
+    coefficients = found.coefficients
+    rest1 = y1 - X1 @ coefficients
+    rest2 = y2 - noise.scale * (X2 @ coefficients)
+    rest1, rest2 = rest1 - np.median(rest1), rest2 - np.median(rest2)
+
+    def position(time: FloatArray) -> FloatArray:
+        return axis.path.basis(time) @ coefficients + noise.left(time)
+
+    time, k = np.concatenate([axis.s, at]), X.shape[1]
+    sd = np.repeat([noise.sd1, noise.sd2], [n1, n2])
+    rest = np.concatenate([rest1, rest2]) / sd
+    speed = (position(time + _ASIDE) - position(time - _ASIDE)) / (2.0 * _ASIDE) / sd
+    speed[n1:] *= noise.scale
+    columns = np.zeros((n1 + n2, k + 5))
+    columns[:n1, :k], columns[n1:, :k] = X1 / noise.sd1, noise.scale * X2 / noise.sd2
+    columns[:n1, k], columns[n1:, k + 1] = 1.0 / noise.sd1, 1.0 / noise.sd2
+    columns[n1:, k + 2], columns[n1:, k + 3], columns[:, k + 4] = position(at) / noise.sd2, -speed[n1:], rest
+    columns *= np.sqrt(np.minimum(1.0, _BEYOND / np.maximum(np.abs(rest), 1e-300)))[:, None]  # Huber's weights
+    used = found.freedom * n1 / (n1 + n2)
+    sd2 = clipped_rms(rest2) * math.sqrt(n2 / max(n2 - 2.0 - found.freedom + used, 1.0))
+    noise = replace(noise, sd2=max(sd2, floor := 1e-9 * float(np.ptp(axis.z2))), penalty=found.penalty)
+    if fitted:
+        whole1, whole2 = rest1 + noise.left(axis.s), rest2 + noise.scale * noise.left(at)
+        smooth, through = residue(axis.s, whole1, used), interpolated(axis.s, whole1)
+        sd1 = clipped_rms(whole1 - smooth(axis.s)) * math.sqrt(n1 / max(n1 - 1.0 - used - smooth.freedom, 1.0))
+        off = [clipped_rms(whole2 - noise.scale * one(at)) for one in (smooth, through)]
+        noise = replace(noise, sd1=max(sd1, floor), left=through if off[1] < _BETTER * off[0] else smooth)
+    return _Linear(axis, time, columns, rest, speed, found, noise)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """The latency of rows between two stamps and half its interval [s], scales by axis with theirs, and the axes."""
+
+    latency: float
+    half: float
+    scale: FloatArray
+    scale_half: FloatArray
+    axes: Sequence[_Linear]
+
+    @property
+    def span(self) -> float:
+        """How long its rows last [s]."""
+        return max(float(np.ptp(one.axis.x)) for one in self.axes)
+
+
+def _fit(axes: Sequence[_Axis], latency: float) -> _Fit | None:
+    """The latency by Gauss-Newton; None where it does not settle."""
+    axes = [one for one in axes if min(len(one.s), len(one.x)) >= _FEWEST]
+    noises = [_Noise(one.slope, *_first_sds(one, latency), Residue()) for one in axes]
+    last = 0.0
+    for count in range(_ROUNDS if axes else 0):
+        lines = [_linear(one, noise, latency, count < _FITTED) for one, noise in zip(axes, noises, strict=True)]
+        grams = _grams(lines)
+        step, scales = _solved(grams, lines)
+        if not math.isfinite(step):
+            return None
+        if count > _FITTED and abs(step) < _CLOSE:
+            break
+        far = _FARTHEST if step * last >= 0.0 else 0.5 * abs(last)  # where it goes to and fro, less and less
+        latency += (last := min(max(step, -far), far))
+        noises = [replace(one.noise, scale=one.noise.scale + more) for one, more in zip(lines, scales, strict=True)]
+    else:
+        return None
+    return _jackknife(grams, lines, latency)
+
+
+def _first_sds(axis: _Axis, latency: float) -> tuple[float, float]:
+    """Noise of both sensors [m or rad]: of the second, what the path by the first leaves."""
+    rest = axis.z2 - axis.slope * axis.path(axis.x - latency)
+    floor = 1e-9 * float(np.ptp(axis.z2))
+    return max(axis.path.sd, floor), max(clipped_rms(rest - np.median(rest)), floor)
+
+
+def _grams(lines: Sequence[_Linear]) -> list[FloatArray]:
+    """For each axis the products of its columns over pieces that tell as much about the latency, (pieces, k+5, k+5)."""
+    time = np.concatenate([one.time[len(one.axis.s) :] for one in lines])
+    order = np.argsort(time)
+    told = np.cumsum(np.concatenate([one.late(False)[1] ** 2 for one in lines])[order])
+    edges = np.interp(np.arange(1, _PIECES) / _PIECES, told / told[-1], time[order])
+
+    def of(line: _Linear) -> FloatArray:
+        order = np.argsort(line.time)
+        rows = np.split(line.columns[order], np.searchsorted(line.time[order], edges))
+        return np.array([some.T @ some for some in rows])
+
+    return [of(line) for line in lines]
+
+
+def _solved(
+    grams: Sequence[FloatArray], lines: Sequence[_Linear], without: int | None = None
+) -> tuple[float, FloatArray]:
+    """By how much the latency [s], and the scale of each axis, differ from those of the lines; without one piece."""
+    score = information = 0.0
+    scales = list[FloatArray]()
+    for gram, line in zip(grams, lines, strict=True):
+        G: FloatArray = gram.sum(axis=0) - (0.0 if without is None else gram[without])
+        k, penalty = len(line.shrunk.coefficients), line.shrunk.penalty
+        normal, right = G[:-2, :-2].copy(), G[:-2, -2:].copy()
+        normal[np.arange(k), np.arange(k)] += penalty**2
+        right[:k, 1] -= penalty**2 * line.shrunk.coefficients
+        size = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        inverse = np.asarray(np.linalg.pinv(size[:, None] * normal * size, 1e-13, hermitian=True), dtype=np.float64)
+        solution = size[:, None] * (inverse @ (size[:, None] * right))
+        score += float(G[-2, -1] - right[:, 0] @ solution[:, 1])
+        information += float(G[-2, -2] - right[:, 0] @ solution[:, 0])
+        scales.append(solution[k + 2])
+    step = score / information if information > 0.0 else math.nan
+    return step, np.array([one[1] - one[0] * step for one in scales])
+
+
+def _jackknife(grams: Sequence[FloatArray], lines: Sequence[_Linear], latency: float) -> _Fit:
+    """The latency and scales with 95 % intervals, by leaving out each piece of the motion once."""
+    from scipy.special import stdtrit
+
+    pairs = [_solved(grams, lines, piece) for piece in range(_PIECES)]
+    each = np.array([[step, *scales] for step, scales in pairs])
+    sd = np.sqrt((_PIECES - 1) / _PIECES * ((each - each.mean(axis=0)) ** 2).sum(axis=0))
+    half = float(stdtrit(_PIECES - 1, 0.975)) * sd
+    scale = np.array([one.noise.scale for one in lines])
+    return _Fit(latency, max(float(half[0]), _FINEST), scale, half[1:], lines)
+
+
+# ---- steps ----------------------------------------------------------------------------------------------------------
+
+
+def _parts(axes: Sequence[_Axis], latency: float) -> tuple[list[_Fit], list[Step]] | None:
+    """The parts of a run with a latency each, and the steps between them."""
+    times = _candidates(axes, latency)
+    while times:
+        edges = [-math.inf, *times, math.inf]
+        fits = [_fit([one.between(*span) for one in axes], latency) for span in pairwise(edges)]
+        steps = [
+            Step(time, one.latency, two.latency, (one.half, two.half))
+            for time, one, two in zip(times, fits, fits[1:], strict=False)
+            if one is not None and two is not None and _differ(one, two)
+        ]
+        if len(steps) == len(times):
+            return [one for one in fits if one is not None], steps
+        times = [step.time for step in steps]
+    whole = _fit(axes, latency)
+    return None if whole is None else ([whole], [])
+
+
+def _differ(one: _Fit, two: _Fit) -> bool:
+    apart = abs(one.latency - two.latency)
+    return apart > max(_FURTHER * math.hypot(one.half, two.half), _SMALLEST_STEP)
+
+
+def _candidates(axes: Sequence[_Axis], latency: float) -> list[float]:
+    """Stamps at which a step of the latency explains the rows better [s]: of all times and latencies on a grid."""
+    shifts = np.arange(-_REACH, _REACH + 0.5 * _STEP, _STEP)
+    time = np.concatenate([one.x for one in axes])
+    cost = np.concatenate([_costs(one, latency + shifts) for one in axes])
+    order = np.argsort(time, kind="stable")
+    summed = np.concatenate([np.zeros((1, len(shifts))), np.cumsum(cost[order], axis=0)])
+    fewest = _FEWEST * len(axes)
+
+    def split(begin: int, end: int) -> list[int]:
+        if end - begin < 2 * fewest:
+            return []
+        at = np.arange(begin + fewest, end - fewest + 1)
+        both = (summed[at] - summed[begin]).min(axis=1) + (summed[end] - summed[at]).min(axis=1)
+        best = int(np.argmin(both))
+        if float((summed[end] - summed[begin]).min()) - float(both[best]) < _GAIN:
+            return []
+        middle = int(at[best])
+        return [*split(begin, middle), middle, *split(middle, end)]
+
+    return [float(time[order][row]) for row in split(0, len(time))]
+
+
+def _costs(axis: _Axis, latencies: FloatArray) -> FloatArray:
+    """What the path by the first sensor leaves of each row of the second at latencies [sd²], (m, l)."""
+    begin, end = float(axis.x[0] - latencies[-1]), float(axis.x[-1] - latencies[0])
+    table = np.linspace(begin, end, min(_TABLE, int((end - begin) / _DENSE) + 2))
+    rest = axis.z2[:, None] - axis.slope * np.interp(axis.x[:, None] - latencies, table, axis.path(table))
+    rest -= np.median(rest, axis=0)
+    sd = min(map(robust_sd, rest.T))
+    return np.minimum((rest / max(sd, 1e-9 * float(np.ptp(axis.z2)))) ** 2, _FAR)
+
+
+# ---- what is told ---------------------------------------------------------------------------------------------------
+
+
+def _alignment(fits: Sequence[_Fit], steps: Sequence[Step], swapped: bool, late: Source) -> Alignment:
+    """What is told of the second sensor; ``swapped``: it was the first one that was the slower."""
+    sign = -1.0 if swapped else 1.0
+    best = max(fits, key=lambda one: one.span)
+    low, high = min(one.latency - one.half for one in fits), max(one.latency + one.half for one in fits)
+    if swapped:
+        low, high = -high, -low
+        steps = [replace(one, before=-one.before, after=-one.after) for one in steps]
+    scale, scale_ci95 = _scale(best, swapped)
+    jitter, sd = _jitter(best, swapped)
+    irregular, bunched = _arrivals(late)
+    if jitter > irregular or jitter < _OF_BOTH * _jitter(best, not swapped)[0]:
+        jitter = 0.0
+    return Alignment(sign * best.latency, (low, high), scale, scale_ci95, sd, jitter, bunched, steps)
+
+
+def _scale(fit: _Fit, swapped: bool) -> tuple[float, tuple[float, float] | None]:
+    """The scale of all axes, ± 1 unless it surely differs; its interval where axes agree."""
+    sign = math.copysign(1.0, float(np.median(fit.scale)))
+    scale, half = sign * fit.scale, np.maximum(fit.scale_half, 1e-6)
+    if swapped:
+        scale, half = 1.0 / scale, half / scale**2
+    weight = half**-2.0
+    mean, error = float(weight @ scale / weight.sum()), 1.0 / math.sqrt(float(weight.sum()))
+    if (np.abs(scale - mean) > _FURTHER * np.maximum(half, _SCALES)).any():
+        return sign, None
+    error = max(error, float(np.std(scale)))
+    low, high = sorted((sign * (mean - error), sign * (mean + error)))
+    return (sign * mean if abs(mean - 1.0) > max(error, _SCALES) else sign), (low, high)
+
+
+def _jitter(fit: _Fit, swapped: bool) -> tuple[float, dict[str, float]]:
+    """Standard deviation of the latency from row to row [s], 0 if none is seen, and the noise at rest by axis.
+
+    By least squares of squared residuals on the squared speed, weighted by what their variance is then.
+    """
+    rows = [one.late(swapped) for one in fit.axes]
+    each = [one.noise.sd1 if swapped else one.noise.sd2 for one in fit.axes]
+    sds = {one.axis.name: sd * robust_sd(rest) for one, sd, (rest, _) in zip(fit.axes, each, rows, strict=True)}
+    rest, speed = (np.concatenate(some) ** 2 for some in zip(*rows, strict=True))
+    number = np.repeat(np.arange(len(rows)), [len(one) for one, _ in rows])
+    X = np.column_stack([number[:, None] == np.arange(len(rows)), speed]).astype(np.float64)
+    weighted, cov, b = X, np.eye(X.shape[1]), np.append(np.ones(len(rows)), 0.0)
+    for _ in range(_FITTED):
+        weighted = X / np.maximum(X @ b, 0.1)[:, None] ** 2
+        cov = np.linalg.pinv(X.T @ weighted)
+        b = np.maximum(cov @ (weighted.T @ rest), 0.0)
+    error = weighted * (rest - X @ b)[:, None]
+    variance = cov @ (error.T @ error) @ cov
+    jitter = math.sqrt(float(b[-1]))
+    if b[-1] < _SURELY * math.sqrt(float(variance[-1, -1])) or jitter < _SMALLEST_JITTER:
+        return 0.0, sds
+    return jitter, {
+        axis: sd * math.sqrt(max(float(one), 1e-2)) for (axis, sd), one in zip(sds.items(), b, strict=False)
+    }
+
+
+def _intervals(source: Source) -> tuple[int, FloatArray]:
+    """How many intervals of its stamps are not within a bunch, and all of them [s]."""
+    interval = np.diff(np.sort(source.stamp[source.stamp != NO_STAMP])) / 1e9
+    return int(np.count_nonzero(interval > _SAME_BUNCH * interval.mean())) if len(interval) else 0, interval
+
+
+def _arrivals(source: Source) -> tuple[float, bool]:
+    """How large a jitter of its stamps may be [s], and whether rows arrive in bunches.
+
+    As their intervals scatter, outliers apart; anything, where these come near those of stamps at random.
+    """
+    apart, interval = _intervals(source)
+    low, high = np.quantile(interval, [0.1, 0.9])
+    bunched = apart < (1.0 - _BUNCHED) * len(interval)
+    irregular = float(high - low) / 2.563
+    return math.inf if bunched or irregular > _RANDOM * interval.mean() else irregular, bunched

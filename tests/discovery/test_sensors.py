@@ -1,0 +1,199 @@
+"""Latencies, scales, steps and jitter of one sensor against another, where all of them were simulated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import pumafuse as pf
+from pumafuse.arrays import FloatArray
+from pumafuse.discovery.following import isolated, scatter
+from pumafuse.discovery.paths import path
+from pumafuse.discovery.sensors import Alignment, aligned, noise
+
+LENGTH, LATENCY, NOISE = 60.0, 0.045, 3e-4  # s, s, m
+
+
+def motion(t: FloatArray, phases: FloatArray) -> FloatArray:
+    """What is commanded [m]."""
+    return 0.05 * np.sin(2.0 * np.pi * np.outer(np.maximum(t, 0.0), [0.1, 0.3, 0.7]) + phases).sum(axis=1)
+
+
+def recorded(
+    seed: int = 0,
+    *,
+    rate: float = 30.0,
+    dense: float = 100.0,
+    scale: float = 1.0,
+    late: float | FloatArray = LATENCY,
+    outliers: float = 0.0,
+    noise: float = NOISE,
+) -> pf.Run:
+    """An arm that no model has: it follows 150 ms late and wanders by 2 mm. An encoder is right, a camera is late."""
+    rng = np.random.default_rng(seed)
+    phases = rng.uniform(0.0, 6.0, 3)
+    t, s = np.arange(0.0, LENGTH, 0.02), np.arange(0.3, LENGTH - 0.5, 1.0 / dense)
+    valid = np.arange(0.5, LENGTH - 1.0, 1.0 / rate)
+
+    def arm(at: FloatArray) -> FloatArray:
+        return motion(at - 0.15, phases) + 2e-3 * np.sin(1.3 * at)
+
+    z = scale * arm(valid) + 0.3 + rng.normal(0.0, noise, len(valid))
+    z[rng.random(len(z)) < outliers] += 0.03
+    stamp = valid + (late if isinstance(late, float) else late[: len(valid)])
+    order = np.argsort(stamp, kind="stable")
+    encoder = s, {"x": arm(s) + rng.normal(0.0, 1e-4, len(s))}
+    sensors = {"encoder": encoder, "camera": (stamp[order], {"x": z[order]})}
+    return pf.Run.from_arrays(t, {"x": motion(t, phases)}, sensors)
+
+
+def told(run: pf.Run, first: str = "encoder", second: str = "camera") -> Alignment:
+    found = aligned([run], first, second)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize(("rate", "dense"), [(30.0, 100.0), (5.0, 100.0), (5.0, 5.0), (100.0, 10.0)])
+def test_a_latency_is_found_whatever_the_rates(rate: float, dense: float) -> None:
+    """The denser one is interpolated; which of both is asked for does not matter; outliers do not either."""
+    run = recorded(rate=rate, dense=dense, outliers=0.01)
+    found, turned = told(run), told(run, "camera", "encoder")
+    assert found.latency == pytest.approx(LATENCY, abs=5e-4)
+    assert turned.latency == pytest.approx(-found.latency, abs=1e-4)
+    assert found.latency_ci95[1] - found.latency_ci95[0] < 2e-3
+    assert found.scale == 1.0
+    assert found.sd["x"] == pytest.approx(NOISE, rel=0.15)
+    assert found.latency_sd == 0.0
+    assert not found.steps
+
+
+def test_intervals_hold() -> None:
+    """Of 20 latencies 95 % lie in theirs: at least 16 do but for one time in 300, and they are not much too wide."""
+    every = [told(recorded(seed, rate=10.0, dense=20.0, noise=3e-3)) for seed in range(20)]
+    off = np.array([(one.latency - LATENCY) / one.half for one in every])
+    assert np.count_nonzero(np.abs(off) < 1.0) >= 16
+    assert np.sqrt(np.mean(off**2)) > 0.3  # 0.51 if they are exact
+
+
+@pytest.mark.parametrize("scale", [0.96, -1.0, -1.05])
+def test_a_scale_costs_no_latency_on_a_path_in_one_direction(scale: float) -> None:
+    """40 s at constant speed with a rest at each end, where a scale that is not fitted is a latency of its own."""
+    rng = np.random.default_rng(3)
+    t, s, x = np.arange(0.0, LENGTH, 0.02), np.arange(0.3, 59.0, 0.01), np.arange(0.5, 58.5, 0.03)
+
+    def ramp(at: FloatArray) -> FloatArray:
+        return 0.02 * np.clip(at - 10.0, 0.0, 40.0) + 0.01 * np.sin(0.5 * at)
+
+    camera = scale * ramp(x - 0.15 - LATENCY) + rng.normal(0.0, 1e-4, len(x))
+    encoder = ramp(s - 0.15) + rng.normal(0.0, 1e-4, len(s))
+    run = pf.Run.from_arrays(t, {"x": ramp(t)}, {"encoder": (s, {"x": encoder}), "camera": (x, {"x": camera})})
+    found = told(run)
+    assert found.latency == pytest.approx(LATENCY, abs=2e-3)
+    assert found.latency_ci95[0] < LATENCY < found.latency_ci95[1]
+    assert found.scale == pytest.approx(scale, abs=2e-3)
+    turned = told(run, "camera", "encoder")
+    assert turned.scale == pytest.approx(1.0 / scale, abs=2e-3)
+
+
+def test_a_step_of_the_latency_is_named_and_a_steady_one_has_none() -> None:
+    """From 45 to 80 ms after 30 s: when, from what, to what; the interval covers both."""
+    late = np.where(np.arange(0.5, LENGTH, 1.0 / 30.0) < 30.0, LATENCY, 0.08)
+    found = told(recorded(late=late))
+    (step,) = found.steps
+    assert step.time == pytest.approx(30.0, abs=0.5)
+    assert (step.before, step.after) == pytest.approx((LATENCY, 0.08), abs=5e-4)
+    assert found.latency_ci95[0] < LATENCY < 0.08 < found.latency_ci95[1]
+    assert told(recorded(late=late), "camera", "encoder").steps[0].after == pytest.approx(-0.08, abs=5e-4)
+
+
+@pytest.mark.parametrize("dense", [100.0, 20.0])
+def test_jitter_is_told_from_noise(dense: float) -> None:
+    """10 ms from row to row; the noise at rest is that of the sensor."""
+    late = LATENCY + np.random.default_rng(9).normal(0.0, 0.01, 3000)
+    found = told(recorded(late=late, dense=dense))
+    assert found.latency_sd == pytest.approx(0.01, rel=0.15)
+    assert found.latency_ci95[0] < LATENCY < found.latency_ci95[1]
+    assert not found.bunched
+    assert found.sd["x"] == pytest.approx(NOISE, rel=0.6)
+
+
+def test_rows_that_arrive_in_bunches_are_said_to() -> None:
+    """Every 100 ms all rows since the last time, with stamps that differ by 10 µs."""
+    valid = np.arange(0.5, LENGTH, 1.0 / 30.0)
+    late = np.ceil((valid + LATENCY) / 0.1) * 0.1 - valid + 1e-5 * (np.arange(len(valid)) % 5)
+    found = told(recorded(late=late))
+    assert found.bunched
+    assert found.latency == pytest.approx(late.mean(), abs=2e-3)
+    assert found.latency_sd == pytest.approx(late.std(), rel=0.15)
+
+
+def test_a_sensor_that_froze_is_not_followed() -> None:
+    """Zeros for 10 s of the motion: neither the latency nor the scale counts them."""
+    run = recorded()
+    encoder = run.sensors["encoder"]
+    frozen = np.where(np.abs(encoder.stamp - encoder.stamp[3000]) < 5e9, 0.0, encoder.values["x"])
+    found = told(replace(run, sensors={**run.sensors, "encoder": replace(encoder, values={"x": frozen})}))
+    assert found.latency == pytest.approx(LATENCY, abs=5e-4)
+
+
+def test_only_the_part_of_the_run_counts_and_runs_are_averaged() -> None:
+    """Before 30 s the latency is another; two runs that agree tell it better than one."""
+    late = np.where(np.arange(0.5, LENGTH, 1.0 / 30.0) < 30.0, LATENCY, 0.08)
+    part = recorded(late=late).between(31.0, None)
+    assert told(part).latency == pytest.approx(0.08, abs=5e-4)
+    runs = [recorded(seed, rate=10.0, dense=20.0, noise=3e-3) for seed in range(3)]
+    every = aligned(runs, "encoder", "camera")
+    assert every is not None
+    assert every.latency == pytest.approx(LATENCY, abs=2e-3)
+    assert every.half < 0.8 * np.mean([told(run).half for run in runs])
+
+
+def test_sensors_without_common_motion_have_no_latency() -> None:
+    """Another axis, another name, too few rows, noise alone."""
+    run = recorded()
+    assert aligned([run], "encoder", "laser") is None
+    camera = run.sensors["camera"]
+    for other in (
+        replace(camera, values={"y": camera.values["x"]}),
+        camera.rows(slice(0, 30)),
+        camera.rows(slice(0, 0)),
+        replace(camera, values={"x": np.random.default_rng(1).normal(size=len(camera.stamp))}),
+        replace(camera, values={"x": np.full(len(camera.stamp), np.nan)}),
+    ):
+        assert aligned([replace(run, sensors={**run.sensors, "camera": other})], "encoder", "camera") is None
+
+
+def test_a_path_is_that_of_a_linear_arm_between_the_rows_of_a_slow_sensor() -> None:
+    """Held steps, 80 ms of dead time and 40 ms of lag at 5 Hz: lines between the rows are off by 10 times as much.
+
+    The noise by third differences is too large by as much as well: they take the motion for it.
+    """
+    rng = np.random.default_rng(2)
+    fine = np.arange(0.0, LENGTH, 1e-3)
+    t = fine[::20]
+    u = np.repeat(rng.uniform(-0.1, 0.1, 100), rng.integers(20, 60, 100))[: len(t)]
+    held = np.repeat(u, 20)[np.maximum(np.arange(len(fine)) - 80, 0)]
+    left = np.exp(-1e-3 / 0.04)
+    position = lfilter([1.0 - left], [1.0, -left], held - u[0]) + u[0]
+    s = np.arange(0.5, 59.0, 0.2) + rng.uniform(-0.01, 0.01, 293)
+    z = np.interp(s, fine, position) + rng.normal(0.0, 1e-4, len(s))
+    found, at = path((t, u), 0.12, s, z), np.arange(1.0, 58.0, 0.013)
+    off, lines = (one - np.interp(at, fine, position) for one in (found(at), np.interp(at, s, z)))
+    assert np.sqrt(np.mean(off**2)) < np.sqrt(np.mean(lines**2)) / 10.0
+    run = pf.Run.from_arrays(t, {"x": u}, {"camera": (s, {"x": z})})
+    assert noise(run.command, run.sensors["camera"], "x", 0.12) < 1e-3 < 0.2 * scatter(z)
+
+
+def test_what_leaves_and_returns_is_an_outlier_and_a_jerk_is_not() -> None:
+    """A row, two on their own; no start, turn or stop of a motion, no jump, and none that dies away."""
+    rng = np.random.default_rng(4)
+    t = np.arange(400)
+    ramp = np.interp(t, [0, 100, 150, 200, 260, 400], [0.0, 0.0, 50.0, 0.0, 10.0, 10.0])
+    jumps = np.where(t > 300, 40.0 * np.exp(-np.maximum(t - 301, 0) / 1.0), 0.0) + np.where(t > 350, 30.0, 0.0)
+    value = ramp + jumps + rng.normal(0.0, 0.01, len(t))
+    assert not isolated(value).any()
+    value[[50, 120, 230]] += 20.0
+    assert np.flatnonzero(isolated(value)).tolist() == [50, 120, 230]
