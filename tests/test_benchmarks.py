@@ -14,8 +14,7 @@ from scipy.stats import multivariate_normal
 
 import pumafuse as pf
 from pages import ROOT
-from pumafuse.tuning.likelihood import Likelihood
-from pumafuse.tuning.posterior import AxisPosterior, axis_posterior
+from pumafuse.tuning.arm_search import ArmSearch
 from pumafuse.units import DEG
 
 SHARED = ROOT.parent / "shared" / "data" / "trunk-servo"
@@ -173,17 +172,17 @@ def test_intervals_of_lags_hold_on_arms_of_all_kinds(lag: ModuleType) -> None:
 @pytest.mark.long
 def test_delays_a_period_away_are_looked_at(lag: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     """In one run a model has two maxima a period of 8 ms apart, in another the first one found is a period off."""
-    posteriors, latency = list[AxisPosterior](), importlib.import_module("pumafuse.tuning.latency")
+    searches, latency = list[ArmSearch](), importlib.import_module("pumafuse.tuning.latency")
 
-    def kept(likelihood: Likelihood, start: pf.FusionConfig, axis: str) -> AxisPosterior:
-        posteriors.append(axis_posterior(likelihood, start, axis))
-        return posteriors[-1]
+    def kept(*given: object) -> ArmSearch:
+        searches.append(ArmSearch(*given))
+        return searches[-1]
 
-    monkeypatch.setattr(latency, "axis_posterior", kept)
+    monkeypatch.setattr(latency, "ArmSearch", kept)
     lag.examined((323, 2, 0.0))
     tops = defaultdict[tuple[int, str], list[float]](list)
-    for number, posterior in enumerate(posteriors):
-        for one in posterior.branches:
+    for number, search in enumerate(searches):
+        for one in search.posterior.branches:
             tops[number, str(one.model)].append(one.delays[np.argmax(one.log_density)] / 0.008)
     assert any(0.6 < max(each) - min(each) < 1.4 for each in tops.values()), tops
     found, _, _ = lag.examined((306, 2, 0.0))

@@ -62,7 +62,7 @@ def test_pairs_beyond_nine_tenths_are_named() -> None:
     found = fit_stage(sim.run, config, ("noise", "delay", "plant"), "axes.tangential.delay_ms", "disturbance_sd_mm")
     inside = [one for one in found.free if one.at_bound(found.best.config) is None]
     information = found.likelihood.derivatives(found.best.config, inside, found.best.outcomes).information
-    information += np.diag([0.0 if one.prior is None else one.prior[1] ** -2 for one in inside])
+    information += np.diag([one.prior_score(found.best.config)[1] for one in inside])
     inverse = np.linalg.inv(information)
     sd = np.sqrt(np.diag(inverse))
     matrix = inverse / np.outer(sd, sd)

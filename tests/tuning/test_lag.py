@@ -65,10 +65,10 @@ def test_a_gain_that_recovers_is_part_of_it() -> None:
     likelihood = Likelihood([sim.run], config)
     delay, plant = sim.config.arm.delay_of("vertical"), axes["vertical"].plant.lag
     free = free_of(likelihood, config, ("noise", "gain"))
-    found = fitted_lags(free, config, config, {"vertical": (0.001, np.inf)})["vertical"]
+    found = fitted_lags(free, config, config, {"vertical": (0.001, np.inf)}, [])["vertical"]
     assert found.lag_ms == pytest.approx(1e3 * (delay + plant + 0.01))
     assert found.lag_ms_ci95 == (pytest.approx(found.lag_ms - 1.0), None)
-    assert fitted_lags(free_of(likelihood, config, ("noise",)), config, config, {}) == {}
+    assert fitted_lags(free_of(likelihood, config, ("noise",)), config, config, {}, []) == {}
 
 
 def test_an_end_is_open_only_where_nothing_can_go_there() -> None:

@@ -257,7 +257,7 @@ def test_the_score_is_the_derivative_of_the_log_likelihood(order: int) -> None:
         assert bare.score[number] == pytest.approx(wanted, rel=1e-5, abs=within), one.key
         with_prior = (up.log_posterior - down.log_posterior) / (2.0 * step)
         assert found.score[number] == pytest.approx(with_prior, rel=1e-5, abs=within), one.key
-        more = 0.0 if one.prior is None else one.prior[1] ** -2
+        _, more = one.prior_score(config)
         assert found.information[number, number] - bare.information[number, number] == pytest.approx(more, rel=1e-6)
         steep += abs(wanted) * sd > 1.0
     assert steep > 0.6 * len(free)

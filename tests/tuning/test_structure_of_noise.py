@@ -205,14 +205,14 @@ def test_a_scale_and_a_constant_gain_are_not_identifiable_apart() -> None:
 
 
 def test_the_prior_of_a_noise_can_be_turned_off() -> None:
-    """A camera of 0.3 mm configured as 3 mm: without the prior as it is, with it nearer to 3 mm.
+    """A camera of 0.3 mm configured as 0.7 mm: without the prior as it is, with it nearer to 0.7 mm.
 
     Both as `tune` takes them; the summary says which it was.
     """
     config, command, path = moving()
     run, config = (
         measured(command, path, 1),
-        with_sensors(config, sd=3e-3),
+        with_sensors(config, sd=0.7e-3),
     )
     with_prior, without = (quietly(lambda on=on: pf.tune([run], config, sd_prior=on)) for on in (True, False))
     assert with_prior.details.sd_prior and not without.details.sd_prior

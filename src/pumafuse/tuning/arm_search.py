@@ -299,7 +299,8 @@ class ArmSearch:
         """The log-density with the free numbers integrated out, each with its prior's constant."""
         log = fit.log_posterior
         free = [name for name, one in zip(names, inside, strict=True) if one]
-        information = fit.information[np.ix_(inside, inside)]
+        some = np.flatnonzero(inside)
+        information = fit.information[np.ix_(some, some)]
         for place, name in enumerate(free):
             if name in PRIORS:
                 log -= math.log(PRIORS[name][1] * math.sqrt(2.0 * math.pi))
@@ -380,4 +381,6 @@ def _quantities(arm: Arm) -> dict[Quantity, float]:
         found |= {"natural_frequency": math.log(2.0 * arm.damping / arm.lag), "damping": math.log(arm.damping)}
     else:
         found["time_constant"] = math.log(arm.lag)
-    return found | ({"gain_recovery": math.log(arm.recovery)} if arm.recovery else {})
+    if arm.recovery:
+        found["gain_recovery"] = math.log(arm.recovery)
+    return found

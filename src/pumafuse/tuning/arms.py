@@ -8,8 +8,8 @@ that sums of squares are likelihoods. The heavy part is in the core (``core/sear
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -307,7 +307,8 @@ class Measured:
         best = np.linalg.solve(inner, left[:, free, 0][:, :, None])[:, :, 0] if free else np.zeros((len(arms), 0))
         squares = left[:, 0, 0] - np.einsum("ni,ni->n", best, left[:, free, 0])
         gain = 1.0 + best[:, 0] if limits is not None else np.array([arm.gain for arm in arms])
-        return -0.5 * (np.maximum(squares, 0.0) + log_determinant + self.count * _LOG_2PI), gain
+        log = -0.5 * (np.maximum(squares, 0.0) + log_determinant + self.count * _LOG_2PI)
+        return np.asarray(log, dtype=np.float64), np.asarray(gain, dtype=np.float64)
 
     def fitted(self, start: Arm, names: Coordinates, rest: Rest, limits: Limits) -> Fit:
         """The arm of the highest posterior near another one, by Gauss and Newton."""
@@ -452,39 +453,28 @@ def rests(
     Yields:
         Each with its log-posterior.
     """
-    from scipy.optimize import minimize
+    from scipy import optimize  # takes 0.2 s to import
 
     left = [one[None] for one in measured.residuals(arm)]
     spread = max(float(np.std(np.concatenate([one[0] for one in left]))), 1e-7)
     means = np.log(np.maximum(start.sd, least))
     s = len(means)
+    sensors = [(max(one, _SDS[0]), _SDS[1]) for one in least]
+    solve: Any = getattr(optimize, "minimize")  # noqa: B009 - whose type pyright does not know
+    for smoothness in (0.0, 1.5, 0.5):
+        begin, bounds = [max(start.walk, 0.1 * spread)], [*sensors, _WALKS]
+        if smoothness:
+            begin, bounds = [0.01 * spread, 0.7 * spread, _TIME], [*bounds, _SDS, (quickest, _TIMES[1])]
 
-    def rest_of(x: FloatArray, smoothness: float | None) -> Rest:
-        sd, walk, *disturbance = (
-            np.split(np.exp(x), [s, s + 1]) if smoothness is None else np.split(np.exp(x), [s, s + 1, s + 2])
-        )
-        found = Rest(sd, float(walk[0]))
-        if smoothness is None:
-            return found
-        return replace(
-            found,
-            disturbance_sd=float(disturbance[0][0]),
-            disturbance_time=float(disturbance[1][0]),
-            smoothness=smoothness,
-        )
+        def rest_of(x: FloatArray, smoothness: float = smoothness) -> Rest:
+            sd, (walk, *disturbance) = np.exp(x[:s]), np.exp(x[s:]).tolist()
+            return Rest(sd, walk, disturbance[0], disturbance[1], smoothness) if disturbance else Rest(sd, walk)
 
-    for smoothness in (None, 1.5, 0.5):
-        begin = [*means, math.log(max(start.walk, 0.1 * spread))]
-        bounds = [(math.log(max(one, _SDS[0])), math.log(_SDS[1])) for one in least] + [tuple(np.log(_WALKS))]
-        if smoothness is not None:
-            begin = [*means, math.log(0.01 * spread), math.log(0.7 * spread), math.log(_TIME)]
-            bounds += [tuple(np.log(_SDS)), (math.log(quickest), math.log(_TIMES[1]))]
-
-        def cost(x: FloatArray, smoothness: float | None = smoothness) -> float:
-            white, log_determinant = measured.whitened(rest_of(x, smoothness), left)
+        def cost(x: FloatArray, rest_of: Callable[[FloatArray], Rest] = rest_of) -> float:
+            white, log_determinant = measured.whitened(rest_of(x), left)
             found = 0.5 * (float(np.vdot(white, white)) + log_determinant + measured.count * _LOG_2PI)
             return found - (sum(map(log_belief, ((x[:s] - means) / prior).tolist())) if prior else 0.0)
 
-        solve: Any = minimize
-        found = solve(cost, np.array(begin), method="SLSQP", bounds=bounds, options={"ftol": 1e-3, "eps": 1e-4})
-        yield rest_of(found.x, smoothness), -float(found.fun)
+        at, options = np.append(means, np.log(begin)), {"ftol": 1e-3, "eps": 1e-4}
+        found: Any = solve(cost, at, method="SLSQP", bounds=np.log(bounds), options=options)
+        yield rest_of(np.array(found.x, dtype=np.float64)), -float(found.fun)

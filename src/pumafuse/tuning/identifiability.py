@@ -198,6 +198,16 @@ def shared_times(
     return found
 
 
+def lone_drifts(
+    sensors: Mapping[str, Sequence[str]], free: Sequence[Parameter], known: FusionConfig
+) -> list[NotIdentifiable]:
+    """The drifts of sensors that measure alone: what they add is as if the arm did it. One that is known stays free."""
+    lone = {names[0] for names in sensors.values() if len(names) == 1}
+    lone -= {name for names in sensors.values() if len(names) > 1 for name in names}
+    drifts = [one for one in free if one.fit == "bias" and one.path[-1] != "bias_time" and one.sensor in lone]
+    return [NotIdentifiable((one.key,), one.key) for one in drifts if not one.given(known)]
+
+
 def _noise_of(one: Parameter, config: FusionConfig) -> float:
     """The least noise of the sensor of a parameter [m or rad]; 0 where it has none."""
     return 0.0 if one.sensor is None else smallest_sd(config, one.sensor)

@@ -323,10 +323,12 @@ def is_fixed(key: str, fixed: Iterable[str]) -> bool:
     return False
 
 
-def with_drifts(config: FusionConfig) -> FusionConfig:
-    """The configuration with a drifting bias of every sensor, by default as large as its noise."""
+def with_drifts(config: FusionConfig, fixed: Sequence[str] = ()) -> FusionConfig:
+    """The configuration with a drifting bias of every sensor, by default as large as its noise; none that is fixed."""
     for name, sensor in config.sensors.items():
         if any(sensor.bias_drift_sd_of(axis) for axis in config.arm.axes):
+            continue
+        if any(key.startswith(f"sensors.{name}.bias_drift_sd") for key in fixed):
             continue
         drift = smallest_sd(config, name)
         if len(config.arm.kinds) > 1:

@@ -110,13 +110,14 @@ def _freedom(config: FusionConfig, free: FreeOf, axis: str) -> Freedom | None:
         here.add("delay")
     plants = {"natural_frequency", "damping"}, {"time_constant"}
     whole = any(plant <= here for plant in plants) and any(plant <= there for plant in plants)
-    gains: list[GainKind] = ["given"]
+    gains: Sequence[GainKind] = ("given",)
     given = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
     if "intercept" in here and "gain_recovery" in there:
-        here, gains, given = here | {"gain_recovery"}, [*GAINS], given._replace(gain=1.0, recovery=0.0, slope=0.0)
+        here, gains, given = here | {"gain_recovery"}, GAINS, given._replace(gain=1.0, recovery=0.0, slope=0.0)
     elif "intercept" in here:
-        gains = ["recovering" if given.recovery else "static"]
-    names = {_NAMES[field] for field in here | (plants[0] if whole else set()) if field in _NAMES}
+        gains = ("recovering" if given.recovery else "static",)
+    here |= plants[0] if whole else here
+    names = {_NAMES[field] for field in here if field in _NAMES}
     order = 2 if given.damping else 1
     return Freedom(given, names, (1, 2) if whole else (order,), gains) if names else None
 
@@ -265,6 +266,8 @@ def _maximum(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify:
                 at = maximise(likelihood, at, shared, notify, tolerance=_ROUGHLY).config
             found = maximise_by_axis(likelihood, at, [one for one in free(at) if one.axis in axes], notify, _ROUGHLY)
             at = found.config
+        if any(one.axis is None and one.sensor is not None for one in free(at)):  # which trades with noise
+            at = maximise(likelihood, at, free(at), notify, tolerance=_ROUGHLY).config
         return point(likelihood, at, [one for one in free(at) if one.axis is not None])
 
     gated = any(sensor.gate > 0.0 for sensor in config.sensors.values())

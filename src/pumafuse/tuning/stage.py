@@ -17,6 +17,7 @@ from .identifiability import (
     NotIdentifiable,
     excited_axes,
     few_measurements,
+    lone_drifts,
     not_identifiable,
     not_identifiable_noise,
     shared_times,
@@ -129,7 +130,9 @@ def run_stage(
     if any(one.fit == "delay" for one in free(own)):
         start = own
     if "bias" in plan.fit:
-        start = with_drifts(start)
+        drifting = with_drifts(start)
+        fixed += lone_drifts(likelihood.sensors, free(drifting), config)
+        start = with_drifts(start, [one.fixed for one in fixed])
     if "noise" in plan.fit:
         start, notes = with_large_biases(likelihood, start, plan.fixed)
     if "latency" in plan.fit:
