@@ -224,7 +224,7 @@ class ArmSearch:
         found = dict[Model, Fit]()
         for model in known or self._freedom.models:
             arms = starts if not found else [self._best(found).arm]
-            tries = [self._fit(model, arm) for arm in self._likeliest(model, arms, max(len(starts), 2))]
+            tries = [self._fit(model, arm) for arm in self._likeliest(model, arms, 1 if known else 2)]
             if known:
                 tries.append(self._fit(model, known[model].arm))
             found[model] = max(tries, key=lambda one: one.log_posterior)
