@@ -28,6 +28,7 @@ _BESIDE = np.linspace(-0.03, 0.03, 13)  # s, and lags about its lag: which of th
 _OUTLIER = 8.0  # times the median distance from the best arm: what is farther does not count
 _FEWEST = 4.0  # independent measurements, at least: however alike their errors are
 _FOLLOWS = 40.0  # of χ² that an arm must explain: of some hundred arms with noise beside them none does by chance
+_ANYHOW = 1.0  # times what it leaves, from which it follows whatever chance would make of it
 _CHANCE = 3.84  # of χ² with one degree of freedom, 95 %
 _ROUNDING = 1e-12  # of all squares: what is left of them where nothing is
 _MOST = 0.8  # of the measurements: how far these are off is not decided by single commands that were never sent
@@ -89,7 +90,7 @@ def plain_arm(measured: Measured) -> PlainArm | None:
     power = float(left @ left)
     alike = min(max(float(left[1:] @ left[:-1]) / max(power, 1e-300), 0.0), 1.0)
     independent = max(measured.count * (1.0 - alike) / (1.0 + alike), _FEWEST)
-    if measured.power - power < _FOLLOWS * power / independent:
+    if measured.power - power < min(_FOLLOWS / independent, _ANYHOW) * power:
         return None
     most = 0.5 * (power * _CHANCE / independent + _ROUNDING * measured.power) / sd**2
     allowed = [one.delay + one.lag for one, behind in zip(arms, log[place] - log, strict=True) if behind <= most]

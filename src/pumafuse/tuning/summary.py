@@ -115,7 +115,7 @@ class TuningSummary(msgspec.Struct, frozen=True, kw_only=True):
         correlations: Pairs beyond ± 0.9.
         not_identifiable: Combinations that the measurements do not determine, a sentence each.
         orders: What was chosen for each axis: the order of its plant, its gain, its disturbance, its delay; in brackets
-            what the alternative gains in log-likelihood less the penalty for its numbers (BIC).
+            the log-odds of the alternative, of a disturbance what it gains less the penalty for its numbers (BIC).
         validation: Before and after on what was validated on; null where nothing was.
         worse: Whether any axis got worse there.
         notes: Everything noticed, a sentence each.
