@@ -18,6 +18,7 @@ from pumafuse.tuning.posterior import (
     Mixture,
     Model,
     chosen_model,
+    own_worth,
     shared_delay,
     sharing,
 )
@@ -65,6 +66,18 @@ def test_axes_that_agree_share_a_delay_and_others_do_not() -> None:
     assert sharing(near) == ["a", "b"]
     assert sharing({name: near[name] for name in "ac"}) == []
     assert sharing({"a": near["a"]}) == []
+
+
+def test_an_own_delay_is_worth_what_the_evidence_gains() -> None:
+    """Two axes known to 1 ms and 1 ms apart: ∫ p₁p₂ of normal densities, times 50 ms and the ten to one of sharing."""
+    pair = {name: AxisPosterior([branch(at, 1e-3)]) for name, at in (("a", 0.080), ("b", 0.081))}
+    shared = norm.logpdf(1e-3, 0.0, math.sqrt(2.0) * 1e-3) + math.log(0.05) + 2.3
+    assert own_worth(pair, ["a", "b"]) == pytest.approx({"a": -shared, "b": -shared}, abs=0.05)
+
+
+def test_odds_are_those_of_the_weights() -> None:
+    posterior = AxisPosterior([branch(0.08, 2e-3, math.log(3.0)), branch(0.09, 2e-3, 0.0, SECOND)])
+    assert posterior.mixture().log_odds(lambda one: one.order == 1) == pytest.approx(math.log(3.0), abs=0.02)
 
 
 def test_a_shared_delay_weighs_the_axes_by_what_they_know() -> None:

@@ -12,7 +12,7 @@ from scipy.optimize import differential_evolution
 import pumafuse as pf
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import maximise_with_gates, point
-from pumafuse.tuning.parameters import Parameter, changed, moved
+from pumafuse.tuning.parameters import Parameter, changed, moved, with_lag
 from tuning_runs import (
     fit_stage,
     later,
@@ -41,6 +41,23 @@ def test_where_it_starts_does_not_matter() -> None:
     starts.append(with_process(sim.config, input_noise=0.0, drift=0.0, maneuver_noise=0.0, maneuver_drift=0.0))
     totals = [fit_stage(sim.run, config, sd_prior=False).best.log_posterior for config in starts]
     assert max(totals) - min(totals) < 0.1
+
+
+def test_a_wrong_delay_and_a_wrong_lag_change_nothing() -> None:
+    """Delay and time constant of a third, twice and three times what they are: the same arm, likelihood and noise."""
+    sim = outage(1)
+    found = list[pf.FusionConfig]()
+    for delay, lag in ((1.0, 1.0), (0.3, 3.0), (2.0, 0.3)):
+        config = replaced(sim.config, arm=replaced(sim.config.arm, delay=delay * sim.config.arm.delay))
+        for axis in config.arm.axes:
+            config = with_lag(config, axis, lag * config.arm.axes[axis].plant.lag)
+        found.append(fit_stage(sim.run, config, ("noise", "delay", "plant")).best.config)
+    for other in found[1:]:
+        assert other.arm.delay == pytest.approx(found[0].arm.delay, abs=1e-6)
+        for axis in ("tangential", "vertical"):
+            model = found[0].arm.axes[axis]
+            assert other.arm.axes[axis].plant.lag == pytest.approx(model.plant.lag, rel=1e-3)
+            assert other.process[axis].drift == pytest.approx(found[0].process[axis].drift, rel=1e-2)
 
 
 SWEEP = """
