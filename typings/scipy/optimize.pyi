@@ -7,6 +7,7 @@ import numpy.typing as npt
 class OptimizeResult:
     x: npt.NDArray[np.float64]
     cost: float
+    fun: float
 
 def least_squares(
     fun: Callable[[npt.NDArray[np.float64]], npt.NDArray[np.float64]],
@@ -26,4 +27,12 @@ def lsq_linear(
     bounds: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]],
     *,
     method: Literal["bvls", "trf"],
+) -> OptimizeResult: ...
+def minimize(
+    fun: Callable[[npt.NDArray[np.float64]], float],
+    x0: npt.NDArray[np.float64],
+    *,
+    method: Literal["SLSQP"],
+    bounds: npt.NDArray[np.float64],
+    options: dict[str, float],
 ) -> OptimizeResult: ...

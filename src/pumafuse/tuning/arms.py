@@ -453,14 +453,13 @@ def rests(
     Yields:
         Each with its log-posterior.
     """
-    from scipy import optimize  # takes 0.2 s to import
+    from scipy.optimize import minimize  # takes 0.2 s to import
 
     left = [one[None] for one in measured.residuals(arm)]
     spread = max(float(np.std(np.concatenate([one[0] for one in left]))), 1e-7)
     means = np.log(np.maximum(start.sd, least))
     s = len(means)
     sensors = [(max(one, _SDS[0]), _SDS[1]) for one in least]
-    solve: Any = getattr(optimize, "minimize")  # noqa: B009 - whose type pyright does not know
     for smoothness in (0.0, 1.5, 0.5):
         begin, bounds = [max(start.walk, 0.1 * spread)], [*sensors, _WALKS]
         if smoothness:
@@ -476,5 +475,5 @@ def rests(
             return found - (sum(map(log_belief, ((x[:s] - means) / prior).tolist())) if prior else 0.0)
 
         at, options = np.append(means, np.log(begin)), {"ftol": 1e-3, "eps": 1e-4}
-        found: Any = solve(cost, at, method="SLSQP", bounds=np.log(bounds), options=options)
-        yield rest_of(np.array(found.x, dtype=np.float64)), -float(found.fun)
+        found = minimize(cost, at, method="SLSQP", bounds=np.log(bounds), options=options)
+        yield rest_of(found.x), -found.fun

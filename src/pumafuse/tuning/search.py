@@ -7,10 +7,9 @@ is worth its numbers is taken.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import TypeAlias
 
-import msgspec
 import numpy as np
 
 from ..arrays import FloatArray
@@ -27,6 +26,7 @@ from .parameters import (
     quickest,
     with_arm,
     with_axis_of,
+    with_disturbance,
     with_gates,
     with_rest,
     with_shared_delay,
@@ -209,38 +209,24 @@ def _noise_models(
         model = config
         for axis, search in arms.items():
             model = with_rest(model, axis, search.rests[number], search.sensors)
-        models.append(_only(free, config, model, likelihood))
+        models.append(_with_free_noise(config, model, free, likelihood.sensors))
     distinct = [model for place, model in enumerate(models) if model not in models[:place]]
     return [_with_quiet(one, arms, free) for one in distinct]
 
 
-def _only(free: FreeOf, config: FusionConfig, model: FusionConfig, likelihood: Likelihood) -> FusionConfig:
-    """The configuration with those noises of a model that are free in it."""
-    for axis in likelihood.sensors:
-        process, new = config.process[axis], model.process[axis]
-        disturbed = msgspec.structs.replace(
-            process,
-            disturbance_sd=new.disturbance_sd,
-            disturbance_time=new.disturbance_time,
-            disturbance_kind=new.disturbance_kind,
-        )
-        with_it = msgspec.structs.replace(config, process={**config.process, axis: disturbed})
-        if any(one.axis == axis and one.path[-1] == "disturbance_sd" for one in free(with_it)) or (
-            new.disturbance_sd == 0.0 and _may_be_undisturbed(config, free, axis)
-        ):
-            config = with_it
+def _with_free_noise(config: FusionConfig, model: FusionConfig, free: FreeOf, axes: Iterable[str]) -> FusionConfig:
+    """The configuration with the noises of a model that are free."""
+    disturbed = config
+    for axis in axes:
+        disturbed = with_disturbance(disturbed, axis, 1.0, 1.0)
+    may_be = {one.axis for one in free(disturbed) if one.path[-1] == "disturbance_sd"}
+    for axis in may_be:
+        new = model.process[str(axis)]
+        config = with_disturbance(config, str(axis), new.disturbance_sd, new.disturbance_time, new.disturbance_kind)
     for one in free(config):
-        if (
-            one.fit == "noise"
-            and not one.path[-1].startswith("disturbance")
-            and (value := one.given(model)) is not None
-        ):
-            config = one.put(config, one.clipped(value))
+        if one.fit == "noise" and (one.sensor or one.path[-1] in _WALKING):
+            config = one.put(config, one.clipped(one.get(model)))
     return config
-
-
-def _may_be_undisturbed(config: FusionConfig, free: FreeOf, axis: str) -> bool:
-    return any(one.axis == axis and one.path[-1] == "disturbance_sd" for one in free(config))
 
 
 def _with_quiet(config: FusionConfig, arms: Mapping[str, ArmSearch], free: FreeOf) -> FusionConfig:
