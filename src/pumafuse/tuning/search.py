@@ -39,6 +39,7 @@ _WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten,
 _SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
 _WELL_KNOWN = 1.0 / 8.0  # of a logarithm: without it some ½ · 8² would be lost in log-likelihood
 _NARROWER, _WIDER = 0.6, 3.0  # times the gates
+_NARROWEST = 3.0  # gate: below it rejecting good measurements pays
 _QUIET = 0.03  # share of what the rest is, that other noise begins with
 _KINDS = ("none", "smooth (Matérn)", "rough (Ornstein-Uhlenbeck)")  # of a disturbance
 _WALKING = ("input_noise", "drift", "maneuver_noise", "maneuver_drift")  # noise without a disturbance
@@ -90,12 +91,13 @@ def search(
     for one in free(config):
         if one.fit == "latency":
             config = _nearest_latency(likelihood, config, one, free)
-    if near is None:
-        found = [_maximum(likelihood, model, free, notify) for model in _noise_models(likelihood, config, arms, free)]
-        best = _without_needless(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
-    else:
-        best = _maximum(likelihood, config, free, notify).config
-    best = maximise_with_gates(likelihood, with_gates(best, config), free(best), notify)
+    models = _noise_models(likelihood, config, arms, free)
+    found = [_maximum(likelihood, model, free, notify) for model in models]
+    best = _without_needless(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
+    if near is not None:  # what was found there may be the highest maximum here, too
+        peaks = [_maximum(likelihood, config, free, notify), point(likelihood, best, free(best))]
+        best = _best_by_axis(likelihood, peaks, [_penalised(likelihood, one, free(one.config)) for one in peaks])
+    best = _under_gates(likelihood, best, config, free, notify)
     return best, {axis: "; ".join(why) for axis, why in reasons.items() if why}, searched
 
 
@@ -257,11 +259,29 @@ def _maximum(likelihood: Likelihood, config: FusionConfig, free: FreeOf, notify:
         return point(likelihood, at, [one for one in free(at) if one.axis is not None])
 
     gated = any(sensor.gate > 0.0 for sensor in config.sensors.values())
-    found = below(config, _NARROWER, likelihood.sensors.keys())
+    found = below(config, _narrower(config), likelihood.sensors.keys())
     if rejecting := likelihood.rejecting(found.results):
         peaks = [found, below(config, _WIDER, rejecting)]
         best = _best_by_axis(likelihood, peaks, [peak.axes for peak in peaks])
         found = point(likelihood, best, [one for one in free(best) if one.axis is not None])
+    return found
+
+
+def _narrower(config: FusionConfig) -> float:
+    """By how much gates may be narrower without being too narrow."""
+    gates = [sensor.gate for sensor in config.sensors.values() if sensor.gate > 0.0]
+    return min(max(_NARROWER, _NARROWEST / min(gates, default=_NARROWEST)), 1.0)
+
+
+def _under_gates(
+    likelihood: Likelihood, best: FusionConfig, given: FusionConfig, free: FreeOf, notify: Notify
+) -> Point:
+    """The highest of the maxima under the gates as given, from narrower and from wider ones, too, if any rejects."""
+    found = maximise_with_gates(likelihood, with_gates(best, given), free(best), notify)
+    for times in (_narrower(given), _WIDER) if likelihood.rejecting(found.results) else ():
+        start = maximise(likelihood, with_gates(found.config, given, times), free(best), tolerance=_ROUGHLY).config
+        other = maximise_with_gates(likelihood, with_gates(start, given), free(best), notify)
+        found = max(found, other, key=lambda one: one.log_posterior)
     return found
 
 

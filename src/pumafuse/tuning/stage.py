@@ -138,9 +138,6 @@ def run_stage(
     if "latency" in plan.fit:
         fixed += shared_times(likelihood.sensors, excited, free(start), start)
     best, orders, arms = search(likelihood, start, free, notify, plan.one_delay, near.arms if near else None)
-    for axis, why in near.orders.items() if near else ():  # whose disturbances stay
-        kept = [one for one in why.split("; ") if one.startswith("disturbance")]
-        orders[axis] = "; ".join([one for one in [orders.get(axis, "")] if one] + kept)
     if "noise" in plan.fit:
         biased, more = with_small_biases(likelihood, best, plan.fixed)
         if more:
