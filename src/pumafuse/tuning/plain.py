@@ -71,7 +71,7 @@ def plain_arm(measured: Measured) -> PlainArm | None:
     measured = measured.excerpt(COMMANDS, ROWS)
     if measured.count < 2 * _FEWEST or not any(np.ptp(one.command) > 0.0 for one in measured.recordings):
         return None
-    late, rest = delays(measured).tolist(), measured.white(Arm(0.0, LAGS[0]))
+    late, rest = delays(measured).tolist(), measured.white(Arm(0.0, float(LAGS[0])))
     arms = [Arm(delay, lag) for delay in late for lag in LAGS.tolist()]
     measured = measured.without_far_from(_fitted(measured, arms, rest, 1)[0], _OUTLIER)
     found = _fitted(measured, arms, rest, _STARTS)
@@ -94,10 +94,10 @@ def plain_arm(measured: Measured) -> PlainArm | None:
         return None
     most = 0.5 * (power * _CHANCE / independent + _ROUNDING * measured.power) / sd**2
     allowed = [one.delay + one.lag for one, behind in zip(arms, log[place] - log, strict=True) if behind <= most]
-    commands = [Arm(delay, LAGS[0]) for delay in late]
+    commands = [Arm(delay, float(LAGS[0])) for delay in late]
     delayed = commands[int(np.argmax(measured.weighed(commands, rest)[0]))]
     ends = [*allowed, delayed.total]
-    return PlainArm(arm, (min(ends), max(ends)), delayed.total, off(measured, delayed), measured)
+    return PlainArm(arm, (float(min(ends)), float(max(ends))), delayed.total, off(measured, delayed), measured)
 
 
 def _fitted(measured: Measured, arms: list[Arm], rest: Rest, count: int) -> list[Arm]:
