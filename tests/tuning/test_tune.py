@@ -346,13 +346,13 @@ def scan_errors(run: pf.Run, config: pf.FusionConfig, *sensors: str) -> dict[str
 def test_the_shipped_scan_is_tuned_as_well_as_it_was_by_hand() -> None:
     """Log-likelihoods at least 4800, 6600 and 7150; errors on the reference, which played no part, are bounded, too.
 
-    At most 0.076, 0.051 and 0.050 mm by tracker and camera, 0.300, 0.192 and 0.161 mm by the camera alone.
+    At most 0.076, 0.051 and 0.050 mm by tracker and camera, 0.300, 0.192 and 0.160 mm by the camera alone.
     """
     run, config = tuned_scan()
     axes = ("tangential", "radial", "vertical")
     likelihood = Likelihood([run], config, ["tracker"])
     totals = dict(zip(likelihood.axes, likelihood.evaluate(config).axes.tolist(), strict=True))
     assert all(totals[axis] >= least for axis, least in zip(axes, (4800.0, 6600.0, 7150.0), strict=True)), totals
-    for sensors, most in ((["tracker", "vision"], (0.076, 0.051, 0.050)), (["vision"], (0.300, 0.192, 0.161))):
+    for sensors, most in ((["tracker", "vision"], (0.076, 0.051, 0.050)), (["vision"], (0.300, 0.192, 0.160))):
         errors = scan_errors(run, config, *sensors)
         assert all(errors[axis] <= limit for axis, limit in zip(axes, most, strict=True)), (sensors, errors)

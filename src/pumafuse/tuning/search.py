@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import TypeAlias
 
+import msgspec
 import numpy as np
 
 from ..arrays import FloatArray
@@ -91,8 +92,11 @@ def search(
     for one in free(config):
         if one.fit == "latency":
             config = _nearest_latency(likelihood, config, one, free)
-    models = _noise_models(likelihood, config, arms, free)
-    found = [_maximum(likelihood, model, free, notify) for model in models]
+    found = list[Point]()
+    for model in _noise_models(likelihood, config, arms, free):
+        if found:  # an arm that is likeliest under one noise is near that under another
+            model = _with_arm_of(model, found[0].config, free)
+        found.append(_maximum(likelihood, model, free, notify))
     best = _without_needless(likelihood, _likeliest(likelihood, found, free, reasons), free, notify)
     if near is not None:  # what was found there may be the highest maximum here, too
         peaks = [_maximum(likelihood, config, free, notify), point(likelihood, best, free(best))]
@@ -142,9 +146,10 @@ def _arm_search(
     sd = np.array([config.sensors[name].sd_of(axis) for name in names], dtype=np.float64)
     least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
     believed = [one.prior for one in free if one.is_noise and one.axis == axis and one.prior is not None]
+    given = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
     return ArmSearch(
         likelihood.measured(axis, config, names),
-        freedom or Freedom(Arm.of(config.arm.axes[axis], config.arm.delay_of(axis)), ()),
+        freedom or Freedom(given, (), (2 if given.damping else 1,), ("given",)),
         Rest(sd),
         least,
         believed[0][1] if believed else None,
@@ -228,6 +233,15 @@ def _with_free_noise(config: FusionConfig, model: FusionConfig, free: FreeOf, ax
     for one in free(config):
         if one.fit == "noise" and (one.sensor or one.path[-1] in _WALKING):
             config = one.put(config, one.clipped(one.get(model)))
+    return config
+
+
+def _with_arm_of(config: FusionConfig, other: FusionConfig, free: FreeOf) -> FusionConfig:
+    """The configuration with the arm of another, and with its numbers that all axes share."""
+    config = msgspec.structs.replace(config, arm=other.arm)
+    for one in free(other):
+        if one.axis is None:
+            config = one.put(config, one.get(other))
     return config
 
 
