@@ -171,7 +171,7 @@ def test_intervals_of_lags_hold_on_arms_of_all_kinds(lag: ModuleType) -> None:
 
 @pytest.mark.long
 def test_delays_a_period_away_are_looked_at(lag: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In one run a model has two maxima a period of 8 ms apart."""
+    """In one run a model has two maxima a period of 8 ms apart, in another the first one found is a period off."""
     searches, latency = list[ArmSearch](), importlib.import_module("pumafuse.tuning.latency")
 
     def kept(*given: object) -> ArmSearch:
@@ -185,12 +185,6 @@ def test_delays_a_period_away_are_looked_at(lag: ModuleType, monkeypatch: pytest
         for one in search.posterior.branches:
             tops[number, str(one.model)].append(one.delays[np.argmax(one.log_density)] / 0.008)
     assert any(0.6 < max(each) - min(each) < 1.4 for each in tops.values()), tops
-
-
-@pytest.mark.long
-@pytest.mark.xfail(reason="a maximum a period away is still missed in some runs")
-def test_a_maximum_a_period_away_is_found(lag: ModuleType) -> None:
-    """In a run in which the first one found is a period off, every interval holds."""
     found, _, _ = lag.examined((306, 2, 0.0))
     assert len(found) == 8
     assert all(one.low <= one.truth <= one.high for one in found), found

@@ -40,10 +40,19 @@ _SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error
 _QUICKEST = 2.0  # update periods, of a disturbance
 _DOUBT = 20.0  # log-likelihood that a recovery at a bound must gain: mostly another model says the same
 _FORLORN = 8.0  # log-likelihood behind the best, from which a model or a dead time counts for nothing
+_TICKS = (
+    -1.0,
+    -0.5,
+    -0.25,
+    0.25,
+    0.5,
+    1.0,
+)  # update periods, by which a dead time may be on a wrong bump of the likelihood
 _SAME = 2e-4  # s, between dead times of maxima that are one
 _STEP = 0.7  # standard deviations, between dead times
 _LONGEST_STEP = 0.03  # s
-_MOST = 12  # steps away from a maximum
+_MOST = 20  # steps away from a maximum
+_SLOWLY, _LONGER = 0.5, 1.5  # log-likelihood that a step loses: with less the next one is so many times as long
 _SLOPE = 1e-5  # of a coordinate, by which quantities are varied
 
 
@@ -229,9 +238,7 @@ class ArmSearch:
                 tries.append(self._fit(model, known[model].arm))
             found[model] = max(tries, key=lambda one: one.log_posterior)
         best = max(found, key=lambda model: found[model].log_posterior)
-        for ticks in (
-            (-1.0, 1.0) if "delay" in self._freedom.free else ()
-        ):  # with commands a period apart a wrong period fits well, too
+        for ticks in _TICKS if "delay" in self._freedom.free else ():
             there = self._delayed(found[best].arm, found[best].arm.delay + ticks * self._measured.period)
             found[best] = max(found[best], self._fit(best, there), key=lambda one: one.log_posterior)
         return found
@@ -333,7 +340,7 @@ class ArmSearch:
 
     def _side(self, peak: Fit, names: Coordinates, step: float, slope: FloatArray, least: float) -> Iterator[Entry]:
         low, high = self._limits.range(names)
-        before, move = peak.arm, step * slope
+        before, move, height = peak.arm, step * slope, -np.inf
         for _ in range(_MOST):
             delay = before.delay + step
             if not -abs(step) < delay <= self._longest:
@@ -347,6 +354,10 @@ class ArmSearch:
                 return
             before = entry.arm
             move = np.array([before.coordinate(name) for name in names]) - at
+            if entry.log_density > height - _SLOWLY:  # the maximum was on a bump of a wide hill
+                longer = min(_LONGER * abs(step), _LONGEST_STEP) / abs(step)
+                step, move = longer * step, longer * move
+            height = entry.log_density
 
     def _at(self, arm: Arm, names: Coordinates) -> Entry:
         """The entry of the best arm with the same dead time."""

@@ -87,14 +87,14 @@ class Branch:
         return np.array([one.log_density for one in self.entries])
 
     def at(self, delays: FloatArray) -> FloatArray:
-        """The log-density at delays, as it falls at the ends beyond them, (m,)."""
+        """The log-density at delays, (m,): beyond the ends as it falls there; where it does not, that is not known."""
         known, found = self.delays, self.log_density
         if len(known) < 2:
             return np.where(np.abs(delays - known[0]) < SHORTEST, found[0], -np.inf)
         middle = np.interp(delays, known, found)
         low, high = (found[1] - found[0]) / (known[1] - known[0]), (found[-1] - found[-2]) / (known[-1] - known[-2])
-        below = found[0] + max(low, 0.0) * (delays - known[0])
-        above = found[-1] + min(high, 0.0) * (delays - known[-1])
+        below = found[0] + low * (delays - known[0]) if low > 0.0 else -np.inf
+        above = found[-1] + high * (delays - known[-1]) if high < 0.0 else -np.inf
         return np.where(delays < known[0], below, np.where(delays > known[-1], above, middle))
 
 
