@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -87,6 +89,18 @@ def test_another_delay_stays_the_axis_own(seed: int) -> None:
     assert "delay: its own (own +" in found.orders["z"]
     forced = stage(truth, seed, one_delay=True).best.config.arm
     assert {one.delay for one in forced.axes.values()} == {None}
+
+
+@pytest.mark.parametrize("seed", [1, later(2), later(3)])
+def test_another_delay_that_hardly_shows_is_said_to_be_doubtful_and_costs_no_lag(seed: int) -> None:
+    """8 ms later, by a camera of 2 mm: a second order with the others' delay says the same, odds of less than e³.
+
+    The lag is right to 2 ms either way.
+    """
+    truth = known({"z": DELAY + 0.008}, {"z": 2e-3})
+    found = stage(truth, seed)
+    assert found.best.config.arm.lag_of("z") == pytest.approx(truth.arm.lag_of("z"), abs=2e-3)
+    assert abs(float(re.findall(r"own ([-+]\d+\.\d)", found.orders["z"])[0])) < 3.0
 
 
 @pytest.mark.parametrize("seed", [1, later(2), later(3)])
