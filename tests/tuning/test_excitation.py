@@ -69,11 +69,30 @@ def test_a_run_given_twice_and_nothing_free() -> None:
 
 
 def test_too_few_measurements() -> None:
-    """Fewer than 30 of an axis are refused, counted over all runs."""
+    """Fewer than 12 of an axis are refused, counted over all runs."""
     run, camera = outage(1).run, outage(1).run.sensors["vision"]
-    few = replace(run, sensors={"vision": camera.rows(slice(0, 29))})
-    assert refused([few], validate=run) == "tangential: only 29 measurements; a fit needs at least 30"
+    few = replace(run, sensors={"vision": camera.rows(slice(0, 11))})
+    assert refused([few], validate=run) == "tangential: only 11 measurements; a fit needs at least 12"
     assert len(fit_stage([few, few], outage(1).config).free) > 0
+
+
+@pytest.mark.parametrize("count", [14, 25])
+def test_a_few_measurements_tell_the_lag_and_little_else(count: int) -> None:
+    """A slow camera of a wide motion: fewer numbers are fitted, and it is said; the lag is right to 15 ms."""
+    time = 0.02 * np.arange(20 * count)
+    stamp = 0.4 * np.arange(count) + 0.115
+    seen = 0.3 * np.sin(np.maximum(stamp - 0.11, 0.0)) + np.random.default_rng(count).normal(0.0, 1e-3, count)
+    run = pf.Run.from_arrays(time, {"x": 0.3 * np.sin(time)}, {"camera": (stamp, {"x": seen})})
+    arm = pf.ArmModel(
+        name="a", update_period=0.02, delay=0.03, axes={"x": pf.AxisModel(plant=pf.FirstOrder(time_constant=0.03))}
+    )
+    config = pf.FusionConfig(arm=arm, sensors={"camera": pf.Sensor(sd=1e-3)})
+    found = quietly(lambda: pf.tune(run, config, fit=["noise", "delay", "plant", "gain"]))
+    assert any(note.startswith(f"x: only {count} measurements: gain, disturbance") for note in found.details.notes)
+    assert found.config.arm.lag_of("x") == pytest.approx(0.1, abs=0.015)
+    assert not any("gain" in key or "disturbance" in key for key in found.params)
+    if count * 2 < 3 * 12:
+        assert found.details.validation is None
 
 
 def test_few_measurements_for_many_numbers_are_told() -> None:

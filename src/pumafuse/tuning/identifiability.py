@@ -15,7 +15,8 @@ from .likelihood import Likelihood
 from .maximise import Point, derivatives
 from .parameters import Parameter, smallest_sd
 
-_FEWEST = 30  # components of an axis
+FEWEST, FEW = 12, 30  # components of an axis: to fit anything, and to fit what only many can tell
+_OF_MANY = ("maneuver_noise", "maneuver_drift", "disturbance_sd", "disturbance_time", "intercept", "gain_recovery")
 _ENOUGH = 30  # components for each number fitted to them; with less, coverage was 45 to 85 % in simulated runs
 _EXCITED = 3.0  # commanded motion over noise from which an axis moves
 _HIGH = 0.9  # a correlation worth reporting
@@ -63,8 +64,8 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
         TuneError: There are too few measurements, no axis moves, or a sensor does not follow the commands at all.
     """
     for axis, count in zip(likelihood.axes, likelihood.count.tolist(), strict=True):
-        if 0 < count < _FEWEST:
-            raise TuneError(f"{axis}: only {count} measurements; a fit needs at least {_FEWEST}")
+        if 0 < count < FEWEST:
+            raise TuneError(f"{axis}: only {count} measurements; a fit needs at least {FEWEST}")
     if not likelihood.count.any():
         raise TuneError("no measurement of a configured sensor lies within the runs: nothing to fit to")
     found: list[str] = []
@@ -92,6 +93,29 @@ def excited_axes(likelihood: Likelihood, config: FusionConfig) -> list[str]:
         if fault.lost and not set(fault.axes).isdisjoint(found):
             raise TuneError(fault.sentence)
     return found
+
+
+def least_count(likelihood: Likelihood) -> int:
+    """How many measurements there are of the axis that has the fewest of those that are measured."""
+    return min((count for count in likelihood.count.tolist() if count > 0), default=0)
+
+
+def for_few(likelihood: Likelihood, free: Sequence[Parameter]) -> tuple[list[Parameter], list[str]]:
+    """The parameters that as many measurements as there are can tell, and a sentence for each axis with few."""
+    few = {
+        axis: count for axis, count in zip(likelihood.axes, likelihood.count.tolist(), strict=True) if 0 < count < FEW
+    }
+    kept = [
+        one
+        for one in free
+        if one.axis not in few
+        or not (one.path[-1] in _OF_MANY or (one.fit == "plant" and one.path[-1] != "time_constant"))
+    ]
+    notes = [
+        f"{axis}: only {count} measurements: gain, disturbance, maneuvers and the order of the plant stay as they are"
+        for axis, count in few.items()
+    ]
+    return kept, notes
 
 
 def few_measurements(likelihood: Likelihood, free: Sequence[Parameter]) -> list[str]:

@@ -29,7 +29,7 @@ from ..toml import Interval
 from ..units import MS
 from .arm_search import BOUNDS, ArmSearch, Freedom
 from .arms import Arm, Rest
-from .identifiability import TuneError, excited_axes
+from .identifiability import FEW, TuneError, excited_axes
 from .likelihood import Likelihood, in_threads
 from .parameters import (
     Parameter,
@@ -386,7 +386,10 @@ def _search(likelihood: Likelihood, axis: str) -> ArmSearch:
     config, names = likelihood.config, likelihood.sensors[axis]
     sd = np.array([config.sensors[name].sd_of(axis) for name in names], dtype=np.float64)
     least = [likelihood.resolution.get((name, axis), 0.0) for name in names]
-    return ArmSearch(likelihood.measured(axis, config), Freedom(Arm(0.0, 0.1)), Rest(sd), least)
+    measured, freedom = likelihood.measured(axis, config), Freedom(Arm(0.0, 0.1))
+    if measured.count < FEW:
+        freedom = freedom._replace(orders=(1,), gains=("given",))
+    return ArmSearch(measured, freedom, Rest(sd), least)
 
 
 def _arm(config: FusionConfig, found: Mapping[str, ArmSearch], trusted: str) -> tuple[FusionConfig, dict[str, AxisLag]]:

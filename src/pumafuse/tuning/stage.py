@@ -17,6 +17,7 @@ from .identifiability import (
     NotIdentifiable,
     excited_axes,
     few_measurements,
+    for_few,
     lone_drifts,
     not_identifiable,
     not_identifiable_noise,
@@ -120,7 +121,7 @@ def run_stage(
     def free(at: FusionConfig) -> list[Parameter]:
         names = [*plan.fixed, *(one.fixed for one in fixed)]
         every = parameters(at, config, likelihood.sensors, plan.fit, names, plan.sd_prior, likelihood.resolution)
-        return [one for one in every if _may_vary(one, at, plan, excited)]
+        return for_few(likelihood, [one for one in every if _may_vary(one, at, plan, excited)])[0]
 
     start, notes = likelihood.config, list[str]()
     if near is not None:
@@ -155,7 +156,7 @@ def run_stage(
         for name, sensor in config.sensors.items()
         if 0.0 < sensor.gate < _NARROWEST and name in used
     ]
-    notes += few_measurements(likelihood, free(best.config))
+    notes += few_measurements(likelihood, free(best.config)) + for_few(likelihood, [])[1]
     return Stage(likelihood, best, free(best.config), fixed, orders, notes, arms)
 
 

@@ -9,14 +9,16 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Literal, TypeAlias, cast
 
-from ..arrays import NO_STAMP
+import numpy as np
+
+from ..arrays import NEVER, NO_STAMP
 from ..errors import ConfigError, PumafuseWarning
 from ..fusion.config import FusionConfig
 from ..fusion.faults import latency_questions
 from ..logs.clock import segments
 from ..logs.run import Run
 from ..units import MS
-from .identifiability import TuneError, correlations, excited_axes
+from .identifiability import FEWEST, TuneError, correlations, excited_axes, least_count
 from .intervals import ConfidenceInterval, Distances, Profile, confidence_intervals, lag_intervals
 from .likelihood import Likelihood, LogLikelihood
 from .maximise import Point
@@ -38,6 +40,7 @@ from .summary import (
 from .validation import Check, check
 
 _FITTED_ON = 2.0 / 3.0  # of a single run; the rest is for validation
+_LATE = 0.1  # of a run: measurements that begin later are split for themselves
 _NOTHING = 0.01  # log-likelihood by which the configuration as given must be ahead to be kept
 
 Progress: TypeAlias = Callable[[str, float], None]
@@ -129,7 +132,9 @@ def tune(
     excited_axes(pipeline.whole, config)  # refuses the runs before a part of them is fitted on
     found: dict[str, Doubt] = {}
     doubted: list[str] = []
-    until = _fitted_until(runs[0]) if len(runs) == 1 and validate is None else None
+    until = None
+    if len(runs) == 1 and validate is None and _FITTED_ON * least_count(pipeline.whole) >= FEWEST:
+        until = _fitted_until(runs[0])
     intervals: dict[str, ConfidenceInterval] = {}
     around: dict[str, Distances] = {}
     validation: list[Check] | None = None
@@ -344,7 +349,14 @@ def _fitted_until(run: Run) -> float | None:
         return None
     stamp = run.command.stamp[run.command.stamp != NO_STAMP]
     since, end = run.since or 0.0, float(stamp.max() - stamp.min()) / 1e9
-    return since + _FITTED_ON * (min(end, run.until or end) - since)
+    end = min(end, run.until or end)
+    first = min(
+        float(np.min(one.stamp[one.stamp != NO_STAMP], initial=NEVER) - stamp.min()) / 1e9
+        for one in run.sensors.values()
+    )
+    if since + _LATE * (end - since) < first < end:
+        since = first
+    return since + _FITTED_ON * (end - since)
 
 
 def _likelihoods(likelihood: Likelihood, before: FusionConfig, after: FusionConfig) -> dict[str, AxisLikelihood]:
