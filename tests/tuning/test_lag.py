@@ -95,7 +95,7 @@ def test_intervals_contain_the_lag_over_25_runs() -> None:
         sim = outage(seed)
         stage = fit_stage(sim.run, spoiled_arm(sim.config), ("noise", "delay", "plant"))
         around = lag_intervals(stage.likelihood, stage.best, stage.free)
-        for axis, one in fitted_lags(stage.free, sim.config, stage.best.config, around).items():
+        for axis, one in fitted_lags(stage.free, sim.config, stage.best.config, around, []).items():
             low, high = one.lag_ms_ci95
             assert low is not None and high is not None and low < one.lag_ms < high
             inside.append(low <= 1e3 * sim.config.arm.lag_of(axis) <= high)

@@ -141,9 +141,9 @@ def test_a_gain_is_found_where_it_shows() -> None:
 @pytest.mark.parametrize("seed", [1, later(2), 3])  # 3: with a delay of its own the second looks like second order
 @pytest.mark.parametrize("begin", [(1, 2), later((1, 1)), later((2, 2))], ids=str)
 def test_the_order_of_a_plant_is_its_own(seed: int, begin: tuple[int, int]) -> None:
-    """By BIC: second for ω = 53.9 rad/s, ζ = 0.864, first for τ = 35.6 ms, whichever it was configured to be.
+    """By the odds: second for ω = 53.9 rad/s, ζ = 0.864, first for τ = 35.6 ms, whichever it was configured to be.
 
-    The penalty is half the logarithm of the number of measurements. Numbers are within 20 % of the truth.
+    Numbers are within 20 % of the truth.
     """
     sim = outage(seed)
     config = spoiled_arm(sim.config)
@@ -157,9 +157,7 @@ def test_the_order_of_a_plant_is_its_own(seed: int, begin: tuple[int, int]) -> N
     assert first.time_constant == pytest.approx(0.0356, rel=0.2)
     for axis, word, sign in zip(AXES, ("second", "first"), (1.0, -1.0), strict=True):
         assert found.orders[axis].startswith(f"order: {word} (second ")
-        ahead, gain = map(float, re.findall(r"[-+]?\d+\.\d", found.orders[axis].partition(";")[0]))
-        count = found.likelihood.count[found.likelihood.axes.index(axis)]
-        assert gain - ahead == pytest.approx(0.5 * np.log(count), abs=0.11)
+        (ahead,) = map(float, re.findall(r"[-+]\d+\.\d", found.orders[axis].partition(";")[0]))
         assert sign * ahead > 0.0
 
 
