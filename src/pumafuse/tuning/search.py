@@ -290,9 +290,10 @@ def _narrower(config: FusionConfig) -> float:
 def _under_gates(
     likelihood: Likelihood, best: FusionConfig, given: FusionConfig, free: FreeOf, notify: Notify
 ) -> Point:
-    """The highest of the maxima under the gates as given, from narrower and from wider ones, too, if any rejects."""
+    """The highest of the maxima under the gates as given: from narrower and wider ones, too, where whole rows go."""
     found = maximise_with_gates(likelihood, with_gates(best, given), free(best), notify)
-    for times in (_narrower(given), _WIDER) if likelihood.rejecting(found.results) else ():
+    whole = any(sensor.gates_rows(given.arm) for sensor in given.sensors.values())
+    for times in (_narrower(given), _WIDER) if whole and likelihood.rejecting(found.results) else ():
         start = maximise(likelihood, with_gates(found.config, given, times), free(best), tolerance=_ROUGHLY).config
         other = maximise_with_gates(likelihood, with_gates(start, given), free(best), notify)
         found = max(found, other, key=lambda one: one.log_posterior)
