@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import pumafuse as pf
+from pumafuse.tuning.arms import Arm
 from pumafuse.tuning.parameters import (
     FITS,
     Parameter,
@@ -19,10 +20,10 @@ from pumafuse.tuning.parameters import (
     is_fixed,
     kinds_of,
     parameters,
+    with_arm,
     with_axis_of,
     with_disturbance,
     with_drifts,
-    with_lag,
     with_order,
     with_own_delays,
 )
@@ -172,7 +173,8 @@ def test_plants_of_another_order_and_lag(axis: str) -> None:
     time = np.linspace(0.0, 2.0, 200_001)
     for order in (1, 2):
         other = with_order(CONFIG, axis, order)
-        for config, lag in ((other, ARM.axes[axis].plant.lag), (with_lag(other, axis, 0.07), 0.07)):
+        slower = with_arm(other, axis, Arm.of(other.arm.axes[axis], 0.0)._replace(lag=0.07))
+        for config, lag in ((other, ARM.axes[axis].plant.lag), (slower, 0.07)):
             plant = config.arm.axes[axis].plant
             assert isinstance(plant, pf.FirstOrder if order == 1 else pf.SecondOrder)
             assert np.trapezoid(1.0 - plant.step_response(time), time) == pytest.approx(lag, rel=1e-6)

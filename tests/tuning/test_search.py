@@ -10,9 +10,10 @@ import pytest
 from scipy.optimize import differential_evolution
 
 import pumafuse as pf
+from pumafuse.tuning.arms import Arm
 from pumafuse.tuning.likelihood import Likelihood
 from pumafuse.tuning.maximise import maximise_with_gates, point
-from pumafuse.tuning.parameters import Parameter, changed, moved, with_lag
+from pumafuse.tuning.parameters import Parameter, changed, moved, with_arm
 from tuning_runs import (
     fit_stage,
     later,
@@ -49,8 +50,9 @@ def test_a_wrong_delay_and_a_wrong_lag_change_nothing() -> None:
     found = list[pf.FusionConfig]()
     for delay, lag in ((1.0, 1.0), (0.3, 3.0), (2.0, 0.3)):
         config = replaced(sim.config, arm=replaced(sim.config.arm, delay=delay * sim.config.arm.delay))
-        for axis in config.arm.axes:
-            config = with_lag(config, axis, lag * config.arm.axes[axis].plant.lag)
+        for axis, model in config.arm.axes.items():
+            arm = Arm.of(model, config.arm.delay)
+            config = with_arm(config, axis, arm._replace(lag=lag * arm.lag))
         found.append(fit_stage(sim.run, config, ("noise", "delay", "plant")).best.config)
     for other in found[1:]:
         assert other.arm.delay == pytest.approx(found[0].arm.delay, abs=1e-6)

@@ -403,16 +403,6 @@ def with_disturbance(
     return changed(config, ("process", axis), process)
 
 
-def with_lag(config: FusionConfig, axis: str, lag: float) -> FusionConfig:
-    """The configuration with an axis's plant of another lag behind an input of constant velocity [s]."""
-    plant = config.arm.axes[axis].plant
-    if isinstance(plant, FirstOrder):
-        plant = FirstOrder(time_constant=lag)
-    else:
-        plant = _replace(plant, natural_frequency=2.0 * plant.damping / lag)
-    return changed(config, ("arm", "axes", axis, "plant"), plant)
-
-
 def with_axis_of(config: FusionConfig, other: FusionConfig, axis: str) -> FusionConfig:
     """The configuration with all numbers of one axis from another: its model, its process noise, its sensors' noise."""
     config = changed(config, ("arm", "axes", axis), other.arm.axes[axis])
