@@ -40,6 +40,7 @@ _WANDERS = 2.3  # log-likelihood that a random walk alone must gain: one to ten,
 _SMOOTHER = 3.0  # log-likelihood that a smooth disturbance must gain: the error bars of a rough one hold for either
 _WELL_KNOWN = 1.0 / 8.0  # of a logarithm: without it some ½ · 8² would be lost in log-likelihood
 _NARROWER, _WIDER = 0.6, 3.0  # times the gates
+_LEAST = 0.02  # of an axis's lag, that its plant has
 _NARROWEST = 3.0  # gate: below it rejecting good measurements pays
 _QUIET = 0.03  # share of what the rest is, that other noise begins with
 _KINDS = ("none", "smooth (Matérn)", "rough (Ornstein-Uhlenbeck)")  # of a disturbance
@@ -290,14 +291,37 @@ def _narrower(config: FusionConfig) -> float:
 def _under_gates(
     likelihood: Likelihood, best: FusionConfig, given: FusionConfig, free: FreeOf, notify: Notify
 ) -> Point:
-    """The highest of the maxima under the gates as given: from narrower and wider ones, too, where whole rows go."""
+    """The highest of the maxima under the gates as given.
+
+    Where whole rows are rejected it is looked for from narrower and wider gates, and an update period of delay away.
+    """
     found = maximise_with_gates(likelihood, with_gates(best, given), free(best), notify)
     whole = any(sensor.gates_rows(given.arm) for sensor in given.sensors.values())
-    for times in (_narrower(given), _WIDER) if whole and likelihood.rejecting(found.results) else ():
-        start = maximise(likelihood, with_gates(found.config, given, times), free(best), tolerance=_ROUGHLY).config
+    if not (whole and likelihood.rejecting(found.results)):
+        return found
+    starts = [
+        maximise(likelihood, with_gates(found.config, given, times), free(best), tolerance=_ROUGHLY).config
+        for times in (_narrower(given), _WIDER)
+    ]
+    plants, delays = (
+        {str(one.axis) for one in free(best) if one.axis and one.fit == fit} for fit in ("plant", "delay")
+    )
+    both = sorted(plants & delays)
+    starts += [_ticks_away(found.config, both, ticks) for ticks in (-1.0, 1.0) if both]
+    for start in starts:
         other = maximise_with_gates(likelihood, with_gates(start, given), free(best), notify)
         found = max(found, other, key=lambda one: one.log_posterior)
     return found
+
+
+def _ticks_away(config: FusionConfig, axes: Sequence[str], ticks: float) -> FusionConfig:
+    """The configuration with delays of axes so many update periods longer, and as much less lag."""
+    for axis in axes:
+        arm = Arm.of(config.arm.axes[axis], config.arm.delay_of(axis))
+        delay = max(arm.delay + ticks * config.arm.update_period, 0.0)
+        lag = max(arm.lag + arm.delay - delay, _LEAST * arm.total)
+        config = with_arm(config, axis, arm._replace(delay=delay, lag=lag))
+    return config
 
 
 def _likeliest(likelihood: Likelihood, peaks: Sequence[Point], free: FreeOf, reasons: Reasons) -> FusionConfig:
