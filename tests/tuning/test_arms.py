@@ -122,3 +122,28 @@ def test_what_an_arm_leaves_is_found(number: int, kind: str) -> None:
         assert likely.walk == pytest.approx(5e-3, rel=0.2)
     else:
         assert (likely.disturbance_sd, likely.disturbance_time) == pytest.approx((0.02, 0.3), rel=0.35)
+
+
+def test_without_a_belief_the_guess_of_the_noise_changes_nothing() -> None:
+    """A thousandth and a thousand times the true noise: the same rest, to the last digit."""
+    measured = Measured([recording(8, 400, 2)], T, ["a", "b"])
+    found = [
+        [one for one, _ in rests(measured, Arm(0.0, 0.1), Rest(np.full(2, guess)), 0.04, [1e-6, 1e-6])]
+        for guess in (1e-5, 10.0)
+    ]
+    for first, second in zip(*found, strict=True):
+        assert np.array_equal(first.sd, second.sd) and (first.walk, first.disturbance_sd) == (
+            second.walk,
+            second.disturbance_sd,
+        )
+
+
+def test_jitter_is_white_noise_beside_a_smooth_motion() -> None:
+    """Two sensors, one ten times as noisy, and a swing that no arm explains: each to a tenth of itself."""
+    rng, count = np.random.default_rng(9), 4000
+    time, source = np.arange(count) * 5_000_000, np.arange(count) // 2000
+    swing = 0.05 * np.sin(2.0 * np.pi * time / 3e9)
+    value = swing + rng.normal(0.0, np.array([1e-4, 1e-3])[source])
+    still = recording(1)._replace(time=time, value=value, source=source, weight=np.ones(count))
+    still = still._replace(command=np.full(100, 0.3))
+    assert Measured([still], T, ["a", "b"]).jitter(Arm(0.0, 0.1)) == pytest.approx([1e-4, 1e-3], rel=0.1)

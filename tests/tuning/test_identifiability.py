@@ -57,7 +57,7 @@ def test_pairs_beyond_nine_tenths_are_named() -> None:
 
     The other axis's delay is known, so that this one has its own.
     """
-    sim = with_outliers(2)
+    sim = with_outliers(1)
     config = with_own_delays(sim.config, ["tangential"])
     found = fit_stage(sim.run, config, ("noise", "delay", "plant"), "axes.tangential.delay_ms", "disturbance_sd_mm")
     inside = [one for one in found.free if one.at_bound(found.best.config) is None]

@@ -183,12 +183,11 @@ class ArmSearch:
 
     def _peaks(self, noise: Rest, least: Sequence[float], prior: float | None) -> list[tuple[float, Model, Fit]]:
         """The maxima of every model with their evidence, the best first; those an update period away, too."""
-        self.rest = noise
         for _ in range(_GATED):
-            self.rest = self._likely_rest(self._best(self._fits).arm, self.rest, least, prior)
+            self.rest = self._likely_rest(self._best(self._fits).arm, noise, least, prior)
             self._measured = self._measured.gated(self._best(self._fits).arm, self.rest, _GATE)
         self._fits = self._likely(self._fitted([self._best(self._fits).arm, *self._on_grid(1)], self._fits))
-        self.rest = self._likely_rest(self._best(self._fits).arm, self.rest, least, prior)
+        self.rest = self._likely_rest(self._best(self._fits).arm, noise, least, prior)
         self._fits = self._likely(self._fitted([self._best(self._fits).arm], self._fits))
         every = [(self._evidence(model, fit), model, fit) for model, fit in self._fits.items()]
         highest = max(one[0] for one in every)
@@ -220,9 +219,9 @@ class ArmSearch:
         summits.sort(key=lambda one: -log[one])
         return [arms[one]._replace(gain=float(gain[one])) for one in summits[:count]]
 
-    def _likely_rest(self, arm: Arm, start: Rest, least: Sequence[float], prior: float | None) -> Rest:
+    def _likely_rest(self, arm: Arm, noise: Rest, least: Sequence[float], prior: float | None) -> Rest:
         """The most likely of what an arm leaves, after the penalty for its numbers."""
-        found = list(rests(self._measured, arm, start, _QUICKEST * self._measured.period, least, prior))
+        found = list(rests(self._measured, arm, noise, _QUICKEST * self._measured.period, least, prior))
         self.rests = [rest for rest, _ in found]
         dearer = math.log(max(self._measured.count, 2))  # of two numbers more (BIC)
         prices = [_WANDERS, dearer + _SMOOTHER, dearer]

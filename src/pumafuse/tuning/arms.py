@@ -31,6 +31,7 @@ _WALKS, _SDS = (1e-8, 10.0), (1e-8, 10.0)  # m/√s, m: bounds
 _TIME, _TIMES = 0.3, (1e-3, 1e3)  # s, of a disturbance: start, bounds
 _PIECES = 20  # of all recordings, that a model which is right has independent scores in
 _SHARE, _SMALLEST = 0.98, 1e-7  # of the measurements that least squares are of; the rest may be outliers; m
+_BEND = 0.6745 * math.sqrt(6.0)  # median of a second difference of white noise, in its standard deviations
 _FEW = 3  # outliers in a row
 _HARMLESS = 0.02  # of the range that is measured
 _SETTLED = 2.6  # s, after which an arm has forgotten earlier commands
@@ -227,6 +228,19 @@ class Measured:
         left = left[: math.ceil(_SHARE * len(left))]
         sd = max(float(np.sqrt(np.mean(left**2))), _SMALLEST) if len(left) else 1.0
         return Rest(np.full(len(self.sensors), sd))
+
+    def jitter(self, arm: Arm) -> FloatArray:
+        """White noise of each sensor [m], (s,), by second differences of what an arm leaves."""
+        found = np.full(len(self.sensors), float(self.white(arm).sd[0]))
+        left = self.residuals(arm)
+        for number in range(len(found)):
+            parts = [
+                np.abs(np.diff(one[(part.source == number) & (part.weight > 0.0)], 2))
+                for one, part in zip(left, self.recordings, strict=True)
+            ]
+            if len(bends := np.concatenate(parts)):
+                found[number] = max(float(np.median(bends)) / _BEND, _SMALLEST)
+        return found
 
     def gated(self, arm: Arm, rest: Rest, gate: float) -> Measured:
         """Without measurements whose innovation beside an arm is beyond so many standard deviations.
@@ -438,14 +452,14 @@ def log_belief(x: float) -> float:
 
 
 def rests(
-    measured: Measured, arm: Arm, start: Rest, quickest: float, least: Sequence[float], prior: float | None = None
+    measured: Measured, arm: Arm, noise: Rest, quickest: float, least: Sequence[float], prior: float | None = None
 ) -> Iterator[tuple[Rest, float]]:
     """The most likely rest that an arm leaves, without a disturbance and with one of each kind.
 
     Args:
         measured: The measurements.
         arm: The arm.
-        start: Where to begin; its noise of the sensors is the mean of their prior, if they have one.
+        noise: The mean of the prior of its sensors' noise.
         quickest: The shortest time of a disturbance that is believed [s].
         least: The least noise of each sensor [m].
         prior: The sd of the logarithm of the sensors' noise; None: the measurements alone decide.
@@ -457,11 +471,11 @@ def rests(
 
     left = [one[None] for one in measured.residuals(arm)]
     spread = max(float(np.std(np.concatenate([one[0] for one in left]))), 1e-7)
-    means = np.log(np.maximum(start.sd, least))
-    s = len(means)
     sensors = [(max(one, _SDS[0]), _SDS[1]) for one in least]
+    white = np.clip(measured.jitter(arm), *np.transpose(sensors))
+    s, means = len(white), np.log(np.maximum(noise.sd, least))
     for smoothness in (0.0, 1.5, 0.5):
-        begin, bounds = [max(start.walk, 0.1 * spread)], [*sensors, _WALKS]
+        begin, bounds = [0.1 * spread], [*sensors, _WALKS]
         if smoothness:
             begin, bounds = [0.01 * spread, 0.7 * spread, _TIME], [*bounds, _SDS, (quickest, _TIMES[1])]
 
@@ -474,6 +488,6 @@ def rests(
             found = 0.5 * (float(np.vdot(white, white)) + log_determinant + measured.count * _LOG_2PI)
             return found - (sum(map(log_belief, ((x[:s] - means) / prior).tolist())) if prior else 0.0)
 
-        at, options = np.append(means, np.log(begin)), {"ftol": 1e-3, "eps": 1e-4}
+        at, options = np.log([*white, *begin]), {"ftol": 1e-3, "eps": 1e-4}
         found = minimize(cost, at, method="SLSQP", bounds=np.log(bounds), options=options)
         yield rest_of(found.x), -found.fun
