@@ -24,6 +24,7 @@ from pumafuse.arrays import FloatArray
 from pumafuse.discovery import names
 from pumafuse.discovery.contents import parts_of
 from pumafuse.discovery.drafts import drafts
+from pumafuse.discovery.guesses import guess
 from pumafuse.discovery.questions import questions
 from pumafuse.discovery.survey import Survey, survey
 from pumafuse.errors import RunError
@@ -60,10 +61,15 @@ def recorded_at_once() -> tuple[FloatArray, FloatArray, FloatArray]:
     return t, u, path(t - LAG) + z - path(s - LAG)
 
 
+def asked(found: Survey) -> list[str]:
+    """What the user has to decide."""
+    return list(questions(found, guess(found)[1]))
+
+
 def written(found: Survey, folder: Path) -> tuple[pf.Run, pf.FusionConfig]:
     """The three files, as the loaders take them."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in drafts(found, folder).items():
+    for name, text in drafts(found, *guess(found), folder).items():
         (folder / name).write_text(text)
     return pf.Run.read(folder), pf.FusionConfig.load(folder / "fusion.toml")
 
@@ -297,7 +303,7 @@ def test_commands_that_are_samples_of_a_path(tmp_path: Path) -> None:
             assert not found.interpolation
             continue
         assert found.interpolation == 0.01
-        assert "(interpolation_ms in run.toml)" in "\n".join(questions(found))
+        assert "(interpolation_ms in run.toml)" in "\n".join(asked(found))
         run, config = written(found, tmp_path / "out")
         assert config.arm.update_period == pytest.approx(0.01)
         text = (tmp_path / "out" / "run.toml").read_text()
@@ -358,7 +364,7 @@ def test_units_without_a_name_are_those_in_which_both_move_alike(unit: str, tmp_
     write(log / "commands.csv", {"time_s": t, **{f"{axis}_m": u[:, n] for n, axis in enumerate("xyz")}})
     write(log / "camera.csv", {"time_s": s, **{f"{axis}{unit}": scale * z[:, n] for n, axis in enumerate("xyz")}})
     found = check_fuses(log, tmp_path / "out")
-    assert any("No name says it" in one for one in questions(found)) is (unit == "")
+    assert any("No name says it" in one for one in asked(found)) is (unit == "")
 
 
 def test_one_table_with_everything_needs_no_names(tmp_path: Path) -> None:
@@ -463,7 +469,7 @@ def test_a_clock_of_its_own_is_said(tmp_path: Path) -> None:
     with pytest.raises(pf.PumafuseError, match=r"take1: its stamps \(0\.\d+ to .* are not of the commands' time"):
         survey(log)
     (log / "take1.csv").rename(log / "camera.csv")
-    assert any("camera: its stamps (0." in one for one in questions(survey(log)))
+    assert any("camera: its stamps (0." in one for one in asked(survey(log)))
 
 
 def test_two_cameras_of_one_table_are_two_sensors(tmp_path: Path) -> None:
@@ -706,7 +712,7 @@ def test_doubts_are_said_with_their_numbers(tmp_path: Path) -> None:
     write(log / "laser.csv", {"time_s": s, "x_m": 1e3 * z[:, 0]})
     write(log / "encoder.csv", {"time_s": s + 1e6, "x_m": z[:, 0]})
     found = survey(log)
-    said = "\n".join(questions(found))
+    said = "\n".join(asked(found))
     assert "camera does not follow the commands on x (correlation" in said
     assert "laser moves 1e+03 times as far as commanded on x: is its unit right?" in said
     assert (
@@ -766,7 +772,8 @@ def test_a_damaged_table_is_surveyed_or_refused_in_a_line(seed: int, tmp_path_fa
         content[place] = draw.integers(256)
     file.write_bytes(content[: len(content) if seed % 3 else draw.integers(len(content))])
     try:
-        drafts(survey(file), folder / "out")
+        found = survey(file)
+        drafts(found, *guess(found), folder / "out")
     except pf.PumafuseError as error:
         assert len(str(error).splitlines()) == 1
 

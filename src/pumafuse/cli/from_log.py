@@ -10,6 +10,7 @@ from pathlib import Path
 import typer
 
 from ..discovery.drafts import drafts
+from ..discovery.guesses import guess
 from ..discovery.survey import survey
 from ..fusion import results
 from ..fusion.config import FusionConfig
@@ -49,11 +50,12 @@ def run(
     """
     results.check_writable(output, force, with_run=True)
     found = survey(log)
-    texts, here = drafts(found, output), Path()
+    arm, begins = guess(found)
+    texts, here = drafts(found, arm, begins, output), Path()
     begun = FusionConfig.parse(texts["fusion.toml"], ArmModel.parse(texts["arm.toml"]))
     begun.sensor_names(sensors)  # before anything is fitted
-    recorded = described(drafts(found, here)["run.toml"], here).between(*part)
-    init.show(found)
+    recorded = described(drafts(found, arm, begins, here)["run.toml"], here).between(*part)
+    init.show(found, begins)
     with fitting() as progress:
         fitted = tune(recorded, begun, fit=_FITTED, progress=progress)
     est = fuse(recorded, fitted.config, sensors=sensors, rate=rate, mode=mode, engine=engine)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from rich.table import Table
 
 from ..discovery.contents import Part, Signal, rate_of
 from ..discovery.drafts import BASES, FILES, drafts
+from ..discovery.guesses import SensorGuess, guess
 from ..discovery.questions import questions
 from ..discovery.roles import Stream
 from ..discovery.survey import Survey, survey
@@ -40,9 +41,10 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     there = [name for name in FILES if (folder / name).exists()]
     if there and not force:
         raise ConfigError(f"{folder}: has {there[0]} already; --force replaces it, or choose another folder")
-    for name, text in drafts(found, folder).items():
+    arm, sensors = guess(found)
+    for name, text in drafts(found, arm, sensors, folder).items():
         write_file(folder / name, text, replace=force)
-    show(found)
+    show(found, sensors)
     place = shlex.quote(str(folder))
     typer.echo(f"written to {folder}: {', '.join(FILES)}; what to decide is in their comments, too\nnext:")
     tuned, fused = f"{place}/tuned", f"{place}/fused"
@@ -51,10 +53,10 @@ def run(log: Path, output: Path | None, rate: float, force: bool) -> None:
     typer.echo(f"  pumafuse fuse {place} -c {tuned}/fusion.toml -o {fused} --rrd --figures")
 
 
-def show(found: Survey) -> None:
+def show(found: Survey, sensors: Mapping[str, SensorGuess]) -> None:
     """Print what was found, and what the user has to decide."""
     print_tables(_tables(found))
-    for number, question in enumerate(questions(found), 1):
+    for number, question in enumerate(questions(found, sensors), 1):
         typer.echo(f"{number}. {question}" if number > 1 else f"To decide:\n1. {question}")
 
 

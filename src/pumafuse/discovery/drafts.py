@@ -14,7 +14,7 @@ from ..errors import printable
 from ..logs.columns import leaf
 from ..units import MS, SCREEN, ending
 from .contents import Signal
-from .guesses import ArmGuess, SensorGuess, guess
+from .guesses import ArmGuess, SensorGuess
 from .roles import Stream
 from .survey import Survey
 
@@ -23,14 +23,15 @@ BASES = {"name": "by name", "type": "by type of message", "turn": "by its turn",
 _COMMENT = 48  # column at which comments begin
 
 
-def drafts(found: Survey, folder: Path) -> dict[str, str]:
+def drafts(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess], folder: Path) -> dict[str, str]:
     """The three files by name.
 
     Args:
         found: What was found in the log.
+        arm: To begin with, from :func:`.guesses.guess`.
+        sensors: Likewise.
         folder: Where they will be: files of the log are named from there.
     """
-    arm, sensors = guess(found)
     return {
         "run.toml": _run_toml(found, folder),
         "arm.toml": _arm_toml(found, arm),

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from ..logs.run import Run
 from ..units import Kind
 from .contents import period_of
 from .following import Following, isolated
-from .sensors import REFERENCE, aligned, noise
+from .sensors import REFERENCE, Alignment, aligned, noise
 from .survey import Survey
 
 _FOLLOWS = 0.5  # correlation of changes below which a lag means nothing
@@ -67,7 +68,7 @@ class ArmGuess:
 class SensorGuess:
     """A sensor: noise and biases by axis [m or rad], latency [s] and where it is from, scale, gate (0: none needed).
 
-    ``turns``: whether it measures angles within a turn.
+    ``turns``: whether it measures angles within a turn. ``doubts``: what one latency does not say, in sentences.
     """
 
     sd: Mapping[str, float]
@@ -77,6 +78,14 @@ class SensorGuess:
     scale: float
     gate: float
     turns: bool
+    doubts: Sequence[str]
+
+
+class _Pair(NamedTuple):
+    """A sensor beside another one."""
+
+    other: str
+    alignment: Alignment
 
 
 def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
@@ -90,7 +99,7 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
     if math.isnan(period):
         raise RunError(f"{found.log}: fewer than two commands with stamps of their own")
     relations = {key: one for key, one in found.relations.items() if abs(one.correlation) >= _FOLLOWS}
-    first, latencies, noises = _against_each_other(found.run, relations)
+    first, latencies, pairs = _against_each_other(found.run, relations)
     leads = {
         axis: {name: relations[name, axis] for name in run.sensors if (name, axis) in relations} for axis in run.axes
     }
@@ -103,14 +112,14 @@ def guess(found: Survey) -> tuple[ArmGuess, dict[str, SensorGuess]]:
     shortest = max(min(lags.values(), default=_UNKNOWN_LAG), 0.0)
     delay = _DELAY_SHARE * shortest
     axes = {axis: _axis(found, axis, leads[axis], lags.get(axis, _UNKNOWN_LAG), delay) for axis in run.axes}
-    sensors = {name: _sensor(found, name, latencies, first, leads, noises.get(name, {})) for name in run.sensors}
+    sensors = {name: _sensor(found, name, latencies, first, leads, pairs.get(name)) for name in run.sensors}
     return ArmGuess(period, delay, axes), sensors
 
 
 def _against_each_other(
     run: Run, relations: Mapping[tuple[str, str], Following]
-) -> tuple[str, dict[str, float], dict[str, Mapping[str, float]]]:
-    """The source that is earliest, the reference if there is one; how much later each is [s]; noise by axis [m or rad].
+) -> tuple[str, dict[str, float], dict[str, _Pair]]:
+    """The source that is earliest, the reference if there is one; how much later each is [s]; each beside the densest.
 
     Without sensors that have no motion in common with the one that has the most rows.
     """
@@ -120,13 +129,14 @@ def _against_each_other(
     if not lags:
         return "", {}, {}
     base = REFERENCE if REFERENCE in lags else max(lags, key=lambda name: len(run.sensors[name].stamp))
-    pairs = {name: aligned([run], base, name) for name in lags if name != base}
-    later = {base: 0.0, **{name: one.latency for name, one in pairs.items() if one is not None}}
+    every = {name: aligned([run], base, name) for name in lags if name != base}
+    pairs = {name: _Pair(base, one) for name, one in every.items() if one is not None}
+    later = {base: 0.0, **{name: pair.alignment.latency for name, pair in pairs.items()}}
     first = base if base == REFERENCE else min(later, key=later.__getitem__)
     ahead = float(np.median(lags[first]))
     ahead = ahead if ahead < -_AHEAD else 0.0
     latencies = {name: ahead + max(late - later[first], 0.0) for name, late in later.items()}
-    return first, latencies, {name: one.sd for name, one in pairs.items() if one is not None}
+    return first, latencies, pairs
 
 
 def _axis(found: Survey, axis: str, followers: Mapping[str, Following], lag: float, delay: float) -> AxisGuess:
@@ -155,8 +165,9 @@ def _sensor(
     latencies: Mapping[str, float],
     first: str,
     leads: Mapping[str, Mapping[str, Following]],
-    noises: Mapping[str, float],
+    pair: _Pair | None,
 ) -> SensorGuess:
+    noises = {} if pair is None else pair.alignment.sd
     relations = {axis: found.relations.get((name, axis)) for axis in found.run.sensors[name].values}
     known = {axis: one for axis, one in relations.items() if one is not None}
     mirrored = [one.slope < 0.0 for one in known.values() if abs(one.correlation) >= _FOLLOWS]
@@ -171,7 +182,8 @@ def _sensor(
         words = f"so much later than {first}; add how old a measurement of that one is"
     turns = found.roles is not None and any(one.turns for one in found.roles.sensors if one.name == name)
     gate = _GATE if any(map(_has_outliers, found.run.sensors[name].values.values())) else 0.0
-    return SensorGuess(sd, bias, latencies.get(name, 0.0), words, scale, gate, turns)
+    doubts = [] if pair is None else list(pair.alignment.doubts(name, pair.other))
+    return SensorGuess(sd, bias, latencies.get(name, 0.0), words, scale, gate, turns, doubts)
 
 
 def _noise(found: Survey, name: str, axis: str, one: Following, beside: float) -> float:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from ..errors import printable
 from ..units import MS
+from .guesses import SensorGuess
 from .roles import another_clock
 from .survey import Survey
 
@@ -13,7 +14,7 @@ _FOLLOWS = 0.5  # correlation of changes
 _OTHER_UNIT = 3.0  # factor by which a sensor may move less or more than its command
 
 
-def questions(found: Survey) -> Iterator[str]:
+def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str]:
     """Sentences, the gravest first."""
     run = found.run
     lags: list[float] = []
@@ -33,6 +34,8 @@ def questions(found: Survey) -> Iterator[str]:
             elif one.lag < 0.0:
                 yield f"{name} runs {-one.lag * MS:.0f} ms ahead of the commands on {axis}: is its clock another one?"
             lags.append(one.lag)
+    for one in sensors.values():
+        yield from one.doubts
     if found.interpolation:
         yield (
             "are the commands samples of a path that the controller interpolates, or is a clock off? What measures"

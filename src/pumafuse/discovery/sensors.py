@@ -9,7 +9,7 @@ errors that last, and those of the path itself, are in it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -17,6 +17,7 @@ import numpy as np
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..logs.run import Run, Source
+from ..units import MS
 from .following import following, isolated, known
 from .paths import Path, Residue, Shrunk, clipped_rms, interpolated, path, residue, robust_sd, shrunk
 
@@ -86,6 +87,31 @@ class Alignment:
     def half(self) -> float:
         """Half of the interval [s]."""
         return 0.5 * (self.latency_ci95[1] - self.latency_ci95[0])
+
+    def doubts(self, name: str, other: str) -> Iterator[str]:
+        """What one latency of this sensor does not say, beside that other one: steps, a drift, jitter, a scale."""
+        rises = {step.after > step.before for step in self.steps}
+        if len(self.steps) > 1 and len(rises) == 1:
+            first, last = self.steps[0], self.steps[-1]
+            yield (
+                f"the latency of {name} drifts from {first.before * MS:.0f} to {last.after * MS:.0f} ms: its clock runs"
+                f" {'slower' if last.after < first.before else 'faster'} than that of {other}"
+            )
+        else:
+            for step in self.steps:
+                yield (
+                    f"the latency of {name} steps from {step.before * MS:.0f} to {step.after * MS:.0f} ms"
+                    f" {step.time:.1f} s after the first command: use parts, --from and --to"
+                )
+        if self.latency_sd:
+            bunched = "; its rows arrive in bunches" if self.bunched else ""
+            yield (
+                f"the latency of {name} scatters by {self.latency_sd * MS:.1f} ms from row to row{bunched}: write"
+                f" latency_sd_ms = {self.latency_sd * MS:.2g}, or stamp rows when they are measured"
+            )
+        if abs(self.scale) != 1.0 and self.scale_ci95 is not None:
+            low, high = self.scale_ci95
+            yield f"{name} moves {self.scale:.4g} ({low:.4g} to {high:.4g}) times as far as {other}: its scale"
 
 
 def aligned(runs: Sequence[Run], first: str, second: str) -> Alignment | None:
@@ -219,7 +245,7 @@ def _clean(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, FloatArray]:
 
 
 def _thinned(time: FloatArray, value: FloatArray) -> tuple[FloatArray, FloatArray]:
-    every = -(-len(time) // _MOST)
+    every = max(-(-len(time) // _MOST), 1)
     return time[::every], value[::every]
 
 

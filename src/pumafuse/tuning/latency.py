@@ -51,7 +51,6 @@ _SAMPLED = (
     " a path that the controller interpolates, write interpolation_ms = {:g} below [command] in run.toml"
 )
 _AHEAD_OF = "{}: what measures is {:.0f} ms ahead of the commands, and the lag is wrong: are both stamped by one clock?"
-_STEPS = "the latency of {} steps from {:.0f} to {:.0f} ms {:.1f} s after the first command: use parts, --from and --to"
 _APART = "{}: sees no motion that {} sees: its latency is not known"
 _FINEST = 2e-5  # s: no stamp of a log is better, whatever the likelihood says where measurements pass commands
 _ROUGHLY = 0.1  # tolerance in log-likelihood
@@ -513,7 +512,7 @@ def _sensors(
             notes += [] if name == trusted else [_APART.format(name, trusted)]
             continue
         found[name] = _sensor_lag(one)
-        notes += _sensor_notes(name, one, trusted)
+        notes += one.doubts(name, trusted)
         sd = sensor.sd if isinstance(sensor.sd, dict) else {}
         better = msgspec.structs.replace(
             sensor,
@@ -535,30 +534,6 @@ def _sensor_lag(one: Alignment) -> SensorLag:
         scale_ci95=one.scale_ci95,
         steps=[LatencyStep(time=step.time, before=step.before, after=step.after) for step in one.steps],
     )
-
-
-def _sensor_notes(name: str, one: Alignment, trusted: str) -> list[str]:
-    """What one latency does not say: steps, a drift, jitter, a scale."""
-    notes: list[str] = []
-    rises = {step.after > step.before for step in one.steps}
-    if len(one.steps) > 1 and len(rises) == 1:
-        first, last = one.steps[0], one.steps[-1]
-        notes.append(
-            f"the latency of {name} drifts from {first.before * MS:.0f} to {last.after * MS:.0f} ms: its clock runs"
-            f" {'slower' if last.after < first.before else 'faster'} than that of {trusted}"
-        )
-    else:
-        notes += [_STEPS.format(name, step.before * MS, step.after * MS, step.time) for step in one.steps]
-    if one.latency_sd:
-        bunched = "; its rows arrive in bunches" if one.bunched else ""
-        notes.append(
-            f"the latency of {name} scatters by {one.latency_sd * MS:.1f} ms from row to row{bunched}: write"
-            f" latency_sd_ms = {one.latency_sd * MS:.2g}, or stamp rows when they are measured"
-        )
-    if abs(one.scale) != 1.0 and one.scale_ci95 is not None:
-        low, high = one.scale_ci95
-        notes.append(f"{name} moves {one.scale:.4g} ({low:.4g} to {high:.4g}) times as far as {trusted}: its scale")
-    return notes
 
 
 # ---- the lag over the run -------------------------------------------------------------------------------------------
