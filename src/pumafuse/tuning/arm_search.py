@@ -19,7 +19,8 @@ from .arms import Arm, Coordinates, Fit, Limits, Measured, Rest, longest_delay, 
 from .plain import COMMANDS, LAGS, ROWS, delays, plain_arm
 from .posterior import GAINS, SHORTEST, AxisPosterior, Branch, Entry, GainKind, Model, Quantity
 
-BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": (0.02, 0.5), "gain": (0.7, 1.3)}  # recovery [s]
+# Recovery in s. A gain beyond these is a wrong unit.
+BOUNDS = {"lag": (5e-4, 4.0), "damping": (0.2, 8.0), "recovery": (0.02, 0.5), "gain": (0.3, 3.0)}
 # A gain is 1 within a tenth. What is sold as an axis neither rings for ever nor has two lags far apart.
 # 95 % of what is believed of a recovery lies within its bounds.
 PRIORS = {

@@ -424,8 +424,8 @@ def _notes(one: AxisLag) -> list[str]:
         found.append("the motion is too poor for the gain; record motion over more of the range")
     if one.gain in BOUNDS["gain"]:
         found.append(
-            f"the gain lies at the end of what is believed, {one.gain:g}: the arm is of a higher order than these"
-            " models; the lag holds, the gain and its recovery mean little"
+            f"the gain lies at the end of what is believed, {one.gain:g}: the axis moves otherwise than these models"
+            " do, and its lag and gain mean little"
         )
     return found
 
