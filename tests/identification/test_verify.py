@@ -139,6 +139,15 @@ def test_the_numbers_are_what_their_names_say() -> None:
     assert best.fit.fit == pytest.approx(100.0 * (1.0 - np.std(left) / np.std(measured)), rel=1e-6)
 
 
+def test_the_best_of_arms_whose_gain_recovers_is_one_of_them() -> None:
+    """Its own numbers make its error, also where a sensor's scale is wrong: no such arm stops beside its commands."""
+    measured = LOW + 1.05 * (moved(arm(recovery=0.1)) - LOW) + noise()
+    best = only(run_of(measured), arm(recovery=0.1), {"tip": LOW}).best_in_class
+    left = measured - moved(arm(best.plant, pf.Gain(intercept=best.gain), best.delay, 0.1))
+    assert best.fit.rms == pytest.approx(np.std(left), rel=1e-6)
+    assert best.fit.rms > 1.5 * NOISE
+
+
 def test_one_mm_and_one_degree_are_verified_alike() -> None:
     """Every number of a run relabelled from mm to degrees, in the units of its keys; lags and gains are the same."""
     to_angle, encoded = np.deg2rad(1.0) / 1e-3, msgspec.json.Encoder(decimal_format="number").encode
