@@ -22,9 +22,10 @@ from ..fusion.segments import build
 from ..logs.axes import in_axes
 from ..logs.clock import segments
 from ..logs.run import Run
-from ..model.arm import ArmModel, AxisModel
+from ..model.arm import ArmModel
+from ..tuning.arms import Arm, Measured, Recording
 from ..units import Kind
-from .best_in_class import BestInClass, Commands, Measured, ModelFit, best_in_class
+from .best_in_class import BestInClass, ModelFit, best_in_class, model_fit, speeds
 
 RECOVERY = 0.1  # s, of an arm that states none: the presets' compromise
 REFERENCE = "reference"
@@ -32,6 +33,7 @@ _FEWEST = 20  # measurements
 _MOST_LEVELS = 8  # of a run whose start level is searched among them
 _AS_GOOD, _FAR = 1.2, 3.0  # times the error of the best in class
 _FARTHEST, _SLOWEST = 1e6, 1e4  # m or rad, from the start level; s
+_SPIKE = 8.0  # robust standard deviations
 _HOLDS = 50.0  # % fit
 _BETTER = 0.8  # share of the error below which a recovery is recommended
 
@@ -138,18 +140,21 @@ def verify(
 
 def _part(run: Run, config: FusionConfig, jumps: Sequence[str]) -> list[tuple[AxisVerification, Trace]]:
     """Every axis and source of one segment of a run."""
-    segment = build(run, config)
+    segment, arm = build(run, config), config.arm
     rows, found = segment.measurement_rows, list[tuple[AxisVerification, Trace]]()
     for number, axis in enumerate(segment.axes):
-        command = Commands(*segment.given(axis), config.arm.update_period)
+        given, command = segment.given(axis)
+        first = segment.start[axis]
         for index, source in enumerate(segment.sensors):
-            here = (rows.source == index) & (rows.known[:, number] == Outcome.FUSED)
-            if np.count_nonzero(here) >= _FEWEST and command.amplitude > 0.0:
-                measured = Measured(run.name, source, rows.time[here], rows.value[here, number])
-                notes = [*jumps, *segment.notes] if not found else []
-                counts = dict(segment.command_counts), _used(segment.counts[source])
-                first = segment.start[axis]
-                found.append(_verified(measured, axis, command, first, config.arm, axis in run.start, counts, notes))
+            here = np.flatnonzero((rows.source == index) & (rows.known[:, number] == Outcome.FUSED))
+            if len(here) < _FEWEST or not np.ptp(command) > 0.0:
+                continue
+            time, value = rows.time[here], rows.value[here, number] - first
+            recording = Recording(given, command, first, time, value, np.zeros_like(time), np.ones(len(time)))
+            measured = Measured([recording], arm.update_period, [source])
+            notes = [*jumps, *segment.notes] if not found else []
+            counts = dict(segment.command_counts), _used(segment.counts[source])
+            found.append(_verified(measured, run, axis, arm, counts, notes))
     return found
 
 
@@ -172,52 +177,45 @@ def _with_sources(run: Run, sensors: Sequence[str] | None) -> Run:
 
 def _verified(
     measured: Measured,
+    run: Run,
     axis: str,
-    command: Commands,
-    first: float,
     arm: ArmModel,
-    given: bool,
     counts: tuple[dict[str, int], dict[str, int]],
     notes: list[str],
 ) -> tuple[AxisVerification, Trace]:
-    model, delay = arm.axes[axis], arm.delay_of(axis)
-    recovery = RECOVERY if model.gain_recovery is None else model.gain_recovery
-    farthest = np.abs(command.moved(model, delay, first, measured.time)).max()
-    if not (abs(first) + farthest <= _FARTHEST and model.plant.lag <= _SLOWEST):  # also where it is not a number
+    model, own = arm.axes[axis], Arm.of(arm.axes[axis], arm.delay_of(axis))
+    recovery = own.recovery or RECOVERY
+    farthest = abs(measured.recordings[0].start) + np.abs(measured.responses(own)[0]).max()
+    if not (farthest <= _FARTHEST and own.lag <= _SLOWEST):  # also where it is not a number
         raise ConfigError(f"axis '{axis}': a start level, gain or plant of no size that an arm has")
-    start, start_from = _start(measured, command, first, model, delay, given)
-    count = len(measured.time)
-    measured = measured.without_spikes(command.moved(model, delay, start, measured.time))
-    modelled = command.moved(model, delay, start, measured.time)
-
-    def fitted(gain_recovery: float | None) -> ModelFit:
-        other = msgspec.structs.replace(model, gain_recovery=gain_recovery)
-        return measured.fit(command.moved(other, delay, start, measured.time), command.amplitude)
-
-    as_it_is, recovering = fitted(model.gain_recovery), fitted(recovery)
-    best = best_in_class(measured, command, model, delay, start)
-    lag = model.lag(delay, float(command.speeds.mean()))
+    measured, start_from = _started(measured, own, axis in run.start)
+    count = len(measured.recordings[0].time)
+    measured = _without_spikes(measured, own)
+    (recording,), (modelled,) = measured.recordings, measured.responses(own)
+    as_it_is, recovering = model_fit(measured, own), model_fit(measured, own._replace(recovery=recovery))
+    best = best_in_class(measured, own)
+    lag = model.lag(own.delay, float(speeds(measured).mean()))
     trace = Trace(
-        units.seconds(measured.time, int(command.time[0])),
-        measured.position - measured.position.mean(),
+        units.seconds(recording.time, int(recording.given[0])),
+        recording.value - recording.value.mean(),
         modelled - modelled.mean(),
     )
     verification = AxisVerification(
-        run=measured.run,
+        run=run.name,
         axis=axis,
         kind=model.kind,
-        source=measured.source,
+        source=measured.sensors[0],
         lag=lag,
-        measurements=len(measured.time),
-        amplitude=command.amplitude,
-        start=start,
+        measurements=len(recording.time),
+        amplitude=float(np.ptp(recording.command)),
+        start=recording.start,
         start_from=start_from,
         model=as_it_is,
-        without_recovery=fitted(None),
+        without_recovery=model_fit(measured, own._replace(recovery=0.0)),
         with_recovery=recovering,
         recovery=recovery,
         best_in_class=best,
-        outlying=count - len(measured.time),
+        outlying=count - len(recording.time),
         commands=counts[0],
         rows=counts[1],
         holds=as_it_is.fit >= _HOLDS,
@@ -227,15 +225,33 @@ def _verified(
     return verification, trace
 
 
-def _start(
-    measured: Measured, command: Commands, first: float, model: AxisModel, delay: float, given: bool
-) -> tuple[float, str]:
-    """Level before the first command [m or rad], and where it comes from."""
-    levels = np.unique(command.value)
+def _started(measured: Measured, own: Arm, given: bool) -> tuple[Measured, str]:
+    """The run from its level before the first command, and where that comes from."""
+    (one,) = measured.recordings
+    levels = np.unique(one.command)
     if given or len(levels) > _MOST_LEVELS:
-        return first, "given" if given else "the first command"
-    rms = [np.std(measured.position - command.moved(model, delay, level, measured.time)) for level in levels.tolist()]
-    return float(levels[np.argmin(rms)]), f"chosen among the run's {len(levels)} levels by RMS"
+        return measured, "given" if given else "the first command"
+    tried = [
+        Measured([one._replace(start=level, value=one.value + one.start - level)], measured.period, measured.sensors)
+        for level in levels.tolist()
+    ]
+    best = min(tried, key=lambda other: float(np.std(other.left(own))))
+    return best, f"chosen among the run's {len(levels)} levels by RMS"
+
+
+def _without_spikes(measured: Measured, own: Arm) -> Measured:
+    """The run without measurements that jump away from their neighbours, whatever the model.
+
+    A model that is wrong for a while must not be spared: only eight robust standard deviations from the running
+    median of five count.
+    """
+    from scipy.ndimage import median_filter
+    from scipy.stats import median_abs_deviation
+
+    (residual,) = measured.residuals(own)
+    jump = residual - median_filter(residual, size=5, mode="nearest")
+    kept = np.abs(jump) <= _SPIKE * max(float(median_abs_deviation(residual, scale="normal")), 1e-9)
+    return Measured([measured.recordings[0].of(kept)], measured.period, measured.sensors)
 
 
 def _verdict(model: ModelFit, lag: float, best: BestInClass) -> str:

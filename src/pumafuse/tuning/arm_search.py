@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import FloatArray
-from .arms import Arm, Coordinates, Fit, Limits, Measured, Rest, longest_delay, rests
+from ..arrays import BoolArray, FloatArray
+from .arms import Arm, Coordinates, Fit, Limits, Measured, Rest, covariance, longest_delay, rests
 from .plain import COMMANDS, LAGS, ROWS, delays, plain_arm
 from .posterior import GAINS, SHORTEST, AxisPosterior, Branch, Entry, GainKind, Model, Quantity
 
@@ -54,6 +54,7 @@ _STEP = 0.7  # standard deviations, between dead times
 _LONGEST_STEP = 0.03  # s
 _MOST = 20  # steps away from a maximum
 _SLOWLY, _LONGER = 0.5, 1.5  # log-likelihood that a step loses: with less the next one is so many times as long
+_PIECES = 20  # of all recordings, that a model which is right has independent scores in
 _SLOPE = 1e-5  # of a coordinate, by which quantities are varied
 
 
@@ -152,16 +153,14 @@ class ArmSearch:
     def lag_scatter(self, model: Model, arm: Arm) -> float:
         """How much more the lag scatters over pieces of the runs than the information says, 1 or more (White, 1982)."""
         names = self._freedom.names(model)
-        low, high = self._limits.range(names)
-        at = np.array([arm.coordinate(name) for name in names])
-        free = [name for name, one in zip(names, (at > low + 1e-6) & (at < high - 1e-6), strict=True) if one]
+        free = [name for name, one in zip(names, self._limits.inside(arm, names), strict=True) if one]
         slope = np.array(
             [(arm.moved([name], [arm.coordinate(name) + _SLOPE]).total - arm.total) / _SLOPE for name in free]
         )
         if not slope.any():
             return 1.0
-        information, scatter = self._measured.scattered(arm, free, self.rest, self._limits)
-        cov = _covariance(information)
+        information, scatter = self._measured.scattered(arm, free, self.rest, self._limits, _PIECES)
+        cov = covariance(information)
         return max(1.0, math.sqrt(float(slope @ cov @ scatter @ cov @ slope) / float(slope @ cov @ slope)))
 
     # ---- maxima -----------------------------------------------------------------------------------------------------
@@ -296,13 +295,11 @@ class ArmSearch:
     def _evidence(self, model: Model, fit: Fit) -> float:
         """The log-density of a maximum with the penalty for the model's numbers, roughly."""
         names = self._freedom.names(model)
-        low, high = self._limits.range(names)
-        at = np.array([fit.arm.coordinate(name) for name in names])
-        bound = (at <= low + 1e-6) | (at >= high - 1e-6)
-        doubt = _DOUBT if any(one for one, name in zip(bound, names, strict=True) if name == "recovery") else 0.0
-        return self._laplace(fit, names, ~bound) - doubt
+        inside = self._limits.inside(fit.arm, names)
+        doubt = _DOUBT if "recovery" in names and not inside[names.index("recovery")] else 0.0
+        return self._laplace(fit, names, inside) - doubt
 
-    def _laplace(self, fit: Fit, names: Coordinates, inside: FloatArray) -> float:
+    def _laplace(self, fit: Fit, names: Coordinates, inside: BoolArray) -> float:
         """The log-density with the free numbers integrated out, each with its prior's constant."""
         log = fit.log_posterior
         free = [name for name, one in zip(names, inside, strict=True) if one]
@@ -328,7 +325,7 @@ class ArmSearch:
         names = self._freedom.names(model)
         if "delay" not in self._freedom.free:
             return Branch(model, [self._entry(peak, names)])
-        cov = _covariance(peak.information)
+        cov = covariance(peak.information)
         sd, slope = math.sqrt(cov[0, 0]), cov[1:, 0] / cov[0, 0]
         step = min(max(_STEP * sd, SHORTEST), _LONGEST_STEP)
         middle = self._at(peak.arm, names[1:])
@@ -364,11 +361,9 @@ class ArmSearch:
         return self._entry(self._measured.fitted(arm, names, self.rest, self._limits), names)
 
     def _entry(self, fit: Fit, names: Coordinates) -> Entry:
-        low, high = self._limits.range(names)
-        at = np.array([fit.arm.coordinate(name) for name in names])
-        inside = (at > low + 1e-6) & (at < high - 1e-6)
+        inside = self._limits.inside(fit.arm, names)
         free = [name for name, one in zip(names, inside, strict=True) if one]
-        cov = _covariance(fit.information[np.ix_(inside, inside)])
+        cov = covariance(fit.information[np.ix_(inside, inside)])
         means = _quantities(fit.arm)
         moved = [_quantities(fit.arm.moved([name], [fit.arm.coordinate(name) + _SLOPE])) for name in free]
         sds: dict[Quantity, float] = {}
@@ -376,13 +371,6 @@ class ArmSearch:
             slope = np.array([(one[quantity] - mean) / _SLOPE for one in moved])
             sds[quantity] = math.sqrt(max(float(slope @ cov @ slope), 0.0)) if free else 0.0
         return Entry(fit.arm.delay, fit.arm, self._laplace(fit, names, inside), means, sds)
-
-
-def _covariance(information: FloatArray) -> FloatArray:
-    """The covariance of coordinates; without information it is enormous."""
-    size = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
-    values, vectors = np.linalg.eigh(information * np.outer(size, size))
-    return (vectors / np.maximum(values, 1e-12)) @ vectors.T * np.outer(size, size)
 
 
 def _quantities(arm: Arm) -> dict[Quantity, float]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray, TimeArray
+from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
 from ..filter.core import Record, at, library
 from ..filter.response import record_of
 from ..model.arm import AxisModel, Gain
@@ -29,7 +29,6 @@ _LATEST, _PERIODS = 0.6, 5.0  # s, or update periods: the longest dead time
 _FAR = 30.0  # times all that is measured: where an offset may begin
 _WALKS, _SDS = (1e-8, 10.0), (1e-8, 10.0)  # m/√s, m: bounds
 _TIME, _TIMES = 0.3, (1e-3, 1e3)  # s, of a disturbance: start, bounds
-_PIECES = 20  # of all recordings, that a model which is right has independent scores in
 _SHARE, _SMALLEST = 0.98, 1e-7  # of the measurements that least squares are of; the rest may be outliers; m
 _BEND = 0.6745 * math.sqrt(6.0)  # median of a second difference of white noise, in its standard deviations
 _FEW = 3  # outliers in a row
@@ -38,7 +37,8 @@ _SETTLED = 2.6  # s, after which an arm has forgotten earlier commands
 _CLOSE = 0.01  # log-likelihood: what is expected to gain less is no step
 _STEPS = 12  # of Gauss and Newton, at most
 _SHIFT, _LOG_SHIFT = 1e-4, 1e-3  # s, 1: by which responses are varied; delays are coarser than a nanosecond's rounding
-_REACH = {"delay": 0.03, "lag": 0.7, "damping": 0.7, "recovery": 0.7, "gain": 1.0}  # longest step of each coordinate
+# longest step of each coordinate; a slope is linear, and its unit is of any size
+_REACH = {"delay": 0.03, "lag": 0.7, "damping": 0.7, "recovery": 0.7, "gain": 1.0, "slope": math.inf}
 _DAMPINGS = (0.0, 1e-2, 1.0, 1e2, 1e4)  # of a step that fails, one after the other
 _LOG_2PI = math.log(2.0 * math.pi)
 
@@ -158,6 +158,12 @@ class Limits(NamedTuple):
         """Lower and upper bounds of coordinates, (2, k)."""
         logs = [[math.log(end) if name in LOGARITHMIC else end for end in self.bounds[name]] for name in names]
         return np.array(logs, dtype=np.float64).reshape(-1, 2).T
+
+    def inside(self, arm: Arm, names: Coordinates) -> BoolArray:
+        """Which coordinates of an arm are not at a bound, (k,)."""
+        low, high = self.range(names)
+        at = np.array([arm.coordinate(name) for name in names])
+        return (at > low + 1e-6) & (at < high - 1e-6)
 
     def log_prior(self, arm: Arm, names: Coordinates) -> float:
         """Logarithm of the prior density, but for a constant."""
@@ -345,10 +351,12 @@ class Measured:
                 break
         return Fit(best.arm, best.log_posterior, best.information)
 
-    def scattered(self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits) -> tuple[FloatArray, FloatArray]:
+    def scattered(
+        self, arm: Arm, names: Coordinates, rest: Rest, limits: Limits, pieces: int
+    ) -> tuple[FloatArray, FloatArray]:
         """The information of coordinates, and what it is by the scatter of the score over pieces of the recordings."""
         left, slopes, _ = self._sloped(arm, names, rest)
-        begins = np.unique(np.arange(_PIECES) * len(left) // _PIECES)
+        begins = np.unique(np.arange(pieces) * len(left) // pieces)
         scores = np.add.reduceat(slopes * left, begins, axis=1)
         return self._linear(arm, names, rest, limits).information, scores @ scores.T
 
@@ -385,8 +393,8 @@ class Measured:
         here, rows = self._response(one, arm), list[FloatArray]()
         for name in names:
             step = _LOG_SHIFT if name in LOGARITHMIC else _SHIFT
-            if name == "gain":
-                step = 1.0  # it is linear
+            if name in ("gain", "slope"):
+                step = 1.0  # they are linear
             there = arm.moved([name], [arm.coordinate(name) + step])
             rows.append((self._response(one, there) - here) / step)
         return np.array([here, *rows])
@@ -432,6 +440,13 @@ def _liveliest(one: Recording, most: int) -> Recording:
     part = one.of((one.time >= since) & (one.time <= given[-1]))
     start = float(command[0])
     return part._replace(given=given, command=command, start=start, value=part.value + one.start - start)
+
+
+def covariance(information: FloatArray) -> FloatArray:
+    """The covariance of coordinates; without information it is enormous."""
+    size = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
+    values, vectors = np.linalg.eigh(information * np.outer(size, size))
+    return (vectors / np.maximum(values, 1e-12)) @ vectors.T * np.outer(size, size)
 
 
 class _Linear(NamedTuple):
