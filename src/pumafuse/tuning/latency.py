@@ -27,7 +27,7 @@ from ..model.arm import ArmModel, AxisModel
 from ..model.plants import FirstOrder
 from ..toml import Interval
 from ..units import MS
-from .arm_search import BOUNDS, ArmSearch, Freedom
+from .arm_search import BOUNDS, RECOVERING_GAIN, ArmSearch, Freedom
 from .arms import Arm, Rest
 from .identifiability import FEW, TuneError, excited_axes
 from .likelihood import Likelihood, in_threads
@@ -422,7 +422,7 @@ def _notes(one: AxisLag) -> list[str]:
         )
     if one.gain_ci95 is not None and one.gain_ci95[1] - one.gain_ci95[0] > _WIDE_GAIN:
         found.append("the motion is too poor for the gain; record motion over more of the range")
-    if one.gain in BOUNDS["gain"]:
+    if one.gain in (*BOUNDS["gain"], *RECOVERING_GAIN):
         found.append(
             f"the gain lies at the end of what is believed, {one.gain:g}: the axis moves otherwise than these models"
             " do, and its lag and gain mean little"
