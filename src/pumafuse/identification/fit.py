@@ -22,7 +22,7 @@ from ..model.plants import PLANTS, FirstOrder, SecondOrder
 from ..model.unit_response import unit_response
 from ..toml import Interval
 from ..tuning.arms import Arm, Limits, Measured, Recording
-from .batch import Batch, Order
+from .batch import Batch, Order, sensitivity
 from .estimate import t_quantile
 from .trials import Trial
 
@@ -213,7 +213,8 @@ def _fit(trial: Trial, found: FloatArray, order: Order) -> StepFit:
     design = np.stack((step * c, np.ones_like(c)), axis=1)
     gain, zero = np.linalg.lstsq(design, trial.position, rcond=None)[0].tolist()
     rms = float(np.sqrt(np.mean((trial.position - design @ [gain, zero]) ** 2)))
-    jacobian = np.column_stack((gain * step * sensitivity(time, shape, order), design))
+    changes = [gain * step * one[0] for one in sensitivity(time[None], found[None], order)]
+    jacobian = np.column_stack((*changes, design))
     fitted = [0, 1, 2, 3, 4] if order == 2 else [0, 1, 3, 4]
     freedom = max(len(time) - len(fitted), 1)
     covariance = np.zeros((5, 5))
@@ -224,17 +225,6 @@ def _fit(trial: Trial, found: FloatArray, order: Order) -> StepFit:
 def reached(time: FloatArray, shape: Shape) -> float:
     """Share of its final value that a response has reached with the last sample."""
     return float(unit_response(np.array(time[-1] - shape.delay), shape.q, shape.p))
-
-
-def sensitivity(time: FloatArray, shape: Shape, order: Order) -> FloatArray:
-    """∂c/∂(delay, q, p) by differences, (n, order + 1)."""
-    columns: list[FloatArray] = []
-    for place, size in enumerate((1e-5 * shape.q, 1e-5 * shape.q, 1e-5 * shape.q**2)[: order + 1]):
-        low, high = np.array(shape), np.array(shape)
-        low[place], high[place] = max(low[place] - size, 0.0), high[place] + size
-        responses = [unit_response(time - one[0], one[1], one[2]) for one in (low, high)]
-        columns.append((responses[1] - responses[0]) / (high[place] - low[place]))
-    return np.stack(columns, axis=1)
 
 
 def inverse(jacobian: FloatArray) -> FloatArray:
