@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from pumafuse import FirstOrder, SecondOrder
 from pumafuse.identification.fit import StepFit, fit_steps, flags
 from pumafuse.identification.trials import StepTrials, Trial
 from pumafuse.model.unit_response import unit_response
+from pumafuse.tuning.arms import Limits, Measured, Recording, Rest
+from pumafuse.tuning.plain import plain_arm
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 TIMES = np.arange(60) * 0.00563  # s, the paper's oscilloscope
@@ -127,6 +130,53 @@ def test_flags_name_what_spoils_a_trial() -> None:
     still = Trial("1", "radial", STEP, 0.28, {}, TIMES, 0.02e-3 * np.random.default_rng(1).standard_normal(60))
     assert flags(fit_step(still, 1))[0].startswith("hardly moved (stiction?)")
     assert flags(fit_step(trial(*SLOW, 0.01e-3), 1, 25)) == ["not settled: 84% reached"]
+
+
+def test_a_long_rest_that_is_sampled_slowly_changes_nothing() -> None:
+    """Beside a trial that is sampled evenly; the delays that are looked at are those between samples of the motion."""
+    even = trial(*SLOW)
+    rested = replace(
+        even, time=np.append(np.arange(-40.0, 0.0), TIMES), position=np.append(np.full(40, ZERO), even.position)
+    )
+    (first, _), (other, _) = fit_steps([rested, even])
+    np.testing.assert_allclose(first.shape, other.shape, rtol=0.0, atol=1e-6)
+
+
+# ---- the one search -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("order", "shape"), [(1, SLOW), (2, SWINGING)], ids=["first", "second"])
+def test_the_search_for_arms_finds_the_same_arm(order: int, shape: tuple[float, float], seed: int) -> None:
+    """A trial as a run that rests and steps: delay and lag to 2e-6 s, gain to 2e-6, and never a lower sum of squares.
+
+    Plain least squares from the arm that `tune` and `latency` begin with. Its derivatives are differences over 0.1 ms.
+    """
+    one = trial(*shape, 1e-5, seed)
+    fit, n = fit_step(one, order), len(TIMES)
+    run = Recording(
+        given=np.array([-(10**9), 0]),
+        command=np.array([0.0, one.step]),
+        start=0.0,
+        time=np.rint(one.time * 1e9).astype(np.int64),
+        value=one.position,
+        source=np.zeros(n, dtype=np.int64),
+        weight=np.ones(n),
+    )
+    measured = Measured([run], 0.028, ["camera"])
+    plain = plain_arm(measured)
+    assert plain is not None
+    names = ["delay", "lag", "gain"] if order == 1 else ["delay", "lag", "damping", "gain"]
+    limits = Limits({"delay": (0.0, 0.6), "lag": (1e-3, 2.0), "damping": (0.2, 8.0), "gain": (-np.inf, np.inf)}, {})
+    start, least = (
+        plain.arm._replace(damping=order - 1.0),
+        Rest(np.array([1e-7])),
+    )  # so little that it never stops early
+    found = measured.fitted(start, names, least, limits).arm
+    assert found.delay == pytest.approx(fit.shape.delay, abs=2e-6)
+    assert found.lag == pytest.approx(fit.shape.q, abs=2e-6)
+    assert found.gain == pytest.approx(fit.gain, rel=2e-6)
+    assert 1.0 - 1e-8 < measured.left(found) @ measured.left(found) / fit.squares < 1.0 + 1e-5
 
 
 # ---- recorded -------------------------------------------------------------------------------------------------------

@@ -141,15 +141,9 @@ def ordered(levels: set[str]) -> list[str]:
 
 def levels_of(values: FloatArray, cells: Sequence[str]) -> list[Level]:
     """Mean and scatter of (n,) values at each level named in ``cells`` (n,)."""
-    return [
-        Level(
-            level=level,
-            trials=len(group),
-            mean=float(group.mean()),
-            sd=float(group.std(ddof=1)) if len(group) > 1 else None,
-        )
-        for level, group in _groups(values, cells).items()
-    ]
+    groups = _groups(values, cells).items()
+    sds = {level: float(group.std(ddof=1)) if len(group) > 1 else None for level, group in groups}
+    return [Level(level=level, trials=len(one), mean=float(one.mean()), sd=sds[level]) for level, one in groups]
 
 
 def dependences(coefficients: Mapping[str, FloatArray], factors: Mapping[str, Sequence[str]]) -> list[Dependence]:
@@ -221,13 +215,12 @@ def performances(
         tolerance: RMS beyond which it is not called valid [m or rad].
         kind: What the axes are.
     """
-    screen = SCREEN[kind]
-    every = {factor: levels_of(rms * screen.scale, cells) for factor, cells in factors.items()}
-    limits = {factor: _limit(levels, tolerance * screen.scale, screen.unit) for factor, levels in every.items()}
-    return [
-        Performance(factor=factor, levels=every[factor], limit=limit, verdict=verdict)
-        for factor, (limit, verdict) in limits.items()
-    ]
+    screen, found = SCREEN[kind], list[Performance]()
+    for factor, cells in factors.items():
+        levels = levels_of(rms * screen.scale, cells)
+        limit, verdict = _limit(levels, tolerance * screen.scale, screen.unit)
+        found.append(Performance(factor=factor, levels=levels, limit=limit, verdict=verdict))
+    return found
 
 
 def _levels(cells: Sequence[str]) -> list[str]:

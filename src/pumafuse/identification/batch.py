@@ -99,10 +99,6 @@ class Batch:
         """Mean time between samples [s], (R,)."""
         return (self.span - self.time[:, 0]) / (self.count - 1.0)
 
-    def response(self, shape: FloatArray) -> FloatArray:
-        """The unit response of (delay, q, p) (R, 3) at every sample, (R, m)."""
-        return unit_response(self.time - shape[:, :1], shape[:, 1:2], shape[:, 2:])
-
     def project(self, values: FloatArray) -> FloatArray:
         """Weighted values (R, m) without what a free zero explains."""
         mean = np.sum(np.where(self.weight > 0.0, values, 0.0), axis=1) / self.count
@@ -110,23 +106,16 @@ class Batch:
 
     def point(self, shape: FloatArray) -> Point:
         """The response of (delay, q, p) (R, 3) with the best amplitude and zero in each row."""
-        c, z = self.project(self.response(shape)), self.project(self.position)
+        c, z = self.project(_response(self.time, shape)), self.project(self.position)
         amplitude = np.einsum("ij,ij->i", c, z) / _power(c)
         return Point(shape, z - amplitude[:, None] * c, c, amplitude)
 
     def slopes(self, at: Point, order: Order) -> tuple[FloatArray, FloatArray]:
-        """Derivatives by (delay, q, p) of the fitted response (k, R, m) and of its amplitude (k, R); order 1 without p.
-
-        The difference quotient of p is one-sided where p is 0.
-        """
-        q, p = at.shape[:, 1], at.shape[:, 2]
-        size = _REACH * q
-        ends = [(size, size), (size, size), (np.minimum(size * q, p), size * q)][: order + 1]
-        quotients: list[FloatArray] = []
-        for unit, (below, above) in zip(np.eye(3), ends, strict=False):
-            low, high = at.shape - below[:, None] * unit, at.shape + above[:, None] * unit
-            quotients.append((self.response(high) - self.response(low)) / (above + below)[:, None])
-        raw = np.stack([self.project(quotient) for quotient in quotients]) * at.amplitude[:, None]
+        """Derivatives by (delay, q, p) of the fitted response (k, R, m) and its amplitude (k, R); order 1 without p."""
+        raw = (
+            np.stack([self.project(change) for change in sensitivity(self.time, at.shape, order)])
+            * at.amplitude[:, None]
+        )
         share = np.einsum("kij,ij->ki", raw, at.unit) / _power(at.unit)
         return raw - share[:, :, None] * at.unit, -share
 
@@ -200,6 +189,25 @@ class Batch:
             if not len(rows):
                 break
         return found
+
+
+def sensitivity(time: FloatArray, shape: FloatArray, order: Order) -> list[FloatArray]:
+    """Derivatives of the unit response at ``time`` (R, m) by (delay, q, p) of ``shape`` (R, 3); order 1 without p.
+
+    The difference quotient of p is one-sided where p is 0.
+    """
+    q, p = shape[:, 1], shape[:, 2]
+    size, found = _REACH * q, list[FloatArray]()
+    ends = [(size, size), (size, size), (np.minimum(size * q, p), size * q)][: order + 1]
+    for unit, (below, above) in zip(np.eye(3), ends, strict=False):
+        low, high = _response(time, shape - below[:, None] * unit), _response(time, shape + above[:, None] * unit)
+        found.append((high - low) / (above + below)[:, None])
+    return found
+
+
+def _response(time: FloatArray, shape: FloatArray) -> FloatArray:
+    """The unit response of (delay, q, p) (R, 3) at ``time`` (R, m)."""
+    return unit_response(time - shape[:, :1], shape[:, 1:2], shape[:, 2:])
 
 
 def _grouped(values: FloatArray, size: int) -> FloatArray:

@@ -2,14 +2,16 @@
 
 c is the unit step response of 1/(p s² + q s + 1): q = 2ζ/ω (or τ) and p = 1/ω² stay finite where a response is of first
 order (p = 0); ω and ζ run off to infinity there. Gain and zero are linear and solved for inside (variable projection);
-delay, q and p are searched on a grid first, because a delay makes local minima.
+delay, q and p are looked for on a grid first, because a delay makes local minima: a trial is a short run, and cells are
+weighed as those of the search for arms are (:class:`pumafuse.tuning.arms.Measured`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
+from itertools import product
 from typing import NamedTuple
 
 import msgspec
@@ -19,15 +21,15 @@ from ..arrays import FloatArray
 from ..model.plants import PLANTS, FirstOrder, SecondOrder
 from ..model.unit_response import unit_response
 from ..toml import Interval
-from .batch import Batch, Order
+from ..tuning.arms import Arm, Limits, Measured, Recording
+from .batch import Batch, Order, sensitivity
 from .estimate import t_quantile
 from .trials import Trial
 
-_STARTS = 4  # cells of the grid to search from
-_RATIOS = (0.0, 0.08, 0.16, 0.25, 0.4, 0.8, 2.0)  # p/q² = 1/(4ζ²): ζ from ∞ to 0.35
-_LAGS = 14  # values of q on the grid
-_MOST_DELAYS, _MOST_SAMPLES = 200, 300  # on the grid
-_FINE = 8  # instants between samples at which the grid's responses are known
+_LAGS, _DAMPINGS = 10, (0.4, 0.8, 1.6)  # values of q, and of ζ, on the grid
+_MOST_DELAYS, _MOST_SAMPLES = 200, 300  # that are looked at there
+_STARTS = 4  # cells to search from
+ALIKE = 1e-9  # of the sum of squares: less between two minima is rounding
 _SETTLED = 0.98  # share of the final value that a settled response has reached at the end
 _FASTEST = 1e-3  # of 2ζ/ω, lower bound of 1/ω
 _MOVES = 0.5  # share of the usual gain below which an arm has hardly moved
@@ -139,8 +141,9 @@ def fit_steps(trials: Sequence[Trial]) -> list[tuple[StepFit, StepFit]]:
         First and second order of each trial. Second order never fits worse than first: that is its p = 0.
     """
     batch = Batch.of(trials, [1.0 / abs(trial.step) for trial in trials])
-    first = _search(batch, 1, [])
-    second = _search(batch, 2, [first])
+    starts = np.stack([_starts(trial) for trial in trials], axis=2)
+    first = _search(batch, 1, starts[0])
+    second = _search(batch, 2, np.concatenate((first[None], starts[1])))
     return [(_fit(trial, one, 1), _fit(trial, two, 2)) for trial, one, two in zip(trials, first, second, strict=True)]
 
 
@@ -167,49 +170,41 @@ def flags(fit: StepFit, usual: float = 1.0) -> list[str]:
     return found
 
 
-def _search(batch: Batch, order: Order, more: list[FloatArray]) -> FloatArray:
-    """The best shape of each row (R, 3), searched from the best cells of a grid and from ``more`` (R, 3) shapes."""
-    count = len(batch.time)
-    grid = np.stack([_starts(batch, row, order) for row in range(count)], axis=1)
-    starts = np.concatenate([grid, *(shape[None] for shape in more)])
-    found = batch.take(np.tile(np.arange(count), len(starts))).fit(starts.reshape(-1, 3), order)
-    shapes, cost = found.shape.reshape(starts.shape), found.cost.reshape(len(starts), count)
-    for shape in more:  # the search begins inside its bounds; a start on them may have been better
-        shapes, cost = np.concatenate((shapes, shape[None])), np.concatenate((cost, batch.point(shape).cost[None]))
-    return shapes[cost.argmin(axis=0), np.arange(count)]
+def _search(batch: Batch, order: Order, starts: FloatArray) -> FloatArray:
+    """The best shape of each row (R, 3), from several starts (s, R, 3); the first of those that are alike."""
+    rows = np.arange(len(batch.time))
+    every, flat = batch.take(np.tile(rows, len(starts))), starts.reshape(-1, 3)
+    ends = every.point(flat), every.fit(flat, order)  # a fit begins inside its bounds: a start on them may be better
+    shapes = np.concatenate([one.shape for one in ends]).reshape(-1, len(rows), 3)
+    cost = np.concatenate([one.cost for one in ends]).reshape(-1, len(rows))
+    return shapes[(cost <= (1.0 + ALIKE) * cost.min(axis=0)).argmax(axis=0), rows]
 
 
-def _starts(batch: Batch, row: int, order: Order) -> FloatArray:
-    """The best cells of the grid for one row, of different delays, (starts, 3)."""
-    inside = np.flatnonzero(batch.weight[row] > 0.0)
-    inside = inside[:: len(inside) // _MOST_SAMPLES + 1]
-    shapes, unit = _grid(batch.time[row, inside].tobytes(), order)
-    position = batch.position[row, inside]
-    explained = ((unit @ (position - position.mean())) ** 2).reshape(shapes.shape[:2])
-    best = explained.argmax(axis=1)
-    chosen = np.argsort(-explained.max(axis=1), kind="stable")[:_STARTS]
-    return shapes[chosen, best[chosen]]
+def _starts(trial: Trial) -> FloatArray:
+    """The best cells of a grid for one trial, of either order and each of another delay, (2, s, 3)."""
+    measured, span = _measured(trial), float(trial.time[-1])
+    spacing = span / min(int(np.count_nonzero(trial.time > 0.0)), _MOST_DELAYS)
+    delays: list[float] = np.arange(0.0, 0.8 * span, spacing).tolist()
+    lags: list[float] = np.geomspace(0.5 * spacing, span, _LAGS).tolist()
+    starts = list[list[Shape]]()
+    for dampings in ((0.0,), _DAMPINGS):
+        arms, best = [Arm(*cell) for cell in product(delays, lags, dampings)], dict[float, Shape]()
+        log, _ = measured.weighed(arms, measured.white(arms[0]), Limits({}, {}))
+        places: list[int] = np.argsort(-log, kind="stable").tolist()
+        for arm in (arms[place] for place in places):
+            p = (0.5 * arm.lag / arm.damping) ** 2 if arm.damping else 0.0
+            best.setdefault(arm.delay, Shape(arm.delay, arm.lag, p))
+        starts.append(list(best.values())[:_STARTS])
+    return np.array(starts)
 
 
-@lru_cache(maxsize=8)
-def _grid(time: bytes, order: Order) -> tuple[FloatArray, FloatArray]:
-    """Shapes by delay (d, g, 3), and their centred responses, each of unit length, (d·g, n)."""
-    t = np.frombuffer(time)
-    span = float(t[-1])
-    spacing = max(float(np.mean(np.diff(t))), span / _MOST_DELAYS)
-    delays = np.arange(0.0, 0.8 * span, 0.75 * spacing)
-    lags, ratio = np.meshgrid(np.geomspace(0.5 * spacing, span, _LAGS), _RATIOS[: 1 if order == 1 else None])
-    q, p = lags.ravel(), (ratio * lags**2).ravel()
-    # a delay is a shift: one fine response of each plant serves all
-    fine = spacing / _FINE
-    table = unit_response(np.arange(0.0, span + 2.0 * fine, fine), q[:, None], p[:, None])
-    place = np.maximum(np.rint((t - delays[:, None]) / fine).astype(np.int64), 0)
-    c = np.ascontiguousarray(table[:, place].swapaxes(0, 1)).reshape(-1, len(t))
-    c -= c.mean(axis=1, keepdims=True)
-    length = np.linalg.norm(c, axis=1)
-    shapes = np.empty((len(delays), len(q), 3))
-    shapes[..., 0], shapes[..., 1], shapes[..., 2] = delays[:, None], q, p
-    return shapes, c / np.where(length > 1e-9, length, np.inf)[:, None]
+def _measured(trial: Trial) -> Measured:
+    """A trial as the search for arms takes it: a recording of one command, in steps; its zero is free."""
+    n, value = len(trial.time), trial.position / trial.step
+    time, source = np.rint(trial.time * 1e9).astype(np.int64), np.zeros(n, dtype=np.int64)
+    one = Recording(np.zeros(1, dtype=np.int64), np.ones(1), 0.0, time, value, source, np.ones(n))
+    # the update period has no effect on a constant gain
+    return Measured([one.of(slice(None, None, n // _MOST_SAMPLES + 1))], 1.0, ["position"])
 
 
 def _fit(trial: Trial, found: FloatArray, order: Order) -> StepFit:
@@ -218,7 +213,8 @@ def _fit(trial: Trial, found: FloatArray, order: Order) -> StepFit:
     design = np.stack((step * c, np.ones_like(c)), axis=1)
     gain, zero = np.linalg.lstsq(design, trial.position, rcond=None)[0].tolist()
     rms = float(np.sqrt(np.mean((trial.position - design @ [gain, zero]) ** 2)))
-    jacobian = np.column_stack((gain * step * sensitivity(time, shape, order), design))
+    changes = [gain * step * one[0] for one in sensitivity(time[None], found[None], order)]
+    jacobian = np.column_stack((*changes, design))
     fitted = [0, 1, 2, 3, 4] if order == 2 else [0, 1, 3, 4]
     freedom = max(len(time) - len(fitted), 1)
     covariance = np.zeros((5, 5))
@@ -229,17 +225,6 @@ def _fit(trial: Trial, found: FloatArray, order: Order) -> StepFit:
 def reached(time: FloatArray, shape: Shape) -> float:
     """Share of its final value that a response has reached with the last sample."""
     return float(unit_response(np.array(time[-1] - shape.delay), shape.q, shape.p))
-
-
-def sensitivity(time: FloatArray, shape: Shape, order: Order) -> FloatArray:
-    """∂c/∂(delay, q, p) by differences, (n, order + 1)."""
-    columns: list[FloatArray] = []
-    for place, size in enumerate((1e-5 * shape.q, 1e-5 * shape.q, 1e-5 * shape.q**2)[: order + 1]):
-        low, high = np.array(shape), np.array(shape)
-        low[place], high[place] = max(low[place] - size, 0.0), high[place] + size
-        responses = [unit_response(time - one[0], one[1], one[2]) for one in (low, high)]
-        columns.append((responses[1] - responses[0]) / (high[place] - low[place]))
-    return np.stack(columns, axis=1)
 
 
 def inverse(jacobian: FloatArray) -> FloatArray:

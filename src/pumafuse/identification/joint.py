@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import FloatArray
 from .batch import Batch, Equations, Order, Point
 from .estimate import Estimate, t_quantile
-from .fit import StepFit
+from .fit import ALIKE, StepFit
 from .trials import Trial
 
 _STARTS = (0.0, 0.05, 0.15, 0.25, 0.4, 1.0)  # p/q² to search from
@@ -83,7 +83,8 @@ def fit_together(trials: Sequence[Trial], own: Sequence[StepFit], order: Order) 
         q = middle if ratio == 0.0 else 1.3 * middle
         starts.append(np.stack(np.broadcast_arrays(np.maximum(lag - q, 0.0), q, ratio * q * q), axis=1))
     found = batch.take(np.tile(np.arange(n), len(starts))).fit(np.concatenate(starts), order, size=n)
-    best = int(found.cost.reshape(-1, n).sum(axis=1).argmin())
+    cost = found.cost.reshape(-1, n).sum(axis=1)
+    best = int((cost <= (1.0 + ALIKE) * cost.min()).argmax())
     at = Point(*(every[best * n : (best + 1) * n] for every in found))
     slopes, amplitude_slopes = batch.slopes(at, order)
     equations = batch.equations(at, slopes)

@@ -13,7 +13,8 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..model.unit_response import unit_response
-from .fit import Shape, StepFit, inverse, reached, sensitivity
+from .batch import sensitivity
+from .fit import Shape, StepFit, inverse, reached
 from .trials import Trial
 
 _REST = 5  # samples of the rest level, at least
@@ -39,7 +40,8 @@ def fit_as_published(trial: Trial, fitted: StepFit) -> StepFit:
     height, n = gain * trial.step, len(trial.time)
     squares = float(np.sum((trial.position - level - height * unit_response(trial.time - delay, *shape[1:])) ** 2))
     covariance, own = np.zeros((5, 5)), slice(1, order + 1)  # what is read off has no interval of its own
-    covariance[own, own] = inverse(height * sensitivity(trial.time, shape, order)[:, 1:]) * squares / max(n - order, 1)
+    changes = [height * one[0] for one in sensitivity(trial.time[None], np.array([shape]), order)[1:]]
+    covariance[own, own] = inverse(np.column_stack(changes)) * squares / max(n - order, 1)
     end = reached(trial.time, shape)
     return replace(read, shape=shape, rms=float(np.sqrt(squares / n)), covariance=covariance, reached=end)
 

@@ -15,8 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ..arrays import BoolArray, FloatArray, IntArray, TimeArray
-from ..filter.core import Record, at, library
-from ..filter.response import record_of
+from ..filter.core import AXIS, Record, at, library
 from ..model.arm import AxisModel, Gain
 from ..model.plants import FirstOrder, SecondOrder
 from .steps import bounded_step
@@ -290,7 +289,7 @@ class Measured:
         Returns:
             Both, (n,).
         """
-        records = np.concatenate([record_of(arm.model, self.period, arm.delay, 0.0) for arm in arms])
+        records = self._records(arms)
         c = len(self.sensors)  # the measurements, and for each sensor but the first whether it is that
         products, own, log_determinant = np.zeros((len(arms), 2, 2 + c)), np.zeros((c, c)), 0.0
         for one in self.recordings:
@@ -406,11 +405,20 @@ class Measured:
         )
 
     def _response(self, one: Recording, arm: Arm) -> FloatArray:
-        record, position = record_of(arm.model, self.period, arm.delay, one.start), np.empty(len(one.time))
+        record, position = self._records([arm], one.start), np.empty(len(one.time))
         library.pf_response(
             at(record), len(one.given), at(one.given), at(one.command), len(one.time), at(one.time), at(position)
         )
         return position
+
+    def _records(self, arms: Sequence[Arm], start: float = 0.0) -> Record:
+        """Arms as the core takes them, (n,)."""
+        found, (delay, lag, damping, recovery, gain, slope) = np.zeros(len(arms), AXIS), np.array(arms).T
+        found["period"], found["delay"], found["start"] = self.period, delay, start
+        found["time_constant"] = np.where(damping > 0.0, 0.0, lag)
+        found["natural_frequency"], found["damping"] = 2.0 * damping / lag, damping
+        found["slope"], found["intercept"], found["recovery"] = slope, gain, recovery
+        return found
 
     def _variance(self, one: Recording, rest: Rest) -> FloatArray:
         return np.where(one.weight > 0.0, np.square(rest.sd)[one.source], np.inf)
