@@ -33,13 +33,13 @@ def drafts(found: Survey, arm: ArmGuess, sensors: Mapping[str, SensorGuess], fol
         folder: Where they will be: files of the log are named from there.
     """
     return {
-        "run.toml": _run_toml(found, folder),
+        "run.toml": _run_toml(found, arm, folder),
         "arm.toml": _arm_toml(found, arm),
         "fusion.toml": _fusion_toml(arm, sensors),
     }
 
 
-def _run_toml(found: Survey, folder: Path) -> str:
+def _run_toml(found: Survey, arm: ArmGuess, folder: Path) -> str:
     if found.manifest is not None:
         return _rebased(found, folder)
     assert found.roles is not None
@@ -52,6 +52,13 @@ def _run_toml(found: Survey, folder: Path) -> str:
     if found.interpolation:
         why = "DECIDE: what measures follows the path between commands; without this line each is held"
         lines.append(_line(_pair("interpolation_ms", found.interpolation * MS), why))
+    levels = {
+        f"{axis}_{SCREEN[one.kind].unit}": _digits(one.start * SCREEN[one.kind].scale, 6)
+        for axis, one in arm.axes.items()
+        if one.start is not None
+    }
+    if levels:
+        lines.append(_line(_pair("start", levels), "its sensor says so: not at its first command"))
     for one in roles.sensors:
         lines += _source(["sensors", one.name], one, folder)
     if roles.reference is not None:
@@ -156,8 +163,7 @@ def _fusion_toml(arm: ArmGuess, sensors: Mapping[str, SensorGuess]) -> str:
             lines += _by_kind("bias_sd", one.bias, arm, "its zero is another than the commands'")
         if one.turns:
             lines.append(_line(_pair("turn_deg", 360), "it measures within a turn"))
-        if one.gate:
-            lines.append(_line(_pair("gate", one.gate), "it has outliers"))
+        lines.append(_line(_pair("gate", one.gate), "it has outliers" if one.gate else "it has no outliers: 0 is none"))
     return "\n".join([*lines, ""])
 
 

@@ -23,8 +23,12 @@ _DELAY_SHARE = 0.6  # of the lag; the PUMA's is 0.6, a servo's on a bus rather 0
 _AHEAD = 0.02  # s, from which what is ahead of the commands has another clock; less may be noise
 _UNKNOWN_LAG = 0.1  # s, where nothing follows
 _UNKNOWN_SD, _SMALLEST_SD = 1e-3, 1e-6  # m or rad
-_OUTLIERS, _FEWEST_OUTLIERS = 3e-3, 3  # share and number from which a gate pays: one or two may be anything
-_GATE = 5.0
+_OUTLIERS, _FEWEST_OUTLIERS = 3e-3, 3  # share and number from which a narrow gate pays: one or two may be anything
+_GATE, _WIDE_GATE = 5.0, 50.0
+_LONGEST_GLITCH = 5  # rows
+_FAR = 0.05  # of what a sensor saw: what leaves its neighbours farther is no jerk of an arm
+_AWAY = 10.0  # times what the delayed command leaves, from which an arm starts elsewhere than at its first command
+_SOON = 0.5  # of the lag, within which a first measurement tells the start
 _DIFFERENT = 5.0  # sds
 
 
@@ -39,6 +43,7 @@ class AxisGuess:
         time_constant: Of the plant [s].
         gain: How far it moves when the command moves by 1.
         misfit: What the delayed command leaves.
+        start: Where it starts, if that is not at its first command; None: it is, or nothing tells.
         offset_sd: For ``[start]``.
         input_noise: Its density [m/√Hz].
         drift: Its density [m/√s].
@@ -50,6 +55,7 @@ class AxisGuess:
     time_constant: float
     gain: float
     misfit: float
+    start: float | None
     offset_sd: float
     input_noise: float
     drift: float
@@ -153,6 +159,7 @@ def _axis(found: Survey, axis: str, followers: Mapping[str, Following], lag: flo
         time_constant=rest,
         gain=abs(one.slope) if one else 1.0,
         misfit=misfit,
+        start=_start(found, axis, best, one, misfit, travel) if one else None,
         offset_sd=max(3.0 * misfit, 2.0 * offset if offset < 0.5 * travel else 0.0),
         input_noise=misfit * math.sqrt(rest),
         drift=0.5 * misfit,
@@ -181,7 +188,8 @@ def _sensor(
     elif first and name != first and name in latencies:
         words = f"so much later than {first}; add how old a measurement of that one is"
     turns = found.roles is not None and any(one.turns for one in found.roles.sensors if one.name == name)
-    gate = _GATE if any(map(_has_outliers, found.run.sensors[name].values.values())) else 0.0
+    gates = [_gate(value) for value in found.run.sensors[name].values.values()]
+    gate = min((one for one in gates if one), default=0.0)
     doubts = [] if pair is None else list(pair.alignment.doubts(name, pair.other))
     return SensorGuess(sd, bias, latencies.get(name, 0.0), words, scale, gate, turns, doubts)
 
@@ -195,11 +203,34 @@ def _noise(found: Survey, name: str, axis: str, one: Following, beside: float) -
     return max(min(one.scatter, alone, beside), one.resolution, _SMALLEST_SD)
 
 
-def _has_outliers(value: FloatArray) -> bool:
-    """Whether a gate pays: values that leave their neighbours and are back at once are more than a few."""
+def _start(found: Survey, axis: str, name: str, one: Following, misfit: float, travel: float) -> float | None:
+    """Where an axis starts by its best sensor [m or rad]; None: at its first command, or nothing tells."""
+    command, sensors = found.run.command, {REFERENCE: found.run.reference, **found.run.sensors}
+    source = sensors[name]
+    assert source is not None
+    told, seen = np.isfinite(command.values[axis]), np.isfinite(source.values[axis])
+    given, stamp = command.stamp[told], source.stamp[seen]
+    near = int(np.argmin(np.abs(stamp - given[0])))
+    if stamp[near] - given[0] > _SOON * max(one.lag, 0.0) * 1e9:
+        return None
+    level = math.copysign(1.0, one.slope) * (float(source.values[axis][seen][near]) - one.offset)
+    unsure = _AWAY * (misfit + one.scatter + one.resolution) + abs(abs(one.slope) - 1.0) * travel
+    return level if abs(level - float(command.values[axis][told][0])) > unsure else None
+
+
+def _gate(value: FloatArray) -> float:
+    """The gate for a sensor with such values: narrow for many outliers, wide for a few glitches, none for jerks."""
     value = value[np.isfinite(value)]
-    count = int(isolated(value).sum())
-    return count >= _FEWEST_OUTLIERS and count > _OUTLIERS * len(value)
+    found = isolated(value)
+    if found.sum() >= _FEWEST_OUTLIERS and found.mean() > _OUTLIERS:
+        return _GATE
+    for every in range(1, _LONGEST_GLITCH + 1):  # by which a glitch of so many rows is one
+        some = value[::every]
+        place = np.flatnonzero(isolated(some))
+        beside = 0.5 * (some[place - 1] + some[place + 1])
+        if (np.abs(some[place] - beside) > _FAR * np.ptp(np.delete(some, place))).any():
+            return _WIDE_GATE
+    return 0.0
 
 
 def _bias(found: Survey, axis: str, one: Following, scale: float, others: Mapping[str, Following]) -> float:

@@ -1,0 +1,96 @@
+"""First guesses: where an arm starts, and which gate its sensors need."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pumafuse as pf
+from executable import pumafuse
+from pumafuse.arrays import FloatArray
+from pumafuse.discovery.drafts import drafts
+from pumafuse.discovery.guesses import guess
+from pumafuse.discovery.survey import survey
+
+T = 0.02  # s
+LATE = 0.12  # s
+
+
+def log(folder: Path, position: FloatArray, command: FloatArray) -> Path:
+    """A table of an axis in mm."""
+    file = folder / "gantry.csv"
+    table = np.column_stack((T * np.arange(len(command)), command, position))
+    np.savetxt(file, table, delimiter=",", header="time_s,target.z_mm,actual.z_mm", comments="", fmt="%.6f")
+    return file
+
+
+def swings(count: int = 900) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times; commands that rest for a second at 40 mm, then swing; where a lag of first order leads from 40 mm [mm]."""
+    t = T * np.arange(count)
+    u = 40.0 + 25.0 * np.sin(np.maximum(t - 1.0, 0.0) * 1.3)
+    z = np.full(count, 40.0)
+    for k in range(1, count):
+        z[k] = u[k - 1] + (z[k - 1] - u[k - 1]) * np.exp(-T / LATE)
+    return t, u, z
+
+
+@pytest.mark.parametrize("away", [-35.0, 0.0, 0.05, 80.0])
+def test_an_arm_that_starts_elsewhere_starts_where_its_sensor_says(away: float, tmp_path: Path) -> None:
+    """35 mm below its first command, or 80 above: run.toml has the level; less than the noise and lag explain: not."""
+    t, u, z = swings()
+    z = z + away * np.exp(-t / LATE) + np.random.default_rng(1).normal(0.0, 0.02, len(t))
+    found = survey(log(tmp_path, z, u))
+    folder = tmp_path / "out"
+    folder.mkdir()
+    for name, text in drafts(found, *guess(found), folder).items():
+        (folder / name).write_text(text)
+    run = pf.Run.read(folder)
+    if abs(away) < 1.0:
+        assert run.start == {}
+        return
+    assert run.start["z"] == pytest.approx(1e-3 * (40.0 + away), abs=5e-4)
+
+
+def test_one_command_follows_an_arm_that_homes(tmp_path: Path) -> None:
+    """80 mm above its first command: no measurement is rejected, and the lag is right to 1 ms."""
+    t, u, z = swings()
+    z = z + 80.0 * np.exp(-t / LATE) + np.random.default_rng(3).normal(0.0, 0.02, len(t))
+    pumafuse("fuse", log(tmp_path, z, u), "-o", tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["axes"]["z"]["sensors"]["actual"]["outcomes"] == {"fused": 900}
+    arm = pf.ArmModel.load(tmp_path / "out" / "arm.toml")
+    assert arm.lag_of("z") == pytest.approx(LATE, abs=1e-3)
+
+
+def jerks(z: FloatArray) -> FloatArray:
+    """An arm that jumps by 0.5 mm and comes back, twice."""
+    z = z.copy()
+    z[[300, 640]] += 0.5
+    return z
+
+
+def glitch(z: FloatArray) -> FloatArray:
+    """A sensor that says 0 three times in a row, once."""
+    z = z.copy()
+    z[420:423] = 0.0
+    return z
+
+
+def outliers(z: FloatArray) -> FloatArray:
+    """One value in fifty is 3 mm off."""
+    z = z.copy()
+    z[25::50] += 3.0
+    return z
+
+
+@pytest.mark.parametrize(("spoilt", "gate"), [(jerks, 0.0), (glitch, 50.0), (outliers, 5.0)])
+def test_gates_are_for_what_leaves_its_neighbours_far(spoilt: object, gate: float, tmp_path: Path) -> None:
+    """Jerks of an arm are none of its sensor's faults."""
+    assert callable(spoilt)
+    t, u, z = swings()
+    value = spoilt(z + np.random.default_rng(2).normal(0.0, 0.01, len(t)))
+    _, sensors = guess(survey(log(tmp_path, value, u)))
+    assert sensors["actual"].gate == gate
