@@ -20,6 +20,8 @@ _REASONS: Mapping[Outcome, str] = {  # the best first
     Outcome.TOO_LATE: "stamped before the window",
     Outcome.INVALID: "not a finite position",
     Outcome.UNKNOWN: "no such sensor or axis",
+    Outcome.STRAY: "leaps away from the commands before and after",
+    Outcome.HELD: "the value before, to the last digit, while the commands move the axis",
 }
 _ORDER = list(_REASONS)
 

@@ -1,0 +1,155 @@
+"""Values that tell nothing: commands that nobody sent, and what a sensor says again and again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from ..arrays import NO_STAMP, BoolArray, FloatArray, TimeArray, median
+from ..units import TURN
+from .run import Source, note_rows
+
+USUAL = 0.9  # of all steps are smaller than the usual one: more are not stray, and jumps of a motion may be as rare
+FAR = 5.0  # usual steps from which a value leaps: where a motion begins or turns it is about one
+BACK = 0.5  # of a leap, up to which what comes after it is back where it began
+MOST_STRAY = 2  # values in a row; three are a motion
+_FEWEST = 20  # changes, from which a usual step is known
+_BRIEF = 2.5  # usual intervals between changes, up to which one value may last
+_FOLLOWED_NS, _FOLLOWED = 1_000_000_000, 3.0  # within 1 s an arm shows it: by steps so many times as large as before
+_STEPS = 10.0  # of its resolution, and ...
+_CLEARLY = 5.0  # ... of its usual steps, that a sensor must have missed
+_FROZEN = 5  # equal values in a row, from which it is asked whether a sensor froze
+_BY_CHANCE = 1e-6  # expected number of such rows below which noise does not explain them
+_SHARE = 0.2  # of the commanded travel, that nobody takes for play or for stiction
+_COARSE = 3.0  # typical over smallest change of a value: below it a sensor counts steps
+
+
+def leaps(value: float, before: float, usual: float) -> bool:
+    """Whether a value is many times the usual step away from the one before, and not by a turn or two of an angle."""
+    apart = abs(value - before)
+    turns = round(apart / TURN)
+    return apart > FAR * usual and not (1 <= turns <= 2 and abs(apart - turns * TURN) <= FAR * usual)
+
+
+def returns(value: float, before: float, out: Iterable[float]) -> bool:
+    """Whether a value is back near the one before those that leapt ``out``."""
+    return abs(value - before) < BACK * min(min(abs(one - before), abs(one - value)) for one in out)
+
+
+def without_stray_values(command: Source, sensors: Sequence[Source], notes: list[str]) -> Source:
+    """The commands without values that nobody sent: NaN, with a note.
+
+    One or two values that leap away from their neighbours and back by many times the usual step are stray, if no sensor
+    follows them.
+    """
+    values, left_out = dict(command.values), np.zeros(len(command.stamp), dtype=np.bool_)
+    for axis, value in command.values.items():
+        told = _in_order(command.stamp, value)
+        measured = [_in_order(one.stamp, one.values[axis])[1:] for one in sensors if axis in one.values]
+        stray = np.zeros(len(value), dtype=np.bool_)
+        stray[told[0]] = _stray(*told[1:], measured)
+        if stray.any():
+            values[axis], left_out = np.where(stray, np.nan, value), left_out | stray
+            what = f"a value of {axis} that leaps away from its neighbours and back, which nothing follows: stray"
+            note_rows(notes, command.label, stray, f"{what}, not used")
+    return replace(command, values=values, stray=left_out) if left_out.any() else command
+
+
+def _in_order(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, TimeArray, FloatArray]:
+    """The rows with both, by stamp; their stamps and values."""
+    rows = np.flatnonzero(np.isfinite(value) & (stamp != NO_STAMP))
+    rows = rows[np.argsort(stamp[rows], kind="stable")]
+    return rows, stamp[rows], value[rows]
+
+
+def _stray(stamp: TimeArray, value: FloatArray, sensors: Sequence[tuple[TimeArray, FloatArray]]) -> BoolArray:
+    """Which of the commands of an axis, by stamp, are stray, (rows,)."""
+    found = np.zeros(len(value), dtype=np.bool_)
+    begin = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)  # a table may say each several times
+    if len(begin) <= _FEWEST:
+        return found
+    steps = np.abs(np.diff(value[begin]))
+    usual, interval = float(np.quantile(steps, USUAL)), median(np.diff(stamp[begin]).astype(np.float64))
+    u, t, end = value[begin].tolist(), stamp[begin].tolist(), [*begin[1:].tolist(), len(value)]
+
+    def pace(row: int, way: int) -> float:
+        """How far the commands go beside a row, one stray value apart."""
+        beside = (min(max(row + way * many, 0), len(u) - 1) for many in (1, 2))
+        return min(abs(u[one] - u[row]) for one in beside)
+
+    row = 1  # the first that may be stray
+    for place in (np.flatnonzero(steps > FAR * usual) + 1).tolist():
+        if place < row:
+            continue
+        before = place - 1
+        for after in range(place + 1, min(place + MOST_STRAY + 1, len(u))):
+            typical, out = max(usual, pace(before, -1), pace(after, 1)), u[place:after]
+            brief = t[after] - t[place] <= _BRIEF * interval * (after - place)
+            away = all(leaps(one, u[beside], typical) for one in out for beside in (before, after))
+            if brief and away and returns(u[after], u[before], out):
+                if not any(_follows(*one, t[place]) for one in sensors):
+                    found[begin[place] : end[after - 1]] = True
+                    row = after + 1
+                break
+    return found
+
+
+def _follows(stamp: TimeArray, value: FloatArray, leap: int) -> bool:
+    """Whether a sensor moves by far larger steps after an instant [ns] than before it, more than once."""
+    edges = np.searchsorted(stamp, [leap - _FOLLOWED_NS, leap, leap + _FOLLOWED_NS]).tolist()
+    before, after = (np.sort(np.abs(np.diff(value[begin:end]))) for begin, end in pairwise(edges))
+    return len(after) > 1 and len(before) > 1 and bool(after[-2] > _FOLLOWED * before[-2])
+
+
+def times_each(value: FloatArray) -> int:
+    """How often each value of a sensor comes in a row, typically, if it holds its samples; else 1.
+
+    Not at rest, where a long row of equal values is one row of many, and not where coarse steps repeat by themselves.
+    """
+    changes = np.flatnonzero(value[1:] != value[:-1])
+    if len(changes) < _FEWEST or 1.5 * len(changes) > len(value):  # half of them, or more, come once
+        return 1
+    steps = np.abs(np.diff(value)[changes])
+    return 1 if median(steps) < _COARSE * steps.min() else int(median(np.diff(changes)))
+
+
+def held(stamp: TimeArray, value: FloatArray, command: tuple[TimeArray, FloatArray], lag: int) -> BoolArray:
+    """Which values of a sensor on an axis are no news, (rows,).
+
+    A sensor that is slower than its rows gives each value several times: of these the first counts. One that froze
+    gives one value while the commands move the axis, by clearly more than its steps, until a lag before its end.
+
+    Args:
+        stamp: Of the rows, ascending [int ns], (rows,).
+        value: Finite.
+        command: Stamps, ascending, and values of the commands, (n,).
+        lag: How late the axis may follow its commands [ns].
+    """
+    changes = np.diff(value, prepend=np.nan) != 0.0
+    begin = np.flatnonzero(changes)
+    if len(begin) <= _FEWEST or len(begin) == len(value):
+        return ~changes & False
+    count, times = np.diff(begin, append=len(value)), times_each(value)
+    place = np.arange(len(value)) - np.repeat(begin, count)
+    found = place % (2 * times) != 0 if times > 1 else np.zeros(len(value), dtype=np.bool_)
+    steps = np.pad(np.abs(np.diff(value[begin])), 1)
+    usual = float(np.quantile(steps[1:-1], USUAL))
+    enough = max(_STEPS * float(steps[1:-1].min()), _CLEARLY * median(steps[1:-1]))
+    travel = _SHARE * float(np.ptp(command[1]))
+    repeats = len(value) - len(begin)
+    for run in np.flatnonzero(count >= max(_FROZEN, 3 * times)).tolist():
+        first, last = int(begin[run]), int(begin[run] + count[run] - 1)
+        low, high = np.searchsorted(command[0], [stamp[first], stamp[last] - lag], side="right").tolist()
+        moved = float(np.ptp(command[1][max(low - 1, 0) : high])) if high >= low > 0 else 0.0
+        leapt = bool(steps[run] > FAR * usual)
+        elsewhere = (repeats - count[run] + 1) / (len(value) - count[run])
+        unlikely = times == 1 and math.log(len(value)) + (count[run] - 1) * math.log(max(elsewhere, 1e-9)) < math.log(
+            _BY_CHANCE
+        )
+        if moved > enough and (leapt or steps[run + 1] > FAR * usual or unlikely or moved > travel):
+            found[first + (0 if leapt else 1) : last + 1] = True  # what it leaps to is where nobody was
+    return found
