@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -25,11 +25,13 @@ from .frame_start import FrameStart
 from .health import Counts, Health, by_word
 from .rate_limit import RateLimitedLog
 from .results import AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
+from .screening import CommandScreen, Screened
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _ABSENT = bytes((ABSENT,))
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
+_STRAY = Outcome.STRAY
 
 
 class _Event(NamedTuple):
@@ -121,6 +123,7 @@ class LiveEstimator:
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
         self._clock = Clock(round(window * 1e9))
         self._watch = CommandWatch(config.arm, config.frame, self._log)
+        self._screen = CommandScreen(config.arm.update_period)
         self._start = dict(start or {})
         self._begin(Counts(len(self._sensors)))
 
@@ -241,6 +244,7 @@ class LiveEstimator:
         model = live_model(self.config, self._frame_start.start(self._start))
         self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
         self._watch.restart()
+        self._screen.restart()
         counts.restart()
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
         # what came is fed again then, and counted anew.
@@ -272,6 +276,36 @@ class LiveEstimator:
             self._aside = []
         if self._event_log is not None:
             self._event_log.append(stamp, sensor, values)
+        if sensor is None:
+            return self._take_screened(stamp, values)
+        if stamp > self._screen.until:
+            self._settle(self._screen.believed())
+        return self._enter(stamp, sensor, values)
+
+    def _take_screened(self, stamp: int, values: Mapping[str, Any]) -> UpdateResult:
+        """Take a command that is in time, or let it wait for the next."""
+        self._counts.outcomes[COMMAND, _STRAY] += 1
+        settled = self._settle(self._screen.take(stamp, values))
+        waits = "leaps by many times the usual step: not used unless the next one is there, too"
+        return settled.get(stamp) or refused(values, _STRAY, waits)
+
+    def _settle(self, commands: Sequence[Screened]) -> dict[int, UpdateResult]:
+        """Enter commands that have waited, or need not, without what is stray; what became of each, by its stamp."""
+        found = dict[int, UpdateResult]()
+        for stamp, values, stray in commands:
+            for name in stray:
+                self._log.write(
+                    f"stray {name}",
+                    f"a command of {name} at {stamp / 1e9:.3f} s leaps away from those before and after it: stray, not"
+                    " used",
+                )
+            if values or not stray:
+                self._counts.outcomes[COMMAND, _STRAY] -= 1
+                found[stamp] = self._enter(stamp, None, values)
+        return found
+
+    def _enter(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
+        """Take an event that is to be used."""
         if self._early is not None:
             return self._take_early(_Event(stamp, sensor, dict(values)))
         return self._feed(stamp, sensor, values)
@@ -321,6 +355,7 @@ class LiveEstimator:
         self._counts.forget(self._window, after)
         self._window.forget(after)
         self._commands.forget(after)
+        self._screen.restart()
         if self._event_log is not None:
             self._event_log.discard(after)
         self._counts.outcomes[COMMAND, _FUSED] -= self._doubtful

@@ -17,8 +17,8 @@ USUAL = 0.9  # of all steps are smaller than the usual one: more are not stray, 
 FAR = 5.0  # usual steps from which a value leaps: where a motion begins or turns it is about one
 BACK = 0.5  # of a leap, up to which what comes after it is back where it began
 MOST_STRAY = 2  # values in a row; three are a motion
-_FEWEST = 20  # changes, from which a usual step is known
-_BRIEF = 2.5  # usual intervals between changes, up to which one value may last
+FEWEST = 20  # changes, from which a usual step is known
+BRIEF = 2.5  # usual intervals between changes, up to which one value may last
 _FOLLOWED_NS, _FOLLOWED = 1_000_000_000, 3.0  # within 1 s an arm shows it: by steps so many times as large as before
 _STEPS = 10.0  # of its resolution, and ...
 _CLEARLY = 5.0  # ... of its usual steps, that a sensor must have missed
@@ -70,7 +70,7 @@ def _stray(stamp: TimeArray, value: FloatArray, sensors: Sequence[tuple[TimeArra
     """Which of the commands of an axis, by stamp, are stray, (rows,)."""
     found = np.zeros(len(value), dtype=np.bool_)
     begin = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)  # a table may say each several times
-    if len(begin) <= _FEWEST:
+    if len(begin) <= FEWEST:
         return found
     steps = np.abs(np.diff(value[begin]))
     usual, interval = float(np.quantile(steps, USUAL)), median(np.diff(stamp[begin]).astype(np.float64))
@@ -88,7 +88,7 @@ def _stray(stamp: TimeArray, value: FloatArray, sensors: Sequence[tuple[TimeArra
         before = place - 1
         for after in range(place + 1, min(place + MOST_STRAY + 1, len(u))):
             typical, out = max(usual, pace(before, -1), pace(after, 1)), u[place:after]
-            brief = t[after] - t[place] <= _BRIEF * interval * (after - place)
+            brief = t[after] - t[place] <= BRIEF * interval * (after - place)
             away = all(leaps(one, u[beside], typical) for one in out for beside in (before, after))
             if brief and away and returns(u[after], u[before], out):
                 if not any(_follows(*one, t[place]) for one in sensors):
@@ -111,7 +111,7 @@ def times_each(value: FloatArray) -> int:
     Not at rest, where a long row of equal values is one row of many, and not where coarse steps repeat by themselves.
     """
     changes = np.flatnonzero(value[1:] != value[:-1])
-    if len(changes) < _FEWEST or 1.5 * len(changes) > len(value):  # half of them, or more, come once
+    if len(changes) < FEWEST or 1.5 * len(changes) > len(value):  # half of them, or more, come once
         return 1
     steps = np.abs(np.diff(value)[changes])
     return 1 if median(steps) < _COARSE * steps.min() else int(median(np.diff(changes)))
@@ -131,7 +131,7 @@ def held(stamp: TimeArray, value: FloatArray, command: tuple[TimeArray, FloatArr
     """
     changes = np.diff(value, prepend=np.nan) != 0.0
     begin = np.flatnonzero(changes)
-    if len(begin) <= _FEWEST or len(begin) == len(value):
+    if len(begin) <= FEWEST or len(begin) == len(value):
         return ~changes & False
     count, times = np.diff(begin, append=len(value)), times_each(value)
     place = np.arange(len(value)) - np.repeat(begin, count)
