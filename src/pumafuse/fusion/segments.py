@@ -25,7 +25,7 @@ from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind, in_ord
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
 from ..logs.run import Run, Source, note_rows
-from ..logs.screening import held, times_each
+from ..logs.screening import held
 from ..model.arm import ArmModel
 from ..units import AN, of_kind, seconds
 from .config import FusionConfig
@@ -486,22 +486,27 @@ def _hold(
     origin: int,
 ) -> list[str]:
     """Mark what one sensor says again and again as held; a sentence on each axis where it does."""
-    found, sensor, arm = list[str](), config.sensors[name], config.arm
+    found = list[str]()
     for column, axis in enumerate(axes):
         mine, told = (np.flatnonzero(one.known[:, column] == _FUSED) for one in (rows, commands))
-        stamp, value = rows.stamp[mine], rows.value[mine, column]
-        lag = round((_LAGS * (arm.lag_of(axis) + abs(sensor.latency)) + arm.update_period) * 1e9)
-        again = held(stamp, value, (commands.stamp[told], commands.value[told, column]), lag)
+        stamp, command = rows.stamp[mine], (commands.stamp[told], commands.value[told, column])
+        again, times = held(stamp, rows.value[mine, column], command, latest_follow(config, name, axis))
         if again.any():
             rows.known[mine[again], column] = int(Outcome.HELD)
-            first, last = (seconds(stamp[again][[0, -1]], origin)).tolist()
-            times = times_each(value)
-            why = f"gives each value {times} times" if times > 1 else "repeats its value while the commands move it"
+            first, last = seconds(stamp[again][[0, -1]], origin).tolist()
+            slow = f"{axis} gives each value {times} times, as a sensor that is slower than its rows"
+            froze = f"{axis} repeats its value to the last digit while the commands move it (did it freeze?)"
             found.append(
-                f"{label}: {axis} {why}, from {first:.2f} to {last:.2f} s: each counts once, {np.count_nonzero(again)}"
-                f" are {Outcome.HELD.word}"
+                f"{label}: {slow if times > 1 else froze}, from {first:.2f} to {last:.2f} s: each value counts once,"
+                f" {np.count_nonzero(again)} are {Outcome.HELD.word}"
             )
     return found
+
+
+def latest_follow(config: FusionConfig, sensor: str, axis: str) -> int:
+    """How long after its command a sensor shows that an axis moves, at most [ns]: the arm may not be known yet."""
+    late = config.arm.lag_of(axis) + abs(config.sensors[sensor].latency)
+    return round((_LAGS * late + config.arm.update_period) * 1e9)
 
 
 def _measurement_counts(kept: Events, stamp: TimeArray) -> dict[str, int]:

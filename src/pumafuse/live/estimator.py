@@ -16,7 +16,7 @@ from ..filter.events import COMMAND
 from ..filter.outcome import ABSENT, FARTHEST, Outcome
 from ..filter.window import MOST_EVENTS, Window
 from ..fusion.config import FusionConfig
-from ..fusion.segments import LONGEST_TAIL_NS
+from ..fusion.segments import LONGEST_TAIL_NS, latest_follow
 from ..fusion.setup import live_model
 from ..logs.frames import CARTESIAN
 from .clock import Clock, Time, Verdict, nanoseconds
@@ -24,14 +24,14 @@ from .commands import Commands, CommandWatch, number
 from .frame_start import FrameStart
 from .health import Counts, Health, by_word
 from .rate_limit import RateLimitedLog
-from .results import AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
-from .screening import CommandScreen, Screened
+from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
+from .screening import CommandScreen, HoldWatch, Screened
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _ABSENT = bytes((ABSENT,))
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
-_STRAY = Outcome.STRAY
+_STRAY, _HELD = Outcome.STRAY, Outcome.HELD
 
 
 class _Event(NamedTuple):
@@ -123,7 +123,8 @@ class LiveEstimator:
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
         self._clock = Clock(round(window * 1e9))
         self._watch = CommandWatch(config.arm, config.frame, self._log)
-        self._screen = CommandScreen(config.arm.update_period)
+        self._screen, self._holds = CommandScreen(config.arm.update_period), HoldWatch(self._clock.window // 2)
+        self._follows = [[latest_follow(config, name, axis) for axis in self.axes] for name in config.sensors]
         self._start = dict(start or {})
         self._begin(Counts(len(self._sensors)))
 
@@ -245,6 +246,7 @@ class LiveEstimator:
         self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
         self._watch.restart()
         self._screen.restart()
+        self._holds.restart()
         counts.restart()
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
         # what came is fed again then, and counted anew.
@@ -407,8 +409,8 @@ class LiveEstimator:
         self._early.append(event)
         return self._feed(*event)
 
-    def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
-        """Give an event that is in time to the window."""
+    def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any], judged: bool = False) -> UpdateResult:
+        """Give an event that is in time to the window; ``judged``: nothing of it is held."""
         window, counts, given, stranger = self._window, self._counts, 0, ""
         new = window.value
         for name, value in values.items():
@@ -424,6 +426,10 @@ class LiveEstimator:
         oldest = self._oldest()
         if stamp < oldest:
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
+        if sensor is not None and not judged:
+            held, released = self._held(stamp, sensor, given)
+            if released or held:
+                return self._without_held(stamp, sensor, given, held, released)
         if not given:
             missing = not stranger and len(values) > 0
             why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
@@ -443,7 +449,8 @@ class LiveEstimator:
         if sensor is None:
             self._take_command(stamp, values, codes, result.outcome, oldest)
             return result
-        counts.came(source, stamp, self._clock.sure)
+        if not judged:
+            counts.came(source, stamp, self._clock.sure)
         if window.port.end == rows:  # it repeats another
             for code in codes.replace(_ABSENT, b""):
                 counts.outcomes[source, code] += 1
@@ -452,6 +459,37 @@ class LiveEstimator:
         elif sensor in self._contradicting and result.outcome is _FUSED:
             del self._contradicting[sensor]
         return result
+
+    def _without_held(
+        self, stamp: int, sensor: str, given: int, held: int, released: Sequence[tuple[int, str, float]]
+    ) -> UpdateResult:
+        """Give the window what is news of a measurement that has come to it, and what was not used before and is."""
+        self._counts.came(self._sensors[sensor], stamp, self._clock.sure)
+        kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (given & ~held) >> axis & 1}
+        again = [name for name, axis in self._bits.items() if held >> axis & 1]
+        result = self._feed(stamp, sensor, kept, judged=True) if kept else refused(again, _HELD, REASONS[_HELD])
+        for earlier, name, value in released:
+            self._feed(earlier, sensor, {name: value}, judged=True)
+        return result
+
+    def _held(self, stamp: int, sensor: str, given: int) -> tuple[int, list[tuple[int, str, float]]]:
+        """Which of the axes that a measurement gives are no news, as bits; values of before that are news after all."""
+        held, released, number = 0, list[tuple[int, str, float]](), self._sensors[sensor]
+        for axis, name in enumerate(self.axes):
+            if not given >> axis & 1:
+                continue
+            value, lag = self._window.value[axis], self._follows[number][axis]
+            found = self._holds.judge((number, axis), stamp, value, self._commands, lag)
+            held |= found.held << axis
+            self._counts.outcomes[number, _HELD] += found.held - len(found.released)
+            released += [(earlier, name, one) for earlier, one in found.released]
+            if found.sure:
+                self._log.write(
+                    f"{sensor} {name} held",
+                    f"sensor '{sensor}' repeats its value of {name} to the last digit at {stamp / 1e9:.3f} s: did it"
+                    " freeze, or is it slower than its rows? Held, not used",
+                )
+        return held, released
 
     def _take_command(self, stamp: int, values: Mapping[str, Any], codes: bytes, outcome: Outcome, oldest: int) -> None:
         """Keep and watch a command that is in the window."""

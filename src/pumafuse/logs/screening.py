@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import NO_STAMP, BoolArray, FloatArray, TimeArray, median
+from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray, median
 from ..units import TURN
 from .run import Source, note_rows
 
@@ -23,9 +23,10 @@ _FOLLOWED_NS, _FOLLOWED = 1_000_000_000, 3.0  # within 1 s an arm shows it: by s
 _STEPS = 10.0  # of its resolution, and ...
 _CLEARLY = 5.0  # ... of its usual steps, that a sensor must have missed
 _FROZEN = 5  # equal values in a row, from which it is asked whether a sensor froze
-_BY_CHANCE = 1e-6  # expected number of such rows below which noise does not explain them
+_BY_CHANCE = 1e-12  # a probability with which noise explains no row of equal values in any log
 _SHARE = 0.2  # of the commanded travel, that nobody takes for play or for stiction
-_COARSE = 3.0  # typical over smallest change of a value: below it a sensor counts steps
+_COARSE = 3.0  # typical over smallest step of a value: below it a sensor counts steps
+_MOSTLY = 1.5  # times that each value comes, on the mean: half of them, or more, come again
 
 
 def leaps(value: float, before: float, usual: float) -> bool:
@@ -105,23 +106,60 @@ def _follows(stamp: TimeArray, value: FloatArray, leap: int) -> bool:
     return len(after) > 1 and len(before) > 1 and bool(after[-2] > _FOLLOWED * before[-2])
 
 
-def times_each(value: FloatArray) -> int:
-    """How often each value of a sensor comes in a row, typically, if it holds its samples; else 1.
+class Habit(NamedTuple):
+    """How the values of a sensor on an axis change from one to another.
 
-    Not at rest, where a long row of equal values is one row of many, and not where coarse steps repeat by themselves.
+    Attributes:
+        smallest: Its steps: the smallest [m or rad],
+        typical: the median,
+        usual: and the one than which few are larger.
+        times: How often each value comes in a row, typically, if it holds its samples; else 1.
     """
-    changes = np.flatnonzero(value[1:] != value[:-1])
-    if len(changes) < FEWEST or 1.5 * len(changes) > len(value):  # half of them, or more, come once
-        return 1
-    steps = np.abs(np.diff(value)[changes])
-    return 1 if median(steps) < _COARSE * steps.min() else int(median(np.diff(changes)))
+
+    smallest: float
+    typical: float
+    usual: float
+    times: int
+
+    @staticmethod
+    def of(steps: FloatArray, lengths: IntArray) -> Habit:
+        """The habit by steps other than 0, and by how often each value came.
+
+        A long row of equal values at rest is one row of many, and coarse steps repeat by themselves: neither is held.
+        """
+        low, middle, high = np.quantile(steps, [0.0, 0.5, USUAL]).tolist()
+        holds = middle >= _COARSE * low and lengths.mean() >= _MOSTLY
+        return Habit(low, middle, high, int(np.median(lengths)) if holds else 1)
+
+    def froze(self, count: int, moved: float, travel: float, leapt: bool, repeats: float) -> bool:
+        """Whether a value that came again and again is that of a sensor that froze, not of an axis that rests.
+
+        Args:
+            count: How often it came.
+            moved: How far the commands have moved the axis meanwhile [m or rad].
+            travel: How far they move it at all.
+            leapt: Whether it is many times the usual step away from the values beside it.
+            repeats: How often other values are repeated, of 1.
+        """
+        if count < _FROZEN * self.times or not self.is_clear(moved):
+            return False
+        unlikely = self.times == 1 and repeats ** (count - 1) < _BY_CHANCE
+        return leapt or unlikely or moved > _SHARE * travel
+
+    def is_clear(self, moved: float) -> bool:
+        """Whether a motion [m or rad] is clearly more than the steps of the values."""
+        return moved > max(_STEPS * self.smallest, _CLEARLY * self.typical)
+
+    def is_again(self, place: int) -> bool:
+        """Whether a value that has come ``place`` times before in a row is that of a sample that is held."""
+        return self.times > 1 and place % (2 * self.times) != 0
 
 
-def held(stamp: TimeArray, value: FloatArray, command: tuple[TimeArray, FloatArray], lag: int) -> BoolArray:
-    """Which values of a sensor on an axis are no news, (rows,).
+def held(stamp: TimeArray, value: FloatArray, command: tuple[TimeArray, FloatArray], lag: int) -> tuple[BoolArray, int]:
+    """Which values of a sensor on an axis are no news, (rows,); how often it gives each of them.
 
     A sensor that is slower than its rows gives each value several times: of these the first counts. One that froze
-    gives one value while the commands move the axis, by clearly more than its steps, until a lag before its end.
+    gives one value while the commands move the axis by clearly more than its steps.
 
     Args:
         stamp: Of the rows, ascending [int ns], (rows,).
@@ -129,27 +167,19 @@ def held(stamp: TimeArray, value: FloatArray, command: tuple[TimeArray, FloatArr
         command: Stamps, ascending, and values of the commands, (n,).
         lag: How late the axis may follow its commands [ns].
     """
-    changes = np.diff(value, prepend=np.nan) != 0.0
-    begin = np.flatnonzero(changes)
+    begin = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)
     if len(begin) <= FEWEST or len(begin) == len(value):
-        return ~changes & False
-    count, times = np.diff(begin, append=len(value)), times_each(value)
+        return np.zeros(len(value), dtype=np.bool_), 1
+    count, steps = np.diff(begin, append=len(value)), np.pad(np.abs(np.diff(value[begin])), 1)
+    habit = Habit.of(steps[1:-1], count[:-1])
     place = np.arange(len(value)) - np.repeat(begin, count)
-    found = place % (2 * times) != 0 if times > 1 else np.zeros(len(value), dtype=np.bool_)
-    steps = np.pad(np.abs(np.diff(value[begin])), 1)
-    usual = float(np.quantile(steps[1:-1], USUAL))
-    enough = max(_STEPS * float(steps[1:-1].min()), _CLEARLY * median(steps[1:-1]))
-    travel = _SHARE * float(np.ptp(command[1]))
-    repeats = len(value) - len(begin)
-    for run in np.flatnonzero(count >= max(_FROZEN, 3 * times)).tolist():
+    found = np.array([habit.is_again(one) for one in range(int(count.max()))])[place]
+    leaps, travel, repeats = steps > FAR * habit.usual, float(np.ptp(command[1])), len(value) - len(begin)
+    for run in np.flatnonzero(count >= _FROZEN).tolist():
         first, last = int(begin[run]), int(begin[run] + count[run] - 1)
         low, high = np.searchsorted(command[0], [stamp[first], stamp[last] - lag], side="right").tolist()
-        moved = float(np.ptp(command[1][max(low - 1, 0) : high])) if high >= low > 0 else 0.0
-        leapt = bool(steps[run] > FAR * usual)
+        moved = float(np.ptp(command[1][max(low - 1, 0) : high])) if high > max(low - 1, 0) else 0.0
         elsewhere = (repeats - count[run] + 1) / (len(value) - count[run])
-        unlikely = times == 1 and math.log(len(value)) + (count[run] - 1) * math.log(max(elsewhere, 1e-9)) < math.log(
-            _BY_CHANCE
-        )
-        if moved > enough and (leapt or steps[run + 1] > FAR * usual or unlikely or moved > travel):
-            found[first + (0 if leapt else 1) : last + 1] = True  # what it leaps to is where nobody was
-    return found
+        if habit.froze(int(count[run]), moved, travel, bool(leaps[run : run + 2].any()), elsewhere):
+            found[first + (0 if leaps[run] else 1) : last + 1] = True  # what it leaps to is where nobody was
+    return found, habit.times
