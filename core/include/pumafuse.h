@@ -32,6 +32,7 @@ extern "C" {
 /* What became of a value; PF_ABSENT: the row gives none for this axis. */
 enum {
     PF_FUSED, PF_REJECTED, PF_REACQUIRED, PF_DUPLICATE, PF_BEFORE_START, PF_TOO_LATE, PF_INVALID, PF_UNKNOWN,
+    PF_STRAY, PF_HELD, /* before it comes to the core: a command that nobody sent, a value that is no news */
     PF_ABSENT = 255
 };
 

@@ -25,7 +25,6 @@ from pumafuse.fusion import chi_square
 from pumafuse.fusion.consistency import (
     LAGS,
     Consistency,
-    _frozen,  # pyright: ignore[reportPrivateUsage]
     chi_square_band,
     consistency,
     ljung_box,
@@ -266,15 +265,6 @@ def test_a_prior_too_wide_for_double_precision_is_said(moving: pf.Run, prior: st
     notes = [note for note in pf.fuse(moving, config).notes if note.startswith("camera: its prior")]
     assert len(notes) == said
     assert all("is 2.0e+06 times its noise" in note for note in notes)
-
-
-@pytest.mark.parametrize(("equal", "found"), [(9, 0), (10, 10), (25, 25)])
-def test_ten_equal_values_in_white_noise_are_frozen(equal: int, found: int) -> None:
-    """Their number is said, wherever they are; nine are not enough."""
-    for first in (0, 100, 300 - equal):
-        values = np.random.default_rng(1).standard_normal(300)
-        values[first : first + equal] = values[first]
-        assert _frozen(values) == found
 
 
 @settings(derandomize=True, deadline=None)

@@ -1,4 +1,4 @@
-"""What shows before anything is filtered: another zero, repeated values, a negative latency, a begin in mid-motion."""
+"""What shows before anything is filtered: another zero, a negative latency, a begin in mid-motion."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import pytest
 
 import pumafuse as pf
 from fusion.test_between import cut
-from pumafuse.fusion.faults import _times_each  # pyright: ignore[reportPrivateUsage]
 from pumafuse.logs.run import Source
 from pumafuse.tuning.likelihood import Likelihood
 from tuning_runs import SCENARIOS, outage, scenario, with_process, with_sensors
@@ -89,28 +88,6 @@ def test_where_a_sensor_is_after_the_run_does_not_count() -> None:
     values = {axis: np.append(value, np.full(count, value[-1] + 0.05)) for axis, value in seen.values.items()}
     longer = replace(seen, stamp=np.append(seen.stamp, stamp), values=values)
     assert not elsewhere(with_vision(lambda _: longer))
-
-
-def held(times: int, one: Source) -> Source:
-    """The sensor logged ``times`` as often as it measures."""
-    stamp = np.repeat(one.stamp, times) + np.tile(np.arange(times) * (30_000_000 // times), len(one.stamp))
-    return replace(one, stamp=stamp, values={axis: np.repeat(value, times) for axis, value in one.values.items()})
-
-
-@pytest.mark.parametrize("times", [2, 5])
-def test_values_that_come_several_times_are_said(times: int) -> None:
-    """Once for the sensor, with how often."""
-    found = [one for one in notes(with_vision(lambda one: held(times, one))) if "each value" in one]
-    assert len(found) == 1 and found[0].startswith(f"sensor 'vision' gives each value {times} times")
-
-
-def test_an_encoder_at_rest_and_coarse_steps_are_no_held_samples() -> None:
-    """Long rests are few rows of equal values, and a slow motion through coarse steps changes by one step at a time."""
-    rng = np.random.default_rng(1)
-    motion = np.concatenate([np.zeros(900), np.cumsum(rng.uniform(0.0, 20.0, 100)), np.full(500, 1e3)])
-    assert _times_each(np.rint(motion)) == 1
-    assert _times_each(np.rint(0.2 * np.arange(1000))) == 1
-    assert _times_each(np.repeat(rng.standard_normal(300), 3)) == 3
 
 
 def test_a_negative_latency_is_questioned() -> None:

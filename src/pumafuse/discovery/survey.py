@@ -15,6 +15,7 @@ import numpy as np
 
 from ..errors import RunError
 from ..logs.axes import in_axes
+from ..logs.clock import without_strays
 from ..logs.run import Run
 from .contents import Part, parts_of, period_of, without_clock
 from .following import Following
@@ -73,7 +74,8 @@ def survey(log: Path, rate: float = 0.0) -> Survey:
     roles = roles_of(parts, str(log))
     if not roles.sensors:
         raise RunError(f"{log}: commands, but nothing that measures where they lead: {_reasons(roles, parts)}")
-    found = Survey(log, roles.run, relations(roles.run), parts, roles)
+    run = without_strays(roles.run)
+    found = Survey(log, run, relations(run), parts, roles)
     if step := interpolation(found):
         command = found.run.command.interpolated(step)
         found = replace(found, run=replace(found.run, command=command), interpolation=step)

@@ -19,6 +19,8 @@ class Outcome(enum.IntEnum):
     TOO_LATE = 5
     INVALID = 6
     UNKNOWN = 7
+    STRAY = 8
+    HELD = 9
 
     @property
     def word(self) -> str:

@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -27,9 +26,7 @@ from .score import Z95
 
 LAGS = 20
 _FEW = 30  # fewer components get no verdict
-_FROZEN = 10  # equal values in a row of a sensor with noise
 _WIDEST = 1e6  # largest ratio of prior to noise at which double precision keeps the error bars
-_NEVER = 1e-6  # expected number below which chance is no explanation
 _COLOURED = 0.01  # p-value below which innovations are not white
 _NOTABLE = 0.1  # correlation below which whiteness is beside the point, however significant
 _MANY_REJECTED = 0.1  # share of rejected components beyond which the others are a selection
@@ -197,22 +194,20 @@ def consistency(
 
 
 def sensor_problems(est: Estimates) -> list[str]:
-    """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows, frozen."""
+    """Notes on sensors with a fault, a sentence each: re-acquired gates, mostly rejected rows."""
     found, given = list[str](), est.measurements
     order, begin = given.grouped
-    outcome, value, ends = given.outcome.take(order), given.value.take(order), begin.tolist()
+    outcome, ends = given.outcome.take(order), begin.tolist()
     count = np.diff(begin).reshape(len(given.sensors), len(given.axes))
     alone = np.count_nonzero(count.any(axis=1)) < 2
     for number, name in enumerate(given.sensors):
         if not count[number].any():
             continue
-        groups = ends[number * len(given.axes) : (number + 1) * len(given.axes) + 1]
-        mine = slice(groups[0], groups[-1])
+        mine = slice(ends[number * len(given.axes)], ends[(number + 1) * len(given.axes)])
         rejected = np.count_nonzero(outcome[mine] == int(Outcome.REJECTED)) / count[number].sum()
         reacquired = len(set(given.time[order[mine][outcome[mine] == int(Outcome.REACQUIRED)]].tolist()))
         times = "once" if reacquired == 1 else f"{reacquired} times"
         width = _width_of_prior(est, name)
-        frozen = {each: _frozen(value[slice(*of)]) for each, of in zip(given.axes, pairwise(groups), strict=True)}
         of_axes = [each for each, some in zip(given.axes, count[number].tolist(), strict=True) if some]
         kinds: dict[Kind, None] = {est.config.arm.axes[each].kind: None for each in of_axes}
         sd, bias_sd, offset_sd = (
@@ -234,10 +229,6 @@ def sensor_problems(est: Estimates) -> list[str]:
                 ),
             ),
             (rejected > _MANY_REJECTED, f"{rejected:.0%} of its components were {_TOO_SMALL.format(sd=sd)}"),
-            *(
-                (count > 0, f"{count} {each} measurements in a row have the same value: it froze")
-                for each, count in frozen.items()
-            ),
         ]
         found += [f"{name}: {problem}" for holds, problem in problems if holds]
     return found
@@ -254,22 +245,6 @@ def _width_of_prior(est: Estimates, name: str) -> float:
         if (sd := sensor.sd_of(axis)) is not None
     ]
     return max(widths, default=0.0)
-
-
-def _frozen(values: FloatArray) -> int:
-    """Length of the longest row of equal values where a working sensor would scatter; 0 if it did not freeze.
-
-    Coarse steps repeat by themselves: with a share p of repeats elsewhere, L equal values in a row come up n p^(L−1)
-    times in n measurements.
-    """
-    values = values[np.isfinite(values)]
-    changes = values[1:] != values[:-1]
-    if len(values) - 1 - np.count_nonzero(changes) < _FROZEN - 1:
-        return 0
-    edges = np.flatnonzero(np.concatenate(([True], changes, [True])))
-    longest = int(np.diff(edges).max())
-    elsewhere = (len(values) - (len(edges) - 1) - (longest - 1)) / max(len(values) - longest, 1)
-    return longest if longest >= _FROZEN and len(values) * elsewhere ** (longest - 1) < _NEVER else 0
 
 
 # ---- in words -------------------------------------------------------------------------------------------------------

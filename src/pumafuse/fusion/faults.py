@@ -1,6 +1,6 @@
 """Faults of a log that show before anything is filtered.
 
-A sensor with another unit, axis, sign, clock or zero, repeated values, a begin in mid-motion.
+A sensor with another unit, axis, sign, clock or zero, a begin in mid-motion.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ _SETTLED = 5.0  # lags of the plant
 _MOVED = 0.5  # share of a motion
 _FEWEST = 4  # measurements of a sensor
 _MOST = 10_000  # commands before the first
-_COARSE = 3.0  # typical over smallest change of a value: below it the sensor counts steps
 _CLEAR, _LOST = 0.9, 0.5  # correlations: a cause is clear; the commands do not show
 _SCALE = 10.0  # factor on a motion up to which it may be a scale that can be fitted
 _ALIKE_SIZE = 0.2  # by how much, over it, the same fault of two sensors may differ
@@ -68,7 +67,7 @@ class Fault:
 
 
 def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
-    """A sentence on each configured sensor that does not follow, is off by a constant, or repeats its values.
+    """A sentence on each configured sensor that does not follow, or is off by a constant.
 
     Raises:
         RunError: A sensor, or the commands, are in another unit than their name says.
@@ -79,13 +78,6 @@ def sensor_faults(segment: Segment, config: FusionConfig) -> list[str]:
     if refused := [one.sentence for one in faults if one.refused]:
         raise RunError(refused[0])
     found, named = [one.sentence for one in faults], {name for one in faults for name in one.sensors}
-    for name, axes in given.items():
-        times = max((_times_each(value) for _, value in axes.values()), default=1)
-        if times > 1:
-            found.append(
-                f"sensor '{name}' gives each value {times} times: a sample that is held? Each counts as a measurement"
-                " of its own, at its own stamp; log each once"
-            )
     quiet = {name: mine for name, mine in trackings.items() if name not in named}
     return [*within_a_turn(segment, config), *found, *_moving_alone(config, quiet), *_off(config, quiet)]
 
@@ -442,7 +434,7 @@ def _of_commands(faults: Sequence[Fault], trackings: _Trackings) -> list[Fault]:
     return found
 
 
-# ---- a begin in mid-motion, held samples, a latency below 0 ---------------------------------------------------------
+# ---- a begin in mid-motion, a latency below 0 ---------------------------------------------------------
 
 
 def _first_speed(segment: Segment, axis: str) -> float:
@@ -490,15 +482,3 @@ def _evidence(segment: Segment, config: FusionConfig, axis: str, speed: float) -
         noise = max((sensor.sd_of(axis) or 0.0) / abs(sensor.scale), float(np.std(left - added * (along / size))))
         score, information = score + along / noise**2, information + size / noise**2
     return score, information
-
-
-def _times_each(values: FloatArray) -> int:
-    """How often each value of a sensor comes in a row, typically, if it holds its samples; else 1.
-
-    Not at rest, where a long row of equal values is one row of many, and not where coarse steps repeat by themselves.
-    """
-    changes = np.flatnonzero(values[1:] != values[:-1])
-    if len(changes) < _FEW or 1.5 * len(changes) > len(values):  # half of them, or more, come once
-        return 1
-    steps = np.abs(np.diff(values)[changes])
-    return 1 if median(steps) < _COARSE * steps.min() else int(median(np.diff(changes)))

@@ -283,9 +283,9 @@ def _row_counts(segment: Segment, filtered: Filtered) -> dict[str, dict[str, int
 def _without_strays(parts: Sequence[Mapping[str, int]], logged: Source, mended: Source) -> dict[str, int]:
     """The sum of the segments' counts of a source, stray stamps apart from none."""
     found = added(parts)
-    unstamped = found.get(NO_STAMP_WORD, 0)
+    unstamped, word = found.get(NO_STAMP_WORD, 0), Outcome.STRAY.word
     stray = min(int(np.count_nonzero(logged.stamp != mended.stamp)), unstamped)
-    return counted(found | {NO_STAMP_WORD: unstamped - stray, "stray": stray})
+    return counted(found | {NO_STAMP_WORD: unstamped - stray, word: found.get(word, 0) + stray})
 
 
 def _measurements(cut: Sequence[Segment], filtered: Sequence[Filtered]) -> Measurements:

@@ -25,13 +25,15 @@ from ..logs.clock import LONGEST_TAIL_NS, TOLERATED_STEP_BACK_NS, behind, in_ord
 from ..logs.frames import CARTESIAN
 from ..logs.grid import regular_grid
 from ..logs.run import Run, Source, note_rows
+from ..logs.screening import held
 from ..model.arm import ArmModel
-from ..units import AN, of_kind
+from ..units import AN, of_kind, seconds
 from .config import FusionConfig
 from .setup import filter_model
 
 _FUSED = int(Outcome.FUSED)  # numpy asks an enumeration for attributes, as long as it compares a whole column
 _MOST_ESTIMATES = 10_000_000
+_LAGS = 2.0  # of an arm that is not known yet, until an axis follows its commands
 _KEPT = 3  # orders of the events: those of a search's point, and a little earlier and later
 
 # What may become of a row, besides its outcome: a command that says again what is in force; outside of --from and --to;
@@ -237,7 +239,9 @@ def build(
         raise RunError(f"{label}: no command for axis '{late[0]}' {run.interval} after the first command")
     given = {axis: (rows.known[:, number] == _FUSED).argmax() for number, axis in enumerate(run.axes)}
     first = {axis: float(rows.value[row, number]) for number, (axis, row) in enumerate(given.items())}
-    parts = [_measurement_rows(run, config, number, used, policy, origin, own, notes) for number in range(len(used))]
+    parts = [
+        _measurement_rows(run, config, number, used, policy, rows, origin, own, notes) for number in range(len(used))
+    ]
     measured = joined([Events.empty(len(run.axes)), *(part for part, _ in parts)])
     counts = {name: {NOT_SELECTED: len(one.stamp[_owned(one.stamp, own)])} for name, one in run.sensors.items()}
     counts |= {name: found for name, (_, found) in zip(used, parts, strict=True)}
@@ -375,6 +379,8 @@ def _command_rows(run: Run, policy: Model, notes: list[str]) -> Events:
     note_rows(notes, label, behind(source.stamp) > 0, "a stamp that steps back: sorted")
     order = in_order(source.stamp, int(np.count_nonzero(missing)))
     rows = _classified(_table(source, run.axes, order, COMMAND), policy, 0, np.zeros_like(missing[order]))
+    if len(source.stray):
+        rows.known[source.stray[order][:, None] & (rows.known == int(Outcome.INVALID))] = int(Outcome.STRAY)
     note_rows(notes, label, source.repeated() & ~missing, "the stamp and values of an earlier row: duplicate")
     for number, axis in enumerate(run.axes):
         known, hollow = rows.known[:, number], np.zeros(len(missing), dtype=np.bool_)
@@ -393,7 +399,7 @@ def _command_counts(rows: Events, unstamped: int) -> dict[str, int]:
         "used": int(np.count_nonzero(best == _FUSED)),
         Outcome.DUPLICATE.word: int(np.count_nonzero(again & hidden)),
         REPETITION: int(np.count_nonzero(again & ~hidden)),
-        Outcome.INVALID.word: int(np.count_nonzero(best == int(Outcome.INVALID))),
+        **{one.word: int(np.count_nonzero(best == int(one))) for one in (Outcome.INVALID, Outcome.STRAY)},
         NO_STAMP_WORD: unstamped,
     }
 
@@ -430,6 +436,7 @@ def _measurement_rows(
     number: int,
     names: Sequence[str],
     policy: Model,
+    commands: Events,
     origin: int,
     own: tuple[int, int],
     notes: list[str],
@@ -444,6 +451,8 @@ def _measurement_rows(
     rows = _table(source, run.axes, order, number, latency)
     rows = _classified(rows, policy, origin, lag[order] > TOLERATED_STEP_BACK_NS)
     rows.known[~used[order]] = ABSENT
+    if sensor is not None:
+        notes += _hold(rows, commands, config, name, label, run.axes, origin)
     kept = rows.where(used[order])
     mine = source.stamp[_owned(_valid(source.stamp, latency), own)]
     counts = _measurement_counts(kept.rows(_owned(kept.time, own)), mine)
@@ -465,6 +474,39 @@ def _measurement_rows(
         hollow = (known[:, column] == int(Outcome.INVALID)) & ~missing
         note_rows(notes, label, hollow, f"no finite {axis} value: {Outcome.INVALID.word}")
     return kept, counts
+
+
+def _hold(
+    rows: Events,
+    commands: Events,
+    config: FusionConfig,
+    name: str,
+    label: str,
+    axes: Sequence[str],
+    origin: int,
+) -> list[str]:
+    """Mark what one sensor says again and again as held; a sentence on each axis where it does."""
+    found = list[str]()
+    for column, axis in enumerate(axes):
+        mine, told = (np.flatnonzero(one.known[:, column] == _FUSED) for one in (rows, commands))
+        stamp, command = rows.stamp[mine], (commands.stamp[told], commands.value[told, column])
+        again, times = held(stamp, rows.value[mine, column], command, latest_follow(config, name, axis))
+        if again.any():
+            rows.known[mine[again], column] = int(Outcome.HELD)
+            first, last = seconds(stamp[again][[0, -1]], origin).tolist()
+            slow = f"{axis} gives each value {times} times, as a sensor that is slower than its rows"
+            froze = f"{axis} repeats its value to the last digit while the commands move it (did it freeze?)"
+            found.append(
+                f"{label}: {slow if times > 1 else froze}, from {first:.2f} to {last:.2f} s: each value counts once,"
+                f" {np.count_nonzero(again)} are {Outcome.HELD.word}"
+            )
+    return found
+
+
+def latest_follow(config: FusionConfig, sensor: str, axis: str) -> int:
+    """How long after its command a sensor shows that an axis moves, at most [ns]: the arm may not be known yet."""
+    late = config.arm.lag_of(axis) + abs(config.sensors[sensor].latency)
+    return round((_LAGS * late + config.arm.update_period) * 1e9)
 
 
 def _measurement_counts(kept: Events, stamp: TimeArray) -> dict[str, int]:

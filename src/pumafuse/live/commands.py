@@ -29,6 +29,7 @@ class Commands:
         """No command yet; ``start`` is the level [m] of each axis before its first one, NaN: that of the first one."""
         self._start = start
         self._given: list[list[tuple[int, float]]] = [[] for _ in start]  # stamps and values, by stamp
+        self._ends = [(math.inf, -math.inf) for _ in start]
 
     def add(self, stamp: int, codes: bytes, values: Sequence[float], oldest: int) -> None:
         """Add the values [m] of a command that were fused, in the place of what the axis had at that stamp [ns].
@@ -39,9 +40,11 @@ class Commands:
             values: [m].
             oldest: Nobody will ask for what was before [ns].
         """
-        for given, code, value in zip(self._given, codes, values, strict=True):
+        for axis, (given, code, value) in enumerate(zip(self._given, codes, values, strict=True)):
             if code != _FUSED:
                 continue
+            low, high = self._ends[axis]
+            self._ends[axis] = min(low, value), max(high, value)
             if not given or stamp > given[-1][0]:
                 given.append((stamp, value))
             else:
@@ -55,6 +58,11 @@ class Commands:
         given = self._given[axis]
         place = bisect_left(given, (stamp + 1,))
         return given[place - 1][1] if place else self._before(axis) if given else None
+
+    def travel(self, axis: int) -> float:
+        """How far apart the commands of an axis have been [m]; 0 before any."""
+        low, high = self._ends[axis]
+        return max(high - low, 0.0)
 
     def latest(self) -> list[tuple[int, float, float] | None]:
         """Of each axis stamp [ns], value and step [m] of its latest command; None before any."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -16,7 +16,7 @@ from ..filter.events import COMMAND
 from ..filter.outcome import ABSENT, FARTHEST, Outcome
 from ..filter.window import MOST_EVENTS, Window
 from ..fusion.config import FusionConfig
-from ..fusion.segments import LONGEST_TAIL_NS
+from ..fusion.segments import LONGEST_TAIL_NS, latest_follow
 from ..fusion.setup import live_model
 from ..logs.frames import CARTESIAN
 from .clock import Clock, Time, Verdict, nanoseconds
@@ -24,12 +24,14 @@ from .commands import Commands, CommandWatch, number
 from .frame_start import FrameStart
 from .health import Counts, Health, by_word
 from .rate_limit import RateLimitedLog
-from .results import AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
+from .results import REASONS, AxisNow, LiveEstimate, UpdateResult, no_estimate, refused, update_result
+from .screening import CommandScreen, HoldWatch, Screened
 
 _MOST_AXES = 62  # the core takes the axes of an event as bits
 _MOST_ASIDE = 10_000  # events kept in case a clock was set anew
 _ABSENT = bytes((ABSENT,))
 _FUSED, _INVALID, _UNKNOWN, _TOO_LATE = Outcome.FUSED, Outcome.INVALID, Outcome.UNKNOWN, Outcome.TOO_LATE
+_STRAY, _HELD = Outcome.STRAY, Outcome.HELD
 
 
 class _Event(NamedTuple):
@@ -121,6 +123,8 @@ class LiveEstimator:
         self._contradicting: dict[str, str] = {}  # sensors, and whom they contradict now
         self._clock = Clock(round(window * 1e9))
         self._watch = CommandWatch(config.arm, config.frame, self._log)
+        self._screen, self._holds = CommandScreen(config.arm.update_period), HoldWatch(self._clock.window // 2)
+        self._follows = [[latest_follow(config, name, axis) for axis in self.axes] for name in config.sensors]
         self._start = dict(start or {})
         self._begin(Counts(len(self._sensors)))
 
@@ -241,6 +245,8 @@ class LiveEstimator:
         model = live_model(self.config, self._frame_start.start(self._start))
         self._window, self._commands = Window(model), Commands(model.axis["start"].tolist())
         self._watch.restart()
+        self._screen.restart()
+        self._holds.restart()
         counts.restart()
         # A frame that waits is placed by the first command; one that comes later, but was given before it, moves it:
         # what came is fed again then, and counted anew.
@@ -272,6 +278,36 @@ class LiveEstimator:
             self._aside = []
         if self._event_log is not None:
             self._event_log.append(stamp, sensor, values)
+        if sensor is None:
+            return self._take_screened(stamp, values)
+        if stamp > self._screen.until:
+            self._settle(self._screen.believed())
+        return self._enter(stamp, sensor, values)
+
+    def _take_screened(self, stamp: int, values: Mapping[str, Any]) -> UpdateResult:
+        """Take a command that is in time, or let it wait for the next."""
+        self._counts.outcomes[COMMAND, _STRAY] += 1
+        settled = self._settle(self._screen.take(stamp, values))
+        waits = "leaps by many times the usual step: not used unless the next one is there, too"
+        return settled.get(stamp) or refused(values, _STRAY, waits)
+
+    def _settle(self, commands: Sequence[Screened]) -> dict[int, UpdateResult]:
+        """Enter commands that have waited, or need not, without what is stray; what became of each, by its stamp."""
+        found = dict[int, UpdateResult]()
+        for stamp, values, stray in commands:
+            for name in stray:
+                self._log.write(
+                    f"stray {name}",
+                    f"a command of {name} at {stamp / 1e9:.3f} s leaps away from those before and after it: stray, not"
+                    " used",
+                )
+            if values or not stray:
+                self._counts.outcomes[COMMAND, _STRAY] -= 1
+                found[stamp] = self._enter(stamp, None, values)
+        return found
+
+    def _enter(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
+        """Take an event that is to be used."""
         if self._early is not None:
             return self._take_early(_Event(stamp, sensor, dict(values)))
         return self._feed(stamp, sensor, values)
@@ -321,6 +357,7 @@ class LiveEstimator:
         self._counts.forget(self._window, after)
         self._window.forget(after)
         self._commands.forget(after)
+        self._screen.restart()
         if self._event_log is not None:
             self._event_log.discard(after)
         self._counts.outcomes[COMMAND, _FUSED] -= self._doubtful
@@ -372,8 +409,8 @@ class LiveEstimator:
         self._early.append(event)
         return self._feed(*event)
 
-    def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any]) -> UpdateResult:
-        """Give an event that is in time to the window."""
+    def _feed(self, stamp: int, sensor: str | None, values: Mapping[str, Any], judged: bool = False) -> UpdateResult:
+        """Give an event that is in time to the window; ``judged``: nothing of it is held."""
         window, counts, given, stranger = self._window, self._counts, 0, ""
         new = window.value
         for name, value in values.items():
@@ -389,6 +426,10 @@ class LiveEstimator:
         oldest = self._oldest()
         if stamp < oldest:
             return self._refuse_late(stamp, sensor, values, counts.outcomes)
+        if sensor is not None and not judged:
+            held, released = self._held(stamp, sensor, given)
+            if released or held:
+                return self._without_held(stamp, sensor, given, held, released)
         if not given:
             missing = not stranger and len(values) > 0
             why = "no command has shown yet where x and y are in the arm's axes" if missing else self._no_axis(stranger)
@@ -408,7 +449,8 @@ class LiveEstimator:
         if sensor is None:
             self._take_command(stamp, values, codes, result.outcome, oldest)
             return result
-        counts.came(source, stamp, self._clock.sure)
+        if not judged:
+            counts.came(source, stamp, self._clock.sure)
         if window.port.end == rows:  # it repeats another
             for code in codes.replace(_ABSENT, b""):
                 counts.outcomes[source, code] += 1
@@ -417,6 +459,37 @@ class LiveEstimator:
         elif sensor in self._contradicting and result.outcome is _FUSED:
             del self._contradicting[sensor]
         return result
+
+    def _without_held(
+        self, stamp: int, sensor: str, given: int, held: int, released: Sequence[tuple[int, str, float]]
+    ) -> UpdateResult:
+        """Give the window what is news of a measurement that has come to it, and what was not used before and is."""
+        self._counts.came(self._sensors[sensor], stamp, self._clock.sure)
+        kept = {name: self._window.value[axis] for name, axis in self._bits.items() if (given & ~held) >> axis & 1}
+        again = [name for name, axis in self._bits.items() if held >> axis & 1]
+        result = self._feed(stamp, sensor, kept, judged=True) if kept else refused(again, _HELD, REASONS[_HELD])
+        for earlier, name, value in released:
+            self._feed(earlier, sensor, {name: value}, judged=True)
+        return result
+
+    def _held(self, stamp: int, sensor: str, given: int) -> tuple[int, list[tuple[int, str, float]]]:
+        """Which of the axes that a measurement gives are no news, as bits; values of before that are news after all."""
+        held, released, number = 0, list[tuple[int, str, float]](), self._sensors[sensor]
+        for axis, name in enumerate(self.axes):
+            if not given >> axis & 1:
+                continue
+            value, lag = self._window.value[axis], self._follows[number][axis]
+            found = self._holds.judge((number, axis), stamp, value, self._commands, lag)
+            held |= found.held << axis
+            self._counts.outcomes[number, _HELD] += found.held - len(found.released)
+            released += [(earlier, name, one) for earlier, one in found.released]
+            if found.sure:
+                self._log.write(
+                    f"{sensor} {name} held",
+                    f"sensor '{sensor}' repeats its value of {name} to the last digit at {stamp / 1e9:.3f} s: did it"
+                    " freeze, or is it slower than its rows? Held, not used",
+                )
+        return held, released
 
     def _take_command(self, stamp: int, values: Mapping[str, Any], codes: bytes, outcome: Outcome, oldest: int) -> None:
         """Keep and watch a command that is in the window."""

@@ -11,7 +11,7 @@ from ..errors import UnknownNameError
 from ..filter.outcome import Outcome
 
 COMPARED = frozenset({Outcome.FUSED, Outcome.REACQUIRED, Outcome.REJECTED})  # with its prediction
-_REASONS: Mapping[Outcome, str] = {  # the best first
+REASONS: Mapping[Outcome, str] = {  # the best first
     Outcome.FUSED: "taken",
     Outcome.REACQUIRED: "taken after rejections in a row: the offset was widened",
     Outcome.REJECTED: "farther from its prediction than the sensor's gate allows",
@@ -20,8 +20,10 @@ _REASONS: Mapping[Outcome, str] = {  # the best first
     Outcome.TOO_LATE: "stamped before the window",
     Outcome.INVALID: "not a finite position",
     Outcome.UNKNOWN: "no such sensor or axis",
+    Outcome.STRAY: "leaps away from the commands before and after",
+    Outcome.HELD: "the value before, to the last digit, while the commands move the axis",
 }
-_ORDER = list(_REASONS)
+_ORDER = list(REASONS)
 
 
 class UpdateResult(NamedTuple):
@@ -42,7 +44,7 @@ class UpdateResult(NamedTuple):
 def update_result(outcomes: Mapping[str, Outcome]) -> UpdateResult:
     """The result of an event from the outcomes of its axes, of which there is at least one."""
     best = min(outcomes.values(), key=_ORDER.index)
-    reasons = "; ".join(dict.fromkeys(_REASONS[outcome] for outcome in outcomes.values()))
+    reasons = "; ".join(dict.fromkeys(REASONS[outcome] for outcome in outcomes.values()))
     return UpdateResult(best, MappingProxyType(dict(outcomes)), reasons)
 
 

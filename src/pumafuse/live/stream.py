@@ -101,11 +101,12 @@ class Stream:
         result = live.measurement(t, sensor, **values) if sensor else live.command(t, **values)
         for watcher in self._watchers:
             watcher.event(event, result)
-        if not COMPARED.issuperset((result.outcome, *result.axes.values())):
+        waits = result.outcome is Outcome.STRAY  # whether it is stray is said once the next has come
+        if not waits and not COMPARED.issuperset((result.outcome, *result.axes.values())):
             who = sensor if sensor in live.config.sensors else "unknown sensor" if sensor else "command"
             became = f"{result.reason} ({result.outcome.word})"
             self._log.write(f"{who} {result.outcome.word}", f"{sensor[:40] or who}{_at(t)}: {became}")
-        if self._step is None and not sensor and result.outcome is Outcome.FUSED:
+        if self._step is None and not sensor and (waits or result.outcome is Outcome.FUSED):
             self._send(live.estimate(nanoseconds(t)))
 
     def idle(self, now: int) -> None:

@@ -16,6 +16,7 @@ from ..arrays import ALWAYS, NO_STAMP, IntArray, TimeArray, median
 from ..errors import RunError
 from ..units import TIMES, mistaken
 from .run import Run, Source, note_rows
+from .screening import without_stray_values
 
 TOLERATED_STEP_BACK_NS = 1_000_000_000  # up to 1 s rows are out of order; beyond it the clock was set back
 _OTHER_PERIOD, _OTHER_BEAT = 2.0, 1.25  # times the update period from which an interval is another one; a steady one
@@ -105,7 +106,7 @@ def _stray_from(stamp: Sequence[int], before: int, row: int) -> int:
 
 
 def without_strays(run: Run) -> Run:
-    """The run with stray stamps (see :func:`stray_offsets`) removed, and a note on each source that has any.
+    """The run without stray stamps (see :func:`stray_offsets`) and commands, and a note on each source that has any.
 
     Their rows stay and count as rows without a stamp: commands are not used, measurements are invalid, and all other
     rows are processed as if these were absent. Rows of sensors and of the reference that are far behind keep their
@@ -130,7 +131,9 @@ def without_strays(run: Run) -> Run:
                 note_rows(notes, label, rows, what, f", by {abs(apart[rows][0]) / 1e9:.3f} s")
         return replace(source, stamp=np.where(apart == 0, source.stamp, NO_STAMP))
 
-    return replace(run.each(mended), notes=tuple(notes), without_strays=True)
+    found = run.each(mended)
+    command = without_stray_values(found.command, list(found.sensors.values()), notes)
+    return replace(found, command=command, notes=tuple(notes), without_strays=True)
 
 
 def segments(run: Run) -> tuple[list[Run], list[str]]:

@@ -49,6 +49,7 @@ class Source:
         spread: For an axis computed by a frame, the factor on the noise of each row, (rows,).
         sd: Standard deviation of the noise of a reference [m or rad], for all axes or for each.
         apart: Whether axes may have rows of their own: NaN is then not invalid, but another axis's row.
+        stray: Rows of commands of which a value is left out, as nobody sent it, (rows,); (0,) where none is.
     """
 
     stamp: TimeArray
@@ -57,6 +58,7 @@ class Source:
     spread: Mapping[str, FloatArray] = field(default_factory=dict[str, FloatArray])
     sd: float | Mapping[str, float] = 0.0
     apart: bool = False
+    stray: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     def sd_of(self, axis: str) -> float:
         """Standard deviation of the noise of a reference on one axis [m or rad]."""
@@ -166,7 +168,8 @@ class Source:
             return self
         values = {axis: value[chosen] for axis, value in self.values.items()}
         spread = {axis: value[chosen] for axis, value in self.spread.items()}
-        return replace(self, stamp=self.stamp[chosen], values=values, spread=spread)
+        stray = self.stray[chosen] if len(self.stray) else self.stray
+        return replace(self, stamp=self.stamp[chosen], values=values, spread=spread, stray=stray)
 
 
 @dataclass(frozen=True, repr=False)

@@ -44,6 +44,8 @@ _BY_GRAVITY = (
     Outcome.TOO_LATE,
     Outcome.INVALID,
     Outcome.UNKNOWN,
+    Outcome.HELD,
+    Outcome.STRAY,
     Outcome.REJECTED,
 )
 _PATH_POINTS = 20_000  # a 3D path needs no more, whatever the rate of the estimates

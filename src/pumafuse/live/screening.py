@@ -1,0 +1,240 @@
+"""What a stream says that tells nothing: commands that nobody sent wait for the next, repeated values are held."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..arrays import ALWAYS, NEVER
+from ..logs.screening import BRIEF, FAR, MOST_STRAY, USUAL, Habit, leaps, returns
+from .commands import Commands, number
+
+_REMEMBERED, _LOOKED_AT = 256, 64  # steps of an axis; after so many new ones the usual one is worked out anew
+_KNOWN = 64  # steps, from which a usual one is known
+_BELIEVED = 1.0 / 3.0  # of a step that was believed, is usual: another of its size is no leap
+_ODD = 1e-4  # a probability of equal values in a row from which they wait
+_PATIENCE = 5.0  # update periods, after which a command that came alone is believed
+
+
+class Screened(NamedTuple):
+    """A command that is decided: its stamp [ns], the values to use, and those that are stray [m]."""
+
+    stamp: int
+    values: dict[str, Any]
+    stray: dict[str, float]
+
+
+class Steps:
+    """The latest value of an axis and its steps.
+
+    Attributes:
+        value: The latest one; NaN before any.
+        pace: Its step, 0 for none.
+        usual: The step than which few are larger, of which the largest is three times as large; 0: not known yet.
+    """
+
+    def __init__(self) -> None:
+        """No value yet."""
+        self.value, self.pace, self.usual = float("nan"), 0.0, 0.0
+        self._recent, self._new = deque[float](maxlen=_REMEMBERED), 0
+
+    def add(self, value: float, consecutive: bool = True) -> None:
+        """Take the next value; one that is not ``consecutive`` tells of no step."""
+        self.pace, self.value = abs(value - self.value) if consecutive else 0.0, value
+        if not self.pace > 0.0:
+            return
+        self._recent.append(self.pace)
+        self._new += 1
+        if len(self._recent) < _KNOWN:
+            return
+        self.usual = max(self.usual, _BELIEVED * self.pace)
+        if self._new >= _LOOKED_AT:
+            steps = sorted(self._recent)
+            self._new, self.usual = 0, max(steps[int(USUAL * len(steps))], _BELIEVED * steps[-1])
+
+    def leapt(self, value: float) -> bool:
+        """Whether the next value is many times the usual step away."""
+        return self.usual > 0.0 and leaps(value, self.value, max(self.usual, self.pace))
+
+
+class _Repeated:
+    """One axis of a sensor: its latest value, since when it has come, how often, where the axis was led meanwhile."""
+
+    def __init__(self) -> None:
+        """No value yet."""
+        self.value, self.stamp, self.since, self.count, self.leapt = math.nan, ALWAYS, ALWAYS, 0, False
+        self.low, self.high = 0.0, 0.0
+        self.waiting, self.believed = list[tuple[int, float]](), False
+        self.habit: Habit | None = None
+        self._steps, self._lengths = deque[float](maxlen=_REMEMBERED), deque[int](maxlen=_REMEMBERED)
+        self._new = 0
+
+    def is_new(self, stamp: int, value: float) -> bool:
+        """Take the next value; whether it is another one."""
+        self.stamp = stamp
+        if value == self.value:
+            self.count += 1
+            return False
+        if math.isfinite(step := abs(value - self.value)):
+            self.leapt = self.habit is not None and step > FAR * self.habit.usual
+            self._steps.append(step)
+            self._lengths.append(self.count)
+            self._new += 1
+            if self._new >= _LOOKED_AT and len(self._steps) >= _KNOWN:
+                self._new, self.habit = 0, Habit.of(np.array(self._steps), np.array(self._lengths))
+        self.value, self.since, self.count = value, stamp, 1
+        self.waiting, self.believed = [], False
+        return True
+
+    def forget(self) -> None:
+        """Begin anew with the next value, as one has come that was before the latest."""
+        self.value, self.waiting = math.nan, []
+
+    @property
+    def repeats(self) -> float:
+        """How often the latest values were repeated, of 1."""
+        return 1.0 - len(self._lengths) / (sum(self._lengths) + 1)
+
+
+class Judged(NamedTuple):
+    """What a measured value is.
+
+    Attributes:
+        held: Whether it is not used, at least not now.
+        sure: Whether it never will be.
+        released: Stamps [ns] and values [m] of those before it that were not used, and are news after all.
+    """
+
+    held: bool
+    sure: bool
+    released: Sequence[tuple[int, float]] = ()
+
+
+_NEWS = Judged(False, False)
+
+
+class HoldWatch:
+    """Judges which values of a sensor on an axis are no news: see :func:`pumafuse.logs.screening.held`.
+
+    One that repeats the value before, against the sensor's habit or while the commands go on, waits: it is used once
+    another one comes, or nothing moves, and held once the commands have clearly moved the axis.
+    """
+
+    def __init__(self, patience: int) -> None:
+        """No value yet; none waits for longer than ``patience`` [ns]."""
+        self._patience = patience
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew by another clock."""
+        self._seen = dict[tuple[int, int], _Repeated]()
+
+    def judge(self, key: tuple[int, int], stamp: int, value: float, commands: Commands, lag: int) -> Judged:
+        """Judge a value; where they come out of order nothing is held.
+
+        Args:
+            key: Which sensor, and which axis.
+            stamp: Int ns.
+            value: [m].
+            commands: As far as they have come.
+            lag: How late the axis may follow them [ns].
+        """
+        one, axis = self._seen.setdefault(key, _Repeated()), key[1]
+        waited = one.waiting
+        if stamp <= one.stamp:
+            one.forget()
+            return Judged(False, False, waited)
+        if one.is_new(stamp, value):
+            return Judged(False, False, waited)
+        if (habit := one.habit) is None:
+            return _NEWS
+        if one.count == 2:
+            one.low = one.high = commands.at(axis, one.since) or 0.0
+        if stamp - lag >= one.since and (led := commands.at(axis, stamp - lag)) is not None:
+            one.low, one.high = min(one.low, led), max(one.high, led)
+        moved = one.high - one.low
+        if habit.is_again(one.count - 1) or habit.froze(
+            one.count, moved, commands.travel(axis), one.leapt, one.repeats
+        ):
+            one.waiting = []
+            return Judged(True, True)
+        led, before = (commands.at(axis, instant) or 0.0 for instant in (stamp, one.since - lag))
+        odd = led != before and (one.leapt or one.repeats ** (one.count - 1) < _ODD)
+        if one.believed or not (odd or habit.is_clear(max(led - one.low, one.high - led))):
+            return _NEWS
+        waited.append((stamp, value))
+        if stamp - waited[0][0] <= self._patience:
+            return Judged(True, False)
+        one.waiting, one.believed = [], True
+        return Judged(True, False, waited)
+
+
+class CommandScreen:
+    """Lets commands through but those that leap away, which wait: if the next ones are back they are stray.
+
+    Attributes:
+        until: Who waits is believed when something is stamped later [ns].
+    """
+
+    def __init__(self, period: float) -> None:
+        """Screen commands that come every ``period`` [s]."""
+        self._apart, self._patience = round(BRIEF * period * 1e9), round(_PATIENCE * period * 1e9)
+        self._axes: dict[str, Steps] = {}
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew by another clock; usual steps stay."""
+        self._last, self.until = ALWAYS, NEVER
+        self._waiting: list[tuple[int, dict[str, Any]]] = []
+
+    def take(self, stamp: int, values: Mapping[str, Any]) -> list[Screened]:
+        """Take a command; those that are decided by now, without what is stray, and that.
+
+        Args:
+            stamp: Int ns.
+            values: By axis.
+        """
+        consecutive, self._last = 0 < stamp - self._last <= self._apart, stamp
+        told = list[Screened]()
+        if self._waiting and consecutive:
+            told = self._back(values)
+            if not told and len(self._waiting) < MOST_STRAY:
+                self._waiting.append((stamp, dict(values)))
+                return []
+        told = told or self.believed()
+        if consecutive and any(self._leaps(name, value) for name, value in values.items()):
+            self._waiting, self.until = [(stamp, dict(values))], stamp + self._patience
+            return told
+        self._learn(values, consecutive)
+        return [*told, Screened(stamp, dict(values), {})]
+
+    def believed(self) -> list[Screened]:
+        """Those that wait, as nothing has shown that they are stray."""
+        told, self._waiting, self.until = self._waiting, [], NEVER
+        for _, values in told:
+            self._learn(values, True)
+        return [Screened(stamp, values, {}) for stamp, values in told]
+
+    def _back(self, now: Mapping[str, Any]) -> list[Screened]:
+        """Those that wait, without what is stray, if each axis that has leapt is back now; else none."""
+        told = list[Screened]()
+        for stamp, values in self._waiting:
+            out = {name: number(value) for name, value in values.items() if self._leaps(name, value)}
+            for name, value in out.items():
+                if not returns(number(now.get(name)), self._axes[name].value, [value]):
+                    return []
+            told.append(Screened(stamp, {name: one for name, one in values.items() if name not in out}, out))
+        self._waiting, self.until = [], NEVER
+        return told
+
+    def _leaps(self, name: str, value: Any) -> bool:
+        return name in self._axes and self._axes[name].leapt(number(value))
+
+    def _learn(self, values: Mapping[str, Any], consecutive: bool) -> None:
+        for name, value in values.items():
+            if math.isfinite(given := number(value)):
+                self._axes.setdefault(name, Steps()).add(given, consecutive)

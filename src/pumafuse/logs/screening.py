@@ -1,0 +1,185 @@
+"""Values that tell nothing: commands that nobody sent, and what a sensor says again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import NO_STAMP, BoolArray, FloatArray, IntArray, TimeArray, median
+from ..units import TURN
+from .run import Source, note_rows
+
+USUAL = 0.9  # of all steps are smaller than the usual one: more are not stray, and jumps of a motion may be as rare
+FAR = 5.0  # usual steps from which a value leaps: where a motion begins or turns it is about one
+BACK = 0.5  # of a leap, up to which what comes after it is back where it began
+MOST_STRAY = 2  # values in a row; three are a motion
+FEWEST = 20  # changes, from which a usual step is known
+BRIEF = 2.5  # usual intervals between changes, up to which one value may last
+_FOLLOWED_NS, _FOLLOWED = 1_000_000_000, 3.0  # within 1 s an arm shows it: by steps so many times as large as before
+_STEPS = 10.0  # of its resolution, and ...
+_CLEARLY = 5.0  # ... of its usual steps, that a sensor must have missed
+_FROZEN = 5  # equal values in a row, from which it is asked whether a sensor froze
+_BY_CHANCE = 1e-12  # a probability with which noise explains no row of equal values in any log
+_SHARE = 0.2  # of the commanded travel, that nobody takes for play or for stiction
+_COARSE = 3.0  # typical over smallest step of a value: below it a sensor counts steps
+_MOSTLY = 1.5  # times that each value comes, on the mean: half of them, or more, come again
+
+
+def leaps(value: float, before: float, usual: float) -> bool:
+    """Whether a value is many times the usual step away from the one before, and not by a turn or two of an angle."""
+    apart = abs(value - before)
+    turns = round(apart / TURN)
+    return apart > FAR * usual and not (1 <= turns <= 2 and abs(apart - turns * TURN) <= FAR * usual)
+
+
+def returns(value: float, before: float, out: Iterable[float]) -> bool:
+    """Whether a value is back near the one before those that leapt ``out``."""
+    return abs(value - before) < BACK * min(min(abs(one - before), abs(one - value)) for one in out)
+
+
+def without_stray_values(command: Source, sensors: Sequence[Source], notes: list[str]) -> Source:
+    """The commands without values that nobody sent: NaN, with a note.
+
+    One or two values that leap away from their neighbours and back by many times the usual step are stray, if no sensor
+    follows them.
+    """
+    values, left_out = dict(command.values), np.zeros(len(command.stamp), dtype=np.bool_)
+    for axis, value in command.values.items():
+        told = _in_order(command.stamp, value)
+        measured = [_in_order(one.stamp, one.values[axis])[1:] for one in sensors if axis in one.values]
+        stray = np.zeros(len(value), dtype=np.bool_)
+        stray[told[0]] = _stray(*told[1:], measured)
+        if stray.any():
+            values[axis], left_out = np.where(stray, np.nan, value), left_out | stray
+            what = f"a value of {axis} that leaps away from its neighbours and back, which nothing follows: stray"
+            note_rows(notes, command.label, stray, f"{what}, not used")
+    return replace(command, values=values, stray=left_out) if left_out.any() else command
+
+
+def _in_order(stamp: TimeArray, value: FloatArray) -> tuple[TimeArray, TimeArray, FloatArray]:
+    """The rows with both, by stamp; their stamps and values."""
+    rows = np.flatnonzero(np.isfinite(value) & (stamp != NO_STAMP))
+    rows = rows[np.argsort(stamp[rows], kind="stable")]
+    return rows, stamp[rows], value[rows]
+
+
+def _stray(stamp: TimeArray, value: FloatArray, sensors: Sequence[tuple[TimeArray, FloatArray]]) -> BoolArray:
+    """Which of the commands of an axis, by stamp, are stray, (rows,)."""
+    found = np.zeros(len(value), dtype=np.bool_)
+    begin = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)  # a table may say each several times
+    if len(begin) <= FEWEST:
+        return found
+    steps = np.abs(np.diff(value[begin]))
+    usual, interval = float(np.quantile(steps, USUAL)), median(np.diff(stamp[begin]).astype(np.float64))
+    u, t, end = value[begin].tolist(), stamp[begin].tolist(), [*begin[1:].tolist(), len(value)]
+
+    def pace(row: int, way: int) -> float:
+        """How far the commands go beside a row, one stray value apart."""
+        beside = (min(max(row + way * many, 0), len(u) - 1) for many in (1, 2))
+        return min(abs(u[one] - u[row]) for one in beside)
+
+    row = 1  # the first that may be stray
+    for place in (np.flatnonzero(steps > FAR * usual) + 1).tolist():
+        if place < row:
+            continue
+        before = place - 1
+        for after in range(place + 1, min(place + MOST_STRAY + 1, len(u))):
+            typical, out = max(usual, pace(before, -1), pace(after, 1)), u[place:after]
+            brief = t[after] - t[place] <= BRIEF * interval * (after - place)
+            away = all(leaps(one, u[beside], typical) for one in out for beside in (before, after))
+            if brief and away and returns(u[after], u[before], out):
+                if not any(_follows(*one, t[place]) for one in sensors):
+                    found[begin[place] : end[after - 1]] = True
+                    row = after + 1
+                break
+    return found
+
+
+def _follows(stamp: TimeArray, value: FloatArray, leap: int) -> bool:
+    """Whether a sensor moves by far larger steps after an instant [ns] than before it, more than once."""
+    edges = np.searchsorted(stamp, [leap - _FOLLOWED_NS, leap, leap + _FOLLOWED_NS]).tolist()
+    before, after = (np.sort(np.abs(np.diff(value[begin:end]))) for begin, end in pairwise(edges))
+    return len(after) > 1 and len(before) > 1 and bool(after[-2] > _FOLLOWED * before[-2])
+
+
+class Habit(NamedTuple):
+    """How the values of a sensor on an axis change from one to another.
+
+    Attributes:
+        smallest: Its steps: the smallest [m or rad],
+        typical: the median,
+        usual: and the one than which few are larger.
+        times: How often each value comes in a row, typically, if it holds its samples; else 1.
+    """
+
+    smallest: float
+    typical: float
+    usual: float
+    times: int
+
+    @staticmethod
+    def of(steps: FloatArray, lengths: IntArray) -> Habit:
+        """The habit by steps other than 0, and by how often each value came.
+
+        A long row of equal values at rest is one row of many, and coarse steps repeat by themselves: neither is held.
+        """
+        low, middle, high = np.quantile(steps, [0.0, 0.5, USUAL]).tolist()
+        holds = middle >= _COARSE * low and lengths.mean() >= _MOSTLY
+        return Habit(low, middle, high, int(np.median(lengths)) if holds else 1)
+
+    def froze(self, count: int, moved: float, travel: float, leapt: bool, repeats: float) -> bool:
+        """Whether a value that came again and again is that of a sensor that froze, not of an axis that rests.
+
+        Args:
+            count: How often it came.
+            moved: How far the commands have moved the axis meanwhile [m or rad].
+            travel: How far they move it at all.
+            leapt: Whether it is many times the usual step away from the values beside it.
+            repeats: How often other values are repeated, of 1.
+        """
+        if count < _FROZEN * self.times or not self.is_clear(moved):
+            return False
+        unlikely = self.times == 1 and repeats ** (count - 1) < _BY_CHANCE
+        return leapt or unlikely or moved > _SHARE * travel
+
+    def is_clear(self, moved: float) -> bool:
+        """Whether a motion [m or rad] is clearly more than the steps of the values."""
+        return moved > max(_STEPS * self.smallest, _CLEARLY * self.typical)
+
+    def is_again(self, place: int) -> bool:
+        """Whether a value that has come ``place`` times before in a row is that of a sample that is held."""
+        return self.times > 1 and place % (2 * self.times) != 0
+
+
+def held(stamp: TimeArray, value: FloatArray, command: tuple[TimeArray, FloatArray], lag: int) -> tuple[BoolArray, int]:
+    """Which values of a sensor on an axis are no news, (rows,); how often it gives each of them.
+
+    A sensor that is slower than its rows gives each value several times: of these the first counts. One that froze
+    gives one value while the commands move the axis by clearly more than its steps.
+
+    Args:
+        stamp: Of the rows, ascending [int ns], (rows,).
+        value: Finite.
+        command: Stamps, ascending, and values of the commands, (n,).
+        lag: How late the axis may follow its commands [ns].
+    """
+    begin = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)
+    if len(begin) <= FEWEST or len(begin) == len(value):
+        return np.zeros(len(value), dtype=np.bool_), 1
+    count, steps = np.diff(begin, append=len(value)), np.pad(np.abs(np.diff(value[begin])), 1)
+    habit = Habit.of(steps[1:-1], count[:-1])
+    place = np.arange(len(value)) - np.repeat(begin, count)
+    found = np.array([habit.is_again(one) for one in range(int(count.max()))])[place]
+    leaps, travel, repeats = steps > FAR * habit.usual, float(np.ptp(command[1])), len(value) - len(begin)
+    for run in np.flatnonzero(count >= _FROZEN).tolist():
+        first, last = int(begin[run]), int(begin[run] + count[run] - 1)
+        low, high = np.searchsorted(command[0], [stamp[first], stamp[last] - lag], side="right").tolist()
+        moved = float(np.ptp(command[1][max(low - 1, 0) : high])) if high > max(low - 1, 0) else 0.0
+        elsewhere = (repeats - count[run] + 1) / (len(value) - count[run])
+        if habit.froze(int(count[run]), moved, travel, bool(leaps[run : run + 2].any()), elsewhere):
+            found[first + (0 if leaps[run] else 1) : last + 1] = True  # what it leaps to is where nobody was
+    return found, habit.times
