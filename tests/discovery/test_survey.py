@@ -121,7 +121,7 @@ def test_clocks_are_known_by_name_by_date_and_by_interval(name: str, stamps: Any
     write(log / "commands.csv", {name: stamps(t), **{f"{axis}_m": u[:, n] for n, axis in enumerate("xyz")}})
     write(log / "camera.csv", {name: stamps(s), **{f"{axis}_m": z[:, n] for n, axis in enumerate("xyz")}})
     found = check_fuses(log, tmp_path / "out")
-    assert {part.clock.unit for part in found.parts if part.clock} == {unit}
+    assert {part.clock.time.unit for part in found.parts if part.clock} == {unit}
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("_deg", 180.0 / np.pi), ("_rad", 1.0), ("", 1.0)])
@@ -186,7 +186,7 @@ def test_tables_without_a_header(tmp_path: Path) -> None:
         lines = [f"{START + int(a)},{round(1e9 * (a % 1.0)):d},base,{x:.7f},{y:.7f},{z:.7f}\n" for a, x, y, z in rows]
         (log / f"{name}.csv").write_text("".join(lines))
     found = check_fuses(log, tmp_path / "out", ("column_4", "column_5", "column_6"))
-    assert {part.clock.nanoseconds for part in found.parts if part.clock} == {"column 2"}
+    assert {part.clock.time.nanoseconds for part in found.parts if part.clock} == {"column 2"}
 
 
 @pytest.mark.parametrize("stamps", ["none", "frames", "seconds"])
@@ -335,7 +335,7 @@ def test_joints_have_the_names_that_are_beside_them(tmp_path: Path) -> None:
             },
         )
     found = check_fuses(log, tmp_path / "out", ("pan", "lift", "wrist"))
-    assert {part.clock.column for part in found.parts if part.clock} == {"field.header.stamp"}
+    assert {part.clock.time.column for part in found.parts if part.clock} == {"field.header.stamp"}
     assert {one.unit for part in found.parts for one in part.signals} == {"rad"}
 
 

@@ -77,7 +77,7 @@ def _tables(found: Survey) -> Iterator[Table]:
 
 def _part_row(part: Part) -> list[str]:
     interval, gaps = ("", "") if part.clock is None else _rate(part.clock.stamp)
-    clock = "none found" if part.clock is None else f"{part.clock.column or 'rows'} ({part.clock.basis})"
+    clock = "none found" if part.clock is None else f"{part.clock.time.column or 'rows'} ({part.clock.basis})"
     named = [f"{name}: {why}" for name, why in part.left_out.items()]
     more = [f"{len(named) - _FEW} more"] if len(named) > _FEW else []
     unused = "; ".join([*part.notes, *named[:_FEW], *more])

@@ -18,12 +18,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as papq
+from msgspec import structs
 
 from ..arrays import NO_STAMP, FloatArray, TimeArray
 from ..errors import RunError, printable
 from ..logs import recordings, tables
 from ..logs.columns import LOG_TIME, Table, Topic, leaf, numeric_paths, prefixes, without_sentinels
+from ..logs.manifest import Time
 from ..logs.run import Source, standing_clock
+from ..logs.stamps import packets
 from ..units import TIMES, ending, kind_of, si_of, unwrapped, wraps
 from . import names
 
@@ -40,6 +43,12 @@ _VALID = names.words_in("valid tracked visible detected")  # columns that say wh
 _OF_JOINT, _NAMED = re.compile(r"positions\[(\d+)\]$"), re.compile(r"(|.*\.)name(\d+)")
 _EPOCHS = {"s": (1e9, 4e9), "ms": (1e12, 4e12), "us": (1e15, 4e15), "ns": (1e18, 4e18)}  # from 2001 to 2096
 _INTERVALS = {"s": 2.0, "ms": 2e3, "us": 2e6}  # rows of a robot's log are 2 ms to 2 s apart; shorter: a finer unit
+_SLOW, _LONGEST_STROKE = 0.05, 60.0  # of these, from which the unit may be a finer one; s that a robot's stroke takes
+_DAYS = ((2e4, 8e4), (7e5, 8e5))  # since 1899 or, as MATLAB counts, since the year 0: from 1954 or 1917 on
+_FINEST_DAY = 2.5e-5  # days, 2 s: rows of a clock that counts seconds are never so near
+_EVEN = 0.1  # share by which most steps of a counter may differ from the usual one
+_LONGEST_WAIT = 3.0  # packets, that a row waits: of rows that come in bursts by themselves some wait longer
+_ALIKE_SPANS = 1.2  # factor between the spans that two clocks of a table tell
 _METRES = ("Pose", "PoseStamped", "PoseWithCovarianceStamped", "Point", "PointStamped", "Odometry", "TransformStamped")
 _RADIANS = ("JointState", "JointTrajectory", "JointTrajectoryControllerState")
 _OTHER_TYPES = names.words_in(
@@ -53,20 +62,28 @@ class Clock:
     """The stamps of a part.
 
     Attributes:
-        column: A column or field path; with a rate, of numbers of frames, and empty where each row is the next.
-        nanoseconds: A column beside it, where it is of whole seconds; else empty.
-        unit: Of numbers whose name does not say it (``ms``), else empty.
+        time: Where they are.
         basis: How the unit is known, in words.
         stamp: Int64 ns, (rows,).
-        rate: At which frames come, as the user says [Hz]; 0: these are stamps.
+        notes: What was wrong with them, a sentence each.
+        doubt: What may be wrong with them, as a question; empty: nothing.
     """
 
-    column: str
-    nanoseconds: str
-    unit: str
+    time: Time
     basis: str
     stamp: TimeArray
-    rate: float = 0.0
+    notes: tuple[str, ...] = ()
+    doubt: str = ""
+
+    @staticmethod
+    def of(table: Table, time: Time, basis: str, doubt: str = "") -> Clock:
+        """The clock of a table.
+
+        Raises:
+            RunError: It has no such stamps.
+        """
+        stamp, notes = time.stamps(table)
+        return Clock(time, basis, stamp, tuple(notes), doubt)
 
 
 @dataclass(frozen=True)
@@ -188,32 +205,39 @@ def _files(log: Path) -> list[Path]:
 
 def _part(table: Table, place: Part, labels: Mapping[str, list[str]], rate: float = 0.0) -> Part:
     """A part with its clock and its columns, from its table."""
-    clock = _clock(table)
-    used = () if clock is None else (clock.column, clock.nanoseconds)
-    signals, left_out, joints = list[Signal](), dict[str, str](), _joints(table)
+    signals, left_out, joints, times = list[Signal](), dict[str, str](), _joints(table), list[str]()
+    counts = {name for name in table.columns if _counts(table, name) is not None}
     for path, where in product(_numeric_paths(table), _axes_in_rows(table)):
         name = _called(path, where)
-        if path in used or path in where or (clock is not None and path.startswith(f"{clock.column}.")):
+        if path in where:
             continue
         if names.is_time(path):
-            left_out[path] = "another clock" if clock else _no_clock(table, path)
+            times.append(path)
+        elif path in counts:
+            left_out[path] = "rises evenly: a count or a clock"
         elif why := names.no_position(name):
             left_out[name] = why
         elif len(signals) == _MOST_COLUMNS:
             left_out[name] = f"more than {_MOST_COLUMNS} columns"
         elif isinstance(
-            found := _signal(table, path, where, place.type, labels.get(leaf(path), []), joints.get(path)), Signal
+            found := _signal(table, path, where, place, labels.get(leaf(path), []), joints.get(path)), Signal
         ):
             signals.append(found)
         elif found:
             left_out[name] = found
-    notes = [*place.notes, *table.notes]
-    if clock is not None and (stands := _stands_still(clock, signals, table)):
-        notes, clock = [f"{clock.column} is no clock: {stands}", *notes], None
+    clock, notes = _clock(table, signals, sorted(counts))
     if clock is None and rate:
         clock = _counted(table, rate)
+    used = () if clock is None else tuple(clock.time.columns)
+    left_out |= {path: "another clock" if clock else _no_clock(table, path) for path in times}
+    mine = {path for path in left_out if path in used or path.startswith(tuple(f"{one}." for one in used))}
     return replace(
-        place, rows=table.rows, clock=clock, signals=_with_units(signals), left_out=left_out, notes=tuple(notes)
+        place,
+        rows=table.rows,
+        clock=clock,
+        signals=_with_units([one for one in signals if one.column not in used]),
+        left_out={path: why for path, why in left_out.items() if path not in mine},
+        notes=(*notes, *(() if clock is None else clock.notes), *place.notes, *table.notes),
     )
 
 
@@ -259,7 +283,7 @@ def _called(column: str, where: Mapping[str, Any]) -> str:
 
 
 def _signal(
-    table: Table, path: str, where: Mapping[str, Any], type_: str, labels: list[str], joint: str | None
+    table: Table, path: str, where: Mapping[str, Any], place: Part, labels: list[str], joint: str | None
 ) -> Signal | str:
     """A column as positions, or why it is none; empty for text."""
     try:
@@ -272,10 +296,10 @@ def _signal(
         return "hardly any number" if len(known) else ""
     if known.min() == known.max() and not names.is_part(path):
         return f"always {known[0]:g}"
-    kind = _RADIANS[0] if joint else type_.rpartition("/")[2]
+    kind = _RADIANS[0] if joint else place.type.rpartition("/")[2]
     sliding = kind in _RADIANS and names.is_sliding(joint or path)
     of_type = "m" if kind in _METRES or sliding else "rad" if kind in _RADIANS else ""
-    unit = names.unit_of(path)
+    unit = names.unit_of(path) or names.unit_of(place.topic or place.entity)
     basis = "name" if unit else "type" if of_type and not sliding else "range"
     axis = joint or names.axis_of(_called(path, where), labels)
     return Signal(path, axis, unit or of_type, basis, values, where=where)
@@ -320,18 +344,74 @@ def _numeric_paths(table: Table) -> Iterator[str]:
 # Clocks.
 
 
-def _clock(table: Table) -> Clock | None:
-    """The first column that runs like a clock, of a header before others; when it was recorded only for want of any.
+def _clock(table: Table, signals: Sequence[Signal], counts: Sequence[str]) -> tuple[Clock | None, list[str]]:
+    """The first column that runs like a clock, and what is wrong with those before it.
 
-    Where none is called so, one in a unit of time may be, ``uptime_s``, one of dates, such as the index of pandas, or
-    the first, if it rises and has no name, or LabVIEW's.
+    Of a header before others; when it was recorded only for want of any. Where none is called so, one in a unit of time
+    may be, ``uptime_s``, one of dates, such as the index of pandas, or the first, if it rises and has no name, or
+    LabVIEW's; at the end a whole number that rises evenly.
     """
-    columns = sorted(_stamp_columns(table), key=lambda name: (name == LOG_TIME, "header" not in names.words(name)))
-    columns = columns or [name for name in table.columns if ending(leaf(name)) in TIMES]
-    columns = columns or [name for name, one in table.columns.items() if _is_dated(table, name, one)]
-    if not columns and next(iter(table.columns), "") in (tables.FIRST, "X_Value"):
-        return _nameless_clock(table)
-    return next((clock for name in columns if (clock := _clock_of(table, name)) is not None), None)
+    notes, stroke, coarse = list[str](), _stroke(signals), 0.0
+    called = sorted(_stamp_columns(table), key=lambda name: (name == LOG_TIME, "header" not in names.words(name)))
+    nameless = next(iter(table.columns), "") in (tables.FIRST, "X_Value")
+
+    def candidates() -> Iterator[Clock | None]:
+        yield from (_clock_of(table, name, stroke) for name in called)
+        yield from (_clock_of(table, name, stroke) for name in table.columns if ending(leaf(name)) in TIMES)
+        yield from (
+            _clock_of(table, name, stroke) for name, one in table.columns.items() if _is_dated(table, name, one)
+        )
+        if nameless and not called:
+            yield _nameless_clock(table, stroke)
+        yield from (_clock_of(table, name, stroke, coarse) for name in counts if _counts(table, name) != 1.0)
+
+    for clock in filter(None, candidates()):
+        source = Source(clock.stamp, {one.name: one.plain for one in signals}, table.path.name)
+        if not signals or not (stands := standing_clock(source)):
+            return _spread(table, clock, counts), notes
+        notes.append(f"{clock.time.column} is no clock: {stands}")
+        coarse = coarse or float(np.ptp(clock.stamp[clock.stamp != NO_STAMP])) / 1e9
+    return None, notes
+
+
+def _spread(table: Table, clock: Clock, counts: Sequence[str]) -> Clock:
+    """A clock whose rows come in packets spread by what counts them, or with a question."""
+    if (found := packets(clock.stamp)) is None or _axes_in_rows(table) != [{}]:
+        return clock
+    each, every = found
+    what = f"{table.path.name}: rows arrive {each:.3g} at a time, every {every:.3g} s"
+    for counter in (name for name in counts if name not in clock.time.columns and _counts(table, name) == 1.0):
+        even = Clock.of(table, structs.replace(clock.time, counter=counter), f"{clock.basis}, spread by {counter}")
+        if float(np.ptp(clock.stamp - even.stamp)) / 1e9 < _LONGEST_WAIT * every:
+            return replace(even, notes=(*even.notes, f"{what}: stamped by {counter}, along the earliest arrivals"))
+    return replace(clock, doubt=f"{what}, and no column counts them: when was each made?")
+
+
+def _counts(table: Table, name: str) -> float | None:
+    """The usual step of a column of whole numbers that rise evenly, as a clock's or a counter's; None of any other."""
+    with suppress(RunError):
+        if names.unit_of(name) or not pa.types.is_integer(table.column(name).type):
+            return None
+        steps = np.diff(table.plain(name)[0])
+        usual = float(np.median(steps)) if len(steps) >= _FEWEST_ROWS else 0.0
+        if usual > 0.0 and np.mean(np.abs(steps - usual) <= _EVEN * usual) >= _IN_ORDER:
+            return usual
+    return None
+
+
+def _stroke(signals: Sequence[Signal]) -> float:
+    """How many rows a motion takes from the lower to the upper third of its range, in the middle of all columns.
+
+    That tells noise, which crosses in a few rows, from motion, and needs no unit; 0 without a column.
+    """
+    found = list[float]()
+    for one in signals:
+        value = one.plain[np.isfinite(one.plain)]
+        low, high = np.quantile(value, [0.05, 0.95])
+        side = np.where(value > high - (high - low) / 3.0, 1, np.where(value < low + (high - low) / 3.0, -1, 0))
+        side = side[side != 0]
+        found.append(len(value) / (np.count_nonzero(np.diff(side)) + 1))
+    return float(np.median(found)) if found else 0.0
 
 
 def _stamp_columns(table: Table) -> Iterator[str]:
@@ -352,26 +432,37 @@ def _stamp_columns(table: Table) -> Iterator[str]:
         yield from inside(name, column.type, 3)
 
 
-def _clock_of(table: Table, name: str) -> Clock | None:
-    """The stamps of a column; None if they do not run like those of a clock."""
+def _clock_of(table: Table, name: str, stroke: float, span: float = 0.0) -> Clock | None:
+    """The stamps of a column; None if they do not run like those of a clock.
+
+    Args:
+        table: The table.
+        name: The column.
+        stroke: How many rows a motion takes, see :func:`_stroke`.
+        span: How long another clock says that the table lasts [s]; 0: unknown.
+    """
+    doubt = ""
     try:
         kind = table.column(name).type
         if pa.types.is_nested(kind) or pa.types.is_temporal(kind) or table.is_dated(name):
-            clock = Clock(name, "", "", _basis(table, name, kind), table.stamps(name)[0])
+            time, basis = Time(name), _basis(table, name, kind)
         elif pa.types.is_integer(kind) and (beside := table.nanoseconds_beside(name)):
-            clock = Clock(name, beside, "", "seconds and nanoseconds", table.stamps(name, beside)[0])
+            time, basis = Time(name, nanoseconds=beside), "seconds and nanoseconds"
         elif (unit := ending(leaf(name))) in TIMES:
-            clock = Clock(name, "", "", f"{unit[1:]} by name", table.stamps(name)[0])
+            time, basis = Time(name), f"{unit[1:]} by name"
+        elif unit := names.time_unit_of(name):
+            time, basis = Time(name, unit), f"{unit} by name"
         else:
-            unit, basis = _time_unit(table.plain(name)[0])
-            clock = Clock(name, "", unit, f"{unit} by {basis}", table.stamps(name, unit=f"_{unit}")[0])
+            unit, basis, doubt = _time_unit(table.plain(name)[0], stroke, span)
+            time, basis = Time(name, unit), f"{unit} by {basis}"
+        clock = Clock.of(table, time, basis, doubt and f"is {name} of {table.path.name} in {doubt}")
     except RunError:
         return None
     steps = np.diff(clock.stamp[clock.stamp != NO_STAMP])
     return clock if len(steps) and steps.any() and (steps >= 0).mean() >= _IN_ORDER else None
 
 
-def _nameless_clock(table: Table) -> Clock | None:
+def _nameless_clock(table: Table, stroke: float) -> Clock | None:
     """The first column, which is called after no clock, if its numbers rise, but do not count rows.
 
     Where they are of whole seconds and the second column may be the nanoseconds, both: ``ros2 topic echo --csv``.
@@ -382,30 +473,24 @@ def _nameless_clock(table: Table) -> Clock | None:
         rest = table.plain(others[0])[0] if others else np.full(len(numbers), np.nan)
         whole = (numbers % 1.0 == 0.0) & (rest % 1.0 == 0.0) & (rest >= 0.0) & (rest < 1e9)
         if whole.all() and rest.max(initial=0.0) > 1e6:
-            return Clock(first, others[0], "", "seconds and nanoseconds", table.stamps(first, others[0])[0])
+            return Clock.of(table, Time(first, nanoseconds=others[0]), "seconds and nanoseconds")
     except RunError:
         return None
     steps = np.diff(numbers)
     rises = len(steps) and (steps > 0.0).mean() >= _IN_ORDER and (steps != 1.0).any()
-    return _clock_of(table, first) if rises else None
-
-
-def _stands_still(clock: Clock, signals: Sequence[Signal], table: Table) -> str:
-    """What is wrong with a clock that is too coarse for the rows, in words; empty of any other."""
-    if not signals:
-        return ""
-    return standing_clock(Source(clock.stamp, {one.name: one.plain for one in signals}, table.path.name))
+    return _clock_of(table, first, stroke) if rises else None
 
 
 def _counted(table: Table, rate: float) -> Clock:
     """Frames that come at a rate, by a column that counts them, or else each row."""
+    basis = f"at {rate:g} Hz, as given"
     for name in table.columns:
         if names.is_counter(name):
             with suppress(RunError):
                 steps = np.diff(table.plain(name)[0])
                 if (steps >= 1.0).all() and (steps % 1.0 == 0.0).all() and (steps == 1.0).mean() > 0.5:
-                    return Clock(name, "", "", f"at {rate:g} Hz, as given", table.frames(rate, name)[0], rate)
-    return Clock("", "", "", f"at {rate:g} Hz, as given", table.frames(rate)[0], rate)
+                    return Clock.of(table, Time(name, rate=rate), basis)
+    return Clock.of(table, Time(rate=rate), basis)
 
 
 def without_clock(part: Part) -> str:
@@ -436,17 +521,33 @@ def _no_clock(table: Table, name: str) -> str:
     return "does not run like a clock"
 
 
-def _time_unit(values: FloatArray) -> tuple[str, str]:
-    """The unit of stamps by what date they would be, or else by the time between rows; and by which."""
+def _time_unit(values: FloatArray, stroke: float, span: float) -> tuple[str, str, str]:
+    """The unit of stamps, by what it is known, and a question where that may be wrong.
+
+    By what date they would be, or else by how long another clock says that it all takes, or by the time between rows.
+    Where rows would be as far apart as a robot's hardly are, the motion has to be one of a robot, too.
+    """
     known = values[np.isfinite(values)]
-    if not len(known):
-        return "s", "default"
+    if len(known) < 2:
+        return "s", "default", ""
     middle, steps = float(np.median(known)), np.diff(known)
-    for unit, (low, high) in _EPOCHS.items():
-        if low <= middle <= high:
-            return unit, "range"
     interval = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
-    return next((unit for unit, longest in _INTERVALS.items() if interval <= longest), "ns"), "interval"
+    for unit, (low, high) in _EPOCHS.items():
+        if low <= middle <= high and not span and interval <= _INTERVALS.get(unit, np.inf):
+            return unit, "range", ""
+    if interval < _FINEST_DAY and any(low <= middle <= high for low, high in _DAYS):
+        return "days", "range", ""
+    for unit, longest in _INTERVALS.items():
+        second = longest / _INTERVALS["s"]
+        if span and 1.0 / _ALIKE_SPANS < float(np.ptp(known)) / second / span < _ALIKE_SPANS:
+            return unit, "another clock", ""
+        if not span and interval <= longest:
+            if interval <= _SLOW * longest or stroke * interval <= _LONGEST_STROKE * second:
+                return unit, "interval", ""
+            slow = f"{float(np.ptp(known)) / second:.4g} s, and a stroke takes {stroke * interval / second:.3g} s"
+            finer = {"s": "ms", "ms": "us", "us": "ns"}[unit]
+            return finer, "motion", f"{finer}? In {unit} the log lasts {slow} (run.toml, time)"
+    return "ns", "interval", ""
 
 
 # Tables.
@@ -476,7 +577,7 @@ def _perhaps(path: Path, rate: float) -> Iterator[Part]:
     """A text in a folder, which may be anything, if it is a table of positions with a clock of its own."""
     with suppress(RunError):
         part = _tabled(path, rate)
-        if part.clock and not part.clock.rate and part.signals:
+        if part.clock and not part.clock.time.rate and part.signals:
             yield part
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import tomli_w
+from msgspec import to_builtins
 
 from ..errors import printable
 from ..logs.columns import leaf
@@ -80,9 +81,9 @@ def _source(table: Sequence[str], stream: Stream, folder: Path) -> list[str]:
     lines = ["", _line(_header(table), printable(stream.why, 200)), _line(_pair("file", _from(folder, part.file)))]
     keys = {"topic": part.topic, "entity": part.entity, "where": dict(part.where)}
     lines += [_line(_pair(key, value)) for key, value in keys.items() if value]
-    more = {"column": clock.column, "unit": clock.unit, "rate_hz": clock.rate}
-    time: Any = {key: value for key, value in more.items() if value} if clock.unit or clock.rate else clock.column
-    time = [clock.column, clock.nanoseconds] if clock.nanoseconds else time
+    time: Any = {key: value for key, value in to_builtins(clock.time).items() if value}
+    if set(time) <= {"column", "nanoseconds"}:
+        time = list(time.values()) if clock.time.nanoseconds else clock.time.column
     lines.append(_line(_pair("time", time), clock.basis))
     for axis, signals in stream.axes.items():
         columns: list[Any] = [_column(one) for one in signals]

@@ -54,8 +54,13 @@ _NO_POSITIONS = words_in(
 _WHOLE = {**dict.fromkeys(words_in("vx vy vz ax ay az"), "a rate"), **dict.fromkeys(words_in("qx qy qz qw"), "turning")}
 _TRANSLATIONS = {"tx": "x", "ty": "y", "tz": "z"}
 _POSITIONS = words_in("position positions pos pose")  # current_position is one
-_TIMES = words_in(
-    "t time times stamp stamps timestamp timestamps sec secs seconds date datetime clock ts arrival arrived zeit"
+_TIME_UNITS = {
+    **dict.fromkeys(words_in("seconds secs sec s"), "s"),
+    **dict.fromkeys(words_in("milliseconds millis msecs msec ms"), "ms"),
+    **dict.fromkeys(words_in("microseconds micros usecs usec us"), "us"),
+}
+_TIMES = frozenset(one for one in _TIME_UNITS if len(one) > 2) | words_in(
+    "t time times stamp stamps timestamp timestamps date datetime clock ts arrival arrived zeit"
 )
 _COUNTERS = words_in("frame frames sample samples index idx count counter seq sequence step tick cycle nr no number")
 _WHOSE = words_in("id joint motor servo axis actuator device node channel marker body")
@@ -114,6 +119,12 @@ def is_part(column: str) -> bool:
 def is_time(column: str) -> bool:
     """Whether a column is called as stamps are."""
     return not _TIMES.isdisjoint(words(column))
+
+
+def time_unit_of(column: str) -> str:
+    """The unit of stamps that a name says otherwise than by its ending, ``micros`` or ``t [ms]``; empty without one."""
+    *before, last = words(leaf(column)) or [""]
+    return _TIME_UNITS.get(last, "") if before or len(last) > 2 else ""
 
 
 def is_counter(column: str) -> bool:

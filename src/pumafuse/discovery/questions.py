@@ -41,6 +41,7 @@ def questions(found: Survey, sensors: Mapping[str, SensorGuess]) -> Iterator[str
             "are the commands samples of a path that the controller interpolates, or is a clock off? What measures"
             " follows that path sooner than an arm can that holds each command (interpolation_ms in run.toml)"
         )
+    yield from dict.fromkeys(part.clock.doubt for part in found.parts if part.clock and part.clock.doubt)
     if found.roles is not None:
         roles = found.roles
         streams = [roles.command, *roles.sensors, *([] if roles.reference is None else [roles.reference])]

@@ -53,6 +53,8 @@ class Stream:
         assert self.part.clock is not None
         values = {axis: np.sum([one.value for one in signals], axis=0) for axis, signals in self.axes.items()}
         source = Source(self.part.clock.stamp, values, self.part.label)
+        if self.part.entity:
+            source, _ = source.on_timeline()
         has_own_rows = any(one.where for signals in self.axes.values() for one in signals)
         return source.pivoted() if has_own_rows else source.rows(source.has_value)
 
@@ -186,7 +188,10 @@ def _streams(part: Part) -> list[Stream]:
     for key, signals in groups.items():
         own = (names.column_role(signals[0].name), f"its columns are called '{key.replace('_', ' ')}'")
         file = (names.role_of(part.stem), f"it is called '{printable(part.stem)}'")
-        clock = (names.column_role(part.clock.column), f"its clock is called '{printable(part.clock.column)}'")
+        clock = (
+            names.column_role(part.clock.time.column),
+            f"its clock is called '{printable(part.clock.time.column)}'",
+        )
         by_type = ("command" if part.type.endswith("JointTrajectory") else None, f"its messages are {part.type}")
         by_state = ("sensor" if part.type.endswith("JointState") else None, f"its messages are {part.type}")
         order = (own, file, clock) if len(groups) > 1 else (file, own, clock)

@@ -25,6 +25,8 @@ from ..errors import RunError, UnknownNameError, counted, reason, shortened
 
 Columns: TypeAlias = Mapping[str, pa.ChunkedArray]
 
+DAYS = "_days"  # the unit of stamps that Excel or MATLAB's datenum counts, from a day of its own on
+_EXCEL_1970, _MATLAB_1970, _BETWEEN = 25_569.0, 719_529.0, 3e5  # 1970-01-01; days, above which they are MATLAB's
 LOG_TIME = "log_time"  # when a row was recorded
 NAMES = "name"  # the list beside another one that says what its elements are
 # Seconds and nanoseconds in a struct: ROS 2, ROS 1, Foxglove's JSON schemas, google.protobuf.Timestamp.
@@ -158,6 +160,10 @@ class Table:
         if dates is not None:
             return self._within_reach(name, self._of_clock(name, dates[0])), dates[1]
         self._refuse_words(name, self._plain_column(name))
+        if unit == DAYS:
+            days, note = self.plain(name)
+            since = _MATLAB_1970 if np.nanmedian(days) > _BETWEEN else _EXCEL_1970
+            return self._within_reach(name, units.nanoseconds((days - since) * 86400.0)), note
         exponent = 9 - 3 * units.TIMES.index(unit or self._ending(name, units.TIMES, "s"))
         return self._of_numbers(name, 10**exponent)
 

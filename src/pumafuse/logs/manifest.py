@@ -7,15 +7,18 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import msgspec
+import numpy as np
 
 from .. import toml
-from ..arrays import TimeArray
+from ..arrays import NO_STAMP, TimeArray
 from ..errors import ConfigError, PumafuseError, UnknownNameError
 from ..toml import NotNegative
 from ..units import ANGLES, LENGTHS, TIMES, Kind, ending, from_si, kind_of, refuse_name
-from .columns import Table, leaf
+from .columns import DAYS, Table, leaf
 from .frames import Frame
+from .stamps import going_on, spread
 
+_OF_TIME = {"unit", "nanoseconds", "counter", "shift_s"}  # keys beside a column of stamps
 _MOST = 2**63  # more than a whole number of a column can be
 
 
@@ -52,12 +55,16 @@ class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         column: Of stamps; with a rate, of numbers of frames, and empty where each row is the next frame.
         unit: Without the bar.
         nanoseconds: A column beside it, which is then of whole seconds.
+        counter: A column that numbers the rows, where they come in packets: they are spread by it.
+        shift: What is added to the stamps [s], as its clock is another one.
         rate: At which frames come [Hz], for a table without stamps; 0: there are some.
     """
 
     column: str = ""
     unit: str = ""
     nanoseconds: str = ""
+    counter: str = ""
+    shift: float = msgspec.field(name="shift_s", default=0.0)
     rate: NotNegative = msgspec.field(name="rate_hz", default=0.0)
 
     @property
@@ -68,10 +75,26 @@ class Time(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def columns(self) -> list[str]:
         """All columns that it takes."""
-        return [column for column in (self.column, self.nanoseconds) if column]
+        return [column for column in (self.column, self.nanoseconds, self.counter) if column]
 
-    def stamps(self, table: Table) -> tuple[TimeArray, str | None]:
-        """Stamps of the rows of a table, see :meth:`Table.stamps`, or by its frames, see :meth:`Table.frames`."""
+    def stamps(self, table: Table) -> tuple[TimeArray, list[str]]:
+        """Stamps of the rows of a table, which go on where its clock begins anew, and notes.
+
+        See :meth:`Table.stamps`, :meth:`Table.frames` and :mod:`.stamps`.
+        """
+        stamp, note = self.as_logged(table)
+        notes = [] if note is None else [note]
+        if not self.rate:
+            stamp, more = going_on(stamp, f"{table.path.name}: {self.column}")
+            notes += more
+        if self.counter:
+            stamp = spread(stamp, table.plain(self.counter)[0])
+        if self.shift:
+            stamp = np.where(stamp == NO_STAMP, stamp, stamp + round(self.shift * 1e9))
+        return stamp, notes
+
+    def as_logged(self, table: Table) -> tuple[TimeArray, str | None]:
+        """The same as they are in the table, and a note."""
         if self.rate:
             return table.frames(self.rate, self.column)
         return table.stamps(self.column, self.nanoseconds, self.ending)
@@ -268,8 +291,8 @@ def _time(given: Any, where: str, path: str) -> dict[str, Any]:
             return {"column": given}
         case [str() as seconds, str() as nanoseconds] if seconds and nanoseconds:
             return {"column": seconds, "nanoseconds": nanoseconds}
-        case {"column": str() as column, **more} if column and more.keys() <= {"unit"}:
-            _check_unit(more, TIMES, where, path)
+        case {"column": str() as column, **more} if column and more.keys() <= _OF_TIME:
+            _check_unit(more, (*TIMES, DAYS), where, path)
             return {"column": column, **more}
         case {"rate_hz": float() | int() as rate, **more} if rate and more.keys() <= {"column"}:
             return {"rate_hz": rate, **more}
@@ -277,7 +300,8 @@ def _time(given: Any, where: str, path: str) -> dict[str, Any]:
             raise ConfigError(
                 f"{where}: {path}: expected a column ('t_s', 'header.stamp'), a column with its unit"
                 " ({ column = 't', unit = 's' }), columns of whole seconds and of nanoseconds (['sec', 'nanosec']), or"
-                " how often rows come ({ rate_hz = 100 }; by a column of frames, { column = 'frame', rate_hz = 100 })"
+                " how often rows come ({ rate_hz = 100 }; by a column of frames, { column = 'frame', rate_hz = 100 });"
+                " beside a column shift_s is added to its stamps, and a counter spreads rows that come in packets"
             )
 
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 Clock = Literal["stamps", "regular"]
 
 _LONGEST_TICK = 0.1  # s, of a clock that stamps several rows alike
+_OUT_OF_ORDER_NS = 1_000_000_000  # by which rows are out of order without a word
 _FEW_ROWS = 10  # too few to judge a clock by
 _MOST_ROWS = 30_000_000  # of interpolated commands, all of which are in memory
 _MOST_STEPS, _PAUSE = 1000, 5.0  # between two commands; times the median interval, which is no path
@@ -161,6 +162,21 @@ class Source:
 
         stamp = self.stamp[row] + np.rint(share * np.append(gap, 0.0)[row]).astype(np.int64)
         return replace(self, stamp=stamp, values={axis: between(value) for axis, value in self.values.items()})
+
+    def on_timeline(self) -> tuple[Source, str | None]:
+        """The source as Rerun shows it, where its clock steps back: by stamps, the first of each; and a note.
+
+        Rerun keeps rows by their time, in whatever order they were logged; a time that was logged anew counts once.
+        """
+        order = np.argsort(self.stamp, kind="stable")
+        if (np.diff(self.stamp) >= -_OUT_OF_ORDER_NS).all():
+            return self, None
+        again = np.append(False, (np.diff(self.stamp[order]) == 0) & (np.diff(order) > 1))
+        mine = [value[order] for value in self.values.values()]
+        other = again & np.any([value != np.roll(value, 1) for value in mine], axis=0)
+        twice = f"; {counted(int(again.sum()), 'row')} of a time that was there already left out" if again.any() else ""
+        twice += f", {other.sum()} of them with another value" if other.any() else ""
+        return self.rows(order[~again]), f"{self.label}: rows are not in the order of time: put in order{twice}"
 
     def rows(self, chosen: BoolArray | IntArray | slice) -> Source:
         """The chosen rows, in the order chosen; not copied if they are all or a slice."""
@@ -529,6 +545,9 @@ def of_tables(
         if known is not None:
             (zoned if known else naive).append(name)
         found = _source(read[entry.rows], entry.time, entry.axes, entry.label, notes, units)
+        if entry.entity:
+            found, note = found.on_timeline()
+            notes.extend([] if note is None else [note])
         return found.pivoted() if entry.has_own_rows else found
 
     sources = {name: source(name) for name in entries}
@@ -616,8 +635,8 @@ def _source(
     units: dict[str, Kind],
 ) -> Source:
     """A source from its columns, those of an axis added up; new notes and new kinds of axes are put in."""
-    stamp, note = time.stamps(table)
-    values, found = dict[str, FloatArray](), [note]
+    stamp, of_time = time.stamps(table)
+    values, found = dict[str, FloatArray](), list[str | None](of_time)
     for axis, columns in axes.items():
         parts = [table.numbers(column.column, column.ending) for column in columns]
         for column in columns:

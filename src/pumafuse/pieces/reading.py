@@ -132,6 +132,8 @@ def needs_whole(path: Path, config: FusionConfig) -> str | None:
         return "turn_deg"
     if listed is not None and any(entry.time.rate for entry in listed.entries.values()):
         return "rate_hz"
+    if listed is not None and any(entry.time.counter or entry.time.shift for entry in listed.entries.values()):
+        return "a counter or shift_s"
     frame = config.frame if listed is None or listed.frame is None else listed.frame
     named = {axis for entry in listed.entries.values() for axis in entry.axes} if listed else set(CARTESIAN)
     return "a cylindrical [frame]" if isinstance(frame, Cylindrical) and not named.isdisjoint(CARTESIAN) else None
@@ -170,7 +172,9 @@ class _Rows:
         if part is None:
             self.ended, self.frontier = True, NEVER
             return 0
-        stamp, _ = self._time.stamps(part)
+        stamp, notes = self._time.stamps(part)
+        if (stamp != self._time.as_logged(part)[0]).any():
+            raise RunError(f"{'; '.join(notes)}; so long a run is fused piece by piece: cut it there")
         self._held.append(pa.table(dict(part.columns)))
         self._stamp = np.concatenate([self._stamp, stamp])
         self._read += part.rows
